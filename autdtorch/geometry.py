@@ -1,0 +1,130 @@
+"""Points and planes in space: bases of planes, points on circles, the observation plane."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from autdtorch.validation import (
+    ArrayLike,
+    Vector,
+    finite_number,
+    finite_vector,
+    positive,
+    positive_entries,
+    positive_integer,
+    unit_vector,
+)
+
+
+def plane_basis(normal: ArrayLike) -> tuple[torch.Tensor, torch.Tensor]:
+    """Orthonormal axes (u, v) of the plane with `normal`, right-handed: u x v = normal / |normal|.
+
+    u is the projection into the plane of the coordinate axis that cyclically follows the axis `normal` is
+    closest to, so that normal +x gives (y, z), +y (z, x), +z (x, y), and -x gives (y, -z).
+
+    Args:
+        normal: (3,), of any length > 0.
+
+    Returns:
+        Two unit tensors (3,), float64.
+
+    Raises:
+        ValueError: `normal` is not three finite numbers, or is zero.
+    """
+    n = torch.tensor(unit_vector("normal", normal), dtype=torch.float64)
+    axis = (int(n.abs().argmax()) + 1) % 3
+    u = -n[axis] * n
+    u[axis] += 1.0
+    u = u / torch.linalg.vector_norm(u)
+    v = torch.linalg.cross(n, u)
+    # Adding 0 turns -0 into 0, which would otherwise show in every printed point.
+    return u + 0.0, v + 0.0
+
+
+def circle_points(
+    center: ArrayLike, radius: float, count: int, normal: ArrayLike, angle: float = 0.0
+) -> torch.Tensor:
+    """Points spread evenly over a circle: center + radius (cos(angle + 2 pi n / count) u + sin(...) v).
+
+    Args:
+        center: centre of the circle (3,) [m].
+        radius: its radius [m], > 0.
+        count: number of points, >= 1.
+        normal: normal of its plane (3,); (u, v) is `plane_basis(normal)`.
+        angle: where point 0 lies, from u towards v [rad].
+
+    Returns:
+        Points (count, 3) [m], float64.
+
+    Raises:
+        ValueError: an argument is not finite, has the wrong shape or is out of range.
+    """
+    origin = torch.tensor(finite_vector("center", center), dtype=torch.float64)
+    radius = positive("radius", radius, "m")
+    count = positive_integer("count", count)
+    u, v = plane_basis(normal)
+    start = finite_number("angle", angle, "rad")
+    angles = start + 2 * math.pi * torch.arange(count, dtype=torch.float64) / count
+    return origin + radius * (angles.cos()[:, None] * u + angles.sin()[:, None] * v)
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A rectangle in space on which a field is sampled.
+
+    Attributes:
+        center: centre (3,) [m].
+        normal: normal (3,), stored with length 1.
+        size: edge lengths (Lu, Lv) [m] along the axes (u, v) of `basis`, > 0.
+
+    Raises:
+        ValueError: an attribute is not finite, has the wrong shape or is out of range.
+    """
+
+    center: Vector
+    normal: Vector
+    size: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        """Check the attributes and bring them into canonical form."""
+        object.__setattr__(self, "center", finite_vector("Plane.center", self.center))
+        object.__setattr__(self, "normal", unit_vector("Plane.normal", self.normal))
+        object.__setattr__(self, "size", positive_entries("Plane.size", self.size, 2))
+
+    @property
+    def basis(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Unit tensors (u, v), (3,) each, along the edges; see `plane_basis`."""
+        return plane_basis(self.normal)
+
+    @property
+    def corners(self) -> torch.Tensor:
+        """The four corners (4, 3) [m]."""
+        signs = torch.tensor([-1.0, 1.0], dtype=torch.float64)
+        return self._at(signs * self.size[0] / 2, signs * self.size[1] / 2).reshape(4, 3)
+
+    def points(self, spacing: float) -> torch.Tensor:
+        """Centres of the equal cells that cover the plane.
+
+        Args:
+            spacing: wanted edge of a cell [m], > 0. The cells fill the plane, with edges Lu / Nu and Lv / Nv.
+
+        Returns:
+            Points (Nu, Nv, 3) [m], float64; Nu = Lu / spacing rounded, at least 1, and Nv alike.
+
+        Raises:
+            ValueError: `spacing` is not a finite number > 0.
+        """
+        spacing = positive("spacing", spacing, "m")
+        along = []
+        for length in self.size:
+            count = max(1, round(length / spacing))
+            along.append(length * ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5))
+        return self._at(along[0], along[1])
+
+    def _at(self, along_u: torch.Tensor, along_v: torch.Tensor) -> torch.Tensor:
+        u, v = self.basis
+        center = torch.tensor(self.center, dtype=torch.float64)
+        return center + along_u[:, None, None] * u + along_v[None, :, None] * v

@@ -1,0 +1,143 @@
+"""Scenes from YAML files.
+
+The keys of a section are the arguments of what it builds, so that the two cannot drift apart.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import os
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from autdtorch.array import TransducerArray
+from autdtorch.geometry import Plane, circle_points
+from autdtorch.scene import Box, Medium, Scene
+from autdtorch.validation import ArrayLike, Vector, finite_vector, invalid, points_tensor
+
+Builder = Callable[..., Any]
+
+
+def load_scene(source: str | os.PathLike[str] | Mapping[str, Any]) -> Scene:
+    """Read a scene from a YAML file, or from a mapping of the same layout such as Hydra's `cfg.scene`.
+
+    Args:
+        source: path of the file, or the mapping. Interpolations (`${...}`) are resolved. A key without a
+            value counts as left out.
+
+    Returns:
+        The scene.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: not YAML, an unknown or missing key, or a value that is not accepted. The message names
+            the file and the section.
+    """
+    where = "scene mapping" if isinstance(source, Mapping) else os.fspath(source)
+    section = _mapping(where, _read(where, source))
+    _check_keys(where, section, Scene)
+    parts = {key: _part(f"{where}: {key}", key, value) for key, value in section.items()}
+    scene: Scene = _build(where, parts, Scene)
+    return scene
+
+
+def _read(where: str, source: str | os.PathLike[str] | Mapping[str, Any]) -> object:
+    """What the file or mapping holds, as plain Python containers."""
+    from omegaconf import DictConfig, ListConfig, OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+    from yaml import MarkedYAMLError, YAMLError  # type: ignore[import-untyped]
+
+    config: DictConfig | ListConfig
+    try:
+        if isinstance(source, Mapping):
+            # A node of a larger configuration stays in its place, where its interpolations resolve.
+            config = source if isinstance(source, DictConfig) else OmegaConf.create(dict(source))
+        else:
+            config = OmegaConf.load(Path(source))
+        return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 0
+        raise ValueError(f"{where}, line {line}: {error.problem}; must be valid YAML") from error
+    except (YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{where}: {error}; must be valid YAML in UTF-8") from error
+    except OmegaConfBaseException as error:
+        raise ValueError(f"{where}: {error}") from error
+    except OSError as error:
+        if error.errno is not None:
+            raise
+        # OmegaConf's way to refuse a file that holds a bare number.
+        raise ValueError(f"{where}: {error}; must hold a mapping of keys to values") from error
+
+
+def _part(where: str, key: str, value: object) -> object:
+    """The argument `key` of `Scene` from the `value` under that key of the file."""
+    match key:
+        case "medium":
+            return _build(where, _mapping(where, value), Medium)
+        case "array":
+            return _build_kind(where, value, {"grid": TransducerArray.grid, "positions": TransducerArray})
+        case "obstacles":
+            if not isinstance(value, list):
+                raise invalid(where, value, "must be a list of obstacles")
+            return [
+                _build_kind(f"{where}[{index}]", entry, {"box": Box}) for index, entry in enumerate(value)
+            ]
+        case "control_points":
+            return _build_kind(where, value, {"circle": circle_points, "points": _points})
+        case "observation_plane":
+            return _build(where, _mapping(where, value), Plane)
+        case "domain":
+            return _build(where, _mapping(where, value), _domain)
+        case _:
+            return value
+
+
+def _points(positions: ArrayLike) -> torch.Tensor:
+    return points_tensor("positions", positions)
+
+
+def _domain(lower: ArrayLike, upper: ArrayLike) -> tuple[Vector, Vector]:
+    return finite_vector("lower", lower), finite_vector("upper", upper)
+
+
+def _build_kind(where: str, value: object, builders: Mapping[str, Builder]) -> Any:
+    """Build with the one of `builders` that the key `type` names."""
+    section = _mapping(where, value)
+    kind = section.pop("type", None)
+    if not isinstance(kind, str) or kind not in builders:
+        raise invalid(f"{where}: type", kind, f"must be one of {', '.join(builders)}{_hint(kind, builders)}")
+    return _build(where, section, builders[kind])
+
+
+def _build(where: str, section: dict[str, Any], builder: Builder) -> Any:
+    _check_keys(where, section, builder)
+    try:
+        return builder(**section)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+
+
+def _mapping(where: str, value: object) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise invalid(where, value, "must be a mapping of keys to values")
+    return {str(key): entry for key, entry in value.items() if entry is not None}
+
+
+def _check_keys(where: str, section: Mapping[str, object], builder: Builder) -> None:
+    parameters = inspect.signature(builder).parameters
+    allowed = f"allowed keys: {', '.join(parameters)}"
+    for key in section:
+        if key not in parameters:
+            raise ValueError(f"{where}: unknown key {key!r}{_hint(key, parameters)}; {allowed}")
+    for key, parameter in parameters.items():
+        if parameter.default is inspect.Parameter.empty and key not in section:
+            raise ValueError(f"{where}: missing key {key!r}; {allowed}")
+
+
+def _hint(key: object, known: Iterable[str]) -> str:
+    nearest = difflib.get_close_matches(str(key), list(known), n=1)
+    return f" (did you mean {nearest[0]!r}?)" if nearest else ""

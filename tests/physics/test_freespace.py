@@ -1,0 +1,83 @@
+"""Point sources in free space against the equations that define them; all in float64."""
+
+import cmath
+import math
+
+import pytest
+import torch
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from autdtorch.array import TransducerArray
+from autdtorch.drive import drive_from_phases, focus_phases
+from autdtorch.freespace import free_space_matrix, green
+from autdtorch.validation import distances
+
+WAVELENGTH = 8.5e-3
+WAVENUMBER = 2 * math.pi / WAVELENGTH
+
+points = hnp.arrays(float, (5, 3), elements=st.floats(-0.1, 0.1))
+
+
+@pytest.fixture
+def array():
+    return TransducerArray.grid((4, 4), pitch=10e-3, center=(1e-3, 50e-3, 50e-3), source_strength=0.7)
+
+
+@pytest.mark.parametrize("target", [(17e-3, 0.0, 0.0), (10e-3, -20e-3, 30e-3), (-60e-3, 40e-3, 1e-3)])
+def test_green_solves_the_helmholtz_equation_away_from_the_source(target):
+    """Seven-point Laplacian of step h: its truncation error is h^2/12 sum d^4 g.
+
+    Far from the source that is at most (k h)^2/12 of k^2 |g|; at the nearest point, 2 wavelengths off
+    (k r = 12.6), the derivatives of 1/r add some 4/(k r), a third. Rounding adds 1e-16/(k h)^2 = 1e-12.
+    """
+    h = WAVELENGTH / 400
+    steps = torch.cat([torch.zeros(1, 3), torch.eye(3), -torch.eye(3)]).double()
+    values = green(torch.tensor(target, dtype=torch.float64) + h * steps, [[0.0, 0.0, 0.0]], WAVENUMBER)[:, 0]
+    laplacian = (values[1:].sum() - 6 * values[0]) / h**2
+    residual = (laplacian + WAVENUMBER**2 * values[0]).abs() / (WAVENUMBER**2 * values[0].abs())
+    assert residual < 4 / 3 * (WAVENUMBER * h) ** 2 / 12
+
+
+def test_green_is_outgoing_and_of_unit_strength():
+    r = torch.tensor([1e-6, 1e-3, 1e-3 + WAVELENGTH / 4], dtype=torch.float64)
+    values = green(torch.stack([r, 0 * r, 0 * r], dim=1), [[0.0, 0.0, 0.0]], WAVENUMBER)[:, 0]
+    # Near the source g is 1/(4 pi r) but for k r = 7e-4.
+    assert abs(4 * math.pi * r[0] * values[0] - 1) < 1e-3
+    # With e^{-i w t}, a quarter of a wavelength outwards turns the phase by +90 degrees.
+    assert cmath.phase(values[2] / values[1]) == pytest.approx(math.pi / 2, rel=1e-12)
+
+
+@settings(deadline=None)
+@given(here=points, there=points)
+def test_green_is_reciprocal(here, there):
+    assume(distances(torch.from_numpy(here), torch.from_numpy(there)).min() > 1e-6)
+    # The two distances are sums of the same squares: equal to the last bit.
+    assert torch.equal(green(here, there, WAVENUMBER), green(there, here, WAVENUMBER).T)
+
+
+def test_matrix_is_equation_2_term_by_term(array):
+    targets = [(80e-3, 50e-3, 50e-3), (80e-3, 20e-3, 50e-3), (33e-3, 1e-3, 99e-3)]
+    matrix = free_space_matrix(targets, array, WAVENUMBER)
+    for row, target in zip(matrix.tolist(), targets, strict=True):
+        for entry, source in zip(row, array.positions.tolist(), strict=True):
+            r = math.dist(target, source)
+            # Phases reach k r = 80 rad: 1e-14 of rounding.
+            assert cmath.isclose(entry, 0.7 * cmath.exp(1j * WAVENUMBER * r) / r, rel_tol=1e-13)
+
+
+@settings(deadline=None)
+@given(
+    focus=hnp.arrays(float, 3, elements=st.floats(5e-3, 0.1)),
+    phases=hnp.arrays(float, 16, elements=st.floats(0, 2 * math.pi)),
+)
+def test_equation_3_puts_every_contribution_in_phase_at_the_focus(focus, phases):
+    array = TransducerArray.grid((4, 4), pitch=10e-3, center=(1e-3, 50e-3, 50e-3), source_strength=0.7)
+    row = free_space_matrix(focus[None], array, WAVENUMBER)[0]
+    limit = (0.7 / distances(torch.from_numpy(focus[None]), array.positions)).sum()
+    focused = row @ drive_from_phases(focus_phases(array.positions, focus, WAVENUMBER))
+    # Phases reach k r = 130 rad: 3e-14 of rounding; the sum of S/r is real, so the phase of p is zero too.
+    torch.testing.assert_close(focused, limit.to(torch.complex128), rtol=1e-13, atol=0)
+    # No other phases do better.
+    assert (row @ drive_from_phases(phases)).abs() <= limit * (1 + 1e-13)

@@ -1,0 +1,350 @@
+"""What is wrong with the input must be clear from the message: the field, the value, what is accepted."""
+
+import copy
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from autdtorch.array import TransducerArray
+from autdtorch.drive import drive_from_phases, focus_phases, normalise, phases_of, validate_drive
+from autdtorch.freespace import free_space_matrix, green
+from autdtorch.geometry import Plane, circle_points, plane_basis
+from autdtorch.scene import Box, Medium, Scene
+from autdtorch.scene_file import load_scene
+
+SCENES = Path(__file__).parents[2] / "configs" / "scene"
+NAN, INF = math.nan, math.inf
+
+
+def medium(**changes):
+    return Medium(**{"density": 1.293, "sound_speed": 340.0} | changes)
+
+
+def box(**changes):
+    material = {"density": 100.0, "sound_speed": 340.0}
+    return Box(**{"center": (41e-3, 50e-3, 50e-3), "size": (10e-3,) * 3} | material | changes)
+
+
+def grid(**changes):
+    return TransducerArray.grid(**{"shape": (4, 4), "pitch": 10e-3, "center": (1e-3, 50e-3, 50e-3)} | changes)
+
+
+def circle(**changes):
+    arguments = {"center": (80e-3, 50e-3, 50e-3), "radius": 30e-3, "count": 4, "normal": (1, 0, 0)}
+    return circle_points(**arguments | changes)
+
+
+def plane(**changes):
+    return Plane(**{"center": (80e-3, 50e-3, 50e-3), "normal": (1, 0, 0), "size": (0.1, 0.1)} | changes)
+
+
+def scene(**changes):
+    arguments = {"array": grid(), "medium": medium(), "frequency": 40e3, "control_points": circle()}
+    return Scene(**arguments | changes)
+
+
+def from_yaml(remove=None, **changes):
+    """Load the paper's three cubes after setting keys (`array__pitch` is `array.pitch`) or removing one."""
+    config = OmegaConf.load(SCENES / "three_cubes.yaml")
+    for key, value in changes.items():
+        OmegaConf.update(config, key.replace("__", "."), value, merge=False, force_add=True)
+    if remove is not None:
+        section, _, key = remove.rpartition(".")
+        del (OmegaConf.select(config, section) if section else config)[key]
+    return load_scene(config)
+
+
+WRONG = {
+    # numbers
+    "density negative": (lambda: medium(density=-1.2), "Medium.density: -1.2 kg/m^3; must be finite and > 0"),
+    "sound speed nan": (lambda: medium(sound_speed=NAN), "Medium.sound_speed: nan m/s; must be finite"),
+    "density text": (lambda: medium(density="1.2"), "Medium.density: '1.2'; must be a real number [kg/m^3]"),
+    "density boolean": (lambda: medium(density=True), "Medium.density: True; must be a real number"),
+    "density numpy boolean": (lambda: medium(density=np.True_), "Medium.density: np.True_; must be a real"),
+    "density complex": (lambda: medium(density=1j), "Medium.density: 1j; must be a real number"),
+    "density missing": (lambda: medium(density=None), "Medium.density: None; must be a real number"),
+    "frequency zero": (lambda: scene(frequency=0), "Scene.frequency: 0 Hz; must be finite and > 0"),
+    "frequency infinite": (lambda: scene(frequency=INF), "Scene.frequency: inf Hz; must be finite"),
+    # boxes
+    "box size negative": (
+        lambda: box(size=(0.01, -1, 0.01)),
+        "Box.size: (0.01, -1, 0.01) m; every entry must be finite and > 0",
+    ),
+    "box size of two": (lambda: box(size=(0.01, 0.01)), "Box.size: (0.01, 0.01); must be 3 real numbers [m]"),
+    "box size scalar": (lambda: box(size=0.01), "Box.size: 0.01; must be 3 real numbers"),
+    "box centre nan": (lambda: box(center=(NAN, 0, 0)), "Box.center: (nan, 0.0, 0.0) m; every entry must be"),
+    "box centre text": (lambda: box(center=("a", 0, 0)), "Box.center: ('a', 0, 0); must be an array of real"),
+    "box centre boolean": (lambda: box(center=(True, 0, 0)), "Box.center: (True, 0, 0); must be an array of"),
+    "box rigid and material": (lambda: box(rigid=True), "Box.rigid: (100.0, 340.0); must have either"),
+    "box neither": (lambda: box(density=None, sound_speed=None), "Box.density: None; must have both"),
+    "box half a material": (lambda: box(sound_speed=None), "Box.sound_speed: None; must have both"),
+    "box rigid text": (lambda: box(rigid="yes"), "Box.rigid: 'yes'; must be true or false"),
+    "box density negative": (
+        lambda: box(density=-100.0),
+        "Box.density: -100.0 kg/m^3; must be finite and > 0",
+    ),
+    "box contains wrong shape": (lambda: box().contains([[0, 0]]), "points: shape (1, 2); must be (..., 3)"),
+    # arrays
+    "array empty": (
+        lambda: TransducerArray([], (1, 0, 0)),
+        "TransducerArray.positions: shape (0,); must be (P, 3)",
+    ),
+    "array of plane points": (
+        lambda: TransducerArray([[0, 0]], (1, 0, 0)),
+        "positions: shape (1, 2); must be (P, 3)",
+    ),
+    "array ragged": (
+        lambda: TransducerArray([[0, 0, 0], [1]], (1, 0, 0)),
+        "positions: ([0, 0, 0], [1]); must be",
+    ),
+    "array nan": (
+        lambda: TransducerArray(torch.full((4, 3), NAN), (1, 0, 0)),
+        "TransducerArray.positions[0, 0]: nan m; every entry must be finite",
+    ),
+    "array boolean tensor": (
+        lambda: TransducerArray(torch.ones(1, 3, dtype=torch.bool), (1, 0, 0)),
+        "TransducerArray.positions: ([True, True, True],); must be an array of real numbers [m]",
+    ),
+    "array duplicates": (
+        lambda: TransducerArray([[0, 0, 0], [0, 1, 0], [0, 0, 1e-10]], (1, 0, 0)),
+        "TransducerArray.positions: points 0 and 2 coincide at (0.0, 0.0, 0.0) m",
+    ),
+    "normal zero": (lambda: grid(normal=(0, 0, 0)), "normal: (0, 0, 0); must be a vector of finite length >"),
+    "one normal zero": (
+        lambda: TransducerArray([[0, 0, 0], [0, 1, 0]], [[1, 0, 0], [0, 0, 0]]),
+        "TransducerArray.normals[1]: (0.0, 0.0, 0.0); must be a vector of finite length",
+    ),
+    "normals too few": (
+        lambda: TransducerArray([[0, 0, 0], [0, 1, 0], [0, 2, 0]], [[1, 0, 0], [1, 0, 0]]),
+        "TransducerArray.normals: shape (2, 3); must be (3,) or (3, 3)",
+    ),
+    "source strength zero": (
+        lambda: grid(source_strength=0.0),
+        "TransducerArray.source_strength: 0.0 Pa m; must be finite and > 0",
+    ),
+    "pitch zero": (lambda: grid(pitch=0), "pitch: 0 m; must be finite and > 0"),
+    "grid of floats": (lambda: grid(shape=(4, 4.5)), "shape[1]: 4.5; must be an integer >= 1"),
+    "grid of none": (lambda: grid(shape=(0, 4)), "shape[0]: 0; must be an integer >= 1"),
+    "grid of one number": (lambda: grid(shape=4), "shape: 4; must be 2 integers >= 1"),
+    # geometry
+    "count not integer": (lambda: circle(count=3.5), "count: 3.5; must be an integer >= 1"),
+    "count boolean": (lambda: circle(count=True), "count: True; must be an integer >= 1"),
+    "radius negative": (lambda: circle(radius=-0.03), "radius: -0.03 m; must be finite and > 0"),
+    "angle infinite": (lambda: circle(angle=INF), "angle: inf rad; must be finite"),
+    "basis of four": (lambda: plane_basis((1, 0, 0, 0)), "normal: (1, 0, 0, 0); must be 3 real numbers"),
+    "basis of nothing": (
+        lambda: plane_basis((1e-12, 0, 0)),
+        "normal: (1e-12, 0, 0); must be a vector of finite",
+    ),
+    "plane size zero": (
+        lambda: plane(size=(0.1, 0)),
+        "Plane.size: (0.1, 0) m; every entry must be finite and > 0",
+    ),
+    "plane spacing": (lambda: plane().points(-1e-3), "spacing: -0.001 m; must be finite and > 0"),
+    # drives
+    "amplitude above one": (
+        lambda: drive_from_phases([0.0, 0.0], [0.5, 1.5]),
+        "amplitudes: from 0.5 to 1.5; every entry must be in [0, 1]",
+    ),
+    "amplitudes of another shape": (
+        lambda: drive_from_phases([0.0, 0.0], [1.0, 1.0, 1.0]),
+        "amplitudes: shape (3,); must broadcast with phases, (2,)",
+    ),
+    "phases nan": (
+        lambda: drive_from_phases([0.0, NAN]),
+        "phases: (0.0, nan) rad; every entry must be finite",
+    ),
+    "phases complex": (
+        lambda: drive_from_phases([1j]),
+        "phases: (1j,); must be an array of real numbers [rad]",
+    ),
+    "phases scalar": (lambda: drive_from_phases(1.0), "phases: shape (); must be (..., M)"),
+    "drive real": (lambda: phases_of([1.0]), "drive: (1.0,); must be an array of complex numbers"),
+    "drive too loud": (
+        lambda: validate_drive([1.1j, 0], 2),
+        "drive: amplitude 1.1; every |q| must be in [0, 1]",
+    ),
+    "drive of another array": (lambda: validate_drive([1j, 0], 16), "drive: shape (2,); must be (..., 16)"),
+    "drive nan": (
+        lambda: validate_drive([complex(NAN, 0)], 1),
+        "drive: ((nan+0j),); every entry must be finite",
+    ),
+    "drive silent": (lambda: normalise([[1j, 0], [0j, 0]]), "drive: 0 for every transducer; at least one"),
+    "drive without entries": (
+        lambda: normalise(torch.zeros(3, 0) * 1j),
+        "drive: shape (3, 0); must be (..., M)",
+    ),
+    "focus of two": (
+        lambda: focus_phases([[0, 0, 0]], (1, 2), 1.0),
+        "focus: (1, 2); must be 3 real numbers [m]",
+    ),
+    "wavenumber zero": (
+        lambda: focus_phases([[0, 0, 0]], (1, 2, 3), 0.0),
+        "wavenumber: 0.0 rad/m; must be finite",
+    ),
+    # free space
+    "point on a source": (
+        lambda: green([[0, 0, 1], [0, 0, 0]], [[0, 0, 0]], 1.0),
+        "points[1]: (0.0, 0.0, 0.0) m; lies on source 0, must be at least 1e-09 m away",
+    ),
+    "point far away": (
+        lambda: free_space_matrix([[0, 0, INF]], grid(), 1.0),
+        "points: ([0.0, 0.0, inf],) m; every entry must be finite",
+    ),
+    # scenes
+    "array of another type": (
+        lambda: scene(array=[[0, 0, 0]]),
+        "Scene.array: ([0, 0, 0],); must be a TransducerA",
+    ),
+    "medium of another type": (lambda: scene(medium=340.0), "Scene.medium: 340.0; must be a Medium"),
+    "plane of another type": (
+        lambda: scene(observation_plane=80e-3),
+        "Scene.observation_plane: 0.08; must be a P",
+    ),
+    "name empty": (lambda: scene(name=""), "Scene.name: ''; must be text of at least one character"),
+    "obstacles not a sequence": (lambda: scene(obstacles=box()), "must be a sequence of obstacles"),
+    "obstacle of another type": (
+        lambda: scene(obstacles=["box"]),
+        "Scene.obstacles[0]: 'box'; must be a Box",
+    ),
+    "one control point without a list": (
+        lambda: scene(control_points=(80e-3, 50e-3, 50e-3)),
+        "Scene.control_points: shape (3,); must be (P, 3) with P >= 1",
+    ),
+    "no control point": (
+        lambda: scene(control_points=[]),
+        "Scene.control_points: shape (0,); must be (P, 3)",
+    ),
+    "control points twice": (
+        lambda: scene(control_points=[(0.08, 0.05, 0.05)] * 2),
+        "Scene.control_points: points 0 and 1 coincide at (0.08, 0.05, 0.05) m",
+    ),
+    "control point on a transducer": (
+        lambda: scene(array=grid(shape=(1, 1)), control_points=[(1e-3, 50e-3, 50e-3)]),
+        "Scene.control_points[0]: (0.001, 0.05, 0.05) m; lies on transducer 0",
+    ),
+    "transducer in an obstacle": (
+        lambda: scene(obstacles=[box(), box(center=(0.0, 35e-3, 35e-3))]),
+        "Scene.array.positions[0]: (0.001, 0.035, 0.035) m; lies in or on obstacle 1",
+    ),
+    "control point in an obstacle": (
+        lambda: scene(obstacles=[box(center=(80e-3, 50e-3, 80e-3))]),
+        "Scene.control_points[1]: (0.08, 0.05, 0.08) m; lies in or on obstacle 0",
+    ),
+    "control point on an obstacle": (
+        lambda: scene(obstacles=[box()], control_points=[(46e-3, 50e-3, 50e-3)]),
+        "must be outside it",
+    ),
+    "obstacles overlap": (
+        lambda: scene(obstacles=[box(), box(center=(50e-3, 50e-3, 50e-3))]),
+        "overlaps obstacle 0 by 0.001 m, may touch it but not overlap",
+    ),
+    "domain upside down": (
+        lambda: scene(domain=((0, 0, 0), (0.1, 0.1, 0))),
+        "Scene.domain: ((0.0, 0.0, 0.0), (0.1, 0.1, 0.0)) m; lower must be below upper on every axis",
+    ),
+    "domain of one corner": (lambda: scene(domain=(1, 1, 1)), "Scene.domain: (1, 1, 1); must be two corners"),
+    "control point outside the domain": (
+        lambda: scene(domain=((0, 0, 0), (0.1, 0.1, 0.07))),
+        "Scene.control_points[1]: (0.08, 0.05, 0.08) m; must be inside the domain, (0.0, 0.0, 0.0) to",
+    ),
+    "transducer outside the domain": (
+        lambda: scene(domain=((0.01, 0, 0), (0.1, 0.1, 0.1))),
+        "Scene.array.positions[0]: (0.001, 0.035, 0.035) m; must be inside the domain",
+    ),
+    "obstacle partly outside the domain": (
+        lambda: scene(domain=((0, 0, 0), (0.1, 0.1, 0.1)), obstacles=[box(center=(41e-3, 50e-3, 98e-3))]),
+        "Scene.obstacles[0] corner[1]: (0.046, 0.055, 0.103",
+    ),
+    "observation plane outside the domain": (
+        lambda: scene(domain=((0, 0, 0), (0.1, 0.1, 0.1)), observation_plane=plane(size=(0.1, 0.2))),
+        "Scene.observation_plane corner[0]: (0.08, 0.0, -0.05) m; must be inside the domain",
+    ),
+    # files
+    "unknown key": (
+        lambda: from_yaml(obstacels=[]),
+        "scene mapping: unknown key 'obstacels' (did you mean 'obstacles'?); allowed keys: array, medium",
+    ),
+    "unknown key in a section": (
+        lambda: from_yaml(array__pich=1e-2),
+        "scene mapping: array: unknown key 'pich' (did you mean 'pitch'?); allowed keys: shape, pitch",
+    ),
+    "key not text": (lambda: load_scene({1: 2}), "scene mapping: unknown key '1'; allowed keys"),
+    "missing key": (lambda: from_yaml(remove="medium"), "scene mapping: missing key 'medium'; allowed keys"),
+    "missing key in a section": (lambda: from_yaml(remove="array.pitch"), "array: missing key 'pitch'"),
+    "missing type": (
+        lambda: from_yaml(remove="control_points.type"),
+        "scene mapping: control_points: type: None; must be one of circle, points",
+    ),
+    "unknown type": (
+        lambda: from_yaml(array__type="gird"),
+        "scene mapping: array: type: 'gird'; must be one of grid, positions (did you mean 'grid'?)",
+    ),
+    "type a list": (lambda: from_yaml(array__type=["grid"]), "array: type: ('grid',); must be one of"),
+    "section not a mapping": (lambda: from_yaml(medium=340.0), "medium: 340.0; must be a mapping of keys to"),
+    "obstacles a mapping": (
+        lambda: from_yaml(obstacles={"type": "box"}),
+        "obstacles: {'type': 'box'}; must be a list",
+    ),
+    "number in quotes": (
+        lambda: from_yaml(medium__density="heavy"),
+        "scene mapping: medium: Medium.density: 'heavy'; must be a real number [kg/m^3]",
+    ),
+    "value of a list entry": (
+        lambda: from_yaml(obstacles=[{"type": "box", "center": [0, 0, 0], "size": [1, 1, 0], "rigid": True}]),
+        "scene mapping: obstacles[0]: Box.size: (1, 1, 0) m; every entry must be finite and > 0",
+    ),
+    "value of the whole": (lambda: from_yaml(frequency=-1), "scene mapping: Scene.frequency: -1 Hz; must be"),
+    "domain of a file": (
+        lambda: from_yaml(domain__lower=[0, 0]),
+        "domain: lower: (0, 0); must be 3 real numbers",
+    ),
+    "interpolation to nowhere": (
+        lambda: from_yaml(frequency="${tone}"),
+        "Interpolation key 'tone' not found",
+    ),
+    "mandatory value": (lambda: from_yaml(frequency="???"), "Missing mandatory value: frequency"),
+}
+
+
+@pytest.mark.parametrize(("call", "message"), WRONG.values(), ids=WRONG.keys())
+def test_wrong_input_is_named(call, message):
+    with pytest.raises(ValueError) as caught:  # noqa: PT011  (compared as plain text below)
+        call()
+    assert message in str(caught.value)
+
+
+FILES = {
+    "syntax": ("name: x\nfrequency: [40e3,\nmedium: }\n", ", line 3: "),
+    "key twice": ("name: x\nname: y\n", ", line 2: found duplicate key name; must be valid YAML"),
+    "a list": ("- 1\n- 2\n", ": (1, 2); must be a mapping of keys to values"),
+    "a number": ("40e3\n", "must hold a mapping of keys to values"),
+    "empty": ("", ": missing key 'array'; allowed keys"),
+    "not text": (b"\xff\xfe\xff", "must be valid YAML in UTF-8"),
+}
+
+
+@pytest.mark.parametrize(("content", "message"), FILES.values(), ids=FILES.keys())
+def test_wrong_file_is_named(tmp_path, content, message):
+    path = tmp_path / "mine.yaml"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(ValueError) as caught:  # noqa: PT011  (compared as plain text below)
+        load_scene(path)
+    assert str(caught.value).startswith(str(path))
+    assert message in str(caught.value)
+
+
+def test_missing_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.yaml"):
+        load_scene(tmp_path / "nowhere.yaml")
+
+
+def test_loading_leaves_the_mapping_as_it_was():
+    given = OmegaConf.to_container(OmegaConf.load(SCENES / "two_cubes.yaml"))
+    before = copy.deepcopy(given)
+    load_scene(given)
+    assert given == before

@@ -1,0 +1,111 @@
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from autdtorch.drive import (
+    amplitudes_of,
+    drive_from_phases,
+    focus_phases,
+    normalise,
+    phases_of,
+    validate_drive,
+)
+
+WAVENUMBER = 2 * math.pi * 40e3 / 340.0
+
+phases_arrays = hnp.arrays(
+    float, hnp.array_shapes(min_dims=1, max_dims=3, max_side=5), elements=st.floats(-1e3, 1e3)
+)
+places = hnp.arrays(float, (6, 3), elements=st.floats(-0.2, 0.2))
+vectors = hnp.arrays(float, 3, elements=st.floats(-0.2, 0.2))
+
+
+def test_a_positive_phase_turns_the_drive_clockwise():
+    drive = drive_from_phases([0.0, math.pi / 2], [1.0, 0.5])
+    expected = torch.tensor([1.0, -0.5j], dtype=torch.complex128)
+    # cos(pi / 2) is 6e-17 in float64.
+    torch.testing.assert_close(drive, expected, rtol=0, atol=1e-16)
+
+
+@settings(deadline=None)
+@given(phases=phases_arrays)
+def test_drive_and_phases_round_trip(phases):
+    drive = drive_from_phases(phases)
+    found = phases_of(drive)
+    assert found.shape == phases.shape
+    assert ((found >= 0) & (found < 2 * math.pi)).all()
+    # Compared on the circle, where 0 and 2 pi are one; 1e3 rad leaves 1e-13 of rounding in sine and cosine.
+    torch.testing.assert_close(drive_from_phases(found), drive, rtol=0, atol=1e-12)
+    torch.testing.assert_close(amplitudes_of(drive), torch.ones(phases.shape).double(), rtol=0, atol=1e-15)
+
+
+@settings(deadline=None)
+@given(phases=phases_arrays, data=st.data())
+def test_amplitudes_round_trip(phases, data):
+    amplitudes = data.draw(hnp.arrays(float, phases.shape, elements=st.floats(0, 1)))
+    found = amplitudes_of(drive_from_phases(phases, amplitudes))
+    # Subnormal amplitudes lose their relative precision in |q|.
+    torch.testing.assert_close(found, torch.from_numpy(amplitudes), rtol=1e-15, atol=1e-300)
+
+
+def test_phases_stay_below_a_full_turn_and_are_zero_for_silence():
+    phases = phases_of(torch.tensor([1 + 1e-17j, 0j, complex(-0.0, 0.0), -1 + 0j], dtype=torch.complex128))
+    assert phases.tolist() == [0.0, 0.0, 0.0, math.pi]
+
+
+def test_drive_carries_the_gradient_of_phases_and_amplitudes():
+    phases = torch.tensor([0.3, 2.0], dtype=torch.float64, requires_grad=True)
+    amplitudes = torch.tensor([0.4, 0.9], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(drive_from_phases, (phases, amplitudes))
+
+
+def test_amplitudes_broadcast_over_phases():
+    drive = drive_from_phases(torch.zeros(5, 1, 2), [1.0, 0.5])
+    assert drive.shape == (5, 1, 2)
+    assert torch.equal(drive[3, 0], torch.tensor([1.0, 0.5], dtype=torch.complex128))
+
+
+def test_focus_phases_are_the_distance_in_radians():
+    phases = focus_phases([[0, 0, 0], [0, 0, 0.5]], (0.3, 0.4, 0.0), wavenumber=10.0)
+    assert phases.tolist() == pytest.approx([5.0, 10 * math.sqrt(0.5)], rel=1e-15)
+
+
+@settings(deadline=None)
+@given(positions=places, focus=vectors, shift=vectors)
+def test_focus_phases_do_not_depend_on_where_the_origin_is(positions, focus, shift):
+    phases = focus_phases(positions, focus, WAVENUMBER)
+    shifted = focus_phases(positions + shift, focus + shift, WAVENUMBER)
+    # Coordinates of 0.4 m carry 6e-17 m of rounding each, times k = 740 rad/m.
+    torch.testing.assert_close(shifted, phases, rtol=0, atol=1e-12)
+
+
+@settings(deadline=None)
+@given(positions=places, focus=vectors)
+def test_focus_phases_do_not_depend_on_the_order_or_sign_of_the_axes(positions, focus):
+    phases = focus_phases(positions, focus, WAVENUMBER)
+    turned = focus_phases(-positions[:, [2, 0, 1]], -focus[[2, 0, 1]], WAVENUMBER)
+    torch.testing.assert_close(turned, phases, rtol=1e-14, atol=1e-300)
+
+
+def test_several_foci_are_each_for_itself():
+    positions = torch.rand(5, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    foci = torch.tensor([[0.1, 0.2, 0.3], [1.0, 2.0, 3.0]], dtype=torch.float64)
+    both = focus_phases(positions, foci, WAVENUMBER)
+    assert both.shape == (2, 5)
+    for row, focus in zip(both, foci, strict=True):
+        assert torch.equal(row, focus_phases(positions, focus, WAVENUMBER))
+
+
+def test_normalise_brings_every_drive_to_full_amplitude():
+    drive = torch.tensor([[3j, 4.0], [0.0, -0.1j]], dtype=torch.complex128)
+    expected = torch.tensor([[0.75j, 1.0], [0.0, -1j]], dtype=torch.complex128)
+    torch.testing.assert_close(normalise(drive), expected, rtol=1e-15, atol=0)
+
+
+def test_validate_drive_accepts_single_precision_of_unit_amplitude():
+    drive = drive_from_phases(torch.arange(16.0)).to(torch.complex64)
+    assert validate_drive(drive, 16).dtype == torch.complex128

@@ -1,0 +1,112 @@
+import dataclasses
+import math
+import pickle
+
+import numpy as np
+import pytest
+import torch
+
+from autdtorch.array import TransducerArray
+from autdtorch.geometry import Plane, circle_points
+from autdtorch.scene import Box, Medium, Scene
+
+AIR = Medium(density=1.293, sound_speed=340.0)
+
+
+def paper_scene(**changes):
+    arguments = {
+        "array": TransducerArray.grid((4, 4), pitch=10e-3, center=(1e-3, 50e-3, 50e-3)),
+        "medium": AIR,
+        "frequency": 40e3,
+        "control_points": circle_points((80e-3, 50e-3, 50e-3), 30e-3, 4, (1, 0, 0)),
+    }
+    return Scene(**arguments | changes)
+
+
+def cube(x, y, z, edge):
+    center = (1e-3 * x, 1e-3 * y, 1e-3 * z)
+    return Box(center=center, size=(1e-3 * edge,) * 3, density=100.0, sound_speed=340.0)
+
+
+def test_wave_quantities_follow_from_frequency_and_medium():
+    scene = paper_scene()
+    assert scene.wavelength == pytest.approx(8.5e-3, rel=1e-15)
+    assert scene.angular_frequency == pytest.approx(2 * math.pi * 40e3, rel=1e-15)
+    assert scene.wavenumber * scene.wavelength == pytest.approx(2 * math.pi, rel=1e-15)
+
+
+def test_box_is_half_open():
+    box = Box(center=(0.5, 0.5, 0.5), size=(1, 1, 1), rigid=True)
+    points = torch.tensor(
+        [[0.0, 0.0, 0.0], [1.0, 0.5, 0.5], [0.5, 0.5, 1.0], [0.5, 0.5, 0.5], [-0.1, 0.5, 0.5]]
+    )
+    assert box.contains(points).tolist() == [True, False, False, True, False]
+    assert box.contains(points.reshape(5, 1, 3)).shape == (5, 1)
+    assert box.contains(points, margin=0.2).all()
+    assert (box.lower, box.upper) == ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+
+
+def test_obstacles_may_touch_by_edge_or_by_face():
+    stepped = (cube(41, 60, 40, 10), cube(41, 50, 50, 10), cube(41, 40, 60, 10))
+    in_a_row = (cube(41, 50, 50, 16), cube(30, 50, 50, 6))
+    assert paper_scene(obstacles=stepped).obstacles == stepped
+    assert paper_scene(obstacles=in_a_row).obstacles == in_a_row
+
+
+@pytest.mark.parametrize("shift", [0.0, 1e-12, -1e-12])
+def test_touching_allows_for_rounding(shift):
+    lower, upper = cube(30, 50, 50, 6), cube(36 + 1e3 * shift, 50, 50, 6)
+    assert len(paper_scene(obstacles=(lower, upper)).obstacles) == 2
+
+
+def test_default_domain_holds_everything_and_two_wavelengths_more():
+    plane = Plane(center=(80e-3, 50e-3, 50e-3), normal=(1, 0, 0), size=(200e-3, 20e-3))
+    scene = paper_scene(obstacles=[cube(120, 50, 50, 10)], observation_plane=plane)
+    margin = 2 * 8.5e-3
+    lower, upper = scene.domain
+    assert lower == pytest.approx((1e-3 - margin, -50e-3 - margin, 20e-3 - margin), rel=1e-12)
+    assert upper == pytest.approx((125e-3 + margin, 150e-3 + margin, 80e-3 + margin), rel=1e-12)
+    assert all(type(entry) is float for entry in lower + upper)
+
+
+def test_given_domain_is_kept_and_may_be_touched():
+    domain = ((1e-3, 0.0, 0.0), (80e-3, 100e-3, 100e-3))  # array and control points lie on its faces
+    assert paper_scene(domain=domain).domain == domain
+    assert paper_scene(domain=np.array(domain)).domain == domain
+
+
+def test_scene_keeps_its_own_copy_of_the_control_points():
+    points = torch.tensor([[80e-3, 50e-3, 50e-3]], dtype=torch.float64)
+    scene = paper_scene(control_points=points)
+    points += 1.0
+    assert scene.control_points.tolist() == [[80e-3, 50e-3, 50e-3]]
+
+
+def test_scene_is_frozen():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        paper_scene().frequency = 20e3
+
+
+def test_replace_checks_again():
+    scene = paper_scene(obstacles=[cube(41, 50, 50, 10)])
+    assert dataclasses.replace(scene, frequency=20e3).wavelength == pytest.approx(17e-3, rel=1e-15)
+    with pytest.raises(ValueError, match="in or on obstacle 0"):
+        dataclasses.replace(scene, control_points=[(41e-3, 50e-3, 50e-3)])
+
+
+def test_scene_survives_pickling():
+    plane = Plane(center=(80e-3, 50e-3, 50e-3), normal=(1, 0, 0), size=(0.1, 0.1))
+    scene = paper_scene(obstacles=[cube(41, 50, 50, 10)], observation_plane=plane, name="one cube")
+    copy = pickle.loads(pickle.dumps(scene))
+    assert torch.equal(copy.control_points, scene.control_points)
+    assert torch.equal(copy.array.positions, scene.array.positions)
+    for field in ("medium", "frequency", "obstacles", "observation_plane", "domain", "name"):
+        assert getattr(copy, field) == getattr(scene, field)
+
+
+def test_repr_names_counts_and_units():
+    scene = paper_scene(domain=((0, 0, 0), (0.1, 0.1, 0.1)), name="homogeneous")
+    assert repr(scene) == (
+        "Scene('homogeneous', 40 kHz, wavelength 8.5 mm, 16 transducers, 4 control points, "
+        "0 obstacles, domain 100 x 100 x 100 mm)"
+    )

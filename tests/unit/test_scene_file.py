@@ -1,0 +1,90 @@
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from autdtorch.scene import Box
+from autdtorch.scene_file import load_scene
+
+SCENES = Path(__file__).parents[2] / "configs" / "scene"
+
+SMALL = """
+frequency: 40e3
+medium: {density: 1.293, sound_speed: 340.0}
+array: {type: positions, positions: [[0, 0, 0], [0, 10e-3, 0]], normals: [1, 0, 0], source_strength: 2.0}
+control_points: {type: points, positions: [[80e-3, 0, 0]]}
+"""
+
+
+def paper_cube(x, y, z, edge):
+    center = (1e-3 * x, 1e-3 * y, 1e-3 * z)
+    return pytest.approx((*center, 1e-3 * edge, 100.0, 340.0), rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("name", "cubes"),
+    [
+        ("homogeneous", []),
+        ("three_cubes", [(41, 60, 40, 10), (41, 50, 50, 10), (41, 40, 60, 10)]),
+        ("two_cubes", [(41, 50, 50, 16), (30, 50, 50, 6)]),
+    ],
+)
+def test_paper_scenes(name, cubes):
+    scene = load_scene(SCENES / f"{name}.yaml")
+    assert scene.name == name
+    assert (scene.frequency, scene.medium.density, scene.medium.sound_speed) == (40e3, 1.293, 340.0)
+    found = [(*box.center, box.size[0], box.density, box.sound_speed) for box in scene.obstacles]
+    assert found == [paper_cube(*given) for given in cubes]
+    assert all(len(set(box.size)) == 1 for box in scene.obstacles)
+    assert scene.domain == ((0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
+    assert scene.observation_plane.points(1e-3).shape == (100, 100, 3)
+    # Decimal millimetres are not exact in binary.
+    assert len(scene.array) == 16
+    middle = torch.tensor([1, 50, 50]).double()
+    torch.testing.assert_close(1e3 * scene.array.positions.mean(dim=0), middle, rtol=1e-14, atol=0)
+    foci = torch.tensor([[80, 80, 50], [80, 50, 80], [80, 20, 50], [80, 50, 20]]).double()
+    torch.testing.assert_close(1e3 * scene.control_points, foci, rtol=1e-14, atol=0)
+
+
+def test_every_scene_of_the_repository_loads():
+    for path in SCENES.glob("*.yaml"):
+        assert load_scene(str(path)).name == path.stem
+
+
+def test_positions_points_and_defaults(tmp_path):
+    path = tmp_path / "small.yaml"
+    path.write_text(SMALL)
+    scene = load_scene(path)
+    assert scene.array.positions.tolist() == [[0.0, 0.0, 0.0], [0.0, 10e-3, 0.0]]
+    assert scene.array.source_strength == 2.0
+    assert scene.control_points.tolist() == [[80e-3, 0.0, 0.0]]
+    assert (scene.obstacles, scene.observation_plane, scene.name) == ((), None, "scene")
+
+
+def test_mapping_and_config_node_give_the_same_scene_as_the_file():
+    config = OmegaConf.load(SCENES / "two_cubes.yaml")
+    plain = OmegaConf.to_container(config)
+    assert (
+        load_scene(plain).obstacles
+        == load_scene(config).obstacles
+        == load_scene(SCENES / "two_cubes.yaml").obstacles
+    )
+
+
+def test_interpolation_reaches_out_of_the_scene_in_a_larger_config():
+    config = OmegaConf.create({"tone": 25e3, "scene": OmegaConf.create(SMALL)})
+    config.scene.frequency = "${tone}"
+    assert load_scene(config.scene).frequency == 25e3
+
+
+def test_key_without_a_value_counts_as_left_out(tmp_path):
+    path = tmp_path / "small.yaml"
+    path.write_text(SMALL + "obstacles:\nobservation_plane: null\n")
+    assert load_scene(path).obstacles == ()
+
+
+def test_rigid_box():
+    obstacle = {"type": "box", "center": [40e-3, 0, 0], "size": [1e-2] * 3, "rigid": True}
+    scene = load_scene({**OmegaConf.create(SMALL), "obstacles": [obstacle]})
+    assert scene.obstacles == (Box((40e-3, 0.0, 0.0), (1e-2,) * 3, rigid=True),)
