@@ -1,0 +1,1 @@
+"""Finite-difference time-domain simulation, tuned to one frequency."""

@@ -1,0 +1,118 @@
+"""Perfectly matched layer for the tuned stencil, with a profile tuned to the drive frequency.
+
+Along its axis a layer replaces the second difference d2 by g d(g d), with g = 1 / (1 + sigma / (alpha - i w))
+in frequency and two memory variables in time (CPML of second order: Komatitsch & Martin 2007, Pasalic &
+McGarry 2010):
+
+    psi  <- b psi  + a (u[l+1] - u[l])                      between the cells
+    zeta <- b zeta + a (u[l+1] - 2 u[l] + u[l-1] + psi[l+1/2] - psi[l-1/2])        at the cells
+    d2 u becomes d2 u + psi[l+1/2] - psi[l-1/2] + zeta.
+
+The 27-point stencil is a second difference along any axis of the pressure smoothed across it, plus terms that
+do not differentiate along that axis. Taking the smoothed pressure for u makes the layer the exact complex
+stretching of the *discrete* equation: a wave that meets it at angle t behaves as in one dimension with the
+wavenumber k cos t. The reflection is then a small linear system for each angle, and the profile is chosen to
+make it small for all of them at once.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+Array = NDArray[np.float64]
+
+TUNED_ANGLES = np.radians((0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 55.0, 60.0, 65.0, 70.0, 75.0, 80.0))
+
+
+_STARTS = ((10.0, 1.5), (20.0, 2.5))
+"""Strength and order of the power-law profiles that the fit starts from; the better end is kept."""
+_START_SHIFT = 0.05
+"""Frequency shift alpha that the fit starts from, in units of w."""
+_BOUNDS = (-14.0, 6.0)
+"""Range of the logarithms of damping and shift over w: from nothing to opaque."""
+
+
+@dataclass(frozen=True)
+class LayerProfile:
+    """Recursion coefficients of a layer of n cells, from its outer end inwards.
+
+    Attributes:
+        decay: b at the half cells 0 .. n and at the cells 1 .. n, interleaved (2 n + 1,).
+        gain: a, likewise.
+    """
+
+    decay: Array
+    gain: Array
+
+    @property
+    def cells(self) -> int:
+        """Thickness of the layer."""
+        return len(self.decay) // 2
+
+
+def layer_profile(sigma: Array, alpha: float) -> LayerProfile:
+    """Recursion coefficients of damping `sigma` (2 n + 1,) and shift `alpha`, both per time step."""
+    decay = np.exp(-(sigma + alpha))
+    return LayerProfile(decay, sigma / (sigma + alpha) * (decay - 1))
+
+
+def reflection(profile: LayerProfile, along: Array, turn: Array) -> NDArray[np.complex128]:
+    """Complex amplitude (n,) of the reflected plane wave, exact for the discrete scheme.
+
+    Args:
+        profile: the layer.
+        along: wavenumber along the layer's normal, times spacing (n,) [rad]: kappa cos(angle) at the drive
+            frequency.
+        turn: angular frequency times time step (n,) [rad].
+    """
+    stretch = 1 + profile.gain / (1 - profile.decay * np.exp(1j * turn)[:, None])
+    half, full = stretch[:, 0::2], stretch[:, 1::2]
+    # Unknown: pressure in cells 1 .. L of the layer, in the first cell of air, and the amplitude r of the
+    # reflected wave. In air cell j the pressure is e^{-i along j} + r e^{i along j}.
+    cells = profile.cells
+    matrix = np.zeros((len(along), cells + 2, cells + 2), complex)
+    rows = np.arange(cells)
+    matrix[:, rows, rows] = (2 - 2 * np.cos(along))[:, None] - full * (half[:, :-1] + half[:, 1:])
+    matrix[:, rows, rows + 1] = full * half[:, 1:]
+    matrix[:, rows[1:], rows[:-1]] = full[:, 1:] * half[:, 1:-1]
+    matrix[:, cells, cells] = 1
+    matrix[:, cells, cells + 1] = -1
+    matrix[:, cells + 1, cells - 1] = 1
+    matrix[:, cells + 1, cells] = -2 * np.cos(along)
+    matrix[:, cells + 1, cells + 1] = np.exp(1j * along)
+    known = np.zeros((len(along), cells + 2, 1), complex)
+    known[:, cells, 0] = 1
+    known[:, cells + 1, 0] = -np.exp(-1j * along)
+    return np.asarray(np.linalg.solve(matrix, known)[:, -1, 0], np.complex128)
+
+
+@lru_cache(maxsize=64)
+def tuned_profile(kappa: float, steps_per_period: int, cells: int) -> LayerProfile:
+    """The profile of `cells` cells that reflects least at the drive frequency, at any angle.
+
+    Every value of the damping is free. The fit takes the complex reflection, which is smooth where its
+    magnitude has a kink, at `TUNED_ANGLES`; those up to 60 degrees count ten times as much as those beyond.
+    """
+    frequency = 2 * math.pi / steps_per_period
+    along, turn = kappa * np.cos(TUNED_ANGLES), np.full_like(TUNED_ANGLES, frequency)
+    weight = np.where(math.radians(62) > TUNED_ANGLES, 10.0, 1.0)
+
+    def profile(logarithms: Array) -> LayerProfile:
+        return layer_profile(frequency * np.exp(logarithms[:-1]), frequency * math.exp(logarithms[-1]))
+
+    def residual(logarithms: Array) -> Array:
+        amplitude = weight * reflection(profile(logarithms), along, turn)
+        return np.concatenate((amplitude.real, amplitude.imag))
+
+    depth = np.linspace(1, 0.5 / cells, 2 * cells + 1)
+    fits = []
+    for strength, order in _STARTS:
+        start = np.append(np.log(strength / (kappa * cells) * depth**order), math.log(_START_SHIFT))
+        fits.append(least_squares(residual, start, bounds=_BOUNDS, max_nfev=60))
+    return profile(min(fits, key=lambda fit: float(fit.cost)).x)

@@ -1,0 +1,89 @@
+"""Band-limited points: sources and receivers anywhere between the cells.
+
+A point is spread over a few cells a side by weights that reproduce every plane wave up to the drive's
+wavenumber, fitted by least squares along each axis. On a cell centre they reduce to that cell. A source and a
+receiver use the same weights, so reciprocity holds to rounding.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+FOOTPRINTS = (4, 6, 8, 10)
+FOOTPRINT_ERROR = 3e-4
+"""Largest error allowed to a centred footprint at the drive's wavenumber: small beside that of any grid it
+serves."""
+
+_REGULARISATION = 1e-5
+"""Keeps the weights small where the fit leaves them free; far below FOOTPRINT_ERROR."""
+
+
+@dataclass(frozen=True)
+class PointWeights:
+    """Cells and weights of P points, each spread over n cells.
+
+    Attributes:
+        index: flat cell indices (P, n), int64.
+        weight: weights (P, n), float64; they sum to about 1.
+    """
+
+    index: NDArray[np.int64]
+    weight: Array
+
+
+def axis_weights(offset: Array, nodes: Array, kappa: float) -> Array:
+    """Weights (P, n) of samples at `nodes` (P, n) that give a function at `offset` (P,), in cells."""
+    abscissa, quadrature = np.polynomial.legendre.leggauss(24)
+    wavenumber, scale = kappa * (abscissa + 1) / 2, np.sqrt(quadrature / 2)
+    phase = wavenumber[:, None] * (nodes - offset[:, None])[:, None, :]
+    system = np.concatenate((scale[:, None] * np.cos(phase), scale[:, None] * np.sin(phase)), axis=1)
+    target = np.concatenate((scale, np.zeros_like(scale)))
+    normal = system.transpose(0, 2, 1) @ system + _REGULARISATION**2 * np.eye(nodes.shape[1])
+    return np.linalg.solve(normal, (system.transpose(0, 2, 1) @ target)[..., None])[..., 0]
+
+
+@lru_cache(maxsize=64)
+def footprint(kappa: float) -> int:
+    """Fewest cells per axis with which a point is interpolated to within `FOOTPRINT_ERROR`."""
+    wavenumber = np.linspace(0, kappa, 33)
+    for cells in FOOTPRINTS:
+        nodes = np.arange(cells, dtype=np.float64) - (cells - 1) / 2
+        weight = axis_weights(np.zeros(1), nodes[None], kappa)[0]
+        if np.abs(np.exp(1j * np.outer(wavenumber, nodes)) @ weight - 1).max() <= FOOTPRINT_ERROR:
+            return cells
+    return FOOTPRINTS[-1]
+
+
+def point_weights(
+    positions: Array,
+    shape: tuple[int, int, int],
+    first: tuple[int, int, int],
+    last: tuple[int, int, int],
+    kappa: float,
+) -> PointWeights:
+    """Spread points over cells [first, last) of an array; near the rim the footprint moves inwards.
+
+    Args:
+        positions: (P, 3) in cells, so that cell i has its centre at i.
+        shape: shape of the whole array, which decides the flat index.
+        first: first cell of each axis that may be used.
+        last: one past the last such cell.
+        kappa: wavenumber times spacing [rad].
+    """
+    index = np.zeros((len(positions), 1), np.int64)
+    weight = np.ones((len(positions), 1))
+    for axis in range(3):
+        offset = positions[:, axis]
+        cells = min(footprint(kappa), last[axis] - first[axis])
+        start = np.clip(np.floor(offset - cells / 2 + 1), first[axis], last[axis] - cells).astype(np.int64)
+        nodes = start[:, None] + np.arange(cells)
+        along = axis_weights(offset, nodes.astype(np.float64), kappa)
+        index = (index[:, :, None] * shape[axis] + nodes[:, None, :]).reshape(len(positions), -1)
+        weight = (weight[:, :, None] * along[:, None, :]).reshape(len(positions), -1)
+    return PointWeights(index, weight)

@@ -1,0 +1,152 @@
+"""The 27-point stencil tuned to one frequency (nonstandard FDTD, Mickens 1994, Cole 2002).
+
+In uniform air the pressure is stepped by
+
+    p_new = 2 p - p_old + C sum_j g_j (p_j - p),
+
+where g takes one value for the 6 faces, one for the 12 edges and one for the 8 corners of the surrounding
+cube. The three values make the symbol
+
+    L(kappa) = sum_j g_j (1 - cos(kappa . n_j)),        kappa = k h,
+
+equal to (k h)^2 for long waves and independent of the direction of a wave at the drive frequency; C then
+makes the frequency of that wave exact for the time step in use. Nothing else is tuned: other frequencies are
+only as good as they happen to be, and the steady state does not contain them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+OFFSETS = tuple((x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1))
+"""The 27 neighbour offsets in row-major order; entry 13 is the cell itself."""
+
+
+@dataclass(frozen=True)
+class Stencil:
+    """Spatial weights tuned at one wavenumber.
+
+    Attributes:
+        kappa: wavenumber times spacing at which the stencil is tuned [rad].
+        face: weight of the 6 face neighbours.
+        edge: weight of the 12 edge neighbours.
+        corner: weight of the 8 corner neighbours.
+        symbol: value of the symbol at `kappa`, averaged over directions.
+        slope: derivative of the symbol by kappa at `kappa`, averaged over directions.
+    """
+
+    kappa: float
+    face: float
+    edge: float
+    corner: float
+    symbol: float
+    slope: float
+
+    @property
+    def weights(self) -> Array:
+        """Weights (27,) in the order of `OFFSETS`, zero for the cell itself."""
+        by_distance = (0.0, self.face, self.edge, self.corner)
+        return np.array([by_distance[sum(map(abs, offset))] for offset in OFFSETS])
+
+    @property
+    def total(self) -> float:
+        """Sum of the weights of all neighbours."""
+        return 6 * self.face + 12 * self.edge + 8 * self.corner
+
+    @property
+    def largest_symbol(self) -> float:
+        """Largest value of the symbol over all waves the grid can carry.
+
+        The symbol is affine in each cos(kappa_i) by itself, so its extremes lie at the corners of the
+        Brillouin zone.
+        """
+        corners = np.array([(x, y, z) for x in (0, np.pi) for y in (0, np.pi) for z in (0, np.pi)])
+        return float((_basis(corners) @ (self.face, self.edge, self.corner)).max())
+
+    def symbol_at(self, kappa: Array) -> Array:
+        """Symbol of a wave vector times spacing, (..., 3) -> (...)."""
+        return np.asarray(_basis(kappa) @ (self.face, self.edge, self.corner), np.float64)
+
+    def isotropic_symbol(self, kappa: float) -> float:
+        """Symbol averaged over directions: what a cell with another sound speed is tuned with."""
+        return float(np.average(self.symbol_at(kappa * _DIRECTIONS), weights=_SOLID_ANGLES))
+
+    def time_factor(self, steps_per_period: int) -> float:
+        """C: what the weights are multiplied with for `steps_per_period` steps a period, dimensionless."""
+        return 2 * (1 - math.cos(2 * math.pi / steps_per_period)) / self.symbol
+
+    def source_factor(self, steps_per_period: int) -> float:
+        """Forcing per step and unit S/h of a point source whose far field is S e^{ikr}/r.
+
+        The discrete Green's function is a Fourier integral over 1/(C L - 2 + 2 cos(w dt)); its far field is
+        set by the slope of the symbol where the denominator vanishes, against 2 kappa in the continuum.
+        """
+        return 4 * math.pi * self.time_factor(steps_per_period) * self.slope / (2 * self.kappa)
+
+
+def _basis(kappa: Array) -> Array:
+    """Contributions (..., 3) of unit face, edge and corner weights to the symbol of kappa (..., 3)."""
+    x, y, z = np.moveaxis(np.cos(kappa), -1, 0)
+    face = 6 - 2 * (x + y + z)
+    edge = 12 - 4 * (x * y + y * z + z * x)
+    corner = 8 - 8 * x * y * z
+    return np.stack((face, edge, corner), axis=-1)
+
+
+def _directions() -> tuple[Array, Array]:
+    """Gauss product rule over one octant of the sphere, which the symmetry of the cube repeats."""
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    cosine, angle = (nodes + 1) / 2, (nodes + 1) * np.pi / 4
+    sine = np.sqrt(1 - cosine**2)
+    directions = np.stack(
+        (
+            np.outer(sine, np.cos(angle)),
+            np.outer(sine, np.sin(angle)),
+            np.repeat(cosine[:, None], 12, axis=1),
+        ),
+        axis=-1,
+    )
+    return directions.reshape(-1, 3), np.outer(weights, weights).reshape(-1)
+
+
+_DIRECTIONS, _SOLID_ANGLES = _directions()
+
+
+@lru_cache(maxsize=64)
+def tuned_stencil(kappa: float) -> Stencil:
+    """The stencil whose symbol at `kappa` varies least over directions (least squares on the sphere).
+
+    Args:
+        kappa: wavenumber times spacing [rad], in (0, pi).
+    """
+    basis = _basis(kappa * _DIRECTIONS)
+    scale = np.sqrt(_SOLID_ANGLES / _SOLID_ANGLES.sum())[:, None]
+    # face = 1 - 4 edge - 4 corner keeps long waves right; the two that remain flatten the symbol.
+    free = basis[:, 1:] - 4 * basis[:, :1]
+    mean = (scale**2 * np.concatenate((free, basis[:, :1]), axis=1)).sum(0)
+    solution = np.linalg.lstsq(scale * (free - mean[:2]), -scale[:, 0] * (basis[:, 0] - mean[2]), rcond=None)[
+        0
+    ]
+    edge, corner = map(float, solution)
+    weights = np.array((1 - 4 * edge - 4 * corner, edge, corner))
+
+    def average(value: Array) -> float:
+        return float(np.average(value, weights=_SOLID_ANGLES))
+
+    step = 1e-4
+    ahead, behind = (_basis(kappa * (1 + sign * step) * _DIRECTIONS) @ weights for sign in (1, -1))
+    return Stencil(
+        kappa=kappa,
+        face=float(weights[0]),
+        edge=edge,
+        corner=corner,
+        symbol=average(basis @ weights),
+        slope=average(ahead - behind) / (2 * step * kappa),
+    )

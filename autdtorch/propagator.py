@@ -1,0 +1,331 @@
+"""Propagators: from drives to pressures, by exact free-space sums or by FDTD on the full domain."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+import warnings
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from autdtorch.drive import validate_drive
+from autdtorch.fdtd.kernels.contract import Kernel, Receivers
+from autdtorch.fdtd.points import footprint
+from autdtorch.fdtd.stepping import Assembly, SteadyState, assemble, last_period, run_to_steady_state
+from autdtorch.freespace import free_space_matrix
+from autdtorch.scene import Scene
+from autdtorch.validation import (
+    LENGTH_TOLERANCE,
+    ArrayLike,
+    invalid,
+    points_tensor,
+    positive,
+    positive_integer,
+)
+
+logger = logging.getLogger(__name__)
+
+METHODS = ("auto", "free_space", "full")
+KERNELS = ("auto", "cpu", "reference")
+DTYPES = {"float32": torch.float32, "float64": torch.float64}
+
+MOST_RECEIVERS = 64
+"""Points that are recorded in every step; of more, this many decide when the run has settled and all are read
+at its end."""
+
+
+class SteadyStateWarning(UserWarning):
+    """A simulation ended before its steady state was reached."""
+
+
+class Propagator(Protocol):
+    """What carries sound from a scene's transducers to points.
+
+    Attributes:
+        scene: the scene it was made for.
+    """
+
+    scene: Scene
+
+    def transfer_matrix(self, points: ArrayLike | None = None) -> torch.Tensor:
+        """Pressure [Pa] at points (P, 3) [m] per unit drive of each transducer: complex128 (P, M)."""
+        ...
+
+    def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
+        """Pressure [Pa] of drives (..., M) at points (P, 3) [m]: complex128 (..., P)."""
+        ...
+
+
+class FreeSpacePropagator:
+    """The exact field of the array in free space; obstacles are left out.
+
+    Attributes:
+        scene: the scene it was made for.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        """Remember the scene; a scene with obstacles is logged as such."""
+        self.scene = scene
+        if scene.obstacles:
+            logger.warning(
+                "free_space leaves out the %d obstacles of scene %r", len(scene.obstacles), scene.name
+            )
+
+    def transfer_matrix(self, points: ArrayLike | None = None) -> torch.Tensor:
+        """Transfer matrix G (Eq. 2).
+
+        Args:
+            points: (P, 3) [m]; by default the scene's control points.
+
+        Returns:
+            complex128 (P, M) [Pa].
+
+        Raises:
+            ValueError: `points` are not finite, have another shape, or lie on a transducer.
+        """
+        points = self.scene.control_points if points is None else points
+        return free_space_matrix(points, self.scene.array, self.scene.wavenumber)
+
+    def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
+        """Pressure of drives at points.
+
+        Args:
+            drive: (..., M) complex, |q| <= 1.
+            points: (P, 3) [m].
+
+        Returns:
+            complex128 (..., P) [Pa]; differentiable by the drive.
+
+        Raises:
+            ValueError: drive or points of another shape or out of range.
+        """
+        drive = validate_drive(drive, len(self.scene.array))
+        return drive @ self.transfer_matrix(points).mT
+
+
+@dataclass(frozen=True)
+class Run:
+    """One simulation, as it went.
+
+    Attributes:
+        periods: periods of the drive that were stepped.
+        remaining: estimated relative distance to the steady state.
+        reached: whether that is within the tolerance.
+        seconds: time it took.
+    """
+
+    periods: int
+    remaining: float
+    reached: bool
+    seconds: float
+
+
+class FullPropagator:
+    """FDTD on the whole domain, in the steady state of the drive.
+
+    Attributes:
+        scene: the scene it was made for.
+        spacing: edge of a cell [m].
+        tolerance: relative distance to the steady state at which a run ends.
+        max_periods: periods after which it ends in any case, with a `SteadyStateWarning`.
+        runs: what every simulation took, in order.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        spacing: float,
+        tolerance: float,
+        kernel: str,
+        dtype: torch.dtype,
+        max_periods: int,
+    ) -> None:
+        """Use `make_propagator`, which checks its arguments."""
+        self.scene = scene
+        self.spacing = spacing
+        self.tolerance = tolerance
+        self.max_periods = max_periods
+        self.runs: list[Run] = []
+        self._kernel = _make_kernel(kernel)
+        self._assembly: Assembly = assemble(scene, spacing, dtype)
+
+    @cached_property
+    def _control_matrix(self) -> torch.Tensor:
+        return self._simulated_matrix(self.scene.control_points)
+
+    def transfer_matrix(self, points: ArrayLike | None = None) -> torch.Tensor:
+        """Transfer matrix G from one simulation a point or one a transducer, whichever are fewer.
+
+        Waves travel from a point to the transducers as they travel back (reciprocity, exact in this scheme to
+        rounding), so that P simulations can do instead of M. The matrix of the control points is kept.
+
+        Args:
+            points: (P, 3) [m] inside the domain; by default the scene's control points.
+
+        Returns:
+            complex128 (P, M) [Pa].
+
+        Raises:
+            ValueError: `points` are not finite, have another shape or leave the domain.
+        """
+        if points is None:
+            return self._control_matrix.clone()
+        return self._simulated_matrix(self._inside(points))
+
+    def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
+        """Pressure of drives at points, from a simulation a drive or from the transfer matrix.
+
+        Args:
+            drive: (..., M) complex, |q| <= 1.
+            points: (P, 3) [m] inside the domain.
+
+        Returns:
+            complex128 (..., P) [Pa]; differentiable by the drive, through the transfer matrix.
+
+        Raises:
+            ValueError: drive or points of another shape or out of range.
+        """
+        drive, points = validate_drive(drive, len(self.scene.array)), self._inside(points)
+        flat = drive.reshape(-1, drive.shape[-1])
+        if drive.requires_grad or len(flat) > min(drive.shape[-1], len(points)):
+            return drive @ self.transfer_matrix(points).mT
+        array = self.scene.array
+        rows = [self._simulate(array.positions, array.source_strength * row, points) for row in flat]
+        return torch.stack(rows).reshape(*drive.shape[:-1], len(points))
+
+    def _inside(self, points: ArrayLike) -> torch.Tensor:
+        points = points_tensor("points", points).cpu()
+        lower, upper = (torch.tensor(corner, dtype=torch.float64) for corner in self.scene.domain)
+        outside = ((points < lower - LENGTH_TOLERANCE) | (points > upper + LENGTH_TOLERANCE)).any(dim=-1)
+        if outside.any():
+            first = int(outside.nonzero()[0, 0])
+            accepted = f"must be inside the domain, {self.scene.domain[0]} to {self.scene.domain[1]} m"
+            raise invalid(f"points[{first}]", points[first], accepted, "m")
+        return points
+
+    def _simulated_matrix(self, points: torch.Tensor) -> torch.Tensor:
+        array = self.scene.array
+        strength = torch.full((1,), array.source_strength, dtype=torch.complex128)
+        if len(points) < len(array) and not self._touches_obstacle(points):
+            logger.info("transfer matrix: %d runs from the points", len(points))
+            return torch.stack([self._simulate(point[None], strength, array.positions) for point in points])
+        logger.info("transfer matrix: %d runs from the transducers", len(array))
+        columns = [self._simulate(position[None], strength, points) for position in array.positions]
+        return torch.stack(columns, dim=1)
+
+    def _touches_obstacle(self, points: torch.Tensor) -> bool:
+        """Whether a source there would not be all in air: then only the way from the transducers is right."""
+        varying = self._assembly.coefficients.varying_index.numpy()
+        return bool(np.isin(self._assembly.spread(points).index, varying).any())
+
+    @torch.no_grad()
+    def _simulate(self, origins: torch.Tensor, strength: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+        """Pressure (P,) of sources (N, 3) with strengths (N,) at points (P, 3)."""
+        begin = time.perf_counter()
+        assembly, kernel = self._assembly, self._kernel
+        if self._touches_obstacle(origins):
+            logger.warning(
+                "a source is within %.2g mm of an obstacle: less accurate; use a finer spacing than %.2g mm",
+                1e3 * assembly.grid.spacing * footprint(assembly.grid.kappa) / 2,
+                1e3 * assembly.grid.spacing,
+            )
+        sources = assembly.sources(origins, strength)
+        every = math.ceil(len(points) / MOST_RECEIVERS)
+        receivers = assembly.receivers(points[::every])
+        state, steady = run_to_steady_state(
+            assembly, kernel, sources, receivers, self.tolerance, self.max_periods
+        )
+        if every == 1:
+            pressure = steady.pressure
+        else:
+            pressure = _read(last_period(assembly, kernel, state, sources), assembly.receivers(points))
+        self._note(steady, time.perf_counter() - begin)
+        return pressure.to(torch.complex128)
+
+    def _note(self, steady: SteadyState, seconds: float) -> None:
+        self.runs.append(Run(steady.periods, steady.remaining, steady.reached, seconds))
+        logger.info("run of %d periods, %.1e from steady, %.1f s", steady.periods, steady.remaining, seconds)
+        if not steady.reached:
+            warnings.warn(
+                f"no steady state after {steady.periods} periods: still about {steady.remaining:.1e} away "
+                f"(relative), tolerance {self.tolerance:g}; raise max_periods or tolerance",
+                SteadyStateWarning,
+                stacklevel=2,
+            )
+
+
+def _read(field: torch.Tensor, receivers: Receivers) -> torch.Tensor:
+    return (field.reshape(-1)[receivers.index] * receivers.weight).sum(dim=-1)
+
+
+def _make_kernel(name: str) -> Kernel:
+    if name == "reference":
+        from autdtorch.fdtd.kernels.reference import ReferenceKernel
+
+        return ReferenceKernel()
+    from autdtorch.fdtd.kernels.cpu import CpuKernel
+
+    return CpuKernel()
+
+
+def make_propagator(
+    scene: Scene,
+    method: str = "auto",
+    spacing: float = 1e-3,
+    tolerance: float = 1e-3,
+    *,
+    kernel: str = "auto",
+    dtype: str | torch.dtype = "float32",
+    max_periods: int = 1000,
+) -> FreeSpacePropagator | FullPropagator:
+    """Choose and prepare a propagator.
+
+    Args:
+        scene: what is simulated.
+        method: "free_space": exact, without obstacles. "full": FDTD on the whole domain. "auto": free space
+            where the scene has no obstacles, else full.
+        spacing: edge of a cell [m], at most a third of the wavelength. The error falls with it; see
+            docs/numerics.md.
+        tolerance: relative distance to the steady state at which a simulation ends, in (0, 1).
+        kernel: "cpu" (numba), "reference" (torch, slow, readable), "auto": the fastest there is.
+        dtype: precision of the fields, float32 or float64.
+        max_periods: periods of the drive after which a simulation ends in any case, with a
+            `SteadyStateWarning`.
+
+    Returns:
+        A propagator for the scene.
+
+    Raises:
+        ValueError: an argument out of range; the message names it.
+    """
+    if not isinstance(scene, Scene):
+        raise invalid("scene", scene, "must be a Scene")
+    _require_one_of("method", method, METHODS)
+    _require_one_of("kernel", kernel, KERNELS)
+    _require_one_of("dtype", str(dtype).removeprefix("torch."), tuple(DTYPES))
+    spacing = positive("spacing", spacing, "m")
+    tolerance = positive("tolerance", tolerance)
+    if tolerance >= 1:
+        raise invalid("tolerance", tolerance, "must be in (0, 1)")
+    max_periods = positive_integer("max_periods", max_periods)
+    if method == "auto":
+        method = "full" if scene.obstacles else "free_space"
+        reason = (
+            f"{len(scene.obstacles)} obstacles" if scene.obstacles else "no obstacles: nothing to simulate"
+        )
+        logger.info("method auto: %s (%s)", method, reason)
+    if method == "free_space":
+        return FreeSpacePropagator(scene)
+    return FullPropagator(
+        scene, spacing, tolerance, kernel, DTYPES[str(dtype).removeprefix("torch.")], max_periods
+    )
+
+
+def _require_one_of(name: str, value: object, accepted: tuple[str, ...]) -> None:
+    if value not in accepted:
+        raise invalid(name, value, f"must be one of {', '.join(accepted)}")
