@@ -161,8 +161,9 @@ class FullPropagator:
     def transfer_matrix(self, points: ArrayLike | None = None) -> torch.Tensor:
         """Transfer matrix G from one simulation a point or one a transducer, whichever are fewer.
 
-        Waves travel from a point to the transducers as they travel back (reciprocity, exact in this scheme to
-        rounding), so that P simulations can do instead of M. The matrix of the control points is kept.
+        Waves travel from a point to the transducers as they travel back (reciprocity; in this scheme but for
+        what the edges of the boundary layer leave, about 1e-5), so that P simulations can do instead of M. The
+        matrix of the control points is kept.
 
         Args:
             points: (P, 3) [m] inside the domain; by default the scene's control points.

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from autdtorch.fdtd.points import footprint
 from autdtorch.scene import Scene
 from autdtorch.validation import invalid, positive
 
@@ -21,10 +22,6 @@ cells."""
 
 LAYER_CELLS = 8
 """Boundary layer: tuned reflection below -70 dB up to 60 degrees at 4 cells per wavelength, -100 dB at 8."""
-
-_MARGIN = 1
-"""Cells of air between the domain and the boundary layer, so that a point on the domain's face has cells on
-both sides."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +92,8 @@ class Grid:
 def make_grid(scene: Scene, spacing: float) -> Grid:
     """Cover the scene's domain with cells of `spacing`, aligned with its lower corner.
 
+    As much air is left between the domain and the boundary layer as points on the domain's faces spread over.
+
     Raises:
         ValueError: if there are fewer than `MIN_CELLS_PER_WAVELENGTH` cells a wavelength.
     """
@@ -103,12 +102,14 @@ def make_grid(scene: Scene, spacing: float) -> Grid:
         reason = f"{MIN_CELLS_PER_WAVELENGTH:g} cells per wavelength at {scene.frequency:g} Hz"
         raise invalid("spacing", spacing, f"must be at most {coarsest:.3g} m, {reason}", "m")
     lower, upper = scene.domain
+    kappa = scene.wavenumber * spacing
+    margin = footprint(kappa) // 2 - 1
     cells = tuple(
-        math.ceil((high - low) / spacing - 1e-6) + 2 * _MARGIN for low, high in zip(lower, upper, strict=True)
+        math.ceil((high - low) / spacing - 1e-6) + 2 * margin for low, high in zip(lower, upper, strict=True)
     )
-    shift = (LAYER_CELLS + 1 + _MARGIN - 0.5) * spacing
+    shift = (LAYER_CELLS + 1 + margin - 0.5) * spacing
     x, y, z = (low - shift for low in lower)
-    return Grid(spacing, (cells[0], cells[1], cells[2]), (x, y, z), scene.wavenumber * spacing)
+    return Grid(spacing, (cells[0], cells[1], cells[2]), (x, y, z), kappa)
 
 
 @dataclass(frozen=True)

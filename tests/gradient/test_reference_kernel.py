@@ -1,0 +1,41 @@
+"""Autograd goes back through the readable kernel: the oracle of every later adjoint."""
+
+from __future__ import annotations
+
+import torch
+
+from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, uniform_state
+from autdtorch.fdtd.kernels.reference import ReferenceKernel
+
+SHAPE = (7, 8, 9)
+CELL = 3 * 72 + 4 * 9 + 4
+
+
+def pressure(force: torch.Tensor, weight: torch.Tensor, steps: int) -> torch.Tensor:
+    """What two receivers hear in `steps` steps on a tiny grid with two varying cells and layers of two
+    cells."""
+    varying = torch.tensor([CELL, CELL + 1])
+    profile = torch.tensor([2.0, 1.5, 1.0, 0.5, 0.1], dtype=torch.float64)
+    decay = torch.exp(-profile - 0.1)
+    gain = profile / (profile + 0.1) * (decay - 1)
+    coefficients = Coefficients(0.2, 0.12, 0.06, 0.045, varying, weight, decay, gain)
+    receivers = Receivers(torch.tensor([[CELL + 9], [CELL - 72]]), torch.ones((2, 1), dtype=torch.float64))
+    signal = torch.stack(
+        (torch.cos(torch.arange(steps) * 0.6), torch.sin(torch.arange(steps) * 0.6)), 1
+    ).double()
+    state = uniform_state(SHAPE, 2, 0.0, torch.float64)
+    sources = Sources(torch.tensor([CELL - 1, CELL + 9]), force)
+    _, recorded = ReferenceKernel().advance(state, coefficients, sources, receivers, signal)
+    return recorded
+
+
+def test_gradients_by_source_and_medium() -> None:
+    generator = torch.Generator().manual_seed(0)
+    force = torch.randn(2, generator=generator, dtype=torch.complex128).requires_grad_()
+    weight = (0.05 * torch.rand((2, 27), generator=generator, dtype=torch.float64)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda f, w: pressure(f, w, steps=5), (force, weight))
+
+
+def test_no_graph_is_kept_unless_asked_for() -> None:
+    force, weight = torch.ones(2, dtype=torch.complex128), torch.full((2, 27), 0.03, dtype=torch.float64)
+    assert not pressure(force, weight, steps=3).requires_grad

@@ -1,0 +1,115 @@
+"""The fast kernel against the readable one, and what both must conserve."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+import torch
+from small_scenes import CUBE, small_scene
+
+from autdtorch.fdtd.kernels.contract import Coefficients, Kernel, Receivers, Sources, State, uniform_state
+from autdtorch.fdtd.kernels.cpu import CpuKernel
+from autdtorch.fdtd.kernels.reference import ReferenceKernel
+from autdtorch.fdtd.stepping import Assembly, assemble, drive_signal
+from autdtorch.scene import Box
+
+RIGID = Box(center=(15e-3, 4e-3, 9e-3), size=(4e-3, 6e-3, 7e-3), rigid=True)
+FAST = Box(center=(14e-3, 20e-3, 14e-3), size=(6e-3, 5e-3, 5e-3), density=3.0, sound_speed=700.0)
+
+
+def scene_parts(dtype: torch.dtype) -> tuple[Assembly, Sources, Receivers]:
+    scene = small_scene((CUBE, RIGID, FAST), extent=24e-3)
+    assembly = assemble(scene, 1e-3, dtype)
+    strength = torch.tensor([1.0, 1j, -0.4, 0.3 - 0.7j], dtype=torch.complex128)
+    return (
+        assembly,
+        assembly.sources(scene.array.positions, strength),
+        assembly.receivers(scene.control_points),
+    )
+
+
+def advance(kernel: Kernel, dtype: torch.dtype, steps: int) -> tuple[State, torch.Tensor]:
+    assembly, sources, receivers = scene_parts(dtype)
+    signal = drive_signal(assembly.steps_per_period, 0, steps).to(dtype)
+    return kernel.advance(assembly.silence(sources), assembly.coefficients, sources, receivers, signal)
+
+
+# float64: rounding grows with the steps and the sums of 27 terms; float32: the design's parity figure, 1e-4
+# of the peak
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
+@pytest.mark.parametrize("steps", [1, 100, 101])
+def test_cpu_kernel_is_the_reference_kernel(dtype: torch.dtype, tolerance: float, steps: int) -> None:
+    state, recorded = advance(CpuKernel(), dtype, steps)
+    expected, expected_recorded = advance(ReferenceKernel(), dtype, steps)
+    pairs = [(state.now, expected.now), (recorded, expected_recorded)]
+    pairs += [
+        pair
+        for one, other in zip(state.layers, expected.layers, strict=True)
+        for pair in zip(one, other, strict=True)
+    ]
+    for value, reference in pairs:
+        assert (value - reference).abs().max() <= tolerance * max(float(reference.abs().max()), 1e-30)
+
+
+def closed_box(dtype: torch.dtype, cells: int = 10) -> Coefficients:
+    """Coefficients of a grid on which nothing absorbs: the ring holds the pressure at zero."""
+    assembly, _, _ = scene_parts(dtype)
+    c = assembly.coefficients
+    silent = torch.zeros(2 * cells + 1, dtype=dtype)
+    nothing = torch.zeros(0, dtype=torch.int64)
+    return Coefficients(
+        c.center, c.face, c.edge, c.corner, nothing, torch.zeros((0, 27), dtype=dtype), silent, silent
+    )
+
+
+@pytest.mark.parametrize("kernel", [CpuKernel(), ReferenceKernel()], ids=["cpu", "reference"])
+def test_a_mode_of_a_closed_box_swings_at_its_own_frequency_for_ever(kernel: Kernel) -> None:
+    """p = sin(k_x x) sin(k_y y) sin(k_z z) cos(w t) is an exact solution of the scheme, with w from the
+    symbol."""
+    shape, steps = (24, 26, 28), 400
+    c = closed_box(torch.float64)
+    wave = [math.pi * n / (size - 1) for n, size in zip((3, 2, 5), shape, strict=True)]
+    x, y, z = (
+        torch.sin(k * torch.arange(size, dtype=torch.float64)) for k, size in zip(wave, shape, strict=True)
+    )
+    mode = x[:, None, None] * y[None, :, None] * z[None, None, :]
+    cx, cy, cz = (math.cos(k) for k in wave)
+    turn = math.acos(
+        (
+            c.center
+            + 2 * c.face * (cx + cy + cz)
+            + 4 * c.edge * (cx * cy + cy * cz + cz * cx)
+            + 8 * c.corner * cx * cy * cz
+        )
+        / 2
+    )
+    state = uniform_state(shape, 10, 0.0, torch.float64)
+    state.now.copy_(mode)
+    state.before.copy_(mode * math.cos(turn))
+    nobody = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.complex128))
+    deaf = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1), dtype=torch.float64))
+    state, _ = kernel.advance(state, c, nobody, deaf, torch.zeros((steps, 2), dtype=torch.float64))
+    # rounding of 400 steps, each of relative size 1e-16, adds up at worst in proportion to steps^2
+    assert (state.now - mode * math.cos(turn * steps)).abs().max() < 1e-10
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_nothing_grows_once_the_drive_is_off(dtype: torch.dtype) -> None:
+    """Random pressures in all the air, which excites every wave the grid has, then silence."""
+    assembly, sources, receivers = scene_parts(dtype)
+    state = uniform_state(assembly.grid.shape, assembly.coefficients.layer_cells, 0.0, dtype)
+    inner = state.now[1:-1, 1:-1, 1:-1]
+    inner.copy_(torch.randn(inner.shape, generator=torch.Generator().manual_seed(0), dtype=dtype))
+    state.now.view(-1)[assembly.coefficients.varying_index] = 0
+    state.before.copy_(state.now)
+    sizes = [float(state.now.norm())]
+    for _ in range(5):
+        silence = torch.zeros((1000, 2), dtype=dtype)
+        state, _ = CpuKernel().advance(state, assembly.coefficients, sources, receivers, silence)
+        sizes.append(float(state.now.norm()))
+    # what stays are the shortest waves, which hardly move, and the obstacles' resonances: both only fade
+    # (the pressure alone is not the energy, so that it may swing a little on its way down)
+    assert all(later < 1.1 * earlier for earlier, later in itertools.pairwise(sizes))
+    assert sizes[-1] < 0.05 * sizes[0]

@@ -1,0 +1,54 @@
+import math
+
+import numpy as np
+import pytest
+
+from autdtorch.fdtd.boundary import reflection, tuned_profile
+from autdtorch.fdtd.grid import LAYER_CELLS
+
+
+def reflected_decibels(
+    cells_per_wavelength: float, steps: int, cells: int, degrees: list[float]
+) -> np.ndarray:
+    kappa = 2 * math.pi / cells_per_wavelength
+    profile = tuned_profile(kappa, steps, cells)
+    along = kappa * np.cos(np.radians(degrees))
+    return 20 * np.log10(np.abs(reflection(profile, along, np.full(len(along), 2 * math.pi / steps))))
+
+
+@pytest.mark.parametrize(
+    ("cells_per_wavelength", "steps", "bound", "grazing_bound"),
+    [(17.0, 25, -90, -75), (8.5, 13, -90, -75), (8.5, 11, -90, -75), (4.25, 6, -65, -50)],
+)
+def test_tuned_layer_reflects_little_at_the_drive_frequency(
+    cells_per_wavelength: float, steps: int, bound: float, grazing_bound: float
+) -> None:
+    # design goal: -70 dB to 60 degrees and -45 dB at 75 with 10 cells at 8.5 cells per wavelength; 8 cells do
+    # better
+    steep = reflected_decibels(cells_per_wavelength, steps, LAYER_CELLS, [0, 7, 15, 22, 30, 37, 45, 52, 60])
+    assert steep.max() < bound
+    assert reflected_decibels(cells_per_wavelength, steps, LAYER_CELLS, [75]).max() < grazing_bound
+
+
+def test_layer_absorbs_other_frequencies_too() -> None:
+    # what the switch-on excites must leave: waves of half and of 1.5 times the frequency, at normal incidence
+    kappa, steps = 2 * math.pi / 8.5, 13
+    profile = tuned_profile(kappa, steps, LAYER_CELLS)
+    along = kappa * np.array([0.5, 1.5])
+    scale = math.sin(math.pi / steps) / math.sin(kappa / 2)
+    turn = 2 * np.arcsin(scale * np.sin(along / 2))
+    assert (20 * np.log10(np.abs(reflection(profile, along, turn))) < -40).all()
+
+
+def test_a_layer_without_damping_is_a_wall() -> None:
+    # zero pressure behind it: everything comes back
+    profile = tuned_profile(2 * math.pi / 8.5, 13, 4)
+    silent = type(profile)(profile.decay, np.zeros_like(profile.gain))
+    reflected = reflection(silent, np.array([0.3, 0.7]), np.full(2, 2 * math.pi / 13))
+    assert np.allclose(np.abs(reflected), 1, atol=1e-12)
+
+
+def test_memory_fades() -> None:
+    profile = tuned_profile(2 * math.pi / 8.5, 13, LAYER_CELLS)
+    assert ((profile.decay > 0) & (profile.decay < 1)).all()
+    assert ((profile.gain > -1) & (profile.gain <= 0)).all()

@@ -1,0 +1,62 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from autdtorch.fdtd.points import FOOTPRINT_ERROR, footprint, point_weights
+
+SHAPE = (24, 22, 20)
+FIRST, LAST = (2, 2, 2), (22, 20, 18)
+
+
+def wave(kappa: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """A plane wave on all cells, and its wave vector times spacing."""
+    vector = np.random.default_rng(seed).normal(size=3)
+    vector *= kappa / np.linalg.norm(vector)
+    cells = np.stack(np.indices(SHAPE), axis=-1)
+    return np.exp(1j * cells @ vector).ravel(), vector
+
+
+@pytest.mark.parametrize("cells", [17.0, 8.5, 6.0, 4.25])
+@given(seed=st.integers(0, 2**31))
+def test_plane_waves_are_read_exactly_between_the_cells(cells: float, seed: int) -> None:
+    kappa = 2 * math.pi / cells
+    field, vector = wave(kappa, seed)
+    positions = np.random.default_rng(seed).uniform(7, 13, (5, 3))
+    weights = point_weights(positions, SHAPE, FIRST, LAST, kappa)
+    read = (field[weights.index] * weights.weight).sum(1)
+    # FOOTPRINT_ERROR an axis, and three axes, each with an error norm of the other two of about 1.5 (sum of
+    # |weights|)
+    assert np.abs(read - np.exp(1j * positions @ vector)).max() < 3 * 1.5**2 * FOOTPRINT_ERROR
+
+
+@pytest.mark.parametrize("cells", [17.0, 8.5])
+def test_points_within_a_cell_of_the_rim_are_read_from_inside(cells: float) -> None:
+    kappa = 2 * math.pi / cells
+    field, vector = wave(kappa, seed=1)
+    positions = np.array([[2.5, 2.5, 2.5], [20.5, 18.5, 16.5], [2.5, 10.2, 16.5]])
+    weights = point_weights(positions, SHAPE, FIRST, LAST, kappa)
+    touched = np.stack(np.unravel_index(weights.index, SHAPE), axis=-1)
+    assert (touched >= FIRST).all()
+    assert (touched < LAST).all()
+    read = (field[weights.index] * weights.weight).sum(1)
+    # one-sided: 2e-4 an axis at 8.5 cells per wavelength, amplified by |weights| sums of 2.8 on the other two
+    # axes
+    assert np.abs(read - np.exp(1j * positions @ vector)).max() < 3 * 2.8**2 * 3e-4
+
+
+def test_a_point_on_a_cell_centre_is_that_cell() -> None:
+    weights = point_weights(np.array([[9.0, 8.0, 7.0]]), SHAPE, FIRST, LAST, 2 * math.pi / 8.5)
+    largest = weights.weight[0].argmax()
+    assert weights.index[0, largest] == np.ravel_multi_index((9, 8, 7), SHAPE)
+    # not to the last digit: the fit is regularised, which costs up to FOOTPRINT_ERROR an axis
+    assert weights.weight[0, largest] == pytest.approx(1, abs=3 * FOOTPRINT_ERROR)
+    assert np.sort(np.abs(weights.weight[0]))[-2] < FOOTPRINT_ERROR
+
+
+def test_coarser_grids_need_wider_footprints() -> None:
+    widths = [footprint(2 * math.pi / cells) for cells in (17.0, 8.5, 6.0, 4.25)]
+    assert widths == sorted(widths)
+    assert widths[0] <= 6
