@@ -20,6 +20,9 @@ MIN_CELLS_PER_WAVELENGTH = 3.0
 """Coarser than this the tuned stencil is no longer isotropic to 1e-4, and points need footprints over 10
 cells."""
 
+MAX_CELLS = 10**9
+"""More would take over 30 GB in single precision."""
+
 LAYER_CELLS = 8
 """Boundary layer: tuned reflection below -70 dB up to 60 degrees at 4 cells per wavelength, -100 dB at 8."""
 
@@ -95,7 +98,7 @@ def make_grid(scene: Scene, spacing: float) -> Grid:
     As much air is left between the domain and the boundary layer as points on the domain's faces spread over.
 
     Raises:
-        ValueError: if there are fewer than `MIN_CELLS_PER_WAVELENGTH` cells a wavelength.
+        ValueError: fewer than `MIN_CELLS_PER_WAVELENGTH` cells a wavelength, or more than `MAX_CELLS` in all.
     """
     coarsest = scene.wavelength / MIN_CELLS_PER_WAVELENGTH
     if positive("spacing", spacing, "m") > coarsest:
@@ -109,7 +112,11 @@ def make_grid(scene: Scene, spacing: float) -> Grid:
     )
     shift = (LAYER_CELLS + 1 + margin - 0.5) * spacing
     x, y, z = (low - shift for low in lower)
-    return Grid(spacing, (cells[0], cells[1], cells[2]), (x, y, z), kappa)
+    grid = Grid(spacing, (cells[0], cells[1], cells[2]), (x, y, z), kappa)
+    if math.prod(grid.shape) > MAX_CELLS:
+        size = " x ".join(map(str, grid.shape))
+        raise invalid("spacing", spacing, f"gives {size} cells, must give at most {MAX_CELLS:.0e} in all", "m")
+    return grid
 
 
 @dataclass(frozen=True)
