@@ -1,0 +1,102 @@
+"""The black box that the optimisers see: drives in, pressure magnitudes at the control points out.
+
+Neither a microphone nor a thermal camera gives a phase, so that an optimiser cannot tell a simulated
+objective from a measured one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal, Protocol, TypeAlias
+
+import torch
+
+from autdtorch.drive import validate_drive
+from autdtorch.propagator import Propagator
+from autdtorch.scene import Scene
+from autdtorch.validation import invalid
+
+#: What is maximised: pressure (..., P) [Pa] to score (...).
+Score: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
+
+
+class Objective(Protocol):
+    """Observes the control points of a scene, simulated or real.
+
+    Attributes:
+        scene: its array plays the drives, its control points are observed.
+        evaluations: number of observations so far.
+    """
+
+    scene: Scene
+    evaluations: int
+
+    def __call__(self, drive: torch.Tensor) -> torch.Tensor:
+        """Observe drives (B, M), complex, |q| <= 1: pressure magnitudes (B, P) [Pa], an evaluation a row."""
+        ...
+
+
+class SimulatedObjective:
+    """An objective whose observations are simulated.
+
+    Attributes:
+        scene: its array plays the drives, its control points are observed.
+        evaluations: number of observations so far.
+    """
+
+    scene: Scene
+    evaluations: int
+
+    def __init__(
+        self, scene: Scene, propagator: Propagator, mode: Literal["transfer", "replay"] = "transfer"
+    ) -> None:
+        """Prepare the observations.
+
+        Args:
+            scene: the scene that `propagator` was made for.
+            propagator: simulates the scene.
+            mode: "transfer" simulates the transfer matrix G here, once, and observes |G q|: the field is
+                linear in the drive. "replay" runs a simulation for every evaluation, as the paper does.
+
+        Raises:
+            ValueError: another mode, or a propagator of another scene.
+        """
+        if mode not in ("transfer", "replay"):
+            raise invalid("mode", mode, 'must be "transfer" or "replay"')
+        if propagator.scene is not scene:
+            raise invalid("scene", scene, f"must be the propagator's scene, {propagator.scene!r}")
+        self.scene = scene
+        self.evaluations = 0
+        self._propagator = propagator
+        self._transfer_matrix = propagator.transfer_matrix().cpu() if mode == "transfer" else None
+
+    def __call__(self, drive: torch.Tensor) -> torch.Tensor:
+        """Observe the control points under each of several drives.
+
+        Args:
+            drive: (B, M) complex, |q| <= 1.
+
+        Returns:
+            Pressure magnitudes (B, P) [Pa], float64, on the CPU, without gradient. In mode "transfer" a row
+            does not depend on the rows beside it, not even in its rounding.
+
+        Raises:
+            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+        """
+        transducers = len(self.scene.array)
+        drive = validate_drive(drive, transducers).detach().cpu()
+        if drive.ndim != 2 or len(drive) == 0:
+            raise ValueError(f"drive: shape {tuple(drive.shape)}; must be (B, {transducers}) with B >= 1")
+        self.evaluations += len(drive)
+        if self._transfer_matrix is None:
+            # One by one: given many drives at once, a propagator may take the transfer matrix as well.
+            rows = [self._propagator.field(row, self.scene.control_points) for row in drive]
+            return torch.stack(rows).abs().cpu()
+        # Not `drive @ G.T`: BLAS rounds by the number of rows, which a search through thousands of choices
+        # amplifies until a trial depends on the trials beside it.
+        return (drive[:, None, :] * self._transfer_matrix).sum(dim=-1).abs()
+
+
+def weakest_focus(pressure: torch.Tensor) -> torch.Tensor:
+    """Pressure (...) [Pa] of the weakest of the foci (..., P): the paper's objective, f = min(p_n)."""
+    return pressure.amin(dim=-1)

@@ -1,0 +1,125 @@
+"""What the optimisers share: the ledger of evaluations, the solution, and the seeds of the trials."""
+
+from __future__ import annotations
+
+import numbers
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from autdtorch.drive import amplitudes_of, phases_of
+from autdtorch.objective import Objective, Score
+from autdtorch.validation import invalid, real_tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The best drive that each of T independent trials observed.
+
+    Attributes:
+        drive: (T, M), complex128.
+        pressure: magnitudes at the P control points (T, P) [Pa], as observed for `drive`.
+        score: (T,), as observed for `drive`; in Pa for the weakest focus.
+        evaluations: number of evaluations (T,), int64.
+        history: best score so far after each evaluation (T, E).
+    """
+
+    drive: torch.Tensor
+    pressure: torch.Tensor
+    score: torch.Tensor
+    evaluations: torch.Tensor
+    history: torch.Tensor
+
+    @property
+    def phases(self) -> torch.Tensor:
+        """Phases in [0, 2 pi) of the drive (T, M) [rad]."""
+        return phases_of(self.drive)
+
+    @property
+    def amplitudes(self) -> torch.Tensor:
+        """Amplitudes of the drive (T, M)."""
+        return amplitudes_of(self.drive)
+
+
+class Ledger:
+    """Evaluates drives for several trials at once, and keeps what was found.
+
+    Optimisers evaluate through a ledger only, so that every evaluation is counted and none is forgotten.
+    """
+
+    def __init__(self, objective: Objective, trials: int, score: Score) -> None:
+        """Open the ledger.
+
+        Args:
+            objective: what is evaluated.
+            trials: number of trials T.
+            score: what is maximised.
+        """
+        transducers, foci = len(objective.scene.array), len(objective.scene.control_points)
+        self._objective = objective
+        self._score = score
+        self._drive = torch.zeros(trials, transducers, dtype=torch.complex128)
+        self._pressure = torch.zeros(trials, foci, dtype=torch.float64)
+        self._best = torch.full((trials,), -torch.inf, dtype=torch.float64)
+        self._scores: list[torch.Tensor] = []
+
+    def evaluate(self, drive: torch.Tensor) -> torch.Tensor:
+        """Evaluate B drives for each trial, all in one call of the objective.
+
+        Args:
+            drive: (T, B, M), complex128, B >= 1.
+
+        Returns:
+            Scores (T, B), float64.
+
+        Raises:
+            ValueError: the objective gave pressures, or the score function gave scores, that are not finite
+                real numbers or have the wrong shape.
+        """
+        batch = drive.shape[:2]
+        pressure = _observed("pressure of the objective", self._objective(drive.flatten(0, 1)), "Pa")
+        _require_shape("pressure of the objective", pressure, (batch.numel(), self._pressure.shape[1]))
+        pressure = pressure.reshape(*batch, -1)
+        score = _observed("score", self._score(pressure))
+        _require_shape("score", score, batch)
+
+        best, index = score.max(dim=1)
+        trial = torch.nonzero(best > self._best)[:, 0]
+        self._best[trial] = best[trial]
+        self._drive[trial] = drive[trial, index[trial]]
+        self._pressure[trial] = pressure[trial, index[trial]]
+        self._scores.append(score)
+        return score
+
+    def solution(self) -> Solution:
+        """The best drive of each trial; at least one evaluation must have been made."""
+        history = torch.cat(self._scores, dim=1).cummax(dim=1).values
+        evaluations = torch.full((len(history),), history.shape[1], dtype=torch.int64)
+        return Solution(self._drive.clone(), self._pressure.clone(), self._best.clone(), evaluations, history)
+
+
+def trial_seed(seed: int, trial: int) -> int:
+    """Seed of one trial, the same however many trials there are; those of different trials are unrelated."""
+    # Half the range of uint64: torch takes seeds as signed.
+    return int(np.random.SeedSequence((seed, trial)).generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+
+def integer_at_least(name: str, value: object, minimum: int) -> int:
+    """`value` as an int.
+
+    Raises:
+        ValueError: not an integer, or below `minimum`.
+    """
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < minimum:
+        raise invalid(name, value, f"must be an integer >= {minimum}")
+    return int(value)
+
+
+def _observed(name: str, value: torch.Tensor, unit: str = "") -> torch.Tensor:
+    return real_tensor(name, value, unit).detach().cpu()
+
+
+def _require_shape(name: str, value: torch.Tensor, shape: tuple[int, ...]) -> None:
+    if value.shape != shape:
+        raise ValueError(f"{name}: shape {tuple(value.shape)}; must be {tuple(shape)}")

@@ -1,0 +1,104 @@
+import pytest
+import torch
+
+from autdtorch.array import TransducerArray
+from autdtorch.drive import drive_from_phases
+from autdtorch.objective import SimulatedObjective, weakest_focus
+from autdtorch.propagator import FreeSpacePropagator, make_propagator
+from autdtorch.scene import Medium, Scene
+
+POINTS = ((80e-3, 10e-3, 0.0), (80e-3, -20e-3, 5e-3))
+
+
+@pytest.fixture
+def scene():
+    return Scene(
+        TransducerArray.grid((2, 2), pitch=10e-3, center=(0, 0, 0)),
+        Medium(1.2, 340.0),
+        frequency=40e3,
+        control_points=torch.tensor(POINTS),
+    )
+
+
+@pytest.fixture
+def drive():
+    phases = torch.rand(7, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    return drive_from_phases(6 * phases, phases.flip(0))
+
+
+class CountingPropagator(FreeSpacePropagator):
+    """Notes what it is asked for."""
+
+    def __init__(self, scene):
+        super().__init__(scene)
+        self.drives = 0
+        self.matrices = 0
+
+    def transfer_matrix(self, points=None):
+        self.matrices += 1
+        return super().transfer_matrix(points)
+
+    def field(self, drive, points):
+        self.drives += drive.shape[:-1].numel()
+        return drive @ FreeSpacePropagator(self.scene).transfer_matrix(points).mT
+
+
+@pytest.mark.parametrize("mode", ["transfer", "replay"])
+def test_pressure_is_the_magnitude_of_the_field(scene, drive, mode):
+    propagator = make_propagator(scene, "free_space")
+    expected = propagator.field(drive, scene.control_points).abs()
+    pressure = SimulatedObjective(scene, propagator, mode)(drive)
+    assert pressure.dtype == torch.float64
+    torch.testing.assert_close(pressure, expected, rtol=1e-13, atol=0)  # the same sum in another order
+
+
+def test_transfer_simulates_once_and_replay_every_time(scene, drive):
+    for mode, drives, matrices in (("transfer", 0, 1), ("replay", 9, 0)):
+        propagator = CountingPropagator(scene)
+        objective = SimulatedObjective(scene, propagator, mode)
+        objective(drive)
+        objective(drive[:2])
+        assert (propagator.drives, propagator.matrices) == (drives, matrices)
+        assert objective.evaluations == 9
+
+
+def test_a_row_does_not_depend_on_the_rows_beside_it(scene, drive):
+    objective = SimulatedObjective(scene, make_propagator(scene, "free_space"))
+    together = objective(drive.repeat(50, 1))
+    assert torch.equal(together[:7], torch.cat([objective(row[None]) for row in drive]))
+    assert torch.equal(together[:7], together[-7:])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda drive: 1.1 * drive / drive.abs().max(), r"amplitude 1\.1"),
+        (lambda drive: drive[:, :3], r"\(7, 3\)"),
+        (lambda drive: drive[0], r"\(4,\)"),
+        (lambda drive: drive[:0], r"\(0, 4\)"),
+        (lambda drive: drive.real, "complex"),
+        (lambda drive: drive * torch.nan, "finite"),
+    ],
+    ids=["too loud", "transducer missing", "no batch", "no row", "real", "nan"],
+)
+def test_drive_that_no_array_can_play_is_refused_and_not_counted(scene, drive, change, message):
+    objective = SimulatedObjective(scene, make_propagator(scene, "free_space"))
+    with pytest.raises(ValueError, match=f"drive.*{message}"):
+        objective(change(drive))
+    assert objective.evaluations == 0
+
+
+def test_unknown_mode_is_refused(scene):
+    with pytest.raises(ValueError, match=r"mode: 'guess'; must be"):
+        SimulatedObjective(scene, make_propagator(scene, "free_space"), "guess")
+
+
+def test_propagator_of_another_scene_is_refused(scene):
+    other = Scene(scene.array, scene.medium, frequency=41e3, control_points=scene.control_points)
+    with pytest.raises(ValueError, match="propagator's scene"):
+        SimulatedObjective(other, make_propagator(scene, "free_space"))
+
+
+def test_weakest_focus_is_the_minimum_over_the_last_axis():
+    pressure = torch.tensor([[[3.0, 1.0, 2.0]], [[5.0, 6.0, 4.0]]])
+    assert torch.equal(weakest_focus(pressure), torch.tensor([[1.0], [4.0]]))
