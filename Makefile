@@ -1,0 +1,44 @@
+# Needs python3 (3.11 or later) with pip and venv; everything else is installed into .venv by the first target.
+
+PYTHON ?= python3
+ARGS ?=
+
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+
+# "make paper trials=50" hands trials=50 to Hydra: every variable of make's command line but our own two.
+OVERRIDES = $(strip $(foreach name,$(filter-out PYTHON ARGS,$(.VARIABLES)),$(if \
+	$(findstring command line,$(origin $(name))),'$(name)=$($(name))')) $(ARGS))
+
+.DEFAULT_GOAL := help
+.PHONY: help paper test lint clean
+
+help:
+	@echo "make paper   run the paper's experiment and write outputs/paper/report.md"
+	@echo "             (make paper trials=5 changes a setting, as does ARGS='trials=5 seed=1')"
+	@echo "make test    run the tests (ARGS='-m unit' selects)"
+	@echo "make lint    ruff, mypy, import-linter"
+	@echo "make clean   remove .venv and the tools' caches; outputs/ stays"
+	@echo "PYTHON=python3.12 chooses the interpreter that .venv is made with."
+
+$(INSTALLED): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "autdtorch needs Python 3.11 or later")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet -c constraints.txt -e '.[viz,dev]'
+	@touch $@
+
+paper: $(INSTALLED)
+	$(BIN)/autdtorch experiment=paper $(OVERRIDES)
+
+test: $(INSTALLED)
+	$(BIN)/python -m pytest $(ARGS)
+
+lint: $(INSTALLED)
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+clean:
+	rm -rf $(VENV) build dist .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
+	find autdtorch tests -name __pycache__ -type d -exec rm -rf {} +

@@ -1,0 +1,47 @@
+from .array import PAPER_SOURCE_STRENGTH, TransducerArray
+from .drive import amplitudes_of, drive_from_phases, focus_phases, phases_of
+from .freespace import green
+from .geometry import Plane, circle_points
+from .metrics import FocusMetrics, focus_metrics
+from .objective import Objective, SimulatedObjective, weakest_focus
+from .optim.base import Solution
+from .optim.bayes import bayes_opt
+from .optim.gabs import gabs
+from .optim.lssg import lssg
+from .plot import plot_convergence, plot_plane, plot_trials
+from .propagator import make_propagator
+from .scene import Box, Medium, Scene
+from .scene_file import load_scene
+from .view3d import view3d
+
+__all__ = [
+    "PAPER_SOURCE_STRENGTH",
+    "Box",
+    "FocusMetrics",
+    "Medium",
+    "Objective",
+    "Plane",
+    "Scene",
+    "SimulatedObjective",
+    "Solution",
+    "TransducerArray",
+    "amplitudes_of",
+    "bayes_opt",
+    "circle_points",
+    "drive_from_phases",
+    "focus_metrics",
+    "focus_phases",
+    "gabs",
+    "green",
+    "load_scene",
+    "lssg",
+    "make_propagator",
+    "phases_of",
+    "plot_convergence",
+    "plot_plane",
+    "plot_trials",
+    "view3d",
+    "weakest_focus",
+]
+
+__version__: str

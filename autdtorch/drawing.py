@@ -1,0 +1,51 @@
+"""What the pictures of `plot` and `view3d` share: units, colours, and checks of what is drawn."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from autdtorch.drive import phases_of, validate_drive
+from autdtorch.validation import ArrayLike
+
+Array: TypeAlias = npt.NDArray[np.float64]
+
+MM = 1e3  # lengths are drawn in millimetres
+
+# From the Okabe-Ito palette, told apart by colour-blind readers too.
+TRANSDUCER_COLOUR = "#0072B2"
+FOCUS_COLOUR = "#D55E00"
+PLANE_COLOUR = "#56B4E9"
+OBSTACLE_COLOUR = "#B0B0B0"
+EDGE_COLOUR = "#222222"
+
+PHASE_MAP = "twilight"  # cyclic: 0 and 2 pi look the same
+PRESSURE_MAP = "inferno"
+
+
+def plane_magnitude(name: str, pressure: ArrayLike) -> Array:
+    """|p| (Nu, Nv) of complex pressure, or of its magnitude, on a plane.
+
+    Raises:
+        ValueError: another number of axes, or no entry.
+    """
+    magnitude: Array = torch.as_tensor(pressure).detach().cpu().abs().double().numpy()
+    if magnitude.ndim != 2 or magnitude.size == 0:
+        raise ValueError(f"{name}: shape {magnitude.shape}; must be (Nu, Nv), the points of a plane")
+    return magnitude
+
+
+def single_drive_phases(drive: ArrayLike, transducers: int) -> Array:
+    """Phases (M,) in [0, 2 pi) [rad] of one drive of an array of `transducers`.
+
+    Raises:
+        ValueError: not one drive that the array can play.
+    """
+    drive = validate_drive(drive, transducers)
+    if drive.ndim != 1:
+        raise ValueError(f"drive: shape {tuple(drive.shape)}; must be ({transducers},), a single drive")
+    phases: Array = phases_of(drive).detach().cpu().numpy()
+    return phases

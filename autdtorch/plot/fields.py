@@ -1,0 +1,160 @@
+"""Maps of the pressure on observation planes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import cast
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+
+from autdtorch.drawing import MM, PRESSURE_MAP, Array, plane_magnitude
+from autdtorch.geometry import Plane
+from autdtorch.plot.style import (
+    TICK_SIZE,
+    ByMethod,
+    label_of,
+    methods_of,
+    new_figure,
+    readable,
+    require_scenes,
+    styled,
+)
+from autdtorch.validation import ArrayLike, points_tensor
+
+_AXIS_TOLERANCE = 1e-12  # by which a unit vector along x, y or z may miss length 1 in that coordinate
+
+
+@styled
+def plot_plane(
+    pressure: ArrayLike, plane: Plane, control_points: ArrayLike | None = None, ax: Axes | None = None
+) -> Figure:
+    """Map of the pressure magnitude on a plane, over the coordinates along its edges.
+
+    Args:
+        pressure: complex pressure or its magnitude (Nu, Nv) [Pa], at `plane.points(...)`.
+        plane: where it was taken.
+        control_points: (P, 3) [m]; those in the plane are circled.
+        ax: axes to draw into; by default those of a new figure.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: `pressure` is not (Nu, Nv), or `control_points` are not points.
+    """
+    if ax is None:
+        ax = new_figure(4.4, 3.6).add_subplot()
+    figure = cast(Figure, ax.get_figure(root=True))
+    magnitude = plane_magnitude("pressure", pressure)
+    mesh = _draw_plane(ax, magnitude, plane, control_points, magnitude.max())
+    _add_colour_bar(figure, mesh, [ax], "vertical")
+    return figure
+
+
+@styled
+def plot_planes(
+    pressure: Mapping[str, ByMethod],
+    planes: Mapping[str, Plane],
+    control_points: Mapping[str, ArrayLike] | None = None,
+) -> Figure:
+    """The paper's Fig. 2: pressure maps, a row for each method and a column for each scene.
+
+    The maps of one scene share their colour scale, so that methods can be compared by eye.
+
+    Args:
+        pressure: by scene and method, complex pressure or its magnitude (Nu, Nv) [Pa]. Where a scene lacks a
+            method that another has, its place stays empty.
+        planes: the plane of each scene.
+        control_points: of each scene (P, 3) [m]; those in the plane are circled.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: no scene, a scene without plane, or an argument of the wrong shape.
+    """
+    require_scenes("pressure", pressure)
+    if missing := pressure.keys() - planes.keys():
+        raise ValueError(f"planes: none for {sorted(missing)}; must have one for each scene in pressure")
+    methods = methods_of(pressure.values())
+    full = all(method in maps for method in methods for maps in pressure.values())
+    alike = full and len({planes[scene] for scene in pressure}) == 1
+    figure = new_figure(2.3 * len(pressure) + 0.4, 2.3 * len(methods) + 0.6)
+    axes = figure.subplots(len(methods), len(pressure), squeeze=False)
+    for column, (scene, maps) in zip(axes.T, pressure.items(), strict=True):
+        magnitudes = {
+            method: plane_magnitude(f"pressure[{scene!r}][{method!r}]", field)
+            for method, field in maps.items()
+        }
+        peak = max(magnitude.max() for magnitude in magnitudes.values())
+        points = None if control_points is None else control_points[scene]
+        for ax, method in zip(column, methods, strict=True):
+            if method not in magnitudes:
+                ax.set_axis_off()
+                continue
+            mesh = _draw_plane(ax, magnitudes[method], planes[scene], points, peak)
+            ax.set_title(f"{label_of(method)}, {readable(scene)}")
+            if alike:
+                ax.label_outer()
+        _add_colour_bar(figure, mesh, list(column), "horizontal")
+    return figure
+
+
+def _draw_plane(
+    ax: Axes, magnitude: Array, plane: Plane, control_points: ArrayLike | None, peak: float
+) -> QuadMesh:
+    (label_u, edges_u), (label_v, edges_v) = (
+        _plane_axis(plane, side, cells) for side, cells in enumerate(magnitude.shape)
+    )
+    mesh = ax.pcolormesh(
+        edges_u, edges_v, magnitude.T, cmap=PRESSURE_MAP, vmin=0.0, vmax=peak, rasterized=True
+    )
+    if control_points is not None:
+        _circle_points(ax, plane, points_tensor("control_points", control_points), max(magnitude.shape))
+    ax.set(xlabel=label_u, ylabel=label_v, aspect="equal")
+    ax.tick_params(labelsize=TICK_SIZE)
+    return mesh
+
+
+def _plane_axis(plane: Plane, side: int, cells: int) -> tuple[str, Array]:
+    """Axis label, and edges of the cells [mm] along side u (0) or v (1) of the plane.
+
+    Where the side runs along x, y or z, these are that coordinate; else the distance from the plane's centre.
+    """
+    direction = plane.basis[side]
+    along = MM * plane.size[side] * np.linspace(-0.5, 0.5, cells + 1)
+    axis = int(direction.abs().argmax())
+    if direction[axis].abs() <= 1 - _AXIS_TOLERANCE:
+        return f"{'uv'[side]} [mm]", along
+    return f"{'xyz'[axis]} [mm]", MM * plane.center[axis] + float(direction[axis]) * along
+
+
+def _circle_points(ax: Axes, plane: Plane, points: torch.Tensor, cells: int) -> None:
+    """Circle those of the `points` (P, 3) [m] that are nearer to the plane than one of its cells is long."""
+    center = points.new_tensor(plane.center)
+    near = ((points - center) @ points.new_tensor(plane.normal)).abs() < max(plane.size) / cells
+    sides = torch.stack(plane.basis).to(points)
+    axes = sides.abs().argmax(dim=1)
+    along_axis = sides.abs().amax(dim=1) > 1 - _AXIS_TOLERANCE
+    coordinates = torch.where(along_axis, points[:, axes], (points - center) @ sides.T)[near]
+    ax.plot(
+        *(MM * coordinates.T.cpu().numpy()),
+        linestyle="none",
+        marker="o",
+        markersize=9,
+        markerfacecolor="none",
+        markeredgecolor="white",
+        markeredgewidth=1.2,
+        path_effects=[withStroke(linewidth=2.6, foreground="black")],
+    )
+
+
+def _add_colour_bar(figure: Figure, mesh: QuadMesh, axes: list[Axes], orientation: str) -> None:
+    bar = figure.colorbar(mesh, ax=axes, orientation=orientation, shrink=0.9, aspect=25)
+    bar.set_label("|p| [Pa]")
+    bar.ax.tick_params(labelsize=TICK_SIZE)

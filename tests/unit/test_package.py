@@ -1,0 +1,103 @@
+"""The package as a whole: what importing it costs, which module may import which, what a wheel holds."""
+
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import autdtorch as at
+
+ROOT = Path(__file__).parents[2]
+HEAVY = ("pyvista", "botorch", "gpytorch", "usb", "hydra", "numba", "matplotlib")
+
+IMPORT = """
+import json, sys, time
+start = time.perf_counter()
+import autdtorch
+seconds = time.perf_counter() - start
+heavy = set(HEAVY)
+after_import = sorted(heavy & sys.modules.keys())
+plots = [name for name in autdtorch.__all__ if name.startswith("plot_")]
+for name in autdtorch.__all__:
+    if name not in plots:
+        getattr(autdtorch, name)
+after_names = sorted(heavy & sys.modules.keys())
+for name in plots:
+    getattr(autdtorch, name)
+after_plots = sorted(heavy & sys.modules.keys())
+print(json.dumps([seconds, after_import, after_names, after_plots]))
+"""
+
+
+@pytest.fixture(scope="module")
+def imported() -> tuple[float, list[str], list[str], list[str]]:
+    """Seconds to import, then heavy packages loaded by it, by all names but plots, by plots."""
+    code = IMPORT.replace("HEAVY", repr(HEAVY))
+    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    seconds, *loaded = json.loads(child.stdout)
+    return seconds, *loaded
+
+
+def test_import_is_quick(imported: tuple[float, list[str], list[str], list[str]]) -> None:
+    # It takes some 30 ms; importing torch, which it must not, takes seconds on a loaded machine.
+    assert imported[0] < 2.0
+
+
+def test_import_loads_no_heavy_package(imported: tuple[float, list[str], list[str], list[str]]) -> None:
+    _, after_import, after_names, after_plots = imported
+    assert after_import == []
+    assert after_names == []
+    assert after_plots == ["matplotlib"]
+
+
+def test_view3d_is_the_function_even_if_its_module_is_imported_first() -> None:
+    code = "import autdtorch.view3d\nassert callable(autdtorch.view3d)"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="no_such_name"):
+        at.no_such_name  # noqa: B018
+
+
+def test_public_names_are_listed_once_and_sorted() -> None:
+    stub = (ROOT / "autdtorch/__init__.pyi").read_text(encoding="utf-8")
+    listed = stub.split("__all__ = [")[1].split("]")[0].replace('"', "").replace(",", "").split()
+    assert sorted(listed) == sorted(set(listed)) == sorted(at.__all__)
+
+
+def test_modules_import_only_downwards() -> None:
+    child = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "from importlinter.cli import lint_imports_command as main; main()",
+            "--no-cache",
+        ],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    assert child.returncode == 0, child.stdout + child.stderr
+
+
+def test_wheel_holds_configs_stub_and_type_marker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from hatchling.build import build_wheel
+
+    monkeypatch.chdir(ROOT)
+    wheel = build_wheel(str(tmp_path))
+    assert wheel == f"autdtorch-{at.__version__}-py3-none-any.whl"
+    with zipfile.ZipFile(tmp_path / wheel) as archive:
+        names = set(archive.namelist())
+        entry_points = archive.read(f"autdtorch-{at.__version__}.dist-info/entry_points.txt").decode()
+    wanted = {f"autdtorch/{path.relative_to(ROOT)}" for path in (ROOT / "configs").rglob("*.yaml")}
+    assert wanted
+    assert wanted | {"autdtorch/__init__.pyi", "autdtorch/py.typed"} <= names
+    assert not any(name.startswith(("configs/", "tests/")) for name in names)
+    assert "autdtorch = autdtorch.cli:main" in entry_points

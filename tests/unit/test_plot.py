@@ -1,0 +1,204 @@
+"""Figures draw the data they are given, with units on every axis, and change no global state."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+import torch
+from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+
+import autdtorch as at
+from autdtorch.plot import plot_convergence, plot_plane, plot_planes, plot_scene, plot_trials
+
+PLANE = at.Plane(center=(80e-3, 50e-3, 40e-3), normal=(1, 0, 0), size=(60e-3, 40e-3))
+RANDOM = np.random.default_rng(7)
+
+
+def mesh_of(ax: Axes) -> QuadMesh:
+    (mesh,) = (artist for artist in ax.collections if isinstance(artist, QuadMesh))
+    return mesh
+
+
+def maps(figure: Figure) -> Iterator[Axes]:
+    """The axes with a map, without those of colour bars."""
+    return (ax for ax in figure.axes if ax.get_aspect() == 1)
+
+
+def test_plane_map_draws_each_cell_at_its_coordinates_in_mm() -> None:
+    points = PLANE.points(10e-3)
+    pressure = torch.complex(points[..., 1], points[..., 2])
+    figure = plot_plane(pressure, PLANE)
+    ax = next(maps(figure))
+    mesh = mesh_of(ax)
+    corners = mesh.get_coordinates()
+    centers = (corners[:-1, :-1] + corners[1:, 1:]) / 2
+    np.testing.assert_allclose(centers, 1e3 * points[..., 1:].numpy().swapaxes(0, 1), atol=1e-9)
+    np.testing.assert_allclose(mesh.get_array(), pressure.abs().numpy().T)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("y [mm]", "z [mm]")
+    assert figure.axes[1].get_ylabel() == "|p| [Pa]"
+
+
+@pytest.mark.parametrize(
+    ("normal", "labels"),
+    [
+        ((1, 0, 0), ("y [mm]", "z [mm]")),
+        ((0, 1, 0), ("z [mm]", "x [mm]")),
+        ((0, 0, -1), ("x [mm]", "y [mm]")),
+        ((1, 1, 0), ("u [mm]", "z [mm]")),
+        ((1, 1, 1), ("u [mm]", "v [mm]")),
+    ],
+)
+def test_plane_axes_carry_the_name_of_the_real_axis(
+    normal: tuple[int, int, int], labels: tuple[str, str]
+) -> None:
+    ax = plot_plane(np.ones((3, 2)), at.Plane((0, 0, 0), normal, (30e-3, 20e-3))).axes[0]
+    assert (ax.get_xlabel(), ax.get_ylabel()) == labels
+
+
+def test_a_side_that_runs_against_its_axis_is_drawn_at_its_coordinates() -> None:
+    plane = at.Plane(center=(0, 50e-3, 40e-3), normal=(-1, 0, 0), size=(60e-3, 40e-3))  # v = -z
+    points = plane.points(10e-3)
+    mesh = mesh_of(plot_plane(points[..., 2], plane).axes[0])
+    corners = mesh.get_coordinates()
+    centers = (corners[:-1, :-1] + corners[1:, 1:]) / 2
+    # The pressure given is the height z, so that each cell must show the height it is drawn at.
+    np.testing.assert_allclose(mesh.get_array(), 1e-3 * centers[..., 1], atol=1e-12)
+
+
+def test_control_points_in_the_plane_are_circled_and_others_are_not() -> None:
+    inside, off = [80e-3, 30e-3, 45e-3], [60e-3, 30e-3, 45e-3]
+    (circles,) = plot_plane(np.ones((6, 4)), PLANE, [inside, off]).axes[0].get_lines()
+    np.testing.assert_allclose(circles.get_xydata(), [[30.0, 45.0]])
+
+
+def test_plane_map_draws_into_given_axes() -> None:
+    ax = Figure().add_subplot()
+    assert plot_plane(np.ones((3, 2)), PLANE, ax=ax) is ax.figure
+    assert mesh_of(ax).get_array().shape == (2, 3)
+
+
+def test_planes_of_a_scene_share_their_colour_scale() -> None:
+    pressure = {
+        "three_cubes": {"lssg": np.full((3, 2), 1.0), "gabs": np.full((3, 2), 4.0)},
+        "empty": {"lssg": np.full((3, 2), 2.0)},
+    }
+    figure = plot_planes(pressure, dict.fromkeys(pressure, PLANE))
+    limits = {ax.get_title(): mesh_of(ax).get_clim() for ax in figure.axes if ax.get_title()}
+    assert limits == {"LSSG, three cubes": (0, 4), "GABS, three cubes": (0, 4), "LSSG, empty": (0, 2)}
+    drawn = [ax for ax in maps(figure) if ax.axison]
+    assert all(ax.get_xlabel() == "y [mm]" and ax.get_ylabel() == "z [mm]" for ax in drawn)
+
+
+def test_planes_need_one_plane_a_scene() -> None:
+    with pytest.raises(ValueError, match=r"planes: none for \['empty'\]"):
+        plot_planes({"empty": {"gabs": np.ones((3, 2))}}, {})
+
+
+def test_trials_draw_quartiles_of_many_and_a_marker_for_one() -> None:
+    values = {"gabs": RANDOM.normal(5, 1, 50), "lssg": torch.tensor([2.5])}
+    figure = plot_trials({"mean pressure [Pa]": {"empty": values}})
+    (ax,) = figure.axes
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("scene", "mean pressure [Pa]")
+    assert [tick.get_text() for tick in ax.get_xticklabels()] == ["empty"]
+    (box,) = (patch for patch in ax.patches if isinstance(patch, PathPatch))
+    vertices = box.get_path().vertices
+    drawn = (vertices[:, 1].min(), vertices[:, 1].max())
+    np.testing.assert_allclose(drawn, np.percentile(values["gabs"], [25, 75]))
+    (diamond,) = (line for line in ax.get_lines() if line.get_marker() == "D")
+    assert diamond.get_ydata()[0] == 2.5
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["GABS", "LSSG"]
+
+
+def test_a_method_has_one_colour_in_all_figures() -> None:
+    trials = plot_trials({"f [1]": {"empty": {"other": [1.0, 2.0], "gabs": [1.0, 2.0]}}})
+    convergence = plot_convergence({"empty": {"gabs": [[1.0, 2.0]], "lssg": [[1.0]], "other": [[1.0, 2.0]]}})
+    (legend,), (lines,) = trials.legends, convergence.legends
+    boxes = {patch.get_label(): patch.get_facecolor()[:3] for patch in legend.get_patches()}
+    colours = {line.get_label(): mpl.colors.to_rgb(line.get_color()) for line in lines.get_lines()}
+    assert boxes["GABS"] == pytest.approx(colours["GABS"])
+    assert boxes["other"] == pytest.approx(colours["other"])
+    assert len(set(colours.values())) == 3
+
+
+def test_convergence_draws_median_and_10_to_90_percent_band() -> None:
+    history = np.maximum.accumulate(RANDOM.normal(size=(50, 30)) + 5, axis=1)
+    figure = plot_convergence({"empty": {"gabs": history}, "two_cubes": {"gabs": history[:1]}})
+    first, second = figure.axes
+    line = first.get_lines()[0]
+    np.testing.assert_array_equal(line.get_xdata(), np.arange(1, 31))
+    np.testing.assert_allclose(line.get_ydata(), np.median(history, axis=0))
+    (band,) = first.collections
+    vertices = band.get_paths()[0].vertices
+    for evaluation, low, high in zip(
+        line.get_xdata(), *np.percentile(history, [10, 90], axis=0), strict=True
+    ):
+        here = vertices[vertices[:, 0] == evaluation, 1]
+        assert (here.min(), here.max()) == pytest.approx((low, high))
+    assert not second.collections, "a single trial has no band"
+    assert [ax.get_title() for ax in figure.axes] == ["empty", "two cubes"]
+    assert first.get_xlabel() == "evaluations"
+    assert first.get_ylabel().endswith("[Pa]")
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: plot_plane(np.ones(3), PLANE), r"pressure: shape \(3,\); must be \(Nu, Nv\)"),
+        (lambda: plot_planes({}, {}), "pressure: scenes"),
+        (lambda: plot_trials({}), "quantities: empty"),
+        (
+            lambda: plot_trials({"f [1]": {"empty": {"gabs": [[1.0]]}}}),
+            r"\['gabs'\]: shape \(1, 1\); must be \(trials",
+        ),
+        (lambda: plot_trials({"f [1]": {"empty": {"gabs": [np.nan]}}}), "every entry must be finite"),
+        (lambda: plot_convergence({"empty": {}}), "at least one method"),
+        (lambda: plot_convergence({"empty": {"gabs": [1.0]}}), r"must be \(trials, evaluations\)"),
+    ],
+)
+def test_bad_data_is_refused(call: object, message: str) -> None:
+    assert callable(call)
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_scene_draws_everything_in_mm() -> None:
+    scene = at.Scene(
+        array=at.TransducerArray.grid((2, 2), pitch=10e-3, center=(0, 0, 0), normal=(1, 0, 0)),
+        medium=at.Medium(density=1.293, sound_speed=340.0),
+        frequency=40e3,
+        control_points=[[80e-3, 0, 0]],
+        obstacles=(at.Box(center=(40e-3, 0, 0), size=(10e-3,) * 3, rigid=True),),
+        observation_plane=at.Plane((80e-3, 0, 0), (1, 0, 0), (40e-3, 40e-3)),
+    )
+    drive = at.drive_from_phases([0.0, 1.0, 2.0, 3.0])
+    figure = plot_scene(scene, drive)
+    ax = figure.axes[0]
+    assert (ax.get_xlabel(), ax.get_ylabel(), ax.get_zlabel()) == ("x [mm]", "y [mm]", "z [mm]")
+    assert figure.axes[1].get_ylabel() == "phase [rad]"
+    _plane, _box, foci, transducers = ax.collections
+    np.testing.assert_allclose(np.stack(foci._offsets3d, axis=-1), [[80, 0, 0]])
+    np.testing.assert_allclose(
+        np.stack(transducers._offsets3d, axis=-1), 1e3 * scene.array.positions, atol=1e-9
+    )
+    np.testing.assert_allclose(transducers.get_array(), [0, 1, 2, 3])
+    with pytest.raises(ValueError, match="a single drive"):
+        plot_scene(scene, drive.expand(3, 4))
+
+
+def test_no_global_state_is_touched() -> None:
+    before = dict(mpl.rcParams)
+    plot_plane(np.ones((3, 2)), PLANE)
+    assert dict(mpl.rcParams) == before
+    code = (
+        "import sys, numpy, autdtorch as at\n"
+        "at.plot_plane(numpy.ones((3, 2)), at.Plane((0, 0, 0), (1, 0, 0), (1e-2, 1e-2)))\n"
+        "pyplot = sys.modules.get('matplotlib.pyplot')\n"
+        "raise SystemExit(pyplot is not None and bool(pyplot.get_fignums()))"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
