@@ -162,7 +162,7 @@ class FullPropagator:
         """Transfer matrix G from one simulation a point or one a transducer, whichever are fewer.
 
         Waves travel from a point to the transducers as they travel back (reciprocity; in this scheme but for
-        what the edges of the boundary layer leave, about 1e-5), so that P simulations can do instead of M. The
+        what the edges of the boundary layer leave, about 1e-5), so P simulations can do instead of M. The
         matrix of the control points is kept.
 
         Args:

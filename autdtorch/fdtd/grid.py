@@ -107,15 +107,15 @@ def make_grid(scene: Scene, spacing: float) -> Grid:
     lower, upper = scene.domain
     kappa = scene.wavenumber * spacing
     margin = footprint(kappa) // 2 - 1
-    cells = tuple(
+    interior = tuple(
         math.ceil((high - low) / spacing - 1e-6) + 2 * margin for low, high in zip(lower, upper, strict=True)
     )
     shift = (LAYER_CELLS + 1 + margin - 0.5) * spacing
     x, y, z = (low - shift for low in lower)
-    grid = Grid(spacing, (cells[0], cells[1], cells[2]), (x, y, z), kappa)
+    grid = Grid(spacing, (interior[0], interior[1], interior[2]), (x, y, z), kappa)
     if math.prod(grid.shape) > MAX_CELLS:
-        size = " x ".join(map(str, grid.shape))
-        raise invalid("spacing", spacing, f"gives {size} cells, must give at most {MAX_CELLS:.0e} in all", "m")
+        cells = " x ".join(map(str, grid.shape))
+        raise invalid("spacing", spacing, f"gives {cells} cells, must be at most {MAX_CELLS:.0e} in all", "m")
     return grid
 
 

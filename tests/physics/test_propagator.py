@@ -160,7 +160,7 @@ def test_free_space_says_that_it_leaves_obstacles_out(caplog: pytest.LogCaptureF
     [
         ({"method": "fem"}, r"method: .*fem.*must be one of auto, free_space, full"),
         ({"spacing": 4e-3}, r"spacing: 0.004 m; must be at most 0.00283 m"),
-        ({"spacing": 1e-5}, r"spacing: 1e-05 m; gives 2420 x 2420 x 2420 cells, must give at most 1e\+09"),
+        ({"spacing": 1e-5}, r"spacing: 1e-05 m; gives 2420 x 2420 x 2420 cells, must be at most 1e\+09"),
         ({"spacing": float("nan")}, r"spacing: nan"),
         ({"spacing": -1e-3}, r"spacing: -0.001 m; must be finite and > 0"),
         ({"tolerance": 1.5}, r"tolerance: 1.5; must be in \(0, 1\)"),
