@@ -1,0 +1,298 @@
+"""The report of a study: ``report.md`` with the figures of the paper and a check of its claims."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import torch
+
+from autdtorch.claims import LABELS, LSSG, judge_claims
+from autdtorch.plot import plot_convergence, plot_planes, plot_scene, plot_trials
+from autdtorch.results import RESULTS_FILE, TRIALS_FILE, MethodResult, SceneResult, StudyResult
+from autdtorch.scene import Scene
+from autdtorch.view3d import rendering_problem, view3d
+
+REPORT_FILE = "report.md"
+
+_FEW_TRIALS = 20  # below this, the spread of a method is not well known
+
+_FIG2 = """## Fig. 2: pressure on the observation plane
+
+![pressure on the observation plane](fig2.png)
+
+|p| of the trial of median score, the control points circled. A scene has one colour scale for all methods."""
+
+_FIG3 = """## Fig. 3: the trials
+
+![trials](fig3abc.png)
+
+{letters}. Boxes span the quartiles of the trials with a line at the median; a diamond is a single trial.
+
+![convergence](fig3d.png)
+
+(d) best score so far against evaluations."""
+
+_BELOW_SUMMARY = """Mean over the trials ± their standard deviation. *mean*, *weakest* and *std* are taken
+over the foci of a trial; *s a trial* is the time of the search alone, without simulation.
+
+Pressures are amplitudes, for transducers of pressure S/r with the source strength S of the scene's array.
+The paper's scenes have that of its Eq. 2, S = 1/(4π) Pa m."""
+
+_BELOW_CLAIMS = """Computed from the data: means over the trials, ± the standard error of the mean. *Not
+clearly*: a difference that decides the verdict is below two standard errors, or there is a single trial."""
+
+_READINGS = """## How the paper was read
+
+- **Area a focus**: the cells of the observation plane where |p| is at least the mean pressure of the foci
+  over √2 (half the intensity), divided by the number of foci. The paper's words, a threshold "above √2 of
+  the average sound pressure", taken as a factor would leave nearly no area.
+- **Evaluations** are those made, each an observation of all control points. GABS makes 1 + (M - 1) L of
+  them for M transducers and L levels, since the phase of the first transducer alone changes no magnitude:
+  241 for M = L = 16, where the paper counts 256. LSSG makes one pass of L offsets over the foci, the
+  paper's 64. BO has a set number, its random start included.
+- **Objective**: the pressure of the weakest focus, as in the paper. A trial returns the best drive it
+  observed.
+- **Frequency** (40 kHz) and **angle of the foci** on their circle are not in the paper; see the scenes'
+  settings."""
+
+_BELOW_SIMULATION = """A run ends when its estimated relative distance to the steady state is at most
+{tolerance:g}; *to steady state* is the largest of a scene's runs. That says nothing of the error of the
+grid: repeat the study with a smaller `solver.spacing` to see it."""
+
+_ORIGIN = """## Origin
+
+- versions: {versions}
+- seed: {seed}
+- source digest: `{digest}`
+- everything behind this report: `{results}` (HDF5); a line a trial: `{trials}`
+
+<details><summary>all settings</summary>
+
+```yaml
+{config}
+```
+
+</details>"""
+
+
+def write_report(
+    results: StudyResult, scenes: Mapping[str, Scene], folder: str | os.PathLike[str], command: str
+) -> Path:
+    """Write `report.md` and its figures.
+
+    Args:
+        results: what is reported.
+        scenes: the scenes of `results`, by the same names.
+        folder: for the report and its figures; made if need be.
+        command: the command line that repeats the study.
+
+    Returns:
+        The report.
+
+    Raises:
+        OSError: the folder cannot be made or written.
+        ValueError: a scene of `results` is missing in `scenes`.
+    """
+    if missing := results.scenes.keys() - scenes.keys():
+        raise ValueError(f"scenes: none for {sorted(missing)}; must have every scene of the results")
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    scenes = {name: scenes[name] for name in results.scenes}
+    parts = [
+        _head(results, command),
+        _scene_figures(scenes, folder),
+        _plane_figure(results, scenes, folder),
+        _trial_figures(results, folder),
+        _summary(results),
+        _claims(results),
+        _READINGS,
+        _simulations(results),
+        _origin(results),
+    ]
+    report = folder / REPORT_FILE
+    report.write_text("\n\n".join(part for part in parts if part) + "\n", encoding="utf-8")
+    return report
+
+
+def summary_rows(results: StudyResult) -> list[list[str]]:
+    """A table of the results, its head first: mean over the trials, and ± their standard deviation."""
+    head = ["scene", "method", "trials", "mean [Pa]", "weakest [Pa]", "std [Pa]", "area [mm²]"]
+    rows = [[*head, "evaluations", "s a trial"]]
+    for scene_name, scene in results.scenes.items():
+        for name, method in scene.methods.items():
+            metrics = method.metrics
+            area = "none" if metrics.area is None else _over_trials(1e6 * metrics.area, ".0f")
+            pressures = (metrics.mean, metrics.min, metrics.std)
+            numbers = [str(method.trials), *(_over_trials(values, ".2f") for values in pressures), area]
+            evaluations = f"{method.solution.evaluations.double().mean():.0f}"
+            rows.append(
+                [scene_name, _label(name), *numbers, evaluations, f"{method.seconds / method.trials:.2g}"]
+            )
+    return rows
+
+
+def _over_trials(values: torch.Tensor, form: str) -> str:
+    mean = f"{values.mean():{form}}"
+    return mean if len(values) == 1 else f"{mean} ± {values.std():{form}}"
+
+
+def _label(method: str) -> str:
+    return LABELS.get(method, method)
+
+
+def _table(rows: Iterable[Sequence[str]]) -> str:
+    head, *body = rows
+    lines = [head, ["---"] * len(head), *body]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+
+
+def _by_method(results: StudyResult) -> dict[str, dict[str, MethodResult]]:
+    return {name: scene.methods for name, scene in results.scenes.items()}
+
+
+def _head(results: StudyResult, command: str) -> str:
+    counts = _trial_counts(results)
+    lines = [
+        "# Foci behind obstacles",
+        f"Made by `{command}` with autdtorch {results.provenance.versions['autdtorch']}, begun "
+        f"{results.provenance.date}.",
+        "Trials: " + ", ".join(f"{_label(name)} {_range(numbers)}" for name, numbers in counts.items()) + ".",
+    ]
+    few = [_label(name) for name, numbers in counts.items() if name != LSSG and max(numbers) < _FEW_TRIALS]
+    if few:
+        lines[-1] += f" Few of {' and '.join(few)}, where the paper has 50: read close comparisons with care."
+    return "\n\n".join(lines)
+
+
+def _trial_counts(results: StudyResult) -> dict[str, list[int]]:
+    counts: dict[str, list[int]] = {}
+    for scene in results.scenes.values():
+        for name, method in scene.methods.items():
+            counts.setdefault(name, []).append(method.trials)
+    return counts
+
+
+def _range(numbers: Sequence[int]) -> str:
+    low, high = min(numbers), max(numbers)
+    return str(low) if low == high else f"{low} to {high}"
+
+
+def _scene_figures(scenes: Mapping[str, Scene], folder: Path) -> str:
+    problem = rendering_problem()
+    for name, scene in scenes.items():
+        if problem is None:
+            view3d(scene, screenshot=folder / f"fig1_{name}.png").close()
+        else:
+            plot_scene(scene).savefig(folder / f"fig1_{name}.png")
+    images = [f"![{name}](fig1_{name}.png)" for name in scenes]
+    below = [] if problem is None else [f"Drawn with Matplotlib. {problem}."]
+    return "\n\n".join(["## Fig. 1: the scenes", _table([list(scenes), images]), *below])
+
+
+def _plane_figure(results: StudyResult, scenes: Mapping[str, Scene], folder: Path) -> str:
+    pressure = {
+        name: {
+            method: result.plane_pressure
+            for method, result in methods.items()
+            if result.plane_pressure is not None
+        }
+        for name, methods in _by_method(results).items()
+    }
+    pressure = {name: fields for name, fields in pressure.items() if fields}
+    if not pressure:
+        return ""
+    planes = {name: plane for name in pressure if (plane := scenes[name].observation_plane) is not None}
+    points = {name: scenes[name].control_points for name in pressure}
+    plot_planes(pressure, planes, points).savefig(folder / "fig2.png")
+    return _FIG2
+
+
+def _trial_figures(results: StudyResult, folder: Path) -> str:
+    methods = _by_method(results)
+    quantities = {"mean pressure of the foci [Pa]": _metric(methods, "mean")}
+    if areas := _metric(methods, "area", scale=1e6):
+        quantities["area a focus [mm²]"] = areas
+    quantities["std among the foci [Pa]"] = _metric(methods, "std")
+    plot_trials(quantities).savefig(folder / "fig3abc.png")
+    history = {
+        scene: {name: method.solution.history for name, method in by_name.items()}
+        for scene, by_name in methods.items()
+    }
+    plot_convergence(history).savefig(folder / "fig3d.png")
+    letters = ", ".join(f"({letter}) {label}" for letter, label in zip("abc", quantities, strict=False))
+    return _FIG3.format(letters=letters)
+
+
+def _metric(
+    methods: Mapping[str, Mapping[str, MethodResult]], name: str, scale: float = 1.0
+) -> dict[str, dict[str, torch.Tensor]]:
+    """A figure of merit by scene and method; scenes that lack it are left out."""
+    values = {
+        scene: {
+            method: scale * value
+            for method, result in by_name.items()
+            if (value := getattr(result.metrics, name)) is not None
+        }
+        for scene, by_name in methods.items()
+    }
+    return {scene: by_name for scene, by_name in values.items() if by_name}
+
+
+def _summary(results: StudyResult) -> str:
+    return "\n\n".join(["## Results", _table(summary_rows(results)), _BELOW_SUMMARY])
+
+
+def _claims(results: StudyResult) -> str:
+    rows = [["", "the paper's claim", "our reading", "our numbers", "verdict"]]
+    for number, (claim, verdict) in enumerate(judge_claims(results), start=1):
+        if verdict is None:
+            evidence, outcome = "", "no data"
+        else:
+            evidence = verdict.evidence
+            outcome = "**reproduced**" if verdict.holds else "**not reproduced**"
+            outcome += "" if verdict.clear else ", but not clearly"
+        rows.append([str(number), claim.text, claim.reading, evidence, outcome])
+    return "\n\n".join(["## The paper's claims", _table(rows), _BELOW_CLAIMS])
+
+
+def _simulations(results: StudyResult) -> str:
+    head = ["scene", "method", "spacing [mm]", "cells a wavelength", "runs", "periods", "to steady state"]
+    rows = [[*head, "reached", "matrix [s]", "plane [s]"]]
+    rows += [[name, *_simulation_cells(scene)] for name, scene in results.scenes.items()]
+    text = ["## Simulation", _table(rows)]
+    tolerances = [scene.simulation.tolerance for scene in results.scenes.values()]
+    if given := [tolerance for tolerance in tolerances if tolerance is not None]:
+        text.append(_BELOW_SIMULATION.format(tolerance=given[0]))
+    return "\n\n".join(text)
+
+
+def _simulation_cells(scene: SceneResult) -> list[str]:
+    simulation = scene.simulation
+    seconds = [f"{simulation.matrix_seconds:.1f}", f"{simulation.plane_seconds:.1f}"]
+    if simulation.spacing is None or not simulation.runs:
+        return [f"{simulation.method} (exact)", *["-"] * 6, *seconds]
+    runs = simulation.runs
+    return [
+        simulation.method,
+        f"{1e3 * simulation.spacing:g}",
+        f"{simulation.wavelength / simulation.spacing:.1f}",
+        str(len(runs)),
+        _range([run.periods for run in runs]),
+        f"{max(run.remaining for run in runs):.1e}",
+        "yes" if all(run.reached for run in runs) else f"not in {sum(not run.reached for run in runs)} runs",
+        *seconds,
+    ]
+
+
+def _origin(results: StudyResult) -> str:
+    provenance = results.provenance
+    return _ORIGIN.format(
+        versions=", ".join(f"{name} {version}" for name, version in provenance.versions.items()),
+        seed=provenance.seed,
+        digest=provenance.source_digest,
+        results=RESULTS_FILE,
+        trials=TRIALS_FILE,
+        config=provenance.config.strip(),
+    )

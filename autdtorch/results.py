@@ -1,0 +1,303 @@
+"""What a study leaves on disk, and how it is read back.
+
+``results.h5`` holds everything, ``trials.jsonl`` a line a trial. Both are written beside their place and then
+renamed, so that what is there is always complete.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import os
+import platform
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import h5py
+import torch
+
+import autdtorch
+from autdtorch.metrics import FocusMetrics
+from autdtorch.optim.base import Solution
+from autdtorch.propagator import Run
+
+RESULTS_FILE = "results.h5"
+TRIALS_FILE = "trials.jsonl"
+
+_PACKAGES = ("torch", "numpy", "numba", "botorch")
+_SOLUTION = ("drive", "pressure", "score", "evaluations", "history")
+_METRICS = ("mean", "min", "std", "uniformity", "area")
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where results come from.
+
+    Attributes:
+        config: all settings, as YAML text.
+        seed: of the random choices.
+        versions: of autdtorch, Python, the packages that compute, and the platform.
+        source_digest: SHA-256 of the package's source.
+        date: when the study was begun, UTC, ISO 8601.
+    """
+
+    config: str
+    seed: int
+    versions: dict[str, str]
+    source_digest: str
+    date: str
+
+    def same_origin(self, other: Provenance) -> bool:
+        """Whether both lead to the same results: all but the date is equal."""
+        return replace(self, date=other.date) == other
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """How the field of a scene was computed.
+
+    Attributes:
+        method: "free_space" (exact) or "full" (FDTD).
+        wavelength: in the medium [m].
+        spacing: edge of a cell [m]; None in free space, as is `tolerance`.
+        tolerance: relative distance to the steady state at which a run ends.
+        runs: every simulation that was made.
+        matrix_seconds: time the transfer matrix of the control points took.
+        plane_seconds: time the observation plane took, for all trials of all methods together.
+    """
+
+    method: str
+    wavelength: float
+    spacing: float | None
+    tolerance: float | None
+    runs: tuple[Run, ...]
+    matrix_seconds: float
+    plane_seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class MethodResult:
+    """What one method found in one scene.
+
+    Attributes:
+        solution: drives of the T trials, with pressures, scores, evaluations and history.
+        metrics: figures of merit (T,).
+        seconds: time of all trials together.
+        shown_trial: the trial of median score, for pictures.
+        plane_pressure: of the shown trial on the observation plane (Nu, Nv), complex128 [Pa], or None where
+            the scene has no such plane.
+    """
+
+    solution: Solution
+    metrics: FocusMetrics
+    seconds: float
+    shown_trial: int
+    plane_pressure: torch.Tensor | None
+
+    @property
+    def trials(self) -> int:
+        """Number of trials T."""
+        return len(self.solution.score)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneResult:
+    """What was found in one scene.
+
+    Attributes:
+        obstacles: number of obstacles.
+        transfer_matrix: of the control points (P, M), complex128 [Pa].
+        simulation: how the field was computed.
+        methods: by name, in the order they ran.
+    """
+
+    obstacles: int
+    transfer_matrix: torch.Tensor
+    simulation: Simulation
+    methods: dict[str, MethodResult]
+
+
+@dataclass(frozen=True, eq=False)
+class StudyResult:
+    """What a study found.
+
+    Attributes:
+        provenance: where it comes from.
+        scenes: by name, in the order they ran; while a study runs, those that are finished.
+    """
+
+    provenance: Provenance
+    scenes: dict[str, SceneResult]
+
+
+def provenance_now(config: str, seed: int) -> Provenance:
+    """Provenance of a study that begins now, in this process and with this source.
+
+    Args:
+        config: all settings, as YAML text.
+        seed: of the random choices.
+    """
+    versions = {"autdtorch": autdtorch.__version__, "python": platform.python_version()}
+    versions |= {package: importlib.metadata.version(package) for package in _PACKAGES}
+    versions["platform"] = platform.platform()
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    return Provenance(config, seed, versions, _source_digest(), date)
+
+
+def save_results(results: StudyResult, folder: str | os.PathLike[str]) -> None:
+    """Write `results.h5` and `trials.jsonl` into a folder, which is made if need be.
+
+    Raises:
+        OSError: the folder cannot be made or written.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    partial = folder / f"{RESULTS_FILE}.partial"
+    with h5py.File(partial, "w") as file:
+        _write_provenance(file, results.provenance)
+        scenes = file.create_group("scenes", track_order=True)
+        for name, scene in results.scenes.items():
+            _write_scene(scenes.create_group(name), scene)
+    partial.replace(folder / RESULTS_FILE)
+
+    partial = folder / f"{TRIALS_FILE}.partial"
+    lines = [json.dumps(row) + "\n" for row in trial_rows(results)]
+    partial.write_text("".join(lines), encoding="utf-8")
+    partial.replace(folder / TRIALS_FILE)
+
+
+def load_results(path: str | os.PathLike[str]) -> StudyResult:
+    """Read what `save_results` wrote.
+
+    Args:
+        path: the file, or the folder that holds `results.h5`.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is not a complete results file of this version.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / RESULTS_FILE
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: there is no such results file")
+    try:
+        with h5py.File(path, "r") as file:
+            scenes = {name: _read_scene(group) for name, group in file["scenes"].items()}
+            return StudyResult(_read_provenance(file), scenes)
+    except (OSError, KeyError, ValueError) as error:
+        accepted = f"must be a results file of autdtorch {autdtorch.__version__}"
+        raise ValueError(f"{path}: {error}; {accepted}") from error
+
+
+def trial_rows(results: StudyResult) -> Iterator[dict[str, str | int | float | None]]:
+    """The trials one by one: what `trials.jsonl` holds.
+
+    Pressures in Pa, areas in mm^2; `seconds` is the trial's share of the time its method took.
+    """
+    for scene_name, scene in results.scenes.items():
+        for method_name, method in scene.methods.items():
+            metrics, area = method.metrics, method.metrics.area
+            for trial in range(method.trials):
+                yield {
+                    "scene": scene_name,
+                    "method": method_name,
+                    "trial": trial,
+                    "seed": results.provenance.seed,
+                    "score": float(method.solution.score[trial]),
+                    "mean": float(metrics.mean[trial]),
+                    "min": float(metrics.min[trial]),
+                    "std": float(metrics.std[trial]),
+                    "uniformity": float(metrics.uniformity[trial]),
+                    "area_mm2": None if area is None else 1e6 * float(area[trial]),
+                    "evaluations": int(method.solution.evaluations[trial]),
+                    "seconds": method.seconds / method.trials,
+                }
+
+
+def _source_digest() -> str:
+    package = Path(__file__).parent
+    digest = hashlib.sha256()
+    for source in sorted(package.rglob("*.py")):
+        digest.update(f"{source.relative_to(package).as_posix()}\n".encode())
+        digest.update(source.read_bytes())
+    return digest.hexdigest()
+
+
+def _write_provenance(file: Any, provenance: Provenance) -> None:
+    for key in ("config", "seed", "source_digest", "date"):
+        file.attrs[key] = getattr(provenance, key)
+    for package, version in provenance.versions.items():
+        file.attrs[f"version_{package}"] = version
+
+
+def _read_provenance(file: Any) -> Provenance:
+    prefix = "version_"
+    values = file.attrs
+    versions = {key.removeprefix(prefix): values[key] for key in values if key.startswith(prefix)}
+    return Provenance(
+        values["config"], int(values["seed"]), versions, values["source_digest"], values["date"]
+    )
+
+
+def _write_scene(group: Any, scene: SceneResult) -> None:
+    simulation = scene.simulation
+    group.attrs["obstacles"] = scene.obstacles
+    for key in ("method", "wavelength", "spacing", "tolerance", "matrix_seconds", "plane_seconds"):
+        if (value := getattr(simulation, key)) is not None:
+            group.attrs[key] = value
+    for key in ("periods", "remaining", "reached", "seconds"):
+        group[f"runs/{key}"] = [getattr(run, key) for run in simulation.runs]
+    group["transfer_matrix"] = scene.transfer_matrix.numpy()
+    methods = group.create_group("methods", track_order=True)
+    for name, method in scene.methods.items():
+        _write_method(methods.create_group(name), method)
+
+
+def _read_scene(group: Any) -> SceneResult:
+    attributes = group.attrs
+    columns = [group[f"runs/{key}"][()].tolist() for key in ("periods", "remaining", "reached", "seconds")]
+    simulation = Simulation(
+        attributes["method"],
+        float(attributes["wavelength"]),
+        float(attributes["spacing"]) if "spacing" in attributes else None,
+        float(attributes["tolerance"]) if "tolerance" in attributes else None,
+        tuple(Run(*row) for row in zip(*columns, strict=True)),
+        float(attributes["matrix_seconds"]),
+        float(attributes["plane_seconds"]),
+    )
+    methods = {name: _read_method(entry) for name, entry in group["methods"].items()}
+    return SceneResult(int(attributes["obstacles"]), _tensor(group, "transfer_matrix"), simulation, methods)
+
+
+def _write_method(group: Any, method: MethodResult) -> None:
+    group.attrs["seconds"] = method.seconds
+    group.attrs["shown_trial"] = method.shown_trial
+    tensors = {key: getattr(method.solution, key) for key in _SOLUTION}
+    tensors |= {key: getattr(method.metrics, key) for key in _METRICS}
+    tensors["plane_pressure"] = method.plane_pressure
+    for key, tensor in tensors.items():
+        if tensor is not None:
+            group[key] = tensor.numpy()
+
+
+def _read_method(group: Any) -> MethodResult:
+    return MethodResult(
+        Solution(*(_tensor(group, key) for key in _SOLUTION)),
+        FocusMetrics(*(_optional_tensor(group, key) for key in _METRICS)),  # only the area may be missing
+        float(group.attrs["seconds"]),
+        int(group.attrs["shown_trial"]),
+        _optional_tensor(group, "plane_pressure"),
+    )
+
+
+def _tensor(group: Any, key: str) -> torch.Tensor:
+    return torch.from_numpy(group[key][()])
+
+
+def _optional_tensor(group: Any, key: str) -> Any:
+    return _tensor(group, key) if key in group else None

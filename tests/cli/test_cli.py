@@ -1,0 +1,277 @@
+"""The command line, run in this process: a subprocess would import PyTorch anew for each."""
+
+import functools
+import json
+import logging
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+import autdtorch.study
+from autdtorch.cli import CONFIGS, main
+from autdtorch.propagator import FreeSpacePropagator, make_propagator
+from autdtorch.results import load_results
+from autdtorch.scene_file import load_scene
+
+Run = Callable[..., int]
+
+SCENES = sorted(path.stem for path in (CONFIGS / "scene").glob("*.yaml"))
+METHODS = sorted(path.stem for path in (CONFIGS / "method").glob("*.yaml"))
+SOLVERS = sorted(path.stem for path in (CONFIGS / "solver").glob("*.yaml"))
+EXPERIMENTS = sorted(path.stem for path in (CONFIGS / "experiment").glob("*.yaml"))
+
+
+SINGLE_FILES = ("results.h5", "trials.jsonl", "plane.png")
+
+
+def written(folder: Path) -> set[str]:
+    """All files below a folder, by their path in it."""
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
+    """Runs a command line in an empty folder; returns its exit status."""
+    root, package = logging.getLogger(), logging.getLogger("autdtorch")
+    handlers, levels = root.handlers[:], (root.level, package.level)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+
+    def command(*arguments: str) -> int:
+        monkeypatch.setattr(sys, "argv", ["autdtorch", *arguments])
+        try:
+            main()
+        except SystemExit as end:
+            return int(end.code or 0)
+        return 0
+
+    yield command
+    # Hydra's logging writes to the stderr of this test alone.
+    root.handlers[:] = handlers
+    root.setLevel(levels[0])
+    package.setLevel(levels[1])
+
+
+@pytest.fixture
+def composed() -> Iterator[Callable[..., dict[str, object]]]:
+    def config(*overrides: str) -> dict[str, object]:
+        # `output` refers to Hydra's own settings, which compose() leaves out.
+        return OmegaConf.to_container(compose("config", [*overrides, "output=x"]), resolve=True)
+
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        yield config
+
+
+def test_every_config_is_found() -> None:
+    assert {"homogeneous", "three_cubes", "two_cubes"} <= set(SCENES)
+    assert {"lssg", "bo", "gabs"} <= set(METHODS)
+    assert "default" in SOLVERS
+    assert "paper" in EXPERIMENTS
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_every_scene_builds_and_has_the_name_of_its_file(
+    name: str, composed: Callable[..., dict[str, object]]
+) -> None:
+    assert load_scene(composed(f"scene={name}")["scene"]).name == name
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_builds_with_known_settings(
+    name: str, composed: Callable[..., dict[str, object]]
+) -> None:
+    method = instantiate(composed(f"method={name}")["method"], _partial_=True)
+    assert isinstance(method, functools.partial)
+    assert callable(method.func)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_every_solver_builds(name: str, composed: Callable[..., dict[str, object]]) -> None:
+    config = composed(f"solver={name}")
+    assert isinstance(make_propagator(load_scene(config["scene"]), **config["solver"]), FreeSpacePropagator)
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_every_experiment_builds(name: str, composed: Callable[..., dict[str, object]]) -> None:
+    config = composed(f"experiment={name}")
+    assert "scene" not in config
+    assert "method" not in config
+    assert all(load_scene(scene) for scene in config["scenes"].values())
+    assert all(instantiate(method, _partial_=True) for method in config["methods"].values())
+
+
+def test_the_papers_experiment(composed: Callable[..., dict[str, object]]) -> None:
+    config = composed("experiment=paper")
+    assert list(config["scenes"]) == ["homogeneous", "three_cubes", "two_cubes"]
+    assert list(config["methods"]) == ["lssg", "bayes_opt", "gabs"]
+    assert config["methods"]["gabs"] == {"_target_": "autdtorch.gabs", "levels": 16}
+    assert config["methods"]["bayes_opt"]["evaluations"] == 256
+    assert config["trials"]["gabs"] == 50
+    assert composed("experiment=paper", "trials=7")["trials"] == 7
+
+
+WRONG = [
+    (["scene=thre_cubes"], "scene: 'thre_cubes'; must be one of homogeneous, three_cubes, two_cubes"),
+    (["experiment=nature"], "experiment: 'nature'; must be one of paper"),
+    (["spacing=1e-3"], "spacing: unknown key"),
+    (["solver.spcing=1e-3"], r"solver\.spcing: unknown key"),
+    (["+solver.spcing=1e-3"], "solver: unknown key 'spcing'; allowed keys: method, spacing, "),
+    (["+speed=1"], "settings: unknown key 'speed'; allowed keys: scene, method, "),
+    (["+method.trials=3"], "method: unknown key 'trials'; allowed keys: levels"),
+    (["+scene.colour=red"], "scene: unknown key 'colour'"),
+    (["solver.spacing=abc"], "solver: spacing: 'abc'; must be a real number"),
+    (["solver.spacing=nan"], "solver: spacing: nan m; must be finite"),
+    (["solver.method=fast"], "solver: method: 'fast'; must be one of auto, free_space, full"),
+    (["method.levels=1"], "method gabs: levels: 1; must be an integer >= 2"),
+    (["trials=0"], "trials: 0; must be an integer >= 1"),
+    (["seed=-1"], "seed: -1; must be an integer >= 0"),
+    (["plane_spacing=0"], "plane_spacing: 0 m; must be finite and > 0"),
+    (["scene.frequency=-40e3"], r"scene: Scene\.frequency: -40000\.0 Hz; must be finite and > 0"),
+    (["scene.array.pitch=nan"], "scene: array: pitch: nan m; must be finite"),
+    (["method._target_=autdtorch.tabu"], r"Error locating target 'autdtorch\.tabu'"),
+    (["~method._target_"], "method: no _target_"),
+    (["solver.spacing=[1"], "no viable alternative at input"),
+    (["seed=1,2"], "Ambiguous value for argument 'seed=1,2'"),
+    (["--config-dir", "nowhere"], "Additional config directory '.*nowhere' not found"),
+    (["output=file/below"], "file/below: Not a directory"),
+    (
+        ["experiment=paper", "scene=two_cubes"],
+        "scene: given beside an experiment, which has its own scenes: homog",
+    ),
+    (["experiment=paper", "scenes.two_cubes.frequency=0"], r"scenes\.two_cubes: Scene\.frequency: 0 Hz"),
+    (["experiment=paper", "methods.gabs.levels=0"], "method gabs: levels: 0"),
+    (["experiment=paper", "trials.gabs=0"], r"trials\.gabs: 0; must be an integer >= 1"),
+    (["experiment=paper", "scenes=3"], "scenes: 3; must be a mapping"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), WRONG, ids=[" ".join(arguments) for arguments, _ in WRONG])
+def test_a_wrong_command_gets_one_line(
+    arguments: list[str],
+    message: str,
+    run: Run,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refuse(*_: object) -> None:
+        raise AssertionError("simulated before all settings were checked")
+
+    monkeypatch.setattr(autdtorch.study, "_run_scene", refuse)
+    (tmp_path / "file").touch()
+    assert run(*arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    (line,) = captured.err.splitlines()
+    assert re.match(rf"autdtorch: {message}", line), line
+
+
+def test_the_traceback_comes_back_where_it_is_asked_for(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    with pytest.raises(ValueError, match=r"^seed: -1; must be an integer >= 0$"):
+        run("seed=-1")
+    assert os.environ["HYDRA_FULL_ERROR"] == "1"
+
+
+def test_the_environment_is_left_as_it_was(run: Run) -> None:
+    assert run("seed=-1") == 2
+    assert "HYDRA_FULL_ERROR" not in os.environ
+
+
+def test_one_scene_and_one_method(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("scene=homogeneous", "method=gabs", "solver.method=free_space", "trials=2") == 0
+    folder = tmp_path / "outputs" / "homogeneous_gabs"
+    assert written(tmp_path) == {f"outputs/homogeneous_gabs/{name}" for name in SINGLE_FILES}
+    assert Path.cwd() == tmp_path
+    method = load_results(folder).scenes["homogeneous"].methods["gabs"]
+    assert method.trials == 2
+    rows = [json.loads(line) for line in (folder / "trials.jsonl").read_text(encoding="utf-8").splitlines()]
+    assert [row["mean"] for row in rows] == method.metrics.mean.tolist()
+    captured = capsys.readouterr()
+    head, row, end = captured.out.splitlines()
+    assert head.split()[:3] == ["scene", "method", "trials"]
+    assert row.split()[:4] == ["homogeneous", "GABS", "2", f"{method.metrics.mean.mean():.2f}"]
+    assert end == f"The results are in {Path('outputs', 'homogeneous_gabs')}"
+    assert "homogeneous: gabs, 2 trials" in captured.err
+
+
+def test_what_is_finished_is_not_computed_again(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = ("scene=homogeneous", "method=lssg", "output=here")
+    assert run(*command) == 0
+    table = capsys.readouterr().out
+    monkeypatch.setattr(autdtorch.study, "_run_scene", lambda *_: pytest.fail("computed again"))
+    assert run(*command) == 0
+    captured = capsys.readouterr()
+    assert captured.out == table
+    assert "re-using homogeneous" in captured.err
+    # Where results go does not change them, but there is nothing to use elsewhere.
+    with pytest.raises(pytest.fail.Exception):
+        run(*command[:-1], "output=elsewhere")
+
+
+def test_ones_own_scene_file(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "mine" / "scene").mkdir(parents=True)
+    text = (CONFIGS / "scene" / "homogeneous.yaml").read_text(encoding="utf-8")
+    own = text.replace("count: 4", "count: 2")
+    (tmp_path / "mine" / "scene" / "pair.yaml").write_text(own, encoding="utf-8")
+    assert run("--config-dir", "mine", "scene=pair", "method=lssg", "plane_spacing=10e-3") == 0
+    assert load_results(tmp_path / "outputs" / "pair_lssg").scenes["pair"].transfer_matrix.shape == (2, 16)
+
+
+def test_an_experiment_ends_with_its_report(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("autdtorch.report.rendering_problem", lambda: "not tried")
+    command = (
+        "experiment=paper",
+        "~methods.bayes_opt",
+        "~scenes.two_cubes",
+        "plane_spacing=5e-3",
+        "trials=2",
+    )
+    assert run(*command, "solver.method=free_space") == 0
+    captured = capsys.readouterr()
+    assert captured.out.splitlines()[-1] == f"The report is {Path('outputs', 'paper', 'report.md')}"
+    results = load_results(tmp_path / "outputs" / "paper")
+    assert list(results.scenes) == ["homogeneous", "three_cubes"]
+    assert [method.trials for method in results.scenes["three_cubes"].methods.values()] == [1, 2]
+    report = (tmp_path / "outputs" / "paper" / "report.md").read_text(encoding="utf-8")
+    assert f"`autdtorch {' '.join(command)} solver.method=free_space`" in report.replace("'", "")
+
+
+def test_ctrl_c_ends_with_one_line_and_its_status(
+    run: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(autdtorch.study, "_run_scene", interrupted)
+    assert run("solver.method=free_space") == 130
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("autdtorch: interrupted; ")
+
+
+def test_a_sweep_has_a_folder_for_each_run(run: Run, tmp_path: Path) -> None:
+    assert run("-m", "method=gabs,lssg", "plane_spacing=0.02") == 0
+    jobs = [f"multirun/method={name},plane_spacing=0.02" for name in ("gabs", "lssg")]
+    assert written(tmp_path) == {f"{job}/{name}" for job in jobs for name in SINGLE_FILES} | {
+        "multirun/multirun.yaml"
+    }
+
+
+def test_help_tells_what_there_is(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--help") == 0
+    text = capsys.readouterr().out
+    assert "autdtorch experiment=paper" in text
+    assert f"scene: {', '.join(SCENES)}" in text
+    assert "  spacing: 0.001" in text
+    assert written(tmp_path) == set()

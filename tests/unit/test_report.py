@@ -1,0 +1,120 @@
+"""The report holds every figure that it shows, and no number that is missing."""
+
+import functools
+import re
+from pathlib import Path
+
+import pytest
+from small_scenes import AIR, CUBE, small_scene
+
+import autdtorch.report
+from autdtorch.geometry import Plane
+from autdtorch.optim.gabs import gabs
+from autdtorch.optim.lssg import lssg
+from autdtorch.report import summary_rows, write_report
+from autdtorch.results import StudyResult
+from autdtorch.scene import Box, Scene
+from autdtorch.study import run_study
+
+PLANE = Plane(center=(20e-3, 12e-3, 12e-3), normal=(1, 0, 0), size=(20e-3, 20e-3))
+# Stands for BO, which takes seconds: the report knows methods by their names.
+METHODS = {
+    "lssg": functools.partial(lssg, levels=4),
+    "bayes_opt": functools.partial(gabs, levels=3),
+    "gabs": functools.partial(gabs, levels=4),
+}
+
+
+def scene(plane: Plane | None = PLANE, obstacles: tuple[Box, ...] = ()) -> Scene:
+    plain = small_scene()
+    return Scene(plain.array, AIR, 40e3, plain.control_points, obstacles, plane, plain.domain)
+
+
+@pytest.fixture(autouse=True)
+def without_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """3D pictures take seconds, and are tested where they are made."""
+    monkeypatch.setattr(
+        autdtorch.report, "rendering_problem", lambda: "3D rendering is not available: no driver"
+    )
+
+
+def reported(scenes: dict[str, Scene], folder: Path, **settings: object) -> tuple[StudyResult, str]:
+    results = run_study(scenes, METHODS, solver={"method": "free_space"}, plane_spacing=2e-3, **settings)
+    path = write_report(results, scenes, folder, "autdtorch experiment=paper trials=3")
+    assert path == folder / "report.md"
+    return results, path.read_text(encoding="utf-8")
+
+
+def figures(report: str) -> list[str]:
+    return re.findall(r"!\[[^]]*\]\(([^)]+)\)", report)
+
+
+def tables(report: str) -> list[list[list[str]]]:
+    blocks = re.findall(r"(?:^\|.*\|$\n?)+", report, flags=re.MULTILINE)
+    return [[line[2:-2].split(" | ") for line in block.strip().splitlines()] for block in blocks]
+
+
+def test_all_figures_are_there_and_shown(tmp_path: Path) -> None:
+    scenes = {"homogeneous": scene(), "three_cubes": scene(obstacles=(CUBE,))}
+    _, report = reported(scenes, tmp_path / "new", trials=3)
+    shown = figures(report)
+    assert shown == [
+        "fig1_homogeneous.png",
+        "fig1_three_cubes.png",
+        "fig2.png",
+        "fig3abc.png",
+        "fig3d.png",
+    ]
+    assert sorted(shown) == sorted(path.name for path in (tmp_path / "new").glob("*.png"))
+    for name in shown:
+        content = (tmp_path / "new" / name).read_bytes()
+        assert content.startswith(b"\x89PNG")
+        assert len(content) > 5_000  # an empty picture of this size has less
+    assert "3D rendering is not available: no driver." in report
+
+
+def test_no_number_is_missing_and_the_tables_are_whole(tmp_path: Path) -> None:
+    scenes = {"homogeneous": scene(), "three_cubes": scene(obstacles=(CUBE,))}
+    results, report = reported(scenes, tmp_path, trials=3, config="trials: 3\n")
+    assert not re.search(r"\bnan\b|\binf\b|None|[{}]", report)
+    for table in tables(report):
+        assert len({len(row) for row in table}) == 1
+    _, summary, claims, simulation = tables(report)
+    assert len(summary) == 2 + 2 * 3
+    assert [row[-1] for row in claims[2:]].count("no data") == 0
+    assert all(row[-1].startswith(("**reproduced**", "**not reproduced**")) for row in claims[2:])
+    assert [row[0] for row in simulation[2:]] == ["homogeneous", "three_cubes"]
+    provenance = results.provenance
+    for text in (
+        "`autdtorch experiment=paper trials=3`",
+        "trials: 3",
+        provenance.source_digest,
+        provenance.date,
+    ):
+        assert text in report
+    assert "LSSG 1, BO 3, GABS 3" in report
+    assert "Few of BO and GABS" in report
+
+
+def test_the_table_gives_the_mean_over_the_trials(tmp_path: Path) -> None:
+    results, _ = reported({"a": scene()}, tmp_path, trials=3)
+    head, lssg_row, _, gabs_row = summary_rows(results)
+    metrics = results.scenes["a"].methods["gabs"].metrics
+    assert head[2:5] == ["trials", "mean [Pa]", "weakest [Pa]"]
+    assert gabs_row[:3] == ["a", "GABS", "3"]
+    assert gabs_row[3] == f"{metrics.mean.mean():.2f} ± {metrics.mean.std():.2f}"
+    assert gabs_row[6] == f"{1e6 * metrics.area.mean():.0f} ± {1e6 * metrics.area.std():.0f}"
+    assert gabs_row[7] == str(1 + 3 * 4)
+    assert lssg_row[3] == f"{results.scenes['a'].methods['lssg'].metrics.mean[0]:.2f}"
+
+
+def test_a_scene_without_observation_plane_is_left_out_of_the_pictures_that_need_one(tmp_path: Path) -> None:
+    _, report = reported({"plain": scene(plane=None)}, tmp_path)
+    assert figures(report) == ["fig1_plain.png", "fig3abc.png", "fig3d.png"]
+    assert not re.search(r"\bnan\b|\binf\b|None", report)
+
+
+def test_every_scene_of_the_results_must_be_given(tmp_path: Path) -> None:
+    results, _ = reported({"a": scene()}, tmp_path)
+    with pytest.raises(ValueError, match=r"scenes: none for \['a'\]"):
+        write_report(results, {"b": scene()}, tmp_path, "")

@@ -1,0 +1,140 @@
+"""What a study found comes back from disk as it was."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from autdtorch.metrics import focus_metrics
+from autdtorch.optim.base import Solution
+from autdtorch.propagator import Run
+from autdtorch.results import (
+    RESULTS_FILE,
+    TRIALS_FILE,
+    MethodResult,
+    Provenance,
+    SceneResult,
+    Simulation,
+    StudyResult,
+    load_results,
+    provenance_now,
+    save_results,
+)
+
+FREE_SPACE = Simulation("free_space", 8.5e-3, None, None, (), 0.25, 0.5)
+FULL = Simulation(
+    "full", 8.5e-3, 1e-3, 2e-3, (Run(183, 1.9e-3, True, 4.5), Run(600, 3e-2, False, 9.0)), 20.0, 80.0
+)
+
+
+def method_result(trials: int, plane: bool, seed: int) -> MethodResult:
+    generator = torch.Generator().manual_seed(seed)
+    drive = torch.randn(trials, 3, dtype=torch.complex128, generator=generator)
+    pressure = torch.rand(trials, 2, dtype=torch.float64, generator=generator)
+    field = torch.randn(trials, 4, 5, dtype=torch.complex128, generator=generator)
+    history = pressure.amin(dim=1, keepdim=True) * torch.tensor([0.5, 1.0], dtype=torch.float64)
+    solution = Solution(drive, pressure, pressure.amin(dim=1), torch.full((trials,), 2), history)
+    metrics = focus_metrics(pressure, *((field.abs(), 1e-6) if plane else (None, None)))
+    return MethodResult(solution, metrics, 1.5, trials - 1, field[-1] if plane else None)
+
+
+@pytest.fixture
+def results() -> StudyResult:
+    provenance = Provenance(
+        "seed: 3\ntext: |\n  °µ\n", 3, {"autdtorch": "0", "torch": "2"}, "abc", "2026-01-01T00:00:00"
+    )
+    matrix = torch.randn(2, 3, dtype=torch.complex128, generator=torch.Generator().manual_seed(0))
+    # Not in alphabetical order, which HDF5 would restore.
+    with_plane = {"lssg": method_result(1, True, 1), "bayes_opt": method_result(4, True, 2)}
+    scenes = {
+        "two_cubes": SceneResult(2, matrix, FULL, with_plane),
+        "empty": SceneResult(0, 2 * matrix, FREE_SPACE, {"gabs": method_result(2, False, 3)}),
+    }
+    return StudyResult(provenance, scenes)
+
+
+def assert_same(first: object, second: object) -> None:
+    assert type(first) is type(second)
+    if isinstance(first, torch.Tensor):
+        assert first.dtype == second.dtype
+        assert torch.equal(first, second)
+    elif isinstance(first, dict):
+        assert list(first) == list(second)
+        for key, value in first.items():
+            assert_same(value, second[key])
+    elif dataclasses.is_dataclass(first):
+        for field in dataclasses.fields(first):
+            assert_same(getattr(first, field.name), getattr(second, field.name))
+    else:
+        assert first == second
+
+
+def test_everything_comes_back(results: StudyResult, tmp_path: Path) -> None:
+    save_results(results, tmp_path / "new" / "folder")
+    assert_same(load_results(tmp_path / "new" / "folder"), results)
+    assert_same(load_results(tmp_path / "new" / "folder" / RESULTS_FILE), results)
+
+
+def test_saving_again_replaces_what_was_there_and_leaves_nothing_else(
+    results: StudyResult, tmp_path: Path
+) -> None:
+    save_results(results, tmp_path)
+    fewer = dataclasses.replace(results, scenes={"empty": results.scenes["empty"]})
+    save_results(fewer, tmp_path)
+    assert list(load_results(tmp_path).scenes) == ["empty"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [RESULTS_FILE, TRIALS_FILE]
+
+
+def test_a_line_a_trial(results: StudyResult, tmp_path: Path) -> None:
+    save_results(results, tmp_path)
+    rows = [json.loads(line) for line in (tmp_path / TRIALS_FILE).read_text(encoding="utf-8").splitlines()]
+    assert [(row["scene"], row["method"], row["trial"]) for row in rows] == [
+        ("two_cubes", "lssg", 0),
+        *(("two_cubes", "bayes_opt", trial) for trial in range(4)),
+        *(("empty", "gabs", trial) for trial in range(2)),
+    ]
+    method = results.scenes["two_cubes"].methods["bayes_opt"]
+    assert rows[3] == {
+        "scene": "two_cubes",
+        "method": "bayes_opt",
+        "trial": 2,
+        "seed": 3,
+        "score": method.solution.score[2].item(),
+        "mean": method.metrics.mean[2].item(),
+        "min": method.metrics.min[2].item(),
+        "std": method.metrics.std[2].item(),
+        "uniformity": method.metrics.uniformity[2].item(),
+        "area_mm2": 1e6 * method.metrics.area[2].item(),
+        "evaluations": 2,
+        "seconds": 1.5 / 4,
+    }
+    assert rows[-1]["area_mm2"] is None
+
+
+def test_only_the_date_may_differ_between_results_of_the_same_origin(results: StudyResult) -> None:
+    first = results.provenance
+    assert first.same_origin(dataclasses.replace(first, date="2027-01-01T00:00:00"))
+    for other in ({"config": "x"}, {"seed": 4}, {"source_digest": "x"}, {"versions": {"autdtorch": "1"}}):
+        assert not first.same_origin(dataclasses.replace(first, **other))
+
+
+def test_the_provenance_of_now_names_what_computes() -> None:
+    provenance = provenance_now("a: 1\n", 5)
+    assert {"autdtorch", "python", "torch", "numpy", "numba", "botorch", "platform"} == set(
+        provenance.versions
+    )
+    assert provenance.same_origin(provenance_now("a: 1\n", 5))
+    assert provenance.date.endswith("+00:00")
+
+
+def test_what_is_not_there_or_not_complete_is_refused_by_name(results: StudyResult, tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=RESULTS_FILE):
+        load_results(tmp_path)
+    save_results(results, tmp_path)
+    content = (tmp_path / RESULTS_FILE).read_bytes()
+    for wrong in (content[: len(content) // 2], b"", b"text"):
+        (tmp_path / RESULTS_FILE).write_bytes(wrong)
+        with pytest.raises(ValueError, match=rf"{RESULTS_FILE}: .*must be a results file"):
+            load_results(tmp_path)

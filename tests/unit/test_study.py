@@ -1,0 +1,230 @@
+"""A study is repeatable, checks its settings first, and does not compute again what it finds finished."""
+
+import functools
+import itertools
+import logging
+import math
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from small_scenes import AIR, CUBE, small_scene
+
+import autdtorch.study
+from autdtorch.freespace import green
+from autdtorch.geometry import Plane
+from autdtorch.objective import Objective
+from autdtorch.optim.base import Solution
+from autdtorch.optim.gabs import gabs
+from autdtorch.optim.lssg import lssg
+from autdtorch.propagator import FreeSpacePropagator, FullPropagator, Run
+from autdtorch.results import RESULTS_FILE, TRIALS_FILE, load_results
+from autdtorch.scene import Box, Scene
+from autdtorch.study import run_study
+
+PLANE = Plane(center=(20e-3, 12e-3, 12e-3), normal=(1, 0, 0), size=(20e-3, 16e-3))
+METHODS = {"lssg": functools.partial(lssg, levels=4), "gabs": functools.partial(gabs, levels=4)}
+FREE_SPACE = {"method": "free_space"}
+
+
+def scene(plane: Plane | None = PLANE, obstacles: tuple[Box, ...] = ()) -> Scene:
+    plain = small_scene()
+    return Scene(plain.array, AIR, 40e3, plain.control_points, obstacles, plane, plain.domain)
+
+
+@pytest.fixture
+def scenes() -> dict[str, Scene]:
+    return {"second": scene(), "first": scene()}
+
+
+@pytest.fixture
+def count_runs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the scenes that are computed, in order."""
+    computed: list[str] = []
+    run_scene = autdtorch.study._run_scene
+
+    def counted(name: str, *rest: object) -> object:
+        computed.append(name)
+        return run_scene(name, *rest)
+
+    monkeypatch.setattr(autdtorch.study, "_run_scene", counted)
+    return computed
+
+
+def test_every_trial_of_every_method_has_its_figures(scenes: dict[str, Scene], tmp_path: Path) -> None:
+    results = run_study(
+        scenes, METHODS, solver=FREE_SPACE, trials=3, seed=2, plane_spacing=2e-3, folder=tmp_path
+    )
+    assert list(results.scenes) == ["second", "first"]
+    propagator = FreeSpacePropagator(scenes["first"])
+    for result in results.scenes.values():
+        assert list(result.methods) == ["lssg", "gabs"]
+        assert torch.equal(result.transfer_matrix, propagator.transfer_matrix())
+        assert [method.trials for method in result.methods.values()] == [1, 3]
+        for method in result.methods.values():
+            expected = propagator.field(method.solution.drive, scenes["first"].control_points).abs()
+            # Sums of 4 terms, in another order.
+            torch.testing.assert_close(method.solution.pressure, expected, rtol=1e-13, atol=0)
+            assert torch.equal(method.metrics.mean, method.solution.pressure.mean(dim=-1))
+            median = method.solution.score.quantile(0.5)
+            assert method.solution.score[method.shown_trial] == median
+            field = propagator.field(method.solution.drive, PLANE.points(2e-3).reshape(-1, 3))
+            shown = field[method.shown_trial].reshape(10, 8)
+            torch.testing.assert_close(method.plane_pressure, shown, rtol=1e-13, atol=0)
+            loud = field.abs() >= method.metrics.mean[:, None] / 2**0.5
+            torch.testing.assert_close(method.metrics.area, loud.sum(dim=1) * 4e-6 / 3, rtol=1e-13, atol=0)
+    assert len((tmp_path / TRIALS_FILE).read_text(encoding="utf-8").splitlines()) == 2 * 4
+
+
+def test_the_same_seed_gives_the_same_drives_and_another_gives_others(scenes: dict[str, Scene]) -> None:
+    def drive(seed: int) -> torch.Tensor:
+        results = run_study(scenes, METHODS, solver=FREE_SPACE, trials=8, seed=seed)
+        return results.scenes["first"].methods["gabs"].solution.drive
+
+    assert torch.equal(drive(0), drive(0))
+    assert not torch.equal(drive(0), drive(1))
+
+
+def test_a_scene_without_observation_plane_has_no_areas() -> None:
+    result = run_study({"a": scene(None, obstacles=(CUBE,))}, METHODS, solver=FREE_SPACE).scenes["a"]
+    assert result.obstacles == 1
+    for method in result.methods.values():
+        assert method.metrics.area is None
+        assert method.plane_pressure is None
+
+
+def test_the_runs_of_a_simulation_are_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+    def simulate(
+        self: FullPropagator, origins: torch.Tensor, strength: torch.Tensor, points: torch.Tensor
+    ) -> torch.Tensor:
+        self.runs.append(Run(7, 0.1, len(self.runs) < 4, 0.5))
+        return 4 * math.pi * green(points, origins, self.scene.wavenumber) @ strength
+
+    monkeypatch.setattr(FullPropagator, "_simulate", simulate)
+    solver = {"method": "full", "spacing": 2e-3, "tolerance": 0.2, "kernel": "reference"}
+    result = run_study({"a": scene()}, METHODS, solver=solver).scenes["a"]
+    simulation = result.simulation
+    assert (simulation.method, simulation.spacing, simulation.tolerance) == ("full", 2e-3, 0.2)
+    # The transfer matrix of 3 control points, and the plane under 2 drives.
+    assert simulation.runs == (Run(7, 0.1, True, 0.5),) * 4 + (Run(7, 0.1, False, 0.5),)
+    # Reciprocity, which is what the transfer matrix was simulated by, is exact but for rounding.
+    torch.testing.assert_close(
+        result.transfer_matrix, FreeSpacePropagator(scene()).transfer_matrix(), rtol=1e-12, atol=0
+    )
+
+
+def test_finished_scenes_of_the_same_settings_are_used_again(
+    scenes: dict[str, Scene], count_runs: list[str], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    study = functools.partial(run_study, scenes, METHODS, solver=FREE_SPACE, folder=tmp_path)
+    first = study(config="a: 1")
+    with caplog.at_level(logging.INFO, logger="autdtorch.study"):
+        again = study(config="a: 1")
+    assert count_runs == ["second", "first"]
+    assert "re-using second, first" in caplog.text
+    assert again.provenance == first.provenance
+    drives = [result.scenes["first"].methods["gabs"].solution.drive for result in (first, again)]
+    assert torch.equal(*drives)
+    study(config="a: 2")
+    assert count_runs == ["second", "first"] * 2
+    study()
+    assert count_runs == ["second", "first"] * 3
+
+
+def test_changed_source_is_computed_again(
+    scenes: dict[str, Scene], count_runs: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = functools.partial(run_study, scenes, METHODS, solver=FREE_SPACE, folder=tmp_path, config="a: 1")
+    study()
+    monkeypatch.setattr("autdtorch.results._source_digest", lambda: "changed")
+    study()
+    assert count_runs == ["second", "first"] * 2
+
+
+def test_a_study_goes_on_after_the_scenes_that_were_finished(
+    scenes: dict[str, Scene], count_runs: list[str], tmp_path: Path
+) -> None:
+    objectives: list[Objective] = []
+
+    def interrupted(objective: Objective) -> Solution:
+        solution = lssg(objective)
+        objectives.append(objective)
+        if len(objectives) == 2:
+            raise KeyboardInterrupt
+        return solution
+
+    study = functools.partial(run_study, scenes, solver=FREE_SPACE, folder=tmp_path, config="a: 1")
+    with pytest.raises(KeyboardInterrupt):
+        study({"lssg": interrupted})
+    assert list(load_results(tmp_path).scenes) == ["second"]
+    results = study({"lssg": lssg})
+    assert count_runs == ["second", "first", "first"]
+    assert list(results.scenes) == ["second", "first"]
+    assert list(load_results(tmp_path).scenes) == ["second", "first"]
+
+
+def test_killed_while_writing_the_last_complete_file_stays(
+    scenes: dict[str, Scene], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = functools.partial(run_study, scenes, METHODS, solver=FREE_SPACE, folder=tmp_path, config="a: 1")
+    write_scene = autdtorch.results._write_scene
+    complete: list[bytes] = []
+    calls = itertools.count(1)
+
+    def killed(group: object, scene: object) -> None:
+        if next(calls) == 3:  # the second scene, when the file is written for the second time
+            complete.append((tmp_path / RESULTS_FILE).read_bytes())
+            raise KeyboardInterrupt
+        write_scene(group, scene)
+
+    monkeypatch.setattr("autdtorch.results._write_scene", killed)
+    with pytest.raises(KeyboardInterrupt):
+        study()
+    assert [(tmp_path / RESULTS_FILE).read_bytes()] == complete
+    assert list(load_results(tmp_path).scenes) == ["second"]
+
+
+def test_an_unreadable_file_is_computed_again(
+    scenes: dict[str, Scene], count_runs: list[str], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    study = functools.partial(run_study, scenes, METHODS, solver=FREE_SPACE, folder=tmp_path, config="a: 1")
+    study()
+    file = tmp_path / RESULTS_FILE
+    os.truncate(file, file.stat().st_size // 2)
+    study()
+    assert "must be a results file" in caplog.text
+    assert count_runs == ["second", "first"] * 2
+    assert list(load_results(tmp_path).scenes) == ["second", "first"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"scenes": {}}, "scenes: empty"),
+        ({"methods": {}}, "methods: empty"),
+        ({"scenes": {"a/b": scene()}}, r"scenes: 'a/b'; .*letters, digits"),
+        ({"trials": 0}, "trials: 0; must be an integer >= 1"),
+        ({"trials": 1.5}, r"trials: 1\.5; must be an integer >= 1"),
+        ({"trials": {"gabs": -1}}, r"trials\.gabs: -1"),
+        ({"trials": {"gabs": 1, "lssg": 2}}, "trials: 'lssg'; must be a method with random choices: gabs"),
+        ({"trials": {}}, "trials: .* must also give the number for gabs"),
+        ({"seed": -1}, "seed: -1"),
+        ({"plane_spacing": float("nan")}, "plane_spacing: nan m"),
+        ({"solver": {"spacing": -1.0}}, r"solver: spacing: -1\.0 m"),
+        (
+            {"methods": {"gabs": functools.partial(gabs, levels=1)}},
+            "method gabs: levels: 1; must be an integer >= 2",
+        ),
+    ],
+)
+def test_settings_are_checked_before_anything_is_simulated(
+    changes: dict[str, object], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise AssertionError("simulated before all settings were checked")
+
+    monkeypatch.setattr(autdtorch.study, "_run_scene", refuse)
+    arguments = {"scenes": {"a": scene()}, "methods": METHODS} | changes
+    with pytest.raises(ValueError, match=message):
+        run_study(**arguments)
