@@ -10,8 +10,10 @@ from .optim.gabs import gabs
 from .optim.lssg import lssg
 from .plot import plot_convergence, plot_plane, plot_trials
 from .propagator import make_propagator
+from .results import load_results
 from .scene import Box, Medium, Scene
 from .scene_file import load_scene
+from .study import run_study
 from .view3d import view3d
 
 __all__ = [
@@ -33,6 +35,7 @@ __all__ = [
     "focus_phases",
     "gabs",
     "green",
+    "load_results",
     "load_scene",
     "lssg",
     "make_propagator",
@@ -40,6 +43,7 @@ __all__ = [
     "plot_convergence",
     "plot_plane",
     "plot_trials",
+    "run_study",
     "view3d",
     "weakest_focus",
 ]

@@ -13,13 +13,13 @@ from typing import TypeAlias
 
 import torch
 
+from autdtorch.optim import METHOD_LABELS
 from autdtorch.results import MethodResult, StudyResult
 
 Scenes: TypeAlias = Callable[[StudyResult], list[str]]
 Quantity: TypeAlias = Callable[[MethodResult], torch.Tensor]
 
 LSSG, BO, GABS = "lssg", "bayes_opt", "gabs"
-LABELS = {LSSG: "LSSG", BO: "BO", GABS: "GABS"}
 
 MUCH_WEAKER = 1 / math.sqrt(2)
 """A pressure is much weaker than another below this share of it (half the intensity), and kept above it."""
@@ -28,7 +28,7 @@ SAME_LEVEL = 0.1
 """Areas are at the same level where they differ by less than this share of the larger one."""
 
 CONVERGED = 0.01
-"""A search has converged where its last `LAST_PART` of evaluations raises the score by at most this share."""
+"""A trial has converged where its last `LAST_PART` of evaluations raises the score by at most this share."""
 
 LAST_PART = 0.1
 """See `CONVERGED`."""
@@ -81,7 +81,9 @@ class _Estimate:
     error: float
 
     def __str__(self) -> str:
-        digits = max(0, 2 - math.floor(math.log10(abs(self.value)))) if self.value else 0
+        if self.error == 0 and self.value.is_integer():
+            return f"{self.value:.0f}"
+        digits = max(0, 2 - math.floor(math.log10(abs(self.value)))) if self.value else 2
         value = f"{self.value:.{digits}f}"
         return value if self.error in (0, math.inf) else f"{value} ± {self.error:.{digits}f}"
 
@@ -153,11 +155,11 @@ def _evaluations(method: MethodResult) -> torch.Tensor:
     return method.solution.evaluations.double()
 
 
-def _last_gain(method: MethodResult) -> torch.Tensor:
-    """By which share of the final score the last part of the evaluations raised it."""
+def _converged(method: MethodResult) -> torch.Tensor:
+    """1 for a trial that has converged before its end, 0 for another."""
     history = method.solution.history
     before = history[:, math.ceil((1 - LAST_PART) * history.shape[1]) - 1]
-    return 1 - before / history[:, -1]
+    return (before >= (1 - CONVERGED) * history[:, -1]).double()
 
 
 def _estimate(results: StudyResult, scene: str, method: str, quantity: Quantity) -> _Estimate:
@@ -184,7 +186,7 @@ def _evidence(
 ) -> str:
     parts = []
     for scene in scenes:
-        numbers = [f"{LABELS[name]} {_estimate(results, scene, name, quantity)}" for name in methods]
+        numbers = [f"{METHOD_LABELS[name]} {_estimate(results, scene, name, quantity)}" for name in methods]
         parts.append(f"{scene}: {', '.join(numbers)} {unit}".rstrip())
     return "; ".join(parts)
 
@@ -218,7 +220,7 @@ def _share_of_empty(
                 pressure = _estimate(results, scene, method, _mean_pressure)
                 margin = pressure - empty * MUCH_WEAKER
                 margins.append(margin * (-1 if weaker else 1))
-                parts.append(f"{LABELS[method]} in {scene}: {pressure.value / empty.value:.2f}")
+                parts.append(f"{METHOD_LABELS[method]} in {scene}: {pressure.value / empty.value:.2f}")
         return _verdict(margins, "share of the pressure without obstacles: " + "; ".join(parts))
 
     return judge
@@ -236,12 +238,12 @@ def _same_area(results: StudyResult) -> Verdict:
 
 def _convergence(results: StudyResult) -> Verdict:
     margins = []
-    threshold = _Estimate(CONVERGED, 0.0)
+    half = _Estimate(0.5, 0.0)
     for scene in results.scenes:
-        margins.append(threshold - _estimate(results, scene, BO, _last_gain))
-        margins.append(_estimate(results, scene, GABS, _last_gain) - threshold)
-    evidence = _evidence(results, results.scenes, (BO, GABS), lambda method: 100 * _last_gain(method), "%")
-    return _verdict(margins, f"raised by the last {LAST_PART:.0%} of the evaluations: {evidence}")
+        margins.append(_estimate(results, scene, BO, _converged) - half)
+        margins.append(half - _estimate(results, scene, GABS, _converged))
+    evidence = _evidence(results, results.scenes, (BO, GABS), _converged, "")
+    return _verdict(margins, f"share of the trials that converged: {evidence}")
 
 
 def _foci_form(results: StudyResult) -> Verdict:
@@ -316,7 +318,7 @@ CLAIMS = (
     Claim(
         "BO may converge within the evaluations it is given, GABS needs all of its own.",
         f"converged: the last {LAST_PART:.0%} of the evaluations raise the score by at most {CONVERGED:.0%}; "
-        "BO has, GABS has not, in every scene",
+        "more than half of the trials of BO, less than half of those of GABS, in every scene",
         (BO, GABS),
         (_all,),
         _convergence,

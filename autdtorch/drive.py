@@ -59,8 +59,8 @@ def phases_of(drive: ArrayLike) -> torch.Tensor:
     """
     drive = complex_tensor("drive", drive)
     phases = torch.remainder(-torch.angle(drive), 2 * math.pi)
-    # remainder rounds a phase just below 0 up to 2 pi itself; the angle of -0 is pi.
-    return torch.where((phases >= 2 * math.pi) | (drive == 0), 0.0, phases)
+    # remainder rounds a phase just below 0 up to 2 pi itself and keeps -0; the angle of -0 is pi.
+    return torch.where((phases >= 2 * math.pi) | (phases == 0) | (drive == 0), 0.0, phases)
 
 
 def amplitudes_of(drive: ArrayLike) -> torch.Tensor:

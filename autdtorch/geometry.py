@@ -12,9 +12,9 @@ from autdtorch.validation import (
     Vector,
     finite_number,
     finite_vector,
+    integer_at_least,
     positive,
     positive_entries,
-    positive_integer,
     unit_vector,
 )
 
@@ -64,7 +64,7 @@ def circle_points(
     """
     origin = torch.tensor(finite_vector("center", center), dtype=torch.float64)
     radius = positive("radius", radius, "m")
-    count = positive_integer("count", count)
+    count = integer_at_least("count", count, 1)
     u, v = plane_basis(normal)
     start = finite_number("angle", angle, "rad")
     angles = start + 2 * math.pi * torch.arange(count, dtype=torch.float64) / count

@@ -22,10 +22,10 @@ from autdtorch.scene import Scene
 from autdtorch.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
+    integer_at_least,
     invalid,
     points_tensor,
     positive,
-    positive_integer,
 )
 
 logger = logging.getLogger(__name__)
@@ -278,11 +278,11 @@ def make_propagator(
     scene: Scene,
     method: str = "auto",
     spacing: float = 1e-3,
-    tolerance: float = 1e-3,
+    tolerance: float = 2e-3,
     *,
     kernel: str = "auto",
     dtype: str | torch.dtype = "float32",
-    max_periods: int = 1000,
+    max_periods: int = 600,
 ) -> FreeSpacePropagator | FullPropagator:
     """Choose and prepare a propagator.
 
@@ -308,23 +308,25 @@ def make_propagator(
         raise invalid("scene", scene, "must be a Scene")
     _require_one_of("method", method, METHODS)
     _require_one_of("kernel", kernel, KERNELS)
-    _require_one_of("dtype", str(dtype).removeprefix("torch."), tuple(DTYPES))
+    dtype_name = str(dtype).removeprefix("torch.")
+    _require_one_of("dtype", dtype_name, tuple(DTYPES))
     spacing = positive("spacing", spacing, "m")
     tolerance = positive("tolerance", tolerance)
     if tolerance >= 1:
         raise invalid("tolerance", tolerance, "must be in (0, 1)")
-    max_periods = positive_integer("max_periods", max_periods)
+    max_periods = integer_at_least("max_periods", max_periods, 1)
+    chosen = method if method != "auto" else "full" if scene.obstacles else "free_space"
+    propagator: FreeSpacePropagator | FullPropagator
+    if chosen == "free_space":
+        propagator = FreeSpacePropagator(scene)
+    else:
+        propagator = FullPropagator(scene, spacing, tolerance, kernel, DTYPES[dtype_name], max_periods)
     if method == "auto":
-        method = "full" if scene.obstacles else "free_space"
         reason = (
             f"{len(scene.obstacles)} obstacles" if scene.obstacles else "no obstacles: nothing to simulate"
         )
-        logger.info("method auto: %s (%s)", method, reason)
-    if method == "free_space":
-        return FreeSpacePropagator(scene)
-    return FullPropagator(
-        scene, spacing, tolerance, kernel, DTYPES[str(dtype).removeprefix("torch.")], max_periods
-    )
+        logger.info("method auto: %s (%s)", chosen, reason)
+    return propagator
 
 
 def _require_one_of(name: str, value: object, accepted: tuple[str, ...]) -> None:

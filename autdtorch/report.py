@@ -8,7 +8,8 @@ from pathlib import Path
 
 import torch
 
-from autdtorch.claims import LABELS, LSSG, judge_claims
+from autdtorch.claims import LSSG, judge_claims
+from autdtorch.optim import METHOD_LABELS
 from autdtorch.plot import plot_convergence, plot_planes, plot_scene, plot_trials
 from autdtorch.results import RESULTS_FILE, TRIALS_FILE, MethodResult, SceneResult, StudyResult
 from autdtorch.scene import Scene
@@ -139,7 +140,7 @@ def _over_trials(values: torch.Tensor, form: str) -> str:
 
 
 def _label(method: str) -> str:
-    return LABELS.get(method, method)
+    return METHOD_LABELS.get(method, method)
 
 
 def _table(rows: Iterable[Sequence[str]]) -> str:

@@ -19,7 +19,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from autdtorch.metrics import focus_metrics
 from autdtorch.objective import Objective, SimulatedObjective
-from autdtorch.optim.base import Solution, integer_at_least
+from autdtorch.optim.base import Solution
 from autdtorch.propagator import FullPropagator, Propagator, make_propagator
 from autdtorch.results import (
     RESULTS_FILE,
@@ -33,7 +33,7 @@ from autdtorch.results import (
     save_results,
 )
 from autdtorch.scene import Scene
-from autdtorch.validation import invalid, positive
+from autdtorch.validation import integer_at_least, invalid, positive
 
 logger = logging.getLogger(__name__)
 

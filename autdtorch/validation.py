@@ -56,14 +56,14 @@ def positive(name: str, value: object, unit: str = "") -> float:
     return number
 
 
-def positive_integer(name: str, value: object) -> int:
-    """`value` as an int >= 1; floats are refused even where they are whole.
+def integer_at_least(name: str, value: object, minimum: int) -> int:
+    """`value` as an int >= `minimum`; floats are refused even where they are whole.
 
     Raises:
-        ValueError: not an integer, or < 1.
+        ValueError: not an integer, or below `minimum`.
     """
-    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < 1:
-        raise invalid(name, value, "must be an integer >= 1")
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < minimum:
+        raise invalid(name, value, f"must be an integer >= {minimum}")
     return int(value)
 
 
@@ -75,7 +75,7 @@ def positive_integers(name: str, value: object, count: int) -> tuple[int, ...]:
     """
     if isinstance(value, str) or not isinstance(value, Sequence) or len(value) != count:
         raise invalid(name, value, f"must be {count} integers >= 1")
-    return tuple(positive_integer(f"{name}[{index}]", entry) for index, entry in enumerate(value))
+    return tuple(integer_at_least(f"{name}[{index}]", entry, 1) for index, entry in enumerate(value))
 
 
 def finite_vector(name: str, value: object, unit: str = "m") -> Vector:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numbers
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +9,7 @@ import torch
 
 from autdtorch.drive import amplitudes_of, phases_of
 from autdtorch.objective import Objective, Score
-from autdtorch.validation import invalid, real_tensor
+from autdtorch.validation import real_tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,17 +102,6 @@ def trial_seed(seed: int, trial: int) -> int:
     """Seed of one trial, the same however many trials there are; those of different trials are unrelated."""
     # Half the range of uint64: torch takes seeds as signed.
     return int(np.random.SeedSequence((seed, trial)).generate_state(1, np.uint64)[0] >> np.uint64(1))
-
-
-def integer_at_least(name: str, value: object, minimum: int) -> int:
-    """`value` as an int.
-
-    Raises:
-        ValueError: not an integer, or below `minimum`.
-    """
-    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < minimum:
-        raise invalid(name, value, f"must be an integer >= {minimum}")
-    return int(value)
 
 
 def _observed(name: str, value: torch.Tensor, unit: str = "") -> torch.Tensor:

@@ -8,7 +8,8 @@ import torch
 
 from autdtorch.drive import drive_from_phases
 from autdtorch.objective import Objective, Score, weakest_focus
-from autdtorch.optim.base import Ledger, Solution, integer_at_least, trial_seed
+from autdtorch.optim.base import Ledger, Solution, trial_seed
+from autdtorch.validation import integer_at_least
 
 
 def gabs(

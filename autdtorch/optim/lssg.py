@@ -8,7 +8,8 @@ import torch
 
 from autdtorch.drive import drive_from_phases, focus_phases, normalise
 from autdtorch.objective import Objective, Score, weakest_focus
-from autdtorch.optim.base import Ledger, Solution, integer_at_least
+from autdtorch.optim.base import Ledger, Solution
+from autdtorch.validation import integer_at_least
 
 
 def lssg(objective: Objective, levels: int = 16, score: Score = weakest_focus) -> Solution:

@@ -8,6 +8,7 @@ from typing import Any, TypeAlias
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
+from autdtorch.optim import METHOD_LABELS
 from autdtorch.validation import ArrayLike
 
 ByMethod: TypeAlias = Mapping[str, ArrayLike]
@@ -28,7 +29,6 @@ styled = mpl.rc_context(_STYLE)
 TICK_SIZE = 8.0  # not in the style: ticks are made when the figure is drawn, after the style has gone
 
 _DPI = 150
-_LABELS = {"lssg": "LSSG", "bayes_opt": "BO", "gabs": "GABS"}
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -55,7 +55,7 @@ def methods_of(scenes: Iterable[ByMethod]) -> list[str]:
 
 def label_of(method: str) -> str:
     """A method's name in the paper, or its own."""
-    return _LABELS.get(method, readable(method))
+    return METHOD_LABELS.get(method, readable(method))
 
 
 def readable(name: str) -> str:

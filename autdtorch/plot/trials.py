@@ -115,9 +115,10 @@ def plot_convergence(
             _draw_history(ax, values, colours[method], dashes[method])
         ax.set_title(readable(scene))
         ax.set_xlim(left=0.0)
-        ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]))
         ax.set_xlabel("evaluations")
         ax.tick_params(labelsize=TICK_SIZE)
+    # Once all panels are drawn: they share the axis, and a limit set earlier would keep it from growing.
+    axes[0].set_ylim(bottom=min(0.0, axes[0].get_ylim()[0]))
     axes[0].set_ylabel(label)
     figure.legend(
         handles=[

@@ -1,6 +1,7 @@
 """The command line, run in this process: a subprocess would import PyTorch anew for each."""
 
 import functools
+import inspect
 import json
 import logging
 import os
@@ -275,3 +276,10 @@ def test_help_tells_what_there_is(run: Run, tmp_path: Path, capsys: pytest.Captu
     assert f"scene: {', '.join(SCENES)}" in text
     assert "  spacing: 0.001" in text
     assert written(tmp_path) == set()
+
+
+def test_solver_settings_are_the_defaults_of_make_propagator() -> None:
+    """One truth: a script and the command line simulate alike."""
+    parameters = inspect.signature(make_propagator).parameters.values()
+    defaults = {parameter.name: parameter.default for parameter in parameters if parameter.name != "scene"}
+    assert OmegaConf.to_container(OmegaConf.load(CONFIGS / "solver" / "default.yaml")) == defaults
