@@ -13,7 +13,6 @@ from .propagator import make_propagator
 from .results import load_results
 from .scene import Box, Medium, Scene
 from .scene_file import load_scene
-from .study import run_study
 from .view3d import view3d
 
 __all__ = [
@@ -43,7 +42,6 @@ __all__ = [
     "plot_convergence",
     "plot_plane",
     "plot_trials",
-    "run_study",
     "view3d",
     "weakest_focus",
 ]

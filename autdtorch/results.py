@@ -1,6 +1,7 @@
 """What a study leaves on disk, and how it is read back.
 
-``results.h5`` holds everything, ``trials.jsonl`` a line a trial. Both are written beside their place and then
+``results.h5`` holds everything, ``trials.jsonl`` a line a trial, ``provenance.json`` where they come from.
+All are written beside their place and then
 renamed, so that what is there is always complete.
 """
 
@@ -12,7 +13,7 @@ import json
 import os
 import platform
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,9 @@ from autdtorch.propagator import Run
 RESULTS_FILE = "results.h5"
 TRIALS_FILE = "trials.jsonl"
 
-_PACKAGES = ("torch", "numpy", "numba", "botorch")
+PROVENANCE_FILE = "provenance.json"
+
+_PACKAGES = ("torch", "numpy", "scipy", "numba", "botorch", "gpytorch", "linear_operator")
 _SOLUTION = ("drive", "pressure", "score", "evaluations", "history")
 _METRICS = ("mean", "min", "std", "uniformity", "area")
 
@@ -149,7 +152,7 @@ def provenance_now(config: str, seed: int) -> Provenance:
 
 
 def save_results(results: StudyResult, folder: str | os.PathLike[str]) -> None:
-    """Write `results.h5` and `trials.jsonl` into a folder, which is made if need be.
+    """Write the files of a study into a folder, which is made if need be.
 
     Raises:
         OSError: the folder cannot be made or written.
@@ -164,10 +167,27 @@ def save_results(results: StudyResult, folder: str | os.PathLike[str]) -> None:
             _write_scene(scenes.create_group(name), scene)
     partial.replace(folder / RESULTS_FILE)
 
-    partial = folder / f"{TRIALS_FILE}.partial"
     lines = [json.dumps(row) + "\n" for row in trial_rows(results)]
-    partial.write_text("".join(lines), encoding="utf-8")
-    partial.replace(folder / TRIALS_FILE)
+    _replace_text(folder / TRIALS_FILE, "".join(lines))
+    _replace_text(folder / PROVENANCE_FILE, json.dumps(asdict(results.provenance), indent=2) + "\n")
+
+
+def set_aside(folder: str | os.PathLike[str]) -> None:
+    """Rename the files of an earlier study in a folder, so that another one does not overwrite them.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    for name in (RESULTS_FILE, TRIALS_FILE, PROVENANCE_FILE):
+        path = Path(folder) / name
+        if path.exists():
+            path.replace(path.with_name(f"previous-{name}"))
+
+
+def _replace_text(path: Path, text: str) -> None:
+    partial = path.with_name(f"{path.name}.partial")
+    partial.write_text(text, encoding="utf-8")
+    partial.replace(path)
 
 
 def load_results(path: str | os.PathLike[str]) -> StudyResult:

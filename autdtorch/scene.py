@@ -296,11 +296,20 @@ def _require_separate_obstacles(obstacles: tuple[Box, ...]) -> None:
                 raise invalid(f"Scene.obstacles[{index}]", box, accepted)
 
 
+def require_inside(domain: tuple[Vector, Vector], name: str, points: torch.Tensor) -> None:
+    """Refuse points (N, 3) [m] outside the corners (lower, upper) of a domain.
+
+    Raises:
+        ValueError: names the first point outside, as an entry of `name`.
+    """
+    lower, upper = (torch.tensor(corner, dtype=torch.float64) for corner in domain)
+    outside = ((points < lower - LENGTH_TOLERANCE) | (points > upper + LENGTH_TOLERANCE)).any(dim=-1)
+    if outside.any():
+        first = int(outside.nonzero()[0, 0])
+        accepted = f"must be inside the domain, {domain[0]} to {domain[1]} m"
+        raise invalid(f"{name}[{first}]", points[first], accepted, "m")
+
+
 def _require_in_domain(scene: Scene) -> None:
-    lower, upper = (torch.tensor(corner, dtype=torch.float64) for corner in scene.domain)
     for name, points in _contents(scene):
-        outside = ((points < lower - LENGTH_TOLERANCE) | (points > upper + LENGTH_TOLERANCE)).any(dim=-1)
-        if outside.any():
-            first = int(outside.nonzero()[0, 0])
-            accepted = f"must be inside the domain, {scene.domain[0]} to {scene.domain[1]} m"
-            raise invalid(f"{name}[{first}]", points[first], accepted, "m")
+        require_inside(scene.domain, name, points)

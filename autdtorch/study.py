@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import inspect
 import logging
+import math
 import os
 import re
 import sys
@@ -31,14 +33,18 @@ from autdtorch.results import (
     load_results,
     provenance_now,
     save_results,
+    set_aside,
 )
 from autdtorch.scene import Scene
-from autdtorch.validation import integer_at_least, invalid, positive
+from autdtorch.validation import LENGTH_TOLERANCE, distances, integer_at_least, invalid, positive
 
 logger = logging.getLogger(__name__)
 
 #: An optimiser with its settings bound. It gets `trials` and `seed` where it has such parameters.
 Method: TypeAlias = Callable[..., Solution]
+
+_LARGEST_SEED = 2**63 - 1  # the largest integer that a results file holds
+_MOST_SAMPLES = 10**6  # of an observation plane: 16 complex columns of them are 256 MB
 
 _NAME = re.compile(r"[\w.+-]+")  # of scenes and methods: they become names of files and of groups in them
 
@@ -82,6 +88,9 @@ def run_study(
     for name, method in methods.items():
         for scene in scenes.values():
             _check_method(name, method, scene, counts[name], seed)
+    planes = {name: _plane_points(scene, plane_spacing) for name, scene in scenes.items()}
+    if any(_function(method).__module__.partition(".")[0] != "autdtorch" for method in methods.values()):
+        config = ""  # the digest of our source says nothing of theirs: nothing is re-used
     stored = _stored(folder, provenance_now(config, seed))
     provenance, finished = stored.provenance, dict(stored.scenes)
     missing = {name: scene for name, scene in scenes.items() if name not in finished}
@@ -89,9 +98,9 @@ def run_study(
 
     with _progress(len(missing) * (len(methods) + 2)) as step:
         for scene_name in missing:
-            # The propagator is dropped when its scene is done, since it holds a grid.
+            propagator = propagators.pop(scene_name)
             finished[scene_name] = _run_scene(
-                scene_name, propagators.pop(scene_name), methods, counts, seed, plane_spacing, step
+                scene_name, propagator, methods, counts, seed, planes[scene_name], step
             )
             results = StudyResult(provenance, {name: finished[name] for name in scenes if name in finished})
             if folder is not None:
@@ -109,7 +118,8 @@ def _check(
         for name in named:
             if not _NAME.fullmatch(name):
                 raise invalid(field, name, "a name must consist of letters, digits and _ . + -")
-    integer_at_least("seed", seed, 0)
+    if integer_at_least("seed", seed, 0) > _LARGEST_SEED:
+        raise invalid("seed", seed, f"must be an integer from 0 to {_LARGEST_SEED}")
     random = [name for name, method in methods.items() if "trials" in inspect.signature(method).parameters]
     if not isinstance(trials, Mapping):
         count = integer_at_least("trials", trials, 1)
@@ -155,6 +165,10 @@ def _check_method(name: str, method: Method, scene: Scene, trials: int, seed: in
         raise ValueError(f"method {name}: {error}") from error
 
 
+def _function(method: Method) -> Callable[..., Any]:
+    return method.func if isinstance(method, functools.partial) else method
+
+
 def _solve(method: Method, objective: Objective, trials: int, seed: int) -> Solution:
     parameters = inspect.signature(method).parameters
     given = {"trials": trials, "seed": seed}
@@ -173,8 +187,11 @@ def _stored(folder: str | os.PathLike[str] | None, provenance: Provenance) -> St
         stored = load_results(path)
     except ValueError as error:
         logger.warning("computing everything again: %s", error)
+        set_aside(folder)
         return nothing
     if not stored.provenance.same_origin(provenance):
+        logger.warning("%s is of other settings, source or packages: kept as previous-%s", path, path.name)
+        set_aside(folder)
         return nothing
     logger.info("re-using %s from %s, same settings and same source", ", ".join(stored.scenes), path)
     return stored
@@ -186,7 +203,7 @@ def _run_scene(
     methods: Mapping[str, Method],
     counts: Mapping[str, int],
     seed: int,
-    plane_spacing: float,
+    plane: torch.Tensor | None,
     step: Callable[[str], None],
 ) -> SceneResult:
     scene = propagator.scene
@@ -203,7 +220,7 @@ def _run_scene(
         seconds[name] = time.perf_counter() - begin
     step(f"{scene_name}: observation plane")
     begin = time.perf_counter()
-    planes, cell_area = _plane_pressures(propagator, solutions, plane_spacing)
+    planes, cell_area = _plane_pressures(propagator, solutions, plane)
     plane_seconds = time.perf_counter() - begin
     results = {
         name: _method_result(solution, planes.get(name), cell_area, seconds[name])
@@ -213,14 +230,31 @@ def _run_scene(
     return SceneResult(len(scene.obstacles), transfer_matrix, simulation, results)
 
 
+def _plane_points(scene: Scene, spacing: float) -> torch.Tensor | None:
+    """Samples (Nu, Nv, 3) [m] of the observation plane, fit to be simulated."""
+    plane = scene.observation_plane
+    if plane is None:
+        return None
+    count = math.prod(max(1, round(length / spacing)) for length in plane.size)
+    if count > _MOST_SAMPLES:
+        accepted = f"gives {count} samples of the observation plane, must be at most {_MOST_SAMPLES}"
+        raise invalid("plane_spacing", spacing, accepted, "m")
+    points = plane.points(spacing)
+    gap = distances(points.reshape(-1, 3), scene.array.positions)
+    if gap.min() < LENGTH_TOLERANCE:
+        transducer = int(gap.argmin()) % len(scene.array)
+        accepted = f"puts a sample of the observation plane on transducer {transducer}; shift the plane"
+        raise invalid("plane_spacing", spacing, accepted, "m")
+    return points
+
+
 def _plane_pressures(
-    propagator: Propagator, solutions: Mapping[str, Solution], spacing: float
+    propagator: Propagator, solutions: Mapping[str, Solution], points: torch.Tensor | None
 ) -> tuple[dict[str, torch.Tensor], float | None]:
     """Pressure (T, Nu, Nv) [Pa] on the observation plane by method, and the area of a cell [m^2]."""
     plane = propagator.scene.observation_plane
-    if plane is None:
+    if plane is None or points is None:
         return {}, None
-    points = plane.points(spacing)
     # All drives in one call: the propagator then needs no more than one simulation a transducer.
     drives = torch.cat([solution.drive for solution in solutions.values()])
     pressure = propagator.field(drives, points.reshape(-1, 3)).cpu().reshape(-1, *points.shape[:2])

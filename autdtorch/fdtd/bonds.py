@@ -8,7 +8,6 @@ rigid cell has no bonds.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,14 +36,9 @@ class VaryingCells:
 
 
 def speed_factors(stencil: Stencil, sound_speed: Array, air_speed: float) -> Array:
-    """s_i for each of `sound_speed` (n,): symbol of air over the symbol at the cell's own wavenumber.
-
-    Slow media, whose waves the grid cannot carry, are held at 2 cells per wavelength.
-    """
+    """s_i for each of `sound_speed` (n,): symbol of air over the symbol at the own wavenumber."""
     speeds, inverse = np.unique(sound_speed, return_inverse=True)
-    factors = [
-        stencil.symbol / stencil.isotropic_symbol(min(stencil.kappa * air_speed / c, math.pi)) for c in speeds
-    ]
+    factors = [stencil.symbol / stencil.isotropic_symbol(stencil.kappa * air_speed / c) for c in speeds]
     return np.array(factors)[inverse]
 
 

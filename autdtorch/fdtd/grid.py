@@ -16,9 +16,8 @@ from autdtorch.validation import invalid, positive
 
 Array = NDArray[np.float64]
 
-MIN_CELLS_PER_WAVELENGTH = 3.0
-"""Coarser than this the tuned stencil is no longer isotropic to 1e-4, and points need footprints over 10
-cells."""
+MIN_CELLS_PER_WAVELENGTH = 4.0
+"""Coarser than this points need over 10 cells a side, and the boundary layer reflects more than -60 dB."""
 
 MAX_CELLS = 10**9
 """More would take over 30 GB in single precision."""
@@ -95,15 +94,16 @@ class Grid:
 def make_grid(scene: Scene, spacing: float) -> Grid:
     """Cover the scene's domain with cells of `spacing`, aligned with its lower corner.
 
-    As much air is left between the domain and the boundary layer as points on the domain's faces spread over.
+    As much air is left between the domain and the boundary layer as points in the outermost cells need.
 
     Raises:
         ValueError: fewer than `MIN_CELLS_PER_WAVELENGTH` cells a wavelength, or more than `MAX_CELLS` in all.
     """
-    coarsest = scene.wavelength / MIN_CELLS_PER_WAVELENGTH
-    if positive("spacing", spacing, "m") > coarsest:
-        reason = f"{MIN_CELLS_PER_WAVELENGTH:g} cells per wavelength at {scene.frequency:g} Hz"
-        raise invalid("spacing", spacing, f"must be at most {coarsest:.3g} m, {reason}", "m")
+    positive("spacing", spacing, "m")
+    _require_fine("the medium", scene.medium.sound_speed, scene.frequency, spacing)
+    for index, obstacle in enumerate(scene.obstacles):
+        if obstacle.sound_speed is not None:
+            _require_fine(f"obstacle {index}", obstacle.sound_speed, scene.frequency, spacing)
     lower, upper = scene.domain
     kappa = scene.wavenumber * spacing
     margin = footprint(kappa) // 2 - 1
@@ -117,6 +117,13 @@ def make_grid(scene: Scene, spacing: float) -> Grid:
         cells = " x ".join(map(str, grid.shape))
         raise invalid("spacing", spacing, f"gives {cells} cells, must be at most {MAX_CELLS:.0e} in all", "m")
     return grid
+
+
+def _require_fine(where: str, sound_speed: float, frequency: float, spacing: float) -> None:
+    coarsest = sound_speed / frequency / MIN_CELLS_PER_WAVELENGTH
+    if spacing > coarsest:
+        reason = f"{MIN_CELLS_PER_WAVELENGTH:g} cells per wavelength in {where} at {frequency:g} Hz"
+        raise invalid("spacing", spacing, f"must be at most {coarsest:.3g} m, {reason}", "m")
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from autdtorch.fdtd.bonds import steps_per_period, varying_cells
 from autdtorch.fdtd.boundary import tuned_profile
@@ -45,12 +46,14 @@ class Assembly:
         stencil: weights in air.
         steps_per_period: time steps a period of the drive.
         coefficients: what the kernel sees.
+        rigid: flat indices of the cells that sound does not enter, ascending.
     """
 
     grid: Grid
     stencil: Stencil
     steps_per_period: int
     coefficients: Coefficients
+    rigid: NDArray[np.int64]
 
     @property
     def dtype(self) -> torch.dtype:
@@ -69,7 +72,15 @@ class Assembly:
     def spread(self, points: torch.Tensor) -> PointWeights:
         """Cells and weights of points (P, 3) [m] inside the domain."""
         grid = self.grid
-        return point_weights(grid.to_cells(points), grid.shape, grid.first, grid.last, grid.kappa)
+        spread = point_weights(grid.to_cells(points), grid.shape, grid.first, grid.last, grid.kappa)
+        if len(self.rigid) == 0:
+            return spread
+        # At a rigid wall the pressure has no slope: what would fall behind it goes to the cells before it.
+        weight = np.where(np.isin(spread.index, self.rigid), 0.0, spread.weight)
+        total = weight.sum(axis=1, keepdims=True)
+        return PointWeights(
+            spread.index, np.divide(weight, total, out=np.zeros_like(weight), where=total > 0.1)
+        )
 
     def receivers(self, points: torch.Tensor) -> Receivers:
         """Receivers at points (P, 3) [m]."""
@@ -102,7 +113,8 @@ def assemble(scene: Scene, spacing: float, dtype: torch.dtype = torch.float32) -
     """
     grid = make_grid(scene, spacing)
     stencil = tuned_stencil(grid.kappa)
-    varying = varying_cells(fill_medium(scene, grid), stencil, scene.medium.density, scene.medium.sound_speed)
+    medium = fill_medium(scene, grid)
+    varying = varying_cells(medium, stencil, scene.medium.density, scene.medium.sound_speed)
     steps = steps_per_period(stencil, varying.bond_norm)
     factor = stencil.time_factor(steps)
     profile = tuned_profile(grid.kappa, steps, LAYER_CELLS)
@@ -121,7 +133,7 @@ def assemble(scene: Scene, spacing: float, dtype: torch.dtype = torch.float32) -
         "grid %s at %.3g mm, %d steps a period, %d varying cells",
         grid.shape, spacing * 1e3, steps, len(varying.index),
     )  # fmt: skip
-    return Assembly(grid, stencil, steps, coefficients)
+    return Assembly(grid, stencil, steps, coefficients, np.flatnonzero(medium.rigid))
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ SOLVERS = sorted(path.stem for path in (CONFIGS / "solver").glob("*.yaml"))
 EXPERIMENTS = sorted(path.stem for path in (CONFIGS / "experiment").glob("*.yaml"))
 
 
-SINGLE_FILES = ("results.h5", "trials.jsonl", "plane.png")
+SINGLE_FILES = ("results.h5", "trials.jsonl", "provenance.json", "plane.png")
 
 
 def written(folder: Path) -> set[str]:

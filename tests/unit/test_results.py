@@ -11,6 +11,7 @@ from autdtorch.metrics import focus_metrics
 from autdtorch.optim.base import Solution
 from autdtorch.propagator import Run
 from autdtorch.results import (
+    PROVENANCE_FILE,
     RESULTS_FILE,
     TRIALS_FILE,
     MethodResult,
@@ -84,7 +85,7 @@ def test_saving_again_replaces_what_was_there_and_leaves_nothing_else(
     fewer = dataclasses.replace(results, scenes={"empty": results.scenes["empty"]})
     save_results(fewer, tmp_path)
     assert list(load_results(tmp_path).scenes) == ["empty"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == [RESULTS_FILE, TRIALS_FILE]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [PROVENANCE_FILE, RESULTS_FILE, TRIALS_FILE]
 
 
 def test_a_line_a_trial(results: StudyResult, tmp_path: Path) -> None:
@@ -122,9 +123,8 @@ def test_only_the_date_may_differ_between_results_of_the_same_origin(results: St
 
 def test_the_provenance_of_now_names_what_computes() -> None:
     provenance = provenance_now("a: 1\n", 5)
-    assert {"autdtorch", "python", "torch", "numpy", "numba", "botorch", "platform"} == set(
-        provenance.versions
-    )
+    packages = {"torch", "numpy", "scipy", "numba", "botorch", "gpytorch", "linear_operator"}
+    assert set(provenance.versions) == {"autdtorch", "python", "platform"} | packages
     assert provenance.same_origin(provenance_now("a: 1\n", 5))
     assert provenance.date.endswith("+00:00")
 

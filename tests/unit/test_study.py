@@ -154,6 +154,7 @@ def test_a_study_goes_on_after_the_scenes_that_were_finished(
             raise KeyboardInterrupt
         return solution
 
+    interrupted.__module__ = lssg.__module__  # results of others' methods are not re-used
     study = functools.partial(run_study, scenes, solver=FREE_SPACE, folder=tmp_path, config="a: 1")
     with pytest.raises(KeyboardInterrupt):
         study({"lssg": interrupted})
