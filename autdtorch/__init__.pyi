@@ -9,7 +9,7 @@ from .optim.bayes import bayes_opt
 from .optim.gabs import gabs
 from .optim.lssg import lssg
 from .plot import plot_convergence, plot_plane, plot_trials
-from .propagator import make_propagator
+from .propagator import SteadyStateWarning, make_propagator
 from .results import load_results
 from .scene import Box, Medium, Scene
 from .scene_file import load_scene
@@ -25,6 +25,7 @@ __all__ = [
     "Scene",
     "SimulatedObjective",
     "Solution",
+    "SteadyStateWarning",
     "TransducerArray",
     "amplitudes_of",
     "bayes_opt",

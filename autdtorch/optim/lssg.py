@@ -19,8 +19,7 @@ def lssg(objective: Objective, levels: int = 16, score: Score = weakest_focus) -
     their order: each tries `levels` offsets while the others stay, and keeps the best. Since 0 is among them,
     LSSG is never worse than its start. The paper leaves the search open but for its number of evaluations,
     which is this one's: P * levels, 64 with 4 foci. Adding one focus after the other, as GABS does with
-    transducers, would take `levels` fewer, but would score foci at which nothing aims yet; in the paper's
-    empty scene it ends 38 % lower.
+    transducers, would take `levels` fewer, but would score foci at which nothing aims yet.
 
     Obstacles enter through the observed scores alone, not through the phases of the foci. The amplitudes are
     in [0, 1], not all 1.
