@@ -95,7 +95,9 @@ def _absorb_rows(p, q, axis, psi, zeta, decay, gain, face, edge, corner):  # typ
                 row = p[n, t] if axis == 0 else p[t, n]
                 a = p[n, t - 1] if axis == 0 else p[t - 1, n]
                 b = p[n, t + 1] if axis == 0 else p[t + 1, n]
-                _smooth_row(u[depth], row, a, b, beside, face, edge, corner)
+                for k in range(nz):
+                    beside[k] = a[k] + b[k]
+                _smooth_row(u[depth], row, beside, face, edge, corner)
             _damp_outermost(u, psi[side, 0, t] if axis == 0 else psi[side, t, 0], decay, gain)
             for depth in range(1, cells + 1):
                 n = last - depth if side else depth
@@ -124,10 +126,8 @@ def _absorb_rows(p, q, axis, psi, zeta, decay, gain, face, edge, corner):  # typ
 
 
 @njit(fastmath=_FAST, cache=True, nogil=True)
-def _smooth_row(u, row, a, b, beside, face, edge, corner):  # type: ignore[no-untyped-def]
-    """U = the 9-point sum across a layer's axis, from a row and the rows a and b beside it."""
-    for k in range(len(row)):
-        beside[k] = a[k] + b[k]
+def _smooth_row(u, row, beside, face, edge, corner):  # type: ignore[no-untyped-def]
+    """Write the 9-point sum across a layer's axis into u, from a row and the sum of the rows beside it."""
     for k in range(1, len(row) - 1):
         u[k] = (
             face * row[k]
@@ -154,13 +154,7 @@ def _absorb_ends(p, q, psi, zeta, decay, gain, face, edge, corner):  # type: ign
                     own[depth, j] = row[k]
                     sides[depth, j] = a[k] + b[k]
             for depth in range(1, cells + 2):
-                row, beside, out = own[depth], sides[depth], u[depth]
-                for j in range(1, ny - 1):
-                    out[j] = (
-                        face * row[j]
-                        + edge * (beside[j] + (row[j - 1] + row[j + 1]))
-                        + corner * (beside[j - 1] + beside[j + 1])
-                    )
+                _smooth_row(u[depth], own[depth], sides[depth], face, edge, corner)
             _damp_outermost(u, psi[side, i, 0], decay, gain)
             term[:] = 0
             for depth in range(1, cells + 1):
