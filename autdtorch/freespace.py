@@ -1,4 +1,4 @@
-"""The field of point sources in free space, exact."""
+"""The field of point sources and discs in free space, exact."""
 
 from __future__ import annotations
 
@@ -7,26 +7,33 @@ import math
 import torch
 
 from autdtorch.array import TransducerArray
-from autdtorch.validation import LENGTH_TOLERANCE, ArrayLike, distances, points_tensor, positive
+from autdtorch.validation import (
+    LENGTH_TOLERANCE,
+    ArrayLike,
+    distances,
+    not_negative,
+    points_tensor,
+    positive,
+)
 
 
-def green(points: ArrayLike, sources: ArrayLike, wavenumber: float) -> torch.Tensor:
+def green(points: ArrayLike, sources: ArrayLike, wavenumber: complex) -> torch.Tensor:
     """Green's function of the Helmholtz equation, outgoing with e^{-i w t}: e^{i k r} / (4 pi r).
 
     Args:
         points: (P, 3) [m].
         sources: (M, 3) [m].
-        wavenumber: k [rad/m], > 0.
+        wavenumber: k [rad/m], > 0, or k + i alpha with an attenuation alpha >= 0 [Np/m].
 
     Returns:
         complex128 (P, M) [1/m], on the device of `points`; not differentiable in the positions.
 
     Raises:
-        ValueError: not finite, wrong shape, a wavenumber <= 0, or a point on a source.
+        ValueError: not finite, wrong shape, k <= 0, alpha < 0, or a point on a source.
     """
     targets = points_tensor("points", points)
     origins = points_tensor("sources", sources).to(targets.device)
-    wavenumber = positive("wavenumber", wavenumber, "rad/m")
+    k, alpha = _wavenumber(wavenumber)
     r = distances(targets, origins)
     if r.min() < LENGTH_TOLERANCE:
         point, source = divmod(int(r.argmin()), len(origins))
@@ -34,21 +41,33 @@ def green(points: ArrayLike, sources: ArrayLike, wavenumber: float) -> torch.Ten
             f"points[{point}]: {tuple(targets[point].tolist())} m; lies on source {source}, "
             f"must be at least {LENGTH_TOLERANCE:g} m away"
         )
-    return torch.polar(1 / (4 * math.pi * r), wavenumber * r)
+    return torch.polar(torch.exp(-alpha * r) / (4 * math.pi * r), k * r)
 
 
-def free_space_matrix(points: ArrayLike, array: TransducerArray, wavenumber: float) -> torch.Tensor:
-    """Transfer matrix of an array of point sources in free space: S e^{i k r} / r (Eq. 2).
+def free_space_matrix(points: ArrayLike, array: TransducerArray, wavenumber: complex) -> torch.Tensor:
+    """Transfer matrix of an array in free space: S e^{i k r} / r (Eq. 2), the mean of it over discs.
 
     Args:
         points: (P, 3) [m].
-        array: the M transducers; S is its source strength. Point sources have no use for its normals.
-        wavenumber: k [rad/m], > 0.
+        array: the M transducers, of source strength S; the mean is taken over `array.nodes`.
+        wavenumber: k [rad/m], > 0, or k + i alpha with an attenuation alpha >= 0 [Np/m].
 
     Returns:
         complex128 (P, M): pressure [Pa] per unit drive.
 
     Raises:
-        ValueError: not finite, wrong shape, a wavenumber <= 0, or a point on a transducer.
+        ValueError: not finite, wrong shape, k <= 0, alpha < 0, or a point on a node of a transducer.
     """
-    return 4 * math.pi * array.source_strength * green(points, array.positions, wavenumber)
+    positions, weights = array.nodes
+    # Node by node: memory for one matrix only.
+    terms = (w * green(points, at, wavenumber) for at, w in zip(positions.unbind(1), weights, strict=True))
+    return 4 * math.pi * array.source_strength * sum(terms, start=torch.zeros(()))
+
+
+def _wavenumber(value: complex) -> tuple[float, float]:
+    """Wavenumber k and attenuation alpha of a complex wavenumber."""
+    if not isinstance(value, complex):
+        return positive("wavenumber", value, "rad/m"), 0.0
+    return positive("wavenumber.real", value.real, "rad/m"), not_negative(
+        "wavenumber.imag", value.imag, "Np/m"
+    )

@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 import torch
 
+from autdtorch.array import Nodes
 from autdtorch.drive import validate_drive
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers
 from autdtorch.fdtd.points import footprint
@@ -96,7 +97,7 @@ class FreeSpacePropagator:
             ValueError: `points` are not finite, have another shape, or lie on a transducer.
         """
         points = self.scene.control_points if points is None else points
-        return free_space_matrix(points, self.scene.array, self.scene.wavenumber)
+        return free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber)
 
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
         """Pressure of drives at points.
@@ -200,13 +201,13 @@ class FullPropagator:
         """
         drive, points = validate_drive(drive, len(self.scene.array)), self._inside(points)
         flat = drive.reshape(-1, drive.shape[-1])
-        array = self.scene.array
+        array, nodes = self.scene.array, self.scene.array.nodes
         fewest = len(points) if self._backward(points) else len(array)
         if drive.requires_grad or len(flat) > fewest:
             return drive @ self._simulated_matrix(points).mT
         field = torch.zeros((len(flat), len(points)), dtype=torch.complex128)
         for row, strength in zip(field, array.source_strength * flat, strict=True):
-            row.copy_(self._simulate(array.positions, strength, points))
+            row.copy_(self._simulate(nodes, strength, _single_nodes(points)))
         return field.reshape(*drive.shape[:-1], len(points))
 
     def _inside(self, points: ArrayLike) -> torch.Tensor:
@@ -220,13 +221,14 @@ class FullPropagator:
         return fewer and self.tolerance >= RECIPROCITY_ERROR and not self._touches_obstacle(points)
 
     def _simulated_matrix(self, points: torch.Tensor) -> torch.Tensor:
-        array = self.scene.array
-        strength = torch.full((1,), array.source_strength, dtype=torch.complex128)
+        transducers, targets = self.scene.array.nodes, _single_nodes(points)
+        strength = torch.full((1,), self.scene.array.source_strength, dtype=torch.complex128)
         if self._backward(points):
             logger.info("transfer matrix: %d runs from the points", len(points))
-            return torch.stack([self._simulate(point[None], strength, array.positions) for point in points])
-        logger.info("transfer matrix: %d runs from the transducers", len(array))
-        columns = [self._simulate(position[None], strength, points) for position in array.positions]
+            rows = [self._simulate(point, strength, transducers) for point in _one_by_one(targets)]
+            return torch.stack(rows)
+        logger.info("transfer matrix: %d runs from the transducers", len(self.scene.array))
+        columns = [self._simulate(transducer, strength, targets) for transducer in _one_by_one(transducers)]
         return torch.stack(columns, dim=1)
 
     def _touches_obstacle(self, points: torch.Tensor) -> bool:
@@ -235,21 +237,22 @@ class FullPropagator:
         return bool(np.isin(self._assembly.spread(points).index, varying).any())
 
     @torch.no_grad()
-    def _simulate(self, origins: torch.Tensor, strength: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-        """Pressure (P,) of sources (N, 3) with strengths (N,) at points (P, 3)."""
+    def _simulate(self, origins: Nodes, strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
+        """Pressure (P,) of N origins with strengths (N,), as the mean over the nodes of each of P targets."""
+        points = targets.positions
         if not strength.any():
             return torch.zeros(len(points), dtype=torch.complex128)
         begin = time.perf_counter()
         assembly, kernel = self._assembly, self._kernel
-        if self._touches_obstacle(origins):
+        if self._touches_obstacle(origins.positions.reshape(-1, 3)):
             logger.warning(
                 "a source is within %.2g mm of an obstacle: less accurate; use a finer spacing than %.2g mm",
                 1e3 * assembly.grid.spacing * footprint(assembly.grid.kappa) / 2,
                 1e3 * assembly.grid.spacing,
             )
-        sources = assembly.sources(origins, strength)
+        sources = assembly.sources(origins.positions, strength, origins.weights)
         every = math.ceil(len(points) / MOST_RECEIVERS)
-        receivers = assembly.receivers(points[::every])
+        receivers = assembly.receivers(points[::every], targets.weights)
         state, steady = run_to_steady_state(
             assembly, kernel, sources, receivers, self.tolerance, self.max_periods
         )
@@ -257,9 +260,9 @@ class FullPropagator:
             pressure = steady.pressure
         else:
             field = last_period(assembly, kernel, state, sources)
-            starts = range(0, len(points), _POINTS_AT_ONCE)
-            chunks = [_read(field, assembly.receivers(points[n : n + _POINTS_AT_ONCE])) for n in starts]
-            pressure = torch.cat(chunks)
+            at_once = max(1, _POINTS_AT_ONCE // len(targets.weights))
+            chunks = (points[n : n + at_once] for n in range(0, len(points), at_once))
+            pressure = torch.cat([_read(field, assembly.receivers(at, targets.weights)) for at in chunks])
         self._note(steady, time.perf_counter() - begin)
         return pressure.to(torch.complex128)
 
@@ -273,6 +276,15 @@ class FullPropagator:
                 SteadyStateWarning,
                 stacklevel=2,
             )
+
+
+def _single_nodes(points: torch.Tensor) -> Nodes:
+    """Points (P, 3) as sources or receivers of one node each."""
+    return Nodes(points[:, None], torch.ones(1, dtype=torch.float64))
+
+
+def _one_by_one(nodes: Nodes) -> list[Nodes]:
+    return [Nodes(positions[None], nodes.weights) for positions in nodes.positions]
 
 
 def _read(field: torch.Tensor, receivers: Receivers) -> torch.Tensor:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
+from autdtorch import air
 from autdtorch.array import TransducerArray
 from autdtorch.geometry import Plane
 from autdtorch.validation import (
@@ -17,6 +18,7 @@ from autdtorch.validation import (
     distances,
     finite_vector,
     invalid,
+    not_negative,
     points_tensor,
     positive,
     positive_entries,
@@ -26,6 +28,10 @@ from autdtorch.validation import (
 
 _DEFAULT_MARGIN = 2.0  # wavelengths of air on each side of everything, where no domain is given
 
+_DECIBELS = 20 / math.log(10)  # of a neper
+
+_MOST_ABSORPTION = 3.0  # dB per wavelength: absorption is to be a small part of the wavenumber
+
 
 @dataclass(frozen=True)
 class Medium:
@@ -34,18 +40,44 @@ class Medium:
     Attributes:
         density: [kg/m^3], > 0.
         sound_speed: [m/s], > 0.
+        absorption: of a plane wave at the frequency of the drive [dB/m], >= 0.
 
     Raises:
-        ValueError: an attribute is not a finite number > 0.
+        ValueError: an attribute is not finite or out of range.
     """
 
     density: float
     sound_speed: float
+    absorption: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the attributes."""
         object.__setattr__(self, "density", positive("Medium.density", self.density, "kg/m^3"))
         object.__setattr__(self, "sound_speed", positive("Medium.sound_speed", self.sound_speed, "m/s"))
+        object.__setattr__(self, "absorption", not_negative("Medium.absorption", self.absorption, "dB/m"))
+
+    @classmethod
+    def air(
+        cls,
+        temperature: float = 20.0,
+        relative_humidity: float = 50.0,
+        pressure: float = 101325.0,
+        frequency: float = 40e3,
+    ) -> Medium:
+        """Humid air: an ideal gas that absorbs by ISO 9613-1:1993; `autdtorch.air` says how accurate that is.
+
+        Args:
+            temperature: [deg C], -20 to 50.
+            relative_humidity: [%], 0 to 100.
+            pressure: ambient [Pa], 50e3 to 200e3.
+            frequency: of the drive, for the absorption [Hz]; 4e-4 to 10 times the pressure in Pa.
+
+        Raises:
+            ValueError: an argument is not a number in its range.
+        """
+        density, sound_speed = air.density_and_sound_speed(temperature, relative_humidity, pressure)
+        absorption = air.absorption(temperature, relative_humidity, pressure, frequency)
+        return cls(density, sound_speed, absorption)
 
 
 @dataclass(frozen=True)
@@ -167,7 +199,8 @@ class Scene:
 
         Raises:
             ValueError: a field of the wrong type or out of range, a transducer or control point in or on an
-                obstacle, two points in one place, overlapping obstacles, or something outside the domain.
+                obstacle, two points in one place, overlapping obstacles, something outside the domain, or a
+                medium that absorbs more than 3 dB per wavelength.
         """
         _require_type("Scene.array", array, TransducerArray)
         _require_type("Scene.medium", medium, Medium)
@@ -184,6 +217,7 @@ class Scene:
         object.__setattr__(self, "observation_plane", observation_plane)
         object.__setattr__(self, "name", name)
         object.__setattr__(self, "domain", self._bounds() if domain is None else _corners(domain))
+        _require_propagating(self)
         _require_separate_points(self)
         _require_separate_obstacles(self.obstacles)
         _require_in_domain(self)
@@ -197,6 +231,16 @@ class Scene:
     def wavenumber(self) -> float:
         """In the medium, k = 2 pi f / c [rad/m]."""
         return self.angular_frequency / self.medium.sound_speed
+
+    @property
+    def attenuation(self) -> float:
+        """In the medium, alpha [Np/m]: a plane wave falls as e^{-alpha x}."""
+        return self.medium.absorption / _DECIBELS
+
+    @property
+    def complex_wavenumber(self) -> complex:
+        """In the medium, k + i alpha [rad/m]: a plane wave is e^{i (k + i alpha) x}."""
+        return complex(self.wavenumber, self.attenuation)
 
     @property
     def wavelength(self) -> float:
@@ -252,9 +296,19 @@ def _points(scene: Scene) -> dict[str, torch.Tensor]:
     return {"Scene.array.positions": scene.array.positions, "Scene.control_points": scene.control_points}
 
 
+def _require_propagating(scene: Scene) -> None:
+    most = _MOST_ABSORPTION / scene.wavelength
+    if scene.medium.absorption > most:
+        accepted = f"must be at most {most:.4g} dB/m, {_MOST_ABSORPTION:g} dB per wavelength"
+        raise invalid("Scene.medium.absorption", scene.medium.absorption, accepted, "dB/m")
+
+
 def _contents(scene: Scene) -> list[tuple[str, torch.Tensor]]:
     """Everything the domain must hold: names, and points (N, 3) [m] that span it."""
     contents = list(_points(scene).items())
+    positions, reach = scene.array.positions, scene.array.half_extents
+    contents += [("Scene.array disc's lower edge", positions - reach)]
+    contents += [("Scene.array disc's upper edge", positions + reach)]
     for index, box in enumerate(scene.obstacles):
         corners = torch.tensor([box.lower, box.upper], dtype=torch.float64)
         contents.append((f"Scene.obstacles[{index}] corner", corners))
@@ -266,7 +320,8 @@ def _contents(scene: Scene) -> list[tuple[str, torch.Tensor]]:
 def _require_separate_points(scene: Scene) -> None:
     """No two points in one place, none in an obstacle or on it, where rounding would choose the side."""
     require_distinct("Scene.control_points", scene.control_points)
-    gap = distances(scene.control_points, scene.array.positions)
+    nodes = scene.array.nodes.positions
+    gap = distances(scene.control_points, nodes.reshape(-1, 3)).reshape(-1, *nodes.shape[:2]).amin(dim=2)
     if gap.min() < LENGTH_TOLERANCE:
         point, transducer = divmod(int(gap.argmin()), len(scene.array))
         raise invalid(
@@ -275,13 +330,13 @@ def _require_separate_points(scene: Scene) -> None:
             f"lies on transducer {transducer}, must be at least {LENGTH_TOLERANCE:g} m away",
             "m",
         )
-    for name, group in _points(scene).items():
+    for name, group in (_points(scene) | {"Scene.array.nodes": nodes}).items():
         for index, box in enumerate(scene.obstacles):
             inside = box.contains(group, margin=LENGTH_TOLERANCE)
             if inside.any():
-                first = int(inside.nonzero()[0, 0])
+                first = tuple(inside.nonzero()[0].tolist())
                 accepted = f"lies in or on obstacle {index}, {box.lower} to {box.upper} m, must be outside it"
-                raise invalid(f"{name}[{first}]", group[first], accepted, "m")
+                raise invalid(f"{name}{list(first)}", group[first], accepted, "m")
 
 
 def _require_separate_obstacles(obstacles: tuple[Box, ...]) -> None:

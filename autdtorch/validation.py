@@ -56,6 +56,30 @@ def positive(name: str, value: object, unit: str = "") -> float:
     return number
 
 
+def number_between(name: str, value: object, least: float, most: float, unit: str = "") -> float:
+    """`value` as a float in `least` to `most`, ends included.
+
+    Raises:
+        ValueError: not a real number, NaN or outside.
+    """
+    number = finite_number(name, value, unit)
+    if not least <= number <= most:
+        raise invalid(name, value, f"must be in {least:g} to {most:g}", unit)
+    return number
+
+
+def not_negative(name: str, value: object, unit: str = "") -> float:
+    """`value` as a finite float >= 0.
+
+    Raises:
+        ValueError: not a finite real number, or < 0.
+    """
+    number = finite_number(name, value, unit)
+    if number < 0:
+        raise invalid(name, value, "must be finite and >= 0", unit)
+    return number
+
+
 def integer_at_least(name: str, value: object, minimum: int) -> int:
     """`value` as an int >= `minimum`; floats are refused even where they are whole.
 

@@ -60,6 +60,33 @@ def footprint(kappa: float) -> int:
     return FOOTPRINTS[-1]
 
 
+def merged(spread: PointWeights, share: Array) -> PointWeights:
+    """Weighted means of groups of points, each cell of a group once.
+
+    Args:
+        spread: P x n points, the n of a group one after the other.
+        share: weight of each point in its group (n,).
+
+    Returns:
+        P groups, each of as many cells as the largest one: the rest has the group's first cell and no weight.
+    """
+    if len(share) == 1:
+        return spread
+    index = spread.index.reshape(-1, len(share) * spread.index.shape[1])
+    weight = (share[:, None] * spread.weight.reshape(len(index), len(share), -1)).reshape(index.shape)
+    groups = []
+    for cells, parts in zip(index, weight, strict=True):
+        unique, place = np.unique(cells, return_inverse=True)
+        groups.append((unique, np.bincount(place, parts)))
+    most = max(len(unique) for unique, _ in groups)
+    return PointWeights(
+        np.stack(
+            [np.pad(unique, (0, most - len(unique)), constant_values=unique[0]) for unique, _ in groups]
+        ),
+        np.stack([np.pad(total, (0, most - len(total))) for _, total in groups]),
+    )
+
+
 def point_weights(
     positions: Array,
     shape: tuple[int, int, int],

@@ -12,6 +12,14 @@ cube. The three values make the symbol
 equal to (k h)^2 for long waves and independent of the direction of a wave at the drive frequency; C then
 makes the frequency of that wave exact for the time step in use. Nothing else is tuned: other frequencies are
 only as good as they happen to be, and the steady state does not contain them.
+
+Where air absorbs, a term D (p_new - p_old) is added on the left. A wave e^{i (kappa + i eta) n - i w t} of
+attenuation eta per cell then solves
+
+    2 cos(w dt) - 2 i D sin(w dt) = 2 - C L(kappa + i eta),
+
+whose real part is the condition for C, with the real part of L, and whose imaginary part gives D. Waves of
+any length are stable under the same bound on C as without loss, and D damps them.
 """
 
 from __future__ import annotations
@@ -19,6 +27,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,19 +44,23 @@ class Stencil:
 
     Attributes:
         kappa: wavenumber times spacing at which the stencil is tuned [rad].
+        eta: attenuation times spacing [Np].
         face: weight of the 6 face neighbours.
         edge: weight of the 12 edge neighbours.
         corner: weight of the 8 corner neighbours.
-        symbol: value of the symbol at `kappa`, averaged over directions.
-        slope: derivative of the symbol by kappa at `kappa`, averaged over directions.
+        symbol: real part of the symbol at kappa + i eta, averaged over directions.
+        loss: imaginary part of it.
+        slope: derivative of the symbol at kappa + i eta, averaged over directions.
     """
 
     kappa: float
+    eta: float
     face: float
     edge: float
     corner: float
     symbol: float
-    slope: float
+    loss: float
+    slope: complex
 
     @property
     def weights(self) -> Array:
@@ -75,23 +88,34 @@ class Stencil:
         return np.asarray(_basis(kappa) @ (self.face, self.edge, self.corner), np.float64)
 
     def isotropic_symbol(self, kappa: float) -> float:
-        """Symbol averaged over directions: what a cell with another sound speed is tuned with."""
-        return float(np.average(self.symbol_at(kappa * _DIRECTIONS), weights=_SOLID_ANGLES))
+        """Symbol averaged over directions: what a cell with another sound speed is tuned with.
+
+        Its real part at kappa (1 + i eta / kappa): the loss is one of time, per wavelength alike everywhere.
+        """
+        loss = self.eta / self.kappa
+        return _mean_symbol(kappa * complex(1, loss), (self.face, self.edge, self.corner)).real
 
     def time_factor(self, steps_per_period: int) -> float:
         """C: what the weights are multiplied with for `steps_per_period` steps a period, dimensionless."""
         return 2 * (1 - math.cos(2 * math.pi / steps_per_period)) / self.symbol
 
-    def source_factor(self, steps_per_period: int) -> float:
+    def damping(self, steps_per_period: int) -> float:
+        """D: the loss of a step, dimensionless; zero where air does not absorb."""
+        turn = 2 * math.pi / steps_per_period
+        return self.time_factor(steps_per_period) * self.loss / (2 * math.sin(turn))
+
+    def source_factor(self, steps_per_period: int) -> complex:
         """Forcing per step and unit S/h of a point source whose far field is S e^{ikr}/r.
 
-        The discrete Green's function is a Fourier integral over 1/(C L - 2 + 2 cos(w dt)); its far field is
-        set by the slope of the symbol where the denominator vanishes, against 2 kappa in the continuum.
+        The discrete Green's function is a Fourier integral over 1/(C L - 2 + 2 cos(w dt) - 2 i D sin(w dt));
+        its far field is set by the slope of the symbol where the denominator vanishes, against
+        2 (kappa + i eta) in the continuum.
         """
-        return 4 * math.pi * self.time_factor(steps_per_period) * self.slope / (2 * self.kappa)
+        factor = self.time_factor(steps_per_period) / (1 + self.damping(steps_per_period))
+        return 4 * math.pi * factor * self.slope / (2 * complex(self.kappa, self.eta))
 
 
-def _basis(kappa: Array) -> Array:
+def _basis(kappa: NDArray[Any]) -> NDArray[Any]:
     """Contributions (..., 3) of unit face, edge and corner weights to the symbol of kappa (..., 3)."""
     x, y, z = np.moveaxis(np.cos(kappa), -1, 0)
     face = 6 - 2 * (x + y + z)
@@ -119,12 +143,18 @@ def _directions() -> tuple[Array, Array]:
 _DIRECTIONS, _SOLID_ANGLES = _directions()
 
 
+def _mean_symbol(wavenumber: complex, weights: tuple[float, ...]) -> complex:
+    """Symbol at a complex wavenumber times spacing, averaged over directions."""
+    return complex(np.average(_basis(wavenumber * _DIRECTIONS) @ weights, weights=_SOLID_ANGLES))
+
+
 @lru_cache(maxsize=64)
-def tuned_stencil(kappa: float) -> Stencil:
+def tuned_stencil(kappa: float, eta: float = 0.0) -> Stencil:
     """The stencil whose symbol at `kappa` varies least over directions (least squares on the sphere).
 
     Args:
         kappa: wavenumber times spacing [rad], in (0, pi).
+        eta: attenuation times spacing [Np], small beside kappa.
     """
     basis = _basis(kappa * _DIRECTIONS)
     scale = np.sqrt(_SOLID_ANGLES / _SOLID_ANGLES.sum())[:, None]
@@ -137,16 +167,15 @@ def tuned_stencil(kappa: float) -> Stencil:
     edge, corner = map(float, solution)
     weights = np.array((1 - 4 * edge - 4 * corner, edge, corner))
 
-    def average(value: Array) -> float:
-        return float(np.average(value, weights=_SOLID_ANGLES))
-
-    step = 1e-4
-    ahead, behind = (_basis(kappa * (1 + sign * step) * _DIRECTIONS) @ weights for sign in (1, -1))
+    wavenumber, step = kappa * complex(1, eta / kappa), 1e-4 * kappa
+    symbol, ahead, behind = (_mean_symbol(wavenumber + shift, tuple(weights)) for shift in (0.0, step, -step))
     return Stencil(
         kappa=kappa,
+        eta=eta,
         face=float(weights[0]),
         edge=edge,
         corner=corner,
-        symbol=average(basis @ weights),
-        slope=average(ahead - behind) / (2 * step * kappa),
+        symbol=symbol.real,
+        loss=symbol.imag,
+        slope=(ahead - behind) / (2 * step),
     )

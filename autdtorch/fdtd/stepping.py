@@ -15,7 +15,7 @@ from autdtorch.fdtd.bonds import steps_per_period, varying_cells
 from autdtorch.fdtd.boundary import tuned_profile
 from autdtorch.fdtd.grid import LAYER_CELLS, Grid, fill_medium, make_grid
 from autdtorch.fdtd.kernels.contract import Coefficients, Kernel, Receivers, Sources, State, uniform_state
-from autdtorch.fdtd.points import PointWeights, point_weights
+from autdtorch.fdtd.points import PointWeights, merged, point_weights
 from autdtorch.fdtd.stencil import Stencil, tuned_stencil
 from autdtorch.scene import Scene
 
@@ -32,6 +32,9 @@ _FAINT = 1e-20
 _WINDOW = 4
 """Periods over which the decay of the transient is averaged when its end is foretold."""
 
+
+_ONE_NODE = torch.ones(1, dtype=torch.float64)
+"""Weights of the nodes of a point."""
 
 _SLOWEST_DECAY = 0.995
 """Decay per period that the foretelling credits a transient with at least; rounding noise decays no more."""
@@ -69,8 +72,11 @@ class Assembly:
         faint = _FAINT * float(sources.force.detach().abs().max())
         return uniform_state(self.grid.shape, LAYER_CELLS, faint, self.dtype)
 
-    def spread(self, points: torch.Tensor) -> PointWeights:
-        """Cells and weights of points (P, 3) [m] inside the domain."""
+    def spread(self, points: torch.Tensor, weights: torch.Tensor = _ONE_NODE) -> PointWeights:
+        """Cells and weights of points (P, 3) [m], or nodes (P, n, 3) with `weights` (n,), in the domain."""
+        return merged(self._spread_nodes(points.reshape(-1, 3)), weights.numpy())
+
+    def _spread_nodes(self, points: torch.Tensor) -> PointWeights:
         grid = self.grid
         spread = point_weights(grid.to_cells(points), grid.shape, grid.first, grid.last, grid.kappa)
         if len(self.rigid) == 0:
@@ -82,17 +88,19 @@ class Assembly:
             spread.index, np.divide(weight, total, out=np.zeros_like(weight), where=total > 0.1)
         )
 
-    def receivers(self, points: torch.Tensor) -> Receivers:
-        """Receivers at points (P, 3) [m]."""
-        spread = self.spread(points)
+    def receivers(self, points: torch.Tensor, weights: torch.Tensor = _ONE_NODE) -> Receivers:
+        """Receivers at points (P, 3) [m], or means over nodes (P, n, 3) with `weights` (n,)."""
+        spread = self.spread(points, weights)
         return Receivers(torch.from_numpy(spread.index), torch.from_numpy(spread.weight).to(self.dtype))
 
-    def sources(self, points: torch.Tensor, strength: torch.Tensor) -> Sources:
+    def sources(
+        self, points: torch.Tensor, strength: torch.Tensor, weights: torch.Tensor = _ONE_NODE
+    ) -> Sources:
         """Point sources at (P, 3) [m] with far field strength e^{ikr}/r, strength (P,) complex [Pa m].
 
-        Differentiable by strength.
+        Nodes (P, n, 3) with `weights` (n,) share the strength of a source. Differentiable by strength.
         """
-        spread = self.spread(points)
+        spread = self.spread(points, weights)
         factor = self.stencil.source_factor(self.steps_per_period) / self.grid.spacing
         index, inverse = np.unique(spread.index, return_inverse=True)
         force = (strength[:, None] * torch.from_numpy(factor * spread.weight)).reshape(-1)
@@ -112,18 +120,21 @@ def assemble(scene: Scene, spacing: float, dtype: torch.dtype = torch.float32) -
         ValueError: if the spacing is too coarse for the frequency.
     """
     grid = make_grid(scene, spacing)
-    stencil = tuned_stencil(grid.kappa)
+    stencil = tuned_stencil(grid.kappa, scene.attenuation * spacing)
     medium = fill_medium(scene, grid)
     varying = varying_cells(medium, stencil, scene.medium.density, scene.medium.sound_speed)
     steps = steps_per_period(stencil, varying.bond_norm)
-    factor = stencil.time_factor(steps)
+    damping = stencil.damping(steps)
+    factor = stencil.time_factor(steps) / (1 + damping)
+    keep = (1 - damping) / (1 + damping)
     profile = tuned_profile(grid.kappa, steps, LAYER_CELLS)
     face, edge, corner = factor * stencil.face, factor * stencil.edge, factor * stencil.corner
     coefficients = Coefficients(
-        center=2 - factor * stencil.total,
+        center=1 + keep - factor * stencil.total,
         face=face,
         edge=edge,
         corner=corner,
+        keep=keep,
         varying_index=torch.from_numpy(varying.index),
         varying_weight=torch.from_numpy(factor * varying.weight).to(dtype),
         layer_decay=torch.from_numpy(profile.decay).to(dtype),

@@ -18,7 +18,7 @@ def pressure(force: torch.Tensor, weight: torch.Tensor, steps: int) -> torch.Ten
     profile = torch.tensor([2.0, 1.5, 1.0, 0.5, 0.1], dtype=torch.float64)
     decay = torch.exp(-profile - 0.1)
     gain = profile / (profile + 0.1) * (decay - 1)
-    coefficients = Coefficients(0.2, 0.12, 0.06, 0.045, varying, weight, decay, gain)
+    coefficients = Coefficients(0.19, 0.12, 0.06, 0.045, 0.99, varying, weight, decay, gain)
     receivers = Receivers(torch.tensor([[CELL + 9], [CELL - 72]]), torch.ones((2, 1), dtype=torch.float64))
     signal = torch.stack(
         (torch.cos(torch.arange(steps) * 0.6), torch.sin(torch.arange(steps) * 0.6)), 1

@@ -60,7 +60,7 @@ def closed_box(dtype: torch.dtype, cells: int = 10) -> Coefficients:
     silent = torch.zeros(2 * cells + 1, dtype=dtype)
     nothing = torch.zeros(0, dtype=torch.int64)
     return Coefficients(
-        c.center, c.face, c.edge, c.corner, nothing, torch.zeros((0, 27), dtype=dtype), silent, silent
+        c.center, c.face, c.edge, c.corner, c.keep, nothing, torch.zeros((0, 27), dtype=dtype), silent, silent
     )
 
 

@@ -12,6 +12,7 @@ import torch
 from small_scenes import AIR, CUBE, small_scene
 
 import autdtorch.study
+from autdtorch.array import Nodes
 from autdtorch.freespace import green
 from autdtorch.geometry import Plane
 from autdtorch.objective import Objective
@@ -96,10 +97,11 @@ def test_a_scene_without_observation_plane_has_no_areas() -> None:
 
 def test_the_runs_of_a_simulation_are_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     def simulate(
-        self: FullPropagator, origins: torch.Tensor, strength: torch.Tensor, points: torch.Tensor
+        self: FullPropagator, origins: Nodes, strength: torch.Tensor, targets: Nodes
     ) -> torch.Tensor:
         self.runs.append(Run(7, 0.1, len(self.runs) < 4, 0.5))
-        return 4 * math.pi * green(points, origins, self.scene.wavenumber) @ strength
+        matrix = green(targets.positions[:, 0], origins.positions[:, 0], self.scene.wavenumber)
+        return 4 * math.pi * matrix @ strength
 
     monkeypatch.setattr(FullPropagator, "_simulate", simulate)
     solver = {"method": "full", "spacing": 2e-3, "tolerance": 0.2, "kernel": "reference"}

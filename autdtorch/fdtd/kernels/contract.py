@@ -2,9 +2,9 @@
 
 One step, from pressures `now` and `before` at two successive times to the next (all of it linear):
 
-1. new = center now + face F + edge E + corner C - before, with F, E, C the sums over the 6, 12 and 8
+1. new = center now + face F + edge E + corner C - keep before, with F, E, C the sums over the 6, 12 and 8
    neighbours;
-2. in the varying cells instead new = 2 now - before + sum_j weight_j (now_j - now);
+2. in the varying cells instead new = (1 + keep) now - keep before + sum_j weight_j (now_j - now);
 3. in each of the six boundary layers the memory is advanced and its term added (`boundary.py`);
 4. the sources are added: new += cos(w t) Re(force) + sin(w t) Im(force), times the envelope;
 5. the outermost ring of cells stays zero.
@@ -27,10 +27,11 @@ class Coefficients:
     """Everything about the medium that a kernel sees.
 
     Attributes:
-        center: weight of the cell itself; center + 6 face + 12 edge + 8 corner = 2.
+        center: weight of the cell itself; center + 6 face + 12 edge + 8 corner = 1 + keep.
         face: weight of each of 6 neighbours.
         edge: weight of each of 12.
         corner: weight of each of 8.
+        keep: weight of the pressure before, 1 in air that does not absorb and below it otherwise.
         varying_index: flat indices (n,) int64 of the varying cells.
         varying_weight: their weights (n, 27).
         layer_decay: b of the boundary layer at half cells and cells, interleaved from outside (2 L + 1,).
@@ -41,6 +42,7 @@ class Coefficients:
     face: float
     edge: float
     corner: float
+    keep: float
     varying_index: torch.Tensor
     varying_weight: torch.Tensor
     layer_decay: torch.Tensor

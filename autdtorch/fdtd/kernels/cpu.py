@@ -27,7 +27,7 @@ _FAST = {"contract", "reassoc", "nsz"}
 
 
 @njit(parallel=True, fastmath=_FAST, cache=True, nogil=True)
-def _sweep(p, q, center, face, edge, corner):  # type: ignore[no-untyped-def]
+def _sweep(p, q, center, face, edge, corner, keep):  # type: ignore[no-untyped-def]
     nx, ny, nz = p.shape
     for i in prange(1, nx - 1):
         beside = np.empty(nz, p.dtype)
@@ -45,11 +45,11 @@ def _sweep(p, q, center, face, edge, corner):  # type: ignore[no-untyped-def]
                     + face * (beside[k] + (row[k - 1] + row[k + 1]))
                     + edge * (diagonal[k] + (beside[k - 1] + beside[k + 1]))
                     + corner * (diagonal[k - 1] + diagonal[k + 1])
-                ) - out[k]
+                ) - keep * out[k]
 
 
 @njit(parallel=True, fastmath=_FAST, cache=True, nogil=True)
-def _varying(p, q, index, weight, offsets, result):  # type: ignore[no-untyped-def]
+def _varying(p, q, index, weight, offsets, keep, result):  # type: ignore[no-untyped-def]
     flat, old = p.ravel(), q.ravel()
     for n in prange(len(index)):
         cell = index[n]
@@ -57,7 +57,7 @@ def _varying(p, q, index, weight, offsets, result):  # type: ignore[no-untyped-d
         change = own - own
         for m in range(27):
             change += weight[n, m] * (flat[cell + offsets[m]] - own)
-        result[n] = own + own - old[cell] + change
+        result[n] = own + keep * (own - old[cell]) + change
 
 
 @njit(fastmath=_FAST, cache=True, nogil=True)
@@ -179,13 +179,13 @@ def _absorb_ends(p, q, psi, zeta, decay, gain, face, edge, corner):  # type: ign
 def _advance(  # type: ignore[no-untyped-def]
     p, q, layers, weights, varying, decay, gain, driven, force, heard, hearing, signal, recorded
 ):
-    center, face, edge, corner = weights
+    center, face, edge, corner, keep = weights
     index, weight, offsets, buffer = varying
     (psi_x, zeta_x), (psi_y, zeta_y), (psi_z, zeta_z) = layers
     for step in range(len(signal)):
         if len(index):
-            _varying(p, q, index, weight, offsets, buffer)
-        _sweep(p, q, center, face, edge, corner)
+            _varying(p, q, index, weight, offsets, keep, buffer)
+        _sweep(p, q, center, face, edge, corner, keep)
         flat = q.ravel()
         for n in range(len(index)):
             flat[index[n]] = buffer[n]
@@ -237,7 +237,7 @@ class CpuKernel:
                 (_rows_last(psi, axis), _rows_last(zeta, axis))
                 for axis, (psi, zeta) in enumerate(state.layers)
             ),
-            (dtype(c.center), dtype(c.face), dtype(c.edge), dtype(c.corner)),
+            (dtype(c.center), dtype(c.face), dtype(c.edge), dtype(c.corner), dtype(c.keep)),
             varying,
             c.layer_decay.numpy(),
             c.layer_gain.numpy(),

@@ -37,13 +37,14 @@ class ReferenceKernel:
         return state, torch.stack(recorded)
 
     def _step(self, state: State, c: Coefficients, driven: torch.Tensor, force: torch.Tensor) -> State:
-        new = torch.nn.functional.pad(_sweep(state.now, c) - _core(state.before), (1,) * 6)
+        new = torch.nn.functional.pad(_sweep(state.now, c) - c.keep * _core(state.before), (1,) * 6)
         flat_now, flat_before = state.now.reshape(-1), state.before.reshape(-1)
-        own = flat_now[c.varying_index]
+        own, before = flat_now[c.varying_index], flat_before[c.varying_index]
         change = (
             c.varying_weight * (flat_now[c.varying_index[:, None] + _offsets(state.now)] - own[:, None])
         ).sum(-1)
-        new = new.reshape(-1).index_copy(0, c.varying_index, 2 * own - flat_before[c.varying_index] + change)
+        kept = own + c.keep * (own - before)
+        new = new.reshape(-1).index_copy(0, c.varying_index, kept + change)
         new = new.reshape(state.now.shape)
         layers = []
         for axis, (psi, zeta) in enumerate(state.layers):
