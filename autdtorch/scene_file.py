@@ -9,6 +9,7 @@ import difflib
 import inspect
 import os
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,8 @@ def load_scene(source: str | os.PathLike[str] | Mapping[str, Any]) -> Scene:
     where = "scene mapping" if isinstance(source, Mapping) else os.fspath(source)
     section = _mapping(where, _read(where, source))
     _check_keys(where, section, Scene)
-    parts = {key: _part(f"{where}: {key}", key, value) for key, value in section.items()}
+    air = partial(Medium.air, frequency=section["frequency"])
+    parts = {key: _part(f"{where}: {key}", key, value, air) for key, value in section.items()}
     scene: Scene = _build(where, parts, Scene)
     return scene
 
@@ -73,11 +75,12 @@ def _read(where: str, source: str | os.PathLike[str] | Mapping[str, Any]) -> obj
         raise ValueError(f"{where}: {error}; must hold a mapping of keys to values") from error
 
 
-def _part(where: str, key: str, value: object) -> object:
-    """The argument `key` of `Scene` from the `value` under that key of the file."""
+def _part(where: str, key: str, value: object, air: Builder) -> object:
+    """The argument `key` of `Scene` from the `value` under that key of the file; `air` builds its air."""
     match key:
         case "medium":
-            return _build(where, _mapping(where, value), Medium)
+            section = _mapping(where, value)
+            return _build(where, section, air if section.keys() & _parameters(air).keys() else Medium)
         case "array":
             return _build_kind(where, value, {"grid": TransducerArray.grid, "positions": TransducerArray})
         case "obstacles":
@@ -128,7 +131,7 @@ def _mapping(where: str, value: object) -> dict[str, Any]:
 
 
 def _check_keys(where: str, section: Mapping[str, object], builder: Builder) -> None:
-    parameters = inspect.signature(builder).parameters
+    parameters = _parameters(builder)
     allowed = f"allowed keys: {', '.join(parameters)}"
     for key in section:
         if key not in parameters:
@@ -136,6 +139,12 @@ def _check_keys(where: str, section: Mapping[str, object], builder: Builder) -> 
     for key, parameter in parameters.items():
         if parameter.default is inspect.Parameter.empty and key not in section:
             raise ValueError(f"{where}: missing key {key!r}; {allowed}")
+
+
+def _parameters(builder: Builder) -> dict[str, inspect.Parameter]:
+    """Arguments that a section gives: all but those that a `partial` has already."""
+    given = builder.keywords if isinstance(builder, partial) else {}
+    return {key: entry for key, entry in inspect.signature(builder).parameters.items() if key not in given}
 
 
 def _hint(key: object, known: Iterable[str]) -> str:

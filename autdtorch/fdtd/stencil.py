@@ -83,9 +83,9 @@ class Stencil:
         corners = np.array([(x, y, z) for x in (0, np.pi) for y in (0, np.pi) for z in (0, np.pi)])
         return float((_basis(corners) @ (self.face, self.edge, self.corner)).max())
 
-    def symbol_at(self, kappa: Array) -> Array:
-        """Symbol of a wave vector times spacing, (..., 3) -> (...)."""
-        return np.asarray(_basis(kappa) @ (self.face, self.edge, self.corner), np.float64)
+    def symbol_at(self, kappa: NDArray[Any]) -> NDArray[Any]:
+        """Symbol of a real or complex wave vector times spacing, (..., 3) -> (...)."""
+        return np.asarray(_basis(kappa) @ (self.face, self.edge, self.corner))
 
     def isotropic_symbol(self, kappa: float) -> float:
         """Symbol averaged over directions: what a cell with another sound speed is tuned with.

@@ -19,8 +19,8 @@ RIGID = Box(center=(15e-3, 4e-3, 9e-3), size=(4e-3, 6e-3, 7e-3), rigid=True)
 FAST = Box(center=(14e-3, 20e-3, 14e-3), size=(6e-3, 5e-3, 5e-3), density=3.0, sound_speed=700.0)
 
 
-def scene_parts(dtype: torch.dtype) -> tuple[Assembly, Sources, Receivers]:
-    scene = small_scene((CUBE, RIGID, FAST), extent=24e-3)
+def scene_parts(dtype: torch.dtype, absorption: float = 0.0) -> tuple[Assembly, Sources, Receivers]:
+    scene = small_scene((CUBE, RIGID, FAST), extent=24e-3, absorption=absorption)
     assembly = assemble(scene, 1e-3, dtype)
     strength = torch.tensor([1.0, 1j, -0.4, 0.3 - 0.7j], dtype=torch.complex128)
     return (
@@ -31,7 +31,7 @@ def scene_parts(dtype: torch.dtype) -> tuple[Assembly, Sources, Receivers]:
 
 
 def advance(kernel: Kernel, dtype: torch.dtype, steps: int) -> tuple[State, torch.Tensor]:
-    assembly, sources, receivers = scene_parts(dtype)
+    assembly, sources, receivers = scene_parts(dtype, absorption=40.0)
     signal = drive_signal(assembly.steps_per_period, 0, steps).to(dtype)
     return kernel.advance(assembly.silence(sources), assembly.coefficients, sources, receivers, signal)
 

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from autdtorch.array import PAPER_SOURCE_STRENGTH, TransducerArray
+from autdtorch.geometry import circle_points
 
 
 def test_grid_is_row_major_along_the_axes_of_its_plane():
@@ -46,14 +47,55 @@ def test_positions_that_require_grad_leave_no_graph_behind():
 
 
 def test_array_survives_pickling():
-    array = TransducerArray.grid((4, 4), pitch=10e-3, center=(0, 0, 0), normal=(1, 2, 3), source_strength=2.0)
+    array = TransducerArray.grid((4, 4), 10e-3, (0, 0, 0), normal=(1, 2, 3), source_strength=2.0, radius=5e-3)
     copy = pickle.loads(pickle.dumps(array))
     assert torch.equal(copy.positions, array.positions)
     assert torch.equal(copy.normals, array.normals)
-    assert copy.source_strength == array.source_strength
+    assert (copy.source_strength, copy.radius) == (array.source_strength, array.radius)
+
+
+def test_a_point_is_one_node_and_a_radius_of_zero_a_point():
+    points, zero = (
+        TransducerArray.grid((2, 2), pitch=10e-3, center=(0, 0, 0), radius=radius) for radius in (None, 0)
+    )
+    assert points.radius == zero.radius == 0
+    for array in (points, zero):
+        positions, weights = array.nodes
+        assert torch.equal(positions[:, 0], array.positions)
+        assert weights.tolist() == [1.0]
+        assert not array.half_extents.any()
+
+
+def test_nodes_lie_on_the_discs_and_have_their_moments():
+    """Mean of x^2 over a disc of radius a: a^2/4; of x^4: a^4/8; of x^2 y^2: a^4/24; odd powers vanish."""
+    normals = torch.tensor([[0, 0, 1], [1, 2, 3]]).double()
+    array = TransducerArray([[0, 0, 0], [0.01, 0, 0]], normals, radius=5e-3)
+    positions, weights = array.nodes
+    assert positions.shape == (2, len(weights), 3)
+    x, y, z = (positions[0] / 5e-3).unbind(dim=1)
+    moments = [x**0, x, x**2, x**4, x**2 * y**2, x * y, x**3, z**2]
+    found = torch.stack([weights @ moment for moment in moments])
+    expected = torch.tensor([1, 0, 1 / 4, 1 / 8, 1 / 24, 0, 0, 0], dtype=torch.float64)
+    torch.testing.assert_close(found, expected, rtol=1e-14, atol=1e-15)  # rounding of 80 terms
+    # tilted: in the plane of the disc, and around its middle
+    offset = positions[1] - array.positions[1]
+    assert (offset @ array.normals[1]).abs().max() < 1e-17
+    torch.testing.assert_close(weights @ offset, torch.zeros(3).double(), rtol=0, atol=1e-17)
+    assert offset.norm(dim=1).max() < 5e-3
+    assert (offset.abs().amax(dim=0) <= array.half_extents[1]).all()
+
+
+def test_half_extents_are_those_of_a_fine_circle():
+    array = TransducerArray([[0, 0, 0]], (1, 2, 3), radius=5e-3)
+    circle = circle_points((0, 0, 0), 5e-3, 3600, (1, 2, 3))
+    # the nearest of 3600 points is at most 1/20 degree off: 4e-7 of the radius
+    torch.testing.assert_close(array.half_extents[0], circle.amax(dim=0), rtol=1e-6, atol=0)
 
 
 def test_repr_names_count_place_and_units():
     array = TransducerArray.grid((4, 4), pitch=10e-3, center=(1e-3, 50e-3, 50e-3))
     shown = "TransducerArray(16 transducers around (1, 50, 50) mm, source strength 0.07958 Pa m)"
     assert repr(array) == shown
+    discs = TransducerArray([[0, 0, 0]], (1, 0, 0), radius=5e-3)
+    shown = "TransducerArray(1 transducers around (0, 0, 0) mm, radius 5 mm, source strength 0.07958 Pa m)"
+    assert repr(discs) == shown

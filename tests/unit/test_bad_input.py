@@ -130,6 +130,32 @@ WRONG = {
     "grid of floats": (lambda: grid(shape=(4, 4.5)), "shape[1]: 4.5; must be an integer >= 1"),
     "grid of none": (lambda: grid(shape=(0, 4)), "shape[0]: 0; must be an integer >= 1"),
     "grid of one number": (lambda: grid(shape=4), "shape: 4; must be 2 integers >= 1"),
+    "disc radius negative": (
+        lambda: grid(radius=-1e-3),
+        "TransducerArray.radius: -0.001 m; must be finite and >= 0",
+    ),
+    "discs that overlap": (
+        lambda: grid(radius=5.1e-3),
+        "TransducerArray.radius: 0.0051 m; must be at most 0.005 m, half the distance of neighbours",
+    ),
+    # air
+    "absorption negative": (
+        lambda: medium(absorption=-1),
+        "Medium.absorption: -1 dB/m; must be finite and >= 0",
+    ),
+    "air too hot": (lambda: Medium.air(70.0), "temperature: 70.0 deg C; must be in -20 to 50"),
+    "humidity as a share of more than all": (
+        lambda: Medium.air(20.0, 120),
+        "relative_humidity: 120 %; must be in 0 to 100",
+    ),
+    "pressure in hPa": (
+        lambda: Medium.air(pressure=1013.25),
+        "pressure: 1013.25 Pa; must be in 50000 to 200000",
+    ),
+    "frequency beyond the standard": (
+        lambda: Medium.air(frequency=2e6),
+        "frequency: 2000000.0 Hz; must be in 40.53 to 1.01325e+06",
+    ),
     # geometry
     "count not integer": (lambda: circle(count=3.5), "count: 3.5; must be an integer >= 1"),
     "count boolean": (lambda: circle(count=True), "count: True; must be an integer >= 1"),
@@ -191,6 +217,10 @@ WRONG = {
         lambda: green([[0, 0, 1], [0, 0, 0]], [[0, 0, 0]], 1.0),
         "points[1]: (0.0, 0.0, 0.0) m; lies on source 0, must be at least 1e-09 m away",
     ),
+    "waves that grow": (
+        lambda: green([[0, 0, 1]], [[0, 0, 0]], 1 - 0.1j),
+        "wavenumber.imag: -0.1 Np/m; must be finite and >= 0",
+    ),
     "point far away": (
         lambda: free_space_matrix([[0, 0, INF]], grid(), 1.0),
         "points: ([0.0, 0.0, inf],) m; every entry must be finite",
@@ -230,6 +260,20 @@ WRONG = {
     "transducer in an obstacle": (
         lambda: scene(obstacles=[box(), box(center=(0.0, 35e-3, 35e-3))]),
         "Scene.array.positions[0]: (0.001, 0.035, 0.035) m; lies in or on obstacle 1",
+    ),
+    "disc in an obstacle": (
+        lambda: scene(array=grid(radius=5e-3), obstacles=[box(center=(0.0, 26e-3, 35e-3))]),
+        "Scene.array.nodes[0, ",
+    ),
+    "disc outside the domain": (
+        lambda: scene(
+            array=grid(radius=5e-3, normal=(0, 1, 0)), domain=((-15e-3, 0, 0), (0.1, 0.1, 0.1))
+        ),
+        "Scene.array disc's lower edge[0]: (-0.019, 0.05, 0.03) m; must be inside the domain",
+    ),
+    "air that lets nothing through": (
+        lambda: scene(medium=medium(absorption=400.0)),
+        "Scene.medium.absorption: 400.0 dB/m; must be at most 352.9 dB/m, 3 dB per wavelength",
     ),
     "control point in an obstacle": (
         lambda: scene(obstacles=[box(center=(80e-3, 50e-3, 80e-3))]),

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autdtorch.fdtd.points import FOOTPRINT_ERROR, footprint, point_weights
+from autdtorch.fdtd.points import FOOTPRINT_ERROR, footprint, merged, point_weights
 
 SHAPE = (24, 22, 20)
 FIRST, LAST = (2, 2, 2), (22, 20, 18)
@@ -54,6 +54,20 @@ def test_a_point_on_a_cell_centre_is_that_cell() -> None:
     # not to the last digit: the fit is regularised, which costs up to FOOTPRINT_ERROR an axis
     assert weights.weight[0, largest] == pytest.approx(1, abs=3 * FOOTPRINT_ERROR)
     assert np.sort(np.abs(weights.weight[0]))[-2] < FOOTPRINT_ERROR
+
+
+def test_merged_groups_read_the_mean_of_their_points() -> None:
+    positions = np.random.default_rng(0).uniform(7, 13, (6, 3))
+    positions[4:] = positions[3]  # of the second group one point alone: fewer cells than the first
+    share = np.array([0.2, 0.3, 0.5])
+    weights = point_weights(positions, SHAPE, FIRST, LAST, 2 * math.pi / 8.5)
+    groups = merged(weights, share)
+    field = np.random.default_rng(1).normal(size=math.prod(SHAPE))
+    each = (field[weights.index] * weights.weight).sum(1).reshape(2, 3)
+    assert np.allclose((field[groups.index] * groups.weight).sum(1), each @ share, rtol=1e-12)
+    for index, weight in zip(groups.index, groups.weight, strict=True):
+        carrying = index[weight != 0]
+        assert len(np.unique(carrying)) == len(carrying)
 
 
 def test_coarser_grids_need_wider_footprints() -> None:

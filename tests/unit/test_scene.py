@@ -1,3 +1,4 @@
+import cmath
 import dataclasses
 import math
 import pickle
@@ -35,6 +36,15 @@ def test_wave_quantities_follow_from_frequency_and_medium():
     assert scene.wavenumber * scene.wavelength == pytest.approx(2 * math.pi, rel=1e-15)
 
 
+def test_attenuation_is_in_nepers():
+    scene = paper_scene(medium=Medium(density=1.293, sound_speed=340.0, absorption=40.0))
+    assert abs(cmath.exp(1j * scene.complex_wavenumber * 0.5)) == pytest.approx(
+        10 ** (-0.5 * 40 / 20), rel=1e-13
+    )
+    assert scene.complex_wavenumber.real == scene.wavenumber
+    assert paper_scene().attenuation == 0
+
+
 def test_box_is_half_open():
     box = Box(center=(0.5, 0.5, 0.5), size=(1, 1, 1), rigid=True)
     points = torch.tensor(
@@ -67,6 +77,13 @@ def test_default_domain_holds_everything_and_two_wavelengths_more():
     assert lower == pytest.approx((1e-3 - margin, -50e-3 - margin, 20e-3 - margin), rel=1e-12)
     assert upper == pytest.approx((125e-3 + margin, 150e-3 + margin, 80e-3 + margin), rel=1e-12)
     assert all(type(entry) is float for entry in lower + upper)
+
+
+def test_default_domain_holds_the_discs():
+    array = TransducerArray.grid((4, 4), pitch=10e-3, center=(1e-3, 50e-3, 50e-3), radius=5e-3)
+    scene = paper_scene(array=array, control_points=[(80e-3, 50e-3, 50e-3)])
+    margin = 2 * 8.5e-3
+    assert scene.domain[0] == pytest.approx((1e-3 - margin, 30e-3 - margin, 30e-3 - margin), rel=1e-12)
 
 
 def test_given_domain_is_kept_and_may_be_touched():

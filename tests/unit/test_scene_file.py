@@ -4,7 +4,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from autdtorch.scene import Box
+from autdtorch.scene import Box, Medium
 from autdtorch.scene_file import load_scene
 
 SCENES = Path(__file__).parents[2] / "configs" / "scene"
@@ -70,6 +70,19 @@ def test_mapping_and_config_node_give_the_same_scene_as_the_file():
         == load_scene(config).obstacles
         == load_scene(SCENES / "two_cubes.yaml").obstacles
     )
+
+
+def test_air_by_its_temperature_absorbs_at_the_frequency_of_the_scene():
+    config = OmegaConf.create(SMALL)
+    config.frequency, config.medium = 25e3, {"temperature": 25.0, "relative_humidity": 40}
+    assert load_scene(config).medium == Medium.air(25.0, 40.0, frequency=25e3)
+
+
+def test_discs_and_absorption(tmp_path):
+    path = tmp_path / "small.yaml"
+    path.write_text(SMALL.replace("340.0", "340.0, absorption: 1.3").replace("2.0}", "2.0, radius: 5e-3}"))
+    scene = load_scene(path)
+    assert (scene.medium.absorption, scene.array.radius) == (1.3, 5e-3)
 
 
 def test_interpolation_reaches_out_of_the_scene_in_a_larger_config():

@@ -34,6 +34,29 @@ def test_plane_wave_at_the_drive_frequency_turns_by_one_period_in_whole_steps(
     assert np.allclose(cosine, math.cos(2 * math.pi / steps), atol=2e-3)
 
 
+@pytest.mark.parametrize(("cells", "bound"), [(17.0, 2e-3), (8.5, 1e-2), (4.25, 4e-2)])
+def test_plane_wave_falls_by_its_attenuation(cells: float, bound: float) -> None:
+    """Put into the discrete equation, e^{i (kappa + i eta) n - i w t} leaves little, in any direction."""
+    kappa, steps = 2 * math.pi / cells, 20
+    eta = 5e-3 * kappa
+    stencil = tuned_stencil(kappa, eta)
+    damping, turn = stencil.damping(steps), 2 * math.pi / steps
+    symbol = stencil.symbol_at((kappa + 1j * eta) * directions(200))
+    left = 2 * math.cos(turn) - 2j * damping * math.sin(turn) - 2 + stencil.time_factor(steps) * symbol
+    # The slope of the symbol turns what is left into an error of the wavenumber: of the phase as of the
+    # symbol without loss, of the attenuation as much as the slope varies with direction.
+    error = left / (stencil.time_factor(steps) * stencil.slope)
+    assert np.abs(error).max() < bound * eta
+    assert abs(np.mean(error)) < 0.1 * bound * eta
+
+
+@given(KAPPAS)
+def test_no_loss_no_damping(kappa: float) -> None:
+    assert tuned_stencil(kappa).damping(12) == 0
+    # The term D (p_new - p_old) lets a wave fall by D a step: eta / kappa of the turn.
+    assert tuned_stencil(kappa, 1e-3 * kappa).damping(200) == pytest.approx(1e-3 * math.pi / 100, rel=0.5)
+
+
 @given(KAPPAS)
 def test_long_waves_see_the_laplacian(kappa: float) -> None:
     stencil = tuned_stencil(kappa)
