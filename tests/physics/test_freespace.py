@@ -109,7 +109,7 @@ def test_disc_on_its_axis_near_by(distance, tolerance):
 
 
 def test_disc_off_its_axis_near_by():
-    """Against the same integral with a hundred times as many nodes, half a radius and a whole one above it."""
+    """Against the same integral with 150 times as many nodes, half a radius and a whole one above it."""
     radius = 6.0 / WAVENUMBER
     disc = TransducerArray([[0, 0, 0]], (0, 0, 1), source_strength=1.0, radius=radius)
     share = (torch.arange(200, dtype=torch.float64) + 0.5) / 200
