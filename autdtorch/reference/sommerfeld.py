@@ -61,39 +61,35 @@ def _contour(
 ) -> tuple[ComplexArray, ComplexArray]:
     """Nodes and weights along 0, dip - i dip, end - i dip, end.
 
-    The way down is diagonal, as evanescent waves that leak have poles to the left of the negative imaginary axis,
-    and in legs that grow eightfold, as near its cut-off a guided wave has its pole near 0.
+    The way down is diagonal, as evanescent waves that leak have poles to the left of the negative imaginary
+    axis, and in legs that grow eightfold, as waves near their cut-off have poles near 0.
     """
     dip = 0.5 * wavenumbers[0]
     if offset > 0:
         dip = min(dip, _DIP / offset)
     down = [dip * (1 - 1j) / 8**leg for leg in range(_DIAGONAL_LEGS, -1, -1)]
-    legs = [
-        _leg(start, stop, wavenumbers, offset, vertical)
-        for start, stop in pairwise([0j, *down, end - 1j * dip, complex(end)])
-    ]
-    return np.concatenate([nodes for nodes, _ in legs]), np.concatenate([weights for _, weights in legs])
+    nodes, weights = [], []
+    for start, stop in pairwise([0j, *down, end - 1j * dip, complex(end)]):
+        edges = _panel_edges(start, stop, wavenumbers, offset, vertical) if start else np.array([0.0, 1.0])
+        fractions, fraction_weights = _gauss(edges)
+        nodes.append(start + (stop - start) * fractions)
+        weights.append((stop - start) * fraction_weights)
+    return np.concatenate(nodes, dtype=np.complex128), np.concatenate(weights, dtype=np.complex128)
 
 
-def _leg(
+def _panel_edges(
     start: complex, stop: complex, wavenumbers: tuple[float, float], offset: float, vertical: float
-) -> tuple[ComplexArray, ComplexArray]:
-    """Nodes and weights on a straight leg: panels short against the distance to singularities and in phase."""
-    length = abs(stop - start)
-    if start == 0:
-        fractions, weights = _gauss(np.array([0.0, 1.0]))
-        return stop * fractions, stop * weights
-    nearest = max(min(-start.imag, -stop.imag), min(start.real, stop.real) - max(wavenumbers))
+) -> npt.NDArray[np.float64]:
+    """Fractions of a leg between which panels are as long as singularities and phase let them be."""
+    length, singular = abs(stop - start), max(wavenumbers)
+    nearest = max(min(-start.imag, -stop.imag), min(start.real, stop.real) - singular)
     along = np.linspace(0, 1, 2 + int(8 * length / nearest))
-    kappa = start + (stop - start) * along
-    clearance = np.maximum(-kappa.imag, kappa.real - max(wavenumbers))
+    kappa = (start + (stop - start) * along).astype(np.complex128)
+    clearance = np.maximum(-kappa.imag, kappa.real - singular)
     outer, inner = (np.abs(kappa / vertical_wavenumber(wavenumber, kappa)) for wavenumber in wavenumbers)
     density = 1 / (_PANEL_LENGTH * clearance) + (offset + vertical * (outer + inner)) / _PANEL_PHASE
     panels = length * cumulative_trapezoid(density, along, initial=0)
-    fractions, weights = _gauss(
-        np.interp(np.linspace(0, panels[-1], 1 + int(np.ceil(panels[-1]))), panels, along)
-    )
-    return start + (stop - start) * fractions, (stop - start) * weights
+    return np.interp(np.linspace(0, panels[-1], 1 + int(np.ceil(panels[-1]))), panels, along)
 
 
 def _tail(integrand: Spectrum, start: float, offset: float, height: float) -> complex:
