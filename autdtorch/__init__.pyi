@@ -1,3 +1,4 @@
+from . import reference
 from .array import PAPER_SOURCE_STRENGTH, TransducerArray
 from .drive import amplitudes_of, drive_from_phases, focus_phases, phases_of
 from .freespace import green
@@ -43,6 +44,7 @@ __all__ = [
     "plot_convergence",
     "plot_plane",
     "plot_trials",
+    "reference",
     "view3d",
     "weakest_focus",
 ]
