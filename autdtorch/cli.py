@@ -207,6 +207,8 @@ def _show(results: StudyResult, scenes: Mapping[str, Scene], folder: Path, singl
     (result,) = results.scenes.values()
     (method,) = result.methods.values()
     if method.plane_pressure is not None and scene.observation_plane is not None:
-        figure = plot_plane(method.plane_pressure, scene.observation_plane, scene.control_points)
+        figure = plot_plane(
+            method.plane_pressure, scene.observation_plane, scene.control_points, scene.obstacles
+        )
         figure.savefig(folder / PLANE_FILE)
     print(f"The results are in {shown}")

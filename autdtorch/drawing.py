@@ -22,6 +22,8 @@ PLANE_COLOUR = "#56B4E9"
 OBSTACLE_COLOUR = "#B0B0B0"
 EDGE_COLOUR = "#222222"
 
+SHARP_ANGLE = np.radians(30)  # edges of obstacles are drawn where faces meet at more than this
+
 PHASE_MAP = "twilight"  # cyclic: 0 and 2 pi look the same
 PRESSURE_MAP = "inferno"
 

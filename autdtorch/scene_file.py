@@ -16,10 +16,19 @@ import torch
 
 from autdtorch.array import TransducerArray
 from autdtorch.geometry import Plane, circle_points
-from autdtorch.scene import Box, Medium, Scene
+from autdtorch.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
+from autdtorch.scene import Medium, Scene
 from autdtorch.validation import ArrayLike, Vector, finite_vector, invalid, points_tensor
 
 Builder = Callable[..., Any]
+
+_OBSTACLES: dict[str, Builder] = {
+    "box": Box,
+    "sphere": Sphere,
+    "cylinder": Cylinder,
+    "mesh": Mesh,
+    "voxel_mask": VoxelMask.load,
+}
 
 
 def load_scene(source: str | os.PathLike[str] | Mapping[str, Any]) -> Scene:
@@ -27,7 +36,8 @@ def load_scene(source: str | os.PathLike[str] | Mapping[str, Any]) -> Scene:
 
     Args:
         source: path of the file, or the mapping. Interpolations (`${...}`) are resolved. A key without a
-            value counts as left out.
+            value counts as left out. Paths in it start from the folder of the file; in a mapping, from the
+            working directory.
 
     Returns:
         The scene.
@@ -40,7 +50,8 @@ def load_scene(source: str | os.PathLike[str] | Mapping[str, Any]) -> Scene:
     where = "scene mapping" if isinstance(source, Mapping) else os.fspath(source)
     section = _mapping(where, _read(where, source))
     _check_keys(where, section, Scene)
-    parts = {key: _part(f"{where}: {key}", key, value) for key, value in section.items()}
+    folder = Path() if isinstance(source, Mapping) else Path(source).parent
+    parts = {key: _part(f"{where}: {key}", key, value, folder) for key, value in section.items()}
     scene: Scene = _build(where, parts, Scene)
     return scene
 
@@ -73,7 +84,7 @@ def _read(where: str, source: str | os.PathLike[str] | Mapping[str, Any]) -> obj
         raise ValueError(f"{where}: {error}; must hold a mapping of keys to values") from error
 
 
-def _part(where: str, key: str, value: object) -> object:
+def _part(where: str, key: str, value: object, folder: Path) -> object:
     """The argument `key` of `Scene` from the `value` under that key of the file."""
     match key:
         case "medium":
@@ -83,9 +94,7 @@ def _part(where: str, key: str, value: object) -> object:
         case "obstacles":
             if not isinstance(value, list):
                 raise invalid(where, value, "must be a list of obstacles")
-            return [
-                _build_kind(f"{where}[{index}]", entry, {"box": Box}) for index, entry in enumerate(value)
-            ]
+            return [_obstacle(f"{where}[{index}]", entry, folder) for index, entry in enumerate(value)]
         case "control_points":
             return _build_kind(where, value, {"circle": circle_points, "points": _points})
         case "observation_plane":
@@ -94,6 +103,13 @@ def _part(where: str, key: str, value: object) -> object:
             return _build(where, _mapping(where, value), _domain)
         case _:
             return value
+
+
+def _obstacle(where: str, value: object, folder: Path) -> Any:
+    section = _mapping(where, value)
+    if isinstance(path := section.get("path"), str):
+        section["path"] = str(folder / path)
+    return _build_kind(where, section, _OBSTACLES)
 
 
 def _points(positions: ArrayLike) -> torch.Tensor:

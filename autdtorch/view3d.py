@@ -20,13 +20,15 @@ from autdtorch.drawing import (
     PHASE_MAP,
     PLANE_COLOUR,
     PRESSURE_MAP,
+    SHARP_ANGLE,
     TRANSDUCER_COLOUR,
     Array,
     plane_magnitude,
     single_drive_phases,
 )
 from autdtorch.geometry import Plane
-from autdtorch.scene import Box, Scene
+from autdtorch.obstacles import Obstacle
+from autdtorch.scene import Scene
 from autdtorch.validation import ArrayLike, distances
 
 if TYPE_CHECKING:
@@ -106,7 +108,7 @@ def view3d(
     plotter.set_background("white")
     _add_transducers(plotter, scene, phases)
     for obstacle in scene.obstacles:
-        _add_box(plotter, obstacle)
+        _add_obstacle(plotter, obstacle)
     _add_control_points(plotter, scene)
     if scene.observation_plane is not None:
         _add_plane(plotter, scene.observation_plane, magnitude)
@@ -158,18 +160,18 @@ def _add_transducers(plotter: pyvista.Plotter, scene: Scene, phases: Array | Non
     plotter.add_mesh(points.glyph(orient="normals", scale=False, geom=arrow), color="#555555")
 
 
-def _add_box(plotter: pyvista.Plotter, box: Box) -> None:
+def _add_obstacle(plotter: pyvista.Plotter, obstacle: Obstacle) -> None:
     import pyvista
 
-    bounds = [MM * corner[axis] for axis in range(3) for corner in (box.lower, box.upper)]
-    plotter.add_mesh(
-        pyvista.Box(bounds),
-        color=OBSTACLE_COLOUR,
-        ambient=0.35,
-        show_edges=True,
-        edge_color=EDGE_COLOUR,
-        line_width=2,
+    vertices, faces = obstacle.surface()
+    surface = pyvista.PolyData.from_regular_faces(MM * vertices.numpy(), faces.numpy())
+    normals = surface.compute_normals(
+        split_vertices=True, feature_angle=math.degrees(SHARP_ANGLE), auto_orient_normals=False
     )
+    plotter.add_mesh(normals, color=OBSTACLE_COLOUR, ambient=0.35, smooth_shading=True)
+    edges = surface.extract_feature_edges(math.degrees(SHARP_ANGLE))
+    if edges.n_cells:
+        plotter.add_mesh(edges, color=EDGE_COLOUR, line_width=2, lighting=False)
 
 
 def _add_control_points(plotter: pyvista.Plotter, scene: Scene) -> None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import Any, cast
 
 import numpy as np
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
-from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from numpy.typing import NDArray
 
 from autdtorch.drawing import (
     EDGE_COLOUR,
@@ -16,13 +18,27 @@ from autdtorch.drawing import (
     OBSTACLE_COLOUR,
     PHASE_MAP,
     PLANE_COLOUR,
+    SHARP_ANGLE,
     TRANSDUCER_COLOUR,
     Array,
     single_drive_phases,
 )
+from autdtorch.obstacles import Obstacle
 from autdtorch.plot.style import TICK_SIZE, new_figure, styled
-from autdtorch.scene import Box, Scene
+from autdtorch.scene import Scene
 from autdtorch.validation import ArrayLike
+
+_ELEVATION, _AZIMUTH = 22.0, -118.0  # of the viewer [degrees]
+
+
+def _direction(elevation: float, azimuth: float) -> Array:
+    """Unit vector (3,) from angles [degrees]."""
+    up, around = np.radians((elevation, azimuth))
+    return np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
+
+
+_TO_VIEWER = _direction(_ELEVATION, _AZIMUTH)
+_LIGHT = _direction(50.0, -160.0)
 
 
 @styled
@@ -44,10 +60,9 @@ def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
     if scene.observation_plane is not None:
         corners = scene.observation_plane.corners[[0, 1, 3, 2]].numpy()
         ax.add_collection3d(Poly3DCollection([MM * corners], facecolor=PLANE_COLOUR, alpha=0.3, zorder=1))
-    for box in scene.obstacles:
-        ax.add_collection3d(
-            Poly3DCollection(_faces(box), facecolor=OBSTACLE_COLOUR, edgecolor=EDGE_COLOUR, zorder=2)
-        )
+    # From far to near: with the order of drawing fixed, what comes later covers what came before.
+    for obstacle in sorted(scene.obstacles, key=_nearness):
+        _add_obstacle(ax, obstacle)
     foci = MM * scene.control_points.numpy()
     ax.scatter(*foci.T, color=FOCUS_COLOUR, s=22, depthshade=False, label="control points", zorder=3)
     _scatter_transducers(ax, scene, drive)
@@ -57,18 +72,47 @@ def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
     ax.zaxis.set_rotate_label(False)  # which would set it upside down
     ax.set_zlabel("z [mm]", rotation=90)
     ax.set_box_aspect(upper - lower, zoom=0.85)
-    ax.view_init(elev=22, azim=-118)
+    ax.view_init(elev=_ELEVATION, azim=_AZIMUTH)
     ax.tick_params(labelsize=TICK_SIZE)
     ax.legend(loc="upper left")
     return figure
 
 
-def _faces(box: Box) -> list[Array]:
-    """The six faces of a box, four corners each [mm]."""
-    grid = np.meshgrid(*zip(box.lower, box.upper, strict=True), indexing="ij")
-    corners = MM * np.stack(grid, axis=-1)
-    faces = [corners.take(end, axis=axis) for axis in range(3) for end in (0, 1)]
-    return [face.reshape(4, 3)[[0, 1, 3, 2]] for face in faces]
+def _nearness(obstacle: Obstacle) -> float:
+    """Position of the middle along the direction to the viewer."""
+    middle = (np.array(obstacle.lower) + np.array(obstacle.upper)) / 2
+    return float(middle @ _TO_VIEWER)
+
+
+def _add_obstacle(ax: Axes3D, obstacle: Obstacle) -> None:
+    """The triangles that face the viewer, shaded, and the sharp edges of these."""
+    vertices, faces = (part.numpy() for part in obstacle.surface())
+    corners = MM * vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    front = normals @ _TO_VIEWER > 0
+    light = 0.7 + 0.3 * normals[front] @ _LIGHT
+    colours = np.clip(light[:, None] * to_rgb(OBSTACLE_COLOUR), 0, 1)
+    # Edges of the faces' own colours close the seams between them.
+    ax.add_collection3d(
+        Poly3DCollection(corners[front], facecolor=colours, edgecolor=colours, lw=0.3, zorder=2)
+    )
+    edges = MM * vertices[_sharp_edges(faces, normals, front)]
+    if len(edges):  # Matplotlib refuses a collection of none
+        ax.add_collection3d(Line3DCollection(edges, colors=EDGE_COLOUR, lw=0.8, zorder=2))
+
+
+def _sharp_edges(faces: NDArray[np.int64], normals: Array, front: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Vertex pairs (E, 2) of the edges of a `front` face whose other face is turned by over `SHARP_ANGLE`."""
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    face = np.tile(np.arange(len(faces)), 3)
+    pairs = np.sort(ends, axis=1)
+    # On a closed surface the faces of an edge follow each other in this order.
+    order = np.lexsort(pairs.T)
+    one, other = face[order[0::2]], face[order[1::2]]
+    sharp = (normals[one] * normals[other]).sum(axis=1) < np.cos(SHARP_ANGLE)
+    edges: NDArray[np.int64] = pairs[order[0::2]][sharp & (front[one] | front[other])]
+    return edges
 
 
 def _scatter_transducers(ax: Axes3D, scene: Scene, drive: ArrayLike | None) -> None:

@@ -13,7 +13,8 @@ from autdtorch.array import TransducerArray
 from autdtorch.drive import drive_from_phases, focus_phases, normalise, phases_of, validate_drive
 from autdtorch.freespace import free_space_matrix, green
 from autdtorch.geometry import Plane, circle_points, plane_basis
-from autdtorch.scene import Box, Medium, Scene
+from autdtorch.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
+from autdtorch.scene import Medium, Scene
 from autdtorch.scene_file import load_scene
 
 SCENES = Path(__file__).parents[2] / "configs" / "scene"

@@ -8,7 +8,8 @@ import torch
 
 from autdtorch.array import TransducerArray
 from autdtorch.geometry import Plane, circle_points
-from autdtorch.scene import Box, Medium, Scene
+from autdtorch.obstacles import Box, Sphere
+from autdtorch.scene import Medium, OverlapWarning, Scene
 
 AIR = Medium(density=1.293, sound_speed=340.0)
 

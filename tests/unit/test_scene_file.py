@@ -4,7 +4,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from autdtorch.scene import Box
+from autdtorch.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
 from autdtorch.scene_file import load_scene
 
 SCENES = Path(__file__).parents[2] / "configs" / "scene"
