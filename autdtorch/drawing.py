@@ -23,6 +23,7 @@ OBSTACLE_COLOUR = "#B0B0B0"
 EDGE_COLOUR = "#222222"
 
 SHARP_ANGLE = np.radians(30)  # edges of obstacles are drawn where faces meet at more than this
+MOST_EDGES = 500  # of one obstacle; more, as voxels have, would blacken it and are left out
 
 PHASE_MAP = "twilight"  # cyclic: 0 and 2 pi look the same
 PRESSURE_MAP = "inferno"

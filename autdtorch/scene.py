@@ -164,7 +164,8 @@ class Scene:
 
 def _require_type(name: str, value: object, kind: type) -> None:
     if not isinstance(value, kind):
-        raise invalid(name, value, f"must be a {kind.__name__}")
+        article = "an" if kind.__name__[0] in "AEIOU" else "a"
+        raise invalid(name, value, f"must be {article} {kind.__name__}")
 
 
 def _obstacles(given: Iterable[Obstacle]) -> tuple[Obstacle, ...]:

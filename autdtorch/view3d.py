@@ -16,6 +16,7 @@ from autdtorch.drawing import (
     EDGE_COLOUR,
     FOCUS_COLOUR,
     MM,
+    MOST_EDGES,
     OBSTACLE_COLOUR,
     PHASE_MAP,
     PLANE_COLOUR,
@@ -170,7 +171,7 @@ def _add_obstacle(plotter: pyvista.Plotter, obstacle: Obstacle) -> None:
     )
     plotter.add_mesh(normals, color=OBSTACLE_COLOUR, ambient=0.35, smooth_shading=True)
     edges = surface.extract_feature_edges(math.degrees(SHARP_ANGLE))
-    if edges.n_cells:
+    if 0 < edges.n_cells <= MOST_EDGES:
         plotter.add_mesh(edges, color=EDGE_COLOUR, line_width=2, lighting=False)
 
 

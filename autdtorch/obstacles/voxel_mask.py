@@ -25,8 +25,8 @@ _AIR = 2
 class VoxelMask(Obstacle):
     """A body made of cubic voxels, such as a segmented scan.
 
-    The signed distance is that to the nearest voxel centre of the other kind, less half a voxel, and linear
-    between the centres: right at flat faces along the axes, up to 0.4 voxels off at edges and corners.
+    The signed distance at a voxel centre is that to the cube of the nearest voxel of the other kind. Between
+    centres it is linear: right at flat faces, up to half a voxel off at edges, at corners and midway between faces.
 
     Attributes:
         mask: (nx, ny, nz), bool, True in the body; kept as a copy that cannot be written to.
@@ -121,9 +121,12 @@ class VoxelMask(Obstacle):
         first, last = self._extent
         window = tuple(slice(low, high) for low, high in zip(first, last, strict=True))
         body = np.pad(self.mask[window], _AIR)
-        outside, inside = distance_transform_edt(~body), distance_transform_edt(body)
-        distance: NDArray[np.float64] = np.where(body, 0.5 - inside, outside - 0.5)
-        return distance
+        here = np.indices(body.shape)
+        outside, inside = (
+            _to_cube(distance_transform_edt(kind, return_distances=False, return_indices=True) - here, axis=0)
+            for kind in (~body, body)
+        )
+        return np.where(body, -inside, outside)
 
     @cached_property
     def _shell(self) -> Any:
@@ -161,8 +164,14 @@ class VoxelMask(Obstacle):
         distance = np.empty(len(voxels))
         distance[near] = map_coordinates(self._field, local[near].T, order=1)
         if not near.all():
-            distance[~near] = self._shell.query(voxels[~near])[0] - 0.5
+            nearest = self._shell.query(voxels[~near])[1]
+            distance[~near] = _to_cube(self._shell.data[nearest] - voxels[~near], axis=1)
         return torch.from_numpy(self.spacing * distance).to(points)
+
+
+def _to_cube(offset: NDArray[Any], axis: int) -> NDArray[np.float64]:
+    """Distance to a cube of edge 1 whose centre lies at `offset`, with the coordinates along `axis`."""
+    return np.asarray(np.linalg.norm(np.maximum(np.abs(offset) - 0.5, 0), axis=axis), np.float64)
 
 
 def _checked_mask(given: object) -> NDArray[np.bool_]:
@@ -179,8 +188,9 @@ def _checked_mask(given: object) -> NDArray[np.bool_]:
 
 def _read(path: Path) -> NDArray[Any]:
     try:
-        content = np.load(path, allow_pickle=False)
-        arrays = [content] if isinstance(content, np.ndarray) else list(content.values())
+        with path.open("rb") as file:
+            content = np.load(file, allow_pickle=False)
+            arrays = [content] if isinstance(content, np.ndarray) else list(content.values())
     except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
         raise invalid("VoxelMask.path", str(path), f"must be a .npy or .npz file ({error})") from error
     if len(arrays) != 1:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, cast
 
 import numpy as np
@@ -15,6 +16,7 @@ from autdtorch.drawing import (
     EDGE_COLOUR,
     FOCUS_COLOUR,
     MM,
+    MOST_EDGES,
     OBSTACLE_COLOUR,
     PHASE_MAP,
     PLANE_COLOUR,
@@ -97,9 +99,17 @@ def _add_obstacle(ax: Axes3D, obstacle: Obstacle) -> None:
     ax.add_collection3d(
         Poly3DCollection(corners[front], facecolor=colours, edgecolor=colours, lw=0.3, zorder=2)
     )
-    edges = MM * vertices[_sharp_edges(faces, normals, front)]
-    if len(edges):  # Matplotlib refuses a collection of none
-        ax.add_collection3d(Line3DCollection(edges, colors=EDGE_COLOUR, lw=0.8, zorder=2))
+    edges = vertices[_sharp_edges(faces, normals, front)]
+    if 0 < len(edges) <= MOST_EDGES:
+        edges = edges[~_hidden(obstacle, edges.mean(axis=1))]
+        ax.add_collection3d(Line3DCollection(MM * edges, colors=EDGE_COLOUR, lw=0.8, zorder=2))
+
+
+def _hidden(obstacle: Obstacle, points: Array) -> NDArray[np.bool_]:
+    """Which points (N, 3) [m] on the surface the obstacle itself hides from the viewer (N,)."""
+    across = math.dist(obstacle.lower, obstacle.upper)
+    steps = across * (np.arange(64) + 0.5) / 64
+    return obstacle.contains(points[:, None] + steps[:, None] * _TO_VIEWER).any(dim=1).numpy()
 
 
 def _sharp_edges(faces: NDArray[np.int64], normals: Array, front: NDArray[np.bool_]) -> NDArray[np.int64]:
