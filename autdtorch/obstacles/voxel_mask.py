@@ -26,7 +26,7 @@ class VoxelMask(Obstacle):
     """A body made of cubic voxels, such as a segmented scan.
 
     The signed distance at a voxel centre is that to the cube of the nearest voxel of the other kind. Between
-    centres it is linear: right at flat faces, up to half a voxel off at edges, at corners and midway between faces.
+    centres it is linear: right at flat faces, up to half a voxel off at edges, corners and half way through.
 
     Attributes:
         mask: (nx, ny, nz), bool, True in the body; kept as a copy that cannot be written to.
