@@ -30,7 +30,7 @@ from autdtorch.drawing import (
 from autdtorch.geometry import Plane
 from autdtorch.obstacles import Obstacle
 from autdtorch.scene import Scene
-from autdtorch.validation import ArrayLike, distances
+from autdtorch.validation import ArrayLike, Vector, distances
 
 if TYPE_CHECKING:
     import pyvista
@@ -109,7 +109,7 @@ def view3d(
     plotter.set_background("white")
     _add_transducers(plotter, scene, phases)
     for obstacle in scene.obstacles:
-        _add_obstacle(plotter, obstacle)
+        _add_obstacle(plotter, obstacle, scene.domain)
     _add_control_points(plotter, scene)
     if scene.observation_plane is not None:
         _add_plane(plotter, scene.observation_plane, magnitude)
@@ -161,11 +161,18 @@ def _add_transducers(plotter: pyvista.Plotter, scene: Scene, phases: Array | Non
     plotter.add_mesh(points.glyph(orient="normals", scale=False, geom=arrow), color="#555555")
 
 
-def _add_obstacle(plotter: pyvista.Plotter, obstacle: Obstacle) -> None:
+def _add_obstacle(plotter: pyvista.Plotter, obstacle: Obstacle, domain: tuple[Vector, Vector]) -> None:
+    """The obstacle's surface and its sharp edges, cut off and left open where the domain ends."""
     import pyvista
 
     vertices, faces = obstacle.surface()
     surface = pyvista.PolyData.from_regular_faces(MM * vertices.numpy(), faces.numpy())
+    for outwards, corner in zip((-1.0, 1.0), domain, strict=True):
+        for normal in outwards * np.eye(3):
+            if (((surface.points - MM * np.array(corner)) @ normal) > 0).any():
+                surface = surface.clip(normal=normal, origin=MM * np.array(corner))
+    if surface.n_cells == 0:  # only its bounding box reaches into the domain
+        return
     normals = surface.compute_normals(
         split_vertices=True, feature_angle=math.degrees(SHARP_ANGLE), auto_orient_normals=False
     )

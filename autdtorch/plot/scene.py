@@ -23,12 +23,13 @@ from autdtorch.drawing import (
     SHARP_ANGLE,
     TRANSDUCER_COLOUR,
     Array,
+    clipped,
     single_drive_phases,
 )
 from autdtorch.obstacles import Obstacle
 from autdtorch.plot.style import TICK_SIZE, new_figure, styled
 from autdtorch.scene import Scene
-from autdtorch.validation import ArrayLike
+from autdtorch.validation import ArrayLike, Vector
 
 _ELEVATION, _AZIMUTH = 22.0, -118.0  # of the viewer [degrees]
 
@@ -64,7 +65,7 @@ def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
         ax.add_collection3d(Poly3DCollection([MM * corners], facecolor=PLANE_COLOUR, alpha=0.3, zorder=1))
     # From far to near: with the order of drawing fixed, what comes later covers what came before.
     for obstacle in sorted(scene.obstacles, key=_nearness):
-        _add_obstacle(ax, obstacle)
+        _add_obstacle(ax, obstacle, scene.domain)
     foci = MM * scene.control_points.numpy()
     ax.scatter(*foci.T, color=FOCUS_COLOUR, s=22, depthshade=False, label="control points", zorder=3)
     _scatter_transducers(ax, scene, drive)
@@ -86,23 +87,38 @@ def _nearness(obstacle: Obstacle) -> float:
     return float(middle @ _TO_VIEWER)
 
 
-def _add_obstacle(ax: Axes3D, obstacle: Obstacle) -> None:
-    """The triangles that face the viewer, shaded, and the sharp edges of these."""
+def _add_obstacle(ax: Axes3D, obstacle: Obstacle, domain: tuple[Vector, Vector]) -> None:
+    """The triangles that face the viewer, shaded, and the sharp edges of these.
+
+    An obstacle that the domain cuts off is left open there: one looks at its far side, which is drawn first.
+    """
     vertices, faces = (part.numpy() for part in obstacle.surface())
-    corners = MM * vertices[faces]
+    corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
     front = normals @ _TO_VIEWER > 0
-    light = 0.7 + 0.3 * normals[front] @ _LIGHT
-    colours = np.clip(light[:, None] * to_rgb(OBSTACLE_COLOUR), 0, 1)
-    # Edges of the faces' own colours close the seams between them.
-    ax.add_collection3d(
-        Poly3DCollection(corners[front], facecolor=colours, edgecolor=colours, lw=0.3, zorder=2)
-    )
+    if (vertices < domain[0]).any() or (vertices > domain[1]).any():
+        _add_faces(ax, corners[~front], normals[~front], domain)
+    _add_faces(ax, corners[front], normals[front], domain)
     edges = vertices[_sharp_edges(faces, normals, front)]
-    if 0 < len(edges) <= MOST_EDGES:
-        edges = edges[~_hidden(obstacle, edges.mean(axis=1))]
-        ax.add_collection3d(Line3DCollection(MM * edges, colors=EDGE_COLOUR, lw=0.8, zorder=2))
+    if len(edges) > MOST_EDGES:
+        return
+    lines = [clipped(edge, *domain) for edge in edges[~_hidden(obstacle, edges.mean(axis=1))]]
+    if lines := [MM * line for line in lines if len(line)]:  # Matplotlib refuses a collection of none
+        ax.add_collection3d(Line3DCollection(lines, colors=EDGE_COLOUR, lw=0.8, zorder=2))
+
+
+def _add_faces(ax: Axes3D, corners: Array, normals: Array, domain: tuple[Vector, Vector]) -> None:
+    """Draw what the domain holds of the triangles (F, 3, 3) [m] with unit normals (F, 3)."""
+    light = 0.7 + 0.3 * normals @ _LIGHT
+    colours = np.clip(light[:, None] * to_rgb(OBSTACLE_COLOUR), 0, 1)
+    polygons = [clipped(triangle, *domain) for triangle in corners]
+    left = [index for index, polygon in enumerate(polygons) if len(polygon)]
+    if not left:
+        return
+    # Edges of the faces' own colours close the seams between them.
+    style: Any = {"facecolor": colours[left], "edgecolor": colours[left], "lw": 0.3, "zorder": 2}
+    ax.add_collection3d(Poly3DCollection([MM * polygons[index] for index in left], **style))
 
 
 def _hidden(obstacle: Obstacle, points: Array) -> NDArray[np.bool_]:

@@ -14,10 +14,11 @@ from matplotlib.collections import QuadMesh
 from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
-from mpl_toolkits.mplot3d.art3d import Line3DCollection
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from small_scenes import scene_of_all_kinds, small_scene
 
 import autdtorch as at
+from autdtorch.drawing import clipped
 from autdtorch.plot import plot_convergence, plot_plane, plot_planes, plot_scene, plot_trials
 
 PLANE = at.Plane(center=(80e-3, 50e-3, 40e-3), normal=(1, 0, 0), size=(60e-3, 40e-3))
@@ -110,6 +111,23 @@ def test_edges_that_their_own_obstacle_hides_are_not_drawn() -> None:
         (edges,) = (artist for artist in ax.collections if isinstance(artist, Line3DCollection))
         drawn.append(edges._segments3d)
     np.testing.assert_array_equal(*drawn)
+
+
+def test_what_is_drawn_of_an_obstacle_ends_at_the_domain() -> None:
+    triangle = np.array([(-1.0, 0.5, 0.5), (3.0, 0.5, 0.5), (-1.0, 0.5, 4.5)])  # x + z <= 3.5 at y = 0.5
+    inside = clipped(triangle, (0, 0, 0), (2, 1, 2))
+    wanted = {(0, 0.5, 0.5), (2, 0.5, 0.5), (2, 0.5, 1.5), (1.5, 0.5, 2), (0, 0.5, 2)}
+    assert {tuple(corner) for corner in inside.tolist()} == wanted
+    assert {tuple(end) for end in clipped(triangle[:2], (0, 0, 0), (2, 1, 2)).tolist()} == {
+        (0, 0.5, 0.5),
+        (2, 0.5, 0.5),
+    }
+    assert clipped(triangle, (0, 1, 0), (2, 2, 2)).shape == (0, 3)
+    wall = at.Box((50e-3, 40e-3, 40e-3), (10e-3, 1.0, 1.0), rigid=True)
+    ax = plot_scene(small_scene((wall,), extent=80e-3)).axes[0]
+    # The wall is open at the edges of the domain, so that its far side is drawn too; its edges are outside.
+    assert sum(isinstance(artist, Poly3DCollection) for artist in ax.collections) == 2
+    assert not any(isinstance(artist, Line3DCollection) for artist in ax.collections)
 
 
 def test_plane_map_draws_into_given_axes() -> None:
