@@ -120,7 +120,7 @@ def test_the_papers_experiment(composed: Callable[..., dict[str, object]]) -> No
 
 
 WRONG = [
-    (["scene=thre_cubes"], "scene: 'thre_cubes'; must be one of homogeneous, three_cubes, two_cubes"),
+    (["scene=thre_cubes"], "scene: 'thre_cubes'; must be one of homogeneous, sphere, three_cubes, two_cubes"),
     (["experiment=nature"], "experiment: 'nature'; must be one of paper"),
     (["spacing=1e-3"], "spacing: unknown key"),
     (["solver.spcing=1e-3"], r"solver\.spcing: unknown key"),
