@@ -5,6 +5,7 @@ from .freespace import green
 from .geometry import Plane, circle_points
 from .metrics import FocusMetrics, focus_metrics
 from .objective import Objective, SimulatedObjective, weakest_focus
+from .obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
 from .optim.base import Solution
 from .optim.bayes import bayes_opt
 from .optim.gabs import gabs
@@ -12,22 +13,28 @@ from .optim.lssg import lssg
 from .plot import plot_convergence, plot_plane, plot_trials
 from .propagator import SteadyStateWarning, make_propagator
 from .results import load_results
-from .scene import Box, Medium, Scene
+from .scene import Medium, OverlapWarning, Scene
 from .scene_file import load_scene
 from .view3d import view3d
 
 __all__ = [
     "PAPER_SOURCE_STRENGTH",
     "Box",
+    "Cylinder",
     "FocusMetrics",
     "Medium",
+    "Mesh",
     "Objective",
+    "Obstacle",
+    "OverlapWarning",
     "Plane",
     "Scene",
     "SimulatedObjective",
     "Solution",
+    "Sphere",
     "SteadyStateWarning",
     "TransducerArray",
+    "VoxelMask",
     "amplitudes_of",
     "bayes_opt",
     "circle_points",

@@ -122,7 +122,7 @@ def _study(config: DictConfig) -> None:
         solver=_solver(settings),
         **{key: settings[key] for key in ("trials", "seed", "plane_spacing") if key in settings},
         folder=folder,
-        config=OmegaConf.to_yaml(OmegaConf.create(settings)),
+        config=_as_text(settings, scenes),
     )
     _show(results, scenes, folder, single)
 
@@ -152,6 +152,18 @@ def _scene(where: str, section: Mapping[str, Any]) -> Scene:
         return load_scene(section)
     except ValueError as error:
         raise ValueError(f"{where}: {str(error).removeprefix('scene mapping: ')}") from error
+
+
+def _as_text(settings: Mapping[str, Any], scenes: Mapping[str, Scene]) -> str:
+    """The settings as YAML, and digests of what they name only by the path of a file."""
+    from autdtorch.obstacles import Mesh, VoxelMask
+
+    contents = {
+        name: [obstacle.digest for obstacle in scene.obstacles if isinstance(obstacle, Mesh | VoxelMask)]
+        for name, scene in scenes.items()
+    }
+    files = {name: digests for name, digests in contents.items() if digests}
+    return OmegaConf.to_yaml(OmegaConf.create({**settings, **({"obstacle_files": files} if files else {})}))
 
 
 def _solver(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -207,6 +219,8 @@ def _show(results: StudyResult, scenes: Mapping[str, Scene], folder: Path, singl
     (result,) = results.scenes.values()
     (method,) = result.methods.values()
     if method.plane_pressure is not None and scene.observation_plane is not None:
-        figure = plot_plane(method.plane_pressure, scene.observation_plane, scene.control_points)
+        figure = plot_plane(
+            method.plane_pressure, scene.observation_plane, scene.control_points, scene.obstacles
+        )
         figure.savefig(folder / PLANE_FILE)
     print(f"The results are in {shown}")

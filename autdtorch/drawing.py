@@ -9,7 +9,7 @@ import numpy.typing as npt
 import torch
 
 from autdtorch.drive import phases_of, validate_drive
-from autdtorch.validation import ArrayLike
+from autdtorch.validation import ArrayLike, Vector
 
 Array: TypeAlias = npt.NDArray[np.float64]
 
@@ -22,8 +22,31 @@ PLANE_COLOUR = "#56B4E9"
 OBSTACLE_COLOUR = "#B0B0B0"
 EDGE_COLOUR = "#222222"
 
+SHARP_ANGLE = np.radians(30)  # edges of obstacles are drawn where faces meet at more than this
+MOST_EDGES = 500  # of one obstacle; more, as voxels have, would blacken it and are left out
+
 PHASE_MAP = "twilight"  # cyclic: 0 and 2 pi look the same
 PRESSURE_MAP = "inferno"
+
+
+def clipped(corners: Array, lower: Vector, upper: Vector) -> Array:
+    """The part of a convex polygon or of a line (K, 3) that lies in a box (Sutherland & Hodgman 1974).
+
+    Returns:
+        Corners (L, 3), L = 0 where nothing is left. A line is run through to its end and may run back.
+    """
+    for side in range(6):
+        axis, sign, bound = side // 2, (1, -1)[side % 2], (lower, upper)[side % 2][side // 2]
+        height = sign * (corners[:, axis] - bound)
+        kept = []
+        for here, there in enumerate(np.roll(np.arange(len(corners)), -1)):
+            if height[here] >= 0:
+                kept.append(corners[here])
+            if height[here] * height[there] < 0:
+                share = height[here] / (height[here] - height[there])
+                kept.append(corners[here] + share * (corners[there] - corners[here]))
+        corners = np.array(kept).reshape(-1, 3)
+    return corners
 
 
 def plane_magnitude(name: str, pressure: ArrayLike) -> Array:

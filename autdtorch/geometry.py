@@ -1,4 +1,4 @@
-"""Points and planes in space: bases of planes, points on circles, the observation plane."""
+"""Points and planes in space: bases of planes, rotations, points on circles, the observation plane."""
 
 from __future__ import annotations
 
@@ -42,6 +42,28 @@ def plane_basis(normal: ArrayLike) -> tuple[torch.Tensor, torch.Tensor]:
     v = torch.linalg.cross(n, u)
     # Adding 0 turns -0 into 0, which would otherwise show in every printed point.
     return u + 0.0, v + 0.0
+
+
+def rotation_matrix(rotation: Vector) -> torch.Tensor:
+    """Matrix R of the rotation by angles (a, b, c) about x, then y, then z, the axes staying where they are.
+
+    R = Rz(c) Ry(b) Rx(a) (extrinsic Euler angles); each is right-handed: (0, 0, pi/2) turns x into y.
+
+    Args:
+        rotation: (a, b, c) [rad].
+
+    Returns:
+        (3, 3), float64; a column vector r is turned into R r.
+    """
+    matrix = torch.eye(3, dtype=torch.float64)
+    for axis, angle in enumerate(rotation):
+        first, second = (axis + 1) % 3, (axis + 2) % 3
+        turn = torch.eye(3, dtype=torch.float64)
+        turn[first, first] = turn[second, second] = math.cos(angle)
+        turn[second, first] = math.sin(angle)
+        turn[first, second] = -math.sin(angle)
+        matrix = turn @ matrix
+    return matrix
 
 
 def circle_points(

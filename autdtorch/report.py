@@ -23,7 +23,8 @@ _FIG2 = """## Fig. 2: pressure on the observation plane
 
 ![pressure on the observation plane](fig2.png)
 
-|p| of the trial of median score, the control points circled. A scene has one colour scale for all methods."""
+|p| of the trial of median score, the control points circled and obstacles outlined. A scene has one colour
+scale for all methods."""
 
 _FIG3 = """## Fig. 3: the trials
 
@@ -206,7 +207,8 @@ def _plane_figure(results: StudyResult, scenes: Mapping[str, Scene], folder: Pat
         return ""
     planes = {name: plane for name in pressure if (plane := scenes[name].observation_plane) is not None}
     points = {name: scenes[name].control_points for name in pressure}
-    plot_planes(pressure, planes, points).savefig(folder / "fig2.png")
+    obstacles = {name: scenes[name].obstacles for name in pressure}
+    plot_planes(pressure, planes, points, obstacles).savefig(folder / "fig2.png")
     return _FIG2
 
 

@@ -31,7 +31,7 @@ TRIALS_FILE = "trials.jsonl"
 
 PROVENANCE_FILE = "provenance.json"
 
-_PACKAGES = ("torch", "numpy", "scipy", "numba", "botorch", "gpytorch", "linear_operator")
+_PACKAGES = ("torch", "numpy", "scipy", "libigl", "numba", "botorch", "gpytorch", "linear_operator")
 _SOLUTION = ("drive", "pressure", "score", "evaluations", "history")
 _METRICS = ("mean", "min", "std", "uniformity", "area")
 

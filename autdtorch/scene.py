@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -11,6 +12,8 @@ import torch
 from autdtorch import air
 from autdtorch.array import TransducerArray
 from autdtorch.geometry import Plane
+from autdtorch.obstacles import Box as Box
+from autdtorch.obstacles import Obstacle
 from autdtorch.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
@@ -21,11 +24,11 @@ from autdtorch.validation import (
     not_negative,
     points_tensor,
     positive,
-    positive_entries,
     real_tensor,
     require_distinct,
 )
 
+_OVERLAP_SAMPLES = 16  # along each axis of the space that two bounding boxes share
 _DEFAULT_MARGIN = 2.0  # wavelengths of air on each side of everything, where no domain is given
 
 _DECIBELS = 20 / math.log(10)  # of a neper
@@ -80,73 +83,8 @@ class Medium:
         return cls(density, sound_speed, absorption)
 
 
-@dataclass(frozen=True)
-class Box:
-    """A cuboid obstacle with edges along the axes: either of a fluid material, or rigid.
-
-    Attributes:
-        center: centre (3,) [m].
-        size: edge lengths (3,) [m], > 0.
-        density: of the material [kg/m^3], > 0; None if rigid.
-        sound_speed: of the material [m/s], > 0; None if rigid.
-        rigid: True for walls that do not move.
-
-    Raises:
-        ValueError: an attribute is not finite, has the wrong shape or is out of range; or both a material and
-            rigid, or neither.
-    """
-
-    center: Vector
-    size: Vector
-    density: float | None = None
-    sound_speed: float | None = None
-    rigid: bool = False
-
-    def __post_init__(self) -> None:
-        """Check the attributes and bring them into canonical form."""
-        object.__setattr__(self, "center", finite_vector("Box.center", self.center))
-        object.__setattr__(self, "size", positive_entries("Box.size", self.size, 3))
-        if not isinstance(self.rigid, bool):
-            raise invalid("Box.rigid", self.rigid, "must be true or false")
-        if self.rigid:
-            if self.density is not None or self.sound_speed is not None:
-                material = (self.density, self.sound_speed)
-                raise invalid("Box.rigid", material, "must have either a material or rigid=True, not both")
-            return
-        if self.density is None or self.sound_speed is None:
-            missing = "density" if self.density is None else "sound_speed"
-            raise invalid(f"Box.{missing}", None, "must have both density and sound_speed, or rigid=True")
-        object.__setattr__(self, "density", positive("Box.density", self.density, "kg/m^3"))
-        object.__setattr__(self, "sound_speed", positive("Box.sound_speed", self.sound_speed, "m/s"))
-
-    @property
-    def lower(self) -> Vector:
-        """Corner with the smallest coordinates (3,) [m]."""
-        return _shifted(self.center, self.size, -0.5)
-
-    @property
-    def upper(self) -> Vector:
-        """Corner with the largest coordinates (3,) [m]."""
-        return _shifted(self.center, self.size, 0.5)
-
-    def contains(self, points: ArrayLike, margin: float = 0.0) -> torch.Tensor:
-        """Which points lie in lower - margin <= r < upper + margin: boxes face to face share no point.
-
-        Args:
-            points: (..., 3) [m].
-            margin: by how much the box is grown on every side [m].
-
-        Returns:
-            bool (...).
-
-        Raises:
-            ValueError: `points` are not finite real numbers or have another last axis.
-        """
-        points = real_tensor("points", points, "m")
-        if points.ndim == 0 or points.shape[-1] != 3:
-            raise ValueError(f"points: shape {tuple(points.shape)}; must be (..., 3)")
-        lower, upper = points.new_tensor(self.lower), points.new_tensor(self.upper)
-        return ((points >= lower - margin) & (points < upper + margin)).all(dim=-1)
+class OverlapWarning(UserWarning):
+    """Two obstacles of different materials overlap."""
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -158,9 +96,9 @@ class Scene:
         medium: what surrounds the obstacles.
         frequency: [Hz], > 0.
         control_points: (P, 3) [m], float64, where pressure is observed; all different.
-        obstacles: may touch, may not overlap.
+        obstacles: may touch and overlap; where they do, the later one counts.
         observation_plane: where pictures and areas are taken, or None.
-        domain: corners (lower, upper) [m] of the space that holds everything.
+        domain: corners (lower, upper) [m] of the space that holds everything but what obstacles have outside.
         name: for titles and file names.
     """
 
@@ -168,7 +106,7 @@ class Scene:
     medium: Medium
     frequency: float
     control_points: torch.Tensor
-    obstacles: tuple[Box, ...]
+    obstacles: tuple[Obstacle, ...]
     observation_plane: Plane | None
     domain: tuple[Vector, Vector]
     name: str
@@ -179,7 +117,7 @@ class Scene:
         medium: Medium,
         frequency: float,
         control_points: ArrayLike,
-        obstacles: Iterable[Box] = (),
+        obstacles: Iterable[Obstacle] = (),
         observation_plane: Plane | None = None,
         domain: ArrayLike | None = None,
         name: str = "scene",
@@ -191,16 +129,20 @@ class Scene:
             medium: what surrounds the obstacles.
             frequency: [Hz], > 0.
             control_points: (P, 3) [m], P >= 1, outside the obstacles.
-            obstacles: may touch, may not overlap.
+            obstacles: may touch and overlap; where they do, the later one counts.
             observation_plane: where pictures and areas are taken.
-            domain: corners (lower, upper) [m] around array, control points, obstacles and observation plane.
-                By default their bounding box and two wavelengths more on each side.
+            domain: corners (lower, upper) [m] around array, control points and observation plane. Obstacles
+                may reach beyond it, as a wall does; what is outside is cut off. By default the bounding box
+                of everything, obstacles included, and two wavelengths more on each side.
             name: for titles and file names.
 
         Raises:
             ValueError: a field of the wrong type or out of range, a transducer or control point in or on an
-                obstacle, two points in one place, overlapping obstacles, something outside the domain, or a
-                medium that absorbs more than 3 dB per wavelength.
+                obstacle, two points in one place, something outside the domain, or a medium that absorbs more
+                than 3 dB per wavelength.
+
+        Warns:
+            OverlapWarning: two obstacles of different materials overlap.
         """
         _require_type("Scene.array", array, TransducerArray)
         _require_type("Scene.medium", medium, Medium)
@@ -219,8 +161,8 @@ class Scene:
         object.__setattr__(self, "domain", self._bounds() if domain is None else _corners(domain))
         _require_propagating(self)
         _require_separate_points(self)
-        _require_separate_obstacles(self.obstacles)
         _require_in_domain(self)
+        _warn_of_overlaps(self.obstacles)
 
     @property
     def angular_frequency(self) -> float:
@@ -258,27 +200,24 @@ class Scene:
         )
 
     def _bounds(self) -> tuple[Vector, Vector]:
-        points = torch.cat([points for _, points in _contents(self)])
+        corners = [torch.tensor([o.lower, o.upper], dtype=torch.float64) for o in self.obstacles]
+        points = torch.cat([points for _, points in _contents(self)] + corners)
         margin = _DEFAULT_MARGIN * self.wavelength
         return _corners(torch.stack([points.amin(dim=0) - margin, points.amax(dim=0) + margin]))
 
 
-def _shifted(center: Vector, size: Vector, share: float) -> Vector:
-    x, y, z = (middle + share * length for middle, length in zip(center, size, strict=True))
-    return x, y, z
-
-
 def _require_type(name: str, value: object, kind: type) -> None:
     if not isinstance(value, kind):
-        raise invalid(name, value, f"must be a {kind.__name__}")
+        article = "an" if kind.__name__[0] in "AEIOU" else "a"
+        raise invalid(name, value, f"must be {article} {kind.__name__}")
 
 
-def _obstacles(given: Iterable[Box]) -> tuple[Box, ...]:
+def _obstacles(given: Iterable[Obstacle]) -> tuple[Obstacle, ...]:
     if not isinstance(given, Iterable):
         raise invalid("Scene.obstacles", given, "must be a sequence of obstacles")
     obstacles = tuple(given)
     for index, obstacle in enumerate(obstacles):
-        _require_type(f"Scene.obstacles[{index}]", obstacle, Box)
+        _require_type(f"Scene.obstacles[{index}]", obstacle, Obstacle)
     return obstacles
 
 
@@ -304,14 +243,11 @@ def _require_propagating(scene: Scene) -> None:
 
 
 def _contents(scene: Scene) -> list[tuple[str, torch.Tensor]]:
-    """Everything the domain must hold: names, and points (N, 3) [m] that span it."""
+    """All that must be inside the domain: names, and points (N, 3) [m] that span it."""
     contents = list(_points(scene).items())
     positions, reach = scene.array.positions, scene.array.half_extents
     contents += [("Scene.array disc's lower edge", positions - reach)]
     contents += [("Scene.array disc's upper edge", positions + reach)]
-    for index, box in enumerate(scene.obstacles):
-        corners = torch.tensor([box.lower, box.upper], dtype=torch.float64)
-        contents.append((f"Scene.obstacles[{index}] corner", corners))
     if scene.observation_plane is not None:
         contents.append(("Scene.observation_plane corner", scene.observation_plane.corners))
     return contents
@@ -331,24 +267,58 @@ def _require_separate_points(scene: Scene) -> None:
             "m",
         )
     for name, group in (_points(scene) | {"Scene.array.nodes": nodes}).items():
-        for index, box in enumerate(scene.obstacles):
-            inside = box.contains(group, margin=LENGTH_TOLERANCE)
+        for index, obstacle in enumerate(scene.obstacles):
+            inside = obstacle.contains(group, margin=LENGTH_TOLERANCE)
             if inside.any():
                 first = tuple(inside.nonzero()[0].tolist())
-                accepted = f"lies in or on obstacle {index}, {box.lower} to {box.upper} m, must be outside it"
+                extent = _extent(obstacle.lower, obstacle.upper)
+                accepted = f"lies in or on obstacle {index}, {extent}, must be outside it"
                 raise invalid(f"{name}{list(first)}", group[first], accepted, "m")
 
 
-def _require_separate_obstacles(obstacles: tuple[Box, ...]) -> None:
-    for index, box in enumerate(obstacles):
-        for other_index, other in enumerate(obstacles[:index]):
-            depth = min(
-                min(box.upper[axis], other.upper[axis]) - max(box.lower[axis], other.lower[axis])
-                for axis in range(3)
-            )
-            if depth > LENGTH_TOLERANCE:
-                accepted = f"overlaps obstacle {other_index} by {depth:g} m, may touch it but not overlap"
-                raise invalid(f"Scene.obstacles[{index}]", box, accepted)
+def _warn_of_overlaps(obstacles: tuple[Obstacle, ...]) -> None:
+    """Name the pairs that overlap and differ in material, for the order of the list then matters.
+
+    They are looked for at the centres of `_OVERLAP_SAMPLES`^3 cells of what two bounding boxes share.
+    """
+    for index, obstacle in enumerate(obstacles):
+        for earlier_index, earlier in enumerate(obstacles[:index]):
+            if _material(obstacle) != _material(earlier) and _overlap(obstacle, earlier):
+                warnings.warn(
+                    f"Scene.obstacles[{index}] overlaps obstacle {earlier_index} of another material; "
+                    f"where both are, obstacle {index} counts",
+                    OverlapWarning,
+                    stacklevel=4,
+                )
+
+
+def _material(obstacle: Obstacle) -> tuple[float | None, float | None, bool]:
+    return obstacle.density, obstacle.sound_speed, obstacle.rigid
+
+
+def _overlap(obstacle: Obstacle, other: Obstacle) -> bool:
+    shared = _shared((obstacle.lower, obstacle.upper), (other.lower, other.upper))
+    if shared is None:
+        return False
+    lower, upper = shared
+    share = (torch.arange(_OVERLAP_SAMPLES, dtype=torch.float64) + 0.5) / _OVERLAP_SAMPLES
+    points = lower + (upper - lower) * torch.cartesian_prod(share, share, share)
+    return bool((obstacle.contains(points) & other.contains(points)).any())
+
+
+def _shared(
+    box: tuple[Vector, Vector], other: tuple[Vector, Vector]
+) -> tuple[torch.Tensor, torch.Tensor] | None:
+    """Corners of the space that two boxes (lower, upper) share; None if there is none, or they only touch."""
+    corners = torch.tensor([box, other], dtype=torch.float64)
+    lower, upper = corners[:, 0].amax(dim=0), corners[:, 1].amin(dim=0)
+    return (lower, upper) if (upper - lower).min() > LENGTH_TOLERANCE else None
+
+
+def _extent(lower: Vector, upper: Vector) -> str:
+    """As text; rounded, for the corners of a bounding box are computed."""
+    low, high = (tuple(float(f"{entry:.9g}") for entry in corner) for corner in (lower, upper))
+    return f"{low} to {high} m"
 
 
 def require_inside(domain: tuple[Vector, Vector], name: str, points: torch.Tensor) -> None:
@@ -368,3 +338,8 @@ def require_inside(domain: tuple[Vector, Vector], name: str, points: torch.Tenso
 def _require_in_domain(scene: Scene) -> None:
     for name, points in _contents(scene):
         require_inside(scene.domain, name, points)
+    for index, obstacle in enumerate(scene.obstacles):
+        bounds = (obstacle.lower, obstacle.upper)
+        if _shared(bounds, scene.domain) is None:
+            accepted = f"must be at least partly inside the domain, {scene.domain[0]} to {scene.domain[1]} m"
+            raise ValueError(f"Scene.obstacles[{index}]: {_extent(*bounds)}; {accepted}")

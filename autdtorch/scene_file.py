@@ -17,10 +17,19 @@ import torch
 
 from autdtorch.array import TransducerArray
 from autdtorch.geometry import Plane, circle_points
-from autdtorch.scene import Box, Medium, Scene
+from autdtorch.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
+from autdtorch.scene import Medium, Scene
 from autdtorch.validation import ArrayLike, Vector, finite_vector, invalid, points_tensor
 
 Builder = Callable[..., Any]
+
+_OBSTACLES: dict[str, Builder] = {
+    "box": Box,
+    "sphere": Sphere,
+    "cylinder": Cylinder,
+    "mesh": Mesh,
+    "voxel_mask": VoxelMask.load,
+}
 
 
 def load_scene(source: str | os.PathLike[str] | Mapping[str, Any]) -> Scene:
@@ -28,7 +37,8 @@ def load_scene(source: str | os.PathLike[str] | Mapping[str, Any]) -> Scene:
 
     Args:
         source: path of the file, or the mapping. Interpolations (`${...}`) are resolved. A key without a
-            value counts as left out.
+            value counts as left out. Paths in it start from the folder of the file; in a mapping, from the
+            working directory.
 
     Returns:
         The scene.
@@ -42,7 +52,8 @@ def load_scene(source: str | os.PathLike[str] | Mapping[str, Any]) -> Scene:
     section = _mapping(where, _read(where, source))
     _check_keys(where, section, Scene)
     air = partial(Medium.air, frequency=section["frequency"])
-    parts = {key: _part(f"{where}: {key}", key, value, air) for key, value in section.items()}
+    folder = Path() if isinstance(source, Mapping) else Path(source).parent
+    parts = {key: _part(f"{where}: {key}", key, value, air, folder) for key, value in section.items()}
     scene: Scene = _build(where, parts, Scene)
     return scene
 
@@ -75,8 +86,8 @@ def _read(where: str, source: str | os.PathLike[str] | Mapping[str, Any]) -> obj
         raise ValueError(f"{where}: {error}; must hold a mapping of keys to values") from error
 
 
-def _part(where: str, key: str, value: object, air: Builder) -> object:
-    """The argument `key` of `Scene` from the `value` under that key of the file; `air` builds its air."""
+def _part(where: str, key: str, value: object, air: Builder, folder: Path) -> object:
+    """The argument `key` of `Scene` from its `value`; `air` builds its air, and paths start from `folder`."""
     match key:
         case "medium":
             section = _mapping(where, value)
@@ -86,9 +97,7 @@ def _part(where: str, key: str, value: object, air: Builder) -> object:
         case "obstacles":
             if not isinstance(value, list):
                 raise invalid(where, value, "must be a list of obstacles")
-            return [
-                _build_kind(f"{where}[{index}]", entry, {"box": Box}) for index, entry in enumerate(value)
-            ]
+            return [_obstacle(f"{where}[{index}]", entry, folder) for index, entry in enumerate(value)]
         case "control_points":
             return _build_kind(where, value, {"circle": circle_points, "points": _points})
         case "observation_plane":
@@ -97,6 +106,13 @@ def _part(where: str, key: str, value: object, air: Builder) -> object:
             return _build(where, _mapping(where, value), _domain)
         case _:
             return value
+
+
+def _obstacle(where: str, value: object, folder: Path) -> Any:
+    section = _mapping(where, value)
+    if isinstance(path := section.get("path"), str):
+        section["path"] = str(folder / path)
+    return _build_kind(where, section, _OBSTACLES)
 
 
 def _points(positions: ArrayLike) -> torch.Tensor:

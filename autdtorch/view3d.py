@@ -16,18 +16,21 @@ from autdtorch.drawing import (
     EDGE_COLOUR,
     FOCUS_COLOUR,
     MM,
+    MOST_EDGES,
     OBSTACLE_COLOUR,
     PHASE_MAP,
     PLANE_COLOUR,
     PRESSURE_MAP,
+    SHARP_ANGLE,
     TRANSDUCER_COLOUR,
     Array,
     plane_magnitude,
     single_drive_phases,
 )
 from autdtorch.geometry import Plane
-from autdtorch.scene import Box, Scene
-from autdtorch.validation import ArrayLike, distances
+from autdtorch.obstacles import Obstacle
+from autdtorch.scene import Scene
+from autdtorch.validation import ArrayLike, Vector, distances
 
 if TYPE_CHECKING:
     import pyvista
@@ -106,7 +109,7 @@ def view3d(
     plotter.set_background("white")
     _add_transducers(plotter, scene, phases)
     for obstacle in scene.obstacles:
-        _add_box(plotter, obstacle)
+        _add_obstacle(plotter, obstacle, scene.domain)
     _add_control_points(plotter, scene)
     if scene.observation_plane is not None:
         _add_plane(plotter, scene.observation_plane, magnitude)
@@ -158,18 +161,25 @@ def _add_transducers(plotter: pyvista.Plotter, scene: Scene, phases: Array | Non
     plotter.add_mesh(points.glyph(orient="normals", scale=False, geom=arrow), color="#555555")
 
 
-def _add_box(plotter: pyvista.Plotter, box: Box) -> None:
+def _add_obstacle(plotter: pyvista.Plotter, obstacle: Obstacle, domain: tuple[Vector, Vector]) -> None:
+    """The obstacle's surface and its sharp edges, cut off and left open where the domain ends."""
     import pyvista
 
-    bounds = [MM * corner[axis] for axis in range(3) for corner in (box.lower, box.upper)]
-    plotter.add_mesh(
-        pyvista.Box(bounds),
-        color=OBSTACLE_COLOUR,
-        ambient=0.35,
-        show_edges=True,
-        edge_color=EDGE_COLOUR,
-        line_width=2,
+    vertices, faces = obstacle.surface()
+    surface = pyvista.PolyData.from_regular_faces(MM * vertices.numpy(), faces.numpy())
+    for outwards, corner in zip((-1.0, 1.0), domain, strict=True):
+        for normal in outwards * np.eye(3):
+            if (((surface.points - MM * np.array(corner)) @ normal) > 0).any():
+                surface = surface.clip(normal=normal, origin=MM * np.array(corner))
+    if surface.n_cells == 0:  # only its bounding box reaches into the domain
+        return
+    normals = surface.compute_normals(
+        split_vertices=True, feature_angle=math.degrees(SHARP_ANGLE), auto_orient_normals=False
     )
+    plotter.add_mesh(normals, color=OBSTACLE_COLOUR, ambient=0.35, smooth_shading=True)
+    edges = surface.extract_feature_edges(math.degrees(SHARP_ANGLE))
+    if 0 < edges.n_cells <= MOST_EDGES:
+        plotter.add_mesh(edges, color=EDGE_COLOUR, line_width=2, lighting=False)
 
 
 def _add_control_points(plotter: pyvista.Plotter, scene: Scene) -> None:

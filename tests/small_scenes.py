@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import numpy as np
 import torch
 
 from autdtorch.array import TransducerArray
-from autdtorch.scene import Box, Medium, Scene
+from autdtorch.geometry import Plane
+from autdtorch.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
+from autdtorch.scene import Medium, Scene
 
 AIR = Medium(density=1.293, sound_speed=340.0)
 CUBE = Box(center=(12e-3, 12e-3, 12e-3), size=(6e-3, 8e-3, 4e-3), density=100.0, sound_speed=340.0)
 
 
 def small_scene(
-    obstacles: tuple[Box, ...] = (), extent: float = 24e-3, absorption: float = 0.0, radius: float = 0.0
+    obstacles: tuple[Obstacle, ...] = (), extent: float = 24e-3, absorption: float = 0.0, radius: float = 0.0
 ) -> Scene:
     """A 2 x 2 array at one face of a cube of air, three control points near the other, none on a cell."""
     array = TransducerArray.grid((2, 2), pitch=8e-3, center=(1.2e-3, extent / 2, extent / 2), radius=radius)
@@ -23,6 +28,29 @@ def small_scene(
         [extent - 2.6e-3, 0.44 * extent, 0.23 * extent],
     ]
     return Scene(array, air, 40e3, points, obstacles, domain=((0, 0, 0), (extent,) * 3))
+
+
+def scene_of_all_kinds(folder: Path) -> Scene:
+    """One obstacle of every kind, with an observation plane; the mesh is written to `folder`."""
+    path = folder / "corner.obj"
+    path.write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n", encoding="utf-8"
+    )
+    obstacles = (
+        Box((40e-3, 20e-3, 20e-3), (10e-3, 14e-3, 8e-3), rotation=(0.3, 0.2, 0.5), rigid=True),
+        Sphere((40e-3, 50e-3, 50e-3), 8e-3, rigid=True),
+        Cylinder((40e-3, 80e-3, 20e-3), 5e-3, 20e-3, axis=(1, 1, 1), rigid=True),
+        Mesh(path, scale=15e-3, offset=(35e-3, 75e-3, 75e-3), rigid=True),
+        VoxelMask(np.ones((3, 2, 3), bool), 4e-3, origin=(35e-3, 15e-3, 75e-3), rigid=True),
+    )
+    return Scene(
+        array=TransducerArray.grid((2, 2), pitch=10e-3, center=(1e-3, 50e-3, 50e-3)),
+        medium=AIR,
+        frequency=40e3,
+        control_points=[(80e-3, 50e-3, 50e-3)],
+        obstacles=obstacles,
+        observation_plane=Plane((80e-3, 50e-3, 50e-3), (1, 0, 0), (0.1, 0.1)),
+    )
 
 
 def relative_error(value: torch.Tensor, reference: torch.Tensor) -> float:

@@ -142,7 +142,7 @@ class CellMedium:
 
 
 def fill_medium(scene: Scene, grid: Grid) -> CellMedium:
-    """A cell takes the material that its centre lies in.
+    """A cell takes the material that its centre lies in, of the last obstacle there; the layer is air.
 
     Centres are moved up by a millionth of a cell first, so that rounding does not decide for a face that runs
     through them.
@@ -152,8 +152,10 @@ def fill_medium(scene: Scene, grid: Grid) -> CellMedium:
     rigid = np.zeros(grid.shape, bool)
     for obstacle in scene.obstacles:
         window = tuple(
-            slice(*np.searchsorted(centers, (low - grid.spacing, high + grid.spacing)))
-            for centers, low, high in zip(grid.centers, obstacle.lower, obstacle.upper, strict=True)
+            slice(*np.searchsorted(centers, (low - grid.spacing, high + grid.spacing)).clip(first, last))
+            for centers, low, high, first, last in zip(
+                grid.centers, obstacle.lower, obstacle.upper, grid.first, grid.last, strict=True
+            )
         )
         axes = (
             torch.from_numpy(centers[part] + 1e-6 * grid.spacing)

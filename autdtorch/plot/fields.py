@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import cast
 
 import numpy as np
@@ -14,6 +14,7 @@ from matplotlib.patheffects import withStroke
 
 from autdtorch.drawing import MM, PRESSURE_MAP, Array, plane_magnitude
 from autdtorch.geometry import Plane
+from autdtorch.obstacles import Obstacle
 from autdtorch.plot.style import (
     TICK_SIZE,
     ByMethod,
@@ -28,10 +29,16 @@ from autdtorch.validation import ArrayLike, points_tensor
 
 _AXIS_TOLERANCE = 1e-12  # by which a unit vector along x, y or z may miss length 1 in that coordinate
 
+_OUTLINE_CELLS = 400  # along the longer side of a plane, to find where obstacles cut it
+
 
 @styled
 def plot_plane(
-    pressure: ArrayLike, plane: Plane, control_points: ArrayLike | None = None, ax: Axes | None = None
+    pressure: ArrayLike,
+    plane: Plane,
+    control_points: ArrayLike | None = None,
+    obstacles: Iterable[Obstacle] = (),
+    ax: Axes | None = None,
 ) -> Figure:
     """Map of the pressure magnitude on a plane, over the coordinates along its edges.
 
@@ -39,6 +46,7 @@ def plot_plane(
         pressure: complex pressure or its magnitude (Nu, Nv) [Pa], at `plane.points(...)`.
         plane: where it was taken.
         control_points: (P, 3) [m]; those in the plane are circled.
+        obstacles: where the plane cuts them, they are outlined.
         ax: axes to draw into; by default those of a new figure.
 
     Returns:
@@ -51,7 +59,7 @@ def plot_plane(
         ax = new_figure(4.4, 3.6).add_subplot()
     figure = cast(Figure, ax.get_figure(root=True))
     magnitude = plane_magnitude("pressure", pressure)
-    mesh = _draw_plane(ax, magnitude, plane, control_points, magnitude.max())
+    mesh = _draw_plane(ax, magnitude, plane, control_points, obstacles, magnitude.max())
     _add_colour_bar(figure, mesh, [ax], "vertical")
     return figure
 
@@ -61,6 +69,7 @@ def plot_planes(
     pressure: Mapping[str, ByMethod],
     planes: Mapping[str, Plane],
     control_points: Mapping[str, ArrayLike] | None = None,
+    obstacles: Mapping[str, Iterable[Obstacle]] | None = None,
 ) -> Figure:
     """The paper's Fig. 2: pressure maps, a row for each method and a column for each scene.
 
@@ -71,6 +80,7 @@ def plot_planes(
             method that another has, its place stays empty.
         planes: the plane of each scene.
         control_points: of each scene (P, 3) [m]; those in the plane are circled.
+        obstacles: of each scene; where the plane cuts them, they are outlined.
 
     Returns:
         The figure.
@@ -93,11 +103,12 @@ def plot_planes(
         }
         peak = max(magnitude.max() for magnitude in magnitudes.values())
         points = None if control_points is None else control_points[scene]
+        outlined = () if obstacles is None else tuple(obstacles[scene])
         for ax, method in zip(column, methods, strict=True):
             if method not in magnitudes:
                 ax.set_axis_off()
                 continue
-            mesh = _draw_plane(ax, magnitudes[method], planes[scene], points, peak)
+            mesh = _draw_plane(ax, magnitudes[method], planes[scene], points, outlined, peak)
             ax.set_title(f"{label_of(method)}, {readable(scene)}")
             if alike:
                 ax.label_outer()
@@ -106,7 +117,12 @@ def plot_planes(
 
 
 def _draw_plane(
-    ax: Axes, magnitude: Array, plane: Plane, control_points: ArrayLike | None, peak: float
+    ax: Axes,
+    magnitude: Array,
+    plane: Plane,
+    control_points: ArrayLike | None,
+    obstacles: Iterable[Obstacle],
+    peak: float,
 ) -> QuadMesh:
     (label_u, edges_u), (label_v, edges_v) = (
         _plane_axis(plane, side, cells) for side, cells in enumerate(magnitude.shape)
@@ -114,6 +130,8 @@ def _draw_plane(
     mesh = ax.pcolormesh(
         edges_u, edges_v, magnitude.T, cmap=PRESSURE_MAP, vmin=0.0, vmax=peak, rasterized=True
     )
+    for obstacle in obstacles:
+        _outline(ax, plane, obstacle)
     if control_points is not None:
         _circle_points(ax, plane, points_tensor("control_points", control_points), max(magnitude.shape))
     ax.set(xlabel=label_u, ylabel=label_v, aspect="equal")
@@ -132,6 +150,17 @@ def _plane_axis(plane: Plane, side: int, cells: int) -> tuple[str, Array]:
     if direction[axis].abs() <= 1 - _AXIS_TOLERANCE:
         return f"{'uv'[side]} [mm]", along
     return f"{'xyz'[axis]} [mm]", MM * plane.center[axis] + float(direction[axis]) * along
+
+
+def _outline(ax: Axes, plane: Plane, obstacle: Obstacle) -> None:
+    """Draw where the surface of the obstacle cuts the plane."""
+    distance = obstacle.signed_distance(plane.points(max(plane.size) / _OUTLINE_CELLS)).numpy()
+    if not distance.min() < 0 < distance.max():
+        return
+    edges = (_plane_axis(plane, side, cells)[1] for side, cells in enumerate(distance.shape))
+    centers = ((along[:-1] + along[1:]) / 2 for along in edges)
+    lines = ax.contour(*centers, distance.T, levels=[0.0], colors="white", linewidths=1.0)
+    lines.set_path_effects([withStroke(linewidth=2.2, foreground="black")])
 
 
 def _circle_points(ax: Axes, plane: Plane, points: torch.Tensor, cells: int) -> None:

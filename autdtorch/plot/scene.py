@@ -2,27 +2,46 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, cast
 
 import numpy as np
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
-from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from numpy.typing import NDArray
 
 from autdtorch.drawing import (
     EDGE_COLOUR,
     FOCUS_COLOUR,
     MM,
+    MOST_EDGES,
     OBSTACLE_COLOUR,
     PHASE_MAP,
     PLANE_COLOUR,
+    SHARP_ANGLE,
     TRANSDUCER_COLOUR,
     Array,
+    clipped,
     single_drive_phases,
 )
+from autdtorch.obstacles import Obstacle
 from autdtorch.plot.style import TICK_SIZE, new_figure, styled
-from autdtorch.scene import Box, Scene
-from autdtorch.validation import ArrayLike
+from autdtorch.scene import Scene
+from autdtorch.validation import ArrayLike, Vector
+
+_ELEVATION, _AZIMUTH = 22.0, -118.0  # of the viewer [degrees]
+
+
+def _direction(elevation: float, azimuth: float) -> Array:
+    """Unit vector (3,) from angles [degrees]."""
+    up, around = np.radians((elevation, azimuth))
+    return np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
+
+
+_TO_VIEWER = _direction(_ELEVATION, _AZIMUTH)
+_LIGHT = _direction(50.0, -160.0)
 
 
 @styled
@@ -44,10 +63,9 @@ def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
     if scene.observation_plane is not None:
         corners = scene.observation_plane.corners[[0, 1, 3, 2]].numpy()
         ax.add_collection3d(Poly3DCollection([MM * corners], facecolor=PLANE_COLOUR, alpha=0.3, zorder=1))
-    for box in scene.obstacles:
-        ax.add_collection3d(
-            Poly3DCollection(_faces(box), facecolor=OBSTACLE_COLOUR, edgecolor=EDGE_COLOUR, zorder=2)
-        )
+    # From far to near: with the order of drawing fixed, what comes later covers what came before.
+    for obstacle in sorted(scene.obstacles, key=_nearness):
+        _add_obstacle(ax, obstacle, scene.domain)
     foci = MM * scene.control_points.numpy()
     ax.scatter(*foci.T, color=FOCUS_COLOUR, s=22, depthshade=False, label="control points", zorder=3)
     _scatter_transducers(ax, scene, drive)
@@ -57,18 +75,70 @@ def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
     ax.zaxis.set_rotate_label(False)  # which would set it upside down
     ax.set_zlabel("z [mm]", rotation=90)
     ax.set_box_aspect(upper - lower, zoom=0.85)
-    ax.view_init(elev=22, azim=-118)
+    ax.view_init(elev=_ELEVATION, azim=_AZIMUTH)
     ax.tick_params(labelsize=TICK_SIZE)
     ax.legend(loc="upper left")
     return figure
 
 
-def _faces(box: Box) -> list[Array]:
-    """The six faces of a box, four corners each [mm]."""
-    grid = np.meshgrid(*zip(box.lower, box.upper, strict=True), indexing="ij")
-    corners = MM * np.stack(grid, axis=-1)
-    faces = [corners.take(end, axis=axis) for axis in range(3) for end in (0, 1)]
-    return [face.reshape(4, 3)[[0, 1, 3, 2]] for face in faces]
+def _nearness(obstacle: Obstacle) -> float:
+    """Position of the middle along the direction to the viewer."""
+    middle = (np.array(obstacle.lower) + np.array(obstacle.upper)) / 2
+    return float(middle @ _TO_VIEWER)
+
+
+def _add_obstacle(ax: Axes3D, obstacle: Obstacle, domain: tuple[Vector, Vector]) -> None:
+    """The triangles that face the viewer, shaded, and the sharp edges of these.
+
+    An obstacle that the domain cuts off is left open there: one looks at its far side, which is drawn first.
+    """
+    vertices, faces = (part.numpy() for part in obstacle.surface())
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
+    front = normals @ _TO_VIEWER > 0
+    if (vertices < domain[0]).any() or (vertices > domain[1]).any():
+        _add_faces(ax, corners[~front], normals[~front], domain)
+    _add_faces(ax, corners[front], normals[front], domain)
+    edges = vertices[_sharp_edges(faces, normals, front)]
+    if len(edges) > MOST_EDGES:
+        return
+    lines = [clipped(edge, *domain) for edge in edges[~_hidden(obstacle, edges.mean(axis=1))]]
+    if lines := [MM * line for line in lines if len(line)]:  # Matplotlib refuses a collection of none
+        ax.add_collection3d(Line3DCollection(lines, colors=EDGE_COLOUR, lw=0.8, zorder=2))
+
+
+def _add_faces(ax: Axes3D, corners: Array, normals: Array, domain: tuple[Vector, Vector]) -> None:
+    """Draw what the domain holds of the triangles (F, 3, 3) [m] with unit normals (F, 3)."""
+    light = 0.7 + 0.3 * normals @ _LIGHT
+    colours = np.clip(light[:, None] * to_rgb(OBSTACLE_COLOUR), 0, 1)
+    polygons = [clipped(triangle, *domain) for triangle in corners]
+    left = [index for index, polygon in enumerate(polygons) if len(polygon)]
+    if not left:
+        return
+    # Edges of the faces' own colours close the seams between them.
+    style: Any = {"facecolor": colours[left], "edgecolor": colours[left], "lw": 0.3, "zorder": 2}
+    ax.add_collection3d(Poly3DCollection([MM * polygons[index] for index in left], **style))
+
+
+def _hidden(obstacle: Obstacle, points: Array) -> NDArray[np.bool_]:
+    """Which points (N, 3) [m] on the surface the obstacle itself hides from the viewer (N,)."""
+    across = math.dist(obstacle.lower, obstacle.upper)
+    steps = across * (np.arange(64) + 0.5) / 64
+    return obstacle.contains(points[:, None] + steps[:, None] * _TO_VIEWER).any(dim=1).numpy()
+
+
+def _sharp_edges(faces: NDArray[np.int64], normals: Array, front: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Vertex pairs (E, 2) of the edges of a `front` face whose other face is turned by over `SHARP_ANGLE`."""
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    face = np.tile(np.arange(len(faces)), 3)
+    pairs = np.sort(ends, axis=1)
+    # On a closed surface the faces of an edge follow each other in this order.
+    order = np.lexsort(pairs.T)
+    one, other = face[order[0::2]], face[order[1::2]]
+    sharp = (normals[one] * normals[other]).sum(axis=1) < np.cos(SHARP_ANGLE)
+    edges: NDArray[np.int64] = pairs[order[0::2]][sharp & (front[one] | front[other])]
+    return edges
 
 
 def _scatter_transducers(ax: Axes3D, scene: Scene, drive: ArrayLike | None) -> None:

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
@@ -119,7 +120,7 @@ def test_the_papers_experiment(composed: Callable[..., dict[str, object]]) -> No
 
 
 WRONG = [
-    (["scene=thre_cubes"], "scene: 'thre_cubes'; must be one of homogeneous, three_cubes, two_cubes"),
+    (["scene=thre_cubes"], "scene: 'thre_cubes'; must be one of homogeneous, sphere, three_cubes, two_cubes"),
     (["experiment=nature"], "experiment: 'nature'; must be one of paper"),
     (["spacing=1e-3"], "spacing: unknown key"),
     (["solver.spcing=1e-3"], r"solver\.spcing: unknown key"),
@@ -217,6 +218,20 @@ def test_what_is_finished_is_not_computed_again(
     # Where results go does not change them, but there is nothing to use elsewhere.
     with pytest.raises(pytest.fail.Exception):
         run(*command[:-1], "output=elsewhere")
+
+
+def test_a_changed_obstacle_file_is_computed_again(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    obstacle = "{type: voxel_mask, path: mask.npy, spacing: 1e-3, origin: [40e-3, 0, 0], rigid: true}"
+    command = (
+        *("method=lssg", "solver.method=free_space", "plane_spacing=10e-3", "output=out"),
+        f"scene.obstacles=[{obstacle}]",
+    )
+    for size, reused in ((2, False), (2, True), (3, False)):
+        np.save(tmp_path / "mask.npy", np.ones((size,) * 3, bool))
+        assert run(*command) == 0
+        assert ("re-using" in capsys.readouterr().err) is reused
 
 
 def test_ones_own_scene_file(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,7 +13,8 @@ from autdtorch.array import TransducerArray
 from autdtorch.drive import drive_from_phases, focus_phases, normalise, phases_of, validate_drive
 from autdtorch.freespace import free_space_matrix, green
 from autdtorch.geometry import Plane, circle_points, plane_basis
-from autdtorch.scene import Box, Medium, Scene
+from autdtorch.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
+from autdtorch.scene import Medium, Scene
 from autdtorch.scene_file import load_scene
 
 SCENES = Path(__file__).parents[2] / "configs" / "scene"
@@ -27,6 +28,14 @@ def medium(**changes):
 def box(**changes):
     material = {"density": 100.0, "sound_speed": 340.0}
     return Box(**{"center": (41e-3, 50e-3, 50e-3), "size": (10e-3,) * 3} | material | changes)
+
+
+def cylinder(**changes):
+    return Cylinder(**{"center": (0, 0, 0), "radius": 1e-3, "height": 1e-3, "rigid": True} | changes)
+
+
+def voxels(mask, **changes):
+    return VoxelMask(**{"mask": mask, "spacing": 1e-3, "rigid": True} | changes)
 
 
 def grid(**changes):
@@ -79,6 +88,52 @@ WRONG = {
     "box centre nan": (lambda: box(center=(NAN, 0, 0)), "Box.center: (nan, 0.0, 0.0) m; every entry must be"),
     "box centre text": (lambda: box(center=("a", 0, 0)), "Box.center: ('a', 0, 0); must be an array of real"),
     "box centre boolean": (lambda: box(center=(True, 0, 0)), "Box.center: (True, 0, 0); must be an array of"),
+    "box rotation of one": (lambda: box(rotation=0.5), "Box.rotation: 0.5; must be 3 real numbers [rad]"),
+    "sphere radius": (
+        lambda: Sphere((0, 0, 0), -1e-3, rigid=True),
+        "Sphere.radius: -0.001 m; must be finite and > 0",
+    ),
+    "sphere without material": (lambda: Sphere((0, 0, 0), 1e-3), "Sphere.density: None; must have both"),
+    "cylinder height": (lambda: cylinder(height=INF), "Cylinder.height: inf m; must be finite"),
+    "cylinder axis": (
+        lambda: cylinder(axis=(0, 0, 0)),
+        "Cylinder.axis: (0, 0, 0); must be a vector of finite",
+    ),
+    "mesh of another format": (
+        lambda: Mesh("chair.step", rigid=True),
+        "Mesh.path: 'chair.step'; must end in one of .stl, .obj, .ply",
+    ),
+    "mesh missing": (
+        lambda: Mesh("no/such.stl", rigid=True),
+        "Mesh.path: 'no/such.stl'; must be an existing file",
+    ),
+    "mesh path a number": (lambda: Mesh(3, rigid=True), "Mesh.path: 3; must be the path of a file"),
+    "mesh scale": (lambda: Mesh("a.stl", scale=0, rigid=True), "Mesh.scale: 0; must be finite and > 0"),
+    "mask of numbers": (
+        lambda: voxels(np.ones((2, 2, 2))),
+        "VoxelMask.mask: array of shape (2, 2, 2) and type float64; must be (nx, ny, nz) of booleans",
+    ),
+    "mask flat": (
+        lambda: voxels(np.ones((2, 2), bool)),
+        "VoxelMask.mask: array of shape (2, 2) and type bool",
+    ),
+    "mask empty": (
+        lambda: voxels(np.zeros((2, 3, 4), bool)),
+        "VoxelMask.mask: array of shape (2, 3, 4); must be True somewhere",
+    ),
+    "mask spacing": (
+        lambda: voxels(np.ones((1, 1, 1), bool), spacing=0),
+        "VoxelMask.spacing: 0 m; must be finite and > 0",
+    ),
+    "mask file missing": (
+        lambda: VoxelMask.load("no/such.npy", 1e-3, rigid=True),
+        "VoxelMask.path: 'no/such.npy'; must be a .npy or .npz file (",
+    ),
+    "points of an obstacle": (lambda: box().contains([1.0, 2.0]), "points: shape (2,); must be (..., 3)"),
+    "margin of an obstacle": (
+        lambda: box().contains([0, 0, 0], margin=-1e-3),
+        "margin: -0.001 m; must be finite and >= 0",
+    ),
     "box rigid and material": (lambda: box(rigid=True), "Box.rigid: (100.0, 340.0); must have either"),
     "box neither": (lambda: box(density=None, sound_speed=None), "Box.density: None; must have both"),
     "box half a material": (lambda: box(sound_speed=None), "Box.sound_speed: None; must have both"),
@@ -239,7 +294,7 @@ WRONG = {
     "obstacles not a sequence": (lambda: scene(obstacles=box()), "must be a sequence of obstacles"),
     "obstacle of another type": (
         lambda: scene(obstacles=["box"]),
-        "Scene.obstacles[0]: 'box'; must be a Box",
+        "Scene.obstacles[0]: 'box'; must be an Obstacle",
     ),
     "one control point without a list": (
         lambda: scene(control_points=(80e-3, 50e-3, 50e-3)),
@@ -281,10 +336,6 @@ WRONG = {
         lambda: scene(obstacles=[box()], control_points=[(46e-3, 50e-3, 50e-3)]),
         "must be outside it",
     ),
-    "obstacles overlap": (
-        lambda: scene(obstacles=[box(), box(center=(50e-3, 50e-3, 50e-3))]),
-        "overlaps obstacle 0 by 0.001 m, may touch it but not overlap",
-    ),
     "domain upside down": (
         lambda: scene(domain=((0, 0, 0), (0.1, 0.1, 0))),
         "Scene.domain: ((0.0, 0.0, 0.0), (0.1, 0.1, 0.0)) m; lower must be below upper on every axis",
@@ -298,9 +349,9 @@ WRONG = {
         lambda: scene(domain=((0.01, 0, 0), (0.1, 0.1, 0.1))),
         "Scene.array.positions[0]: (0.001, 0.035, 0.035) m; must be inside the domain",
     ),
-    "obstacle partly outside the domain": (
-        lambda: scene(domain=((0, 0, 0), (0.1, 0.1, 0.1)), obstacles=[box(center=(41e-3, 50e-3, 98e-3))]),
-        "Scene.obstacles[0] corner[1]: (0.046, 0.055, 0.103",
+    "obstacle outside the domain": (
+        lambda: scene(domain=((0, 0, 0), (0.1, 0.1, 0.1)), obstacles=[box(center=(41e-3, 50e-3, 105e-3))]),
+        "Scene.obstacles[0]: (0.036, 0.045, 0.1) to (0.046, 0.055, 0.11) m; must be at least partly inside",
     ),
     "observation plane outside the domain": (
         lambda: scene(domain=((0, 0, 0), (0.1, 0.1, 0.1)), observation_plane=plane(size=(0.1, 0.2))),
@@ -358,6 +409,40 @@ def test_wrong_input_is_named(call, message):
     with pytest.raises(ValueError) as caught:  # noqa: PT011  (compared as plain text below)
         call()
     assert message in str(caught.value)
+
+
+ONE_TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+MESHES = {
+    "open.obj": (
+        ONE_TRIANGLE,
+        "3 of its 3 edges do not join two triangles of one orientation, must be watertight",
+    ),
+    "flat.obj": (ONE_TRIANGLE + "f 3 2 1\n", "must enclose a volume"),
+    "twice.obj": (ONE_TRIANGLE + "f 1 2 3\n", "3 of its 3 edges do not join"),
+    "no_vertex.obj": ("v 0 0 0\nv 1 0 0\nf 1 2 7\n", "must be a mesh file that holds triangles"),
+    "empty.obj": ("", "must be a mesh file"),
+    "text.stl": ("hello", "must be a mesh file"),
+    "text.ply": ("hello", "must be a mesh file"),
+}
+
+
+@pytest.mark.parametrize(("name", "content", "message"), [(name, *case) for name, case in MESHES.items()])
+def test_what_is_no_watertight_mesh_is_refused(tmp_path, name, content, message):
+    path = tmp_path / name
+    path.write_text(content)
+    with pytest.raises(ValueError, match=r"^Mesh\.path: .*") as caught:
+        Mesh(path, rigid=True)
+    assert message in str(caught.value)
+
+
+def test_what_is_no_mask_file_is_refused(tmp_path):
+    path = tmp_path / "two.npz"
+    np.savez(path, a=np.ones(1), b=np.ones(1))
+    with pytest.raises(ValueError, match="holds 2 arrays, must hold a single one"):
+        VoxelMask.load(path, 1e-3, rigid=True)
+    path.write_bytes(b"PK\x03\x04 and then nothing")
+    with pytest.raises(ValueError, match=r"VoxelMask\.path: .* must be a \.npy or \.npz file"):
+        VoxelMask.load(path, 1e-3, rigid=True)
 
 
 FILES = {

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
@@ -10,10 +11,14 @@ import pytest
 import torch
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
+from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from small_scenes import scene_of_all_kinds, small_scene
 
 import autdtorch as at
+from autdtorch.drawing import clipped
 from autdtorch.plot import plot_convergence, plot_plane, plot_planes, plot_scene, plot_trials
 
 PLANE = at.Plane(center=(80e-3, 50e-3, 40e-3), normal=(1, 0, 0), size=(60e-3, 40e-3))
@@ -75,6 +80,54 @@ def test_control_points_in_the_plane_are_circled_and_others_are_not() -> None:
     inside, off = [80e-3, 30e-3, 45e-3], [60e-3, 30e-3, 45e-3]
     (circles,) = plot_plane(np.ones((6, 4)), PLANE, [inside, off]).axes[0].get_lines()
     np.testing.assert_allclose(circles.get_xydata(), [[30.0, 45.0]])
+
+
+def test_obstacles_are_outlined_where_the_plane_cuts_them() -> None:
+    cut = at.Sphere((80e-3, 45e-3, 38e-3), 10e-3, rigid=True)
+    off = at.Sphere((95e-3, 45e-3, 38e-3), 10e-3, rigid=True)
+    ax = plot_plane(np.ones((6, 4)), PLANE, obstacles=(cut, off)).axes[0]
+    (outline,) = (artist for artist in ax.collections if isinstance(artist, ContourSet))
+    ((points,),) = outline.allsegs
+    # Straight lines between samples 0.15 mm apart leave the circle by far less.
+    np.testing.assert_allclose(np.linalg.norm(points - [45, 38], axis=1), 10, atol=1e-3)
+
+
+def test_every_kind_of_obstacle_is_drawn(tmp_path: Path) -> None:
+    figure = plot_scene(scene_of_all_kinds(tmp_path))
+    figure.canvas.draw()
+    # The plane; faces of five obstacles; edges of all but the sphere; points and transducers.
+    assert len(figure.axes[0].collections) == 1 + 5 + 4 + 2
+
+
+def test_edges_that_their_own_obstacle_hides_are_not_drawn() -> None:
+    slab = np.zeros((5, 4, 5), bool)
+    slab[:, 0] = True
+    with_voxel_behind = slab.copy()
+    with_voxel_behind[3, 3, 1] = True  # seen from low x, low y and high z, the slab is in front of it
+    drawn = []
+    for mask in (slab, with_voxel_behind):
+        voxels = at.VoxelMask(mask, 4e-3, origin=(30e-3, 30e-3, 30e-3), rigid=True)
+        ax = plot_scene(small_scene((voxels,), extent=80e-3)).axes[0]
+        (edges,) = (artist for artist in ax.collections if isinstance(artist, Line3DCollection))
+        drawn.append(edges._segments3d)
+    np.testing.assert_array_equal(*drawn)
+
+
+def test_what_is_drawn_of_an_obstacle_ends_at_the_domain() -> None:
+    triangle = np.array([(-1.0, 0.5, 0.5), (3.0, 0.5, 0.5), (-1.0, 0.5, 4.5)])  # x + z <= 3.5 at y = 0.5
+    inside = clipped(triangle, (0, 0, 0), (2, 1, 2))
+    wanted = {(0, 0.5, 0.5), (2, 0.5, 0.5), (2, 0.5, 1.5), (1.5, 0.5, 2), (0, 0.5, 2)}
+    assert {tuple(corner) for corner in inside.tolist()} == wanted
+    assert {tuple(end) for end in clipped(triangle[:2], (0, 0, 0), (2, 1, 2)).tolist()} == {
+        (0, 0.5, 0.5),
+        (2, 0.5, 0.5),
+    }
+    assert clipped(triangle, (0, 1, 0), (2, 2, 2)).shape == (0, 3)
+    wall = at.Box((50e-3, 40e-3, 40e-3), (10e-3, 1.0, 1.0), rigid=True)
+    ax = plot_scene(small_scene((wall,), extent=80e-3)).axes[0]
+    # The wall is open at the edges of the domain, so that its far side is drawn too; its edges are outside.
+    assert sum(isinstance(artist, Poly3DCollection) for artist in ax.collections) == 2
+    assert not any(isinstance(artist, Line3DCollection) for artist in ax.collections)
 
 
 def test_plane_map_draws_into_given_axes() -> None:
@@ -181,7 +234,10 @@ def test_scene_draws_everything_in_mm() -> None:
     ax = figure.axes[0]
     assert (ax.get_xlabel(), ax.get_ylabel(), ax.get_zlabel()) == ("x [mm]", "y [mm]", "z [mm]")
     assert figure.axes[1].get_ylabel() == "phase [rad]"
-    _plane, _box, foci, transducers = ax.collections
+    _plane, box, edges, foci, transducers = ax.collections
+    assert len(box._faces) == 6  # triangles of the three faces that the viewer sees
+    assert len(edges._segments3d) == 9
+    np.testing.assert_allclose(np.concatenate(edges._segments3d).max(axis=0), [45, 5, 5])
     np.testing.assert_allclose(np.stack(foci._offsets3d, axis=-1), [[80, 0, 0]])
     np.testing.assert_allclose(
         np.stack(transducers._offsets3d, axis=-1), 1e3 * scene.array.positions, atol=1e-9

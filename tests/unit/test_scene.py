@@ -8,8 +8,10 @@ import pytest
 import torch
 
 from autdtorch.array import TransducerArray
+from autdtorch.fdtd.grid import fill_medium, make_grid
 from autdtorch.geometry import Plane, circle_points
-from autdtorch.scene import Box, Medium, Scene
+from autdtorch.obstacles import Box, Sphere
+from autdtorch.scene import Medium, OverlapWarning, Scene
 
 AIR = Medium(density=1.293, sound_speed=340.0)
 
@@ -67,6 +69,50 @@ def test_obstacles_may_touch_by_edge_or_by_face():
 def test_touching_allows_for_rounding(shift):
     lower, upper = cube(30, 50, 50, 6), cube(36 + 1e3 * shift, 50, 50, 6)
     assert len(paper_scene(obstacles=(lower, upper)).obstacles) == 2
+
+
+def ball(x, radius, density):
+    return Sphere((1e-3 * x, 50e-3, 50e-3), 1e-3 * radius, density=density, sound_speed=340.0)
+
+
+def test_overlapping_obstacles_of_different_materials_are_named():
+    with pytest.warns(
+        OverlapWarning, match=r"obstacles\[2\] overlaps obstacle 0 .* obstacle 2 counts"
+    ) as caught:
+        paper_scene(obstacles=[ball(40, 8, 100.0), ball(60, 8, 50.0), ball(45, 8, 50.0)])
+    assert len(caught) == 1  # and not 2 with 1, which are of one material
+    assert caught[0].filename == __file__
+
+
+def test_obstacles_of_one_material_may_overlap_and_those_of_two_may_touch():
+    paper_scene(obstacles=[ball(40, 8, 100.0), ball(45, 8, 100.0)])
+    paper_scene(obstacles=[ball(40, 5, 100.0), ball(50, 5, 50.0)])
+    diagonal = Sphere(
+        (46e-3, 56e-3, 56e-3), 5e-3, rigid=True
+    )  # 0.4 mm off, though the bounding boxes overlap
+    paper_scene(obstacles=[ball(40, 5, 100.0), diagonal])
+
+
+def test_the_later_of_two_overlapping_obstacles_counts_and_the_boundary_layer_stays_air():
+    wall = Box((50e-3, 0.0, 50e-3), (10e-3, 1.0, 1.0), density=10.0, sound_speed=340.0)  # through the domain
+    with pytest.warns(OverlapWarning):
+        scene = paper_scene(obstacles=[wall, ball(50, 8, 50.0)], domain=((0, 0, 0), (0.1,) * 3))
+    grid = make_grid(scene, 2e-3)
+    density = fill_medium(scene, grid).density
+    at = tuple(int(cell) for cell in grid.to_cells(torch.tensor([50e-3, 50e-3, 50e-3])).round())
+    interior = tuple(slice(first, last) for first, last in zip(grid.first, grid.last, strict=True))
+    assert density[at] == 50.0
+    assert (density[at[0]][interior[1:]] != AIR.density).all()
+    density[interior] = AIR.density
+    assert (density == AIR.density).all()
+
+
+def test_obstacles_may_reach_beyond_the_domain():
+    domain = ((0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
+    wall = Box((90e-3, 50e-3, 50e-3), (10e-3, 1.0, 1.0), rigid=True)
+    assert paper_scene(obstacles=[wall], domain=domain).domain == domain
+    lower, upper = paper_scene(obstacles=[wall]).domain
+    assert (lower[1], upper[2]) == pytest.approx((-0.45 - 17e-3, 0.55 + 17e-3))
 
 
 def test_default_domain_holds_everything_and_two_wavelengths_more():

@@ -1,10 +1,12 @@
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
 
-from autdtorch.scene import Box, Medium
+from autdtorch.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
+from autdtorch.scene import Medium
 from autdtorch.scene_file import load_scene
 
 SCENES = Path(__file__).parents[2] / "configs" / "scene"
@@ -101,3 +103,44 @@ def test_rigid_box():
     obstacle = {"type": "box", "center": [40e-3, 0, 0], "size": [1e-2] * 3, "rigid": True}
     scene = load_scene({**OmegaConf.create(SMALL), "obstacles": [obstacle]})
     assert scene.obstacles == (Box((40e-3, 0.0, 0.0), (1e-2,) * 3, rigid=True),)
+
+
+def test_obstacles_of_every_type_with_files_beside_the_scene(tmp_path):
+    mask = np.ones((2, 3, 4), bool)
+    np.save(tmp_path / "mask.npy", mask)
+    (tmp_path / "shapes").mkdir()
+    tetrahedron = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    (tmp_path / "shapes" / "corner.obj").write_text(tetrahedron)
+    path = tmp_path / "scene.yaml"
+    path.write_text(
+        SMALL
+        + """
+obstacles:
+  - {type: box, center: [20e-3, 0, 0], size: [5e-3, 5e-3, 5e-3], rotation: [0, 0, 0.5], rigid: true}
+  - {type: sphere, center: [30e-3, 0, 0], radius: 3e-3, density: 100.0, sound_speed: 340.0}
+  - {type: cylinder, center: [40e-3, 0, 0], radius: 3e-3, height: 9e-3, axis: [0, 1, 1], rigid: true}
+  - {type: mesh, path: shapes/corner.obj, scale: 5e-3, offset: [50e-3, 0, 0], rigid: true}
+  - {type: voxel_mask, path: mask.npy, spacing: 1e-3, origin: [60e-3, 0, 0], rigid: true}
+"""
+    )
+    assert load_scene(path).obstacles == (
+        Box((20e-3, 0, 0), (5e-3,) * 3, rotation=(0, 0, 0.5), rigid=True),
+        Sphere((30e-3, 0, 0), 3e-3, density=100.0, sound_speed=340.0),
+        Cylinder((40e-3, 0, 0), 3e-3, 9e-3, axis=(0, 1, 1), rigid=True),
+        Mesh(tmp_path / "shapes" / "corner.obj", scale=5e-3, offset=(50e-3, 0, 0), rigid=True),
+        VoxelMask(mask, 1e-3, origin=(60e-3, 0, 0), rigid=True),
+    )
+
+
+def test_path_in_a_mapping_starts_from_the_working_directory(tmp_path, monkeypatch):
+    np.save(tmp_path / "mask.npy", np.ones((2, 3, 4), bool))
+    monkeypatch.chdir(tmp_path)
+    obstacle = {
+        "type": "voxel_mask",
+        "path": "mask.npy",
+        "spacing": 1e-3,
+        "origin": [60e-3, 0, 0],
+        "rigid": True,
+    }
+    (found,) = load_scene({**OmegaConf.create(SMALL), "obstacles": [obstacle]}).obstacles
+    assert found.upper == pytest.approx((62e-3, 3e-3, 4e-3))

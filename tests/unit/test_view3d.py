@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from small_scenes import scene_of_all_kinds, small_scene
 
 import autdtorch as at
 from autdtorch.view3d import rendering_problem, view3d
@@ -109,6 +110,28 @@ def test_a_picture_is_written_and_not_blank(scene: at.Scene, tmp_path: Path) -> 
     # The discs are drawn without lighting, so that their colour is exact: at least 100 pixels each, of 12.
     disc = np.abs(picture[..., :3] - np.array([0x00, 0x72, 0xB2]) / 255).max(axis=-1) < 0.01
     assert disc.sum() > 1200
+
+
+@pytest.mark.usefixtures("renderer")
+def test_obstacles_are_drawn_where_they_are_in_millimetres(tmp_path: Path) -> None:
+    scene = scene_of_all_kinds(tmp_path)
+    plotter = view3d(scene)
+    drawn = [mesh.bounds for mesh in plotter.meshes]
+    plotter.close()
+    for obstacle in scene.obstacles:
+        vertices, _ = obstacle.surface()
+        wanted = 1e3 * torch.stack([vertices.amin(dim=0), vertices.amax(dim=0)]).T.reshape(-1).numpy()
+        assert any(np.allclose(bounds, wanted, atol=1e-4) for bounds in drawn)  # VTK keeps float32
+
+
+@pytest.mark.usefixtures("renderer")
+def test_a_wall_is_drawn_as_far_as_the_domain() -> None:
+    wall = at.Box((50e-3, 40e-3, 40e-3), (10e-3, 1.0, 1.0), rigid=True)
+    outside = at.Sphere((85e-3, 85e-3, 85e-3), 8e-3, rigid=True)  # but for its bounding box
+    plotter = view3d(small_scene((wall, outside), extent=80e-3))
+    bounds = [mesh.bounds for mesh in plotter.meshes]
+    plotter.close()
+    assert any(np.allclose(found, (45, 55, 0, 80, 0, 80), atol=1e-4) for found in bounds)  # VTK keeps float32
 
 
 @pytest.mark.usefixtures("renderer")

@@ -1,0 +1,227 @@
+"""Obstacles of every kind: inside, distance and surface agree with each other and with exact solutions."""
+
+import math
+import pickle
+
+import igl
+import numpy as np
+import pytest
+import torch
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from autdtorch.geometry import rotation_matrix
+from autdtorch.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
+
+CENTER, TURN = (0.4, -0.2, 0.1), (0.5, -0.3, 2.0)
+BOX = Box(CENTER, (1.0, 0.6, 0.4), rotation=TURN, rigid=True)
+SPHERE = Sphere(CENTER, 0.7, rigid=True)
+CYLINDER = Cylinder(CENTER, 0.5, 1.2, axis=(1, -2, 0.5), rigid=True)
+PRIMITIVES = pytest.mark.parametrize("shape", [BOX, SPHERE, CYLINDER], ids=lambda shape: type(shape).__name__)
+
+# The 48 x 24 facets of a sphere reach 3.75 degrees each way: this share of the radius inside at most.
+SAGITTA = 1 - math.cos(math.radians(math.hypot(3.75, 3.75)))
+
+
+def saved(folder, name, vertices, faces):
+    igl.write_triangle_mesh(str(folder / name), np.asarray(vertices), np.ascontiguousarray(faces))
+    return folder / name
+
+
+def cloud(count=2000, spread=1.5, seed=0):
+    return torch.randn(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * spread
+
+
+def volume(vertices, faces):
+    return float(torch.linalg.det(vertices[faces]).sum() / 6)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("meshes")
+
+
+@pytest.fixture(scope="module")
+def box_mesh(folder):
+    return Mesh(saved(folder, "box.obj", *Box(CENTER, (1.0, 0.6, 0.4), rigid=True).surface()), rigid=True)
+
+
+@PRIMITIVES
+@settings(deadline=None, max_examples=50)  # the first call of torch takes long
+@given(st.tuples(*[st.floats(-2, 2)] * 3))
+def test_the_gradient_leads_back_to_the_nearest_point_of_the_surface(shape, point):
+    # Outside a convex body the distance has a gradient everywhere: of length 1, away from the nearest point.
+    points = torch.tensor([point], dtype=torch.float64, requires_grad=True)
+    distance = shape.signed_distance(points)
+    assume(distance.item() > 1e-3)
+    (gradient,) = torch.autograd.grad(distance.sum(), points)
+    assert torch.linalg.vector_norm(gradient).item() == pytest.approx(1.0, abs=1e-12)
+    nearest = points.detach() - distance.detach()[:, None] * gradient
+    assert shape.signed_distance(nearest).abs().item() < 1e-11  # rounding, 1e-14, over the shortest distance
+
+
+@PRIMITIVES
+def test_distance_inside_is_that_to_the_nearest_of_many_points_of_the_surface(shape):
+    inside = cloud(4000, 0.4)[shape.contains(cloud(4000, 0.4))]
+    vertices, faces = shape.surface()
+    weights = torch.distributions.Dirichlet(torch.ones(3, dtype=torch.float64))
+    torch.manual_seed(0)
+    corners = vertices[faces].repeat(max(1, 40000 // len(faces)), 1, 1)
+    surface = (weights.sample((len(corners),))[..., None] * corners).sum(dim=1)
+    nearest = torch.cdist(inside[:200], surface).amin(dim=1)
+    # The samples are some 0.02 apart, and facets up to 0.5 % of the radius inside.
+    torch.testing.assert_close(-shape.signed_distance(inside[:200]), nearest, rtol=0, atol=0.02)
+
+
+@PRIMITIVES
+def test_inside_is_where_the_distance_is_negative(shape):
+    points = cloud()
+    distance = shape.signed_distance(points)
+    assert torch.equal(shape.contains(points), distance < 0)
+    assert shape.contains(points[distance < 0.1], margin=0.1).all()
+    assert shape.signed_distance(points.reshape(20, 100, 3)).shape == (20, 100)
+    assert shape.signed_distance(np.zeros((0, 3))).shape == (0,)
+
+
+@PRIMITIVES
+def test_surface_is_on_the_obstacle_and_spans_its_bounding_box(shape):
+    vertices, faces = shape.surface()
+    on_edges = vertices[faces].roll(1, dims=1).lerp(vertices[faces], 0.5).reshape(-1, 3)
+    assert shape.signed_distance(vertices).abs().max() < 1e-14
+    assert shape.signed_distance(on_edges).max() < 1e-14  # convex: chords are inside
+    lower, upper = vertices.new_tensor(shape.lower), vertices.new_tensor(shape.upper)
+    assert (vertices >= lower - 1e-14).all()
+    assert (vertices <= upper + 1e-14).all()
+    # Corners of a 48-gon miss the outermost point of a circle by at most 1 - cos(3.75 degrees) of the radius.
+    slack = 0.7 * (1 - math.cos(math.radians(3.75)))
+    torch.testing.assert_close(vertices.amin(dim=0), lower, rtol=0, atol=slack)
+    torch.testing.assert_close(vertices.amax(dim=0), upper, rtol=0, atol=slack)
+
+
+def test_surfaces_enclose_the_volume_and_face_outwards(box_mesh):
+    assert volume(*BOX.surface()) == pytest.approx(0.24, rel=1e-12)
+    assert volume(*box_mesh.surface()) == pytest.approx(0.24, rel=1e-12)
+    polygon = 24 * math.sin(math.radians(7.5)) / math.pi  # area of the 48-gon over that of its circle
+    assert volume(*CYLINDER.surface()) == pytest.approx(math.pi * 0.5**2 * 1.2 * polygon, rel=1e-12)
+    assert volume(*SPHERE.surface()) == pytest.approx(4 / 3 * math.pi * 0.7**3, rel=3 * SAGITTA)
+    mask = np.random.default_rng(0).random((5, 4, 3)) < 0.5
+    voxels = VoxelMask(mask, 0.5, rigid=True)
+    assert volume(*voxels.surface()) == pytest.approx(mask.sum() * 0.5**3, rel=1e-12)
+
+
+def test_box_keeps_its_distances_when_box_and_points_are_turned():
+    points, turn = cloud(), rotation_matrix(TURN)
+    plain, turned = Box((0, 0, 0), BOX.size, rigid=True), Box((0, 0, 0), BOX.size, TURN, rigid=True)
+    torch.testing.assert_close(
+        turned.signed_distance(points @ turn.T), plain.signed_distance(points), rtol=0, atol=1e-14
+    )
+
+
+def test_box_turned_by_a_right_angle_is_the_box_of_swapped_sizes():
+    turned = Box(CENTER, (1.0, 0.6, 0.4), rotation=(0, 0, math.pi / 2), rigid=True)
+    swapped = Box(CENTER, (0.6, 1.0, 0.4), rigid=True)
+    assert (turned.lower, turned.upper) == (pytest.approx(swapped.lower), pytest.approx(swapped.upper))
+    points = cloud()
+    torch.testing.assert_close(
+        turned.signed_distance(points), swapped.signed_distance(points), rtol=0, atol=1e-14
+    )
+
+
+def test_rotations_are_about_fixed_axes_x_first():
+    x, y, z = torch.eye(3, dtype=torch.float64)
+    quarter = math.pi / 2
+    torch.testing.assert_close(rotation_matrix((0, 0, quarter)) @ x, y)
+    torch.testing.assert_close(rotation_matrix((quarter, 0, 0)) @ y, z)
+    torch.testing.assert_close(rotation_matrix((0, quarter, 0)) @ z, x)
+    torch.testing.assert_close(
+        rotation_matrix((quarter, 0, quarter)) @ y, z
+    )  # y to z about x, and there it stays
+
+
+def test_cylinder_does_not_care_which_way_its_axis_points():
+    points = cloud()
+    other = Cylinder(CENTER, 0.5, 1.2, axis=(-2, 4, -1), rigid=True)
+    torch.testing.assert_close(other.signed_distance(points), CYLINDER.signed_distance(points))
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "STL"])
+def test_mesh_of_a_sphere_is_nearly_the_sphere(folder, suffix):
+    # libigl writes STL as text, in double precision; it takes the format from the suffix in lower case.
+    path = saved(folder, f"sphere.{suffix.lower()}", *SPHERE.surface())
+    mesh = Mesh(path.rename(path.with_suffix(f".{suffix}")), rigid=True)
+    assert len(mesh.vertices) == 2 + 23 * 48
+    points = cloud()
+    off = mesh.signed_distance(points) - SPHERE.signed_distance(points)
+    assert off.min() > -1e-5  # outside the facets, which are inside the sphere, but for rounding in the file
+    assert off.max() < 0.7 * SAGITTA + 1e-5
+
+
+def test_mesh_is_placed_by_scale_rotation_and_offset(folder):
+    path = saved(folder, "small.obj", *Box((0, 0, 0), (100.0, 60.0, 40.0), rigid=True).surface())
+    mesh = Mesh(path, scale=1e-2, offset=CENTER, rotation=TURN, rigid=True)
+    points = cloud()
+    torch.testing.assert_close(mesh.signed_distance(points), BOX.signed_distance(points), rtol=0, atol=1e-12)
+    assert (mesh.lower, mesh.upper) == (pytest.approx(BOX.lower), pytest.approx(BOX.upper))
+
+
+def test_mesh_may_be_inside_out_in_its_file(folder, box_mesh):
+    vertices, faces = box_mesh.surface()
+    inverted = Mesh(saved(folder, "inverted.obj", vertices, faces.flip(1)), rigid=True)
+    torch.testing.assert_close(inverted.signed_distance(cloud()), box_mesh.signed_distance(cloud()))
+
+
+def test_meshes_and_masks_are_equal_by_content(folder, box_mesh):
+    again = Mesh(saved(folder, "copy.obj", *box_mesh.surface()), rigid=True)
+    assert again == box_mesh
+    assert hash(again) == hash(box_mesh)
+    assert Mesh(again.path, scale=2.0, rigid=True) != box_mesh
+    assert Mesh(again.path, density=1.0, sound_speed=1.0) != box_mesh
+    mask = np.ones((2, 2, 2), bool)
+    assert VoxelMask(mask, 1.0, rigid=True) == VoxelMask(torch.tensor(mask), 1.0, rigid=True)
+    other = mask.copy()
+    other[0, 0, 0] = False
+    assert VoxelMask(mask, 1.0, rigid=True) != VoxelMask(other, 1.0, rigid=True)
+
+
+def test_mesh_and_mask_survive_pickling_without_their_files(folder, box_mesh):
+    path = saved(folder, "gone.obj", *box_mesh.surface())
+    packed = pickle.dumps((Mesh(path, rigid=True), VoxelMask(np.ones((2, 3, 4), bool), 0.1, rigid=True)))
+    path.unlink()
+    mesh, voxels = pickle.loads(packed)
+    torch.testing.assert_close(mesh.signed_distance(cloud()), box_mesh.signed_distance(cloud()))
+    assert voxels.upper == pytest.approx((0.2, 0.3, 0.4))
+
+
+def test_voxels_that_fill_a_box_are_that_box():
+    spacing, mask = 0.05, np.zeros((14, 12, 16), bool)
+    mask[2:12, 3:9, 4:8] = True
+    voxels = VoxelMask(mask, spacing, origin=(1.0, 2.0, 3.0), rigid=True)
+    box = Box((1.35, 2.3, 3.3), (0.5, 0.3, 0.2), rigid=True)
+    assert (voxels.lower, voxels.upper) == (pytest.approx(box.lower), pytest.approx(box.upper))
+    points = torch.tensor(box.center, dtype=torch.float64) + cloud(4000, 0.3)
+    assert torch.equal(voxels.contains(points), box.contains(points))
+    # Farthest off at a corner, between 8 voxels: 1 in the body and, outside, 3 off its faces, 3 off its
+    # edges and 1 off its corner.
+    off = voxels.signed_distance(points) - box.signed_distance(points)
+    assert off.abs().max() < (-0.5 + 3 * 0.5 + 3 * 0.5**0.5 + 0.75**0.5) / 8 * spacing
+    middle = torch.tensor([1.35, 2.3, 0], dtype=torch.float64)
+    along = middle + torch.linspace(3.33, 3.6, 50, dtype=torch.float64)[:, None] * torch.tensor([0, 0, 1.0])
+    torch.testing.assert_close(voxels.signed_distance(along), box.signed_distance(along), rtol=0, atol=1e-12)
+
+
+def test_voxel_mask_is_read_from_numpy_files(tmp_path):
+    mask = np.random.default_rng(1).random((4, 3, 2)) < 0.5
+    np.save(tmp_path / "mask.npy", mask)
+    np.savez_compressed(tmp_path / "mask.npz", mask)
+    wanted = VoxelMask(mask, 1e-3, (1.0, 2.0, 3.0), density=100.0, sound_speed=340.0)
+    for name in ("mask.npy", "mask.npz"):
+        assert VoxelMask.load(tmp_path / name, 1e-3, (1, 2, 3), density=100.0, sound_speed=340.0) == wanted
+
+
+def test_voxel_mask_keeps_its_own_copy():
+    mask = np.ones((2, 2, 2), bool)
+    voxels = VoxelMask(mask, 1.0, rigid=True)
+    mask[:] = False
+    assert voxels.mask.all()
+    with pytest.raises(ValueError, match="read-only"):
+        voxels.mask[0, 0, 0] = False
