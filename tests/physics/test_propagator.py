@@ -29,11 +29,13 @@ def random_drive(rows: int, transducers: int, seed: int = 0) -> torch.Tensor:
 
 
 # required of the paper's scene: 0.5 % at 1 mm, 2 % at 2 mm; this small one has its points closer to the
-# boundary layers
-@pytest.mark.parametrize(("spacing", "tolerance"), [(0.7e-3, 1e-3), (1e-3, 2e-3), (2e-3, 1e-2)])
+# boundary layers. At 2.8 mm, 3 cells per wavelength, the layers send back up to 1.6 % each (-36 dB).
+@pytest.mark.parametrize(
+    ("spacing", "tolerance"), [(0.7e-3, 1e-3), (1e-3, 2e-3), (2e-3, 1e-2), (2.8e-3, 4e-2)]
+)
 def test_free_space_is_exact_to_the_grid(spacing: float, tolerance: float) -> None:
     scene = small_scene()
-    simulated = make_propagator(scene, "full", spacing, tolerance=1e-4).transfer_matrix()
+    simulated = make_propagator(scene, "full", spacing, tolerance=tolerance / 10).transfer_matrix()
     assert (
         relative_error(simulated, free_space_matrix(scene.control_points, scene.array, scene.wavenumber))
         < tolerance
@@ -167,7 +169,7 @@ def test_free_space_says_that_it_leaves_obstacles_out(caplog: pytest.LogCaptureF
         ({"method": "fem"}, r"method: .*fem.*must be one of auto, free_space, full"),
         (
             {"spacing": 4e-3},
-            r"spacing: 0.004 m; must be at most 0.00213 m, 4 cells per .* in the medium",
+            r"spacing: 0.004 m; must be at most 0.00283 m, 3 cells per .* in the medium",
         ),
         ({"spacing": 1e-5}, r"spacing: 1e-05 m; gives 2420 x 2420 x 2420 cells, must be at most 1e\+09"),
         ({"spacing": float("nan")}, r"spacing: nan"),
@@ -192,8 +194,15 @@ def test_points_outside_the_domain_are_refused() -> None:
 
 def test_a_slow_obstacle_needs_a_finer_grid() -> None:
     slow = small_scene((Box(CUBE.center, CUBE.size, density=100.0, sound_speed=100.0),))
-    with pytest.raises(ValueError, match=r"spacing: 0.001 m; must be at most 0.000625 m, .* in obstacle 0"):
+    with pytest.raises(ValueError, match=r"spacing: 0.001 m; must be at most 0.000833 m, .* in obstacle 0"):
         make_propagator(slow, "full", 1e-3)
+
+
+def test_a_coarse_grid_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    make_propagator(small_scene((CUBE,)), "full", 2e-3)
+    assert "coarse" not in caplog.text
+    make_propagator(small_scene((CUBE,)), "full", 2.5e-3)
+    assert "spacing 2.5 mm is coarse, 3.4 cells per wavelength in the medium" in caplog.text
 
 
 def test_nothing_in_gives_nothing_out() -> None:

@@ -18,7 +18,7 @@ def reflected_decibels(
 
 @pytest.mark.parametrize(
     ("cells_per_wavelength", "steps", "bound", "grazing_bound"),
-    [(17.0, 25, -90, -75), (8.5, 13, -90, -75), (8.5, 11, -90, -75), (4.25, 6, -65, -50)],
+    [(17.0, 25, -90, -75), (8.5, 13, -90, -75), (8.5, 11, -90, -75), (4.25, 6, -65, -50), (3.0, 4, -36, -22)],
 )
 def test_tuned_layer_reflects_little_at_the_drive_frequency(
     cells_per_wavelength: float, steps: int, bound: float, grazing_bound: float
