@@ -16,7 +16,7 @@ import torch
 from autdtorch.drive import validate_drive
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers
 from autdtorch.fdtd.points import footprint
-from autdtorch.fdtd.stepping import Assembly, SteadyState, assemble, last_period, run_to_steady_state
+from autdtorch.fdtd.stepping import Assembly, SteadyState, assemble, last_block, run_to_steady_state
 from autdtorch.freespace import free_space_matrix
 from autdtorch.scene import Scene, require_inside
 from autdtorch.validation import (
@@ -140,6 +140,7 @@ class FullPropagator:
         spacing: edge of a cell [m].
         tolerance: relative distance to the steady state at which a run ends.
         max_periods: periods after which it ends in any case, with a `SteadyStateWarning`.
+        time_step: the one in use [s].
         runs: what every simulation took, in order.
     """
 
@@ -151,6 +152,7 @@ class FullPropagator:
         kernel: str,
         dtype: torch.dtype,
         max_periods: int,
+        time_step: float | None,
     ) -> None:
         """Use `make_propagator`, which checks its arguments."""
         self.scene = scene
@@ -159,7 +161,8 @@ class FullPropagator:
         self.max_periods = max_periods
         self.runs: list[Run] = []
         self._kernel = _make_kernel(kernel)
-        self._assembly: Assembly = assemble(scene, spacing, dtype)
+        self._assembly: Assembly = assemble(scene, spacing, dtype, time_step)
+        self.time_step = 1 / (scene.frequency * float(self._assembly.steps_per_period))
 
     @cached_property
     def _control_matrix(self) -> torch.Tensor:
@@ -256,7 +259,7 @@ class FullPropagator:
         if every == 1:
             pressure = steady.pressure
         else:
-            field = last_period(assembly, kernel, state, sources)
+            field = last_block(assembly, kernel, state, sources)
             starts = range(0, len(points), _POINTS_AT_ONCE)
             chunks = [_read(field, assembly.receivers(points[n : n + _POINTS_AT_ONCE])) for n in starts]
             pressure = torch.cat(chunks)
@@ -298,6 +301,7 @@ def make_propagator(
     kernel: str = "auto",
     dtype: str | torch.dtype = "float32",
     max_periods: int = 600,
+    time_step: float | None = None,
 ) -> FreeSpacePropagator | FullPropagator:
     """Choose and prepare a propagator.
 
@@ -311,7 +315,8 @@ def make_propagator(
         kernel: "cpu" (numba), "reference" (torch, slow, readable), "auto": the fastest there is.
         dtype: precision of the fields, float32 or float64.
         max_periods: periods of the drive after which a simulation ends in any case, with a
-            `SteadyStateWarning`.
+            `SteadyStateWarning`. They are stepped in blocks of a few, and the last block is finished.
+        time_step: at most this [s], and at least 97 % of it; by default the largest stable one.
 
     Returns:
         A propagator for the scene.
@@ -330,12 +335,16 @@ def make_propagator(
     if tolerance >= 1:
         raise invalid("tolerance", tolerance, "must be in (0, 1)")
     max_periods = integer_at_least("max_periods", max_periods, 1)
+    if time_step is not None:
+        time_step = positive("time_step", time_step, "s")
     chosen = method if method != "auto" else "full" if scene.obstacles else "free_space"
     propagator: FreeSpacePropagator | FullPropagator
     if chosen == "free_space":
         propagator = FreeSpacePropagator(scene)
     else:
-        propagator = FullPropagator(scene, spacing, tolerance, kernel, DTYPES[dtype_name], max_periods)
+        propagator = FullPropagator(
+            scene, spacing, tolerance, kernel, DTYPES[dtype_name], max_periods, time_step
+        )
     if method == "auto":
         reason = (
             f"{len(scene.obstacles)} obstacles" if scene.obstacles else "no obstacles: nothing to simulate"

@@ -93,7 +93,7 @@ def reflection(profile: LayerProfile, along: Array, turn: Array) -> NDArray[np.c
 
 
 @lru_cache(maxsize=64)
-def tuned_profile(kappa: float, steps_per_period: int, cells: int) -> LayerProfile:
+def tuned_profile(kappa: float, steps_per_period: float, cells: int) -> LayerProfile:
     """The profile of `cells` cells that reflects least at the drive frequency, at any angle.
 
     Every value of the damping is free. The fit takes the complex reflection, which is smooth where its

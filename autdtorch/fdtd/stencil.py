@@ -78,11 +78,11 @@ class Stencil:
         """Symbol averaged over directions: what a cell with another sound speed is tuned with."""
         return float(np.average(self.symbol_at(kappa * _DIRECTIONS), weights=_SOLID_ANGLES))
 
-    def time_factor(self, steps_per_period: int) -> float:
+    def time_factor(self, steps_per_period: float) -> float:
         """C: what the weights are multiplied with for `steps_per_period` steps a period, dimensionless."""
         return 2 * (1 - math.cos(2 * math.pi / steps_per_period)) / self.symbol
 
-    def source_factor(self, steps_per_period: int) -> float:
+    def source_factor(self, steps_per_period: float) -> float:
         """Forcing per step and unit S/h of a point source whose far field is S e^{ikr}/r.
 
         The discrete Green's function is a Fourier integral over 1/(C L - 2 + 2 cos(w dt)); its far field is
