@@ -41,10 +41,6 @@ at its end."""
 _POINTS_AT_ONCE = 8192
 """Points that are read at once from a field, which bounds the memory for their weights."""
 
-RECIPROCITY_ERROR = 1e-3
-"""Runs of a finer tolerance are not reversed: where two boundary layers meet, the scheme is not symmetric,
-which leaves about 2e-4 between a transfer matrix and its reverse in the paper's scenes."""
-
 
 class SteadyStateWarning(UserWarning):
     """A simulation ended before its steady state was reached."""
@@ -172,8 +168,7 @@ class FullPropagator:
         """Transfer matrix G from one simulation a point or one a transducer, whichever are fewer.
 
         Waves travel from a point to the transducers as they travel back (reciprocity): P simulations do
-        instead of M, unless the tolerance is below `RECIPROCITY_ERROR` or a point is next to an obstacle. The
-        matrix of the control points is kept.
+        instead of M, unless a point is next to an obstacle. The matrix of the control points is kept.
 
         Args:
             points: (P, 3) [m] inside the domain; by default the scene's control points.
@@ -220,7 +215,7 @@ class FullPropagator:
     def _backward(self, points: torch.Tensor) -> bool:
         """Whether the transfer matrix is simulated from the points, by reciprocity."""
         fewer = len(points) < len(self.scene.array)
-        return fewer and self.tolerance >= RECIPROCITY_ERROR and not self._touches_obstacle(points)
+        return fewer and not self._touches_obstacle(points)
 
     def _simulated_matrix(self, points: torch.Tensor) -> torch.Tensor:
         array = self.scene.array

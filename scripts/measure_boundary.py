@@ -1,10 +1,10 @@
 """How much the boundary layer sends back, measured against a larger domain; prints a Markdown table.
 
-    python scripts/measure_boundary.py        about a minute on 2 idle cores
+    python scripts/measure_boundary.py        a few seconds on 2 idle cores
 
 A source and receivers stand in a row, all at the same distance from one layer. The same is stepped again with
-that layer so far away that its echo does not return in time, and everything else in place: what differs is the
-echo. It is set against the wave of the source's mirror image, with the layer's inner face as the mirror.
+that layer so far away that its echo does not return in time, and the rest in place: what differs is the echo.
+It is set against the wave of the source's mirror image, with the layer's inner face as the mirror.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def main() -> None:
     )
     parser.add_argument("--cells-per-wavelength", type=float, default=8.5)
     parser.add_argument("--distance", type=int, default=9, help="cells to the layer")
-    parser.add_argument("--aside", type=int, default=60, help="cells to the other layers")
+    parser.add_argument("--aside", type=int, default=12, help="cells to the other layers")
     given = parser.parse_args()
     print("| cells | " + " | ".join(f"{angle:g} degrees" for angle in DEGREES) + " |")
     print("| --- |" + " --- |" * len(DEGREES))

@@ -23,13 +23,14 @@ MIN_CELLS_PER_WAVELENGTH = 3.0
 """Coarser grids are refused."""
 
 FAIR_CELLS_PER_WAVELENGTH = 4.0
-"""Coarser grids are warned of: points would need over 10 cells a side, the layer reflects over -60 dB."""
+"""Coarser grids are warned of: points would need over 10 cells a side, the layer reflects over -65 dB."""
 
 MAX_CELLS = 10**9
 """More would take over 30 GB in single precision."""
 
-LAYER_CELLS = 8
-"""Boundary layer: reflects less than -65 dB up to 60 degrees at 4.25 cells per wavelength, -90 dB at 8.5."""
+FINE_LAYER_CELLS, COARSE_LAYER_CELLS = 6, 8
+"""Boundary layer from 6 cells per wavelength on, and of coarser grids. It reflects less than -75 dB up to 60
+degrees, from 8.5 cells on -90 dB; the other less than -72 dB at 4.25 cells per wavelength, -37 dB at 3."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +53,14 @@ class Grid:
     kappa: float
 
     @property
+    def layer_cells(self) -> int:
+        """Thickness of the boundary layer."""
+        return layer_cells(self.kappa)
+
+    @property
     def rim(self) -> int:
         """Cells between the array's face and the interior."""
-        return LAYER_CELLS + 1
+        return self.layer_cells + 1
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -97,6 +103,11 @@ class Grid:
         return np.asarray((points.numpy() - np.array(self.origin)) / self.spacing, np.float64)
 
 
+def layer_cells(kappa: float) -> int:
+    """Thickness of the boundary layer on a grid of wavenumber times spacing `kappa` [rad]."""
+    return FINE_LAYER_CELLS if kappa <= 2 * math.pi / 6 else COARSE_LAYER_CELLS
+
+
 def make_grid(scene: Scene, spacing: float) -> Grid:
     """Cover the scene's domain with cells of `spacing`, aligned with its lower corner.
 
@@ -116,7 +127,7 @@ def make_grid(scene: Scene, spacing: float) -> Grid:
     interior = tuple(
         math.ceil((high - low) / spacing - 1e-6) + 2 * margin for low, high in zip(lower, upper, strict=True)
     )
-    shift = (LAYER_CELLS + 1 + margin - 0.5) * spacing
+    shift = (layer_cells(kappa) + 1 + margin - 0.5) * spacing
     x, y, z = (low - shift for low in lower)
     grid = Grid(spacing, (interior[0], interior[1], interior[2]), (x, y, z), kappa)
     if math.prod(grid.shape) > MAX_CELLS:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from autdtorch.fdtd.bonds import varying_cells
 from autdtorch.fdtd.boundary import tuned_profile
-from autdtorch.fdtd.grid import LAYER_CELLS, Grid, fill_medium, make_grid
+from autdtorch.fdtd.grid import Grid, fill_medium, make_grid
 from autdtorch.fdtd.kernels.contract import Coefficients, Kernel, Receivers, Sources, State, uniform_state
 from autdtorch.fdtd.points import PointWeights, point_weights
 from autdtorch.fdtd.stability import fewest_steps, largest_eigenvalue, whole_steps
@@ -75,7 +75,7 @@ class Assembly:
         slow (2.4 times, measured at 120^3 in float32).
         """
         faint = _FAINT * float(sources.force.detach().abs().max())
-        return uniform_state(self.grid.shape, LAYER_CELLS, faint, self.dtype)
+        return uniform_state(self.grid.shape, self.grid.layer_cells, faint, self.dtype)
 
     def spread(self, points: torch.Tensor) -> PointWeights:
         """Cells and weights of points (P, 3) [m] inside the domain."""
@@ -132,7 +132,7 @@ def assemble(
     steps_per_period = whole_steps(_wanted_steps(fewest, time_step, scene.frequency))
     steps = float(steps_per_period)
     factor = stencil.time_factor(steps)
-    profile = tuned_profile(grid.kappa, steps, LAYER_CELLS)
+    profile = tuned_profile(grid.kappa, steps, grid.layer_cells)
     face, edge, corner = factor * stencil.face, factor * stencil.edge, factor * stencil.corner
     coefficients = Coefficients(
         center=2 - factor * stencil.total,
