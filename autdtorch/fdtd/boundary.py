@@ -8,12 +8,12 @@ McGarry 2010):
     zeta <- b zeta + a (u[l+1] - 2 u[l] + u[l-1] + psi[l+1/2] - psi[l-1/2])        at the cells
     d2 u becomes d2 u + psi[l+1/2] - psi[l-1/2] + zeta.
 
-The 27-point sum consists of products of T_x, T_y and T_z, T_a being the sum of the two neighbours along axis a.
-With E_a u what the layer adds to d2 u, it puts T_a + E_a in place of every T_a, in the products too. That is the
-exact complex stretching of the *discrete* equation, edges and corners of the grid included: it keeps the
-equation symmetric, and a wave that meets a layer at angle t behaves as in one dimension with the wavenumber
-k cos t. The reflection is then a small linear system for each angle, and the profile is chosen to make it small
-for all of them at once.
+The 27-point sum consists of products of T_x, T_y and T_z, T_a being the sum of the two neighbours along axis
+a. With E_a u what the layer adds to d2 u, T_a + E_a takes the place of every T_a, in products too. That is
+the exact complex stretching of the *discrete* equation, the grid's edges and corners included: the equation
+stays symmetric, and a wave that meets a layer at angle t behaves as in one dimension with the wavenumber
+k cos t. The reflection is then a small linear system for each angle, and the profile is chosen to make it
+small for all of them at once.
 """
 
 from __future__ import annotations

@@ -178,6 +178,7 @@ def test_free_space_says_that_it_leaves_obstacles_out(caplog: pytest.LogCaptureF
         ({"kernel": "fortran"}, r"kernel: .*fortran.*must be one of auto, cpu, reference"),
         ({"dtype": "float16"}, r"dtype: .*float16.*must be one of float32, float64"),
         ({"max_periods": 0}, r"max_periods: 0"),
+        ({"time_step": 0.0}, r"time_step: 0.0 s; must be finite and > 0"),
     ],
 )
 def test_bad_arguments_are_named(arguments: dict[str, object], message: str) -> None:
