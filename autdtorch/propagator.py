@@ -17,7 +17,7 @@ from autdtorch.array import Nodes
 from autdtorch.drive import validate_drive
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers
 from autdtorch.fdtd.points import footprint
-from autdtorch.fdtd.stepping import Assembly, SteadyState, assemble, last_period, run_to_steady_state
+from autdtorch.fdtd.stepping import Assembly, SteadyState, assemble, last_block, run_to_steady_state
 from autdtorch.freespace import free_space_matrix
 from autdtorch.scene import Scene, require_inside
 from autdtorch.validation import (
@@ -41,10 +41,6 @@ at its end."""
 
 _POINTS_AT_ONCE = 8192
 """Points that are read at once from a field, which bounds the memory for their weights."""
-
-RECIPROCITY_ERROR = 1e-3
-"""Runs of a finer tolerance are not reversed: where two boundary layers meet, the scheme is not symmetric,
-which leaves about 2e-4 between a transfer matrix and its reverse in the paper's scenes."""
 
 
 class SteadyStateWarning(UserWarning):
@@ -141,6 +137,7 @@ class FullPropagator:
         spacing: edge of a cell [m].
         tolerance: relative distance to the steady state at which a run ends.
         max_periods: periods after which it ends in any case, with a `SteadyStateWarning`.
+        time_step: the one in use [s].
         runs: what every simulation took, in order.
     """
 
@@ -152,6 +149,7 @@ class FullPropagator:
         kernel: str,
         dtype: torch.dtype,
         max_periods: int,
+        time_step: float | None,
     ) -> None:
         """Use `make_propagator`, which checks its arguments."""
         self.scene = scene
@@ -160,7 +158,8 @@ class FullPropagator:
         self.max_periods = max_periods
         self.runs: list[Run] = []
         self._kernel = _make_kernel(kernel)
-        self._assembly: Assembly = assemble(scene, spacing, dtype)
+        self._assembly: Assembly = assemble(scene, spacing, dtype, time_step)
+        self.time_step = 1 / (scene.frequency * float(self._assembly.steps_per_period))
 
     @cached_property
     def _control_matrix(self) -> torch.Tensor:
@@ -170,8 +169,7 @@ class FullPropagator:
         """Transfer matrix G from one simulation a point or one a transducer, whichever are fewer.
 
         Waves travel from a point to the transducers as they travel back (reciprocity): P simulations do
-        instead of M, unless the tolerance is below `RECIPROCITY_ERROR` or a point is next to an obstacle. The
-        matrix of the control points is kept.
+        instead of M, unless a point is next to an obstacle. The matrix of the control points is kept.
 
         Args:
             points: (P, 3) [m] inside the domain; by default the scene's control points.
@@ -218,7 +216,7 @@ class FullPropagator:
     def _backward(self, points: torch.Tensor) -> bool:
         """Whether the transfer matrix is simulated from the points, by reciprocity."""
         fewer = len(points) < len(self.scene.array)
-        return fewer and self.tolerance >= RECIPROCITY_ERROR and not self._touches_obstacle(points)
+        return fewer and not self._touches_obstacle(points)
 
     def _simulated_matrix(self, points: torch.Tensor) -> torch.Tensor:
         transducers, targets = self.scene.array.nodes, _single_nodes(points)
@@ -259,7 +257,7 @@ class FullPropagator:
         if every == 1:
             pressure = steady.pressure
         else:
-            field = last_period(assembly, kernel, state, sources)
+            field = last_block(assembly, kernel, state, sources)
             at_once = max(1, _POINTS_AT_ONCE // len(targets.weights))
             chunks = (points[n : n + at_once] for n in range(0, len(points), at_once))
             pressure = torch.cat([_read(field, assembly.receivers(at, targets.weights)) for at in chunks])
@@ -310,6 +308,7 @@ def make_propagator(
     kernel: str = "auto",
     dtype: str | torch.dtype = "float32",
     max_periods: int = 600,
+    time_step: float | None = None,
 ) -> FreeSpacePropagator | FullPropagator:
     """Choose and prepare a propagator.
 
@@ -323,7 +322,8 @@ def make_propagator(
         kernel: "cpu" (numba), "reference" (torch, slow, readable), "auto": the fastest there is.
         dtype: precision of the fields, float32 or float64.
         max_periods: periods of the drive after which a simulation ends in any case, with a
-            `SteadyStateWarning`.
+            `SteadyStateWarning`. They are stepped in blocks of a few, and the last block is finished.
+        time_step: at most this [s], and at least 97 % of it; by default the largest stable one.
 
     Returns:
         A propagator for the scene.
@@ -342,12 +342,16 @@ def make_propagator(
     if tolerance >= 1:
         raise invalid("tolerance", tolerance, "must be in (0, 1)")
     max_periods = integer_at_least("max_periods", max_periods, 1)
+    if time_step is not None:
+        time_step = positive("time_step", time_step, "s")
     chosen = method if method != "auto" else "full" if scene.obstacles else "free_space"
     propagator: FreeSpacePropagator | FullPropagator
     if chosen == "free_space":
         propagator = FreeSpacePropagator(scene)
     else:
-        propagator = FullPropagator(scene, spacing, tolerance, kernel, DTYPES[dtype_name], max_periods)
+        propagator = FullPropagator(
+            scene, spacing, tolerance, kernel, DTYPES[dtype_name], max_periods, time_step
+        )
     if method == "auto":
         reason = (
             f"{len(scene.obstacles)} obstacles" if scene.obstacles else "no obstacles: nothing to simulate"

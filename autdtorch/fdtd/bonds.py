@@ -1,4 +1,4 @@
-"""Where the medium varies: symmetric bonds between cells, and the bound on the time step that they give.
+"""Where the medium varies: symmetric bonds between cells.
 
 The scheme is m_i d2p_i/dt2 = sum_j B_ij (p_j - p_i) with mass m_i = 1 / (rho_i s_i), bonds B_ij = 2 g_ij /
 (rho_i + rho_j) and g_ij the tuned stencil. s_i is 1 in air and elsewhere the factor that gives a wave in that
@@ -27,12 +27,10 @@ class VaryingCells:
         index: flat cell indices (n,), int64, ascending.
         weight: what (p_j - p_i) is multiplied with for the 27 neighbours (n, 27), to be scaled by the time
             factor.
-        bond_norm: largest eigenvalue of the scheme is at most this times the time factor.
     """
 
     index: NDArray[np.int64]
     weight: Array
-    bond_norm: float
 
 
 def speed_factors(stencil: Stencil, sound_speed: Array, air_speed: float) -> Array:
@@ -54,7 +52,7 @@ def varying_cells(medium: CellMedium, stencil: Stencil, air_density: float, air_
     air = (medium.density == air_density) & (medium.sound_speed == air_speed) & ~medium.rigid
     other = np.argwhere(~air)
     if len(other) == 0:
-        return VaryingCells(np.zeros(0, np.int64), np.zeros((0, 27)), stencil.largest_symbol)
+        return VaryingCells(np.zeros(0, np.int64), np.zeros((0, 27)))
     offsets = np.array(OFFSETS)
     shape = air.shape
     near = np.unique(np.ravel_multi_index(tuple((other[:, None, :] + offsets).reshape(-1, 3).T), shape))
@@ -69,17 +67,5 @@ def varying_cells(medium: CellMedium, stencil: Stencil, air_density: float, air_
     bond = np.where(open_bond, 2 * stencil.weights / (own + others), 0.0)
     own_speed = speed[:, 13:14]
     weight = bond * own * own_speed
-    # A bond B adds B (p_i - p_j)^2 <= B (1/m_i + 1/m_j) (m_i p_i^2 + m_j p_j^2) to the energy: summed over
-    # the bonds of a cell, this bounds the largest eigenvalue at any contrast. Cells of uniform air have 2 x
-    # stencil.total.
-    norm = (bond * (own * own_speed + others * speed)).sum(1).max()
     changed = (weight != stencil.weights).any(1) | (own_speed[:, 0] != 1)
-    return VaryingCells(near[changed], weight[changed], max(float(norm), 2 * stencil.total))
-
-
-def steps_per_period(stencil: Stencil, bond_norm: float) -> int:
-    """Fewest whole steps a period for which leapfrog is stable: time factor x bond norm <= 4."""
-    steps = 3
-    while stencil.time_factor(steps) * bond_norm > 4:
-        steps += 1
-    return steps
+    return VaryingCells(near[changed], weight[changed])

@@ -8,11 +8,12 @@ McGarry 2010):
     zeta <- b zeta + a (u[l+1] - 2 u[l] + u[l-1] + psi[l+1/2] - psi[l-1/2])        at the cells
     d2 u becomes d2 u + psi[l+1/2] - psi[l-1/2] + zeta.
 
-The 27-point stencil is a second difference along any axis of the pressure smoothed across it, plus terms that
-do not differentiate along that axis. Taking the smoothed pressure for u makes the layer the exact complex
-stretching of the *discrete* equation: a wave that meets it at angle t behaves as in one dimension with the
-wavenumber k cos t. The reflection is then a small linear system for each angle, and the profile is chosen to
-make it small for all of them at once.
+The 27-point sum consists of products of T_x, T_y and T_z, T_a being the sum of the two neighbours along axis
+a. With E_a u what the layer adds to d2 u, T_a + E_a takes the place of every T_a, in products too. That is
+the exact complex stretching of the *discrete* equation, the grid's edges and corners included: the equation
+stays symmetric, and a wave that meets a layer at angle t behaves as in one dimension with the wavenumber
+k cos t. The reflection is then a small linear system for each angle, and the profile is chosen to make it
+small for all of them at once.
 """
 
 from __future__ import annotations
@@ -93,7 +94,7 @@ def reflection(profile: LayerProfile, along: Array, turn: Array) -> NDArray[np.c
 
 
 @lru_cache(maxsize=64)
-def tuned_profile(kappa: float, steps_per_period: int, cells: int) -> LayerProfile:
+def tuned_profile(kappa: float, steps_per_period: float, cells: int) -> LayerProfile:
     """The profile of `cells` cells that reflects least at the drive frequency, at any angle.
 
     Every value of the damping is free. The fit takes the complex reflection, which is smooth where its

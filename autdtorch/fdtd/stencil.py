@@ -95,16 +95,16 @@ class Stencil:
         loss = self.eta / self.kappa
         return _mean_symbol(kappa * complex(1, loss), (self.face, self.edge, self.corner)).real
 
-    def time_factor(self, steps_per_period: int) -> float:
+    def time_factor(self, steps_per_period: float) -> float:
         """C: what the weights are multiplied with for `steps_per_period` steps a period, dimensionless."""
         return 2 * (1 - math.cos(2 * math.pi / steps_per_period)) / self.symbol
 
-    def damping(self, steps_per_period: int) -> float:
+    def damping(self, steps_per_period: float) -> float:
         """D: the loss of a step, dimensionless; zero where air does not absorb."""
         turn = 2 * math.pi / steps_per_period
         return self.time_factor(steps_per_period) * self.loss / (2 * math.sin(turn))
 
-    def source_factor(self, steps_per_period: int) -> complex:
+    def source_factor(self, steps_per_period: float) -> complex:
         """Forcing per step and unit S/h of a point source whose far field is S e^{ikr}/r.
 
         The discrete Green's function is a Fourier integral over 1/(C L - 2 + 2 cos(w dt) - 2 i D sin(w dt));

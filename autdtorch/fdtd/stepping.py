@@ -1,23 +1,30 @@
-"""From a scene to its steady state: assemble, step period by period, lock in, know when to stop."""
+"""From a scene to its steady state: assemble, step block by block, lock in, know when to stop.
+
+A block is the fewest periods that take a whole number of steps.
+"""
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from fractions import Fraction
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.bonds import steps_per_period, varying_cells
+from autdtorch.fdtd.bonds import varying_cells
 from autdtorch.fdtd.boundary import tuned_profile
-from autdtorch.fdtd.grid import LAYER_CELLS, Grid, fill_medium, make_grid
+from autdtorch.fdtd.grid import Grid, fill_medium, make_grid
 from autdtorch.fdtd.kernels.contract import Coefficients, Kernel, Receivers, Sources, State, uniform_state
 from autdtorch.fdtd.points import PointWeights, merged, point_weights
+from autdtorch.fdtd.stability import fewest_steps, largest_eigenvalue, whole_steps
 from autdtorch.fdtd.stencil import Stencil, tuned_stencil
 from autdtorch.scene import Scene
+from autdtorch.validation import invalid
 
 logger = logging.getLogger(__name__)
 
@@ -30,7 +37,7 @@ _FAINT = 1e-20
 """Pressure of the silence before a run, relative to the strongest force."""
 
 _WINDOW = 4
-"""Periods over which the decay of the transient is averaged when its end is foretold."""
+"""Periods, and at least two blocks, over which the transient's decay is averaged when its end is foretold."""
 
 
 _ONE_NODE = torch.ones(1, dtype=torch.float64)
@@ -47,14 +54,15 @@ class Assembly:
     Attributes:
         grid: where the cells are.
         stencil: weights in air.
-        steps_per_period: time steps a period of the drive.
+        steps_per_period: time steps a period of the drive: steps a block (numerator) over periods a block
+            (denominator).
         coefficients: what the kernel sees.
         rigid: flat indices of the cells that sound does not enter, ascending.
     """
 
     grid: Grid
     stencil: Stencil
-    steps_per_period: int
+    steps_per_period: Fraction
     coefficients: Coefficients
     rigid: NDArray[np.int64]
 
@@ -70,7 +78,7 @@ class Assembly:
         slow (2.4 times, measured at 120^3 in float32).
         """
         faint = _FAINT * float(sources.force.detach().abs().max())
-        return uniform_state(self.grid.shape, LAYER_CELLS, faint, self.dtype)
+        return uniform_state(self.grid.shape, self.grid.layer_cells, faint, self.dtype)
 
     def spread(self, points: torch.Tensor, weights: torch.Tensor = _ONE_NODE) -> PointWeights:
         """Cells and weights of points (P, 3) [m], or nodes (P, n, 3) with `weights` (n,), in the domain."""
@@ -101,7 +109,7 @@ class Assembly:
         Nodes (P, n, 3) with `weights` (n,) share the strength of a source. Differentiable by strength.
         """
         spread = self.spread(points, weights)
-        factor = self.stencil.source_factor(self.steps_per_period) / self.grid.spacing
+        factor = self.stencil.source_factor(float(self.steps_per_period)) / self.grid.spacing
         index, inverse = np.unique(spread.index, return_inverse=True)
         force = (strength[:, None] * torch.from_numpy(factor * spread.weight)).reshape(-1)
         total = torch.zeros(len(index), dtype=force.dtype).index_add(
@@ -113,21 +121,28 @@ class Assembly:
         )
 
 
-def assemble(scene: Scene, spacing: float, dtype: torch.dtype = torch.float32) -> Assembly:
-    """Put a scene on a grid of `spacing` [m], with the largest time step that its operator's bound allows.
+def assemble(
+    scene: Scene, spacing: float, dtype: torch.dtype = torch.float32, time_step: float | None = None
+) -> Assembly:
+    """Put a scene on a grid of `spacing` [m], with a time step of `time_step` [s] or just below.
+
+    By default that is the largest stable one.
 
     Raises:
-        ValueError: if the spacing is too coarse for the frequency.
+        ValueError: the spacing is too coarse for the frequency, or the time step is not stable.
     """
     grid = make_grid(scene, spacing)
     stencil = tuned_stencil(grid.kappa, scene.attenuation * spacing)
     medium = fill_medium(scene, grid)
     varying = varying_cells(medium, stencil, scene.medium.density, scene.medium.sound_speed)
-    steps = steps_per_period(stencil, varying.bond_norm)
+    largest = largest_eigenvalue(varying.index, varying.weight, stencil, grid.shape)
+    fewest = fewest_steps(stencil, largest)
+    steps_per_period = whole_steps(_wanted_steps(fewest, time_step, scene.frequency))
+    steps = float(steps_per_period)
     damping = stencil.damping(steps)
     factor = stencil.time_factor(steps) / (1 + damping)
     keep = (1 - damping) / (1 + damping)
-    profile = tuned_profile(grid.kappa, steps, LAYER_CELLS)
+    profile = tuned_profile(grid.kappa, steps, grid.layer_cells)
     face, edge, corner = factor * stencil.face, factor * stencil.edge, factor * stencil.corner
     coefficients = Coefficients(
         center=1 + keep - factor * stencil.total,
@@ -140,11 +155,24 @@ def assemble(scene: Scene, spacing: float, dtype: torch.dtype = torch.float32) -
         layer_decay=torch.from_numpy(profile.decay).to(dtype),
         layer_gain=torch.from_numpy(profile.gain).to(dtype),
     )
-    logger.debug(
-        "grid %s at %.3g mm, %d steps a period, %d varying cells",
-        grid.shape, spacing * 1e3, steps, len(varying.index),
+    logger.info(
+        "grid %s at %.3g mm, %d varying cells; %d steps in %d periods: %.4g us, %.1f %% of the limit",
+        grid.shape, spacing * 1e3, len(varying.index), steps_per_period.numerator,
+        steps_per_period.denominator, 1e6 / (steps * scene.frequency), 100 * fewest / steps,
     )  # fmt: skip
-    return Assembly(grid, stencil, steps, coefficients, np.flatnonzero(medium.rigid))
+    return Assembly(grid, stencil, steps_per_period, coefficients, np.flatnonzero(medium.rigid))
+
+
+def _wanted_steps(fewest: float, time_step: float | None, frequency: float) -> float:
+    """Steps a period of a wanted time step [s], which must be stable; `fewest` by default."""
+    if time_step is None:
+        return fewest
+    limit = 1 / (frequency * fewest)
+    if time_step > limit:
+        # rounded down, so that the number shown is accepted
+        shown = f"{limit * (1 - 5e-5):.5g} s"
+        raise invalid("time_step", time_step, f"must be at most {shown}, the stability limit here", "s")
+    return 1 / (frequency * time_step)
 
 
 @dataclass(frozen=True)
@@ -164,33 +192,32 @@ class SteadyState:
     reached: bool
 
 
-def drive_signal(steps: int, first: int, count: int) -> torch.Tensor:
+def drive_signal(steps_per_period: Fraction, first: int, count: int) -> torch.Tensor:
     """Rows (count, 2) of cos(w t) and sin(w t) under the switch-on envelope, from step `first` on."""
-    step = torch.arange(first, first + count, dtype=torch.float64)
-    phase = 2 * math.pi * torch.remainder(step, steps) / steps
-    ramp = (step / (RAMP_PERIODS * steps)).clamp(max=1)
+    step = torch.arange(first, first + count)
+    block, turns = steps_per_period.numerator, steps_per_period.denominator
+    phase = 2 * math.pi / block * torch.remainder(step * turns, block).double()
+    ramp = (step.double() / float(RAMP_PERIODS * steps_per_period)).clamp(max=1)
     envelope = ramp**4 * (35 - 84 * ramp + 70 * ramp**2 - 20 * ramp**3)
     return torch.stack((envelope * torch.cos(phase), envelope * torch.sin(phase)), dim=1)
 
 
-def lock_in(recorded: torch.Tensor) -> torch.Tensor:
-    """Phasors (R,) of one period, recorded after each of its steps (steps, R)."""
+def lock_in(recorded: torch.Tensor, periods: int) -> torch.Tensor:
+    """Phasors (R,) of one block of `periods`, recorded after each of its steps (steps, R)."""
     steps = len(recorded)
-    turn = 2 * math.pi * torch.arange(1, steps + 1, dtype=torch.float64) / steps
+    turn = 2 * math.pi * periods / steps * torch.arange(1, steps + 1, dtype=torch.float64)
     return torch.einsum("t,tr->r", 2 / steps * torch.exp(1j * turn), recorded.to(torch.complex128))
 
 
-def periods(
+def blocks(
     assembly: Assembly, kernel: Kernel, sources: Sources, receivers: Receivers
 ) -> Iterator[tuple[State, torch.Tensor]]:
-    """Step period by period from silence, yielding the state and the receivers' phasors (R,) of each."""
+    """Step block by block from silence, yielding the state and the receivers' phasors (R,) of each."""
     state, steps = assembly.silence(sources), assembly.steps_per_period
-    first = 0
-    while True:
-        signal = drive_signal(steps, first, steps).to(assembly.dtype)
+    for block in itertools.count():
+        signal = drive_signal(steps, block * steps.numerator, steps.numerator).to(assembly.dtype)
         state, recorded = kernel.advance(state, assembly.coefficients, sources, receivers, signal)
-        first += steps
-        yield state, lock_in(recorded)
+        yield state, lock_in(recorded, steps.denominator)
 
 
 def run_to_steady_state(
@@ -203,24 +230,24 @@ def run_to_steady_state(
 ) -> tuple[State, SteadyState]:
     """Step until the receivers' phasors stand, to `tolerance` (relative), or `max_periods` have passed.
 
-    The change from period to period decays geometrically once the slowest mode is left. From its size and its
-    decay over a few periods the distance still to go is foretold; a small change alone would not tell, in a
+    The change from block to block decays geometrically once the slowest mode is left. From its size and its
+    decay over a few blocks the distance still to go is foretold; a small change alone would not tell, in a
     resonant scene. A run is not judged before sound has crossed the domain twice.
     """
     crossing = assembly.grid.diagonal / assembly.grid.wavelength
     earliest = RAMP_PERIODS + math.ceil(2 * crossing)
-    stepped = periods(assembly, kernel, sources, receivers)
+    stepped = blocks(assembly, kernel, sources, receivers)
     state, phasor = next(stepped)
-    count = 1
+    block = count = assembly.steps_per_period.denominator
     changes: list[float] = []
     while True:
-        remaining = _foretold(changes)
+        remaining = _foretold(changes, block)
         reached = count >= earliest and remaining <= tolerance
         if reached or count >= max_periods:
             return state, SteadyState(phasor, count, remaining, reached)
         previous = phasor
         state, phasor = next(stepped)
-        count += 1
+        count += block
         changes.append(_relative_change(phasor, previous))
 
 
@@ -229,26 +256,27 @@ def _relative_change(phasor: torch.Tensor, previous: torch.Tensor) -> float:
     return float((phasor - previous).detach().norm()) / size if size else math.inf
 
 
-def _foretold(changes: list[float]) -> float:
-    """Relative distance to the limit of a sequence, foretold from its latest relative changes."""
-    if len(changes) < 2 * _WINDOW:
+def _foretold(changes: list[float], periods: int) -> float:
+    """Relative distance to the limit of phasors a block of `periods` apart, foretold from their changes."""
+    window = max(2, math.ceil(_WINDOW / periods))
+    if len(changes) < 2 * window:
         return math.inf
-    late, early = max(changes[-_WINDOW:]), max(changes[-2 * _WINDOW : -_WINDOW])
+    late, early = max(changes[-window:]), max(changes[-2 * window : -window])
     if not math.isfinite(late):
         return math.inf
-    ratio = min(math.pow(late / early, 1 / _WINDOW), _SLOWEST_DECAY) if early else 0.0
+    ratio = min(math.pow(late / early, 1 / window), _SLOWEST_DECAY**periods) if early else 0.0
     return late * ratio / (1 - ratio)
 
 
-def last_period(assembly: Assembly, kernel: Kernel, state: State, sources: Sources) -> torch.Tensor:
-    """Phasor of every cell (nx, ny, nz) over one more period of a run in its steady state."""
-    steps = assembly.steps_per_period
+def last_block(assembly: Assembly, kernel: Kernel, state: State, sources: Sources) -> torch.Tensor:
+    """Phasor of every cell (nx, ny, nz) over one more block of a run in its steady state."""
+    steps, turns = assembly.steps_per_period.numerator, assembly.steps_per_period.denominator
     nobody = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1), dtype=assembly.dtype))
     first = RAMP_PERIODS * steps
     spectrum = torch.zeros(assembly.grid.shape, dtype=sources.force.dtype)
     for step in range(steps):
-        signal = drive_signal(steps, first + step, 1).to(assembly.dtype)
+        signal = drive_signal(assembly.steps_per_period, first + step, 1).to(assembly.dtype)
         state, _ = kernel.advance(state, assembly.coefficients, sources, nobody, signal)
-        turn = 2 * math.pi * (step + 1) / steps
+        turn = 2 * math.pi * turns * (step + 1) / steps
         spectrum = spectrum + state.now * complex(math.cos(turn), math.sin(turn)) * (2 / steps)
     return spectrum

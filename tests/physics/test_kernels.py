@@ -97,10 +97,10 @@ def test_a_mode_of_a_closed_box_swings_at_its_own_frequency_for_ever(kernel: Ker
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_nothing_grows_once_the_drive_is_off(dtype: torch.dtype) -> None:
-    """Random pressures in all the air, which excites every wave the grid has, then silence."""
+    """Random pressures in the air inside the layers, which excites every wave the grid has, then silence."""
     assembly, sources, receivers = scene_parts(dtype)
     state = uniform_state(assembly.grid.shape, assembly.coefficients.layer_cells, 0.0, dtype)
-    inner = state.now[1:-1, 1:-1, 1:-1]
+    inner = state.now[tuple(map(slice, assembly.grid.first, assembly.grid.last))]
     inner.copy_(torch.randn(inner.shape, generator=torch.Generator().manual_seed(0), dtype=dtype))
     state.now.view(-1)[assembly.coefficients.varying_index] = 0
     state.before.copy_(state.now)
@@ -112,4 +112,4 @@ def test_nothing_grows_once_the_drive_is_off(dtype: torch.dtype) -> None:
     # what stays are the shortest waves, which hardly move, and the obstacles' resonances: both only fade
     # (the pressure alone is not the energy, so that it may swing a little on its way down)
     assert all(later < 1.1 * earlier for earlier, later in itertools.pairwise(sizes))
-    assert sizes[-1] < 0.05 * sizes[0]
+    assert sizes[-1] < 0.1 * sizes[0]

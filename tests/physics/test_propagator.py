@@ -16,7 +16,6 @@ from autdtorch.freespace import free_space_matrix
 from autdtorch.geometry import plane_basis
 from autdtorch.objective import SimulatedObjective
 from autdtorch.propagator import (
-    RECIPROCITY_ERROR,
     FreeSpacePropagator,
     FullPropagator,
     SteadyStateWarning,
@@ -31,11 +30,13 @@ def random_drive(rows: int, transducers: int, seed: int = 0) -> torch.Tensor:
 
 
 # required of the paper's scene: 0.5 % at 1 mm, 2 % at 2 mm; this small one has its points closer to the
-# boundary layers
-@pytest.mark.parametrize(("spacing", "tolerance"), [(0.7e-3, 1e-3), (1e-3, 2e-3), (2e-3, 1e-2)])
+# boundary layers. At 2.8 mm, 3 cells per wavelength, the layers send back up to 1.6 % each (-36 dB).
+@pytest.mark.parametrize(
+    ("spacing", "tolerance"), [(0.7e-3, 1e-3), (1e-3, 2e-3), (2e-3, 1e-2), (2.8e-3, 4e-2)]
+)
 def test_free_space_is_exact_to_the_grid(spacing: float, tolerance: float) -> None:
     scene = small_scene()
-    simulated = make_propagator(scene, "full", spacing, tolerance=1e-4).transfer_matrix()
+    simulated = make_propagator(scene, "full", spacing, tolerance=tolerance / 10).transfer_matrix()
     assert (
         relative_error(simulated, free_space_matrix(scene.control_points, scene.array, scene.wavenumber))
         < tolerance
@@ -86,12 +87,13 @@ def test_piston_radiates_as_a_piston() -> None:
 def test_reciprocity_of_discs() -> None:
     """Heard by a disc, the mean over its nodes: from the control points as from the transducers."""
     scene = small_scene((CUBE,), radius=3.9e-3, extent=28e-3)
-    backward, forward = (
-        make_propagator(scene, "full", 1e-3, tolerance=tolerance) for tolerance in (RECIPROCITY_ERROR, 1e-5)
-    )
-    matrices = backward.transfer_matrix(), forward.transfer_matrix()
-    assert (len(backward.runs), len(forward.runs)) == (3, 4)
-    assert relative_error(*matrices) < RECIPROCITY_ERROR
+    propagator = make_propagator(scene, "full", 1e-3, tolerance=1e-5)
+    backward = propagator.transfer_matrix()
+    more = torch.cat((scene.control_points, scene.control_points + 1e-3))
+    forward = propagator.transfer_matrix(more)[: len(scene.control_points)]
+    assert len(propagator.runs) == 3 + 4
+    # both are 1e-5 from the steady state, and single precision adds as much
+    assert relative_error(backward, forward) < 5e-5
 
 
 def test_field_of_a_plane_right_up_to_the_faces_of_the_domain() -> None:
@@ -110,16 +112,16 @@ def test_field_of_a_plane_right_up_to_the_faces_of_the_domain() -> None:
 
 
 def test_reciprocity() -> None:
-    """From the control points to the transducers as back, past an obstacle."""
-    scene = small_scene((CUBE,))
-    propagator = make_propagator(scene, "full", 1e-3, tolerance=RECIPROCITY_ERROR)
-    backward = propagator.transfer_matrix()
-    assert len(propagator.runs) == 3  # 3 points, 4 transducers: from the points
-    finer = make_propagator(scene, "full", 1e-3, tolerance=1e-5)
-    forward = finer.transfer_matrix()
-    assert len(finer.runs) == 4
-    # where the boundary layers meet the scheme is not symmetric: 3e-5 here
-    assert relative_error(backward, forward) < propagator.tolerance
+    """From points next to the domain's edges and corners to the transducers as back."""
+    scene = small_scene()
+    points = torch.tensor([[23.8e-3, 0.3e-3, 23.5e-3], [23.6e-3, 12.2e-3, 0.2e-3]], dtype=torch.float64)
+    propagator = make_propagator(scene, "full", 1e-3, tolerance=1e-7, dtype="float64")
+    backward = propagator.transfer_matrix(points)
+    assert len(propagator.runs) == 2  # 2 points, 4 transducers: from the points
+    forward = propagator.transfer_matrix(torch.cat((points, points + 1e-4 * (12e-3 - points))))[:2]
+    assert len(propagator.runs) == 2 + 4
+    # the scheme is symmetric, its layers and their corners included: what is left is the tolerance
+    assert relative_error(backward, forward) < 1e-6
 
 
 def test_replay_and_transfer_objectives_agree() -> None:
@@ -223,9 +225,9 @@ def test_free_space_says_that_it_leaves_obstacles_out(caplog: pytest.LogCaptureF
         ({"method": "fem"}, r"method: .*fem.*must be one of auto, free_space, full"),
         (
             {"spacing": 4e-3},
-            r"spacing: 0.004 m; must be at most 0.00213 m, 4 cells per .* in the medium",
+            r"spacing: 0.004 m; must be at most 0.00283 m, 3 cells per .* in the medium",
         ),
-        ({"spacing": 1e-5}, r"spacing: 1e-05 m; gives 2420 x 2420 x 2420 cells, must be at most 1e\+09"),
+        ({"spacing": 1e-5}, r"spacing: 1e-05 m; gives 2416 x 2416 x 2416 cells, must be at most 1e\+09"),
         ({"spacing": float("nan")}, r"spacing: nan"),
         ({"spacing": -1e-3}, r"spacing: -0.001 m; must be finite and > 0"),
         ({"tolerance": 1.5}, r"tolerance: 1.5; must be in \(0, 1\)"),
@@ -233,6 +235,7 @@ def test_free_space_says_that_it_leaves_obstacles_out(caplog: pytest.LogCaptureF
         ({"kernel": "fortran"}, r"kernel: .*fortran.*must be one of auto, cpu, reference"),
         ({"dtype": "float16"}, r"dtype: .*float16.*must be one of float32, float64"),
         ({"max_periods": 0}, r"max_periods: 0"),
+        ({"time_step": 0.0}, r"time_step: 0.0 s; must be finite and > 0"),
     ],
 )
 def test_bad_arguments_are_named(arguments: dict[str, object], message: str) -> None:
@@ -248,8 +251,15 @@ def test_points_outside_the_domain_are_refused() -> None:
 
 def test_a_slow_obstacle_needs_a_finer_grid() -> None:
     slow = small_scene((Box(CUBE.center, CUBE.size, density=100.0, sound_speed=100.0),))
-    with pytest.raises(ValueError, match=r"spacing: 0.001 m; must be at most 0.000625 m, .* in obstacle 0"):
+    with pytest.raises(ValueError, match=r"spacing: 0.001 m; must be at most 0.000833 m, .* in obstacle 0"):
         make_propagator(slow, "full", 1e-3)
+
+
+def test_a_coarse_grid_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    make_propagator(small_scene((CUBE,)), "full", 2e-3)
+    assert "coarse" not in caplog.text
+    make_propagator(small_scene((CUBE,)), "full", 2.5e-3)
+    assert "spacing 2.5 mm is coarse, 3.4 cells per wavelength in the medium" in caplog.text
 
 
 def test_nothing_in_gives_nothing_out() -> None:

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from autdtorch.fdtd.boundary import reflection, tuned_profile
-from autdtorch.fdtd.grid import LAYER_CELLS
+from autdtorch.fdtd.grid import FINE_LAYER_CELLS, layer_cells
 
 
 def reflected_decibels(
-    cells_per_wavelength: float, steps: int, cells: int, degrees: list[float]
+    cells_per_wavelength: float, steps: float, cells: int, degrees: list[float]
 ) -> np.ndarray:
     kappa = 2 * math.pi / cells_per_wavelength
     profile = tuned_profile(kappa, steps, cells)
@@ -18,22 +18,29 @@ def reflected_decibels(
 
 @pytest.mark.parametrize(
     ("cells_per_wavelength", "steps", "bound", "grazing_bound"),
-    [(17.0, 25, -90, -75), (8.5, 13, -90, -75), (8.5, 11, -90, -75), (4.25, 6, -65, -50)],
+    [
+        (34.0, 43, -90, -70),
+        (17.0, 25, -90, -70),
+        (8.5, 12, -90, -70),
+        (6.0, 8.5, -75, -55),
+        (4.25, 6, -72, -60),
+        (3.0, 4, -37, -22),
+    ],
 )
 def test_tuned_layer_reflects_little_at_the_drive_frequency(
-    cells_per_wavelength: float, steps: int, bound: float, grazing_bound: float
+    cells_per_wavelength: float, steps: float, bound: float, grazing_bound: float
 ) -> None:
-    # design goal: -70 dB to 60 degrees and -45 dB at 75 with 10 cells at 8.5 cells per wavelength; 8 cells do
-    # better
-    steep = reflected_decibels(cells_per_wavelength, steps, LAYER_CELLS, [0, 7, 15, 22, 30, 37, 45, 52, 60])
+    # design goal: -70 dB to 60 degrees and -45 dB at 75 with 10 cells at 8.5 cells per wavelength
+    cells = layer_cells(2 * math.pi / cells_per_wavelength)
+    steep = reflected_decibels(cells_per_wavelength, steps, cells, [0, 7, 15, 22, 30, 37, 45, 52, 60])
     assert steep.max() < bound
-    assert reflected_decibels(cells_per_wavelength, steps, LAYER_CELLS, [75]).max() < grazing_bound
+    assert reflected_decibels(cells_per_wavelength, steps, cells, [75]).max() < grazing_bound
 
 
 def test_layer_absorbs_other_frequencies_too() -> None:
     # what the switch-on excites must leave: waves of half and of 1.5 times the frequency, at normal incidence
     kappa, steps = 2 * math.pi / 8.5, 13
-    profile = tuned_profile(kappa, steps, LAYER_CELLS)
+    profile = tuned_profile(kappa, steps, FINE_LAYER_CELLS)
     along = kappa * np.array([0.5, 1.5])
     scale = math.sin(math.pi / steps) / math.sin(kappa / 2)
     turn = 2 * np.arcsin(scale * np.sin(along / 2))
@@ -49,6 +56,6 @@ def test_a_layer_without_damping_is_a_wall() -> None:
 
 
 def test_memory_fades() -> None:
-    profile = tuned_profile(2 * math.pi / 8.5, 13, LAYER_CELLS)
+    profile = tuned_profile(2 * math.pi / 8.5, 13, FINE_LAYER_CELLS)
     assert ((profile.decay > 0) & (profile.decay < 1)).all()
     assert ((profile.gain > -1) & (profile.gain <= 0)).all()

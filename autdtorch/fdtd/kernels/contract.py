@@ -5,7 +5,7 @@ One step, from pressures `now` and `before` at two successive times to the next 
 1. new = center now + face F + edge E + corner C - keep before, with F, E, C the sums over the 6, 12 and 8
    neighbours;
 2. in the varying cells instead new = (1 + keep) now - keep before + sum_j weight_j (now_j - now);
-3. in each of the six boundary layers the memory is advanced and its term added (`boundary.py`);
+3. the boundary layers add what stretches the sum of the two neighbours along each axis (`boundary.py`);
 4. the sources are added: new += cos(w t) Re(force) + sin(w t) Im(force), times the envelope;
 5. the outermost ring of cells stays zero.
 """
@@ -18,8 +18,11 @@ from typing import Protocol
 import torch
 
 Layer = tuple[torch.Tensor, torch.Tensor]
-"""Memory of the two boundary layers of an axis, stacked (2, nx, ny, nz) low and high: psi with n + 1 half
-cells and zeta with n cells along that axis, counted inwards from outside on both sides."""
+"""Memory of the two boundary layers of an axis, stacked (2, nx, ny, nz) low and high: psi with L + 1 half
+cells and zeta with L cells along that axis, counted inwards from outside on both sides."""
+
+ROWS_LAST = ((0, 2, 1, 3), (0, 1, 2, 3), (0, 1, 3, 2), (0, 1, 2, 3))
+"""How the memory of each of a state's layers lies: last the rows that a kernel runs along, then the depth."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,11 @@ class Coefficients:
 
 @dataclass
 class State:
-    """Two pressure fields (nx, ny, nz) and the memory of the boundary layers of x, y and z."""
+    """Two pressure fields (nx, ny, nz) and the memory of the boundary layers.
+
+    It is that of E_x, E_y and E_z, and of E_y acting on E_z p, which has 2 L cells along z: those of the low
+    layer and those of the high one, counted inwards.
+    """
 
     now: torch.Tensor
     before: torch.Tensor
@@ -68,21 +75,18 @@ def uniform_state(
 ) -> State:
     """A medium at rest at one pressure, on an array of `shape`."""
     layers = []
-    for axis in range(3):
-        half, full = [2, *shape], [2, *shape]
+    sizes = (shape, shape, shape, (*shape[:2], 2 * layer_cells))
+    for axis, order, size in zip((0, 1, 2, 1), ROWS_LAST, sizes, strict=True):
+        half, full = [2, *size], [2, *size]
         half[axis + 1], full[axis + 1] = layer_cells + 1, layer_cells
-        # Contiguous along y across z, along z across x and y: the long direction, in which a kernel runs.
-        layers.append((_zeros(half, axis == 2, dtype), _zeros(full, axis == 2, dtype)))
+        layers.append((_zeros(half, order, dtype), _zeros(full, order, dtype)))
     core = torch.full([cells - 2 for cells in shape], pressure, dtype=dtype)
     now = torch.nn.functional.pad(core, (1,) * 6)
     return State(now, now.clone(), tuple(layers))
 
 
-def _zeros(size: list[int], swapped: bool, dtype: torch.dtype) -> torch.Tensor:
-    if not swapped:
-        return torch.zeros(size, dtype=dtype)
-    two, x, y, z = size
-    return torch.zeros((two, x, z, y), dtype=dtype).transpose(2, 3)
+def _zeros(size: list[int], order: tuple[int, ...], dtype: torch.dtype) -> torch.Tensor:
+    return torch.zeros([size[axis] for axis in order], dtype=dtype).permute(order)
 
 
 @dataclass(frozen=True)

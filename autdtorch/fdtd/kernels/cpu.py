@@ -21,7 +21,7 @@ import torch
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, State
+from autdtorch.fdtd.kernels.contract import ROWS_LAST, Coefficients, Receivers, Sources, State
 
 _FAST = {"contract", "reassoc", "nsz"}
 
@@ -61,127 +61,131 @@ def _varying(p, q, index, weight, offsets, keep, result):  # type: ignore[no-unt
 
 
 @njit(fastmath=_FAST, cache=True, nogil=True)
-def _damp_row(u, depth, memory, outer, shift, out, decay, gain):  # type: ignore[no-untyped-def]
-    """Advance the memory of one row at `depth` cells inside a layer and add its term to the row `out`."""
-    behind, here, ahead = u[depth - 1], u[depth], u[depth + 1]
-    b_cell, a_cell = decay[2 * depth - 1], gain[2 * depth - 1]
-    b_half, a_half = decay[2 * depth], gain[2 * depth]
-    for k in range(1, len(here) - 1):
-        difference = ahead[k] - here[k]
-        memory[k] = b_half * memory[k] + a_half * difference
-        slope = memory[k] - outer[k]
-        shift[k] = b_cell * shift[k] + a_cell * (difference - (here[k] - behind[k]) + slope)
-        out[k] += slope + shift[k]
+def _stretch(u, psi, zeta, out, decay, gain):  # type: ignore[no-untyped-def]
+    """Advance the memory of a layer whose cells are the rows of u (L + 2, n); add its term to out (L, n)."""
+    here, ahead, outer = u[0], u[1], psi[0]
+    for k in range(len(here)):
+        outer[k] = decay[0] * outer[k] + gain[0] * (ahead[k] - here[k])
+    for depth in range(1, len(u) - 1):
+        behind, here, ahead = u[depth - 1], u[depth], u[depth + 1]
+        outer, memory, shift, term = psi[depth - 1], psi[depth], zeta[depth - 1], out[depth - 1]
+        b_cell, a_cell = decay[2 * depth - 1], gain[2 * depth - 1]
+        b_half, a_half = decay[2 * depth], gain[2 * depth]
+        for k in range(len(here)):
+            difference = ahead[k] - here[k]
+            memory[k] = b_half * memory[k] + a_half * difference
+            slope = memory[k] - outer[k]
+            shift[k] = b_cell * shift[k] + a_cell * (difference - (here[k] - behind[k]) + slope)
+            term[k] += slope + shift[k]
 
 
 @njit(fastmath=_FAST, cache=True, nogil=True)
-def _damp_outermost(u, memory, decay, gain):  # type: ignore[no-untyped-def]
-    """Advance the memory of the half cell between a layer and the ring."""
-    here, ahead = u[0], u[1]
-    for k in range(1, len(here) - 1):
-        memory[k] = decay[0] * memory[k] + gain[0] * (ahead[k] - here[k])
-
-
-@njit(parallel=True, fastmath=_FAST, cache=True, nogil=True)
-def _absorb_rows(p, q, axis, psi, zeta, decay, gain, face, edge, corner):  # type: ignore[no-untyped-def]
-    """The two boundary layers across x (axis 0) or y (axis 1)."""
-    cells, nz, last = len(decay) // 2, p.shape[2], p.shape[axis] - 1
-    for t in prange(1, p.shape[1 - axis] - 1):
-        u = np.zeros((cells + 2, nz), p.dtype)
-        beside = np.empty(nz, p.dtype)
-        for side in range(2):
-            for depth in range(1, cells + 2):
-                n = last - depth if side else depth
-                row = p[n, t] if axis == 0 else p[t, n]
-                a = p[n, t - 1] if axis == 0 else p[t - 1, n]
-                b = p[n, t + 1] if axis == 0 else p[t + 1, n]
-                for k in range(nz):
-                    beside[k] = a[k] + b[k]
-                _smooth_row(u[depth], row, beside, face, edge, corner)
-            _damp_outermost(u, psi[side, 0, t] if axis == 0 else psi[side, t, 0], decay, gain)
-            for depth in range(1, cells + 1):
-                n = last - depth if side else depth
-                if axis == 0:
-                    _damp_row(
-                        u,
-                        depth,
-                        psi[side, depth, t],
-                        psi[side, depth - 1, t],
-                        zeta[side, depth - 1, t],
-                        q[n, t],
-                        decay,
-                        gain,
-                    )
-                else:
-                    _damp_row(
-                        u,
-                        depth,
-                        psi[side, t, depth],
-                        psi[side, t, depth - 1],
-                        zeta[side, t, depth - 1],
-                        q[t, n],
-                        decay,
-                        gain,
-                    )
-
-
-@njit(fastmath=_FAST, cache=True, nogil=True)
-def _smooth_row(u, row, beside, face, edge, corner):  # type: ignore[no-untyped-def]
-    """Write the 9-point sum across a layer's axis into u, from a row and the sum of the rows beside it."""
+def _smooth(out, row, a, b, face, edge, corner):  # type: ignore[no-untyped-def]
+    """Add to a row the 9-point sum across: of the row itself and of those beside it."""
     for k in range(1, len(row) - 1):
-        u[k] = (
+        out[k] += (
             face * row[k]
-            + edge * (beside[k] + (row[k - 1] + row[k + 1]))
-            + corner * (beside[k - 1] + beside[k + 1])
+            + edge * ((a[k] + b[k]) + (row[k - 1] + row[k + 1]))
+            + corner * ((a[k - 1] + a[k + 1]) + (b[k - 1] + b[k + 1]))
         )
 
 
 @njit(parallel=True, fastmath=_FAST, cache=True, nogil=True)
-def _absorb_ends(p, q, psi, zeta, decay, gain, face, edge, corner):  # type: ignore[no-untyped-def]
-    """The two boundary layers across z: the ends of all rows, turned so that rows run along y."""
+def _stretch_planes(p, layers, terms, decay, gain):  # type: ignore[no-untyped-def]
+    """The layers' terms E_y p, E_z p and E_y E_z p, plane by plane."""
+    (psi_y, zeta_y), (psi_z, zeta_z), (psi_yz, zeta_yz) = layers
+    e_y, e_z, e_yz = terms
     cells = len(decay) // 2
     nx, ny, nz = p.shape
     for i in prange(1, nx - 1):
-        own = np.empty((cells + 2, ny), p.dtype)
-        sides = np.empty((cells + 2, ny), p.dtype)
-        u = np.zeros((cells + 2, ny), p.dtype)
-        term = np.empty((cells + 1, ny), p.dtype)
+        rows = np.empty((cells + 2, nz), p.dtype)
+        columns = np.empty((cells + 2, ny), p.dtype)
+        ends = np.empty((cells + 2, 2 * cells), p.dtype)
+        e_y[i], e_z[i], e_yz[i] = 0, 0, 0
         for side in range(2):
             for j in range(ny):
-                row, a, b = p[i, j], p[i - 1, j], p[i + 1, j]
-                for depth in range(1, cells + 2):
-                    k = nz - 1 - depth if side else depth
-                    own[depth, j] = row[k]
-                    sides[depth, j] = a[k] + b[k]
-            for depth in range(1, cells + 2):
-                _smooth_row(u[depth], own[depth], sides[depth], face, edge, corner)
-            _damp_outermost(u, psi[side, i, 0], decay, gain)
+                for depth in range(cells + 2):
+                    columns[depth, j] = p[i, j, nz - 1 - depth if side else depth]
+            _stretch(columns, psi_z[side, i], zeta_z[side, i], e_z[i, side], decay, gain)
+        for side in range(2):
+            for depth in range(cells + 2):
+                j = ny - 1 - depth if side else depth
+                rows[depth] = p[i, j]
+                for end in range(2):
+                    for k in range(cells):
+                        ends[depth, end * cells + k] = e_z[i, end, k, j]
+            _stretch(rows, psi_y[side, i], zeta_y[side, i], e_y[i, side], decay, gain)
+            _stretch(ends, psi_yz[side, i], zeta_yz[side, i], e_yz[i, side], decay, gain)
+
+
+@njit(parallel=True, fastmath=_FAST, cache=True, nogil=True)
+def _absorb_planes(q, terms, face, edge, corner):  # type: ignore[no-untyped-def]
+    """Add the terms of the layers across y and z, smoothed across."""
+    e_y, e_z, e_yz = terms
+    cells = e_z.shape[2]
+    nx, ny, nz = q.shape
+    for i in prange(1, nx - 1):
+        term = np.empty((cells, ny), q.dtype)
+        for side in range(2):
             term[:] = 0
-            for depth in range(1, cells + 1):
-                _damp_row(
-                    u,
-                    depth,
-                    psi[side, i, depth],
-                    psi[side, i, depth - 1],
-                    zeta[side, i, depth - 1],
-                    term[depth],
-                    decay,
-                    gain,
-                )
+            for depth in range(cells):
+                a, b = e_z[i - 1, side, depth], e_z[i + 1, side, depth]
+                _smooth(term[depth], e_z[i, side, depth], a, b, face, edge, corner)
             for j in range(1, ny - 1):
-                out = q[i, j]
-                for depth in range(1, cells + 1):
-                    k = nz - 1 - depth if side else depth
-                    out[k] += term[depth, j]
+                for depth in range(cells):
+                    q[i, j, nz - 2 - depth if side else depth + 1] += term[depth, j]
+            for depth in range(cells):
+                out = q[i, ny - 2 - depth if side else depth + 1]
+                a, b = e_y[i - 1, side, depth], e_y[i + 1, side, depth]
+                _smooth(out, e_y[i, side, depth], a, b, face, edge, corner)
+                own, a, b = e_yz[i, side, depth], e_yz[i - 1, side, depth], e_yz[i + 1, side, depth]
+                for k in range(cells):
+                    out[k + 1] += edge * own[k] + corner * (a[k] + b[k])
+                    out[nz - 2 - k] += edge * own[cells + k] + corner * (a[cells + k] + b[cells + k])
+
+
+@njit(parallel=True, fastmath=_FAST, cache=True, nogil=True)
+def _absorb_x(p, q, psi, zeta, terms, decay, gain, face, edge, corner):  # type: ignore[no-untyped-def]
+    """The layers across x, of the sum across it in which the layers of y and z are already stretched."""
+    e_y, e_z, e_yz = terms
+    cells = len(decay) // 2
+    nx, ny, nz = p.shape
+    for j in prange(1, ny - 1):
+        u = np.empty((cells + 2, nz), p.dtype)
+        term = np.empty((cells, nz), p.dtype)
+        beside = min(j, ny - 1 - j) - 1
+        for side in range(2):
+            u[:] = 0
+            term[:] = 0
+            for depth in range(1, cells + 2):
+                i, row = nx - 1 - depth if side else depth, u[depth]
+                _smooth(row, p[i, j], p[i, j - 1], p[i, j + 1], face, edge, corner)
+                if beside < cells:
+                    e = e_y[i, int(2 * j > ny), beside]
+                    for k in range(1, nz - 1):
+                        row[k] += edge * e[k] + corner * (e[k - 1] + e[k + 1])
+                    e = e_yz[i, int(2 * j > ny), beside]
+                    for k in range(cells):
+                        row[k + 1] += corner * e[k]
+                        row[nz - 2 - k] += corner * e[cells + k]
+                for k in range(cells):
+                    low, high = e_z[i, 0, k], e_z[i, 1, k]
+                    row[k + 1] += edge * low[j] + corner * (low[j - 1] + low[j + 1])
+                    row[nz - 2 - k] += edge * high[j] + corner * (high[j - 1] + high[j + 1])
+            _stretch(u, psi[side, j], zeta[side, j], term, decay, gain)
+            for depth in range(cells):
+                out = q[nx - 2 - depth if side else depth + 1, j]
+                for k in range(nz):
+                    out[k] += term[depth, k]
 
 
 @njit(cache=True, nogil=True)
 def _advance(  # type: ignore[no-untyped-def]
-    p, q, layers, weights, varying, decay, gain, driven, force, heard, hearing, signal, recorded
+    p, q, layers, terms, weights, varying, decay, gain, driven, force, heard, hearing, signal, recorded
 ):
     center, face, edge, corner, keep = weights
     index, weight, offsets, buffer = varying
-    (psi_x, zeta_x), (psi_y, zeta_y), (psi_z, zeta_z) = layers
+    (psi, zeta), across = layers[0], layers[1:]
     for step in range(len(signal)):
         if len(index):
             _varying(p, q, index, weight, offsets, keep, buffer)
@@ -189,9 +193,9 @@ def _advance(  # type: ignore[no-untyped-def]
         flat = q.ravel()
         for n in range(len(index)):
             flat[index[n]] = buffer[n]
-        _absorb_rows(p, q, 0, psi_x, zeta_x, decay, gain, face, edge, corner)
-        _absorb_rows(p, q, 1, psi_y, zeta_y, decay, gain, face, edge, corner)
-        _absorb_ends(p, q, psi_z, zeta_z, decay, gain, face, edge, corner)
+        _stretch_planes(p, across, terms, decay, gain)
+        _absorb_planes(q, terms, face, edge, corner)
+        _absorb_x(p, q, psi, zeta, terms, decay, gain, face, edge, corner)
         for n in range(len(driven)):
             flat[driven[n]] += force[n].real * signal[step, 0] + force[n].imag * signal[step, 1]
         for r in range(len(heard)):
@@ -202,9 +206,10 @@ def _advance(  # type: ignore[no-untyped-def]
         p, q = q, p
 
 
-def _rows_last(memory: torch.Tensor, axis: int) -> NDArray[np.floating]:
-    """Memory of an axis with that axis never last, contiguous in the layout of `uniform_state`."""
-    return (memory.transpose(2, 3) if axis == 2 else memory).numpy()
+def _no_terms(shape: torch.Size, cells: int, dtype: type) -> tuple[NDArray[np.floating], ...]:
+    """Room for E_y p, E_z p and E_y E_z p by plane, side and depth; the last only has ends of rows."""
+    nx, ny, nz = shape
+    return tuple(np.zeros((nx, 2, cells, row), dtype) for row in (nz, ny, 2 * cells))
 
 
 class CpuKernel:
@@ -234,9 +239,10 @@ class CpuKernel:
             state.now.numpy(),
             state.before.numpy(),
             tuple(
-                (_rows_last(psi, axis), _rows_last(zeta, axis))
-                for axis, (psi, zeta) in enumerate(state.layers)
+                (psi.permute(order).numpy(), zeta.permute(order).numpy())
+                for order, (psi, zeta) in zip(ROWS_LAST, state.layers, strict=True)
             ),
+            _no_terms(state.now.shape, c.layer_cells, dtype),
             (dtype(c.center), dtype(c.face), dtype(c.edge), dtype(c.corner), dtype(c.keep)),
             varying,
             c.layer_decay.numpy(),

@@ -46,13 +46,9 @@ class ReferenceKernel:
         kept = own + c.keep * (own - before)
         new = new.reshape(-1).index_copy(0, c.varying_index, kept + change)
         new = new.reshape(state.now.shape)
-        layers = []
-        for axis, (psi, zeta) in enumerate(state.layers):
-            low, low_term = _absorb(state.now, (psi[0], zeta[0]), c, axis, mirrored=False)
-            high, high_term = _absorb(state.now, (psi[1], zeta[1]), c, axis, mirrored=True)
-            layers.append((torch.stack((low[0], high[0])), torch.stack((low[1], high[1]))))
-            new = new + low_term + high_term
-        return State(new.reshape(-1).index_add(0, driven, force).reshape(new.shape), state.now, tuple(layers))
+        layers, term = _absorb(state.now, state.layers, c)
+        new = new + term
+        return State(new.reshape(-1).index_add(0, driven, force).reshape(new.shape), state.now, layers)
 
 
 def _core(field: torch.Tensor) -> torch.Tensor:
@@ -79,40 +75,66 @@ def _sweep(p: torch.Tensor, c: Coefficients) -> torch.Tensor:
     return c.center * _core(p) + c.face * faces + c.edge * edges + c.corner * corners
 
 
+def _around(field: torch.Tensor, axis: int) -> torch.Tensor:
+    """Sum of the two neighbours along an axis in every cell; beyond the field is nothing."""
+    return _between(neighbours(field, axis), axis, 1, 1)
+
+
+def _between(field: torch.Tensor, axis: int, before: int, after: int) -> torch.Tensor:
+    """The field with `before` and `after` cells of nothing around it along an axis."""
+    width = [0] * 6
+    width[4 - 2 * axis], width[5 - 2 * axis] = before, after
+    return torch.nn.functional.pad(field, width)
+
+
 def _absorb(
-    p: torch.Tensor, layer: Layer, c: Coefficients, axis: int, mirrored: bool
-) -> tuple[Layer, torch.Tensor]:
-    """Advance one boundary layer's memory; returns it and the term to add to the new pressure."""
-    cells = c.layer_cells
-    slab = p.narrow(axis, p.shape[axis] - cells - 2 if mirrored else 0, cells + 2)
-    slab = torch.flip(slab, (axis,)) if mirrored else slab
-    across = [other for other in range(3) if other != axis]
-    first, second = across
-    smoothed = (
-        c.face * middle(middle(slab, first), second)
-        + c.edge * (middle(neighbours(slab, first), second) + middle(neighbours(slab, second), first))
-        + c.corner * neighbours(neighbours(slab, first), second)
-    )
+    p: torch.Tensor, layers: tuple[Layer, ...], c: Coefficients
+) -> tuple[tuple[Layer, ...], torch.Tensor]:
+    """Advance the boundary layers' memory; returns it and the term to add to the new pressure.
+
+    With T_a the sum of the two neighbours along axis a, the layers put T_a + E_a in place of T_a everywhere
+    in the 27-point sum, products included.
+    """
+    x, y, z, yz = layers
+    cells, size = c.layer_cells, p.shape
+
+    def smooth(field: torch.Tensor, first: int, second: int) -> torch.Tensor:
+        one, other = _around(field, first), _around(field, second)
+        return c.face * field + c.edge * (one + other) + c.corner * _around(one, second)
+
+    def placed(sides: tuple[torch.Tensor, ...], axis: int) -> torch.Tensor:
+        low, high = sides
+        rest = size[axis] - cells - 1
+        return _between(low, axis, 1, rest) + _between(torch.flip(high, (axis,)), axis, rest, 1)
+
+    z, ends = _stretch(p, z, c, 2)
+    y, sides = _stretch(p, y, c, 1)
+    yz, edges = _stretch(torch.cat(ends, 2), yz, c, 1)
+    e_z, e_y = placed(ends, axis=2), placed(sides, axis=1)
+    e_yz = placed(torch.split(placed(edges, axis=1), cells, dim=2), axis=2)
+    across = smooth(p, 1, 2) + c.edge * (e_y + e_z) + c.corner * (_around(e_y, 2) + _around(e_z, 1) + e_yz)
     # The ring at the array's face is silent: nothing is smoothed into it.
-    smoothed = torch.cat(
-        (torch.zeros_like(smoothed.narrow(axis, 0, 1)), smoothed.narrow(axis, 1, cells + 1)), axis
-    )
-    shape = [1, 1, 1]
+    x, faces = _stretch(torch.nn.functional.pad(_core(across), (1,) * 6), x, c, 0)
+    term = placed(faces, axis=0) + smooth(e_y, 0, 2) + smooth(e_z, 0, 1)
+    term = term + c.edge * e_yz + c.corner * _around(e_yz, 0)
+    return (x, y, z, yz), torch.nn.functional.pad(_core(term), (1,) * 6)
+
+
+def _stretch(
+    field: torch.Tensor, layer: Layer, c: Coefficients, axis: int
+) -> tuple[Layer, tuple[torch.Tensor, torch.Tensor]]:
+    """Advance the memory of an axis; returns it and E_a of the field in the low and the high layer."""
+    cells, shape = c.layer_cells, [1, 1, 1]
     shape[axis] = -1
     b_half, b_cell = c.layer_decay[0::2].reshape(shape), c.layer_decay[1::2].reshape(shape)
     a_half, a_cell = c.layer_gain[0::2].reshape(shape), c.layer_gain[1::2].reshape(shape)
-    psi, zeta = (middle(middle(memory, first), second) for memory in layer)
-    difference = torch.diff(smoothed, dim=axis)
-    psi = b_half * psi + a_half * difference
-    slope = torch.diff(psi, dim=axis)
-    zeta = b_cell * zeta + a_cell * (torch.diff(difference, dim=axis) + slope)
-    term = slope + zeta
-    inner = [0] * 6
-    for other in across:
-        inner[2 * (2 - other)] = inner[2 * (2 - other) + 1] = 1
-    outer = list(inner)
-    before, after = 1, p.shape[axis] - cells - 1
-    outer[2 * (2 - axis)], outer[2 * (2 - axis) + 1] = (after, before) if mirrored else (before, after)
-    term = torch.flip(term, (axis,)) if mirrored else term
-    pad = torch.nn.functional.pad
-    return (pad(psi, inner), pad(zeta, inner)), pad(term, outer)
+    advanced, terms = [], []
+    for slab, psi, zeta in zip((field, torch.flip(field, (axis,))), *layer, strict=True):
+        difference = torch.diff(slab.narrow(axis, 0, cells + 2), dim=axis)
+        psi = b_half * psi + a_half * difference
+        slope = torch.diff(psi, dim=axis)
+        zeta = b_cell * zeta + a_cell * (torch.diff(difference, dim=axis) + slope)
+        advanced.append((psi, zeta))
+        terms.append(slope + zeta)
+    (low_psi, low_zeta), (high_psi, high_zeta) = advanced
+    return (torch.stack((low_psi, high_psi)), torch.stack((low_zeta, high_zeta))), (terms[0], terms[1])

@@ -1,0 +1,143 @@
+"""The largest time step that leapfrog takes on an assembled scene.
+
+A step p_new = 2 p - p_old - C A p, with (A p)_i = sum_j w_ij (p_i - p_j), is stable as long as C lambda <= 4,
+lambda being the largest eigenvalue of A. The weights are w_ij = B_ij / m_i with symmetric bonds and masses. A
+therefore has the eigenvalues of the symmetric matrix with -sign(w_ij) sqrt(w_ij w_ji) off its diagonal, for
+which the weights are enough. Nothing here asks bonds to be positive.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import math
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import eigvalsh_tridiagonal
+from scipy.sparse import csr_array
+
+from autdtorch.fdtd.stencil import OFFSETS, Stencil
+
+logger = logging.getLogger(__name__)
+
+Array = NDArray[np.float64]
+
+CLOSE = 1.03
+"""A bound within this factor of a value that is reached is taken as it is: 1.5 % of the time step."""
+
+MARGIN = 1.01
+"""What the iterated eigenvalue is raised by, at 0.5 % of the time step. It comes from below: 60 steps leave
+up to 2e-4, the rim of one cell 3e-4 (cubes of density ratio 1e-3 to 1e4, speed ratio 0.3 to 4)."""
+
+MOST_CELLS = 1_000_000
+"""Varying cells that are iterated on, in about five seconds; of more, the bound decides alone."""
+
+LONG_ENOUGH = 0.97
+"""Share of the longest time step that is worth having. The rest asks for blocks of more periods, and a run
+ends with a whole block: it would lose what it wins."""
+
+_LANCZOS_STEPS = 60
+
+
+def largest_eigenvalue(
+    index: NDArray[np.int64], weight: Array, stencil: Stencil, shape: tuple[int, int, int]
+) -> float:
+    """Largest eigenvalue of a scene's operator, from above.
+
+    The larger of two: what uniform air reaches, and what the varying cells reach with a rim of one cell. A
+    mode that beats the air's is bound to those cells and fades within a cell.
+
+    Args:
+        index: flat indices (n,) of the cells whose weights differ from the stencil's, ascending; none of them
+            in the outermost two layers.
+        weight: their weights w_ij (n, 27), such that m_i w_ij is symmetric for some masses.
+        stencil: weights of all other cells.
+        shape: cells of the grid.
+    """
+    air = stencil.largest_symbol
+    if len(index) == 0:
+        return air
+    rows, place = _with_rim(index, shape)
+    neighbour = place[rows[:, None] + _flat_offsets(shape)]
+    inside = neighbour >= 0
+    forth = np.broadcast_to(stencil.weights, (len(rows), 27)).copy()
+    forth[place[index]] = weight
+    back = np.where(inside, forth[neighbour, _REVERSED], stencil.weights)
+    # A bond B adds B (p_i - p_j)^2 <= max(B, 0) (1/m_i + 1/m_j) (m_i p_i^2 + m_j p_j^2) to the energy: summed
+    # over the bonds of a cell, this bounds the largest eigenvalue at any contrast.
+    bound = float(np.maximum(forth + back, 0).sum(1).max())
+    if bound <= CLOSE * air:
+        return bound
+    if len(index) > MOST_CELLS:
+        logger.warning(
+            "the time step comes from a bound, up to a tenth short of the limit: the largest eigenvalue of %d"
+            " varying cells is not worked out, only of up to %d", len(index), MOST_CELLS,
+        )  # fmt: skip
+        return bound
+    matrix = np.where(inside, -np.sign(forth) * np.sqrt(forth * back), 0)
+    matrix[:, 13] = forth.sum(1)
+    column = np.where(inside, neighbour, np.arange(len(rows), dtype=np.int32)[:, None])
+    first = np.arange(0, 27 * len(rows) + 1, 27)
+    reached = _lanczos(csr_array((matrix.ravel(), column.ravel(), first)), _LANCZOS_STEPS)
+    return min(bound, max(air, MARGIN * reached))
+
+
+_REVERSED = 26 - np.arange(27)
+"""Where `OFFSETS` holds the way back."""
+
+
+def _flat_offsets(shape: tuple[int, int, int]) -> NDArray[np.int64]:
+    return np.asarray(np.array(OFFSETS) @ (shape[1] * shape[2], shape[2], 1), np.int64)
+
+
+def _with_rim(
+    index: NDArray[np.int64], shape: tuple[int, int, int]
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Cells `index` and their neighbours, ascending, and the place among them of each cell of the grid."""
+    found = np.zeros(math.prod(shape), bool)
+    for offset in _flat_offsets(shape):
+        found[index + offset] = True
+    rows = np.flatnonzero(found)
+    place = np.full(len(found), -1, np.int32)
+    place[rows] = np.arange(len(rows))
+    return rows, place
+
+
+def _lanczos(matrix: csr_array, steps: int) -> float:
+    """Largest Ritz value of a symmetric matrix: never above its largest eigenvalue, but for rounding.
+
+    The vectors are not made orthogonal again. That repeats Ritz values and moves none beyond the spectrum
+    (Paige 1980).
+    """
+    vector = np.random.default_rng(0).standard_normal(matrix.shape[0])
+    vector /= np.linalg.norm(vector)
+    previous, beta = np.zeros_like(vector), 0.0
+    diagonal, beside = [], []
+    for _ in range(steps):
+        image = matrix @ vector - beta * previous
+        diagonal.append(float(vector @ image))
+        image -= diagonal[-1] * vector
+        beta = float(np.linalg.norm(image))
+        if beta <= 1e-12 * abs(diagonal[0]):  # the vectors span an invariant space
+            break
+        beside.append(beta)
+        previous, vector = vector, image / beta
+    return float(eigvalsh_tridiagonal(diagonal, beside[: len(diagonal) - 1])[-1])
+
+
+def fewest_steps(stencil: Stencil, largest: float) -> float:
+    """Steps a period at the stability limit, where time factor x `largest` eigenvalue = 4."""
+    return 2 * math.pi / math.acos(1 - 2 * stencil.symbol / largest)
+
+
+def whole_steps(fewest: float) -> Fraction:
+    """Steps a period, at least `fewest`, that are whole in a block of periods: the denominator.
+
+    The block is the shortest whose time step is `LONG_ENOUGH`. A block of q periods loses less than 1 step in
+    q x fewest, so that 12 steps a period need up to 3 periods, 6 steps up to 6.
+    """
+    # rounding must not add a step to a number that is whole
+    counts = (Fraction(math.ceil(block * fewest - 1e-9), block) for block in itertools.count(1))
+    return next(count for count in counts if fewest >= LONG_ENOUGH * count)

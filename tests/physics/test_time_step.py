@@ -1,0 +1,136 @@
+"""The time step against the true limit: whole grids, through the kernel's own steps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import torch
+from scipy.sparse.linalg import LinearOperator, eigs
+from small_scenes import CUBE, relative_error, small_scene
+
+from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, State, uniform_state
+from autdtorch.fdtd.kernels.cpu import CpuKernel
+from autdtorch.fdtd.stability import fewest_steps
+from autdtorch.fdtd.stepping import Assembly, assemble, drive_signal, lock_in
+from autdtorch.propagator import make_propagator
+from autdtorch.scene import Box
+
+NOBODY = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.complex128))
+DEAF = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1), dtype=torch.float64))
+
+
+def cube(density: float, sound_speed: float = 340.0) -> tuple[Box, ...]:
+    return (Box(CUBE.center, CUBE.size, density=density, sound_speed=sound_speed),)
+
+
+SCENES = {
+    "air": ((), 1e-3),
+    "paper": (cube(100.0), 1e-3),
+    "paper, coarse": (cube(100.0), 2e-3),
+    "paper, coarsest": (cube(100.0), 2.8e-3),
+    "rigid": ((Box(CUBE.center, CUBE.size, rigid=True),), 1e-3),
+    "heavy": (cube(1.293e4), 1e-3),
+    "light": (cube(1.293e-3), 1e-3),
+    "fast": (cube(100.0, 4 * 340.0), 1e-3),
+    "slow": (cube(3.0, 0.3 * 340.0), 0.7e-3),
+}
+
+
+def scaled(c: Coefficients, ratio: float) -> Coefficients:
+    """The same medium with another time factor."""
+    return replace(
+        c,
+        center=2 - ratio * (2 - c.center),
+        face=ratio * c.face,
+        edge=ratio * c.edge,
+        corner=ratio * c.corner,
+        varying_weight=ratio * c.varying_weight,
+    )
+
+
+def advance(c: Coefficients, state: State, steps: int) -> State:
+    return CpuKernel().advance(state, c, NOBODY, DEAF, torch.zeros((steps, 2), dtype=torch.float64))[0]
+
+
+def true_eigenvalue(assembly: Assembly) -> float:
+    """Largest eigenvalue of the whole grid's operator without its layers: what a step does, by Arnoldi."""
+    c = assembly.coefficients
+    open_ended = replace(c, layer_gain=torch.zeros_like(c.layer_gain))
+    factor = assembly.stencil.time_factor(float(assembly.steps_per_period))
+
+    def apply(pressure: np.ndarray) -> np.ndarray:
+        state = uniform_state(assembly.grid.shape, c.layer_cells, 0.0, torch.float64)
+        state.now[1:-1, 1:-1, 1:-1] = torch.from_numpy(pressure).reshape(inner)
+        before = state.now.clone()
+        new = advance(open_ended, state, 1).now
+        return ((2 * before - new)[1:-1, 1:-1, 1:-1] / factor).numpy().ravel()
+
+    inner = [cells - 2 for cells in assembly.grid.shape]
+    operator = LinearOperator((math.prod(inner),) * 2, matvec=apply, dtype=np.float64)
+    start = np.random.default_rng(1).standard_normal(math.prod(inner))
+    (largest,) = eigs(operator, 1, which="LM", v0=start, tol=1e-4, return_eigenvectors=False)
+    return float(largest.real)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_time_step_is_just_below_the_limit(name: str) -> None:
+    obstacles, spacing = SCENES[name]
+    assembly = assemble(small_scene(obstacles), spacing, torch.float64)
+    limit = fewest_steps(assembly.stencil, true_eigenvalue(assembly))
+    assert 0.95 <= limit / float(assembly.steps_per_period) <= 1
+
+
+@pytest.mark.parametrize("name", ["paper", "light"])
+def test_a_run_is_bounded_at_the_chosen_time_step_and_blows_up_above_the_limit(name: str) -> None:
+    obstacles, spacing = SCENES[name]
+    assembly = assemble(small_scene(obstacles), spacing, torch.float64)
+    stencil, c = assembly.stencil, assembly.coefficients
+    limit = fewest_steps(stencil, true_eigenvalue(assembly))
+    ratio = stencil.time_factor(limit / 1.05) / stencil.time_factor(float(assembly.steps_per_period))
+
+    def growth(coefficients: Coefficients, steps: int) -> float:
+        state = uniform_state(assembly.grid.shape, c.layer_cells, 0.0, torch.float64)
+        inner = state.now[1:-1, 1:-1, 1:-1]
+        inner.copy_(torch.randn(inner.shape, generator=torch.Generator().manual_seed(0), dtype=inner.dtype))
+        state.before.copy_(state.now)
+        start = float(state.now.norm())
+        return float(advance(coefficients, state, steps).now.norm()) / start
+
+    # the pressure alone is no energy: in a light body it may rise by the root of the density ratio
+    assert growth(c, 3000) < 10
+    # C lambda = 4 x 1.1 grows by e^{2 acosh(sqrt(1.1))} a step at the mode's frequency: e^{0.6}
+    assert growth(scaled(c, ratio), 300) > 1e30
+
+
+def test_a_block_of_several_periods_locks_in_exactly() -> None:
+    """Whatever phasor goes in comes out, over blocks of any number of periods."""
+    phasor = torch.tensor([0.3 - 2j, 1j], dtype=torch.complex128)
+    for steps in (Fraction(12), Fraction(23, 2), Fraction(35, 3), Fraction(17, 4)):
+        block = 100 * steps.numerator
+        assert drive_signal(steps, block, 1).tolist() == [[1, 0]]
+        after_each_step = drive_signal(steps, block + 1, steps.numerator)
+        recorded = after_each_step @ torch.stack((phasor.real, phasor.imag))
+        assert torch.allclose(lock_in(recorded, steps.denominator), phasor, rtol=1e-12)
+
+
+def test_a_time_step_of_ones_own() -> None:
+    scene = small_scene((CUBE,))
+    finest = make_propagator(scene, "full", 2e-3, time_step=2e-6)
+    chosen = make_propagator(scene, "full", 2e-3)
+    assert 0.97 * 2e-6 <= finest.time_step <= 2e-6
+    # the drive's frequency is exact at any time step: what is left is the tolerance, twice
+    point = scene.control_points[:1]
+    difference = relative_error(finest.transfer_matrix(point), chosen.transfer_matrix(point))
+    assert difference < finest.tolerance + chosen.tolerance
+
+
+def test_a_time_step_above_the_limit_is_refused_with_both_numbers() -> None:
+    scene = small_scene((CUBE,))
+    with pytest.raises(ValueError, match=r"time_step: 3e-06 s; must be at most 2\.136e-06 s") as error:
+        make_propagator(scene, "full", 1e-3, time_step=3e-6)
+    limit = float(str(error.value).split("at most ")[1].split(" s")[0])
+    assert make_propagator(scene, "full", 1e-3, time_step=limit).time_step <= limit

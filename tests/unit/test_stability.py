@@ -1,0 +1,100 @@
+import itertools
+import logging
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from autdtorch.fdtd import stability
+from autdtorch.fdtd.stability import fewest_steps, largest_eigenvalue, whole_steps
+from autdtorch.fdtd.stencil import OFFSETS, tuned_stencil
+
+STENCIL = tuned_stencil(2 * math.pi / 8.5)
+SHAPE = (8, 8, 8)
+
+
+def random_weights(seed: int, contrast: float, negative: float) -> tuple[np.ndarray, np.ndarray]:
+    """Varying cells in the middle of air: symmetric bonds, some of them negative, over random masses."""
+    rng = np.random.default_rng(seed)
+    inside = np.zeros(SHAPE, bool)
+    inside[2:-2, 2:-2, 2:-2] = True
+    index, strides = np.flatnonzero(inside), np.array((64, 8, 1))
+    mass, weight = np.ones(math.prod(SHAPE)), np.tile(STENCIL.weights, (math.prod(SHAPE), 1))
+    mass[index] = contrast ** rng.uniform(-1, 1, len(index))
+    for column, offset in enumerate(OFFSETS[14:], start=14):
+        for cell, other in zip(index, index + strides @ offset, strict=True):
+            if inside.flat[other]:
+                bond = weight[cell, column] * rng.uniform(-negative, 1) * math.sqrt(mass[cell] * mass[other])
+                weight[cell, column], weight[other, 26 - column] = bond / mass[cell], bond / mass[other]
+            else:
+                weight[cell, column] /= mass[cell]
+        for cell, other in zip(index, index - strides @ offset, strict=True):
+            if not inside.flat[other]:
+                weight[cell, 26 - column] /= mass[cell]
+    return index, weight[index]
+
+
+def dense(index: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """The operator on all cells but the outermost, which are held at zero."""
+    inner = np.zeros(SHAPE, bool)
+    inner[1:-1, 1:-1, 1:-1] = True
+    rows = np.flatnonzero(inner)
+    full = np.tile(STENCIL.weights, (inner.size, 1))
+    full[index] = weight
+    matrix = np.zeros((inner.size, inner.size))
+    for offset, column in zip(np.array(OFFSETS) @ (64, 8, 1), full.T, strict=True):
+        matrix[rows, rows + offset] -= column[rows]
+    matrix[rows, rows] += full[rows].sum(1)
+    return matrix[np.ix_(rows, rows)]
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 10**6), st.floats(1, 1e4), st.sampled_from([0.0, 0.2]))
+def test_largest_eigenvalue_is_never_below_the_truth_and_close_to_it(
+    seed: int, contrast: float, negative: float
+) -> None:
+    index, weight = random_weights(seed, contrast, negative)
+    truth = max(np.abs(np.linalg.eigvals(dense(index, weight))).max(), STENCIL.largest_symbol)
+    found = largest_eigenvalue(index, weight, STENCIL, SHAPE)
+    # above: the margin, or the width within which a bound is taken as it is
+    assert truth * (1 - 1e-9) <= found <= truth * max(stability.MARGIN, stability.CLOSE)
+
+
+def test_of_uniform_air_it_is_that_of_the_shortest_wave() -> None:
+    nothing = np.zeros(0, np.int64), np.zeros((0, 27))
+    assert largest_eigenvalue(*nothing, STENCIL, SHAPE) == STENCIL.largest_symbol
+
+
+def test_too_many_cells_get_the_bound_and_the_log_says_so(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    index, weight = random_weights(0, contrast=100.0, negative=0.2)
+    worked_out = largest_eigenvalue(index, weight, STENCIL, SHAPE)
+    monkeypatch.setattr(stability, "MOST_CELLS", len(index) - 1)
+    with caplog.at_level(logging.WARNING):
+        assert largest_eigenvalue(index, weight, STENCIL, SHAPE) > worked_out
+    assert f"the largest eigenvalue of {len(index)} varying cells is not worked out" in caplog.text
+
+
+@given(st.floats(2.5, 1e3))
+def test_steps_are_whole_in_the_shortest_block_that_is_long_enough(fewest: float) -> None:
+    steps = whole_steps(fewest)
+    assert stability.LONG_ENOUGH * steps <= fewest <= steps * (1 + 1e-9)
+    for periods in range(1, steps.denominator):
+        assert math.ceil(periods * fewest) * stability.LONG_ENOUGH > periods * fewest
+    # a block of q periods loses less than 1 / (q fewest)
+    assert steps.denominator <= 1 + stability.LONG_ENOUGH / (1 - stability.LONG_ENOUGH) / fewest
+
+
+@pytest.mark.parametrize(("fewest", "steps"), [(12, 12), (11.7, 12), (11.62, Fraction(35, 3)), (11.2, 11.5)])
+def test_steps_of_common_grids(fewest: float, steps: float) -> None:
+    assert whole_steps(fewest) == steps
+
+
+def test_fewest_steps_are_those_of_leapfrog() -> None:
+    steps = fewest_steps(STENCIL, largest=9.0)
+    assert STENCIL.time_factor(steps) * 9.0 == pytest.approx(4, rel=1e-12)
+    assert all(a < b for a, b in itertools.pairwise(fewest_steps(STENCIL, value) for value in (7, 8, 9)))
