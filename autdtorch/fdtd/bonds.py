@@ -1,71 +1,232 @@
-"""Where the medium varies: symmetric bonds between cells.
+"""Where the medium varies: bonds between cells, the mass of cells, and the rows a kernel steps with.
 
-The scheme is m_i d2p_i/dt2 = sum_j B_ij (p_j - p_i) with mass m_i = 1 / (rho_i s_i), bonds B_ij = 2 g_ij /
-(rho_i + rho_j) and g_ij the tuned stencil. s_i is 1 in air and elsewhere the factor that gives a wave in that
-cell's sound speed its right frequency. Symmetric bonds keep reciprocity and an energy at any contrast. A
-rigid cell has no bonds.
+The scheme is m_i d2p_i/dt2 = sum_j B_ij (p_j - p_i). In air B is the tuned stencil and m = 1; in another
+uniform material B is divided by its density, and m by its density and speed factor; the elements that
+surfaces cut bring their own (`surface.py`). Bonds are symmetric, which keeps reciprocity and an energy at any
+contrast.
 """
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.grid import CellMedium
+from autdtorch.fdtd.medium import ElementMedium
 from autdtorch.fdtd.stencil import OFFSETS, Stencil
+from autdtorch.fdtd.surface import PAIRS, VERTICES, CutElements, energy_matrix, uniform_bonds
+
+logger = logging.getLogger(__name__)
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Shape = tuple[int, int, int]
+
+_SEALED = 0.1
+"""Sum of bonds, relative to air, up to which a cell of a rigid obstacle is closed to sound; those at a
+surface have 0.3 and more, all others 0.03 at most."""
+
+_ROUNDING = 1e-9
+"""Rows closer than this to those of air are air."""
+
+_ROUNDS = 6
+"""Times that light cells ask for mass; once is nearly always enough."""
 
 
 @dataclass(frozen=True)
 class VaryingCells:
-    """The cells whose bonds differ from those of uniform air.
+    """The cells whose rows differ from those of uniform air.
 
     Attributes:
-        index: flat cell indices (n,), int64, ascending.
-        weight: what (p_j - p_i) is multiplied with for the 27 neighbours (n, 27), to be scaled by the time
-            factor.
+        index: flat cell indices (n,), ascending.
+        weight: what (p_j - p_i) is multiplied with for the 27 neighbours, B_ij / m_i (n, 27), to be scaled
+            by the time factor.
+        mass: m_i (n,), 1 in air.
+        rigid: flat indices of the cells that sound does not enter, ascending.
     """
 
-    index: NDArray[np.int64]
+    index: Index
     weight: Array
+    mass: Array
+    rigid: Index
+
+    def mass_of(self, cells: Index) -> Array:
+        """Mass (k,) of cells (k,) that are varying or of air."""
+        mass = np.ones(len(cells))
+        _, ours, theirs = np.intersect1d(self.index, cells, return_indices=True)
+        mass[theirs] = self.mass[ours]
+        return mass
 
 
-def speed_factors(stencil: Stencil, sound_speed: Array, air_speed: float) -> Array:
-    """s_i for each of `sound_speed` (n,): symbol of air over the symbol at the own wavenumber."""
-    speeds, inverse = np.unique(sound_speed, return_inverse=True)
-    factors = [stencil.symbol / stencil.isotropic_symbol(stencil.kappa * air_speed / c) for c in speeds]
-    return np.array(factors)[inverse]
-
-
-def varying_cells(medium: CellMedium, stencil: Stencil, air_density: float, air_speed: float) -> VaryingCells:
-    """Find the cells that a uniform-air sweep would get wrong, and their weights.
-
-    Args:
-        medium: what fills the grid; its outermost two layers of cells must be air.
-        stencil: weights in air.
-        air_density: [kg/m^3].
-        air_speed: [m/s].
-    """
-    air = (medium.density == air_density) & (medium.sound_speed == air_speed) & ~medium.rigid
-    other = np.argwhere(~air)
-    if len(other) == 0:
-        return VaryingCells(np.zeros(0, np.int64), np.zeros((0, 27)))
-    offsets = np.array(OFFSETS)
-    shape = air.shape
-    near = np.unique(np.ravel_multi_index(tuple((other[:, None, :] + offsets).reshape(-1, 3).T), shape))
-    strides = np.array((shape[1] * shape[2], shape[2], 1))
-    neighbour = near[:, None] + offsets @ strides
-    density, rigid = medium.density.ravel(), medium.rigid.ravel()
-    speed = speed_factors(stencil, medium.sound_speed.ravel()[neighbour.ravel()], air_speed).reshape(
-        neighbour.shape
+def varying_cells(medium: ElementMedium, stencil: Stencil) -> VaryingCells:
+    """Find the cells that a sweep of uniform air would get wrong, and their rows."""
+    x, y, z = medium.number.shape
+    shape = (x + 1, y + 1, z + 1)
+    touched = np.unique(_cut_vertices(medium, shape))
+    touched = touched[_inner(touched, shape)]
+    bonds, mass, closed = _closed_up(medium, touched, shape, stencil)
+    mass = _shared_mass(bonds, mass, touched, shape, _largest_row(medium, stencil))
+    weight = bonds / mass[:, None]
+    changed = (np.abs(weight - stencil.weights) > _ROUNDING).any(axis=1) | (mass != 1)
+    parts = (
+        (touched[changed], weight[changed], mass[changed]),
+        _bulk(medium, touched, closed, stencil),
+        _shell(touched, closed, shape),
     )
-    own, others = density[near, None], density[neighbour]
-    open_bond = ~(rigid[near, None] | rigid[neighbour])
-    bond = np.where(open_bond, 2 * stencil.weights / (own + others), 0.0)
-    own_speed = speed[:, 13:14]
-    weight = bond * own * own_speed
-    changed = (weight != stencil.weights).any(1) | (own_speed[:, 0] != 1)
-    return VaryingCells(near[changed], weight[changed])
+    index, weight, mass = (np.concatenate(part) for part in zip(*parts, strict=True))
+    order = np.argsort(index)
+    return VaryingCells(index[order], weight[order], mass[order], np.flatnonzero(closed))
+
+
+def _neighbours(index: Index, shape: Shape) -> Index:
+    """Flat indices (n, 27) of cells and their neighbours."""
+    strides = np.array((shape[1] * shape[2], shape[2], 1))
+    return np.asarray(index[:, None] + np.array(OFFSETS) @ strides, np.int64)
+
+
+def _inner(index: Index, shape: Shape) -> NDArray[np.bool_]:
+    """Which cells (n,) are not on the rim, which stays silent."""
+    places = np.stack(np.unravel_index(index, shape), axis=-1)
+    return np.asarray(((places > 0) & (places < np.array(shape) - 1)).all(axis=1))
+
+
+def _cut_vertices(medium: ElementMedium, shape: Shape) -> Index:
+    """Cells (n, 8) at the vertices of the cut elements."""
+    first = np.stack(np.unravel_index(medium.cut, medium.number.shape), axis=-1)
+    places = np.moveaxis(first[:, None] + VERTICES, -1, 0)
+    return np.asarray(np.ravel_multi_index(tuple(places), shape), np.int64)
+
+
+def _rigid(medium: ElementMedium, shape: Shape) -> NDArray[np.bool_]:
+    """Which cells (k,) have their centre in a rigid obstacle."""
+    rigid = medium.rigid[_cell_number(medium)].ravel()
+    rigid[_cut_vertices(medium, shape)] = medium.rigid[medium.elements.number]
+    return rigid
+
+
+def _closed_up(
+    medium: ElementMedium, touched: Index, shape: Shape, stencil: Stencil
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Bonds and mass of the touched cells, and which cells (k,) of rigid obstacles are closed to sound."""
+    rigid, parts = _rigid(medium, shape), medium.elements
+    inside = rigid[touched]
+    closed, known = rigid.copy(), -1
+    closed[touched] = False
+    while True:
+        bonds, mass = _assembled(medium, parts, touched, shape, stencil)
+        bonds *= ~(closed[touched, None] | closed[_neighbours(touched, shape)])
+        closed[touched] |= inside & (np.abs(bonds).sum(axis=1) <= _SEALED * stencil.total)
+        if closed.sum() == known or not inside.any():
+            return bonds, mass, closed
+        known = closed.sum()
+        parts = _condensed(medium, closed, shape)
+
+
+def _condensed(medium: ElementMedium, closed: NDArray[np.bool_], shape: Shape) -> CutElements:
+    """The cut elements without their closed vertices, whose pressure takes the value of least energy.
+
+    Leaving out their bonds alone could make the energy of the others negative.
+    """
+    out = closed[_cut_vertices(medium, shape)]
+    some = np.flatnonzero(out.any(axis=1))
+    gone = out[some]
+    matrix = energy_matrix(medium.elements.bonds[some])
+    both = gone[:, :, None] & gone[:, None, :]
+    inverse = np.linalg.pinv(np.where(both, matrix, 0), rcond=1e-10, hermitian=True)
+    across = np.where(gone[:, None, :], matrix, 0)
+    matrix = matrix - across @ inverse @ across.transpose(0, 2, 1)
+    matrix[gone[:, :, None] | gone[:, None, :]] = 0
+    bonds, mass = medium.elements.bonds.copy(), np.where(out, 0, medium.elements.mass)
+    bonds[some] = -matrix[:, PAIRS[:, 0], PAIRS[:, 1]]
+    return CutElements(bonds, mass, medium.elements.number)
+
+
+def _assembled(
+    medium: ElementMedium, parts: CutElements, touched: Index, shape: Shape, stencil: Stencil
+) -> tuple[Array, Array]:
+    """Bonds (n, 27) and mass (n,) of the cells that cut elements touch, summed over their elements."""
+    bonds, mass = np.zeros((len(touched), 27)), np.zeros(len(touched))
+    places = np.stack(np.unravel_index(touched, shape), axis=-1)
+    elements = tuple(cells - 1 for cells in shape)
+    cut = np.zeros(elements, bool)
+    cut.ravel()[medium.cut] = True
+    cut_pairs = np.zeros((8, 8, len(medium.cut)))
+    for column, (a, b) in enumerate(PAIRS):
+        cut_pairs[a, b] = cut_pairs[b, a] = parts.bonds[:, column]
+    air_pairs = np.zeros((8, 8))
+    air_pairs[PAIRS[:, 0], PAIRS[:, 1]] = air_pairs[PAIRS[:, 1], PAIRS[:, 0]] = uniform_bonds(stencil)
+    for own, vertex in enumerate(VERTICES):
+        element = np.ravel_multi_index(tuple((places - vertex).T), elements)
+        is_cut = cut.ravel()[element]
+        place = np.searchsorted(medium.cut, element[is_cut])
+        number = medium.number.ravel()[element]
+        for other, target in enumerate(VERTICES):
+            column = int((target - vertex + 1) @ (9, 3, 1))
+            part = air_pairs[own, other] / medium.materials.density[number]
+            part[is_cut] = cut_pairs[own, other, place]
+            bonds[:, column] += part
+        part = medium.materials.mass[number] / 8
+        part[is_cut] = parts.mass[place, own]
+        mass += part
+    return bonds, mass
+
+
+def _cell_number(medium: ElementMedium) -> NDArray[np.int16]:
+    """Material of each cell (nx, ny, nz): its first element's, which stands for all where none is cut."""
+    return np.pad(medium.number, ((1, 0),) * 3, mode="edge")
+
+
+def _largest_row(medium: ElementMedium, stencil: Stencil) -> float:
+    """Sum of weights that a uniform material needs at most: of air, or of the fastest obstacle."""
+    fastest = 1 / (medium.materials.density * medium.materials.mass)
+    return stencil.total * float(fastest.max())
+
+
+def _shared_mass(bonds: Array, mass: Array, touched: Index, shape: Shape, largest: float) -> Array:
+    """Mass (n,) with which no row sums to more than `largest`, so that none shortens the time step.
+
+    A light cell with strong bonds, in a heavy obstacle just below its surface, moves with the air before it:
+    it takes mass from the cells it is bound to, which changes little and nothing in sum. Gershgorin's circles
+    then bound the operator at any contrast.
+    """
+    mass, need = mass.copy(), np.abs(bonds).sum(axis=1) / largest
+    asked = mass.sum()
+    for _ in range(_ROUNDS):
+        light = np.flatnonzero(need > mass)
+        if len(light) == 0:
+            break
+        neighbour = _neighbours(touched[light], shape)
+        place = np.searchsorted(touched, neighbour).clip(max=len(touched) - 1)
+        spare = np.maximum(mass - need, 0)
+        offer = np.abs(bonds[light]) * np.where(touched[place] == neighbour, spare[place], 0)
+        whole = offer.sum(axis=1, keepdims=True)
+        wish = (need - mass)[light, None] * np.divide(offer, whole, out=np.zeros_like(offer), where=whole > 0)
+        wished = np.bincount(place.ravel(), wish.ravel(), len(mass))
+        wish *= np.divide(spare, wished, out=np.ones_like(spare), where=wished > spare)[place]
+        mass -= np.bincount(place.ravel(), wish.ravel(), len(mass))
+        mass[light] += wish.sum(axis=1)
+    mass = np.maximum(mass, need)
+    if mass.sum() > asked * (1 + 1e-6):
+        logger.debug("light cells found too little mass around them: %.2g of it added", mass.sum() - asked)
+    return np.where(mass > 0, mass, 1.0)
+
+
+def _bulk(
+    medium: ElementMedium, touched: Index, closed: NDArray[np.bool_], stencil: Stencil
+) -> tuple[Index, Array, Array]:
+    """Cells inside obstacles whose sound speed is not that of air: index, weight and mass."""
+    factor = 1 / (medium.materials.density * medium.materials.mass)
+    number = _cell_number(medium).ravel()
+    inside = (factor != 1)[number] & ~closed
+    inside[touched] = False
+    index = np.flatnonzero(inside)
+    return index, factor[number[index], None] * stencil.weights, medium.materials.mass[number[index]]
+
+
+def _shell(touched: Index, closed: NDArray[np.bool_], shape: Shape) -> tuple[Index, Array, Array]:
+    """Closed cells next to those that surfaces touch: what lies behind them is never reached."""
+    around = np.unique(_neighbours(touched, shape))
+    around = np.setdiff1d(around[closed[around]], touched)
+    return around, np.zeros((len(around), 27)), np.ones(len(around))

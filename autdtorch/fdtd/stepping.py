@@ -14,12 +14,12 @@ from fractions import Fraction
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from autdtorch.fdtd.bonds import varying_cells
+from autdtorch.fdtd.bonds import VaryingCells, varying_cells
 from autdtorch.fdtd.boundary import tuned_profile
-from autdtorch.fdtd.grid import Grid, fill_medium, make_grid
+from autdtorch.fdtd.grid import Grid, make_grid
 from autdtorch.fdtd.kernels.contract import Coefficients, Kernel, Receivers, Sources, State, uniform_state
+from autdtorch.fdtd.medium import fill_elements
 from autdtorch.fdtd.points import PointWeights, merged, point_weights
 from autdtorch.fdtd.stability import fewest_steps, largest_eigenvalue, whole_steps
 from autdtorch.fdtd.stencil import Stencil, tuned_stencil
@@ -57,14 +57,14 @@ class Assembly:
         steps_per_period: time steps a period of the drive: steps a block (numerator) over periods a block
             (denominator).
         coefficients: what the kernel sees.
-        rigid: flat indices of the cells that sound does not enter, ascending.
+        varying: the cells that are not of uniform air.
     """
 
     grid: Grid
     stencil: Stencil
     steps_per_period: Fraction
     coefficients: Coefficients
-    rigid: NDArray[np.int64]
+    varying: VaryingCells
 
     @property
     def dtype(self) -> torch.dtype:
@@ -87,10 +87,10 @@ class Assembly:
     def _spread_nodes(self, points: torch.Tensor) -> PointWeights:
         grid = self.grid
         spread = point_weights(grid.to_cells(points), grid.shape, grid.first, grid.last, grid.kappa)
-        if len(self.rigid) == 0:
+        if len(self.varying.rigid) == 0:
             return spread
         # At a rigid wall the pressure has no slope: what would fall behind it goes to the cells before it.
-        weight = np.where(np.isin(spread.index, self.rigid), 0.0, spread.weight)
+        weight = np.where(np.isin(spread.index, self.varying.rigid), 0.0, spread.weight)
         total = weight.sum(axis=1, keepdims=True)
         return PointWeights(
             spread.index, np.divide(weight, total, out=np.zeros_like(weight), where=total > 0.1)
@@ -115,6 +115,7 @@ class Assembly:
         total = torch.zeros(len(index), dtype=force.dtype).index_add(
             0, torch.from_numpy(inverse.reshape(-1)), force
         )
+        total = total / torch.from_numpy(self.varying.mass_of(index))
         return Sources(
             torch.from_numpy(index),
             total.to(torch.complex128 if self.dtype == torch.float64 else torch.complex64),
@@ -133,8 +134,7 @@ def assemble(
     """
     grid = make_grid(scene, spacing)
     stencil = tuned_stencil(grid.kappa, scene.attenuation * spacing)
-    medium = fill_medium(scene, grid)
-    varying = varying_cells(medium, stencil, scene.medium.density, scene.medium.sound_speed)
+    varying = varying_cells(fill_elements(scene, grid, stencil), stencil)
     largest = largest_eigenvalue(varying.index, varying.weight, stencil, grid.shape)
     fewest = fewest_steps(stencil, largest)
     steps_per_period = whole_steps(_wanted_steps(fewest, time_step, scene.frequency))
@@ -160,7 +160,7 @@ def assemble(
         grid.shape, spacing * 1e3, len(varying.index), steps_per_period.numerator,
         steps_per_period.denominator, 1e6 / (steps * scene.frequency), 100 * fewest / steps,
     )  # fmt: skip
-    return Assembly(grid, stencil, steps_per_period, coefficients, np.flatnonzero(medium.rigid))
+    return Assembly(grid, stencil, steps_per_period, coefficients, varying)
 
 
 def _wanted_steps(fewest: float, time_step: float | None, frequency: float) -> float:

@@ -1,0 +1,289 @@
+"""Surfaces between the cell centres: what an obstacle's surface makes of the elements it cuts.
+
+An element is the cube between eight cell centres, its vertices. The scheme is a sum over elements of an
+energy of bonds between vertices and of a mass at each vertex; in an element of one material both are the
+tuned stencil's. A cut element gets
+
+- bonds in series: density averaged along the line between two vertices, which is right for a flow across the
+  surface;
+- a correction that gives three fields their exact energy: two that vary along the surface, and one that
+  crosses it, continuous in pressure and in flow, with the kink that the densities ask for. Its matrix is
+  C^T (A - N^T L N) C with L that of the bonds, N the fields at the vertices, A their exact energies, and
+  C = (N^T L N)^-1 N^T L the projection on them: the consistency of virtual element methods (Beirao da Veiga
+  et al. 2013) for the local solutions of immersed finite elements (Li 1998). The fields follow the curvature
+  of the surface;
+- masses that stay on their side: a sliver of air gives its mass to the vertices in air, as its pressure is
+  theirs, also where the cell it lies in has its centre in a heavy obstacle.
+
+Lengths are in cells, density and mass relative to air. `docs/decisions/surfaces.md` compares it with others.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from autdtorch.fdtd.stencil import Stencil
+
+Array = NDArray[np.float64]
+
+SUBCELLS = 4
+"""Sub-cells an edge of a cut element, on which volumes are summed."""
+
+VERTICES = np.array(list(itertools.product((0, 1), repeat=3)))
+"""The eight vertices of an element, as offsets in cells."""
+
+PAIRS = np.array(list(itertools.combinations(range(8), 2)))
+"""The 28 pairs of vertices that bonds join."""
+
+FAR = 1e3
+"""Distance [cells] that stands for an obstacle too far away to matter."""
+
+_PRESENT = 1e-4
+"""Share of an element's volume below which a material counts as absent."""
+
+_FLAT = 0.5
+"""Smallest mean gradient of a signed distance for which the element has one normal: two faces of a thin plate
+cancel."""
+
+_SHARPEST = 0.5
+"""Largest curvature [1/cells] that the fields follow; edges have none."""
+
+LATTICE = np.array(list(itertools.product(range(SUBCELLS + 1), repeat=3))) / SUBCELLS
+"""Where the signed distances of an element are needed (125, 3), from its first vertex [cells]."""
+
+_SUBCENTRES = (np.array(list(itertools.product(range(SUBCELLS), repeat=3))) + 0.5) / SUBCELLS
+_HATS = np.prod(np.where(VERTICES == 1, _SUBCENTRES[:, None], 1 - _SUBCENTRES[:, None]), axis=2)
+_LOW = np.arange(SUBCELLS)
+_CORNERS = np.ravel_multi_index((VERTICES * SUBCELLS).T, (SUBCELLS + 1,) * 3)
+_LINES = np.ravel_multi_index(
+    np.moveaxis(
+        SUBCELLS * VERTICES[PAIRS[:, 0], None]
+        + np.arange(SUBCELLS + 1)[:, None] * (VERTICES[PAIRS[:, 1]] - VERTICES[PAIRS[:, 0]])[:, None],
+        -1,
+        0,
+    ),
+    (SUBCELLS + 1,) * 3,
+)
+
+
+def _quadratic(x: Array) -> Array:
+    """Monomials up to degree two at points (n, 3), in the order value, gradient, second derivatives."""
+    second = [x[:, a] * x[:, b] / (2 if a == b else 1) for a, b in _SECOND]
+    return np.column_stack((np.ones(len(x)), x, *second))
+
+
+_SECOND = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+_FIT = np.linalg.pinv(_quadratic(LATTICE - 0.5))
+
+
+@dataclass(frozen=True)
+class Materials:
+    """The materials of a scene, relative to air, which is number 0.
+
+    Attributes:
+        density: (m,).
+        mass: of a cell (m,).
+    """
+
+    density: Array
+    mass: Array
+
+
+@dataclass(frozen=True)
+class CutElements:
+    """What n cut elements add to the scheme.
+
+    Attributes:
+        bonds: between the `PAIRS` of vertices (n, 28).
+        mass: at the vertices (n, 8).
+        number: of the material that each vertex lies in (n, 8).
+    """
+
+    bonds: Array
+    mass: Array
+    number: NDArray[np.int64]
+
+
+def cut_elements(
+    distance: Array, material: NDArray[np.int64], materials: Materials, stencil: Stencil
+) -> CutElements:
+    """Bonds and masses of elements that surfaces cut.
+
+    Args:
+        distance: signed distance of K obstacles, the later of which win, at the `LATTICE` of n elements
+            (K, n, 125) [cells]; `FAR` where an obstacle is not near.
+        material: number of the material of each obstacle (K,).
+        materials: the materials.
+        stencil: weights in air.
+    """
+    count = len(materials.density)
+    volumes = _shares(_volume_coverage, distance, material, count)
+    lines = _shares(_line_coverage, distance, material, count)
+    density = (lines @ materials.density).reshape(-1, len(PAIRS), SUBCELLS).mean(axis=2)
+    bonds = uniform_bonds(stencil) / density
+    present = volumes.mean(axis=1) > _PRESENT
+    chosen = np.flatnonzero(present.sum(axis=1) == 2)
+    if len(chosen):
+        inner = count - 1 - present[chosen, ::-1].argmax(axis=1)
+        outer = present[chosen].argmax(axis=1)
+        level = _level(distance[:, chosen], material, inner)
+        sides = materials.density[np.stack((outer, inner), axis=1)]
+        flat, correction = _correction(level, sides, volumes[chosen], materials, bonds[chosen])
+        bonds[chosen[flat]] += correction
+    number = np.zeros((distance.shape[1], 8), np.int64)
+    for far, own in zip(distance, material, strict=True):
+        number[far[:, _CORNERS] < 0] = own
+    return CutElements(bonds, _masses(number, volumes, materials), number)
+
+
+def uniform_bonds(stencil: Stencil) -> Array:
+    """Bonds (28,) of an element of air; face bonds are shared by four elements, edge bonds by two."""
+    shared = np.array((0.0, stencil.face / 4, stencil.edge / 2, stencil.corner))
+    return np.asarray(shared[np.abs(VERTICES[PAIRS[:, 0]] - VERTICES[PAIRS[:, 1]]).sum(axis=1)])
+
+
+def _volume_coverage(distance: Array) -> Array:
+    """Share of each sub-cell (..., 64) with a distance below zero: exact for faces along the grid."""
+    cube = distance.reshape(*distance.shape[:-1], *(SUBCELLS + 1,) * 3)
+    mean, width = cube, np.zeros(cube.shape)
+    for axis in (-3, -2, -1):
+        low, high = np.take(mean, _LOW, axis), np.take(mean, _LOW + 1, axis)
+        width = (np.take(width, _LOW, axis) + np.take(width, _LOW + 1, axis)) / 2 + np.abs(high - low)
+        mean = (low + high) / 2
+    share = np.clip(0.5 - mean / np.maximum(width, 1e-12), 0, 1)
+    return np.asarray(share.reshape(*distance.shape[:-1], SUBCELLS**3))
+
+
+def _line_coverage(distance: Array) -> Array:
+    """Share of each quarter of the lines between vertices (..., 112) with a distance below zero."""
+    ends = distance[..., _LINES]
+    low = np.minimum(ends[..., :-1], ends[..., 1:])
+    high = np.maximum(ends[..., :-1], ends[..., 1:])
+    share = np.clip(-low / np.maximum(high - low, 1e-12), 0, 1)
+    return np.asarray(share.reshape(*distance.shape[:-1], -1))
+
+
+def _shares(
+    coverage: Callable[[Array], Array], distance: Array, material: NDArray[np.int64], count: int
+) -> Array:
+    """Share of each material (n, q, m) in the q parts that `coverage` divides an element into.
+
+    Obstacles that touch leave no air between them: what is not air is what their union covers.
+    """
+    covered = coverage(distance)
+    share = np.zeros((*covered.shape[1:], count))
+    for cover, number in zip(covered, material, strict=True):
+        share *= 1 - cover[..., None]
+        share[..., number] += cover
+    solid = share.sum(axis=2)
+    union = coverage(distance.min(axis=0))
+    share *= np.divide(union, solid, out=np.zeros_like(solid), where=solid > 0)[..., None]
+    share[..., 0] += 1 - union
+    return share
+
+
+def _level(distance: Array, material: NDArray[np.int64], inner: NDArray[np.int64]) -> Array:
+    """Signed distance (n, 125) to the region of material `inner` (n,), cut by later obstacles."""
+    level = np.full(distance.shape[1:], FAR)
+    for far, number in zip(distance, material, strict=True):
+        same = (inner == number)[:, None]
+        level = np.where(same, np.minimum(level, far), np.maximum(level, -far))
+    return level
+
+
+def _correction(
+    level: Array, sides: Array, volumes: Array, materials: Materials, bonds: Array
+) -> tuple[NDArray[np.bool_], Array]:
+    """Bonds that give the local solutions of two-material elements their exact energy.
+
+    Args:
+        level: signed distance to the surface (n, 125), negative in the inner material.
+        sides: density of the outer and the inner material (n, 2).
+        volumes: shares of the materials in the sub-cells (n, 64, m).
+        materials: the materials.
+        bonds: in series (n, 28).
+
+    Returns:
+        Which elements have one normal (n,), and the bonds to add in those.
+    """
+    fit = level @ _FIT.T
+    steep = np.linalg.norm(fit[:, 1:4], axis=1)
+    flat = steep > _FLAT
+    level, sides, volumes, bonds, fit, steep = (
+        part[flat] for part in (level, sides, volumes, bonds, fit, steep)
+    )
+    normal = fit[:, 1:4] / steep[:, None]
+    tangents = _tangents(normal)
+    bend = _curvature(fit, tangents)
+    trace = np.trace(bend, axis1=1, axis2=2)[:, None]
+
+    # The fields at the vertices: surface coordinates of the foot of the vertex, and the kinked one.
+    depth = level[:, _CORNERS]
+    along = (VERTICES - 0.5) @ tangents.transpose(0, 2, 1)
+    along = along - depth[:, :, None] * (along @ bend)
+    kinked = np.where(depth < 0, sides[:, 1:], sides[:, :1]) * (depth - trace * depth**2 / 2)
+    fields = np.concatenate((along, kinked[:, :, None]), axis=2)
+
+    # Their energies, summed over the sub-cells.
+    depth = level.reshape(-1, *(SUBCELLS + 1,) * 3)
+    for axis in (1, 2, 3):
+        depth = (np.take(depth, range(SUBCELLS), axis) + np.take(depth, range(1, SUBCELLS + 1), axis)) / 2
+    depth = depth.reshape(len(depth), -1)
+    stretch = np.eye(2) - depth[:, :, None, None] * bend[:, None]
+    mobility = (volumes @ (1 / materials.density)) / SUBCELLS**3
+    inertia = (volumes @ materials.density) / SUBCELLS**3
+    energy = np.zeros((len(level), 3, 3))
+    energy[:, :2, :2] = np.einsum("nq,nqab,nqcb->nac", mobility, stretch, stretch)
+    energy[:, 2, 2] = (inertia * (1 - trace * depth) ** 2).sum(axis=1)
+
+    matrix = energy_matrix(bonds)
+    flow = matrix @ fields
+    own = fields.transpose(0, 2, 1) @ flow
+    projection = np.linalg.solve(own, flow.transpose(0, 2, 1))
+    added = projection.transpose(0, 2, 1) @ (energy - own) @ projection
+    return flat, -added[:, PAIRS[:, 0], PAIRS[:, 1]]
+
+
+def _tangents(normal: Array) -> Array:
+    """Two unit vectors (n, 2, 3) across unit vectors (n, 3)."""
+    helper = np.where(np.abs(normal[:, :1]) < 0.7, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    first = np.cross(normal, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack((first, np.cross(normal, first)), axis=1)
+
+
+def _curvature(fit: Array, tangents: Array) -> Array:
+    """Curvature (n, 2, 2) [1/cells] along the surface, none where it is too sharp to follow."""
+    hessian = np.zeros((len(fit), 3, 3))
+    for column, (a, b) in enumerate(_SECOND, start=4):
+        hessian[:, a, b] = hessian[:, b, a] = fit[:, column]
+    bend = tangents @ hessian @ tangents.transpose(0, 2, 1)
+    sharp = np.abs(np.linalg.eigvalsh(bend)).max(axis=1) > _SHARPEST
+    bend[sharp] = 0
+    return bend
+
+
+def energy_matrix(bonds: Array) -> Array:
+    """Energy matrix (n, 8, 8) of bonds (n, 28)."""
+    matrix = np.zeros((len(bonds), 8, 8))
+    matrix[:, PAIRS[:, 0], PAIRS[:, 1]] = -bonds
+    matrix += matrix.transpose(0, 2, 1)
+    matrix[:, range(8), range(8)] = -matrix.sum(axis=2)
+    return matrix
+
+
+def _masses(number: NDArray[np.int64], volumes: Array, materials: Materials) -> Array:
+    """Masses at the vertices (n, 8): each material's goes to the vertices in it, if there are any."""
+    total = np.zeros(number.shape)
+    for own, mass in enumerate(materials.mass):
+        lumped = volumes[:, :, own] @ _HATS / SUBCELLS**3
+        kept = lumped * (number == own)
+        whole, held = lumped.sum(axis=1, keepdims=True), kept.sum(axis=1, keepdims=True)
+        has = held > _PRESENT * whole
+        total += mass * np.where(has, kept * whole / np.where(has, held, 1), lumped)
+    return total
