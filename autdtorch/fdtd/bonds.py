@@ -28,6 +28,9 @@ _SEALED = 0.1
 """Sum of bonds, relative to air, up to which a cell of a rigid obstacle is closed to sound; those at a
 surface have 0.3 and more, all others 0.03 at most."""
 
+_NO_ENERGY = 1e-3
+"""Share of the largest below which an eigenvalue of closed vertices counts as zero."""
+
 _ROUNDING = 1e-9
 """Rows closer than this to those of air are air."""
 
@@ -134,7 +137,7 @@ def _condensed(medium: ElementMedium, closed: NDArray[np.bool_], shape: Shape) -
     gone = out[some]
     matrix = energy_matrix(medium.elements.bonds[some])
     both = gone[:, :, None] & gone[:, None, :]
-    inverse = np.linalg.pinv(np.where(both, matrix, 0), rcond=1e-10, hermitian=True)
+    inverse = np.linalg.pinv(np.where(both, matrix, 0), rcond=_NO_ENERGY, hermitian=True)
     across = np.where(gone[:, None, :], matrix, 0)
     matrix = matrix - across @ inverse @ across.transpose(0, 2, 1)
     matrix[gone[:, :, None] | gone[:, None, :]] = 0

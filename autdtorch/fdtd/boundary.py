@@ -34,9 +34,9 @@ TUNED_ANGLES = np.radians((0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 55.0, 60.0, 65.0, 
 _STARTS = ((10.0, 1.5), (20.0, 2.5))
 """Strength and order of the power-law profiles that the fit starts from; the better end is kept."""
 _SHIFT = 0.1
-"""Frequency shift alpha in units of w. A layer gives energy to waves that fade towards it, at frequencies above
-alpha: too small a shift lets the slow near field of a light obstacle grow (the fit alone would choose 0.01,
-which returned ten times as much; 0.3 would cost 16 dB of reflection)."""
+"""Frequency shift alpha in units of w. A layer gives energy to waves that fade towards it, at frequencies
+above alpha: too small a shift lets the slow near field of a light obstacle grow (the fit alone would choose
+0.01, which returned ten times as much; 0.3 would cost 16 dB of reflection)."""
 _BOUNDS = (-14.0, 6.0)
 """Range of the logarithms of the damping over w: from nothing to opaque."""
 

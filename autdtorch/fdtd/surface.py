@@ -6,8 +6,9 @@ tuned stencil's. A cut element gets
 
 - bonds in series: density averaged along the line between two vertices, which is right for a flow across the
   surface;
-- a correction that gives three fields their exact energy: two that vary along the surface, and one that
-  crosses it, continuous in pressure and in flow, with the kink that the densities ask for. Its matrix is
+- a correction that gives two fields that vary along the surface their exact energy, and leaves that of a
+  third, which crosses it continuous in pressure and in flow, with the kink that the densities ask for: for it
+  bonds in series are right. Its matrix is
   C^T (A - N^T L N) C with L that of the bonds, N the fields at the vertices, A their exact energies, and
   C = (N^T L N)^-1 N^T L the projection on them: the consistency of virtual element methods (Beirao da Veiga
   et al. 2013) for the local solutions of immersed finite elements (Li 1998). The fields follow the curvature
@@ -126,18 +127,19 @@ def cut_elements(
     lines = _shares(_line_coverage, distance, material, count)
     density = (lines @ materials.density).reshape(-1, len(PAIRS), SUBCELLS).mean(axis=2)
     bonds = uniform_bonds(stencil) / density
+    number = np.zeros((distance.shape[1], 8), np.int64)
+    for far, own in zip(distance, material, strict=True):
+        number[far[:, _CORNERS] < 0] = own
+    held = (number[:, :, None] == np.arange(count)).any(axis=1)
     present = volumes.mean(axis=1) > _PRESENT
-    chosen = np.flatnonzero(present.sum(axis=1) == 2)
+    chosen = np.flatnonzero((held.sum(axis=1) == 2) & (held == present).all(axis=1))
     if len(chosen):
-        inner = count - 1 - present[chosen, ::-1].argmax(axis=1)
-        outer = present[chosen].argmax(axis=1)
+        inner = count - 1 - held[chosen, ::-1].argmax(axis=1)
+        outer = held[chosen].argmax(axis=1)
         level = _level(distance[:, chosen], material, inner)
         sides = materials.density[np.stack((outer, inner), axis=1)]
         flat, correction = _correction(level, sides, volumes[chosen], materials, bonds[chosen])
         bonds[chosen[flat]] += correction
-    number = np.zeros((distance.shape[1], 8), np.int64)
-    for far, own in zip(distance, material, strict=True):
-        number[far[:, _CORNERS] < 0] = own
     return CutElements(bonds, _masses(number, volumes, materials), number)
 
 
@@ -229,21 +231,20 @@ def _correction(
     kinked = np.where(depth < 0, sides[:, 1:], sides[:, :1]) * (depth - trace * depth**2 / 2)
     fields = np.concatenate((along, kinked[:, :, None]), axis=2)
 
-    # Their energies, summed over the sub-cells.
+    # The energies of the first two, summed over the sub-cells.
     depth = level.reshape(-1, *(SUBCELLS + 1,) * 3)
     for axis in (1, 2, 3):
         depth = (np.take(depth, range(SUBCELLS), axis) + np.take(depth, range(1, SUBCELLS + 1), axis)) / 2
     depth = depth.reshape(len(depth), -1)
     stretch = np.eye(2) - depth[:, :, None, None] * bend[:, None]
     mobility = (volumes @ (1 / materials.density)) / SUBCELLS**3
-    inertia = (volumes @ materials.density) / SUBCELLS**3
     energy = np.zeros((len(level), 3, 3))
     energy[:, :2, :2] = np.einsum("nq,nqab,nqcb->nac", mobility, stretch, stretch)
-    energy[:, 2, 2] = (inertia * (1 - trace * depth) ** 2).sum(axis=1)
 
     matrix = energy_matrix(bonds)
     flow = matrix @ fields
     own = fields.transpose(0, 2, 1) @ flow
+    energy[:, 2, 2] = own[:, 2, 2]
     projection = np.linalg.solve(own, flow.transpose(0, 2, 1))
     added = projection.transpose(0, 2, 1) @ (energy - own) @ projection
     return flat, -added[:, PAIRS[:, 0], PAIRS[:, 1]]
