@@ -108,7 +108,7 @@ def kernel_rate(cells: int = 112) -> None:
     deaf = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1)))
 
     def rate(kernel: Kernel, steps: int) -> float:
-        state = uniform_state(shape, coefficients.layer_cells, 1.0, torch.float32)
+        state = uniform_state(shape, coefficients, 1.0)
         state, _ = kernel.advance(state, coefficients, nobody, deaf, torch.zeros((2, 2)))
         best = np.inf
         for _ in range(5):

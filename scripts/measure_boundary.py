@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from autdtorch.fdtd.boundary import tuned_profile
-from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, uniform_state
+from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Receivers, Sources, uniform_state
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.stability import fewest_steps, whole_steps
 from autdtorch.fdtd.stencil import tuned_stencil
@@ -81,8 +81,10 @@ def _air(cells_per_wavelength: float, layer_cells: int) -> Air:
         keep=1.0,
         varying_index=torch.zeros(0, dtype=torch.int64),
         varying_weight=torch.zeros((0, 27), dtype=torch.float64),
+        closed_index=torch.zeros(0, dtype=torch.int64),
         layer_decay=torch.from_numpy(profile.decay),
         layer_gain=torch.from_numpy(profile.gain),
+        columns=Columns.none(layer_cells, torch.float64),
     )
     return Air(coefficients, steps_per_period, stencil.source_factor(steps).real)
 
@@ -98,7 +100,7 @@ def _pressure(
     index = torch.from_numpy(source + shape[2] * offsets)[:, None]
     blocks = math.ceil(periods / steps.denominator)
     _, recorded = CpuKernel().advance(
-        uniform_state(shape, air.coefficients.layer_cells, 0.0, torch.float64),
+        uniform_state(shape, air.coefficients, 0.0),
         air.coefficients,
         Sources(torch.tensor([source]), torch.tensor([air.force], dtype=torch.complex128)),
         Receivers(index, torch.ones(index.shape, dtype=torch.float64)),

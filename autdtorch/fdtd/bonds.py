@@ -48,12 +48,14 @@ class VaryingCells:
             by the time factor.
         mass: m_i (n,), 1 in air.
         rigid: flat indices of the cells that sound does not enter, ascending.
+        shell: those of them next to cells that it does enter; what lies behind is never reached.
     """
 
     index: Index
     weight: Array
     mass: Array
     rigid: Index
+    shell: Index
 
     def mass_of(self, cells: Index) -> Array:
         """Mass (k,) of cells (k,) that are varying or of air."""
@@ -73,14 +75,16 @@ def varying_cells(medium: ElementMedium, stencil: Stencil) -> VaryingCells:
     mass = _shared_mass(bonds, mass, touched, shape, _largest_row(medium, stencil))
     weight = bonds / mass[:, None]
     changed = (np.abs(weight - stencil.weights) > _ROUNDING).any(axis=1) | (mass != 1)
+    changed &= ~closed[touched]
     parts = (
         (touched[changed], weight[changed], mass[changed]),
-        _bulk(medium, touched, closed, stencil),
-        _shell(touched, closed, shape),
+        _bulk(medium, touched, closed, shape, stencil),
     )
     index, weight, mass = (np.concatenate(part) for part in zip(*parts, strict=True))
     order = np.argsort(index)
-    return VaryingCells(index[order], weight[order], mass[order], np.flatnonzero(closed))
+    around = np.unique(_neighbours(touched, shape))
+    shell = around[closed[around] & _inner(around, shape)]
+    return VaryingCells(index[order], weight[order], mass[order], np.flatnonzero(closed), shell)
 
 
 def _neighbours(index: Index, shape: Shape) -> Index:
@@ -217,7 +221,7 @@ def _shared_mass(bonds: Array, mass: Array, touched: Index, shape: Shape, larges
 
 
 def _bulk(
-    medium: ElementMedium, touched: Index, closed: NDArray[np.bool_], stencil: Stencil
+    medium: ElementMedium, touched: Index, closed: NDArray[np.bool_], shape: Shape, stencil: Stencil
 ) -> tuple[Index, Array, Array]:
     """Cells inside obstacles whose sound speed is not that of air: index, weight and mass."""
     factor = 1 / (medium.materials.density * medium.materials.mass)
@@ -225,11 +229,5 @@ def _bulk(
     inside = (factor != 1)[number] & ~closed
     inside[touched] = False
     index = np.flatnonzero(inside)
+    index = index[_inner(index, shape)]
     return index, factor[number[index], None] * stencil.weights, medium.materials.mass[number[index]]
-
-
-def _shell(touched: Index, closed: NDArray[np.bool_], shape: Shape) -> tuple[Index, Array, Array]:
-    """Closed cells next to those that surfaces touch: what lies behind them is never reached."""
-    around = np.unique(_neighbours(touched, shape))
-    around = np.setdiff1d(around[closed[around]], touched)
-    return around, np.zeros((len(around), 27)), np.ones(len(around))

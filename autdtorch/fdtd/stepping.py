@@ -17,6 +17,7 @@ import torch
 
 from autdtorch.fdtd.bonds import VaryingCells, varying_cells
 from autdtorch.fdtd.boundary import tuned_profile
+from autdtorch.fdtd.columns import layer_columns
 from autdtorch.fdtd.grid import Grid, make_grid
 from autdtorch.fdtd.kernels.contract import Coefficients, Kernel, Receivers, Sources, State, uniform_state
 from autdtorch.fdtd.medium import fill_elements
@@ -78,7 +79,7 @@ class Assembly:
         slow (2.4 times, measured at 120^3 in float32).
         """
         faint = _FAINT * float(sources.force.detach().abs().max())
-        return uniform_state(self.grid.shape, self.grid.layer_cells, faint, self.dtype)
+        return uniform_state(self.grid.shape, self.coefficients, faint)
 
     def spread(self, points: torch.Tensor, weights: torch.Tensor = _ONE_NODE) -> PointWeights:
         """Cells and weights of points (P, 3) [m], or nodes (P, n, 3) with `weights` (n,), in the domain."""
@@ -152,8 +153,10 @@ def assemble(
         keep=keep,
         varying_index=torch.from_numpy(varying.index),
         varying_weight=torch.from_numpy(factor * varying.weight).to(dtype),
+        closed_index=torch.from_numpy(varying.shell),
         layer_decay=torch.from_numpy(profile.decay).to(dtype),
         layer_gain=torch.from_numpy(profile.gain).to(dtype),
+        columns=layer_columns(varying, stencil, grid, factor, dtype),
     )
     logger.info(
         "grid %s at %.3g mm, %d varying cells; %d steps in %d periods: %.4g us, %.1f %% of the limit",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, uniform_state
+from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Receivers, Sources, uniform_state
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 
 SHAPE = (7, 8, 9)
@@ -18,12 +18,19 @@ def pressure(force: torch.Tensor, weight: torch.Tensor, steps: int) -> torch.Ten
     profile = torch.tensor([2.0, 1.5, 1.0, 0.5, 0.1], dtype=torch.float64)
     decay = torch.exp(-profile - 0.1)
     gain = profile / (profile + 0.1) * (decay - 1)
-    coefficients = Coefficients(0.19, 0.12, 0.06, 0.045, 0.99, varying, weight, decay, gain)
+    columns = Columns(
+        torch.tensor([[CELL - 4, CELL - 3, CELL - 2, CELL - 1]]),
+        torch.tensor([[-81, -72, -63, -9, 0, 9, 63, 72, 81]]),
+        weight[:1, :9],
+    )
+    coefficients = Coefficients(
+        0.19, 0.12, 0.06, 0.045, 0.99, varying, weight, torch.tensor([CELL + 3]), decay, gain, columns
+    )
     receivers = Receivers(torch.tensor([[CELL + 9], [CELL - 72]]), torch.ones((2, 1), dtype=torch.float64))
     signal = torch.stack(
         (torch.cos(torch.arange(steps) * 0.6), torch.sin(torch.arange(steps) * 0.6)), 1
     ).double()
-    state = uniform_state(SHAPE, 2, 0.0, torch.float64)
+    state = uniform_state(SHAPE, coefficients, 0.0)
     sources = Sources(torch.tensor([CELL - 1, CELL + 9]), force)
     _, recorded = ReferenceKernel().advance(state, coefficients, sources, receivers, signal)
     return recorded

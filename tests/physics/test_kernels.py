@@ -9,7 +9,15 @@ import pytest
 import torch
 from small_scenes import CUBE, small_scene
 
-from autdtorch.fdtd.kernels.contract import Coefficients, Kernel, Receivers, Sources, State, uniform_state
+from autdtorch.fdtd.kernels.contract import (
+    Coefficients,
+    Columns,
+    Kernel,
+    Receivers,
+    Sources,
+    State,
+    uniform_state,
+)
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import Assembly, assemble, drive_signal
@@ -19,8 +27,12 @@ RIGID = Box(center=(15e-3, 4e-3, 9e-3), size=(4e-3, 6e-3, 7e-3), rigid=True)
 FAST = Box(center=(14e-3, 20e-3, 14e-3), size=(6e-3, 5e-3, 5e-3), density=3.0, sound_speed=700.0)
 
 
+PLATE = Box((12e-3, 12e-3, 21.7e-3), (30e-3, 40e-3, 1.7e-3), density=5.0, sound_speed=300.0)
+"""Runs through the boundary layers of x and y."""
+
+
 def scene_parts(dtype: torch.dtype, absorption: float = 0.0) -> tuple[Assembly, Sources, Receivers]:
-    scene = small_scene((CUBE, RIGID, FAST), extent=24e-3, absorption=absorption)
+    scene = small_scene((CUBE, RIGID, FAST, PLATE), extent=24e-3, absorption=absorption)
     assembly = assemble(scene, 1e-3, dtype)
     strength = torch.tensor([1.0, 1j, -0.4, 0.3 - 0.7j], dtype=torch.complex128)
     return (
@@ -44,9 +56,10 @@ def test_cpu_kernel_is_the_reference_kernel(dtype: torch.dtype, tolerance: float
     state, recorded = advance(CpuKernel(), dtype, steps)
     expected, expected_recorded = advance(ReferenceKernel(), dtype, steps)
     pairs = [(state.now, expected.now), (recorded, expected_recorded)]
+    memory, expected_memory = ((*each.layers, each.columns) for each in (state, expected))
     pairs += [
         pair
-        for one, other in zip(state.layers, expected.layers, strict=True)
+        for one, other in zip(memory, expected_memory, strict=True)
         for pair in zip(one, other, strict=True)
     ]
     for value, reference in pairs:
@@ -60,7 +73,17 @@ def closed_box(dtype: torch.dtype, cells: int = 10) -> Coefficients:
     silent = torch.zeros(2 * cells + 1, dtype=dtype)
     nothing = torch.zeros(0, dtype=torch.int64)
     return Coefficients(
-        c.center, c.face, c.edge, c.corner, c.keep, nothing, torch.zeros((0, 27), dtype=dtype), silent, silent
+        c.center,
+        c.face,
+        c.edge,
+        c.corner,
+        c.keep,
+        nothing,
+        torch.zeros((0, 27), dtype=dtype),
+        nothing,
+        silent,
+        silent,
+        Columns.none(cells, dtype),
     )
 
 
@@ -85,7 +108,7 @@ def test_a_mode_of_a_closed_box_swings_at_its_own_frequency_for_ever(kernel: Ker
         )
         / 2
     )
-    state = uniform_state(shape, 10, 0.0, torch.float64)
+    state = uniform_state(shape, c, 0.0)
     state.now.copy_(mode)
     state.before.copy_(mode * math.cos(turn))
     nobody = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.complex128))
@@ -99,7 +122,7 @@ def test_a_mode_of_a_closed_box_swings_at_its_own_frequency_for_ever(kernel: Ker
 def test_nothing_grows_once_the_drive_is_off(dtype: torch.dtype) -> None:
     """Random pressures in the air inside the layers, which excites every wave the grid has, then silence."""
     assembly, sources, receivers = scene_parts(dtype)
-    state = uniform_state(assembly.grid.shape, assembly.coefficients.layer_cells, 0.0, dtype)
+    state = uniform_state(assembly.grid.shape, assembly.coefficients, 0.0)
     inner = state.now[tuple(map(slice, assembly.grid.first, assembly.grid.last))]
     inner.copy_(torch.randn(inner.shape, generator=torch.Generator().manual_seed(0), dtype=dtype))
     state.now.view(-1)[assembly.coefficients.varying_index] = 0

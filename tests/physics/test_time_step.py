@@ -63,7 +63,7 @@ def true_eigenvalue(assembly: Assembly) -> float:
     factor = assembly.stencil.time_factor(float(assembly.steps_per_period))
 
     def apply(pressure: np.ndarray) -> np.ndarray:
-        state = uniform_state(assembly.grid.shape, c.layer_cells, 0.0, torch.float64)
+        state = uniform_state(assembly.grid.shape, c, 0.0)
         state.now[1:-1, 1:-1, 1:-1] = torch.from_numpy(pressure).reshape(inner)
         before = state.now.clone()
         new = advance(open_ended, state, 1).now
@@ -93,7 +93,7 @@ def test_a_run_is_bounded_at_the_chosen_time_step_and_blows_up_above_the_limit(n
     ratio = stencil.time_factor(limit / 1.05) / stencil.time_factor(float(assembly.steps_per_period))
 
     def growth(coefficients: Coefficients, steps: int) -> float:
-        state = uniform_state(assembly.grid.shape, c.layer_cells, 0.0, torch.float64)
+        state = uniform_state(assembly.grid.shape, c, 0.0)
         inner = state.now[1:-1, 1:-1, 1:-1]
         inner.copy_(torch.randn(inner.shape, generator=torch.Generator().manual_seed(0), dtype=inner.dtype))
         state.before.copy_(state.now)

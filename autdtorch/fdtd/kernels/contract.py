@@ -5,9 +5,10 @@ One step, from pressures `now` and `before` at two successive times to the next 
 1. new = center now + face F + edge E + corner C - keep before, with F, E, C the sums over the 6, 12 and 8
    neighbours;
 2. in the varying cells instead new = (1 + keep) now - keep before + sum_j weight_j (now_j - now);
-3. the boundary layers add what stretches the sum of the two neighbours along each axis (`boundary.py`);
+3. the boundary layers add what stretches the sum of the two neighbours along each axis (`boundary.py`), as
+   in air and, by column, for what the weights differ from those of air by (`columns.py`);
 4. the sources are added: new += cos(w t) Re(force) + sin(w t) Im(force), times the envelope;
-5. the outermost ring of cells stays zero.
+5. the outermost ring of cells and the closed cells stay zero.
 """
 
 from __future__ import annotations
@@ -26,6 +27,27 @@ ROWS_LAST = ((0, 2, 1, 3), (0, 1, 2, 3), (0, 1, 3, 2), (0, 1, 2, 3))
 
 
 @dataclass(frozen=True)
+class Columns:
+    """m columns of L cells through a boundary layer, between the silent ring and the first cell inside.
+
+    Attributes:
+        index: flat indices of their cells (m, L + 2) int64, from the ring inwards.
+        offset: from a cell to the 9 across the column, flat (m, 9) int64.
+        weight: what those have more than in air (m, 9).
+    """
+
+    index: torch.Tensor
+    offset: torch.Tensor
+    weight: torch.Tensor
+
+    @classmethod
+    def none(cls, layer_cells: int, dtype: torch.dtype) -> Columns:
+        """No columns: nothing but air in the layers."""
+        index, offset = (torch.zeros((0, cells), dtype=torch.int64) for cells in (layer_cells + 2, 9))
+        return cls(index, offset, torch.zeros((0, 9), dtype=dtype))
+
+
+@dataclass(frozen=True)
 class Coefficients:
     """Everything about the medium that a kernel sees.
 
@@ -37,8 +59,10 @@ class Coefficients:
         keep: weight of the pressure before, 1 in air that does not absorb and below it otherwise.
         varying_index: flat indices (n,) int64 of the varying cells.
         varying_weight: their weights (n, 27).
+        closed_index: flat indices (k,) int64 of the closed cells.
         layer_decay: b of the boundary layer at half cells and cells, interleaved from outside (2 L + 1,).
         layer_gain: a, likewise.
+        columns: where obstacles run through the boundary layers.
     """
 
     center: float
@@ -48,8 +72,10 @@ class Coefficients:
     keep: float
     varying_index: torch.Tensor
     varying_weight: torch.Tensor
+    closed_index: torch.Tensor
     layer_decay: torch.Tensor
     layer_gain: torch.Tensor
+    columns: Columns
 
     @property
     def layer_cells(self) -> int:
@@ -62,18 +88,19 @@ class State:
     """Two pressure fields (nx, ny, nz) and the memory of the boundary layers.
 
     It is that of E_x, E_y and E_z, and of E_y acting on E_z p, which has 2 L cells along z: those of the low
-    layer and those of the high one, counted inwards.
+    layer and those of the high one, counted inwards. `columns` is that of the columns, psi (L + 1, m) and
+    zeta (L, m).
     """
 
     now: torch.Tensor
     before: torch.Tensor
     layers: tuple[Layer, ...]
+    columns: Layer
 
 
-def uniform_state(
-    shape: tuple[int, int, int], layer_cells: int, pressure: float, dtype: torch.dtype
-) -> State:
+def uniform_state(shape: tuple[int, int, int], coefficients: Coefficients, pressure: float) -> State:
     """A medium at rest at one pressure, on an array of `shape`."""
+    dtype, layer_cells = coefficients.layer_decay.dtype, coefficients.layer_cells
     layers = []
     sizes = (shape, shape, shape, (*shape[:2], 2 * layer_cells))
     for axis, order, size in zip((0, 1, 2, 1), ROWS_LAST, sizes, strict=True):
@@ -82,7 +109,9 @@ def uniform_state(
         layers.append((_zeros(half, order, dtype), _zeros(full, order, dtype)))
     core = torch.full([cells - 2 for cells in shape], pressure, dtype=dtype)
     now = torch.nn.functional.pad(core, (1,) * 6)
-    return State(now, now.clone(), tuple(layers))
+    count = len(coefficients.columns.index)
+    columns = [torch.zeros((layer_cells + more, count), dtype=dtype) for more in (1, 0)]
+    return State(now, now.clone(), tuple(layers), (columns[0], columns[1]))
 
 
 def _zeros(size: list[int], order: tuple[int, ...], dtype: torch.dtype) -> torch.Tensor:

@@ -179,13 +179,46 @@ def _absorb_x(p, q, psi, zeta, terms, decay, gain, face, edge, corner):  # type:
                     out[k] += term[depth, k]
 
 
+@njit(parallel=True, fastmath=_FAST, cache=True, nogil=True)
+def _stretch_columns(p, columns, memory, terms, decay, gain):  # type: ignore[no-untyped-def]
+    """Advance the columns' memory and write what is to be added to their cells (L, m)."""
+    (index, offset, weight), (psi, zeta) = columns, memory
+    flat = p.ravel()
+    for block in prange((len(index) + 63) // 64):
+        first, last = 64 * block, min(64 * block + 64, len(index))
+        u = np.zeros((len(psi) + 1, last - first), p.dtype)
+        for n in range(first, last):
+            for depth in range(1, len(u)):
+                for m in range(9):
+                    u[depth, n - first] += weight[n, m] * flat[index[n, depth] + offset[n, m]]
+        out = terms[:, first:last]
+        out[:] = 0
+        _stretch(u, psi[:, first:last], zeta[:, first:last], out, decay, gain)
+
+
 @njit(cache=True, nogil=True)
 def _advance(  # type: ignore[no-untyped-def]
-    p, q, layers, terms, weights, varying, decay, gain, driven, force, heard, hearing, signal, recorded
+    p,
+    q,
+    layers,
+    terms,
+    columns,
+    memory,
+    weights,
+    varying,
+    closed,
+    profile,
+    sources,
+    receivers,
+    signal,
+    recorded,
 ):
+    (decay, gain), (driven, force), (heard, hearing) = profile, sources, receivers
     center, face, edge, corner, keep = weights
     index, weight, offsets, buffer = varying
     (psi, zeta), across = layers[0], layers[1:]
+    places = columns[0]
+    shares = np.zeros((len(memory[1]), len(places)), p.dtype)
     for step in range(len(signal)):
         if len(index):
             _varying(p, q, index, weight, offsets, keep, buffer)
@@ -196,8 +229,14 @@ def _advance(  # type: ignore[no-untyped-def]
         _stretch_planes(p, across, terms, decay, gain)
         _absorb_planes(q, terms, face, edge, corner)
         _absorb_x(p, q, psi, zeta, terms, decay, gain, face, edge, corner)
+        _stretch_columns(p, columns, memory, shares, decay, gain)
+        for n in range(len(places)):
+            for depth in range(len(shares)):
+                flat[places[n, depth + 1]] += shares[depth, n]
         for n in range(len(driven)):
             flat[driven[n]] += force[n].real * signal[step, 0] + force[n].imag * signal[step, 1]
+        for n in range(len(closed)):
+            flat[closed[n]] = 0
         for r in range(len(heard)):
             total = 0.0
             for m in range(heard.shape[1]):
@@ -243,16 +282,16 @@ class CpuKernel:
                 for order, (psi, zeta) in zip(ROWS_LAST, state.layers, strict=True)
             ),
             _no_terms(state.now.shape, c.layer_cells, dtype),
+            (c.columns.index.numpy(), c.columns.offset.numpy(), c.columns.weight.numpy()),
+            tuple(memory.numpy() for memory in state.columns),
             (dtype(c.center), dtype(c.face), dtype(c.edge), dtype(c.corner), dtype(c.keep)),
             varying,
-            c.layer_decay.numpy(),
-            c.layer_gain.numpy(),
-            sources.index.numpy(),
-            sources.force.numpy(),
-            receivers.index.numpy(),
-            receivers.weight.numpy(),
+            c.closed_index.numpy(),
+            (c.layer_decay.numpy(), c.layer_gain.numpy()),
+            (sources.index.numpy(), sources.force.numpy()),
+            (receivers.index.numpy(), receivers.weight.numpy()),
             signal.numpy(),
             recorded.numpy(),
         )
         now, before = (state.now, state.before) if len(signal) % 2 == 0 else (state.before, state.now)
-        return State(now, before, state.layers), recorded
+        return State(now, before, state.layers, state.columns), recorded

@@ -47,8 +47,11 @@ class ReferenceKernel:
         new = new.reshape(-1).index_copy(0, c.varying_index, kept + change)
         new = new.reshape(state.now.shape)
         layers, term = _absorb(state.now, state.layers, c)
-        new = new + term
-        return State(new.reshape(-1).index_add(0, driven, force).reshape(new.shape), state.now, layers)
+        columns, shares = _absorb_columns(flat_now, state.columns, c)
+        inside = c.columns.index.T[1:-1].reshape(-1)
+        new = (new + term).reshape(-1).index_add(0, inside, shares.reshape(-1))
+        new = new.index_add(0, driven, force).index_fill(0, c.closed_index, 0)
+        return State(new.reshape(state.now.shape), state.now, layers, columns)
 
 
 def _core(field: torch.Tensor) -> torch.Tensor:
@@ -118,6 +121,19 @@ def _absorb(
     term = placed(faces, axis=0) + smooth(e_y, 0, 2) + smooth(e_z, 0, 1)
     term = term + c.edge * e_yz + c.corner * _around(e_yz, 0)
     return (x, y, z, yz), torch.nn.functional.pad(_core(term), (1,) * 6)
+
+
+def _absorb_columns(flat: torch.Tensor, memory: Layer, c: Coefficients) -> tuple[Layer, torch.Tensor]:
+    """Advance the columns' memory; returns it and what to add to their cells (L, m)."""
+    columns = c.columns
+    cells = columns.index.T[1:, :, None] + columns.offset
+    across = torch.nn.functional.pad((columns.weight * flat[cells]).sum(-1), (0, 0, 1, 0))
+    decay, gain = c.layer_decay[:, None], c.layer_gain[:, None]
+    difference = torch.diff(across, dim=0)
+    psi = decay[0::2] * memory[0] + gain[0::2] * difference
+    slope = torch.diff(psi, dim=0)
+    zeta = decay[1::2] * memory[1] + gain[1::2] * (torch.diff(difference, dim=0) + slope)
+    return (psi, zeta), slope + zeta
 
 
 def _stretch(
