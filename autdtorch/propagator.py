@@ -8,7 +8,7 @@ import time
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Literal, Protocol, overload
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from autdtorch.array import Nodes
 from autdtorch.drive import validate_drive
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers
 from autdtorch.fdtd.points import footprint
+from autdtorch.fdtd.spacing import PILOT_CELLS, coarsest_spacing, grid_error, second_spacing, spacing_for
 from autdtorch.fdtd.stepping import Assembly, SteadyState, assemble, last_block, run_to_steady_state
 from autdtorch.freespace import free_space_matrix
 from autdtorch.scene import Scene, require_inside
@@ -80,20 +81,35 @@ class FreeSpacePropagator:
                 "free_space leaves out the %d obstacles of scene %r", len(scene.obstacles), scene.name
             )
 
-    def transfer_matrix(self, points: ArrayLike | None = None) -> torch.Tensor:
+    @overload
+    def transfer_matrix(
+        self, points: ArrayLike | None = None, return_error: Literal[False] = False
+    ) -> torch.Tensor: ...
+
+    @overload
+    def transfer_matrix(
+        self, points: ArrayLike | None = None, *, return_error: Literal[True]
+    ) -> tuple[torch.Tensor, float]: ...
+
+    def transfer_matrix(
+        self, points: ArrayLike | None = None, return_error: bool = False
+    ) -> torch.Tensor | tuple[torch.Tensor, float]:
         """Transfer matrix G (Eq. 2).
 
         Args:
             points: (P, 3) [m]; by default the scene's control points.
+            return_error: also return the estimated relative error: 0, or infinite where obstacles are left
+                out.
 
         Returns:
-            complex128 (P, M) [Pa].
+            complex128 (P, M) [Pa], and the error if asked for.
 
         Raises:
             ValueError: `points` are not finite, have another shape, or lie on a transducer.
         """
         points = self.scene.control_points if points is None else points
-        return free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber)
+        matrix = free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber)
+        return (matrix, math.inf if self.scene.obstacles else 0.0) if return_error else matrix
 
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
         """Pressure of drives at points.
@@ -146,7 +162,7 @@ class FullPropagator:
         scene: Scene,
         spacing: float,
         tolerance: float,
-        kernel: str,
+        kernel: Kernel,
         dtype: torch.dtype,
         max_periods: int,
         time_step: float | None,
@@ -157,7 +173,7 @@ class FullPropagator:
         self.tolerance = tolerance
         self.max_periods = max_periods
         self.runs: list[Run] = []
-        self._kernel = _make_kernel(kernel)
+        self._kernel = kernel
         self._assembly: Assembly = assemble(scene, spacing, dtype, time_step)
         self.time_step = 1 / (scene.frequency * float(self._assembly.steps_per_period))
 
@@ -165,7 +181,27 @@ class FullPropagator:
     def _control_matrix(self) -> torch.Tensor:
         return self._simulated_matrix(self.scene.control_points)
 
-    def transfer_matrix(self, points: ArrayLike | None = None) -> torch.Tensor:
+    @cached_property
+    def _second(self) -> FullPropagator:
+        """The same on another grid, which tells the error of this one."""
+        spacing = second_spacing(self.scene, self.spacing)
+        return FullPropagator(
+            self.scene, spacing, self.tolerance, self._kernel, self._assembly.dtype, self.max_periods, None
+        )
+
+    @overload
+    def transfer_matrix(
+        self, points: ArrayLike | None = None, return_error: Literal[False] = False
+    ) -> torch.Tensor: ...
+
+    @overload
+    def transfer_matrix(
+        self, points: ArrayLike | None = None, *, return_error: Literal[True]
+    ) -> tuple[torch.Tensor, float]: ...
+
+    def transfer_matrix(
+        self, points: ArrayLike | None = None, return_error: bool = False
+    ) -> torch.Tensor | tuple[torch.Tensor, float]:
         """Transfer matrix G from one simulation a point or one a transducer, whichever are fewer.
 
         Waves travel from a point to the transducers as they travel back (reciprocity): P simulations do
@@ -173,16 +209,24 @@ class FullPropagator:
 
         Args:
             points: (P, 3) [m] inside the domain; by default the scene's control points.
+            return_error: also return the estimated relative error (L2 of the whole matrix): what a second
+                grid tells, a fifth of the cost where it is coarser, and the distance to the steady state.
 
         Returns:
-            complex128 (P, M) [Pa].
+            complex128 (P, M) [Pa], and the error if asked for.
 
         Raises:
             ValueError: `points` are not finite, have another shape or leave the domain.
         """
-        if points is None:
-            return self._control_matrix.clone()
-        return self._simulated_matrix(self._inside(points))
+        before = 0 if points is None else len(self.runs)
+        matrix = (
+            self._control_matrix.clone() if points is None else self._simulated_matrix(self._inside(points))
+        )
+        if not return_error:
+            return matrix
+        steady = max((run.remaining for run in self.runs[before:]), default=0.0)
+        second = self._second.transfer_matrix(points)
+        return matrix, steady + grid_error(matrix, second, coarser=self._second.spacing > self.spacing)
 
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
         """Pressure of drives at points, from a simulation a drive or from the transfer matrix.
@@ -302,7 +346,7 @@ def _make_kernel(name: str) -> Kernel:
 def make_propagator(
     scene: Scene,
     method: str = "auto",
-    spacing: float = 1e-3,
+    spacing: float | None = 1e-3,
     tolerance: float = 2e-3,
     *,
     kernel: str = "auto",
@@ -317,8 +361,10 @@ def make_propagator(
         method: "free_space": exact, without obstacles. "full": FDTD on the whole domain. "auto": free space
             where the scene has no obstacles, else full.
         spacing: edge of a cell [m], at most a third of the wavelength. The error falls with it; see
-            docs/numerics.md.
-        tolerance: relative distance to the steady state at which a simulation ends, in (0, 1).
+            docs/numerics.md. None: two coarse grids are simulated, and the spacing is chosen with which the
+            error of the transfer matrix should stay below `tolerance`.
+        tolerance: relative error, in (0, 1): the distance to the steady state at which a simulation ends; half
+            of that where the spacing is chosen, the other half being the grid's.
         kernel: "cpu" (numba), "reference" (torch, slow, readable), "auto": the fastest there is.
         dtype: precision of the fields, float32 or float64.
         max_periods: periods of the drive after which a simulation ends in any case, with a
@@ -337,7 +383,8 @@ def make_propagator(
     _require_one_of("kernel", kernel, KERNELS)
     dtype_name = str(dtype).removeprefix("torch.")
     _require_one_of("dtype", dtype_name, tuple(DTYPES))
-    spacing = positive("spacing", spacing, "m")
+    if spacing is not None:
+        spacing = positive("spacing", spacing, "m")
     tolerance = positive("tolerance", tolerance)
     if tolerance >= 1:
         raise invalid("tolerance", tolerance, "must be in (0, 1)")
@@ -349,15 +396,31 @@ def make_propagator(
     if chosen == "free_space":
         propagator = FreeSpacePropagator(scene)
     else:
-        propagator = FullPropagator(
-            scene, spacing, tolerance, kernel, DTYPES[dtype_name], max_periods, time_step
-        )
+        settings = _make_kernel(kernel), DTYPES[dtype_name], max_periods
+        if spacing is None:
+            tolerance /= 2
+            spacing = _chosen_spacing(scene, tolerance, *settings)
+        propagator = FullPropagator(scene, spacing, tolerance, *settings, time_step)
     if method == "auto":
         reason = (
             f"{len(scene.obstacles)} obstacles" if scene.obstacles else "no obstacles: nothing to simulate"
         )
         logger.info("method auto: %s (%s)", chosen, reason)
     return propagator
+
+
+def _chosen_spacing(
+    scene: Scene, tolerance: float, kernel: Kernel, dtype: torch.dtype, max_periods: int
+) -> float:
+    """Spacing [m] at which the grid's error should be `tolerance`, told from two coarse grids."""
+    coarsest = coarsest_spacing(scene)
+    pilot = min(scene.wavelength / PILOT_CELLS, coarsest)
+    near_steady = max(tolerance, 1e-3)
+    propagator = FullPropagator(scene, pilot, near_steady, kernel, dtype, max_periods, None)
+    _, error = propagator.transfer_matrix(return_error=True)
+    spacing = min(spacing_for(tolerance, error, pilot), coarsest)
+    logger.info("spacing %.3g mm: the error at %.3g mm is about %.2g", 1e3 * spacing, 1e3 * pilot, error)
+    return spacing
 
 
 def _require_one_of(name: str, value: object, accepted: tuple[str, ...]) -> None:
