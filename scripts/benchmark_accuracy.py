@@ -212,7 +212,7 @@ def sweep(case: Case, spacings: Sequence[float]) -> list[Row]:
 
 
 def worst_shift(name: str, spacing: float, count: int) -> Row:
-    """The worst of `count` random places of a sphere between the cells of `spacing` [mm]."""
+    """The worst (by total error) of `count` random places of a sphere between the cells [mm]."""
     # the same for every sphere and, in cells, for every spacing
     shifts = np.random.default_rng(0).uniform(-0.5, 0.5, (count, 3)) * spacing * 1e-3
     rows = []
@@ -322,6 +322,8 @@ def main() -> None:
         make_reference()
         return
     spacings = sorted({*given.spacings, *(FINE_SPACINGS if given.fine else ())}, reverse=True)
+    if len(spacings) < 2:
+        parser.error(f"argument --spacings: {given.spacings}; must be at least two different ones")
     rows = measure(spacings, given.shifts)
     write_report(rows, orders(rows), command(), given.output)
 
