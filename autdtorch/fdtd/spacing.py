@@ -1,4 +1,4 @@
-"""How the error falls with the spacing: an estimate from two grids, and the spacing that meets a tolerance."""
+"""How the error falls with the spacing: an estimate from two grids, and the spacing for a tolerance."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def second_spacing(scene: Scene, spacing: float) -> float:
 
 
 def grid_error(matrix: torch.Tensor, second: torch.Tensor, coarser: bool) -> float:
-    """Estimated relative error (L2) of a matrix, from that of a second grid `RATIO` times coarser or finer."""
+    """Estimated relative error (L2) of a matrix, from a second one on a grid `RATIO` coarser or finer."""
     difference = float((matrix - second).norm() / matrix.norm())
     gain: float = RATIO**ORDER
     return difference / (gain - 1) if coarser else difference * gain / (gain - 1)
