@@ -72,7 +72,7 @@ def largest_eigenvalue(
         return bound
     if len(index) > MOST_CELLS:
         logger.warning(
-            "the time step comes from a bound, up to a tenth short of the limit: the largest eigenvalue of %d"
+            "the time step comes from a bound, up to a quarter short of the limit: the largest eigenvalue of %d"
             " varying cells is not worked out, only of up to %d", len(index), MOST_CELLS,
         )  # fmt: skip
         return bound
