@@ -23,14 +23,14 @@ MIN_CELLS_PER_WAVELENGTH = 3.0
 """Coarser grids are refused."""
 
 FAIR_CELLS_PER_WAVELENGTH = 4.0
-"""Coarser grids are warned of: points would need over 10 cells a side, the layer reflects over -65 dB."""
+"""Coarser grids are warned of: points would need over 10 cells a side, the layer reflects over -61 dB."""
 
 MAX_CELLS = 10**9
 """More would take over 30 GB in single precision."""
 
 FINE_LAYER_CELLS, COARSE_LAYER_CELLS = 6, 8
-"""Boundary layer from 6 cells per wavelength on, and of coarser grids. It reflects less than -75 dB up to 60
-degrees, from 8.5 cells on -90 dB; the other less than -72 dB at 4.25 cells per wavelength, -37 dB at 3."""
+"""Boundary layer from 6 cells per wavelength on, and of coarser grids. It reflects less than -68 dB up to 60
+degrees, from 8.5 cells on -82 dB; the other less than -66 dB at 4.25 cells per wavelength, -32 dB at 3."""
 
 
 @dataclass(frozen=True)

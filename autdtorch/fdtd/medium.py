@@ -25,6 +25,9 @@ RIGID = 1e5
 _REACH = 0.87
 """Half the diagonal of an element: a surface farther from its centre does not cut it [cells]."""
 
+_TOUCHING = 1e-9
+"""What obstacles are larger by [cells], so that two that touch leave no film of air, in whatever plane."""
+
 _ELEMENTS_AT_ONCE = 4096
 
 
@@ -111,7 +114,7 @@ def _distance(body: Body, points: Array, spacing: float) -> Array:
     """Signed distance (...) [cells] of points (..., 3) [m]."""
     places = torch.from_numpy(points)
     nearest = torch.stack([obstacle.signed_distance(places) for obstacle in body]).amin(dim=0)
-    return np.asarray(nearest.numpy() / spacing)
+    return np.asarray(nearest.numpy() / spacing - _TOUCHING)
 
 
 def _windows(body: Body, centers: list[Array], spacing: float) -> Iterator[tuple[tuple[slice, ...], Array]]:

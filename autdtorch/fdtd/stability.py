@@ -72,8 +72,8 @@ def largest_eigenvalue(
         return bound
     if len(index) > MOST_CELLS:
         logger.warning(
-            "the time step comes from a bound, up to a tenth short of the limit: the largest eigenvalue of %d"
-            " varying cells is not worked out, only of up to %d", len(index), MOST_CELLS,
+            "the time step comes from a bound, up to a quarter short of the limit: the largest eigenvalue of"
+            " %d varying cells is not worked out, only of up to %d", len(index), MOST_CELLS,
         )  # fmt: skip
         return bound
     matrix = np.where(inside, -np.sign(forth) * np.sqrt(forth * back), 0)

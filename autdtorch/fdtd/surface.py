@@ -132,7 +132,7 @@ def cut_elements(
         number[far[:, _CORNERS] < 0] = own
     held = (number[:, :, None] == np.arange(count)).any(axis=1)
     present = volumes.mean(axis=1) > _PRESENT
-    chosen = np.flatnonzero((held.sum(axis=1) == 2) & (held == present).all(axis=1))
+    chosen = np.flatnonzero((held.sum(axis=1) == 2) & (present <= held).all(axis=1))
     if len(chosen):
         inner = count - 1 - held[chosen, ::-1].argmax(axis=1)
         outer = held[chosen].argmax(axis=1)

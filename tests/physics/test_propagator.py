@@ -174,9 +174,9 @@ def test_image_source_at_a_rigid_wall() -> None:
 
 
 def test_steady_state_that_is_not_reached_is_said() -> None:
-    propagator = make_propagator(small_scene((CUBE,)), "full", 1e-3, tolerance=1e-6, max_periods=20)
+    propagator = make_propagator(small_scene((CUBE,)), "full", 1e-3, tolerance=1e-6, max_periods=15)
     with pytest.warns(
-        SteadyStateWarning, match=r"no steady state after 20 periods.*raise max_periods or tolerance"
+        SteadyStateWarning, match=r"no steady state after 15 periods.*raise max_periods or tolerance"
     ):
         propagator.transfer_matrix()
     assert not any(run.reached for run in propagator.runs)

@@ -21,15 +21,16 @@ def reflected_decibels(
     [
         (34.0, 43, -90, -70),
         (17.0, 25, -90, -70),
-        (8.5, 12, -90, -70),
-        (6.0, 8.5, -75, -55),
-        (4.25, 6, -72, -60),
-        (3.0, 4, -37, -22),
+        (8.5, 12, -82, -63),
+        (6.0, 8.5, -68, -50),
+        (4.25, 6, -66, -48),
+        (3.0, 4, -32, -18),
     ],
 )
 def test_tuned_layer_reflects_little_at_the_drive_frequency(
     cells_per_wavelength: float, steps: float, bound: float, grazing_bound: float
 ) -> None:
+    # The shift that keeps near fields of light obstacles from growing costs 3 to 8 dB of what is possible;
     # design goal: -70 dB to 60 degrees and -45 dB at 75 with 10 cells at 8.5 cells per wavelength
     cells = layer_cells(2 * math.pi / cells_per_wavelength)
     steep = reflected_decibels(cells_per_wavelength, steps, cells, [0, 7, 15, 22, 30, 37, 45, 52, 60])

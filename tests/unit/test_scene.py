@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from autdtorch.array import TransducerArray
-from autdtorch.fdtd.grid import fill_medium, make_grid
 from autdtorch.geometry import Plane, circle_points
 from autdtorch.obstacles import Box, Sphere
 from autdtorch.scene import Medium, OverlapWarning, Scene
@@ -91,20 +90,6 @@ def test_obstacles_of_one_material_may_overlap_and_those_of_two_may_touch():
         (46e-3, 56e-3, 56e-3), 5e-3, rigid=True
     )  # 0.4 mm off, though the bounding boxes overlap
     paper_scene(obstacles=[ball(40, 5, 100.0), diagonal])
-
-
-def test_the_later_of_two_overlapping_obstacles_counts_and_the_boundary_layer_stays_air():
-    wall = Box((50e-3, 0.0, 50e-3), (10e-3, 1.0, 1.0), density=10.0, sound_speed=340.0)  # through the domain
-    with pytest.warns(OverlapWarning):
-        scene = paper_scene(obstacles=[wall, ball(50, 8, 50.0)], domain=((0, 0, 0), (0.1,) * 3))
-    grid = make_grid(scene, 2e-3)
-    density = fill_medium(scene, grid).density
-    at = tuple(int(cell) for cell in grid.to_cells(torch.tensor([50e-3, 50e-3, 50e-3])).round())
-    interior = tuple(slice(first, last) for first, last in zip(grid.first, grid.last, strict=True))
-    assert density[at] == 50.0
-    assert (density[at[0]][interior[1:]] != AIR.density).all()
-    density[interior] = AIR.density
-    assert (density == AIR.density).all()
 
 
 def test_obstacles_may_reach_beyond_the_domain():

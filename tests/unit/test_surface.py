@@ -1,0 +1,179 @@
+"""Cut elements: planes and spheres through the cube between eight cell centres.
+
+In units of a cell and of air. Materials of which one has a mass and the other none show where mass goes.
+"""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from autdtorch.fdtd.stencil import tuned_stencil
+from autdtorch.fdtd.surface import (
+    FAR,
+    LATTICE,
+    VERTICES,
+    CutElements,
+    Materials,
+    cut_elements,
+    energy_matrix,
+    uniform_bonds,
+)
+
+STENCIL = tuned_stencil(2 * math.pi / 8.5)
+ONE = np.array([1])
+OFFSETS = st.floats(-0.4, 0.4)
+CONTRASTS = st.floats(-3, 5).map(lambda exponent: 10**exponent)
+NORMALS = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array).filter(lambda n: np.linalg.norm(n) > 0.1)
+
+
+def plane(normal: np.ndarray, offset: float) -> np.ndarray:
+    """Distance from a plane that passes the middle of the element at `offset`."""
+    return np.asarray((LATTICE - 0.5) @ normal / np.linalg.norm(normal) - offset)
+
+
+def sphere(normal: np.ndarray, offset: float, radius: float) -> np.ndarray:
+    """Distance from a sphere whose nearest point to the middle of the element is at `offset`."""
+    center = 0.5 + (offset - radius) * normal / np.linalg.norm(normal)
+    return np.asarray(np.linalg.norm(LATTICE - center, axis=1) - radius)
+
+
+def element(
+    *distance: np.ndarray, density: tuple[float, ...] = (1, 77), mass: tuple[float, ...] | None = None
+) -> CutElements:
+    """One element, obstacle k of which is of material k + 1; masses are 1/density by default."""
+    materials = Materials(np.array(density, float), np.array(mass or [1 / d for d in density], float))
+    return cut_elements(np.stack(distance)[:, None], np.arange(len(distance)) + 1, materials, STENCIL)
+
+
+def energy(cut: CutElements, field: np.ndarray) -> float:
+    """Of a field (8,) at the vertices: the integral of |gradient|^2 / density."""
+    return float(field @ energy_matrix(cut.bonds)[0] @ field)
+
+
+@pytest.mark.parametrize("density", [1e-3, 1.0, 1e5])
+def test_an_element_of_one_material_is_the_tuned_stencil_over_its_density(density: float) -> None:
+    inside = np.full(len(LATTICE), -FAR)
+    cut = element(inside, density=(1, density))
+    # rounding
+    assert np.allclose(cut.bonds, uniform_bonds(STENCIL) / density, rtol=1e-14)
+    assert np.allclose(cut.mass, 1 / (8 * density), rtol=1e-14)
+    assert np.allclose(element(-inside).bonds, uniform_bonds(STENCIL), rtol=1e-14)
+
+
+def test_eight_elements_of_air_add_up_to_the_tuned_stencil() -> None:
+    matrix = energy_matrix(uniform_bonds(STENCIL)[None])[0]
+    sums = np.zeros((3, 3, 3))
+    for own, vertex in enumerate(VERTICES):
+        for other, target in enumerate(VERTICES):
+            sums[tuple(target - vertex + 1)] -= matrix[own, other]
+    sums[1, 1, 1] = 0
+    assert np.allclose(sums.ravel(), STENCIL.weights, rtol=1e-14)
+
+
+@settings(max_examples=60, deadline=None)
+@given(NORMALS, OFFSETS, CONTRASTS, st.one_of(st.none(), st.floats(1, 30)))
+def test_energy_is_never_negative_at_any_contrast(
+    normal: np.ndarray, offset: float, density: float, radius: float | None
+) -> None:
+    distance = plane(normal, offset) if radius is None else sphere(normal, offset, radius)
+    matrix = energy_matrix(element(distance, density=(1, density)).bonds)[0]
+    size = np.abs(matrix).max()
+    # rounding of sums of terms up to the contrast apart
+    assert np.linalg.eigvalsh(matrix).min() > -1e-11 * size
+    assert np.abs(matrix @ np.ones(8)).max() < 1e-12 * size
+
+
+@settings(max_examples=60, deadline=None)
+@given(NORMALS, OFFSETS, CONTRASTS)
+def test_a_field_along_a_plane_surface_has_its_exact_energy(
+    normal: np.ndarray, offset: float, density: float
+) -> None:
+    cut = element(plane(normal, offset), density=(1, density))
+    volumes = element(plane(normal, offset), density=(1, density), mass=(0, 1)).mass.sum()
+    assume(1e-3 < volumes < 1 - 1e-3)  # what is smaller may count as absent
+    along = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    along /= np.linalg.norm(along)
+    # 1/density averaged over the element, which is what its masses sum to; rounding as above
+    assert energy(cut, VERTICES @ along) == pytest.approx(cut.mass.sum(), rel=1e-9)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@given(offset=OFFSETS, density=CONTRASTS)
+def test_a_flow_through_a_surface_along_the_grid_meets_its_exact_resistance(
+    axis: int, offset: float, density: float
+) -> None:
+    normal = np.eye(3)[axis]
+    depth = VERTICES[:, axis] - 0.5 - offset
+    kinked = np.where(depth < 0, density, 1.0) * depth  # of unit flow
+    cut = element(plane(normal, offset), density=(1, density))
+    resistance = (0.5 + offset) * density + (0.5 - offset)
+    flow = energy_matrix(cut.bonds)[0] @ kinked
+    # nothing flows along the surface, all of it across; rounding
+    assert flow[depth > 0].sum() == pytest.approx(1, rel=1e-9)
+    assert energy(cut, kinked) == pytest.approx(resistance, rel=1e-9)
+
+
+@settings(max_examples=40, deadline=None)
+@given(NORMALS, OFFSETS)
+def test_masses_stay_on_their_side(normal: np.ndarray, offset: float) -> None:
+    distance = plane(normal, offset)
+    air, solid = element(distance, mass=(1, 0)), element(distance, mass=(0, 1))
+    inside = solid.number[0] == 1
+    assert (solid.mass[0, ~inside] == 0).all() or not inside.any()
+    assert (air.mass[0, inside] == 0).all() or inside.all()
+    assert air.mass.sum() + solid.mass.sum() == pytest.approx(1, rel=1e-14)
+
+
+@given(offset=OFFSETS)
+def test_volumes_are_exact_for_faces_along_the_grid(offset: float) -> None:
+    cut = element(plane(np.array((0, 1, 0)), offset), mass=(0, 1))
+    assert cut.mass.sum() == pytest.approx(0.5 + offset, abs=1e-12)
+
+
+@pytest.mark.parametrize("offset", [-0.6, -0.2, 0.1, 0.5])
+def test_volumes_are_close_for_tilted_planes(offset: float) -> None:
+    normal, points = np.array((0.8, 0.5, 0.33)), np.random.default_rng(0).random((400_000, 3))
+    exact = ((points - 0.5) @ normal / np.linalg.norm(normal) < offset).mean()
+    # random points are good to 8e-4; the sub-cells of a quarter to 1 % (measured)
+    assert element(plane(normal, offset), mass=(0, 1)).mass.sum() == pytest.approx(exact, abs=0.012)
+
+
+def test_of_two_obstacles_the_later_wins() -> None:
+    lower, deeper = plane(np.array((1, 0, 0)), 0.3), plane(np.array((1, 0, 0)), -0.1)
+    masses = [
+        element(lower, deeper, density=(1, 5, 9), mass=tuple(np.eye(3)[own])).mass.sum() for own in range(3)
+    ]
+    assert masses == pytest.approx([0.2, 0.4, 0.4], abs=1e-12)
+    assert element(deeper, lower, density=(1, 5, 9), mass=(0, 1, 0)).mass.sum() == pytest.approx(0, abs=1e-12)
+
+
+def test_obstacles_that_touch_leave_no_air_between_them() -> None:
+    normal = np.array((0.6, 0.0, 0.8))
+    lower, upper = plane(normal, 0.1), plane(-normal, -0.1)
+    assert element(lower, upper, density=(1, 5, 9), mass=(1, 0, 0)).mass.sum() == pytest.approx(0, abs=1e-12)
+
+
+def test_a_plate_of_half_a_cell_between_the_vertices_is_there() -> None:
+    thickness, density = 0.5, 50.0
+    plate = np.abs(LATTICE[:, 0] - 0.46) - thickness / 2
+    cut = element(plate, density=(1, density), mass=(0, 1))
+    assert not cut.number.any()
+    assert cut.mass.sum() == pytest.approx(thickness, rel=1e-12)
+    # a flow across it meets the resistance of both
+    resistance = 1 + (density - 1) * thickness
+    assert energy(cut, VERTICES[:, 0].astype(float)) == pytest.approx(1 / resistance, rel=1e-12)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_face_through_vertices_is_corrected_from_either_side(side: int) -> None:
+    """All of one material, four vertices of which count to the other."""
+    density = 77.0
+    distance = LATTICE[:, 0] - 1 if side < 0 else LATTICE[:, 0] - 1e-9
+    cut = element(distance, density=(1, density))
+    assert set(cut.number[0]) == {0, 1}
+    mobility = 1 / density if side < 0 else 1.0
+    # the sliver of 1e-9, and rounding
+    assert energy(cut, VERTICES[:, 1].astype(float)) == pytest.approx(mobility, rel=1e-6)
