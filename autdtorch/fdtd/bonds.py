@@ -80,6 +80,7 @@ def varying_cells(medium: ElementMedium, stencil: Stencil) -> VaryingCells:
     )
     index, weight, mass = (np.concatenate(part) for part in zip(*parts, strict=True))
     order = np.argsort(index)
+    order = order[_inner(index[order], shape)]  # inside obstacles too the rim stays silent
     return VaryingCells(index[order], weight[order], mass[order], np.flatnonzero(closed))
 
 
