@@ -363,8 +363,8 @@ def make_propagator(
         spacing: edge of a cell [m], at most a third of the wavelength. The error falls with it; see
             docs/numerics.md. None: two coarse grids are simulated, and the spacing is chosen with which the
             error of the transfer matrix should stay below `tolerance`.
-        tolerance: relative error, in (0, 1): the distance to the steady state at which a simulation ends; half
-            of that where the spacing is chosen, the other half being the grid's.
+        tolerance: relative error, in (0, 1): the distance to the steady state at which a simulation ends;
+            half of that where the spacing is chosen, the other half being the grid's.
         kernel: "cpu" (numba), "reference" (torch, slow, readable), "auto": the fastest there is.
         dtype: precision of the fields, float32 or float64.
         max_periods: periods of the drive after which a simulation ends in any case, with a

@@ -58,6 +58,15 @@ def speed_factor(stencil: Stencil, speed_ratio: float) -> float:
     return stencil.symbol / stencil.isotropic_symbol(stencil.kappa / speed_ratio)
 
 
+def _flow_factor(kappa: float, speed_ratio: float) -> float:
+    """What a material's bonds and mass are multiplied with for its impedance to be right beside air.
+
+    The difference between two cells is a wave's slope times sin(k / 2) / (k / 2), with the material's own k:
+    only where it is that of air do both sides agree on the flow between them.
+    """
+    return float(np.sinc(kappa / (2 * np.pi)) / np.sinc(kappa / speed_ratio / (2 * np.pi)))
+
+
 def fill_elements(scene: Scene, grid: Grid, stencil: Stencil) -> ElementMedium:
     """Find the material of every element, and the bonds and masses of those that surfaces cut.
 
@@ -98,7 +107,12 @@ def _bodies(
         else:
             bodies.append([obstacle])
             numbers.append(own)
-    density = [RIGID if m is None else m.density / air.density for m in known]
+    density = [
+        RIGID
+        if m is None
+        else m.density / air.density / _flow_factor(stencil.kappa, m.sound_speed / air.sound_speed)
+        for m in known
+    ]
     factor = [1.0 if m is None else speed_factor(stencil, m.sound_speed / air.sound_speed) for m in known]
     materials = Materials(np.array(density), 1 / (np.array(density) * np.array(factor)))
     return bodies, np.array(numbers, np.int64), materials, np.array([m is None for m in known])

@@ -76,7 +76,8 @@ def largest_eigenvalue(
             " %d varying cells is not worked out, only of up to %d", len(index), MOST_CELLS,
         )  # fmt: skip
         return bound
-    matrix = np.where(inside, -np.sign(forth) * np.sqrt(forth * back), 0)
+    product = np.where(inside, forth * back, 0).clip(min=0)  # zeros by rounding may differ in sign
+    matrix = -np.sign(forth) * np.sqrt(product)
     matrix[:, 13] = forth.sum(1)
     column = np.where(inside, neighbour, np.arange(len(rows), dtype=np.int32)[:, None])
     first = np.arange(0, 27 * len(rows) + 1, 27)
