@@ -1,0 +1,244 @@
+"""Does anything grow? Random scenes, stepped long after they should be steady; prints two Markdown tables.
+
+    python scripts/stress_stability.py                       500 scenes, about 12 minutes on 2 idle cores
+    python scripts/stress_stability.py --seed 3 --only 17    one of them again
+
+The scenes are those of `random_scenes.py`. Each runs twice: driven from silence, and from random pressure
+without a source, which excites every mode the grid has. It fails if a run does not stay finite, if the norm
+of its pressure still rises in its last half by more than a driven resonance can, or if its phasors wander
+more and more. Exit status 1 if any scene fails.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import math
+import multiprocessing
+import os
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from random_scenes import LONG_SHARE, LONG_STEPS, Trial, draw_trial
+from tqdm import tqdm
+
+from autdtorch.fdtd.kernels.contract import Receivers, Sources, State
+from autdtorch.fdtd.kernels.cpu import CpuKernel
+from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, assemble, drive_signal, lock_in
+
+Array = NDArray[np.float64]
+
+FEWEST_PERIODS = 3 * RAMP_PERIODS
+"""Of a driven run: in a fast obstacle a period has hundreds of steps."""
+
+WINDOWS, SAMPLES = 32, 16
+"""Windows of a run, and samples of its energy in each, of which the largest counts."""
+
+LARGEST_RISE = {"driven": math.log(2.5), "free": math.log(1.2)}
+"""Of the logarithm of the pressure's norm over the last half of a run. A driven resonance without loss rises
+in proportion to time, to the double. Nothing should rise on its own: 1.2 is left to beating modes."""
+
+WANDERING = 2.0
+"""Spread of the phasors in the last quarter of a run over that in the two quarters before."""
+STILL = {torch.float32: 1e-3, torch.float64: 1e-6}
+"""Spread relative to the phasors that is no wandering."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a trial.
+
+    Attributes:
+        trial: what was run.
+        rate: growth per period of the norm of the pressure over the last half, by run.
+        rise: growth over the last half, by run; logarithms.
+        finite: whether all stayed so.
+        wandering: spread of the phasors in the last quarter of the driven run over that before.
+        where: place of the largest pressure at the end of the run that rose most [cells], or what went wrong
+            before a run.
+    """
+
+    trial: Trial
+    rate: dict[str, float]
+    rise: dict[str, float]
+    finite: bool
+    wandering: float
+    where: str
+
+    @property
+    def failed(self) -> bool:
+        """Whether anything grew."""
+        risen = any(rise > LARGEST_RISE[run] for run, rise in self.rise.items())
+        return not self.finite or risen or self.wandering > WANDERING
+
+    def __str__(self) -> str:
+        """The trial and its figures."""
+        rates = ", ".join(
+            f"{run} {rate:+.2g} (x {_power(self.rise[run])})" for run, rate in self.rate.items()
+        )
+        return (
+            f"{self.trial}\n    growth per period: {rates}; phasors' spread x {self.wandering:.2g}; "
+            f"largest at {self.where}{'' if self.finite else '; NOT FINITE'}"
+        )
+
+
+def _power(logarithm: float) -> str:
+    return f"{math.exp(min(logarithm, 700)):.3g}"
+
+
+def run_trial(trial: Trial) -> Outcome:
+    """Step a trial's scene, driven and free."""
+    try:
+        assembly = assemble(trial.scene, trial.spacing, trial.dtype)
+    except Exception as error:  # a finding like any other: the scenes are all in order
+        infinite = dict.fromkeys(LARGEST_RISE, math.inf)
+        return Outcome(trial, infinite, infinite, False, math.inf, f"assembling: {error!r}")
+    period = float(assembly.steps_per_period)
+    steps = {"driven": max(trial.steps, math.ceil(FEWEST_PERIODS * period)), "free": trial.steps}
+    mass = np.ones(math.prod(assembly.grid.shape))
+    mass[assembly.varying.index] = assembly.varying.mass
+    strength = torch.full(
+        (len(trial.scene.array),), trial.scene.array.source_strength, dtype=torch.complex128
+    )
+    sources = assembly.sources(trial.scene.array.positions, strength)
+    nobody = Sources(sources.index[:0], sources.force[:0])
+    receivers = assembly.receivers(trial.scene.control_points)
+    start = {"driven": assembly.silence(sources), "free": _random_state(assembly, sources, trial.number)}
+    drive = {"driven": sources, "free": nobody}
+    courses = {
+        run: _course(assembly, start[run], drive[run], receivers, mass, count) for run, count in steps.items()
+    }
+    rise = {run: _rise(course.norm) for run, course in courses.items()}
+    return Outcome(
+        trial,
+        {run: value / (steps[run] / 2 / period) for run, value in rise.items()},
+        rise,
+        all(math.isfinite(value) for value in rise.values()),
+        _wandering(courses["driven"].phasor, STILL[trial.dtype]),
+        courses[max(rise, key=lambda run: rise[run])].where,
+    )
+
+
+@dataclass(frozen=True)
+class _Course:
+    """How a run went: largest norm of each window (n,), phasors block by block (b, R), place of the peak."""
+
+    norm: Array
+    phasor: NDArray[np.complex128]
+    where: str
+
+
+def _random_state(assembly: Assembly, sources: Sources, seed: int) -> State:
+    """Random pressure at rest in the interior; none in rigid cells, where it would stay for ever."""
+    grid, state = assembly.grid, assembly.silence(sources)
+    inside = tuple(slice(low, high) for low, high in zip(grid.first, grid.last, strict=True))
+    state.now[inside] = torch.from_numpy(np.random.default_rng(seed).standard_normal(grid.interior)).to(
+        assembly.dtype
+    )
+    state.now.reshape(-1)[torch.from_numpy(assembly.varying.rigid)] = 0
+    state.before.copy_(state.now)
+    return state
+
+
+def _course(
+    assembly: Assembly, state: State, sources: Sources, receivers: Receivers, mass: Array, steps: int
+) -> _Course:
+    """Step a run and watch the norm of its pressure, weighted with the masses as in the energy."""
+    at_once = math.ceil(steps / (WINDOWS * SAMPLES))
+    norm, recorded = np.zeros(WINDOWS * SAMPLES), []
+    for sample in range(len(norm)):
+        signal = drive_signal(assembly.steps_per_period, sample * at_once, at_once).to(assembly.dtype)
+        state, heard = CpuKernel().advance(state, assembly.coefficients, sources, receivers, signal)
+        recorded.append(heard)
+        pressure = state.now.numpy().ravel().astype(np.float64)
+        with np.errstate(over="ignore", invalid="ignore"):  # found out below
+            norm[sample] = np.sqrt((mass * pressure**2).sum())
+    block = assembly.steps_per_period.numerator
+    whole = torch.cat(recorded)
+    phasor = [
+        lock_in(whole[first : first + block], assembly.steps_per_period.denominator)
+        for first in range(0, len(whole) - block + 1, block)
+    ]
+    peak = np.unravel_index(np.abs(state.now.numpy()).argmax(), assembly.grid.shape)
+    where = np.array(peak) - assembly.grid.to_cells(torch.zeros((1, 3), dtype=torch.float64))[0]
+    text = "(" + ", ".join(f"{x:.1f}" for x in where) + ")"
+    return _Course(norm.reshape(WINDOWS, SAMPLES).max(axis=1), torch.stack(phasor).numpy(), text)
+
+
+def _rise(norm: Array) -> float:
+    """Rise of the logarithm of `norm` over the last half of its windows, by a straight line."""
+    late = norm[len(norm) // 2 :]
+    if not np.isfinite(late).all():
+        return math.inf
+    if late.min() == 0:
+        return 0.0
+    return float(np.polyfit(np.linspace(0, 1, len(late)), np.log(late), 1)[0])
+
+
+def _wandering(phasor: NDArray[np.complex128], still: float) -> float:
+    """Spread of phasors (b, R) in the last quarter over that in the two before; 0 if it is within `still`."""
+    quarters = np.array_split(phasor, 4)[1:]
+    early, middle, late = (float(np.linalg.norm(part - part.mean(axis=0), axis=1).max()) for part in quarters)
+    if late <= still * np.linalg.norm(phasor, axis=1).max():
+        return 0.0
+    return late / max(early, middle, 1e-300)
+
+
+def table(outcomes: list[Outcome]) -> str:
+    """Markdown table of outcomes by label; a scene counts under each of its labels."""
+    lines = [
+        "| scenes with | count | failed | not finite | worst rate, driven | worst rate, free |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    for label in ("any", *sorted({label for outcome in outcomes for label in outcome.trial.labels})):
+        own = [o for o in outcomes if label == "any" or label in o.trial.labels]
+        driven, free = (max(o.rate[run] for o in own) for run in ("driven", "free"))
+        failed, broken = sum(o.failed for o in own), sum(not o.finite for o in own)
+        lines.append(f"| {label} | {len(own)} | {failed} | {broken} | {driven:+.1e} | {free:+.1e} |")
+    return "\n".join(lines)
+
+
+def _numbered(task: tuple[int, int, float]) -> Outcome:
+    torch.set_num_threads(1)
+    logging.getLogger("autdtorch").setLevel(logging.ERROR)  # coarse spacings are meant
+    return run_trial(draw_trial(*task))
+
+
+def main() -> int:
+    """Run the scenes; print the failures as they come, then the tables."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--scenes", type=int, default=500)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", type=int, help="number of the one scene to run")
+    parser.add_argument("--long-share", type=float, default=LONG_SHARE, help=f"share of {LONG_STEPS} steps")
+    parser.add_argument("--processes", type=int, default=2)
+    given = parser.parse_args()
+    if given.only is not None:
+        outcome = _numbered((given.seed, given.only, given.long_share))
+        print(outcome)
+        return int(outcome.failed)
+    tasks = [(given.seed, number, given.long_share) for number in range(given.scenes)]
+    os.environ["NUMBA_NUM_THREADS"] = "1"  # read by the processes that are started below
+    with multiprocessing.get_context("spawn").Pool(given.processes) as pool:
+        outcomes = []
+        for outcome in tqdm(pool.imap(_numbered, tasks), total=len(tasks)):
+            outcomes.append(outcome)
+            if outcome.failed:
+                tqdm.write(f"{outcome}\n")
+    for title, inside in (
+        ("Obstacles inside the domain", True),
+        ("Obstacles that may reach out of it", False),
+    ):
+        print(f"\n{title}:\n\n{table([o for o in outcomes if o.trial.inside == inside])}")
+    refused = sum(outcome.trial.refused for outcome in outcomes)
+    print(f"\n{refused} scenes more were refused: an obstacle too slow for the spacing.")
+    return int(any(outcome.failed for outcome in outcomes))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,20 @@
+"""Nothing grows: the first scenes of `scripts/stress_stability.py`, in short runs on its smallest grids."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import pytest
+from random_scenes import Trial, draw_trial
+from stress_stability import run_trial
+
+TRIALS = [replace(draw_trial(0, number, long_share=1.0), steps=1_000) for number in range(14)]
+TRIALS = [trial for trial in TRIALS if trial.inside]  # obstacles through the boundary layer: not yet
+
+
+@pytest.mark.parametrize("trial", TRIALS, ids=lambda trial: str(trial.number))
+def test_nothing_grows_in_a_random_scene(trial: Trial, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.ERROR)  # coarse spacings are meant
+    outcome = run_trial(trial)
+    assert not outcome.failed, str(outcome)
