@@ -51,7 +51,7 @@ def largest_eigenvalue(
 
     Args:
         index: flat indices (n,) of the cells whose weights differ from the stencil's, ascending; none of them
-            in the outermost two layers.
+            in the outermost layer.
         weight: their weights w_ij (n, 27), such that m_i w_ij is symmetric for some masses.
         stencil: weights of all other cells.
         shape: cells of the grid.
@@ -93,6 +93,11 @@ def _flat_offsets(shape: tuple[int, int, int]) -> NDArray[np.int64]:
     return np.asarray(np.array(OFFSETS) @ (shape[1] * shape[2], shape[2], 1), np.int64)
 
 
+def _inner(shape: tuple[int, int, int]) -> NDArray[np.bool_]:
+    """Which cells (k,) are not in the silent ring."""
+    return np.pad(np.ones([cells - 2 for cells in shape], bool), 1).ravel()
+
+
 def _with_rim(
     index: NDArray[np.int64], shape: tuple[int, int, int]
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
@@ -100,6 +105,7 @@ def _with_rim(
     found = np.zeros(math.prod(shape), bool)
     for offset in _flat_offsets(shape):
         found[index + offset] = True
+    found &= _inner(shape)
     rows = np.flatnonzero(found)
     place = np.full(len(found), -1, np.int32)
     place[rows] = np.arange(len(rows))
