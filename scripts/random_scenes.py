@@ -146,7 +146,9 @@ class _Draft:
         """The scene, with points in its air; None where the obstacles leave too little of it."""
         candidates = self.spacing * self.domain * self.rng.uniform(0.02, 0.98, (512, 3))
         gap = np.min([o.signed_distance(candidates).numpy() for o in self.obstacles], axis=0) / self.spacing
-        free, chosen = np.flatnonzero(gap > 0.2), []
+        # between voxel centres a distance is not exact
+        inside = np.any([o.contains(candidates, margin=1e-6).numpy() for o in self.obstacles], axis=0)
+        free, chosen = np.flatnonzero((gap > 0.2) & ~inside), []
         if len(free) < 4:
             return None
         for _ in range(4):

@@ -1,6 +1,6 @@
 """Does anything grow? Random scenes, stepped long after they should be steady; prints two Markdown tables.
 
-    python scripts/stress_stability.py                       500 scenes, about 20 minutes on 2 idle cores
+    python scripts/stress_stability.py                       500 scenes, about 12 minutes on 2 idle cores
     python scripts/stress_stability.py --seed 3 --only 17    one of them again
 
 The scenes are those of `random_scenes.py`. Each runs twice: driven from silence, and from random pressure
