@@ -84,6 +84,8 @@ def _air(cells_per_wavelength: float, layer_cells: int) -> Air:
         closed_index=torch.zeros(0, dtype=torch.int64),
         layer_decay=torch.from_numpy(profile.decay),
         layer_gain=torch.from_numpy(profile.gain),
+        layer_index=torch.zeros(0, dtype=torch.int64),
+        layer_scale=torch.zeros(0, dtype=torch.float64),
         columns=Columns.none(layer_cells, torch.float64),
     )
     return Air(coefficients, steps_per_period, stencil.source_factor(steps).real)

@@ -12,13 +12,10 @@ from numpy.typing import NDArray
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.fdtd.surface import FAR, LATTICE, CutElements, Materials, cut_elements
-from autdtorch.obstacles import Obstacle
+from autdtorch.obstacles import Box, Obstacle
 from autdtorch.scene import Medium, Scene
 
 Array = NDArray[np.float64]
-Body = list[Obstacle]
-"""Consecutive obstacles of one material, which need not be told apart."""
-
 RIGID = 1e5
 """Density, relative to air, that rigid obstacles are assembled with; what it leaves open is then sealed."""
 
@@ -29,6 +26,41 @@ _TOUCHING = 1e-9
 """What obstacles are larger by [cells], so that two that touch leave no film of air, in whatever plane."""
 
 _ELEMENTS_AT_ONCE = 4096
+
+
+@dataclass(frozen=True)
+class Body:
+    """Consecutive obstacles of one material, which need not be told apart.
+
+    Attributes:
+        obstacles: of which it consists.
+        number: of its material.
+        goes_on: whether it goes on through the boundary layers, where it leaves the interior; else it ends.
+    """
+
+    obstacles: tuple[Obstacle, ...]
+    number: int
+    goes_on: bool
+
+    @property
+    def lower(self) -> Array:
+        """Corner of the bounding box with the smallest coordinates (3,) [m]."""
+        return np.asarray(np.array([obstacle.lower for obstacle in self.obstacles]).min(axis=0))
+
+    @property
+    def upper(self) -> Array:
+        """Corner of the bounding box with the largest coordinates (3,) [m]."""
+        return np.asarray(np.array([obstacle.upper for obstacle in self.obstacles]).max(axis=0))
+
+    def distance(self, cell: Array, grid: Grid) -> Array:
+        """Signed distance [cells] of places (..., 3) in cells."""
+        inside = np.clip(cell, grid.first, np.array(grid.last) - 1)
+        places = np.array(grid.origin) + grid.spacing * (inside if self.goes_on else cell)
+        each = [obstacle.signed_distance(torch.from_numpy(places)) for obstacle in self.obstacles]
+        distance = torch.stack(each).amin(dim=0).numpy() / grid.spacing - _TOUCHING
+        if self.goes_on:
+            return np.asarray(distance)
+        return np.asarray(np.maximum(distance, np.abs(cell - inside).max(axis=-1) - 0.5))
 
 
 @dataclass(frozen=True)
@@ -70,43 +102,35 @@ def _flow_factor(kappa: float, speed_ratio: float) -> float:
 def fill_elements(scene: Scene, grid: Grid, stencil: Stencil) -> ElementMedium:
     """Find the material of every element, and the bonds and masses of those that surfaces cut.
 
-    Where obstacles overlap the later wins. Those that reach beyond the interior go on through the boundary
-    layer as they leave the interior.
+    Where obstacles overlap the later wins. Of those that reach beyond the interior, walls, slabs and plates
+    along the grid go on through the boundary layer, as they leave the interior; others end there.
     """
-    bodies, numbers, materials, rigid = _bodies(scene, stencil)
-    centers = [
-        _clamped(grid, axis, 0.5 + np.arange(grid.shape[axis] - 1, dtype=np.float64)) for axis in range(3)
-    ]
-    number = np.zeros([len(c) for c in centers], np.int16)
+    bodies, materials, rigid = _bodies(scene, stencil)
+    number = np.zeros([cells - 1 for cells in grid.shape], np.int16)
     cut = np.zeros(number.shape, bool)
-    for body, own in zip(bodies, numbers, strict=True):
-        for window, distance in _windows(body, centers, grid.spacing):
-            number[window][distance < 0] = own
+    for body in bodies:
+        for window, distance in _windows(body, grid):
+            number[window][distance < 0] = body.number
             cut[window] = (cut[window] | (distance < _REACH)) & (distance > -_REACH)
     index = np.flatnonzero(cut)
-    return ElementMedium(
-        materials, rigid, number, index, _cut(bodies, numbers, index, grid, materials, stencil)
-    )
+    return ElementMedium(materials, rigid, number, index, _cut(bodies, index, grid, materials, stencil))
 
 
-def _bodies(
-    scene: Scene, stencil: Stencil
-) -> tuple[list[Body], NDArray[np.int64], Materials, NDArray[np.bool_]]:
+def _bodies(scene: Scene, stencil: Stencil) -> tuple[list[Body], Materials, NDArray[np.bool_]]:
     """Obstacles joined where consecutive ones share a material, and the materials that there are."""
     air = scene.medium
     known: list[Medium | None] = [air]
     bodies: list[Body] = []
-    numbers: list[int] = []
     for obstacle in scene.obstacles:
         material = None if obstacle.rigid else Medium(obstacle.density, obstacle.sound_speed)  # type: ignore[arg-type]
         if material not in known:
             known.append(material)
         own = known.index(material)
-        if numbers and numbers[-1] == own:
-            bodies[-1].append(obstacle)
+        kind = own, _goes_on(obstacle, air)
+        if bodies and kind == (bodies[-1].number, bodies[-1].goes_on):
+            bodies[-1] = Body((*bodies[-1].obstacles, obstacle), *kind)
         else:
-            bodies.append([obstacle])
-            numbers.append(own)
+            bodies.append(Body((obstacle,), *kind))
     density = [
         RIGID
         if m is None
@@ -115,7 +139,7 @@ def _bodies(
     ]
     factor = [1.0 if m is None else speed_factor(stencil, m.sound_speed / air.sound_speed) for m in known]
     materials = Materials(np.array(density), 1 / (np.array(density) * np.array(factor)))
-    return bodies, np.array(numbers, np.int64), materials, np.array([m is None for m in known])
+    return bodies, materials, np.array([m is None for m in known])
 
 
 def _clamped(grid: Grid, axis: int, cell: Array) -> Array:
@@ -124,27 +148,30 @@ def _clamped(grid: Grid, axis: int, cell: Array) -> Array:
     return np.asarray(grid.origin[axis] + grid.spacing * inside)
 
 
-def _distance(body: Body, points: Array, spacing: float) -> Array:
-    """Signed distance (...) [cells] of points (..., 3) [m]."""
-    places = torch.from_numpy(points)
-    nearest = torch.stack([obstacle.signed_distance(places) for obstacle in body]).amin(dim=0)
-    return np.asarray(nearest.numpy() / spacing - _TOUCHING)
+def _goes_on(obstacle: Obstacle, air: Medium) -> bool:
+    """Whether it is a wall, slab or plate along the grid, not lighter than air.
+
+    In the layers other shapes were found to grow: light ones, and those that are bent where layers meet.
+    """
+    straight = isinstance(obstacle, Box) and obstacle.rotation == (0.0, 0.0, 0.0)
+    return straight and (obstacle.density is None or obstacle.density >= air.density)
 
 
-def _windows(body: Body, centers: list[Array], spacing: float) -> Iterator[tuple[tuple[slice, ...], Array]]:
+def _windows(body: Body, grid: Grid) -> Iterator[tuple[tuple[slice, ...], Array]]:
     """Slabs of elements around a body, with the signed distance [cells] of their centres."""
-    lower = np.min([obstacle.lower for obstacle in body], axis=0) - spacing
-    upper = np.max([obstacle.upper for obstacle in body], axis=0) + spacing
-    ranges = [np.searchsorted(c, (low, high)) for c, low, high in zip(centers, lower, upper, strict=True)]
+    middle = [np.arange(cells - 1) + 0.5 for cells in grid.shape]
+    ranges = []
+    for axis, low, high in zip(range(3), body.lower - grid.spacing, body.upper + grid.spacing, strict=True):
+        inside = np.clip(middle[axis], grid.first[axis], grid.last[axis] - 1)
+        ranges.append(np.searchsorted(grid.origin[axis] + grid.spacing * inside, (low, high)))
     for x in range(ranges[0][0], ranges[0][1]):
         window = (slice(x, x + 1), slice(*ranges[1]), slice(*ranges[2]))
-        axes = (c[part] for c, part in zip(centers, window, strict=True))
-        yield window, _distance(body, np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1), spacing)
+        axes = (m[part] for m, part in zip(middle, window, strict=True))
+        yield window, body.distance(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1), grid)
 
 
 def _cut(
     bodies: list[Body],
-    numbers: NDArray[np.int64],
     index: NDArray[np.int64],
     grid: Grid,
     materials: Materials,
@@ -154,14 +181,16 @@ def _cut(
     shape = tuple(cells - 1 for cells in grid.shape)
     for start in range(0, len(index), _ELEMENTS_AT_ONCE):
         first = np.stack(np.unravel_index(index[start : start + _ELEMENTS_AT_ONCE], shape), axis=-1)
-        points = np.stack([_clamped(grid, d, first[:, None, d] + LATTICE[:, d]) for d in range(3)], axis=-1)
-        distance = np.full((len(bodies), *points.shape[:2]), FAR)
+        cell = first[:, None] + LATTICE
+        middle = np.clip(first + 0.5, grid.first, np.array(grid.last) - 1)
+        center = np.array(grid.origin) + grid.spacing * middle
+        distance = np.full((len(bodies), *cell.shape[:2]), FAR)
         for far, body in zip(distance, bodies, strict=True):
-            low = np.min([obstacle.lower for obstacle in body], axis=0) - 2 * grid.spacing
-            high = np.max([obstacle.upper for obstacle in body], axis=0) + 2 * grid.spacing
-            near = ((points[:, 0] > low) & (points[:, 0] < high)).all(axis=1)
+            low, high = body.lower - 2 * grid.spacing, body.upper + 2 * grid.spacing
+            near = ((center > low) & (center < high)).all(axis=1)
             if near.any():
-                far[near] = _distance(body, points[near], grid.spacing)
+                far[near] = body.distance(cell[near], grid)
+        numbers = np.array([body.number for body in bodies], np.int64)
         parts.append(cut_elements(distance, numbers, materials, stencil))
     return CutElements(
         np.concatenate([part.bonds for part in parts]),

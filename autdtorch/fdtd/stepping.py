@@ -17,7 +17,7 @@ import torch
 
 from autdtorch.fdtd.bonds import VaryingCells, varying_cells
 from autdtorch.fdtd.boundary import tuned_profile
-from autdtorch.fdtd.columns import layer_columns
+from autdtorch.fdtd.columns import layer_columns, scaled_cells
 from autdtorch.fdtd.grid import Grid, make_grid
 from autdtorch.fdtd.kernels.contract import Coefficients, Kernel, Receivers, Sources, State, uniform_state
 from autdtorch.fdtd.medium import fill_elements
@@ -145,6 +145,7 @@ def assemble(
     keep = (1 - damping) / (1 + damping)
     profile = tuned_profile(grid.kappa, steps, grid.layer_cells)
     face, edge, corner = factor * stencil.face, factor * stencil.edge, factor * stencil.corner
+    layer_index, layer_scale = scaled_cells(varying, stencil, grid, dtype)
     coefficients = Coefficients(
         center=1 + keep - factor * stencil.total,
         face=face,
@@ -156,6 +157,8 @@ def assemble(
         closed_index=torch.from_numpy(varying.shell),
         layer_decay=torch.from_numpy(profile.decay).to(dtype),
         layer_gain=torch.from_numpy(profile.gain).to(dtype),
+        layer_index=layer_index,
+        layer_scale=layer_scale,
         columns=layer_columns(varying, stencil, grid, factor, dtype),
     )
     logger.info(

@@ -23,8 +23,20 @@ def pressure(force: torch.Tensor, weight: torch.Tensor, steps: int) -> torch.Ten
         torch.tensor([[-81, -72, -63, -9, 0, 9, 63, 72, 81]]),
         weight[:1, :9],
     )
+    scaled = torch.tensor([CELL]), torch.tensor([1.3], dtype=torch.float64)
     coefficients = Coefficients(
-        0.19, 0.12, 0.06, 0.045, 0.99, varying, weight, torch.tensor([CELL + 3]), decay, gain, columns
+        0.19,
+        0.12,
+        0.06,
+        0.045,
+        0.99,
+        varying,
+        weight,
+        torch.tensor([CELL + 3]),
+        decay,
+        gain,
+        *scaled,
+        columns,
     )
     receivers = Receivers(torch.tensor([[CELL + 9], [CELL - 72]]), torch.ones((2, 1), dtype=torch.float64))
     signal = torch.stack(

@@ -83,6 +83,8 @@ def closed_box(dtype: torch.dtype, cells: int = 10) -> Coefficients:
         nothing,
         silent,
         silent,
+        nothing,
+        torch.zeros(0, dtype=dtype),
         Columns.none(cells, dtype),
     )
 

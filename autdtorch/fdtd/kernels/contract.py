@@ -6,7 +6,7 @@ One step, from pressures `now` and `before` at two successive times to the next 
    neighbours;
 2. in the varying cells instead new = (1 + keep) now - keep before + sum_j weight_j (now_j - now);
 3. the boundary layers add what stretches the sum of the two neighbours along each axis (`boundary.py`), as
-   in air and, by column, for what the weights differ from those of air by (`columns.py`);
+   in air, times `layer_scale` in varying cells, and by column what those differ by (`columns.py`);
 4. the sources are added: new += cos(w t) Re(force) + sin(w t) Im(force), times the envelope;
 5. the outermost ring of cells and the closed cells stay zero.
 """
@@ -62,7 +62,9 @@ class Coefficients:
         closed_index: flat indices (k,) int64 of the closed cells.
         layer_decay: b of the boundary layer at half cells and cells, interleaved from outside (2 L + 1,).
         layer_gain: a, likewise.
-        columns: where obstacles run through the boundary layers.
+        layer_index: flat indices (k,) int64 of the varying cells in the layers.
+        layer_scale: how many times air's their term is (k,).
+        columns: where surfaces run through the boundary layers.
     """
 
     center: float
@@ -75,6 +77,8 @@ class Coefficients:
     closed_index: torch.Tensor
     layer_decay: torch.Tensor
     layer_gain: torch.Tensor
+    layer_index: torch.Tensor
+    layer_scale: torch.Tensor
     columns: Columns
 
     @property

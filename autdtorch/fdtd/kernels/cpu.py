@@ -213,11 +213,11 @@ def _advance(  # type: ignore[no-untyped-def]
     signal,
     recorded,
 ):
-    (decay, gain), (driven, force), (heard, hearing) = profile, sources, receivers
+    (decay, gain, scaled, scale), (driven, force), (heard, hearing) = profile, sources, receivers
     center, face, edge, corner, keep = weights
     index, weight, offsets, buffer = varying
     (psi, zeta), across = layers[0], layers[1:]
-    places = columns[0]
+    places, unlayered = columns[0], np.empty(len(scaled), p.dtype)
     shares = np.zeros((len(memory[1]), len(places)), p.dtype)
     for step in range(len(signal)):
         if len(index):
@@ -226,9 +226,13 @@ def _advance(  # type: ignore[no-untyped-def]
         flat = q.ravel()
         for n in range(len(index)):
             flat[index[n]] = buffer[n]
+        for n in range(len(scaled)):
+            unlayered[n] = flat[scaled[n]]
         _stretch_planes(p, across, terms, decay, gain)
         _absorb_planes(q, terms, face, edge, corner)
         _absorb_x(p, q, psi, zeta, terms, decay, gain, face, edge, corner)
+        for n in range(len(scaled)):
+            flat[scaled[n]] = unlayered[n] + scale[n] * (flat[scaled[n]] - unlayered[n])
         _stretch_columns(p, columns, memory, shares, decay, gain)
         for n in range(len(places)):
             for depth in range(len(shares)):
@@ -287,7 +291,7 @@ class CpuKernel:
             (dtype(c.center), dtype(c.face), dtype(c.edge), dtype(c.corner), dtype(c.keep)),
             varying,
             c.closed_index.numpy(),
-            (c.layer_decay.numpy(), c.layer_gain.numpy()),
+            (c.layer_decay.numpy(), c.layer_gain.numpy(), c.layer_index.numpy(), c.layer_scale.numpy()),
             (sources.index.numpy(), sources.force.numpy()),
             (receivers.index.numpy(), receivers.weight.numpy()),
             signal.numpy(),

@@ -47,6 +47,10 @@ class ReferenceKernel:
         new = new.reshape(-1).index_copy(0, c.varying_index, kept + change)
         new = new.reshape(state.now.shape)
         layers, term = _absorb(state.now, state.layers, c)
+        flat_term = term.reshape(-1)
+        term = flat_term.index_copy(0, c.layer_index, c.layer_scale * flat_term[c.layer_index]).reshape(
+            term.shape
+        )
         columns, shares = _absorb_columns(flat_now, state.columns, c)
         inside = c.columns.index.T[1:-1].reshape(-1)
         new = (new + term).reshape(-1).index_add(0, inside, shares.reshape(-1))
