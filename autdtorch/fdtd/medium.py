@@ -60,7 +60,8 @@ class Body:
         distance = torch.stack(each).amin(dim=0).numpy() / grid.spacing - _TOUCHING
         if self.goes_on:
             return np.asarray(distance)
-        return np.asarray(np.maximum(distance, np.abs(cell - inside).max(axis=-1) - 0.5))
+        beyond = np.maximum(np.array(grid.first) - cell, cell - np.array(grid.last) + 1).max(axis=-1) - 0.5
+        return np.asarray(np.maximum(distance, beyond))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,75 @@
+"""What a propagator says of its own error, against exact solutions."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from small_scenes import AIR, relative_error, small_scene
+
+from autdtorch import reference
+from autdtorch.fdtd.spacing import RATIO, coarsest_spacing, grid_error, second_spacing, spacing_for
+from autdtorch.freespace import free_space_matrix
+from autdtorch.obstacles import Sphere
+from autdtorch.propagator import FreeSpacePropagator, FullPropagator, make_propagator
+
+CENTER, RADIUS = (12.2e-3, 11.9e-3, 12.1e-3), 3.3e-3
+
+
+def exact_sphere(rigid: bool) -> tuple[Sphere, torch.Tensor]:
+    scene = small_scene()
+    where = (scene.control_points, scene.array.positions, scene.wavenumber, CENTER, RADIUS)
+    strength = 4 * math.pi * scene.array.source_strength
+    if rigid:
+        return Sphere(CENTER, RADIUS, rigid=True), strength * reference.rigid_sphere(*where)
+    heavy = Sphere(CENTER, RADIUS, density=10 * AIR.density, sound_speed=1.5 * AIR.sound_speed)
+    return heavy, strength * reference.fluid_sphere(*where, 10.0, 1.5)
+
+
+@pytest.mark.parametrize("rigid", [True, False], ids=["rigid", "heavy"])
+@pytest.mark.parametrize("spacing", [1.8e-3, 1.3e-3])
+def test_the_estimate_is_honest(rigid: bool, spacing: float) -> None:
+    """Required: within a factor of 3 of the true error, or above it."""
+    sphere, exact = exact_sphere(rigid)
+    propagator = make_propagator(small_scene((sphere,)), "full", spacing, tolerance=1e-3)
+    matrix, error = propagator.transfer_matrix(return_error=True)
+    true = relative_error(matrix, exact)
+    assert true / 3 < error < 20 * true  # the upper bound: an estimate that says nothing is none
+
+
+def test_the_estimate_is_honest_in_free_space() -> None:
+    scene = small_scene()
+    propagator = make_propagator(scene, "full", 1.3e-3, tolerance=1e-3)
+    matrix, error = propagator.transfer_matrix(return_error=True)
+    exact = free_space_matrix(scene.control_points, scene.array, scene.wavenumber)
+    assert relative_error(matrix, exact) / 3 < error < 0.02
+
+
+def test_exact_fields_have_no_error_and_left_out_obstacles_an_unknown_one() -> None:
+    assert FreeSpacePropagator(small_scene()).transfer_matrix(return_error=True)[1] == 0
+    sphere, _ = exact_sphere(rigid=True)
+    assert FreeSpacePropagator(small_scene((sphere,))).transfer_matrix(return_error=True)[1] == math.inf
+
+
+def test_a_tolerance_chooses_a_spacing_that_meets_it() -> None:
+    sphere, exact = exact_sphere(rigid=True)
+    loose, tight = (
+        make_propagator(small_scene((sphere,)), "full", None, tolerance=tolerance)
+        for tolerance in (0.2, 0.06)
+    )
+    assert isinstance(loose, FullPropagator)
+    assert isinstance(tight, FullPropagator)
+    assert tight.spacing < loose.spacing <= coarsest_spacing(loose.scene)
+    assert relative_error(tight.transfer_matrix(), exact) < 0.06
+
+
+def test_spacings_and_errors_scale_with_the_order() -> None:
+    exact, h = torch.ones(2, 3, dtype=torch.complex128), 1e-3
+    fine, coarse = (exact * (1 + 1e-3 * scale ** (4 / 3)) for scale in (1, RATIO))
+    assert grid_error(fine, coarse, coarser=True) == pytest.approx(1e-3, rel=2e-3)
+    assert grid_error(coarse, fine, coarser=False) == pytest.approx(1e-3 * RATIO ** (4 / 3), rel=3e-3)
+    assert spacing_for(1e-3, 1e-3 * 2 ** (4 / 3), 2 * h) == pytest.approx(h)
+    scene = small_scene()
+    assert second_spacing(scene, h) == RATIO * h
+    assert second_spacing(scene, 2e-3) == 2e-3 / RATIO
