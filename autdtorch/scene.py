@@ -133,7 +133,8 @@ class Scene:
             observation_plane: where pictures and areas are taken.
             domain: corners (lower, upper) [m] around array, control points and observation plane. Obstacles
                 may reach beyond it: rigid and heavy boxes along the axes then go on without end, others end
-                there. By default the bounding box of everything, obstacles included, and two wavelengths more on each side.
+                there. By default the bounding box of everything, obstacles included, and two wavelengths
+                more on each side.
             name: for titles and file names.
 
         Raises:
