@@ -103,8 +103,8 @@ def _flow_factor(kappa: float, speed_ratio: float) -> float:
 def fill_elements(scene: Scene, grid: Grid, stencil: Stencil) -> ElementMedium:
     """Find the material of every element, and the bonds and masses of those that surfaces cut.
 
-    Where obstacles overlap the later wins. Of those that reach beyond the interior, walls, slabs and plates
-    along the grid go on through the boundary layer, as they leave the interior; others end there.
+    Where obstacles overlap the later wins. Of those that reach beyond the interior, walls and slabs across
+    the domain go on through the boundary layer, as they leave the interior; others end there.
     """
     bodies, materials, rigid = _bodies(scene, stencil)
     number = np.zeros([cells - 1 for cells in grid.shape], np.int16)
@@ -127,7 +127,7 @@ def _bodies(scene: Scene, stencil: Stencil) -> tuple[list[Body], Materials, NDAr
         if material not in known:
             known.append(material)
         own = known.index(material)
-        kind = own, _goes_on(obstacle, air)
+        kind = own, _goes_on(obstacle, scene)
         if bodies and kind == (bodies[-1].number, bodies[-1].goes_on):
             bodies[-1] = Body((*bodies[-1].obstacles, obstacle), *kind)
         else:
@@ -149,13 +149,16 @@ def _clamped(grid: Grid, axis: int, cell: Array) -> Array:
     return np.asarray(grid.origin[axis] + grid.spacing * inside)
 
 
-def _goes_on(obstacle: Obstacle, air: Medium) -> bool:
-    """Whether it is a wall, slab or plate along the grid, not lighter than air.
+def _goes_on(obstacle: Obstacle, scene: Scene) -> bool:
+    """Whether it is a wall or slab along the grid that crosses the whole domain, not lighter than air.
 
-    In the layers other shapes were found to grow: light ones, and those that are bent where layers meet.
+    In the layers other shapes were found to grow.
     """
-    straight = isinstance(obstacle, Box) and obstacle.rotation == (0.0, 0.0, 0.0)
-    return straight and (obstacle.density is None or obstacle.density >= air.density)
+    if not isinstance(obstacle, Box) or obstacle.rotation != (0.0, 0.0, 0.0):
+        return False
+    corners = zip(obstacle.lower, obstacle.upper, *scene.domain, strict=True)
+    crossed = sum(low <= first and high >= last for low, high, first, last in corners)
+    return crossed >= 2 and (obstacle.density is None or obstacle.density >= scene.medium.density)
 
 
 def _windows(body: Body, grid: Grid) -> Iterator[tuple[tuple[slice, ...], Array]]:

@@ -61,12 +61,12 @@ def test_slab_transmits() -> None:
     [
         (Sphere((FACE, 12e-3, 0.0), 8e-3, density=3.0, sound_speed=340.0), False),
         (Box((FACE, 12e-3, 0.0), (8e-3, 8e-3, 8e-3), density=1.0, sound_speed=340.0), False),
-        (Box((FACE, 12e-3, 0.0), (8e-3, 8e-3, 80e-3), density=3.0, sound_speed=340.0), True),
-        (Box((FACE, 12e-3, 0.0), (8e-3, 8e-3, 80e-3), rigid=True), True),
+        (Box((FACE, 12e-3, 0.0), (8e-3, 8e-3, 80e-3), density=3.0, sound_speed=340.0), False),
+        (Box((FACE, 12e-3, 0.0), (8e-3, 80e-3, 80e-3), rigid=True), True),
     ],
-    ids=["sphere", "light box", "heavy box", "rigid box"],
+    ids=["sphere", "light box", "post", "wall"],
 )
-def test_only_walls_along_the_grid_go_on_through_the_layers(obstacle: Obstacle, goes_on: bool) -> None:
+def test_only_walls_across_the_domain_go_on_through_the_layers(obstacle: Obstacle, goes_on: bool) -> None:
     assembly = assemble(layered_scene(obstacle, FRONT), 2e-3)
     index = torch.cat((torch.from_numpy(assembly.varying.index), torch.from_numpy(assembly.varying.rigid)))
     depth = index % assembly.grid.shape[2]
