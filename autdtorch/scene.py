@@ -132,7 +132,7 @@ class Scene:
             obstacles: may touch and overlap; where they do, the later one counts.
             observation_plane: where pictures and areas are taken.
             domain: corners (lower, upper) [m] around array, control points and observation plane. Obstacles
-                may reach beyond it: rigid and heavy walls and slabs across it then go on without end, others
+                may reach beyond it: parallel walls and slabs across it then go on without end, others
                 end there. By default the bounding box of everything, obstacles included, and two wavelengths
                 more on each side.
             name: for titles and file names.

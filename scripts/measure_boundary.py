@@ -87,6 +87,8 @@ def _air(cells_per_wavelength: float, layer_cells: int) -> Air:
         layer_index=torch.zeros(0, dtype=torch.int64),
         layer_scale=torch.zeros(0, dtype=torch.float64),
         columns=Columns.none(layer_cells, torch.float64),
+        crossed=Columns.none(layer_cells, torch.float64, width=3),
+        crossing=torch.zeros((0, layer_cells + 2), dtype=torch.int64),
     )
     return Air(coefficients, steps_per_period, stencil.source_factor(steps).real)
 

@@ -33,8 +33,19 @@ LONG_SHARE = 0.01
 """Share of the scenes that run `LONG_STEPS`; they are the smallest, 6 cells across."""
 INSIDE_SHARE = 0.75
 """Share of the scenes whose obstacles keep out of the boundary layer."""
-KINDS = {"box": 0.3, "rotated box": 0.2, "sphere": 0.2, "cylinder": 0.2, "voxels": 0.05, "mesh": 0.05}
-"""Kinds of obstacles and their shares."""
+KINDS = {
+    "box": 0.25,
+    "rotated box": 0.15,
+    "sphere": 0.15,
+    "cylinder": 0.15,
+    "voxels": 0.05,
+    "mesh": 0.05,
+    "wall": 0.2,
+}
+"""Kinds of obstacles and their shares; walls go on for ever, in the scenes that allow for it."""
+
+FOR_EVER = 1e3
+"""Extent of a wall [cells]."""
 
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 
@@ -185,6 +196,8 @@ class _Draft:
         rng, aligned, thin = self.rng, self.rng.uniform() < 0.4, self.rng.uniform() < 0.25
         kind = str(rng.choice(list(KINDS), p=list(KINDS.values())))
         size = np.exp(rng.uniform(0, math.log(8.0), 3))
+        if kind == "wall":
+            size[np.arange(3) != rng.integers(3)] = FOR_EVER
         axis, turn = rng.normal(size=3), rng.uniform(-math.pi, math.pi, 3)
         if aligned:
             size, axis, turn = np.rint(size), np.eye(3)[rng.integers(3)], np.zeros(3)
@@ -204,7 +217,8 @@ class _Draft:
         if not self.obstacles or chance < 0.4:
             return self.domain * rng.uniform(0, 1, 3), "apart"
         last = self.obstacles[-1]
-        lower, upper = np.array(last.lower) / self.spacing, np.array(last.upper) / self.spacing
+        lower, upper = (np.array(corner) / self.spacing for corner in (last.lower, last.upper))
+        lower, upper = lower.clip(min=-self.domain), upper.clip(max=2 * self.domain)
         middle, extent = (lower + upper) / 2, upper - lower
         if chance < 0.7:
             towards = np.sign(rng.normal(size=3)) * (rng.uniform(size=3) < 0.6)
@@ -240,7 +254,7 @@ def _make(
         return Sphere(middle, x / 2, **material)
     if kind == "cylinder":
         return Cylinder(middle, x / 2, z, tuple(axis.tolist()), **material)
-    if kind == "box":
+    if kind in ("box", "wall"):
         return Box(middle, (x, y, z), **material)
     if kind == "rotated box":
         return Box(middle, (x, y, z), angles, **material)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from autdtorch.fdtd.medium import ElementMedium
-from autdtorch.fdtd.stencil import OFFSETS, Stencil
+from autdtorch.fdtd.stencil import Stencil, flat_offsets
 from autdtorch.fdtd.surface import PAIRS, VERTICES, CutElements, energy_matrix, uniform_bonds
 
 logger = logging.getLogger(__name__)
@@ -28,8 +28,9 @@ _SEALED = 0.1
 """Sum of bonds, relative to air, up to which a cell of a rigid obstacle is closed to sound; those at a
 surface have 0.3 and more, all others 0.03 at most."""
 
-_NO_ENERGY = 1e-3
-"""Share of the largest below which an eigenvalue of closed vertices counts as zero."""
+_NO_ENERGY = 1e-10
+"""Share of the largest below which an eigenvalue of closed vertices is rounding. More left out would take
+energy from pressures that are nearly constant."""
 
 _ROUNDING = 1e-9
 """Rows closer than this to those of air are air."""
@@ -89,8 +90,7 @@ def varying_cells(medium: ElementMedium, stencil: Stencil) -> VaryingCells:
 
 def _neighbours(index: Index, shape: Shape) -> Index:
     """Flat indices (n, 27) of cells and their neighbours."""
-    strides = np.array((shape[1] * shape[2], shape[2], 1))
-    return np.asarray(index[:, None] + np.array(OFFSETS) @ strides, np.int64)
+    return np.asarray(index[:, None] + flat_offsets(shape), np.int64)
 
 
 def _inner(index: Index, shape: Shape) -> NDArray[np.bool_]:
@@ -187,8 +187,7 @@ def _cell_number(medium: ElementMedium) -> NDArray[np.int16]:
 
 def _largest_row(medium: ElementMedium, stencil: Stencil) -> float:
     """Sum of weights that a uniform material needs at most: of air, or of the fastest obstacle."""
-    fastest = 1 / (medium.materials.density * medium.materials.mass)
-    return stencil.total * float(fastest.max())
+    return stencil.total * float(medium.materials.speed.max())
 
 
 def _shared_mass(bonds: Array, mass: Array, touched: Index, shape: Shape, largest: float) -> Array:
@@ -224,7 +223,7 @@ def _bulk(
     medium: ElementMedium, touched: Index, closed: NDArray[np.bool_], shape: Shape, stencil: Stencil
 ) -> tuple[Index, Array, Array]:
     """Cells inside obstacles whose sound speed is not that of air: index, weight and mass."""
-    factor = 1 / (medium.materials.density * medium.materials.mass)
+    factor = medium.materials.speed
     number = _cell_number(medium).ravel()
     inside = (factor != 1)[number] & ~closed
     inside[touched] = False

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from autdtorch.fdtd.placement import grid_offset
 from autdtorch.fdtd.points import footprint
 from autdtorch.scene import Scene
 from autdtorch.validation import invalid, positive
@@ -102,6 +103,10 @@ class Grid:
         """Positions (P, 3) [m] in units of cells, cell centres being whole numbers."""
         return np.asarray((points.numpy() - np.array(self.origin)) / self.spacing, np.float64)
 
+    def clip(self, cells: Array) -> Array:
+        """Positions (..., 3) in cells, those in the boundary layer moved to the interior cell they touch."""
+        return np.clip(cells, self.first, np.array(self.last) - 1)
+
 
 def layer_cells(kappa: float) -> int:
     """Thickness of the boundary layer on a grid of wavenumber times spacing `kappa` [rad]."""
@@ -109,7 +114,7 @@ def layer_cells(kappa: float) -> int:
 
 
 def make_grid(scene: Scene, spacing: float) -> Grid:
-    """Cover the scene's domain with cells of `spacing`, aligned with its lower corner.
+    """Cover the scene's domain with cells of `spacing`, placed as flat faces need it (`placement.py`).
 
     As much air is left between the domain and the boundary layer as points in the outermost cells need.
 
@@ -124,11 +129,13 @@ def make_grid(scene: Scene, spacing: float) -> Grid:
     lower, upper = scene.domain
     kappa = scene.wavenumber * spacing
     margin = footprint(kappa) // 2 - 1
+    offset = grid_offset(scene, spacing)
     interior = tuple(
-        math.ceil((high - low) / spacing - 1e-6) + 2 * margin for low, high in zip(lower, upper, strict=True)
+        math.ceil((high - low) / spacing + first - 1e-6) + 2 * margin
+        for low, high, first in zip(lower, upper, offset, strict=True)
     )
-    shift = (layer_cells(kappa) + 1 + margin - 0.5) * spacing
-    x, y, z = (low - shift for low in lower)
+    rim = layer_cells(kappa) + 1 + margin - 0.5
+    x, y, z = (low - (rim + first) * spacing for low, first in zip(lower, offset, strict=True))
     grid = Grid(spacing, (interior[0], interior[1], interior[2]), (x, y, z), kappa)
     if math.prod(grid.shape) > MAX_CELLS:
         cells = " x ".join(map(str, grid.shape))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -15,7 +16,10 @@ from autdtorch.fdtd.surface import FAR, LATTICE, CutElements, Materials, cut_ele
 from autdtorch.obstacles import Box, Obstacle
 from autdtorch.scene import Medium, Scene
 
+logger = logging.getLogger(__name__)
+
 Array = NDArray[np.float64]
+
 RIGID = 1e5
 """Density, relative to air, that rigid obstacles are assembled with; what it leaves open is then sealed."""
 
@@ -54,13 +58,12 @@ class Body:
 
     def distance(self, cell: Array, grid: Grid) -> Array:
         """Signed distance [cells] of places (..., 3) in cells."""
-        inside = np.clip(cell, grid.first, np.array(grid.last) - 1)
-        places = np.array(grid.origin) + grid.spacing * (inside if self.goes_on else cell)
+        places = np.array(grid.origin) + grid.spacing * (grid.clip(cell) if self.goes_on else cell)
         each = [obstacle.signed_distance(torch.from_numpy(places)) for obstacle in self.obstacles]
         distance = torch.stack(each).amin(dim=0).numpy() / grid.spacing - _TOUCHING
         if self.goes_on:
             return np.asarray(distance)
-        beyond = np.maximum(np.array(grid.first) - cell, cell - np.array(grid.last) + 1).max(axis=-1) - 0.5
+        beyond = np.maximum(np.array(grid.first) - cell, cell - np.array(grid.last) + 1).max(axis=-1) + 0.5
         return np.asarray(np.maximum(distance, beyond))
 
 
@@ -103,8 +106,8 @@ def _flow_factor(kappa: float, speed_ratio: float) -> float:
 def fill_elements(scene: Scene, grid: Grid, stencil: Stencil) -> ElementMedium:
     """Find the material of every element, and the bonds and masses of those that surfaces cut.
 
-    Where obstacles overlap the later wins. Of those that reach beyond the interior, walls and slabs across
-    the domain go on through the boundary layer, as they leave the interior; others end there.
+    Where obstacles overlap the later wins. Of those that reach beyond the interior, parallel walls and slabs
+    across the domain go on through the boundary layer, as they leave the interior; others end before it.
     """
     bodies, materials, rigid = _bodies(scene, stencil)
     number = np.zeros([cells - 1 for cells in grid.shape], np.int16)
@@ -122,12 +125,12 @@ def _bodies(scene: Scene, stencil: Stencil) -> tuple[list[Body], Materials, NDAr
     air = scene.medium
     known: list[Medium | None] = [air]
     bodies: list[Body] = []
-    for obstacle in scene.obstacles:
+    for obstacle, goes_on in zip(scene.obstacles, _going_on(scene), strict=True):
         material = None if obstacle.rigid else Medium(obstacle.density, obstacle.sound_speed)  # type: ignore[arg-type]
         if material not in known:
             known.append(material)
         own = known.index(material)
-        kind = own, _goes_on(obstacle, scene)
+        kind = own, goes_on
         if bodies and kind == (bodies[-1].number, bodies[-1].goes_on):
             bodies[-1] = Body((*bodies[-1].obstacles, obstacle), *kind)
         else:
@@ -143,22 +146,26 @@ def _bodies(scene: Scene, stencil: Stencil) -> tuple[list[Body], Materials, NDAr
     return bodies, materials, np.array([m is None for m in known])
 
 
-def _clamped(grid: Grid, axis: int, cell: Array) -> Array:
-    """Coordinates [m] of places in cells, moved into the interior: the layer repeats what it touches."""
-    inside = np.clip(cell, grid.first[axis], grid.last[axis] - 1)
-    return np.asarray(grid.origin[axis] + grid.spacing * inside)
+def _going_on(scene: Scene) -> list[bool]:
+    """Which obstacles go on through the boundary layers: parallel walls and slabs along the grid.
 
-
-def _goes_on(obstacle: Obstacle, scene: Scene) -> bool:
-    """Whether it is a wall or slab along the grid that crosses the whole domain, not lighter than air.
-
-    In the layers other shapes were found to grow.
+    They cross the whole domain along two axes at least. In the layers other shapes were found to grow, and so
+    are the edges where walls of two directions meet: the first to come decides the direction.
     """
-    if not isinstance(obstacle, Box) or obstacle.rotation != (0.0, 0.0, 0.0):
-        return False
-    corners = zip(obstacle.lower, obstacle.upper, *scene.domain, strict=True)
-    crossed = sum(low <= first and high >= last for low, high, first, last in corners)
-    return crossed >= 2 and (obstacle.density is None or obstacle.density >= scene.medium.density)
+    going, normal = [], None
+    for number, obstacle in enumerate(scene.obstacles):
+        corners = zip(obstacle.lower, obstacle.upper, *scene.domain, strict=True)
+        ends = [axis for axis, (low, high, first, last) in enumerate(corners) if low > first or high < last]
+        along = isinstance(obstacle, Box) and obstacle.rotation == (0.0, 0.0, 0.0)
+        going.append(along and len(ends) <= 1 and (not ends or normal in (None, ends[0])))
+        if going[-1] and ends:
+            normal = ends[0]
+        elif along and len(ends) == 1:
+            logger.warning(
+                "obstacle %d crosses the domain in another direction than the wall before it: it ends where"
+                " the boundary layer begins, and its end reflects", number,
+            )  # fmt: skip
+    return going
 
 
 def _windows(body: Body, grid: Grid) -> Iterator[tuple[tuple[slice, ...], Array]]:
@@ -166,7 +173,7 @@ def _windows(body: Body, grid: Grid) -> Iterator[tuple[tuple[slice, ...], Array]
     middle = [np.arange(cells - 1) + 0.5 for cells in grid.shape]
     ranges = []
     for axis, low, high in zip(range(3), body.lower - grid.spacing, body.upper + grid.spacing, strict=True):
-        inside = np.clip(middle[axis], grid.first[axis], grid.last[axis] - 1)
+        inside = middle[axis].clip(grid.first[axis], grid.last[axis] - 1)
         ranges.append(np.searchsorted(grid.origin[axis] + grid.spacing * inside, (low, high)))
     for x in range(ranges[0][0], ranges[0][1]):
         window = (slice(x, x + 1), slice(*ranges[1]), slice(*ranges[2]))
@@ -182,19 +189,18 @@ def _cut(
     stencil: Stencil,
 ) -> CutElements:
     parts = [CutElements(np.zeros((0, 28)), np.zeros((0, 8)), np.zeros((0, 8), np.int64))]
+    numbers = np.array([body.number for body in bodies], np.int64)
     shape = tuple(cells - 1 for cells in grid.shape)
     for start in range(0, len(index), _ELEMENTS_AT_ONCE):
         first = np.stack(np.unravel_index(index[start : start + _ELEMENTS_AT_ONCE], shape), axis=-1)
         cell = first[:, None] + LATTICE
-        middle = np.clip(first + 0.5, grid.first, np.array(grid.last) - 1)
-        center = np.array(grid.origin) + grid.spacing * middle
+        center = np.array(grid.origin) + grid.spacing * grid.clip(np.asarray(first + 0.5))
         distance = np.full((len(bodies), *cell.shape[:2]), FAR)
         for far, body in zip(distance, bodies, strict=True):
             low, high = body.lower - 2 * grid.spacing, body.upper + 2 * grid.spacing
             near = ((center > low) & (center < high)).all(axis=1)
             if near.any():
                 far[near] = body.distance(cell[near], grid)
-        numbers = np.array([body.number for body in bodies], np.int64)
         parts.append(cut_elements(distance, numbers, materials, stencil))
     return CutElements(
         np.concatenate([part.bonds for part in parts]),

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigvalsh_tridiagonal
 from scipy.sparse import csr_array
 
-from autdtorch.fdtd.stencil import OFFSETS, Stencil
+from autdtorch.fdtd.stencil import Stencil, flat_offsets
 
 logger = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ def largest_eigenvalue(
     if len(index) == 0:
         return air
     rows, place = _with_rim(index, shape)
-    neighbour = place[rows[:, None] + _flat_offsets(shape)]
+    neighbour = place[rows[:, None] + flat_offsets(shape)]
     inside = neighbour >= 0
     forth = np.broadcast_to(stencil.weights, (len(rows), 27)).copy()
     forth[place[index]] = weight
@@ -89,10 +89,6 @@ _REVERSED = 26 - np.arange(27)
 """Where `OFFSETS` holds the way back."""
 
 
-def _flat_offsets(shape: tuple[int, int, int]) -> NDArray[np.int64]:
-    return np.asarray(np.array(OFFSETS) @ (shape[1] * shape[2], shape[2], 1), np.int64)
-
-
 def _inner(shape: tuple[int, int, int]) -> NDArray[np.bool_]:
     """Which cells (k,) are not in the silent ring."""
     return np.pad(np.ones([cells - 2 for cells in shape], bool), 1).ravel()
@@ -103,7 +99,7 @@ def _with_rim(
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """Cells `index` and their neighbours, ascending, and the place among them of each cell of the grid."""
     found = np.zeros(math.prod(shape), bool)
-    for offset in _flat_offsets(shape):
+    for offset in flat_offsets(shape):
         found[index + offset] = True
     found &= _inner(shape)
     rows = np.flatnonzero(found)

@@ -38,6 +38,16 @@ OFFSETS = tuple((x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 
 """The 27 neighbour offsets in row-major order; entry 13 is the cell itself."""
 
 
+def flat_strides(shape: tuple[int, int, int]) -> NDArray[np.int64]:
+    """Steps (3,) along the axes between flat indices of a grid."""
+    return np.array((shape[1] * shape[2], shape[2], 1))
+
+
+def flat_offsets(shape: tuple[int, int, int]) -> NDArray[np.int64]:
+    """Steps (27,) to the neighbours between flat indices of a grid."""
+    return np.asarray(np.array(OFFSETS) @ flat_strides(shape), np.int64)
+
+
 @dataclass(frozen=True)
 class Stencil:
     """Spatial weights tuned at one wavenumber.

@@ -146,6 +146,7 @@ def assemble(
     profile = tuned_profile(grid.kappa, steps, grid.layer_cells)
     face, edge, corner = factor * stencil.face, factor * stencil.edge, factor * stencil.corner
     layer_index, layer_scale = scaled_cells(varying, stencil, grid, dtype)
+    columns, crossed, crossing = layer_columns(varying, stencil, grid, factor, dtype)
     coefficients = Coefficients(
         center=1 + keep - factor * stencil.total,
         face=face,
@@ -159,7 +160,9 @@ def assemble(
         layer_gain=torch.from_numpy(profile.gain).to(dtype),
         layer_index=layer_index,
         layer_scale=layer_scale,
-        columns=layer_columns(varying, stencil, grid, factor, dtype),
+        columns=columns,
+        crossed=crossed,
+        crossing=crossing,
     )
     logger.info(
         "grid %s at %.3g mm, %d varying cells; %d steps in %d periods: %.4g us, %.1f %% of the limit",

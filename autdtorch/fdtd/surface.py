@@ -6,9 +6,11 @@ tuned stencil's. A cut element gets
 
 - bonds in series: density averaged along the line between two vertices, which is right for a flow across the
   surface;
-- a correction that gives two fields that vary along the surface their exact energy, and leaves that of a
-  third, which crosses it continuous in pressure and in flow, with the kink that the densities ask for: for it
-  bonds in series are right. Its matrix is
+- if the surface is a face along the grid, bonds with which the scheme is a product of its direction and the
+  two along it;
+- if not, a correction that gives two fields that vary along the surface their exact energy, and leaves that
+  of a third, which crosses it continuous in pressure and in flow, with the kink that the densities ask for:
+  for it bonds in series are right. Its matrix is
   C^T (A - N^T L N) C with L that of the bonds, N the fields at the vertices, A their exact energies, and
   C = (N^T L N)^-1 N^T L the projection on them: the consistency of virtual element methods (Beirao da Veiga
   et al. 2013) for the local solutions of immersed finite elements (Li 1998). The fields follow the curvature
@@ -41,6 +43,9 @@ VERTICES = np.array(list(itertools.product((0, 1), repeat=3)))
 PAIRS = np.array(list(itertools.combinations(range(8), 2)))
 """The 28 pairs of vertices that bonds join."""
 
+_APART = np.abs(VERTICES[PAIRS[:, 0]] - VERTICES[PAIRS[:, 1]])
+"""Of which axes the edges lead from one vertex of a pair to the other (28, 3)."""
+
 FAR = 1e3
 """Distance [cells] that stands for an obstacle too far away to matter."""
 
@@ -50,6 +55,13 @@ _PRESENT = 1e-4
 _FLAT = 0.5
 """Smallest mean gradient of a signed distance for which the element has one normal: two faces of a thin plate
 cancel."""
+
+_PLANE = 1e-6
+"""Departure of signed distances [cells] from those of a face along the grid that is rounding."""
+
+_SPARE = 6.0
+"""What an element full of the heavier material lends to diagonal bonds across its face, in units of what it
+needs for its own. A sixth is left over by the element behind, of which half is lent."""
 
 _SHARPEST = 0.5
 """Largest curvature [1/cells] that the fields follow; edges have none."""
@@ -93,6 +105,11 @@ class Materials:
 
     density: Array
     mass: Array
+
+    @property
+    def speed(self) -> Array:
+        """What the weights of a cell are times air's (m,), about the square of the speed ratio."""
+        return 1 / (self.density * self.mass)
 
 
 @dataclass(frozen=True)
@@ -138,15 +155,67 @@ def cut_elements(
         outer = held[chosen].argmax(axis=1)
         level = _level(distance[:, chosen], material, inner)
         sides = materials.density[np.stack((outer, inner), axis=1)]
-        flat, correction = _correction(level, sides, volumes[chosen], materials, bonds[chosen])
+        across = _face_axis(level)
+        for axis in range(3):
+            own = chosen[across == axis]
+            bonds[own] = _layered_bonds(axis, number[own], volumes[own], materials, stencil)
+        other = across < 0
+        chosen = chosen[other]
+        flat, correction = _correction(level[other], sides[other], volumes[chosen], materials, bonds[chosen])
         bonds[chosen[flat]] += correction
     return CutElements(bonds, _masses(number, volumes, materials), number)
 
 
+def _face_axis(level: Array) -> NDArray[np.int64]:
+    """Axis (n,) across which the face of elements with signed distances (n, 125) lies; -1 for others."""
+    cube = level.reshape(-1, *(SUBCELLS + 1,) * 3)
+    found = np.full(len(level), -1)
+    for axis in range(3):
+        lines = np.moveaxis(cube, axis + 1, 1).reshape(len(cube), SUBCELLS + 1, SUBCELLS + 1, SUBCELLS + 1)
+        slope = SUBCELLS * np.diff(lines[:, :, 0, 0], axis=1)
+        alike = np.ptp(lines, axis=(2, 3)).max(axis=1) < _PLANE
+        straight = (np.abs(np.abs(slope) - 1).max(axis=1) < _PLANE) & (np.ptp(slope, axis=1) < 1)
+        found[alike & straight] = axis
+    return found
+
+
+def _layered_bonds(
+    axis: int, number: NDArray[np.int64], volumes: Array, materials: Materials, stencil: Stencil
+) -> Array:
+    """Bonds (n, 28) of elements with a face across an axis, with which the scheme is a product.
+
+    With p0 and p1 the pressures in the two planes of vertices, the energy is g (p1 - p0)^T W (p1 - p0), g
+    being the series mobility, and in each plane that of air times the mobility t of what lies on its side. In
+    a boundary layer that the face runs into, the energy of each direction for itself must be positive, else
+    it grows: what W has off its diagonal takes from it, and is kept only as far as t of the heavier side
+    allows; the rest goes to the diagonal.
+    """
+    across = _APART[:, axis] == 1
+    straight = across & (_APART.sum(axis=1) == 1)
+    uniform = uniform_bonds(stencil)
+    beside = np.where(across, 0, _by_steps(stencil)[np.minimum(_APART.sum(axis=1) + 1, 3)])
+    share = volumes.mean(axis=1)
+    density = share @ materials.density
+    own = number[:, PAIRS[:, 0]]
+    along = 2 * np.take_along_axis(share, own, axis=1) / materials.density[own]
+    sides = materials.density[number]
+    lightest, heaviest = sides.min(axis=1), sides.max(axis=1)
+    heavy = np.where(materials.density >= heaviest[:, None], share, 0).sum(axis=1)
+    allowed = (lightest / heaviest + 1) / 2 + _SPARE * heavy
+    kept = np.minimum(1, allowed * density / heaviest)[:, None]
+    even = np.where(straight, uniform[across].sum() / 4, 0)
+    link = np.where(across, kept * uniform + (1 - kept) * even, -kept * beside) / density[:, None]
+    return np.asarray(np.where(across, 0, along * (uniform + beside)) + link)
+
+
 def uniform_bonds(stencil: Stencil) -> Array:
     """Bonds (28,) of an element of air; face bonds are shared by four elements, edge bonds by two."""
-    shared = np.array((0.0, stencil.face / 4, stencil.edge / 2, stencil.corner))
-    return np.asarray(shared[np.abs(VERTICES[PAIRS[:, 0]] - VERTICES[PAIRS[:, 1]]).sum(axis=1)])
+    return np.asarray(_by_steps(stencil)[_APART.sum(axis=1)])
+
+
+def _by_steps(stencil: Stencil) -> Array:
+    """Bonds of an element of air between vertices that are 0 to 3 of its edges apart."""
+    return np.array((0.0, stencil.face / 4, stencil.edge / 2, stencil.corner))
 
 
 def _volume_coverage(distance: Array) -> Array:
@@ -234,8 +303,8 @@ def _correction(
     # The energies of the first two, summed over the sub-cells.
     depth = level.reshape(-1, *(SUBCELLS + 1,) * 3)
     for axis in (1, 2, 3):
-        depth = (np.take(depth, range(SUBCELLS), axis) + np.take(depth, range(1, SUBCELLS + 1), axis)) / 2
-    depth = depth.reshape(len(depth), -1)
+        depth = (np.take(depth, _LOW, axis) + np.take(depth, _LOW + 1, axis)) / 2
+    depth = depth.reshape(len(depth), SUBCELLS**3)
     stretch = np.eye(2) - depth[:, :, None, None] * bend[:, None]
     mobility = (volumes @ (1 / materials.density)) / SUBCELLS**3
     energy = np.zeros((len(level), 3, 3))

@@ -37,6 +37,8 @@ def pressure(force: torch.Tensor, weight: torch.Tensor, steps: int) -> torch.Ten
         gain,
         *scaled,
         columns,
+        Columns(columns.index, columns.offset[:, 3:6], weight[1:, 9:12]),
+        torch.tensor([[2, 2, 0, 1]]),
     )
     receivers = Receivers(torch.tensor([[CELL + 9], [CELL - 72]]), torch.ones((2, 1), dtype=torch.float64))
     signal = torch.stack(

@@ -56,7 +56,7 @@ def test_cpu_kernel_is_the_reference_kernel(dtype: torch.dtype, tolerance: float
     state, recorded = advance(CpuKernel(), dtype, steps)
     expected, expected_recorded = advance(ReferenceKernel(), dtype, steps)
     pairs = [(state.now, expected.now), (recorded, expected_recorded)]
-    memory, expected_memory = ((*each.layers, each.columns) for each in (state, expected))
+    memory, expected_memory = ((*each.layers, each.columns, each.crossed) for each in (state, expected))
     pairs += [
         pair
         for one, other in zip(memory, expected_memory, strict=True)
@@ -86,6 +86,8 @@ def closed_box(dtype: torch.dtype, cells: int = 10) -> Coefficients:
         nothing,
         torch.zeros(0, dtype=dtype),
         Columns.none(cells, dtype),
+        Columns.none(cells, dtype, width=3),
+        torch.zeros((0, cells + 2), dtype=torch.int64),
     )
 
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
 from small_scenes import AIR, relative_error
 
 from autdtorch import reference
 from autdtorch.array import TransducerArray
+from autdtorch.fdtd.kernels.contract import Receivers, Sources
+from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.stepping import assemble
 from autdtorch.obstacles import Box, Obstacle, Sphere
 from autdtorch.propagator import make_propagator
@@ -21,21 +24,23 @@ FRONT = [(8e-3, 15e-3, 13e-3), (12e-3, 8e-3, 16e-3), (10e-3, 16e-3, 9e-3)]
 BEHIND = [(27e-3, 13e-3, 12e-3), (29e-3, 9e-3, 14e-3)]
 
 
-def layered_scene(obstacle: Obstacle, points: list[tuple[float, float, float]]) -> Scene:
+def layered_scene(obstacles: tuple[Obstacle, ...], points: list[tuple[float, float, float]]) -> Scene:
     array = TransducerArray([(3e-3, 11e-3, 12e-3), (5e-3, 14e-3, 10e-3)], (1, 0, 0))
-    return Scene(array, AIR, 40e3, points, (obstacle,), domain=((0, 0, 0), (32e-3, 24e-3, 24e-3)))
+    return Scene(array, AIR, 40e3, points, obstacles, domain=((0, 0, 0), (32e-3, 24e-3, 24e-3)))
 
 
-def error(scene: Scene, exact: Callable[..., torch.Tensor], spacing: float = 1e-3, **what: float) -> float:
+def error(
+    scene: Scene, exact: Callable[..., torch.Tensor], face: float = FACE, spacing: float = 1e-3, **what: float
+) -> float:
     found = make_propagator(scene, "full", spacing, tolerance=1e-3).transfer_matrix()
-    where = (scene.control_points, scene.array.positions, scene.wavenumber, (FACE, 0, 0), (-1, 0, 0))
+    where = (scene.control_points, scene.array.positions, scene.wavenumber, (face, 0, 0), (-1, 0, 0))
     return relative_error(found, 4 * math.pi * scene.array.source_strength * exact(*where, **what))
 
 
 def test_rigid_wall_mirrors_the_source() -> None:
     wall = Box((FACE + 0.5, 0, 0), (1.0, 1.0, 1.0), rigid=True)
     # the grid's own error in air is 3e-4, and the run ends 1e-3 from steady
-    assert error(layered_scene(wall, FRONT), reference.rigid_plane) < 1.5e-3
+    assert error(layered_scene((wall,), FRONT), reference.rigid_plane) < 1.5e-3
 
 
 def test_fluid_half_space_reflects() -> None:
@@ -44,31 +49,75 @@ def test_fluid_half_space_reflects() -> None:
     )
     ratios = {"density_ratio": 3.0, "speed_ratio": 1.5}
     # measured 0.12 %; of second order in the spacing
-    assert error(layered_scene(wall, FRONT), reference.fluid_half_space, **ratios) < 3e-3
+    assert error(layered_scene((wall,), FRONT), reference.fluid_half_space, **ratios) < 3e-3
 
 
-def test_slab_transmits() -> None:
-    """Required: 1 %; at 1 mm it is 1.1 % here, of second order."""
-    slab = Box(
-        (FACE + 2.5e-3, 0, 0), (5e-3, 1.0, 1.0), density=3 * AIR.density, sound_speed=1.5 * AIR.sound_speed
-    )
+def slab(normal: int = 0, begin: float = FACE, thickness: float = 5e-3, density: float = 3.0) -> Box:
+    """Of a density relative to air and 1.5 times its sound speed, across an axis."""
+    center, size = [0.0] * 3, [1.0] * 3
+    center[normal], size[normal] = begin + thickness / 2, thickness
+    return Box(center, size, density=density * AIR.density, sound_speed=1.5 * AIR.sound_speed)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.37e-3])
+def test_slab_transmits(shift: float) -> None:
+    """Required: 1 %, wherever the faces lie. At 1 mm it is 1.4 % here, of second to third order."""
     what = {"thickness": 5e-3, "density_ratio": 3.0, "speed_ratio": 1.5}
-    assert error(layered_scene(slab, BEHIND), reference.fluid_slab, 0.5e-3, **what) < 1e-2
+    scene = layered_scene((slab(begin=FACE + shift),), BEHIND)
+    assert error(scene, reference.fluid_slab, FACE + shift, 0.7e-3, **what) < 1e-2
+
+
+@pytest.mark.parametrize("density", [77.0, 3.0, 0.01])
+@pytest.mark.parametrize("offset", [0.0, 0.2, 0.4, 0.8])
+def test_slabs_through_the_layers_do_not_grow(
+    density: float, offset: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Random pressure, wherever the faces lie; the slab runs through two layers and where they meet."""
+    monkeypatch.setattr("autdtorch.fdtd.grid.grid_offset", lambda scene, spacing: (0.0, 0.0, 0.0))
+    array = TransducerArray([(2e-3, 4e-3, 2e-3)], (1, 0, 0))
+    plate = slab(2, (4 + offset) * 1e-3, 3.2e-3, density)
+    scene = Scene(array, AIR, 40e3, [(6e-3, 5e-3, 2e-3)], (plate,), domain=((0, 0, 0), (9e-3,) * 3))
+    assembly = assemble(scene, 1e-3, torch.float64)
+    state = assembly.silence(assembly.sources(scene.array.positions, torch.ones(1, dtype=torch.complex128)))
+    inside = tuple(map(slice, assembly.grid.first, assembly.grid.last))
+    shape = assembly.grid.interior
+    state.now[inside] = torch.randn(shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    state.before.copy_(state.now)
+    nobody = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.complex128))
+    deaf = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1), dtype=torch.float64))
+    sizes = []
+    for _ in range(4):
+        silence = torch.zeros((300, 2), dtype=torch.float64)
+        state, _ = CpuKernel().advance(state, assembly.coefficients, nobody, deaf, silence)
+        sizes.append(float(state.now.norm()))
+    # without the products of two layers, or with surfaces' energy along one direction negative, these grew by
+    # more than e per period; a constant pressure may stay
+    assert sizes[3] < 1.05 * sizes[1]
 
 
 @pytest.mark.parametrize(
     ("obstacle", "goes_on"),
     [
         (Sphere((FACE, 12e-3, 0.0), 8e-3, density=3.0, sound_speed=340.0), False),
-        (Box((FACE, 12e-3, 0.0), (8e-3, 8e-3, 8e-3), density=1.0, sound_speed=340.0), False),
         (Box((FACE, 12e-3, 0.0), (8e-3, 8e-3, 80e-3), density=3.0, sound_speed=340.0), False),
         (Box((FACE, 12e-3, 0.0), (8e-3, 80e-3, 80e-3), rigid=True), True),
+        (Box((FACE, 12e-3, 0.0), (8e-3, 80e-3, 80e-3), density=0.1, sound_speed=340.0), True),
     ],
-    ids=["sphere", "light box", "post", "wall"],
+    ids=["sphere", "post", "wall", "light slab"],
 )
 def test_only_walls_across_the_domain_go_on_through_the_layers(obstacle: Obstacle, goes_on: bool) -> None:
-    assembly = assemble(layered_scene(obstacle, FRONT), 2e-3)
+    assembly = assemble(layered_scene((obstacle,), FRONT), 2e-3)
     index = torch.cat((torch.from_numpy(assembly.varying.index), torch.from_numpy(assembly.varying.rigid)))
     depth = index % assembly.grid.shape[2]
-    assert bool((depth < assembly.grid.first[2] - 2).any()) == goes_on
+    assert bool((depth < assembly.grid.first[2]).any()) == goes_on
     assert (len(assembly.coefficients.columns.index) > 0) == goes_on
+    assert (len(assembly.coefficients.crossed.index) > 0) == goes_on
+
+
+def test_walls_of_another_direction_end_before_the_layers(caplog: pytest.LogCaptureFixture) -> None:
+    assembly = assemble(layered_scene((slab(0), slab(0, 28e-3), slab(1, 17e-3)), FRONT), 2e-3)
+    assert "obstacle 2 crosses the domain in another direction" in caplog.text
+    x, _, z = np.unravel_index(assembly.varying.index, assembly.grid.shape)
+    before = x < assembly.grid.to_cells(torch.tensor([[FACE - 4e-3, 0, 0]]))[0, 0]
+    assert before.any()
+    assert (z[before] >= assembly.grid.first[2]).all()

@@ -8,11 +8,11 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from autdtorch.array import TransducerArray
-from autdtorch.fdtd.bonds import VaryingCells, varying_cells
+from autdtorch.fdtd.bonds import VaryingCells, _condensed, varying_cells
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.medium import ElementMedium, fill_elements
 from autdtorch.fdtd.stencil import OFFSETS, tuned_stencil
-from autdtorch.fdtd.surface import VERTICES
+from autdtorch.fdtd.surface import VERTICES, CutElements, Materials, energy_matrix
 from autdtorch.obstacles import Box, Obstacle, Sphere
 from autdtorch.scene import Medium, Scene
 
@@ -49,8 +49,8 @@ def box(
 
 
 def assembled(*obstacles: Obstacle) -> tuple[ElementMedium, VaryingCells]:
-    array = TransducerArray([[-0.9, 0.0, 0.0]], (1, 0, 0))
-    scene = Scene(array, AIR, 40e3, [[0.9, 0.0, 0.0]], obstacles, domain=((-1, -1, -1), (1, 1, 1)))
+    array = TransducerArray([[2e-3, -0.9, 0.0]], (1, 0, 0))
+    scene = Scene(array, AIR, 40e3, [[2e-3, 0.9, 0.0]], obstacles, domain=((-1, -1, -1), (1, 1, 1)))
     medium = fill_elements(scene, GRID, STENCIL)
     return medium, varying_cells(medium, STENCIL)
 
@@ -194,8 +194,9 @@ def test_modes_of_a_duct_of_two_fluids() -> None:
     cells behind it are given to keep the time step: 0.1 % of the wavenumber at 20 cells per wavelength, 1.2 %
     at 7.
     """
-    ends = ((-20, -20, -20), (1, 20, 20)), ((9, -20, -20), (20, 20, 20))
-    _, cells = assembled(*(box(*end, None) for end in ends), box((4, -20, -20), (9, 20, 20), 50.0))
+    far = 2000
+    ends = ((-far,) * 3, (1, far, far)), ((9, -far, -far), (far,) * 3)
+    _, cells = assembled(*(box(*end, None) for end in ends), box((4, -far, -far), (9, far, far), 50.0))
     duct = (GRID.first + np.array([(x, 5, 5) for x in range(1, 9)])) @ STRIDES
     line = np.tile(STENCIL.weights, (len(duct), 1))
     listed = np.isin(duct, cells.index)
@@ -216,3 +217,20 @@ def _duct_modes(a: float, b: float, z1: float, z2: float) -> np.ndarray:
     value = z2 * np.sin(k * a) * np.cos(k * b) + z1 * np.sin(k * b) * np.cos(k * a)
     crossing = np.flatnonzero(np.diff(np.sign(value)))
     return k[crossing] - value[crossing] * (k[1] - k[0]) / (value[crossing + 1] - value[crossing])
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.floats(-6, 0), min_size=28, max_size=28), st.integers(1, 254))
+def test_condensed_elements_keep_their_energy_positive(exponents: list[float], gone: int) -> None:
+    """Bonds of all sizes, as where three materials meet: no pressure may have an energy below zero."""
+    bonds = 10.0 ** np.array(exponents)[None]
+    number, cut = np.zeros((3, 3, 3), np.int16), np.array([13])
+    elements = CutElements(bonds, np.full((1, 8), 0.1), np.zeros((1, 8), np.int64))
+    medium = ElementMedium(Materials(np.ones(1), np.ones(1)), np.zeros(1, bool), number, cut, elements)
+    closed = np.zeros((4, 4, 4), bool)
+    out = np.array([gone >> vertex & 1 for vertex in range(8)], bool)
+    closed[tuple((VERTICES[out] + 1).T)] = True
+    matrix = energy_matrix(_condensed(medium, closed.ravel(), (4, 4, 4)).bonds)[0]
+    # rounding of the elimination
+    assert np.linalg.eigvalsh(matrix).min() > -1e-9 * bonds.max()
+    assert not matrix[out].any()

@@ -32,8 +32,8 @@ class Columns:
 
     Attributes:
         index: flat indices of their cells (m, L + 2) int64, from the ring inwards.
-        offset: from a cell to the 9 across the column, flat (m, 9) int64.
-        weight: what those have more than in air (m, 9).
+        offset: from a cell to the w across the column, flat (m, w) int64.
+        weight: what those have more than in air (m, w).
     """
 
     index: torch.Tensor
@@ -41,10 +41,10 @@ class Columns:
     weight: torch.Tensor
 
     @classmethod
-    def none(cls, layer_cells: int, dtype: torch.dtype) -> Columns:
+    def none(cls, layer_cells: int, dtype: torch.dtype, width: int = 9) -> Columns:
         """No columns: nothing but air in the layers."""
-        index, offset = (torch.zeros((0, cells), dtype=torch.int64) for cells in (layer_cells + 2, 9))
-        return cls(index, offset, torch.zeros((0, 9), dtype=dtype))
+        index, offset = (torch.zeros((0, cells), dtype=torch.int64) for cells in (layer_cells + 2, width))
+        return cls(index, offset, torch.zeros((0, width), dtype=dtype))
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,9 @@ class Coefficients:
         layer_index: flat indices (k,) int64 of the varying cells in the layers.
         layer_scale: how many times air's their term is (k,).
         columns: where surfaces run through the boundary layers.
+        crossed: where they run through two at once, along one of them.
+        crossing: place, among the terms (L, n) of the `crossed`, flat, of what is added to the sums across
+            each cell of the columns (m, L + 2) int64; L n where there is nothing.
     """
 
     center: float
@@ -80,6 +83,8 @@ class Coefficients:
     layer_index: torch.Tensor
     layer_scale: torch.Tensor
     columns: Columns
+    crossed: Columns
+    crossing: torch.Tensor
 
     @property
     def layer_cells(self) -> int:
@@ -93,13 +98,14 @@ class State:
 
     It is that of E_x, E_y and E_z, and of E_y acting on E_z p, which has 2 L cells along z: those of the low
     layer and those of the high one, counted inwards. `columns` is that of the columns, psi (L + 1, m) and
-    zeta (L, m).
+    zeta (L, m), and `crossed` that of the crossed ones.
     """
 
     now: torch.Tensor
     before: torch.Tensor
     layers: tuple[Layer, ...]
     columns: Layer
+    crossed: Layer
 
 
 def uniform_state(shape: tuple[int, int, int], coefficients: Coefficients, pressure: float) -> State:
@@ -113,9 +119,11 @@ def uniform_state(shape: tuple[int, int, int], coefficients: Coefficients, press
         layers.append((_zeros(half, order, dtype), _zeros(full, order, dtype)))
     core = torch.full([cells - 2 for cells in shape], pressure, dtype=dtype)
     now = torch.nn.functional.pad(core, (1,) * 6)
-    count = len(coefficients.columns.index)
-    columns = [torch.zeros((layer_cells + more, count), dtype=dtype) for more in (1, 0)]
-    return State(now, now.clone(), tuple(layers), (columns[0], columns[1]))
+    columns, crossed = (
+        (torch.zeros((layer_cells + 1, count), dtype=dtype), torch.zeros((layer_cells, count), dtype=dtype))
+        for count in (len(coefficients.columns.index), len(coefficients.crossed.index))
+    )
+    return State(now, now.clone(), tuple(layers), columns, crossed)
 
 
 def _zeros(size: list[int], order: tuple[int, ...], dtype: torch.dtype) -> torch.Tensor:

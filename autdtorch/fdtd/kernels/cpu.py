@@ -21,7 +21,7 @@ import torch
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.kernels.contract import ROWS_LAST, Coefficients, Receivers, Sources, State
+from autdtorch.fdtd.kernels.contract import ROWS_LAST, Coefficients, Columns, Receivers, Sources, State
 
 _FAST = {"contract", "reassoc", "nsz"}
 
@@ -180,17 +180,19 @@ def _absorb_x(p, q, psi, zeta, terms, decay, gain, face, edge, corner):  # type:
 
 
 @njit(parallel=True, fastmath=_FAST, cache=True, nogil=True)
-def _stretch_columns(p, columns, memory, terms, decay, gain):  # type: ignore[no-untyped-def]
-    """Advance the columns' memory and write what is to be added to their cells (L, m)."""
+def _stretch_columns(p, columns, beside, place, memory, terms, decay, gain):  # type: ignore[no-untyped-def]
+    """Advance the columns' memory and write their terms (L, m); `beside` has more to sum, by `place`."""
     (index, offset, weight), (psi, zeta) = columns, memory
-    flat = p.ravel()
+    flat, more = p.ravel(), beside.ravel()
     for block in prange((len(index) + 63) // 64):
         first, last = 64 * block, min(64 * block + 64, len(index))
         u = np.zeros((len(psi) + 1, last - first), p.dtype)
         for n in range(first, last):
             for depth in range(1, len(u)):
-                for m in range(9):
+                for m in range(weight.shape[1]):
                     u[depth, n - first] += weight[n, m] * flat[index[n, depth] + offset[n, m]]
+                if place[n, depth] < len(more):
+                    u[depth, n - first] += more[place[n, depth]]
         out = terms[:, first:last]
         out[:] = 0
         _stretch(u, psi[:, first:last], zeta[:, first:last], out, decay, gain)
@@ -217,8 +219,10 @@ def _advance(  # type: ignore[no-untyped-def]
     center, face, edge, corner, keep = weights
     index, weight, offsets, buffer = varying
     (psi, zeta), across = layers[0], layers[1:]
+    (columns, crossed, crossing), (memory, crossed_memory) = columns, memory
     places, unlayered = columns[0], np.empty(len(scaled), p.dtype)
-    shares = np.zeros((len(memory[1]), len(places)), p.dtype)
+    shares, beside = np.zeros_like(memory[1]), np.zeros_like(crossed_memory[1])
+    alone, nothing = np.zeros_like(crossed[0]), np.zeros((0, 0), p.dtype)
     for step in range(len(signal)):
         if len(index):
             _varying(p, q, index, weight, offsets, keep, buffer)
@@ -233,7 +237,8 @@ def _advance(  # type: ignore[no-untyped-def]
         _absorb_x(p, q, psi, zeta, terms, decay, gain, face, edge, corner)
         for n in range(len(scaled)):
             flat[scaled[n]] = unlayered[n] + scale[n] * (flat[scaled[n]] - unlayered[n])
-        _stretch_columns(p, columns, memory, shares, decay, gain)
+        _stretch_columns(p, crossed, nothing, alone, crossed_memory, beside, decay, gain)
+        _stretch_columns(p, columns, beside, crossing, memory, shares, decay, gain)
         for n in range(len(places)):
             for depth in range(len(shares)):
                 flat[places[n, depth + 1]] += shares[depth, n]
@@ -253,6 +258,10 @@ def _no_terms(shape: torch.Size, cells: int, dtype: type) -> tuple[NDArray[np.fl
     """Room for E_y p, E_z p and E_y E_z p by plane, side and depth; the last only has ends of rows."""
     nx, ny, nz = shape
     return tuple(np.zeros((nx, 2, cells, row), dtype) for row in (nz, ny, 2 * cells))
+
+
+def _arrays(columns: Columns) -> tuple[NDArray[np.generic], ...]:
+    return columns.index.numpy(), columns.offset.numpy(), columns.weight.numpy()
 
 
 class CpuKernel:
@@ -286,8 +295,8 @@ class CpuKernel:
                 for order, (psi, zeta) in zip(ROWS_LAST, state.layers, strict=True)
             ),
             _no_terms(state.now.shape, c.layer_cells, dtype),
-            (c.columns.index.numpy(), c.columns.offset.numpy(), c.columns.weight.numpy()),
-            tuple(memory.numpy() for memory in state.columns),
+            (_arrays(c.columns), _arrays(c.crossed), c.crossing.numpy()),
+            tuple((psi.numpy(), zeta.numpy()) for psi, zeta in (state.columns, state.crossed)),
             (dtype(c.center), dtype(c.face), dtype(c.edge), dtype(c.corner), dtype(c.keep)),
             varying,
             c.closed_index.numpy(),
@@ -298,4 +307,4 @@ class CpuKernel:
             recorded.numpy(),
         )
         now, before = (state.now, state.before) if len(signal) % 2 == 0 else (state.before, state.now)
-        return State(now, before, state.layers, state.columns), recorded
+        return State(now, before, state.layers, state.columns, state.crossed), recorded

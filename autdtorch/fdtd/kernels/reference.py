@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from autdtorch.fdtd.kernels.contract import Coefficients, Layer, Receivers, Sources, State
+from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Layer, Receivers, Sources, State
 
 
 def neighbours(field: torch.Tensor, axis: int) -> torch.Tensor:
@@ -51,11 +51,14 @@ class ReferenceKernel:
         term = flat_term.index_copy(0, c.layer_index, c.layer_scale * flat_term[c.layer_index]).reshape(
             term.shape
         )
-        columns, shares = _absorb_columns(flat_now, state.columns, c)
+        nothing = torch.zeros(c.crossed.index.T[1:].shape, dtype=flat_now.dtype)
+        crossed, beside = _absorb_columns(flat_now, c.crossed, nothing, state.crossed, c)
+        beside = torch.nn.functional.pad(beside.reshape(-1), (0, 1))[c.crossing.T[1:]]
+        columns, shares = _absorb_columns(flat_now, c.columns, beside, state.columns, c)
         inside = c.columns.index.T[1:-1].reshape(-1)
         new = (new + term).reshape(-1).index_add(0, inside, shares.reshape(-1))
         new = new.index_add(0, driven, force).index_fill(0, c.closed_index, 0)
-        return State(new.reshape(state.now.shape), state.now, layers, columns)
+        return State(new.reshape(state.now.shape), state.now, layers, columns, crossed)
 
 
 def _core(field: torch.Tensor) -> torch.Tensor:
@@ -127,11 +130,12 @@ def _absorb(
     return (x, y, z, yz), torch.nn.functional.pad(_core(term), (1,) * 6)
 
 
-def _absorb_columns(flat: torch.Tensor, memory: Layer, c: Coefficients) -> tuple[Layer, torch.Tensor]:
-    """Advance the columns' memory; returns it and what to add to their cells (L, m)."""
-    columns = c.columns
+def _absorb_columns(
+    flat: torch.Tensor, columns: Columns, beside: torch.Tensor, memory: Layer, c: Coefficients
+) -> tuple[Layer, torch.Tensor]:
+    """Advance the memory of columns with more to sum across (L + 1, m); returns it and the terms (L, m)."""
     cells = columns.index.T[1:, :, None] + columns.offset
-    across = torch.nn.functional.pad((columns.weight * flat[cells]).sum(-1), (0, 0, 1, 0))
+    across = torch.nn.functional.pad((columns.weight * flat[cells]).sum(-1) + beside, (0, 0, 1, 0))
     decay, gain = c.layer_decay[:, None], c.layer_gain[:, None]
     difference = torch.diff(across, dim=0)
     psi = decay[0::2] * memory[0] + gain[0::2] * difference
