@@ -35,6 +35,11 @@ energy from pressures that are nearly constant."""
 _ROUNDING = 1e-9
 """Rows closer than this to those of air are air."""
 
+_ROOM = 1.1
+"""By how much rows at a surface may exceed those of a uniform material before they take mass. The largest
+eigenvalue of air is farther than that from Gershgorin's bound. With the paper's cubes 1.1 costs 3 % of the
+time step, 1.2 would cost 8 %; a slab of density ratio 3 keeps its mass."""
+
 _ROUNDS = 6
 """Times that light cells ask for mass; once is nearly always enough."""
 
@@ -186,8 +191,8 @@ def _cell_number(medium: ElementMedium) -> NDArray[np.int16]:
 
 
 def _largest_row(medium: ElementMedium, stencil: Stencil) -> float:
-    """Sum of weights that a uniform material needs at most: of air, or of the fastest obstacle."""
-    return stencil.total * float(medium.materials.speed.max())
+    """Sum of weights that a row may have: what air or the fastest obstacle needs, and some more."""
+    return _ROOM * stencil.total * float(medium.materials.speed.max())
 
 
 def _shared_mass(bonds: Array, mass: Array, touched: Index, shape: Shape, largest: float) -> Array:

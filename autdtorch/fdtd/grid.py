@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -28,6 +29,10 @@ FAIR_CELLS_PER_WAVELENGTH = 4.0
 
 MAX_CELLS = 10**9
 """More would take over 30 GB in single precision."""
+
+AROUND = 3
+"""Cells of air between the obstacles and the boundary layer of a box. The first may vary, the other two are
+those that radiate (`scatter.py`)."""
 
 FINE_LAYER_CELLS, COARSE_LAYER_CELLS = 6, 8
 """Boundary layer from 6 cells per wavelength on, and of coarser grids. It reflects less than -68 dB up to 60
@@ -100,7 +105,7 @@ class Grid:
         return x, y, z
 
     def to_cells(self, points: torch.Tensor) -> Array:
-        """Positions (P, 3) [m] in units of cells, cell centres being whole numbers."""
+        """Positions (..., 3) [m] in units of cells, cell centres being whole numbers."""
         return np.asarray((points.numpy() - np.array(self.origin)) / self.spacing, np.float64)
 
     def clip(self, cells: Array) -> Array:
@@ -121,15 +126,26 @@ def make_grid(scene: Scene, spacing: float) -> Grid:
     Raises:
         ValueError: fewer than `MIN_CELLS_PER_WAVELENGTH` cells a wavelength, or more than `MAX_CELLS` in all.
     """
+    return _covering(scene, spacing, scene.domain, footprint(scene.wavenumber * spacing) // 2 - 1)
+
+
+def make_box(scene: Scene, spacing: float) -> Grid:
+    """Cover the scene's obstacles, of which there must be some, with `AROUND` cells of air around them."""
+    lower = torch.tensor([obstacle.lower for obstacle in scene.obstacles]).amin(dim=0)
+    upper = torch.tensor([obstacle.upper for obstacle in scene.obstacles]).amax(dim=0)
+    return _covering(scene, spacing, (lower.tolist(), upper.tolist()), AROUND)
+
+
+def _covering(scene: Scene, spacing: float, corners: Sequence[Sequence[float]], margin: int) -> Grid:
+    """Cover what lies between two corners, and a margin of cells."""
     positive("spacing", spacing, "m")
     _require_fine("the medium", scene.medium.sound_speed, scene.frequency, spacing)
     for index, obstacle in enumerate(scene.obstacles):
         if obstacle.sound_speed is not None:
             _require_fine(f"obstacle {index}", obstacle.sound_speed, scene.frequency, spacing)
-    lower, upper = scene.domain
+    lower, upper = corners
     kappa = scene.wavenumber * spacing
-    margin = footprint(kappa) // 2 - 1
-    offset = grid_offset(scene, spacing)
+    offset = grid_offset(scene, spacing, lower)
     interior = tuple(
         math.ceil((high - low) / spacing + first - 1e-6) + 2 * margin
         for low, high, first in zip(lower, upper, offset, strict=True)

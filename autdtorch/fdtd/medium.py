@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -97,10 +98,12 @@ def speed_factor(stencil: Stencil, speed_ratio: float) -> float:
 def _flow_factor(kappa: float, speed_ratio: float) -> float:
     """What a material's bonds and mass are multiplied with for its impedance to be right beside air.
 
-    The difference between two cells is a wave's slope times sin(k / 2) / (k / 2), with the material's own k:
-    only where it is that of air do both sides agree on the flow between them.
+    Half-way between two cells a wave's slope is their difference over 2 sin(k / 2) / k, and its value their
+    mean over cos(k / 2), with the material's own k: the grid's impedance is off by tan(k / 2) / (k / 2). For
+    waves at an angle the two normal k differ, but to second order not the ratio of these factors.
     """
-    return float(np.sinc(kappa / (2 * np.pi)) / np.sinc(kappa / speed_ratio / (2 * np.pi)))
+    air, own = kappa / 2, kappa / speed_ratio / 2
+    return (math.tan(air) / air) / (math.tan(own) / own)
 
 
 def fill_elements(scene: Scene, grid: Grid, stencil: Stencil) -> ElementMedium:

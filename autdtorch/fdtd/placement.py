@@ -9,6 +9,8 @@ little on average; a face along the grid has one.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,19 +32,19 @@ _WORTHWHILE = 0.9
 """Share of the miss, of a grid that begins at the domain's corner, below which another place is taken."""
 
 
-def grid_offset(scene: Scene, spacing: float) -> tuple[float, float, float]:
-    """How far below the domain's lower corner the first cell should begin, per axis [cells], in [0, 1).
+def grid_offset(scene: Scene, spacing: float, lower: Sequence[float]) -> tuple[float, float, float]:
+    """How far below a grid's lower corner (3,) [m] its first cell should begin, per axis [cells], in [0, 1).
 
     Zero if no obstacle has flat faces along the grid, or if they lie as well as they can.
     """
-    x, y, z = (_axis_offset(*_faces(scene, axis), spacing) for axis in range(3))
+    x, y, z = (_axis_offset(*_faces(scene, axis, low), spacing) for axis, low in enumerate(lower))
     return x, y, z
 
 
-def _faces(scene: Scene, axis: int) -> tuple[Array, Array, Array]:
+def _faces(scene: Scene, axis: int, origin: float) -> tuple[Array, Array, Array]:
     """Faces across an axis within the domain.
 
-    Their distance from its lower corner [m], 1 where the lighter side comes first and -1 where the heavier
+    Their distance from an origin [m], 1 where the lighter side comes first and -1 where the heavier
     does, and their area [m^2].
     """
     low, high = (corner[axis] for corner in scene.domain)
@@ -51,7 +53,7 @@ def _faces(scene: Scene, axis: int) -> tuple[Array, Array, Array]:
         place, outward, area = _flat_faces(obstacle, axis)
         heavier = obstacle.density is None or obstacle.density >= scene.medium.density
         inside = (place > low) & (place < high)
-        parts.append(np.stack((place - low, -outward if heavier else outward, area))[:, inside])
+        parts.append(np.stack((place - origin, -outward if heavier else outward, area))[:, inside])
     place, first, area = np.concatenate(parts, axis=1)
     return place, first, area
 

@@ -111,6 +111,7 @@ def point_weights(
         start = np.clip(np.floor(offset - cells / 2 + 1), first[axis], last[axis] - cells).astype(np.int64)
         nodes = start[:, None] + np.arange(cells)
         along = axis_weights(offset, nodes.astype(np.float64), kappa)
-        index = (index[:, :, None] * shape[axis] + nodes[:, None, :]).reshape(len(positions), -1)
-        weight = (weight[:, :, None] * along[:, None, :]).reshape(len(positions), -1)
+        flat = len(positions), index.shape[1] * cells
+        index = (index[:, :, None] * shape[axis] + nodes[:, None, :]).reshape(flat)
+        weight = (weight[:, :, None] * along[:, None, :]).reshape(flat)
     return PointWeights(index, weight)

@@ -1,14 +1,9 @@
-"""From a scene to its steady state: assemble, step block by block, lock in, know when to stop.
-
-A block is the fewest periods that take a whole number of steps.
-"""
+"""A scene on a grid, ready to step; its drive, and what is locked in to it."""
 
 from __future__ import annotations
 
-import itertools
 import logging
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -19,7 +14,7 @@ from autdtorch.fdtd.bonds import VaryingCells, varying_cells
 from autdtorch.fdtd.boundary import tuned_profile
 from autdtorch.fdtd.columns import layer_columns, scaled_cells
 from autdtorch.fdtd.grid import Grid, make_grid
-from autdtorch.fdtd.kernels.contract import Coefficients, Kernel, Receivers, Sources, State, uniform_state
+from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, State, uniform_state
 from autdtorch.fdtd.medium import fill_elements
 from autdtorch.fdtd.points import PointWeights, merged, point_weights
 from autdtorch.fdtd.stability import fewest_steps, largest_eigenvalue, whole_steps
@@ -37,15 +32,8 @@ periods left changes of 1e-3 a period after 60 periods, this one 5e-5)."""
 _FAINT = 1e-20
 """Pressure of the silence before a run, relative to the strongest force."""
 
-_WINDOW = 4
-"""Periods, and at least two blocks, over which the transient's decay is averaged when its end is foretold."""
-
-
 _ONE_NODE = torch.ones(1, dtype=torch.float64)
 """Weights of the nodes of a point."""
-
-_SLOWEST_DECAY = 0.995
-"""Decay per period that the foretelling credits a transient with at least; rounding noise decays no more."""
 
 
 @dataclass(frozen=True)
@@ -126,14 +114,23 @@ class Assembly:
 def assemble(
     scene: Scene, spacing: float, dtype: torch.dtype = torch.float32, time_step: float | None = None
 ) -> Assembly:
-    """Put a scene on a grid of `spacing` [m], with a time step of `time_step` [s] or just below.
-
-    By default that is the largest stable one.
+    """Put a scene on a grid of its domain, of `spacing` [m]; see `assemble_on`.
 
     Raises:
         ValueError: the spacing is too coarse for the frequency, or the time step is not stable.
     """
-    grid = make_grid(scene, spacing)
+    return assemble_on(make_grid(scene, spacing), scene, dtype, time_step)
+
+
+def assemble_on(grid: Grid, scene: Scene, dtype: torch.dtype, time_step: float | None) -> Assembly:
+    """Put a scene on a grid, with a time step of `time_step` [s] or just below.
+
+    By default that is the largest stable one.
+
+    Raises:
+        ValueError: the time step is not stable.
+    """
+    spacing = grid.spacing
     stencil = tuned_stencil(grid.kappa, scene.attenuation * spacing)
     varying = varying_cells(fill_elements(scene, grid, stencil), stencil)
     largest = largest_eigenvalue(varying.index, varying.weight, stencil, grid.shape)
@@ -184,23 +181,6 @@ def _wanted_steps(fewest: float, time_step: float | None, frequency: float) -> f
     return 1 / (frequency * time_step)
 
 
-@dataclass(frozen=True)
-class SteadyState:
-    """Phasors at the receivers and how sure they are.
-
-    Attributes:
-        pressure: (R,) complex, amplitude of the pressure at each receiver.
-        periods: periods stepped.
-        remaining: estimated relative distance to the steady state, infinite while it cannot be told.
-        reached: whether that is within the tolerance.
-    """
-
-    pressure: torch.Tensor
-    periods: int
-    remaining: float
-    reached: bool
-
-
 def drive_signal(steps_per_period: Fraction, first: int, count: int) -> torch.Tensor:
     """Rows (count, 2) of cos(w t) and sin(w t) under the switch-on envelope, from step `first` on."""
     step = torch.arange(first, first + count)
@@ -216,76 +196,3 @@ def lock_in(recorded: torch.Tensor, periods: int) -> torch.Tensor:
     steps = len(recorded)
     turn = 2 * math.pi * periods / steps * torch.arange(1, steps + 1, dtype=torch.float64)
     return torch.einsum("t,tr->r", 2 / steps * torch.exp(1j * turn), recorded.to(torch.complex128))
-
-
-def blocks(
-    assembly: Assembly, kernel: Kernel, sources: Sources, receivers: Receivers
-) -> Iterator[tuple[State, torch.Tensor]]:
-    """Step block by block from silence, yielding the state and the receivers' phasors (R,) of each."""
-    state, steps = assembly.silence(sources), assembly.steps_per_period
-    for block in itertools.count():
-        signal = drive_signal(steps, block * steps.numerator, steps.numerator).to(assembly.dtype)
-        state, recorded = kernel.advance(state, assembly.coefficients, sources, receivers, signal)
-        yield state, lock_in(recorded, steps.denominator)
-
-
-def run_to_steady_state(
-    assembly: Assembly,
-    kernel: Kernel,
-    sources: Sources,
-    receivers: Receivers,
-    tolerance: float,
-    max_periods: int,
-) -> tuple[State, SteadyState]:
-    """Step until the receivers' phasors stand, to `tolerance` (relative), or `max_periods` have passed.
-
-    The change from block to block decays geometrically once the slowest mode is left. From its size and its
-    decay over a few blocks the distance still to go is foretold; a small change alone would not tell, in a
-    resonant scene. A run is not judged before sound has crossed the domain twice.
-    """
-    crossing = assembly.grid.diagonal / assembly.grid.wavelength
-    earliest = RAMP_PERIODS + math.ceil(2 * crossing)
-    stepped = blocks(assembly, kernel, sources, receivers)
-    state, phasor = next(stepped)
-    block = count = assembly.steps_per_period.denominator
-    changes: list[float] = []
-    while True:
-        remaining = _foretold(changes, block)
-        reached = count >= earliest and remaining <= tolerance
-        if reached or count >= max_periods:
-            return state, SteadyState(phasor, count, remaining, reached)
-        previous = phasor
-        state, phasor = next(stepped)
-        count += block
-        changes.append(_relative_change(phasor, previous))
-
-
-def _relative_change(phasor: torch.Tensor, previous: torch.Tensor) -> float:
-    size = float(phasor.detach().norm())
-    return float((phasor - previous).detach().norm()) / size if size else math.inf
-
-
-def _foretold(changes: list[float], periods: int) -> float:
-    """Relative distance to the limit of phasors a block of `periods` apart, foretold from their changes."""
-    window = max(2, math.ceil(_WINDOW / periods))
-    if len(changes) < 2 * window:
-        return math.inf
-    late, early = max(changes[-window:]), max(changes[-2 * window : -window])
-    if not math.isfinite(late):
-        return math.inf
-    ratio = min(math.pow(late / early, 1 / window), _SLOWEST_DECAY**periods) if early else 0.0
-    return late * ratio / (1 - ratio)
-
-
-def last_block(assembly: Assembly, kernel: Kernel, state: State, sources: Sources) -> torch.Tensor:
-    """Phasor of every cell (nx, ny, nz) over one more block of a run in its steady state."""
-    steps, turns = assembly.steps_per_period.numerator, assembly.steps_per_period.denominator
-    nobody = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1), dtype=assembly.dtype))
-    first = RAMP_PERIODS * steps
-    spectrum = torch.zeros(assembly.grid.shape, dtype=sources.force.dtype)
-    for step in range(steps):
-        signal = drive_signal(assembly.steps_per_period, first + step, 1).to(assembly.dtype)
-        state, _ = kernel.advance(state, assembly.coefficients, sources, nobody, signal)
-        turn = 2 * math.pi * turns * (step + 1) / steps
-        spectrum = spectrum + state.now * complex(math.cos(turn), math.sin(turn)) * (2 / steps)
-    return spectrum

@@ -6,8 +6,8 @@ tuned stencil's. A cut element gets
 
 - bonds in series: density averaged along the line between two vertices, which is right for a flow across the
   surface;
-- if the surface is a face along the grid, bonds with which the scheme is a product of its direction and the
-  two along it;
+- if what is in it is layered along an axis, by faces along the grid, bonds with which the scheme is a product
+  of that direction and the two others;
 - if not, a correction that gives two fields that vary along the surface their exact energy, and leaves that
   of a third, which crosses it continuous in pressure and in flow, with the kink that the densities ask for:
   for it bonds in series are right. Its matrix is
@@ -57,7 +57,7 @@ _FLAT = 0.5
 cancel."""
 
 _PLANE = 1e-6
-"""Departure of signed distances [cells] from those of a face along the grid that is rounding."""
+"""Variation of a signed distance [cells] along a face that is rounding."""
 
 _SPARE = 6.0
 """What an element full of the heavier material lends to diagonal bonds across its face, in units of what it
@@ -147,48 +147,44 @@ def cut_elements(
     number = np.zeros((distance.shape[1], 8), np.int64)
     for far, own in zip(distance, material, strict=True):
         number[far[:, _CORNERS] < 0] = own
+    layered = _layered_axis(distance)
+    for axis in range(3):
+        own = layered == axis
+        bonds[own] = _layered_bonds(axis, number[own], volumes[own], materials, stencil)
     held = (number[:, :, None] == np.arange(count)).any(axis=1)
     present = volumes.mean(axis=1) > _PRESENT
-    chosen = np.flatnonzero((held.sum(axis=1) == 2) & (present <= held).all(axis=1))
+    two = (held.sum(axis=1) == 2) & (present <= held).all(axis=1)
+    chosen = np.flatnonzero(two & (layered < 0))
     if len(chosen):
         inner = count - 1 - held[chosen, ::-1].argmax(axis=1)
         outer = held[chosen].argmax(axis=1)
         level = _level(distance[:, chosen], material, inner)
         sides = materials.density[np.stack((outer, inner), axis=1)]
-        across = _face_axis(level)
-        for axis in range(3):
-            own = chosen[across == axis]
-            bonds[own] = _layered_bonds(axis, number[own], volumes[own], materials, stencil)
-        other = across < 0
-        chosen = chosen[other]
-        flat, correction = _correction(level[other], sides[other], volumes[chosen], materials, bonds[chosen])
+        flat, correction = _correction(level, sides, volumes[chosen], materials, bonds[chosen])
         bonds[chosen[flat]] += correction
     return CutElements(bonds, _masses(number, volumes, materials), number)
 
 
-def _face_axis(level: Array) -> NDArray[np.int64]:
-    """Axis (n,) across which the face of elements with signed distances (n, 125) lies; -1 for others."""
-    cube = level.reshape(-1, *(SUBCELLS + 1,) * 3)
-    found = np.full(len(level), -1)
+def _layered_axis(distance: Array) -> NDArray[np.int64]:
+    """Axis (n,) along which alone the signed distances (K, n, 125) of elements vary; -1 where they do not."""
+    cube = distance.reshape(*distance.shape[:2], *(SUBCELLS + 1,) * 3)
+    found = np.full(distance.shape[1], -1)
     for axis in range(3):
-        lines = np.moveaxis(cube, axis + 1, 1).reshape(len(cube), SUBCELLS + 1, SUBCELLS + 1, SUBCELLS + 1)
-        slope = SUBCELLS * np.diff(lines[:, :, 0, 0], axis=1)
-        alike = np.ptp(lines, axis=(2, 3)).max(axis=1) < _PLANE
-        straight = (np.abs(np.abs(slope) - 1).max(axis=1) < _PLANE) & (np.ptp(slope, axis=1) < 1)
-        found[alike & straight] = axis
+        others = tuple(other + 2 for other in range(3) if other != axis)
+        found[np.ptp(cube, axis=others).max(axis=(0, 2), initial=0) < _PLANE] = axis
     return found
 
 
 def _layered_bonds(
     axis: int, number: NDArray[np.int64], volumes: Array, materials: Materials, stencil: Stencil
 ) -> Array:
-    """Bonds (n, 28) of elements with a face across an axis, with which the scheme is a product.
+    """Bonds (n, 28) of elements with faces across an axis, with which the scheme is a product.
 
     With p0 and p1 the pressures in the two planes of vertices, the energy is g (p1 - p0)^T W (p1 - p0), g
-    being the series mobility, and in each plane that of air times the mobility t of what lies on its side. In
-    a boundary layer that the face runs into, the energy of each direction for itself must be positive, else
-    it grows: what W has off its diagonal takes from it, and is kept only as far as t of the heavier side
-    allows; the rest goes to the diagonal.
+    being the series mobility, and in each plane that of air times a mobility t: of each material that plane's
+    where its vertices alone lie in it, else half. In a boundary layer that the faces run into, the energy of
+    each direction for itself must be positive, else it grows: what W has off its diagonal takes from it, and
+    is kept only as far as t of the heavier side allows; the rest goes to the diagonal.
     """
     across = _APART[:, axis] == 1
     straight = across & (_APART.sum(axis=1) == 1)
@@ -196,8 +192,11 @@ def _layered_bonds(
     beside = np.where(across, 0, _by_steps(stencil)[np.minimum(_APART.sum(axis=1) + 1, 3)])
     share = volumes.mean(axis=1)
     density = share @ materials.density
-    own = number[:, PAIRS[:, 0]]
-    along = 2 * np.take_along_axis(share, own, axis=1) / materials.density[own]
+    side = VERTICES[:, axis]
+    held = [(number[:, side == plane, None] == np.arange(share.shape[1])).any(axis=1) for plane in (0, 1)]
+    part = np.stack((1.0 + held[0] - held[1], 1.0 + held[1] - held[0]))
+    mobility = (part * share) @ (1 / materials.density)
+    along = mobility[side[PAIRS[:, 0]]].T
     sides = materials.density[number]
     lightest, heaviest = sides.min(axis=1), sides.max(axis=1)
     heavy = np.where(materials.density >= heaviest[:, None], share, 0).sum(axis=1)

@@ -222,7 +222,7 @@ def test_free_space_says_that_it_leaves_obstacles_out(caplog: pytest.LogCaptureF
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"method": "fem"}, r"method: .*fem.*must be one of auto, free_space, full"),
+        ({"method": "fem"}, r"method: .*fem.*must be one of auto, free_space, box, full"),
         (
             {"spacing": 4e-3},
             r"spacing: 0.004 m; must be at most 0.00283 m, 3 cells per .* in the medium",

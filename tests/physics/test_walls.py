@@ -48,8 +48,7 @@ def test_fluid_half_space_reflects() -> None:
         (FACE + 0.5, 0, 0), (1.0, 1.0, 1.0), density=3 * AIR.density, sound_speed=1.5 * AIR.sound_speed
     )
     ratios = {"density_ratio": 3.0, "speed_ratio": 1.5}
-    # measured 0.12 %; of second order in the spacing
-    assert error(layered_scene((wall,), FRONT), reference.fluid_half_space, **ratios) < 3e-3
+    assert error(layered_scene((wall,), FRONT), reference.fluid_half_space, **ratios) < 2e-3
 
 
 def slab(normal: int = 0, begin: float = FACE, thickness: float = 5e-3, density: float = 3.0) -> Box:
@@ -61,10 +60,10 @@ def slab(normal: int = 0, begin: float = FACE, thickness: float = 5e-3, density:
 
 @pytest.mark.parametrize("shift", [0.0, 0.37e-3])
 def test_slab_transmits(shift: float) -> None:
-    """Required: 1 %, wherever the faces lie. At 1 mm it is 1.4 % here, of second to third order."""
+    """Required: 1 %. The faces lie half-way between cell centres, where the scheme is exact head on."""
     what = {"thickness": 5e-3, "density_ratio": 3.0, "speed_ratio": 1.5}
     scene = layered_scene((slab(begin=FACE + shift),), BEHIND)
-    assert error(scene, reference.fluid_slab, FACE + shift, 0.7e-3, **what) < 1e-2
+    assert error(scene, reference.fluid_slab, FACE + shift, **what) < 2e-3
 
 
 @pytest.mark.parametrize("density", [77.0, 3.0, 0.01])
@@ -73,7 +72,7 @@ def test_slabs_through_the_layers_do_not_grow(
     density: float, offset: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Random pressure, wherever the faces lie; the slab runs through two layers and where they meet."""
-    monkeypatch.setattr("autdtorch.fdtd.grid.grid_offset", lambda scene, spacing: (0.0, 0.0, 0.0))
+    monkeypatch.setattr("autdtorch.fdtd.grid.grid_offset", lambda *_: (0.0, 0.0, 0.0))
     array = TransducerArray([(2e-3, 4e-3, 2e-3)], (1, 0, 0))
     plate = slab(2, (4 + offset) * 1e-3, 3.2e-3, density)
     scene = Scene(array, AIR, 40e3, [(6e-3, 5e-3, 2e-3)], (plate,), domain=((0, 0, 0), (9e-3,) * 3))

@@ -63,19 +63,21 @@ def test_a_face_that_cannot_lie_half_way_lies_closer_to_the_lighter_side(density
 def test_nothing_moves_without_flat_faces_along_the_grid() -> None:
     sphere = Sphere((12.3e-3, 10.2e-3, 9.9e-3), 5e-3, rigid=True)
     tilted = Box((20e-3, 20e-3, 20e-3), (3e-3, 4e-3, 5e-3), (0.3, 0.2, 0.1), rigid=True)
-    assert grid_offset(scene(sphere, tilted), SPACING) == (0.0, 0.0, 0.0)
-    assert grid_offset(scene(), SPACING) == (0.0, 0.0, 0.0)
+    assert grid_offset(scene(sphere, tilted), SPACING, (0, 0, 0)) == (0.0, 0.0, 0.0)
+    assert grid_offset(scene(), SPACING, (0, 0, 0)) == (0.0, 0.0, 0.0)
 
 
 def test_nothing_moves_where_faces_lie_well() -> None:
-    assert grid_offset(scene(box((5, 6, 7), (8, 9, 10))), SPACING) == (0.0, 0.0, 0.0)
+    assert grid_offset(scene(box((5, 6, 7), (8, 9, 10))), SPACING, (0, 0, 0)) == (0.0, 0.0, 0.0)
 
 
 def test_voxels_have_faces_too() -> None:
     mask = np.zeros((4, 3, 3), bool)
     mask[1:3, 1, 1] = True
     voxels = VoxelMask(mask, 2e-3, (10.4e-3, 10.4e-3, 10.4e-3), rigid=True)
-    assert all(math.isclose(offset, 0.6, abs_tol=1e-6) for offset in grid_offset(scene(voxels), SPACING))
+    assert all(
+        math.isclose(offset, 0.6, abs_tol=1e-6) for offset in grid_offset(scene(voxels), SPACING, (0, 0, 0))
+    )
 
 
 def test_the_grid_covers_the_domain_wherever_it_lies() -> None:

@@ -301,8 +301,9 @@ class CpuKernel:
             varying,
             c.closed_index.numpy(),
             (c.layer_decay.numpy(), c.layer_gain.numpy(), c.layer_index.numpy(), c.layer_scale.numpy()),
-            (sources.index.numpy(), sources.force.numpy()),
-            (receivers.index.numpy(), receivers.weight.numpy()),
+            # contiguous: for arrays with gaps numba compiles anew, and crashed when it loaded that from disk
+            (sources.index.contiguous().numpy(), sources.force.contiguous().numpy()),
+            (receivers.index.contiguous().numpy(), receivers.weight.contiguous().numpy()),
             signal.numpy(),
             recorded.numpy(),
         )

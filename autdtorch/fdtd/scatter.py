@@ -1,0 +1,163 @@
+"""The scattered field alone: driven where the medium is not air, radiated from a surface around it.
+
+With p = p_inc + p_scat and p_inc the exact field in free space, the scheme leaves for p_scat a force
+sum_j (w_ij - w_air) (p_inc,j - p_inc,i) on the varying cells. Around them, where chi steps from 1 to 0
+between two cells of air, the cells radiate sum_j w_ij (chi_j - chi_i) p_scat,j, by the exact Green's
+function: what a field that is p_scat outside and zero inside needs for its sources (a discrete Huygens
+surface). Between the surface and everything else lies no grid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from autdtorch.array import Nodes
+from autdtorch.fdtd.kernels.contract import Sources
+from autdtorch.fdtd.stencil import flat_offsets
+from autdtorch.fdtd.stepping import Assembly
+
+_AT_ONCE = 4_000_000
+"""Pairs of points that Green's function is worked out for at once."""
+
+_NEAREST = 0.5
+"""Distance [cells] from a source at which the incident field is cut off; it is singular there."""
+
+
+@dataclass(frozen=True)
+class Scattering:
+    """An assembled box with what drives it and what it radiates.
+
+    Attributes:
+        assembly: of the box.
+        wavenumber: complex [rad/m].
+    """
+
+    assembly: Assembly
+    wavenumber: complex
+
+    def sources(self, origins: Nodes, strength: torch.Tensor) -> Sources:
+        """Forces of the incident field of N origins with far fields strength e^{ikr}/r, (N,) [Pa m]."""
+        assembly = self.assembly
+        index = assembly.varying.index
+        cells, place = self._driven
+        field = self.incident(self._positions(cells), origins, strength).numpy()
+        step = field[place] - field[place[:, 13]][:, None]
+        factor = assembly.coefficients.face / assembly.stencil.face
+        force = factor * ((assembly.varying.weight - assembly.stencil.weights) * step).sum(axis=1)
+        dtype = torch.complex128 if assembly.dtype == torch.float64 else torch.complex64
+        return Sources(torch.from_numpy(index), torch.from_numpy(force).to(dtype))
+
+    def incident(self, points: torch.Tensor, origins: Nodes, strength: torch.Tensor) -> torch.Tensor:
+        """Field (P,) in free space of N origins at points (P, 3) [m]."""
+        nodes, shares = origins.positions.reshape(-1, 3), origins.weights.repeat(len(strength))
+        amplitude = strength.repeat_interleave(len(origins.weights)) * shares
+        return self._sum(points, nodes, amplitude, _NEAREST * self.assembly.grid.spacing)
+
+    def reach(self, targets: Nodes) -> Reach:
+        """How the scattered field gets to P targets, as the mean over the nodes of each."""
+        _, surface, outward = self._surface
+        within = self._inside(targets.positions)
+        spread = self.assembly.spread(targets.positions[within])
+        cells, place = np.unique(np.concatenate((surface, spread.index.ravel())), return_inverse=True)
+        from_surface = csr_array(
+            (np.ones(len(surface)), (np.arange(len(surface)), place[: len(surface)])),
+            (len(surface), len(cells)),
+        )
+        rows = np.arange(len(spread.index)).repeat(spread.index.shape[1])
+        inward = csr_array(
+            (spread.weight.ravel(), (rows, place[len(surface) :])), (len(within[within]), len(cells))
+        )
+        return Reach(self, targets, within, cells, outward @ from_surface, inward)
+
+    def radiated(self, amplitude: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+        """Field (P,) at points (P, 3) [m] of the radiating cells with amplitudes (n,) [Pa m]."""
+        return self._sum(points, self._surface[0], amplitude, 0.0)
+
+    def _inside(self, points: torch.Tensor) -> torch.Tensor:
+        """Which points (...) lie within the surface, where the field is that of the grid."""
+        grid = self.assembly.grid
+        cells = torch.from_numpy(grid.to_cells(points))
+        first, last = torch.tensor(grid.first), torch.tensor(grid.last)
+        return ((cells > first) & (cells < last - 1)).all(dim=-1)
+
+    @cached_property
+    def _driven(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Cells where the incident field is needed, and the places among them of the neighbours (n, 27)."""
+        around = self.assembly.varying.index[:, None] + flat_offsets(self.assembly.grid.shape)
+        cells, place = np.unique(around, return_inverse=True)
+        return cells, place.reshape(around.shape)
+
+    @cached_property
+    def _surface(self) -> tuple[torch.Tensor, NDArray[np.int64], csr_array]:
+        """Positions (n, 3) of the radiating cells, the cells (m,) they read, and with what weights (n, m)."""
+        assembly = self.assembly
+        grid, stencil = assembly.grid, assembly.stencil
+        chi = np.zeros(grid.shape)
+        chi[tuple(slice(first + 1, last - 1) for first, last in zip(grid.first, grid.last, strict=True))] = 1
+        interior = np.zeros(grid.shape, bool)
+        interior[tuple(map(slice, grid.first, grid.last))] = True
+        index = np.flatnonzero(interior)
+        around = index[:, None] + flat_offsets(grid.shape)
+        step = chi.ravel()[around] - chi.ravel()[index, None]
+        radiating = step.any(axis=1)
+        index, around, step = index[radiating], around[radiating], step[radiating]
+        cells, place = np.unique(around[step != 0], return_inverse=True)
+        row, column = np.nonzero(step)
+        factor = assembly.coefficients.face / stencil.face * grid.spacing
+        value = factor / assembly.stencil.source_factor(float(assembly.steps_per_period))
+        value = value * stencil.weights[column] * step[row, column]
+        return self._positions(index), cells, csr_array((value, (row, place)), (len(index), len(cells)))
+
+    def _positions(self, cells: NDArray[np.int64]) -> torch.Tensor:
+        """Centres (n, 3) [m] of cells."""
+        grid = self.assembly.grid
+        places = np.stack(np.unravel_index(cells, grid.shape), axis=-1)
+        return torch.from_numpy(np.array(grid.origin) + grid.spacing * places)
+
+    def _sum(
+        self, points: torch.Tensor, sources: torch.Tensor, amplitude: torch.Tensor, nearest: float
+    ) -> torch.Tensor:
+        """Sum (P,) of amplitude e^{ikr}/r over sources, distances below `nearest` [m] taken as that."""
+        k = self.wavenumber
+        at_once = max(1, _AT_ONCE // len(sources))
+        parts = []
+        for some in torch.split(points, at_once):
+            r = torch.cdist(some, sources, compute_mode="donot_use_mm_for_euclid_dist").clamp(min=nearest)
+            parts.append(torch.polar(torch.exp(-k.imag * r) / r, k.real * r) @ amplitude)
+        return torch.cat(parts) if parts else torch.zeros(0, dtype=torch.complex128)
+
+
+@dataclass(frozen=True)
+class Reach:
+    """From phasors of the box's cells to the scattered field at P targets of n nodes.
+
+    Attributes:
+        scattering: of the box.
+        targets: where the field is wanted.
+        within: which nodes (P, n) lie in the box, where its cells are read.
+        cells: flat indices (k,) of the cells whose phasors are needed.
+        outward: amplitudes of the radiating cells from those phasors.
+        inward: field at the nodes in the box from them.
+    """
+
+    scattering: Scattering
+    targets: Nodes
+    within: torch.Tensor
+    cells: NDArray[np.int64]
+    outward: csr_array
+    inward: csr_array
+
+    def field(self, phasor: torch.Tensor, every: int = 1) -> torch.Tensor:
+        """Scattered field at each `every`-th target, from the cells' phasors (k,)."""
+        field = torch.zeros(self.within.shape, dtype=torch.complex128)
+        field[self.within] = torch.from_numpy(self.inward @ phasor.numpy())
+        field, outside = field[::every], ~self.within[::every]
+        amplitude = torch.from_numpy(self.outward @ phasor.numpy())
+        field[outside] = self.scattering.radiated(amplitude, self.targets.positions[::every][outside])
+        return field @ self.targets.weights.to(field.dtype)

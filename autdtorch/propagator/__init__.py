@@ -1,0 +1,129 @@
+"""Propagators: from drives to pressures, by exact sums, by FDTD in a box or by FDTD on the whole domain."""
+
+from __future__ import annotations
+
+import logging
+
+import torch
+
+from autdtorch.fdtd.kernels.contract import Kernel
+from autdtorch.fdtd.spacing import PILOT_CELLS, coarsest_spacing, spacing_for
+from autdtorch.propagator.base import Propagator, Run, SimulatedPropagator, SteadyStateWarning
+from autdtorch.propagator.box import BoxPropagator
+from autdtorch.propagator.free_space import FreeSpacePropagator
+from autdtorch.propagator.full import FullPropagator
+from autdtorch.scene import Scene
+from autdtorch.validation import integer_at_least, invalid, positive
+
+__all__ = [
+    "BoxPropagator",
+    "FreeSpacePropagator",
+    "FullPropagator",
+    "Propagator",
+    "Run",
+    "SimulatedPropagator",
+    "SteadyStateWarning",
+    "make_propagator",
+]
+
+logger = logging.getLogger(__name__)
+
+METHODS = ("auto", "free_space", "box", "full")
+KERNELS = ("auto", "cpu", "reference")
+DTYPES = {"float32": torch.float32, "float64": torch.float64}
+
+
+def _make_kernel(name: str) -> Kernel:
+    if name == "reference":
+        from autdtorch.fdtd.kernels.reference import ReferenceKernel
+
+        return ReferenceKernel()
+    from autdtorch.fdtd.kernels.cpu import CpuKernel
+
+    return CpuKernel()
+
+
+def make_propagator(
+    scene: Scene,
+    method: str = "auto",
+    spacing: float | None = 1e-3,
+    tolerance: float = 2e-3,
+    *,
+    kernel: str = "auto",
+    dtype: str | torch.dtype = "float32",
+    max_periods: int = 600,
+    time_step: float | None = None,
+) -> FreeSpacePropagator | SimulatedPropagator:
+    """Choose and prepare a propagator.
+
+    Args:
+        scene: what is simulated.
+        method: "free_space": exact, without obstacles. "full": FDTD on the whole domain. "auto": free space
+            where the scene has no obstacles, else full.
+        spacing: edge of a cell [m], at most a third of the wavelength. The error falls with it; see
+            docs/numerics.md. None: two coarse grids are simulated, and the spacing is chosen with which the
+            error of the transfer matrix should stay below `tolerance`.
+        tolerance: relative error, in (0, 1): the distance to the steady state at which a simulation ends;
+            half of that where the spacing is chosen, the other half being the grid's.
+        kernel: "cpu" (numba), "reference" (torch, slow, readable), "auto": the fastest there is.
+        dtype: precision of the fields, float32 or float64.
+        max_periods: periods of the drive after which a simulation ends in any case, with a
+            `SteadyStateWarning`. They are stepped in blocks of a few, and the last block is finished.
+        time_step: at most this [s], and at least 97 % of it; by default the largest stable one.
+
+    Returns:
+        A propagator for the scene.
+
+    Raises:
+        ValueError: an argument out of range; the message names it.
+    """
+    if not isinstance(scene, Scene):
+        raise invalid("scene", scene, "must be a Scene")
+    _require_one_of("method", method, METHODS)
+    _require_one_of("kernel", kernel, KERNELS)
+    dtype_name = str(dtype).removeprefix("torch.")
+    _require_one_of("dtype", dtype_name, tuple(DTYPES))
+    if spacing is not None:
+        spacing = positive("spacing", spacing, "m")
+    tolerance = positive("tolerance", tolerance)
+    if tolerance >= 1:
+        raise invalid("tolerance", tolerance, "must be in (0, 1)")
+    max_periods = integer_at_least("max_periods", max_periods, 1)
+    if time_step is not None:
+        time_step = positive("time_step", time_step, "s")
+    chosen = method if method != "auto" else "full" if scene.obstacles else "free_space"
+    propagator: FreeSpacePropagator | SimulatedPropagator
+    if chosen == "free_space":
+        propagator = FreeSpacePropagator(scene)
+    else:
+        settings = _make_kernel(kernel), DTYPES[dtype_name], max_periods
+        if spacing is None:
+            tolerance /= 2
+            spacing = _chosen_spacing(scene, tolerance, *settings)
+        kind = BoxPropagator if chosen == "box" else FullPropagator
+        propagator = kind(scene, spacing, tolerance, *settings, time_step)
+    if method == "auto":
+        reason = (
+            f"{len(scene.obstacles)} obstacles" if scene.obstacles else "no obstacles: nothing to simulate"
+        )
+        logger.info("method auto: %s (%s)", chosen, reason)
+    return propagator
+
+
+def _chosen_spacing(
+    scene: Scene, tolerance: float, kernel: Kernel, dtype: torch.dtype, max_periods: int
+) -> float:
+    """Spacing [m] at which the grid's error should be `tolerance`, told from two coarse grids."""
+    coarsest = coarsest_spacing(scene)
+    pilot = min(scene.wavelength / PILOT_CELLS, coarsest)
+    near_steady = max(tolerance, 1e-3)
+    propagator = FullPropagator(scene, pilot, near_steady, kernel, dtype, max_periods, None)
+    _, error = propagator.transfer_matrix(return_error=True)
+    spacing = min(spacing_for(tolerance, error, pilot), coarsest)
+    logger.info("spacing %.3g mm: the error at %.3g mm is about %.2g", 1e3 * spacing, 1e3 * pilot, error)
+    return spacing
+
+
+def _require_one_of(name: str, value: object, accepted: tuple[str, ...]) -> None:
+    if value not in accepted:
+        raise invalid(name, value, f"must be one of {', '.join(accepted)}")

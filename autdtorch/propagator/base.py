@@ -1,0 +1,221 @@
+"""What propagators have in common: their protocol, and how one that simulates makes a transfer matrix."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, Protocol, Self, overload
+
+import torch
+
+from autdtorch.array import Nodes
+from autdtorch.drive import validate_drive
+from autdtorch.fdtd.kernels.contract import Kernel
+from autdtorch.fdtd.spacing import grid_error, second_spacing
+from autdtorch.fdtd.steady_state import SteadyState
+from autdtorch.fdtd.stepping import Assembly
+from autdtorch.scene import Scene
+from autdtorch.validation import ArrayLike
+
+logger = logging.getLogger(__name__)
+
+
+MOST_JUDGED = 64
+"""Targets whose pressure decides when a run has settled."""
+
+
+class SteadyStateWarning(UserWarning):
+    """A simulation ended before its steady state was reached."""
+
+
+class Propagator(Protocol):
+    """What carries sound from a scene's transducers to points.
+
+    Attributes:
+        scene: the scene it was made for.
+    """
+
+    scene: Scene
+
+    def transfer_matrix(self, points: ArrayLike | None = None) -> torch.Tensor:
+        """Pressure [Pa] at points (P, 3) [m] per unit drive of each transducer: complex128 (P, M)."""
+        ...
+
+    def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
+        """Pressure [Pa] of drives (..., M) at points (P, 3) [m]: complex128 (..., P)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Run:
+    """One simulation, as it went.
+
+    Attributes:
+        periods: periods of the drive that were stepped.
+        remaining: estimated relative distance to the steady state.
+        reached: whether that is within the tolerance.
+        seconds: time it took.
+    """
+
+    periods: int
+    remaining: float
+    reached: bool
+    seconds: float
+
+
+class SimulatedPropagator(ABC):
+    """A propagator that steps a grid to the steady state of the drive.
+
+    Attributes:
+        scene: the scene it was made for.
+        spacing: edge of a cell [m].
+        tolerance: relative distance to the steady state at which a run ends.
+        max_periods: periods after which it ends in any case, with a `SteadyStateWarning`.
+        time_step: the one in use [s].
+        runs: what every simulation took, in order.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        spacing: float,
+        tolerance: float,
+        kernel: Kernel,
+        dtype: torch.dtype,
+        max_periods: int,
+        time_step: float | None,
+    ) -> None:
+        """Use `make_propagator`, which checks its arguments."""
+        self.scene = scene
+        self.spacing = spacing
+        self.tolerance = tolerance
+        self.max_periods = max_periods
+        self.runs: list[Run] = []
+        self._kernel = kernel
+        self._assembly = self._assembled(dtype, time_step)
+        self.time_step = 1 / (scene.frequency * float(self._assembly.steps_per_period))
+
+    @abstractmethod
+    def _assembled(self, dtype: torch.dtype, time_step: float | None) -> Assembly:
+        """The scene on its grid."""
+
+    @abstractmethod
+    def _checked(self, points: ArrayLike) -> torch.Tensor:
+        """Points (P, 3) where the field can be told."""
+
+    @abstractmethod
+    def _backward(self, points: torch.Tensor) -> bool:
+        """Whether the transfer matrix is simulated from the points, by reciprocity."""
+
+    @abstractmethod
+    def _simulate(self, origins: Nodes, strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
+        """Pressure (P,) of N origins with strengths (N,), as the mean over the nodes of each of P targets."""
+
+    @cached_property
+    def _control_matrix(self) -> torch.Tensor:
+        return self._simulated_matrix(self.scene.control_points)
+
+    @cached_property
+    def _second(self) -> Self:
+        """The same on another grid, which tells the error of this one."""
+        spacing = second_spacing(self.scene, self.spacing)
+        return type(self)(
+            self.scene, spacing, self.tolerance, self._kernel, self._assembly.dtype, self.max_periods, None
+        )
+
+    @overload
+    def transfer_matrix(
+        self, points: ArrayLike | None = None, return_error: Literal[False] = False
+    ) -> torch.Tensor: ...
+
+    @overload
+    def transfer_matrix(
+        self, points: ArrayLike | None = None, *, return_error: Literal[True]
+    ) -> tuple[torch.Tensor, float]: ...
+
+    def transfer_matrix(
+        self, points: ArrayLike | None = None, return_error: bool = False
+    ) -> torch.Tensor | tuple[torch.Tensor, float]:
+        """Transfer matrix G from one simulation a point or one a transducer, whichever are fewer.
+
+        Waves travel from a point to the transducers as they travel back (reciprocity): P simulations do
+        instead of M, unless a point is next to an obstacle. The matrix of the control points is kept.
+
+        Args:
+            points: (P, 3) [m], for `FullPropagator` inside the domain; by default the scene's control points.
+            return_error: also return the estimated relative error (L2 of the whole matrix): what a second
+                grid tells, a fifth of the cost where it is coarser, and the distance to the steady state.
+
+        Returns:
+            complex128 (P, M) [Pa], and the error if asked for.
+
+        Raises:
+            ValueError: `points` are not finite, have another shape or leave the domain.
+        """
+        before = 0 if points is None else len(self.runs)
+        matrix = (
+            self._control_matrix.clone() if points is None else self._simulated_matrix(self._checked(points))
+        )
+        if not return_error:
+            return matrix
+        steady = max((run.remaining for run in self.runs[before:]), default=0.0)
+        second = self._second.transfer_matrix(points)
+        return matrix, steady + grid_error(matrix, second, coarser=self._second.spacing > self.spacing)
+
+    def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
+        """Pressure of drives at points, from a simulation a drive or from the transfer matrix.
+
+        Args:
+            drive: (..., M) complex, |q| <= 1.
+            points: (P, 3) [m], for `FullPropagator` inside the domain.
+
+        Returns:
+            complex128 (..., P) [Pa]; differentiable by the drive, through the transfer matrix.
+
+        Raises:
+            ValueError: drive or points of another shape or out of range.
+        """
+        drive, points = validate_drive(drive, len(self.scene.array)), self._checked(points)
+        flat = drive.reshape(-1, drive.shape[-1])
+        array, nodes = self.scene.array, self.scene.array.nodes
+        fewest = len(points) if self._backward(points) else len(array)
+        if drive.requires_grad or len(flat) > fewest:
+            return drive @ self._simulated_matrix(points).mT
+        field = torch.zeros((len(flat), len(points)), dtype=torch.complex128)
+        for row, strength in zip(field, array.source_strength * flat, strict=True):
+            row.copy_(self._simulate(nodes, strength, single_nodes(points)))
+        return field.reshape(*drive.shape[:-1], len(points))
+
+    def _simulated_matrix(self, points: torch.Tensor) -> torch.Tensor:
+        transducers, targets = self.scene.array.nodes, single_nodes(points)
+        strength = torch.full((1,), self.scene.array.source_strength, dtype=torch.complex128)
+        if self._backward(points):
+            logger.info("transfer matrix: %d runs from the points", len(points))
+            rows = [self._simulate(point, strength, transducers) for point in _one_by_one(targets)]
+            return torch.stack(rows)
+        logger.info("transfer matrix: %d runs from the transducers", len(self.scene.array))
+        columns = [self._simulate(transducer, strength, targets) for transducer in _one_by_one(transducers)]
+        return torch.stack(columns, dim=1)
+
+    def _note(self, steady: SteadyState, seconds: float) -> None:
+        self.runs.append(Run(steady.periods, steady.remaining, steady.reached, seconds))
+        logger.info("run of %d periods, %.1e from steady, %.1f s", steady.periods, steady.remaining, seconds)
+        if not steady.reached:
+            warnings.warn(
+                f"no steady state after {steady.periods} periods: still about {steady.remaining:.1e} away "
+                f"(relative), tolerance {self.tolerance:g}; raise max_periods or tolerance",
+                SteadyStateWarning,
+                stacklevel=2,
+            )
+
+
+def single_nodes(points: torch.Tensor) -> Nodes:
+    """Points (P, 3) as sources or receivers of one node each."""
+    return Nodes(points[:, None], torch.ones(1, dtype=torch.float64))
+
+
+def _one_by_one(nodes: Nodes) -> list[Nodes]:
+    return [Nodes(positions[None], nodes.weights) for positions in nodes.positions]

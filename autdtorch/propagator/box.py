@@ -1,0 +1,62 @@
+"""FDTD of the scattered field in a box around the obstacles, exact everywhere else."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+
+import torch
+
+from autdtorch.array import Nodes
+from autdtorch.fdtd.grid import make_box
+from autdtorch.fdtd.scatter import Scattering
+from autdtorch.fdtd.steady_state import run_to_steady_state
+from autdtorch.fdtd.stepping import Assembly, assemble_on
+from autdtorch.propagator.base import MOST_JUDGED, SimulatedPropagator
+from autdtorch.validation import ArrayLike, points_tensor
+
+logger = logging.getLogger(__name__)
+
+
+class BoxPropagator(SimulatedPropagator):
+    """FDTD in a box around the obstacles; see `SimulatedPropagator`.
+
+    The incident field and the way from the box to the points are exact (Green's function): array and points
+    cost no grid, wherever they are.
+    """
+
+    def _assembled(self, dtype: torch.dtype, time_step: float | None) -> Assembly:
+        assembly = assemble_on(make_box(self.scene, self.spacing), self.scene, dtype, time_step)
+        self._scattering = Scattering(assembly, self.scene.complex_wavenumber)
+        return assembly
+
+    def _checked(self, points: ArrayLike) -> torch.Tensor:
+        return points_tensor("points", points).cpu()
+
+    def _backward(self, points: torch.Tensor) -> bool:
+        in_obstacle = any(obstacle.contains(points).any() for obstacle in self.scene.obstacles)
+        return len(points) < len(self.scene.array) and not in_obstacle
+
+    @torch.no_grad()
+    def _simulate(self, origins: Nodes, strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
+        if not strength.any():
+            return torch.zeros(len(targets.positions), dtype=torch.complex128)
+        begin = time.perf_counter()
+        assembly, kernel, scattering = self._assembly, self._kernel, self._scattering
+        sources = scattering.sources(origins, strength)
+        points = targets.positions
+        incident = scattering.incident(points.reshape(-1, 3), origins, strength)
+        pressure = incident.reshape(points.shape[:-1]) @ targets.weights.to(incident.dtype)
+        reach = scattering.reach(targets)
+        every = math.ceil(len(points) / MOST_JUDGED)
+        steady = run_to_steady_state(
+            assembly, kernel, sources, reach.cells, self.tolerance, self.max_periods,
+            lambda phasor: pressure[::every] + reach.field(phasor, every),
+        )  # fmt: skip
+        pressure = pressure + reach.field(steady.pressure)
+        for obstacle in self.scene.obstacles:
+            if obstacle.rigid:
+                pressure[obstacle.contains(points).any(dim=1)] = 0
+        self._note(steady, time.perf_counter() - begin)
+        return pressure

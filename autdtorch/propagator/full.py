@@ -1,0 +1,70 @@
+"""FDTD on the whole domain."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+
+import numpy as np
+import torch
+from scipy.sparse import csr_array
+
+from autdtorch.array import Nodes
+from autdtorch.fdtd.points import footprint
+from autdtorch.fdtd.steady_state import run_to_steady_state
+from autdtorch.fdtd.stepping import Assembly, assemble
+from autdtorch.propagator.base import MOST_JUDGED, SimulatedPropagator
+from autdtorch.scene import require_inside
+from autdtorch.validation import ArrayLike, points_tensor
+
+logger = logging.getLogger(__name__)
+
+
+class FullPropagator(SimulatedPropagator):
+    """FDTD on the whole domain, in the steady state of the drive; see `SimulatedPropagator`."""
+
+    def _assembled(self, dtype: torch.dtype, time_step: float | None) -> Assembly:
+        return assemble(self.scene, self.spacing, dtype, time_step)
+
+    def _checked(self, points: ArrayLike) -> torch.Tensor:
+        points = points_tensor("points", points).cpu()
+        require_inside(self.scene.domain, "points", points)
+        return points
+
+    def _backward(self, points: torch.Tensor) -> bool:
+        """Whether the transfer matrix is simulated from the points, by reciprocity."""
+        fewer = len(points) < len(self.scene.array)
+        return fewer and not self._touches_obstacle(points)
+
+    def _touches_obstacle(self, points: torch.Tensor) -> bool:
+        """Whether a source there would not be all in air: then only the way from the transducers is right."""
+        varying = self._assembly.coefficients.varying_index.numpy()
+        return bool(np.isin(self._assembly.spread(points).index, varying).any())
+
+    @torch.no_grad()
+    def _simulate(self, origins: Nodes, strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
+        """Pressure (P,) of N origins with strengths (N,), as the mean over the nodes of each of P targets."""
+        points = targets.positions
+        if not strength.any():
+            return torch.zeros(len(points), dtype=torch.complex128)
+        begin = time.perf_counter()
+        assembly, kernel = self._assembly, self._kernel
+        if self._touches_obstacle(origins.positions.reshape(-1, 3)):
+            logger.warning(
+                "a source is within %.2g mm of an obstacle: less accurate; use a finer spacing than %.2g mm",
+                1e3 * assembly.grid.spacing * footprint(assembly.grid.kappa) / 2,
+                1e3 * assembly.grid.spacing,
+            )
+        sources = assembly.sources(origins.positions, strength, origins.weights)
+        spread = assembly.spread(points, targets.weights)
+        cells, place = np.unique(spread.index, return_inverse=True)
+        rows = np.arange(len(points)).repeat(spread.index.shape[1])
+        read = csr_array((spread.weight.ravel(), (rows, place.ravel())), (len(points), len(cells)))
+        some = read[:: math.ceil(len(points) / MOST_JUDGED)]
+        steady = run_to_steady_state(
+            assembly, kernel, sources, cells, self.tolerance, self.max_periods,
+            lambda phasor: torch.from_numpy(some @ phasor.numpy()),
+        )  # fmt: skip
+        self._note(steady, time.perf_counter() - begin)
+        return torch.from_numpy(read @ steady.pressure.numpy())
