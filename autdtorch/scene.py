@@ -336,6 +336,13 @@ def require_inside(domain: tuple[Vector, Vector], name: str, points: torch.Tenso
         raise invalid(f"{name}[{first}]", points[first], accepted, "m")
 
 
+def within(obstacle: Obstacle, domain: tuple[Vector, Vector]) -> bool:
+    """Whether an obstacle's bounding box lies in a domain."""
+    lower, upper = domain
+    corners = zip(obstacle.lower, obstacle.upper, lower, upper, strict=True)
+    return all(first <= low and high <= last for low, high, first, last in corners)
+
+
 def _require_in_domain(scene: Scene) -> None:
     for name, points in _contents(scene):
         require_inside(scene.domain, name, points)

@@ -35,7 +35,7 @@ import autdtorch as at
 from autdtorch import reference
 from autdtorch.freespace import free_space_matrix
 from autdtorch.geometry import plane_basis
-from autdtorch.propagator import FullPropagator
+from autdtorch.propagator import SimulatedPropagator
 
 ROOT = Path(__file__).parents[1]
 SCENES = ROOT / "configs" / "scene"
@@ -45,7 +45,7 @@ TOLERANCE = 1e-3
 SPACINGS = (2.0, 1.5, 1.0)  # [mm]
 FINE_SPACINGS = (0.5,)
 
-REFERENCE_SPACINGS = (0.5e-3, 1e-3 / 3)
+REFERENCE_SPACINGS = (0.5e-3, 1e-3 / 3, 0.25e-3, 0.2e-3)
 """All of them have the cubes' faces between cells, so that their errors are of one family."""
 
 AIR = at.Medium(density=1.293, sound_speed=340.0)
@@ -172,7 +172,7 @@ def make_reference() -> None:
     for name in CUBES:
         scene, matrices = load(name), []
         for spacing in REFERENCE_SPACINGS:
-            propagator = at.make_propagator(scene, "full", spacing, tolerance=TOLERANCE / 2)
+            propagator = at.make_propagator(scene, "box", spacing, tolerance=TOLERANCE / 2)
             matrices.append(propagator.transfer_matrix(scene.control_points[:1]))
             print(f"{name} at {spacing * 1e3:.4g} mm done", flush=True)
         limit = extrapolate(REFERENCE_SPACINGS, matrices, CUBE_ORDER)
@@ -188,8 +188,9 @@ def make_reference() -> None:
 def simulate(case: Case, spacing: float) -> Simulation:
     """The transfer matrix at `spacing` [mm]."""
     begin = time.perf_counter()
-    propagator = at.make_propagator(case.scene, "full", spacing * 1e-3, tolerance=TOLERANCE)
-    assert isinstance(propagator, FullPropagator)
+    method = "auto" if case.scene.obstacles else "full"
+    propagator = at.make_propagator(case.scene, method, spacing * 1e-3, tolerance=TOLERANCE)
+    assert isinstance(propagator, SimulatedPropagator)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", at.SteadyStateWarning)  # the report tells
         matrix = propagator.transfer_matrix(case.points)

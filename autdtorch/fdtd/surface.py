@@ -140,6 +140,9 @@ def cut_elements(
         stencil: weights in air.
     """
     count = len(materials.density)
+    # an obstacle that an element is wholly outside or inside of has no place in it
+    distance = np.where((distance > 0).all(axis=2, keepdims=True), FAR, distance)
+    distance = np.where((distance < 0).all(axis=2, keepdims=True), -FAR, distance)
     volumes = _shares(_volume_coverage, distance, material, count)
     lines = _shares(_line_coverage, distance, material, count)
     density = (lines @ materials.density).reshape(-1, len(PAIRS), SUBCELLS).mean(axis=2)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import logging
+import math
 
 import torch
 
+from autdtorch.fdtd.grid import make_box, make_grid
 from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.spacing import PILOT_CELLS, coarsest_spacing, spacing_for
 from autdtorch.propagator.base import Propagator, Run, SimulatedPropagator, SteadyStateWarning
 from autdtorch.propagator.box import BoxPropagator
 from autdtorch.propagator.free_space import FreeSpacePropagator
 from autdtorch.propagator.full import FullPropagator
-from autdtorch.scene import Scene
+from autdtorch.scene import Scene, within
 from autdtorch.validation import integer_at_least, invalid, positive
 
 __all__ = [
@@ -58,8 +60,10 @@ def make_propagator(
 
     Args:
         scene: what is simulated.
-        method: "free_space": exact, without obstacles. "full": FDTD on the whole domain. "auto": free space
-            where the scene has no obstacles, else full.
+        method: "free_space": exact, without obstacles. "full": FDTD on the whole domain. "box": FDTD of the
+            scattered field in a box around the obstacles, exact elsewhere, points outside the domain
+            included. "auto": free space where the scene has no obstacles, full where one reaches out of the
+            domain, else what needs fewer cells.
         spacing: edge of a cell [m], at most a third of the wavelength. The error falls with it; see
             docs/numerics.md. None: two coarse grids are simulated, and the spacing is chosen with which the
             error of the transfer matrix should stay below `tolerance`.
@@ -91,33 +95,48 @@ def make_propagator(
     max_periods = integer_at_least("max_periods", max_periods, 1)
     if time_step is not None:
         time_step = positive("time_step", time_step, "s")
-    chosen = method if method != "auto" else "full" if scene.obstacles else "free_space"
-    propagator: FreeSpacePropagator | SimulatedPropagator
-    if chosen == "free_space":
-        propagator = FreeSpacePropagator(scene)
-    else:
-        settings = _make_kernel(kernel), DTYPES[dtype_name], max_periods
-        if spacing is None:
-            tolerance /= 2
-            spacing = _chosen_spacing(scene, tolerance, *settings)
-        kind = BoxPropagator if chosen == "box" else FullPropagator
-        propagator = kind(scene, spacing, tolerance, *settings, time_step)
     if method == "auto":
-        reason = (
-            f"{len(scene.obstacles)} obstacles" if scene.obstacles else "no obstacles: nothing to simulate"
-        )
-        logger.info("method auto: %s (%s)", chosen, reason)
-    return propagator
+        method = _cheapest(scene, spacing or coarsest_spacing(scene))
+    if method == "box" and not scene.obstacles:
+        raise invalid("method", method, "needs a scene with obstacles; take free_space")
+    if method == "free_space":
+        return FreeSpacePropagator(scene)
+    kind = BoxPropagator if method == "box" else FullPropagator
+    settings = _make_kernel(kernel), DTYPES[dtype_name], max_periods
+    if spacing is None:
+        tolerance /= 2
+        spacing = _chosen_spacing(kind, scene, tolerance, *settings)
+    return kind(scene, spacing, tolerance, *settings, time_step)
+
+
+def _cheapest(scene: Scene, spacing: float) -> str:
+    """The method that tells the field of a scene with the fewest cells."""
+    if not scene.obstacles:
+        logger.info("method auto: free_space (no obstacles: nothing to simulate)")
+        return "free_space"
+    for index, obstacle in enumerate(scene.obstacles):
+        if not within(obstacle, scene.domain):
+            logger.info("method auto: full (obstacle %d reaches out of the domain)", index)
+            return "full"
+    full, box = (math.prod(make(scene, spacing).shape) for make in (make_grid, make_box))
+    chosen = "box" if box < full else "full"
+    logger.info("method auto: %s (box of %d cells, domain of %d)", chosen, box, full)
+    return chosen
 
 
 def _chosen_spacing(
-    scene: Scene, tolerance: float, kernel: Kernel, dtype: torch.dtype, max_periods: int
+    kind: type[BoxPropagator | FullPropagator],
+    scene: Scene,
+    tolerance: float,
+    kernel: Kernel,
+    dtype: torch.dtype,
+    max_periods: int,
 ) -> float:
     """Spacing [m] at which the grid's error should be `tolerance`, told from two coarse grids."""
     coarsest = coarsest_spacing(scene)
     pilot = min(scene.wavelength / PILOT_CELLS, coarsest)
     near_steady = max(tolerance, 1e-3)
-    propagator = FullPropagator(scene, pilot, near_steady, kernel, dtype, max_periods, None)
+    propagator = kind(scene, pilot, near_steady, kernel, dtype, max_periods, None)
     _, error = propagator.transfer_matrix(return_error=True)
     spacing = min(spacing_for(tolerance, error, pilot), coarsest)
     logger.info("spacing %.3g mm: the error at %.3g mm is about %.2g", 1e3 * spacing, 1e3 * pilot, error)

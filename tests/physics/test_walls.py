@@ -120,3 +120,16 @@ def test_walls_of_another_direction_end_before_the_layers(caplog: pytest.LogCapt
     before = x < assembly.grid.to_cells(torch.tensor([[FACE - 4e-3, 0, 0]]))[0, 0]
     assert before.any()
     assert (z[before] >= assembly.grid.first[2]).all()
+
+
+def test_an_obstacle_at_a_wall_leaves_its_rows_in_the_layers() -> None:
+    """It ends before them: there all rows along the wall are alike, also those beside its end."""
+    post = Box((FACE - 3e-3, 12e-3, 20e-3), (6e-3, 7e-3, 80e-3), density=40.0, sound_speed=1e3)
+    assembly = assemble(layered_scene((slab(), post), FRONT), 1e-3, torch.float64)
+    columns = assembly.coefficients.columns
+    x, _, z = np.unravel_index(columns.index[:, 1].numpy(), assembly.grid.shape)
+    for place in np.unique(x):
+        along = columns.weight[(x == place) & (z == 1)].numpy()
+        assert len(along) == assembly.grid.shape[1] - 2
+        # rounding of the distances
+        assert np.ptp(along, axis=0).max() < 1e-9
