@@ -125,7 +125,7 @@ def fill_elements(scene: Scene, grid: Grid, stencil: Stencil) -> ElementMedium:
 
 def _bodies(scene: Scene, stencil: Stencil) -> tuple[list[Body], Materials, NDArray[np.bool_]]:
     """Obstacles joined where consecutive ones share a material, and the materials that there are."""
-    air = scene.medium
+    air = Medium(scene.medium.density, scene.medium.sound_speed)  # what absorbs, absorbs everywhere
     known: list[Medium | None] = [air]
     bodies: list[Body] = []
     for obstacle, goes_on in zip(scene.obstacles, _going_on(scene), strict=True):

@@ -130,7 +130,7 @@ WRONG = [
     (["+scene.colour=red"], "scene: unknown key 'colour'"),
     (["solver.spacing=abc"], "solver: spacing: 'abc'; must be a real number"),
     (["solver.spacing=nan"], "solver: spacing: nan m; must be finite"),
-    (["solver.method=fast"], "solver: method: 'fast'; must be one of auto, free_space, full"),
+    (["solver.method=fast"], "solver: method: 'fast'; must be one of auto, free_space, box, full"),
     (["method.levels=1"], "method gabs: levels: 1; must be an integer >= 2"),
     (["trials=0"], "trials: 0; must be an integer >= 1"),
     (["seed=-1"], "seed: -1; must be an integer >= 0"),

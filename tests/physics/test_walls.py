@@ -127,9 +127,13 @@ def test_an_obstacle_at_a_wall_leaves_its_rows_in_the_layers() -> None:
     post = Box((FACE - 3e-3, 12e-3, 20e-3), (6e-3, 7e-3, 80e-3), density=40.0, sound_speed=1e3)
     assembly = assemble(layered_scene((slab(), post), FRONT), 1e-3, torch.float64)
     columns = assembly.coefficients.columns
-    x, _, z = np.unravel_index(columns.index[:, 1].numpy(), assembly.grid.shape)
-    for place in np.unique(x):
-        along = columns.weight[(x == place) & (z == 1)].numpy()
+    inwards = columns.index[:, 1] - columns.index[:, 0] == 1  # along z, from its lower end
+    weight, x = (
+        columns.weight[inwards].numpy(),
+        columns.index[inwards, 0] // math.prod(assembly.grid.shape[1:]),
+    )
+    for place in x.unique():
+        along = weight[(x == place).numpy()]
         assert len(along) == assembly.grid.shape[1] - 2
         # rounding of the distances
         assert np.ptp(along, axis=0).max() < 1e-9
