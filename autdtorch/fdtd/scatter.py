@@ -46,18 +46,21 @@ class Scattering:
         assembly = self.assembly
         index = assembly.varying.index
         cells, place = self._driven
-        field = self.incident(self._positions(cells), origins, strength).numpy()
+        nearest = _NEAREST * assembly.grid.spacing
+        field = self.incident(self._positions(cells), origins, strength, nearest).numpy()
         step = field[place] - field[place[:, 13]][:, None]
         factor = assembly.coefficients.face / assembly.stencil.face
         force = factor * ((assembly.varying.weight - assembly.stencil.weights) * step).sum(axis=1)
         dtype = torch.complex128 if assembly.dtype == torch.float64 else torch.complex64
         return Sources(torch.from_numpy(index), torch.from_numpy(force).to(dtype))
 
-    def incident(self, points: torch.Tensor, origins: Nodes, strength: torch.Tensor) -> torch.Tensor:
-        """Field (P,) in free space of N origins at points (P, 3) [m]."""
+    def incident(
+        self, points: torch.Tensor, origins: Nodes, strength: torch.Tensor, nearest: float = 0.0
+    ) -> torch.Tensor:
+        """Field (P,) in free space of N origins at points (P, 3) [m], at least `nearest` [m] off."""
         nodes, shares = origins.positions.reshape(-1, 3), origins.weights.repeat(len(strength))
         amplitude = strength.repeat_interleave(len(origins.weights)) * shares
-        return self._sum(points, nodes, amplitude, _NEAREST * self.assembly.grid.spacing)
+        return self._sum(points, nodes, amplitude, nearest)
 
     def reach(self, targets: Nodes) -> Reach:
         """How the scattered field gets to P targets, as the mean over the nodes of each."""

@@ -25,8 +25,11 @@ from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, drive_signal, lock_i
 _PARTS = 4
 """Phasors a block."""
 
-_MOST_PHASORS = 64
-"""That are kept to extrapolate from."""
+_FEWEST_PHASORS, _MOST_PHASORS = 12, 64
+"""That are kept to extrapolate from: the more the better, as far as `_MOST_NUMBERS` reach."""
+
+_MOST_NUMBERS = 20_000_000
+"""That they hold, 320 MB."""
 
 _MOST_FITTED = 8192
 """Cells whose phasors decide the means; of more, this many."""
@@ -78,7 +81,8 @@ def run_to_steady_state(
     """
     crossing = assembly.grid.diagonal / assembly.grid.wavelength
     earliest = RAMP_PERIODS + math.ceil(2 * crossing)
-    phasors: deque[NDArray[np.complex128]] = deque(maxlen=_MOST_PHASORS)
+    kept = min(max(_FEWEST_PHASORS, _MOST_NUMBERS // len(cells)), _MOST_PHASORS)
+    phasors: deque[NDArray[np.complex128]] = deque(maxlen=kept)
     values: deque[torch.Tensor] = deque(maxlen=3)
     ramp = math.ceil(RAMP_PERIODS * assembly.steps_per_period)
     for count, windows in _windows(assembly, kernel, sources, cells):

@@ -14,7 +14,7 @@ from autdtorch.fdtd.scatter import Scattering
 from autdtorch.fdtd.steady_state import run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble_on
 from autdtorch.propagator.base import MOST_JUDGED, SimulatedPropagator
-from autdtorch.validation import ArrayLike, points_tensor
+from autdtorch.validation import LENGTH_TOLERANCE, ArrayLike, distances, invalid, points_tensor
 
 logger = logging.getLogger(__name__)
 
@@ -32,7 +32,13 @@ class BoxPropagator(SimulatedPropagator):
         return assembly
 
     def _checked(self, points: ArrayLike) -> torch.Tensor:
-        return points_tensor("points", points).cpu()
+        points = points_tensor("points", points).cpu()
+        nearest = distances(points, self.scene.array.nodes.positions.reshape(-1, 3)).amin(dim=1)
+        if nearest.min() < LENGTH_TOLERANCE:
+            index = int(nearest.argmin())
+            accepted = f"lies on a transducer, must be at least {LENGTH_TOLERANCE:g} m away"
+            raise invalid(f"points[{index}]", points[index], accepted, "m")
+        return points
 
     def _backward(self, points: torch.Tensor) -> bool:
         in_obstacle = any(obstacle.contains(points).any() for obstacle in self.scene.obstacles)

@@ -91,6 +91,13 @@ def test_auto_takes_what_has_fewer_cells(caplog: pytest.LogCaptureFixture) -> No
         assert reason in caplog.text
 
 
+def test_points_on_a_transducer_are_refused() -> None:
+    scene = small_scene((CUBE,))
+    points = [[20e-3, 3e-3, 3e-3], scene.array.positions[2].tolist()]
+    with pytest.raises(ValueError, match=r"points\[1\]: .* lies on a transducer, must be at least"):
+        make_propagator(scene, "box", 2e-3).transfer_matrix(points)
+
+
 def test_a_box_needs_obstacles() -> None:
     with pytest.raises(ValueError, match="method: 'box'; needs a scene with obstacles"):
         make_propagator(small_scene(), "box")
