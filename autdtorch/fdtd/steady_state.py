@@ -1,8 +1,8 @@
 """The steady state of a run: stepped block by block, its limit foretold from the phasors on the way.
 
-A block is the fewest periods that take a whole number of steps. Phasors of windows as long as a block, a
-quarter of a block apart, follow x_(n+1) = A x_n + b, as the scheme is linear. Reduced rank extrapolation
-(Eddy 1979; Sidi 2017) finds the fixed point: of all means sum g_j x_j with sum g_j = 1 it takes the one whose
+A block is the fewest periods, three at least, that take a whole number of steps. Phasors of windows as long
+as a block, a quarter of a block apart, follow x_(n+1) = A x_n + b, as the scheme is linear. Reduced rank
+extrapolation (Eddy 1979; Sidi 2017) finds the fixed point: of all means sum g_j x_j with sum g_j = 1 it takes the one whose
 differences, sum g_j (x_(j+1) - x_j), are smallest. That removes the slowest modes first, those of cavities.
 """
 
@@ -13,7 +13,6 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from fractions import Fraction
 
 import numpy as np
 import torch
@@ -21,6 +20,9 @@ from numpy.typing import NDArray
 
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources
 from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, drive_signal, lock_in
+
+_FEWEST_PERIODS = 3
+"""Of a block. Shorter ones cost more work between the steps, and the phasors kept reach less far back."""
 
 _PARTS = 4
 """Phasors a block."""
@@ -114,7 +116,8 @@ def _windows(
 ) -> Iterator[tuple[int, list[tuple[int, NDArray[np.complex128]]]]]:
     """Step from silence; after each block the periods so far, and first step and phasors of its windows."""
     steps_per_period = assembly.steps_per_period
-    steps, periods = steps_per_period.numerator, steps_per_period.denominator
+    parts = math.ceil(_FEWEST_PERIODS / steps_per_period.denominator)
+    steps, periods = parts * steps_per_period.numerator, parts * steps_per_period.denominator
     shift = max(1, steps // _PARTS)
     receivers = Receivers(torch.from_numpy(cells[:, None]), torch.ones((len(cells), 1), dtype=assembly.dtype))
     state, earlier = assembly.silence(sources), torch.zeros((steps, len(cells)), dtype=assembly.dtype)
@@ -127,15 +130,14 @@ def _windows(
         windows = [(end - steps, both[end - first : end - first + steps]) for end in ends]
         yield (
             (block + 1) * periods,
-            [(start, _turned(window, start, steps_per_period)) for start, window in windows],
+            [(start, _turned(window, start, periods)) for start, window in windows],
         )
         earlier = recorded
 
 
-def _turned(window: torch.Tensor, start: int, steps_per_period: Fraction) -> NDArray[np.complex128]:
-    """Phasors (k,) of a window of recorded pressures (steps, k) that follows step `start`."""
-    steps, periods = steps_per_period.numerator, steps_per_period.denominator
-    turn = 2 * math.pi * (start * periods % steps) / steps
+def _turned(window: torch.Tensor, start: int, periods: int) -> NDArray[np.complex128]:
+    """Phasors (k,) of a window of `periods`, recorded (steps, k) after each step that follows `start`."""
+    turn = 2 * math.pi * (start * periods % len(window)) / len(window)
     return np.asarray(lock_in(window, periods).numpy() * complex(math.cos(turn), math.sin(turn)))
 
 
