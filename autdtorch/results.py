@@ -64,7 +64,7 @@ class Simulation:
     """How the field of a scene was computed.
 
     Attributes:
-        method: "free_space" (exact) or "full" (FDTD).
+        method: "free_space" (exact), "box" or "full" (FDTD).
         wavelength: in the medium [m].
         spacing: edge of a cell [m]; None in free space, as is `tolerance`.
         tolerance: relative distance to the steady state at which a run ends.

@@ -132,9 +132,9 @@ class Scene:
             obstacles: may touch and overlap; where they do, the later one counts.
             observation_plane: where pictures and areas are taken.
             domain: corners (lower, upper) [m] around array, control points and observation plane. Obstacles
-                may reach beyond it: parallel walls and slabs across it then go on without end, others
-                end there. By default the bounding box of everything, obstacles included, and two wavelengths
-                more on each side.
+                may reach beyond it: parallel walls and slabs across it then go on without end, others end
+                before it. By default the bounding box of everything, obstacles included, and two
+                wavelengths more on each side.
             name: for titles and file names.
 
         Raises:
@@ -334,13 +334,6 @@ def require_inside(domain: tuple[Vector, Vector], name: str, points: torch.Tenso
         first = int(outside.nonzero()[0, 0])
         accepted = f"must be inside the domain, {domain[0]} to {domain[1]} m"
         raise invalid(f"{name}[{first}]", points[first], accepted, "m")
-
-
-def within(obstacle: Obstacle, domain: tuple[Vector, Vector]) -> bool:
-    """Whether an obstacle's bounding box lies in a domain."""
-    lower, upper = domain
-    corners = zip(obstacle.lower, obstacle.upper, lower, upper, strict=True)
-    return all(first <= low and high <= last for low, high, first, last in corners)
 
 
 def _require_in_domain(scene: Scene) -> None:

@@ -22,7 +22,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from autdtorch.metrics import focus_metrics
 from autdtorch.objective import Objective, SimulatedObjective
 from autdtorch.optim.base import Solution
-from autdtorch.propagator import FullPropagator, Propagator, make_propagator
+from autdtorch.propagator import Propagator, SimulatedPropagator, make_propagator
 from autdtorch.results import (
     RESULTS_FILE,
     MethodResult,
@@ -272,9 +272,11 @@ def _method_result(
 
 def _simulation(propagator: Propagator, matrix_seconds: float, plane_seconds: float) -> Simulation:
     wavelength = propagator.scene.wavelength
-    if isinstance(propagator, FullPropagator):
+    if isinstance(propagator, SimulatedPropagator):
         spacing, tolerance, runs = propagator.spacing, propagator.tolerance, tuple(propagator.runs)
-        return Simulation("full", wavelength, spacing, tolerance, runs, matrix_seconds, plane_seconds)
+        return Simulation(
+            propagator.method, wavelength, spacing, tolerance, runs, matrix_seconds, plane_seconds
+        )
     return Simulation("free_space", wavelength, None, None, (), matrix_seconds, plane_seconds)
 
 

@@ -30,9 +30,9 @@ FAIR_CELLS_PER_WAVELENGTH = 4.0
 MAX_CELLS = 10**9
 """More would take over 30 GB in single precision."""
 
-AROUND = 3
-"""Cells of air between the obstacles and the boundary layer of a box. The first may vary, the other two are
-those that radiate (`scatter.py`)."""
+AROUND = 5
+"""Cells of air between the obstacles and the boundary layer of a box. The first may vary, the next two are
+those that radiate, and the last two help to read points beside these (`scatter.py`)."""
 
 FINE_LAYER_CELLS, COARSE_LAYER_CELLS = 6, 8
 """Boundary layer from 6 cells per wavelength on, and of coarser grids. It reflects less than -68 dB up to 60
@@ -131,8 +131,8 @@ def make_grid(scene: Scene, spacing: float) -> Grid:
 
 def make_box(scene: Scene, spacing: float) -> Grid:
     """Cover the scene's obstacles, of which there must be some, with `AROUND` cells of air around them."""
-    lower = torch.tensor([obstacle.lower for obstacle in scene.obstacles]).amin(dim=0)
-    upper = torch.tensor([obstacle.upper for obstacle in scene.obstacles]).amax(dim=0)
+    lower = np.array([obstacle.lower for obstacle in scene.obstacles]).min(axis=0)
+    upper = np.array([obstacle.upper for obstacle in scene.obstacles]).max(axis=0)
     return _covering(scene, spacing, (lower.tolist(), upper.tolist()), AROUND)
 
 

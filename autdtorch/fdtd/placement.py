@@ -55,7 +55,8 @@ def _faces(scene: Scene, axis: int, origin: float) -> tuple[Array, Array, Array]
         inside = (place > low) & (place < high)
         parts.append(np.stack((place - origin, -outward if heavier else outward, area))[:, inside])
     place, first, area = np.concatenate(parts, axis=1)
-    return place, first, area
+    faces, own = np.unique(np.stack((place.round(9), first)), axis=1, return_inverse=True)
+    return faces[0], faces[1], np.bincount(own.ravel(), area, faces.shape[1]).astype(np.float64)
 
 
 def _flat_faces(obstacle: Obstacle, axis: int) -> tuple[Array, Array, Array]:

@@ -25,6 +25,10 @@ from autdtorch.fdtd.stepping import Assembly
 _AT_ONCE = 4_000_000
 """Pairs of points that Green's function is worked out for at once."""
 
+_BESIDE = 1.25
+"""Cells from the rim of the interior up to which points are not read. The outermost are not interpolated well;
+what radiates, two cells from the rim, is not a point source closer than half a cell."""
+
 _NEAREST = 0.5
 """Distance [cells] from a source at which the incident field is cut off; it is singular there."""
 
@@ -47,7 +51,7 @@ class Scattering:
         index = assembly.varying.index
         cells, place = self._driven
         nearest = _NEAREST * assembly.grid.spacing
-        field = self.incident(self._positions(cells), origins, strength, nearest).numpy()
+        field = self.incident(self.positions(cells), origins, strength, nearest).numpy()
         step = field[place] - field[place[:, 13]][:, None]
         factor = assembly.coefficients.face / assembly.stencil.face
         force = factor * ((assembly.varying.weight - assembly.stencil.weights) * step).sum(axis=1)
@@ -65,7 +69,7 @@ class Scattering:
     def reach(self, targets: Nodes) -> Reach:
         """How the scattered field gets to P targets, as the mean over the nodes of each."""
         _, surface, outward = self._surface
-        within = self._inside(targets.positions)
+        within = self.inside(targets.positions)
         spread = self.assembly.spread(targets.positions[within])
         cells, place = np.unique(np.concatenate((surface, spread.index.ravel())), return_inverse=True)
         from_surface = csr_array(
@@ -82,12 +86,12 @@ class Scattering:
         """Field (P,) at points (P, 3) [m] of the radiating cells with amplitudes (n,) [Pa m]."""
         return self._sum(points, self._surface[0], amplitude, 0.0)
 
-    def _inside(self, points: torch.Tensor) -> torch.Tensor:
-        """Which points (...) lie within the surface, where the field is that of the grid."""
+    def inside(self, points: torch.Tensor) -> torch.Tensor:
+        """Which points (..., 3) are read from the grid; others are far enough from the cells that radiate."""
         grid = self.assembly.grid
         cells = torch.from_numpy(grid.to_cells(points))
         first, last = torch.tensor(grid.first), torch.tensor(grid.last)
-        return ((cells > first) & (cells < last - 1)).all(dim=-1)
+        return ((cells > first + _BESIDE) & (cells < last - 1 - _BESIDE)).all(dim=-1)
 
     @cached_property
     def _driven(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -102,7 +106,7 @@ class Scattering:
         assembly = self.assembly
         grid, stencil = assembly.grid, assembly.stencil
         chi = np.zeros(grid.shape)
-        chi[tuple(slice(first + 1, last - 1) for first, last in zip(grid.first, grid.last, strict=True))] = 1
+        chi[tuple(slice(first + 3, last - 3) for first, last in zip(grid.first, grid.last, strict=True))] = 1
         interior = np.zeros(grid.shape, bool)
         interior[tuple(map(slice, grid.first, grid.last))] = True
         index = np.flatnonzero(interior)
@@ -115,9 +119,9 @@ class Scattering:
         factor = assembly.coefficients.face / stencil.face * grid.spacing
         value = factor / assembly.stencil.source_factor(float(assembly.steps_per_period))
         value = value * stencil.weights[column] * step[row, column]
-        return self._positions(index), cells, csr_array((value, (row, place)), (len(index), len(cells)))
+        return self.positions(index), cells, csr_array((value, (row, place)), (len(index), len(cells)))
 
-    def _positions(self, cells: NDArray[np.int64]) -> torch.Tensor:
+    def positions(self, cells: NDArray[np.int64]) -> torch.Tensor:
         """Centres (n, 3) [m] of cells."""
         grid = self.assembly.grid
         places = np.stack(np.unravel_index(cells, grid.shape), axis=-1)

@@ -3,8 +3,8 @@
 A block is the fewest periods, three at least, that take a whole number of steps. Phasors of windows as long
 as a block, a quarter of a block apart, follow x_(n+1) = A x_n + b, as the scheme is linear. Reduced rank
 extrapolation (Eddy 1979; Sidi 2017) finds the fixed point: of all means sum g_j x_j with sum g_j = 1 it takes
-the one whose differences, sum g_j (x_(j+1) - x_j), are smallest. That removes the slowest modes first, those of
-cavities.
+the one whose differences, sum g_j (x_(j+1) - x_j), are smallest. That removes the slowest modes first, the
+cavities'.
 """
 
 from __future__ import annotations

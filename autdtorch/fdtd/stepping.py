@@ -85,6 +85,10 @@ class Assembly:
             spread.index, np.divide(weight, total, out=np.zeros_like(weight), where=total > 0.1)
         )
 
+    def touches_varying(self, points: torch.Tensor) -> bool:
+        """Whether any of the points (N, 3) [m], in the domain, is spread over cells that are not of air."""
+        return len(points) > 0 and bool(np.isin(self.spread(points).index, self.varying.index).any())
+
     def receivers(self, points: torch.Tensor, weights: torch.Tensor = _ONE_NODE) -> Receivers:
         """Receivers at points (P, 3) [m], or means over nodes (P, n, 3) with `weights` (n,)."""
         spread = self.spread(points, weights)

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import logging
-import math
 
 import torch
 
-from autdtorch.fdtd.grid import make_box, make_grid
 from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.spacing import PILOT_CELLS, coarsest_spacing, spacing_for
 from autdtorch.propagator.base import Propagator, Run, SimulatedPropagator, SteadyStateWarning
 from autdtorch.propagator.box import BoxPropagator
 from autdtorch.propagator.free_space import FreeSpacePropagator
 from autdtorch.propagator.full import FullPropagator
-from autdtorch.scene import Scene, within
+from autdtorch.scene import Scene
 from autdtorch.validation import integer_at_least, invalid, positive
 
 __all__ = [
@@ -62,8 +60,8 @@ def make_propagator(
         scene: what is simulated.
         method: "free_space": exact, without obstacles. "full": FDTD on the whole domain. "box": FDTD of the
             scattered field in a box around the obstacles, exact elsewhere, points outside the domain
-            included. "auto": free space where the scene has no obstacles, full where one reaches out of the
-            domain, else what needs fewer cells.
+            included; obstacles are simulated whole, also what of them reaches out of the domain. "auto": free
+            space where the scene has no obstacles, else full.
         spacing: edge of a cell [m], at most a third of the wavelength. The error falls with it; see
             docs/numerics.md. None: two coarse grids are simulated, and the spacing is chosen with which the
             error of the transfer matrix should stay below `tolerance`.
@@ -96,7 +94,10 @@ def make_propagator(
     if time_step is not None:
         time_step = positive("time_step", time_step, "s")
     if method == "auto":
-        method = _cheapest(scene, spacing or coarsest_spacing(scene))
+        method = "full" if scene.obstacles else "free_space"
+        count = len(scene.obstacles)
+        reason = f"{count} obstacles" if count else "no obstacles: nothing to simulate"
+        logger.info("method auto: %s (%s)", method, reason)
     if method == "box" and not scene.obstacles:
         raise invalid("method", method, "needs a scene with obstacles; take free_space")
     if method == "free_space":
@@ -107,21 +108,6 @@ def make_propagator(
         tolerance /= 2
         spacing = _chosen_spacing(kind, scene, tolerance, *settings)
     return kind(scene, spacing, tolerance, *settings, time_step)
-
-
-def _cheapest(scene: Scene, spacing: float) -> str:
-    """The method that tells the field of a scene with the fewest cells."""
-    if not scene.obstacles:
-        logger.info("method auto: free_space (no obstacles: nothing to simulate)")
-        return "free_space"
-    for index, obstacle in enumerate(scene.obstacles):
-        if not within(obstacle, scene.domain):
-            logger.info("method auto: full (obstacle %d reaches out of the domain)", index)
-            return "full"
-    full, box = (math.prod(make(scene, spacing).shape) for make in (make_grid, make_box))
-    chosen = "box" if box < full else "full"
-    logger.info("method auto: %s (box of %d cells, domain of %d)", chosen, box, full)
-    return chosen
 
 
 def _chosen_spacing(

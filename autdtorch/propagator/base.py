@@ -7,13 +7,14 @@ import warnings
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, Protocol, Self, overload
+from typing import ClassVar, Literal, Protocol, Self, overload
 
 import torch
 
 from autdtorch.array import Nodes
 from autdtorch.drive import validate_drive
 from autdtorch.fdtd.kernels.contract import Kernel
+from autdtorch.fdtd.points import footprint
 from autdtorch.fdtd.spacing import grid_error, second_spacing
 from autdtorch.fdtd.steady_state import SteadyState
 from autdtorch.fdtd.stepping import Assembly
@@ -70,6 +71,7 @@ class SimulatedPropagator(ABC):
     """A propagator that steps a grid to the steady state of the drive.
 
     Attributes:
+        method: by which `make_propagator` calls it.
         scene: the scene it was made for.
         spacing: edge of a cell [m].
         tolerance: relative distance to the steady state at which a run ends.
@@ -77,6 +79,8 @@ class SimulatedPropagator(ABC):
         time_step: the one in use [s].
         runs: what every simulation took, in order.
     """
+
+    method: ClassVar[str]
 
     def __init__(
         self,
@@ -107,12 +111,27 @@ class SimulatedPropagator(ABC):
         """Points (P, 3) where the field can be told."""
 
     @abstractmethod
-    def _backward(self, points: torch.Tensor) -> bool:
-        """Whether the transfer matrix is simulated from the points, by reciprocity."""
+    def _near_obstacle(self, points: torch.Tensor) -> bool:
+        """Whether a source at any of the points (N, 3) would not be all in air, on the grid."""
 
     @abstractmethod
     def _simulate(self, origins: Nodes, strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
         """Pressure (P,) of N origins with strengths (N,), as the mean over the nodes of each of P targets."""
+
+    def _backward(self, points: torch.Tensor) -> bool:
+        """Whether the transfer matrix is simulated from the points, by reciprocity.
+
+        Next to an obstacle only the way from the transducers is right.
+        """
+        return len(points) < len(self.scene.array) and not self._near_obstacle(points)
+
+    def _warn_near_obstacle(self, origins: Nodes) -> None:
+        grid = self._assembly.grid
+        if self._near_obstacle(origins.positions.reshape(-1, 3)):
+            logger.warning(
+                "a source is within %.2g mm of an obstacle: less accurate; use a finer spacing than %.2g mm",
+                1e3 * grid.spacing * footprint(grid.kappa) / 2, 1e3 * grid.spacing,
+            )  # fmt: skip
 
     @cached_property
     def _control_matrix(self) -> torch.Tensor:
@@ -153,7 +172,8 @@ class SimulatedPropagator(ABC):
             complex128 (P, M) [Pa], and the error if asked for.
 
         Raises:
-            ValueError: `points` are not finite, have another shape or leave the domain.
+            ValueError: `points` are not finite, have another shape, leave the domain (`FullPropagator`) or
+                lie on a transducer (`BoxPropagator`).
         """
         before = 0 if points is None else len(self.runs)
         matrix = (

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import time
 
@@ -11,18 +10,17 @@ import torch
 from scipy.sparse import csr_array
 
 from autdtorch.array import Nodes
-from autdtorch.fdtd.points import footprint
 from autdtorch.fdtd.steady_state import run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble
 from autdtorch.propagator.base import MOST_JUDGED, SimulatedPropagator
 from autdtorch.scene import require_inside
 from autdtorch.validation import ArrayLike, points_tensor
 
-logger = logging.getLogger(__name__)
-
 
 class FullPropagator(SimulatedPropagator):
     """FDTD on the whole domain, in the steady state of the drive; see `SimulatedPropagator`."""
+
+    method = "full"
 
     def _assembled(self, dtype: torch.dtype, time_step: float | None) -> Assembly:
         return assemble(self.scene, self.spacing, dtype, time_step)
@@ -32,15 +30,8 @@ class FullPropagator(SimulatedPropagator):
         require_inside(self.scene.domain, "points", points)
         return points
 
-    def _backward(self, points: torch.Tensor) -> bool:
-        """Whether the transfer matrix is simulated from the points, by reciprocity."""
-        fewer = len(points) < len(self.scene.array)
-        return fewer and not self._touches_obstacle(points)
-
-    def _touches_obstacle(self, points: torch.Tensor) -> bool:
-        """Whether a source there would not be all in air: then only the way from the transducers is right."""
-        varying = self._assembly.coefficients.varying_index.numpy()
-        return bool(np.isin(self._assembly.spread(points).index, varying).any())
+    def _near_obstacle(self, points: torch.Tensor) -> bool:
+        return self._assembly.touches_varying(points)
 
     @torch.no_grad()
     def _simulate(self, origins: Nodes, strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
@@ -50,12 +41,7 @@ class FullPropagator(SimulatedPropagator):
             return torch.zeros(len(points), dtype=torch.complex128)
         begin = time.perf_counter()
         assembly, kernel = self._assembly, self._kernel
-        if self._touches_obstacle(origins.positions.reshape(-1, 3)):
-            logger.warning(
-                "a source is within %.2g mm of an obstacle: less accurate; use a finer spacing than %.2g mm",
-                1e3 * assembly.grid.spacing * footprint(assembly.grid.kappa) / 2,
-                1e3 * assembly.grid.spacing,
-            )
+        self._warn_near_obstacle(origins)
         sources = assembly.sources(origins.positions, strength, origins.weights)
         spread = assembly.spread(points, targets.weights)
         cells, place = np.unique(spread.index, return_inverse=True)

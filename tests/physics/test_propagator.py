@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import logging
 import math
 
 import pytest
@@ -16,6 +17,7 @@ from autdtorch.geometry import plane_basis
 from autdtorch.objective import SimulatedObjective
 from autdtorch.propagator import (
     FreeSpacePropagator,
+    FullPropagator,
     SteadyStateWarning,
     make_propagator,
 )
@@ -203,6 +205,13 @@ def test_field_is_linear_and_differentiable_in_the_drive() -> None:
     phase = field[0, 1].detach() / field[0, 1].detach().abs()
     assert torch.allclose(drive.grad[0], phase * matrix[1].conj(), rtol=1e-6)
     assert not propagator.transfer_matrix(points).requires_grad
+
+
+def test_auto_skips_the_grid_where_nothing_scatters(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO):
+        assert isinstance(make_propagator(small_scene()), FreeSpacePropagator)
+        assert isinstance(make_propagator(small_scene((CUBE,)), spacing=2e-3), FullPropagator)
+    assert "no obstacles: nothing to simulate" in caplog.text
 
 
 def test_free_space_says_that_it_leaves_obstacles_out(caplog: pytest.LogCaptureFixture) -> None:
