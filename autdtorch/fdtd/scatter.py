@@ -26,8 +26,8 @@ _AT_ONCE = 4_000_000
 """Pairs of points that Green's function is worked out for at once."""
 
 _BESIDE = 1.25
-"""Cells from the rim of the interior up to which points are not read. The outermost are not interpolated well;
-what radiates, two cells from the rim, is not a point source closer than half a cell."""
+"""Cells from the rim of the interior up to which points are not read. The outermost are not interpolated
+well; what radiates, two cells from the rim, is not a point source closer than half a cell."""
 
 _NEAREST = 0.5
 """Distance [cells] from a source at which the incident field is cut off; it is singular there."""
