@@ -10,6 +10,7 @@ little on average; a face along the grid has one.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,16 +33,42 @@ _WORTHWHILE = 0.9
 """Share of the miss, of a grid that begins at the domain's corner, below which another place is taken."""
 
 
+@dataclass(frozen=True)
+class _Triangles:
+    """An obstacle's surface.
+
+    Attributes:
+        corner: first corner of each triangle (n, 3) [m].
+        normal: outward (n, 3), of twice the triangle's area [m^2].
+    """
+
+    corner: Array
+    normal: Array
+
+    @classmethod
+    def of(cls, obstacle: Obstacle) -> _Triangles:
+        vertices, triangles = (part.numpy() for part in obstacle.surface())
+        first, second, third = np.moveaxis(vertices[triangles], 1, 0)
+        return cls(first, np.cross(second - first, third - first))
+
+    def across(self, axis: int) -> tuple[Array, Array, Array]:
+        """Those across an axis: coordinate [m], sign of the normal along the axis, area [m^2]."""
+        double = np.linalg.norm(self.normal, axis=1)
+        flat = np.abs(self.normal[:, axis]) > _ALONG * double
+        return self.corner[flat, axis], np.sign(self.normal[flat, axis]), double[flat] / 2
+
+
 def grid_offset(scene: Scene, spacing: float, lower: Sequence[float]) -> tuple[float, float, float]:
     """How far below a grid's lower corner (3,) [m] its first cell should begin, per axis [cells], in [0, 1).
 
     Zero if no obstacle has flat faces along the grid, or if they lie as well as they can.
     """
-    x, y, z = (_axis_offset(*_faces(scene, axis, low), spacing) for axis, low in enumerate(lower))
+    surfaces = [_Triangles.of(obstacle) for obstacle in scene.obstacles]
+    x, y, z = (_axis_offset(*_faces(scene, surfaces, axis, low), spacing) for axis, low in enumerate(lower))
     return x, y, z
 
 
-def _faces(scene: Scene, axis: int, origin: float) -> tuple[Array, Array, Array]:
+def _faces(scene: Scene, surfaces: list[_Triangles], axis: int, origin: float) -> tuple[Array, Array, Array]:
     """Faces across an axis within the domain.
 
     Their distance from an origin [m], 1 where the lighter side comes first and -1 where the heavier
@@ -49,24 +76,14 @@ def _faces(scene: Scene, axis: int, origin: float) -> tuple[Array, Array, Array]
     """
     low, high = (corner[axis] for corner in scene.domain)
     parts = [np.zeros((3, 0))]
-    for obstacle in scene.obstacles:
-        place, outward, area = _flat_faces(obstacle, axis)
+    for obstacle, surface in zip(scene.obstacles, surfaces, strict=True):
+        place, outward, area = surface.across(axis)
         heavier = obstacle.density is None or obstacle.density >= scene.medium.density
         inside = (place > low) & (place < high)
         parts.append(np.stack((place - origin, -outward if heavier else outward, area))[:, inside])
     place, first, area = np.concatenate(parts, axis=1)
     faces, own = np.unique(np.stack((place.round(9), first)), axis=1, return_inverse=True)
     return faces[0], faces[1], np.bincount(own.ravel(), area, faces.shape[1]).astype(np.float64)
-
-
-def _flat_faces(obstacle: Obstacle, axis: int) -> tuple[Array, Array, Array]:
-    """Triangles across an axis: coordinate [m], sign of the outward normal along the axis, area [m^2]."""
-    vertices, triangles = (part.numpy() for part in obstacle.surface())
-    corners = vertices[triangles]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    double = np.linalg.norm(normal, axis=1)
-    flat = np.abs(normal[:, axis]) > _ALONG * double
-    return corners[flat, 0, axis], np.sign(normal[flat, axis]), double[flat] / 2
 
 
 def _axis_offset(place: Array, first: Array, area: Array, spacing: float) -> float:

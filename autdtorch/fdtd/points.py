@@ -12,6 +12,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 Array = NDArray[np.float64]
 
@@ -35,6 +36,12 @@ class PointWeights:
 
     index: NDArray[np.int64]
     weight: Array
+
+    def reading(self, cells: NDArray[np.int64]) -> csr_array:
+        """Matrix (P, k) that reads the points from the values of `cells` (k,), ascending, all of theirs."""
+        rows = np.arange(len(self.index)).repeat(self.index.shape[1])
+        columns = np.searchsorted(cells, self.index.ravel())
+        return csr_array((self.weight.ravel(), (rows, columns)), (len(self.index), len(cells)))
 
 
 def axis_weights(offset: Array, nodes: Array, kappa: float) -> Array:

@@ -19,6 +19,7 @@ from scipy.sparse import csr_array
 
 from autdtorch.array import Nodes
 from autdtorch.fdtd.kernels.contract import Sources
+from autdtorch.fdtd.points import PointWeights
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
 
@@ -71,16 +72,9 @@ class Scattering:
         _, surface, outward = self._surface
         within = self.inside(targets.positions)
         spread = self.assembly.spread(targets.positions[within])
-        cells, place = np.unique(np.concatenate((surface, spread.index.ravel())), return_inverse=True)
-        from_surface = csr_array(
-            (np.ones(len(surface)), (np.arange(len(surface)), place[: len(surface)])),
-            (len(surface), len(cells)),
-        )
-        rows = np.arange(len(spread.index)).repeat(spread.index.shape[1])
-        inward = csr_array(
-            (spread.weight.ravel(), (rows, place[len(surface) :])), (len(within[within]), len(cells))
-        )
-        return Reach(self, targets, within, cells, outward @ from_surface, inward)
+        cells = np.unique(np.concatenate((surface, spread.index.ravel())))
+        picked = PointWeights(surface[:, None], np.ones((len(surface), 1))).reading(cells)
+        return Reach(self, targets, within, cells, outward @ picked, spread.reading(cells))
 
     def radiated(self, amplitude: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
         """Field (P,) at points (P, 3) [m] of the radiating cells with amplitudes (n,) [Pa m]."""

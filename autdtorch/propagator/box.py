@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import time
 
@@ -15,8 +14,6 @@ from autdtorch.fdtd.steady_state import run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble_on
 from autdtorch.propagator.base import MOST_JUDGED, SimulatedPropagator
 from autdtorch.validation import LENGTH_TOLERANCE, ArrayLike, distances, invalid, points_tensor
-
-logger = logging.getLogger(__name__)
 
 
 class BoxPropagator(SimulatedPropagator):

@@ -7,7 +7,6 @@ import time
 
 import numpy as np
 import torch
-from scipy.sparse import csr_array
 
 from autdtorch.array import Nodes
 from autdtorch.fdtd.steady_state import run_to_steady_state
@@ -44,9 +43,8 @@ class FullPropagator(SimulatedPropagator):
         self._warn_near_obstacle(origins)
         sources = assembly.sources(origins.positions, strength, origins.weights)
         spread = assembly.spread(points, targets.weights)
-        cells, place = np.unique(spread.index, return_inverse=True)
-        rows = np.arange(len(points)).repeat(spread.index.shape[1])
-        read = csr_array((spread.weight.ravel(), (rows, place.ravel())), (len(points), len(cells)))
+        cells = np.unique(spread.index)
+        read = spread.reading(cells)
         some = read[:: math.ceil(len(points) / MOST_JUDGED)]
         steady = run_to_steady_state(
             assembly, kernel, sources, cells, self.tolerance, self.max_periods,
