@@ -22,9 +22,6 @@ Layer = tuple[torch.Tensor, torch.Tensor]
 """Memory of the two boundary layers of an axis, stacked (2, nx, ny, nz) low and high: psi with L + 1 half
 cells and zeta with L cells along that axis, counted inwards from outside on both sides."""
 
-ROWS_LAST = ((0, 2, 1, 3), (0, 1, 2, 3), (0, 1, 3, 2), (0, 1, 2, 3))
-"""How the memory of each of a state's layers lies: last the rows that a kernel runs along, then the depth."""
-
 
 @dataclass(frozen=True)
 class Columns:
@@ -113,10 +110,10 @@ def uniform_state(shape: tuple[int, int, int], coefficients: Coefficients, press
     dtype, layer_cells = coefficients.layer_decay.dtype, coefficients.layer_cells
     layers = []
     sizes = (shape, shape, shape, (*shape[:2], 2 * layer_cells))
-    for axis, order, size in zip((0, 1, 2, 1), ROWS_LAST, sizes, strict=True):
+    for axis, size in zip((0, 1, 2, 1), sizes, strict=True):
         half, full = [2, *size], [2, *size]
         half[axis + 1], full[axis + 1] = layer_cells + 1, layer_cells
-        layers.append((_zeros(half, order, dtype), _zeros(full, order, dtype)))
+        layers.append((torch.zeros(half, dtype=dtype), torch.zeros(full, dtype=dtype)))
     core = torch.full([cells - 2 for cells in shape], pressure, dtype=dtype)
     now = torch.nn.functional.pad(core, (1,) * 6)
     columns, crossed = (
@@ -124,10 +121,6 @@ def uniform_state(shape: tuple[int, int, int], coefficients: Coefficients, press
         for count in (len(coefficients.columns.index), len(coefficients.crossed.index))
     )
     return State(now, now.clone(), tuple(layers), columns, crossed)
-
-
-def _zeros(size: list[int], order: tuple[int, ...], dtype: torch.dtype) -> torch.Tensor:
-    return torch.zeros([size[axis] for axis in order], dtype=dtype).permute(order)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,102 @@
+"""How the kernel for CPUs keeps the boundary layers: flat, as `cpu_sweep.py` runs through them.
+
+The contract counts both layers of an axis inwards. Here the upper ones of y and z lie in the order of the axis,
+which turns the sign of psi, and what belongs to ends of rows lies in lanes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from autdtorch.fdtd.kernels.contract import Coefficients, Layer
+
+Array = NDArray[np.floating]
+
+Profile = tuple[Array, Array, Array, Array]
+"""b and a of the half cells, then b and a of the cells, each as often as `stretch` meets it."""
+
+
+def rows_profile(c: Coefficients, row: int) -> Profile:
+    """Profile of a lower layer, of rows."""
+    decay, gain = c.layer_decay.numpy(), c.layer_gain.numpy()
+    b_half, a_half, b_cell, a_cell = (
+        part.repeat(row) for part in (decay[0::2], gain[0::2], decay[1::2], gain[1::2])
+    )
+    return b_half, a_half, b_cell, a_cell
+
+
+def plane_profiles(c: Coefficients, shape: torch.Size) -> tuple[Array, ...]:
+    """Profiles across y, z, and y for the lanes, of both layers each."""
+    _, ny, nz = shape
+    decay, gain = c.layer_decay.numpy(), c.layer_gain.numpy()
+    across_z = []
+    for values in (decay, gain):
+        half, cell, none = values[0::2], values[1::2], np.zeros(1, values.dtype)
+        halves = np.concatenate((half, none, half[::-1], none))
+        cells = np.concatenate((cell, none, none, cell[::-1], none, none))
+        across_z.append((np.tile(halves, ny), np.tile(cells, ny)))
+    (b_half, b_cell), (a_half, a_cell) = across_z
+    lanes = 2 * (c.layer_cells + 2)
+    return *_both_rows(c, nz), b_half, a_half, b_cell, a_cell, *_both_rows(c, lanes)
+
+
+def _both_rows(c: Coefficients, row: int) -> Profile:
+    """Profile of a lower layer of rows and of the upper one, one row of nothing after their cells."""
+    low = rows_profile(c, row)
+    none = np.zeros(row, low[0].dtype)
+    high = [part.reshape(-1, row)[::-1].ravel() for part in low]
+    b_half, a_half = (np.concatenate(both) for both in zip(low[:2], high[:2], strict=True))
+    b_cell, a_cell = (
+        np.concatenate((first, none, second, none)) for first, second in zip(low[2:], high[2:], strict=True)
+    )
+    return b_half, a_half, b_cell, a_cell
+
+
+class Memory:
+    """The memory of the boundary layers in this layout, taken from a state and given back to it.
+
+    Attributes:
+        arrays: psi and zeta of x, of y, of the ends of rows, and of y for these.
+    """
+
+    def __init__(self, layers: tuple[Layer, ...]) -> None:
+        """Copy what a state remembers; what it has of x is used as it is."""
+        self._layers = [[part.numpy() for part in layer] for layer in layers]
+        x, (psi_y, zeta_y), (psi_z, _), (psi_yz, zeta_yz) = self._layers
+        nx, ny, layer_cells = len(psi_z[0]), psi_z.shape[2], psi_z.shape[3] - 1
+        lanes = 2 * (layer_cells + 2)
+        sizes = (
+            psi_y.shape,
+            zeta_y.shape,
+            *2 * ((nx, ny, lanes),),
+            *((*p.shape[:3], lanes) for p in (psi_yz, zeta_yz)),
+        )
+        self.arrays = (*x, *(np.zeros(size, psi_y.dtype) for size in sizes))
+        for here, there, sign in self._pairs():
+            here[...] = sign * there
+
+    def give_back(self) -> None:
+        """Write it back to the state."""
+        for here, there, sign in self._pairs():
+            there[...] = sign * here
+
+    def _pairs(self) -> Iterator[tuple[Array, Array, int]]:
+        """Views of parts of the arrays, and of the same parts of the state; psi of upper layers changes sign."""
+        for half, number in ((True, 2), (False, 3)):
+            y, z, yz = self.arrays[number], self.arrays[number + 2], self.arrays[number + 4]
+            _, of_y, of_z, of_yz = (layer[not half] for layer in self._layers)
+            reach = z.shape[-1] // 2
+            cells = reach - 2
+            upper = -1 if half else 1
+            first, last = (0, reach - 1) if half else (1, reach - 1)
+            low, high = slice(first, last), slice(reach + first, reach + last)
+            yield z[..., low], of_z[0], 1
+            yield z[..., high][..., ::-1], of_z[1], upper
+            for side, sign, order in ((0, 1, slice(None)), (1, upper, slice(None, None, -1))):
+                yield y[side][:, order], of_y[side], sign
+                yield yz[side][:, order, 1 : cells + 1], of_yz[side][..., :cells], sign
+                yield yz[side][:, order, reach + 1 : -1][..., ::-1], of_yz[side][..., cells:], sign
