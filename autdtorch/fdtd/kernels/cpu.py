@@ -113,7 +113,7 @@ def _stretch_columns(p, columns, beside, place, memory, terms):  # type: ignore[
     more = beside.ravel()
     u = np.zeros(depths * count, p.dtype)
     for n in range(count):
-        for depth in range(1):
+        for depth in range(1, depths):
             total = p[0] - p[0]
             for m in range(weight.shape[1]):
                 total += weight[n, m] * p[index[n, depth] + offset[n, m]]
