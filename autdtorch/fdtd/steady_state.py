@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources
 from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, drive_signal, lock_in
 
+Phasors = NDArray[np.complex128]
+
 _FEWEST_PERIODS = 3
 """Of a block. Shorter ones cost more work between the steps, and the phasors kept reach less far back."""
 
@@ -34,7 +36,7 @@ _FEWEST_PHASORS, _MOST_PHASORS = 12, 64
 _MOST_NUMBERS = 20_000_000
 """That they hold, 320 MB."""
 
-_MOST_FITTED = 8192
+_MOST_FITTED = 2048
 """Cells whose phasors decide the means; of more, this many."""
 
 _ROUNDING = 1e-13
@@ -84,13 +86,14 @@ def run_to_steady_state(
     """
     crossing = assembly.grid.diagonal / assembly.grid.wavelength
     earliest = RAMP_PERIODS + math.ceil(2 * crossing)
-    kept = min(max(_FEWEST_PHASORS, _MOST_NUMBERS // len(cells)), _MOST_PHASORS)
-    phasors: deque[NDArray[np.complex128]] = deque(maxlen=kept)
+    sequence = Extrapolation(min(max(_FEWEST_PHASORS, _MOST_NUMBERS // len(cells)), _MOST_PHASORS))
     values: deque[torch.Tensor] = deque(maxlen=3)
     ramp = math.ceil(RAMP_PERIODS * assembly.steps_per_period)
     for count, windows in _windows(assembly, kernel, sources, cells):
-        phasors.extend(phasor for start, phasor in windows if start >= ramp)
-        limit = torch.from_numpy(extrapolated(np.array(phasors or [windows[-1][1]])))
+        for start, phasor in windows:
+            if start >= ramp:
+                sequence.append(phasor)
+        limit = torch.from_numpy(sequence.limit() if len(sequence) else windows[-1][1])
         values.append(judged(limit))
         remaining = _distance(values)
         reached = count >= earliest and remaining <= tolerance
@@ -99,22 +102,48 @@ def run_to_steady_state(
     return SteadyState(limit, count, remaining, reached)
 
 
-def extrapolated(phasors: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Limit (k,) of a sequence of phasors (n, k), n >= 1."""
-    if len(phasors) < 3:
-        return np.asarray(phasors[-1])
-    step = np.diff(phasors[:, :: -(-phasors.shape[1] // _MOST_FITTED)], axis=0)
-    product = step.conj() @ step.T
-    size = float(np.trace(product).real) / len(step)
-    if not (math.isfinite(size) and size > 0):
-        return np.asarray(phasors[-1])
-    mean = np.linalg.solve(product + _ROUNDING * size * np.eye(len(step)), np.ones(len(step)))
-    return np.asarray((mean / mean.sum()) @ phasors[1:], np.complex128)
+class Extrapolation:
+    """The limit of a sequence of which the last numbers are kept, `most` of them."""
+
+    def __init__(self, most: int) -> None:
+        """An empty sequence."""
+        self._values: deque[Phasors] = deque(maxlen=most)
+        self._steps: deque[Phasors] = deque(maxlen=most - 1)
+        self._product = np.zeros((0, 0), np.complex128)
+
+    def __len__(self) -> int:
+        """How many are kept."""
+        return len(self._values)
+
+    def append(self, value: Phasors) -> None:
+        """Go on with the next (k,)."""
+        if self._values:
+            step = (value - self._values[-1])[:: -(-len(value) // _MOST_FITTED)]
+            self._steps.append(step)
+            old = self._product[-len(self._steps) + 1 :, -len(self._steps) + 1 :]
+            self._product = np.empty((len(self._steps),) * 2, np.complex128)
+            self._product[:-1, :-1] = old if len(self._steps) > 1 else 0
+            self._product[:, -1] = [np.vdot(other, step) for other in self._steps]
+            self._product[-1] = self._product[:, -1].conj()
+        self._values.append(value)
+
+    def limit(self) -> Phasors:
+        """Where it goes (k,), the last number while there are too few; one at least must have been given."""
+        count = len(self._steps)
+        size = float(np.trace(self._product).real) / max(count, 1)
+        if count < 2 or not (math.isfinite(size) and size > 0):
+            return self._values[-1]
+        mean = np.linalg.solve(self._product + _ROUNDING * size * np.eye(count), np.ones(count))
+        mean /= mean.sum()
+        total = np.zeros_like(self._values[-1])
+        for share, value in zip(mean, itertools.islice(self._values, 1, None), strict=True):
+            total += share * value
+        return total
 
 
 def _windows(
     assembly: Assembly, kernel: Kernel, sources: Sources, cells: NDArray[np.int64]
-) -> Iterator[tuple[int, list[tuple[int, NDArray[np.complex128]]]]]:
+) -> Iterator[tuple[int, list[tuple[int, Phasors]]]]:
     """Step from silence; after each block the periods so far, and first step and phasors of its windows."""
     steps_per_period = assembly.steps_per_period
     parts = math.ceil(_FEWEST_PERIODS / steps_per_period.denominator)
@@ -126,8 +155,8 @@ def _windows(
         first = block * steps
         signal = drive_signal(steps_per_period, first, steps).to(assembly.dtype)
         state, recorded = kernel.advance(state, assembly.coefficients, sources, receivers, signal)
-        both = torch.cat((earlier, recorded))
         ends = range(-(-(first + 1) // shift) * shift, first + steps + 1, shift)
+        both = torch.cat((earlier, recorded))
         windows = [(end - steps, both[end - first : end - first + steps]) for end in ends]
         yield (
             (block + 1) * periods,
@@ -136,7 +165,7 @@ def _windows(
         earlier = recorded
 
 
-def _turned(window: torch.Tensor, start: int, periods: int) -> NDArray[np.complex128]:
+def _turned(window: torch.Tensor, start: int, periods: int) -> Phasors:
     """Phasors (k,) of a window of `periods`, recorded (steps, k) after each step that follows `start`."""
     turn = 2 * math.pi * (start * periods % len(window)) / len(window)
     return np.asarray(lock_in(window, periods).numpy() * complex(math.cos(turn), math.sin(turn)))

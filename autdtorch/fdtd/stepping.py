@@ -199,4 +199,6 @@ def lock_in(recorded: torch.Tensor, periods: int) -> torch.Tensor:
     """Phasors (R,) of one block of `periods`, recorded after each of its steps (steps, R)."""
     steps = len(recorded)
     turn = 2 * math.pi * periods / steps * torch.arange(1, steps + 1, dtype=torch.float64)
-    return torch.einsum("t,tr->r", 2 / steps * torch.exp(1j * turn), recorded.to(torch.complex128))
+    basis = 2 / steps * torch.stack((torch.cos(turn), torch.sin(turn)))
+    cosine, sine = (basis.to(recorded.dtype) @ recorded).double()
+    return torch.complex(cosine, sine)
