@@ -12,10 +12,11 @@ from __future__ import annotations
 
 import os
 
-# An idle OpenMP thread spins unless told otherwise; on a busy machine every parallel loop then waits for the
-# scheduler (16 times slower, measured with one other process on two cores). It is read once, when numba
-# starts its threads.
+# An idle OpenMP thread spins for milliseconds unless told otherwise. On a busy machine it then keeps the others
+# from their work; if it sleeps at once it is not there when it is needed (12 times slower, measured with two
+# other processes on two cores). A short while is best on both. It is read when numba starts its threads.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+os.environ.setdefault("GOMP_SPINCOUNT", "20000")
 
 import numpy as np
 import torch
@@ -24,17 +25,15 @@ from numpy.typing import NDArray
 
 from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Receivers, Sources, State
 from autdtorch.fdtd.kernels.cpu_layout import Memory, plane_profiles, rows_profile
-from autdtorch.fdtd.kernels.cpu_sweep import stretch, sweep_planes
+from autdtorch.fdtd.kernels.cpu_sweep import INNER, stretch, sweep_planes
 
 Array = NDArray[np.generic]
-
-_FAST = {"contract", "reassoc", "nsz"}
 
 _CHUNK_CELLS = 200_000
 """Cells of a chunk at least: what a second thread needs to be woken for."""
 
 
-@njit(fastmath=_FAST, cache=True, nogil=True)
+@njit(**INNER)
 def _record(p, receivers, first, last, out):  # type: ignore[no-untyped-def]
     heard, hearing = receivers
     for r in range(first, last):
@@ -44,7 +43,7 @@ def _record(p, receivers, first, last, out):  # type: ignore[no-untyped-def]
         out[r] = total
 
 
-@njit(fastmath=_FAST, cache=True, nogil=True)
+@njit(**INNER)
 def _sweep_chunk(c, p, q, medium, layers, cells, room):  # type: ignore[no-untyped-def]
     cuts, starts = medium[0], medium[1]
     e_y, e_z, e_yz, ends, total, across, u, outermost = room
@@ -71,7 +70,7 @@ def _sweep_chunk(c, p, q, medium, layers, cells, room):  # type: ignore[no-untyp
     )
 
 
-@njit(fastmath=_FAST, cache=True, nogil=True)
+@njit(**INNER)
 def _finish_chunk(c, q, medium, cells, outermost, sources, turn):  # type: ignore[no-untyped-def]
     """Add what the neighbours' outermost planes owe to those of chunk c; then set its varying and driven cells."""
     cuts, starts, driven_starts = medium[:3]
@@ -94,17 +93,7 @@ def _finish_chunk(c, q, medium, cells, outermost, sources, turn):  # type: ignor
         q[driven[n]] += force[n].real * cosine + force[n].imag * sine
 
 
-@njit(parallel=True, fastmath=_FAST, cache=True, nogil=True)
-def _step_chunks(p, q, medium, layers, cells, room, sources, turn, receivers, out):  # type: ignore[no-untyped-def]
-    chunks, heard = len(medium[0]) - 1, len(out)
-    for c in prange(chunks):
-        _record(p, receivers, c * heard // chunks, (c + 1) * heard // chunks, out)
-        _sweep_chunk(c, p, q, medium, layers, cells, room)
-    for c in prange(chunks):
-        _finish_chunk(c, q, medium, cells, room[-1], sources, turn)
-
-
-@njit(fastmath=_FAST, cache=True, nogil=True)
+@njit(**INNER)
 def _stretch_columns(p, columns, beside, place, memory, terms):  # type: ignore[no-untyped-def]
     """Advance the columns' memory and write their terms (L, m); `beside` has more to sum, by `place`."""
     index, offset, weight, b_half, a_half, b_cell, a_cell = columns
@@ -127,33 +116,49 @@ def _stretch_columns(p, columns, beside, place, memory, terms):  # type: ignore[
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
-def _advance(  # type: ignore[no-untyped-def]
-    p, q, medium, layers, cells, room, columns, memory, closed, sources, receivers, signal, recorded
-):  # fmt: skip
-    (columns, crossed, crossing), (memory, crossed_memory) = columns, memory
-    shares, beside = np.zeros_like(memory[1]), np.zeros_like(crossed_memory[1])
-    alone, nothing = np.zeros_like(crossed[0]), np.zeros((0, 0), p.dtype)
-    unheard = np.zeros(len(receivers[0]), recorded.dtype)
-    chunks, cut = len(medium[0]) - 1, len(columns[0])
-    for step in range(len(signal)):
-        out, turn = (recorded[step - 1] if step else unheard), (signal[step, 0], signal[step, 1])
-        if chunks > 1:
-            _step_chunks(p, q, medium, layers, cells, room, sources, turn, receivers, out)
-        else:
-            _record(p, receivers, 0, len(out), out)
-            _sweep_chunk(0, p, q, medium, layers, cells, room)
-            _finish_chunk(0, q, medium, cells, room[-1], sources, turn)
-        if cut:
-            _stretch_columns(p, crossed, nothing, alone, crossed_memory, beside)
-            _stretch_columns(p, columns, beside, crossing, memory, shares)
-        for n in range(cut):
+@njit(**INNER)
+def _finish_step(p, q, columns, memory, closed):  # type: ignore[no-untyped-def]
+    """Add what surfaces through the layers differ by, and silence the closed cells."""
+    (cut, crossed, crossing), (cut_memory, crossed_memory) = columns, memory
+    if len(cut[0]):
+        shares, beside = np.zeros_like(cut_memory[1]), np.zeros_like(crossed_memory[1])
+        alone, nothing = np.zeros_like(crossed[0]), np.zeros((0, 0), p.dtype)
+        _stretch_columns(p, crossed, nothing, alone, crossed_memory, beside)
+        _stretch_columns(p, cut, beside, crossing, cut_memory, shares)
+        for n in range(len(cut[0])):
             for depth in range(len(shares)):
-                q[columns[0][n, depth + 1]] += shares[depth, n]
-        for n in range(len(closed)):
-            q[closed[n]] = 0
+                q[cut[0][n, depth + 1]] += shares[depth, n]
+    for n in range(len(closed)):
+        q[closed[n]] = 0
+
+
+@njit(cache=True, nogil=True)
+def _advance_alone(  # type: ignore[no-untyped-def]
+    p, q, medium, layers, cells, room, columns, memory, closed, sources, receivers, signal, recorded
+):
+    for step in range(len(signal)):
+        _sweep_chunk(0, p, q, medium, layers, cells, room)
+        _finish_chunk(0, q, medium, cells, room[-1], sources, (signal[step, 0], signal[step, 1]))
+        _finish_step(p, q, columns, memory, closed)
+        _record(q, receivers, 0, recorded.shape[1], recorded[step])
         p, q = q, p
-    _record(p, receivers, 0, len(unheard), recorded[-1])
+
+
+@njit(parallel=True, cache=True, nogil=True)
+def _advance_together(  # type: ignore[no-untyped-def]
+    p, q, medium, layers, cells, room, columns, memory, closed, sources, receivers, signal, recorded
+):
+    chunks, heard = len(medium[0]) - 1, recorded.shape[1]
+    for step in range(len(signal)):
+        for c in prange(chunks):
+            if step:
+                _record(p, receivers, c * heard // chunks, (c + 1) * heard // chunks, recorded[step - 1])
+            _sweep_chunk(c, p, q, medium, layers, cells, room)
+        for c in prange(chunks):
+            _finish_chunk(c, q, medium, cells, room[-1], sources, (signal[step, 0], signal[step, 1]))
+        _finish_step(p, q, columns, memory, closed)
+        p, q = q, p
+    _record(p, receivers, 0, heard, recorded[-1])
 
 
 def _cuts(shape: torch.Size, layer_cells: int) -> NDArray[np.int64]:
@@ -216,7 +221,8 @@ class CpuKernel:
             *plane_profiles(c, shape),
         )
         memory = Memory(state.layers)
-        _advance(
+        advance = _advance_alone if len(cuts) == 2 else _advance_together
+        advance(
             state.now.numpy().reshape(-1),
             state.before.numpy().reshape(-1),
             medium,

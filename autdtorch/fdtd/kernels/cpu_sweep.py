@@ -21,11 +21,20 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-_FAST = {"contract", "reassoc", "nsz"}
 _U = np.uint64
 
+INNER = {
+    "fastmath": {"contract", "reassoc", "nsz"},
+    "error_model": "numpy",
+    "cache": True,
+    "nogil": True,
+    "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+}
+"""Of functions that others call: what only Python needs, and tests for division by zero, are left out."""
 
-@njit(fastmath=_FAST, cache=True, nogil=True)
+
+@njit(**INNER)
 def _sweep(p, at, n, row, old, old_at, total, across, weights):  # type: ignore[no-untyped-def]
     """Finish the plane before: old = total + A - keep old; then total = B + A before, across = A."""
     center, face, edge, corner, keep = weights
@@ -41,7 +50,7 @@ def _sweep(p, at, n, row, old, old_at, total, across, weights):  # type: ignore[
         across[first + k] = a
 
 
-@njit(fastmath=_FAST, cache=True, nogil=True)
+@njit(**INNER)
 def _varying(p, q, cells, first, last, keep):  # type: ignore[no-untyped-def]
     """New pressure of some varying cells; in layers also what the sweep alone would make of them."""
     index, weight, offset, scale, air, new, swept = cells
@@ -59,7 +68,7 @@ def _varying(p, q, cells, first, last, keep):  # type: ignore[no-untyped-def]
             swept[n] = change - keep * old
 
 
-@njit(fastmath=_FAST, cache=True, nogil=True)
+@njit(**INNER)
 def stretch(u, at, step, psi, psi_at, zeta, zeta_at, term, term_at, cells, profile, profile_at):  # type: ignore[no-untyped-def]
     """Advance the memory of a layer and write its terms.
 
@@ -79,7 +88,7 @@ def stretch(u, at, step, psi, psi_at, zeta, zeta_at, term, term_at, cells, profi
         term[term_at + k] = slope + moved
 
 
-@njit(fastmath=_FAST, cache=True, nogil=True)
+@njit(**INNER)
 def _stretch_plane(p, i, shape, cells, memory, terms, ends, profiles):  # type: ignore[no-untyped-def]
     """The layers' terms E_y p, E_z p and E_y E_z p of plane i."""
     _, ny, nz = shape
@@ -113,7 +122,7 @@ def _stretch_plane(p, i, shape, cells, memory, terms, ends, profiles):  # type: 
         )  # fmt: skip
 
 
-@njit(fastmath=_FAST, cache=True, nogil=True)
+@njit(**INNER)
 def _add_ends(q, base, shape, cells, ends):  # type: ignore[no-untyped-def]
     """Add lanes to a plane that begins at `base`, the layers' cells of them."""
     _, ny, nz = shape
@@ -126,7 +135,7 @@ def _add_ends(q, base, shape, cells, ends):  # type: ignore[no-untyped-def]
             q[high + depth] += ends[at + reach + depth]
 
 
-@njit(fastmath=_FAST, cache=True, nogil=True)
+@njit(**INNER)
 def _absorb_plane(q, i, shape, cells, terms, ends, weights):  # type: ignore[no-untyped-def]
     """Add to plane i the terms of the layers across y and z, smoothed over x and the other of both."""
     _, ny, nz = shape
@@ -157,7 +166,7 @@ def _absorb_plane(q, i, shape, cells, terms, ends, weights):  # type: ignore[no-
     _add_ends(q, base, shape, cells, ends)
 
 
-@njit(fastmath=_FAST, cache=True, nogil=True)
+@njit(**INNER)
 def _stretched_across(across, out, i, shape, cells, terms, ends, weights):  # type: ignore[no-untyped-def]
     """Write A of plane i, with the terms of the layers across y and z, to its place among three planes."""
     _, ny, nz = shape
@@ -186,13 +195,13 @@ def _stretched_across(across, out, i, shape, cells, terms, ends, weights):  # ty
         out[base + (j + one) * nz - one] = 0
 
 
-@njit(fastmath=_FAST, cache=True, nogil=True)
+@njit(**INNER)
 def _half_cell(psi, at, u, ahead, here, n, decay, gain):  # type: ignore[no-untyped-def]
     for k in range(n):
         psi[at + k] = decay * psi[at + k] + gain * (u[ahead + k] - u[here + k])
 
 
-@njit(fastmath=_FAST, cache=True, nogil=True)
+@njit(**INNER)
 def _absorb_x(q, i, shape, memory, u, profile):  # type: ignore[no-untyped-def]
     """Add to plane i what the layer across x makes of A, of which `u` holds the planes around."""
     nx, ny, nz = shape
@@ -220,7 +229,7 @@ def _absorb_x(q, i, shape, memory, u, profile):  # type: ignore[no-untyped-def]
         q[out + k] += slope + moved
 
 
-@njit(fastmath=_FAST, cache=True, nogil=True)
+@njit(**INNER)
 def sweep_planes(  # type: ignore[no-untyped-def]
     p, q, first, last, shape, weights, layer, layers, profile, profiles, cells, starts, room
 ):
@@ -236,7 +245,8 @@ def sweep_planes(  # type: ignore[no-untyped-def]
         done, here = i - one, i % three * plane
         if i < last:
             _varying(p, q, cells, starts[i], starts[i + one], keep)
-            _stretch_plane(p, i, shape, depth, layers, terms, ends, profiles)
+            if depth:
+                _stretch_plane(p, i, shape, depth, layers, terms, ends, profiles)
             old, at = (outermost, _U(0)) if i == first else (q, done * plane + nz + one)
             _sweep(p, i * plane + nz + one, n, nz, old, at, total, across, weights)
         else:
@@ -254,7 +264,8 @@ def sweep_planes(  # type: ignore[no-untyped-def]
         for k in range(plane if i + one == last else _U(0)):
             outermost[plane + k] = u[here + k]
         if i > first:
-            _absorb_plane(q, done, shape, depth, terms, ends, weights)
+            if depth:
+                _absorb_plane(q, done, shape, depth, terms, ends, weights)
             if done <= depth or done + depth + one >= nx:
                 _absorb_x(q, done, shape, layer, u, profile)
             for j in range(one, ny - one):
