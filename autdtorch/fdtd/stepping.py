@@ -198,5 +198,6 @@ def drive_signal(steps_per_period: Fraction, first: int, count: int) -> torch.Te
 def lock_in(recorded: torch.Tensor, periods: int) -> torch.Tensor:
     """Phasors (R,) of one block of `periods`, recorded after each of its steps (steps, R)."""
     steps = len(recorded)
-    turn = 2 * math.pi * periods / steps * torch.arange(1, steps + 1, dtype=torch.float64)
+    step = torch.arange(1, steps + 1, dtype=torch.float64, device=recorded.device)
+    turn = 2 * math.pi * periods / steps * step
     return torch.einsum("t,tr->r", 2 / steps * torch.exp(1j * turn), recorded.to(torch.complex128))
