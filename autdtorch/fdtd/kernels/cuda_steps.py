@@ -10,7 +10,7 @@ another one of the same launch writes: their order does not matter.
 """
 
 # The arguments are values of Triton's compiler, which has no types for them.
-# mypy: disable-error-code="no-untyped-def, no-untyped-call, untyped-decorator"
+# mypy: disable-error-code="no-untyped-def, untyped-decorator"
 
 from __future__ import annotations
 
@@ -181,7 +181,7 @@ def _read(p, receivers, row, program, LANES: tl.constexpr):
         place = node * receivers.size + r
         cell = tl.load(receivers.cell + place, mask=mask, other=0)
         total += tl.load(receivers.weight + place, mask=mask, other=0) * tl.load(p + cell, mask=mask, other=0)
-    tl.store(receivers.recorded + row * receivers.size + r, total, mask=mask)
+    tl.store(receivers.recorded + tl.cast(row, tl.int64) * receivers.size + r, total, mask=mask)
 
 
 @triton.jit(do_not_specialize=["offset"])
