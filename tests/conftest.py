@@ -1,11 +1,16 @@
 """Every test carries the marker named like its folder, so that ``pytest -m physics`` runs
-``tests/physics``."""
+``tests/physics``. Where there is no GPU, Triton interprets the CUDA kernel on the CPU."""
 
+import os
 from pathlib import Path
 
 import pytest
+import torch
 
 TESTS = Path(__file__).parent
+
+if not torch.cuda.is_available():
+    os.environ["TRITON_INTERPRET"] = "1"  # read when Triton's functions are defined
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

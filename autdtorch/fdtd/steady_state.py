@@ -155,8 +155,8 @@ def _windows(
         first = block * steps
         signal = drive_signal(steps_per_period, first, steps).to(assembly.dtype)
         state, recorded = kernel.advance(state, assembly.coefficients, sources, receivers, signal)
+        both = torch.cat((earlier.to(recorded.device), recorded))
         ends = range(-(-(first + 1) // shift) * shift, first + steps + 1, shift)
-        both = torch.cat((earlier, recorded))
         windows = [(end - steps, both[end - first : end - first + steps]) for end in ends]
         yield (
             (block + 1) * periods,
@@ -168,7 +168,7 @@ def _windows(
 def _turned(window: torch.Tensor, start: int, periods: int) -> Phasors:
     """Phasors (k,) of a window of `periods`, recorded (steps, k) after each step that follows `start`."""
     turn = 2 * math.pi * (start * periods % len(window)) / len(window)
-    return np.asarray(lock_in(window, periods).numpy() * complex(math.cos(turn), math.sin(turn)))
+    return np.asarray(lock_in(window, periods).cpu().numpy() * complex(math.cos(turn), math.sin(turn)))
 
 
 def _distance(values: deque[torch.Tensor]) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from importlib.util import find_spec
 
 import torch
 
@@ -29,7 +30,7 @@ __all__ = [
 logger = logging.getLogger(__name__)
 
 METHODS = ("auto", "free_space", "box", "full")
-KERNELS = ("auto", "cpu", "reference")
+KERNELS = ("auto", "cpu", "cuda", "reference")
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
@@ -38,6 +39,17 @@ def _make_kernel(name: str) -> Kernel:
         from autdtorch.fdtd.kernels.reference import ReferenceKernel
 
         return ReferenceKernel()
+    has_triton = find_spec("triton") is not None
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() and has_triton else "cpu"
+        found = f"CUDA device: {torch.cuda.is_available()}, Triton: {has_triton}"
+        logger.info("kernel auto: %s (%s)", name, found)
+    if name == "cuda":
+        if not has_triton:
+            raise invalid("kernel", name, "needs Triton: pip install 'autdtorch[cuda]'")
+        from autdtorch.fdtd.kernels.cuda import CudaKernel
+
+        return CudaKernel()
     from autdtorch.fdtd.kernels.cpu import CpuKernel
 
     return CpuKernel()
@@ -67,7 +79,8 @@ def make_propagator(
             error of the transfer matrix should stay below `tolerance`.
         tolerance: relative error, in (0, 1): the distance to the steady state at which a simulation ends;
             half of that where the spacing is chosen, the other half being the grid's.
-        kernel: "cpu" (numba), "reference" (torch, slow, readable), "auto": the fastest there is.
+        kernel: "cpu" (numba), "cuda" (Triton, on an NVIDIA GPU), "reference" (torch, slow, readable), "auto":
+            the fastest there is.
         dtype: precision of the fields, float32 or float64.
         max_periods: periods of the drive after which a simulation ends in any case, with a
             `SteadyStateWarning`. They are stepped in blocks of a few, and the last block is finished.
@@ -77,7 +90,7 @@ def make_propagator(
         A propagator for the scene.
 
     Raises:
-        ValueError: an argument out of range; the message names it.
+        ValueError: an argument out of range, or what a kernel needs is missing; the message names it.
     """
     if not isinstance(scene, Scene):
         raise invalid("scene", scene, "must be a Scene")

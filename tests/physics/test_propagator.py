@@ -232,7 +232,7 @@ def test_free_space_says_that_it_leaves_obstacles_out(caplog: pytest.LogCaptureF
         ({"spacing": -1e-3}, r"spacing: -0.001 m; must be finite and > 0"),
         ({"tolerance": 1.5}, r"tolerance: 1.5; must be in \(0, 1\)"),
         ({"tolerance": 0}, r"tolerance: 0; must be finite and > 0"),
-        ({"kernel": "fortran"}, r"kernel: .*fortran.*must be one of auto, cpu, reference"),
+        ({"kernel": "fortran"}, r"kernel: .*fortran.*must be one of auto, cpu, cuda, reference"),
         ({"dtype": "float16"}, r"dtype: .*float16.*must be one of float32, float64"),
         ({"max_periods": 0}, r"max_periods: 0"),
         ({"time_step": 0.0}, r"time_step: 0.0 s; must be finite and > 0"),

@@ -1,0 +1,226 @@
+"""The kernel for NVIDIA GPUs, in Triton: the same contract as the reference, on the device.
+
+Fields, memory and coefficients stay there between calls: the states given back hold the device's tensors, and
+so does what is recorded. With TRITON_INTERPRET=1 Triton interprets the steps, slowly, on the CPU.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import torch
+import triton
+
+from autdtorch.fdtd.kernels import cuda_steps
+from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, State
+from autdtorch.fdtd.kernels.cuda_tables import (
+    Memories,
+    Memory,
+    Shape,
+    column_table,
+    driven_table,
+    heard_table,
+    memories,
+    no_terms,
+    profile_table,
+    settled_table,
+    varying_table,
+)
+from autdtorch.validation import invalid
+
+_GRAPH_STEPS = 16
+"""Steps of a captured graph; even, so that both fields are again where they were."""
+
+_MOST_CAPTURED = 2**25
+"""Cells up to which steps are captured. Beyond, a step should take longer than its launches: 33 million cells
+at 12 bytes need 130 us at 3 TB/s, three launches from Python some 100 us. An estimate, not measured."""
+
+
+class Blocks(NamedTuple):
+    """What one program works on; of sizes that are powers of two.
+
+    Attributes:
+        x: planes that a tile marches through.
+        y: rows of a tile.
+        z: cells of its rows, which are contiguous.
+        lanes: columns through a boundary layer.
+    """
+
+    x: int = 16
+    y: int = 8
+    z: int = 32
+    lanes: int = 16
+
+
+BLOCKS = Blocks()
+"""One thread a cell. Chosen for few registers and many programs on small grids, not by timings."""
+
+
+class Ends(NamedTuple):
+    """Number of the program after the last one of each task of `prepare`, but for the receivers."""
+
+    z: int
+    y: int
+    yz: int
+    varying: int
+    crossed: int
+
+
+class DeviceMedium:
+    """A medium on the device, and room for what each step works out on the way."""
+
+    def __init__(self, c: Coefficients, shape: Shape, blocks: Blocks, device: torch.device) -> None:
+        """Put the medium `c` of a grid on a device."""
+        self.coefficients, self.shape, self.blocks, self.device = c, shape, blocks, device
+        self.cells, self.depths = c.layer_cells, triton.next_power_of_2(c.layer_cells)
+        self.dtype = c.layer_decay.dtype
+        self.weights = torch.tensor(
+            [c.center, c.face, c.edge, c.corner, c.keep], dtype=self.dtype, device=device
+        )
+        self.profile = profile_table(c, self.depths, device)
+        self.varying = varying_table(c, device)
+        self.columns = column_table(c.columns, c.crossing, device)
+        self.crossed = column_table(c.crossed, c.crossing[:0], device)
+        self.settled = settled_table(c, device)
+        self.terms = no_terms(shape, c, device)
+        nx, ny, nz = shape
+        z, y, yz = (2 * triton.cdiv(rows, blocks.lanes) for rows in (nx * ny, nx * nz, 2 * self.cells * nx))
+        varying = triton.cdiv(self.varying.size, self.depths * blocks.lanes)
+        crossed = triton.cdiv(self.crossed.size, blocks.lanes)
+        self.ends = Ends(*itertools.accumulate((z, y, yz, varying, crossed)))
+        self.tiles = triton.cdiv(nx - 2, blocks.x) * triton.cdiv(ny, blocks.y) * triton.cdiv(nz, blocks.z)
+
+
+class DeviceRun:
+    """A state that is driven and read: everything that one step after the other is launched with."""
+
+    def __init__(
+        self, medium: DeviceMedium, state: State, sources: Sources, receivers: Receivers, steps: int
+    ) -> None:
+        """Put a state on the medium's device, to go on in calls of `steps` each."""
+        self.medium, self.state, self.sources, self.receivers = medium, state, sources, receivers
+        dtype, device = medium.dtype, medium.device
+        self._fields = tuple(field.to(device).contiguous() for field in (state.now, state.before))
+        memory = memories(state, device)
+        fresh = Memories(*(Memory(*map(torch.zeros_like, each)) for each in memory))
+        self._memories = memory, fresh
+        self._driven = driven_table(sources, medium.settled, dtype, device)
+        self._heard = heard_table(receivers, steps, dtype, device)
+        self.signal = torch.zeros((steps, 2), dtype=dtype, device=device)
+        self._first = torch.zeros((), dtype=torch.int64, device=device)
+        self._turn = 0
+        self._graphs: dict[int, torch.cuda.CUDAGraph] = {}
+
+    def goes_on(self, state: State, sources: Sources, receivers: Receivers, steps: int) -> bool:
+        """Whether this is the state that the last call gave back, driven and read as then."""
+        same = self.state is state and self.sources is sources and self.receivers is receivers
+        return same and len(self.signal) == steps
+
+    def advance(self, signal: torch.Tensor) -> torch.Tensor:
+        """Step once per row of the signal; returns what the receivers recorded."""
+        self.signal.copy_(signal)
+        self._first.zero_()
+        steps = len(signal)
+        done = self._replay(steps) if self._captures(steps) else 0
+        for offset in range(steps - done):
+            self._step(self._turn + offset, offset)
+        self._turn = (self._turn + steps) % 2
+        heard, block = self._heard, self.medium.depths * self.medium.blocks.lanes
+        cuda_steps.read_last[(triton.cdiv(heard.size, block),)](
+            self._fields[self._turn], heard, steps - 1, LANES=block
+        )
+        memory = self._memories[self._turn]
+        layers = tuple((each.psi, each.zeta) for each in memory)
+        now, before = self._fields[self._turn], self._fields[1 - self._turn]
+        self.state = State(now, before, layers[:4], *layers[4:])
+        return heard.recorded.clone()
+
+    def _captures(self, steps: int) -> bool:
+        cells = self._fields[0].numel()
+        return self.medium.device.type == "cuda" and steps > _GRAPH_STEPS and cells <= _MOST_CAPTURED
+
+    def _replay(self, steps: int) -> int:
+        """Step by replays of a captured graph as far as it goes; returns the steps done."""
+        done = 0
+        if self._turn not in self._graphs:
+            # Two steps in the open: nothing may be compiled while a graph is captured.
+            for done in (1, 2):
+                self._step(self._turn + done - 1, done - 1)
+            self._first += done
+            graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(graph):
+                for offset in range(_GRAPH_STEPS):
+                    self._step(self._turn + offset, offset)
+                self._first += _GRAPH_STEPS
+            self._graphs[self._turn] = graph
+        while steps - done >= _GRAPH_STEPS:
+            self._graphs[self._turn].replay()
+            done += _GRAPH_STEPS
+        return done
+
+    def _step(self, turn: int, offset: int) -> None:
+        """Launch the step of `offset` rows of the signal after the first one."""
+        m, blocks, driven, heard = self.medium, self.medium.blocks, self._driven, self._heard
+        now, old = self._fields[turn % 2], self._memories[turn % 2]
+        other, new = self._fields[(turn + 1) % 2], self._memories[(turn + 1) % 2]
+        lanes = m.depths * blocks.lanes
+        sizes = {"CELLS": m.cells, "DEPTHS": m.depths, "LANES": blocks.lanes}
+        cuda_steps.prepare[(m.ends.crossed + triton.cdiv(heard.size, lanes),)](
+            now, other, m.shape, m.weights, m.profile, old, new, m.terms, m.varying, m.crossed, heard, m.ends,
+            self._first, offset, CROSSED_WIDTH=len(m.crossed.weight), **sizes,
+        )  # fmt: skip
+        cuda_steps.sweep[(m.tiles + triton.cdiv(m.columns.size, blocks.lanes),)](
+            now, other, m.shape, m.weights, m.profile, old, new, m.terms, m.columns, m.tiles,
+            COLUMNS_WIDTH=len(m.columns.weight), X=blocks.x, Y=blocks.y, Z=blocks.z,
+            num_warps=blocks.y * blocks.z // 32, **sizes,
+        )  # fmt: skip
+        cuda_steps.settle[(triton.cdiv(driven.size, lanes),)](
+            other, m.varying, m.settled, driven, m.terms.columns, self.signal, self._first, offset,
+            SHARES=len(m.settled.share), LANES=lanes,
+        )  # fmt: skip
+
+
+class CudaKernel:
+    """See `kernels.contract`; on the current CUDA device, where the states given back stay.
+
+    The medium and the last run stay on the device until others are given.
+    """
+
+    def __init__(self, blocks: Blocks = BLOCKS) -> None:
+        """Look for the device.
+
+        Args:
+            blocks: what one program works on.
+
+        Raises:
+            ValueError: there is no CUDA device, and Triton does not interpret either.
+        """
+        interpreted = triton.knobs.runtime.interpret
+        if not interpreted and not torch.cuda.is_available():
+            raise invalid("kernel", "cuda", "needs an NVIDIA GPU: torch.cuda.is_available() is false")
+        self._device = torch.device("cpu" if interpreted else "cuda")
+        self._blocks = blocks
+        self._medium: DeviceMedium | None = None
+        self._run: DeviceRun | None = None
+
+    @torch.no_grad()
+    def advance(
+        self,
+        state: State,
+        coefficients: Coefficients,
+        sources: Sources,
+        receivers: Receivers,
+        signal: torch.Tensor,
+    ) -> tuple[State, torch.Tensor]:
+        """See `Kernel.advance`; what is recorded lies on the device."""
+        shape = Shape(*state.now.shape)
+        medium, run = self._medium, self._run
+        if medium is None or medium.coefficients is not coefficients or medium.shape != shape:
+            self._run = run = None
+            self._medium = medium = DeviceMedium(coefficients, shape, self._blocks, self._device)
+        if run is None or not run.goes_on(state, sources, receivers, len(signal)):
+            self._run = run = None  # gives its memory back before the next one takes some
+            self._run = run = DeviceRun(medium, state, sources, receivers, len(signal))
+        recorded = run.advance(signal)
+        return run.state, recorded

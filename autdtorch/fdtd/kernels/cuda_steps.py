@@ -1,0 +1,324 @@
+"""One time step on a GPU, in Triton: three launches, each of programs with different tasks.
+
+`prepare` only reads the pressures: it stretches the layers across y and z and the crossed columns, works out
+what varying cells become, and reads the receivers. `sweep` does the 27-point sum with all layers in it, those
+across x on the way, and the columns beside it. `settle` puts right the cells that this leaves wrong: varying
+and closed ones, those of columns and those that are driven.
+
+The memory of layers and columns is read from one place and written to another, so that no program reads what
+another one of the same launch writes: their order does not matter.
+"""
+
+# The arguments are values of Triton's compiler, which has no types for them.
+# mypy: disable-error-code="no-untyped-def, untyped-decorator"
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+CENTER, FACE, EDGE, CORNER, KEEP = (tl.constexpr(place) for place in range(5))
+"""Places in the tensor of weights. Scalars would reach the kernels in single precision."""
+
+
+@triton.jit
+def _advanced(behind, here, ahead, memory, half, cell, stride, profile, depth, mask):
+    """Memory of a layer at cells at `depth`: psi outside and inside of them, and zeta."""
+    difference = ahead - here
+    decay, gain = profile.decay + 2 * depth, profile.gain + 2 * depth
+    outer = tl.load(decay - 2) * tl.load(memory.psi + half, mask=mask, other=0)
+    outer += tl.load(gain - 2) * (here - behind)
+    inner = tl.load(decay) * tl.load(memory.psi + half + stride, mask=mask, other=0)
+    inner += tl.load(gain) * difference
+    zeta = tl.load(decay - 1) * tl.load(memory.zeta + cell, mask=mask, other=0)
+    zeta += tl.load(gain - 1) * (difference - (here - behind) + (inner - outer))
+    return outer, inner, zeta
+
+
+@triton.jit
+def _stretch(behind, here, ahead, old, new, half, cell, stride, profile, depth, mask, CELLS: tl.constexpr):
+    """Advance the memory of a layer at cells at `depth`; returns their term."""
+    outer, inner, zeta = _advanced(behind, here, ahead, old, half, cell, stride, profile, depth, mask)
+    tl.store(new.psi + half, outer, mask=mask)
+    tl.store(new.psi + half + stride, inner, mask=mask & (depth == CELLS))
+    tl.store(new.zeta + cell, zeta, mask=mask)
+    return inner - outer + zeta
+
+
+@triton.jit
+def _row_end(p, shape, row, side, depth, mask, CELLS: tl.constexpr):
+    """Pressure behind, at and ahead of cells of the layers across z, and their places in the memory."""
+    inwards = 1 - 2 * side
+    at = p + row.to(tl.int64) * shape.nz + (side * (shape.nz - 1) + inwards * depth)
+    behind, here = tl.load(at - inwards, mask=mask, other=0), tl.load(at, mask=mask, other=0)
+    ahead = tl.load(at + inwards, mask=mask, other=0)
+    column = side * shape.nx * shape.ny + row
+    return behind, here, ahead, column * (CELLS + 1) + depth - 1, column * CELLS + depth - 1
+
+
+@triton.jit
+def _lanes(program, LANES: tl.constexpr, DEPTHS: tl.constexpr):
+    """A block of columns through the layers, along the second axis, and the depths in them."""
+    return program * LANES + tl.arange(0, LANES)[None, :], 1 + tl.arange(0, DEPTHS)[:, None]
+
+
+@triton.jit
+def _stretch_z(p, shape, old, new, profile, terms, program, CELLS: tl.constexpr, DEPTHS: tl.constexpr,
+               LANES: tl.constexpr):  # fmt: skip
+    side = program % 2
+    row, depth = _lanes(program // 2, LANES, DEPTHS)
+    mask = (row < shape.nx * shape.ny) & (depth <= CELLS)
+    behind, here, ahead, half, cell = _row_end(p, shape, row, side, depth, mask, CELLS)
+    term = _stretch(behind, here, ahead, old, new, half, cell, 1, profile, depth, mask, CELLS)
+    tl.store(terms + (2 * row + side) * CELLS + depth - 1, term, mask=mask)
+
+
+@triton.jit
+def _stretch_y(p, shape, old, new, profile, terms, program, CELLS: tl.constexpr, DEPTHS: tl.constexpr,
+               LANES: tl.constexpr):  # fmt: skip
+    side = program % 2
+    column, depth = _lanes(program // 2, LANES, DEPTHS)
+    mask = (column < shape.nx * shape.nz) & (depth <= CELLS)
+    plane, k = column // shape.nz, column % shape.nz
+    inwards = (1 - 2 * side) * shape.nz
+    at = p + (plane * shape.ny + side * (shape.ny - 1)).to(tl.int64) * shape.nz + (inwards * depth + k)
+    behind, here = tl.load(at - inwards, mask=mask, other=0), tl.load(at, mask=mask, other=0)
+    ahead = tl.load(at + inwards, mask=mask, other=0)
+    slab = side * shape.nx + plane
+    half = (slab * (CELLS + 1) + depth - 1) * shape.nz + k
+    cell = (slab * CELLS + depth - 1) * shape.nz + k
+    term = _stretch(behind, here, ahead, old, new, half, cell, shape.nz, profile, depth, mask, CELLS)
+    tl.store(terms + ((2 * plane + side) * CELLS + depth - 1) * shape.nz + k, term, mask=mask)
+
+
+@triton.jit
+def _term_z(p, shape, old, profile, row, side, depth, mask, CELLS: tl.constexpr):
+    """E_z p, as `_stretch_z` makes it elsewhere in the same launch."""
+    behind, here, ahead, half, cell = _row_end(p, shape, row, side, depth, mask, CELLS)
+    outer, inner, zeta = _advanced(behind, here, ahead, old, half, cell, 1, profile, depth, mask)
+    return inner - outer + zeta
+
+
+@triton.jit
+def _stretch_yz(p, shape, old_z, old, new, profile, terms, program, CELLS: tl.constexpr,
+                DEPTHS: tl.constexpr, LANES: tl.constexpr):  # fmt: skip
+    side = program % 2
+    column, depth = _lanes(program // 2, LANES, DEPTHS)
+    mask = (column < 2 * CELLS * shape.nx) & (depth <= CELLS)
+    plane, place = column // (2 * CELLS), column % (2 * CELLS)
+    end, inside = place // CELLS, place % CELLS + 1
+    inwards = 1 - 2 * side
+    row = plane * shape.ny + side * (shape.ny - 1) + inwards * depth
+    behind = _term_z(p, shape, old_z, profile, row - inwards, end, inside, mask, CELLS)
+    here = _term_z(p, shape, old_z, profile, row, end, inside, mask, CELLS)
+    ahead = _term_z(p, shape, old_z, profile, row + inwards, end, inside, mask, CELLS)
+    slab = side * shape.nx + plane
+    half = (slab * (CELLS + 1) + depth - 1) * (2 * CELLS) + place
+    cell = (slab * CELLS + depth - 1) * (2 * CELLS) + place
+    term = _stretch(behind, here, ahead, old, new, half, cell, 2 * CELLS, profile, depth, mask, CELLS)
+    tl.store(terms + ((2 * plane + side) * CELLS + depth - 1) * (2 * CELLS) + place, term, mask=mask)
+
+
+@triton.jit
+def _across(p, columns, terms, column, depth, mask, WIDTH: tl.constexpr, CROSSED: tl.constexpr):
+    """What the columns sum across them at `depth`; nothing in the ring."""
+    mask = mask & (depth > 0)
+    cell = p + tl.load(columns.cell + depth * columns.size + column, mask=mask, other=0)
+    total = tl.zeros(cell.shape, p.dtype.element_ty)
+    if CROSSED:
+        place = tl.load(columns.crossing + depth * columns.size + column, mask=mask, other=0)
+        total += tl.load(terms + place, mask=mask, other=0)
+    for beside in tl.static_range(WIDTH):
+        offset = tl.load(columns.offset + beside * columns.size + column, mask=mask, other=0)
+        weight = tl.load(columns.weight + beside * columns.size + column, mask=mask, other=0)
+        total += weight * tl.load(cell + offset, mask=mask, other=0)
+    return total
+
+
+@triton.jit
+def _stretch_columns(p, columns, old, new, profile, crossed, terms, program, WIDTH: tl.constexpr,
+                     CROSSED: tl.constexpr, CELLS: tl.constexpr, DEPTHS: tl.constexpr,
+                     LANES: tl.constexpr):  # fmt: skip
+    column, depth = _lanes(program, LANES, DEPTHS)
+    mask = (column < columns.size) & (depth <= CELLS)
+    behind = _across(p, columns, crossed, column, depth - 1, mask, WIDTH, CROSSED)
+    here = _across(p, columns, crossed, column, depth, mask, WIDTH, CROSSED)
+    ahead = _across(p, columns, crossed, column, depth + 1, mask, WIDTH, CROSSED)
+    cell = (depth - 1) * columns.size + column
+    term = _stretch(behind, here, ahead, old, new, cell, cell, columns.size, profile, depth, mask, CELLS)
+    tl.store(terms + cell, term, mask=mask)
+
+
+@triton.jit
+def _gather_varying(p, before, shape, weights, varying, program, LANES: tl.constexpr):
+    n = program * LANES + tl.arange(0, LANES)
+    mask = n < varying.size
+    cell = tl.load(varying.cell + n, mask=mask, other=0)
+    own, old = tl.load(p + cell, mask=mask, other=0), tl.load(before + cell, mask=mask, other=0)
+    keep = tl.load(weights + KEEP)
+    air, change = -keep * old, tl.zeros([LANES], p.dtype.element_ty)
+    plane = tl.cast(shape.ny, tl.int64) * shape.nz
+    for x in tl.static_range(3):
+        for y in tl.static_range(3):
+            for z in tl.static_range(3):
+                beside = p + cell + ((x - 1) * plane + (y - 1) * shape.nz + (z - 1))
+                value = tl.load(beside, mask=mask, other=0)
+                place = n + (9 * x + 3 * y + z) * varying.size
+                change += tl.load(varying.weight + place, mask=mask, other=0) * (value - own)
+                kind = (x - 1) * (x - 1) + (y - 1) * (y - 1) + (z - 1) * (z - 1)
+                air += tl.load(weights + kind) * value
+    scale = tl.load(varying.scale + n, mask=mask, other=0)
+    # The sweep comes to `air` and the layers' term, of which `settle` adds `scale` times what it finds.
+    tl.store(varying.settled + n, own + keep * (own - old) + change - scale * air, mask=mask)
+
+
+@triton.jit
+def _read(p, receivers, row, program, LANES: tl.constexpr):
+    r = program * LANES + tl.arange(0, LANES)
+    mask = (r < receivers.size) & (row >= 0)
+    total = tl.zeros([LANES], p.dtype.element_ty)
+    for node in range(receivers.width):
+        place = node * receivers.size + r
+        cell = tl.load(receivers.cell + place, mask=mask, other=0)
+        total += tl.load(receivers.weight + place, mask=mask, other=0) * tl.load(p + cell, mask=mask, other=0)
+    tl.store(receivers.recorded + tl.cast(row, tl.int64) * receivers.size + r, total, mask=mask)
+
+
+@triton.jit(do_not_specialize=["offset"])
+def prepare(p, before, shape, weights, profile, old, new, terms, varying, crossed, receivers, ends, first,
+            offset, CROSSED_WIDTH: tl.constexpr, CELLS: tl.constexpr, DEPTHS: tl.constexpr,
+            LANES: tl.constexpr):  # fmt: skip
+    """All of a step that only reads the pressures; the receivers are read as the step before left them."""
+    program = tl.program_id(0)
+    if program < ends.z:
+        _stretch_z(p, shape, old.z, new.z, profile, terms.z, program, CELLS, DEPTHS, LANES)
+    elif program < ends.y:
+        _stretch_y(p, shape, old.y, new.y, profile, terms.y, program - ends.z, CELLS, DEPTHS, LANES)
+    elif program < ends.yz:
+        _stretch_yz(p, shape, old.z, old.yz, new.yz, profile, terms.yz, program - ends.y, CELLS, DEPTHS,
+                    LANES)  # fmt: skip
+    elif program < ends.varying:
+        _gather_varying(p, before, shape, weights, varying, program - ends.yz, DEPTHS * LANES)
+    elif program < ends.crossed:
+        _stretch_columns(p, crossed, old.crossed, new.crossed, profile, terms.crossed, terms.crossed,
+                         program - ends.varying, CROSSED_WIDTH, False, CELLS, DEPTHS, LANES)  # fmt: skip
+    else:
+        _read(p, receivers, tl.load(first) + offset - 1, program - ends.crossed, DEPTHS * LANES)
+
+
+@triton.jit
+def _plane(p, i, shape, tile, weights, terms, CELLS: tl.constexpr):
+    """Sums over a plane across x: what it adds to its own cells, and to those of the planes beside it."""
+    ny, nz = shape.ny, shape.nz
+    column, inside, near_y, near_z, in_y, in_z, place_y, place_z, place_yz = tile
+    center, face, edge, corner = weights
+    here = p + i * (tl.cast(ny, tl.int64) * nz) + column
+    below, above = here - nz, here + nz
+    own = tl.load(here, mask=inside)
+    faces = tl.load(below, mask=inside) + tl.load(above, mask=inside)
+    faces += tl.load(here - 1, mask=inside) + tl.load(here + 1, mask=inside)
+    edges = tl.load(below - 1, mask=inside) + tl.load(below + 1, mask=inside)
+    edges += tl.load(above - 1, mask=inside) + tl.load(above + 1, mask=inside)
+    if near_z:
+        at = terms.z + i * ny * (2 * CELLS) + place_z
+        faces += tl.load(at, mask=in_z, other=0)
+        edges += tl.load(at - 2 * CELLS, mask=in_z, other=0) + tl.load(at + 2 * CELLS, mask=in_z, other=0)
+    if near_y:
+        at = terms.y + i * (2 * CELLS) * nz + place_y
+        faces += tl.load(at, mask=in_y, other=0)
+        edges += tl.load(at - 1, mask=in_y, other=0) + tl.load(at + 1, mask=in_y, other=0)
+    if near_y & near_z:
+        at = terms.yz + i * (2 * CELLS) * (2 * CELLS) + place_yz
+        edges += tl.load(at, mask=in_y & in_z, other=0)
+    return center * own + face * faces + edge * edges, face * own + edge * faces + corner * edges
+
+
+@triton.jit
+def _tile(low_y, low_z, shape, CELLS: tl.constexpr, Y: tl.constexpr, Z: tl.constexpr):
+    """Cells of a tile: their place in a plane, and which of them lie where in the layers' terms."""
+    ny, nz = shape.ny, shape.nz
+    j, k = low_y + tl.arange(0, Y)[:, None], low_z + tl.arange(0, Z)[None, :]
+    inside = (j >= 1) & (j < ny - 1) & (k >= 1) & (k < nz - 1)
+    near_y = (low_y <= CELLS) | (low_y + Y >= ny - CELLS)
+    near_z = (low_z <= CELLS) | (low_z + Z >= nz - CELLS)
+    in_y = inside & ((j <= CELLS) | (j >= ny - 1 - CELLS))
+    in_z = inside & ((k <= CELLS) | (k >= nz - 1 - CELLS))
+    place_y = tl.where(j <= CELLS, j - 1, CELLS + ny - 2 - j)
+    place_z = tl.where(k <= CELLS, k - 1, CELLS + nz - 2 - k)
+    place_yz = place_y * (2 * CELLS) + place_z
+    place_y, place_z = place_y * nz + k, j * (2 * CELLS) + place_z
+    return j * nz + k, inside, near_y, near_z, in_y, in_z, place_y, place_z, place_yz
+
+
+@triton.jit
+def _march(p, q, shape, weights, profile, old, new, terms, program, CELLS: tl.constexpr, X: tl.constexpr,
+           Y: tl.constexpr, Z: tl.constexpr):  # fmt: skip
+    """Step a tile of y and z through X planes along x, each of which is summed once."""
+    nx, ny, nz = shape.nx, shape.ny, shape.nz
+    tiles_y, tiles_z = tl.cdiv(ny, Y), tl.cdiv(nz, Z)
+    tile = _tile(program // tiles_z % tiles_y * Y, program % tiles_z * Z, shape, CELLS, Y, Z)
+    column, inside = tile[0], tile[1]
+    sums = (
+        tl.load(weights + CENTER), tl.load(weights + FACE), tl.load(weights + EDGE), tl.load(weights + CORNER)
+    )  # fmt: skip
+    keep = tl.load(weights + KEEP)
+    area = tl.cast(ny, tl.int64) * nz
+    first = 1 + program // (tiles_y * tiles_z) * X
+    _, behind = _plane(p, first - 1, shape, tile, sums, terms, CELLS)
+    level, here = _plane(p, first, shape, tile, sums, terms, CELLS)
+    for i in range(first, tl.minimum(first + X, nx - 1)):
+        at = q + i * area + column
+        before = tl.load(at, mask=inside)
+        level_ahead, ahead = _plane(p, i + 1, shape, tile, sums, terms, CELLS)
+        value = level + (behind + ahead) - keep * before
+        if i <= CELLS:
+            half = (i - 1) * area + column
+            value += _stretch(behind, here, ahead, old, new, half, half, area, profile, i, inside, CELLS)
+        elif i >= nx - 1 - CELLS:
+            depth = nx - 1 - i
+            cell = (CELLS + depth - 1) * area + column
+            half = cell + area
+            value += _stretch(ahead, here, behind, old, new, half, cell, area, profile, depth, inside, CELLS)
+        tl.store(at, value, mask=inside)
+        behind, here, level = here, ahead, level_ahead
+
+
+@triton.jit
+def sweep(p, q, shape, weights, profile, old, new, terms, columns, tiles, COLUMNS_WIDTH: tl.constexpr,
+          CELLS: tl.constexpr, DEPTHS: tl.constexpr, LANES: tl.constexpr, X: tl.constexpr, Y: tl.constexpr,
+          Z: tl.constexpr):  # fmt: skip
+    """The 27-point sum with all layers in it, in place of the pressures before; beside it, the columns."""
+    program = tl.program_id(0)
+    if program < tiles:
+        _march(p, q, shape, weights, profile, old.x, new.x, terms, program, CELLS, X, Y, Z)
+    else:
+        _stretch_columns(p, columns, old.columns, new.columns, profile, terms.crossed, terms.columns,
+                         program - tiles, COLUMNS_WIDTH, True, CELLS, DEPTHS, LANES)  # fmt: skip
+
+
+@triton.jit(do_not_specialize=["offset"])
+def settle(q, varying, settled, driven, shares, signal, first, offset, SHARES: tl.constexpr,
+           LANES: tl.constexpr):  # fmt: skip
+    """Put right the cells that the sweep leaves wrong."""
+    n = tl.program_id(0) * LANES + tl.arange(0, LANES)
+    mask, still = n < driven.size, n < driven.settled
+    at = q + tl.load(driven.cell + n, mask=mask, other=0)
+    value = tl.load(at, mask=mask, other=0)
+    place = tl.load(settled.varying + n, mask=still, other=-1)
+    varies = place >= 0
+    scale = tl.load(varying.scale + place, mask=varies, other=1)
+    value = scale * value + tl.load(varying.settled + place, mask=varies, other=0)
+    for share in tl.static_range(SHARES):
+        source = tl.load(settled.share + share * driven.settled + n, mask=still, other=0)
+        value += tl.load(shares + source, mask=still, other=0)
+    row = 2 * (tl.load(first) + offset)
+    value += tl.load(signal + row) * tl.load(driven.force + n, mask=mask, other=0)
+    value += tl.load(signal + row + 1) * tl.load(driven.force + driven.size + n, mask=mask, other=0)
+    closed = tl.load(settled.closed + n, mask=still, other=0) > 0
+    tl.store(at, tl.where(closed, 0, value), mask=mask)
+
+
+@triton.jit(do_not_specialize=["row"])
+def read_last(p, receivers, row, LANES: tl.constexpr):
+    """The receivers after the last step, for which there is no next one to do it."""
+    _read(p, receivers, row, tl.program_id(0), LANES)

@@ -1,0 +1,183 @@
+"""The CUDA kernel against the readable one: on a GPU, or interpreted by Triton on the CPU."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from small_scenes import CUBE, relative_error, small_scene
+
+pytest.importorskip("triton", reason="the CUDA kernel needs Triton: install autdtorch[cuda]")
+
+from triton.runtime import interpreter
+
+from autdtorch.fdtd.kernels.contract import Coefficients, Kernel, Receivers, Sources, State, uniform_state
+from autdtorch.fdtd.kernels.cpu import CpuKernel
+from autdtorch.fdtd.kernels.cuda import Blocks, CudaKernel
+from autdtorch.fdtd.kernels.reference import ReferenceKernel
+from autdtorch.fdtd.stepping import assemble
+from autdtorch.obstacles import Box, Obstacle
+from autdtorch.propagator import make_propagator
+
+needs_gpu = pytest.mark.skipif(
+    not torch.cuda.is_available(), reason="needs an NVIDIA GPU: torch.cuda.is_available() is false"
+)
+
+SIZE = 9e-3
+"""Edge of the domain [m], 9 cells; the layers make it 23 to 28."""
+
+HEAVY = Box((3.4e-3, 4.5e-3, 4.5e-3), (1.8e-3, 4e-3, 3e-3), density=100.0, sound_speed=340.0)
+RIGID = Box((3.4e-3, 4.5e-3, 4.5e-3), (2.2e-3, 5e-3, 4e-3), rigid=True)
+WALL = Box((4.5e-3, 4.5e-3, 7.3e-3), (30e-3, 30e-3, 1.2e-3), density=5.0, sound_speed=300.0)
+"""Runs through the boundary layers of x and y."""
+
+WHOLE = Blocks(x=32, y=32, z=32, lanes=1024)
+"""One program a task: interpreted, a program takes the same time however large it is."""
+
+BLOCKS = Blocks() if torch.cuda.is_available() else WHOLE
+
+Parts = tuple[tuple[int, int, int], Coefficients, Sources, Receivers]
+
+
+def parts(obstacles: tuple[Obstacle, ...], dtype: torch.dtype, absorption: float = 0.0) -> Parts:
+    """Coefficients of a scene; sources and receivers all over the grid, in special cells too."""
+    assembly = assemble(small_scene(obstacles, SIZE, absorption), 1e-3, dtype)
+    c, shape = assembly.coefficients, assembly.grid.shape
+    generator = torch.Generator().manual_seed(1)
+    inner = torch.zeros(shape, dtype=torch.bool)
+    inner[1:-1, 1:-1, 1:-1] = True
+    somewhere = torch.nonzero(inner.reshape(-1)).reshape(-1)[::97]
+    special = [each.reshape(-1)[::5] for each in (c.varying_index, c.closed_index, c.columns.index[:, 1:-1])]
+    index = torch.unique(torch.cat((somewhere, *special)))
+    index = index[torch.randperm(len(index), generator=generator)]
+    force = torch.randn(len(index), dtype=torch.complex128, generator=generator)
+    weight = torch.rand((len(index) // 2, 2), dtype=torch.float64, generator=generator).to(dtype)
+    return (
+        shape,
+        c,
+        Sources(index, force.to(torch.complex128 if dtype == torch.float64 else torch.complex64)),
+        Receivers(index[: 2 * len(weight)].reshape(-1, 2), weight),
+    )
+
+
+def noise(shape: tuple[int, int, int], c: Coefficients) -> State:
+    """Noise all over the grid, which brings every part of a step into play at once."""
+    state = uniform_state(shape, c, 0.0)
+    generator = torch.Generator().manual_seed(0)
+    for field in (state.now, state.before):
+        core = field[1:-1, 1:-1, 1:-1]
+        core.copy_(torch.randn(core.shape, generator=generator, dtype=torch.float64))
+    return state
+
+
+def advance(kernel: Kernel, given: Parts, blocks: tuple[int, ...]) -> tuple[State, torch.Tensor]:
+    """Step from noise in calls of several steps each."""
+    shape, coefficients, sources, receivers = given
+    state, recorded = noise(shape, coefficients), []
+    signal = torch.randn((sum(blocks), 2), generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    for part in signal.to(coefficients.layer_decay.dtype).split(blocks):
+        state, heard = kernel.advance(state, coefficients, sources, receivers, part)
+        recorded.append(heard)
+    return state, torch.cat(recorded)
+
+
+def assert_same(one: tuple[State, torch.Tensor], other: tuple[State, torch.Tensor], tolerance: float) -> None:
+    """Fields, all memory and what was recorded, relative to the peak of each."""
+
+    def tensors(state: State, recorded: torch.Tensor) -> list[torch.Tensor]:
+        memory = [each for layer in (*state.layers, state.columns, state.crossed) for each in layer]
+        return [state.now, state.before, recorded, *memory]
+
+    for value, reference in zip(tensors(*one), tensors(*other), strict=True):
+        assert value.shape == reference.shape
+        if reference.numel():
+            assert (value.cpu() - reference).abs().max() <= tolerance * reference.abs().max()
+
+
+# float64: rounding of sums of 27 terms, over two steps; float32: the design's parity figure, 1e-4 of the
+# peak, of which rounding takes a hundredth
+@pytest.mark.parametrize(
+    ("obstacles", "absorption", "dtype", "tolerance"),
+    [
+        pytest.param((), 0.0, torch.float64, 1e-12, id="air"),
+        pytest.param((HEAVY,), 40.0, torch.float64, 1e-12, id="heavy obstacle in absorbing air"),
+        pytest.param((RIGID,), 0.0, torch.float64, 1e-12, id="rigid obstacle"),
+        pytest.param((WALL,), 0.0, torch.float64, 1e-12, id="wall through the layers"),
+        pytest.param((RIGID, WALL), 40.0, torch.float32, 1e-6, id="float32"),
+    ],
+)
+def test_cuda_kernel_is_the_reference_kernel(
+    obstacles: tuple[Obstacle, ...], absorption: float, dtype: torch.dtype, tolerance: float
+) -> None:
+    given = parts(obstacles, dtype, absorption)
+    c = given[1]
+    assert (len(c.varying_index) > 0) == bool(obstacles)
+    assert (len(c.closed_index) > 0) == (RIGID in obstacles)
+    assert (len(c.columns.index) > 0 and len(c.crossed.index) > 0) == (WALL in obstacles)
+    expected = advance(ReferenceKernel(), given, (2,))
+    assert_same(advance(CudaKernel(BLOCKS), given, (1, 1)), expected, tolerance)
+
+
+def test_no_seam_between_programs_in_whatever_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interpreted, they run one after the other: here the last one first."""
+    builder = interpreter.InterpreterBuilder
+    place = builder.set_grid_idx
+    monkeypatch.setattr(
+        builder, "set_grid_idx", lambda self, x, y, z: place(self, self.grid_dim[0] - 1 - x, y, z)
+    )
+    given = parts((RIGID, WALL), torch.float64)
+    expected = advance(ReferenceKernel(), given, (1,))
+    assert_same(advance(CudaKernel(Blocks(x=16, y=16, z=8, lanes=256)), given, (1,)), expected, 1e-12)
+
+
+def test_a_state_that_was_given_back_stays_while_another_one_is_stepped() -> None:
+    given = parts((), torch.float64)
+    kernel = CudaKernel(BLOCKS)
+    state, _ = advance(kernel, given, (1,))
+    pressure = state.now.clone()
+    advance(kernel, given, (1,))
+    assert torch.equal(state.now, pressure)
+
+
+def test_without_a_gpu_it_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ValueError, match=r"kernel: 'cuda'; needs an NVIDIA GPU"):
+        make_propagator(small_scene((HEAVY,), SIZE), kernel="cuda")
+    monkeypatch.setitem(sys.modules, "triton", None)
+    with pytest.raises(ValueError, match=r"kernel: 'cuda'; needs Triton: pip install 'autdtorch\[cuda\]'"):
+        make_propagator(small_scene((HEAVY,), SIZE), kernel="cuda")
+
+
+def test_every_launch_compiles_for_a_gpu(tmp_path: Path) -> None:
+    """The interpreter takes more than the compiler does."""
+    environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
+    run = subprocess.run(
+        [sys.executable, Path(__file__).parents[2] / "scripts" / "compile_cuda_kernel.py"],
+        env=environment | {"TRITON_CACHE_DIR": str(tmp_path)}, check=True, capture_output=True, text=True,
+    )  # fmt: skip
+    rows = [line.split("|")[1:-1] for line in run.stdout.splitlines()[2:]]
+    assert [row[0].strip() for row in rows] == ["prepare", "sweep", "settle", "read_last"]
+    assert all(int(row[-1]) == 0 for row in rows)  # nothing spilled
+
+
+@needs_gpu
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 1e-4)])
+def test_captured_steps_are_those_of_the_cpu_kernel(dtype: torch.dtype, tolerance: float) -> None:
+    """Odd blocks, so that graphs are captured for both fields in turn; the design's parity figures."""
+    given = parts((RIGID, WALL), dtype, 40.0)
+    expected = advance(CpuKernel(), given, (53, 53, 53))
+    assert_same(advance(CudaKernel(), given, (53, 53, 53)), expected, tolerance)
+
+
+@needs_gpu
+def test_transfer_matrix_is_that_of_the_cpu_kernel() -> None:
+    scene = small_scene((CUBE,))
+    matrix, expected = (
+        make_propagator(scene, spacing=2e-3, kernel=kernel).transfer_matrix() for kernel in ("cuda", "cpu")
+    )
+    assert relative_error(matrix, expected) < 1e-4  # rounding in float32, of all of a run
