@@ -58,7 +58,7 @@ class LayerProfile:
     @property
     def cells(self) -> int:
         """Thickness of the layer."""
-        return self.decay.shape[-1] // 2
+        return int(self.decay.shape[-1]) // 2
 
 
 def layer_profile(sigma: Array, alpha: float) -> LayerProfile:

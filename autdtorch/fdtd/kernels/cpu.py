@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import os
 
-# An idle OpenMP thread spins for milliseconds unless told otherwise. On a busy machine it then keeps the others
-# from their work; if it sleeps at once it is not there when it is needed (12 times slower, measured with two
-# other processes on two cores). A short while is best on both. It is read when numba starts its threads.
+# An idle OpenMP thread spins for milliseconds unless told otherwise. On a busy machine it then keeps the
+# others from their work; if it sleeps at once it is not there when it is needed (12 times slower, measured
+# with two other processes on two cores). A short while is best. It is read when numba starts its threads.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 os.environ.setdefault("GOMP_SPINCOUNT", "20000")
 
@@ -72,7 +72,7 @@ def _sweep_chunk(c, p, q, medium, layers, cells, room):  # type: ignore[no-untyp
 
 @njit(**INNER)
 def _finish_chunk(c, q, medium, cells, outermost, sources, turn):  # type: ignore[no-untyped-def]
-    """Add what the neighbours' outermost planes owe to those of chunk c; then set its varying and driven cells."""
+    """Add what the neighbours owe to the outermost planes of chunk c; then set its single cells."""
     cuts, starts, driven_starts = medium[:3]
     ny, nz = int(medium[4]), int(medium[5])
     plane = ny * nz

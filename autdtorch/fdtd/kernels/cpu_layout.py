@@ -1,7 +1,7 @@
 """How the kernel for CPUs keeps the boundary layers: flat, as `cpu_sweep.py` runs through them.
 
-The contract counts both layers of an axis inwards. Here the upper ones of y and z lie in the order of the axis,
-which turns the sign of psi, and what belongs to ends of rows lies in lanes.
+The contract counts both layers of an axis inwards. Here the upper ones of y and z lie in the order of the
+axis, which turns the sign of psi, and what belongs to ends of rows lies in lanes.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class Memory:
             there[...] = sign * here
 
     def _pairs(self) -> Iterator[tuple[Array, Array, int]]:
-        """Views of parts of the arrays, and of the same parts of the state; psi of upper layers changes sign."""
+        """Views of parts of the arrays and of the state; psi of upper layers changes its sign."""
         for half, number in ((True, 2), (False, 3)):
             y, z, yz = self.arrays[number], self.arrays[number + 2], self.arrays[number + 4]
             _, of_y, of_z, of_yz = (layer[not half] for layer in self._layers)

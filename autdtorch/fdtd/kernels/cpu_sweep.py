@@ -18,12 +18,14 @@ inwards, L + 2, then as many of the high end, outwards.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 
 _U = np.uint64
 
-INNER = {
+INNER: dict[str, Any] = {
     "fastmath": {"contract", "reassoc", "nsz"},
     "error_model": "numpy",
     "cache": True,
@@ -72,8 +74,8 @@ def _varying(p, q, cells, first, last, keep):  # type: ignore[no-untyped-def]
 def stretch(u, at, step, psi, psi_at, zeta, zeta_at, term, term_at, cells, profile, profile_at):  # type: ignore[no-untyped-def]
     """Advance the memory of a layer and write its terms.
 
-    Its axis is that in which cells lie `step` apart. There is a half cell between each cell of u from `at` on and
-    the next; `cells`, and the terms, begin with the second cell, the profile has a value for each.
+    Its axis is that in which cells lie `step` apart. There is a half cell between each cell of u from `at` on
+    and the next; `cells`, and the terms, begin with the second cell; the profile has a value for each.
     """
     b_half, a_half, b_cell, a_cell = profile
     for k in range(cells + step):
@@ -233,7 +235,7 @@ def _absorb_x(q, i, shape, memory, u, profile):  # type: ignore[no-untyped-def]
 def sweep_planes(  # type: ignore[no-untyped-def]
     p, q, first, last, shape, weights, layer, layers, profile, profiles, cells, starts, room
 ):
-    """Step the planes first .. last - 1 as if those beyond were silent; `room` then has A of the outermost."""
+    """Step the planes first .. last - 1 as if those beyond were silent; `room` then has the outermost A."""
     nx, ny, nz = shape
     terms, ends, total, across, u, outermost = room
     one, two, three = _U(1), _U(2), _U(3)
