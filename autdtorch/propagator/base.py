@@ -18,6 +18,7 @@ from autdtorch.fdtd.points import footprint
 from autdtorch.fdtd.spacing import grid_error, second_spacing
 from autdtorch.fdtd.steady_state import SteadyState
 from autdtorch.fdtd.stepping import Assembly
+from autdtorch.propagator.symmetry import Plan, Symmetry, backward_plan, forward_plan, symmetries
 from autdtorch.scene import Scene
 from autdtorch.validation import ArrayLike
 
@@ -77,7 +78,7 @@ class SimulatedPropagator(ABC):
         tolerance: relative distance to the steady state at which a run ends.
         max_periods: periods after which it ends in any case, with a `SteadyStateWarning`.
         time_step: the one in use [s].
-        runs: what every simulation took, in order.
+        runs: what every simulation took, in order; mirror images take none.
     """
 
     method: ClassVar[str]
@@ -118,12 +119,17 @@ class SimulatedPropagator(ABC):
     def _simulate(self, origins: Nodes, strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
         """Pressure (P,) of N origins with strengths (N,), as the mean over the nodes of each of P targets."""
 
-    def _backward(self, points: torch.Tensor) -> bool:
-        """Whether the transfer matrix is simulated from the points, by reciprocity.
+    def _plan(self, points: torch.Tensor) -> Plan:
+        """The fewest simulations for a transfer matrix: from the transducers or, by reciprocity, from points.
 
         Next to an obstacle only the way from the transducers is right.
         """
-        return len(points) < len(self.scene.array) and not self._near_obstacle(points)
+        forward = forward_plan(points, self._symmetries)
+        if self._near_obstacle(points):
+            return forward
+        backward = backward_plan(points, self._symmetries)
+        fewer = (backward.runs, len(points)) < (forward.runs, len(self.scene.array))
+        return backward if fewer else forward
 
     def _warn_near_obstacle(self, origins: Nodes) -> None:
         grid = self._assembly.grid
@@ -134,8 +140,12 @@ class SimulatedPropagator(ABC):
             )  # fmt: skip
 
     @cached_property
-    def _control_matrix(self) -> torch.Tensor:
-        return self._simulated_matrix(self.scene.control_points)
+    def _control_matrix(self) -> tuple[torch.Tensor, float]:
+        return self._settled_matrix(self.scene.control_points)
+
+    @cached_property
+    def _symmetries(self) -> list[Symmetry]:
+        return symmetries(self._assembly, self.scene.array.nodes)
 
     @cached_property
     def _second(self) -> Self:
@@ -161,7 +171,9 @@ class SimulatedPropagator(ABC):
         """Transfer matrix G from one simulation a point or one a transducer, whichever are fewer.
 
         Waves travel from a point to the transducers as they travel back (reciprocity): P simulations do
-        instead of M, unless a point is next to an obstacle. The matrix of the control points is kept.
+        instead of M, unless a point is next to an obstacle. Where scene and grid are symmetric, one
+        simulation does for all points or transducers that are images of each other: mirrored along axes, or
+        with axes exchanged. The matrix of the control points is kept.
 
         Args:
             points: (P, 3) [m], for `FullPropagator` inside the domain; by default the scene's control points.
@@ -175,15 +187,14 @@ class SimulatedPropagator(ABC):
             ValueError: `points` are not finite, have another shape, leave the domain (`FullPropagator`) or
                 lie on a transducer (`BoxPropagator`).
         """
-        before = 0 if points is None else len(self.runs)
-        matrix = (
-            self._control_matrix.clone() if points is None else self._simulated_matrix(self._checked(points))
-        )
+        if points is None:
+            matrix, remaining = self._control_matrix[0].clone(), self._control_matrix[1]
+        else:
+            matrix, remaining = self._settled_matrix(self._checked(points))
         if not return_error:
             return matrix
-        steady = max((run.remaining for run in self.runs[before:]), default=0.0)
         second = self._second.transfer_matrix(points)
-        return matrix, steady + grid_error(matrix, second, coarser=self._second.spacing > self.spacing)
+        return matrix, remaining + grid_error(matrix, second, coarser=self._second.spacing > self.spacing)
 
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
         """Pressure of drives at points, from a simulation a drive or from the transfer matrix.
@@ -201,24 +212,38 @@ class SimulatedPropagator(ABC):
         drive, points = validate_drive(drive, len(self.scene.array)), self._checked(points)
         flat = drive.reshape(-1, drive.shape[-1])
         array, nodes = self.scene.array, self.scene.array.nodes
-        fewest = len(points) if self._backward(points) else len(array)
-        if drive.requires_grad or len(flat) > fewest:
-            return drive @ self._simulated_matrix(points).mT
+        if drive.requires_grad or len(flat) > self._plan(points).runs:
+            return drive @ self._settled_matrix(points)[0].mT
         field = torch.zeros((len(flat), len(points)), dtype=torch.complex128)
         for row, strength in zip(field, array.source_strength * flat, strict=True):
             row.copy_(self._simulate(nodes, strength, single_nodes(points)))
         return field.reshape(*drive.shape[:-1], len(points))
 
+    def _settled_matrix(self, points: torch.Tensor) -> tuple[torch.Tensor, float]:
+        """Transfer matrix and its distance to the steady state."""
+        before = len(self.runs)
+        matrix, runs = self._simulated_matrix(points), self.runs[before:]
+        remaining = max((run.remaining for run in runs), default=0.0)
+        return matrix, remaining
+
     def _simulated_matrix(self, points: torch.Tensor) -> torch.Tensor:
         transducers, targets = self.scene.array.nodes, single_nodes(points)
+        plan = self._plan(points)
+        origins, heard = (targets, transducers) if plan.backward else (transducers, targets)
+        logger.info(
+            "transfer matrix: %d runs from %s", plan.runs, "points" if plan.backward else "transducers"
+        )
+        if plan.runs < len(plan.stands):
+            logger.info("%d runs stand for %d by symmetry", plan.runs, len(plan.stands))
         strength = torch.full((1,), self.scene.array.source_strength, dtype=torch.complex128)
-        if self._backward(points):
-            logger.info("transfer matrix: %d runs from the points", len(points))
-            rows = [self._simulate(point, strength, transducers) for point in _one_by_one(targets)]
-            return torch.stack(rows)
-        logger.info("transfer matrix: %d runs from the transducers", len(self.scene.array))
-        columns = [self._simulate(transducer, strength, targets) for transducer in _one_by_one(transducers)]
-        return torch.stack(columns, dim=1)
+        rows = torch.zeros((len(plan.stands), len(heard.positions)), dtype=torch.complex128)
+        for own, (stands, by) in enumerate(zip(plan.stands, plan.by, strict=True)):
+            if stands == own:
+                origin = Nodes(origins.positions[own : own + 1], origins.weights)
+                rows[own] = self._simulate(origin, strength, heard)
+            else:
+                rows[own] = rows[stands, plan.images[by]]
+        return rows if plan.backward else rows.mT.contiguous()
 
     def _note(self, steady: SteadyState, seconds: float) -> None:
         self.runs.append(Run(steady.periods, steady.remaining, steady.reached, seconds))
@@ -235,7 +260,3 @@ class SimulatedPropagator(ABC):
 def single_nodes(points: torch.Tensor) -> Nodes:
     """Points (P, 3) as sources or receivers of one node each."""
     return Nodes(points[:, None], torch.ones(1, dtype=torch.float64))
-
-
-def _one_by_one(nodes: Nodes) -> list[Nodes]:
-    return [Nodes(positions[None], nodes.weights) for positions in nodes.positions]
