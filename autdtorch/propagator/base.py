@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 import warnings
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import ClassVar, Literal, Protocol, Self, overload
 
 import torch
 
 from autdtorch.array import Nodes
+from autdtorch.cache import DiskCache, digest_of
 from autdtorch.drive import validate_drive
 from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.points import footprint
@@ -20,6 +21,7 @@ from autdtorch.fdtd.steady_state import SteadyState
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.propagator.symmetry import Plan, Symmetry, backward_plan, forward_plan, symmetries
 from autdtorch.scene import Scene
+from autdtorch.source import package_versions, source_digest
 from autdtorch.validation import ArrayLike
 
 logger = logging.getLogger(__name__)
@@ -27,6 +29,9 @@ logger = logging.getLogger(__name__)
 
 MOST_JUDGED = 64
 """Targets whose pressure decides when a run has settled."""
+
+_NOT_HEARD = ("control_points", "observation_plane", "name")
+"""What of a scene decides nothing of what is heard in it."""
 
 
 class SteadyStateWarning(UserWarning):
@@ -78,7 +83,7 @@ class SimulatedPropagator(ABC):
         tolerance: relative distance to the steady state at which a run ends.
         max_periods: periods after which it ends in any case, with a `SteadyStateWarning`.
         time_step: the one in use [s].
-        runs: what every simulation took, in order; mirror images take none.
+        runs: what every simulation took, in order; mirror images and what was kept on disk take none.
     """
 
     method: ClassVar[str]
@@ -91,6 +96,7 @@ class SimulatedPropagator(ABC):
         kernel: Kernel,
         dtype: torch.dtype,
         max_periods: int,
+        cache: DiskCache | None,
         time_step: float | None,
     ) -> None:
         """Use `make_propagator`, which checks its arguments."""
@@ -100,6 +106,7 @@ class SimulatedPropagator(ABC):
         self.max_periods = max_periods
         self.runs: list[Run] = []
         self._kernel = kernel
+        self._cache = cache
         self._assembly = self._assembled(dtype, time_step)
         self.time_step = 1 / (scene.frequency * float(self._assembly.steps_per_period))
 
@@ -141,7 +148,7 @@ class SimulatedPropagator(ABC):
 
     @cached_property
     def _control_matrix(self) -> tuple[torch.Tensor, float]:
-        return self._settled_matrix(self.scene.control_points)
+        return self._kept_matrix(self.scene.control_points)
 
     @cached_property
     def _symmetries(self) -> list[Symmetry]:
@@ -152,8 +159,9 @@ class SimulatedPropagator(ABC):
         """The same on another grid, which tells the error of this one."""
         spacing = second_spacing(self.scene, self.spacing)
         return type(self)(
-            self.scene, spacing, self.tolerance, self._kernel, self._assembly.dtype, self.max_periods, None
-        )
+            self.scene, spacing, self.tolerance, self._kernel, self._assembly.dtype, self.max_periods,
+            self._cache, None,
+        )  # fmt: skip
 
     @overload
     def transfer_matrix(
@@ -190,7 +198,7 @@ class SimulatedPropagator(ABC):
         if points is None:
             matrix, remaining = self._control_matrix[0].clone(), self._control_matrix[1]
         else:
-            matrix, remaining = self._settled_matrix(self._checked(points))
+            matrix, remaining = self._kept_matrix(self._checked(points))
         if not return_error:
             return matrix
         second = self._second.transfer_matrix(points)
@@ -213,18 +221,39 @@ class SimulatedPropagator(ABC):
         flat = drive.reshape(-1, drive.shape[-1])
         array, nodes = self.scene.array, self.scene.array.nodes
         if drive.requires_grad or len(flat) > self._plan(points).runs:
-            return drive @ self._settled_matrix(points)[0].mT
+            return drive @ self._kept_matrix(points)[0].mT
         field = torch.zeros((len(flat), len(points)), dtype=torch.complex128)
         for row, strength in zip(field, array.source_strength * flat, strict=True):
             row.copy_(self._simulate(nodes, strength, single_nodes(points)))
         return field.reshape(*drive.shape[:-1], len(points))
 
-    def _settled_matrix(self, points: torch.Tensor) -> tuple[torch.Tensor, float]:
-        """Transfer matrix and its distance to the steady state."""
+    def _kept_matrix(self, points: torch.Tensor) -> tuple[torch.Tensor, float]:
+        """Transfer matrix and its distance to the steady state, from disk if it is there."""
+        digest = "" if self._cache is None else self._digest(points)
+        if self._cache is not None and (found := self._cache.load(digest)) is not None:
+            logger.info("transfer matrix from %s: no run", self._cache.folder)
+            return torch.from_numpy(found[0]), found[1]
         before = len(self.runs)
         matrix, runs = self._simulated_matrix(points), self.runs[before:]
         remaining = max((run.remaining for run in runs), default=0.0)
+        if self._cache is not None and all(run.reached for run in runs):
+            self._cache.save(digest, matrix.numpy(), remaining)
         return matrix, remaining
+
+    def _digest(self, points: torch.Tensor) -> str:
+        """Of all that decides the transfer matrix of points (P, 3) [m]."""
+        scene = {entry.name: getattr(self.scene, entry.name) for entry in fields(self.scene)}
+        settings = {
+            "method": self.method,
+            "spacing": self.spacing,
+            "tolerance": self.tolerance,
+            "max_periods": self.max_periods,
+            "steps_per_period": str(self._assembly.steps_per_period),
+            "dtype": str(self._assembly.dtype),
+            "kernel": type(self._kernel).__name__,
+        }
+        heard = {name: part for name, part in scene.items() if name not in _NOT_HEARD}
+        return digest_of(source_digest(), package_versions(), settings, heard, points)
 
     def _simulated_matrix(self, points: torch.Tensor) -> torch.Tensor:
         transducers, targets = self.scene.array.nodes, single_nodes(points)

@@ -139,7 +139,7 @@ def test_changed_source_is_computed_again(
 ) -> None:
     study = functools.partial(run_study, scenes, METHODS, solver=FREE_SPACE, folder=tmp_path, config="a: 1")
     study()
-    monkeypatch.setattr("autdtorch.results._source_digest", lambda: "changed")
+    monkeypatch.setattr("autdtorch.results.source_digest", lambda: "changed")
     study()
     assert count_runs == ["second", "first"] * 2
 
