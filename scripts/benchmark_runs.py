@@ -30,7 +30,9 @@ SPACINGS = (2.0, 1.7, 1.4, 1.3, 0.85, 0.75, 0.7, 0.65, 0.6, 0.45, 0.4)
 def measure_runs(name: str, method: str) -> None:
     """Print times and differences of one scene's matrix."""
     scene = at.load_scene(ROOT / "configs" / "scene" / f"{name}.yaml")
-    at.make_propagator(scene, method, 2e-3, tolerance=0.1).transfer_matrix()  # compiles the kernel
+    at.make_propagator(
+        scene, method, 2e-3, tolerance=0.1, cache=False
+    ).transfer_matrix()  # compiles the kernel
     with tempfile.TemporaryDirectory() as folder:
         propagator = at.make_propagator(scene, method, SPACING, cache=folder)
         assert isinstance(propagator, SimulatedPropagator)

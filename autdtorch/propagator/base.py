@@ -259,11 +259,10 @@ class SimulatedPropagator(ABC):
         transducers, targets = self.scene.array.nodes, single_nodes(points)
         plan = self._plan(points)
         origins, heard = (targets, transducers) if plan.backward else (transducers, targets)
-        logger.info(
-            "transfer matrix: %d runs from %s", plan.runs, "points" if plan.backward else "transducers"
-        )
-        if plan.runs < len(plan.stands):
-            logger.info("%d runs stand for %d by symmetry", plan.runs, len(plan.stands))
+        whence, count = "points" if plan.backward else "transducers", len(plan.stands)
+        logger.info("transfer matrix: %d runs from %s", plan.runs, whence)
+        if plan.runs < count:
+            logger.info("by symmetry, %d of %d %s stand for all", plan.runs, count, whence)
         strength = torch.full((1,), self.scene.array.source_strength, dtype=torch.complex128)
         rows = torch.zeros((len(plan.stands), len(heard.positions)), dtype=torch.complex128)
         for own, (stands, by) in enumerate(zip(plan.stands, plan.by, strict=True)):
