@@ -113,13 +113,15 @@ def _study(config: DictConfig) -> None:
     settings: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     _require_known("settings", settings, _SETTINGS)
     folder = Path(HydraConfig.get().runtime.output_dir)
+    solver = _solver(settings)
     del settings["output"]  # it is Hydra's folder by now, and changes no result
+    settings["solver"] = {key: value for key, value in solver.items() if key != "cache"}  # nor does that
     single = "scenes" not in settings
     scenes, methods = _single(settings) if single else _experiment(settings)
     results = run_study(
         scenes,
         methods,
-        solver=_solver(settings),
+        solver=solver,
         **{key: settings[key] for key in ("trials", "seed", "plane_spacing") if key in settings},
         folder=folder,
         config=_as_text(settings, scenes),

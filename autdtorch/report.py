@@ -274,13 +274,15 @@ def _simulations(results: StudyResult) -> str:
 def _simulation_cells(scene: SceneResult) -> list[str]:
     simulation = scene.simulation
     seconds = [f"{simulation.matrix_seconds:.1f}", f"{simulation.plane_seconds:.1f}"]
-    if simulation.spacing is None or not simulation.runs:
+    if simulation.spacing is None:
         return [f"{simulation.method} (exact)", *["-"] * 6, *seconds]
+    cells = simulation.wavelength / simulation.spacing
+    head = [simulation.method, f"{1e3 * simulation.spacing:g}", f"{cells:.1f}"]
     runs = simulation.runs
+    if not runs:
+        return [*head, "0, kept on disk", *["-"] * 3, *seconds]
     return [
-        simulation.method,
-        f"{1e3 * simulation.spacing:g}",
-        f"{simulation.wavelength / simulation.spacing:.1f}",
+        *head,
         str(len(runs)),
         _range([run.periods for run in runs]),
         f"{max(run.remaining for run in runs):.1e}",

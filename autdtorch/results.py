@@ -7,8 +7,6 @@ renamed, so that what is there is always complete.
 
 from __future__ import annotations
 
-import hashlib
-import importlib.metadata
 import json
 import os
 import platform
@@ -25,13 +23,13 @@ import autdtorch
 from autdtorch.metrics import FocusMetrics
 from autdtorch.optim.base import Solution
 from autdtorch.propagator import Run
+from autdtorch.source import package_versions, source_digest
 
 RESULTS_FILE = "results.h5"
 TRIALS_FILE = "trials.jsonl"
 
 PROVENANCE_FILE = "provenance.json"
 
-_PACKAGES = ("torch", "numpy", "scipy", "libigl", "numba", "botorch", "gpytorch", "linear_operator")
 _SOLUTION = ("drive", "pressure", "score", "evaluations", "history")
 _METRICS = ("mean", "min", "std", "uniformity", "area")
 
@@ -68,7 +66,7 @@ class Simulation:
         wavelength: in the medium [m].
         spacing: edge of a cell [m]; None in free space, as is `tolerance`.
         tolerance: relative distance to the steady state at which a run ends.
-        runs: every simulation that was made.
+        runs: every simulation that was made; none for matrices that were kept on disk.
         matrix_seconds: time the transfer matrix of the control points took.
         plane_seconds: time the observation plane took, for all trials of all methods together.
     """
@@ -145,10 +143,10 @@ def provenance_now(config: str, seed: int) -> Provenance:
         seed: of the random choices.
     """
     versions = {"autdtorch": autdtorch.__version__, "python": platform.python_version()}
-    versions |= {package: importlib.metadata.version(package) for package in _PACKAGES}
+    versions |= package_versions()
     versions["platform"] = platform.platform()
     date = datetime.now(UTC).isoformat(timespec="seconds")
-    return Provenance(config, seed, versions, _source_digest(), date)
+    return Provenance(config, seed, versions, source_digest(), date)
 
 
 def save_results(results: StudyResult, folder: str | os.PathLike[str]) -> None:
@@ -237,15 +235,6 @@ def trial_rows(results: StudyResult) -> Iterator[dict[str, str | int | float | N
                     "evaluations": int(method.solution.evaluations[trial]),
                     "seconds": method.seconds / method.trials,
                 }
-
-
-def _source_digest() -> str:
-    package = Path(__file__).parent
-    digest = hashlib.sha256()
-    for source in sorted(package.rglob("*.py")):
-        digest.update(f"{source.relative_to(package).as_posix()}\n".encode())
-        digest.update(source.read_bytes())
-    return digest.hexdigest()
 
 
 def _write_provenance(file: Any, provenance: Provenance) -> None:

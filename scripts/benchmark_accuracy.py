@@ -174,7 +174,7 @@ def make_reference() -> None:
     for name in CUBES:
         scene, matrices = load(name), []
         for spacing in REFERENCE_SPACINGS:
-            propagator = at.make_propagator(scene, "box", spacing, tolerance=TOLERANCE / 2)
+            propagator = at.make_propagator(scene, "box", spacing, tolerance=TOLERANCE / 2, cache=False)
             matrices.append(propagator.transfer_matrix(scene.control_points[:1]))
             print(f"{name} at {spacing * 1e3:.4g} mm done", flush=True)
         limit = extrapolate(REFERENCE_SPACINGS, matrices, CUBE_ORDER)
@@ -190,7 +190,7 @@ def make_reference() -> None:
 def simulate(case: Case, spacing: float) -> Simulation:
     """The transfer matrix at `spacing` [mm]."""
     begin = time.perf_counter()
-    propagator = at.make_propagator(case.scene, case.method, spacing * 1e-3, tolerance=TOLERANCE)
+    propagator = at.make_propagator(case.scene, case.method, spacing * 1e-3, tolerance=TOLERANCE, cache=False)
     assert isinstance(propagator, SimulatedPropagator)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", at.SteadyStateWarning)  # the report tells

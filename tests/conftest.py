@@ -13,6 +13,12 @@ if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when Triton's functions are defined
 
 
+@pytest.fixture(autouse=True)
+def nothing_from_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tests simulate, whatever matrices the user keeps."""
+    monkeypatch.delenv("AUTDTORCH_CACHE_DIR", raising=False)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         item.add_marker(item.path.relative_to(TESTS).parts[0])

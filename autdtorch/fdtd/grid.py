@@ -145,7 +145,7 @@ def _covering(scene: Scene, spacing: float, corners: Sequence[Sequence[float]], 
             _require_fine(f"obstacle {index}", obstacle.sound_speed, scene.frequency, spacing)
     lower, upper = corners
     kappa = scene.wavenumber * spacing
-    offset = grid_offset(scene, spacing, lower)
+    offset = grid_offset(scene, spacing, lower, upper)
     interior = tuple(
         math.ceil((high - low) / spacing + first - 1e-6) + 2 * margin
         for low, high, first in zip(lower, upper, offset, strict=True)

@@ -5,10 +5,14 @@ standing wave on the grid would need a mass of 1/2 + tan(kappa d) / (2 tan(kappa
 1/2 + d + kappa^2 (d^3/3 - d/12) + ...: the last term is missed. It vanishes for d = 1/2 and is largest,
 kappa^2 / 4, for a face that just touches the next centre. A curved surface has all distances and misses
 little on average; a face along the grid has one.
+
+Of places about as good, the grid takes one whose middle is that of what it covers: a scene that is its own
+mirror image is then one on the grid, too, which saves runs (`propagator/symmetry.py`).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,6 +21,7 @@ from numpy.typing import NDArray
 
 from autdtorch.obstacles import Obstacle
 from autdtorch.scene import Scene
+from autdtorch.validation import LENGTH_TOLERANCE
 
 Array = NDArray[np.float64]
 
@@ -26,11 +31,22 @@ _ALONG = 1 - 1e-9
 _TOUCHING = 1e-6
 """Distance of a face from a cell centre [cells] up to which the centre lies on it, thus in the obstacle."""
 
+_ROUNDING = 1e-6
+"""Of a length [cells]: that much more than whole cells needs no further one."""
+
 _STEPS = 20
-"""Places within a cell that are tried, beside those with a face half-way between centres."""
+"""Places within a cell that are tried, beside those with a face half-way between centres; from a symmetric
+one on, so that mirror images of faces have mirror images of places."""
+
+_SYMMETRIC = 0, _STEPS // 2
+"""Those among them where the grid is symmetric: a cell or a face between cells in the middle."""
 
 _WORTHWHILE = 0.9
-"""Share of the miss, of a grid that begins at the domain's corner, below which another place is taken."""
+"""Share of the miss of a symmetric grid below which another place is taken, for faces that are not."""
+
+_FORGIVEN = 0.07
+"""Miss [kappa^2], root of the mean square, that a symmetric grid may have more for faces that are symmetric:
+a quarter of the largest. `docs/decisions/runs.md` has the errors."""
 
 
 @dataclass(frozen=True)
@@ -58,13 +74,31 @@ class _Triangles:
         return self.corner[flat, axis], np.sign(self.normal[flat, axis]), double[flat] / 2
 
 
-def grid_offset(scene: Scene, spacing: float, lower: Sequence[float]) -> tuple[float, float, float]:
-    """How far below a grid's lower corner (3,) [m] its first cell should begin, per axis [cells], in [0, 1).
+def grid_offset(
+    scene: Scene, spacing: float, lower: Sequence[float], upper: Sequence[float]
+) -> tuple[float, float, float]:
+    """How far below a lower corner (3,) [m] a grid's first cell should begin, per axis [cells], in [0, 1).
 
-    Zero if no obstacle has flat faces along the grid, or if they lie as well as they can.
+    Args:
+        scene: its obstacles decide.
+        spacing: edge of a cell [m].
+        lower: corner of what the grid is to cover.
+        upper: the other corner.
+
+    Returns:
+        Offsets with which the grid extends as far beyond the one corner as beyond the other, unless flat
+        faces lie clearly better in another place.
     """
     surfaces = [_Triangles.of(obstacle) for obstacle in scene.obstacles]
-    x, y, z = (_axis_offset(*_faces(scene, surfaces, axis, low), spacing) for axis, low in enumerate(lower))
+    x, y, z = (
+        _axis_offset(
+            _faces(scene, surfaces, axis, low),
+            scene.array.positions.numpy()[:, axis] - low,
+            high - low,
+            spacing,
+        )
+        for axis, (low, high) in enumerate(zip(lower, upper, strict=True))
+    )
     return x, y, z
 
 
@@ -86,15 +120,35 @@ def _faces(scene: Scene, surfaces: list[_Triangles], axis: int, origin: float) -
     return faces[0], faces[1], np.bincount(own.ravel(), area, faces.shape[1]).astype(np.float64)
 
 
-def _axis_offset(place: Array, first: Array, area: Array, spacing: float) -> float:
-    """Offset [cells] with the smallest sum of squares of what the faces miss."""
+def _axis_offset(
+    faces: tuple[Array, Array, Array], transducers: Array, length: float, spacing: float
+) -> float:
+    """Offset [cells] with a small sum of squares of what the faces miss, if need be of the symmetric ones.
+
+    Coordinates of faces and transducers begin at one end of what is covered [m]; `length` is that of the
+    other.
+    """
+    place, first, area = faces
+    cells, whole = place / spacing, length / spacing
+    middle = (math.ceil(whole - _ROUNDING) - whole) / 2
     if len(place) == 0:
-        return 0.0
-    cells = place / spacing
-    between = np.unique(np.round(-cells % 1, 9) % 1)
-    offsets = np.concatenate(((0.0,), between[:_STEPS], np.arange(_STEPS) / _STEPS))
+        return middle
+    between = np.unique(np.round(-cells % 1, 9))[:_STEPS]
+    offsets = np.concatenate((middle + np.arange(_STEPS) / _STEPS, between))
+    offsets -= np.floor(offsets + _ROUNDING)
     distance = first * (cells + offsets[:, None] - 0.5)
     distance = (distance - _TOUCHING) % 1 + _TOUCHING
-    missed = (distance**3 / 3 - distance / 12) ** 2 @ area
-    best = int(missed.argmin())
-    return float(offsets[best]) if missed[best] < _WORTHWHILE * missed[0] else 0.0
+    missed = (distance**3 / 3 - distance / 12) ** 2 @ area / area.sum()
+    best, symmetric = int(missed.argmin()), min(_SYMMETRIC, key=lambda number: missed[number])
+    allowed = missed[best] / _WORTHWHILE
+    pointlike = np.stack((transducers, np.zeros_like(transducers), np.zeros_like(transducers)))
+    if _mirrored(np.concatenate((faces, pointlike), axis=1), length):
+        allowed = max(allowed, (math.sqrt(missed[best]) + _FORGIVEN) ** 2)
+    return float(offsets[symmetric if missed[symmetric] <= allowed else best])
+
+
+def _mirrored(things: Array, length: float) -> bool:
+    """Whether things (3, n) are their own mirror images: coordinate from one end [m], direction and area."""
+    images = np.stack((length - things[0], -things[1], things[2]))
+    here, there = (each[:, np.lexsort((each[1], each[0].round(9)))] for each in (things, images))
+    return np.allclose(here, there, rtol=0, atol=2 * LENGTH_TOLERANCE)

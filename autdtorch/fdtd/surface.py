@@ -223,13 +223,18 @@ def _by_steps(stencil: Stencil) -> Array:
 def _volume_coverage(distance: Array) -> Array:
     """Share of each sub-cell (..., 64) with a distance below zero: exact for faces along the grid."""
     cube = distance.reshape(*distance.shape[:-1], *(SUBCELLS + 1,) * 3)
-    mean, width = cube, np.zeros(cube.shape)
-    for axis in (-3, -2, -1):
-        low, high = np.take(mean, _LOW, axis), np.take(mean, _LOW + 1, axis)
-        width = (np.take(width, _LOW, axis) + np.take(width, _LOW + 1, axis)) / 2 + np.abs(high - low)
-        mean = (low + high) / 2
+    mean, *slopes = (_over_subcells(cube, along) for along in (None, -3, -2, -1))
+    width = np.abs(slopes).sum(axis=0)
     share = np.clip(0.5 - mean / np.maximum(width, 1e-12), 0, 1)
     return np.asarray(share.reshape(*distance.shape[:-1], SUBCELLS**3))
+
+
+def _over_subcells(cube: Array, along: int | None) -> Array:
+    """Mean over the corners of each sub-cell, of the values or of their differences along an axis."""
+    for axis in (-3, -2, -1):
+        low, high = np.take(cube, _LOW, axis), np.take(cube, _LOW + 1, axis)
+        cube = high - low if axis == along else (low + high) / 2
+    return cube
 
 
 def _line_coverage(distance: Array) -> Array:

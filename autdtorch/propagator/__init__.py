@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import logging
+import os
 from importlib.util import find_spec
+from typing import Literal
 
 import torch
 
+from autdtorch.cache import DiskCache
 from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.spacing import PILOT_CELLS, coarsest_spacing, spacing_for
 from autdtorch.propagator.base import Propagator, Run, SimulatedPropagator, SteadyStateWarning
@@ -31,6 +34,7 @@ logger = logging.getLogger(__name__)
 
 METHODS = ("auto", "free_space", "box", "full")
 KERNELS = ("auto", "cpu", "cuda", "reference")
+CACHE_VARIABLE = "AUTDTORCH_CACHE_DIR"
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
@@ -65,6 +69,7 @@ def make_propagator(
     dtype: str | torch.dtype = "float32",
     max_periods: int = 600,
     time_step: float | None = None,
+    cache: str | os.PathLike[str] | Literal[False] | None = None,
 ) -> FreeSpacePropagator | SimulatedPropagator:
     """Choose and prepare a propagator.
 
@@ -85,6 +90,10 @@ def make_propagator(
         max_periods: periods of the drive after which a simulation ends in any case, with a
             `SteadyStateWarning`. They are stepped in blocks of a few, and the last block is finished.
         time_step: at most this [s], and at least 97 % of it; by default the largest stable one.
+        cache: folder where simulated transfer matrices are kept, to be used again for the same scene, points
+            and settings by the same version of this package. By default that of the environment variable
+            AUTDTORCH_CACHE_DIR, and nowhere if that is not set; False: nowhere. It may be shared by any
+            number of processes.
 
     Returns:
         A propagator for the scene.
@@ -106,6 +115,7 @@ def make_propagator(
     max_periods = integer_at_least("max_periods", max_periods, 1)
     if time_step is not None:
         time_step = positive("time_step", time_step, "s")
+    disk_cache = _disk_cache(cache)
     if method == "auto":
         method = "full" if scene.obstacles else "free_space"
         count = len(scene.obstacles)
@@ -116,7 +126,7 @@ def make_propagator(
     if method == "free_space":
         return FreeSpacePropagator(scene)
     kind = BoxPropagator if method == "box" else FullPropagator
-    settings = _make_kernel(kernel), DTYPES[dtype_name], max_periods
+    settings = _make_kernel(kernel), DTYPES[dtype_name], max_periods, disk_cache
     if spacing is None:
         tolerance /= 2
         spacing = _chosen_spacing(kind, scene, tolerance, *settings)
@@ -130,16 +140,33 @@ def _chosen_spacing(
     kernel: Kernel,
     dtype: torch.dtype,
     max_periods: int,
+    cache: DiskCache | None,
 ) -> float:
     """Spacing [m] at which the grid's error should be `tolerance`, told from two coarse grids."""
     coarsest = coarsest_spacing(scene)
     pilot = min(scene.wavelength / PILOT_CELLS, coarsest)
     near_steady = max(tolerance, 1e-3)
-    propagator = kind(scene, pilot, near_steady, kernel, dtype, max_periods, None)
+    propagator = kind(scene, pilot, near_steady, kernel, dtype, max_periods, cache, None)
     _, error = propagator.transfer_matrix(return_error=True)
     spacing = min(spacing_for(tolerance, error, pilot), coarsest)
     logger.info("spacing %.3g mm: the error at %.3g mm is about %.2g", 1e3 * spacing, 1e3 * pilot, error)
     return spacing
+
+
+def _disk_cache(folder: str | os.PathLike[str] | Literal[False] | None) -> DiskCache | None:
+    name = "cache"
+    if folder is None:
+        name, folder = CACHE_VARIABLE, os.environ.get(CACHE_VARIABLE) or False
+    if folder is False:
+        return None
+    if not isinstance(folder, str | os.PathLike) or not os.fspath(folder):
+        raise invalid(name, folder, "must be the path of a folder, or False")
+    try:
+        return DiskCache(folder)
+    except OSError as error:
+        raise invalid(
+            name, os.fspath(folder), f"must be a folder, or one that can be made ({error})"
+        ) from error
 
 
 def _require_one_of(name: str, value: object, accepted: tuple[str, ...]) -> None:

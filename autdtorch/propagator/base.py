@@ -5,20 +5,23 @@ from __future__ import annotations
 import logging
 import warnings
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import ClassVar, Literal, Protocol, Self, overload
 
 import torch
 
 from autdtorch.array import Nodes
+from autdtorch.cache import DiskCache, digest_of
 from autdtorch.drive import validate_drive
 from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.points import footprint
 from autdtorch.fdtd.spacing import grid_error, second_spacing
 from autdtorch.fdtd.steady_state import SteadyState
 from autdtorch.fdtd.stepping import Assembly
+from autdtorch.propagator.symmetry import Plan, Symmetry, backward_plan, forward_plan, symmetries
 from autdtorch.scene import Scene
+from autdtorch.source import package_versions, source_digest
 from autdtorch.validation import ArrayLike
 
 logger = logging.getLogger(__name__)
@@ -26,6 +29,9 @@ logger = logging.getLogger(__name__)
 
 MOST_JUDGED = 64
 """Targets whose pressure decides when a run has settled."""
+
+_NOT_HEARD = ("control_points", "observation_plane", "name")
+"""What of a scene decides nothing of what is heard in it."""
 
 
 class SteadyStateWarning(UserWarning):
@@ -77,7 +83,7 @@ class SimulatedPropagator(ABC):
         tolerance: relative distance to the steady state at which a run ends.
         max_periods: periods after which it ends in any case, with a `SteadyStateWarning`.
         time_step: the one in use [s].
-        runs: what every simulation took, in order.
+        runs: what every simulation took, in order; mirror images and what was kept on disk take none.
     """
 
     method: ClassVar[str]
@@ -90,6 +96,7 @@ class SimulatedPropagator(ABC):
         kernel: Kernel,
         dtype: torch.dtype,
         max_periods: int,
+        cache: DiskCache | None,
         time_step: float | None,
     ) -> None:
         """Use `make_propagator`, which checks its arguments."""
@@ -99,6 +106,7 @@ class SimulatedPropagator(ABC):
         self.max_periods = max_periods
         self.runs: list[Run] = []
         self._kernel = kernel
+        self._cache = cache
         self._assembly = self._assembled(dtype, time_step)
         self.time_step = 1 / (scene.frequency * float(self._assembly.steps_per_period))
 
@@ -118,12 +126,17 @@ class SimulatedPropagator(ABC):
     def _simulate(self, origins: Nodes, strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
         """Pressure (P,) of N origins with strengths (N,), as the mean over the nodes of each of P targets."""
 
-    def _backward(self, points: torch.Tensor) -> bool:
-        """Whether the transfer matrix is simulated from the points, by reciprocity.
+    def _plan(self, points: torch.Tensor) -> Plan:
+        """The fewest simulations for a transfer matrix: from the transducers or, by reciprocity, from points.
 
         Next to an obstacle only the way from the transducers is right.
         """
-        return len(points) < len(self.scene.array) and not self._near_obstacle(points)
+        forward = forward_plan(points, self._symmetries)
+        if self._near_obstacle(points):
+            return forward
+        backward = backward_plan(points, self._symmetries)
+        fewer = (backward.runs, len(points)) < (forward.runs, len(self.scene.array))
+        return backward if fewer else forward
 
     def _warn_near_obstacle(self, origins: Nodes) -> None:
         grid = self._assembly.grid
@@ -134,16 +147,21 @@ class SimulatedPropagator(ABC):
             )  # fmt: skip
 
     @cached_property
-    def _control_matrix(self) -> torch.Tensor:
-        return self._simulated_matrix(self.scene.control_points)
+    def _control_matrix(self) -> tuple[torch.Tensor, float]:
+        return self._kept_matrix(self.scene.control_points)
+
+    @cached_property
+    def _symmetries(self) -> list[Symmetry]:
+        return symmetries(self._assembly, self.scene.array.nodes)
 
     @cached_property
     def _second(self) -> Self:
         """The same on another grid, which tells the error of this one."""
         spacing = second_spacing(self.scene, self.spacing)
         return type(self)(
-            self.scene, spacing, self.tolerance, self._kernel, self._assembly.dtype, self.max_periods, None
-        )
+            self.scene, spacing, self.tolerance, self._kernel, self._assembly.dtype, self.max_periods,
+            self._cache, None,
+        )  # fmt: skip
 
     @overload
     def transfer_matrix(
@@ -161,7 +179,9 @@ class SimulatedPropagator(ABC):
         """Transfer matrix G from one simulation a point or one a transducer, whichever are fewer.
 
         Waves travel from a point to the transducers as they travel back (reciprocity): P simulations do
-        instead of M, unless a point is next to an obstacle. The matrix of the control points is kept.
+        instead of M, unless a point is next to an obstacle. Where scene and grid are symmetric, one
+        simulation does for all points or transducers that are images of each other: mirrored along axes, or
+        with axes exchanged. The matrix of the control points is kept.
 
         Args:
             points: (P, 3) [m], for `FullPropagator` inside the domain; by default the scene's control points.
@@ -175,15 +195,14 @@ class SimulatedPropagator(ABC):
             ValueError: `points` are not finite, have another shape, leave the domain (`FullPropagator`) or
                 lie on a transducer (`BoxPropagator`).
         """
-        before = 0 if points is None else len(self.runs)
-        matrix = (
-            self._control_matrix.clone() if points is None else self._simulated_matrix(self._checked(points))
-        )
+        if points is None:
+            matrix, remaining = self._control_matrix[0].clone(), self._control_matrix[1]
+        else:
+            matrix, remaining = self._kept_matrix(self._checked(points))
         if not return_error:
             return matrix
-        steady = max((run.remaining for run in self.runs[before:]), default=0.0)
         second = self._second.transfer_matrix(points)
-        return matrix, steady + grid_error(matrix, second, coarser=self._second.spacing > self.spacing)
+        return matrix, remaining + grid_error(matrix, second, coarser=self._second.spacing > self.spacing)
 
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
         """Pressure of drives at points, from a simulation a drive or from the transfer matrix.
@@ -201,24 +220,58 @@ class SimulatedPropagator(ABC):
         drive, points = validate_drive(drive, len(self.scene.array)), self._checked(points)
         flat = drive.reshape(-1, drive.shape[-1])
         array, nodes = self.scene.array, self.scene.array.nodes
-        fewest = len(points) if self._backward(points) else len(array)
-        if drive.requires_grad or len(flat) > fewest:
-            return drive @ self._simulated_matrix(points).mT
+        if drive.requires_grad or len(flat) > self._plan(points).runs:
+            return drive @ self._kept_matrix(points)[0].mT
         field = torch.zeros((len(flat), len(points)), dtype=torch.complex128)
         for row, strength in zip(field, array.source_strength * flat, strict=True):
             row.copy_(self._simulate(nodes, strength, single_nodes(points)))
         return field.reshape(*drive.shape[:-1], len(points))
 
+    def _kept_matrix(self, points: torch.Tensor) -> tuple[torch.Tensor, float]:
+        """Transfer matrix and its distance to the steady state, from disk if it is there."""
+        digest = "" if self._cache is None else self._digest(points)
+        if self._cache is not None and (found := self._cache.load(digest)) is not None:
+            logger.info("transfer matrix from %s: no run", self._cache.folder)
+            return torch.from_numpy(found[0]), found[1]
+        before = len(self.runs)
+        matrix, runs = self._simulated_matrix(points), self.runs[before:]
+        remaining = max((run.remaining for run in runs), default=0.0)
+        if self._cache is not None and all(run.reached for run in runs):
+            self._cache.save(digest, matrix.numpy(), remaining)
+        return matrix, remaining
+
+    def _digest(self, points: torch.Tensor) -> str:
+        """Of all that decides the transfer matrix of points (P, 3) [m]."""
+        scene = {entry.name: getattr(self.scene, entry.name) for entry in fields(self.scene)}
+        settings = {
+            "method": self.method,
+            "spacing": self.spacing,
+            "tolerance": self.tolerance,
+            "max_periods": self.max_periods,
+            "steps_per_period": str(self._assembly.steps_per_period),
+            "dtype": str(self._assembly.dtype),
+            "kernel": type(self._kernel).__name__,
+        }
+        heard = {name: part for name, part in scene.items() if name not in _NOT_HEARD}
+        return digest_of(source_digest(), package_versions(), settings, heard, points)
+
     def _simulated_matrix(self, points: torch.Tensor) -> torch.Tensor:
         transducers, targets = self.scene.array.nodes, single_nodes(points)
+        plan = self._plan(points)
+        origins, heard = (targets, transducers) if plan.backward else (transducers, targets)
+        whence, count = "points" if plan.backward else "transducers", len(plan.stands)
+        logger.info("transfer matrix: %d runs from %s", plan.runs, whence)
+        if plan.runs < count:
+            logger.info("by symmetry, %d of %d %s stand for all", plan.runs, count, whence)
         strength = torch.full((1,), self.scene.array.source_strength, dtype=torch.complex128)
-        if self._backward(points):
-            logger.info("transfer matrix: %d runs from the points", len(points))
-            rows = [self._simulate(point, strength, transducers) for point in _one_by_one(targets)]
-            return torch.stack(rows)
-        logger.info("transfer matrix: %d runs from the transducers", len(self.scene.array))
-        columns = [self._simulate(transducer, strength, targets) for transducer in _one_by_one(transducers)]
-        return torch.stack(columns, dim=1)
+        rows = torch.zeros((len(plan.stands), len(heard.positions)), dtype=torch.complex128)
+        for own, (stands, by) in enumerate(zip(plan.stands, plan.by, strict=True)):
+            if stands == own:
+                origin = Nodes(origins.positions[own : own + 1], origins.weights)
+                rows[own] = self._simulate(origin, strength, heard)
+            else:
+                rows[own] = rows[stands, plan.images[by]]
+        return rows if plan.backward else rows.mT.contiguous()
 
     def _note(self, steady: SteadyState, seconds: float) -> None:
         self.runs.append(Run(steady.periods, steady.remaining, steady.reached, seconds))
@@ -235,7 +288,3 @@ class SimulatedPropagator(ABC):
 def single_nodes(points: torch.Tensor) -> Nodes:
     """Points (P, 3) as sources or receivers of one node each."""
     return Nodes(points[:, None], torch.ones(1, dtype=torch.float64))
-
-
-def _one_by_one(nodes: Nodes) -> list[Nodes]:
-    return [Nodes(positions[None], nodes.weights) for positions in nodes.positions]

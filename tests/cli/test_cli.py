@@ -220,6 +220,16 @@ def test_what_is_finished_is_not_computed_again(
         run(*command[:-1], "output=elsewhere")
 
 
+def test_where_matrices_are_kept_changes_no_result(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ("scene=homogeneous", "method=lssg", "solver.method=free_space", "plane_spacing=10e-3")
+    for folder in ("one", "two"):
+        assert run(*command, f"solver.cache={tmp_path / folder}", "output=out") == 0
+    assert (tmp_path / "one").is_dir()
+    assert "re-using homogeneous" in capsys.readouterr().err
+
+
 def test_a_changed_obstacle_file_is_computed_again(
     run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -117,7 +117,7 @@ def test_cubes_reference_is_the_limit_of_what_was_stored(
     class PowerLaw:
         """Transfer matrices that differ from that of free space by a power of the spacing."""
 
-        def __init__(self, scene: at.Scene, _: str, spacing: float, tolerance: float) -> None:
+        def __init__(self, scene: at.Scene, _: str, spacing: float, tolerance: float, cache: bool) -> None:
             self.scene, self.factor = scene, 1 + (10 * spacing) ** CUBE_ORDER
 
         def transfer_matrix(self, points: torch.Tensor) -> torch.Tensor:

@@ -16,6 +16,7 @@ from autdtorch.obstacles import Box, Obstacle, Sphere, VoxelMask
 from autdtorch.scene import Scene
 
 SPACING = 1e-3
+CORNERS = (0, 0, 0), (30e-3, 30e-3, 30e-3)
 ARRAY = TransducerArray([(1e-3, 10e-3, 10e-3)], (1, 0, 0))
 
 
@@ -64,12 +65,12 @@ def test_a_face_that_cannot_lie_half_way_lies_closer_to_the_lighter_side(density
 def test_nothing_moves_without_flat_faces_along_the_grid() -> None:
     sphere = Sphere((12.3e-3, 10.2e-3, 9.9e-3), 5e-3, rigid=True)
     tilted = Box((20e-3, 20e-3, 20e-3), (3e-3, 4e-3, 5e-3), (0.3, 0.2, 0.1), rigid=True)
-    assert grid_offset(scene(sphere, tilted), SPACING, (0, 0, 0)) == (0.0, 0.0, 0.0)
-    assert grid_offset(scene(), SPACING, (0, 0, 0)) == (0.0, 0.0, 0.0)
+    assert grid_offset(scene(sphere, tilted), SPACING, *CORNERS) == (0.0, 0.0, 0.0)
+    assert grid_offset(scene(), SPACING, *CORNERS) == (0.0, 0.0, 0.0)
 
 
 def test_nothing_moves_where_faces_lie_well() -> None:
-    assert grid_offset(scene(box((5, 6, 7), (8, 9, 10))), SPACING, (0, 0, 0)) == (0.0, 0.0, 0.0)
+    assert grid_offset(scene(box((5, 6, 7), (8, 9, 10))), SPACING, *CORNERS) == (0.0, 0.0, 0.0)
 
 
 def test_voxels_have_faces_too() -> None:
@@ -77,7 +78,7 @@ def test_voxels_have_faces_too() -> None:
     mask[1:3, 1, 1] = True
     voxels = VoxelMask(mask, 2e-3, (10.4e-3, 10.4e-3, 10.4e-3), rigid=True)
     assert all(
-        math.isclose(offset, 0.6, abs_tol=1e-6) for offset in grid_offset(scene(voxels), SPACING, (0, 0, 0))
+        math.isclose(offset, 0.6, abs_tol=1e-6) for offset in grid_offset(scene(voxels), SPACING, *CORNERS)
     )
 
 

@@ -118,3 +118,16 @@ def test_every_scene_of_the_results_must_be_given(tmp_path: Path) -> None:
     results, _ = reported({"a": scene()}, tmp_path)
     with pytest.raises(ValueError, match=r"scenes: none for \['a'\]"):
         write_report(results, {"b": scene()}, tmp_path, "")
+
+
+def test_matrices_that_were_kept_are_no_runs_and_not_exact(tmp_path: Path) -> None:
+    solver = {"method": "full", "spacing": 2.8e-3, "tolerance": 0.05, "cache": tmp_path / "kept"}
+    for runs in ("4", "0, kept on disk"):
+        results = run_study(
+            {"cube": scene(None, (CUBE,))}, {"gabs": METHODS["gabs"]}, solver=solver, trials=1
+        )
+        report = write_report(results, {"cube": scene(None, (CUBE,))}, tmp_path, "autdtorch").read_text(
+            "utf-8"
+        )
+        (row,) = [row for table in tables(report) for row in table if row[1:2] == ["full"]]
+        assert row[4] == runs

@@ -1,0 +1,136 @@
+"""Arrays that took long to compute, kept on disk under a digest of all that decides them.
+
+A file is written beside its place and then renamed: whoever reads finds nothing or all of it, whatever other
+processes do and whenever one is killed. Its first line is a checksum of the rest.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import io
+import logging
+import os
+import time
+import uuid
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+logger = logging.getLogger(__name__)
+
+SUFFIX = ".matrix"
+PARTIAL = ".partial"
+
+ABANDONED = 3600.0
+"""Age [s] from which on the partial file of a writer that was killed is removed; writing takes seconds."""
+
+
+def digest_of(*parts: object) -> str:
+    """SHA-256 of values, to their last bit: numbers, text, arrays, tensors, and what is made up of these.
+
+    Of a dataclass the fields that are compared count, and all arrays.
+
+    Raises:
+        TypeError: a value of another kind.
+    """
+    digest = hashlib.sha256()
+    for part in parts:
+        _add(digest, part)
+    return digest.hexdigest()
+
+
+def _add(digest: Any, part: Any) -> None:
+    """Add a value, its kind and its length, so that no two different ones look the same."""
+    if part is None or isinstance(part, str | bool | int | float):
+        text = part.hex() if isinstance(part, float) else repr(part)
+        digest.update(f"{type(part).__name__} {len(text)} {text}\n".encode())
+    elif hasattr(part, "__array__"):
+        array = np.ascontiguousarray(part)
+        digest.update(f"array {array.dtype.str} {array.shape}\n".encode() + array.tobytes())
+    elif dataclasses.is_dataclass(part):
+        named = [(field, getattr(part, field.name)) for field in dataclasses.fields(part)]
+        kept = {field.name: own for field, own in named if field.compare or hasattr(own, "__array__")}
+        _add(digest, (type(part).__name__, kept))
+    elif isinstance(part, Mapping):
+        _add(digest, tuple(part.items()))
+    elif isinstance(part, tuple | list):
+        digest.update(f"sequence {len(part)}\n".encode())
+        for entry in part:
+            _add(digest, entry)
+    else:
+        raise TypeError(f"{type(part).__name__}: cannot be told by its content")
+
+
+class DiskCache:
+    """A folder of arrays, each with one number, under their digests.
+
+    Attributes:
+        folder: where they are.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        """Make the folder if need be.
+
+        Raises:
+            OSError: it cannot be made.
+        """
+        self.folder = Path(folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
+
+    def load(self, digest: str) -> tuple[NDArray[Any], float] | None:
+        """What `save` was given; None if nothing is there, or what is there is damaged."""
+        path = self._path(digest)
+        try:
+            content = path.read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            logger.warning("%s cannot be read (%s): computing again", path, error.strerror)
+            return None
+        checksum, _, body = content.partition(b"\n")
+        if hashlib.sha256(body).hexdigest().encode() != checksum:
+            logger.warning("%s is damaged (its checksum is wrong): computing again", path)
+            return None
+        stream = io.BytesIO(body)
+        return np.load(stream, allow_pickle=False), float(np.load(stream, allow_pickle=False))
+
+    def save(self, digest: str, array: NDArray[Any], number: float) -> None:
+        """Keep an array and a number. What cannot be written is left out, and logged."""
+        stream = io.BytesIO()
+        np.save(stream, array, allow_pickle=False)
+        np.save(stream, np.float64(number), allow_pickle=False)
+        body = stream.getvalue()
+        path = self._path(digest)
+        try:
+            self._remove_abandoned()
+            with _partial_file(path) as file:
+                file.write(hashlib.sha256(body).hexdigest().encode() + b"\n" + body)
+        except OSError as error:
+            logger.warning("%s cannot be written (%s): not kept", path, error.strerror)
+
+    def _path(self, digest: str) -> Path:
+        return self.folder / f"{digest}{SUFFIX}"
+
+    def _remove_abandoned(self) -> None:
+        for path in self.folder.glob(f"*{PARTIAL}"):
+            with contextlib.suppress(OSError):  # another process removes it as well, or it is another user's
+                if time.time() - path.stat().st_mtime > ABANDONED:
+                    path.unlink()
+
+
+@contextlib.contextmanager
+def _partial_file(path: Path) -> Iterator[BinaryIO]:
+    """A file of this process alone, which takes its place when it is complete and is removed otherwise."""
+    partial = path.with_name(f"{path.stem}-{uuid.uuid4().hex}{PARTIAL}")
+    try:
+        with partial.open("xb") as file:
+            yield file
+        partial.replace(path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise

@@ -1,0 +1,223 @@
+"""Mirror images: one run stands for all points, or all transducers, that are images of each other."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from small_scenes import AIR, relative_error
+
+from autdtorch.array import TransducerArray
+from autdtorch.fdtd.grid import make_box
+from autdtorch.geometry import circle_points
+from autdtorch.obstacles import Box, Cylinder, Obstacle, Sphere, VoxelMask
+from autdtorch.propagator import SimulatedPropagator, make_propagator
+from autdtorch.scene import OverlapWarning, Scene
+from autdtorch.scene_file import load_scene
+
+SCENES = Path(__file__).parents[2] / "configs" / "scene"
+MIDDLE = 12e-3, 12e-3, 12e-3
+ARRAY = TransducerArray.grid((2, 2), pitch=8e-3, center=(1.2e-3, 12e-3, 12e-3))
+HEAVY = {"density": 100.0, "sound_speed": 340.0}
+CUBE = Box(MIDDLE, (5.3e-3, 6.1e-3, 6.1e-3), **HEAVY)
+FOCI = circle_points((21.3e-3, 12e-3, 12e-3), radius=7.3e-3, count=4, normal=(1, 0, 0))
+
+SETTLED = 1e-6
+"""Tolerance of the runs that are compared. Rounding makes them differ by up to about as much: the limit is
+extrapolated from differences that small. An image that is a wrong one differs by 1."""
+
+
+def scene(
+    *obstacles: Obstacle, array: TransducerArray = ARRAY, points: torch.Tensor = FOCI, extent: float = 24e-3
+) -> Scene:
+    return Scene(array, AIR, 40e3, points, obstacles, domain=((0, 0, 0), (24e-3, 24e-3, extent)))
+
+
+def simulated(
+    scene: Scene, method: str = "box", spacing: float = 1.3e-3, tolerance: float = 1e-3
+) -> SimulatedPropagator:
+    propagator = make_propagator(scene, method, spacing, tolerance=tolerance, dtype="float64")
+    assert isinstance(propagator, SimulatedPropagator)
+    return propagator
+
+
+def count(scene: Scene, method: str = "box") -> int:
+    return len(simulated(scene, method)._symmetries)
+
+
+@pytest.mark.parametrize("name", ["two_cubes", "three_cubes", "sphere"])
+@pytest.mark.parametrize("spacing", [2e-3, 1.3e-3, 0.75e-3])
+def test_the_papers_scenes_take_one_run(name: str, spacing: float) -> None:
+    paper = load_scene(SCENES / f"{name}.yaml")
+    assert simulated(paper, "box", spacing)._plan(paper.control_points).runs == 1
+
+
+@pytest.mark.parametrize("method", ["box", "full"])
+def test_images_are_what_direct_runs_give(method: str, caplog: pytest.LogCaptureFixture) -> None:
+    propagator = simulated(scene(CUBE, points=FOCI[:3]), method, tolerance=SETTLED)
+    with caplog.at_level(logging.INFO):
+        matrix = propagator.transfer_matrix()
+    assert len(propagator.runs) == 1
+    assert "by symmetry, 1 of 3 points stand for all" in caplog.text
+    direct = torch.cat([propagator.transfer_matrix(point[None]) for point in FOCI[1:3]])
+    assert len(propagator.runs) == 1 + 2
+    assert relative_error(matrix[1:], direct) < SETTLED
+
+
+@pytest.mark.parametrize("method", ["box", "full"])
+def test_images_of_transducers(method: str) -> None:
+    """More points than transducers, in any order, some of them twice."""
+    axis = torch.tensor([[20e-3, 12e-3, 12e-3], [22e-3, 12e-3, 12e-3]], dtype=torch.float64)
+    points = torch.cat((axis, FOCI[[2, 0, 3, 1]], axis))
+    propagator = simulated(scene(CUBE), method, tolerance=SETTLED)
+    matrix = propagator.transfer_matrix(points)
+    assert len(propagator.runs) == 1
+    direct = [propagator.field(drive, points) for drive in torch.eye(4, dtype=torch.complex128)[2:]]
+    assert len(propagator.runs) == 1 + 2
+    assert relative_error(matrix[:, 2:], torch.stack(direct, dim=1)) < SETTLED
+
+
+def test_points_that_are_no_images_run_by_themselves() -> None:
+    propagator = simulated(scene(CUBE))
+    points = torch.cat((FOCI[:2], FOCI[:1] + 1e-3))
+    assert propagator._plan(points).runs == 2
+
+
+SMALL = Sphere((12e-3, 12e-3, 17.5e-3), 1.4e-3, **HEAVY)
+PAIR = Sphere((12e-3, 12e-3, 6.5e-3), 1.4e-3, **HEAVY)
+TILTED = torch.tensor([[1.0, 0, 0]] * 3 + [[1, 0.01, 0]])
+
+
+@pytest.mark.parametrize(
+    ("left", "changed"),
+    [
+        (8, scene(CUBE)),  # two mirrors, y and z exchanged, and what they make together
+        (4, scene(CUBE, SMALL, PAIR)),
+        (2, scene(CUBE, SMALL)),
+        (2, scene(CUBE, SMALL, replace(PAIR, center=(12e-3, 12e-3, 6.503e-3)))),
+        (2, scene(CUBE, SMALL, replace(PAIR, density=99.9))),
+        (2, scene(CUBE, SMALL, replace(PAIR, sound_speed=341.0))),
+        (2, scene(CUBE, SMALL, replace(PAIR, density=None, sound_speed=None, rigid=True))),
+        (2, scene(CUBE, array=TransducerArray(ARRAY.positions[:3], (1, 0, 0)))),
+        (1, scene(CUBE, SMALL, array=TransducerArray(ARRAY.positions[:3], (1, 0, 0)))),
+        (1, scene(CUBE, array=TransducerArray(ARRAY.positions, TILTED, radius=2e-3))),
+        (8, scene(CUBE, array=TransducerArray(ARRAY.positions, TILTED))),  # points have no direction
+        (8, scene(CUBE, array=TransducerArray(ARRAY.positions, (1, 0, 0), radius=2e-3))),
+    ],
+)
+def test_what_breaks_a_symmetry(left: int, changed: Scene) -> None:
+    assert count(changed) == left
+
+
+def test_the_domain_counts_where_it_is_simulated() -> None:
+    longer = scene(CUBE, extent=27e-3)
+    assert count(longer, "full") == 2
+    assert count(longer, "box") == 8
+
+
+def test_the_order_of_overlapping_obstacles_counts() -> None:
+    left, right = (Box((12e-3, 12e-3, z), (4e-3, 4e-3, 4e-3), **HEAVY) for z in (9.5e-3, 14.5e-3))
+    between = Box(MIDDLE, (4e-3, 4e-3, 3e-3), density=2.0, sound_speed=340.0)
+    for order, left_over in (((left, right, between), 4), ((left, between, right), 2)):
+        with pytest.warns(OverlapWarning):
+            assert count(scene(*order)) == left_over
+
+
+def test_a_wall_that_goes_on_is_symmetric_too() -> None:
+    wall = Box((30e-3, 12e-3, 12e-3), (20e-3, 60e-3, 60e-3), rigid=True)
+    points = FOCI - torch.tensor([4e-3, 0, 0])
+    propagator = simulated(scene(wall, points=points), "full", tolerance=SETTLED)
+    assert len(propagator._symmetries) == 8
+    matrix = propagator.transfer_matrix()
+    direct = propagator.transfer_matrix(points[3:])
+    assert relative_error(matrix[3:], direct) < SETTLED
+
+
+def test_voxels_need_not_know_their_symmetries() -> None:
+    mask = np.zeros((3, 4, 4), bool)
+    mask[1:, 1:3, :] = mask[1:, :, 1:3] = True
+    origin = 9e-3, 9e-3, 9e-3
+    assert count(scene(VoxelMask(mask, 1.5e-3, origin, rigid=True))) == 8
+    mask[2, 0, 0] = True
+    assert count(scene(VoxelMask(mask, 1.5e-3, origin, rigid=True))) == 2
+
+
+def image(obstacle: Obstacle, exchange: bool, signs: tuple[int, int]) -> Obstacle:
+    """With y and z exchanged, if so wanted, and then mirrored about the middle."""
+    order = [0, 2, 1] if exchange else [0, 1, 2]
+    middle, sign = np.array(MIDDLE), np.array((1, *signs))
+    center = tuple(middle + sign * (np.array(obstacle.center) - middle)[order])  # type: ignore[attr-defined]
+    match obstacle:
+        case Box():
+            return replace(obstacle, center=center, size=tuple(np.array(obstacle.size)[order]))
+        case Cylinder():
+            return replace(obstacle, center=center, axis=tuple(sign * np.array(obstacle.axis)[order]))
+        case _:
+            return replace(obstacle, center=center)
+
+
+def lies_symmetrically(scene: Scene, spacing: float) -> bool:
+    grid = make_box(scene, spacing)
+    # rounding of coordinates
+    return all(abs(grid.centers[axis][[0, -1]].mean() - 12e-3) < 1e-12 for axis in (1, 2))
+
+
+OFF_AXIS = st.tuples(st.floats(8.5e-3, 15e-3), st.floats(13.1e-3, 16e-3), st.floats(13.1e-3, 16e-3))
+MATERIAL = st.sampled_from([{"rigid": True}, HEAVY, {"density": 0.3, "sound_speed": 500.0}])
+EDGE = st.floats(1e-3, 4e-3)
+DIRECTION = st.tuples(*[st.floats(0.2, 1)] * 3)
+OBSTACLES = st.one_of(
+    st.builds(lambda c, d, m: Sphere(c, d / 2, **m), OFF_AXIS, EDGE, MATERIAL),
+    st.builds(lambda c, s, m: Box(c, s, **m), OFF_AXIS, st.tuples(EDGE, EDGE, EDGE), MATERIAL),
+    st.builds(lambda c, d, h, a, m: Cylinder(c, d / 2, h, a, **m), OFF_AXIS, EDGE, EDGE, DIRECTION, MATERIAL),
+)
+
+
+@settings(max_examples=6, deadline=None)
+@given(OBSTACLES, st.floats(1.2e-3, 1.6e-3))
+def test_random_symmetric_scenes(obstacle: Obstacle, spacing: float) -> None:
+    signs = itertools.product((1, -1), repeat=2)
+    copies = [image(obstacle, *which) for which in itertools.product((False, True), signs)]
+    symmetric = scene(*copies)
+    assume(lies_symmetrically(symmetric, spacing))  # with many faces, another place may be clearly better
+    propagator = simulated(symmetric, "box", spacing, tolerance=SETTLED)
+    assert len(propagator._symmetries) == 8
+    matrix = propagator.transfer_matrix()  # of as many points as transducers: from the transducers
+    assert len(propagator.runs) == 1
+    direct = propagator.field(torch.tensor([0, 0, 0, 1], dtype=torch.complex128), FOCI)
+    assert len(propagator.runs) == 2
+    assert relative_error(matrix[:, 3], direct) < SETTLED
+
+
+@settings(max_examples=6, deadline=None)
+@given(OBSTACLES, st.floats(1.2e-3, 1.6e-3), st.floats(0.05e-3, 1e-3))
+def test_random_asymmetric_scenes(obstacle: Obstacle, spacing: float, shift: float) -> None:
+    """A sphere in the middle, which alone has all symmetries, and a body off every plane of symmetry."""
+    x, y, _ = obstacle.center  # type: ignore[attr-defined]
+    off = replace(obstacle, center=(x, y, y + shift))  # type: ignore[call-arg]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", OverlapWarning)
+        both = scene(Sphere(MIDDLE, 2e-3, density=5.0, sound_speed=340.0), off)
+    assert count(both) == 1
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.tuples(*[st.floats(2e-3, 9e-3)] * 3), st.floats(0.7e-3, 2e-3))
+def test_the_grid_lies_symmetrically_where_a_scene_is(size: tuple[float, ...], spacing: float) -> None:
+    assert lies_symmetrically(scene(Box(MIDDLE, size, **HEAVY)), spacing)
+    assert lies_symmetrically(scene(Sphere(MIDDLE, size[0] / 2, **HEAVY)), spacing)
+
+
+def test_a_symmetric_grid_is_left_where_faces_lie_clearly_better_elsewhere() -> None:
+    plates = [
+        Box((x, 12e-3, 12e-3), (2e-3, 4e-3, size), **HEAVY) for x, size in ((9e-3, 2e-3), (15e-3, 1e-3))
+    ]
+    assert not lies_symmetrically(scene(*plates), 1e-3)
