@@ -8,11 +8,11 @@ import torch
 
 from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.spacing import PILOT_CELLS, coarsest_spacing, spacing_for
+from autdtorch.propagator.auto import chosen_method
 from autdtorch.propagator.base import Propagator, Run, SimulatedPropagator, SteadyStateWarning
 from autdtorch.propagator.box import BoxPropagator
 from autdtorch.propagator.free_space import FreeSpacePropagator
 from autdtorch.propagator.full import FullPropagator
-from autdtorch.propagator.plan import chosen_method
 from autdtorch.scene import Scene
 from autdtorch.validation import integer_at_least, invalid, positive
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import warnings
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Literal, Protocol, Self, overload
@@ -115,8 +116,11 @@ class SimulatedPropagator(ABC):
         """Whether a source at any of the points (N, 3) would not be all in air, on the grid."""
 
     @abstractmethod
-    def _simulate(self, origins: Nodes, strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
-        """Pressure (P,) of N origins with strengths (N,), as the mean over the nodes of each of P targets."""
+    def _simulate(self, origins: Sequence[Nodes], strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
+        """Pressure (R, P) of R runs, each with N origins of strengths (R, N), none of them silent.
+
+        Of each of P targets it is the mean over the nodes.
+        """
 
     def _backward(self, points: torch.Tensor) -> bool:
         """Whether the transfer matrix is simulated from the points, by reciprocity.
@@ -205,20 +209,23 @@ class SimulatedPropagator(ABC):
         if drive.requires_grad or len(flat) > fewest:
             return drive @ self._simulated_matrix(points).mT
         field = torch.zeros((len(flat), len(points)), dtype=torch.complex128)
-        for row, strength in zip(field, array.source_strength * flat, strict=True):
-            row.copy_(self._simulate(nodes, strength, single_nodes(points)))
+        loud = flat.any(dim=1)
+        runs = [nodes] * int(loud.sum())
+        if runs:
+            field[loud] = self._simulate(runs, array.source_strength * flat[loud], single_nodes(points))
         return field.reshape(*drive.shape[:-1], len(points))
 
     def _simulated_matrix(self, points: torch.Tensor) -> torch.Tensor:
         transducers, targets = self.scene.array.nodes, single_nodes(points)
-        strength = torch.full((1,), self.scene.array.source_strength, dtype=torch.complex128)
-        if self._backward(points):
-            logger.info("transfer matrix: %d runs from the points", len(points))
-            rows = [self._simulate(point, strength, transducers) for point in _one_by_one(targets)]
-            return torch.stack(rows)
-        logger.info("transfer matrix: %d runs from the transducers", len(self.scene.array))
-        columns = [self._simulate(transducer, strength, targets) for transducer in _one_by_one(transducers)]
-        return torch.stack(columns, dim=1)
+        backward = self._backward(points)
+        origins, heard = (targets, transducers) if backward else (transducers, targets)
+        runs = [Nodes(positions[None], origins.weights) for positions in origins.positions]
+        logger.info(
+            "transfer matrix: %d runs from the %s", len(runs), "points" if backward else "transducers"
+        )
+        strength = torch.full((len(runs), 1), self.scene.array.source_strength, dtype=torch.complex128)
+        rows = self._simulate(runs, strength, heard)
+        return rows if backward else rows.mT.contiguous()
 
     def _note(self, steady: SteadyState, seconds: float) -> None:
         self.runs.append(Run(steady.periods, steady.remaining, steady.reached, seconds))
@@ -235,7 +242,3 @@ class SimulatedPropagator(ABC):
 def single_nodes(points: torch.Tensor) -> Nodes:
     """Points (P, 3) as sources or receivers of one node each."""
     return Nodes(points[:, None], torch.ones(1, dtype=torch.float64))
-
-
-def _one_by_one(nodes: Nodes) -> list[Nodes]:
-    return [Nodes(positions[None], nodes.weights) for positions in nodes.positions]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable, Sequence
 
 import torch
 
@@ -44,26 +45,29 @@ class BoxPropagator(SimulatedPropagator):
         return self._assembly.touches_varying(points[self._scattering.inside(points)])
 
     @torch.no_grad()
-    def _simulate(self, origins: Nodes, strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
-        if not strength.any():
-            return torch.zeros(len(targets.positions), dtype=torch.complex128)
-        begin = time.perf_counter()
-        assembly, kernel, scattering = self._assembly, self._kernel, self._scattering
-        self._warn_near_obstacle(origins)
-        sources = scattering.sources(origins, strength)
-        points = targets.positions
+    def _simulate(self, origins: Sequence[Nodes], strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
+        scattering, points = self._scattering, targets.positions
         reach = scattering.reach(targets)
-        incident = scattering.incident(points.reshape(-1, 3), origins, strength)
-        pressure = incident.reshape(points.shape[:-1]) @ targets.weights.to(incident.dtype)
         every = math.ceil(len(points) / MOST_JUDGED)
-        steady = run_to_steady_state(
-            assembly, kernel, sources, reach.cells, self.tolerance, self.max_periods,
-            lambda phasor: pressure[::every] + reach.field(phasor, every),
-        )  # fmt: skip
-        pressure = pressure + reach.field(steady.pressure)
+        judged = reach.matrix(every)
+        pressure, phasors = [], []
+        for nodes, own in zip(origins, strength, strict=True):
+            begin = time.perf_counter()
+            self._warn_near_obstacle(nodes)
+            incident = scattering.incident(points.reshape(-1, 3), nodes, own).reshape(points.shape[:-1])
+            pressure.append(incident @ targets.weights.to(incident.dtype))
+            steady = run_to_steady_state(
+                self._assembly, self._kernel, scattering.sources(nodes, own), reach.cells, self.tolerance,
+                self.max_periods, _heard(pressure[-1][::every], judged),
+            )  # fmt: skip
+            self._note(steady, time.perf_counter() - begin)
+            phasors.append(steady.pressure)
+        total = torch.stack(pressure) + reach.field(torch.stack(phasors, dim=1)).mT
         silent = torch.zeros(len(points), dtype=torch.bool)
         for obstacle in self.scene.obstacles:  # the later counts
             silent = torch.where(obstacle.contains(points).any(dim=1), obstacle.rigid, silent)
-        pressure[silent] = 0
-        self._note(steady, time.perf_counter() - begin)
-        return pressure
+        return total.masked_fill(silent, 0)
+
+
+def _heard(incident: torch.Tensor, matrix: torch.Tensor) -> Callable[[torch.Tensor], torch.Tensor]:
+    return lambda phasor: incident + matrix @ phasor

@@ -13,7 +13,7 @@ from small_scenes import CUBE, relative_error, small_scene
 from autdtorch.fdtd.grid import make_box, make_grid
 from autdtorch.obstacles import Box, Obstacle, Sphere
 from autdtorch.propagator import FreeSpacePropagator, SimulatedPropagator, make_propagator
-from autdtorch.propagator.plan import chosen_method
+from autdtorch.propagator.auto import chosen_method
 
 
 def test_nothing_is_simulated_where_nothing_scatters(caplog: pytest.LogCaptureFixture) -> None:
