@@ -44,23 +44,33 @@ class Scattering:
     assembly: Assembly
     wavenumber: complex
 
-    def sources(self, origins: Nodes, strength: torch.Tensor) -> Sources:
-        """Forces of the incident field of N origins with far fields strength e^{ikr}/r, (N,) [Pa m]."""
+    @property
+    def driven(self) -> torch.Tensor:
+        """Places (n, 3) [m] where the incident field must be known: in the varying cells and next to them."""
+        return self.positions(self._driven[0])
+
+    def sources(self, field: torch.Tensor) -> Sources:
+        """Forces of an incident field, given (n,) where it drives."""
         assembly = self.assembly
-        index = assembly.varying.index
-        cells, place = self._driven
-        nearest = _NEAREST * assembly.grid.spacing
-        field = self.incident(self.positions(cells), origins, strength, nearest).numpy()
-        step = field[place] - field[place[:, 13]][:, None]
+        place = self._driven[1]
+        heard = field.numpy()
+        step = heard[place] - heard[place[:, 13]][:, None]
         factor = assembly.coefficients.face / assembly.stencil.face
         force = factor * ((assembly.varying.weight - assembly.stencil.weights) * step).sum(axis=1)
         dtype = torch.complex128 if assembly.dtype == torch.float64 else torch.complex64
-        return Sources(torch.from_numpy(index), torch.from_numpy(force).to(dtype))
+        return Sources(torch.from_numpy(assembly.varying.index), torch.from_numpy(force).to(dtype))
 
-    def incident(
-        self, points: torch.Tensor, origins: Nodes, strength: torch.Tensor, nearest: float = 0.0
+    def incident(self, points: torch.Tensor, origins: Nodes, strength: torch.Tensor) -> torch.Tensor:
+        """Field (P,) in free space at points (P, 3) [m] of N origins with strengths (N,) [Pa m]."""
+        return self._incident(points, origins, strength, 0.0)
+
+    def driving(self, origins: Nodes, strength: torch.Tensor) -> torch.Tensor:
+        """The same (n,) where it drives."""
+        return self._incident(self.driven, origins, strength, _NEAREST * self.assembly.grid.spacing)
+
+    def _incident(
+        self, points: torch.Tensor, origins: Nodes, strength: torch.Tensor, nearest: float
     ) -> torch.Tensor:
-        """Field (P,) in free space of N origins at points (P, 3) [m], at least `nearest` [m] off."""
         nodes, shares = origins.positions.reshape(-1, 3), origins.weights.repeat(len(strength))
         amplitude = strength.repeat_interleave(len(origins.weights)) * shares
         return self._sum(points, nodes, amplitude[:, None], nearest)[:, 0]
@@ -153,9 +163,13 @@ class Reach:
         """Scattered fields (P, R) at the targets, from the cells' phasors (k, R) in R runs."""
         field = torch.zeros((*self.within.shape, phasors.shape[1]), dtype=torch.complex128)
         field[self.within] = torch.from_numpy(self.inward @ phasors.numpy())
-        amplitude = torch.from_numpy(self.outward @ phasors.numpy())
+        amplitude = self.amplitudes(phasors)
         field[~self.within] = self.scattering.radiated(amplitude, self.targets.positions[~self.within])
         return torch.einsum("pnr,n->pr", field, self.targets.weights.to(field.dtype))
+
+    def amplitudes(self, phasors: torch.Tensor) -> torch.Tensor:
+        """What the radiating cells send out (n, R) [Pa m], from the cells' phasors (k, R)."""
+        return torch.from_numpy(self.outward @ phasors.numpy())
 
     def matrix(self, every: int) -> torch.Tensor:
         """Matrix from phasors (k,) to the scattered field at each `every`-th target."""

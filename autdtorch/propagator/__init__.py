@@ -61,7 +61,7 @@ def make_propagator(
         scene: what is simulated.
         method: "free_space": exact, without obstacles. "full": FDTD on the whole domain. "box": FDTD of the
             scattered field in a box around the obstacles, exact elsewhere, points outside the domain
-            included; obstacles are simulated whole, also what of them reaches out of the domain. "auto": free
+            included; obstacles far apart get a box each where that is cheaper, and are coupled; obstacles are simulated whole, also what of them reaches out of the domain. "auto": free
             space where the scene has no obstacles, full where a wall goes on without end, box where other
             obstacles reach out of the domain, else the cheaper of the two. What was chosen is the
             propagator's `method`; why, and what that skips, is logged.
@@ -97,7 +97,7 @@ def make_propagator(
     if time_step is not None:
         time_step = positive("time_step", time_step, "s")
     if method == "auto":
-        method = chosen_method(scene, _pilot_spacing(scene) if spacing is None else spacing)
+        method = chosen_method(scene, _pilot_spacing(scene) if spacing is None else spacing, tolerance)
     if method == "box" and not scene.obstacles:
         raise invalid("method", method, "needs a scene with obstacles; take free_space")
     if method == "free_space":

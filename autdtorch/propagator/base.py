@@ -56,7 +56,7 @@ class Run:
     """One simulation, as it went.
 
     Attributes:
-        periods: periods of the drive that were stepped.
+        periods: periods of the drive that were stepped, in several boxes their sum.
         remaining: estimated relative distance to the steady state.
         reached: whether that is within the tolerance.
         seconds: time it took.
@@ -77,8 +77,8 @@ class SimulatedPropagator(ABC):
         spacing: edge of a cell [m].
         tolerance: relative distance to the steady state at which a run ends.
         max_periods: periods after which it ends in any case, with a `SteadyStateWarning`.
-        time_step: the one in use [s].
-        runs: what every simulation took, in order.
+        time_step: the one in use [s], of several boxes the shortest.
+        runs: what every simulation took, in order; one in several boxes counts as one.
     """
 
     method: ClassVar[str]
@@ -100,12 +100,13 @@ class SimulatedPropagator(ABC):
         self.max_periods = max_periods
         self.runs: list[Run] = []
         self._kernel = kernel
-        self._assembly = self._assembled(dtype, time_step)
-        self.time_step = 1 / (scene.frequency * float(self._assembly.steps_per_period))
+        self._assemblies = self._assembled(dtype, time_step)
+        most = max(assembly.steps_per_period for assembly in self._assemblies)
+        self.time_step = 1 / (scene.frequency * float(most))
 
     @abstractmethod
-    def _assembled(self, dtype: torch.dtype, time_step: float | None) -> Assembly:
-        """The scene on its grid."""
+    def _assembled(self, dtype: torch.dtype, time_step: float | None) -> Sequence[Assembly]:
+        """The scene on its grid, or on several."""
 
     @abstractmethod
     def _checked(self, points: ArrayLike) -> torch.Tensor:
@@ -130,7 +131,7 @@ class SimulatedPropagator(ABC):
         return len(points) < len(self.scene.array) and not self._near_obstacle(points)
 
     def _warn_near_obstacle(self, origins: Nodes) -> None:
-        grid = self._assembly.grid
+        grid = self._assemblies[0].grid
         if self._near_obstacle(origins.positions.reshape(-1, 3)):
             logger.warning(
                 "a source is within %.2g mm of an obstacle: less accurate; use a finer spacing than %.2g mm",
@@ -146,7 +147,13 @@ class SimulatedPropagator(ABC):
         """The same on another grid, which tells the error of this one."""
         spacing = second_spacing(self.scene, self.spacing)
         return type(self)(
-            self.scene, spacing, self.tolerance, self._kernel, self._assembly.dtype, self.max_periods, None
+            self.scene,
+            spacing,
+            self.tolerance,
+            self._kernel,
+            self._assemblies[0].dtype,
+            self.max_periods,
+            None,
         )
 
     @overload

@@ -22,8 +22,8 @@ class FullPropagator(SimulatedPropagator):
 
     method = "full"
 
-    def _assembled(self, dtype: torch.dtype, time_step: float | None) -> Assembly:
-        return assemble(self.scene, self.spacing, dtype, time_step)
+    def _assembled(self, dtype: torch.dtype, time_step: float | None) -> Sequence[Assembly]:
+        return (assemble(self.scene, self.spacing, dtype, time_step),)
 
     def _checked(self, points: ArrayLike) -> torch.Tensor:
         points = points_tensor("points", points).cpu()
@@ -31,11 +31,11 @@ class FullPropagator(SimulatedPropagator):
         return points
 
     def _near_obstacle(self, points: torch.Tensor) -> bool:
-        return self._assembly.touches_varying(points)
+        return self._assemblies[0].touches_varying(points)
 
     @torch.no_grad()
     def _simulate(self, origins: Sequence[Nodes], strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
-        assembly = self._assembly
+        (assembly,) = self._assemblies
         spread = assembly.spread(targets.positions, targets.weights)
         cells = np.unique(spread.index)
         read = spread.reading(cells)

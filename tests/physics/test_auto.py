@@ -37,7 +37,7 @@ def test_the_cheapest_that_is_right(
     obstacle: Obstacle, method: str, reason: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.INFO):
-        assert chosen_method(small_scene((obstacle,)), 1e-3) == method
+        assert chosen_method(small_scene((obstacle,)), 1e-3, 2e-3) == method
     assert reason in caplog.text
 
 
