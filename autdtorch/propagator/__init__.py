@@ -61,10 +61,11 @@ def make_propagator(
         scene: what is simulated.
         method: "free_space": exact, without obstacles. "full": FDTD on the whole domain. "box": FDTD of the
             scattered field in a box around the obstacles, exact elsewhere, points outside the domain
-            included; obstacles far apart get a box each where that is cheaper, and are coupled; obstacles are simulated whole, also what of them reaches out of the domain. "auto": free
-            space where the scene has no obstacles, full where a wall goes on without end, box where other
-            obstacles reach out of the domain, else the cheaper of the two. What was chosen is the
-            propagator's `method`; why, and what that skips, is logged.
+            included; obstacles far apart get a box each where that is cheaper, and are coupled; they are
+            simulated whole, also what of them reaches out of the domain. "auto": free space where the scene
+            has no obstacles, full where a wall goes on without end, box where other obstacles reach out of
+            the domain, else the cheaper of the two. What was chosen is the propagator's `method`; why, and
+            what that skips, is logged.
         spacing: edge of a cell [m], at most a third of the wavelength. The error falls with it; see
             docs/numerics.md. None: two coarse grids are simulated, and the spacing is chosen with which the
             error of the transfer matrix should stay below `tolerance`.

@@ -77,7 +77,6 @@ class SimulatedPropagator(ABC):
         spacing: edge of a cell [m].
         tolerance: relative distance to the steady state at which a run ends.
         max_periods: periods after which it ends in any case, with a `SteadyStateWarning`.
-        time_step: the one in use [s], of several boxes the shortest.
         runs: what every simulation took, in order; one in several boxes counts as one.
     """
 
@@ -101,8 +100,12 @@ class SimulatedPropagator(ABC):
         self.runs: list[Run] = []
         self._kernel = kernel
         self._assemblies = self._assembled(dtype, time_step)
+
+    @property
+    def time_step(self) -> float:
+        """The time step in use [s], of several boxes the shortest."""
         most = max(assembly.steps_per_period for assembly in self._assemblies)
-        self.time_step = 1 / (scene.frequency * float(most))
+        return 1 / (self.scene.frequency * float(most))
 
     @abstractmethod
     def _assembled(self, dtype: torch.dtype, time_step: float | None) -> Sequence[Assembly]:

@@ -74,18 +74,17 @@ def coupled_runs(
     left = torch.zeros(runs, dtype=torch.float64)
     for number in range(1, MOST_PASSES + 1):
         parts = []
+        own = tolerance / 2 ** (number + 1)  # half the tolerance in all passes
+        unsettled = torch.zeros((len(boxes), runs), dtype=torch.float64)
         for index, field in enumerate(driving):
-            share = (field.norm(dim=0) / largest).tolist()
-            own = tolerance / (2 if number == 1 else 4)
-            steady = [
-                simulate(index, column, min(own / max(part, own / _LOOSEST), _LOOSEST))
-                for column, part in zip(field.mT, share, strict=True)
-            ]
+            share = field.norm(dim=0) / largest
+            loose = (own / share).clamp(max=_LOOSEST).tolist()
+            steady = [simulate(index, column, each) for column, each in zip(field.mT, loose, strict=True)]
             parts.append(torch.stack([each.pressure for each in steady], dim=1))
             periods += [each.periods for each in steady]
             reached &= [each.reached for each in steady]
-            if number == 1:
-                left = torch.maximum(left, torch.tensor([each.remaining for each in steady]))
+            unsettled[index] = share * torch.tensor([each.remaining for each in steady])
+        left += unsettled.amax(dim=0)
         sums.append(torch.cat(parts) + (sums[-1] if sums else 0))
         limit = [extrapolated(each) for each in torch.stack(sums).permute(2, 0, 1).numpy()]
         phasors = torch.from_numpy(np.stack(limit, axis=1))

@@ -84,8 +84,8 @@ def test_reciprocity_between_boxes() -> None:
     assert len(propagator.runs) == 1
     forward = propagator.transfer_matrix(torch.cat((points, points + 0.2e-3)))[:1]
     assert len(propagator.runs) == 1 + 2
-    # Scheme and Green's function are symmetric. What drives a box and what it radiates are so up to the grid's
-    # error in air, over a box: 7e-5 here, as for a single one.
+    # Scheme and Green's function are symmetric. What drives a box and what it radiates are so up to the
+    # grid's error in air, over a box: 7e-5 here, as for a single one.
     assert relative_error(backward, forward) < 2e-4
 
 
