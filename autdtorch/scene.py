@@ -132,9 +132,9 @@ class Scene:
             obstacles: may touch and overlap; where they do, the later one counts.
             observation_plane: where pictures and areas are taken.
             domain: corners (lower, upper) [m] around array, control points and observation plane. Obstacles
-                may reach beyond it: parallel walls and slabs across it then go on without end, others end
-                before it. By default the bounding box of everything, obstacles included, and two
-                wavelengths more on each side.
+                may reach beyond it: parallel walls and slabs across it then go on without end, others are
+                whole or end before it, as `make_propagator` says of its methods. By default the bounding box
+                of everything, obstacles included, and two wavelengths more on each side.
             name: for titles and file names.
 
         Raises:

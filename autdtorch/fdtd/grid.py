@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from autdtorch.fdtd.placement import grid_offset
 from autdtorch.fdtd.points import footprint
+from autdtorch.obstacles import Obstacle
 from autdtorch.scene import Scene
 from autdtorch.validation import invalid, positive
 
@@ -118,41 +119,66 @@ def layer_cells(kappa: float) -> int:
     return FINE_LAYER_CELLS if kappa <= 2 * math.pi / 6 else COARSE_LAYER_CELLS
 
 
+@dataclass(frozen=True)
+class Extent:
+    """What a grid covers.
+
+    Attributes:
+        lower: corner with the smallest coordinates (3,) [m].
+        upper: corner with the largest coordinates (3,) [m].
+        margin: cells around that, before the boundary layer begins.
+    """
+
+    lower: Sequence[float]
+    upper: Sequence[float]
+    margin: int
+
+    def interior(self, spacing: float, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> tuple[int, int, int]:
+        """Cells per axis that cover it, the first `offset` (3,) [cells] below the lower corner."""
+        x, y, z = (
+            math.ceil((high - low) / spacing + first - 1e-6) + 2 * self.margin
+            for low, high, first in zip(self.lower, self.upper, offset, strict=True)
+        )
+        return x, y, z
+
+
+def domain_extent(scene: Scene, spacing: float) -> Extent:
+    """The scene's domain, and as much air around it as points in the outermost cells need."""
+    return Extent(*scene.domain, footprint(scene.wavenumber * spacing) // 2 - 1)
+
+
+def obstacles_extent(obstacles: Sequence[Obstacle]) -> Extent:
+    """Obstacles, of which there must be some, and the air around them."""
+    lower = np.array([obstacle.lower for obstacle in obstacles]).min(axis=0)
+    upper = np.array([obstacle.upper for obstacle in obstacles]).max(axis=0)
+    return Extent(lower.tolist(), upper.tolist(), AROUND)
+
+
 def make_grid(scene: Scene, spacing: float) -> Grid:
     """Cover the scene's domain with cells of `spacing`, placed as flat faces need it (`placement.py`).
-
-    As much air is left between the domain and the boundary layer as points in the outermost cells need.
 
     Raises:
         ValueError: fewer than `MIN_CELLS_PER_WAVELENGTH` cells a wavelength, or more than `MAX_CELLS` in all.
     """
-    return _covering(scene, spacing, scene.domain, footprint(scene.wavenumber * spacing) // 2 - 1)
+    return _covering(scene, spacing, domain_extent(scene, spacing))
 
 
 def make_box(scene: Scene, spacing: float) -> Grid:
     """Cover the scene's obstacles, of which there must be some, with `AROUND` cells of air around them."""
-    lower = np.array([obstacle.lower for obstacle in scene.obstacles]).min(axis=0)
-    upper = np.array([obstacle.upper for obstacle in scene.obstacles]).max(axis=0)
-    return _covering(scene, spacing, (lower.tolist(), upper.tolist()), AROUND)
+    return _covering(scene, spacing, obstacles_extent(scene.obstacles))
 
 
-def _covering(scene: Scene, spacing: float, corners: Sequence[Sequence[float]], margin: int) -> Grid:
-    """Cover what lies between two corners, and a margin of cells."""
+def _covering(scene: Scene, spacing: float, extent: Extent) -> Grid:
     positive("spacing", spacing, "m")
     _require_fine("the medium", scene.medium.sound_speed, scene.frequency, spacing)
     for index, obstacle in enumerate(scene.obstacles):
         if obstacle.sound_speed is not None:
             _require_fine(f"obstacle {index}", obstacle.sound_speed, scene.frequency, spacing)
-    lower, upper = corners
     kappa = scene.wavenumber * spacing
-    offset = grid_offset(scene, spacing, lower, upper)
-    interior = tuple(
-        math.ceil((high - low) / spacing + first - 1e-6) + 2 * margin
-        for low, high, first in zip(lower, upper, offset, strict=True)
-    )
-    rim = layer_cells(kappa) + 1 + margin - 0.5
-    x, y, z = (low - (rim + first) * spacing for low, first in zip(lower, offset, strict=True))
-    grid = Grid(spacing, (interior[0], interior[1], interior[2]), (x, y, z), kappa)
+    offset = grid_offset(scene, spacing, extent.lower, extent.upper)
+    rim = layer_cells(kappa) + 1 + extent.margin - 0.5
+    x, y, z = (low - (rim + first) * spacing for low, first in zip(extent.lower, offset, strict=True))
+    grid = Grid(spacing, extent.interior(spacing, offset), (x, y, z), kappa)
     if math.prod(grid.shape) > MAX_CELLS:
         cells = " x ".join(map(str, grid.shape))
         raise invalid("spacing", spacing, f"gives {cells} cells, must be at most {MAX_CELLS:.0e} in all", "m")

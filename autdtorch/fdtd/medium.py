@@ -149,21 +149,31 @@ def _bodies(scene: Scene, stencil: Stencil) -> tuple[list[Body], Materials, NDAr
     return bodies, materials, np.array([m is None for m in known])
 
 
-def _going_on(scene: Scene) -> list[bool]:
-    """Which obstacles go on through the boundary layers: parallel walls and slabs along the grid.
+def is_wall(scene: Scene, obstacle: Obstacle) -> bool:
+    """Whether an obstacle is a wall or slab along the grid, across the whole domain on two axes at least."""
+    along = isinstance(obstacle, Box) and obstacle.rotation == (0.0, 0.0, 0.0)
+    return along and len(_ends(scene, obstacle)) <= 1
 
-    They cross the whole domain along two axes at least. In the layers other shapes were found to grow, and so
-    are the edges where walls of two directions meet: the first to come decides the direction.
+
+def _ends(scene: Scene, obstacle: Obstacle) -> list[int]:
+    """Axes on which an obstacle does not cross the whole domain."""
+    corners = zip(obstacle.lower, obstacle.upper, *scene.domain, strict=True)
+    return [axis for axis, (low, high, first, last) in enumerate(corners) if low > first or high < last]
+
+
+def _going_on(scene: Scene) -> list[bool]:
+    """Which obstacles go on through the boundary layers: parallel walls.
+
+    In the layers other shapes were found to grow, and so are the edges where walls of two directions meet:
+    the first to come decides the direction.
     """
     going, normal = [], None
     for number, obstacle in enumerate(scene.obstacles):
-        corners = zip(obstacle.lower, obstacle.upper, *scene.domain, strict=True)
-        ends = [axis for axis, (low, high, first, last) in enumerate(corners) if low > first or high < last]
-        along = isinstance(obstacle, Box) and obstacle.rotation == (0.0, 0.0, 0.0)
-        going.append(along and len(ends) <= 1 and (not ends or normal in (None, ends[0])))
+        wall, ends = is_wall(scene, obstacle), _ends(scene, obstacle)
+        going.append(wall and (not ends or normal in (None, ends[0])))
         if going[-1] and ends:
             normal = ends[0]
-        elif along and len(ends) == 1:
+        elif wall and ends:
             logger.warning(
                 "obstacle %d crosses the domain in another direction than the wall before it: it ends where"
                 " the boundary layer begins, and its end reflects", number,

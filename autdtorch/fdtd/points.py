@@ -12,9 +12,11 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve
 from scipy.sparse import csr_array
 
 Array = NDArray[np.float64]
+Shape = tuple[int, int, int]
 
 FOOTPRINTS = (4, 6, 8, 10)
 FOOTPRINT_ERROR = 3e-4
@@ -23,6 +25,13 @@ serves."""
 
 _REGULARISATION = 1e-5
 """Keeps the weights small where the fit leaves them free; far below FOOTPRINT_ERROR."""
+
+_ONE_SIDED_REGULARISATION = 1e-2
+"""The same where cells are missing: what lies behind the others is extrapolated by up to a cell, and the
+field there holds more than waves of the drive's wavenumber."""
+
+_ONE_SIDED_REACH = 3
+"""Farthest cells, along each axis, that are then fitted: solving for more takes long."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +62,36 @@ def axis_weights(offset: Array, nodes: Array, kappa: float) -> Array:
     target = np.concatenate((scale, np.zeros_like(scale)))
     normal = system.transpose(0, 2, 1) @ system + _REGULARISATION**2 * np.eye(nodes.shape[1])
     return np.linalg.solve(normal, (system.transpose(0, 2, 1) @ target)[..., None])[..., 0]
+
+
+def without(
+    spread: PointWeights, cells: Array, missing: NDArray[np.bool_], shape: Shape, kappa: float
+) -> PointWeights:
+    """Points of which some cells are missing, fitted to the others.
+
+    The fit is that of `axis_weights`, over all waves whose wavenumbers along the axes are up to the drive's.
+    Points with no cell left next to them get no weight.
+
+    Args:
+        spread: P points on n cells.
+        cells: their positions (P, 3) in cells.
+        missing: which of their cells (P, n) do not count.
+        shape: of the whole array.
+        kappa: wavenumber times spacing [rad].
+    """
+    weight = spread.weight.copy()
+    shared = np.sinc(kappa / np.pi * np.arange(2 * _ONE_SIDED_REACH))
+    for row in np.flatnonzero(missing.any(axis=1)):
+        places = np.stack(np.unravel_index(spread.index[row], shape), axis=-1)
+        off = np.abs(places - cells[row])
+        left = ~missing[row] & (off < _ONE_SIDED_REACH).all(axis=1)
+        weight[row] = 0
+        if (off[left] < 1).all(axis=1).any():
+            apart = np.abs(places[left][:, None] - places[left])
+            system = shared[apart].prod(axis=-1) + _ONE_SIDED_REGULARISATION**2 * np.eye(len(apart))
+            target = np.sinc(kappa / np.pi * off[left]).prod(axis=-1)
+            weight[row, left] = solve(system, target, assume_a="pos")
+    return PointWeights(spread.index, weight)
 
 
 @lru_cache(maxsize=64)
@@ -96,9 +135,9 @@ def merged(spread: PointWeights, share: Array) -> PointWeights:
 
 def point_weights(
     positions: Array,
-    shape: tuple[int, int, int],
-    first: tuple[int, int, int],
-    last: tuple[int, int, int],
+    shape: Shape,
+    first: Shape,
+    last: Shape,
     kappa: float,
 ) -> PointWeights:
     """Spread points over cells [first, last) of an array; near the rim the footprint moves inwards.

@@ -22,9 +22,7 @@ from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.points import PointWeights
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
-
-_AT_ONCE = 4_000_000
-"""Pairs of points that Green's function is worked out for at once."""
+from autdtorch.freespace import superposition
 
 _BESIDE = 1.25
 """Cells from the rim of the interior up to which points are not read. The outermost are not interpolated
@@ -46,26 +44,36 @@ class Scattering:
     assembly: Assembly
     wavenumber: complex
 
-    def sources(self, origins: Nodes, strength: torch.Tensor) -> Sources:
-        """Forces of the incident field of N origins with far fields strength e^{ikr}/r, (N,) [Pa m]."""
+    @property
+    def driven(self) -> torch.Tensor:
+        """Places (n, 3) [m] where the incident field must be known: in the varying cells and next to them."""
+        return self.positions(self._driven[0])
+
+    def sources(self, field: torch.Tensor) -> Sources:
+        """Forces of an incident field, given (n,) where it drives."""
         assembly = self.assembly
-        index = assembly.varying.index
-        cells, place = self._driven
-        nearest = _NEAREST * assembly.grid.spacing
-        field = self.incident(self.positions(cells), origins, strength, nearest).numpy()
-        step = field[place] - field[place[:, 13]][:, None]
+        place = self._driven[1]
+        heard = field.numpy()
+        step = heard[place] - heard[place[:, 13]][:, None]
         factor = assembly.coefficients.face / assembly.stencil.face
         force = factor * ((assembly.varying.weight - assembly.stencil.weights) * step).sum(axis=1)
         dtype = torch.complex128 if assembly.dtype == torch.float64 else torch.complex64
-        return Sources(torch.from_numpy(index), torch.from_numpy(force).to(dtype))
+        return Sources(torch.from_numpy(assembly.varying.index), torch.from_numpy(force).to(dtype))
 
-    def incident(
-        self, points: torch.Tensor, origins: Nodes, strength: torch.Tensor, nearest: float = 0.0
+    def incident(self, points: torch.Tensor, origins: Nodes, strength: torch.Tensor) -> torch.Tensor:
+        """Field (P,) in free space at points (P, 3) [m] of N origins with strengths (N,) [Pa m]."""
+        return self._incident(points, origins, strength, 0.0)
+
+    def driving(self, origins: Nodes, strength: torch.Tensor) -> torch.Tensor:
+        """The same (n,) where it drives."""
+        return self._incident(self.driven, origins, strength, _NEAREST * self.assembly.grid.spacing)
+
+    def _incident(
+        self, points: torch.Tensor, origins: Nodes, strength: torch.Tensor, nearest: float
     ) -> torch.Tensor:
-        """Field (P,) in free space of N origins at points (P, 3) [m], at least `nearest` [m] off."""
         nodes, shares = origins.positions.reshape(-1, 3), origins.weights.repeat(len(strength))
         amplitude = strength.repeat_interleave(len(origins.weights)) * shares
-        return self._sum(points, nodes, amplitude, nearest)
+        return self._sum(points, nodes, amplitude[:, None], nearest)[:, 0]
 
     def reach(self, targets: Nodes) -> Reach:
         """How the scattered field gets to P targets, as the mean over the nodes of each."""
@@ -77,8 +85,12 @@ class Scattering:
         return Reach(self, targets, within, cells, outward @ picked, spread.reading(cells))
 
     def radiated(self, amplitude: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-        """Field (P,) at points (P, 3) [m] of the radiating cells with amplitudes (n,) [Pa m]."""
+        """Fields (P, R) at points (P, 3) [m] of the radiating cells with amplitudes (n, R) [Pa m]."""
         return self._sum(points, self._surface[0], amplitude, 0.0)
+
+    def at_surface(self, sources: torch.Tensor, amplitude: torch.Tensor) -> torch.Tensor:
+        """Fields (n, R) at the radiating cells of point sources (N, 3) [m] with amplitudes (N, R) [Pa m]."""
+        return self._sum(self._surface[0], sources, amplitude, 0.0)
 
     def inside(self, points: torch.Tensor) -> torch.Tensor:
         """Which points (..., 3) are read from the grid; others are far enough from the cells that radiate."""
@@ -124,14 +136,7 @@ class Scattering:
     def _sum(
         self, points: torch.Tensor, sources: torch.Tensor, amplitude: torch.Tensor, nearest: float
     ) -> torch.Tensor:
-        """Sum (P,) of amplitude e^{ikr}/r over sources, distances below `nearest` [m] taken as that."""
-        k = self.wavenumber
-        at_once = max(1, _AT_ONCE // len(sources))
-        parts = []
-        for some in torch.split(points, at_once):
-            r = torch.cdist(some, sources, compute_mode="donot_use_mm_for_euclid_dist").clamp(min=nearest)
-            parts.append(torch.polar(torch.exp(-k.imag * r) / r, k.real * r) @ amplitude)
-        return torch.cat(parts) if parts else torch.zeros(0, dtype=torch.complex128)
+        return superposition(points, sources, amplitude, self.wavenumber, nearest, self.assembly.dtype)
 
 
 @dataclass(frozen=True)
@@ -154,11 +159,30 @@ class Reach:
     outward: csr_array
     inward: csr_array
 
-    def field(self, phasor: torch.Tensor, every: int = 1) -> torch.Tensor:
-        """Scattered field at each `every`-th target, from the cells' phasors (k,)."""
-        field = torch.zeros(self.within.shape, dtype=torch.complex128)
-        field[self.within] = torch.from_numpy(self.inward @ phasor.numpy())
-        field, outside = field[::every], ~self.within[::every]
-        amplitude = torch.from_numpy(self.outward @ phasor.numpy())
-        field[outside] = self.scattering.radiated(amplitude, self.targets.positions[::every][outside])
-        return field @ self.targets.weights.to(field.dtype)
+    def field(self, phasors: torch.Tensor) -> torch.Tensor:
+        """Scattered fields (P, R) at the targets, from the cells' phasors (k, R) in R runs."""
+        field = torch.zeros((*self.within.shape, phasors.shape[1]), dtype=torch.complex128)
+        field[self.within] = torch.from_numpy(self.inward @ phasors.numpy())
+        amplitude = self.amplitudes(phasors)
+        field[~self.within] = self.scattering.radiated(amplitude, self.targets.positions[~self.within])
+        return torch.einsum("pnr,n->pr", field, self.targets.weights.to(field.dtype))
+
+    def amplitudes(self, phasors: torch.Tensor) -> torch.Tensor:
+        """What the radiating cells send out (n, R) [Pa m], from the cells' phasors (k, R)."""
+        return torch.from_numpy(self.outward @ phasors.numpy())
+
+    def matrix(self, every: int) -> torch.Tensor:
+        """Matrix from phasors (k,) to the scattered field at each `every`-th target."""
+        within, share = self.within[::every], self.targets.weights.expand(self.within[::every].shape)
+        target = torch.arange(len(within))[:, None].expand(within.shape)
+        outside = self.targets.positions[::every][~within]
+        amplitude = torch.zeros((len(outside), len(within)), dtype=torch.complex128)
+        amplitude[torch.arange(len(outside)), target[~within]] = share[~within].to(amplitude.dtype)
+        heard = self.scattering.at_surface(outside, amplitude)  # as from there: Green's function is symmetric
+        number = torch.zeros(self.within.shape, dtype=torch.int64)
+        number[self.within] = torch.arange(int(self.within.sum()))
+        picked = csr_array(
+            (share[within].numpy(), (target[within].numpy(), number[::every][within].numpy())),
+            (len(within), self.inward.shape[0]),
+        )
+        return torch.from_numpy((self.outward.T @ heard.numpy()).T + (picked @ self.inward).toarray())

@@ -84,8 +84,7 @@ def run_to_steady_state(
         judged: what of the phasors (k,) must stand. A run is not judged before sound has crossed the grid
             twice.
     """
-    crossing = assembly.grid.diagonal / assembly.grid.wavelength
-    earliest = RAMP_PERIODS + math.ceil(2 * crossing)
+    earliest = fewest_periods(assembly.grid.diagonal / assembly.grid.wavelength)
     sequence = Extrapolation(min(max(_FEWEST_PHASORS, _MOST_NUMBERS // len(cells)), _MOST_PHASORS))
     values: deque[torch.Tensor] = deque(maxlen=3)
     ramp = math.ceil(RAMP_PERIODS * assembly.steps_per_period)
@@ -100,6 +99,11 @@ def run_to_steady_state(
         if reached or count >= max_periods:
             break
     return SteadyState(limit, count, remaining, reached)
+
+
+def fewest_periods(crossing: float) -> int:
+    """Periods of the shortest run on a grid that sound crosses within `crossing` periods."""
+    return RAMP_PERIODS + math.ceil(2 * crossing)
 
 
 class Extrapolation:

@@ -16,7 +16,7 @@ from autdtorch.fdtd.columns import layer_columns, scaled_cells
 from autdtorch.fdtd.grid import Grid, make_grid
 from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, State, uniform_state
 from autdtorch.fdtd.medium import fill_elements
-from autdtorch.fdtd.points import PointWeights, merged, point_weights
+from autdtorch.fdtd.points import PointWeights, merged, point_weights, without
 from autdtorch.fdtd.stability import fewest_steps, largest_eigenvalue, whole_steps
 from autdtorch.fdtd.stencil import Stencil, tuned_stencil
 from autdtorch.scene import Scene
@@ -75,15 +75,10 @@ class Assembly:
 
     def _spread_nodes(self, points: torch.Tensor) -> PointWeights:
         grid = self.grid
-        spread = point_weights(grid.to_cells(points), grid.shape, grid.first, grid.last, grid.kappa)
-        if len(self.varying.rigid) == 0:
-            return spread
-        # At a rigid wall the pressure has no slope: what would fall behind it goes to the cells before it.
-        weight = np.where(np.isin(spread.index, self.varying.rigid), 0.0, spread.weight)
-        total = weight.sum(axis=1, keepdims=True)
-        return PointWeights(
-            spread.index, np.divide(weight, total, out=np.zeros_like(weight), where=total > 0.1)
-        )
+        cells = grid.to_cells(points)
+        spread = point_weights(cells, grid.shape, grid.first, grid.last, grid.kappa)
+        # the pressure of a rigid obstacle's closed cells means nothing
+        return without(spread, cells, np.isin(spread.index, self.varying.rigid), grid.shape, grid.kappa)
 
     def touches_varying(self, points: torch.Tensor) -> bool:
         """Whether any of the points (N, 3) [m], in the domain, is spread over cells that are not of air."""

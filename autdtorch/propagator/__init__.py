@@ -12,6 +12,7 @@ import torch
 from autdtorch.cache import DiskCache
 from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.spacing import PILOT_CELLS, coarsest_spacing, spacing_for
+from autdtorch.propagator.auto import chosen_method
 from autdtorch.propagator.base import Propagator, Run, SimulatedPropagator, SteadyStateWarning
 from autdtorch.propagator.box import BoxPropagator
 from autdtorch.propagator.free_space import FreeSpacePropagator
@@ -77,8 +78,11 @@ def make_propagator(
         scene: what is simulated.
         method: "free_space": exact, without obstacles. "full": FDTD on the whole domain. "box": FDTD of the
             scattered field in a box around the obstacles, exact elsewhere, points outside the domain
-            included; obstacles are simulated whole, also what of them reaches out of the domain. "auto": free
-            space where the scene has no obstacles, else full.
+            included; obstacles far apart get a box each where that is cheaper, and are coupled; they are
+            simulated whole, also what of them reaches out of the domain. "auto": free space where the scene
+            has no obstacles, full where a wall goes on without end, box where other obstacles reach out of
+            the domain, else the cheaper of the two. What was chosen is the propagator's `method`; why, and
+            what that skips, is logged.
         spacing: edge of a cell [m], at most a third of the wavelength. The error falls with it; see
             docs/numerics.md. None: two coarse grids are simulated, and the spacing is chosen with which the
             error of the transfer matrix should stay below `tolerance`.
@@ -117,10 +121,7 @@ def make_propagator(
         time_step = positive("time_step", time_step, "s")
     disk_cache = _disk_cache(cache)
     if method == "auto":
-        method = "full" if scene.obstacles else "free_space"
-        count = len(scene.obstacles)
-        reason = f"{count} obstacles" if count else "no obstacles: nothing to simulate"
-        logger.info("method auto: %s (%s)", method, reason)
+        method = chosen_method(scene, _pilot_spacing(scene) if spacing is None else spacing, tolerance)
     if method == "box" and not scene.obstacles:
         raise invalid("method", method, "needs a scene with obstacles; take free_space")
     if method == "free_space":
@@ -143,12 +144,11 @@ def _chosen_spacing(
     cache: DiskCache | None,
 ) -> float:
     """Spacing [m] at which the grid's error should be `tolerance`, told from two coarse grids."""
-    coarsest = coarsest_spacing(scene)
-    pilot = min(scene.wavelength / PILOT_CELLS, coarsest)
+    pilot = _pilot_spacing(scene)
     near_steady = max(tolerance, 1e-3)
     propagator = kind(scene, pilot, near_steady, kernel, dtype, max_periods, cache, None)
     _, error = propagator.transfer_matrix(return_error=True)
-    spacing = min(spacing_for(tolerance, error, pilot), coarsest)
+    spacing = min(spacing_for(tolerance, error, pilot), coarsest_spacing(scene))
     logger.info("spacing %.3g mm: the error at %.3g mm is about %.2g", 1e3 * spacing, 1e3 * pilot, error)
     return spacing
 
@@ -167,6 +167,10 @@ def _disk_cache(folder: str | os.PathLike[str] | Literal[False] | None) -> DiskC
         raise invalid(
             name, os.fspath(folder), f"must be a folder, or one that can be made ({error})"
         ) from error
+
+
+def _pilot_spacing(scene: Scene) -> float:
+    return min(scene.wavelength / PILOT_CELLS, coarsest_spacing(scene))
 
 
 def _require_one_of(name: str, value: object, accepted: tuple[str, ...]) -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import logging
 import warnings
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import ClassVar, Literal, Protocol, Self, overload
 
+import numpy as np
 import torch
 
 from autdtorch.array import Nodes
@@ -61,7 +63,7 @@ class Run:
     """One simulation, as it went.
 
     Attributes:
-        periods: periods of the drive that were stepped.
+        periods: periods of the drive that were stepped, in several boxes their sum.
         remaining: estimated relative distance to the steady state.
         reached: whether that is within the tolerance.
         seconds: time it took.
@@ -82,8 +84,8 @@ class SimulatedPropagator(ABC):
         spacing: edge of a cell [m].
         tolerance: relative distance to the steady state at which a run ends.
         max_periods: periods after which it ends in any case, with a `SteadyStateWarning`.
-        time_step: the one in use [s].
-        runs: what every simulation took, in order; mirror images and what was kept on disk take none.
+        runs: what every simulation took, in order; one in several boxes counts as one, mirror images and what
+            was kept on disk take none.
     """
 
     method: ClassVar[str]
@@ -107,12 +109,17 @@ class SimulatedPropagator(ABC):
         self.runs: list[Run] = []
         self._kernel = kernel
         self._cache = cache
-        self._assembly = self._assembled(dtype, time_step)
-        self.time_step = 1 / (scene.frequency * float(self._assembly.steps_per_period))
+        self._assemblies = self._assembled(dtype, time_step)
+
+    @property
+    def time_step(self) -> float:
+        """The time step in use [s], of several boxes the shortest."""
+        most = max(assembly.steps_per_period for assembly in self._assemblies)
+        return 1 / (self.scene.frequency * float(most))
 
     @abstractmethod
-    def _assembled(self, dtype: torch.dtype, time_step: float | None) -> Assembly:
-        """The scene on its grid."""
+    def _assembled(self, dtype: torch.dtype, time_step: float | None) -> Sequence[Assembly]:
+        """The scene on its grid, or on several."""
 
     @abstractmethod
     def _checked(self, points: ArrayLike) -> torch.Tensor:
@@ -123,8 +130,11 @@ class SimulatedPropagator(ABC):
         """Whether a source at any of the points (N, 3) would not be all in air, on the grid."""
 
     @abstractmethod
-    def _simulate(self, origins: Nodes, strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
-        """Pressure (P,) of N origins with strengths (N,), as the mean over the nodes of each of P targets."""
+    def _simulate(self, origins: Sequence[Nodes], strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
+        """Pressure (R, P) of R runs, each with N origins of strengths (R, N), none of them silent.
+
+        Of each of P targets it is the mean over the nodes.
+        """
 
     def _plan(self, points: torch.Tensor) -> Plan:
         """The fewest simulations for a transfer matrix: from the transducers or, by reciprocity, from points.
@@ -139,7 +149,7 @@ class SimulatedPropagator(ABC):
         return backward if fewer else forward
 
     def _warn_near_obstacle(self, origins: Nodes) -> None:
-        grid = self._assembly.grid
+        grid = self._assemblies[0].grid
         if self._near_obstacle(origins.positions.reshape(-1, 3)):
             logger.warning(
                 "a source is within %.2g mm of an obstacle: less accurate; use a finer spacing than %.2g mm",
@@ -152,14 +162,14 @@ class SimulatedPropagator(ABC):
 
     @cached_property
     def _symmetries(self) -> list[Symmetry]:
-        return symmetries(self._assembly, self.scene.array.nodes)
+        return symmetries(self._assemblies, self.scene.array.nodes)
 
     @cached_property
     def _second(self) -> Self:
         """The same on another grid, which tells the error of this one."""
         spacing = second_spacing(self.scene, self.spacing)
         return type(self)(
-            self.scene, spacing, self.tolerance, self._kernel, self._assembly.dtype, self.max_periods,
+            self.scene, spacing, self.tolerance, self._kernel, self._assemblies[0].dtype, self.max_periods,
             self._cache, None,
         )  # fmt: skip
 
@@ -223,8 +233,10 @@ class SimulatedPropagator(ABC):
         if drive.requires_grad or len(flat) > self._plan(points).runs:
             return drive @ self._kept_matrix(points)[0].mT
         field = torch.zeros((len(flat), len(points)), dtype=torch.complex128)
-        for row, strength in zip(field, array.source_strength * flat, strict=True):
-            row.copy_(self._simulate(nodes, strength, single_nodes(points)))
+        loud = flat.any(dim=1)
+        runs = [nodes] * int(loud.sum())
+        if runs:
+            field[loud] = self._simulate(runs, array.source_strength * flat[loud], single_nodes(points))
         return field.reshape(*drive.shape[:-1], len(points))
 
     def _kept_matrix(self, points: torch.Tensor) -> tuple[torch.Tensor, float]:
@@ -248,8 +260,9 @@ class SimulatedPropagator(ABC):
             "spacing": self.spacing,
             "tolerance": self.tolerance,
             "max_periods": self.max_periods,
-            "steps_per_period": str(self._assembly.steps_per_period),
-            "dtype": str(self._assembly.dtype),
+            "grids": [assembly.grid for assembly in self._assemblies],
+            "steps_per_period": [str(assembly.steps_per_period) for assembly in self._assemblies],
+            "dtype": str(self._assemblies[0].dtype),
             "kernel": type(self._kernel).__name__,
         }
         heard = {name: part for name, part in scene.items() if name not in _NOT_HEARD}
@@ -263,14 +276,13 @@ class SimulatedPropagator(ABC):
         logger.info("transfer matrix: %d runs from %s", plan.runs, whence)
         if plan.runs < count:
             logger.info("by symmetry, %d of %d %s stand for all", plan.runs, count, whence)
-        strength = torch.full((1,), self.scene.array.source_strength, dtype=torch.complex128)
-        rows = torch.zeros((len(plan.stands), len(heard.positions)), dtype=torch.complex128)
-        for own, (stands, by) in enumerate(zip(plan.stands, plan.by, strict=True)):
-            if stands == own:
-                origin = Nodes(origins.positions[own : own + 1], origins.weights)
-                rows[own] = self._simulate(origin, strength, heard)
-            else:
-                rows[own] = rows[stands, plan.images[by]]
+        own = np.flatnonzero(plan.stands == np.arange(count))
+        runs = [Nodes(origins.positions[index : index + 1], origins.weights) for index in own]
+        strength = torch.full((len(runs), 1), self.scene.array.source_strength, dtype=torch.complex128)
+        rows = torch.zeros((count, len(heard.positions)), dtype=torch.complex128)
+        rows[own] = self._simulate(runs, strength, heard)
+        for index in np.flatnonzero(plan.stands != np.arange(count)):
+            rows[index] = rows[plan.stands[index], plan.images[plan.by[index]]]
         return rows if plan.backward else rows.mT.contiguous()
 
     def _note(self, steady: SteadyState, seconds: float) -> None:

@@ -2,22 +2,37 @@
 
 from __future__ import annotations
 
+import dataclasses
+import logging
 import math
 import time
+import warnings
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 import torch
 
 from autdtorch.array import Nodes
 from autdtorch.fdtd.grid import make_box
-from autdtorch.fdtd.scatter import Scattering
-from autdtorch.fdtd.steady_state import run_to_steady_state
+from autdtorch.fdtd.scatter import Reach, Scattering
+from autdtorch.fdtd.steady_state import SteadyState, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble_on
 from autdtorch.propagator.base import MOST_JUDGED, SimulatedPropagator
+from autdtorch.propagator.coupling import coupled_runs
+from autdtorch.propagator.groups import MOST_PASSES, cheapest_grouping, one_box
+from autdtorch.scene import OverlapWarning, Scene
 from autdtorch.validation import LENGTH_TOLERANCE, ArrayLike, distances, invalid, points_tensor
+
+logger = logging.getLogger(__name__)
+
+Drive: TypeAlias = tuple[Nodes, torch.Tensor]
+"""N origins and their strengths (N,)."""
+
+Judged: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
 
 
 class BoxPropagator(SimulatedPropagator):
-    """FDTD in a box around the obstacles; see `SimulatedPropagator`.
+    """FDTD in a box around the obstacles, or in several; see `SimulatedPropagator`.
 
     The incident field and the way from the box to the points are exact (Green's function): array and points
     cost no grid, wherever they are.
@@ -25,10 +40,25 @@ class BoxPropagator(SimulatedPropagator):
 
     method = "box"
 
-    def _assembled(self, dtype: torch.dtype, time_step: float | None) -> Assembly:
-        assembly = assemble_on(make_box(self.scene, self.spacing), self.scene, dtype, time_step)
-        self._scattering = Scattering(assembly, self.scene.complex_wavenumber)
-        return assembly
+    def _assembled(self, dtype: torch.dtype, time_step: float | None) -> Sequence[Assembly]:
+        self._wanted = dtype, time_step
+        runs = min(len(self.scene.control_points), len(self.scene.array))
+        grouping = cheapest_grouping(self.scene, self.spacing, self.tolerance, runs)
+        if len(grouping.groups) > 1:
+            alone = one_box(self.scene, self.spacing)
+            logger.info(
+                "%d boxes in about %d passes: %.2g times cheaper than one box of %d cells",
+                len(grouping.groups), grouping.passes, alone.cost(runs) / grouping.cost(runs),
+                alone.grids[0].cells,
+            )  # fmt: skip
+        return self._boxed(grouping.groups)
+
+    def _boxed(self, groups: Sequence[Sequence[int]]) -> Sequence[Assembly]:
+        """The obstacles of each group in a box."""
+        scenes = [self.scene] if len(groups) == 1 else [_part(self.scene, group) for group in groups]
+        assemblies = [assemble_on(make_box(scene, self.spacing), scene, *self._wanted) for scene in scenes]
+        self._boxes = [Scattering(assembly, self.scene.complex_wavenumber) for assembly in assemblies]
+        return assemblies
 
     def _checked(self, points: ArrayLike) -> torch.Tensor:
         points = points_tensor("points", points).cpu()
@@ -41,29 +71,88 @@ class BoxPropagator(SimulatedPropagator):
         return points
 
     def _near_obstacle(self, points: torch.Tensor) -> bool:
-        return self._assembly.touches_varying(points[self._scattering.inside(points)])
+        return any(box.assembly.touches_varying(points[box.inside(points)]) for box in self._boxes)
 
     @torch.no_grad()
-    def _simulate(self, origins: Nodes, strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
-        if not strength.any():
-            return torch.zeros(len(targets.positions), dtype=torch.complex128)
-        begin = time.perf_counter()
-        assembly, kernel, scattering = self._assembly, self._kernel, self._scattering
-        self._warn_near_obstacle(origins)
-        sources = scattering.sources(origins, strength)
-        points = targets.positions
-        reach = scattering.reach(targets)
-        incident = scattering.incident(points.reshape(-1, 3), origins, strength)
-        pressure = incident.reshape(points.shape[:-1]) @ targets.weights.to(incident.dtype)
-        every = math.ceil(len(points) / MOST_JUDGED)
-        steady = run_to_steady_state(
-            assembly, kernel, sources, reach.cells, self.tolerance, self.max_periods,
-            lambda phasor: pressure[::every] + reach.field(phasor, every),
-        )  # fmt: skip
-        pressure = pressure + reach.field(steady.pressure)
+    def _simulate(self, origins: Sequence[Nodes], strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
+        points, weights = targets.positions, targets.weights.to(torch.complex128)
+        drives = list(zip(origins, strength, strict=True))
+        incident = torch.stack(
+            [
+                self._boxes[0].incident(points.reshape(-1, 3), *drive).reshape(points.shape[:-1]) @ weights
+                for drive in drives
+            ],
+            dim=1,
+        )
+        for nodes in origins:
+            self._warn_near_obstacle(nodes)
+        reaches = [box.reach(targets) for box in self._boxes]
+        if len(self._boxes) == 1:
+            phasors = self._in_one_box(drives, incident, reaches[0])
+        else:
+            coupled = self._in_several_boxes(drives, incident, reaches)
+            if coupled is None:
+                logger.warning(
+                    "%d boxes hear too much of each other: not settled after %d passes; one box instead",
+                    len(self._boxes), MOST_PASSES,
+                )  # fmt: skip
+                self._assemblies = self._boxed([range(len(self.scene.obstacles))])
+                return self._simulate(origins, strength, targets)
+            phasors = coupled
+        parts = torch.split(phasors, [len(reach.cells) for reach in reaches])
+        total = incident + sum(reach.field(part) for reach, part in zip(reaches, parts, strict=True))
         silent = torch.zeros(len(points), dtype=torch.bool)
         for obstacle in self.scene.obstacles:  # the later counts
             silent = torch.where(obstacle.contains(points).any(dim=1), obstacle.rigid, silent)
-        pressure[silent] = 0
-        self._note(steady, time.perf_counter() - begin)
-        return pressure
+        return total.mT.masked_fill(silent, 0)
+
+    def _in_one_box(self, drives: Sequence[Drive], incident: torch.Tensor, reach: Reach) -> torch.Tensor:
+        """Phasors (k, R) of the cells that `reach` reads, incident (P, R) being the field at its targets."""
+        (box,) = self._boxes
+        every = math.ceil(len(incident) / MOST_JUDGED)
+        matrix = reach.matrix(every)
+        phasors = []
+        for drive, direct in zip(drives, incident[::every].mT, strict=True):
+            begin = time.perf_counter()
+            steady = self._run(box, box.driving(*drive), reach, self.tolerance, _heard(matrix, direct))
+            self._note(steady, time.perf_counter() - begin)
+            phasors.append(steady.pressure)
+        return torch.stack(phasors, dim=1)
+
+    def _in_several_boxes(
+        self, drives: Sequence[Drive], incident: torch.Tensor, reaches: Sequence[Reach]
+    ) -> torch.Tensor | None:
+        """The same for the cells of all boxes, one after the other; None if they do not settle."""
+        every = math.ceil(len(incident) / MOST_JUDGED)
+        matrix = torch.cat([reach.matrix(every) for reach in reaches], dim=1)
+
+        def simulate(index: int, field: torch.Tensor, tolerance: float) -> SteadyState:
+            reach = reaches[index]  # judged by all that leaves the box
+            return self._run(self._boxes[index], field, reach, tolerance, reach.amplitudes)
+
+        driving = [torch.stack([box.driving(*drive) for drive in drives], dim=1) for box in self._boxes]
+        heard = _heard(matrix, incident[::every])
+        coupled = coupled_runs(self._boxes, reaches, driving, heard, simulate, self.tolerance)
+        if coupled is None:
+            return None
+        for run in coupled:
+            self._note(run.steady, run.seconds)
+        return torch.stack([run.steady.pressure for run in coupled], dim=1)
+
+    def _run(
+        self, box: Scattering, field: torch.Tensor, reach: Reach, tolerance: float, judged: Judged
+    ) -> SteadyState:
+        return run_to_steady_state(
+            box.assembly, self._kernel, box.sources(field), reach.cells, tolerance, self.max_periods, judged
+        )
+
+
+def _heard(matrix: torch.Tensor, incident: torch.Tensor) -> Judged:
+    return lambda phasors: incident + matrix @ phasors
+
+
+def _part(scene: Scene, group: Sequence[int]) -> Scene:
+    """A scene with some of its obstacles."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", OverlapWarning)  # the whole scene has given it
+        return dataclasses.replace(scene, obstacles=tuple(scene.obstacles[index] for index in group))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -21,8 +22,8 @@ class FullPropagator(SimulatedPropagator):
 
     method = "full"
 
-    def _assembled(self, dtype: torch.dtype, time_step: float | None) -> Assembly:
-        return assemble(self.scene, self.spacing, dtype, time_step)
+    def _assembled(self, dtype: torch.dtype, time_step: float | None) -> Sequence[Assembly]:
+        return (assemble(self.scene, self.spacing, dtype, time_step),)
 
     def _checked(self, points: ArrayLike) -> torch.Tensor:
         points = points_tensor("points", points).cpu()
@@ -30,25 +31,23 @@ class FullPropagator(SimulatedPropagator):
         return points
 
     def _near_obstacle(self, points: torch.Tensor) -> bool:
-        return self._assembly.touches_varying(points)
+        return self._assemblies[0].touches_varying(points)
 
     @torch.no_grad()
-    def _simulate(self, origins: Nodes, strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
-        """Pressure (P,) of N origins with strengths (N,), as the mean over the nodes of each of P targets."""
-        points = targets.positions
-        if not strength.any():
-            return torch.zeros(len(points), dtype=torch.complex128)
-        begin = time.perf_counter()
-        assembly, kernel = self._assembly, self._kernel
-        self._warn_near_obstacle(origins)
-        sources = assembly.sources(origins.positions, strength, origins.weights)
-        spread = assembly.spread(points, targets.weights)
+    def _simulate(self, origins: Sequence[Nodes], strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
+        (assembly,) = self._assemblies
+        spread = assembly.spread(targets.positions, targets.weights)
         cells = np.unique(spread.index)
         read = spread.reading(cells)
-        some = read[:: math.ceil(len(points) / MOST_JUDGED)]
-        steady = run_to_steady_state(
-            assembly, kernel, sources, cells, self.tolerance, self.max_periods,
-            lambda phasor: torch.from_numpy(some @ phasor.numpy()),
-        )  # fmt: skip
-        self._note(steady, time.perf_counter() - begin)
-        return torch.from_numpy(read @ steady.pressure.numpy())
+        some = read[:: math.ceil(len(targets.positions) / MOST_JUDGED)]
+        rows = []
+        for nodes, own in zip(origins, strength, strict=True):
+            begin = time.perf_counter()
+            self._warn_near_obstacle(nodes)
+            steady = run_to_steady_state(
+                assembly, self._kernel, assembly.sources(nodes.positions, own, nodes.weights), cells,
+                self.tolerance, self.max_periods, lambda phasor: torch.from_numpy(some @ phasor.numpy()),
+            )  # fmt: skip
+            self._note(steady, time.perf_counter() - begin)
+            rows.append(torch.from_numpy(read @ steady.pressure.numpy()))
+        return torch.stack(rows)

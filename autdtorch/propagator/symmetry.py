@@ -9,7 +9,7 @@ and no kind of obstacle needs to know its symmetries. With S any of them, G[p, m
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -97,14 +97,15 @@ def _standing(images: Index) -> tuple[Index, Index]:
     return known.min(axis=0), known.argmin(axis=0)
 
 
-def symmetries(assembly: Assembly, transducers: Nodes) -> list[Symmetry]:
-    """All symmetries of a scene on its grid, the identity first."""
+def symmetries(assemblies: Sequence[Assembly], transducers: Nodes) -> list[Symmetry]:
+    """All symmetries of a scene on its grid, the identity first; of several grids that alone."""
+    assembly = assemblies[0]
     grid, varying = assembly.grid, assembly.varying
     center = np.array(grid.origin) + grid.spacing * (np.array(grid.shape) - 1) / 2
     alike = _ALIKE * assembly.stencil.face
     positions, weights = transducers.positions.numpy(), transducers.weights.numpy()
     found = [Symmetry(np.eye(3, dtype=np.int64), center, np.arange(len(positions)))]
-    for matrix in itertools.islice(_signed_permutations(), 1, None):
+    for matrix in itertools.islice(_signed_permutations(), 1, None if len(assemblies) == 1 else 1):
         images = _matched(positions, weights, matrix, center)
         if (images != _NONE).all() and _maps_cells(varying, grid, matrix, alike):
             found.append(Symmetry(matrix, center, images))

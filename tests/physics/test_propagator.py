@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import logging
 import math
 
 import pytest
@@ -17,7 +16,6 @@ from autdtorch.geometry import plane_basis
 from autdtorch.objective import SimulatedObjective
 from autdtorch.propagator import (
     FreeSpacePropagator,
-    FullPropagator,
     SteadyStateWarning,
     make_propagator,
 )
@@ -207,13 +205,6 @@ def test_field_is_linear_and_differentiable_in_the_drive() -> None:
     assert not propagator.transfer_matrix(points).requires_grad
 
 
-def test_auto_skips_the_grid_where_nothing_scatters(caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.INFO):
-        assert isinstance(make_propagator(small_scene()), FreeSpacePropagator)
-        assert isinstance(make_propagator(small_scene((CUBE,)), spacing=2e-3), FullPropagator)
-    assert "no obstacles: nothing to simulate" in caplog.text
-
-
 def test_free_space_says_that_it_leaves_obstacles_out(caplog: pytest.LogCaptureFixture) -> None:
     make_propagator(small_scene((CUBE,)), "free_space")
     assert "leaves out the 1 obstacles" in caplog.text
@@ -227,7 +218,10 @@ def test_free_space_says_that_it_leaves_obstacles_out(caplog: pytest.LogCaptureF
             {"spacing": 4e-3},
             r"spacing: 0.004 m; must be at most 0.00283 m, 3 cells per .* in the medium",
         ),
-        ({"spacing": 1e-5}, r"spacing: 1e-05 m; gives 2416 x 2416 x 2416 cells, must be at most 1e\+09"),
+        (
+            {"spacing": 1e-5, "method": "full"},
+            r"spacing: 1e-05 m; gives 2416 x 2416 x 2416 cells, must be at most 1e\+09",
+        ),
         ({"spacing": float("nan")}, r"spacing: nan"),
         ({"spacing": -1e-3}, r"spacing: -0.001 m; must be finite and > 0"),
         ({"tolerance": 1.5}, r"tolerance: 1.5; must be in \(0, 1\)"),

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autdtorch.fdtd.points import FOOTPRINT_ERROR, footprint, merged, point_weights
+from autdtorch.fdtd.points import FOOTPRINT_ERROR, footprint, merged, point_weights, without
 
 SHAPE = (24, 22, 20)
 FIRST, LAST = (2, 2, 2), (22, 20, 18)
@@ -45,6 +45,24 @@ def test_points_within_a_cell_of_the_rim_are_read_from_inside(cells: float) -> N
     # one-sided: 2e-4 an axis at 8.5 cells per wavelength, amplified by |weights| sums of 2.8 on the other two
     # axes
     assert np.abs(read - np.exp(1j * positions @ vector)).max() < 3 * 2.8**2 * 3e-4
+
+
+@pytest.mark.parametrize("cells", [17.0, 8.5])
+def test_points_beside_missing_cells_are_read_from_the_others(cells: float) -> None:
+    """Up to a cell beyond the last of them; with none next to a point, nothing is read."""
+    kappa = 2 * math.pi / cells
+    field, vector = wave(kappa, seed=2)
+    positions = np.array([[10.2, 9.6, 8.3], [10.6, 9.1, 8.8], [10.95, 9.0, 8.5], [11.01, 9.0, 8.5]])
+    spread = point_weights(positions, SHAPE, FIRST, LAST, kappa)
+    missing = np.unravel_index(spread.index, SHAPE)[0] > 10
+    weights = without(spread, positions, missing, SHAPE, kappa)
+    assert not weights.weight[missing].any()
+    assert not weights.weight[3].any()
+    read = (field[weights.index] * weights.weight).sum(1)
+    # a line through the last two cells would miss up to kappa^2, 0.14 and 0.55; a parabola kappa^3
+    assert np.abs(read - np.exp(1j * positions @ vector))[:3].max() < 0.1
+    kept = without(spread, positions, np.zeros_like(missing), SHAPE, kappa)
+    assert np.array_equal(kept.weight, spread.weight)
 
 
 def test_a_point_on_a_cell_centre_is_that_cell() -> None:

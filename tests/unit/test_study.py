@@ -5,6 +5,7 @@ import itertools
 import logging
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -97,11 +98,13 @@ def test_a_scene_without_observation_plane_has_no_areas() -> None:
 
 def test_the_runs_of_a_simulation_are_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     def simulate(
-        self: FullPropagator, origins: Nodes, strength: torch.Tensor, targets: Nodes
+        self: FullPropagator, origins: Sequence[Nodes], strength: torch.Tensor, targets: Nodes
     ) -> torch.Tensor:
-        self.runs.append(Run(7, 0.1, len(self.runs) < 3, 0.5))
-        matrix = green(targets.positions[:, 0], origins.positions[:, 0], self.scene.wavenumber)
-        return 4 * math.pi * matrix @ strength
+        rows = []
+        for nodes, own in zip(origins, strength, strict=True):
+            self.runs.append(Run(7, 0.1, len(self.runs) < 3, 0.5))
+            rows.append(green(targets.positions[:, 0], nodes.positions[:, 0], self.scene.wavenumber) @ own)
+        return 4 * math.pi * torch.stack(rows)
 
     monkeypatch.setattr(FullPropagator, "_simulate", simulate)
     solver = {"method": "full", "spacing": 2e-3, "tolerance": 0.2, "kernel": "reference"}

@@ -1,0 +1,62 @@
+"""The cheapest method that is right for a scene."""
+
+from __future__ import annotations
+
+import logging
+
+from autdtorch.fdtd.grid import Extent, domain_extent, obstacles_extent
+from autdtorch.fdtd.medium import is_wall
+from autdtorch.propagator.cost import full_cost, grid_cost
+from autdtorch.propagator.groups import cheapest_grouping
+from autdtorch.scene import Scene
+
+logger = logging.getLogger(__name__)
+
+
+def chosen_method(scene: Scene, spacing: float, tolerance: float) -> str:
+    """The cheapest method that is right for a scene, and why, in the log.
+
+    Args:
+        scene: what is simulated.
+        spacing: edge of a cell [m].
+        tolerance: relative error to which boxes are coupled, if several are cheaper than one.
+    """
+    if not scene.obstacles:
+        logger.info("method auto: free_space (no obstacles: nothing to simulate)")
+        return "free_space"
+    runs = min(len(scene.control_points), len(scene.array))
+    domain = grid_cost(scene, domain_extent(scene, spacing), spacing)
+    boxes = cheapest_grouping(scene, spacing, tolerance, runs)
+    gain = full_cost(domain, runs) / boxes.cost(runs)
+    if any(is_wall(scene, obstacle) for obstacle in scene.obstacles):
+        method, reason = "full", "a wall goes on without end"
+    elif any(_reaches_out(scene, obstacles_extent([obstacle])) for obstacle in scene.obstacles):
+        method, reason = "box", "obstacles reach out of the domain, where full would cut them off"
+    elif gain > 1:
+        method, reason = "box", f"{gain:.2g} times cheaper than full"
+    else:
+        method, reason = "full", f"{1 / gain:.2g} times cheaper than box"
+    grids, passes = (boxes.grids, boxes.passes) if method == "box" else ((domain,), 1)
+    cells, steps = sum(grid.cells for grid in grids), max(grid.steps for grid in grids) * passes
+    logger.info("method auto: %s (%s), at least %s", method, reason, _shown(cells, steps, runs))
+    skipped = {
+        "cells": 1 - cells / domain.cells,
+        "steps": 1 - steps / domain.steps,
+        "runs": 1 - runs / len(scene.array),
+    }
+    logger.info(
+        "skipped of the naive plan, the domain and a run a transducer (%s): %s",
+        _shown(domain.cells, domain.steps, len(scene.array)),
+        ", ".join(f"{100 * share:.0f} % of the {what}" for what, share in skipped.items()),
+    )
+    return method
+
+
+def _shown(cells: int, steps: int, runs: int) -> str:
+    return f"{cells:,} cells x {steps:,} steps x {runs:,} runs"
+
+
+def _reaches_out(scene: Scene, extent: Extent) -> bool:
+    lower, upper = scene.domain
+    pairs = zip(lower, extent.lower, strict=True), zip(extent.upper, upper, strict=True)
+    return any(inner > outer for pair in pairs for inner, outer in pair)

@@ -1,0 +1,137 @@
+"""Obstacles far apart, a box each: as one box and as the whole domain, their coupling included."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import logging
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from small_scenes import AIR, relative_error
+
+from autdtorch.array import TransducerArray
+from autdtorch.freespace import free_space_matrix
+from autdtorch.obstacles import Box, Obstacle, Sphere
+from autdtorch.propagator import BoxPropagator, make_propagator
+from autdtorch.propagator.groups import Grouping, cheapest_grouping, one_box
+from autdtorch.scene import Scene
+
+EXTENT, SPACING, TOLERANCE = 64e-3, 1.4e-3, 1e-3
+NEAR = (13.8e-3, 15.2e-3, 15.2e-3)
+FAR = (NEAR[0] + 25 * SPACING, NEAR[1] + 24 * SPACING, NEAR[2] + 23 * SPACING)
+"""A sphere of 4 mm lies alike on the cells of its own box, of one box for both and of the domain."""
+ARRAY = TransducerArray.grid((1, 2), pitch=8e-3, center=(1e-3, EXTENT / 2, EXTENT / 2))
+POINTS = [[61e-3, 52e-3, 55e-3]]
+OneBox = Callable[[], None]
+
+
+@pytest.fixture
+def take_one_box(monkeypatch: pytest.MonkeyPatch) -> OneBox:
+    """From when it is called, all obstacles share a box."""
+
+    def alone(scene: Scene, spacing: float, *_: float) -> Grouping:
+        return one_box(scene, spacing)
+
+    return functools.partial(monkeypatch.setattr, "autdtorch.propagator.box.cheapest_grouping", alone)
+
+
+def far_apart(*obstacles: Obstacle) -> Scene:
+    return Scene(ARRAY, AIR, 40e3, POINTS, obstacles, domain=((0, 0, 0), (EXTENT,) * 3))
+
+
+def spheres(**material: float | bool) -> Scene:
+    return far_apart(*(Sphere(center, 4e-3, **(material or {"rigid": True})) for center in (NEAR, FAR)))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "scene", [spheres(), spheres(density=100.0, sound_speed=340.0)], ids=["rigid", "dense"]
+)
+def test_boxes_apart_are_one_box_and_the_domain(scene: Scene, take_one_box: OneBox) -> None:
+    apart = make_propagator(scene, "box", SPACING, tolerance=TOLERANCE)
+    full = make_propagator(scene, "full", SPACING, tolerance=TOLERANCE)
+    matrix = apart.transfer_matrix()
+    take_one_box()
+    together = make_propagator(scene, "box", SPACING, tolerance=TOLERANCE)
+    assert [len(_cells(each)) for each in (apart, together)] == [2, 1]
+    assert relative_error(matrix, together.transfer_matrix()) < TOLERANCE
+    # the domain has the grid's error in air as well, 0.2 % at 1.4 mm over this distance
+    assert relative_error(matrix, full.transfer_matrix()) < 4e-3
+    # what was stepped: both boxes the same number of cells, to a few
+    assert max(_cells(apart)) * apart.runs[0].periods < 0.8 * _cells(together)[0] * together.runs[0].periods
+
+
+def test_coupling_is_heard(take_one_box: OneBox) -> None:
+    """Without it the error would be far above the tolerance."""
+    scene = spheres()
+    matrix = make_propagator(scene, "box", SPACING, tolerance=TOLERANCE).transfer_matrix()
+    take_one_box()
+    free = free_space_matrix(scene.control_points, ARRAY, scene.wavenumber)
+    alone = sum(
+        make_propagator(far_apart(obstacle), "box", SPACING, tolerance=TOLERANCE).transfer_matrix() - free
+        for obstacle in scene.obstacles
+    )
+    assert relative_error(free + alone, matrix) > 4 * TOLERANCE
+
+
+def test_reciprocity_between_boxes() -> None:
+    """From a point between the boxes to the transducers as back."""
+    points = torch.tensor([[30e-3, 31e-3, 32e-3]], dtype=torch.float64)
+    propagator = make_propagator(spheres(), "box", SPACING, tolerance=1e-6, dtype="float64")
+    backward = propagator.transfer_matrix(points)
+    assert len(propagator.runs) == 1
+    forward = propagator.transfer_matrix(torch.cat((points, points + 0.2e-3)))[:1]
+    assert len(propagator.runs) == 1 + 2
+    # Scheme and Green's function are symmetric. What drives a box and what it radiates are so up to the
+    # grid's error in air, over a box: 7e-5 here, as for a single one.
+    assert relative_error(backward, forward) < 2e-4
+
+
+def test_points_in_a_box_read_its_grid_and_hear_the_other(take_one_box: OneBox) -> None:
+    scene, drive = spheres(), torch.ones(2, dtype=torch.complex128)
+    points = [[20e-3, 15e-3, 15.3e-3], [14e-3, 15e-3, 9.5e-3], [50e-3, 43.5e-3, 48e-3]]
+    apart = make_propagator(scene, "box", SPACING, tolerance=TOLERANCE).field(drive, points)
+    take_one_box()
+    together = make_propagator(scene, "box", SPACING, tolerance=TOLERANCE).field(drive, points)
+    assert relative_error(apart, together) < TOLERANCE
+
+
+def test_boxes_that_hear_too_much_of_each_other_are_joined(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("autdtorch.propagator.coupling.MOST_PASSES", 1)
+    propagator = make_propagator(spheres(), "box", SPACING, tolerance=TOLERANCE)
+    propagator.transfer_matrix()
+    assert "2 boxes hear too much of each other" in caplog.text
+    assert len(_cells(propagator)) == 1
+    assert [run.reached for run in propagator.runs] == [True]
+
+
+def test_near_obstacles_share_a_box_and_far_ones_where_that_is_cheaper(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    near = Sphere((NEAR[0], NEAR[1], NEAR[2] + 9e-3), 3e-3, rigid=True)
+    scene = far_apart(Sphere(NEAR, 4e-3, rigid=True), Sphere(FAR, 4e-3, rigid=True), near)
+    grouping = cheapest_grouping(scene, 1e-3, TOLERANCE, runs=1)
+    assert sorted(grouping.groups) == [(0, 2), (1,)]
+    assert grouping.cost(1) < one_box(scene, 1e-3).cost(1)
+    # on coarse cells boundary layers fill each box: one is cheaper
+    assert cheapest_grouping(scene, 2.8e-3, TOLERANCE, runs=1) == one_box(scene, 2.8e-3)
+    with caplog.at_level(logging.INFO):
+        make_propagator(spheres(), "box", SPACING, tolerance=TOLERANCE)
+    assert "2 boxes in about" in caplog.text
+
+
+def test_plates_that_face_each_other_share_a_box() -> None:
+    """Between them sound goes to and fro: passes would be too many."""
+    plate = Box((12e-3, 32e-3, 32e-3), (2e-3, 50e-3, 50e-3), rigid=True)
+    other = dataclasses.replace(plate, center=(42e-3, 32e-3, 32e-3))
+    scene = far_apart(plate, other)
+    assert len(cheapest_grouping(scene, 1e-3, TOLERANCE, runs=1).groups) == 1
+
+
+def _cells(propagator: object) -> list[int]:
+    assert isinstance(propagator, BoxPropagator)
+    return [math.prod(assembly.grid.shape) for assembly in propagator._assemblies]
