@@ -88,7 +88,7 @@ def run_to_steady_state(
     sequence = Extrapolation(min(max(_FEWEST_PHASORS, _MOST_NUMBERS // len(cells)), _MOST_PHASORS))
     values: deque[torch.Tensor] = deque(maxlen=3)
     ramp = math.ceil(RAMP_PERIODS * assembly.steps_per_period)
-    for count, windows in _windows(assembly, kernel, sources, cells):
+    for count, windows in windows_of_run(assembly, kernel, sources, cells):
         for start, phasor in windows:
             if start >= ramp:
                 sequence.append(phasor)
@@ -145,7 +145,7 @@ class Extrapolation:
         return total
 
 
-def _windows(
+def windows_of_run(
     assembly: Assembly, kernel: Kernel, sources: Sources, cells: NDArray[np.int64]
 ) -> Iterator[tuple[int, list[tuple[int, Phasors]]]]:
     """Step from silence; after each block the periods so far, and first step and phasors of its windows."""

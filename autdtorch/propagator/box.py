@@ -8,6 +8,7 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import TypeAlias
 
 import torch
@@ -111,13 +112,17 @@ class BoxPropagator(SimulatedPropagator):
         (box,) = self._boxes
         every = math.ceil(len(incident) / MOST_JUDGED)
         matrix = reach.matrix(every)
-        phasors = []
-        for drive, direct in zip(drives, incident[::every].mT, strict=True):
+
+        def run(drive: Drive, direct: torch.Tensor) -> tuple[SteadyState, float]:
             begin = time.perf_counter()
             steady = self._run(box, box.driving(*drive), reach, self.tolerance, _heard(matrix, direct))
-            self._note(steady, time.perf_counter() - begin)
-            phasors.append(steady.pressure)
-        return torch.stack(phasors, dim=1)
+            return steady, time.perf_counter() - begin
+
+        with ThreadPoolExecutor(self._kernel.at_once(box.assembly.grid.shape)) as pool:
+            runs = list(pool.map(run, drives, incident[::every].mT))
+        for steady, seconds in runs:
+            self._note(steady, seconds)
+        return torch.stack([steady.pressure for steady, _ in runs], dim=1)
 
     def _in_several_boxes(
         self, drives: Sequence[Drive], incident: torch.Tensor, reaches: Sequence[Reach]

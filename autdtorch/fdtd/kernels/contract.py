@@ -142,6 +142,10 @@ class Receivers:
 class Kernel(Protocol):
     """Advances a state by whole steps."""
 
+    def at_once(self, shape: tuple[int, int, int]) -> int:
+        """How many runs on an array of `shape` may go side by side, in threads: they gain by it."""
+        ...
+
     def advance(
         self,
         state: State,

@@ -10,6 +10,7 @@ numba's threads do not survive a fork: start processes that use this module by s
 
 from __future__ import annotations
 
+import math
 import os
 
 # An idle OpenMP thread spins for milliseconds unless told otherwise. On a busy machine it then keeps the
@@ -161,11 +162,15 @@ def _advance_together(  # type: ignore[no-untyped-def]
     _record(p, receivers, 0, heard, recorded[-1])
 
 
+def _chunks(cells: int) -> int:
+    return max(1, min(get_num_threads(), cells // _CHUNK_CELLS))
+
+
 def _cuts(shape: torch.Size, layer_cells: int) -> NDArray[np.int64]:
     """First planes of the chunks, and one past the last: the layers across x are not cut."""
     planes = shape[0] - 2
-    chunks = min(get_num_threads(), shape.numel() // _CHUNK_CELLS, planes // (layer_cells + 2))
-    return np.linspace(1, 1 + planes, max(1, chunks) + 1).astype(np.int64)
+    chunks = max(1, min(_chunks(shape.numel()), planes // (layer_cells + 2)))
+    return np.linspace(1, 1 + planes, chunks + 1).astype(np.int64)
 
 
 def _room(chunks: int, shape: torch.Size, layer_cells: int, dtype: type) -> tuple[Array, ...]:
@@ -195,6 +200,10 @@ def _varying_cells(c: Coefficients, strides: NDArray[np.int64]) -> tuple[Array, 
 
 class CpuKernel:
     """See `kernels.contract`; updates the state in place."""
+
+    def at_once(self, shape: tuple[int, int, int]) -> int:
+        """One for each core, if the grid is one chunk."""
+        return get_num_threads() if _chunks(math.prod(shape)) == 1 else 1
 
     def advance(
         self,

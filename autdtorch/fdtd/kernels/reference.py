@@ -20,6 +20,10 @@ def middle(field: torch.Tensor, axis: int) -> torch.Tensor:
 class ReferenceKernel:
     """One torch expression per line of the contract, none in place, so that autograd can go back."""
 
+    def at_once(self, shape: tuple[int, int, int]) -> int:
+        """One: torch itself uses all cores."""
+        return 1
+
     def advance(
         self,
         state: State,
