@@ -37,8 +37,7 @@ LARGEST_ERROR = 0.2
 """Of points that ratios are taken at: what is further off tells nothing of use."""
 
 STEADY = 1e-2
-"""Distance to the steady state at which a peer may end, as our own solver does by default; it is told from the
-last period of the run."""
+"""Distance to the steady state at which a peer may end, our default; told from the end of its run."""
 
 
 @dataclass(frozen=True)
