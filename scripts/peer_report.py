@@ -79,8 +79,9 @@ def write_report(points: Sequence[Point], refusals: Sequence[Refusal], command: 
     """Write peers.json, peers.png and peers.md into `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
     made = {"command": command, "date": date.today().isoformat(), "cores": os.cpu_count()}
-    rows = {"points": [asdict(one) for one in points], "refusals": [asdict(one) for one in refusals]}
-    (folder / "peers.json").write_text(json.dumps({**made, **rows}, indent=1) + "\n", encoding="utf-8")
+    rows = ",\n ".join(json.dumps(_rounded(asdict(one))) for one in (*points, *refusals))
+    text = f'{json.dumps(made)[:-1]}, "rows": [\n {rows}\n]}}\n'
+    (folder / "peers.json").write_text(text, encoding="utf-8")
     plot_pareto(points, command).savefig(folder / "peers.png")
     stated = f"Measured on {made['cores']} cores, {made['date']}:\n\n    {command}"
     parts = [stated, "![Error over run time](peers.png)", ratios(points), figures(points)]
@@ -197,3 +198,8 @@ def _draw_case(ax: Axes, points: Sequence[Point]) -> None:
         axis.set_minor_formatter(NullFormatter())
     ax.tick_params(labelsize=TICK_SIZE, labelbottom=True)
     ax.margins(0.06, 0.1)
+
+
+def _rounded(row: dict[str, object]) -> dict[str, object]:
+    """A row with four digits of each number."""
+    return {name: float(f"{value:.4g}") if isinstance(value, float) else value for name, value in row.items()}

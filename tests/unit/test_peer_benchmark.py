@@ -141,7 +141,8 @@ def test_report_fills_in_its_block(tmp_path: Path) -> None:
     refusals = [Refusal("cubes", "devito", "1 mm", "no compiler")]
     write_report(points, refusals, "python it.py", tmp_path)
     stored = json.loads((tmp_path / "peers.json").read_text(encoding="utf-8"))
-    assert [Point(**row) for row in stored["points"]] == points
+    assert [Point(**row) for row in stored["rows"][:-1]] == points
+    assert [Refusal(**row) for row in stored["rows"][-1:]] == refusals
     text = (tmp_path / "peers.md").read_text(encoding="utf-8")
     assert "| cubes | k-wave-python | 1.2e+03 | 5 % | 600 | 6 % |" in text
     assert "no compiler" in text
