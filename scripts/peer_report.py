@@ -36,6 +36,9 @@ NAMES = {"deepwave": "Deepwave", "devito": "Devito", "jwave": "j-Wave", "kwave":
 LARGEST_ERROR = 0.2
 """Of points that ratios are taken at: what is further off tells nothing of use."""
 
+ERRORS = (0.1, 0.05, 0.03, 0.01)
+"""That the time to reach is told of."""
+
 STEADY = 1e-2
 """Distance to the steady state at which a peer may end, our default; told from the end of its run."""
 
@@ -84,7 +87,7 @@ def write_report(points: Sequence[Point], refusals: Sequence[Refusal], command: 
     (folder / "peers.json").write_text(text, encoding="utf-8")
     plot_pareto(points, command).savefig(folder / "peers.png")
     stated = f"Measured on {made['cores']} cores, {made['date']}:\n\n    {command}"
-    parts = [stated, "![Error over run time](peers.png)", ratios(points), figures(points)]
+    parts = [stated, "![Error over run time](peers.png)", times(points), ratios(points), figures(points)]
     fill_in(DOCUMENT, "benchmark_peers", [*parts, *refused(refusals)], folder)
 
 
@@ -92,6 +95,29 @@ def time_ratio(peer: Point, points: Sequence[Point]) -> float | None:
     """Run time of a peer's point over that of our fastest run whose error is not larger, None without one."""
     ours = [p.seconds for p in points if (p.case, p.program) == (peer.case, OURS) and p.error <= peer.error]
     return peer.seconds / min(ours) if ours else None
+
+
+def times(points: Sequence[Point]) -> str:
+    """Time in which each program comes to an error and a steady state, and how many times ours that is."""
+    lines = [
+        "| scene | program | " + " | ".join(f"to {percent(error)}" for error in ERRORS) + " | best error |"
+    ]
+    lines.append("| --- |" + " --- |" * (len(ERRORS) + 2))
+    steady = list(settled(points))
+    for case, program in dict.fromkeys((p.case, p.program) for p in points):
+        cells = [case, NAMES.get(program, program)]
+        for error in ERRORS:
+            ours, mine = (_time_to(error, steady, case, name) for name in (OURS, program))
+            told = f" ({mine / ours:.3g} times ours)" if program != OURS and mine and ours else ""
+            cells.append(f"{mine:.3g} s{told}" if mine else "")
+        best = min(p.error for p in steady if (p.case, p.program) == (case, program))
+        lines.append("| " + " | ".join([*cells, percent(best)]) + " |")
+    return "\n".join(lines)
+
+
+def _time_to(error: float, points: Sequence[Point], case: str, program: str) -> float | None:
+    mine = (p.seconds for p in points if (p.case, p.program) == (case, program) and p.error <= error)
+    return min(mine, default=None)
 
 
 def ratios(points: Sequence[Point]) -> str:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from benchmark_accuracy import free_space_case, sphere_case
 from benchmark_peers import SETTINGS, reason
-from peer_report import OURS, Point, Refusal, front, settled, time_ratio, write_report
+from peer_report import OURS, Point, Refusal, front, settled, time_ratio, times, write_report
 from peer_scene import next_smooth, scene_grid, spread
 from peers.task import LOCK_IN_PERIODS, Answer, Task
 
@@ -147,3 +147,10 @@ def test_report_fills_in_its_block(tmp_path: Path) -> None:
     assert "| cubes | k-wave-python | 1.2e+03 | 5 % | 600 | 6 % |" in text
     assert "no compiler" in text
     assert (tmp_path / "peers.png").stat().st_size > 0
+
+
+def test_times_are_told_to_each_error_and_beside_ours() -> None:
+    points = [point(OURS, 0.04, 0.5), point("jwave", 0.02, 2.0, remaining=0.1), point("jwave", 0.08, 5.0)]
+    _, _, ours, jwave = times(points).splitlines()
+    assert ours == "| cubes | autdtorch | 0.5 s | 0.5 s |  |  | 4 % |"
+    assert jwave == "| cubes | j-Wave | 5 s (10 times ours) |  |  |  | 8 % |"
