@@ -33,10 +33,14 @@ _LOOKS = {
 
 NAMES = {"deepwave": "Deepwave", "devito": "Devito", "jwave": "j-Wave", "kwave": "k-wave-python"}
 
+REQUIRED_CASE = "three cubes"
+REQUIRED = (("fastest peer", tuple(NAMES), 50), ("k-wave-python", ("kwave",), 1000))
+"""Of whom the fastest must take so many times as long as we do."""
+
 LARGEST_ERROR = 0.2
 """Of points that ratios are taken at: what is further off tells nothing of use."""
 
-ERRORS = (0.1, 0.05, 0.03, 0.01)
+ERRORS = (0.2, 0.1, 0.05, 0.03, 0.01)
 """That the time to reach is told of."""
 
 STEADY = 1e-2
@@ -87,7 +91,8 @@ def write_report(points: Sequence[Point], refusals: Sequence[Refusal], command: 
     (folder / "peers.json").write_text(text, encoding="utf-8")
     plot_pareto(points, command).savefig(folder / "peers.png")
     stated = f"Measured on {made['cores']} cores, {made['date']}:\n\n    {command}"
-    parts = [stated, "![Error over run time](peers.png)", times(points), ratios(points), figures(points)]
+    picture = "![Error over run time](peers.png)"
+    parts = [stated, picture, requirements(points), times(points), ratios(points), figures(points)]
     fill_in(DOCUMENT, "benchmark_peers", [*parts, *refused(refusals)], folder)
 
 
@@ -95,6 +100,23 @@ def time_ratio(peer: Point, points: Sequence[Point]) -> float | None:
     """Run time of a peer's point over that of our fastest run whose error is not larger, None without one."""
     ours = [p.seconds for p in points if (p.case, p.program) == (peer.case, OURS) and p.error <= peer.error]
     return peer.seconds / min(ours) if ours else None
+
+
+def requirements(points: Sequence[Point]) -> str:
+    """Whether we are as much faster to each error and a steady state as required, in `REQUIRED_CASE`."""
+    lines = [f"| time to an error, {REQUIRED_CASE} | required | measured | kept |", "| --- |" + " --- |" * 3]
+    steady = list(settled(points))
+    for error in ERRORS:
+        ours = _time_to(error, steady, REQUIRED_CASE, OURS)
+        for who, peers, least in REQUIRED:
+            found = [t for peer in peers if (t := _time_to(error, steady, REQUIRED_CASE, peer))]
+            what = f"| {percent(error)}, {who} | at least {least} times ours |"
+            if ours is None or not found:
+                lines.append(f"{what} not reached | |")
+                continue
+            kept = "yes" if min(found) >= least * ours else "**no**"
+            lines.append(f"{what} {min(found) / ours:.3g} times | {kept} |")
+    return "\n".join(lines)
 
 
 def times(points: Sequence[Point]) -> str:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from benchmark_accuracy import free_space_case, sphere_case
 from benchmark_peers import SETTINGS, reason
-from peer_report import OURS, Point, Refusal, front, settled, time_ratio, times, write_report
+from peer_report import OURS, Point, Refusal, front, requirements, settled, time_ratio, times, write_report
 from peer_scene import next_smooth, scene_grid, spread
 from peers.task import LOCK_IN_PERIODS, Answer, Task
 
@@ -152,5 +152,18 @@ def test_report_fills_in_its_block(tmp_path: Path) -> None:
 def test_times_are_told_to_each_error_and_beside_ours() -> None:
     points = [point(OURS, 0.04, 0.5), point("jwave", 0.02, 2.0, remaining=0.1), point("jwave", 0.08, 5.0)]
     _, _, ours, jwave = times(points).splitlines()
-    assert ours == "| cubes | autdtorch | 0.5 s | 0.5 s |  |  | 4 % |"
-    assert jwave == "| cubes | j-Wave | 5 s (10 times ours) |  |  |  | 8 % |"
+    assert ours == "| cubes | autdtorch | 0.5 s | 0.5 s | 0.5 s |  |  | 4 % |"
+    assert jwave == "| cubes | j-Wave | 5 s (10 times ours) | 5 s (10 times ours) |  |  |  | 8 % |"
+
+
+def test_requirements_are_of_the_fastest_peer_to_each_error() -> None:
+    points = [
+        point(OURS, 0.009, 0.5, case="three cubes"),
+        point("jwave", 0.08, 20.0, case="three cubes"),
+        point("kwave", 0.04, 600.0, case="three cubes"),
+    ]
+    rows = [line.split(" | ")[2:] for line in requirements(points).splitlines()[2:]]
+    slow, fast = ["1.2e+03 times", "yes |"], ["40 times", "**no** |"]
+    # to 20, 10 and 5 %: the fastest peer, then k-wave-python; nobody comes to less than 4 %
+    assert rows[:6] == [fast, slow, fast, slow, slow, slow]
+    assert all("not reached" in row[0] for row in rows[6:])
