@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from datetime import date
 from pathlib import Path
 
+from generated_block import fill_in
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
@@ -16,8 +17,6 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from autdtorch.plot.style import TICK_SIZE, new_figure, readable, styled
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "benchmarks.md"
-BEGIN = "<!-- written by scripts/benchmark_accuracy.py: begin -->"
-END = "<!-- written by scripts/benchmark_accuracy.py: end -->"
 
 Orders = Mapping[str, Mapping[str, float]]
 
@@ -86,21 +85,7 @@ def write_report(rows: Sequence[Row], orders: Orders, command: str, folder: Path
     plot_pareto(rows, command).savefig(folder / "accuracy.png")
     stated = f"Measured on {made['cores']} cores, {made['date']}:\n\n    {command}"
     parts = (stated, "![Error over run time](accuracy.png)", requirements(rows), errors(rows), slopes(orders))
-    text = DOCUMENT.read_text(encoding="utf-8")
-    (folder / DOCUMENT.name).write_text(with_block(text, "\n\n".join(parts)), encoding="utf-8")
-
-
-def with_block(text: str, block: str) -> str:
-    """`text` with what is between the marks replaced.
-
-    Raises:
-        ValueError: it has not exactly one pair of marks.
-    """
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end or BEGIN in after or END in after:
-        raise ValueError(f"{DOCUMENT.name}: must have {BEGIN!r} and {END!r} once each")
-    return f"{before}{BEGIN}\n\n{block}\n\n{END}{after}"
+    fill_in(DOCUMENT, "benchmark_accuracy", parts, folder)
 
 
 def requirements(rows: Sequence[Row]) -> str:

@@ -187,10 +187,10 @@ def make_reference() -> None:
     CUBE_MATRICES.write_text(json.dumps({"command": command(), "scenes": scenes}, indent=1) + "\n", "utf-8")
 
 
-def simulate(case: Case, spacing: float) -> Simulation:
+def simulate(case: Case, spacing: float, tolerance: float = TOLERANCE) -> Simulation:
     """The transfer matrix at `spacing` [mm]."""
     begin = time.perf_counter()
-    propagator = at.make_propagator(case.scene, case.method, spacing * 1e-3, tolerance=TOLERANCE, cache=False)
+    propagator = at.make_propagator(case.scene, case.method, spacing * 1e-3, tolerance=tolerance, cache=False)
     assert isinstance(propagator, SimulatedPropagator)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", at.SteadyStateWarning)  # the report tells

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from documents import measured, table, update
+from generated_block import fill_in, measured, table
 from numba import get_num_threads, njit, prange
 
 import autdtorch as at
@@ -24,7 +24,8 @@ from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import Assembly, assemble, assemble_on
 
-SCENES = Path(__file__).parents[1] / "configs" / "scene"
+ROOT = Path(__file__).parents[1]
+SCENES, DOCS = ROOT / "configs" / "scene", ROOT / "docs"
 SIDE = 112
 LARGE = 100_000_000
 """Numbers of an array that no cache holds."""
@@ -134,7 +135,7 @@ def main() -> None:
     rates = table(["kernel", "grid", "Gcell/s", "of the uniform rate"], rows)
     stated = measured("python scripts/benchmark_kernels.py") + f"\n\nThreads: {get_num_threads()}."
     print(stated, memory, rates, sep="\n\n")
-    update("performance.md", "benchmark_kernels.py", stated, memory, rates)
+    fill_in(DOCS / "performance.md", "benchmark_kernels", (stated, memory, rates), DOCS)
 
 
 if __name__ == "__main__":

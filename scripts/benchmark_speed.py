@@ -17,8 +17,8 @@ import tempfile
 import time
 
 import torch
-from benchmark_accuracy import CUBES, SCENES, TOLERANCE, cube_case, relative_error
-from documents import measured, table, update
+from benchmark_accuracy import CUBES, ROOT, SCENES, TOLERANCE, cube_case, relative_error
+from generated_block import fill_in, measured, table
 from numba import get_num_threads
 
 import autdtorch as at
@@ -175,14 +175,20 @@ def main() -> None:
         [periods_to_limit(name) for name in CUBES],
     )
     stated = measured("python scripts/benchmark_speed.py") + f"\n\nThreads: {get_num_threads()}."
-    update(
-        "performance.md", "benchmark_speed.py", stated,
-        "Transfer matrix of all four foci and 16 transducers, 1e-3 from the steady state:", whole,
-        "Box against whole domain, the same matrix at 1 mm:", pairs,
-        "AUTD3-size array, two cubes in between, the four foci:", sizes,
-        "Periods until the field stays within 1e-3 of its limit (1 mm, one focus):", limits,
-        "First call of a process:", cold,
-    )  # fmt: skip
+    parts = (
+        stated,
+        "Transfer matrix of all four foci and 16 transducers, 1e-3 from the steady state:",
+        whole,
+        "Box against whole domain, the same matrix at 1 mm:",
+        pairs,
+        "AUTD3-size array, two cubes in between, the four foci:",
+        sizes,
+        "Periods until the field stays within 1e-3 of its limit (1 mm, one focus):",
+        limits,
+        "First call of a process:",
+        cold,
+    )
+    fill_in(ROOT / "docs" / "performance.md", "benchmark_speed", parts, ROOT / "docs")
 
 
 if __name__ == "__main__":

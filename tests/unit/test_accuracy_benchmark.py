@@ -8,7 +8,7 @@ import benchmark_accuracy
 import numpy as np
 import pytest
 import torch
-from accuracy_report import Row, with_block, write_report
+from accuracy_report import Row, write_report
 from benchmark_accuracy import (
     CUBE_ORDER,
     Simulation,
@@ -24,6 +24,7 @@ from benchmark_accuracy import (
     wall_case,
     worst_point,
 )
+from generated_block import with_block
 from surface_variants import TREATMENTS, treatment
 
 import autdtorch as at
@@ -150,4 +151,4 @@ def test_report_fills_in_its_block_and_keeps_the_rest(tmp_path: Path) -> None:
     assert "| sphere, default, 1 mm, total | at most 3 % | 2 % | yes |" in text
     assert (tmp_path / "accuracy.png").stat().st_size > 0
     with pytest.raises(ValueError, match="once each"):
-        with_block("no marks", "block")
+        with_block("no marks", "script", "block")

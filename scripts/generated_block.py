@@ -1,4 +1,4 @@
-"""Generated blocks of documents, each between two marks that name the script that writes it."""
+"""The part of a document that a script writes."""
 
 from __future__ import annotations
 
@@ -7,20 +7,24 @@ from collections.abc import Iterable, Sequence
 from datetime import date
 from pathlib import Path
 
-DOCS = Path(__file__).parents[1] / "docs"
+
+def fill_in(document: Path, script: str, parts: Iterable[str], folder: Path) -> None:
+    """Write `document` into `folder`, with `parts` in the block of a script."""
+    text = with_block(document.read_text(encoding="utf-8"), script, "\n\n".join(parts))
+    (folder / document.name).write_text(text, encoding="utf-8")
 
 
 def with_block(text: str, script: str, block: str) -> str:
     """`text` with what is between the marks of a script replaced.
 
     Raises:
-        ValueError: it has not exactly one pair of its marks.
+        ValueError: it has not exactly one pair of marks.
     """
-    begin, end = (f"<!-- written by scripts/{script}: {edge} -->" for edge in ("begin", "end"))
+    begin, end = (f"<!-- written by scripts/{script}.py: {which} -->" for which in ("begin", "end"))
     before, found, rest = text.partition(begin)
     _, closed, after = rest.partition(end)
     if not found or not closed or begin in after or end in after:
-        raise ValueError(f"document: must have {begin!r} and {end!r} once each")
+        raise ValueError(f"text: must have {begin!r} and {end!r} once each")
     return f"{before}{begin}\n\n{block}\n\n{end}{after}"
 
 
@@ -33,11 +37,3 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A Markdown table."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
-
-
-def update(document: str, script: str, *parts: str) -> None:
-    """Write the parts of a script's block into a document of `docs`."""
-    path = DOCS / document
-    path.write_text(
-        with_block(path.read_text(encoding="utf-8"), script, "\n\n".join(parts)), encoding="utf-8"
-    )

@@ -1,0 +1,169 @@
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from benchmark_accuracy import free_space_case, sphere_case
+from benchmark_peers import SETTINGS, reason
+from peer_report import OURS, Point, Refusal, front, requirements, settled, time_ratio, times, write_report
+from peer_scene import next_smooth, scene_grid, spread
+from peers.task import LOCK_IN_PERIODS, Answer, Task
+
+import autdtorch as at
+
+
+def task(**changes) -> Task:
+    whole = {
+        "density": np.ones((3, 4, 5), np.float32),
+        "sound_speed": 340.0,
+        "spacing": 1e-3,
+        "frequency": 40e3,
+        "time_step": 1e-6,
+        "steps_per_period": 12,
+        "source_cells": np.array([[1, 2, 3]]),
+        "source_weights": np.ones(1, np.float32),
+        "receiver_cells": np.array([[0, 0, 0], [2, 3, 4]]),
+        "ends": np.array([6, 9]),
+        "layer_cells": 8,
+        "order": 4,
+    }
+    return Task(**{**whole, **changes})
+
+
+def point(program: str, error: float, seconds: float, remaining: float = 0.0, case: str = "cubes"):
+    return Point(case, program, "1 mm", 20, remaining, error, seconds, None)
+
+
+def test_tasks_and_answers_survive_their_files(tmp_path: Path) -> None:
+    for one in (task(), Answer(np.array([[1 + 2j]]), 0.5, 2.0, 0.0, 60)):
+        one.save(tmp_path / "one.npz")
+        found = type(one).load(tmp_path / "one.npz")
+        for name, value in vars(one).items():
+            assert np.array_equal(getattr(found, name), value)
+            assert type(getattr(found, name)) is type(value)
+
+
+def test_phasors_are_those_of_our_sign() -> None:
+    asked = task()
+    recorded = np.array([[1.0, 0.3]]) * asked.drive()[:, None]
+    late = np.array([[1.0, 0.3]]) * asked.drive(-1.5)[:, None]
+    # a whole number of periods is locked in after the ramp: exact but for rounding
+    assert np.allclose(asked.phasors(recorded), [[1, 0.3]] * 2, atol=1e-12)
+    turned = np.exp(2j * np.pi * 1.5 / 12)  # e^{-i w t}: what comes later is turned forwards
+    assert np.allclose(asked.phasors(late)[1], turned * np.array([1, 0.3]), atol=1e-12)
+
+
+def test_drive_begins_at_rest_and_is_up_before_the_first_phasor() -> None:
+    asked = task()
+    assert asked.drive()[0] == 0
+    assert len(asked.drive()) == asked.steps == 9 * 12
+    full = asked.drive()[(6 - LOCK_IN_PERIODS) * 12 :]
+    assert full.max() == pytest.approx(1, abs=1e-12)
+
+
+def test_points_between_cells_read_waves() -> None:
+    kappa = 2 * np.pi / 8.5
+    place = np.array([20.3, 20.0, 20.5])
+    cells, weights = spread(place)
+    for direction in np.array([[1, 0, 0], [0.6, 0, 0.8], [0.48, 0.6, 0.64]]):
+        read = weights @ np.exp(1j * kappa * cells @ direction)
+        # 1e-3 is what a sinc of this width reaches at 8.5 cells per wavelength (Hicks 2002)
+        assert abs(read - np.exp(1j * kappa * place @ direction)) < 2e-3
+
+
+def test_grids_hold_the_scene() -> None:
+    scene = free_space_case().scene
+    on, between = (scene_grid(scene, 1e-3, offset, 8, smooth=False) for offset in (0.0, 0.5))
+    assert on.source_cells.shape == (1, 3)
+    assert (on.receiver_weights.sum(axis=0) == 1).all()
+    apart = on.receiver_cells - on.source_cells
+    wanted = 1e3 * (scene.array.positions - scene.control_points[0]).numpy()
+    assert sorted(map(tuple, apart)) == sorted(map(tuple, wanted.round().astype(int)))
+    for grid in (on, between):
+        assert np.allclose(grid.density, scene.medium.density)
+        cells = np.concatenate((grid.source_cells, grid.receiver_cells))
+        assert (cells >= 0).all()
+        assert (cells < grid.density.shape).all()
+        assert np.allclose(grid.receiver_weights.sum(axis=1), 1)
+
+
+def test_densities_are_harmonic_means() -> None:
+    scene = sphere_case("sphere").scene
+    grid = scene_grid(scene, 2e-3, 0.0, 8, smooth=True)
+    sphere = scene.obstacles[0]
+    assert isinstance(sphere, at.Sphere)
+    light, heavy = 1 / scene.medium.density, 1 / sphere.density
+    filled = (light - 1 / grid.density.astype(float)).sum() / (light - heavy) * (2e-3) ** 3
+    # 1 % is what points a third of a millimetre apart tell of a volume of 16 mm across
+    assert filled == pytest.approx(4 / 3 * torch.pi * sphere.radius**3, rel=1e-2)
+    assert all(next_smooth(n + 16) == n + 16 for n in grid.density.shape)
+
+
+def test_smooth_numbers() -> None:
+    assert [next_smooth(n) for n in (1, 7, 53, 100, 121)] == [1, 7, 54, 100, 125]
+
+
+def test_ratio_is_to_our_fastest_that_is_not_worse() -> None:
+    ours = [point(OURS, 0.04, 0.5), point(OURS, 0.01, 2.0), point(OURS, 0.005, 1.0)]
+    assert time_ratio(point("kwave", 0.05, 100.0), ours) == 200
+    assert time_ratio(point("kwave", 0.01, 100.0), ours) == 100
+    assert time_ratio(point("kwave", 0.001, 100.0), ours) is None
+    assert time_ratio(point("kwave", 0.05, 100.0, case="sphere"), ours) is None
+
+
+def test_runs_stand_where_they_stay_in_the_steady_state() -> None:
+    run = [point("jwave", 0.1, t, left) for t, left in ((1, 0.3), (2, 0.009), (3, 0.02), (4, 0.005), (5, 0))]
+    assert [p.seconds for p in settled(run)] == [4]
+
+
+def test_front_has_no_point_that_another_beats() -> None:
+    points = [point("jwave", e, s) for s, e in ((1, 0.3), (2, 0.4), (3, 0.1), (3, 0.2), (4, 0.1))]
+    assert [(p.seconds, p.error) for p in front(points)] == [(1, 0.3), (3, 0.1)]
+
+
+def test_free_space_comes_first_and_settings_differ() -> None:
+    names = {(one.peer, str(one)) for one in SETTINGS}
+    assert len(names) == len(SETTINGS)
+    assert all(one.cases[0] == "free space" for one in SETTINGS)
+
+
+def test_reasons_are_one_line() -> None:
+    error = subprocess.CalledProcessError(1, "python", stderr="Traceback\n  ...\nValueError: too large\n")
+    assert reason(error) == "ValueError: too large"
+
+
+def test_report_fills_in_its_block(tmp_path: Path) -> None:
+    points = [point(OURS, 0.04, 0.5), point("kwave", 0.06, 300.0, 0.1), point("kwave", 0.05, 600.0)]
+    refusals = [Refusal("cubes", "devito", "1 mm", "no compiler")]
+    write_report(points, refusals, "python it.py", tmp_path)
+    stored = json.loads((tmp_path / "peers.json").read_text(encoding="utf-8"))
+    assert [Point(**row) for row in stored["rows"][:-1]] == points
+    assert [Refusal(**row) for row in stored["rows"][-1:]] == refusals
+    text = (tmp_path / "peers.md").read_text(encoding="utf-8")
+    assert "| cubes | k-wave-python | 1.2e+03 | 5 % | 600 | 6 % |" in text
+    assert "no compiler" in text
+    assert (tmp_path / "peers.png").stat().st_size > 0
+
+
+def test_times_are_told_to_each_error_and_beside_ours() -> None:
+    points = [point(OURS, 0.04, 0.5), point("jwave", 0.02, 2.0, remaining=0.1), point("jwave", 0.08, 5.0)]
+    _, _, ours, jwave = times(points).splitlines()
+    assert ours == "| cubes | autdtorch | 0.5 s | 0.5 s | 0.5 s |  |  | 4 % |"
+    assert jwave == "| cubes | j-Wave | 5 s (10 times ours) | 5 s (10 times ours) |  |  |  | 8 % |"
+
+
+def test_requirements_are_of_the_fastest_peer_to_each_error() -> None:
+    points = [
+        point(OURS, 0.009, 0.5, case="three cubes"),
+        point("jwave", 0.08, 20.0, case="three cubes"),
+        point("kwave", 0.04, 600.0, case="three cubes"),
+    ]
+    rows = [line.split(" | ")[2:] for line in requirements(points).splitlines()[2:]]
+    slow, fast = ["1.2e+03 times", "yes |"], ["40 times", "**no** |"]
+    # to 20, 10 and 5 %: the fastest peer, then k-wave-python; nobody comes to less than 4 %
+    assert rows[:6] == [fast, slow, fast, slow, slow, slow]
+    assert all("not reached" in row[0] for row in rows[6:])
