@@ -66,6 +66,16 @@ def test_cpu_kernel_is_the_reference_kernel(dtype: torch.dtype, tolerance: float
         assert (value - reference).abs().max() <= tolerance * max(float(reference.abs().max()), 1e-30)
 
 
+@pytest.mark.parametrize("chunks", [2, 4])
+def test_chunks_of_planes_are_the_whole(chunks: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On any number of cores: rounding of the sums alone, which are taken in another order."""
+    whole, heard = advance(CpuKernel(), torch.float64, 101)
+    monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._chunks", lambda cells: chunks)
+    parts, heard_in_parts = advance(CpuKernel(), torch.float64, 101)
+    for value, reference in ((parts.now, whole.now), (heard_in_parts, heard)):
+        assert (value - reference).abs().max() <= 1e-12 * reference.abs().max()
+
+
 def closed_box(dtype: torch.dtype, cells: int = 10) -> Coefficients:
     """Coefficients of a grid on which nothing absorbs: the ring holds the pressure at zero."""
     assembly, _, _ = scene_parts(dtype)

@@ -54,12 +54,12 @@ class Coefficients:
         edge: weight of each of 12.
         corner: weight of each of 8.
         keep: weight of the pressure before, 1 in air that does not absorb and below it otherwise.
-        varying_index: flat indices (n,) int64 of the varying cells.
+        varying_index: flat indices (n,) int64 of the varying cells, ascending.
         varying_weight: their weights (n, 27).
         closed_index: flat indices (k,) int64 of the closed cells.
         layer_decay: b of the boundary layer at half cells and cells, interleaved from outside (2 L + 1,).
         layer_gain: a, likewise.
-        layer_index: flat indices (k,) int64 of the varying cells in the layers.
+        layer_index: flat indices (k,) int64 of the varying cells in the layers, ascending.
         layer_scale: how many times air's their term is (k,).
         columns: where surfaces run through the boundary layers.
         crossed: where they run through two at once, along one of them.
@@ -125,7 +125,7 @@ def uniform_state(shape: tuple[int, int, int], coefficients: Coefficients, press
 
 @dataclass(frozen=True)
 class Sources:
-    """Cells that are driven: flat `index` (n,) int64 without repeats, complex `force` (n,) [Pa]."""
+    """Cells that are driven: flat `index` (n,) int64, ascending without repeats, complex `force` (n,) [Pa]."""
 
     index: torch.Tensor
     force: torch.Tensor
