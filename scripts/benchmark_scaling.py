@@ -171,7 +171,7 @@ def main() -> None:
     stated = measured(COMMAND) + f"\n\nThreads: {get_num_threads()}."
     update(
         "performance.md", "benchmark_scaling.py", stated,
-        '"Box, mirror images" is the paper\'s array of 16 and its four foci, of which one run stands for all.',
+        '"Box, mirror images" is the paper\'s array of 16 and its four foci, one run standing for all.',
         "![Time and memory over spacing, domain, transducers and foci](scaling.png)",
         "Powers fitted to what costs at least twice as much as the cheapest of the series:",
         exponents(points), "All measurements:", measurements(points),
