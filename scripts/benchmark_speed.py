@@ -9,7 +9,6 @@ are compiled before, except where the cold start is measured, in processes of th
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import subprocess
 import sys
@@ -19,6 +18,7 @@ import time
 import torch
 from benchmark_accuracy import CUBES, ROOT, SCENES, TOLERANCE, cube_case, relative_error
 from generated_block import fill_in, measured, table
+from large_arrays import autd3_array, with_array
 from numba import get_num_threads
 
 import autdtorch as at
@@ -88,18 +88,12 @@ def box_and_domain(name: str) -> list[str]:
 def large_array(spacing: float) -> list[str]:
     """249 transducers in the places of an AUTD3's against the paper's 16, two cubes in between."""
     scene = at.load_scene(SCENES / "two_cubes.yaml")
-    device = at.TransducerArray.grid((18, 14), pitch=10.16e-3, center=(1e-3, 50e-3, 50e-3), normal=(1, 0, 0))
-    missing = [(1, 1), (2, 1), (16, 1)]
-    kept = [i for i in range(18 * 14) if (i // 14, i % 14) not in missing]
-    positions = device.positions[kept]
-    array = at.TransducerArray(positions, device.normals[kept])
-    corners = torch.cat((positions, torch.tensor(scene.domain, dtype=torch.float64).reshape(-1, 3)))
-    domain = torch.stack((corners.amin(0) - 3e-3, corners.amax(0) + 3e-3))
-    large = dataclasses.replace(scene, array=array, domain=domain, observation_plane=None)
+    large = with_array(scene, autd3_array())
     _, small_seconds, small = timed(scene, "auto", spacing)
     _, seconds, propagator = timed(large, "auto", spacing)
     row = [
-        f"{len(array)} transducers", f"{spacing:.3g} mm", f"{seconds:.2f} s, {len(propagator.runs)} runs",
+        f"{len(large.array)} transducers", f"{spacing:.3g} mm",
+        f"{seconds:.2f} s, {len(propagator.runs)} runs",
         f"{small_seconds:.2f} s, {len(small.runs)} runs", f"{seconds / small_seconds:.2f}",
     ]  # fmt: skip
     print(row, flush=True)
