@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib.metadata
 from functools import lru_cache
 from pathlib import Path
 
 _PACKAGES = ("torch", "numpy", "scipy", "libigl", "numba", "botorch", "gpytorch", "linear_operator")
+_OPTIONAL_PACKAGES = ("triton",)
 
 
 @lru_cache(maxsize=1)
@@ -22,5 +24,9 @@ def source_digest() -> str:
 
 
 def package_versions() -> dict[str, str]:
-    """Versions of the packages that compute."""
-    return {package: importlib.metadata.version(package) for package in _PACKAGES}
+    """Versions of the packages that compute, of those of extras as far as they are installed."""
+    versions = {package: importlib.metadata.version(package) for package in _PACKAGES}
+    for package in _OPTIONAL_PACKAGES:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            versions[package] = importlib.metadata.version(package)
+    return versions

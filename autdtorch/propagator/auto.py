@@ -38,7 +38,9 @@ def chosen_method(scene: Scene, spacing: float, tolerance: float) -> str:
         method, reason = "full", f"{1 / gain:.2g} times cheaper than box"
     grids, passes = (boxes.grids, boxes.passes) if method == "box" else ((domain,), 1)
     cells, steps = sum(grid.cells for grid in grids), max(grid.steps for grid in grids) * passes
-    logger.info("method auto: %s (%s), at least %s", method, reason, _shown(cells, steps, runs))
+    logger.info(
+        "method auto: %s (%s), about %s but for mirror images", method, reason, _shown(cells, steps, runs)
+    )
     skipped = {
         "cells": 1 - cells / domain.cells,
         "steps": 1 - steps / domain.steps,

@@ -66,7 +66,7 @@ class Run:
         periods: periods of the drive that were stepped, in several boxes their sum.
         remaining: estimated relative distance to the steady state.
         reached: whether that is within the tolerance.
-        seconds: time it took.
+        seconds: time it took, beside others that went on at once.
     """
 
     periods: int

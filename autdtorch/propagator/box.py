@@ -113,13 +113,15 @@ class BoxPropagator(SimulatedPropagator):
         every = math.ceil(len(incident) / MOST_JUDGED)
         matrix = reach.matrix(every)
 
+        @torch.no_grad()  # which is each thread's own
         def run(drive: Drive, direct: torch.Tensor) -> tuple[SteadyState, float]:
             begin = time.perf_counter()
             steady = self._run(box, box.driving(*drive), reach, self.tolerance, _heard(matrix, direct))
             return steady, time.perf_counter() - begin
 
-        with ThreadPoolExecutor(self._kernel.at_once(box.assembly.grid.shape)) as pool:
-            runs = list(pool.map(run, drives, incident[::every].mT))
+        at_once = min(self._kernel.at_once(box.assembly.grid.shape), len(drives))
+        with ThreadPoolExecutor(at_once) as pool:
+            runs = list((pool.map if at_once > 1 else map)(run, drives, incident[::every].mT))
         for steady, seconds in runs:
             self._note(steady, seconds)
         return torch.stack([steady.pressure for steady, _ in runs], dim=1)
@@ -147,8 +149,11 @@ class BoxPropagator(SimulatedPropagator):
     def _run(
         self, box: Scattering, field: torch.Tensor, reach: Reach, tolerance: float, judged: Judged
     ) -> SteadyState:
+        sources = box.sources(field)
+        if not sources.force.any():  # obstacles like air, or drives that cancel
+            return SteadyState(torch.zeros(len(reach.cells), dtype=torch.complex128), 0, 0.0, True)
         return run_to_steady_state(
-            box.assembly, self._kernel, box.sources(field), reach.cells, tolerance, self.max_periods, judged
+            box.assembly, self._kernel, sources, reach.cells, tolerance, self.max_periods, judged
         )
 
 

@@ -12,6 +12,10 @@ from autdtorch.fdtd.steady_state import fewest_periods
 from autdtorch.fdtd.stencil import tuned_stencil
 from autdtorch.scene import Scene
 
+_LAYER = 4.0
+"""What a step of a cell in a boundary layer costs, in steps of a cell outside: fits the rates of boxes and
+domains in docs/performance.md, all on one core."""
+
 _BESIDE = 2_000_000
 """What a run in a box costs beside its steps, in steps of a cell: sums over Green's function."""
 
@@ -33,6 +37,11 @@ class GridCost:
     cells: int
     steps: int
 
+    @property
+    def work(self) -> float:
+        """Cost of the steps, in steps of a cell outside the layers."""
+        return self.steps * (_LAYER * self.cells + (1 - _LAYER) * math.prod(self.interior))
+
 
 def grid_cost(scene: Scene, extent: Extent, spacing: float) -> GridCost:
     """What a run takes on a grid of `spacing` [m] over an extent of a scene."""
@@ -48,7 +57,7 @@ def grid_cost(scene: Scene, extent: Extent, spacing: float) -> GridCost:
 
 def full_cost(grid: GridCost, runs: int) -> float:
     """Cost of runs on a domain, in steps of a cell."""
-    return float(runs * grid.cells * grid.steps)
+    return runs * grid.work
 
 
 def box_cost(grids: Sequence[GridCost], passes: int, runs: int) -> float:
@@ -57,7 +66,7 @@ def box_cost(grids: Sequence[GridCost], passes: int, runs: int) -> float:
     Between two passes the boxes hear each other: from the cells that radiate, at those in and next to an
     obstacle, for all runs at once.
     """
-    steps = sum(grid.cells * grid.steps + _BESIDE for grid in grids)
+    steps = sum(grid.work + _BESIDE for grid in grids)
     radiating = [_shrunk(grid, 4) - _shrunk(grid, 8) for grid in grids]
     heard = [_shrunk(grid, 8) for grid in grids]
     pairs = sum(radiating) * sum(heard) - sum(map(math.prod, zip(radiating, heard, strict=True)))

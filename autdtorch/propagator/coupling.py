@@ -92,7 +92,7 @@ def coupled_runs(
         amplitudes = [reach.amplitudes(part) for reach, part in zip(reaches, parts, strict=True)]
         before, value = value, heard(phasors)
         smaller, size = size, torch.cat(amplitudes).norm(dim=0)
-        change = (value - before).norm(dim=0) / value.norm(dim=0)
+        change = (value - before).norm(dim=0) / value.norm(dim=0).clamp(min=torch.finfo(torch.float64).tiny)
         if smaller is not None:
             remaining = _CAUTION * change * (size / smaller).clamp(max=1)
             if (remaining <= tolerance / 2).all():

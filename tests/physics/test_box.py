@@ -99,6 +99,17 @@ def test_nothing_is_heard_in_a_rigid_obstacle() -> None:
     assert not field.any()
 
 
+def test_runs_side_by_side_are_those_one_after_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = small_scene((CUBE,))
+    alone, beside = (make_propagator(scene, "box", 2e-3, tolerance=0.05) for _ in range(2))
+    monkeypatch.setattr(type(alone._kernel), "at_once", lambda self, shape: 1)
+    one_by_one = alone.transfer_matrix()
+    monkeypatch.setattr(type(alone._kernel), "at_once", lambda self, shape: 2)
+    at_once = beside.transfer_matrix()
+    assert torch.equal(at_once, one_by_one)
+    assert [run.periods for run in beside.runs] == [run.periods for run in alone.runs]
+
+
 def test_both_ways_are_the_same() -> None:
     """From P points or from M transducers: the scheme is symmetric, and so is Green's function."""
     scene = small_scene((CUBE,))

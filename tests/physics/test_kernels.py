@@ -72,7 +72,9 @@ def test_chunks_of_planes_are_the_whole(chunks: int, monkeypatch: pytest.MonkeyP
     whole, heard = advance(CpuKernel(), torch.float64, 101)
     monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._chunks", lambda cells: chunks)
     parts, heard_in_parts = advance(CpuKernel(), torch.float64, 101)
-    for value, reference in ((parts.now, whole.now), (heard_in_parts, heard)):
+    memories = zip((*parts.layers, parts.columns), (*whole.layers, whole.columns), strict=True)
+    pairs = [pair for one, other in memories for pair in zip(one, other, strict=True)]
+    for value, reference in ((parts.now, whole.now), (heard_in_parts, heard), *pairs):
         assert (value - reference).abs().max() <= 1e-12 * reference.abs().max()
 
 

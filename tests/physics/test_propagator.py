@@ -133,11 +133,12 @@ def test_replay_and_transfer_objectives_agree() -> None:
     assert float((replay - transfer).norm() / transfer.norm()) < 1e-4
 
 
+@pytest.mark.parametrize("method", ["full", "box"])
 @pytest.mark.parametrize("absorption", [0.0, 40.0])
-def test_an_obstacle_of_air_is_no_obstacle(absorption: float) -> None:
+def test_an_obstacle_of_air_is_no_obstacle(absorption: float, method: str) -> None:
     cube = Box(CUBE.center, CUBE.size, density=AIR.density, sound_speed=AIR.sound_speed)
     scene = small_scene((cube,), absorption=absorption)
-    simulated = make_propagator(scene, "full", 1e-3, tolerance=1e-4).transfer_matrix()
+    simulated = make_propagator(scene, method, 1e-3, tolerance=1e-4).transfer_matrix()
     exact = free_space_matrix(scene.control_points, scene.array, scene.complex_wavenumber)
     assert relative_error(simulated, exact) < 2e-3
 

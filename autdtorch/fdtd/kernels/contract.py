@@ -125,7 +125,7 @@ def uniform_state(shape: tuple[int, int, int], coefficients: Coefficients, press
 
 @dataclass(frozen=True)
 class Sources:
-    """Cells that are driven: flat `index` (n,) int64, ascending without repeats, complex `force` (n,) [Pa]."""
+    """Cells that are driven: flat `index` (n,) int64, ascending, no two alike; complex `force` (n,) [Pa]."""
 
     index: torch.Tensor
     force: torch.Tensor

@@ -204,11 +204,11 @@ class CudaKernel:
         self._medium: DeviceMedium | None = None
         self._run: DeviceRun | None = None
 
-    @torch.no_grad()
     def at_once(self, shape: tuple[int, int, int]) -> int:
         """One: what stays on the device is that of the last run."""
         return 1
 
+    @torch.no_grad()
     def advance(
         self,
         state: State,
