@@ -13,11 +13,11 @@ from __future__ import annotations
 import math
 import os
 
-# An idle OpenMP thread spins for milliseconds unless told otherwise. On a busy machine it then keeps the
-# others from their work; if it sleeps at once it is not there when it is needed (12 times slower, measured
-# with two other processes on two cores). A short while is best. It is read when numba starts its threads.
+# What an idle OpenMP thread does while it waits for the next loop is decided when numba starts its threads.
+# If it sleeps at once it is not there when it is needed, on a busy machine least of all; it spins for a few
+# milliseconds here, which was best on an idle machine and on a busy one (docs/decisions/cpu-kernel.md).
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-os.environ.setdefault("GOMP_SPINCOUNT", "20000")
+os.environ.setdefault("GOMP_SPINCOUNT", "1000000")
 
 import numpy as np
 import torch
