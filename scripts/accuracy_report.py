@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from datetime import date
 from pathlib import Path
 
-from generated_block import fill_in
+from generated_block import fill_in, measured, table
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
@@ -83,8 +83,13 @@ def write_report(rows: Sequence[Row], orders: Orders, command: str, folder: Path
     content = {**made, "rows": [asdict(row) for row in rows], "orders": orders}
     (folder / "accuracy.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     plot_pareto(rows, command).savefig(folder / "accuracy.png")
-    stated = f"Measured on {made['cores']} cores, {made['date']}:\n\n    {command}"
-    parts = (stated, "![Error over run time](accuracy.png)", requirements(rows), errors(rows), slopes(orders))
+    parts = (
+        measured(command),
+        "![Error over run time](accuracy.png)",
+        requirements(rows),
+        errors(rows),
+        slopes(orders),
+    )
     fill_in(DOCUMENT, "benchmark_accuracy", parts, folder)
 
 
@@ -109,13 +114,15 @@ def requirements(rows: Sequence[Row]) -> str:
 
 def errors(rows: Sequence[Row]) -> str:
     """All measurements."""
-    lines = ["| case | treatment | spacing | total | scattered | run time |", "| --- |" + " --- |" * 5]
+    lines = []
     for row in rows:
         scattered = "" if row.scattered is None else percent(row.scattered)
         late = "" if row.settled else ", not settled"
-        figures = f"{row.spacing:g} mm | {percent(row.total)} | {scattered} | {row.seconds:.3g} s{late}"
-        lines.append(f"| {readable(row.case)} | {row.treatment} | {figures} |")
-    return "\n".join(lines)
+        lines.append(
+            [readable(row.case), row.treatment, f"{row.spacing:g} mm", percent(row.total), scattered,
+             f"{row.seconds:.3g} s{late}"]
+        )  # fmt: skip
+    return table(["case", "treatment", "spacing", "total", "scattered", "run time"], lines)
 
 
 def slopes(orders: Orders) -> str:
@@ -170,10 +177,15 @@ def _draw_case(ax: Axes, rows: Sequence[Row]) -> None:
                 text = f"{row.spacing:g}"
                 ax.annotate(text, place, (2, 4), textcoords="offset points", fontsize=TICK_SIZE)
         ax.plot(*zip(*places, strict=True), color=colour, marker=marker, ms=4, lw=1.2, label=name)
+    log_axes(ax, (1, 3), (1, 2, 5))
+    ax.tick_params(labelsize=TICK_SIZE)
+    ax.margins(0.12, 0.15)
+
+
+def log_axes(ax: Axes, across: Sequence[float], up: Sequence[float]) -> None:
+    """Make both axes logarithmic, with plain numbers at these multiples of each power of ten."""
     ax.set(xscale="log", yscale="log")
-    for axis, ticks in ((ax.xaxis, (1, 3)), (ax.yaxis, (1, 2, 5))):
+    for axis, ticks in ((ax.xaxis, across), (ax.yaxis, up)):
         axis.set_major_locator(LogLocator(subs=ticks))
         axis.set_major_formatter(StrMethodFormatter("{x:g}"))
         axis.set_minor_formatter(NullFormatter())
-    ax.tick_params(labelsize=TICK_SIZE)
-    ax.margins(0.12, 0.15)

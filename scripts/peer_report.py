@@ -10,11 +10,10 @@ from dataclasses import asdict, dataclass
 from datetime import date
 from pathlib import Path
 
-from accuracy_report import percent
-from generated_block import fill_in
+from accuracy_report import log_axes, percent
+from generated_block import fill_in, measured, table
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from autdtorch.plot.style import TICK_SIZE, new_figure, styled
 
@@ -90,9 +89,8 @@ def write_report(points: Sequence[Point], refusals: Sequence[Refusal], command: 
     text = f'{json.dumps(made)[:-1]}, "rows": [\n {rows}\n]}}\n'
     (folder / "peers.json").write_text(text, encoding="utf-8")
     plot_pareto(points, command).savefig(folder / "peers.png")
-    stated = f"Measured on {made['cores']} cores, {made['date']}:\n\n    {command}"
     picture = "![Error over run time](peers.png)"
-    parts = [stated, picture, requirements(points), times(points), ratios(points), figures(points)]
+    parts = [measured(command), picture, requirements(points), times(points), ratios(points), figures(points)]
     fill_in(DOCUMENT, "benchmark_peers", [*parts, *refused(refusals)], folder)
 
 
@@ -162,8 +160,7 @@ def ratios(points: Sequence[Point]) -> str:
 
 def figures(points: Sequence[Point]) -> str:
     """A line for each setting in each scene."""
-    lines = ["| scene | program | setting | periods | error | run time | Mcell/s | times our time |"]
-    lines.append("| --- |" + " --- |" * 7)
+    lines = []
     for point in settled(points):
         ratio = time_ratio(point, points) if point.program != OURS else None
         cells = (
@@ -176,8 +173,9 @@ def figures(points: Sequence[Point]) -> str:
             "" if point.rate is None else f"{point.rate / 1e6:.3g}",
             "" if ratio is None else f"{ratio:.3g}",
         )
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        lines.append(cells)
+    header = ("scene", "program", "setting", "periods", "error", "run time", "Mcell/s", "times our time")
+    return table(header, lines)
 
 
 def settled(points: Sequence[Point]) -> Iterator[Point]:
@@ -192,9 +190,8 @@ def refused(refusals: Sequence[Refusal]) -> list[str]:
     """A table of what did not run, if there is any."""
     if not refusals:
         return []
-    lines = ["| scene | program | setting | did not run |", "| --- |" + " --- |" * 3]
-    lines += [f"| {r.case} | {NAMES[r.program]} | {r.setting} | {r.reason} |" for r in refusals]
-    return ["\n".join(lines)]
+    lines = [[r.case, NAMES[r.program], r.setting, r.reason] for r in refusals]
+    return [table(["scene", "program", "setting", "did not run"], lines)]
 
 
 def front(points: Sequence[Point]) -> list[Point]:
@@ -239,11 +236,7 @@ def _draw_case(ax: Axes, points: Sequence[Point]) -> None:
             *zip(*((p.seconds, 100 * p.error) for p in front(mine)), strict=True),
             color=colour, marker=marker, ms=4, lw=1.2, label=NAMES.get(name, name),
         )  # fmt: skip
-    ax.set(xscale="log", yscale="log")
-    for axis, ticks in ((ax.xaxis, (1,)), (ax.yaxis, (1, 3))):
-        axis.set_major_locator(LogLocator(subs=ticks))
-        axis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        axis.set_minor_formatter(NullFormatter())
+    log_axes(ax, (1,), (1, 3))
     ax.tick_params(labelsize=TICK_SIZE, labelbottom=True)
     ax.margins(0.06, 0.1)
 
