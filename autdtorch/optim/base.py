@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 import torch
 
 from autdtorch.drive import amplitudes_of, phases_of
 from autdtorch.objective import Objective, Score
-from autdtorch.validation import real_tensor
+from autdtorch.validation import integer_at_least, real_tensor
+
+Trials: TypeAlias = int | Sequence[int]
+"""A number of trials T, or the numbers of the T trials to run, so that a study can be run in parts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,8 +103,24 @@ class Ledger:
         return Solution(self._drive.clone(), self._pressure.clone(), self._best.clone(), evaluations, history)
 
 
+def trial_seeds(seed: int, trials: Trials) -> list[int]:
+    """Seed of each trial, the same whatever trials are run beside it; different ones are unrelated.
+
+    Raises:
+        ValueError: a seed below 0, no trial, a trial twice, or a trial below 0.
+    """
+    seed = integer_at_least("seed", seed, 0)
+    if isinstance(trials, Sequence) and not isinstance(trials, str):
+        numbers = [integer_at_least(f"trials[{place}]", trial, 0) for place, trial in enumerate(trials)]
+        if not numbers or len(set(numbers)) < len(numbers):
+            raise ValueError(f"trials: {numbers}; must be an integer >= 1, or trial numbers, each once")
+    else:
+        numbers = list(range(integer_at_least("trials", trials, 1)))
+    return [trial_seed(seed, trial) for trial in numbers]
+
+
 def trial_seed(seed: int, trial: int) -> int:
-    """Seed of one trial, the same however many trials there are; those of different trials are unrelated."""
+    """Seed of one trial."""
     # Half the range of uint64: torch takes seeds as signed.
     return int(np.random.SeedSequence((seed, trial)).generate_state(1, np.uint64)[0] >> np.uint64(1))
 

@@ -13,7 +13,7 @@ import torch
 
 from autdtorch.drive import drive_from_phases
 from autdtorch.objective import Objective, Score, weakest_focus
-from autdtorch.optim.base import Ledger, Solution, trial_seed
+from autdtorch.optim.base import Ledger, Solution, Trials, trial_seeds
 from autdtorch.validation import integer_at_least, invalid
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ def bayes_opt(
     objective: Objective,
     evaluations: int = 256,
     initial: int = 16,
-    trials: int = 1,
+    trials: Trials = 1,
     seed: int = 0,
     fixed_transducer: int = 6,
     score: Score = weakest_focus,
@@ -49,7 +49,7 @@ def bayes_opt(
         evaluations: number of evaluations a trial, > `initial`.
         initial: how many of them, >= 2, are spread over all phases (a scrambled Sobol sequence) before the
             search.
-        trials: number of trials T, >= 1.
+        trials: number of trials T, >= 1, or their numbers.
         seed: >= 0; trial t is the same for every number of trials.
         fixed_transducer: index of the transducer whose phase stays 0, since a common offset of all phases
             changes no magnitude; 6 is the paper's 7th.
@@ -64,22 +64,20 @@ def bayes_opt(
     """
     initial = integer_at_least("initial", initial, 2)
     evaluations = integer_at_least("evaluations", evaluations, initial + 1)
-    trials = integer_at_least("trials", trials, 1)
-    seed = integer_at_least("seed", seed, 0)
+    seeds = trial_seeds(seed, trials)
     transducers = integer_at_least("transducers of the objective's array", len(objective.scene.array), 2)
     if integer_at_least("fixed_transducer", fixed_transducer, 0) >= transducers:
         raise invalid("fixed_transducer", fixed_transducer, f"must be an integer from 0 to {transducers - 1}")
 
-    ledger = Ledger(objective, trials, score)
-    seeds = [trial_seed(seed, trial) for trial in range(trials)]
+    ledger = Ledger(objective, len(seeds), score)
     generators = [torch.Generator().manual_seed(trial) for trial in seeds]
     points = torch.stack([_spread_points(initial, transducers - 1, trial) for trial in seeds])
     scores = ledger.evaluate(_drive(points, fixed_transducer))
-    length_scales: list[float | None] = [None] * trials
+    length_scales: list[float | None] = [None] * len(seeds)
     next_fit = initial
     for count in range(initial, evaluations):
         if count >= next_fit:
-            length_scales = [None] * trials
+            length_scales = [None] * len(seeds)
             next_fit = math.ceil(_REFIT_GROWTH * count)
         found = [_next_point(*known) for known in zip(points, scores, length_scales, generators, strict=True)]
         length_scales = [length_scale for _, length_scale in found]

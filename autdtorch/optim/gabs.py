@@ -8,12 +8,12 @@ import torch
 
 from autdtorch.drive import drive_from_phases
 from autdtorch.objective import Objective, Score, weakest_focus
-from autdtorch.optim.base import Ledger, Solution, trial_seed
+from autdtorch.optim.base import Ledger, Solution, Trials, trial_seeds
 from autdtorch.validation import integer_at_least
 
 
 def gabs(
-    objective: Objective, levels: int = 16, trials: int = 1, seed: int = 0, score: Score = weakest_focus
+    objective: Objective, levels: int = 16, trials: Trials = 1, seed: int = 0, score: Score = weakest_focus
 ) -> Solution:
     """Switch on one transducer after the other, each with the best of `levels` phases (Algorithm 2).
 
@@ -27,7 +27,7 @@ def gabs(
     Args:
         objective: what is evaluated.
         levels: number of phases in [0, 2 pi), >= 2.
-        trials: number of trials T, >= 1.
+        trials: number of trials T, >= 1, or their numbers.
         seed: >= 0; trial t is the same for every number of trials.
         score: what is maximised.
 
@@ -39,15 +39,14 @@ def gabs(
         ValueError: an argument out of range, or the objective's pressures or scores are not finite.
     """
     levels = integer_at_least("levels", levels, 2)
-    trials = integer_at_least("trials", trials, 1)
-    seed = integer_at_least("seed", seed, 0)
+    seeds = trial_seeds(seed, trials)
     transducers = len(objective.scene.array)
-    order = torch.stack([_random_order(transducers, trial_seed(seed, trial)) for trial in range(trials)])
+    order = torch.stack([_random_order(transducers, own) for own in seeds])
     choices = drive_from_phases(2 * math.pi * torch.arange(levels, dtype=torch.float64) / levels)
-    rows = torch.arange(trials)
+    rows = torch.arange(len(seeds))
 
-    ledger = Ledger(objective, trials, score)
-    drive = torch.zeros(trials, transducers, dtype=torch.complex128)
+    ledger = Ledger(objective, len(seeds), score)
+    drive = torch.zeros(len(seeds), transducers, dtype=torch.complex128)
     drive[rows, order[:, 0]] = 1
     ledger.evaluate(drive[:, None])
     for transducer in order.T[1:]:

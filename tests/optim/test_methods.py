@@ -67,6 +67,9 @@ def test_a_trial_depends_on_its_seed_and_not_on_the_trials_beside_it(make_object
     few = method(objective, trials=2, seed=3)
     assert torch.equal(many.drive[:2], few.drive)
     assert torch.equal(many.history[:2], few.history)
+    some = method(objective, trials=[3, 1], seed=3)
+    assert torch.equal(some.drive, many.drive[[3, 1]])
+    assert torch.equal(some.history, many.history[[3, 1]])
     assert not torch.equal(method(objective, trials=4, seed=4).drive, many.drive)
 
 
@@ -93,6 +96,9 @@ def test_phases_at_the_control_points_are_never_seen(make_objective, random_matr
         (gabs, {"levels": 0}, "levels: 0; must be an integer >= 2"),
         (gabs, {"trials": 0}, "trials: 0; must be an integer >= 1"),
         (gabs, {"trials": True}, "trials: True; must be an integer"),
+        (gabs, {"trials": []}, r"trials: \[\]; must be an integer >= 1, or trial numbers, each once"),
+        (gabs, {"trials": [2, 2]}, r"trials: \[2, 2\]; must be an integer >= 1, or trial numbers, each"),
+        (gabs, {"trials": [0, -1]}, r"trials\[1\]: -1; must be an integer >= 0"),
         (gabs, {"seed": -1}, "seed: -1; must be an integer >= 0"),
         (bayes_opt, {"trials": 0}, "trials: 0; must be an integer >= 1"),
         (bayes_opt, {"seed": 0.5}, r"seed: 0\.5; must be an integer >= 0"),
