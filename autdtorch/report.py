@@ -129,9 +129,7 @@ def summary_rows(results: StudyResult) -> list[list[str]]:
             pressures = (metrics.mean, metrics.min, metrics.std)
             numbers = [str(method.trials), *(_over_trials(values, ".2f") for values in pressures), area]
             evaluations = f"{method.solution.evaluations.double().mean():.0f}"
-            rows.append(
-                [scene_name, _label(name), *numbers, evaluations, f"{method.seconds / method.trials:.2g}"]
-            )
+            rows.append([scene_name, _label(name), *numbers, evaluations, f"{method.seconds.mean():.2g}"])
     return rows
 
 

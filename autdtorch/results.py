@@ -87,7 +87,7 @@ class MethodResult:
     Attributes:
         solution: drives of the T trials, with pressures, scores, evaluations and history.
         metrics: figures of merit (T,).
-        seconds: time of all trials together.
+        seconds: each trial's share of the time they took (T,), float64.
         shown_trial: the trial of median score, for pictures.
         plane_pressure: of the shown trial on the observation plane (Nu, Nv), complex128 [Pa], or None where
             the scene has no such plane.
@@ -95,7 +95,7 @@ class MethodResult:
 
     solution: Solution
     metrics: FocusMetrics
-    seconds: float
+    seconds: torch.Tensor
     shown_trial: int
     plane_pressure: torch.Tensor | None
 
@@ -112,12 +112,14 @@ class SceneResult:
     Attributes:
         obstacles: number of obstacles.
         transfer_matrix: of the control points (P, M), complex128 [Pa].
+        bound: certified upper bound on the weakest focus [Pa]; None where the extra `bound` is not installed.
         simulation: how the field was computed.
         methods: by name, in the order they ran.
     """
 
     obstacles: int
     transfer_matrix: torch.Tensor
+    bound: float | None
     simulation: Simulation
     methods: dict[str, MethodResult]
 
@@ -215,7 +217,7 @@ def load_results(path: str | os.PathLike[str]) -> StudyResult:
 def trial_rows(results: StudyResult) -> Iterator[dict[str, str | int | float | None]]:
     """The trials one by one: what `trials.jsonl` holds.
 
-    Pressures in Pa, areas in mm^2; `seconds` is the trial's share of the time its method took.
+    Pressures in Pa, areas in mm^2, seconds as in `MethodResult`.
     """
     for scene_name, scene in results.scenes.items():
         for method_name, method in scene.methods.items():
@@ -233,7 +235,7 @@ def trial_rows(results: StudyResult) -> Iterator[dict[str, str | int | float | N
                     "uniformity": float(metrics.uniformity[trial]),
                     "area_mm2": None if area is None else 1e6 * float(area[trial]),
                     "evaluations": int(method.solution.evaluations[trial]),
-                    "seconds": method.seconds / method.trials,
+                    "seconds": float(method.seconds[trial]),
                 }
 
 
@@ -256,6 +258,8 @@ def _read_provenance(file: Any) -> Provenance:
 def _write_scene(group: Any, scene: SceneResult) -> None:
     simulation = scene.simulation
     group.attrs["obstacles"] = scene.obstacles
+    if scene.bound is not None:
+        group.attrs["bound"] = scene.bound
     for key in ("method", "wavelength", "spacing", "tolerance", "matrix_seconds", "plane_seconds"):
         if (value := getattr(simulation, key)) is not None:
             group.attrs[key] = value
@@ -280,15 +284,20 @@ def _read_scene(group: Any) -> SceneResult:
         float(attributes["plane_seconds"]),
     )
     methods = {name: _read_method(entry) for name, entry in group["methods"].items()}
-    return SceneResult(int(attributes["obstacles"]), _tensor(group, "transfer_matrix"), simulation, methods)
+    return SceneResult(
+        int(attributes["obstacles"]),
+        _tensor(group, "transfer_matrix"),
+        float(attributes["bound"]) if "bound" in attributes else None,
+        simulation,
+        methods,
+    )
 
 
 def _write_method(group: Any, method: MethodResult) -> None:
-    group.attrs["seconds"] = method.seconds
     group.attrs["shown_trial"] = method.shown_trial
     tensors = {key: getattr(method.solution, key) for key in _SOLUTION}
     tensors |= {key: getattr(method.metrics, key) for key in _METRICS}
-    tensors["plane_pressure"] = method.plane_pressure
+    tensors |= {"seconds": method.seconds, "plane_pressure": method.plane_pressure}
     for key, tensor in tensors.items():
         if tensor is not None:
             group[key] = tensor.numpy()
@@ -298,7 +307,7 @@ def _read_method(group: Any) -> MethodResult:
     return MethodResult(
         Solution(*(_tensor(group, key) for key in _SOLUTION)),
         FocusMetrics(*(_optional_tensor(group, key) for key in _METRICS)),  # only the area may be missing
-        float(group.attrs["seconds"]),
+        _tensor(group, "seconds"),
         int(group.attrs["shown_trial"]),
         _optional_tensor(group, "plane_pressure"),
     )

@@ -227,7 +227,7 @@ def _run_scene(
         for name, solution in solutions.items()
     }
     simulation = _simulation(propagator, matrix_seconds, plane_seconds)
-    return SceneResult(len(scene.obstacles), transfer_matrix, simulation, results)
+    return SceneResult(len(scene.obstacles), transfer_matrix, None, simulation, results)
 
 
 def _plane_points(scene: Scene, spacing: float) -> torch.Tensor | None:
@@ -267,7 +267,8 @@ def _method_result(
 ) -> MethodResult:
     metrics = focus_metrics(solution.pressure, None if plane is None else plane.abs(), cell_area)
     shown = int(solution.score.argsort(stable=True)[(len(solution.score) - 1) // 2])
-    return MethodResult(solution, metrics, seconds, shown, None if plane is None else plane[shown].clone())
+    shares = torch.full((len(solution.score),), seconds / len(solution.score), dtype=torch.float64)
+    return MethodResult(solution, metrics, shares, shown, None if plane is None else plane[shown].clone())
 
 
 def _simulation(propagator: Propagator, matrix_seconds: float, plane_seconds: float) -> Simulation:

@@ -48,7 +48,7 @@ def method_result(trials: int, spread: float, values: dict[str, float]) -> Metho
     solution = Solution(drive, mean[:, None], history[:, -1], counts, history)
     std, area = values["std"] * around, 1e-6 * values["area"] * around
     metrics = FocusMetrics(mean, history[:, -1], std, torch.ones_like(mean), area)
-    return MethodResult(solution, metrics, 1.0, 0, None)
+    return MethodResult(solution, metrics, torch.ones(trials, dtype=torch.float64), 0, None)
 
 
 def study(
@@ -63,7 +63,9 @@ def study(
             )
             for name, values in methods.items()
         }
-        scenes[scene] = SceneResult(0 if scene == "homogeneous" else 2, torch.ones(1, 1), SIMULATION, results)
+        scenes[scene] = SceneResult(
+            0 if scene == "homogeneous" else 2, torch.ones(1, 1), None, SIMULATION, results
+        )
     return StudyResult(Provenance("", 0, {}, "", ""), scenes)
 
 
@@ -145,5 +147,5 @@ def test_claims_without_data_have_no_verdict() -> None:
             metrics = FocusMetrics(
                 *(getattr(method.metrics, key) for key in ("mean", "min", "std", "uniformity")), None
             )
-            scene.methods[name] = MethodResult(method.solution, metrics, 1.0, 0, None)
+            scene.methods[name] = MethodResult(method.solution, metrics, method.seconds, 0, None)
     assert undecided(results) == [6, 7]
