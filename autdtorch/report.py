@@ -11,8 +11,9 @@ import torch
 from autdtorch.claims import LSSG, judge_claims
 from autdtorch.optim import METHOD_LABELS
 from autdtorch.plot import plot_convergence, plot_planes, plot_scene, plot_trials
-from autdtorch.results import RESULTS_FILE, TRIALS_FILE, MethodResult, SceneResult, StudyResult
+from autdtorch.results import RESULTS_FILE, MethodResult, SceneResult, StudyResult
 from autdtorch.scene import Scene
+from autdtorch.trial_file import TRIALS_FILE
 from autdtorch.view3d import rendering_problem, view3d
 
 REPORT_FILE = "report.md"

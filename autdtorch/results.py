@@ -1,8 +1,7 @@
 """What a study leaves on disk, and how it is read back.
 
-``results.h5`` holds everything, ``trials.jsonl`` a line a trial, ``provenance.json`` where they come from.
-All are written beside their place and then
-renamed, so that what is there is always complete.
+``results.h5`` holds everything of the finished scenes, ``provenance.json`` where it comes from. Both are
+written beside their place and then renamed, so that what is there is always complete.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import platform
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -26,8 +24,6 @@ from autdtorch.propagator import Run
 from autdtorch.source import package_versions, source_digest
 
 RESULTS_FILE = "results.h5"
-TRIALS_FILE = "trials.jsonl"
-
 PROVENANCE_FILE = "provenance.json"
 
 _SOLUTION = ("drive", "pressure", "score", "evaluations", "history")
@@ -167,27 +163,32 @@ def save_results(results: StudyResult, folder: str | os.PathLike[str]) -> None:
             _write_scene(scenes.create_group(name), scene)
     partial.replace(folder / RESULTS_FILE)
 
-    lines = [json.dumps(row) + "\n" for row in trial_rows(results)]
-    _replace_text(folder / TRIALS_FILE, "".join(lines))
-    _replace_text(folder / PROVENANCE_FILE, json.dumps(asdict(results.provenance), indent=2) + "\n")
 
-
-def set_aside(folder: str | os.PathLike[str]) -> None:
-    """Rename the files of an earlier study in a folder, so that another one does not overwrite them.
+def save_provenance(provenance: Provenance, folder: str | os.PathLike[str]) -> None:
+    """Write where the files of a study come from into its folder.
 
     Raises:
         OSError: the folder cannot be written.
     """
-    for name in (RESULTS_FILE, TRIALS_FILE, PROVENANCE_FILE):
-        path = Path(folder) / name
-        if path.exists():
-            path.replace(path.with_name(f"previous-{name}"))
-
-
-def _replace_text(path: Path, text: str) -> None:
+    path = Path(folder) / PROVENANCE_FILE
     partial = path.with_name(f"{path.name}.partial")
-    partial.write_text(text, encoding="utf-8")
+    partial.write_text(json.dumps(asdict(provenance), indent=2) + "\n", encoding="utf-8")
     partial.replace(path)
+
+
+def load_provenance(folder: str | os.PathLike[str]) -> Provenance:
+    """Read what `save_provenance` wrote.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is not a complete one of this version.
+    """
+    path = Path(folder) / PROVENANCE_FILE
+    try:
+        return Provenance(**json.loads(path.read_text(encoding="utf-8")))
+    except (ValueError, TypeError) as error:
+        accepted = f"must be a provenance file of autdtorch {autdtorch.__version__}"
+        raise ValueError(f"{path}: {error}; {accepted}") from error
 
 
 def load_results(path: str | os.PathLike[str]) -> StudyResult:
@@ -212,31 +213,6 @@ def load_results(path: str | os.PathLike[str]) -> StudyResult:
     except (OSError, KeyError, ValueError) as error:
         accepted = f"must be a results file of autdtorch {autdtorch.__version__}"
         raise ValueError(f"{path}: {error}; {accepted}") from error
-
-
-def trial_rows(results: StudyResult) -> Iterator[dict[str, str | int | float | None]]:
-    """The trials one by one: what `trials.jsonl` holds.
-
-    Pressures in Pa, areas in mm^2, seconds as in `MethodResult`.
-    """
-    for scene_name, scene in results.scenes.items():
-        for method_name, method in scene.methods.items():
-            metrics, area = method.metrics, method.metrics.area
-            for trial in range(method.trials):
-                yield {
-                    "scene": scene_name,
-                    "method": method_name,
-                    "trial": trial,
-                    "seed": results.provenance.seed,
-                    "score": float(method.solution.score[trial]),
-                    "mean": float(metrics.mean[trial]),
-                    "min": float(metrics.min[trial]),
-                    "std": float(metrics.std[trial]),
-                    "uniformity": float(metrics.uniformity[trial]),
-                    "area_mm2": None if area is None else 1e6 * float(area[trial]),
-                    "evaluations": int(method.solution.evaluations[trial]),
-                    "seconds": float(method.seconds[trial]),
-                }
 
 
 def _write_provenance(file: Any, provenance: Provenance) -> None:

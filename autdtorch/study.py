@@ -1,47 +1,39 @@
-"""Trials x scenes x methods, one after the other; what is finished is kept on disk and not computed again."""
+"""Trials x scenes x methods; what is finished is kept on disk, trial by trial, and not computed again."""
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import inspect
 import logging
 import math
 import os
 import re
-import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias
 
 import torch
-from tqdm import tqdm
-from tqdm.contrib.logging import logging_redirect_tqdm
 
 from autdtorch.metrics import focus_metrics
 from autdtorch.objective import Objective, SimulatedObjective
-from autdtorch.optim.base import Solution
-from autdtorch.propagator import Propagator, SimulatedPropagator, make_propagator
-from autdtorch.results import (
-    RESULTS_FILE,
-    MethodResult,
-    Provenance,
-    SceneResult,
-    Simulation,
-    StudyResult,
-    load_results,
-    provenance_now,
-    save_results,
-    set_aside,
-)
+from autdtorch.optim.base import Solution, Trials
+from autdtorch.progress import Progress, show_progress
+from autdtorch.propagator import CACHE_VARIABLE, Propagator, SimulatedPropagator, make_propagator
+from autdtorch.results import MethodResult, SceneResult, Simulation, StudyResult, provenance_now
 from autdtorch.scene import Scene
+from autdtorch.study_folder import StudyFolder, open_folder
+from autdtorch.trial_file import TrialFile
 from autdtorch.validation import LENGTH_TOLERANCE, distances, integer_at_least, invalid, positive
 
 logger = logging.getLogger(__name__)
 
-#: An optimiser with its settings bound. It gets `trials` and `seed` where it has such parameters.
+#: An optimiser with its settings bound. It gets the numbers of `trials` and `seed` where it has such
+#: parameters.
 Method: TypeAlias = Callable[..., Solution]
+
+_FIRST_BLOCK = 2  # Trials are run so many at a time at first,
+_LARGEST_GROWTH = 4  # then up to so many times more,
+_BLOCK_SECONDS = 10.0  # so that about as much is lost when the process is killed.
 
 _LARGEST_SEED = 2**63 - 1  # the largest integer that a results file holds
 _MOST_SAMPLES = 10**6  # of an observation plane: 16 complex columns of them are 256 MB
@@ -72,15 +64,16 @@ def run_study(
         trials: of every method that has random choices, or by method name.
         seed: of the random choices, >= 0; the same in every scene.
         plane_spacing: edge of a cell of the observation plane [m].
-        folder: where results are saved after every scene; None to save nothing.
-        config: all of the above as text. A scene that the folder holds for the same text, made with the same
-            source and packages, is taken from there. Without text, everything is computed.
+        folder: where trials are saved as they end, scenes when they are finished; None to save nothing.
+        config: all of the above as text. What the folder holds for the same text, made with the same source
+            and packages, is taken from there. Without text, everything is computed.
 
     Returns:
         The results of all scenes.
 
     Raises:
-        ValueError: an argument out of range, a solver's and a method's included.
+        ValueError: an argument out of range, a solver's and a method's included, or another process writes
+            into the folder.
         OSError: the folder cannot be written.
     """
     counts = _check(scenes, methods, trials, seed)
@@ -91,21 +84,16 @@ def run_study(
     planes = {name: _plane_points(scene, plane_spacing) for name, scene in scenes.items()}
     if any(_function(method).__module__.partition(".")[0] != "autdtorch" for method in methods.values()):
         config = ""  # the digest of our source says nothing of theirs: nothing is re-used
-    stored = _stored(folder, provenance_now(config, seed))
-    provenance, finished = stored.provenance, dict(stored.scenes)
-    missing = {name: scene for name, scene in scenes.items() if name not in finished}
-    propagators = {name: _propagator(scene, solver or {}) for name, scene in missing.items()}
-
-    with _progress(len(missing) * (len(methods) + 2)) as step:
-        for scene_name in missing:
-            propagator = propagators.pop(scene_name)
-            finished[scene_name] = _run_scene(
-                scene_name, propagator, methods, counts, seed, planes[scene_name], step
-            )
-            results = StudyResult(provenance, {name: finished[name] for name in scenes if name in finished})
-            if folder is not None:
-                save_results(results, folder)
-    return StudyResult(provenance, {name: finished[name] for name in scenes})
+    with open_folder(folder, provenance_now(config, seed)) as kept:
+        missing = {name: scene for name, scene in scenes.items() if name not in kept.scenes}
+        propagators = {name: _propagator(scene, solver or {}, kept) for name, scene in missing.items()}
+        with show_progress(len(missing) * (sum(counts.values()) + 2)) as progress:
+            for name in missing:
+                finished = _run_scene(
+                    name, propagators.pop(name), methods, counts, seed, planes[name], kept.trials, progress
+                )
+                kept.save(name, finished, scenes)
+        return StudyResult(kept.provenance, {name: kept.scenes[name] for name in scenes})
 
 
 def _check(
@@ -133,9 +121,12 @@ def _check(
     return {name: integer_at_least(f"trials.{name}", trials.get(name, 1), 1) for name in methods}
 
 
-def _propagator(scene: Scene, solver: Mapping[str, Any]) -> Propagator:
+def _propagator(scene: Scene, solver: Mapping[str, Any], kept: StudyFolder) -> Propagator:
+    cache = solver.get("cache")
+    if cache is None and CACHE_VARIABLE not in os.environ and kept.matrices is not None:
+        cache = kept.matrices  # a study that goes on needs its matrices again
     try:
-        return make_propagator(scene, **solver)
+        return make_propagator(scene, **{**solver, "cache": cache})
     except ValueError as error:
         raise ValueError(f"solver: {error}") from error
 
@@ -158,7 +149,7 @@ class _Probe:
 def _check_method(name: str, method: Method, scene: Scene, trials: int, seed: int) -> None:
     """Have the method check its settings now, not after minutes of simulation."""
     try:
-        _solve(method, _Probe(scene), trials, seed)
+        _solve(method, _Probe(scene), range(trials), seed)
     except _FirstEvaluationError:
         pass
     except ValueError as error:
@@ -169,65 +160,63 @@ def _function(method: Method) -> Callable[..., Any]:
     return method.func if isinstance(method, functools.partial) else method
 
 
-def _solve(method: Method, objective: Objective, trials: int, seed: int) -> Solution:
+def _solve(method: Method, objective: Objective, trials: Trials, seed: int) -> Solution:
     parameters = inspect.signature(method).parameters
     given = {"trials": trials, "seed": seed}
     return method(objective, **{key: value for key, value in given.items() if key in parameters})
 
 
-def _stored(folder: str | os.PathLike[str] | None, provenance: Provenance) -> StudyResult:
-    """What the folder holds of the same study; nothing where it holds another one, or none."""
-    nothing = StudyResult(provenance, {})
-    if folder is None or not provenance.config:
-        return nothing
-    path = Path(folder) / RESULTS_FILE
-    if not path.exists():
-        return nothing
-    try:
-        stored = load_results(path)
-    except ValueError as error:
-        logger.warning("computing everything again: %s", error)
-        set_aside(folder)
-        return nothing
-    if not stored.provenance.same_origin(provenance):
-        logger.warning("%s is of other settings, source or packages: kept as previous-%s", path, path.name)
-        set_aside(folder)
-        return nothing
-    logger.info("re-using %s from %s, same settings and same source", ", ".join(stored.scenes), path)
-    return stored
-
-
 def _run_scene(
-    scene_name: str,
+    name: str,
     propagator: Propagator,
     methods: Mapping[str, Method],
     counts: Mapping[str, int],
     seed: int,
     plane: torch.Tensor | None,
-    step: Callable[[str], None],
+    trials: TrialFile,
+    progress: Progress,
 ) -> SceneResult:
     scene = propagator.scene
-    step(f"{scene_name}: transfer matrix")
+    progress.begin(f"{name}: transfer matrix")
     begin = time.perf_counter()
     objective = SimulatedObjective(scene, propagator)
     transfer_matrix = propagator.transfer_matrix().cpu()
     matrix_seconds = time.perf_counter() - begin
-    solutions, seconds = {}, {}
-    for name, method in methods.items():
-        step(f"{scene_name}: {name}, {counts[name]} trials")
-        begin = time.perf_counter()
-        solutions[name] = _solve(method, objective, counts[name], seed)
-        seconds[name] = time.perf_counter() - begin
-    step(f"{scene_name}: observation plane")
+    progress.advance(1)
+    for method_name, method in methods.items():
+        where = name, method_name, counts[method_name]
+        progress.advance(where[2] - len(trials.missing(*where)))
+        _run_trials(where, functools.partial(_solve, method, objective, seed=seed), trials, progress)
+    found = {method_name: trials.found(name, method_name, count) for method_name, count in counts.items()}
+    progress.begin(f"{name}: observation plane")
     begin = time.perf_counter()
+    solutions = {method_name: solution for method_name, (solution, _) in found.items()}
     planes, cell_area = _plane_pressures(propagator, solutions, plane)
     plane_seconds = time.perf_counter() - begin
+    progress.advance(1)
     results = {
-        name: _method_result(solution, planes.get(name), cell_area, seconds[name])
-        for name, solution in solutions.items()
+        method_name: _method_result(solution, planes.get(method_name), cell_area, seconds)
+        for method_name, (solution, seconds) in found.items()
     }
     simulation = _simulation(propagator, matrix_seconds, plane_seconds)
     return SceneResult(len(scene.obstacles), transfer_matrix, None, simulation, results)
+
+
+def _run_trials(
+    where: tuple[str, str, int], solve: Callable[..., Solution], trials: TrialFile, progress: Progress
+) -> None:
+    """Run the trials that are missing, in blocks; `where` is scene, method and number of trials."""
+    scene, method, count = where
+    missing, size = trials.missing(*where), _FIRST_BLOCK
+    while missing:
+        block, missing = missing[:size], missing[size:]
+        progress.begin(f"{scene}: {method}, {len(block)} of {count} trials")
+        begin = time.perf_counter()
+        solution = solve(trials=block)
+        seconds = time.perf_counter() - begin
+        trials.append(scene, method, block, solution, seconds)
+        progress.advance(len(block))
+        size = max(1, int(size * min(_LARGEST_GROWTH, _BLOCK_SECONDS / seconds)))
 
 
 def _plane_points(scene: Scene, spacing: float) -> torch.Tensor | None:
@@ -263,12 +252,11 @@ def _plane_pressures(
 
 
 def _method_result(
-    solution: Solution, plane: torch.Tensor | None, cell_area: float | None, seconds: float
+    solution: Solution, plane: torch.Tensor | None, cell_area: float | None, seconds: torch.Tensor
 ) -> MethodResult:
     metrics = focus_metrics(solution.pressure, None if plane is None else plane.abs(), cell_area)
     shown = int(solution.score.argsort(stable=True)[(len(solution.score) - 1) // 2])
-    shares = torch.full((len(solution.score),), seconds / len(solution.score), dtype=torch.float64)
-    return MethodResult(solution, metrics, shares, shown, None if plane is None else plane[shown].clone())
+    return MethodResult(solution, metrics, seconds, shown, None if plane is None else plane[shown].clone())
 
 
 def _simulation(propagator: Propagator, matrix_seconds: float, plane_seconds: float) -> Simulation:
@@ -279,20 +267,3 @@ def _simulation(propagator: Propagator, matrix_seconds: float, plane_seconds: fl
             propagator.method, wavelength, spacing, tolerance, runs, matrix_seconds, plane_seconds
         )
     return Simulation("free_space", wavelength, None, None, (), matrix_seconds, plane_seconds)
-
-
-@contextlib.contextmanager
-def _progress(steps: int) -> Iterator[Callable[[str], None]]:
-    """A bar on a terminal, beside the log; elsewhere the log alone."""
-    if not sys.stderr.isatty():
-        yield logger.info
-        return
-    with logging_redirect_tqdm(), tqdm(total=steps, file=sys.stderr, dynamic_ncols=True) as bar:
-
-        def step(what: str) -> None:
-            if bar.desc:
-                bar.update()
-            bar.set_description(what)
-
-        yield step
-        bar.update()

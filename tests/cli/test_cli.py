@@ -30,7 +30,7 @@ SOLVERS = sorted(path.stem for path in (CONFIGS / "solver").glob("*.yaml"))
 EXPERIMENTS = sorted(path.stem for path in (CONFIGS / "experiment").glob("*.yaml"))
 
 
-SINGLE_FILES = ("results.h5", "trials.jsonl", "provenance.json", "plane.png")
+SINGLE_FILES = ("results.h5", "trials.jsonl", "provenance.json", ".lock", "plane.png")
 
 
 def written(folder: Path) -> set[str]:
@@ -201,7 +201,7 @@ def test_one_scene_and_one_method(run: Run, tmp_path: Path, capsys: pytest.Captu
     assert head.split()[:3] == ["scene", "method", "trials"]
     assert row.split()[:4] == ["homogeneous", "GABS", "2", f"{method.metrics.mean.mean():.2f}"]
     assert end == f"The results are in {Path('outputs', 'homogeneous_gabs')}"
-    assert "homogeneous: gabs, 2 trials" in captured.err
+    assert "homogeneous: gabs, 2 of 2 trials" in captured.err
 
 
 def test_what_is_finished_is_not_computed_again(

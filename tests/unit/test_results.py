@@ -1,7 +1,6 @@
 """What a study found comes back from disk as it was."""
 
 import dataclasses
-import json
 from pathlib import Path
 
 import pytest
@@ -13,14 +12,15 @@ from autdtorch.propagator import Run
 from autdtorch.results import (
     PROVENANCE_FILE,
     RESULTS_FILE,
-    TRIALS_FILE,
     MethodResult,
     Provenance,
     SceneResult,
     Simulation,
     StudyResult,
+    load_provenance,
     load_results,
     provenance_now,
+    save_provenance,
     save_results,
 )
 
@@ -86,33 +86,18 @@ def test_saving_again_replaces_what_was_there_and_leaves_nothing_else(
     fewer = dataclasses.replace(results, scenes={"empty": results.scenes["empty"]})
     save_results(fewer, tmp_path)
     assert list(load_results(tmp_path).scenes) == ["empty"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == [PROVENANCE_FILE, RESULTS_FILE, TRIALS_FILE]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [RESULTS_FILE]
 
 
-def test_a_line_a_trial(results: StudyResult, tmp_path: Path) -> None:
-    save_results(results, tmp_path)
-    rows = [json.loads(line) for line in (tmp_path / TRIALS_FILE).read_text(encoding="utf-8").splitlines()]
-    assert [(row["scene"], row["method"], row["trial"]) for row in rows] == [
-        ("two_cubes", "lssg", 0),
-        *(("two_cubes", "bayes_opt", trial) for trial in range(4)),
-        *(("empty", "gabs", trial) for trial in range(2)),
-    ]
-    method = results.scenes["two_cubes"].methods["bayes_opt"]
-    assert rows[3] == {
-        "scene": "two_cubes",
-        "method": "bayes_opt",
-        "trial": 2,
-        "seed": 3,
-        "score": method.solution.score[2].item(),
-        "mean": method.metrics.mean[2].item(),
-        "min": method.metrics.min[2].item(),
-        "std": method.metrics.std[2].item(),
-        "uniformity": method.metrics.uniformity[2].item(),
-        "area_mm2": 1e6 * method.metrics.area[2].item(),
-        "evaluations": 2,
-        "seconds": method.seconds[2].item(),
-    }
-    assert rows[-1]["area_mm2"] is None
+def test_the_provenance_comes_back_or_is_refused_by_name(results: StudyResult, tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=PROVENANCE_FILE):
+        load_provenance(tmp_path)
+    save_provenance(results.provenance, tmp_path)
+    assert load_provenance(tmp_path) == results.provenance
+    for wrong in ("", '{"config": "a"}', '{"config": '):
+        (tmp_path / PROVENANCE_FILE).write_text(wrong, encoding="utf-8")
+        with pytest.raises(ValueError, match=rf"{PROVENANCE_FILE}: .*must be a provenance file"):
+            load_provenance(tmp_path)
 
 
 def test_only_the_date_may_differ_between_results_of_the_same_origin(results: StudyResult) -> None:

@@ -21,9 +21,10 @@ from autdtorch.optim.base import Solution
 from autdtorch.optim.gabs import gabs
 from autdtorch.optim.lssg import lssg
 from autdtorch.propagator import FreeSpacePropagator, FullPropagator, Run
-from autdtorch.results import RESULTS_FILE, TRIALS_FILE, load_results
+from autdtorch.results import RESULTS_FILE, load_results
 from autdtorch.scene import Box, Scene
 from autdtorch.study import run_study
+from autdtorch.trial_file import TRIALS_FILE
 
 PLANE = Plane(center=(20e-3, 12e-3, 12e-3), normal=(1, 0, 0), size=(20e-3, 16e-3))
 METHODS = {"lssg": functools.partial(lssg, levels=4), "gabs": functools.partial(gabs, levels=4)}
@@ -124,7 +125,7 @@ def test_finished_scenes_of_the_same_settings_are_used_again(
 ) -> None:
     study = functools.partial(run_study, scenes, METHODS, solver=FREE_SPACE, folder=tmp_path)
     first = study(config="a: 1")
-    with caplog.at_level(logging.INFO, logger="autdtorch.study"):
+    with caplog.at_level(logging.INFO, logger="autdtorch.study_folder"):
         again = study(config="a: 1")
     assert count_runs == ["second", "first"]
     assert "re-using second, first" in caplog.text

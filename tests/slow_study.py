@@ -1,0 +1,48 @@
+"""A study of two scenes and twelve slow trials, run as a program so that a test can kill it."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import time
+
+from small_scenes import CUBE, small_scene
+
+import autdtorch.study
+from autdtorch.geometry import Plane
+from autdtorch.objective import Objective
+from autdtorch.optim.base import Solution, Trials
+from autdtorch.optim.gabs import gabs
+
+PLANE = Plane(center=(20e-3, 12e-3, 12e-3), normal=(1, 0, 0), size=(20e-3, 16e-3))
+SOLVER = {"method": "auto", "spacing": 2e-3, "tolerance": 0.1, "kernel": "reference"}
+
+
+def slow_gabs(objective: Objective, trials: Trials = 1, seed: int = 0) -> Solution:
+    """GABS that takes a while."""
+    time.sleep(0.15)
+    return gabs(objective, levels=4, trials=trials, seed=seed)
+
+
+def main() -> None:
+    """Run the study into the folder that the command line names."""
+    slow_gabs.__module__ = gabs.__module__  # results of others' methods are not used again
+    autdtorch.study._FIRST_BLOCK = autdtorch.study._LARGEST_GROWTH = 1  # a trial a block
+    scenes = {
+        "empty": dataclasses.replace(small_scene(), observation_plane=PLANE),
+        "cube": dataclasses.replace(small_scene((CUBE,)), observation_plane=PLANE),
+    }
+    print("ready", flush=True)
+    autdtorch.study.run_study(
+        scenes,
+        {"gabs": slow_gabs},
+        solver=SOLVER,
+        trials=6,
+        plane_spacing=4e-3,
+        folder=sys.argv[1],
+        config="a",
+    )
+
+
+if __name__ == "__main__":
+    main()
