@@ -1,18 +1,20 @@
 """What the paper claims (sections IV and V), each claim judged by the stored results of a study.
 
-Means over trials are compared. A difference is clear where it exceeds two of its standard errors; that of a
-mean is taken as infinite where there is a single trial of a method with random choices.
+Means over trials are compared. A comparison is clear where its 95 % confidence interval is all on one side of
+what decides it.
 """
 
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import torch
 
+from autdtorch.intervals import Interval, bootstrap, share_interval
 from autdtorch.optim import METHOD_LABELS
 from autdtorch.results import MethodResult, StudyResult
 
@@ -36,8 +38,6 @@ LAST_PART = 0.1
 FORMED = 0.5
 """Foci have formed where the weakest has at least this share of their mean pressure."""
 
-_CLEAR = 2.0  # standard errors
-
 
 @dataclass(frozen=True)
 class Verdict:
@@ -45,13 +45,13 @@ class Verdict:
 
     Attributes:
         holds: whether every comparison comes out as claimed.
-        clear: whether the differences that decide this exceed the uncertainty of so few trials.
-        evidence: our numbers.
+        clear: whether the confidence intervals of the comparisons that decide this leave no doubt of it.
+        evidence: our numbers, line by line.
     """
 
     holds: bool
     clear: bool
-    evidence: str
+    evidence: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -71,27 +71,6 @@ class Claim:
     methods: tuple[str, ...]
     needs: tuple[Scenes, ...]
     judge: Callable[[StudyResult], Verdict]
-
-
-@dataclass(frozen=True)
-class _Estimate:
-    """A mean over trials and its standard error."""
-
-    value: float
-    error: float
-
-    def __str__(self) -> str:
-        if self.error == 0 and self.value.is_integer():
-            return f"{self.value:.0f}"
-        digits = max(0, 2 - math.floor(math.log10(abs(self.value)))) if self.value else 2
-        value = f"{self.value:.{digits}f}"
-        return value if self.error in (0, math.inf) else f"{value} ± {self.error:.{digits}f}"
-
-    def __sub__(self, other: _Estimate) -> _Estimate:
-        return _Estimate(self.value - other.value, math.hypot(self.error, other.error))
-
-    def __mul__(self, factor: float) -> _Estimate:
-        return _Estimate(factor * self.value, abs(factor) * self.error)
 
 
 def judge_claims(results: StudyResult) -> list[tuple[Claim, Verdict | None]]:
@@ -156,39 +135,46 @@ def _evaluations(method: MethodResult) -> torch.Tensor:
 
 
 def _converged(method: MethodResult) -> torch.Tensor:
-    """1 for a trial that has converged before its end, 0 for another."""
-    history = method.solution.history
-    before = history[:, math.ceil((1 - LAST_PART) * history.shape[1]) - 1]
-    return (before >= (1 - CONVERGED) * history[:, -1]).double()
+    """Whether each trial has converged before its end."""
+    history, evaluations = method.solution.history, method.solution.evaluations
+    end = evaluations.long() - 1  # what is stored after it is padding
+    before = ((1 - LAST_PART) * evaluations).ceil().long() - 1
+    return history.gather(1, before[:, None]) >= (1 - CONVERGED) * history.gather(1, end[:, None])
 
 
-def _estimate(results: StudyResult, scene: str, method: str, quantity: Quantity) -> _Estimate:
+def _values(results: StudyResult, scene: str, method: str, quantity: Quantity) -> torch.Tensor | float:
+    """The quantity of the trials; one number where no chance is in it."""
     values = quantity(results.scenes[scene].methods[method])
-    if len(values) > 1:
-        return _Estimate(float(values.mean()), float(values.std()) / math.sqrt(len(values)))
-    exact = method == LSSG or quantity is _evaluations
-    return _Estimate(float(values[0]), 0.0 if exact else math.inf)
+    exact = quantity is _evaluations or (method == LSSG and len(values) == 1)
+    return float(values.mean()) if exact else values
 
 
-def _verdict(margins: Iterable[_Estimate], evidence: str) -> Verdict:
+def _means(results: StudyResult, scene: str, methods: Iterable[str], quantity: Quantity, unit: str) -> str:
+    parts = []
+    for method in methods:
+        values = _values(results, scene, method, quantity)
+        mean = Interval.exact(values) if isinstance(values, float) else Interval.unknown(float(values.mean()))
+        parts.append(f"{METHOD_LABELS[method]} {mean}")
+    return f"{', '.join(parts)} {unit}".rstrip()
+
+
+def _verdict(margins: Iterable[Interval], evidence: Iterable[str]) -> Verdict:
     """A claim holds where all `margins` are positive."""
     margins = list(margins)
     holds = all(margin.value > 0 for margin in margins)
     if holds:
-        clear = all(margin.value > _CLEAR * margin.error for margin in margins)
+        clear = all(margin.low > 0 for margin in margins)
     else:
-        clear = any(not margin.value > -_CLEAR * margin.error for margin in margins)
-    return Verdict(holds, clear, evidence)
+        clear = any(margin.high <= 0 for margin in margins)
+    return Verdict(holds, clear, tuple(evidence))
 
 
-def _evidence(
-    results: StudyResult, scenes: Iterable[str], methods: tuple[str, ...], quantity: Quantity, unit: str
-) -> str:
-    parts = []
-    for scene in scenes:
-        numbers = [f"{METHOD_LABELS[name]} {_estimate(results, scene, name, quantity)}" for name in methods]
-        parts.append(f"{scene}: {', '.join(numbers)} {unit}".rstrip())
-    return "; ".join(parts)
+def _above(number: Interval, threshold: float) -> Interval:
+    return number.mapped(lambda value: value - threshold)
+
+
+def _below(number: Interval, threshold: float) -> Interval:
+    return number.mapped(lambda value: threshold - value)
 
 
 def _ordered(
@@ -197,12 +183,15 @@ def _ordered(
     """In each of the `scenes`, `quantity` of one method is smaller than that of each of the `larger`."""
 
     def judge(results: StudyResult) -> Verdict:
-        margins = [
-            _estimate(results, scene, name, quantity) - _estimate(results, scene, smaller, quantity)
-            for scene in scenes(results)
-            for name in larger
-        ]
-        return _verdict(margins, _evidence(results, scenes(results), (smaller, *larger), quantity, unit))
+        margins, lines = [], []
+        for scene in scenes(results):
+            parts = [_means(results, scene, (smaller, *larger), quantity, unit)]
+            for name in larger:
+                both = (_values(results, scene, method, quantity) for method in (name, smaller))
+                margins.append(bootstrap(*both, combine=operator.sub))
+                parts.append(f"{METHOD_LABELS[name]} - {METHOD_LABELS[smaller]} {margins[-1]}")
+            lines.append(f"{scene}: {'; '.join(parts)}")
+        return _verdict(margins, lines)
 
     return judge
 
@@ -213,48 +202,50 @@ def _share_of_empty(
     """In each of the `scenes` the mean pressure is much weaker than without obstacles, or is kept."""
 
     def judge(results: StudyResult) -> Verdict:
-        margins, parts = [], []
-        for method in methods:
-            empty = _estimate(results, _empty(results)[0], method, _mean_pressure)
-            for scene in scenes(results):
-                pressure = _estimate(results, scene, method, _mean_pressure)
-                margin = pressure - empty * MUCH_WEAKER
-                margins.append(margin * (-1 if weaker else 1))
-                parts.append(f"{METHOD_LABELS[method]} in {scene}: {pressure.value / empty.value:.2f}")
-        return _verdict(margins, "share of the pressure without obstacles: " + "; ".join(parts))
+        margins, lines = [], ["share of the pressure without obstacles"]
+        for scene in scenes(results):
+            parts = []
+            for method in methods:
+                both = (
+                    _values(results, name, method, _mean_pressure) for name in (scene, _empty(results)[0])
+                )
+                share = bootstrap(*both, combine=operator.truediv)
+                margins.append((_below if weaker else _above)(share, MUCH_WEAKER))
+                parts.append(f"{METHOD_LABELS[method]} {share}")
+            lines.append(f"{scene}: {', '.join(parts)}")
+        return _verdict(margins, lines)
 
     return judge
 
 
 def _same_area(results: StudyResult) -> Verdict:
-    margins = []
+    margins, lines = [], []
     for scene in _empty_with_area(results):
-        gabs, bo = (_estimate(results, scene, method, _area) for method in (GABS, BO))
-        difference = gabs - bo
-        allowed = SAME_LEVEL * max(gabs.value, bo.value)
-        margins.append(_Estimate(allowed - abs(difference.value), difference.error))
-    return _verdict(margins, _evidence(results, _empty_with_area(results), (GABS, BO), _area, "mm²"))
+        both = (_values(results, scene, method, _area) for method in (GABS, BO))
+        ratio = bootstrap(*both, combine=operator.truediv)
+        margins += [_above(ratio, 1 - SAME_LEVEL), _below(ratio, 1 / (1 - SAME_LEVEL))]
+        lines.append(f"{scene}: {_means(results, scene, (GABS, BO), _area, 'mm²')}; GABS / BO {ratio}")
+    return _verdict(margins, lines)
 
 
 def _convergence(results: StudyResult) -> Verdict:
-    margins = []
-    half = _Estimate(0.5, 0.0)
+    margins, lines = [], ["share of the trials that converged"]
     for scene in results.scenes:
-        margins.append(_estimate(results, scene, BO, _converged) - half)
-        margins.append(half - _estimate(results, scene, GABS, _converged))
-    evidence = _evidence(results, results.scenes, (BO, GABS), _converged, "")
-    return _verdict(margins, f"share of the trials that converged: {evidence}")
+        bo, gabs = (
+            share_interval(_converged(results.scenes[scene].methods[method])) for method in (BO, GABS)
+        )
+        margins += [_above(bo, 0.5), _below(gabs, 0.5)]
+        lines.append(f"{scene}: BO {bo}, GABS {gabs}")
+    return _verdict(margins, lines)
 
 
 def _foci_form(results: StudyResult) -> Verdict:
-    threshold = _Estimate(FORMED, 0.0)
-    margins = [
-        _estimate(results, scene, method, _weakest_share) - threshold
-        for scene in results.scenes
-        for method in (BO, GABS)
-    ]
-    evidence = _evidence(results, results.scenes, (BO, GABS), _weakest_share, "")
-    return _verdict(margins, f"weakest focus over mean: {evidence}")
+    margins, lines = [], ["weakest focus over mean"]
+    for scene in results.scenes:
+        bo, gabs = (bootstrap(_values(results, scene, method, _weakest_share)) for method in (BO, GABS))
+        margins += [_above(bo, FORMED), _above(gabs, FORMED)]
+        lines.append(f"{scene}: BO {bo}, GABS {gabs}")
+    return _verdict(margins, lines)
 
 
 CLAIMS = (

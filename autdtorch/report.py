@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 
-from autdtorch.claims import LSSG, judge_claims
-from autdtorch.optim import METHOD_LABELS
+from autdtorch.claims import BO, GABS, judge_claims
+from autdtorch.findings import NEAR_BOUND, find
+from autdtorch.intervals import FEWEST_TRIALS
 from autdtorch.plot import plot_convergence, plot_planes, plot_scene, plot_trials
+from autdtorch.plot.style import label_of
 from autdtorch.results import RESULTS_FILE, MethodResult, SceneResult, StudyResult
 from autdtorch.scene import Scene
 from autdtorch.trial_file import TRIALS_FILE
@@ -19,6 +23,10 @@ from autdtorch.view3d import rendering_problem, view3d
 REPORT_FILE = "report.md"
 
 _FEW_TRIALS = 20  # below this, the spread of a method is not well known
+_NO_NUMBER = "-"
+
+_BASELINE = "gradient_ascent"
+"""The method that is no competitor but a line to compare with: it knows the transfer matrix."""
 
 _FIG2 = """## Fig. 2: pressure on the observation plane
 
@@ -35,16 +43,33 @@ _FIG3 = """## Fig. 3: the trials
 
 ![convergence](fig3d.png)
 
-(d) best score so far against evaluations."""
+(d) best score so far against evaluations; a dot marks where a method ends."""
 
 _BELOW_SUMMARY = """Mean over the trials ± their standard deviation. *mean*, *weakest* and *std* are taken
-over the foci of a trial; *s a trial* is the time of the search alone, without simulation.
+over the foci of a trial.
 
 Pressures are amplitudes, for transducers of pressure S/r with the source strength S of the scene's array.
 The paper's scenes have that of its Eq. 2, S = 1/(4π) Pa m."""
 
-_BELOW_CLAIMS = """Computed from the data: means over the trials, ± the standard error of the mean. *Not
-clearly*: a difference that decides the verdict is below two standard errors, or there is a single trial."""
+_BELOW_CLAIMS = f"""Computed from the data: means over the trials, and in brackets the 95 % confidence
+interval of each difference, ratio or share (bootstrap over the trials; Wilson's for shares of trials). LSSG
+has no chance in it: its one trial is exact. *Not clearly*: an interval leaves the verdict open, or there are
+fewer than {FEWEST_TRIALS} trials, which have no interval. Every interval is of one comparison alone."""
+
+_BELOW_FINDINGS = f"""*Score*: pressure of the weakest focus, its median over the trials, in brackets with its
+95 % confidence interval (bootstrap; none for fewer than {FEWEST_TRIALS} trials). *s a trial*: mean time of the
+search alone, without simulation."""
+
+_ABOUT_BOUND = f"""*Bound*: a certified upper bound on the score of any drive with amplitudes up to 1, from the
+semidefinite relaxation. No method can be better, and the best drive may lie below it. *Gap*: 1 - score/bound.
+*To {NEAR_BOUND:.0%} of it*: evaluations until the best score so far was there, the median over the trials; in
+parentheses how many of them got there, if not all. A trial that did not counts as later than all that did;
+where that leaves the median open, there is a dash."""
+
+_NO_BOUND = "The certified bound and the gaps to it need the extra `bound`: `pip install autdtorch[bound]`."
+
+_ABOUT_BASELINE = """{label} is a line to compare with and no competitor: it reads gradients off the transfer
+matrix, which the others do not know, so that its evaluations are not listed."""
 
 _READINGS = """## How the paper was read
 
@@ -110,6 +135,7 @@ def write_report(
         _trial_figures(results, folder),
         _summary(results),
         _claims(results),
+        _findings(results),
         _READINGS,
         _simulations(results),
         _origin(results),
@@ -122,7 +148,7 @@ def write_report(
 def summary_rows(results: StudyResult) -> list[list[str]]:
     """A table of the results, its head first: mean over the trials, and ± their standard deviation."""
     head = ["scene", "method", "trials", "mean [Pa]", "weakest [Pa]", "std [Pa]", "area [mm²]"]
-    rows = [[*head, "evaluations", "s a trial"]]
+    rows = [[*head, "evaluations"]]
     for scene_name, scene in results.scenes.items():
         for name, method in scene.methods.items():
             metrics = method.metrics
@@ -130,17 +156,13 @@ def summary_rows(results: StudyResult) -> list[list[str]]:
             pressures = (metrics.mean, metrics.min, metrics.std)
             numbers = [str(method.trials), *(_over_trials(values, ".2f") for values in pressures), area]
             evaluations = f"{method.solution.evaluations.double().mean():.0f}"
-            rows.append([scene_name, _label(name), *numbers, evaluations, f"{method.seconds.mean():.2g}"])
+            rows.append([scene_name, label_of(name), *numbers, evaluations])
     return rows
 
 
 def _over_trials(values: torch.Tensor, form: str) -> str:
     mean = f"{values.mean():{form}}"
     return mean if len(values) == 1 else f"{mean} ± {values.std():{form}}"
-
-
-def _label(method: str) -> str:
-    return METHOD_LABELS.get(method, method)
 
 
 def _table(rows: Iterable[Sequence[str]]) -> str:
@@ -159,9 +181,11 @@ def _head(results: StudyResult, command: str) -> str:
         "# Foci behind obstacles",
         f"Made by `{command}` with autdtorch {results.provenance.versions['autdtorch']}, begun "
         f"{results.provenance.date}.",
-        "Trials: " + ", ".join(f"{_label(name)} {_range(numbers)}" for name, numbers in counts.items()) + ".",
+        "Trials: "
+        + ", ".join(f"{label_of(name)} {_range(numbers)}" for name, numbers in counts.items())
+        + ".",
     ]
-    few = [_label(name) for name, numbers in counts.items() if name != LSSG and max(numbers) < _FEW_TRIALS]
+    few = [label_of(name) for name in (BO, GABS) if max(counts.get(name, [_FEW_TRIALS])) < _FEW_TRIALS]
     if few:
         lines[-1] += f" Few of {' and '.join(few)}, where the paper has 50: read close comparisons with care."
     return "\n\n".join(lines)
@@ -219,12 +243,24 @@ def _trial_figures(results: StudyResult, folder: Path) -> str:
     quantities["std among the foci [Pa]"] = _metric(methods, "std")
     plot_trials(quantities).savefig(folder / "fig3abc.png")
     history = {
-        scene: {name: method.solution.history for name, method in by_name.items()}
+        scene: {name: method.solution.history for name, method in by_name.items() if name != _BASELINE}
         for scene, by_name in methods.items()
     }
-    plot_convergence(history).savefig(folder / "fig3d.png")
+    levels = {name: _levels(results.scenes[name]) for name, by_name in history.items() if by_name}
+    if history := {name: history[name] for name in levels}:
+        plot_convergence(history, levels).savefig(folder / "fig3d.png")
     letters = ", ".join(f"({letter}) {label}" for letter, label in zip("abc", quantities, strict=False))
     return _FIG3.format(letters=letters)
+
+
+def _levels(scene: SceneResult) -> dict[str, float]:
+    """Scores that methods are compared with, by label."""
+    levels: dict[str, float] = {}
+    if scene.bound is not None:
+        levels |= {"bound": scene.bound, f"{NEAR_BOUND:.0%} of the bound": NEAR_BOUND * scene.bound}
+    if _BASELINE in scene.methods:
+        levels[label_of(_BASELINE)] = float(scene.methods[_BASELINE].solution.score.median())
+    return levels
 
 
 def _metric(
@@ -252,11 +288,45 @@ def _claims(results: StudyResult) -> str:
         if verdict is None:
             evidence, outcome = "", "no data"
         else:
-            evidence = verdict.evidence
+            evidence = "<br>".join(verdict.evidence)
             outcome = "**reproduced**" if verdict.holds else "**not reproduced**"
             outcome += "" if verdict.clear else ", but not clearly"
         rows.append([str(number), claim.text, claim.reading, evidence, outcome])
     return "\n\n".join(["## The paper's claims", _table(rows), _BELOW_CLAIMS])
+
+
+def _findings(results: StudyResult) -> str:
+    head = ["scene", "method", "trials", "score [Pa]", "gap to the bound [%]", "evaluations"]
+    rows = [[*head, f"to {NEAR_BOUND:.0%} of it", "s a trial"]]
+    for scene_name, scene in results.scenes.items():
+        if scene.bound is not None:
+            rows.append([scene_name, "*bound*", _NO_NUMBER, f"{scene.bound:.3g}", "0", *[_NO_NUMBER] * 3])
+        for name, method in scene.methods.items():
+            rows.append([scene_name, label_of(name), *_finding_cells(name, method, scene.bound)])
+    text = ["## Beyond the paper", _table(rows), _BELOW_FINDINGS]
+    without = all(scene.bound is None for scene in results.scenes.values())
+    text.append(_NO_BOUND if without else _ABOUT_BOUND)
+    if any(_BASELINE in scene.methods for scene in results.scenes.values()):
+        text.append(_ABOUT_BASELINE.format(label=label_of(_BASELINE).capitalize()))
+    return "\n\n".join(text)
+
+
+def _finding_cells(name: str, method: MethodResult, bound: float | None) -> list[str]:
+    finding = find(method, bound)
+    gap = _NO_NUMBER if finding.gap is None else str(finding.gap.mapped(lambda share: 100 * share))
+    evaluations, near = f"{method.solution.evaluations.double().mean():.0f}", _NO_NUMBER
+    if finding.evaluations_near is not None:
+        near = _median_of_reached(finding.evaluations_near)
+    if name == _BASELINE:
+        evaluations = near = _NO_NUMBER
+    return [str(method.trials), str(finding.score), gap, evaluations, near, f"{method.seconds.mean():.2g}"]
+
+
+def _median_of_reached(evaluations: torch.Tensor) -> str:
+    """The median, and how many trials got there if not all did; inf is a trial that did not."""
+    median, reached = float(np.median(evaluations.numpy())), int(evaluations.isfinite().sum())
+    shown = f"{median:g}" if math.isfinite(median) else _NO_NUMBER
+    return shown if reached == len(evaluations) else f"{shown} ({reached} of {len(evaluations)})"
 
 
 def _simulations(results: StudyResult) -> str:

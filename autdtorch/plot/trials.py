@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from typing import TypeAlias
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -24,12 +26,31 @@ from autdtorch.plot.style import (
 )
 from autdtorch.validation import ArrayLike, real_tensor
 
-# Okabe-Ito. The paper's methods have the same colour in every figure, any other takes the next one left over.
-_COLOURS = {"lssg": "#0072B2", "bayes_opt": "#D55E00", "gabs": "#009E73"}
-_SPARE_COLOURS = ("#CC79A7", "#56B4E9", "#E69F00", "#F0E442", "#000000")
+# Okabe-Ito. Our methods have the same colour in every figure, any other takes the next one left over.
+_COLOURS = {
+    "lssg": "#0072B2",
+    "bayes_opt": "#D55E00",
+    "gabs": "#009E73",
+    "identify": "#CC79A7",
+    "random_search": "#56B4E9",
+    "lss": "#E69F00",
+    "gradient_ascent": "#000000",
+}
+_SPARE_COLOURS = ("#882255", "#999933", "#999999")  # of Tol's muted scheme
 
 _Dashes: TypeAlias = tuple[float, tuple[float, ...]]
-_DASHES: tuple[_Dashes, ...] = ((0, ()), (0, (5, 1.5)), (0, (5, 1.5, 1, 1.5)), (0, (1, 1)))
+_DASHES: tuple[_Dashes, ...] = (
+    (0, ()),
+    (0, (5, 1.5)),
+    (0, (5, 1.5, 1, 1.5)),
+    (0, (1, 1)),
+    (0, (8, 1.5)),
+    (0, (3, 1, 1, 1, 1, 1)),
+)
+_LEVEL_COLOUR = "0.3"
+
+_WIDTH = 7.2  # of the trials' figure [inch]
+_LEGEND_COLUMN = 1.4  # inch
 
 
 @styled
@@ -52,8 +73,8 @@ def plot_trials(quantities: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
         raise ValueError("quantities: empty; must have at least one")
     methods = methods_of(values for scenes in quantities.values() for values in scenes.values())
     colours = _colours(methods)
-    figure = new_figure(0.6 + 2.7 * len(quantities), 3.5)
-    axes = figure.subplots(1, len(quantities), squeeze=False)[0]
+    figure = new_figure(_WIDTH, 0.6 + 1.9 * len(quantities))
+    axes = figure.subplots(len(quantities), squeeze=False)[:, 0]
     single = dict.fromkeys(methods, True)
     for letter, ax, (label, scenes) in zip("abcdefgh", axes, quantities.items(), strict=False):
         require_scenes(f"quantities[{label!r}]", scenes)
@@ -66,27 +87,26 @@ def plot_trials(quantities: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
         ax.set_xticks(range(len(scenes)), [readable(scene).replace(" ", "\n") for scene in scenes])
         ax.set_xlim(-0.5, len(scenes) - 0.5)
         ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]))
-        ax.set_xlabel("scene")
         ax.set_ylabel(label)
         ax.tick_params(labelsize=TICK_SIZE)
         if len(quantities) > 1:
             ax.set_title(f"({letter})", loc="left")
-    figure.legend(
-        handles=[
-            Line2D([], [], color=colours[method], marker="D", linestyle="none", label=label_of(method))
-            if single[method]
-            else Patch(facecolor=colours[method], alpha=0.6, edgecolor="black", label=label_of(method))
-            for method in methods
-        ],
-        loc="outside upper center",
-        ncols=len(methods),
-    )
+    axes[-1].set_xlabel("scene")
+    handles = [
+        Line2D([], [], color=colours[method], marker="D", linestyle="none", label=label_of(method))
+        if single[method]
+        else Patch(facecolor=colours[method], alpha=0.6, edgecolor="black", label=label_of(method))
+        for method in methods
+    ]
+    _add_legend(figure, handles)
     return figure
 
 
 @styled
 def plot_convergence(
-    history: Mapping[str, ByMethod], label: str = "best weakest focus so far [Pa]"
+    history: Mapping[str, ByMethod],
+    levels: Mapping[str, Mapping[str, float]] | None = None,
+    label: str = "best weakest focus so far [Pa]",
 ) -> Figure:
     """The paper's Fig. 3(d): best score so far against evaluations, a panel for each scene.
 
@@ -95,24 +115,35 @@ def plot_convergence(
 
     Args:
         history: by scene and method, `Solution.history` (trials, evaluations).
+        levels: by scene and label, scores to compare with; drawn across the panel.
         label: of the score, with its unit.
 
     Returns:
         The figure.
 
     Raises:
-        ValueError: no scene, or a history that is not (trials, evaluations) finite numbers.
+        ValueError: no scene, a history that is not (trials, evaluations) finite numbers, or levels of a scene
+            without history.
     """
     require_scenes("history", history)
+    levels = levels or {}
+    if unknown := levels.keys() - history.keys():
+        raise ValueError(
+            f"levels: of scenes {sorted(unknown)}; must be of scenes in history: {list(history)}"
+        )
+    level_labels = list(dict.fromkeys(name for by_label in levels.values() for name in by_label))
+    level_dashes = {name: _DASHES[index % len(_DASHES)] for index, name in enumerate(level_labels)}
     methods = methods_of(history.values())
     colours = _colours(methods)
     dashes = {method: _DASHES[index % len(_DASHES)] for index, method in enumerate(methods)}
-    figure = new_figure(0.6 + 2.7 * len(history), 3.1)
+    figure = new_figure(0.6 + 2.7 * len(history), 3.4)
     axes = figure.subplots(1, len(history), squeeze=False, sharey=True)[0]
     for ax, (scene, by_method) in zip(axes, history.items(), strict=True):
         for method, given in by_method.items():
             values = _values(f"history[{scene!r}][{method!r}]", given, "trials", "evaluations")
             _draw_history(ax, values, colours[method], dashes[method])
+        for name, level in levels.get(scene, {}).items():
+            ax.axhline(level, color=_LEVEL_COLOUR, linestyle=level_dashes[name], linewidth=1.0, zorder=1)
         ax.set_title(readable(scene))
         ax.set_xlim(left=0.0)
         ax.set_xlabel("evaluations")
@@ -120,16 +151,23 @@ def plot_convergence(
     # Once all panels are drawn: they share the axis, and a limit set earlier would keep it from growing.
     axes[0].set_ylim(bottom=min(0.0, axes[0].get_ylim()[0]))
     axes[0].set_ylabel(label)
-    figure.legend(
-        handles=[
-            Line2D([], [], color=colours[method], linestyle=dashes[method], label=label_of(method))
-            for method in methods
-        ],
-        title="median of the trials, band: 10th to 90th percentile",
-        loc="outside upper center",
-        ncols=len(methods),
-    )
+    handles = [
+        Line2D([], [], color=colours[method], linestyle=dashes[method], label=label_of(method))
+        for method in methods
+    ]
+    handles += [
+        Line2D([], [], color=_LEVEL_COLOUR, linestyle=level_dashes[name], linewidth=1.0, label=name)
+        for name in level_labels
+    ]
+    _add_legend(figure, handles, "median of the trials, band: 10th to 90th percentile")
     return figure
+
+
+def _add_legend(figure: Figure, handles: Sequence[Artist], title: str | None = None) -> None:
+    """A legend above all panels, in as many rows as its entries need."""
+    rows = math.ceil(len(handles) * _LEGEND_COLUMN / figure.get_figwidth())
+    columns = math.ceil(len(handles) / rows)
+    figure.legend(handles=handles, title=title, loc="outside upper center", ncols=columns)
 
 
 def _colours(methods: list[str]) -> dict[str, str]:

@@ -1,0 +1,94 @@
+"""Confidence intervals cover what they should, and claim nothing that so few trials cannot show."""
+
+import math
+import operator
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from autdtorch.intervals import CONFIDENCE, FEWEST_TRIALS, Interval, bootstrap, share_interval
+
+DRAWS = 200
+# Of 200 draws, each of which covers the truth with 95 %, fewer or more than these do in 1 of 1000 cases.
+LEAST, MOST = (int(stats.binom.ppf(tail, DRAWS, CONFIDENCE)) for tail in (1e-3, 1 - 1e-3))
+
+
+@pytest.mark.parametrize("trials", [FEWEST_TRIALS, 30])
+def test_intervals_cover_the_truth_as_often_as_they_say(trials: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("autdtorch.intervals._RESAMPLES", 999)  # enough for their mean coverage, and quick
+    generator = torch.Generator().manual_seed(3)
+    covered = dict.fromkeys(("mean", "median", "difference", "ratio"), 0)
+    for _ in range(DRAWS):
+        first, second = 5 + torch.randn(2, trials, dtype=torch.float64, generator=generator)
+        for name, truth, found in (
+            ("mean", 5.0, bootstrap(first)),
+            ("median", 5.0, bootstrap(first, average=np.median)),
+            ("difference", 0.0, bootstrap(first, second, combine=operator.sub)),
+            ("ratio", 1.0, bootstrap(first, second, combine=operator.truediv)),
+        ):
+            assert found.low <= found.value <= found.high
+            covered[name] += found.low <= truth <= found.high
+    assert LEAST >= 0.89 * DRAWS
+    assert all(LEAST <= count <= MOST for count in covered.values()), covered
+
+
+def test_the_interval_of_a_mean_is_about_that_of_students_t() -> None:
+    values = torch.randn(50, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    found = bootstrap(values)
+    exact = stats.t.interval(CONFIDENCE, 49, values.mean(), values.std() / math.sqrt(50))
+    # Ends from 4999 resamples scatter by 3 % of the half width; the bootstrap lacks a factor sqrt(49 / 50),
+    # for which its level makes up.
+    assert (found.low, found.high) == pytest.approx(exact, abs=0.1 * float(values.std()) / math.sqrt(50) * 2)
+
+
+def test_the_same_data_give_the_same_interval() -> None:
+    values = torch.rand(20, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    assert bootstrap(values) == bootstrap(values)
+
+
+def test_what_is_known_exactly_adds_no_uncertainty() -> None:
+    values = torch.rand(20, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    assert bootstrap(2.0, 3.0, combine=operator.sub) == Interval.exact(-1.0)
+    alone, shifted = bootstrap(values), bootstrap(values, 2.0, combine=operator.sub)
+    for end in ("value", "low", "high"):
+        assert getattr(shifted, end) == pytest.approx(getattr(alone, end) - 2.0, rel=1e-12)
+    assert bootstrap(torch.full((20,), 3.0)) == Interval.exact(3.0)
+
+
+def test_too_few_trials_have_no_interval() -> None:
+    many, few = torch.arange(20.0), torch.arange(FEWEST_TRIALS - 1.0)
+    assert (bootstrap(few).low, bootstrap(few).high) == (-math.inf, math.inf)
+    assert bootstrap(many, few, combine=operator.sub).high == math.inf
+    assert math.isfinite(bootstrap(torch.arange(float(FEWEST_TRIALS))).high)
+
+
+def test_a_share_of_all_trials_is_not_certain() -> None:
+    # Wilson's interval of n of n is [n / (n + z^2), 1].
+    every = share_interval(torch.ones(50, dtype=torch.bool))
+    assert (every.value, every.low, every.high) == pytest.approx((1.0, 50 / (50 + 1.96**2), 1.0), rel=1e-4)
+    none = share_interval(torch.zeros(50, dtype=torch.bool))
+    assert (none.low, none.high) == pytest.approx((0.0, 1 - every.low), abs=1e-12)
+    assert share_interval(torch.arange(4) < 1).value == 0.25
+
+
+def test_a_falling_function_turns_the_interval_around() -> None:
+    assert Interval(2.0, 1.0, 4.0).mapped(lambda value: -value) == Interval(-2.0, -4.0, -1.0)
+    assert Interval(2.0, -math.inf, math.inf).mapped(lambda value: 1 - value).low == -math.inf
+
+
+@pytest.mark.parametrize(
+    ("interval", "text"),
+    [
+        (Interval(1.2345, 1.1, 1.3), "1.23 [1.10, 1.30]"),
+        (Interval(-0.0123, -0.2, 0.1), "-0.012 [-0.200, 0.100]"),
+        (Interval(512.3, 498.0, 533.9), "512 [498, 534]"),
+        (Interval.unknown(1.2345), "1.23"),
+        (Interval.unknown(6.0), "6.00"),
+        (Interval.exact(241.0), "241"),
+        (Interval.exact(0.0), "0"),
+    ],
+)
+def test_numbers_have_three_digits(interval: Interval, text: str) -> None:
+    assert str(interval) == text
