@@ -37,13 +37,19 @@ class Interval:
     def __str__(self) -> str:
         """As "1.23 [1.10, 1.35]"; the number alone where it is exact or its interval unknown."""
         if self.low == self.high and self.value.is_integer():
-            return f"{self.value:.0f}"
+            return f"{self:.0f}"
         known = self.low < self.high < math.inf
         shown = (self.value, self.low, self.high) if known else (self.value,)
         largest = max(abs(number) for number in shown)
         digits = max(0, 2 - math.floor(math.log10(largest))) if largest else 0
-        value, *ends = (f"{number:.{digits}f}" for number in shown)
-        return f"{value} [{', '.join(ends)}]" if ends else value
+        return f"{self:.{digits}f}"
+
+    def __format__(self, form: str) -> str:
+        """The same, each number in the given form."""
+        if not form:
+            return str(self)
+        value, low, high = (format(number, form) for number in (self.value, self.low, self.high))
+        return f"{value} [{low}, {high}]" if self.low < self.high < math.inf else value
 
     @classmethod
     def exact(cls, value: float) -> Interval:

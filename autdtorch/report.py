@@ -24,6 +24,7 @@ REPORT_FILE = "report.md"
 
 _FEW_TRIALS = 20  # below this, the spread of a method is not well known
 _NO_NUMBER = "-"
+_NEAR = f"{100 * NEAR_BOUND:.0f} %"
 
 _BASELINE = "gradient_ascent"
 """The method that is no competitor but a line to compare with: it knows the transfer matrix."""
@@ -57,12 +58,12 @@ has no chance in it: its one trial is exact. *Not clearly*: an interval leaves t
 fewer than {FEWEST_TRIALS} trials, which have no interval. Every interval is of one comparison alone."""
 
 _BELOW_FINDINGS = f"""*Score*: pressure of the weakest focus, its median over the trials, in brackets with its
-95 % confidence interval (bootstrap; none for fewer than {FEWEST_TRIALS} trials). *s a trial*: mean time of the
-search alone, without simulation."""
+95 % confidence interval (bootstrap; none for fewer than {FEWEST_TRIALS} trials). *s a trial*: mean time of
+the search alone, without simulation."""
 
-_ABOUT_BOUND = f"""*Bound*: a certified upper bound on the score of any drive with amplitudes up to 1, from the
+_ABOUT_BOUND = f"""*Bound*: certified upper bound on the score of any drive with amplitudes up to 1, by the
 semidefinite relaxation. No method can be better, and the best drive may lie below it. *Gap*: 1 - score/bound.
-*To {NEAR_BOUND:.0%} of it*: evaluations until the best score so far was there, the median over the trials; in
+*To {_NEAR} of the bound*: evaluations until the best score so far was there, the median over the trials; in
 parentheses how many of them got there, if not all. A trial that did not counts as later than all that did;
 where that leaves the median open, there is a dash."""
 
@@ -160,6 +161,37 @@ def summary_rows(results: StudyResult) -> list[list[str]]:
     return rows
 
 
+def finding_rows(results: StudyResult) -> list[list[str]]:
+    """A table of how near to the bound the methods come and at what cost, its head first."""
+    head = ["scene", "method", "score [Pa]", "gap to the bound [%]", "evaluations"]
+    rows = [[*head, f"to {_NEAR} of the bound", "s a trial"]]
+    for scene_name, scene in results.scenes.items():
+        if scene.bound is not None:
+            rows.append([scene_name, "*bound*", f"{scene.bound:.3g}", "0", *[_NO_NUMBER] * 3])
+        for name, method in scene.methods.items():
+            rows.append([scene_name, label_of(name), *_finding_cells(name, method, scene.bound)])
+    return rows
+
+
+def _finding_cells(name: str, method: MethodResult, bound: float | None) -> list[str]:
+    finding = find(method, bound)
+    gap = _NO_NUMBER if finding.gap is None else f"{finding.gap.mapped(lambda share: 100 * share):.1f}"
+    evaluations, near = f"{method.solution.evaluations.double().mean():.0f}", _NO_NUMBER
+    if finding.evaluations_near is not None:
+        near = _median_of_reached(finding.evaluations_near)
+    if name == _BASELINE:
+        evaluations = near = _NO_NUMBER
+    return [str(finding.score), gap, evaluations, near, f"{method.seconds.mean():.2g}"]
+
+
+def _median_of_reached(evaluations: torch.Tensor) -> str:
+    """The median, and how many trials got there if not all did; inf is a trial that did not."""
+    median, reached = float(np.median(evaluations.numpy())), int(evaluations.isfinite().sum())
+    shown = f"{median:g}" if math.isfinite(median) else _NO_NUMBER
+    every = len(evaluations) in (1, reached)
+    return shown if every else f"{shown} ({reached} of {len(evaluations)})"
+
+
 def _over_trials(values: torch.Tensor, form: str) -> str:
     mean = f"{values.mean():{form}}"
     return mean if len(values) == 1 else f"{mean} ± {values.std():{form}}"
@@ -243,12 +275,15 @@ def _trial_figures(results: StudyResult, folder: Path) -> str:
     quantities["std among the foci [Pa]"] = _metric(methods, "std")
     plot_trials(quantities).savefig(folder / "fig3abc.png")
     history = {
-        scene: {name: method.solution.history for name, method in by_name.items() if name != _BASELINE}
+        scene: {
+            name: method.solution.history
+            for name, method in by_name.items()
+            if name != _BASELINE or len(by_name) == 1
+        }
         for scene, by_name in methods.items()
     }
-    levels = {name: _levels(results.scenes[name]) for name, by_name in history.items() if by_name}
-    if history := {name: history[name] for name in levels}:
-        plot_convergence(history, levels).savefig(folder / "fig3d.png")
+    levels = {name: _levels(scene) for name, scene in results.scenes.items()}
+    plot_convergence(history, levels).savefig(folder / "fig3d.png")
     letters = ", ".join(f"({letter}) {label}" for letter, label in zip("abc", quantities, strict=False))
     return _FIG3.format(letters=letters)
 
@@ -257,7 +292,7 @@ def _levels(scene: SceneResult) -> dict[str, float]:
     """Scores that methods are compared with, by label."""
     levels: dict[str, float] = {}
     if scene.bound is not None:
-        levels |= {"bound": scene.bound, f"{NEAR_BOUND:.0%} of the bound": NEAR_BOUND * scene.bound}
+        levels |= {"bound": scene.bound, f"{_NEAR} of the bound": NEAR_BOUND * scene.bound}
     if _BASELINE in scene.methods:
         levels[label_of(_BASELINE)] = float(scene.methods[_BASELINE].solution.score.median())
     return levels
@@ -296,37 +331,12 @@ def _claims(results: StudyResult) -> str:
 
 
 def _findings(results: StudyResult) -> str:
-    head = ["scene", "method", "trials", "score [Pa]", "gap to the bound [%]", "evaluations"]
-    rows = [[*head, f"to {NEAR_BOUND:.0%} of it", "s a trial"]]
-    for scene_name, scene in results.scenes.items():
-        if scene.bound is not None:
-            rows.append([scene_name, "*bound*", _NO_NUMBER, f"{scene.bound:.3g}", "0", *[_NO_NUMBER] * 3])
-        for name, method in scene.methods.items():
-            rows.append([scene_name, label_of(name), *_finding_cells(name, method, scene.bound)])
-    text = ["## Beyond the paper", _table(rows), _BELOW_FINDINGS]
+    text = ["## Beyond the paper", _table(finding_rows(results)), _BELOW_FINDINGS]
     without = all(scene.bound is None for scene in results.scenes.values())
     text.append(_NO_BOUND if without else _ABOUT_BOUND)
     if any(_BASELINE in scene.methods for scene in results.scenes.values()):
         text.append(_ABOUT_BASELINE.format(label=label_of(_BASELINE).capitalize()))
     return "\n\n".join(text)
-
-
-def _finding_cells(name: str, method: MethodResult, bound: float | None) -> list[str]:
-    finding = find(method, bound)
-    gap = _NO_NUMBER if finding.gap is None else str(finding.gap.mapped(lambda share: 100 * share))
-    evaluations, near = f"{method.solution.evaluations.double().mean():.0f}", _NO_NUMBER
-    if finding.evaluations_near is not None:
-        near = _median_of_reached(finding.evaluations_near)
-    if name == _BASELINE:
-        evaluations = near = _NO_NUMBER
-    return [str(method.trials), str(finding.score), gap, evaluations, near, f"{method.seconds.mean():.2g}"]
-
-
-def _median_of_reached(evaluations: torch.Tensor) -> str:
-    """The median, and how many trials got there if not all did; inf is a trial that did not."""
-    median, reached = float(np.median(evaluations.numpy())), int(evaluations.isfinite().sum())
-    shown = f"{median:g}" if math.isfinite(median) else _NO_NUMBER
-    return shown if reached == len(evaluations) else f"{shown} ({reached} of {len(evaluations)})"
 
 
 def _simulations(results: StudyResult) -> str:

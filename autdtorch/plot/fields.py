@@ -184,6 +184,9 @@ def _circle_points(ax: Axes, plane: Plane, points: torch.Tensor, cells: int) -> 
 
 
 def _add_colour_bar(figure: Figure, mesh: QuadMesh, axes: list[Axes], orientation: str) -> None:
-    bar = figure.colorbar(mesh, ax=axes, orientation=orientation, shrink=0.9, aspect=25)
+    part = min(0.15, 0.45 / len(axes))  # of the height of all axes together
+    bar = figure.colorbar(
+        mesh, ax=axes, orientation=orientation, shrink=0.9, aspect=25, fraction=part, pad=part / 3
+    )
     bar.set_label("|p| [Pa]")
     bar.ax.tick_params(labelsize=TICK_SIZE)

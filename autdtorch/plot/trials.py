@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -47,7 +47,12 @@ _DASHES: tuple[_Dashes, ...] = (
     (0, (8, 1.5)),
     (0, (3, 1, 1, 1, 1, 1)),
 )
-_LEVEL_COLOUR = "0.3"
+# The first is broad and pale, so that what lies on it is seen.
+_LEVELS: tuple[dict[str, Any], ...] = (
+    {"color": "0.75", "linewidth": 2.5, "linestyle": "-"},
+    {"color": "0.2", "linewidth": 1.0, "linestyle": (0, (5, 3))},
+    {"color": "0.2", "linewidth": 1.0, "linestyle": (0, (1, 1.5))},
+)
 
 _WIDTH = 7.2  # of the trials' figure [inch]
 _LEGEND_COLUMN = 1.4  # inch
@@ -73,7 +78,7 @@ def plot_trials(quantities: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
         raise ValueError("quantities: empty; must have at least one")
     methods = methods_of(values for scenes in quantities.values() for values in scenes.values())
     colours = _colours(methods)
-    figure = new_figure(_WIDTH, 0.6 + 1.9 * len(quantities))
+    figure = new_figure(_WIDTH, 0.7 + 2.1 * len(quantities))
     axes = figure.subplots(len(quantities), squeeze=False)[:, 0]
     single = dict.fromkeys(methods, True)
     for letter, ax, (label, scenes) in zip("abcdefgh", axes, quantities.items(), strict=False):
@@ -84,7 +89,7 @@ def plot_trials(quantities: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
                 position = column + 0.8 * ((methods.index(method) + 0.5) / len(methods) - 0.5)
                 _draw_trials(ax, values, position, 0.6 / len(methods), colours[method])
                 single[method] &= values.size == 1
-        ax.set_xticks(range(len(scenes)), [readable(scene).replace(" ", "\n") for scene in scenes])
+        ax.set_xticks(range(len(scenes)), [readable(scene) for scene in scenes])
         ax.set_xlim(-0.5, len(scenes) - 0.5)
         ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]))
         ax.set_ylabel(label)
@@ -132,7 +137,7 @@ def plot_convergence(
             f"levels: of scenes {sorted(unknown)}; must be of scenes in history: {list(history)}"
         )
     level_labels = list(dict.fromkeys(name for by_label in levels.values() for name in by_label))
-    level_dashes = {name: _DASHES[index % len(_DASHES)] for index, name in enumerate(level_labels)}
+    styles = {name: _LEVELS[index % len(_LEVELS)] for index, name in enumerate(level_labels)}
     methods = methods_of(history.values())
     colours = _colours(methods)
     dashes = {method: _DASHES[index % len(_DASHES)] for index, method in enumerate(methods)}
@@ -143,7 +148,7 @@ def plot_convergence(
             values = _values(f"history[{scene!r}][{method!r}]", given, "trials", "evaluations")
             _draw_history(ax, values, colours[method], dashes[method])
         for name, level in levels.get(scene, {}).items():
-            ax.axhline(level, color=_LEVEL_COLOUR, linestyle=level_dashes[name], linewidth=1.0, zorder=1)
+            ax.axhline(level, zorder=1, **styles[name])
         ax.set_title(readable(scene))
         ax.set_xlim(left=0.0)
         ax.set_xlabel("evaluations")
@@ -155,10 +160,7 @@ def plot_convergence(
         Line2D([], [], color=colours[method], linestyle=dashes[method], label=label_of(method))
         for method in methods
     ]
-    handles += [
-        Line2D([], [], color=_LEVEL_COLOUR, linestyle=level_dashes[name], linewidth=1.0, label=name)
-        for name in level_labels
-    ]
+    handles += [Line2D([], [], label=name, **styles[name]) for name in level_labels]
     _add_legend(figure, handles, "median of the trials, band: 10th to 90th percentile")
     return figure
 
@@ -184,7 +186,7 @@ def _values(name: str, given: ArrayLike, *axes: str) -> Array:
 
 def _draw_trials(ax: Axes, values: Array, position: float, width: float, colour: str) -> None:
     if values.size == 1:
-        ax.plot([position], values, linestyle="none", marker="D", markersize=6, color=colour)
+        ax.plot([position], values, linestyle="none", marker="D", markersize=6, color=colour, clip_on=False)
         return
     ax.boxplot(
         [values],
@@ -206,4 +208,4 @@ def _draw_history(ax: Axes, values: Array, colour: str, dashes: _Dashes) -> None
     if len(values) > 1:
         ax.fill_between(evaluations, low, high, color=colour, alpha=0.2, linewidth=0)
     ax.plot(evaluations, median, color=colour, linestyle=dashes, linewidth=1.5)
-    ax.plot(evaluations[-1:], median[-1:], marker="o", markersize=4, color=colour)
+    ax.plot(evaluations[-1:], median[-1:], marker="o", markersize=4, color=colour, clip_on=False)

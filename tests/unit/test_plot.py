@@ -199,6 +199,46 @@ def test_convergence_draws_median_and_10_to_90_percent_band() -> None:
     assert first.get_ylabel().endswith("[Pa]")
 
 
+def test_levels_are_drawn_across_their_scene() -> None:
+    history = {"empty": {"gabs": [[1.0, 2.0]]}, "two_cubes": {"gabs": [[1.0, 2.0]]}}
+    figure = plot_convergence(history, {"empty": {"bound": 4.0, "90 %": 3.6}, "two_cubes": {"bound": 5.0}})
+    for ax, expected in zip(figure.axes, ([4.0, 3.6], [5.0]), strict=True):
+        across = [line for line in ax.get_lines() if list(line.get_xdata()) == [0, 1]]  # of the width
+        assert [line.get_ydata()[0] for line in across] == expected
+        assert ax.get_ylim()[1] >= max(expected)
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels == ["GABS", "bound", "90 %"]
+
+
+METHODS = ("lssg", "bayes_opt", "gabs", "lss", "random_search", "identify", "gradient_ascent")
+
+
+def test_all_our_methods_have_colours_of_their_own() -> None:
+    figure = plot_convergence({"empty": {name: [[1.0, 2.0]] for name in METHODS}})
+    lines = figure.legends[0].get_lines()
+    assert len({line.get_color() for line in lines}) == len(METHODS) == len(lines)
+
+
+def test_nothing_is_cut_off_with_all_methods() -> None:
+    scenes = ("homogeneous", "three_cubes", "two_cubes")
+    values = {scene: {name: RANDOM.random(5) for name in METHODS} for scene in scenes}
+    history = {scene: {name: np.ones((2, 256)) for name in METHODS} for scene in scenes}
+    levels = {scene: {"bound": 4.0, "90 % of the bound": 3.6, "a third line": 3.0} for scene in scenes}
+    maps = {scene: {name: np.ones((3, 3)) for name in METHODS} for scene in scenes}
+    for figure in (
+        plot_trials({"mean pressure of the foci [Pa]": values, "area a focus [mm²]": values}),
+        plot_convergence(history, levels),
+        plot_planes(maps, dict.fromkeys(scenes, PLANE)),
+    ):
+        figure.draw_without_rendering()
+        drawn = figure.get_tightbbox()
+        width, height = figure.get_size_inches()
+        # A hundredth of an inch is 1.5 pixels, less than the edge of any line or letter.
+        assert min(drawn.x0, drawn.y0) >= -0.01
+        assert drawn.x1 <= width + 0.01
+        assert drawn.y1 <= height + 0.01
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -212,6 +252,7 @@ def test_convergence_draws_median_and_10_to_90_percent_band() -> None:
         (lambda: plot_trials({"f [1]": {"empty": {"gabs": [np.nan]}}}), "every entry must be finite"),
         (lambda: plot_convergence({"empty": {}}), "at least one method"),
         (lambda: plot_convergence({"empty": {"gabs": [1.0]}}), r"must be \(trials, evaluations\)"),
+        (lambda: plot_convergence({"empty": {"gabs": [[1.0]]}}, {"two": {}}), r"levels: of scenes \['two'\]"),
     ],
 )
 def test_bad_data_is_refused(call: object, message: str) -> None:

@@ -2,16 +2,19 @@
 
 import functools
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 from small_scenes import AIR, CUBE, small_scene
 
 import autdtorch.report
 from autdtorch.geometry import Plane
 from autdtorch.optim.gabs import gabs
 from autdtorch.optim.lssg import lssg
-from autdtorch.report import summary_rows, write_report
+from autdtorch.plot import plot_convergence
+from autdtorch.report import finding_rows, summary_rows, write_report
 from autdtorch.results import StudyResult
 from autdtorch.scene import Box, Scene
 from autdtorch.study import run_study
@@ -79,8 +82,8 @@ def test_no_number_is_missing_and_the_tables_are_whole(tmp_path: Path) -> None:
     assert not re.search(r"\bnan\b|\binf\b|None|[{}]", report)
     for table in tables(report):
         assert len({len(row) for row in table}) == 1
-    _, summary, claims, simulation = tables(report)
-    assert len(summary) == 2 + 2 * 3
+    _, summary, claims, beyond, simulation = tables(report)
+    assert len(summary) == len(beyond) == 2 + 2 * 3
     assert [row[-1] for row in claims[2:]].count("no data") == 0
     assert all(row[-1].startswith(("**reproduced**", "**not reproduced**")) for row in claims[2:])
     assert [row[0] for row in simulation[2:]] == ["homogeneous", "three_cubes"]
@@ -106,6 +109,68 @@ def test_the_table_gives_the_mean_over_the_trials(tmp_path: Path) -> None:
     assert gabs_row[6] == f"{1e6 * metrics.area.mean():.0f} ± {1e6 * metrics.area.std():.0f}"
     assert gabs_row[7] == str(1 + 3 * 4)
     assert lssg_row[3] == f"{results.scenes['a'].methods['lssg'].metrics.mean[0]:.2f}"
+
+
+def with_bound(results: StudyResult, bound: float) -> StudyResult:
+    scenes = {name: replace(result, bound=bound) for name, result in results.scenes.items()}
+    return replace(results, scenes=scenes)
+
+
+def test_the_gap_to_the_bound_is_told_for_every_method(tmp_path: Path) -> None:
+    results, report = reported({"a": scene()}, tmp_path, trials=7)
+    assert "need the extra `bound`" in report
+    assert all(row[3] == row[5] == "-" for row in finding_rows(results)[1:])
+
+    solution = results.scenes["a"].methods["gabs"].solution
+    median = float(solution.score.median())  # of seven trials, one of them
+    _, bound_row, lssg_row, _, gabs_row = finding_rows(with_bound(results, 2 * median))
+    assert bound_row[:4] == ["a", "*bound*", f"{2 * median:.3g}", "0"]
+    assert gabs_row[3].startswith("50.0")
+    assert gabs_row[4:6] == [str(1 + 3 * 4), "- (0 of 7)"]
+    assert lssg_row[5] == "-"
+
+
+def test_a_median_of_evaluations_is_told_where_more_than_half_of_the_trials_got_there(tmp_path: Path) -> None:
+    results, _ = reported({"a": scene()}, tmp_path, trials=7)
+    history = torch.ones(7, 5, dtype=torch.float64)
+    for reaching, after, text in (
+        (7, 3, "3"),
+        (5, 3, "3 (5 of 7)"),
+        (3, 3, "- (3 of 7)"),
+        (0, 3, "- (0 of 7)"),
+    ):
+        changed = history.clone()
+        changed[:reaching, after - 1 :] = 9.0
+        method = results.scenes["a"].methods["gabs"]
+        solution = replace(method.solution, history=changed, evaluations=torch.full((7,), 5))
+        results.scenes["a"].methods["gabs"] = replace(method, solution=solution)
+        assert finding_rows(with_bound(results, 10.0))[-1][5] == text
+
+
+def test_the_gradient_is_a_line_to_compare_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    results, report = reported({"a": scene()}, tmp_path, trials=2)
+    assert "no competitor" not in report
+    methods = results.scenes["a"].methods
+    methods["gradient_ascent"] = methods.pop("lssg")
+    score = float(methods["gradient_ascent"].solution.score)
+    drawn: list[object] = []
+
+    def record(*arguments: object) -> object:
+        drawn.extend(arguments)
+        return plot_convergence(*arguments)
+
+    monkeypatch.setattr(autdtorch.report, "plot_convergence", record)
+    write_report(with_bound(results, 2 * score), {"a": scene()}, tmp_path, "autdtorch")
+    row = finding_rows(with_bound(results, 2 * score))[-1]
+    assert (row[1], row[3], row[4], row[5]) == ("gradient ascent", "50.0", "-", "-")
+    history, levels = drawn
+    assert list(history["a"]) == ["bayes_opt", "gabs"]
+    assert levels["a"] == {
+        "bound": 2 * score,
+        "90 % of the bound": pytest.approx(1.8 * score),
+        "gradient ascent": score,
+    }
+    assert "Gradient ascent is a line to compare with" in (tmp_path / "report.md").read_text("utf-8")
 
 
 def test_a_scene_without_observation_plane_is_left_out_of_the_pictures_that_need_one(tmp_path: Path) -> None:
