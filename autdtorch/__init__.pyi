@@ -1,5 +1,6 @@
 from . import reference
 from .array import PAPER_SOURCE_STRENGTH, TransducerArray
+from .conditions import Dead, Drift, Noise, Quantised, true_pressure
 from .drive import amplitudes_of, drive_from_phases, focus_phases, phases_of
 from .freespace import green
 from .geometry import Plane, circle_points
@@ -9,7 +10,8 @@ from .obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
 from .optim.base import Solution
 from .optim.bayes import bayes_opt
 from .optim.gabs import gabs
-from .optim.lssg import lssg
+from .optim.lssg import lss, lssg
+from .optim.random_search import random_search
 from .plot import plot_convergence, plot_plane, plot_trials
 from .propagator import SteadyStateWarning, make_propagator
 from .results import load_results
@@ -21,13 +23,17 @@ __all__ = [
     "PAPER_SOURCE_STRENGTH",
     "Box",
     "Cylinder",
+    "Dead",
+    "Drift",
     "FocusMetrics",
     "Medium",
     "Mesh",
+    "Noise",
     "Objective",
     "Obstacle",
     "OverlapWarning",
     "Plane",
+    "Quantised",
     "Scene",
     "SimulatedObjective",
     "Solution",
@@ -45,13 +51,16 @@ __all__ = [
     "green",
     "load_results",
     "load_scene",
+    "lss",
     "lssg",
     "make_propagator",
     "phases_of",
     "plot_convergence",
     "plot_plane",
     "plot_trials",
+    "random_search",
     "reference",
+    "true_pressure",
     "view3d",
     "weakest_focus",
 ]

@@ -70,6 +70,11 @@ class SimulatedObjective:
         self._propagator = propagator
         self._transfer_matrix = propagator.transfer_matrix().cpu() if mode == "transfer" else None
 
+    @property
+    def transfer_matrix(self) -> torch.Tensor | None:
+        """G (P, M), complex [Pa], on the CPU; None in mode "replay"."""
+        return self._transfer_matrix
+
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
         """Observe the control points under each of several drives.
 
@@ -83,10 +88,7 @@ class SimulatedObjective:
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
         """
-        transducers = len(self.scene.array)
-        drive = validate_drive(drive, transducers).detach().cpu()
-        if drive.ndim != 2 or len(drive) == 0:
-            raise ValueError(f"drive: shape {tuple(drive.shape)}; must be (B, {transducers}) with B >= 1")
+        drive = validate_drives(drive, len(self.scene.array))
         self.evaluations += len(drive)
         if self._transfer_matrix is None:
             # One by one: given many drives at once, a propagator may take the transfer matrix as well.
@@ -95,6 +97,18 @@ class SimulatedObjective:
         # Not `drive @ G.T`: BLAS rounds by the number of rows, which a search through thousands of choices
         # amplifies until a trial depends on the trials beside it.
         return (drive[:, None, :] * self._transfer_matrix).sum(dim=-1).abs()
+
+
+def validate_drives(drive: torch.Tensor, transducers: int) -> torch.Tensor:
+    """Drives (B, M) to observe, complex128, on the CPU and without gradient, after checking them.
+
+    Raises:
+        ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+    """
+    drive = validate_drive(drive, transducers).detach().cpu()
+    if drive.ndim != 2 or len(drive) == 0:
+        raise ValueError(f"drive: shape {tuple(drive.shape)}; must be (B, {transducers}) with B >= 1")
+    return drive
 
 
 def weakest_focus(pressure: torch.Tensor) -> torch.Tensor:

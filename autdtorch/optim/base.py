@@ -9,6 +9,7 @@ from typing import TypeAlias
 import numpy as np
 import torch
 
+from autdtorch.conditions import playable
 from autdtorch.drive import amplitudes_of, phases_of
 from autdtorch.objective import Objective, Score
 from autdtorch.validation import integer_at_least, real_tensor
@@ -22,11 +23,12 @@ class Solution:
     """The best drive that each of T independent trials observed.
 
     Attributes:
-        drive: (T, M), complex128.
+        drive: (T, M), complex128, as it was played: on the levels of a `Quantised` objective.
         pressure: magnitudes at the P control points (T, P) [Pa], as observed for `drive`.
         score: (T,), as observed for `drive`; in Pa for the weakest focus.
         evaluations: number of evaluations (T,), int64.
-        history: best score so far after each evaluation (T, E).
+        history: best score so far after each evaluation (T, E). E is the most evaluations that the settings
+            allow; a trial that ended before keeps its last score.
     """
 
     drive: torch.Tensor
@@ -66,13 +68,15 @@ class Ledger:
         self._drive = torch.zeros(trials, transducers, dtype=torch.complex128)
         self._pressure = torch.zeros(trials, foci, dtype=torch.float64)
         self._best = torch.full((trials,), -torch.inf, dtype=torch.float64)
+        self._evaluations = torch.zeros(trials, dtype=torch.int64)
         self._scores: list[torch.Tensor] = []
 
-    def evaluate(self, drive: torch.Tensor) -> torch.Tensor:
+    def evaluate(self, drive: torch.Tensor, trials: torch.Tensor | None = None) -> torch.Tensor:
         """Evaluate B drives for each trial, all in one call of the objective.
 
         Args:
             drive: (T, B, M), complex128, B >= 1.
+            trials: places of the T trials that go on, all by default. One that is left out has ended.
 
         Returns:
             Scores (T, B), float64.
@@ -88,19 +92,37 @@ class Ledger:
         score = _observed("score", self._score(pressure))
         _require_shape("score", score, batch)
 
+        trials = torch.arange(len(self._best)) if trials is None else trials
         best, index = score.max(dim=1)
-        trial = torch.nonzero(best > self._best)[:, 0]
-        self._best[trial] = best[trial]
-        self._drive[trial] = drive[trial, index[trial]]
-        self._pressure[trial] = pressure[trial, index[trial]]
-        self._scores.append(score)
+        row = torch.nonzero(best > self._best[trials])[:, 0]
+        better = trials[row]
+        self._best[better] = best[row]
+        self._drive[better] = drive[row, index[row]]
+        self._pressure[better] = pressure[row, index[row]]
+        self._evaluations[trials] += batch[1]
+        everyone = torch.full((len(self._best), batch[1]), -torch.inf, dtype=torch.float64)
+        everyone[trials] = score
+        self._scores.append(everyone)
         return score
 
-    def solution(self) -> Solution:
-        """The best drive of each trial; at least one evaluation must have been made."""
+    @property
+    def evaluations(self) -> int:
+        """Evaluations so far of a trial that has not ended."""
+        return int(self._evaluations.max())
+
+    def solution(self, most: int | None = None) -> Solution:
+        """The best drive of each trial; at least one evaluation must have been made.
+
+        Args:
+            most: evaluations that a trial could have made, where trials may end early: with it the history
+                of a trial is as long whatever trials are run beside it.
+        """
         history = torch.cat(self._scores, dim=1).cummax(dim=1).values
-        evaluations = torch.full((len(history),), history.shape[1], dtype=torch.int64)
-        return Solution(self._drive.clone(), self._pressure.clone(), self._best.clone(), evaluations, history)
+        if most is not None:
+            ended = history[:, -1:].expand(-1, most - history.shape[1])
+            history = torch.cat([history, ended], dim=1)
+        drive = playable(self._objective, self._drive)
+        return Solution(drive, self._pressure.clone(), self._best.clone(), self._evaluations.clone(), history)
 
 
 def trial_seeds(seed: int, trials: Trials) -> list[int]:

@@ -2,31 +2,46 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
+from typing import Literal
 
 import torch
 
-from autdtorch.drive import drive_from_phases
 from autdtorch.objective import Objective, Score, weakest_focus
 from autdtorch.optim.base import Ledger, Solution, Trials, trial_seeds
-from autdtorch.validation import integer_at_least
+from autdtorch.optim.coordinates import repeat_passes, take_best_levels
+from autdtorch.validation import integer_at_least, invalid
 
 
 def gabs(
-    objective: Objective, levels: int = 16, trials: Trials = 1, seed: int = 0, score: Score = weakest_focus
+    objective: Objective,
+    levels: int = 16,
+    order: Literal["random", "given", "strength"] | Sequence[int] = "random",
+    first: int | None = None,
+    passes: int = 1,
+    trials: Trials = 1,
+    seed: int = 0,
+    score: Score = weakest_focus,
 ) -> Solution:
     """Switch on one transducer after the other, each with the best of `levels` phases (Algorithm 2).
 
-    Trials differ in the order of the transducers, which is random. All trials take a step together, in one
-    call of the objective of trials * levels rows.
+    All trials take a step together, in one call of the objective of trials * levels rows. Further passes go
+    through all M transducers again in the same order (coordinate ascent), while the others stay; a trial ends
+    early with a pass that changes nothing.
 
     A trial takes 1 + (M - 1) * levels evaluations: the first transducer alone, whose phase changes no
     magnitude, then `levels` for every further one. That is 241 for the paper's M = levels = 16; the paper
-    says M * levels, 256.
+    says M * levels, 256. The order "strength" takes M - 1 more, a further pass at most M * levels.
 
     Args:
         objective: what is evaluated.
         levels: number of phases in [0, 2 pi), >= 2.
+        order: of the transducers. "random" is another one in every trial; "given" that of the array, as
+            Algorithm 2 is written; "strength" by falling score of each transducer alone; or all their
+            indices. Trials differ in a random order only.
+        first: index of the transducer that comes first, the others after it in their order; None for the
+            first of the order.
+        passes: >= 1.
         trials: number of trials T, >= 1, or their numbers.
         seed: >= 0; trial t is the same for every number of trials.
         score: what is maximised.
@@ -39,23 +54,53 @@ def gabs(
         ValueError: an argument out of range, or the objective's pressures or scores are not finite.
     """
     levels = integer_at_least("levels", levels, 2)
+    passes = integer_at_least("passes", passes, 1)
     seeds = trial_seeds(seed, trials)
     transducers = len(objective.scene.array)
-    order = torch.stack([_random_order(transducers, own) for own in seeds])
-    choices = drive_from_phases(2 * math.pi * torch.arange(levels, dtype=torch.float64) / levels)
-    rows = torch.arange(len(seeds))
+    orders = _known_orders(order, transducers, seeds)
+    if first is not None and integer_at_least("first", first, 0) >= transducers:
+        raise invalid("first", first, f"must be an integer from 0 to {transducers - 1}")
 
     ledger = Ledger(objective, len(seeds), score)
-    drive = torch.zeros(len(seeds), transducers, dtype=torch.complex128)
-    drive[rows, order[:, 0]] = 1
-    ledger.evaluate(drive[:, None])
-    for transducer in order.T[1:]:
-        candidates = drive[:, None].repeat(1, levels, 1)
-        candidates[rows, :, transducer] = choices
-        best = ledger.evaluate(candidates).argmax(dim=1)
-        drive = candidates[rows, best]
-    return ledger.solution()
+    alone = torch.eye(transducers, dtype=torch.complex128)
+    if orders is None:
+        scores = ledger.evaluate(alone.expand(len(seeds), -1, -1))
+        orders = _with_first(scores.argsort(dim=1, descending=True, stable=True), first)
+    else:
+        orders = _with_first(orders, first)
+        ledger.evaluate(alone[orders[:, :1]])
+    drive = take_best_levels(ledger, alone[orders[:, 0]], orders[:, 1:], levels, _itself)
+    so_far = ledger.evaluations
+    repeat_passes(ledger, drive, orders, levels, passes - 1, _itself)
+    return ledger.solution(most=so_far + (passes - 1) * transducers * levels)
 
 
-def _random_order(transducers: int, seed: int) -> torch.Tensor:
-    return torch.randperm(transducers, generator=torch.Generator().manual_seed(seed))
+def _known_orders(order: str | Sequence[int], transducers: int, seeds: Sequence[int]) -> torch.Tensor | None:
+    """The order of each trial (T, M), or None for what only evaluations can tell."""
+    if order == "strength":
+        return None
+    if order == "random":
+        generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+        return torch.stack([torch.randperm(transducers, generator=own) for own in generators])
+    if order == "given":
+        indices = list(range(transducers))
+    elif isinstance(order, Sequence) and not isinstance(order, str):
+        indices = [integer_at_least(f"order[{place}]", index, 0) for place, index in enumerate(order)]
+    else:
+        indices = []
+    if sorted(indices) != list(range(transducers)):
+        accepted = f'must be "random", "given", "strength" or the indices 0 to {transducers - 1}, each once'
+        raise invalid("order", order, accepted)
+    return torch.tensor(indices).expand(len(seeds), -1)
+
+
+def _with_first(orders: torch.Tensor, first: int | None) -> torch.Tensor:
+    """`orders` (T, M) with the transducer `first` moved to the front."""
+    if first is None:
+        return orders
+    others = orders[orders != first].reshape(len(orders), -1)
+    return torch.cat([torch.full((len(orders), 1), first), others], dim=1)
+
+
+def _itself(drive: torch.Tensor) -> torch.Tensor:
+    return drive

@@ -1,18 +1,38 @@
-"""LSSG: the linear synthesis scheme with greedily searched offsets, the paper's baseline."""
+"""LSS, the linear synthesis scheme, and LSSG, its offsets searched greedily: the paper's baseline."""
 
 from __future__ import annotations
-
-import math
 
 import torch
 
 from autdtorch.drive import drive_from_phases, focus_phases, normalise
 from autdtorch.objective import Objective, Score, weakest_focus
 from autdtorch.optim.base import Ledger, Solution
+from autdtorch.optim.coordinates import repeat_passes
+from autdtorch.scene import Scene
 from autdtorch.validation import integer_at_least
 
 
-def lssg(objective: Objective, levels: int = 16, score: Score = weakest_focus) -> Solution:
+def lss(objective: Objective, score: Score = weakest_focus) -> Solution:
+    """Superpose the free-space drives of the single foci (Eq. 4, 5 and 6, all offsets 0): one evaluation.
+
+    The amplitudes are in [0, 1], not all 1.
+
+    Args:
+        objective: what is evaluated.
+        score: what is reported; nothing is searched.
+
+    Returns:
+        One trial: the method has no randomness.
+
+    Raises:
+        ValueError: the objective's pressure or score is not finite.
+    """
+    ledger = Ledger(objective, trials=1, score=score)
+    ledger.evaluate(normalise(_focus_drives(objective.scene).sum(dim=0))[None, None])
+    return ledger.solution()
+
+
+def lssg(objective: Objective, levels: int = 16, passes: int = 1, score: Score = weakest_focus) -> Solution:
     """Superpose the free-space drives of the single foci, with the best offset for each (Eq. 4, 5 and 6).
 
     The search starts from the linear synthesis scheme, all offsets 0, and goes through the foci once, in
@@ -21,29 +41,34 @@ def lssg(objective: Objective, levels: int = 16, score: Score = weakest_focus) -
     which is this one's: P * levels, 64 with 4 foci. Adding one focus after the other, as GABS does with
     transducers, would take `levels` fewer, but would score foci at which nothing aims yet.
 
+    Further passes go through the foci again, for P * levels evaluations each; the search ends early with a
+    pass that changes nothing.
+
     Obstacles enter through the observed scores alone, not through the phases of the foci. The amplitudes are
     in [0, 1], not all 1.
 
     Args:
         objective: what is evaluated.
         levels: number of offsets in [0, 2 pi), >= 2.
+        passes: >= 1.
         score: what is maximised.
 
     Returns:
         One trial: the method has no randomness.
 
     Raises:
-        ValueError: `levels` is not an integer >= 2, or the objective's pressures or scores are not finite.
+        ValueError: an argument out of range, or the objective's pressures or scores are not finite.
     """
     levels = integer_at_least("levels", levels, 2)
-    scene = objective.scene
-    foci = drive_from_phases(focus_phases(scene.array.positions, scene.control_points, scene.wavenumber))
-    offsets = drive_from_phases(2 * math.pi * torch.arange(levels, dtype=torch.float64) / levels)
+    passes = integer_at_least("passes", passes, 1)
+    foci = _focus_drives(objective.scene)
     ledger = Ledger(objective, trials=1, score=score)
-    weights = torch.ones(len(foci), dtype=torch.complex128)
-    for focus in range(len(foci)):
-        candidates = weights.repeat(levels, 1)
-        candidates[:, focus] = offsets
-        scores = ledger.evaluate(normalise(candidates @ foci)[None])
-        weights = candidates[scores[0].argmax()]
-    return ledger.solution()
+    start = torch.ones(1, len(foci), dtype=torch.complex128)
+    order = torch.arange(len(foci))[None]
+    repeat_passes(ledger, start, order, levels, passes, lambda weights: normalise(weights @ foci))
+    return ledger.solution(most=passes * len(foci) * levels)
+
+
+def _focus_drives(scene: Scene) -> torch.Tensor:
+    """Drives that aim at each focus in free space (P, M)."""
+    return drive_from_phases(focus_phases(scene.array.positions, scene.control_points, scene.wavenumber))
