@@ -169,7 +169,7 @@ class Drift(Condition):
     def _factors(self, walk: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Factors of the drives (..., M), and of the observed pressures (..., 1)."""
         transducers = len(self.scene.array)
-        phase, loss, sensor = torch.split(walk, (transducers, transducers, 1), dim=-1)
+        phase, loss, sensor = torch.split(walk, [transducers, transducers, 1], dim=-1)
         return drive_from_phases(phase, (-loss.abs()).exp()), sensor.exp()
 
 
