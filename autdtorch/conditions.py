@@ -72,7 +72,7 @@ class Quantised(Condition):
 
         Args:
             objective: what the device plays to.
-            levels: number of phases in [0, 2 pi), >= 2; 32 for SonicSurface and OpenMPD, 256 for AUTD3.
+            levels: number of phases in [0, 2 pi), >= 2; 32 for SonicSurface, 128 for OpenMPD, 256 for AUTD3.
             on_off: amplitudes of 0.5 and more become 1, others 0.
 
         Raises:

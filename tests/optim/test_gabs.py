@@ -9,21 +9,21 @@ from autdtorch.optim.gabs import gabs
 from autdtorch.optim.lssg import lssg
 
 
+def weakest(matrix, drive):
+    rows = matrix.tolist()
+    return min(abs(sum(g * q for g, q in zip(row, drive, strict=True))) for row in rows)
+
+
 def greedy_search(matrix, order, levels):
     """Algorithm 2 in plain Python: the final drive, and the best weakest focus seen on the way."""
     drive = [0j] * matrix.shape[1]
-
-    def weakest(drive):
-        rows = matrix.tolist()
-        return min(abs(sum(g * q for g, q in zip(row, drive, strict=True))) for row in rows)
-
     drive[order[0]] = 1 + 0j
-    seen = [weakest(drive)]
+    seen = [weakest(matrix, drive)]
     for transducer in order[1:]:
         tried = []
         for level in range(levels):
             drive[transducer] = cmath.exp(-2j * math.pi * level / levels)
-            tried.append((weakest(drive), drive[transducer]))
+            tried.append((weakest(matrix, drive), drive[transducer]))
         best = max(tried, key=lambda pair: pair[0])
         drive[transducer] = best[1]
         seen.append(best[0])
@@ -43,6 +43,80 @@ def test_same_as_a_plain_loop(make_objective, random_matrix, seed):
         if seen[-1] == max(seen):
             expected = torch.tensor(drive, dtype=torch.complex128)
             torch.testing.assert_close(solution.drive[trial], expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"order": "given"}, [0, 1, 2, 3]),
+        ({"order": "given", "first": 2}, [2, 0, 1, 3]),
+        ({"order": [3, 1, 0, 2]}, [3, 1, 0, 2]),
+        ({"order": (3, 1, 0, 2), "first": 0}, [0, 3, 1, 2]),
+    ],
+)
+def test_order_is_the_one_asked_for(make_objective, random_matrix, options, expected):
+    matrix = random_matrix(2, 4, 7)
+    solution = gabs(make_objective(matrix), levels=5, **options)
+    _, seen = greedy_search(matrix, expected, levels=5)
+    # The best so far after each transducer, which tells the orders apart.
+    best = [max(seen[: count + 1]) for count in range(4)]
+    assert solution.history[0, ::5].tolist() == pytest.approx(best, rel=1e-12)
+    assert solution.evaluations.tolist() == [1 + 3 * 5]
+
+
+def test_strongest_first_is_found_by_evaluations_which_count(make_objective, random_matrix):
+    matrix = random_matrix(2, 5, 8)
+    objective = make_objective(matrix)
+    solution = gabs(objective, levels=4, order="strength")
+    order = matrix.abs().amin(dim=0).argsort(descending=True).tolist()
+    drive, seen = greedy_search(matrix, order, levels=4)
+    assert solution.history[0, -1].item() == pytest.approx(max(seen), rel=1e-12)
+    assert solution.evaluations.tolist() == [5 + 4 * 4] == [objective.evaluations]
+
+
+def test_first_transducer_leads_every_random_order(make_objective, random_matrix):
+    matrix = random_matrix(1, 6, 9)
+    solution = gabs(make_objective(matrix), levels=4, first=3, trials=5)
+    torch.testing.assert_close(solution.history[:, 0], matrix[0, 3].abs().expand(5), rtol=1e-14, atol=0)
+    assert torch.equal(solution.drive[:, 3], torch.ones(5, dtype=torch.complex128))
+    assert len({tuple(row.tolist()) for row in solution.history}) > 1
+
+
+def test_a_trial_ends_where_no_single_transducer_can_improve(make_objective, random_matrix):
+    matrix, levels = random_matrix(3, 5, 4), 6
+    objective = make_objective(matrix)
+    solution = gabs(objective, levels=levels, passes=30, trials=6)
+    assert (solution.evaluations < 1 + 4 * levels + 29 * 5 * levels).all()
+    assert len(set(solution.evaluations.tolist())) > 1  # they end for themselves
+    assert objective.evaluations == solution.evaluations.sum()
+    for trial in range(6):
+        drive = solution.drive[trial].tolist()
+        for transducer in range(5):
+            for level in range(levels):
+                moved = drive.copy()
+                moved[transducer] = cmath.exp(-2j * math.pi * level / levels)
+                assert weakest(matrix, moved) <= solution.score[trial].item() * (1 + 1e-12)
+
+
+def test_further_passes_start_where_one_pass_ends(make_objective, random_matrix):
+    objective = make_objective(random_matrix(3, 6, 2))
+    one, three = (gabs(objective, levels=8, passes=passes, trials=10) for passes in (1, 3))
+    assert torch.equal(three.history[:, : one.history.shape[1]], one.history)
+    assert (three.score >= one.score).all()
+    assert (three.score > one.score).any()
+
+
+def test_a_trial_that_ends_early_keeps_its_last_score(make_objective, random_matrix):
+    objective = make_objective(random_matrix(2, 4, 5))
+    solution = gabs(objective, levels=4, passes=9, trials=8)
+    assert solution.history.shape == (8, 1 + 3 * 4 + 8 * 4 * 4)
+    for trial in range(8):
+        end = int(solution.evaluations[trial])
+        assert (solution.history[trial, end - 1 :] == solution.score[trial]).all()
+        alone = gabs(objective, levels=4, passes=9, trials=[trial])
+        assert torch.equal(alone.history[0], solution.history[trial])
+        assert torch.equal(alone.drive[0], solution.drive[trial])
+        assert torch.equal(alone.evaluations[0], solution.evaluations[trial])
 
 
 @pytest.mark.parametrize("levels", [3, 16])

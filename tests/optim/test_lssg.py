@@ -5,7 +5,7 @@ import torch
 
 from autdtorch.drive import drive_from_phases, focus_phases, normalise
 from autdtorch.objective import weakest_focus
-from autdtorch.optim.lssg import lssg
+from autdtorch.optim.lssg import lss, lssg
 
 
 def focus_drives(scene):
@@ -45,10 +45,34 @@ def test_common_offset_changes_nothing(make_objective, random_matrix):
 @pytest.mark.parametrize("seed", range(5))
 def test_never_worse_than_the_linear_synthesis_scheme(make_objective, random_matrix, seed):
     objective = make_objective(random_matrix(4, 6, seed))
-    start = normalise(focus_drives(objective.scene).sum(dim=0))
-    synthesis = weakest_focus(objective(start[None]))
     # The start is among the drives tried, but for the rounding of its sum.
-    assert lssg(objective).score >= synthesis * (1 - 1e-12)
+    assert lssg(objective).score >= lss(objective).score * (1 - 1e-12)
+
+
+def test_linear_synthesis_scheme_is_the_plain_sum_of_focus_drives(make_objective, random_matrix):
+    objective = make_objective(random_matrix(4, 6, 0))
+    solution = lss(objective)
+    assert torch.equal(solution.drive, normalise(focus_drives(objective.scene).sum(dim=0))[None])
+    assert solution.evaluations.tolist() == [1] == [objective.evaluations]
+    assert solution.history.shape == (1, 1)
+
+
+def test_further_passes_end_where_no_single_offset_can_improve(make_objective, random_matrix):
+    levels = 6
+    objective = make_objective(random_matrix(4, 6, 3))
+    solution = lssg(objective, levels, passes=40)
+    count = int(solution.evaluations)
+    assert count == objective.evaluations < 40 * 4 * levels
+    assert solution.history.shape == (1, 40 * 4 * levels)
+    assert (solution.history[0, count - 1 :] == solution.score).all()
+    assert torch.equal(solution.history[:, : 4 * levels], lssg(objective, levels).history)
+    drives = focus_drives(objective.scene)
+    weights = torch.linalg.lstsq(drives.T, solution.drive[0]).solution
+    for focus in range(4):
+        moved = weights.repeat(levels, 1)
+        moved[:, focus] *= drive_from_phases(2 * math.pi * torch.arange(levels) / levels)
+        # Six equations for four weights, solved to rounding.
+        assert (weakest_focus(objective(normalise(moved @ drives))) <= solution.score * (1 + 1e-9)).all()
 
 
 def test_evaluations_are_the_papers_64(paper_objective):

@@ -8,9 +8,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from autdtorch.conditions import Quantised
 from autdtorch.optim.bayes import bayes_opt
 from autdtorch.optim.gabs import gabs
-from autdtorch.optim.lssg import lssg
+from autdtorch.optim.lssg import lss, lssg
+from autdtorch.optim.random_search import random_search
 
 
 def small_bayes_opt(objective, **options):
@@ -19,8 +21,15 @@ def small_bayes_opt(objective, **options):
 
 METHODS = pytest.mark.parametrize(
     "method",
-    [lssg, partial(gabs, trials=2), partial(small_bayes_opt, trials=2)],
-    ids=["lssg", "gabs", "bayes_opt"],
+    [
+        lss,
+        lssg,
+        partial(gabs, trials=2),
+        partial(gabs, order="strength", trials=2),
+        partial(small_bayes_opt, trials=2),
+        partial(random_search, evaluations=70, trials=2),
+    ],
+    ids=["lss", "lssg", "gabs", "gabs by strength", "bayes_opt", "random_search"],
 )
 
 
@@ -48,6 +57,19 @@ def test_solution_is_consistent(make_objective, random_matrix, method):
 
 
 @METHODS
+@pytest.mark.parametrize("on_off", [False, True])
+def test_on_a_device_of_few_levels_the_drive_is_the_one_it_played(
+    make_objective, random_matrix, method, on_off
+):
+    inner = make_objective(random_matrix(3, 5, 0))
+    solution = method(Quantised(inner, 6, on_off))
+    steps = solution.phases * 6 / (2 * math.pi)
+    torch.testing.assert_close(steps, steps.round(), rtol=0, atol=1e-12)
+    # Played without the wrapper it gives what was observed; both roundings of an amplitude differ.
+    torch.testing.assert_close(inner(solution.drive), solution.pressure, rtol=1e-12, atol=0)
+
+
+@METHODS
 def test_same_again_and_no_global_random_state(make_objective, random_matrix, method):
     matrix = random_matrix(3, 5, 0)
     torch.manual_seed(1)
@@ -60,7 +82,11 @@ def test_same_again_and_no_global_random_state(make_objective, random_matrix, me
     assert torch.equal(first.history, again.history)
 
 
-@pytest.mark.parametrize("method", [gabs, small_bayes_opt], ids=["gabs", "bayes_opt"])
+@pytest.mark.parametrize(
+    "method",
+    [gabs, partial(gabs, passes=3), small_bayes_opt, partial(random_search, evaluations=70)],
+    ids=["gabs", "gabs, 3 passes", "bayes_opt", "random_search"],
+)
 def test_a_trial_depends_on_its_seed_and_not_on_the_trials_beside_it(make_objective, random_matrix, method):
     objective = make_objective(random_matrix(3, 6, 0))
     many = method(objective, trials=4, seed=3)
@@ -93,6 +119,18 @@ def test_phases_at_the_control_points_are_never_seen(make_objective, random_matr
     [
         (lssg, {"levels": 1}, "levels: 1; must be an integer >= 2"),
         (lssg, {"levels": 16.0}, r"levels: 16\.0; must be an integer >= 2"),
+        (lssg, {"passes": 0}, "passes: 0; must be an integer >= 1"),
+        (gabs, {"passes": 1.5}, r"passes: 1\.5; must be an integer >= 1"),
+        (gabs, {"order": "loudest"}, 'order: \'loudest\'; must be "random", "given", "strength" or'),
+        (gabs, {"order": [0, 1, 2, 3]}, r"order: .0, 1, 2, 3.; must be .* the indices 0 to 4, each once"),
+        (gabs, {"order": [0, 1, 2, 3, 3]}, r"order: .0, 1, 2, 3, 3.; must be"),
+        (gabs, {"order": [0, 1, 2, 3, 4.0]}, r"order\[4\]: 4\.0; must be an integer >= 0"),
+        (gabs, {"order": None}, "order: None; must be"),
+        (gabs, {"first": 5}, "first: 5; must be an integer from 0 to 4"),
+        (gabs, {"first": -1}, "first: -1; must be an integer >= 0"),
+        (random_search, {"evaluations": 0}, "evaluations: 0; must be an integer >= 1"),
+        (random_search, {"levels": 1}, "levels: 1; must be an integer >= 2"),
+        (random_search, {"trials": 0}, "trials: 0; must be an integer >= 1"),
         (gabs, {"levels": 0}, "levels: 0; must be an integer >= 2"),
         (gabs, {"trials": 0}, "trials: 0; must be an integer >= 1"),
         (gabs, {"trials": True}, "trials: True; must be an integer"),

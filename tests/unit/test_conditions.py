@@ -1,0 +1,273 @@
+"""What real conditions do to an objective."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import kstest, rice
+from small_scenes import small_scene
+
+from autdtorch.conditions import Condition, Dead, Drift, Noise, Quantised, playable, true_pressure
+from autdtorch.drive import drive_from_phases
+from autdtorch.objective import Objective, SimulatedObjective
+from autdtorch.optim.gabs import gabs
+from autdtorch.propagator import FreeSpacePropagator
+
+SCENE = small_scene()  # 4 transducers, 3 control points
+
+phases = st.lists(st.floats(-10, 10), min_size=4, max_size=4)
+amplitudes = st.lists(st.floats(0, 1), min_size=4, max_size=4)
+
+
+class Recorder:
+    """Hears 1 Pa everywhere and notes what it is asked for."""
+
+    def __init__(self) -> None:
+        self.scene = SCENE
+        self.evaluations = 0
+        self.drives: list[torch.Tensor] = []
+
+    def __call__(self, drive: torch.Tensor) -> torch.Tensor:
+        self.evaluations += len(drive)
+        self.drives.append(drive)
+        return torch.ones(len(drive), 3, dtype=torch.float64)
+
+    @property
+    def heard(self) -> torch.Tensor:
+        return torch.cat(self.drives)
+
+
+@pytest.fixture
+def simulated() -> SimulatedObjective:
+    return SimulatedObjective(SCENE, FreeSpacePropagator(SCENE))
+
+
+def random_drive(rows: int, seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return drive_from_phases(6.28 * torch.rand(rows, 4, dtype=torch.float64, generator=generator))
+
+
+def fully_on(rows: int) -> torch.Tensor:
+    return torch.ones(rows, 4, dtype=torch.complex128)
+
+
+@pytest.mark.parametrize("snr", [30.0, 6.0, 0.0, -10.0])
+def test_readings_are_rice_distributed(snr: float) -> None:
+    count = 20000
+    noise = Noise(Recorder(), snr, seed=3, reference=1.0)
+    readings = noise(fully_on(count))[:, 1].numpy()
+    part = 10 ** (-snr / 20) / math.sqrt(2)  # deviation of the real and of the imaginary part
+    expected = rice(1 / part, scale=part)
+    # The seed is fixed. 4 standard errors, and the 0.1 % point of the Kolmogorov-Smirnov statistic.
+    assert abs(readings.mean() - expected.mean()) < 4 * expected.std() / math.sqrt(count)
+    assert kstest(readings, expected.cdf).statistic < 1.95 / math.sqrt(count)
+
+
+def test_noise_at_control_points_and_rows_is_independent() -> None:
+    readings = Noise(Recorder(), 20, reference=1.0)(fully_on(20000))
+    # Deviation of an estimated correlation: 1 / sqrt(samples); 4 of them.
+    points = torch.corrcoef(readings.T) - torch.eye(3)
+    rows = torch.corrcoef(torch.stack([readings[:-1, 0], readings[1:, 0]]))[0, 1]
+    assert points.abs().max() < 4 / math.sqrt(20000)
+    assert abs(rows) < 4 / math.sqrt(20000)
+
+
+def test_default_reference_is_the_rms_pressure_under_random_phases(simulated: SimulatedObjective) -> None:
+    sigma = Noise(Quantised(Dead(simulated, [0]), 4), snr=20).sigma
+    squares = simulated(random_drive(20000)).square().mean(dim=1)
+    # 4 standard errors of the mean square, halved by the root.
+    error = 2 * (squares.std() / squares.mean()).item() / math.sqrt(20000)
+    assert 10 * sigma == pytest.approx(squares.mean().sqrt().item(), rel=error)
+
+
+def test_reference_must_be_given_where_nothing_tells_it(simulated: SimulatedObjective) -> None:
+    replayed = SimulatedObjective(SCENE, FreeSpacePropagator(SCENE), mode="replay")
+    for objective in (replayed, Recorder(), Dead(replayed, [1])):
+        with pytest.raises(ValueError, match="reference: None Pa; must be given where .* no transfer matrix"):
+            Noise(objective, 20)
+        assert Noise(objective, 20, reference=2.0).sigma == pytest.approx(0.2)
+
+
+def test_reads_are_averaged_and_counted() -> None:
+    recorder = Recorder()
+    noise = Noise(recorder, 20, reads=25, reference=1.0)
+    assert noise(fully_on(2000)).shape == (2000, 3)
+    assert noise.evaluations == recorder.evaluations == 50000
+    one, many = Noise(Recorder(), 20, reference=1.0)(fully_on(2000)), noise(fully_on(2000))
+    # A deviation of n samples is known to 1 / sqrt(2 n): 4 of that, for each of the two.
+    assert (one.std() / many.std()).item() == pytest.approx(5, rel=8 / math.sqrt(2 * 6000))
+
+
+def test_noise_far_below_the_pressure_changes_nothing(simulated: SimulatedObjective) -> None:
+    drive = random_drive(10)
+    noisy = Noise(simulated, 400)(drive)
+    # Noise of 1e-20 of the reference: below rounding.
+    torch.testing.assert_close(noisy, simulated(drive), rtol=1e-14, atol=0)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda inner, seed: Noise(inner, 20, seed=seed, reference=1.0),
+        lambda inner, seed: Noise(inner, 20, reads=3, seed=seed, reference=1.0),
+        lambda inner, seed: Drift(inner, phase=0.3, loss=0.2, sensor=0.1, seed=seed),
+    ],
+    ids=["noise", "reads", "drift"],
+)
+def test_randomness_follows_from_the_seed_however_the_rows_are_divided(
+    make: type, simulated: SimulatedObjective
+) -> None:
+    drive = random_drive(40)
+    torch.manual_seed(1)
+    state = torch.get_rng_state()
+    together = make(simulated, 5)(drive)
+    assert torch.equal(torch.get_rng_state(), state)
+    objective = make(simulated, 5)
+    divided = torch.cat([objective(part) for part in drive.split([1, 7, 32])])
+    # A walk is summed up in other groups.
+    torch.testing.assert_close(divided, together, rtol=1e-12, atol=0)
+    assert not torch.allclose(make(simulated, 6)(drive), together)
+
+
+def test_noise_and_drift_of_one_seed_are_unrelated() -> None:
+    recorder = Recorder()
+    Drift(recorder, phase=1.0, seed=4)(fully_on(3000))
+    steps = torch.diff(recorder.heard[:, 0].angle())
+    readings = Noise(Recorder(), 40, seed=4, reference=1.0)(fully_on(3000))[1:, 0]
+    # 4 / sqrt(samples), as above.
+    assert abs(torch.corrcoef(torch.stack([steps, readings]))[0, 1]) < 4 / math.sqrt(3000)
+
+
+@given(phases=phases, amplitudes=amplitudes, levels=st.integers(2, 256), on_off=st.booleans())
+def test_quantised_is_the_nearest_and_stays(
+    phases: list[float], amplitudes: list[float], levels: int, on_off: bool
+) -> None:
+    device = Quantised(Recorder(), levels, on_off)
+    drive = drive_from_phases([phases], [amplitudes])
+    played = device.emitted(drive)
+    steps = torch.remainder(-played.angle(), 2 * math.pi) * levels / (2 * math.pi)
+    torch.testing.assert_close(steps, steps.round(), rtol=0, atol=1e-9)
+    sounding = (played != 0) & (drive != 0)
+    assert ((played / drive)[sounding].angle().abs() <= math.pi / levels + 1e-12).all()
+    expected = (drive.abs() >= 0.5).double() if on_off else drive.abs()
+    torch.testing.assert_close(played.abs(), expected, rtol=1e-14, atol=0)
+    torch.testing.assert_close(device.emitted(played), played, rtol=1e-12, atol=0)
+
+
+def test_levels_that_are_the_devices_are_played_as_they_are(simulated: SimulatedObjective) -> None:
+    plain = gabs(simulated, levels=16, trials=3)
+    device = gabs(Quantised(simulated, 32, on_off=True), levels=16, trials=3)
+    # The same phases but for their last digit.
+    torch.testing.assert_close(device.drive, plain.drive, rtol=0, atol=1e-14)
+    torch.testing.assert_close(device.history, plain.history, rtol=1e-13, atol=0)
+
+
+def test_dead_transducers_are_silent_and_nobody_is_told() -> None:
+    recorder = Recorder()
+    broken = Dead(recorder, [0, 2])
+    drive = random_drive(3)
+    broken(drive)
+    assert torch.equal(recorder.heard[:, [0, 2]], torch.zeros(3, 2, dtype=torch.complex128))
+    assert torch.equal(recorder.heard[:, [1, 3]], drive[:, [1, 3]])
+    assert torch.equal(playable(broken, drive), drive)
+
+
+def test_drift_has_the_stated_rms_after_1000_evaluations() -> None:
+    ends = []
+    for seed in range(100):
+        recorder = Recorder()
+        readings = Drift(recorder, phase=0.2, loss=0.1, sensor=0.05, seed=seed)(fully_on(1000))
+        ends.append((recorder.heard[-1], readings[-1]))
+    drives, readings = (torch.stack(part) for part in zip(*ends, strict=True))
+    # Deviations of 400 and of 100 samples, each known to 1 / sqrt(2 n); 4 of that.
+    few, many = 4 / math.sqrt(200), 4 / math.sqrt(800)
+    assert drives.angle().square().mean().sqrt().item() == pytest.approx(0.2, rel=many)
+    assert drives.abs().log().square().mean().sqrt().item() == pytest.approx(0.1, rel=many)
+    assert readings[:, 0].log().square().mean().sqrt().item() == pytest.approx(0.05, rel=few)
+    assert torch.equal(readings[:, 0], readings[:, 1])
+    assert (drives.abs() <= 1).all()
+
+
+def test_drift_is_slow_and_begins_at_the_undrifted(simulated: SimulatedObjective) -> None:
+    drift = Drift(simulated, phase=0.3)
+    drive = random_drive(1)
+    # One step has an rms of 0.3 / sqrt(1000) = 0.0095 rad a transducer; 5 of them, at the foci's terms.
+    bound = 5 * 0.0095 * simulated.transfer_matrix.abs().sum(dim=1)
+    assert ((drift(drive) - simulated(drive)).abs() <= bound).all()
+
+
+def test_true_pressure_keeps_the_device_and_drops_the_sensor(simulated: SimulatedObjective) -> None:
+    drift = Drift(Dead(simulated, [1]), phase=0.5, loss=0.2, sensor=0.5, seed=1)
+    objective = Noise(Quantised(drift, 8), 10, reads=2, seed=1)
+    drive = random_drive(50)
+    objective(drive)
+    counts = [objective.evaluations, drift.evaluations]
+    emitted = drift.emitted(Quantised(Recorder(), 8).emitted(drive)) * torch.tensor([1.0, 0, 1, 1])
+    true = true_pressure(objective, drive)
+    # Other roundings of the same factors.
+    torch.testing.assert_close(true, simulated(emitted), rtol=1e-12, atol=0)
+    assert [objective.evaluations, drift.evaluations] == counts == [100, 100]
+    assert torch.equal(true_pressure(simulated, drive), simulated(drive))
+    assert not torch.allclose(true, simulated(drive), rtol=1e-2)
+
+
+def test_a_solution_is_on_the_levels_of_the_device_but_knows_no_fault(simulated: SimulatedObjective) -> None:
+    objective = Noise(Quantised(Drift(Dead(simulated, [1]), phase=0.5), 8, on_off=True), 20)
+    solution = gabs(objective, levels=16, trials=2)
+    steps = solution.phases * 8 / (2 * math.pi)
+    torch.testing.assert_close(steps, steps.round(), rtol=0, atol=1e-12)
+    assert objective.evaluations == solution.evaluations.sum()
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        Condition,
+        lambda inner: Noise(inner, 20, reads=2),
+        lambda inner: Quantised(inner, 4),
+        lambda inner: Dead(inner, [0]),
+        lambda inner: Drift(inner, phase=0.1),
+    ],
+    ids=["none", "noise", "quantised", "dead", "drift"],
+)
+def test_a_drive_that_no_array_can_play_is_refused_and_not_counted(
+    make: type, simulated: SimulatedObjective
+) -> None:
+    objective: Objective = make(simulated)
+    for wrong in (random_drive(2)[:, :3], random_drive(2)[0], 2 * random_drive(2), random_drive(2).real):
+        with pytest.raises(ValueError, match="drive"):
+            objective(wrong)
+        with pytest.raises(ValueError, match="drive"):
+            true_pressure(objective, wrong)
+    assert objective.evaluations == simulated.evaluations == 0
+    assert objective.scene is SCENE
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda o: Noise(o, math.inf), "snr: inf dB; must be finite"),
+        (lambda o: Noise(o, "20"), "snr: '20'; must be a real number"),
+        (lambda o: Noise(o, 20, reads=0), "reads: 0; must be an integer >= 1"),
+        (lambda o: Noise(o, 20, seed=-1), "seed: -1; must be an integer >= 0"),
+        (lambda o: Noise(o, 20, reference=0.0), r"reference: 0\.0 Pa; must be finite and > 0"),
+        (lambda o: Quantised(o, 1), "levels: 1; must be an integer >= 2"),
+        (lambda o: Quantised(o, 4, on_off=1), "on_off: 1; must be true or false"),
+        (lambda o: Dead(o, []), r"transducers: \(\); must be indices from 0 to 3, each once"),
+        (lambda o: Dead(o, [4]), r"transducers: \(4,\); must be indices from 0 to 3"),
+        (lambda o: Dead(o, [1, 1]), r"transducers: \(1, 1\); must be indices"),
+        (lambda o: Dead(o, [-1]), r"transducers\[0\]: -1; must be an integer >= 0"),
+        (lambda o: Dead(o, 2), "transducers: 2; must be indices"),
+        (lambda o: Drift(o, phase=-0.1), r"phase: -0\.1 rad; must be finite and >= 0"),
+        (lambda o: Drift(o, loss=math.nan), "loss: nan; must be finite"),
+        (lambda o: Drift(o, sensor="much"), "sensor: 'much'; must be a real number"),
+        (lambda o: Drift(o, seed=0.5), r"seed: 0\.5; must be an integer >= 0"),
+    ],
+)
+def test_bad_arguments_are_named(make: type, message: str, simulated: SimulatedObjective) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(simulated)
