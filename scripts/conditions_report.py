@@ -13,12 +13,12 @@ from matplotlib.figure import Figure
 from autdtorch.plot.style import TICK_SIZE, new_figure, readable, styled
 
 AXES = {
-    "signal to noise [dB]": {
+    "signal-to-noise ratio [dB]": {
         "10": "SNR 10 dB",
         "20": "SNR 20 dB",
         "30": "SNR 30 dB",
         "40": "SNR 40 dB",
-        "none": "undisturbed",
+        r"$\infty$": "undisturbed",
     },
     "phase levels": {
         "2": "2 levels",

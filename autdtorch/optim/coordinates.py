@@ -3,12 +3,34 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 
 from autdtorch.drive import drive_from_phases
 from autdtorch.optim.base import Ledger
+from autdtorch.validation import integer_at_least, invalid
+
+
+def indices_of(order: str | Sequence[int], count: int, names: Sequence[str] = ("given",)) -> torch.Tensor:
+    """Indices (count,) of an `order`, which is "given", from 0 on, or all indices themselves.
+
+    Args:
+        order: as the user gave it.
+        count: number of what is ordered.
+        names: what the order may be called, for the message.
+
+    Raises:
+        ValueError: anything else.
+    """
+    if order == "given":
+        return torch.arange(count)
+    if isinstance(order, Sequence) and not isinstance(order, str):
+        indices = [integer_at_least(f"order[{place}]", index, 0) for place, index in enumerate(order)]
+        if sorted(indices) == list(range(count)):
+            return torch.tensor(indices)
+    named = ", ".join(f'"{name}"' for name in names)
+    raise invalid("order", order, f"must be {named} or the indices 0 to {count - 1}, each once")
 
 
 def take_best_levels(

@@ -9,7 +9,7 @@ import torch
 
 from autdtorch.objective import Objective, Score, weakest_focus
 from autdtorch.optim.base import Ledger, Solution, Trials, trial_seeds
-from autdtorch.optim.coordinates import repeat_passes, take_best_levels
+from autdtorch.optim.coordinates import indices_of, repeat_passes, take_best_levels
 from autdtorch.validation import integer_at_least, invalid
 
 
@@ -82,16 +82,7 @@ def _known_orders(order: str | Sequence[int], transducers: int, seeds: Sequence[
     if order == "random":
         generators = [torch.Generator().manual_seed(seed) for seed in seeds]
         return torch.stack([torch.randperm(transducers, generator=own) for own in generators])
-    if order == "given":
-        indices = list(range(transducers))
-    elif isinstance(order, Sequence) and not isinstance(order, str):
-        indices = [integer_at_least(f"order[{place}]", index, 0) for place, index in enumerate(order)]
-    else:
-        indices = []
-    if sorted(indices) != list(range(transducers)):
-        accepted = f'must be "random", "given", "strength" or the indices 0 to {transducers - 1}, each once'
-        raise invalid("order", order, accepted)
-    return torch.tensor(indices).expand(len(seeds), -1)
+    return indices_of(order, transducers, ("random", "given", "strength")).expand(len(seeds), -1)
 
 
 def _with_first(orders: torch.Tensor, first: int | None) -> torch.Tensor:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Literal
+
 import torch
 
 from autdtorch.drive import drive_from_phases, focus_phases, normalise
 from autdtorch.objective import Objective, Score, weakest_focus
 from autdtorch.optim.base import Ledger, Solution
-from autdtorch.optim.coordinates import repeat_passes
+from autdtorch.optim.coordinates import indices_of, repeat_passes
 from autdtorch.scene import Scene
 from autdtorch.validation import integer_at_least
 
@@ -32,7 +35,13 @@ def lss(objective: Objective, score: Score = weakest_focus) -> Solution:
     return ledger.solution()
 
 
-def lssg(objective: Objective, levels: int = 16, passes: int = 1, score: Score = weakest_focus) -> Solution:
+def lssg(
+    objective: Objective,
+    levels: int = 16,
+    order: Literal["given"] | Sequence[int] = "given",
+    passes: int = 1,
+    score: Score = weakest_focus,
+) -> Solution:
     """Superpose the free-space drives of the single foci, with the best offset for each (Eq. 4, 5 and 6).
 
     The search starts from the linear synthesis scheme, all offsets 0, and goes through the foci once, in
@@ -50,6 +59,7 @@ def lssg(objective: Objective, levels: int = 16, passes: int = 1, score: Score =
     Args:
         objective: what is evaluated.
         levels: number of offsets in [0, 2 pi), >= 2.
+        order: of the foci: "given", that of the control points, or all their indices.
         passes: >= 1.
         score: what is maximised.
 
@@ -62,10 +72,10 @@ def lssg(objective: Objective, levels: int = 16, passes: int = 1, score: Score =
     levels = integer_at_least("levels", levels, 2)
     passes = integer_at_least("passes", passes, 1)
     foci = _focus_drives(objective.scene)
+    places = indices_of(order, len(foci))
     ledger = Ledger(objective, trials=1, score=score)
     start = torch.ones(1, len(foci), dtype=torch.complex128)
-    order = torch.arange(len(foci))[None]
-    repeat_passes(ledger, start, order, levels, passes, lambda weights: normalise(weights @ foci))
+    repeat_passes(ledger, start, places[None], levels, passes, lambda weights: normalise(weights @ foci))
     return ledger.solution(most=passes * len(foci) * levels)
 
 

@@ -69,7 +69,7 @@ def test_strongest_first_is_found_by_evaluations_which_count(make_objective, ran
     objective = make_objective(matrix)
     solution = gabs(objective, levels=4, order="strength")
     order = matrix.abs().amin(dim=0).argsort(descending=True).tolist()
-    drive, seen = greedy_search(matrix, order, levels=4)
+    _, seen = greedy_search(matrix, order, levels=4)
     assert solution.history[0, -1].item() == pytest.approx(max(seen), rel=1e-12)
     assert solution.evaluations.tolist() == [5 + 4 * 4] == [objective.evaluations]
 

@@ -70,7 +70,7 @@ def test_further_passes_end_where_no_single_offset_can_improve(make_objective, r
     weights = torch.linalg.lstsq(drives.T, solution.drive[0]).solution
     for focus in range(4):
         moved = weights.repeat(levels, 1)
-        moved[:, focus] *= drive_from_phases(2 * math.pi * torch.arange(levels) / levels)
+        moved[:, focus] *= drive_from_phases(2 * math.pi * torch.arange(levels).double() / levels)
         # Six equations for four weights, solved to rounding.
         assert (weakest_focus(objective(normalise(moved @ drives))) <= solution.score * (1 + 1e-9)).all()
 
@@ -81,3 +81,20 @@ def test_evaluations_are_the_papers_64(paper_objective):
     assert solution.evaluations.tolist() == [64]
     assert paper_objective.evaluations - before == 64
     assert solution.drive.shape == (1, 16)
+
+
+def test_order_of_the_foci_is_the_one_asked_for(make_objective, random_matrix):
+    levels = 4
+    objective = make_objective(random_matrix(3, 6, 1))
+    solution = lssg(objective, levels, order=[2, 0, 1])
+    drives = focus_drives(objective.scene)
+    weights = torch.ones(3, dtype=torch.complex128)
+    seen = []
+    for focus in (2, 0, 1):
+        tried = weights.repeat(levels, 1)
+        tried[:, focus] = drive_from_phases(2 * math.pi * torch.arange(levels).double() / levels)
+        scores = weakest_focus(objective(normalise(tried @ drives)))
+        weights = tried[scores.argmax()]
+        seen.append(scores.max().item())
+    assert solution.history[0, levels - 1 :: levels].tolist() == pytest.approx(seen, rel=1e-12)
+    assert not torch.equal(solution.history, lssg(objective, levels).history)

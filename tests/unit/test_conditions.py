@@ -12,7 +12,7 @@ from scipy.stats import kstest, rice
 from small_scenes import small_scene
 
 from autdtorch.conditions import Condition, Dead, Drift, Noise, Quantised, playable, true_pressure
-from autdtorch.drive import drive_from_phases
+from autdtorch.drive import drive_from_phases, phases_of
 from autdtorch.objective import Objective, SimulatedObjective
 from autdtorch.optim.gabs import gabs
 from autdtorch.propagator import FreeSpacePropagator
@@ -20,7 +20,7 @@ from autdtorch.propagator import FreeSpacePropagator
 SCENE = small_scene()  # 4 transducers, 3 control points
 
 phases = st.lists(st.floats(-10, 10), min_size=4, max_size=4)
-amplitudes = st.lists(st.floats(0, 1), min_size=4, max_size=4)
+amplitudes = st.lists(st.just(0.0) | st.floats(1e-9, 1), min_size=4, max_size=4)
 
 
 class Recorder:
@@ -55,7 +55,7 @@ def fully_on(rows: int) -> torch.Tensor:
     return torch.ones(rows, 4, dtype=torch.complex128)
 
 
-@pytest.mark.parametrize("snr", [30.0, 6.0, 0.0, -10.0])
+@pytest.mark.parametrize("snr", [20.0, 6.0, 0.0, -10.0])
 def test_readings_are_rice_distributed(snr: float) -> None:
     count = 20000
     noise = Noise(Recorder(), snr, seed=3, reference=1.0)
@@ -87,7 +87,7 @@ def test_default_reference_is_the_rms_pressure_under_random_phases(simulated: Si
 def test_reference_must_be_given_where_nothing_tells_it(simulated: SimulatedObjective) -> None:
     replayed = SimulatedObjective(SCENE, FreeSpacePropagator(SCENE), mode="replay")
     for objective in (replayed, Recorder(), Dead(replayed, [1])):
-        with pytest.raises(ValueError, match="reference: None Pa; must be given where .* no transfer matrix"):
+        with pytest.raises(ValueError, match="reference: None Pa; must be given where the objective has no"):
             Noise(objective, 20)
         assert Noise(objective, 20, reference=2.0).sigma == pytest.approx(0.2)
 
@@ -149,7 +149,7 @@ def test_quantised_is_the_nearest_and_stays(
     device = Quantised(Recorder(), levels, on_off)
     drive = drive_from_phases([phases], [amplitudes])
     played = device.emitted(drive)
-    steps = torch.remainder(-played.angle(), 2 * math.pi) * levels / (2 * math.pi)
+    steps = phases_of(played) * levels / (2 * math.pi)
     torch.testing.assert_close(steps, steps.round(), rtol=0, atol=1e-9)
     sounding = (played != 0) & (drive != 0)
     assert ((played / drive)[sounding].angle().abs() <= math.pi / levels + 1e-12).all()
