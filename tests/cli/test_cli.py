@@ -113,7 +113,9 @@ def test_the_papers_experiment(composed: Callable[..., dict[str, object]]) -> No
     config = composed("experiment=paper")
     assert list(config["scenes"]) == ["homogeneous", "three_cubes", "two_cubes"]
     assert list(config["methods"]) == ["lssg", "bayes_opt", "gabs"]
-    assert config["methods"]["gabs"] == {"_target_": "autdtorch.gabs", "levels": 16}
+    assert config["methods"]["gabs"] == {
+        "_target_": "autdtorch.gabs", "levels": 16, "order": "random", "first": None, "passes": 1
+    }  # fmt: skip
     assert config["methods"]["bayes_opt"]["evaluations"] == 256
     assert config["trials"]["gabs"] == 50
     assert composed("experiment=paper", "trials=7")["trials"] == 7
