@@ -8,7 +8,9 @@ from .objective import Objective, SimulatedObjective, weakest_focus
 from .obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
 from .optim.base import Solution
 from .optim.bayes import bayes_opt
+from .optim.bound import focus_bound
 from .optim.gabs import gabs
+from .optim.gradient import gradient_ascent
 from .optim.lssg import lssg
 from .plot import plot_convergence, plot_plane, plot_trials
 from .propagator import SteadyStateWarning, make_propagator
@@ -39,9 +41,11 @@ __all__ = [
     "bayes_opt",
     "circle_points",
     "drive_from_phases",
+    "focus_bound",
     "focus_metrics",
     "focus_phases",
     "gabs",
+    "gradient_ascent",
     "green",
     "load_results",
     "load_scene",

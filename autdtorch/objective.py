@@ -42,10 +42,12 @@ class SimulatedObjective:
     Attributes:
         scene: its array plays the drives, its control points are observed.
         evaluations: number of observations so far.
+        transfer_matrix: G (P, M), complex128; None in mode "replay". Not for methods that see magnitudes only.
     """
 
     scene: Scene
     evaluations: int
+    transfer_matrix: torch.Tensor | None
 
     def __init__(
         self, scene: Scene, propagator: Propagator, mode: Literal["transfer", "replay"] = "transfer"
@@ -68,7 +70,9 @@ class SimulatedObjective:
         self.scene = scene
         self.evaluations = 0
         self._propagator = propagator
-        self._transfer_matrix = propagator.transfer_matrix().cpu() if mode == "transfer" else None
+        self.transfer_matrix = None
+        if mode == "transfer":
+            self.transfer_matrix = propagator.transfer_matrix().to("cpu", torch.complex128)
 
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
         """Observe the control points under each of several drives.
@@ -88,13 +92,13 @@ class SimulatedObjective:
         if drive.ndim != 2 or len(drive) == 0:
             raise ValueError(f"drive: shape {tuple(drive.shape)}; must be (B, {transducers}) with B >= 1")
         self.evaluations += len(drive)
-        if self._transfer_matrix is None:
+        if self.transfer_matrix is None:
             # One by one: given many drives at once, a propagator may take the transfer matrix as well.
             rows = [self._propagator.field(row, self.scene.control_points) for row in drive]
             return torch.stack(rows).abs().cpu()
         # Not `drive @ G.T`: BLAS rounds by the number of rows, which a search through thousands of choices
         # amplifies until a trial depends on the trials beside it.
-        return (drive[:, None, :] * self._transfer_matrix).sum(dim=-1).abs()
+        return (drive[:, None, :] * self.transfer_matrix).sum(dim=-1).abs()
 
 
 def weakest_focus(pressure: torch.Tensor) -> torch.Tensor:

@@ -145,6 +145,11 @@ class _Probe:
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
         raise _FirstEvaluationError
 
+    @property
+    def transfer_matrix(self) -> torch.Tensor:
+        """What gradient ascent asks for, once its settings are checked."""
+        raise _FirstEvaluationError
+
 
 def _check_method(name: str, method: Method, scene: Scene, trials: int, seed: int) -> None:
     """Have the method check its settings now, not after minutes of simulation."""

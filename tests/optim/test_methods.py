@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from autdtorch.optim.bayes import bayes_opt
 from autdtorch.optim.gabs import gabs
+from autdtorch.optim.gradient import gradient_ascent
 from autdtorch.optim.lssg import lssg
 
 
@@ -19,8 +20,13 @@ def small_bayes_opt(objective, **options):
 
 METHODS = pytest.mark.parametrize(
     "method",
-    [lssg, partial(gabs, trials=2), partial(small_bayes_opt, trials=2)],
-    ids=["lssg", "gabs", "bayes_opt"],
+    [
+        lssg,
+        partial(gabs, trials=2),
+        partial(small_bayes_opt, trials=2),
+        partial(gradient_ascent, trials=2),
+    ],
+    ids=["lssg", "gabs", "bayes_opt", "gradient_ascent"],
 )
 
 
@@ -60,7 +66,9 @@ def test_same_again_and_no_global_random_state(make_objective, random_matrix, me
     assert torch.equal(first.history, again.history)
 
 
-@pytest.mark.parametrize("method", [gabs, small_bayes_opt], ids=["gabs", "bayes_opt"])
+@pytest.mark.parametrize(
+    "method", [gabs, small_bayes_opt, gradient_ascent], ids=["gabs", "bayes_opt", "gradient_ascent"]
+)
 def test_a_trial_depends_on_its_seed_and_not_on_the_trials_beside_it(make_objective, random_matrix, method):
     objective = make_objective(random_matrix(3, 6, 0))
     many = method(objective, trials=4, seed=3)
@@ -100,6 +108,8 @@ def test_phases_at_the_control_points_are_never_seen(make_objective, random_matr
         (gabs, {"trials": [2, 2]}, r"trials: \[2, 2\]; must be an integer >= 1, or trial numbers, each"),
         (gabs, {"trials": [0, -1]}, r"trials\[1\]: -1; must be an integer >= 0"),
         (gabs, {"seed": -1}, "seed: -1; must be an integer >= 0"),
+        (gradient_ascent, {"starts": 0}, "starts: 0; must be an integer >= 1"),
+        (gradient_ascent, {"steps": 1}, "steps: 1; must be an integer >= 2"),
         (bayes_opt, {"trials": 0}, "trials: 0; must be an integer >= 1"),
         (bayes_opt, {"seed": 0.5}, r"seed: 0\.5; must be an integer >= 0"),
         (bayes_opt, {"initial": 1}, "initial: 1; must be an integer >= 2"),
