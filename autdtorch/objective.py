@@ -42,7 +42,7 @@ class SimulatedObjective:
     Attributes:
         scene: its array plays the drives, its control points are observed.
         evaluations: number of observations so far.
-        transfer_matrix: G (P, M), complex128; None in mode "replay". Not for methods that see magnitudes only.
+        transfer_matrix: G (P, M), complex128; None in mode "replay". Not for black-box methods.
     """
 
     scene: Scene

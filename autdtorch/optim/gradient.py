@@ -13,8 +13,8 @@ from autdtorch.objective import Objective, weakest_focus
 from autdtorch.optim.base import Ledger, Solution, Trials, trial_seeds
 from autdtorch.validation import integer_at_least, invalid
 
-# The smooth minimum's temperature, as a part of the foci's mean pressure, and the step, as a part of the largest
-# amplitude: from first to last in equal ratios. A hotter start forgets where it began, a colder end only oscillates.
+# From first to last in equal ratios: temperature of the smooth minimum, in mean pressures of the foci, and
+# step, in largest amplitudes.
 _TEMPERATURE = (0.3, 1e-4)
 _STEP = (0.5, 0.005)
 _MOMENTUM = 0.9
@@ -24,9 +24,10 @@ _TINY = 1e-300
 def gradient_ascent(
     objective: Objective, starts: int = 32, steps: int = 300, trials: Trials = 1, seed: int = 0
 ) -> Solution:
-    """Climb the weakest focus over all drives of amplitudes <= 1, by the transfer matrix of a simulated objective.
+    """Climb the weakest focus over all drives of amplitudes <= 1, by the objective's transfer matrix.
 
     A trial climbs from `starts` drives of random phases and evaluates where it came highest: one evaluation.
+    With 16 transducers that is the global maximum nearly always, less 1e-4; a few hundred want more `steps`.
 
     Args:
         objective: simulated, with a `transfer_matrix`.
@@ -68,8 +69,8 @@ def random_drives(count: int, transducers: int, generator: torch.Generator) -> t
 def climb(matrix: torch.Tensor, drive: torch.Tensor, steps: int) -> torch.Tensor:
     """The drive of the strongest weakest focus that projected gradient ascent with momentum finds.
 
-    What is climbed is a smooth minimum, -T log sum_p exp(-|p_p| / T), whose temperature T falls until it is the
-    minimum. No trial depends on the trials beside it, not even in its rounding.
+    What is climbed is a smooth minimum, -T log sum_p exp(-|p_p| / T), whose temperature T falls until
+    it is the minimum. No trial depends on the trials beside it, not even in its rounding.
 
     Args:
         matrix: transfer matrices (T, P, M), complex128.
@@ -88,7 +89,6 @@ def climb(matrix: torch.Tensor, drive: torch.Tensor, steps: int) -> torch.Tensor
         hardness = 1 / (temperature * magnitude.mean(dim=-1, keepdim=True)).clamp_min(_TINY)
         weights = torch.softmax(-magnitude * hardness, dim=-1)
         slope = ((weights * pressure.sgn())[..., None] * matrix.conj()).sum(dim=-2)
-        # A step moves a drive by its own slope, relative to the mean: slopes are as strong as the transducers.
         slope = slope / slope.abs().mean(dim=-1, keepdim=True).clamp_min(_TINY)
         velocity = _MOMENTUM * velocity + (1 - _MOMENTUM) * slope
         drive = drive + step * velocity

@@ -1,5 +1,3 @@
-import math
-
 import numpy as np
 import pytest
 import scipy.optimize
@@ -41,22 +39,13 @@ def polished(matrix: torch.Tensor, starts: int) -> float:
 def test_reaches_the_best_of_many_starts_of_another_optimiser(make_objective, random_matrix, seed):
     matrix = random_matrix(4, 10, seed)
     score = gradient_ascent(make_objective(matrix), trials=3).score
-    # The colder end of the smooth minimum leaves some 1e-4.
+    # The cold end of the smooth minimum leaves some 1e-4.
     assert score.min() > (1 - 1e-3) * polished(matrix, starts=20)
 
 
 def test_every_trial_ends_at_the_best_of_the_paper_scene(paper_objective):
     score = gradient_ascent(paper_objective, trials=10).score
     assert score.min() > (1 - 1e-3) * polished(paper_objective.transfer_matrix, starts=5)
-
-
-def test_switches_down_what_only_harms(make_objective):
-    # The second transducer, at whatever phase, leaves one of eight foci at most 2 sin(pi / 16) = 0.39.
-    turns = torch.polar(torch.ones(8).double(), 2 * math.pi * torch.arange(8).double() / 8)
-    matrix = torch.stack([torch.ones_like(turns), turns], dim=1)
-    solution = gradient_ascent(make_objective(matrix))
-    assert solution.score.item() > 0.99
-    assert solution.amplitudes.amin() < 0.02
 
 
 def test_takes_one_evaluation(make_objective, random_matrix):
@@ -74,5 +63,5 @@ def test_what_nothing_reaches_is_no_reason_to_fail(make_objective):
 def test_needs_a_transfer_matrix(make_objective, random_matrix):
     objective = make_objective(random_matrix(2, 3, 0))
     replay = SimulatedObjective(objective.scene, objective._propagator, mode="replay")
-    with pytest.raises(ValueError, match="objective: .*; must have a transfer matrix"):
+    with pytest.raises(ValueError, match=r"objective: .*; must have a transfer matrix"):
         gradient_ascent(replay)
