@@ -9,7 +9,9 @@ from .objective import Objective, SimulatedObjective, weakest_focus
 from .obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
 from .optim.base import Solution
 from .optim.bayes import bayes_opt
+from .optim.bound import focus_bound
 from .optim.gabs import gabs
+from .optim.gradient import gradient_ascent
 from .optim.lssg import lss, lssg
 from .optim.random_search import random_search
 from .plot import plot_convergence, plot_plane, plot_trials
@@ -45,9 +47,11 @@ __all__ = [
     "bayes_opt",
     "circle_points",
     "drive_from_phases",
+    "focus_bound",
     "focus_metrics",
     "focus_phases",
     "gabs",
+    "gradient_ascent",
     "green",
     "load_results",
     "load_scene",

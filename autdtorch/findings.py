@@ -21,27 +21,25 @@ class Finding:
 
     Attributes:
         score: median over the trials [Pa].
-        gap: what the median lacks to the bound, as a share of it; None without a bound.
+        gap: what the median lacks to the bound, as a share of it.
         evaluations_near: evaluations until each trial was near the bound (T,), float64, inf where it never
-            was; None without a bound.
+            was.
     """
 
     score: Interval
-    gap: Interval | None
-    evaluations_near: torch.Tensor | None
+    gap: Interval
+    evaluations_near: torch.Tensor
 
 
-def find(method: MethodResult, bound: float | None) -> Finding:
+def find(method: MethodResult, bound: float) -> Finding:
     """What one method found in a scene.
 
     Args:
         method: its trials. A single one has no interval.
-        bound: upper bound on the score [Pa], > 0, or None.
+        bound: upper bound on the score [Pa], >= 0.
     """
     score = bootstrap(method.solution.score, average=np.median)
-    if bound is None:
-        return Finding(score, None, None)
-    gap = score.mapped(lambda value: 1 - value / bound)
+    gap = score.mapped(lambda value: 1 - value / bound if bound > 0 else 0.0)
     return Finding(score, gap, evaluations_to(method.solution, NEAR_BOUND * bound))
 
 

@@ -42,10 +42,12 @@ class SimulatedObjective:
     Attributes:
         scene: its array plays the drives, its control points are observed.
         evaluations: number of observations so far.
+        transfer_matrix: G (P, M), complex128; None in mode "replay". Not for black-box methods.
     """
 
     scene: Scene
     evaluations: int
+    transfer_matrix: torch.Tensor | None
 
     def __init__(
         self, scene: Scene, propagator: Propagator, mode: Literal["transfer", "replay"] = "transfer"
@@ -68,12 +70,9 @@ class SimulatedObjective:
         self.scene = scene
         self.evaluations = 0
         self._propagator = propagator
-        self._transfer_matrix = propagator.transfer_matrix().cpu() if mode == "transfer" else None
-
-    @property
-    def transfer_matrix(self) -> torch.Tensor | None:
-        """G (P, M), complex [Pa], on the CPU; None in mode "replay"."""
-        return self._transfer_matrix
+        self.transfer_matrix = None
+        if mode == "transfer":
+            self.transfer_matrix = propagator.transfer_matrix().to("cpu", torch.complex128)
 
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
         """Observe the control points under each of several drives.
@@ -90,13 +89,13 @@ class SimulatedObjective:
         """
         drive = validate_drives(drive, len(self.scene.array))
         self.evaluations += len(drive)
-        if self._transfer_matrix is None:
+        if self.transfer_matrix is None:
             # One by one: given many drives at once, a propagator may take the transfer matrix as well.
             rows = [self._propagator.field(row, self.scene.control_points) for row in drive]
             return torch.stack(rows).abs().cpu()
         # Not `drive @ G.T`: BLAS rounds by the number of rows, which a search through thousands of choices
         # amplifies until a trial depends on the trials beside it.
-        return (drive[:, None, :] * self._transfer_matrix).sum(dim=-1).abs()
+        return (drive[:, None, :] * self.transfer_matrix).sum(dim=-1).abs()
 
 
 def validate_drives(drive: torch.Tensor, transducers: int) -> torch.Tensor:

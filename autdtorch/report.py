@@ -67,8 +67,6 @@ semidefinite relaxation. No method can be better, and the best drive may lie bel
 parentheses how many of them got there, if not all. A trial that did not counts as later than all that did;
 where that leaves the median open, there is a dash."""
 
-_NO_BOUND = "The certified bound and the gaps to it need the extra `bound`: `pip install autdtorch[bound]`."
-
 _ABOUT_BASELINE = """{label} is a line to compare with and no competitor: it reads gradients off the transfer
 matrix, which the others do not know, so that its evaluations are not listed."""
 
@@ -166,19 +164,17 @@ def finding_rows(results: StudyResult) -> list[list[str]]:
     head = ["scene", "method", "score [Pa]", "gap to the bound [%]", "evaluations"]
     rows = [[*head, f"to {_NEAR} of the bound", "s a trial"]]
     for scene_name, scene in results.scenes.items():
-        if scene.bound is not None:
-            rows.append([scene_name, "*bound*", f"{scene.bound:.3g}", "0", *[_NO_NUMBER] * 3])
+        rows.append([scene_name, "*bound*", f"{scene.bound:.3g}", "0", *[_NO_NUMBER] * 3])
         for name, method in scene.methods.items():
             rows.append([scene_name, label_of(name), *_finding_cells(name, method, scene.bound)])
     return rows
 
 
-def _finding_cells(name: str, method: MethodResult, bound: float | None) -> list[str]:
+def _finding_cells(name: str, method: MethodResult, bound: float) -> list[str]:
     finding = find(method, bound)
-    gap = _NO_NUMBER if finding.gap is None else f"{finding.gap.mapped(lambda share: 100 * share):.1f}"
-    evaluations, near = f"{method.solution.evaluations.double().mean():.0f}", _NO_NUMBER
-    if finding.evaluations_near is not None:
-        near = _median_of_reached(finding.evaluations_near)
+    gap = f"{finding.gap.mapped(lambda share: 100 * share):.1f}"
+    evaluations = f"{method.solution.evaluations.double().mean():.0f}"
+    near = _median_of_reached(finding.evaluations_near)
     if name == _BASELINE:
         evaluations = near = _NO_NUMBER
     return [str(finding.score), gap, evaluations, near, f"{method.seconds.mean():.2g}"]
@@ -290,9 +286,7 @@ def _trial_figures(results: StudyResult, folder: Path) -> str:
 
 def _levels(scene: SceneResult) -> dict[str, float]:
     """Scores that methods are compared with, by label."""
-    levels: dict[str, float] = {}
-    if scene.bound is not None:
-        levels |= {"bound": scene.bound, f"{_NEAR} of the bound": NEAR_BOUND * scene.bound}
+    levels = {"bound": scene.bound, f"{_NEAR} of the bound": NEAR_BOUND * scene.bound}
     if _BASELINE in scene.methods:
         levels[label_of(_BASELINE)] = float(scene.methods[_BASELINE].solution.score.median())
     return levels
@@ -331,9 +325,7 @@ def _claims(results: StudyResult) -> str:
 
 
 def _findings(results: StudyResult) -> str:
-    text = ["## Beyond the paper", _table(finding_rows(results)), _BELOW_FINDINGS]
-    without = all(scene.bound is None for scene in results.scenes.values())
-    text.append(_NO_BOUND if without else _ABOUT_BOUND)
+    text = ["## Beyond the paper", _table(finding_rows(results)), _BELOW_FINDINGS, _ABOUT_BOUND]
     if any(_BASELINE in scene.methods for scene in results.scenes.values()):
         text.append(_ABOUT_BASELINE.format(label=label_of(_BASELINE).capitalize()))
     return "\n\n".join(text)

@@ -108,14 +108,14 @@ class SceneResult:
     Attributes:
         obstacles: number of obstacles.
         transfer_matrix: of the control points (P, M), complex128 [Pa].
-        bound: certified upper bound on the weakest focus [Pa]; None where the extra `bound` is not installed.
+        bound: certified upper bound on the weakest focus [Pa].
         simulation: how the field was computed.
         methods: by name, in the order they ran.
     """
 
     obstacles: int
     transfer_matrix: torch.Tensor
-    bound: float | None
+    bound: float
     simulation: Simulation
     methods: dict[str, MethodResult]
 
@@ -234,8 +234,7 @@ def _read_provenance(file: Any) -> Provenance:
 def _write_scene(group: Any, scene: SceneResult) -> None:
     simulation = scene.simulation
     group.attrs["obstacles"] = scene.obstacles
-    if scene.bound is not None:
-        group.attrs["bound"] = scene.bound
+    group.attrs["bound"] = scene.bound
     for key in ("method", "wavelength", "spacing", "tolerance", "matrix_seconds", "plane_seconds"):
         if (value := getattr(simulation, key)) is not None:
             group.attrs[key] = value
@@ -263,7 +262,7 @@ def _read_scene(group: Any) -> SceneResult:
     return SceneResult(
         int(attributes["obstacles"]),
         _tensor(group, "transfer_matrix"),
-        float(attributes["bound"]) if "bound" in attributes else None,
+        float(attributes["bound"]),
         simulation,
         methods,
     )

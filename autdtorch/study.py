@@ -17,6 +17,7 @@ import torch
 from autdtorch.metrics import focus_metrics
 from autdtorch.objective import Objective, SimulatedObjective
 from autdtorch.optim.base import Solution, Trials
+from autdtorch.optim.bound import focus_bound
 from autdtorch.progress import Progress, show_progress
 from autdtorch.propagator import CACHE_VARIABLE, Propagator, SimulatedPropagator, make_propagator
 from autdtorch.results import MethodResult, SceneResult, Simulation, StudyResult, provenance_now
@@ -145,6 +146,11 @@ class _Probe:
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
         raise _FirstEvaluationError
 
+    @property
+    def transfer_matrix(self) -> torch.Tensor:
+        """What gradient ascent asks for, once its settings are checked."""
+        raise _FirstEvaluationError
+
 
 def _check_method(name: str, method: Method, scene: Scene, trials: int, seed: int) -> None:
     """Have the method check its settings now, not after minutes of simulation."""
@@ -179,9 +185,9 @@ def _run_scene(
     scene = propagator.scene
     progress.begin(f"{name}: transfer matrix")
     begin = time.perf_counter()
-    objective = SimulatedObjective(scene, propagator)
     transfer_matrix = propagator.transfer_matrix().cpu()
     matrix_seconds = time.perf_counter() - begin
+    objective = SimulatedObjective(scene, propagator)
     progress.advance(1)
     for method_name, method in methods.items():
         where = name, method_name, counts[method_name]
@@ -199,7 +205,9 @@ def _run_scene(
         for method_name, (solution, seconds) in found.items()
     }
     simulation = _simulation(propagator, matrix_seconds, plane_seconds)
-    return SceneResult(len(scene.obstacles), transfer_matrix, None, simulation, results)
+    return SceneResult(
+        len(scene.obstacles), transfer_matrix, focus_bound(transfer_matrix), simulation, results
+    )
 
 
 def _run_trials(

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from autdtorch.conditions import Quantised
 from autdtorch.optim.bayes import bayes_opt
 from autdtorch.optim.gabs import gabs
+from autdtorch.optim.gradient import gradient_ascent
 from autdtorch.optim.lssg import lss, lssg
 from autdtorch.optim.random_search import random_search
 
@@ -19,18 +20,16 @@ def small_bayes_opt(objective, **options):
     return bayes_opt(objective, evaluations=9, initial=6, fixed_transducer=1, **options)
 
 
-METHODS = pytest.mark.parametrize(
-    "method",
-    [
-        lss,
-        lssg,
-        partial(gabs, trials=2),
-        partial(gabs, order="strength", trials=2),
-        partial(small_bayes_opt, trials=2),
-        partial(random_search, evaluations=70, trials=2),
-    ],
-    ids=["lss", "lssg", "gabs", "gabs by strength", "bayes_opt", "random_search"],
-)
+BLACK_BOX_METHODS = {
+    "lss": lss,
+    "lssg": lssg,
+    "gabs": partial(gabs, trials=2),
+    "gabs by strength": partial(gabs, order="strength", trials=2),
+    "bayes_opt": partial(small_bayes_opt, trials=2),
+    "random_search": partial(random_search, evaluations=70, trials=2),
+}
+EVERY_METHOD = BLACK_BOX_METHODS | {"gradient_ascent": partial(gradient_ascent, trials=2)}
+METHODS = pytest.mark.parametrize("method", EVERY_METHOD.values(), ids=EVERY_METHOD.keys())
 
 
 @METHODS
@@ -56,7 +55,7 @@ def test_solution_is_consistent(make_objective, random_matrix, method):
     assert torch.equal(objective(solution.drive), solution.pressure)
 
 
-@METHODS
+@pytest.mark.parametrize("method", BLACK_BOX_METHODS.values(), ids=BLACK_BOX_METHODS.keys())
 @pytest.mark.parametrize("on_off", [False, True])
 def test_on_a_device_of_few_levels_the_drive_is_the_one_it_played(
     make_objective, random_matrix, method, on_off
@@ -84,8 +83,8 @@ def test_same_again_and_no_global_random_state(make_objective, random_matrix, me
 
 @pytest.mark.parametrize(
     "method",
-    [gabs, partial(gabs, passes=3), small_bayes_opt, partial(random_search, evaluations=70)],
-    ids=["gabs", "gabs, 3 passes", "bayes_opt", "random_search"],
+    [gabs, partial(gabs, passes=3), small_bayes_opt, partial(random_search, evaluations=70), gradient_ascent],
+    ids=["gabs", "gabs, 3 passes", "bayes_opt", "random_search", "gradient_ascent"],
 )
 def test_a_trial_depends_on_its_seed_and_not_on_the_trials_beside_it(make_objective, random_matrix, method):
     objective = make_objective(random_matrix(3, 6, 0))
@@ -140,6 +139,8 @@ def test_phases_at_the_control_points_are_never_seen(make_objective, random_matr
         (gabs, {"trials": [2, 2]}, r"trials: \[2, 2\]; must be an integer >= 1, or trial numbers, each"),
         (gabs, {"trials": [0, -1]}, r"trials\[1\]: -1; must be an integer >= 0"),
         (gabs, {"seed": -1}, "seed: -1; must be an integer >= 0"),
+        (gradient_ascent, {"starts": 0}, "starts: 0; must be an integer >= 1"),
+        (gradient_ascent, {"steps": 1}, "steps: 1; must be an integer >= 2"),
         (bayes_opt, {"trials": 0}, "trials: 0; must be an integer >= 1"),
         (bayes_opt, {"seed": 0.5}, r"seed: 0\.5; must be an integer >= 0"),
         (bayes_opt, {"initial": 1}, "initial: 1; must be an integer >= 2"),

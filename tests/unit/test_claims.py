@@ -67,7 +67,7 @@ def study(
             for name, values in methods.items()
         }
         scenes[scene] = SceneResult(
-            0 if scene == "homogeneous" else 2, torch.ones(1, 1), None, SIMULATION, results
+            0 if scene == "homogeneous" else 2, torch.ones(1, 1), 10.0, SIMULATION, results
         )
     return StudyResult(Provenance("", 0, {}, "", ""), scenes)
 

@@ -55,10 +55,11 @@ def test_the_gap_is_what_the_median_score_lacks_to_the_bound() -> None:
     assert finding.evaluations_near.tolist() == [math.inf] * 8 + [1]
 
 
-def test_a_single_trial_has_a_gap_without_interval_and_no_bound_gives_none() -> None:
+def test_a_single_trial_has_a_gap_without_interval() -> None:
     finding = find(method_result([[4.0, 8.0]]), 10.0)
     assert finding.gap.value == pytest.approx(0.2)
     assert math.isinf(finding.gap.low)
-    without = find(method_result([[4.0, 8.0]]), None)
-    assert (without.gap, without.evaluations_near) == (None, None)
-    assert without.score.value == 8.0
+
+
+def test_where_nothing_can_be_heard_there_is_no_gap() -> None:
+    assert find(method_result([[0.0, 0.0]]), 0.0).gap.value == 0.0

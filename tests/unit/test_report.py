@@ -11,6 +11,7 @@ from small_scenes import AIR, CUBE, small_scene
 
 import autdtorch.report
 from autdtorch.geometry import Plane
+from autdtorch.optim.bound import focus_bound
 from autdtorch.optim.gabs import gabs
 from autdtorch.optim.lssg import lssg
 from autdtorch.plot import plot_convergence
@@ -83,7 +84,8 @@ def test_no_number_is_missing_and_the_tables_are_whole(tmp_path: Path) -> None:
     for table in tables(report):
         assert len({len(row) for row in table}) == 1
     _, summary, claims, beyond, simulation = tables(report)
-    assert len(summary) == len(beyond) == 2 + 2 * 3
+    assert len(summary) == 2 + 2 * 3
+    assert len(beyond) == 2 + 2 * (3 + 1)  # and the bound
     assert [row[-1] for row in claims[2:]].count("no data") == 0
     assert all(row[-1].startswith(("**reproduced**", "**not reproduced**")) for row in claims[2:])
     assert [row[0] for row in simulation[2:]] == ["homogeneous", "three_cubes"]
@@ -118,8 +120,9 @@ def with_bound(results: StudyResult, bound: float) -> StudyResult:
 
 def test_the_gap_to_the_bound_is_told_for_every_method(tmp_path: Path) -> None:
     results, report = reported({"a": scene()}, tmp_path, trials=7)
-    assert "need the extra `bound`" in report
-    assert all(row[3] == row[5] == "-" for row in finding_rows(results)[1:])
+    bound = focus_bound(results.scenes["a"].transfer_matrix)
+    assert finding_rows(results)[1][:3] == ["a", "*bound*", f"{bound:.3g}"]
+    assert "semidefinite relaxation" in report
 
     solution = results.scenes["a"].methods["gabs"].solution
     median = float(solution.score.median())  # of seven trials, one of them

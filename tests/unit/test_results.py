@@ -52,7 +52,7 @@ def results() -> StudyResult:
     with_plane = {"lssg": method_result(1, True, 1), "bayes_opt": method_result(4, True, 2)}
     scenes = {
         "two_cubes": SceneResult(2, matrix, 1.25, FULL, with_plane),
-        "empty": SceneResult(0, 2 * matrix, None, FREE_SPACE, {"gabs": method_result(2, False, 3)}),
+        "empty": SceneResult(0, 2 * matrix, 0.75, FREE_SPACE, {"gabs": method_result(2, False, 3)}),
     }
     return StudyResult(provenance, scenes)
 

@@ -1,0 +1,93 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from autdtorch.optim.bound import focus_bound
+from autdtorch.optim.gabs import gabs
+from autdtorch.optim.gradient import gradient_ascent, random_drives
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    points=st.integers(1, 8),
+    transducers=st.integers(2, 32),
+    seed=st.integers(0, 1000),
+    spread=st.sampled_from([0.0, 1.0, 3.0]),
+)
+def test_nothing_that_a_method_finds_is_above(
+    make_objective, random_matrix, points, transducers, seed, spread
+):
+    # Some foci and transducers are up to 10^spread times stronger than others.
+    generator = torch.Generator().manual_seed(seed)
+    rows, columns = (
+        10 ** (spread * torch.rand(count, dtype=torch.float64, generator=generator))
+        for count in (points, transducers)
+    )
+    objective = make_objective(random_matrix(points, transducers, seed) * rows[:, None] * columns)
+    bound = focus_bound(objective.transfer_matrix)
+    found = [gradient_ascent(objective, starts=4, steps=50), gabs(objective)]
+    assert max(solution.score.item() for solution in found) <= bound
+    assert objective(random_drives(200, transducers, generator)).amin(dim=1).max() <= bound
+
+
+def test_one_focus_gets_the_sum_of_all_transducers(random_matrix):
+    matrix = random_matrix(1, 7, 0)
+    bound = focus_bound(matrix)
+    best = matrix.abs().sum().item()
+    # It must not be below by a rounding error.
+    assert best < bound < best * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("size", [2, 3, 8])
+def test_foci_that_share_the_power(size):
+    # sum_p |p_p|^2 = M sum_i |q_i|^2 <= M^2, and the foci can share it evenly.
+    turns = torch.outer(torch.arange(size), torch.arange(size)).double()
+    matrix = torch.polar(torch.ones(size, size).double(), 2 * math.pi * turns / size)
+    assert focus_bound(matrix) == pytest.approx(math.sqrt(size), rel=1e-6)
+
+
+def test_a_focus_far_stronger_than_the_others_does_not_count(random_matrix):
+    weak, strong = random_matrix(1, 6, 0), 100 * random_matrix(1, 6, 1)
+    # The drive that is best for the weak focus gives the strong one more.
+    assert focus_bound(torch.cat([weak, strong])) == pytest.approx(weak.abs().sum().item(), rel=1e-5)
+
+
+def test_phases_units_and_silent_transducers_change_nothing(random_matrix):
+    matrix = random_matrix(3, 5, 0)
+    bound = focus_bound(matrix)
+    turned = torch.polar(torch.ones(3).double(), torch.arange(3).double())[:, None] * matrix
+    assert focus_bound(turned) == pytest.approx(bound, rel=1e-5)
+    assert focus_bound(1e-6 * matrix) == pytest.approx(1e-6 * bound, rel=1e-5)
+    silent = torch.zeros(3, 1, dtype=torch.complex128)
+    assert focus_bound(torch.cat([matrix, silent], dim=1)) == pytest.approx(bound, rel=1e-5)
+    assert focus_bound(matrix.numpy()) == bound
+
+
+def test_a_focus_that_nothing_reaches(random_matrix):
+    matrix = random_matrix(3, 5, 0)
+    matrix[1] = 0
+    assert focus_bound(matrix) == 0
+
+
+def test_paper_scene_without_obstacles_is_solved(paper_objective):
+    score = gradient_ascent(paper_objective).score.item()
+    bound = focus_bound(paper_objective.transfer_matrix)
+    assert score <= bound < 1.001 * score  # measured: 1.0001
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        (torch.ones(2, 3), "G: .*; must be an array of complex numbers"),
+        (torch.ones(3, dtype=torch.complex128), r"G: shape \(3,\); must be \(P, M\) with P, M >= 1"),
+        (np.ones((0, 3), dtype=complex), r"G: shape \(0, 3\); must be \(P, M\) with P, M >= 1"),
+        (torch.full((1, 2), complex(math.nan, 0)), "G: .*; every entry must be finite"),
+    ],
+)
+def test_bad_matrices_are_named(matrix, message):
+    with pytest.raises(ValueError, match=message):
+        focus_bound(matrix)
