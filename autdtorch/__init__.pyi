@@ -11,6 +11,7 @@ from .optim.bayes import bayes_opt
 from .optim.bound import focus_bound
 from .optim.gabs import gabs
 from .optim.gradient import gradient_ascent
+from .optim.identify import identify
 from .optim.lssg import lssg
 from .plot import plot_convergence, plot_plane, plot_trials
 from .propagator import SteadyStateWarning, make_propagator
@@ -47,6 +48,7 @@ __all__ = [
     "gabs",
     "gradient_ascent",
     "green",
+    "identify",
     "load_results",
     "load_scene",
     "lssg",

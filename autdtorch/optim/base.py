@@ -19,7 +19,7 @@ Trials: TypeAlias = int | Sequence[int]
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The best drive that each of T independent trials observed.
+    """The drive that each of T trials chose: the best it observed, but where a method says otherwise.
 
     Attributes:
         drive: (T, M), complex128.
@@ -69,13 +69,18 @@ class Ledger:
         self._scores: list[torch.Tensor] = []
 
     def evaluate(self, drive: torch.Tensor) -> torch.Tensor:
+        """Scores (T, B), float64, of drives (T, B, M): see `observe`."""
+        self.observe(drive)
+        return self._scores[-1]
+
+    def observe(self, drive: torch.Tensor) -> torch.Tensor:
         """Evaluate B drives for each trial, all in one call of the objective.
 
         Args:
             drive: (T, B, M), complex128, B >= 1.
 
         Returns:
-            Scores (T, B), float64.
+            Pressure magnitudes (T, B, P) [Pa], float64.
 
         Raises:
             ValueError: the objective gave pressures, or the score function gave scores, that are not finite
@@ -93,14 +98,22 @@ class Ledger:
         self._best[trial] = best[trial]
         self._drive[trial] = drive[trial, index[trial]]
         self._pressure[trial] = pressure[trial, index[trial]]
+        self._last = drive[:, -1], pressure[:, -1], score[:, -1]
         self._scores.append(score)
-        return score
+        return pressure
 
-    def solution(self) -> Solution:
-        """The best drive of each trial; at least one evaluation must have been made."""
+    def solution(self, last: bool = False) -> Solution:
+        """The best drive that each trial observed; at least one evaluation must have been made.
+
+        Args:
+            last: the last drive instead, for a method that knows better than one reading: of many noisy
+                readings the highest is a lucky one.
+        """
         history = torch.cat(self._scores, dim=1).cummax(dim=1).values
         evaluations = torch.full((len(history),), history.shape[1], dtype=torch.int64)
-        return Solution(self._drive.clone(), self._pressure.clone(), self._best.clone(), evaluations, history)
+        found = self._last if last else (self._drive, self._pressure, self._best)
+        drive, pressure, score = (value.clone() for value in found)
+        return Solution(drive, pressure, score, evaluations, history)
 
 
 def trial_seeds(seed: int, trials: Trials) -> list[int]:
