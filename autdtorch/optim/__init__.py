@@ -6,6 +6,7 @@ METHOD_LABELS = {
     "bayes_opt": "BO",
     "gabs": "GABS",
     "random_search": "random search",
+    "identify": "identify",
     "gradient_ascent": "gradient ascent",
 }
-"""The paper's names of the methods, by the names of the functions."""
+"""Names of the methods, the paper's where it has one, by the names of the functions."""

@@ -20,7 +20,7 @@ Trials: TypeAlias = int | Sequence[int]
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The best drive that each of T independent trials observed.
+    """The drive that each of T trials chose: the best it observed, but where a method says otherwise.
 
     Attributes:
         drive: (T, M), complex128, as it was played: on the levels of a `Quantised` objective.
@@ -71,6 +71,12 @@ class Ledger:
         self._evaluations = torch.zeros(trials, dtype=torch.int64)
         self._scores: list[torch.Tensor] = []
 
+    def observe(self, drive: torch.Tensor) -> torch.Tensor:
+        """Evaluate as `evaluate` does, for all trials: pressure magnitudes (T, B, P) [Pa], float64."""
+        pressure, score = self._record(drive, torch.arange(len(self._best)))
+        self._last = drive[:, -1], pressure[:, -1], score[:, -1]
+        return pressure
+
     def evaluate(self, drive: torch.Tensor, trials: torch.Tensor | None = None) -> torch.Tensor:
         """Evaluate B drives for each trial, all in one call of the objective.
 
@@ -85,6 +91,10 @@ class Ledger:
             ValueError: the objective gave pressures, or the score function gave scores, that are not finite
                 real numbers or have the wrong shape.
         """
+        return self._record(drive, torch.arange(len(self._best)) if trials is None else trials)[1]
+
+    def _record(self, drive: torch.Tensor, trials: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Pressure and score of drives of some trials."""
         batch = drive.shape[:2]
         pressure = _observed("pressure of the objective", self._objective(drive.flatten(0, 1)), "Pa")
         _require_shape("pressure of the objective", pressure, (batch.numel(), self._pressure.shape[1]))
@@ -92,7 +102,6 @@ class Ledger:
         score = _observed("score", self._score(pressure))
         _require_shape("score", score, batch)
 
-        trials = torch.arange(len(self._best)) if trials is None else trials
         best, index = score.max(dim=1)
         row = torch.nonzero(best > self._best[trials])[:, 0]
         better = trials[row]
@@ -103,26 +112,29 @@ class Ledger:
         everyone = torch.full((len(self._best), batch[1]), -torch.inf, dtype=torch.float64)
         everyone[trials] = score
         self._scores.append(everyone)
-        return score
+        return pressure, score
 
     @property
     def evaluations(self) -> int:
         """Evaluations so far of a trial that has not ended."""
         return int(self._evaluations.max())
 
-    def solution(self, most: int | None = None) -> Solution:
+    def solution(self, most: int | None = None, last: bool = False) -> Solution:
         """The best drive of each trial; at least one evaluation must have been made.
 
         Args:
             most: evaluations that a trial could have made, where trials may end early: with it the history
                 of a trial is as long whatever trials are run beside it.
+            last: the last drive of `observe` instead, for a method that knows better than one reading: of
+                many noisy readings the highest is a lucky one.
         """
         history = torch.cat(self._scores, dim=1).cummax(dim=1).values
         if most is not None:
             ended = history[:, -1:].expand(-1, most - history.shape[1])
             history = torch.cat([history, ended], dim=1)
-        drive = playable(self._objective, self._drive)
-        return Solution(drive, self._pressure.clone(), self._best.clone(), self._evaluations.clone(), history)
+        drive, pressure, score = self._last if last else (self._drive, self._pressure, self._best)
+        drive = playable(self._objective, drive)
+        return Solution(drive, pressure.clone(), score.clone(), self._evaluations.clone(), history)
 
 
 def trial_seeds(seed: int, trials: Trials) -> list[int]:
