@@ -8,7 +8,7 @@ import importlib.metadata
 from functools import lru_cache
 from pathlib import Path
 
-_PACKAGES = ("torch", "numpy", "scipy", "libigl", "numba", "botorch", "gpytorch", "linear_operator")
+_PACKAGES = ("torch", "numpy", "scipy", "libigl", "numba")
 _OPTIONAL_PACKAGES = ("triton",)
 
 

@@ -98,6 +98,29 @@ def test_a_trial_depends_on_its_seed_and_not_on_the_trials_beside_it(make_object
     assert not torch.equal(method(objective, trials=4, seed=4).drive, many.drive)
 
 
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"acquisition": "log_ei", "embedding": "circle", "initial_points": "random", "noise": "inferred"}],
+    ids=["paper", "others"],
+)
+def test_a_trial_of_bayes_opt_is_the_same_in_any_block_and_on_any_number_of_threads(
+    make_objective, random_matrix, options
+):
+    objective = make_objective(random_matrix(3, 7, 0))
+    run = partial(bayes_opt, objective, evaluations=60, initial=8, fixed_transducer=1, seed=3, **options)
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        alone = run(trials=7)
+        for count, block in ((1, [5]), (2, range(7)), (3, [6, 0, 3])):
+            torch.set_num_threads(count)
+            solution = run(trials=block)
+            assert torch.equal(solution.drive, alone.drive[list(block)])
+            assert torch.equal(solution.history, alone.history[list(block)])
+    finally:
+        torch.set_num_threads(threads)
+
+
 @pytest.mark.parametrize("method", [lssg, partial(gabs, trials=3)], ids=["lssg", "gabs"])
 @settings(deadline=None, max_examples=25)
 @given(
@@ -147,6 +170,11 @@ def test_phases_at_the_control_points_are_never_seen(make_objective, random_matr
         (bayes_opt, {"evaluations": 16, "initial": 16}, "evaluations: 16; must be an integer >= 17"),
         (bayes_opt, {"fixed_transducer": 5}, "fixed_transducer: 5; must be an integer from 0 to 4"),
         (bayes_opt, {"fixed_transducer": -1}, "fixed_transducer: -1; must be an integer >= 0"),
+        (bayes_opt, {"acquisition": "ucb"}, "acquisition: 'ucb'; must be one of ei, log_ei"),
+        (bayes_opt, {"embedding": None}, "embedding: None; must be one of phases, circle"),
+        (bayes_opt, {"initial_points": "grid"}, "initial_points: 'grid'; must be one of sobol, random"),
+        (bayes_opt, {"noise": "fixed"}, "noise: 'fixed'; must be one of inferred"),
+        (bayes_opt, {"noise": 0}, "noise: 0; must be in 1e-06 to 1"),
     ],
 )
 def test_bad_hyperparameters_are_named(make_objective, random_matrix, method, options, message):
