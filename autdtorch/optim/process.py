@@ -123,8 +123,8 @@ class Process:
     def known(self) -> Known:
         """What is known of the scores, for `posterior` and the acquisition functions."""
         standard = self._standard()
-        weights = _weights(self._factor, standard)
-        scale = math.sqrt(max(standard @ weights[: self.count] / self.count, _LEAST_VARIANCE))
+        weights, explained = _weights(self._factor, standard)
+        scale = math.sqrt(max(explained / self.count, _LEAST_VARIANCE))
         return Known(
             self.circle, self.count, self._features, self._factor, weights, self.length_scale, scale,
             standard.max(),
@@ -220,13 +220,15 @@ def _append(features, factor, count, at, length_scale, noise):  # type: ignore[n
 
 @njit(**COMPILED)
 def _weights(factor, standard):  # type: ignore[no-untyped-def]
+    """W^T W y (capacity,) and |W y|^2, without BLAS: that rounds by where vectors lie in memory."""
     count = len(standard)
-    white, weights = np.empty(count), np.zeros(len(factor))
+    white, weights, explained = np.empty(count), np.zeros(len(factor)), 0.0
     whiten(factor, count, standard, white)
     for i in range(count):
+        explained += white[i] * white[i]
         for j in range(i + 1):
             weights[j] += white[i] * factor[i, j]
-    return weights
+    return weights, explained
 
 
 @njit(**COMPILED)
