@@ -69,7 +69,7 @@ def posterior(known, points):  # type: ignore[no-untyped-def]
                 explained[c] += white[c] * white[c]
         for c in range(width):
             mean[first + c] = block_mean[c]
-            deviation[first + c] = _deviation(1 - explained[c])
+            deviation[first + c] = known.scale * _deviation(1 - explained[c])
     return mean, deviation
 
 
@@ -143,14 +143,14 @@ def _value(known, log, point, gradient, room):  # type: ignore[no-untyped-def]
     for n in range(count):
         mean += known.weights[n] * kernel[n]
         explained += white[n] * white[n]
-    deviation = _deviation(1 - explained)
+    deviation = known.scale * _deviation(1 - explained)
     value, by_mean, by_deviation = _improvement(mean, deviation, known.best, log)
     pull[:count] = 0.0
     for i in range(count):
         for j in range(i + 1):
             pull[j] += white[i] * known.factor[i, j]
     for n in range(count):
-        by_kernel = by_mean * known.weights[n] - by_deviation / deviation * pull[n]
+        by_kernel = by_mean * known.weights[n] - by_deviation * known.scale**2 / deviation * pull[n]
         pull[n] = 2 * slope[n] * by_kernel
     for f in range(len(at)):
         total = 0.0

@@ -13,8 +13,8 @@ from autdtorch.objective import Objective, Score, weakest_focus
 from autdtorch.optim.base import Ledger, Solution, Trials, trial_seeds
 from autdtorch.validation import integer_at_least, invalid, number_between, require_one_of
 
-#: Variance of the observation noise that the Gaussian process assumes, in variances of the scores. Fitted, it
-#: takes the kinks of the minimum over the foci for noise, and the search ends lower.
+#: Variance of the observation noise that the Gaussian process assumes, in its own variances. Fitted, it takes
+#: the kinks of the minimum over the foci for noise, and the search ends lower.
 NOISE = 1e-4
 
 
@@ -55,7 +55,7 @@ def bayes_opt(
         embedding: what the kernel measures distances between: the "phases" as numbers from 0 to 2 pi, or
             their points (cos, sin) on the "circle", which makes the process periodic.
         initial_points: a scrambled "sobol" sequence, or independent "random" points.
-        noise: variance of the observations, in variances of the scores, from 1e-6 to 1; "inferred" fits it.
+        noise: variance of the observations, in variances of the process, from 1e-6 to 1; "inferred" fits it.
 
     Returns:
         The best drive observed in each trial.

@@ -29,7 +29,7 @@ class Settings:
         log: whether the logarithm of the expected improvement is climbed.
         circle: whether the kernel measures distances between points on the circle.
         sobol: whether the initial points are a scrambled Sobol sequence.
-        noise: variance of the observations in variances of the scores; None to fit it.
+        noise: variance of the observations in variances of the process; None to fit it.
     """
 
     dimensions: int

@@ -1,10 +1,12 @@
-"""Gaussian process of one trial: zero mean, unit variance, isotropic Matern 5/2 kernel, and noise.
+"""Gaussian process of one trial: zero mean, isotropic Matern 5/2 kernel, and noise.
 
 What a step needs is kept, and gets a row for every new point: the inverse W of the Cholesky factor of the
-covariances K + noise of the N points. A step between fits then costs O(N^2). With the standardised scores y,
-and the covariances k(x) of the points with a point x,
+correlations K + noise of the N points. A step between fits then costs O(N^2). With the standardised scores y,
+and the correlations k(x) of the points with a point x,
 
-    mean(x) = k(x)^T W^T W y,    variance(x) = 1 - |W k(x)|^2.
+    mean(x) = k(x)^T W^T W y,    variance(x) = s^2 (1 - |W k(x)|^2),    s^2 = |W y|^2 / N,
+
+s^2 being the variance of the process that makes y most likely.
 
 All of it is compiled, and works on the arrays of one trial alone: a trial is what it is whatever trials run
 beside it, and on however many threads.
@@ -34,6 +36,10 @@ LEAST_NOISE = 1e-6
 
 _FIRST_NOISE = 1e-2
 _LENGTH_SCALES = 1e-2, 1e3
+_LEAST_VARIANCE = 1e-12
+"""Of the process, in variances of the scores: where they never change."""
+_STARTS = np.array([1.0, 4.0, 16.0, 64.0])
+"""Of the fit, in first length scales: with many phases there is a second optimum, where scores are smooth."""
 _FIRST_STEP, _LAST_STEP = 0.7, 0.02
 """Of the fit, in the logarithm of the hyperparameters."""
 
@@ -48,6 +54,7 @@ class Known(NamedTuple):
         factor: W (capacity, capacity), lower triangular.
         weights: W^T W y (capacity,).
         length_scale: of the kernel.
+        scale: standard deviation s of the process.
         best: largest of the standardised scores.
     """
 
@@ -57,6 +64,7 @@ class Known(NamedTuple):
     factor: Vector
     weights: Vector
     length_scale: float
+    scale: float
     best: float
 
 
@@ -70,7 +78,7 @@ class Process:
             dimensions: number of phases D.
             capacity: largest number of points.
             circle: takes each phase as the point (cos, sin) of the circle: periodic. Otherwise as a number.
-            noise: variance of the observations in variances of the scores; None to fit it.
+            noise: variance of the observations in variances of the process; None to fit it.
         """
         self.circle = circle
         self.noise_is_fitted = noise is None
@@ -108,17 +116,19 @@ class Process:
         _invert(self._features, self.count, self.length_scale, self.noise, self._factor)
 
     def log_likelihood(self) -> float:
-        """Logarithm of the marginal likelihood of the standardised scores."""
+        """Logarithm of the marginal likelihood of the standardised scores, at the most likely variance."""
         squares = _squared_distances(self._features, self.count)
         return float(_log_likelihood(squares, self._standard(), self.length_scale, self.noise))
 
     def known(self) -> Known:
         """What is known of the scores, for `posterior` and the acquisition functions."""
         standard = self._standard()
-        weights = _weights(self._factor, standard)
+        weights, explained = _weights(self._factor, standard)
+        scale = math.sqrt(max(explained / self.count, _LEAST_VARIANCE))
         return Known(
-            self.circle, self.count, self._features, self._factor, weights, self.length_scale, standard.max()
-        )
+            self.circle, self.count, self._features, self._factor, weights, self.length_scale, scale,
+            standard.max(),
+        )  # fmt: skip
 
     def _standard(self) -> Vector:
         """Scores (N,) of mean 0 and variance 1."""
@@ -210,13 +220,15 @@ def _append(features, factor, count, at, length_scale, noise):  # type: ignore[n
 
 @njit(**COMPILED)
 def _weights(factor, standard):  # type: ignore[no-untyped-def]
+    """W^T W y (capacity,) and |W y|^2, without BLAS: that rounds by where vectors lie in memory."""
     count = len(standard)
-    white, weights = np.empty(count), np.zeros(len(factor))
+    white, weights, explained = np.empty(count), np.zeros(len(factor)), 0.0
     whiten(factor, count, standard, white)
     for i in range(count):
+        explained += white[i] * white[i]
         for j in range(i + 1):
             weights[j] += white[i] * factor[i, j]
-    return weights
+    return weights, explained
 
 
 @njit(**COMPILED)
@@ -257,24 +269,27 @@ def _log_likelihood(squares, standard, length_scale, noise):  # type: ignore[no-
     root = _cholesky(squares, length_scale, noise)
     count = len(standard)
     left = standard.copy()
-    total = -0.5 * count * math.log(2 * math.pi)
+    total, explained = 0.0, 0.0
     for i in range(count):
         white = left[i] / root[i, i]
         for j in range(i + 1, count):
             left[j] -= white * root[i, j]
-        total -= 0.5 * white * white + math.log(root[i, i])
-    return total
+        explained += white * white
+        total -= math.log(root[i, i])
+    variance = max(explained / count, _LEAST_VARIANCE)
+    return total - 0.5 * count * math.log(2 * math.pi * variance) - 0.5 * explained / variance
 
 
 @njit(**COMPILED)
 def _fit(features, count, standard, first, warm, noise_is_fitted):  # type: ignore[no-untyped-def]
-    """Compass search in the logarithms, from the better of the first and the last hyperparameters."""
+    """Compass search in the logarithms, from the best of the last hyperparameters and the first ones."""
     squares = _squared_distances(features, count)
     place = np.log(warm)
     highest = _log_likelihood(squares, standard, warm[0], warm[1])
-    value = _log_likelihood(squares, standard, first[0], first[1])
-    if value > highest:
-        place, highest = np.log(first), value
+    for start in _STARTS:
+        value = _log_likelihood(squares, standard, start * first[0], first[1])
+        if value > highest:
+            place, highest = np.log(np.array([start * first[0], first[1]])), value
     lower, upper = (
         np.log(np.array([_LENGTH_SCALES[0], LEAST_NOISE])),
         np.log(np.array([_LENGTH_SCALES[1], 1.0])),
