@@ -12,6 +12,7 @@ from .optim.bayes import bayes_opt
 from .optim.bound import focus_bound
 from .optim.gabs import gabs
 from .optim.gradient import gradient_ascent
+from .optim.identify import identify
 from .optim.lssg import lss, lssg
 from .optim.random_search import random_search
 from .plot import plot_convergence, plot_plane, plot_trials
@@ -53,6 +54,7 @@ __all__ = [
     "gabs",
     "gradient_ascent",
     "green",
+    "identify",
     "load_results",
     "load_scene",
     "lss",

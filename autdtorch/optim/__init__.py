@@ -5,7 +5,8 @@ METHOD_LABELS = {
     "lssg": "LSSG",
     "bayes_opt": "BO",
     "gabs": "GABS",
+    "identify": "identify",
     "random_search": "random search",
     "gradient_ascent": "gradient ascent",
 }
-"""The paper's names of the methods, by the names of the functions."""
+"""Names of the methods, the paper's where it has one, by the names of the functions."""

@@ -20,7 +20,7 @@ Trials: TypeAlias = int | Sequence[int]
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The best drive that each of T independent trials observed.
+    """The drive that each of T trials chose: the best it observed, but where a method says otherwise.
 
     Attributes:
         drive: (T, M), complex128, as it was played: on the levels of a `Quantised` objective.
@@ -72,6 +72,12 @@ class Ledger:
         self._scores: list[torch.Tensor] = []
 
     def evaluate(self, drive: torch.Tensor, trials: torch.Tensor | None = None) -> torch.Tensor:
+        """Scores (T, B), float64, of drives (T, B, M): `observe`, where only the score counts."""
+        self.observe(drive, trials)
+        scores = self._scores[-1]
+        return scores if trials is None else scores[trials]
+
+    def observe(self, drive: torch.Tensor, trials: torch.Tensor | None = None) -> torch.Tensor:
         """Evaluate B drives for each trial, all in one call of the objective.
 
         Args:
@@ -79,7 +85,7 @@ class Ledger:
             trials: places of the T trials that go on, all by default. One that is left out has ended.
 
         Returns:
-            Scores (T, B), float64.
+            Pressure magnitudes (T, B, P) [Pa], float64.
 
         Raises:
             ValueError: the objective gave pressures, or the score function gave scores, that are not finite
@@ -103,7 +109,7 @@ class Ledger:
         everyone = torch.full((len(self._best), batch[1]), -torch.inf, dtype=torch.float64)
         everyone[trials] = score
         self._scores.append(everyone)
-        return score
+        return pressure
 
     @property
     def evaluations(self) -> int:

@@ -1,0 +1,122 @@
+"""Check the certified bound on the weakest focus: no method may find more, in random scenes and in the paper's.
+
+Half of the random scenes have a transfer matrix without structure, half one of transducers and control points in
+empty air; 2 to 32 transducers, 1 to 8 foci. Prints what docs/decisions/bound.md quotes.
+
+    python scripts/check_bound.py --scenes 1000
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import autdtorch as at
+from autdtorch.freespace import free_space_matrix
+from autdtorch.optim.gradient import random_drives
+
+FREQUENCY = 40e3
+AIR = at.Medium(density=1.2, sound_speed=340.0)
+PAPER_SCENES = ("homogeneous", "three_cubes", "two_cubes")
+RANDOM_DRIVES = 256
+
+
+class MatrixPropagator:
+    """Gives any transfer matrix to a scene."""
+
+    def __init__(self, scene: at.Scene, matrix: torch.Tensor) -> None:
+        """Keep the `matrix` (P, M)."""
+        self.scene = scene
+        self._matrix = matrix
+
+    def transfer_matrix(self) -> torch.Tensor:
+        """The matrix."""
+        return self._matrix
+
+
+def random_objective(generator: torch.Generator) -> at.SimulatedObjective:
+    """An objective of 2 to 32 transducers and 1 to 8 foci, of either kind."""
+
+    def integer(low: int, high: int) -> int:
+        return int(torch.randint(low, high + 1, (), generator=generator))
+
+    def uniform(*shape: int) -> torch.Tensor:
+        return torch.rand(shape, dtype=torch.float64, generator=generator)
+
+    transducers, foci, physical = integer(2, 32), integer(1, 8), integer(0, 1)
+    # Transducers on a 10 mm grid of 8 x 8, foci in a cube of 100 mm that begins 40 mm in front of it.
+    places = torch.randperm(64, generator=generator)[:transducers]
+    positions = 10e-3 * torch.stack([torch.zeros(transducers), places // 8, places % 8], dim=1).double()
+    points = 100e-3 * uniform(foci, 3) + torch.tensor([40e-3, -15e-3, -15e-3])
+    array = at.TransducerArray(positions, (1.0, 0.0, 0.0))
+    scene = at.Scene(array, AIR, frequency=FREQUENCY, control_points=points)
+    matrix = torch.randn(foci, transducers, dtype=torch.complex128, generator=generator)
+    if physical:
+        matrix = free_space_matrix(points, array, scene.wavenumber)
+    return at.SimulatedObjective(scene, MatrixPropagator(scene, matrix))
+
+
+def highest_scores(objective: at.SimulatedObjective, generator: torch.Generator) -> dict[str, float]:
+    """Weakest focus [Pa] that each method finds."""
+    transducers = len(objective.scene.array)
+    random = objective(random_drives(RANDOM_DRIVES, transducers, generator)).amin(dim=1)
+    return {
+        "random": random.max().item(),
+        "gabs": at.gabs(objective).score.item(),
+        "identify": at.identify(objective, evaluations=4 * transducers).score.item(),
+        "gradient_ascent": at.gradient_ascent(objective).score.item(),
+    }
+
+
+def check_random_scenes(count: int, seed: int) -> int:
+    """Print the gaps to the bound in `count` random scenes; returns how often a method was above."""
+    generator = torch.Generator().manual_seed(seed)
+    gaps = defaultdict(list)
+    seconds, above = [], 0
+    for _ in range(count):
+        objective = random_objective(generator)
+        start = time.perf_counter()
+        bound = at.focus_bound(objective.transfer_matrix)
+        seconds.append(time.perf_counter() - start)
+        for name, score in highest_scores(objective, generator).items():
+            gaps[name].append(1 - score / bound)
+            above += score > bound
+    print(f"{count} random scenes, seed {seed}: {above} scores above the bound")
+    print(f"  seconds a bound: median {np.median(seconds):.3f}, most {max(seconds):.3f}")
+    for name, values in gaps.items():
+        print(f"  {name}: gap least {min(values):.1e}, median {np.median(values):.2%}, most {max(values):.2%}")
+    return above
+
+
+def check_paper_scenes(folder: Path) -> None:
+    """Print the gap of gradient ascent in the paper's scenes."""
+    for name in PAPER_SCENES:
+        scene = at.load_scene(folder / f"{name}.yaml")
+        objective = at.SimulatedObjective(scene, at.make_propagator(scene))
+        bound = at.focus_bound(objective.transfer_matrix)
+        unit = 4 * math.pi * 80e-3  # one transducer of the paper's strength on its axis, at the foci's distance
+        score = at.gradient_ascent(objective).score.item()
+        print(f"{name}: bound {bound * unit:.4f}, gradient {score * unit:.4f}, gap {1 - score / bound:.3%}")
+
+
+def main() -> None:
+    """Run both checks; exit with 1 where a score is above its bound."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scenes", type=int, default=1000, help="number of random scenes (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="of the random scenes (default: %(default)s)")
+    parser.add_argument(
+        "--paper", type=Path, default=Path("configs/scene"), help="folder of the paper's scenes (%(default)s)"
+    )
+    arguments = parser.parse_args()
+    check_paper_scenes(arguments.paper)
+    raise SystemExit(check_random_scenes(arguments.scenes, arguments.seed) > 0)
+
+
+if __name__ == "__main__":
+    main()
