@@ -5,8 +5,8 @@ METHOD_LABELS = {
     "lssg": "LSSG",
     "bayes_opt": "BO",
     "gabs": "GABS",
-    "random_search": "random search",
     "identify": "identify",
+    "random_search": "random search",
     "gradient_ascent": "gradient ascent",
 }
 """Names of the methods, the paper's where it has one, by the names of the functions."""

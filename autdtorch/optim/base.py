@@ -71,13 +71,13 @@ class Ledger:
         self._evaluations = torch.zeros(trials, dtype=torch.int64)
         self._scores: list[torch.Tensor] = []
 
-    def observe(self, drive: torch.Tensor) -> torch.Tensor:
-        """Evaluate as `evaluate` does, for all trials: pressure magnitudes (T, B, P) [Pa], float64."""
-        pressure, score = self._record(drive, torch.arange(len(self._best)))
-        self._last = drive[:, -1], pressure[:, -1], score[:, -1]
-        return pressure
-
     def evaluate(self, drive: torch.Tensor, trials: torch.Tensor | None = None) -> torch.Tensor:
+        """Scores (T, B), float64, of drives (T, B, M): `observe`, where only the score counts."""
+        self.observe(drive, trials)
+        scores = self._scores[-1]
+        return scores if trials is None else scores[trials]
+
+    def observe(self, drive: torch.Tensor, trials: torch.Tensor | None = None) -> torch.Tensor:
         """Evaluate B drives for each trial, all in one call of the objective.
 
         Args:
@@ -85,16 +85,12 @@ class Ledger:
             trials: places of the T trials that go on, all by default. One that is left out has ended.
 
         Returns:
-            Scores (T, B), float64.
+            Pressure magnitudes (T, B, P) [Pa], float64.
 
         Raises:
             ValueError: the objective gave pressures, or the score function gave scores, that are not finite
                 real numbers or have the wrong shape.
         """
-        return self._record(drive, torch.arange(len(self._best)) if trials is None else trials)[1]
-
-    def _record(self, drive: torch.Tensor, trials: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Pressure and score of drives of some trials."""
         batch = drive.shape[:2]
         pressure = _observed("pressure of the objective", self._objective(drive.flatten(0, 1)), "Pa")
         _require_shape("pressure of the objective", pressure, (batch.numel(), self._pressure.shape[1]))
@@ -102,6 +98,7 @@ class Ledger:
         score = _observed("score", self._score(pressure))
         _require_shape("score", score, batch)
 
+        trials = torch.arange(len(self._best)) if trials is None else trials
         best, index = score.max(dim=1)
         row = torch.nonzero(best > self._best[trials])[:, 0]
         better = trials[row]
@@ -112,29 +109,26 @@ class Ledger:
         everyone = torch.full((len(self._best), batch[1]), -torch.inf, dtype=torch.float64)
         everyone[trials] = score
         self._scores.append(everyone)
-        return pressure, score
+        return pressure
 
     @property
     def evaluations(self) -> int:
         """Evaluations so far of a trial that has not ended."""
         return int(self._evaluations.max())
 
-    def solution(self, most: int | None = None, last: bool = False) -> Solution:
+    def solution(self, most: int | None = None) -> Solution:
         """The best drive of each trial; at least one evaluation must have been made.
 
         Args:
             most: evaluations that a trial could have made, where trials may end early: with it the history
                 of a trial is as long whatever trials are run beside it.
-            last: the last drive of `observe` instead, for a method that knows better than one reading: of
-                many noisy readings the highest is a lucky one.
         """
         history = torch.cat(self._scores, dim=1).cummax(dim=1).values
         if most is not None:
             ended = history[:, -1:].expand(-1, most - history.shape[1])
             history = torch.cat([history, ended], dim=1)
-        drive, pressure, score = self._last if last else (self._drive, self._pressure, self._best)
-        drive = playable(self._objective, drive)
-        return Solution(drive, pressure.clone(), score.clone(), self._evaluations.clone(), history)
+        drive = playable(self._objective, self._drive)
+        return Solution(drive, self._pressure.clone(), self._best.clone(), self._evaluations.clone(), history)
 
 
 def trial_seeds(seed: int, trials: Trials) -> list[int]:

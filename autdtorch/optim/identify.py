@@ -6,6 +6,8 @@ transfer matrix, but for a phase that no magnitude shows (docs/decisions/identif
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from autdtorch.conditions import playable
@@ -64,14 +66,16 @@ def identify(objective: Objective, evaluations: int = 64, trials: Trials = 1, se
         left -= count
         if count == 0:
             continue
-        near = torch.stack([_nearby(*of, count) for of in zip(best, generators, strict=True)])
-        near = playable(objective, near)
+        spread = [_nearby(*of, count) for of in zip(best, generators, strict=True)]
+        near = playable(objective, torch.stack(spread))
         drives = torch.cat([drives, near], dim=1)
         observed = torch.cat([observed, ledger.observe(near)], dim=1)
         rows = [_fit(*seen) for seen in zip(drives, observed, rows, strict=True)]
         best = _strongest(rows, generators)
-    ledger.observe(best[:, None])
-    return ledger.solution(last=True)
+    pressure = ledger.observe(best[:, None])[:, 0]
+    # Not the highest reading: among many noisy ones that is a lucky one.
+    chosen = playable(objective, best)
+    return replace(ledger.solution(), drive=chosen, pressure=pressure, score=weakest_focus(pressure))
 
 
 def _search(drives: torch.Tensor, observed: torch.Tensor, generator: torch.Generator) -> torch.Tensor:

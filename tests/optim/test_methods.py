@@ -28,7 +28,7 @@ BLACK_BOX_METHODS = {
     "gabs by strength": partial(gabs, order="strength", trials=2),
     "bayes_opt": partial(small_bayes_opt, trials=2),
     "random_search": partial(random_search, evaluations=70, trials=2),
-    "identify": partial(identify, trials=2, evaluations=30),
+    "identify": partial(identify, evaluations=30, trials=2),
 }
 EVERY_METHOD = BLACK_BOX_METHODS | {"gradient_ascent": partial(gradient_ascent, trials=2)}
 METHODS = pytest.mark.parametrize("method", EVERY_METHOD.values(), ids=EVERY_METHOD.keys())
