@@ -42,19 +42,6 @@ def test_ledger_keeps_the_best_drive_of_every_trial(make_objective, random_matri
     assert torch.equal(solution.pressure, objective(solution.drive))
 
 
-def test_a_method_may_choose_its_last_drive(make_objective, random_matrix):
-    objective = make_objective(random_matrix(3, 4, 0))
-    ledger = Ledger(objective, 2, weakest_focus)
-    drives = [random_drives(2, 5, 4, seed=seed) for seed in range(2)]
-    for drive in drives:
-        ledger.observe(drive)
-    solution = ledger.solution(last=True)
-    assert torch.equal(solution.drive, drives[-1][:, -1])
-    assert torch.equal(solution.pressure, objective(solution.drive))
-    assert torch.equal(solution.score, solution.pressure.amin(dim=1))
-    assert torch.equal(solution.history, ledger.solution().history)
-
-
 def test_score_is_a_separate_function(make_objective, random_matrix):
     ledger = Ledger(make_objective(random_matrix(3, 4, 0)), 1, lambda pressure: pressure.mean(dim=-1))
     ledger.evaluate(random_drives(1, 6, 4))
