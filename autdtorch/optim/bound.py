@@ -21,6 +21,9 @@ from autdtorch.validation import ArrayLike, complex_tensor
 #: The spectral norm has kinks, where minima lie. Schatten norms of these orders have none, and tend to it.
 _ORDERS = (8, 64, 512, 4096, 32768)
 
+#: Relative to the one they start with: no step of the search may end where all weights are 0.
+_LEAST_WEIGHT = 1e-12
+
 #: Relative, on top of the bound: rounding, of the bound and of a pressure beside it, is below 1e-13.
 _MARGIN = 1e-12
 
@@ -56,7 +59,7 @@ def focus_bound(G: ArrayLike) -> float:
             args=(rows, alone, order),
             jac=True,
             method="L-BFGS-B",
-            bounds=[(0, None)] * len(rows) + [(None, None)] * rows.shape[1],
+            bounds=[(_LEAST_WEIGHT, None)] * len(rows) + [(None, None)] * rows.shape[1],
             options={"maxcor": 40, "maxiter": 2000, "ftol": 1e-14, "gtol": 1e-10},
         ).x
     return float(np.exp(_log_bound(x, rows, alone, np.inf)[0]) * (1 + _MARGIN))
