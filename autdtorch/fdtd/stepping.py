@@ -104,10 +104,7 @@ class Assembly:
             0, torch.from_numpy(inverse.reshape(-1)), force
         )
         total = total / torch.from_numpy(self.varying.mass_of(index))
-        return Sources(
-            torch.from_numpy(index),
-            total.to(torch.complex128 if self.dtype == torch.float64 else torch.complex64),
-        )
+        return Sources(torch.from_numpy(index), torch.view_as_real(total).to(self.dtype))
 
 
 def assemble(
