@@ -38,8 +38,7 @@ def scaled_cells(
     varying: VaryingCells, stencil: Stencil, grid: Grid, dtype: torch.dtype
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Cells of the boundary layers (k,) whose rows are not of air, and their scale (k,)."""
-    places = np.stack(np.unravel_index(varying.index, grid.shape), axis=-1)
-    here = ((places < np.array(grid.first)) | (places >= np.array(grid.last))).any(axis=1)
+    here = ~grid.inside(varying.index)
     scale = row_scale(varying.weight[here], stencil)
     return torch.from_numpy(varying.index[here]), torch.from_numpy(scale).to(dtype)
 

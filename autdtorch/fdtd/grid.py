@@ -109,6 +109,11 @@ class Grid:
         """Positions (..., 3) [m] in units of cells, cell centres being whole numbers."""
         return np.asarray((points.numpy() - np.array(self.origin)) / self.spacing, np.float64)
 
+    def inside(self, index: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which cells of flat `index` (...) are interior."""
+        places = np.stack(np.unravel_index(index, self.shape), axis=-1)
+        return np.asarray(((places >= np.array(self.first)) & (places < np.array(self.last))).all(axis=-1))
+
     def clip(self, cells: Array) -> Array:
         """Positions (..., 3) in cells, those in the boundary layer moved to the interior cell they touch."""
         return np.clip(cells, self.first, np.array(self.last) - 1)
