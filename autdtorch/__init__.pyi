@@ -11,7 +11,7 @@ from .optim.bayes import bayes_opt
 from .optim.gabs import gabs
 from .optim.lssg import lssg
 from .plot import plot_convergence, plot_plane, plot_trials
-from .propagator import SteadyStateWarning, make_propagator
+from .propagator import SteadyStateWarning, cell_centers, differentiable_field, make_propagator
 from .results import load_results
 from .scene import Medium, OverlapWarning, Scene
 from .scene_file import load_scene
@@ -37,7 +37,9 @@ __all__ = [
     "VoxelMask",
     "amplitudes_of",
     "bayes_opt",
+    "cell_centers",
     "circle_points",
+    "differentiable_field",
     "drive_from_phases",
     "focus_metrics",
     "focus_phases",

@@ -91,6 +91,16 @@ def integer_at_least(name: str, value: object, minimum: int) -> int:
     return int(value)
 
 
+def require_one_of(name: str, value: object, accepted: tuple[str, ...]) -> None:
+    """Check that `value` is one of the texts accepted.
+
+    Raises:
+        ValueError: it is not.
+    """
+    if value not in accepted:
+        raise invalid(name, value, f"must be one of {', '.join(accepted)}")
+
+
 def positive_integers(name: str, value: object, count: int) -> tuple[int, ...]:
     """`value` as `count` integers >= 1.
 

@@ -152,7 +152,7 @@ class _Neighbourhood:
         place[self.cells] = torch.arange(len(self.cells))
         total = torch.empty((len(self.index), 27), dtype=after.dtype)
         at_once = max(1, _GATHERED // (27 * len(after)))
-        for part in torch.arange(len(self.index)).split(at_once):
+        for part in torch.split(torch.arange(len(self.index)), at_once):
             around = place[self.index[part, None] + self.offsets]
             field = torch.cat((first[:, around], after[:-1, around]))
             total[part] = torch.einsum("tn,tnj->nj", adjoint[:, part], field - field[:, :, 13:14])
@@ -167,7 +167,7 @@ class _Recorded(torch.autograd.Function):
         """Record, and keep the states at the cuts where derivatives by the weights are wanted."""
         sources, steps = Sources(run.driven, force.detach()), len(run.signal)
         state = run.assembly.silence(sources)
-        ctx.run, ctx.sources, ctx.around = run, sources, None
+        ctx.run, ctx.sources, ctx.around, ctx.cuts = run, sources, None, [0, steps]
         if not ctx.needs_input_grad[1]:
             return run.advance(state, sources, run.receivers, run.signal)[1]
         ctx.around = around = _Neighbourhood.of(run)
@@ -189,30 +189,27 @@ class _Recorded(torch.autograd.Function):
     def backward(ctx: Any, slope: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None, None]:
         """Step the adjoint run, and again the segments that go with it."""
         run, around, steps, driven = ctx.run, ctx.around, len(slope), len(ctx.run.driven)
-        weight = run.assembly.coefficients.varying_weight
-        by_force, by_weight = torch.zeros_like(ctx.sources.force), None
-        groups, cuts = [run.driven], [0, steps]
-        if around is not None:
-            by_weight, cuts = torch.zeros_like(weight), ctx.cuts
-            groups.append(around.index)
-        if not slope.any():
-            return by_force, by_weight, None
-        cells, mass = torch.cat(groups), torch.cat([run.mass(group) for group in groups])
-        sources, signal = run.adjoint_sources(slope)
-        state = run.assembly.silence(sources)
-        for number, (start, end) in reversed(list(enumerate(pairwise(cuts)))):
-            state, heard = run.advance(state, sources, run.single(cells), signal[steps - end : steps - start])
-            adjoint = mass * heard.flip(0)
-            by_force += adjoint[:, :driven].T @ run.signal[start:end]
-            if around is not None:
-                last = end == steps
-                field = (
-                    ctx.last
-                    if last
-                    else run.fields(ctx.states[number], ctx.sources, around.cells, run.signal[start:end])
-                )
-                by_weight[around.own] += around.correlated(adjoint[:, driven:], *field)
-        return by_force, by_weight, None
+        by_force = torch.zeros_like(ctx.sources.force)
+        by_weight = torch.zeros_like(run.assembly.coefficients.varying_weight)
+        if slope.any():
+            cells = [run.driven] if around is None else [run.driven, around.index]
+            mass, read = torch.cat([run.mass(group) for group in cells]), run.single(torch.cat(cells))
+            sources, signal = run.adjoint_sources(slope)
+            state = run.assembly.silence(sources)
+            for number in reversed(range(len(ctx.cuts) - 1)):
+                start, end = ctx.cuts[number : number + 2]
+                part = run.signal[start:end]
+                state, heard = run.advance(state, sources, read, signal[steps - end : steps - start])
+                adjoint = mass * heard.flip(0)
+                by_force += adjoint[:, :driven].T @ part
+                if around is not None:
+                    again = (
+                        ctx.last
+                        if end == steps
+                        else run.fields(ctx.states[number], ctx.sources, around.cells, part)
+                    )
+                    by_weight[around.own] += around.correlated(adjoint[:, driven:], *again)
+        return by_force, None if around is None else by_weight, None
 
 
 def _copy(state: State) -> State:

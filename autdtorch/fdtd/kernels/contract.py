@@ -125,8 +125,12 @@ def uniform_state(shape: tuple[int, int, int], coefficients: Coefficients, press
 
 @dataclass(frozen=True)
 class Sources:
-    """Cells that are driven: flat `index` (n,) int64, ascending, no two alike; `force` (n, S) [Pa] by each of
-    the S signals. A drive has two, the cosine and the sine of w t, and the real and imaginary part of a phasor."""
+    """Cells that are driven, by S signals: a drive has two, cos(w t) and sin(w t), times its envelope.
+
+    Attributes:
+        index: flat (n,) int64, ascending, no two alike.
+        force: by each signal (n, S) [Pa]; of a drive, real and imaginary part of the phasors.
+    """
 
     index: torch.Tensor
     force: torch.Tensor
