@@ -28,11 +28,8 @@ from autdtorch.fdtd.points import PointWeights
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
 
-_SEGMENT_BYTES = 256 * 2**20
+_SEGMENT_BYTES = 128 * 2**20
 """Of what is recorded in a segment at once; longer ones only where the states kept would take more."""
-
-_GATHERED = 2**22
-"""Numbers that are gathered at once to sum up the derivatives by weights."""
 
 _ROUNDING = 4
 """Roundings of the largest singular value below which others are nothing else."""
@@ -146,17 +143,20 @@ class _Neighbourhood:
         """What the receivers hear (steps, R) of the field in the cells (steps, k)."""
         return torch.from_numpy((self.points.reading(self.cells.numpy()) @ field.numpy().T).T)
 
-    def correlated(self, adjoint: torch.Tensor, first: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
-        """Sums (n, 27) of lambda_i (p_j - p_i) over the steps, from lambda (steps, n) and `_Run.fields`."""
-        place = torch.zeros(int(self.cells[-1]) + 1, dtype=torch.int64)
-        place[self.cells] = torch.arange(len(self.cells))
-        total = torch.empty((len(self.index), 27), dtype=after.dtype)
-        at_once = max(1, _GATHERED // (27 * len(after)))
-        for part in torch.split(torch.arange(len(self.index)), at_once):
-            around = place[self.index[part, None] + self.offsets]
-            field = torch.cat((first[:, around], after[:-1, around]))
-            total[part] = torch.einsum("tn,tnj->nj", adjoint[:, part], field - field[:, :, 13:14])
-        return total
+    def correlate(
+        self, adjoint: torch.Tensor, first: torch.Tensor, after: torch.Tensor, total: torch.Tensor
+    ) -> None:
+        """Add to `total` (n, 27) the sums of lambda_i (p_j - p_i), of lambda (steps, n) and `_Run.fields`."""
+        from autdtorch.fdtd.kernels.cpu_correlation import correlate  # with numba, which takes its time
+
+        field = torch.empty(after.shape[::-1], dtype=after.dtype)
+        field[:, 0], field[:, 1:] = first[0], after[:-1].T
+        place = torch.zeros(int(self.cells[-1]) + 1, dtype=torch.int32)
+        place[self.cells] = torch.arange(len(self.cells), dtype=torch.int32)
+        correlate(
+            adjoint.T.contiguous().numpy(), field.numpy(), self.index.numpy(), self.offsets.numpy(),
+            place.numpy(), total.numpy(),
+        )  # fmt: skip
 
 
 class _Recorded(torch.autograd.Function):
@@ -190,7 +190,7 @@ class _Recorded(torch.autograd.Function):
         """Step the adjoint run, and again the segments that go with it."""
         run, around, steps, driven = ctx.run, ctx.around, len(slope), len(ctx.run.driven)
         by_force = torch.zeros_like(ctx.sources.force)
-        by_weight = torch.zeros_like(run.assembly.coefficients.varying_weight)
+        by_row = torch.zeros((0 if around is None else len(around.index), 27), dtype=by_force.dtype)
         if slope.any():
             cells = [run.driven] if around is None else [run.driven, around.index]
             mass, read = torch.cat([run.mass(group) for group in cells]), run.single(torch.cat(cells))
@@ -203,13 +203,15 @@ class _Recorded(torch.autograd.Function):
                 adjoint = mass * heard.flip(0)
                 by_force += adjoint[:, :driven].T @ part
                 if around is not None:
-                    again = (
-                        ctx.last
-                        if end == steps
-                        else run.fields(ctx.states[number], ctx.sources, around.cells, part)
-                    )
-                    by_weight[around.own] += around.correlated(adjoint[:, driven:], *again)
-        return by_force, None if around is None else by_weight, None
+                    fields = ctx.last
+                    if end < steps:
+                        fields = run.fields(ctx.states[number], ctx.sources, around.cells, part)
+                    around.correlate(adjoint[:, driven:], *fields, by_row)
+        if around is None:
+            return by_force, None, None
+        by_weight = torch.zeros_like(run.assembly.coefficients.varying_weight)
+        by_weight[around.own] = by_row
+        return by_force, by_weight, None
 
 
 def _copy(state: State) -> State:

@@ -58,7 +58,7 @@ def _flow_factor(stencil: Stencil, speed_ratio: torch.Tensor) -> torch.Tensor:
 
 
 def _speed_factor(stencil: Stencil, speed_ratio: torch.Tensor) -> torch.Tensor:
-    """`medium.speed_factor`, cell by cell: the mean of cos(k . n) over all directions is sin(k |n|) / (k |n|)."""
+    """`medium.speed_factor`, cell by cell: over all directions cos(k . n) has the mean sin(|k n|) / |k n|."""
     wave = complex(stencil.kappa, stencil.eta) / speed_ratio
     symbol = torch.zeros_like(speed_ratio)
     for count, weight, length in (

@@ -1,9 +1,9 @@
-"""Varying cells that autograd can go back through, to the obstacles' materials and places."""
+"""Varying cells that autograd can go back through: to the materials of obstacles."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,15 +16,14 @@ from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.medium import fill_elements
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.fdtd.stepping import Assembly, air_stencil, assembly_of
-from autdtorch.obstacles import Moved, Obstacle
+from autdtorch.obstacles import Obstacle
 from autdtorch.scene import Scene
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _SMALL = 1e-4
-"""Step of the central differences, relative to a material's value or in cells. Rounding is then 1e-8 of what
-is told from it, and so is the curvature."""
+"""Relative step of the central differences: what they miss and the rounding in them are about 1e-8."""
 
 
 @dataclass(frozen=True)
@@ -45,133 +44,120 @@ class VariableCells:
         """Ready to step, differentiable by `coefficients.varying_weight`; see `assemble_on`."""
         stencil = air_stencil(grid, scene)
         assembly = assembly_of(grid, stencil, self.varying, scene.frequency, dtype, time_step)
-        factor = assembly.coefficients.face / stencil.face
-        weight = (factor * self.weight).to(dtype)
-        return replace(assembly, coefficients=replace(assembly.coefficients, varying_weight=weight))
+        coefficients = assembly.coefficients
+        weight = (coefficients.face / stencil.face * self.weight).to(dtype)
+        return replace(assembly, coefficients=replace(coefficients, varying_weight=weight))
 
     def driven(self, sources: Sources) -> Sources:
-        """Sources of an assembly, differentiable by the mass of the cells they are in, too."""
+        """Sources of the assembly, differentiable also by the mass of the cells they are in."""
         _, place, own = np.intersect1d(self.varying.index, sources.index.numpy(), return_indices=True)
         share = torch.ones(len(sources.index), dtype=self.mass.dtype)
         share[own] = torch.from_numpy(self.varying.mass[place]) / self.mass[place]
         return Sources(sources.index, share.to(sources.force)[:, None] * sources.force)
 
 
+@dataclass(frozen=True)
+class _Difference:
+    """The cells for a number (a tensor of no axes) a little larger and smaller, 2 `step` apart."""
+
+    number: torch.Tensor
+    step: float
+    ahead: VaryingCells
+    behind: VaryingCells
+
+
 def with_materials(
-    scene: Scene, density: torch.Tensor | None, sound_speed: torch.Tensor | None, offset: torch.Tensor | None
+    scene: Scene, density: torch.Tensor | None, sound_speed: torch.Tensor | None
 ) -> tuple[Obstacle, ...]:
-    """A scene's K obstacles of other density (K,), sound speed (K,), and moved by (K, 3), where given."""
-    changed = []
-    for number, obstacle in enumerate(scene.obstacles):
-        if not obstacle.rigid:
-            if density is not None:
-                obstacle = replace(obstacle, density=float(density[number]))
-            if sound_speed is not None:
-                obstacle = replace(obstacle, sound_speed=float(sound_speed[number]))
-        if offset is not None and offset[number].any():
-            x, y, z = offset[number].tolist()
-            obstacle = Moved(
-                shape=obstacle, offset=(x, y, z), density=obstacle.density,
-                sound_speed=obstacle.sound_speed, rigid=obstacle.rigid,
-            )  # fmt: skip
-        changed.append(obstacle)
-    return tuple(changed)
+    """A scene's K obstacles with the densities (K,) and sound speeds (K,) given; rigid ones as they are."""
+    obstacles = list(scene.obstacles)
+    for number, obstacle in enumerate(obstacles):
+        if density is not None and not obstacle.rigid:
+            obstacle = replace(obstacle, density=float(density[number]))
+        if sound_speed is not None and not obstacle.rigid:
+            obstacle = replace(obstacle, sound_speed=float(sound_speed[number]))
+        obstacles[number] = obstacle
+    return tuple(obstacles)
 
 
 def cells_of_obstacles(
-    scene: Scene,
-    grid: Grid,
-    density: torch.Tensor | None = None,
-    sound_speed: torch.Tensor | None = None,
-    offset: torch.Tensor | None = None,
+    scene: Scene, grid: Grid, density: torch.Tensor | None = None, sound_speed: torch.Tensor | None = None
 ) -> VariableCells:
-    """Varying cells of a scene's K obstacles, differentiable by what is given as a tensor that asks for it.
+    """Varying cells of a scene's K obstacles, differentiable by their materials.
 
-    The derivatives are central differences of the whole assembly, one for each number. Values that do not
-    ask for gradients, and materials of rigid obstacles, take none.
+    The derivatives are central differences of the whole assembly, one for each number of a tensor that asks
+    for gradients.
 
     Args:
         scene: of which all else is taken.
-        grid: that does not move with the obstacles.
-        density: (K,) [kg/m^3].
-        sound_speed: (K,) [m/s].
-        offset: by which the obstacles are moved (K, 3) [m].
+        grid: on which.
+        density: (K,) [kg/m^3]; what is given for rigid obstacles does not count.
+        sound_speed: (K,) [m/s], likewise.
 
     Raises:
-        ValueError: a derivative reaches into the boundary layers, or a cell of a rigid obstacle opens or
-            closes within the difference.
+        ValueError: an obstacle that is differentiated reaches into the boundary layers.
     """
-    given = (density, sound_speed, offset)
     stencil = air_stencil(grid, scene)
-
-    def assembled(values: Sequence[torch.Tensor | None]) -> VaryingCells:
-        changed = copy.copy(scene)  # not checked again: it differs by 1e-4 of a cell
-        object.__setattr__(changed, "obstacles", with_materials(scene, *values))
-        return varying_cells(fill_elements(changed, grid, stencil), stencil)
-
-    fixed = [None if value is None else value.detach() for value in given]
-    base = assembled(fixed)
-    entries, pairs = [], []
-    for which, value in enumerate(given):
-        if value is None or not value.requires_grad:
-            continue
-        for place in np.ndindex(*value.shape):
-            if which < 2 and scene.obstacles[place[0]].rigid:
-                continue
-            step = _SMALL * (grid.spacing if which == 2 else float(value[place]))
-            moved = []
-            for sign in (1, -1):
-                other = value.detach().clone()
-                other[place] += sign * step
-                moved.append(assembled([*fixed[:which], other, *fixed[which + 1 :]]))
-            _require_alike(place[0], base, moved)
-            entries.append(value[place] / (2 * step))
-            pairs.append(moved)
-    return _linear(base, entries, pairs, grid, stencil)
-
-
-def _require_alike(number: int, base: VaryingCells, moved: Sequence[VaryingCells]) -> None:
-    if not all(np.array_equal(base.rigid, other.rigid) for other in moved):
-        raise ValueError(
-            f"offset[{number}]: a cell of the rigid obstacle opens or closes just here; move it a little"
-        )
-
-
-def _linear(
-    base: VaryingCells,
-    entries: Sequence[torch.Tensor],
-    pairs: Sequence[Sequence[VaryingCells]],
-    grid: Grid,
-    stencil: Stencil,
-) -> VariableCells:
-    """Cells whose rows and masses have the values of `base`, and half the pairs' differences as slopes."""
-    index = np.unique(np.concatenate([base.index, *(each.index for pair in pairs for each in pair)]))
-    weight, mass = _on(index, base, stencil)
-    varying = VaryingCells(index, weight, mass, base.rigid, base.shell)
-    variable_weight, variable_mass = torch.from_numpy(weight), torch.from_numpy(mass)
-    for entry, (ahead, behind) in zip(entries, pairs, strict=True):
-        rows, masses = (
-            more - less
-            for more, less in zip(_on(index, ahead, stencil), _on(index, behind, stencil), strict=True)
-        )
+    fixed = [None if given is None else given.detach() for given in (density, sound_speed)]
+    base = _assembled(scene, grid, stencil, *fixed)
+    differences = list(_differences(scene, grid, stencil, density, sound_speed))
+    every = [base.index, *(each.index for one in differences for each in (one.ahead, one.behind))]
+    index = np.unique(np.concatenate(every))
+    weight, mass = (torch.from_numpy(part) for part in _on(index, base, stencil))
+    varying = VaryingCells(index, weight.numpy(), mass.numpy(), base.rigid, base.shell)
+    for one in differences:
+        ahead, behind = _on(index, one.ahead, stencil), _on(index, one.behind, stencil)
+        rows, masses = ((more - less) / (2 * one.step) for more, less in zip(ahead, behind, strict=True))
         changed = np.flatnonzero(rows.any(axis=1) | (masses != 0))
         if not grid.inside(index[changed]).all():
             raise ValueError(
-                "density, sound_speed, offset: reach the boundary layers; obstacles to be differentiated must end "
-                "inside the domain"
+                "density, sound_speed: an obstacle that is differentiated reaches into the boundary layers; "
+                "must end inside the domain"
             )
-        shift = entry - entry.detach()
-        variable_weight = variable_weight.index_add(
-            0, torch.from_numpy(changed), shift * torch.from_numpy(rows[changed])
-        )
-        variable_mass = variable_mass.index_add(
-            0, torch.from_numpy(changed), shift * torch.from_numpy(masses[changed])
-        )
-    return VariableCells(varying, variable_weight, variable_mass)
+        places, shift = torch.from_numpy(changed), one.number - one.number.detach()
+        weight = weight.index_add(0, places, shift * torch.from_numpy(rows[changed]))
+        mass = mass.index_add(0, places, shift * torch.from_numpy(masses[changed]))
+    return VariableCells(varying, weight, mass)
+
+
+def _differences(
+    scene: Scene,
+    grid: Grid,
+    stencil: Stencil,
+    density: torch.Tensor | None,
+    sound_speed: torch.Tensor | None,
+) -> Iterator[_Difference]:
+    given = {"density": density, "sound_speed": sound_speed}
+    fixed = {name: None if each is None else each.detach() for name, each in given.items()}
+    for name, values in given.items():
+        if values is None or not values.requires_grad:
+            continue
+        for number, obstacle in enumerate(scene.obstacles):
+            if obstacle.rigid:
+                continue
+            step = _SMALL * float(values.detach()[number])
+            sides = []
+            for way in (1, -1):
+                moved = values.detach().clone()
+                moved[number] += way * step
+                sides.append(_assembled(scene, grid, stencil, **(fixed | {name: moved})))
+            yield _Difference(values[number], step, *sides)
+
+
+def _assembled(
+    scene: Scene,
+    grid: Grid,
+    stencil: Stencil,
+    density: torch.Tensor | None,
+    sound_speed: torch.Tensor | None,
+) -> VaryingCells:
+    changed = copy.copy(scene)  # without another look at its geometry, which is the same
+    object.__setattr__(changed, "obstacles", with_materials(scene, density, sound_speed))
+    return varying_cells(fill_elements(changed, grid, stencil), stencil)
 
 
 def _on(index: Index, cells: VaryingCells, stencil: Stencil) -> tuple[Array, Array]:
-    """Rows (n, 27) and mass (n,) on cells of which some may be of air."""
+    """Rows (n, 27) and mass (n,) of `index` (n,), which holds all of `cells` and besides them air."""
     weight, mass = np.tile(stencil.weights, (len(index), 1)), np.ones(len(index))
     place = np.searchsorted(index, cells.index)
     weight[place], mass[place] = cells.weight, cells.mass

@@ -4,8 +4,7 @@ from autdtorch.obstacles.base import Obstacle
 from autdtorch.obstacles.box import Box
 from autdtorch.obstacles.cylinder import Cylinder
 from autdtorch.obstacles.mesh import Mesh
-from autdtorch.obstacles.moved import Moved
 from autdtorch.obstacles.sphere import Sphere
 from autdtorch.obstacles.voxel_mask import VoxelMask
 
-__all__ = ["Box", "Cylinder", "Mesh", "Moved", "Obstacle", "Sphere", "VoxelMask"]
+__all__ = ["Box", "Cylinder", "Mesh", "Obstacle", "Sphere", "VoxelMask"]

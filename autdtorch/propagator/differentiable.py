@@ -13,7 +13,7 @@ from autdtorch.fdtd.grid import Grid, make_grid, require_fine
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources
 from autdtorch.fdtd.steady_state import block_of, fewest_periods
 from autdtorch.fdtd.stepping import Assembly, drive_signal, lock_in
-from autdtorch.fdtd.variable_cells import VariableCells, cells_of_obstacles, with_materials
+from autdtorch.fdtd.variable_cells import VariableCells, cells_of_obstacles
 from autdtorch.propagator.stepper import KERNELS, make_kernel, precision_of
 from autdtorch.scene import Scene, require_inside
 from autdtorch.validation import (
@@ -34,7 +34,6 @@ def differentiable_field(
     *,
     density: ArrayLike | None = None,
     sound_speed: ArrayLike | None = None,
-    offset: ArrayLike | None = None,
     spacing: float = 1e-3,
     periods: int | None = None,
     kernel: str = "auto",
@@ -43,25 +42,25 @@ def differentiable_field(
 ) -> torch.Tensor:
     """Pressure of drives at points, differentiable by every tensor given, on the whole domain.
 
-    A loss is differentiated by an adjoint run of the same kernel; what is kept for it is bounded, however
-    long the run. Density and sound speed are those of the scene's K obstacles, or a map of the domain's cells
-    in a scene without obstacles (`cell_centers` says where they are). The grid stays where the scene's own
-    obstacles have it when `offset` moves them.
+    A loss is differentiated by an adjoint run of the same kernel, in bounded memory. Density and sound speed
+    are those of the scene's K obstacles or, in a scene without obstacles, maps of the domain's cells, whose
+    places `cell_centers` tells. Maps know no surfaces between the cells and are less accurate, but the field
+    of a map that changes smoothly with a place or a shape does so too; that of an obstacle does not, as the
+    grid shows through (docs/decisions/gradients.md).
 
     Args:
         scene: all that is not given here.
-        drive: (..., M) complex, |q| <= 1; one run for each, and one or two more for its gradient.
+        drive: (..., M) complex, |q| <= 1; each takes a run, and its gradient one or two more.
         points: (P, 3) [m] inside the domain; by default the scene's control points.
         density: (K,) or (nx, ny, nz) [kg/m^3], > 0. What is given for rigid obstacles does not count.
         sound_speed: (K,) or (nx, ny, nz) [m/s], > 0, likewise.
-        offset: by which the obstacles are moved (K, 3) [m].
         spacing: edge of a cell [m], at most a third of the wavelength.
         periods: of the drive that are stepped, in whole blocks of a few; the last block is locked in. By
             default sound crosses the domain twice. What resonates needs more.
         kernel: as in `make_propagator`.
         dtype: precision of the fields, float32 or float64.
-        time_step: at most this [s], as in `make_propagator`. By default the largest stable one: it may change
-            with the medium from call to call, and the field with it by a little.
+        time_step: as in `make_propagator`. By default the largest stable one, which may change with the
+            medium from call to call, and the field with it by a little.
 
     Returns:
         complex128 (..., P) [Pa].
@@ -84,8 +83,7 @@ def differentiable_field(
     if time_step is not None:
         time_step = positive("time_step", time_step, "s")
     cells = _cells(
-        scene, grid, _material("density", density, scene), _material("sound_speed", sound_speed, scene),
-        _offset(offset, scene),
+        scene, grid, _material("density", density, scene), _material("sound_speed", sound_speed, scene)
     )  # fmt: skip
     assembly = cells.assembly(grid, scene, precision, time_step)
     receivers, stepper = assembly.receivers(targets), make_kernel(kernel)
@@ -128,33 +126,17 @@ def _material(name: str, given: ArrayLike | None, scene: Scene) -> torch.Tensor 
     return values
 
 
-def _offset(given: ArrayLike | None, scene: Scene) -> torch.Tensor | None:
-    if given is None:
-        return None
-    offset, shape = real_tensor("offset", given, "m").cpu(), (len(scene.obstacles), 3)
-    if offset.shape != shape:
-        raise ValueError(f"offset: shape {tuple(offset.shape)}; must be {shape}")
-    return offset
-
-
 def _cells(
-    scene: Scene,
-    grid: Grid,
-    density: torch.Tensor | None,
-    sound_speed: torch.Tensor | None,
-    offset: torch.Tensor | None,
+    scene: Scene, grid: Grid, density: torch.Tensor | None, sound_speed: torch.Tensor | None
 ) -> VariableCells:
-    if sound_speed is not None and sound_speed.numel():
-        require_fine("the medium given", float(sound_speed.detach().min()), scene.frequency, grid.spacing)
+    if sound_speed is not None:
+        rigid = torch.tensor([obstacle.rigid for obstacle in scene.obstacles], dtype=torch.bool)
+        speeds = sound_speed.detach() if sound_speed.ndim == 3 else sound_speed.detach()[~rigid]
+        for slowest in speeds.reshape(-1).sort().values[:1].tolist():
+            require_fine("the medium given", slowest, scene.frequency, grid.spacing)
     if any(given is not None and given.ndim == 3 for given in (density, sound_speed)):
         return cells_of_maps(scene, grid, density, sound_speed)
-    fixed = (None if given is None else given.detach() for given in (density, sound_speed, offset))
-    obstacles = with_materials(scene, *fixed)
-    Scene(  # refuses what may not be
-        scene.array, scene.medium, scene.frequency, scene.control_points, obstacles, scene.observation_plane,
-        scene.domain,
-    )  # fmt: skip
-    return cells_of_obstacles(scene, grid, density, sound_speed, offset)
+    return cells_of_obstacles(scene, grid, density, sound_speed)
 
 
 def _sources(assembly: Assembly, scene: Scene, drive: torch.Tensor) -> Sources:
