@@ -4,7 +4,7 @@
 
 What is measured is simulated on a grid twice as fine, with the sphere's true surface and 1 % of noise. The
 model is a map of the density, in which the sphere's surface is smooth over about a cell: its place and its
-density are then tensors like any others, and L-BFGS follows the gradients of `differentiable_field`. Prints
+density are then tensors like any others, and Adam follows the gradients of `differentiable_field`. Prints
 the way and draws it (--picture FILE, recover_obstacle.png by default).
 """
 
@@ -25,6 +25,9 @@ SIZE = (40e-3, 32e-3, 32e-3)
 RADIUS = 4e-3
 TRUE_CENTER, TRUE_DENSITY = (21.3e-3, 17.1e-3, 14.6e-3), 6.0
 FIRST_CENTER, FIRST_DENSITY = (19.5e-3, 15.0e-3, 16.5e-3), 2.0
+FIRST_STEP, SHORTER = 0.4, 0.93
+"""Of Adam [mm, or of the logarithm of the density], and how much shorter each next step is."""
+
 SMOOTH = 0.3
 """Length over which a surface is smoothed [cells]; the density changes over about four times that."""
 
@@ -36,7 +39,7 @@ class Guess:
     Attributes:
         center: (3,) [m].
         density: [kg/m^3].
-        misfit: relative, of the pressure.
+        misfit: relative, of what the sphere changes.
     """
 
     center: torch.Tensor
@@ -78,26 +81,26 @@ def density_map(
 
 
 def recover(drive: torch.Tensor, heard: torch.Tensor, spacing: float, steps: int) -> Iterator[Guess]:
-    """Follow the gradient from the first guess; yields every guess that L-BFGS settles on."""
+    """Follow the gradient from the first guess; yields every guess on the way."""
     scene = scene_of()
     centers = at.cell_centers(scene, spacing)
+    silent = at.make_propagator(scene, "free_space").field(drive, scene.control_points)
+    scattered = (heard - silent).abs().square().sum()
     # in units in which all four numbers matter about alike
     place = (1e3 * torch.tensor(FIRST_CENTER, dtype=torch.float64)).requires_grad_()
     weight = torch.tensor(FIRST_DENSITY, dtype=torch.float64).log().requires_grad_()
-    optimiser = torch.optim.LBFGS([place, weight], max_iter=1, line_search_fn="strong_wolfe")
-
-    def misfit() -> torch.Tensor:
-        optimiser.zero_grad()
-        density = density_map(1e-3 * place, weight.exp(), centers, spacing)
-        field = at.differentiable_field(scene, drive, density=density, spacing=spacing)
-        loss = (field - heard).abs().square().sum() / heard.abs().square().sum()
-        loss.backward()
-        return loss
-
+    optimiser = torch.optim.Adam([place, weight], lr=FIRST_STEP)
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimiser, SHORTER)
     for _ in range(steps):
-        center, density = 1e-3 * place.detach().clone(), float(weight.detach().exp())
-        loss = float(optimiser.step(misfit).detach())
-        yield Guess(center, density, loss**0.5)
+        optimiser.zero_grad()
+        center, density = 1e-3 * place, weight.exp()
+        given = density_map(center, density, centers, spacing)
+        field = at.differentiable_field(scene, drive, density=given, spacing=spacing)
+        loss = (field - heard).abs().square().sum() / scattered
+        loss.backward()
+        yield Guess(center.detach(), float(density.detach()), float(loss.detach()) ** 0.5)
+        optimiser.step()
+        schedule.step()
 
 
 def draw(way: list[Guess], picture: Path) -> None:
@@ -130,16 +133,14 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--picture", type=Path, default=Path("recover_obstacle.png"))
-    spacing, drive = 1e-3, drives(3)
+    spacing, drive = 1.4e-3, drives(2)
     picture = parser.parse_args().picture
     heard, way = measured(drive, spacing / 2), []
-    for guess in recover(drive, heard, spacing, steps=14):
+    for guess in recover(drive, heard, spacing, steps=25):
         way.append(guess)
         off = 1e3 * float((guess.center - torch.tensor(TRUE_CENTER)).norm())
-        print(
-            f"{len(way):2d}: misfit {100 * guess.misfit:5.1f} %, {off:5.2f} mm off, {guess.density:5.2f} kg/m^3",
-            flush=True,
-        )
+        found = f"{off:5.2f} mm off, {guess.density:5.2f} kg/m^3"
+        print(f"{len(way):2d}: misfit {100 * guess.misfit:5.1f} %, {found}", flush=True)
     draw(way, picture)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from numba import njit, prange
 
 
-@njit(parallel=True, cache=True, nogil=True, fastmath={"reassoc", "contract"})
+@njit(parallel=True, cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
 def correlate(adjoint, field, index, offsets, place, total):  # type: ignore[no-untyped-def]
     """Add to `total` (n, 27) what lambda_i (p_j - p_i) sums up to over the steps.
 
