@@ -89,7 +89,7 @@ def recover(drive: torch.Tensor, heard: torch.Tensor, spacing: float, steps: int
     # in units in which all four numbers matter about alike
     place = (1e3 * torch.tensor(FIRST_CENTER, dtype=torch.float64)).requires_grad_()
     weight = torch.tensor(FIRST_DENSITY, dtype=torch.float64).log().requires_grad_()
-    optimiser = torch.optim.Adam([place, weight], lr=FIRST_STEP)
+    optimiser = torch.optim.Adam([place, weight], lr=FIRST_STEP, betas=(0.6, 0.9))
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimiser, SHORTER)
     for _ in range(steps):
         optimiser.zero_grad()
@@ -105,7 +105,7 @@ def recover(drive: torch.Tensor, heard: torch.Tensor, spacing: float, steps: int
 
 def draw(way: list[Guess], picture: Path) -> None:
     """The way in two planes, and density and misfit along it."""
-    figure, axes = plt.subplots(1, 3, figsize=(11, 3.6), layout="constrained")
+    figure, axes = plt.subplots(1, 3, figsize=(11, 4), layout="constrained")
     centers = 1e3 * torch.stack([guess.center for guess in way])
     truth = 1e3 * torch.tensor(TRUE_CENTER)
     scene = scene_of()
@@ -118,13 +118,14 @@ def draw(way: list[Guess], picture: Path) -> None:
         axis.plot(centers[:, 0], centers[:, other], ".-", color="C3", label="centre found")
         axis.plot(truth[0], truth[other], "k+", ms=10, label="centre")
         axis.set(xlabel="x [mm]", ylabel=f"{name} [mm]", aspect="equal", xlim=(0, 40), ylim=(0, 32))
-    axes[0].legend(fontsize=7, loc="lower right")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower left", ncols=5, fontsize=8)
     axes[2].semilogy([100 * guess.misfit for guess in way], ".-", color="C0", label="misfit [%]")
     axes[2].semilogy([guess.density for guess in way], ".-", color="C1", label="density [kg/m$^3$]")
     axes[2].axhline(TRUE_DENSITY, color="C1", ls=":", lw=1)
     axes[2].set(xlabel="step")
     axes[2].legend(fontsize=7)
     figure.savefig(picture, dpi=120)
+    plt.close(figure)
 
 
 def main() -> None:
@@ -133,10 +134,10 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--picture", type=Path, default=Path("recover_obstacle.png"))
-    spacing, drive = 1.4e-3, drives(2)
+    spacing, drive = 1e-3, drives(2)
     picture = parser.parse_args().picture
     heard, way = measured(drive, spacing / 2), []
-    for guess in recover(drive, heard, spacing, steps=25):
+    for guess in recover(drive, heard, spacing, steps=16):
         way.append(guess)
         off = 1e3 * float((guess.center - torch.tensor(TRUE_CENTER)).norm())
         found = f"{off:5.2f} mm off, {guess.density:5.2f} kg/m^3"
