@@ -16,7 +16,7 @@ from .optim.identify import identify
 from .optim.lssg import lss, lssg
 from .optim.random_search import random_search
 from .plot import plot_convergence, plot_plane, plot_trials
-from .propagator import SteadyStateWarning, make_propagator
+from .propagator import SteadyStateWarning, cell_centers, differentiable_field, make_propagator
 from .results import load_results
 from .scene import Medium, OverlapWarning, Scene
 from .scene_file import load_scene
@@ -46,7 +46,9 @@ __all__ = [
     "VoxelMask",
     "amplitudes_of",
     "bayes_opt",
+    "cell_centers",
     "circle_points",
+    "differentiable_field",
     "drive_from_phases",
     "focus_bound",
     "focus_metrics",

@@ -87,7 +87,7 @@ def cell_rate(kernel: Kernel, shape: tuple[int, int, int], coefficients: Coeffic
     """Cells stepped a second, all of the array counted, without sources and receivers."""
     state = uniform_state(shape, coefficients, 1e-20)
     dtype = coefficients.layer_decay.dtype
-    nobody = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.complex64))
+    nobody = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros((0, 2)))
     deaf = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1), dtype=dtype))
 
     def step(times: int) -> None:

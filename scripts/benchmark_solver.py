@@ -104,7 +104,7 @@ def kernel_rate(cells: int = 112) -> None:
     scene = load("homogeneous")
     coefficients = assemble(scene, 1e-3).coefficients
     shape = (cells, cells, cells)
-    nobody = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.complex64))
+    nobody = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros((0, 2)))
     deaf = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1)))
 
     def rate(kernel: Kernel, steps: int) -> float:

@@ -38,8 +38,7 @@ def scaled_cells(
     varying: VaryingCells, stencil: Stencil, grid: Grid, dtype: torch.dtype
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Cells of the boundary layers (k,) whose rows are not of air, and their scale (k,)."""
-    places = np.stack(np.unravel_index(varying.index, grid.shape), axis=-1)
-    here = ((places < np.array(grid.first)) | (places >= np.array(grid.last))).any(axis=1)
+    here = ~grid.inside(varying.index)
     scale = row_scale(varying.weight[here], stencil)
     return torch.from_numpy(varying.index[here]), torch.from_numpy(scale).to(dtype)
 
@@ -59,8 +58,10 @@ def layer_columns(
     Returns:
         The columns, the crossed ones, and the places of the terms of these: see `Coefficients`.
     """
-    rows = varying.weight - row_scale(varying.weight, stencil)[:, None] * stencil.weights
-    places = np.stack(np.unravel_index(varying.index, grid.shape), axis=-1)
+    outside = ~grid.inside(varying.index)
+    index, weight = varying.index[outside], varying.weight[outside]
+    rows = weight - row_scale(weight, stencil)[:, None] * stencil.weights
+    places = np.stack(np.unravel_index(index, grid.shape), axis=-1)
     strides = flat_strides(grid.shape)
     ahead = np.array(OFFSETS) == 1
     middle, inside = 1 + grid.layer_cells // 2, np.arange(1, grid.layer_cells + 2)
@@ -69,7 +70,7 @@ def layer_columns(
         used = np.abs(rows[:, ahead[:, axis]]).max(axis=1, initial=0) > _ALIKE * stencil.face
         here = np.flatnonzero(used & (_depth(places, axis, side, grid) == middle))
         stride = (1 - 2 * side) * strides[axis]
-        foot = varying.index[here] - middle * stride
+        foot = index[here] - middle * stride
         parts.append(_columns(foot, stride, rows[here], ahead[:, axis], strides))
         crossing = np.full((2, len(here), grid.layer_cells + 2), -1)
         for other, end in _LAYERS[2 * axis + 2 :]:

@@ -109,6 +109,11 @@ class Grid:
         """Positions (..., 3) [m] in units of cells, cell centres being whole numbers."""
         return np.asarray((points.numpy() - np.array(self.origin)) / self.spacing, np.float64)
 
+    def inside(self, index: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which cells of flat `index` (...) are interior."""
+        places = np.stack(np.unravel_index(index, self.shape), axis=-1)
+        return np.asarray(((places >= np.array(self.first)) & (places < np.array(self.last))).all(axis=-1))
+
     def clip(self, cells: Array) -> Array:
         """Positions (..., 3) in cells, those in the boundary layer moved to the interior cell they touch."""
         return np.clip(cells, self.first, np.array(self.last) - 1)
@@ -170,10 +175,10 @@ def make_box(scene: Scene, spacing: float) -> Grid:
 
 def _covering(scene: Scene, spacing: float, extent: Extent) -> Grid:
     positive("spacing", spacing, "m")
-    _require_fine("the medium", scene.medium.sound_speed, scene.frequency, spacing)
+    require_fine("the medium", scene.medium.sound_speed, scene.frequency, spacing)
     for index, obstacle in enumerate(scene.obstacles):
         if obstacle.sound_speed is not None:
-            _require_fine(f"obstacle {index}", obstacle.sound_speed, scene.frequency, spacing)
+            require_fine(f"obstacle {index}", obstacle.sound_speed, scene.frequency, spacing)
     kappa = scene.wavenumber * spacing
     offset = grid_offset(scene, spacing, extent.lower, extent.upper)
     rim = layer_cells(kappa) + 1 + extent.margin - 0.5
@@ -185,7 +190,12 @@ def _covering(scene: Scene, spacing: float, extent: Extent) -> Grid:
     return grid
 
 
-def _require_fine(where: str, sound_speed: float, frequency: float, spacing: float) -> None:
+def require_fine(where: str, sound_speed: float, frequency: float, spacing: float) -> None:
+    """Refuse a spacing [m] that is too coarse for a sound speed [m/s] somewhere; warn if it is nearly.
+
+    Raises:
+        ValueError: fewer than `MIN_CELLS_PER_WAVELENGTH` cells a wavelength.
+    """
     wavelength = sound_speed / frequency
     coarsest = wavelength / MIN_CELLS_PER_WAVELENGTH
     if spacing > coarsest:

@@ -95,7 +95,7 @@ def speed_factor(stencil: Stencil, speed_ratio: float) -> float:
     return stencil.symbol / stencil.isotropic_symbol(stencil.kappa / speed_ratio)
 
 
-def _flow_factor(kappa: float, speed_ratio: float) -> float:
+def flow_factor(kappa: float, speed_ratio: float) -> float:
     """What a material's bonds and mass are multiplied with for its impedance to be right beside air.
 
     Half-way between two cells a wave's slope is their difference over 2 sin(k / 2) / k, and its value their
@@ -141,7 +141,7 @@ def _bodies(scene: Scene, stencil: Stencil) -> tuple[list[Body], Materials, NDAr
     density = [
         RIGID
         if m is None
-        else m.density / air.density / _flow_factor(stencil.kappa, m.sound_speed / air.sound_speed)
+        else m.density / air.density / flow_factor(stencil.kappa, m.sound_speed / air.sound_speed)
         for m in known
     ]
     factor = [1.0 if m is None else speed_factor(stencil, m.sound_speed / air.sound_speed) for m in known]

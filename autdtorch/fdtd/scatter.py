@@ -57,8 +57,8 @@ class Scattering:
         step = heard[place] - heard[place[:, 13]][:, None]
         factor = assembly.coefficients.face / assembly.stencil.face
         force = factor * ((assembly.varying.weight - assembly.stencil.weights) * step).sum(axis=1)
-        dtype = torch.complex128 if assembly.dtype == torch.float64 else torch.complex64
-        return Sources(torch.from_numpy(assembly.varying.index), torch.from_numpy(force).to(dtype))
+        both = torch.view_as_real(torch.from_numpy(force)).to(assembly.dtype)
+        return Sources(torch.from_numpy(assembly.varying.index), both)
 
     def incident(self, points: torch.Tensor, origins: Nodes, strength: torch.Tensor) -> torch.Tensor:
         """Field (P,) in free space at points (P, 3) [m] of N origins with strengths (N,) [Pa m]."""

@@ -14,6 +14,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from fractions import Fraction
 
 import numpy as np
 import torch
@@ -101,6 +102,12 @@ def run_to_steady_state(
     return SteadyState(limit, count, remaining, reached)
 
 
+def block_of(steps_per_period: Fraction) -> tuple[int, int]:
+    """Steps and periods of a block."""
+    parts = math.ceil(_FEWEST_PERIODS / steps_per_period.denominator)
+    return parts * steps_per_period.numerator, parts * steps_per_period.denominator
+
+
 def fewest_periods(crossing: float) -> int:
     """Periods of the shortest run on a grid that sound crosses within `crossing` periods."""
     return RAMP_PERIODS + math.ceil(2 * crossing)
@@ -150,8 +157,7 @@ def windows_of_run(
 ) -> Iterator[tuple[int, list[tuple[int, Phasors]]]]:
     """Step from silence; after each block the periods so far, and first step and phasors of its windows."""
     steps_per_period = assembly.steps_per_period
-    parts = math.ceil(_FEWEST_PERIODS / steps_per_period.denominator)
-    steps, periods = parts * steps_per_period.numerator, parts * steps_per_period.denominator
+    steps, periods = block_of(steps_per_period)
     shift = max(1, steps // _PARTS)
     receivers = Receivers(torch.from_numpy(cells[:, None]), torch.ones((len(cells), 1), dtype=assembly.dtype))
     state, earlier = assembly.silence(sources), torch.zeros((steps, len(cells)), dtype=assembly.dtype)

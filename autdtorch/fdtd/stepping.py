@@ -104,10 +104,7 @@ class Assembly:
             0, torch.from_numpy(inverse.reshape(-1)), force
         )
         total = total / torch.from_numpy(self.varying.mass_of(index))
-        return Sources(
-            torch.from_numpy(index),
-            total.to(torch.complex128 if self.dtype == torch.float64 else torch.complex64),
-        )
+        return Sources(torch.from_numpy(index), torch.view_as_real(total).to(self.dtype))
 
 
 def assemble(
@@ -129,12 +126,28 @@ def assemble_on(grid: Grid, scene: Scene, dtype: torch.dtype, time_step: float |
     Raises:
         ValueError: the time step is not stable.
     """
-    spacing = grid.spacing
-    stencil = tuned_stencil(grid.kappa, scene.attenuation * spacing)
+    stencil = air_stencil(grid, scene)
     varying = varying_cells(fill_elements(scene, grid, stencil), stencil)
+    return assembly_of(grid, stencil, varying, scene.frequency, dtype, time_step)
+
+
+def air_stencil(grid: Grid, scene: Scene) -> Stencil:
+    """Weights of a scene's air on a grid."""
+    return tuned_stencil(grid.kappa, scene.attenuation * grid.spacing)
+
+
+def assembly_of(
+    grid: Grid,
+    stencil: Stencil,
+    varying: VaryingCells,
+    frequency: float,
+    dtype: torch.dtype,
+    time_step: float | None,
+) -> Assembly:
+    """Make a grid ready to step whose varying cells are known; see `assemble_on`."""
     largest = largest_eigenvalue(varying.index, varying.weight, stencil, grid.shape)
     fewest = fewest_steps(stencil, largest)
-    steps_per_period = whole_steps(_wanted_steps(fewest, time_step, scene.frequency))
+    steps_per_period = whole_steps(_wanted_steps(fewest, time_step, frequency))
     steps = float(steps_per_period)
     damping = stencil.damping(steps)
     factor = stencil.time_factor(steps) / (1 + damping)
@@ -162,8 +175,8 @@ def assemble_on(grid: Grid, scene: Scene, dtype: torch.dtype, time_step: float |
     )
     logger.info(
         "grid %s at %.3g mm, %d varying cells; %d steps in %d periods: %.4g us, %.1f %% of the limit",
-        grid.shape, spacing * 1e3, len(varying.index), steps_per_period.numerator,
-        steps_per_period.denominator, 1e6 / (steps * scene.frequency), 100 * fewest / steps,
+        grid.shape, grid.spacing * 1e3, len(varying.index), steps_per_period.numerator,
+        steps_per_period.denominator, 1e6 / (steps * frequency), 100 * fewest / steps,
     )  # fmt: skip
     return Assembly(grid, stencil, steps_per_period, coefficients, varying)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-from importlib.util import find_spec
 from typing import Literal
 
 import torch
@@ -15,10 +14,12 @@ from autdtorch.fdtd.spacing import PILOT_CELLS, coarsest_spacing, spacing_for
 from autdtorch.propagator.auto import chosen_method
 from autdtorch.propagator.base import Propagator, Run, SimulatedPropagator, SteadyStateWarning
 from autdtorch.propagator.box import BoxPropagator
+from autdtorch.propagator.differentiable import cell_centers, differentiable_field
 from autdtorch.propagator.free_space import FreeSpacePropagator
 from autdtorch.propagator.full import FullPropagator
+from autdtorch.propagator.stepper import KERNELS, make_kernel, precision_of
 from autdtorch.scene import Scene
-from autdtorch.validation import integer_at_least, invalid, positive
+from autdtorch.validation import integer_at_least, invalid, positive, require_one_of
 
 __all__ = [
     "BoxPropagator",
@@ -28,36 +29,15 @@ __all__ = [
     "Run",
     "SimulatedPropagator",
     "SteadyStateWarning",
+    "cell_centers",
+    "differentiable_field",
     "make_propagator",
 ]
 
 logger = logging.getLogger(__name__)
 
 METHODS = ("auto", "free_space", "box", "full")
-KERNELS = ("auto", "cpu", "cuda", "reference")
 CACHE_VARIABLE = "AUTDTORCH_CACHE_DIR"
-DTYPES = {"float32": torch.float32, "float64": torch.float64}
-
-
-def _make_kernel(name: str) -> Kernel:
-    if name == "reference":
-        from autdtorch.fdtd.kernels.reference import ReferenceKernel
-
-        return ReferenceKernel()
-    has_triton = find_spec("triton") is not None
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() and has_triton else "cpu"
-        found = f"CUDA device: {torch.cuda.is_available()}, Triton: {has_triton}"
-        logger.info("kernel auto: %s (%s)", name, found)
-    if name == "cuda":
-        if not has_triton:
-            raise invalid("kernel", name, "needs Triton: pip install 'autdtorch[cuda]'")
-        from autdtorch.fdtd.kernels.cuda import CudaKernel
-
-        return CudaKernel()
-    from autdtorch.fdtd.kernels.cpu import CpuKernel
-
-    return CpuKernel()
 
 
 def make_propagator(
@@ -107,10 +87,9 @@ def make_propagator(
     """
     if not isinstance(scene, Scene):
         raise invalid("scene", scene, "must be a Scene")
-    _require_one_of("method", method, METHODS)
-    _require_one_of("kernel", kernel, KERNELS)
-    dtype_name = str(dtype).removeprefix("torch.")
-    _require_one_of("dtype", dtype_name, tuple(DTYPES))
+    require_one_of("method", method, METHODS)
+    require_one_of("kernel", kernel, KERNELS)
+    precision = precision_of(dtype)
     if spacing is not None:
         spacing = positive("spacing", spacing, "m")
     tolerance = positive("tolerance", tolerance)
@@ -127,7 +106,7 @@ def make_propagator(
     if method == "free_space":
         return FreeSpacePropagator(scene)
     kind = BoxPropagator if method == "box" else FullPropagator
-    settings = _make_kernel(kernel), DTYPES[dtype_name], max_periods, disk_cache
+    settings = make_kernel(kernel), precision, max_periods, disk_cache
     if spacing is None:
         tolerance /= 2
         spacing = _chosen_spacing(kind, scene, tolerance, *settings)
@@ -171,8 +150,3 @@ def _disk_cache(folder: str | os.PathLike[str] | Literal[False] | None) -> DiskC
 
 def _pilot_spacing(scene: Scene) -> float:
     return min(scene.wavelength / PILOT_CELLS, coarsest_spacing(scene))
-
-
-def _require_one_of(name: str, value: object, accepted: tuple[str, ...]) -> None:
-    if value not in accepted:
-        raise invalid(name, value, f"must be one of {', '.join(accepted)}")

@@ -54,12 +54,12 @@ def parts(obstacles: tuple[Obstacle, ...], dtype: torch.dtype, absorption: float
     special = [each.reshape(-1)[::5] for each in (c.varying_index, c.closed_index, c.columns.index[:, 1:-1])]
     index = torch.unique(torch.cat((somewhere, *special)))
     index = index[torch.randperm(len(index), generator=generator)]
-    force = torch.randn(len(index), dtype=torch.complex128, generator=generator)
+    force = torch.randn((len(index), 3), dtype=torch.float64, generator=generator)
     weight = torch.rand((len(index) // 2, 2), dtype=torch.float64, generator=generator).to(dtype)
     return (
         shape,
         c,
-        Sources(index, force.to(torch.complex128 if dtype == torch.float64 else torch.complex64)),
+        Sources(index, force.to(dtype)),
         Receivers(index[: 2 * len(weight)].reshape(-1, 2), weight),
     )
 
@@ -78,7 +78,7 @@ def advance(kernel: Kernel, given: Parts, blocks: tuple[int, ...]) -> tuple[Stat
     """Step from noise in calls of several steps each."""
     shape, coefficients, sources, receivers = given
     state, recorded = noise(shape, coefficients), []
-    signal = torch.randn((sum(blocks), 2), generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    signal = torch.randn((sum(blocks), 3), generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     for part in signal.to(coefficients.layer_decay.dtype).split(blocks):
         state, heard = kernel.advance(state, coefficients, sources, receivers, part)
         recorded.append(heard)

@@ -127,7 +127,7 @@ def test_a_mode_of_a_closed_box_swings_at_its_own_frequency_for_ever(kernel: Ker
     state = uniform_state(shape, c, 0.0)
     state.now.copy_(mode)
     state.before.copy_(mode * math.cos(turn))
-    nobody = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.complex128))
+    nobody = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros((0, 2), dtype=torch.float64))
     deaf = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1), dtype=torch.float64))
     state, _ = kernel.advance(state, c, nobody, deaf, torch.zeros((steps, 2), dtype=torch.float64))
     # rounding of 400 steps, each of relative size 1e-16, adds up at worst in proportion to steps^2

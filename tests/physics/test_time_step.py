@@ -19,7 +19,7 @@ from autdtorch.fdtd.stepping import Assembly, assemble, drive_signal, lock_in
 from autdtorch.propagator import make_propagator
 from autdtorch.scene import Box
 
-NOBODY = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.complex128))
+NOBODY = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros((0, 2), dtype=torch.float64))
 DEAF = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1), dtype=torch.float64))
 
 

@@ -82,7 +82,7 @@ def test_slabs_through_the_layers_do_not_grow(
     shape = assembly.grid.interior
     state.now[inside] = torch.randn(shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     state.before.copy_(state.now)
-    nobody = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.complex128))
+    nobody = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros((0, 2), dtype=torch.float64))
     deaf = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1), dtype=torch.float64))
     sizes = []
     for _ in range(4):

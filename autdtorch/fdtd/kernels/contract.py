@@ -7,7 +7,7 @@ One step, from pressures `now` and `before` at two successive times to the next 
 2. in the varying cells instead new = (1 + keep) now - keep before + sum_j weight_j (now_j - now);
 3. the boundary layers add what stretches the sum of the two neighbours along each axis (`boundary.py`), as
    in air, times `layer_scale` in varying cells, and by column what those differ by (`columns.py`);
-4. the sources are added: new += cos(w t) Re(force) + sin(w t) Im(force), times the envelope;
+4. the sources are added: new += sum_s signal_s force_s, of the S signals that they share;
 5. the outermost ring of cells and the closed cells stay zero.
 """
 
@@ -125,7 +125,12 @@ def uniform_state(shape: tuple[int, int, int], coefficients: Coefficients, press
 
 @dataclass(frozen=True)
 class Sources:
-    """Cells that are driven: flat `index` (n,) int64, ascending, no two alike; complex `force` (n,) [Pa]."""
+    """Cells that are driven, by S signals: a drive has two, cos(w t) and sin(w t), times its envelope.
+
+    Attributes:
+        index: flat (n,) int64, ascending, no two alike.
+        force: by each signal (n, S) [Pa]; of a drive, real and imaginary part of the phasors.
+    """
 
     index: torch.Tensor
     force: torch.Tensor
@@ -154,7 +159,7 @@ class Kernel(Protocol):
         receivers: Receivers,
         signal: torch.Tensor,
     ) -> tuple[State, torch.Tensor]:
-        """Step once per row of `signal` (steps, 2), the cosine and sine of w t times the envelope.
+        """Step once per row of `signal` (steps, S), the signals of the sources.
 
         Returns:
             The state afterwards, which may share memory with the one given (do not use that one again), and

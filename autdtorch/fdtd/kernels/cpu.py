@@ -72,7 +72,7 @@ def _sweep_chunk(c, p, q, medium, layers, cells, room):  # type: ignore[no-untyp
 
 
 @njit(**INNER)
-def _finish_chunk(c, q, medium, cells, outermost, sources, turn):  # type: ignore[no-untyped-def]
+def _finish_chunk(c, q, medium, cells, outermost, sources, row):  # type: ignore[no-untyped-def]
     """Add what the neighbours owe to the outermost planes of chunk c; then set its single cells."""
     cuts, starts, driven_starts = medium[:3]
     ny, nz = int(medium[4]), int(medium[5])
@@ -89,9 +89,9 @@ def _finish_chunk(c, q, medium, cells, outermost, sources, turn):  # type: ignor
         absorbed = scale[n] * (q[index[n]] - swept[n]) if scale[n] != 0 else scale[n]
         q[index[n]] = new[n] + absorbed
     driven, force = sources
-    cosine, sine = turn
     for n in range(driven_starts[c], driven_starts[c + 1]):
-        q[driven[n]] += force[n].real * cosine + force[n].imag * sine
+        for s in range(len(row)):
+            q[driven[n]] += force[n, s] * row[s]
 
 
 @njit(**INNER)
@@ -139,7 +139,7 @@ def _advance_alone(  # type: ignore[no-untyped-def]
 ):
     for step in range(len(signal)):
         _sweep_chunk(0, p, q, medium, layers, cells, room)
-        _finish_chunk(0, q, medium, cells, room[-1], sources, (signal[step, 0], signal[step, 1]))
+        _finish_chunk(0, q, medium, cells, room[-1], sources, signal[step])
         _finish_step(p, q, columns, memory, closed)
         _record(q, receivers, 0, recorded.shape[1], recorded[step])
         p, q = q, p
@@ -156,7 +156,7 @@ def _advance_together(  # type: ignore[no-untyped-def]
                 _record(p, receivers, c * heard // chunks, (c + 1) * heard // chunks, recorded[step - 1])
             _sweep_chunk(c, p, q, medium, layers, cells, room)
         for c in prange(chunks):
-            _finish_chunk(c, q, medium, cells, room[-1], sources, (signal[step, 0], signal[step, 1]))
+            _finish_chunk(c, q, medium, cells, room[-1], sources, signal[step])
         _finish_step(p, q, columns, memory, closed)
         p, q = q, p
     _record(p, receivers, 0, heard, recorded[-1])
@@ -244,7 +244,7 @@ class CpuKernel:
             # contiguous: for arrays with gaps numba compiles anew, and crashed when it loaded that from disk
             (sources.index.contiguous().numpy(), sources.force.contiguous().numpy()),
             (receivers.index.contiguous().numpy(), receivers.weight.contiguous().numpy()),
-            signal.numpy(),
+            signal.contiguous().numpy(),
             recorded.numpy(),
         )
         memory.give_back()

@@ -107,7 +107,7 @@ class DeviceRun:
         self._memories = memory, fresh
         self._driven = driven_table(sources, medium.settled, dtype, device)
         self._heard = heard_table(receivers, steps, dtype, device)
-        self.signal = torch.zeros((steps, 2), dtype=dtype, device=device)
+        self.signal = torch.zeros((steps, sources.force.shape[1]), dtype=dtype, device=device)
         self._first = torch.zeros((), dtype=torch.int64, device=device)
         self._turn = 0
         self._graphs: dict[int, torch.cuda.CUDAGraph] = {}
@@ -177,7 +177,7 @@ class DeviceRun:
         )  # fmt: skip
         cuda_steps.settle[(triton.cdiv(driven.size, lanes),)](
             other, m.varying, m.settled, driven, m.terms.columns, self.signal, self._first, offset,
-            SHARES=len(m.settled.share), LANES=lanes,
+            SHARES=len(m.settled.share), SIGNALS=len(driven.force), LANES=lanes,
         )  # fmt: skip
 
 

@@ -298,7 +298,7 @@ def sweep(p, q, shape, weights, profile, old, new, terms, columns, tiles, COLUMN
 
 @triton.jit(do_not_specialize=["offset"])
 def settle(q, varying, settled, driven, shares, signal, first, offset, SHARES: tl.constexpr,
-           LANES: tl.constexpr):  # fmt: skip
+           SIGNALS: tl.constexpr, LANES: tl.constexpr):  # fmt: skip
     """Put right the cells that the sweep leaves wrong."""
     n = tl.program_id(0) * LANES + tl.arange(0, LANES)
     mask, still = n < driven.size, n < driven.settled
@@ -311,9 +311,9 @@ def settle(q, varying, settled, driven, shares, signal, first, offset, SHARES: t
     for share in tl.static_range(SHARES):
         source = tl.load(settled.share + share * driven.settled + n, mask=still, other=0)
         value += tl.load(shares + source, mask=still, other=0)
-    row = 2 * (tl.load(first) + offset)
-    value += tl.load(signal + row) * tl.load(driven.force + n, mask=mask, other=0)
-    value += tl.load(signal + row + 1) * tl.load(driven.force + driven.size + n, mask=mask, other=0)
+    row = SIGNALS * (tl.load(first) + offset)
+    for s in tl.static_range(SIGNALS):
+        value += tl.load(signal + row + s) * tl.load(driven.force + s * driven.size + n, mask=mask, other=0)
     closed = tl.load(settled.closed + n, mask=still, other=0) > 0
     tl.store(at, tl.where(closed, 0, value), mask=mask)
 

@@ -107,7 +107,7 @@ class Driven(NamedTuple):
         settled: k.
         size: n.
         cell: flat index (n,).
-        force: real and imaginary part (2, n).
+        force: by each of the S signals (S, n).
     """
 
     settled: int
@@ -178,9 +178,9 @@ def driven_table(sources: Sources, settled: Settled, dtype: torch.dtype, device:
     cell = torch.cat((settled.cell, index[~known]))
     place = torch.searchsorted(settled.cell, index)
     place[~known] = torch.arange(len(settled.cell), len(cell), device=device)
-    force = torch.zeros((2, len(cell)), dtype=dtype, device=device)
-    given = sources.force.detach().to(device)
-    force[:, place] = torch.stack((given.real, given.imag)).to(dtype)
+    given = sources.force.detach().to(device, dtype)
+    force = torch.zeros((given.shape[1], len(cell)), dtype=dtype, device=device)
+    force[:, place] = given.T
     return Driven(len(settled.cell), len(cell), cell, force)
 
 

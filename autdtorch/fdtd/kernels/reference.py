@@ -34,9 +34,8 @@ class ReferenceKernel:
     ) -> tuple[State, torch.Tensor]:
         """See `Kernel.advance`."""
         recorded = []
-        for cosine, sine in signal:
-            force = cosine * sources.force.real + sine * sources.force.imag
-            state = self._step(state, coefficients, sources.index, force)
+        for row in signal:
+            state = self._step(state, coefficients, sources.index, (sources.force * row).sum(-1))
             recorded.append((state.now.reshape(-1)[receivers.index] * receivers.weight).sum(-1))
         return state, torch.stack(recorded)
 

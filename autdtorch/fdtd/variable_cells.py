@@ -1,0 +1,164 @@
+"""Varying cells that autograd can go back through: to the materials of obstacles."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from autdtorch.fdtd.bonds import VaryingCells, varying_cells
+from autdtorch.fdtd.grid import Grid
+from autdtorch.fdtd.kernels.contract import Sources
+from autdtorch.fdtd.medium import fill_elements
+from autdtorch.fdtd.stencil import Stencil
+from autdtorch.fdtd.stepping import Assembly, air_stencil, assembly_of
+from autdtorch.obstacles import Obstacle
+from autdtorch.scene import Scene
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+_SMALL = 1e-4
+"""Relative step of the central differences: what they miss and the rounding in them are about 1e-8."""
+
+
+@dataclass(frozen=True)
+class VariableCells:
+    """Varying cells, and what of them is differentiable.
+
+    Attributes:
+        varying: the cells.
+        weight: their weights (n, 27), differentiable.
+        mass: their mass (n,), differentiable.
+    """
+
+    varying: VaryingCells
+    weight: torch.Tensor
+    mass: torch.Tensor
+
+    def assembly(self, grid: Grid, scene: Scene, dtype: torch.dtype, time_step: float | None) -> Assembly:
+        """Ready to step, differentiable by `coefficients.varying_weight`; see `assemble_on`."""
+        stencil = air_stencil(grid, scene)
+        assembly = assembly_of(grid, stencil, self.varying, scene.frequency, dtype, time_step)
+        coefficients = assembly.coefficients
+        weight = (coefficients.face / stencil.face * self.weight).to(dtype)
+        return replace(assembly, coefficients=replace(coefficients, varying_weight=weight))
+
+    def driven(self, sources: Sources) -> Sources:
+        """Sources of the assembly, differentiable also by the mass of the cells they are in."""
+        _, place, own = np.intersect1d(self.varying.index, sources.index.numpy(), return_indices=True)
+        share = torch.ones(len(sources.index), dtype=self.mass.dtype)
+        share[own] = torch.from_numpy(self.varying.mass[place]) / self.mass[place]
+        return Sources(sources.index, share.to(sources.force)[:, None] * sources.force)
+
+
+@dataclass(frozen=True)
+class _Difference:
+    """The cells for a number (a tensor of no axes) a little larger and smaller, 2 `step` apart."""
+
+    number: torch.Tensor
+    step: float
+    ahead: VaryingCells
+    behind: VaryingCells
+
+
+def with_materials(
+    scene: Scene, density: torch.Tensor | None, sound_speed: torch.Tensor | None
+) -> tuple[Obstacle, ...]:
+    """A scene's K obstacles with the densities (K,) and sound speeds (K,) given; rigid ones as they are."""
+    obstacles = list(scene.obstacles)
+    for number, obstacle in enumerate(obstacles):
+        if density is not None and not obstacle.rigid:
+            obstacle = replace(obstacle, density=float(density[number]))
+        if sound_speed is not None and not obstacle.rigid:
+            obstacle = replace(obstacle, sound_speed=float(sound_speed[number]))
+        obstacles[number] = obstacle
+    return tuple(obstacles)
+
+
+def cells_of_obstacles(
+    scene: Scene, grid: Grid, density: torch.Tensor | None = None, sound_speed: torch.Tensor | None = None
+) -> VariableCells:
+    """Varying cells of a scene's K obstacles, differentiable by their materials.
+
+    The derivatives are central differences of the whole assembly, one for each number of a tensor that asks
+    for gradients.
+
+    Args:
+        scene: of which all else is taken.
+        grid: on which.
+        density: (K,) [kg/m^3]; what is given for rigid obstacles does not count.
+        sound_speed: (K,) [m/s], likewise.
+
+    Raises:
+        ValueError: an obstacle that is differentiated reaches into the boundary layers.
+    """
+    stencil = air_stencil(grid, scene)
+    fixed = [None if given is None else given.detach() for given in (density, sound_speed)]
+    base = _assembled(scene, grid, stencil, *fixed)
+    differences = list(_differences(scene, grid, stencil, density, sound_speed))
+    every = [base.index, *(each.index for one in differences for each in (one.ahead, one.behind))]
+    index = np.unique(np.concatenate(every))
+    weight, mass = (torch.from_numpy(part) for part in _on(index, base, stencil))
+    varying = VaryingCells(index, weight.numpy(), mass.numpy(), base.rigid, base.shell)
+    for one in differences:
+        ahead, behind = _on(index, one.ahead, stencil), _on(index, one.behind, stencil)
+        rows, masses = ((more - less) / (2 * one.step) for more, less in zip(ahead, behind, strict=True))
+        changed = np.flatnonzero(rows.any(axis=1) | (masses != 0))
+        if not grid.inside(index[changed]).all():
+            raise ValueError(
+                "density, sound_speed: an obstacle that is differentiated reaches into the boundary layers; "
+                "must end inside the domain"
+            )
+        places, shift = torch.from_numpy(changed), one.number - one.number.detach()
+        weight = weight.index_add(0, places, shift * torch.from_numpy(rows[changed]))
+        mass = mass.index_add(0, places, shift * torch.from_numpy(masses[changed]))
+    return VariableCells(varying, weight, mass)
+
+
+def _differences(
+    scene: Scene,
+    grid: Grid,
+    stencil: Stencil,
+    density: torch.Tensor | None,
+    sound_speed: torch.Tensor | None,
+) -> Iterator[_Difference]:
+    given = {"density": density, "sound_speed": sound_speed}
+    fixed = {name: None if each is None else each.detach() for name, each in given.items()}
+    for name, values in given.items():
+        if values is None or not values.requires_grad:
+            continue
+        for number, obstacle in enumerate(scene.obstacles):
+            if obstacle.rigid:
+                continue
+            step = _SMALL * float(values.detach()[number])
+            sides = []
+            for way in (1, -1):
+                moved = values.detach().clone()
+                moved[number] += way * step
+                sides.append(_assembled(scene, grid, stencil, **(fixed | {name: moved})))
+            yield _Difference(values[number], step, *sides)
+
+
+def _assembled(
+    scene: Scene,
+    grid: Grid,
+    stencil: Stencil,
+    density: torch.Tensor | None,
+    sound_speed: torch.Tensor | None,
+) -> VaryingCells:
+    changed = copy.copy(scene)  # without another look at its geometry, which is the same
+    object.__setattr__(changed, "obstacles", with_materials(scene, density, sound_speed))
+    return varying_cells(fill_elements(changed, grid, stencil), stencil)
+
+
+def _on(index: Index, cells: VaryingCells, stencil: Stencil) -> tuple[Array, Array]:
+    """Rows (n, 27) and mass (n,) of `index` (n,), which holds all of `cells` and besides them air."""
+    weight, mass = np.tile(stencil.weights, (len(index), 1)), np.ones(len(index))
+    place = np.searchsorted(index, cells.index)
+    weight[place], mass[place] = cells.weight, cells.mass
+    return weight, mass

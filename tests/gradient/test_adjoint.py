@@ -1,0 +1,134 @@
+"""The adjoint run of the fast kernel against the readable one under plain autograd, and against itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+from small_scenes import small_scene
+
+from autdtorch.fdtd import adjoint
+from autdtorch.fdtd.adjoint import recorded
+from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources, State
+from autdtorch.fdtd.kernels.cpu import CpuKernel
+from autdtorch.fdtd.kernels.reference import ReferenceKernel
+from autdtorch.fdtd.stepping import Assembly, assemble
+from autdtorch.obstacles import Box, Obstacle, Sphere
+
+HEAVY = Sphere((4.7e-3, 4.2e-3, 4.6e-3), 1.7e-3, density=20.0, sound_speed=300.0)
+RIGID = Box((3.2e-3, 7e-3, 7e-3), (3e-3, 2.3e-3, 2.3e-3), rigid=True)
+WALL = Box((4e-3, 4e-3, 7.4e-3), (40e-3, 40e-3, 1e-3), density=5.0, sound_speed=340.0)
+"""Runs through the boundary layers of x and y."""
+
+STEPS = 24
+Parts = tuple[Assembly, Sources, Receivers, torch.Tensor]
+Gradients = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
+
+
+def parts(dtype: torch.dtype, *obstacles: Obstacle) -> Parts:
+    """A 2 x 2 array in absorbing air, what drives it, and three receivers."""
+    scene = small_scene(obstacles, extent=9e-3, absorption=40.0)
+    assembly = assemble(scene, 1.4e-3, dtype)
+    strength = torch.tensor([1.0, 1j, -0.4, 0.3 - 0.7j], dtype=torch.complex128)
+    return (
+        assembly,
+        assembly.sources(scene.array.positions, strength),
+        assembly.receivers(scene.control_points),
+        torch.randn((STEPS, 2), generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(dtype),
+    )
+
+
+def differentiable(assembly: Assembly, sources: Sources) -> tuple[Assembly, Sources]:
+    weight = assembly.coefficients.varying_weight.clone().requires_grad_()
+    coefficients = replace(assembly.coefficients, varying_weight=weight)
+    return replace(assembly, coefficients=coefficients), replace(
+        sources, force=sources.force.clone().requires_grad_()
+    )
+
+
+def gradients(given: Parts, kernel: Kernel | None) -> Gradients:
+    """What is recorded, and a random loss's derivatives; those of plain autograd without a kernel."""
+    assembly, sources, receivers, signal = given
+    assembly, sources = differentiable(assembly, sources)
+    if kernel is None:
+        state, c = assembly.silence(sources), assembly.coefficients
+        _, heard = ReferenceKernel().advance(state, c, sources, receivers, signal)
+    else:
+        heard = recorded(kernel, assembly, sources, receivers, signal)
+    slope = torch.randn(heard.shape, generator=torch.Generator().manual_seed(0), dtype=heard.dtype)
+    (slope * heard).sum().backward()
+    return heard.detach(), sources.force.grad, assembly.coefficients.varying_weight.grad
+
+
+# float64: rounding over the steps; float32: the design's parity figure, of which rounding takes a tenth
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
+def test_fast_gradients_are_those_of_the_readable_kernel(dtype: torch.dtype, tolerance: float) -> None:
+    given = parts(dtype, HEAVY, RIGID)
+    for value, oracle in zip(gradients(given, CpuKernel()), gradients(given, None), strict=True):
+        assert (value - oracle).abs().max() <= tolerance * oracle.abs().max()
+
+
+def test_walls_through_the_layers_keep_the_gradients_exact() -> None:
+    """Rows in the layers are constants; all others and the drive have the oracle's derivatives."""
+    given = parts(torch.float64, HEAVY, WALL)
+    inside = torch.from_numpy(given[0].grid.inside(given[0].varying.index))
+    assert 0 < inside.sum() < len(inside)
+    (_, force, weight), (_, by_force, by_weight) = (gradients(given, each) for each in (CpuKernel(), None))
+    assert not weight[~inside].any()
+    # rows that differ from air's by less than 1e-9 are taken for air's, which leaves that much asymmetry
+    assert (force - by_force).abs().max() <= 1e-10 * by_force.abs().max()
+    assert (weight - by_weight)[inside].abs().max() <= 1e-10 * by_weight[inside].abs().max()
+
+
+def test_segments_are_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = parts(torch.float64, HEAVY, RIGID)
+    whole = gradients(given, CpuKernel())
+    monkeypatch.setattr(adjoint, "_cuts", lambda *_: [0, 9, 10, STEPS])
+    for part, one in zip(gradients(given, CpuKernel()), whole, strict=True):
+        # sums in another order
+        assert (part - one).abs().max() <= 1e-13 * one.abs().max()
+
+
+def test_cuts_bound_what_is_kept() -> None:
+    """At 100^3 cells, of which all vary: states kept and the record of a segment stay below 1 GiB."""
+    state = State(torch.zeros((118,) * 3), torch.zeros(0), (), (torch.zeros(0),) * 2, (torch.zeros(0),) * 2)
+    cells = 102**3
+    for steps in (10, 1000, 10_000):
+        cuts = adjoint._cuts(steps, state, cells)
+        longest = max(end - start for start, end in pairwise(cuts))
+        assert (cuts[0], cuts[-1]) == (0, steps)
+        kept = (len(cuts) - 1) * 2 * state.now.numel() + 2 * longest * cells
+        # the least that can be is 2 sqrt(steps x state x row); the record of short runs is 128 MiB, twice
+        assert 4 * kept <= max(2.1 * 4 * (steps * 4 * state.now.numel() * cells) ** 0.5, 600 * 2**20)
+
+
+@pytest.mark.parametrize("kernel", [CpuKernel(), ReferenceKernel()], ids=["cpu", "reference"])
+def test_adjoint_dot_product(kernel: Kernel) -> None:
+    """<c, J f> = <J^T c, f>, of any forces f and any weights c of what is recorded."""
+    assembly, sources, receivers, signal = parts(torch.float64, HEAVY, RIGID)
+    generator = torch.Generator().manual_seed(3)
+    force = torch.randn(sources.force.shape, generator=generator, dtype=torch.float64).requires_grad_()
+    heard = recorded(kernel, assembly, Sources(sources.index, force), receivers, signal)
+    slope = torch.randn(heard.shape, generator=generator, dtype=torch.float64)
+    (back,) = torch.autograd.grad(heard, force, slope)
+    # rounding over the steps
+    assert float(back.flatten() @ force.detach().flatten()) == pytest.approx(
+        float(slope.flatten() @ heard.detach().flatten()), rel=1e-12
+    )
+
+
+def test_a_loss_that_hears_nothing_has_no_gradient() -> None:
+    assembly, sources = differentiable(*parts(torch.float64, HEAVY)[:2])
+    heard = recorded(CpuKernel(), assembly, sources, *parts(torch.float64, HEAVY)[2:])
+    (0 * heard).sum().backward()
+    assert not sources.force.grad.any()
+    assert not assembly.coefficients.varying_weight.grad.any()
+
+
+def test_receivers_in_the_layers_are_refused() -> None:
+    assembly, sources, _, signal = parts(torch.float64, HEAVY)
+    corner = Receivers(torch.tensor([[40]]), torch.ones((1, 1), dtype=torch.float64))
+    with pytest.raises(ValueError, match="receivers: cells in the boundary layers"):
+        recorded(CpuKernel(), assembly, sources, corner, signal)

@@ -1,0 +1,193 @@
+"""`differentiable_field`: its gradients against differences, its field against the propagator's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from small_scenes import AIR, relative_error, small_scene
+
+import autdtorch as at
+from autdtorch.fdtd.bonds import varying_cells
+from autdtorch.fdtd.cell_maps import cells_of_maps
+from autdtorch.fdtd.grid import make_grid
+from autdtorch.fdtd.medium import fill_elements
+from autdtorch.fdtd.stepping import air_stencil
+
+SPHERE = at.Sphere((6.2e-3, 5.7e-3, 6.1e-3), 2e-3, density=20.0, sound_speed=300.0)
+RIGID = at.Box((3e-3, 9.5e-3, 9.5e-3), (3e-3, 3e-3, 3e-3), rigid=True)
+BOX = at.Box((9e-3, 9e-3, 3e-3), (3e-3, 3e-3, 3e-3), density=3.0, sound_speed=400.0)
+WALL = at.Box((6e-3, 6e-3, 12e-3), (40e-3, 40e-3, 2e-3), density=5.0, sound_speed=340.0)
+
+DRIVE = torch.tensor([0.9, 0.9j, -0.4, 0.3 - 0.7j], dtype=torch.complex128)
+EXACT = {"spacing": 2e-3, "periods": 3, "kernel": "cpu", "dtype": "float64"}
+
+
+def materials(*obstacles: at.Obstacle) -> tuple[torch.Tensor, torch.Tensor]:
+    """Density and sound speed (K,), ones for rigid obstacles."""
+    density, speed = (
+        torch.tensor([getattr(one, name) or 1.0 for one in obstacles], dtype=torch.float64)
+        for name in ("density", "sound_speed")
+    )
+    return density.requires_grad_(), speed.requires_grad_()
+
+
+def maps(scene: at.Scene, spacing: float, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    """Random density of 1 to 5 times air's and sound speed of 0.9 to 1.3 times air's."""
+    shape = at.cell_centers(scene, spacing).shape[:3]
+    generator = torch.Generator().manual_seed(seed)
+    density, speed = (torch.rand(shape, generator=generator, dtype=torch.float64) for _ in range(2))
+    return (
+        (AIR.density * (1 + 4 * density)).requires_grad_(),
+        (AIR.sound_speed * (0.9 + 0.4 * speed)).requires_grad_(),
+    )
+
+
+# the defaults of gradcheck, 1e-3, or 1e-5 of small values, with differences that are 1e-6 apart
+
+
+def test_gradcheck_of_drive_density_and_sound_speed() -> None:
+    scene = small_scene((SPHERE, RIGID), extent=12e-3)
+
+    def field(drive: torch.Tensor, density: torch.Tensor, sound_speed: torch.Tensor) -> torch.Tensor:
+        return at.differentiable_field(scene, drive, density=density, sound_speed=sound_speed, **EXACT)
+
+    drive = DRIVE.clone().requires_grad_()
+    assert torch.autograd.gradcheck(field, (drive, *materials(SPHERE, RIGID)), fast_mode=True)
+
+
+def test_gradcheck_of_maps() -> None:
+    """Also of the cells that the sources are in."""
+    scene = small_scene(extent=12e-3)
+
+    def field(drive: torch.Tensor, density: torch.Tensor, sound_speed: torch.Tensor) -> torch.Tensor:
+        return at.differentiable_field(scene, drive, density=density, sound_speed=sound_speed, **EXACT)
+
+    drive = DRIVE.clone().requires_grad_()
+    assert torch.autograd.gradcheck(field, (drive, *maps(scene, 2e-3)), fast_mode=True)
+
+
+def test_every_material_has_its_own_derivative() -> None:
+    """Against differences: each to the 1e-8 that both have, and what rounding leaves of that."""
+    scene = small_scene((SPHERE, RIGID, BOX), extent=12e-3)
+    given = dict(zip(("density", "sound_speed"), materials(SPHERE, RIGID, BOX), strict=True))
+
+    def loss(**values: torch.Tensor) -> torch.Tensor:
+        return at.differentiable_field(scene, DRIVE, **values, **EXACT).abs().sum()
+
+    loss(**given).backward()
+    fixed = {name: value.detach() for name, value in given.items()}
+    for name, values in given.items():
+        for number in (0, 2):
+            step = torch.zeros(3, dtype=torch.float64)
+            step[number] = 1e-4 * values.detach()[number]
+            ends = [float(loss(**(fixed | {name: fixed[name] + way * step}))) for way in (1, -1)]
+            slope = (ends[0] - ends[1]) / (2 * float(step[number]))
+            assert float(values.grad[number]) == pytest.approx(slope, rel=1e-6)
+        assert values.grad[1] == 0  # the rigid one
+
+
+def test_several_drives_are_one_by_one() -> None:
+    scene = small_scene((SPHERE,), extent=12e-3)
+    both = torch.stack((DRIVE, DRIVE.conj())).requires_grad_()
+    field = at.differentiable_field(scene, both, **EXACT)
+    field.abs().sum().backward()
+    for drive, slope, row in zip(both.detach(), both.grad, field, strict=True):
+        own = drive.clone().requires_grad_()
+        alone = at.differentiable_field(scene, own, **EXACT)
+        alone.abs().sum().backward()
+        assert torch.equal(alone, row)
+        assert torch.equal(own.grad, slope)
+
+
+def test_field_is_the_propagators() -> None:
+    """In the steady state, to the tolerance that the propagator's run ends at."""
+    scene = small_scene((SPHERE, RIGID), extent=16e-3)
+    steady = at.make_propagator(scene, "full", 1.5e-3, tolerance=1e-4).field(DRIVE, scene.control_points)
+    field = at.differentiable_field(scene, DRIVE, spacing=1.5e-3, periods=60)
+    assert relative_error(field, steady) < 1e-3
+
+
+def test_gradient_by_the_drive_is_that_of_the_transfer_matrix() -> None:
+    scene = small_scene((SPHERE,), extent=16e-3)
+    matrix = at.make_propagator(scene, "full", 1.5e-3, tolerance=1e-4).transfer_matrix()
+    drive = DRIVE.clone().requires_grad_()
+    at.differentiable_field(scene, drive, spacing=1.5e-3, periods=60).abs().sum().backward()
+    exact = DRIVE.clone().requires_grad_()
+    (matrix @ exact).abs().sum().backward()
+    # runs that end 1e-4 from steady, and one of 60 periods
+    assert relative_error(drive.grad, exact.grad) < 1e-3
+
+
+def test_uniform_maps_are_a_material() -> None:
+    """Deep in a box the rows and masses of a map are those of an obstacle; the map of air is air."""
+    air = small_scene(extent=24e-3)
+    box = at.Box((12e-3, 12e-3, 12e-3), (12e-3, 12e-3, 12e-3), density=3.0, sound_speed=450.0)
+    scene = small_scene((box,), extent=24e-3, absorption=40.0)
+    grid = make_grid(scene, 2e-3)
+    stencil = air_stencil(grid, scene)
+    cells = varying_cells(fill_elements(scene, grid, stencil), stencil)
+    shape = at.cell_centers(air, 2e-3).shape[:3]
+    full = torch.ones(shape, dtype=torch.float64)
+    same = cells_of_maps(scene, grid, 3.0 * full, 450.0 * full).varying
+    places = np.stack(np.unravel_index(cells.index, grid.shape), axis=-1)
+    far = box.signed_distance(np.array(grid.origin) + grid.spacing * places).numpy()
+    deep = far < -1.8 * grid.spacing
+    assert deep.sum() >= 8
+    place = np.searchsorted(same.index, cells.index[deep])
+    # the mean over directions is a quadrature in the one and a closed form in the other
+    np.testing.assert_allclose(same.weight[place], cells.weight[deep], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(same.mass[place], cells.mass[deep], rtol=1e-9)
+    silent = cells_of_maps(scene, grid, AIR.density * full, AIR.sound_speed * full).varying
+    np.testing.assert_allclose(silent.weight, np.tile(stencil.weights, (len(silent.index), 1)), atol=1e-9)
+
+
+def test_a_map_moves_smoothly_with_an_obstacle() -> None:
+    """Second differences of the field, of steps of a tenth of a cell, are those of a smooth function."""
+    scene = small_scene(extent=16e-3)
+    centers = at.cell_centers(scene)
+
+    def field(shift: float) -> torch.Tensor:
+        far = at.Sphere((8e-3 + shift, 8e-3, 8e-3), 3e-3, rigid=True).signed_distance(centers)
+        lightness = (1 - torch.sigmoid(-far / 0.25e-3)) / AIR.density + torch.sigmoid(-far / 0.25e-3) / 50.0
+        return at.differentiable_field(scene, DRIVE, density=1 / lightness, time_step=1.7e-6)
+
+    fields = torch.stack([field(1e-4 * step) for step in range(4)])
+    first, second = fields.diff(dim=0), fields.diff(n=2, dim=0)
+    # a wave's phase changes by 4 pi / wavelength x 0.1 mm = 0.15 a step at most, forth and back
+    assert second.norm(dim=1).max() < 0.15 * first.norm(dim=1).max()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda s: at.differentiable_field(s, DRIVE, density=[1.0, 2.0]), r"density: shape \(2,\)"),
+        (lambda s: at.differentiable_field(s, DRIVE, density=[-1.0]), "density: -1.0; every entry"),
+        (lambda s: at.differentiable_field(s, DRIVE, density=torch.ones(24, 24, 24)), r"must be \(1,\)"),
+        (lambda s: at.differentiable_field(s, DRIVE, sound_speed=[50.0]), "cells per wavelength in"),
+        (lambda s: at.differentiable_field(s, DRIVE[:2]), "drive: shape"),
+        (lambda s: at.differentiable_field(s, DRIVE, [[1.0, 0, 0]]), "points"),
+        (lambda s: at.differentiable_field(s, DRIVE, periods=0), "periods: 0"),
+        (lambda s: at.differentiable_field(s, DRIVE, kernel="fast"), "kernel: 'fast'"),
+        (lambda s: at.differentiable_field(s, DRIVE, dtype="int8"), "dtype: 'int8'"),
+        (lambda s: at.differentiable_field(s, DRIVE, time_step=1.0), "time_step: 1.0 s"),
+        (lambda s: at.differentiable_field("scene", DRIVE), "scene: 'scene'"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_refused(call: Callable[[at.Scene], torch.Tensor], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        call(small_scene((at.Sphere((12e-3,) * 3, 3e-3, density=3.0, sound_speed=340.0),)))
+
+
+def test_maps_of_another_shape_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"density: shape \(2, 2, 2\); must be \(24, 24, 24\)"):
+        at.differentiable_field(small_scene(), DRIVE, density=torch.ones(2, 2, 2))
+
+
+def test_obstacles_in_the_layers_are_not_differentiated() -> None:
+    scene = small_scene((SPHERE, WALL), extent=12e-3)
+    density, _ = materials(SPHERE, WALL)
+    with pytest.raises(ValueError, match="reaches into the boundary layers"):
+        at.differentiable_field(scene, DRIVE, density=density, **EXACT)
