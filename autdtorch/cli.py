@@ -63,7 +63,7 @@ def main() -> None:
     try:
         _run()
     except KeyboardInterrupt:
-        _stop(_INTERRUPTED, "interrupted; finished scenes are kept, and the same command goes on after them")
+        _stop(_INTERRUPTED, "interrupted; finished trials are kept, and the same command goes on after them")
     except _Refusal as refusal:
         error = refusal.cause
     except _REFUSALS as refused:

@@ -92,7 +92,7 @@ def large_objectives() -> dict[str, at.SimulatedObjective]:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, and write the block."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--trials", type=int, default=4)
+    parser.add_argument("--trials", type=int, default=3)
     trials = parser.parse_args(arguments).trials
     objectives = large_objectives()
     rows = measure(objectives, trials)
