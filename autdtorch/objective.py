@@ -82,7 +82,7 @@ class SimulatedObjective:
 
         Returns:
             Pressure magnitudes (B, P) [Pa], float64, on the CPU, without gradient. In mode "transfer" a row
-            does not depend on the rows beside it, not even in its rounding.
+            does not depend on the rows beside it, nor on the number of threads, not even in its rounding.
 
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
@@ -93,9 +93,20 @@ class SimulatedObjective:
             # One by one: given many drives at once, a propagator may take the transfer matrix as well.
             rows = [self._propagator.field(row, self.scene.control_points) for row in drive]
             return torch.stack(rows).abs().cpu()
-        # Not `drive @ G.T`: BLAS rounds by the number of rows, which a search through thousands of choices
-        # amplifies until a trial depends on the trials beside it.
-        return (drive[:, None, :] * self.transfer_matrix).sum(dim=-1).abs()
+        return _magnitudes(self.transfer_matrix, drive)
+
+
+def _magnitudes(matrix: torch.Tensor, drive: torch.Tensor) -> torch.Tensor:
+    """|G q| (B, P) of drives (B, M), every row rounded in the same way.
+
+    A search through thousands of choices amplifies any other rounding until a trial depends on the trials
+    beside it. BLAS rounds by the number of rows, complex products by their place in a vector register and so
+    by where threads begin; single real operations round in one way only.
+    """
+    drive = drive.contiguous()[:, None]
+    real = (matrix.real * drive.real - matrix.imag * drive.imag).sum(dim=-1)
+    imaginary = (matrix.real * drive.imag + matrix.imag * drive.real).sum(dim=-1)
+    return (real.square() + imaginary.square()).sqrt()
 
 
 def validate_drives(drive: torch.Tensor, transducers: int) -> torch.Tensor:

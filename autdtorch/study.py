@@ -28,8 +28,8 @@ from autdtorch.validation import LENGTH_TOLERANCE, distances, integer_at_least, 
 
 logger = logging.getLogger(__name__)
 
-#: An optimiser with its settings bound. It gets the numbers of `trials` and `seed` where it has such
-#: parameters.
+#: An optimiser with its settings bound. Where it has parameters `trials` and `seed` it gets a sequence of the
+#: numbers of the trials to run, of which it is to return as many, and the study's seed.
 Method: TypeAlias = Callable[..., Solution]
 
 _FIRST_BLOCK = 2  # Trials are run so many at a time at first,
@@ -222,6 +222,9 @@ def _run_trials(
         begin = time.perf_counter()
         solution = solve(trials=block)
         seconds = time.perf_counter() - begin
+        if len(solution.score) != len(block):
+            accepted = f"must be the trials {list(block)}, or one where it has no random choices"
+            raise invalid(f"method {method}", len(solution.score), accepted, "trials")
         trials.append(scene, method, block, solution, seconds)
         progress.advance(len(block))
         size = max(1, int(size * min(_LARGEST_GROWTH, _BLOCK_SECONDS / seconds)))

@@ -82,7 +82,8 @@ class TrialFile:
     def found(self, scene: str, method: str, trials: int) -> tuple[Solution, torch.Tensor]:
         """What the first `trials` trials found, all of which must be there, and seconds (T,) of each."""
         each = [self._trials[scene, method, trial] for trial in range(trials)]
-        return _together([solution for solution, _ in each]), torch.tensor([seconds for _, seconds in each])
+        seconds = torch.tensor([share for _, share in each], dtype=torch.float64)
+        return _together([solution for solution, _ in each]), seconds
 
     def _row(self, scene: str, method: str, trial: int) -> dict[str, Any]:
         solution, seconds = self._trials[scene, method, trial]

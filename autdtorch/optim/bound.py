@@ -50,28 +50,31 @@ def focus_bound(G: ArrayLike) -> float:
     alone = np.abs(matrix).sum(axis=1)  # what each focus reaches by itself
     if alone.min() == 0:
         return 0.0
+    importance = (alone.min() / alone) ** 2  # of a focus; another unit would overflow sooner
     rows = (matrix / alone[:, None])[:, np.abs(matrix).max(axis=0) > 0]
     x = np.concatenate([np.ones(len(rows)), np.log(np.linalg.norm(rows, axis=0))])
     for order in _ORDERS:
         x = scipy.optimize.minimize(
             _log_bound,
             x,
-            args=(rows, alone, order),
+            args=(rows, importance, order),
             jac=True,
             method="L-BFGS-B",
             bounds=[(_LEAST_WEIGHT, None)] * len(rows) + [(None, None)] * rows.shape[1],
             options={"maxcor": 40, "maxiter": 2000, "ftol": 1e-14, "gtol": 1e-10},
         ).x
-    return float(np.exp(_log_bound(x, rows, alone, np.inf)[0]) * (1 + _MARGIN))
+    return float(alone.min() * np.exp(_log_bound(x, rows, importance, np.inf)[0]) * (1 + _MARGIN))
 
 
-def _log_bound(x: _Reals, rows: _Complexes, alone: _Reals, order: float) -> tuple[float, _Reals]:
-    """Logarithm of the bound, with the Schatten norm of this `order` for the spectral norm, and its gradient.
+def _log_bound(x: _Reals, rows: _Complexes, importance: _Reals, order: float) -> tuple[float, _Reals]:
+    """Logarithm of the bound over the least of `alone`, and its gradient.
+
+    The Schatten norm of this `order` stands for the spectral norm.
 
     Args:
-        x: the weights w, times the squares of `alone`, then log z (P + M,).
-        rows: transfer matrix (P, M), its rows divided by `alone`.
-        alone: pressure of each focus when it has the array to itself (P,) [Pa].
+        x: the weights w over `importance`, then log z (P + M,).
+        rows: transfer matrix (P, M), its rows divided by `alone`: what each focus reaches by itself.
+        importance: (min(alone) / alone)^2 (P,).
         order: >= 2; infinite for the spectral norm.
     """
     weights, log_z = np.split(x, [len(rows)])
@@ -80,11 +83,11 @@ def _log_bound(x: _Reals, rows: _Complexes, alone: _Reals, order: float) -> tupl
     _, singular, right = np.linalg.svd(np.sqrt(weights)[:, None] * columns, full_matrices=False)
     ratios = singular / singular[0]
     norm = np.linalg.norm(ratios, order)
-    mean = np.sum(weights / alone**2)
+    mean = weights @ importance
     log_bound = np.log(singular[0] * norm * np.linalg.norm(z)) - np.log(mean) / 2
 
     # How the logarithm of the norm grows with the squares of the singular values
     growth = (ratios / norm) ** (order - 2) / (singular[0] * norm) ** 2 / 2
-    slope_weights = np.abs(columns @ right.conj().T) ** 2 @ growth - 1 / alone**2 / mean / 2
+    slope_weights = np.abs(columns @ right.conj().T) ** 2 @ growth - importance / mean / 2
     slope_log_z = z**2 / np.sum(z**2) - 2 * (growth * singular**2) @ np.abs(right) ** 2
     return float(log_bound), np.concatenate([slope_weights, slope_log_z])

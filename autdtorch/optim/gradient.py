@@ -52,11 +52,10 @@ def gradient_ascent(
             objective,
             'must have a transfer matrix, as SimulatedObjective has in mode "transfer"',
         )
-    drive = torch.stack(
-        [random_drives(starts, matrix.shape[1], torch.Generator().manual_seed(own)) for own in seeds]
-    )
     ledger = Ledger(objective, len(seeds), weakest_focus)
-    ledger.evaluate(climb(matrix.expand(len(seeds), -1, -1), drive, steps)[:, None])
+    generators = [torch.Generator().manual_seed(own) for own in seeds]
+    highest = [climb(matrix, random_drives(starts, matrix.shape[1], own), steps) for own in generators]
+    ledger.evaluate(torch.stack(highest)[:, None])
     return ledger.solution()
 
 
@@ -70,17 +69,16 @@ def climb(matrix: torch.Tensor, drive: torch.Tensor, steps: int) -> torch.Tensor
     """The drive of the strongest weakest focus that projected gradient ascent with momentum finds.
 
     What is climbed is a smooth minimum, -T log sum_p exp(-|p_p| / T), whose temperature T falls until
-    it is the minimum. No trial depends on the trials beside it, not even in its rounding.
+    it is the minimum.
 
     Args:
-        matrix: transfer matrices (T, P, M), complex128.
-        drive: where to start (T, S, M).
+        matrix: transfer matrix (P, M), complex128.
+        drive: where to start (S, M).
         steps: >= 2.
 
     Returns:
-        Drives (T, M), amplitudes <= 1.
+        Drive (M,), amplitudes <= 1.
     """
-    matrix = matrix[:, None]
     velocity = torch.zeros_like(drive)
     for progress in torch.linspace(0, 1, steps).tolist():
         temperature, step = (first * (last / first) ** progress for first, last in (_TEMPERATURE, _STEP))
@@ -93,10 +91,8 @@ def climb(matrix: torch.Tensor, drive: torch.Tensor, steps: int) -> torch.Tensor
         velocity = _MOMENTUM * velocity + (1 - _MOMENTUM) * slope
         drive = drive + step * velocity
         drive = drive / drive.abs().clamp_min(1)
-    best = weakest_focus(_pressure(matrix, drive).abs()).argmax(dim=1)
-    return drive[torch.arange(len(drive)), best]
+    return drive[weakest_focus(_pressure(matrix, drive).abs()).argmax()]
 
 
 def _pressure(matrix: torch.Tensor, drive: torch.Tensor) -> torch.Tensor:
-    # Not a matrix product, which rounds by the number of rows (SimulatedObjective).
-    return (drive[:, :, None] * matrix).sum(dim=-1)
+    return (drive[:, None] * matrix).sum(dim=-1)

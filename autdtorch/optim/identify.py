@@ -107,9 +107,11 @@ def _fit(drives: torch.Tensor, observed: torch.Tensor, rows: torch.Tensor) -> to
 
 def _strongest(rows: list[torch.Tensor], generators: list[torch.Generator]) -> torch.Tensor:
     """The drive (T, M) of the strongest weakest focus, by each trial's rows (M, P)."""
-    matrix = torch.stack(rows).mT
-    starts = [random_drives(_STARTS, matrix.shape[2], own) for own in generators]
-    return climb(matrix, torch.stack(starts), _CLIMB_STEPS)
+    drives = [
+        climb(own.T, random_drives(_STARTS, len(own), generator), _CLIMB_STEPS)
+        for own, generator in zip(rows, generators, strict=True)
+    ]
+    return torch.stack(drives)
 
 
 def _nearby(drive: torch.Tensor, generator: torch.Generator, count: int) -> torch.Tensor:

@@ -67,6 +67,26 @@ def test_a_row_does_not_depend_on_the_rows_beside_it(scene, drive):
     together = objective(drive.repeat(50, 1))
     assert torch.equal(together[:7], torch.cat([objective(row[None]) for row in drive]))
     assert torch.equal(together[:7], together[-7:])
+    assert torch.equal(together[:7], objective(drive.T.contiguous().T))
+
+
+def test_a_row_does_not_depend_on_the_number_of_threads():
+    # 340204 products: wherever a thread begins it is in the middle of a row.
+    array = TransducerArray.grid((17, 1), pitch=10e-3, center=(0, 0, 0))
+    points = torch.tensor([(80e-3, 1e-2 * y, 0.0) for y in range(4)])
+    scene = Scene(array, Medium(1.2, 340.0), frequency=40e3, control_points=points)
+    objective = SimulatedObjective(scene, make_propagator(scene, "free_space"))
+    phases = torch.rand(5003, 17, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    drive = drive_from_phases(6 * phases)
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        expected = objective(drive)
+        for count in range(2, 11):
+            torch.set_num_threads(count)
+            assert torch.equal(objective(drive), expected)
+    finally:
+        torch.set_num_threads(threads)
 
 
 @pytest.mark.parametrize(

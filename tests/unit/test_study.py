@@ -235,3 +235,12 @@ def test_settings_are_checked_before_anything_is_simulated(
     arguments = {"scenes": {"a": scene()}, "methods": METHODS} | changes
     with pytest.raises(ValueError, match=message):
         run_study(**arguments)
+
+
+@pytest.mark.parametrize("returned", [1, 3])
+def test_a_method_returns_the_trials_it_is_asked_for(returned: int) -> None:
+    def method(objective: Objective, trials: Sequence[int], seed: int) -> Solution:
+        return gabs(objective, levels=4, trials=returned, seed=seed)
+
+    with pytest.raises(ValueError, match=rf"method own: {returned} trials; must be the trials \[0, 1\]"):
+        run_study({"a": scene(None)}, {"own": method}, solver=FREE_SPACE, trials=2)

@@ -42,6 +42,7 @@ def test_trials_come_back_bit_for_bit_in_their_order(path: Path) -> None:
         assert read.missing("a", "lssg", 1) == [0]
         back, seconds = read.found("a", "gabs", 4)
         assert_equal(back, solution)
+        assert seconds.dtype == torch.float64
         assert seconds.tolist() == [2.0, 6.0, 2.0, 2.0]
 
 
