@@ -62,8 +62,11 @@ def highest_scores(objective: at.SimulatedObjective) -> dict[str, float]:
     """Weakest focus [Pa] that each method finds."""
     transducers = len(objective.scene.array)
     return {
+        "lss": at.lss(objective).score.item(),
+        "lssg": at.lssg(objective).score.item(),
         "random_search": at.random_search(objective).score.item(),
         "gabs": at.gabs(objective).score.item(),
+        "bayes_opt": at.bayes_opt(objective, evaluations=48, fixed_transducer=0).score.item(),
         "identify": at.identify(objective, evaluations=4 * transducers).score.item(),
         "gradient_ascent": at.gradient_ascent(objective).score.item(),
     }
