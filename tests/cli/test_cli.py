@@ -112,12 +112,12 @@ def test_every_experiment_builds(name: str, composed: Callable[..., dict[str, ob
 def test_the_papers_experiment(composed: Callable[..., dict[str, object]]) -> None:
     config = composed("experiment=paper")
     assert list(config["scenes"]) == ["homogeneous", "three_cubes", "two_cubes"]
-    assert list(config["methods"]) == ["lssg", "bayes_opt", "gabs"]
+    assert list(config["methods"]) == ["lssg", "bayes_opt", "gabs", "identify", "gradient_ascent"]
     assert config["methods"]["gabs"] == {
         "_target_": "autdtorch.gabs", "levels": 16, "order": "random", "first": None, "passes": 1
     }  # fmt: skip
     assert config["methods"]["bayes_opt"]["evaluations"] == 256
-    assert config["trials"]["gabs"] == 50
+    assert config["trials"]["gabs"] == config["trials"]["bayes_opt"] == 50
     assert composed("experiment=paper", "trials=7")["trials"] == 7
 
 
@@ -271,7 +271,7 @@ def test_an_experiment_ends_with_its_report(
     assert captured.out.splitlines()[-1] == f"The report is {Path('outputs', 'paper', 'report.md')}"
     results = load_results(tmp_path / "outputs" / "paper")
     assert list(results.scenes) == ["homogeneous", "three_cubes"]
-    assert [method.trials for method in results.scenes["three_cubes"].methods.values()] == [1, 2]
+    assert [method.trials for method in results.scenes["three_cubes"].methods.values()] == [1, 2, 2, 2]
     report = (tmp_path / "outputs" / "paper" / "report.md").read_text(encoding="utf-8")
     assert f"`autdtorch {' '.join(command)} solver.method=free_space`" in report.replace("'", "")
 
