@@ -95,7 +95,7 @@ class SimulatedObjective:
             return torch.stack(rows).abs().cpu()
         # Not `drive @ G.T`: BLAS rounds by the number of rows, which a search through thousands of choices
         # amplifies until a trial depends on the trials beside it.
-        return (drive[:, None, :] * self.transfer_matrix).sum(dim=-1).abs()
+        return magnitude((drive[:, None, :] * self.transfer_matrix).sum(dim=-1))
 
 
 def validate_drives(drive: torch.Tensor, transducers: int) -> torch.Tensor:
@@ -108,6 +108,14 @@ def validate_drives(drive: torch.Tensor, transducers: int) -> torch.Tensor:
     if drive.ndim != 2 or len(drive) == 0:
         raise ValueError(f"drive: shape {tuple(drive.shape)}; must be (B, {transducers}) with B >= 1")
     return drive
+
+
+def magnitude(phasors: torch.Tensor) -> torch.Tensor:
+    """Magnitudes of complex `phasors`, each rounded the same wherever it stands.
+
+    Not `abs`, which rounds the last few of a complex tensor, those that fill no vector register, otherwise.
+    """
+    return torch.hypot(phasors.real, phasors.imag)
 
 
 def weakest_focus(pressure: torch.Tensor) -> torch.Tensor:

@@ -9,7 +9,7 @@ import math
 
 import torch
 
-from autdtorch.objective import Objective, weakest_focus
+from autdtorch.objective import Objective, magnitude, weakest_focus
 from autdtorch.optim.base import Ledger, Solution, Trials, trial_seeds
 from autdtorch.validation import integer_at_least, invalid
 
@@ -85,15 +85,15 @@ def climb(matrix: torch.Tensor, drive: torch.Tensor, steps: int) -> torch.Tensor
     for progress in torch.linspace(0, 1, steps).tolist():
         temperature, step = (first * (last / first) ** progress for first, last in (_TEMPERATURE, _STEP))
         pressure = _pressure(matrix, drive)
-        magnitude = pressure.abs()
-        hardness = 1 / (temperature * magnitude.mean(dim=-1, keepdim=True)).clamp_min(_TINY)
-        weights = torch.softmax(-magnitude * hardness, dim=-1)
-        slope = ((weights * pressure.sgn())[..., None] * matrix.conj()).sum(dim=-2)
-        slope = slope / slope.abs().mean(dim=-1, keepdim=True).clamp_min(_TINY)
+        strength = magnitude(pressure)
+        hardness = 1 / (temperature * strength.mean(dim=-1, keepdim=True)).clamp_min(_TINY)
+        weights = torch.softmax(-strength * hardness, dim=-1) / strength.clamp_min(_TINY)
+        slope = ((weights * pressure)[..., None] * matrix.conj()).sum(dim=-2)
+        slope = slope / magnitude(slope).mean(dim=-1, keepdim=True).clamp_min(_TINY)
         velocity = _MOMENTUM * velocity + (1 - _MOMENTUM) * slope
         drive = drive + step * velocity
-        drive = drive / drive.abs().clamp_min(1)
-    best = weakest_focus(_pressure(matrix, drive).abs()).argmax(dim=1)
+        drive = drive / magnitude(drive).clamp_min(1)
+    best = weakest_focus(magnitude(_pressure(matrix, drive))).argmax(dim=1)
     return drive[torch.arange(len(drive)), best]
 
 
