@@ -42,7 +42,7 @@ def test_levels_of_the_device_are_known_to_the_fit(paper_objective):
 
 def test_more_readings_are_better(paper_objective):
     noisy = Noise(paper_objective, 10)
-    few, many = (identify(noisy, evaluations=count, trials=8).drive for count in (64, 512))
+    few, many = (identify(noisy, evaluations=count, trials=4).drive for count in (64, 256))
     assert paper_objective(few).amin(dim=1).mean() < paper_objective(many).amin(dim=1).mean()
 
 
