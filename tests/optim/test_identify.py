@@ -19,7 +19,7 @@ def test_as_good_as_the_gradient_without_seeing_the_matrix(paper_objective, eval
 @pytest.mark.parametrize(("evaluations", "share"), [(64, 0.95), (256, 0.98)])
 def test_readings_average_noise(paper_objective, evaluations, share):
     best = gradient_ascent(paper_objective).score
-    solution = identify(Noise(paper_objective, 20), evaluations=evaluations, trials=10)
+    solution = identify(Noise(paper_objective, 20), evaluations=evaluations, trials=6)
     # Measured: 0.987 and 0.996 (docs/decisions/identify.md).
     assert paper_objective(solution.drive).amin(dim=1).median() > share * best
 
@@ -38,12 +38,6 @@ def test_levels_of_the_device_are_known_to_the_fit(paper_objective):
     # Fitted to the drives as they were asked for, the readings would seem to have noise 13 dB below them.
     solution = identify(Quantised(paper_objective, 8), trials=5)
     assert paper_objective(solution.drive).amin(dim=1).median() > 0.9 * best
-
-
-def test_more_readings_are_better(paper_objective):
-    noisy = Noise(paper_objective, 10)
-    few, many = (identify(noisy, evaluations=count, trials=4).drive for count in (64, 256))
-    assert paper_objective(few).amin(dim=1).mean() < paper_objective(many).amin(dim=1).mean()
 
 
 @pytest.mark.parametrize(("points", "transducers"), [(1, 1), (2, 2), (1, 3), (8, 3), (3, 8)])
