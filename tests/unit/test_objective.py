@@ -3,7 +3,7 @@ import torch
 
 from autdtorch.array import TransducerArray
 from autdtorch.drive import drive_from_phases
-from autdtorch.objective import SimulatedObjective, magnitude, weakest_focus
+from autdtorch.objective import SimulatedObjective, weakest_focus
 from autdtorch.propagator import FreeSpacePropagator, make_propagator
 from autdtorch.scene import Medium, Scene
 
@@ -87,14 +87,6 @@ def test_a_row_does_not_depend_on_the_number_of_threads():
             assert torch.equal(objective(drive), expected)
     finally:
         torch.set_num_threads(threads)
-
-
-def test_magnitudes_are_rounded_alike_wherever_they_stand():
-    # `abs` differs for a few of these: no multiple of 4 fills the registers.
-    generator = torch.Generator().manual_seed(0)
-    phasors = torch.randn(1001, 3, dtype=torch.complex128, generator=generator)
-    assert torch.equal(magnitude(phasors), torch.cat([magnitude(row) for row in phasors.split(1)]))
-    torch.testing.assert_close(magnitude(phasors), phasors.abs(), rtol=1e-15, atol=0)
 
 
 @pytest.mark.parametrize(
