@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import inspect
-import logging
 import math
 import os
 import re
@@ -25,8 +24,6 @@ from autdtorch.scene import Scene
 from autdtorch.study_folder import StudyFolder, open_folder
 from autdtorch.trial_file import TrialFile
 from autdtorch.validation import LENGTH_TOLERANCE, distances, integer_at_least, invalid, positive
-
-logger = logging.getLogger(__name__)
 
 #: An optimiser with its settings bound. Where it has parameters `trials` and `seed` it gets a sequence of the
 #: numbers of the trials to run, of which it is to return as many, and the study's seed.
