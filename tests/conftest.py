@@ -1,6 +1,7 @@
 """Every test carries the marker named like its folder, so that ``pytest -m physics`` runs
 ``tests/physics``. Where there is no GPU, Triton interprets the CUDA kernel on the CPU. Where pytest runs in
-several processes, they share the cores: threads that wait for each other on busy cores are many times slower."""
+several processes, these share the cores: threads that wait for each other on busy cores are many times
+slower."""
 
 import os
 from pathlib import Path
