@@ -14,6 +14,7 @@ import os
 import re
 import shlex
 import sys
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
@@ -136,7 +137,9 @@ def _run(config: DictConfig) -> None:
     if swept:
         logger.info("job %s: %s", job.job.num, ", ".join(job.overrides.task))
     try:
-        _study(config, Path(job.sweep.dir) if swept else None)
+        with warnings.catch_warnings():
+            warnings.showwarning = _log_warning
+            _study(config, Path(job.sweep.dir) if swept else None)
     except _REFUSALS as error:
         if not swept:
             raise _Refusal(error) from error
@@ -145,6 +148,11 @@ def _run(config: DictConfig) -> None:
         raise _FailedJob(
             "a job failed, as the log says; the same command repeats what is not finished"
         ) from error
+
+
+def _log_warning(message: Warning | str, *_: object) -> None:
+    """A line of the log, without the place in our source."""
+    logger.warning("%s", message)
 
 
 def _job_folder(overrides: str) -> str:
