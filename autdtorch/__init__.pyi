@@ -1,4 +1,4 @@
-from . import reference
+from . import hardware, reference
 from .array import PAPER_SOURCE_STRENGTH, TransducerArray
 from .conditions import Dead, Drift, Noise, Quantised, true_pressure
 from .drive import amplitudes_of, drive_from_phases, focus_phases, phases_of
@@ -56,6 +56,7 @@ __all__ = [
     "gabs",
     "gradient_ascent",
     "green",
+    "hardware",
     "identify",
     "load_results",
     "load_scene",
