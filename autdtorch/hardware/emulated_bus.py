@@ -30,6 +30,7 @@ class EmulatedChip:
         vendor: idVendor.
         product: idProduct.
         strings: string descriptors by their index.
+        firmware: what takes the bytes behind the chip.
         present: whether it is plugged in.
     """
 
@@ -39,7 +40,7 @@ class EmulatedChip:
         self.product = product
         self.strings = (*_STRINGS, serial)
         self.present = True
-        self._firmware = firmware
+        self.firmware = firmware
         self._format = usb.EIGHT_N_ONE
         self._baud = 9600.0
 
@@ -52,12 +53,12 @@ class EmulatedChip:
 
     def write(self, data: bytes) -> None:
         """Send bytes on to the firmware, which loses them at another rate or format than its own."""
-        wanted = self._firmware.baud
+        wanted = self.firmware.baud
         if wanted is not None:
             off_rate = abs(self._baud / wanted - 1) > _BAUD_TOLERANCE
             if off_rate or self._format != usb.EIGHT_N_ONE:
                 return
-        self._firmware.receive(data)
+        self.firmware.receive(data)
 
     def read(self) -> bytes:
         """An IN packet: no device here answers, so that it is the status alone."""
