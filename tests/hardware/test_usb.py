@@ -34,12 +34,20 @@ def test_none_or_several_are_an_error_that_lists_what_is_there(chips, serial, me
 
 
 @pytest.mark.parametrize(
-    ("baud", "divisor"),
-    # FTDI's own table, application note AN232B-05.
-    [(300, 0x2710), (9600, 0x4138), (38400, 0xC04E), (57600, 0xC034), (115200, 0x001A), (230400, 0x000D)],
+    ("baud", "value", "index"),
+    [  # FTDI's application note AN232B-05
+        (300, 0x2710, 0),
+        (9600, 0x4138, 0),
+        (19200, 0x809C, 0),
+        (38400, 0xC04E, 0),
+        (55944, 0x4035, 1),
+        (115_200, 0x001A, 0),
+        (230_400, 0x000D, 0),
+        (460_800, 0x4006, 0),
+    ],
 )
-def test_baud_divisors_are_those_of_the_data_sheet(baud, divisor):
-    assert baud_divisor(baud) == (divisor, 0)
+def test_baud_divisors_are_those_of_the_application_note(baud, value, index):
+    assert baud_divisor(baud) == (value, index)
 
 
 def test_at_another_rate_the_device_hears_nothing():
