@@ -3,7 +3,7 @@ from .emulator import EmulatedBench, EmulatedSensor
 from .link import Link, open_link
 from .objective import HardwareObjective
 from .sensor import Sensor
-from .usb import LinkError
+from .usb import LinkError, Port
 
 __all__ = [
     "OPENMPD",
@@ -14,6 +14,7 @@ __all__ = [
     "HardwareObjective",
     "Link",
     "LinkError",
+    "Port",
     "Sensor",
     "open_link",
 ]
