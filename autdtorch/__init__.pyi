@@ -1,4 +1,4 @@
-from . import reference
+from . import hardware, reference
 from .array import PAPER_SOURCE_STRENGTH, TransducerArray
 from .collect import Sweep, collect_results
 from .conditions import Dead, Drift, Noise, Quantised, true_pressure
@@ -59,6 +59,7 @@ __all__ = [
     "gabs",
     "gradient_ascent",
     "green",
+    "hardware",
     "identify",
     "load_results",
     "load_scene",

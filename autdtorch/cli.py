@@ -138,7 +138,7 @@ def _run(config: DictConfig) -> None:
         logger.info("job %s: %s", job.job.num, ", ".join(job.overrides.task))
     try:
         with warnings.catch_warnings():
-            warnings.showwarning = _log_warning
+            warnings.showwarning = lambda message, *_: logger.warning("%s", message)  # without our source
             _study(config, Path(job.sweep.dir) if swept else None)
     except _REFUSALS as error:
         if not swept:
@@ -148,11 +148,6 @@ def _run(config: DictConfig) -> None:
         raise _FailedJob(
             "a job failed, as the log says; the same command repeats what is not finished"
         ) from error
-
-
-def _log_warning(message: Warning | str, *_: object) -> None:
-    """A line of the log, without the place in our source."""
-    logger.warning("%s", message)
 
 
 def _job_folder(overrides: str) -> str:
