@@ -95,6 +95,9 @@ def save_drive(
 def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
     """The drive (M,), complex128, from a file as `save_drive` writes it; levels as the device plays them.
 
+    Args:
+        path: of the file; its suffix says the format.
+
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: another suffix, or a file that holds no drive. The message names the file, and the line

@@ -54,6 +54,9 @@ class OpenMPDBoard:
     def load(cls, path: str | os.PathLike[str]) -> OpenMPDBoard:
         """Read a .pat file.
 
+        Args:
+            path: of the file.
+
         Raises:
             FileNotFoundError: there is no such file.
             ValueError: it is none of a board. The message names the file, the line and what is wrong.

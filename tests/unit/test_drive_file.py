@@ -84,7 +84,7 @@ def test_the_field_of_what_autd3_plays_is_that_of_the_drive_within_its_levels(tm
     array = TransducerArray.autd3((0, 0, 0), normal=(0, 0, 1))
     drive = some_drive(249)
     save_drive(tmp_path / "drive.csv", drive, array, "autd3")
-    matrix = free_space_matrix(array, [[0, 0, 0.1], [0.02, 0.03, 0.15]], wavenumber=739.0)
+    matrix = free_space_matrix([[0, 0, 0.1], [0.02, 0.03, 0.15]], array, wavenumber=739.0)
 
     moved = (matrix @ (load_drive(tmp_path / "drive.csv") - drive)).abs()
 
