@@ -11,6 +11,7 @@ import autdtorch
 
 project = "autdtorch"
 author = "The autdtorch authors"
+copyright = "the autdtorch authors; MIT licence"
 version = release = autdtorch.__version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
@@ -51,7 +52,7 @@ napoleon_use_ivar = True
 
 def escape(app: Sphinx, what: str, name: str, thing: object, options: object, lines: list[str]) -> None:
     """Keep |q| and np.bool_ in docstrings from being read as reStructuredText's references."""
-    lines[:] = [re.sub(r"\||_(?!\w)", r"\\\g<0>", line) for line in lines]
+    lines[:] = [re.sub(r"\||_(?=[]),]|$)", r"\\\g<0>", line) for line in lines]
 
 
 def name_aliases(

@@ -9,7 +9,7 @@ import re
 import pytest
 
 import autdtorch
-from autdtorch import reference, validation
+from autdtorch import validation
 
 UNITS = {
     "deg C": {"temperature"},
@@ -62,15 +62,16 @@ WITHOUT_UNIT = {
 }
 
 ARRAY = re.compile(r"Tensor|ArrayLike|NDArray|Vector")
-QUANTITY = re.compile(rf"^(?!Mapping).*\b(float|complex|{ARRAY.pattern})\b")
+QUANTITY = re.compile(rf"^(?!Mapping|Callable).*\b(float|complex|{ARRAY.pattern})\b")
 SHAPE = re.compile(r"\((\.\.\.|\w+,)[^()]*\)|shape")
 CHECKS = [name for name, thing in vars(validation).items() if inspect.isfunction(thing) and name[0] != "_"]
 REFUSES = re.compile(rf"\braise\b|\b({'|'.join(CHECKS)})\(")
 
 
 def public_members():
-    """Functions, properties and classes by name: those in ``__all__``, and their own members."""
-    for module in (autdtorch, reference):
+    """By name: functions and classes of ``__all__``, in public submodules too, and members of classes."""
+    submodules = [thing for name in autdtorch.__all__ if inspect.ismodule(thing := getattr(autdtorch, name))]
+    for module in (autdtorch, *submodules):
         for name in module.__all__:
             thing = getattr(module, name)
             if inspect.isfunction(thing):
