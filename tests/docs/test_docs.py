@@ -9,11 +9,10 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import pytest
+from filelock import FileLock
 from sphinx.util.inventory import InventoryFile
 
 import autdtorch
-
-pytestmark = pytest.mark.xdist_group("docs")  # one process builds them
 
 DOCS = Path(__file__).parents[2] / "docs"
 NOTEBOOKS = sorted(page for page in DOCS.rglob("*.md") if "\n```{code-cell}" in page.read_text("utf-8"))
@@ -38,11 +37,15 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="session")
 def built(tmp_path_factory):
-    out = tmp_path_factory.mktemp("docs")
+    out = tmp_path_factory.getbasetemp() / "docs"
+    if "PYTEST_XDIST_WORKER" in os.environ:  # the first of several processes builds for all
+        out = tmp_path_factory.getbasetemp().parent / "docs"
     environment = {key: value for key, value in os.environ.items() if key != "AUTDTORCH_CACHE_DIR"}
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-d", out / "doctrees", DOCS]
-    build = subprocess.run([*command, out / "html"], env=environment, capture_output=True, text=True)
-    assert build.returncode == 0, build.stdout + build.stderr
+    with FileLock(f"{out}.lock"):
+        if not (out / "html" / "objects.inv").exists():
+            build = subprocess.run([*command, out / "html"], env=environment, capture_output=True, text=True)
+            assert build.returncode == 0, build.stdout + build.stderr
     return out / "html"
 
 
