@@ -212,6 +212,22 @@ def test_exports_are_self_contained(scene: at.Scene, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("renderer")
+def test_a_page_has_a_legend_of_its_own(scene: at.Scene, tmp_path: Path) -> None:
+    pytest.importorskip("trame_pyvista", reason="in the extra notebook")
+    view3d(scene, field=torch.ones(4, 3), reference=1.5, save=tmp_path / "scene.html").close()
+    page = (tmp_path / "scene.html").read_text(encoding="utf-8")
+    assert "pressure [dB]<div" in page
+    assert "0 dB = 1.5 Pa" in page
+    assert 'src="http' not in page
+
+
+def test_a_page_says_what_it_needs(scene: at.Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "trame_pyvista", None)
+    with pytest.raises(RuntimeError, match=r"needs trame-pyvista: pip install 'autdtorch\[notebook\]'"):
+        view3d(scene, save="scene.html")
+
+
+@pytest.mark.usefixtures("renderer")
 def test_an_animation_turns_the_wave_through_one_period(scene: at.Scene, tmp_path: Path) -> None:
     from PIL import Image
 
