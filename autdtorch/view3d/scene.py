@@ -181,7 +181,7 @@ def _add_control_points(plotter: pyvista.Plotter, scene: Scene) -> None:
 
 def _add_axes(plotter: pyvista.Plotter, scene: Scene) -> None:
     lower, upper = scene.domain
-    plotter.show_bounds(
+    axes = plotter.show_bounds(
         bounds=[MM * corner[axis] for axis in range(3) for corner in (lower, upper)],
         xtitle="x [mm]",
         ytitle="y [mm]",
@@ -189,12 +189,11 @@ def _add_axes(plotter: pyvista.Plotter, scene: Scene) -> None:
         grid="back",
         location="outer",
         fmt="%.0f",
-        n_xlabels=5,
-        n_ylabels=5,
-        n_zlabels=5,
         color="black",
         font_size=15,
     )
+    for axis in range(3):
+        axes.SetAxisLabels(axis, None)  # PyVista's: VTK's own are at round numbers
     plotter.view_vector(_CAMERA, viewup=(0.0, 0.0, 1.0))
     plotter.enable_parallel_projection()
     plotter.reset_camera()
