@@ -76,8 +76,8 @@ def add_transducers(plotter: pyvista.Plotter, scene: Scene, phases: Array | None
 
     positions = scene.array.positions
     apart = distances(positions, positions).fill_diagonal_(math.inf).min().item()
-    # The scene holds points, not apertures: draw discs that do not touch, of one wavelength at most.
-    radius = MM * 0.42 * min(apart, scene.wavelength)
+    # Those that are points are drawn as discs that do not touch, of one wavelength at most.
+    radius = MM * (scene.array.radius or 0.42 * min(apart, scene.wavelength))
     points = pyvista.PolyData(MM * positions.numpy())
     points["normals"] = scene.array.normals.numpy()
     if phases is not None:
