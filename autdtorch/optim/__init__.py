@@ -10,3 +10,8 @@ METHOD_LABELS = {
     "gradient_ascent": "gradient ascent",
 }
 """Names of the methods, the paper's where it has one, by the names of the functions."""
+
+
+def label_of(method: str) -> str:
+    """A method's name in the paper, or its own without underscores."""
+    return METHOD_LABELS.get(method, method.replace("_", " "))
