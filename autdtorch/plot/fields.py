@@ -57,6 +57,7 @@ def plot_plane(
     """
     if ax is None:
         ax = new_figure(4.4, 3.6).add_subplot()
+        ax.figure.set_layout_engine("compressed")  # the other one cuts off labels beside a square
     figure = cast(Figure, ax.get_figure(root=True))
     magnitude = plane_magnitude("pressure", pressure)
     mesh = _draw_plane(ax, magnitude, plane, control_points, obstacles, magnitude.max())
