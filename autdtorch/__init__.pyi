@@ -1,5 +1,6 @@
 from . import reference
 from .array import PAPER_SOURCE_STRENGTH, TransducerArray
+from .collect import Sweep, collect_results
 from .conditions import Dead, Drift, Noise, Quantised, true_pressure
 from .drive import amplitudes_of, drive_from_phases, focus_phases, phases_of
 from .freespace import green
@@ -42,12 +43,14 @@ __all__ = [
     "Solution",
     "Sphere",
     "SteadyStateWarning",
+    "Sweep",
     "TransducerArray",
     "VoxelMask",
     "amplitudes_of",
     "bayes_opt",
     "cell_centers",
     "circle_points",
+    "collect_results",
     "differentiable_field",
     "drive_from_phases",
     "focus_bound",
