@@ -43,7 +43,7 @@ class ShownFigure(Figure):
         return picture.getvalue(), {"width": round(_SCREEN_DPI * self.get_figwidth())}
 
 
-def new_figure(width: float, height: float) -> ShownFigure:
+def new_figure(width: float, height: float) -> Figure:
     """An empty figure of that size [inch], which pyplot does not know of."""
     return ShownFigure(figsize=(width, height), dpi=_DPI, layout="constrained")
 

@@ -13,7 +13,7 @@ from autdtorch.metrics import focus_metrics
 from autdtorch.objective import SimulatedObjective
 from autdtorch.obstacles import Obstacle, VoxelMask
 from autdtorch.optim.gabs import gabs
-from autdtorch.plot.style import new_figure
+from autdtorch.plot.style import ShownFigure
 from autdtorch.propagator import make_propagator
 from autdtorch.results import MethodResult, Provenance, SceneResult, Simulation, StudyResult
 from autdtorch.scene import Scene
@@ -86,6 +86,6 @@ def test_outlines_go_around_what_faces_the_viewer(axes: list[int], tmp_path: Pat
 
 
 def test_a_notebook_shows_figures_by_itself() -> None:
-    picture, shown = new_figure(2.0, 1.0)._repr_png_()
+    picture, shown = ShownFigure(figsize=(2.0, 1.0))._repr_png_()
     assert picture.startswith(b"\x89PNG")
     assert shown == {"width": 2 * 96}  # CSS pixels in an inch
