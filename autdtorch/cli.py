@@ -14,6 +14,7 @@ import os
 import re
 import shlex
 import sys
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
@@ -136,7 +137,9 @@ def _run(config: DictConfig) -> None:
     if swept:
         logger.info("job %s: %s", job.job.num, ", ".join(job.overrides.task))
     try:
-        _study(config, Path(job.sweep.dir) if swept else None)
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_: logger.warning("%s", message)  # without our source
+            _study(config, Path(job.sweep.dir) if swept else None)
     except _REFUSALS as error:
         if not swept:
             raise _Refusal(error) from error

@@ -29,7 +29,7 @@ def test_a_sweep_has_a_folder_for_each_job(run: Run, tmp_path: Path, launcher: s
 
 
 def test_jobs_in_one_scene_share_its_matrices(run: Run, tmp_path: Path) -> None:
-    coarse = ("scene=sphere", "solver.spacing=2.8e-3", "solver.max_periods=30", "plane_spacing=0.02")
+    coarse = ("scene=sphere", "solver.spacing=2.8e-3", "solver.tolerance=0.1", "plane_spacing=0.02")
     assert run("-m", *coarse, "method=lss,lssg") == 0
     (matrix,) = (tmp_path / "multirun" / "matrices").iterdir()
     assert matrix.suffix == ".matrix"
