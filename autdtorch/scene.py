@@ -217,7 +217,7 @@ class Scene:
             ("domain", f"{self._size()} mm, {self._size(self.wavelength, 3)} wavelengths"),
         ]
         views = sketch(self.array, self.obstacles, self.control_points, self.observation_plane, self.domain)
-        return f"<div>{html_facts(f'Scene {self.name}', facts)}{views}</div>"
+        return f"<div>{html_facts(f'Scene {self.name!r}', facts)}{views}</div>"
 
     def _size(self, unit: float = 1e-3, digits: int = 4) -> str:
         """Edges of the domain, in units of so many m."""
