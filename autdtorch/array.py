@@ -211,7 +211,7 @@ class TransducerArray:
 
     @property
     def nodes(self) -> Nodes:
-        """The monopoles of each transducer: the point itself, or 80 of its disc.
+        """The monopoles of each transducer, the point itself or 80 of its disc.
 
         On a disc of radius a they are 5 rings, Gauss points in r^2, of 16 equal angles, each turned by half a
         step against the next (Peirce, J. SIAM 5 (1957) 66-73). For k a <= 6 the field is right to 1e-6 far

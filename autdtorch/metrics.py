@@ -12,14 +12,14 @@ from autdtorch.validation import ArrayLike, positive, real_tensor
 
 @dataclass(frozen=True, eq=False)
 class FocusMetrics:
-    """Figures of merit of the foci, each of the leading shape (...) of the pressure they were computed from.
+    """Figures of merit of the foci; (...) is the leading shape of the pressure they were computed from.
 
     Attributes:
-        mean: mean pressure of the foci [Pa] (Fig. 3a).
-        min: pressure of the weakest focus [Pa].
-        std: standard deviation among the foci [Pa], of the population (Fig. 3c).
-        uniformity: 1 - (max - min) / (max + min), from 0 to 1; 1 where all foci are equal.
-        area: area a focus [m^2] (Fig. 3b), or None where no plane was given.
+        mean: mean pressure (...) of the foci [Pa] (Fig. 3a).
+        min: pressure (...) of the weakest focus [Pa].
+        std: standard deviation (...) among the foci [Pa], of the population (Fig. 3c).
+        uniformity: (...), 1 - (max - min) / (max + min), from 0 to 1; 1 where all foci are equal.
+        area: area (...) a focus [m^2] (Fig. 3b), or None where no plane was given.
     """
 
     mean: torch.Tensor

@@ -180,12 +180,12 @@ class Scene:
 
     @property
     def attenuation(self) -> float:
-        """In the medium, alpha [Np/m]: a plane wave falls as e^{-alpha x}."""
+        """In the medium, alpha [Np/m]; a plane wave falls as e^{-alpha x}."""
         return self.medium.absorption / _DECIBELS
 
     @property
     def complex_wavenumber(self) -> complex:
-        """In the medium, k + i alpha [rad/m]: a plane wave is e^{i (k + i alpha) x}."""
+        """In the medium, k + i alpha [rad/m]; a plane wave is e^{i (k + i alpha) x}."""
         return complex(self.wavenumber, self.attenuation)
 
     @property
