@@ -3,8 +3,8 @@
     python scripts/crosscheck_acoustools.py
 
 Fills in crosschecks.md, in docs/ or `--output`. The sources are points: AcousTools' pistons with radius 0.
-Scenes and errors are those of benchmark_accuracy.py, the cubes made rigid. The judge of the sphere is its exact
-series, that of the cubes the limit of our grids, which AcousTools' errors tend to zero against.
+Scenes and errors are those of benchmark_accuracy.py, the cubes made rigid. The judge of the sphere is its
+exact series, that of the cubes the limit of our own grids.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ from benchmark_accuracy import (
 from generated_block import fill_in, measured, table
 
 import autdtorch as at
+from autdtorch.devices import TRANSDUCER_RADIUS
 from autdtorch.freespace import free_space_matrix
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "crosschecks.md"
 COMMAND = "python scripts/crosscheck_acoustools.py"
 PACKAGES = ("acoustools", "vedo")
 
-SPHERE_SUBDIVISIONS = (2, 3, 4)
-CUBE_SUBDIVISIONS = (2, 3, 4)
+SUBDIVISIONS = (2, 3, 4)
 SPACINGS = (2.0, 1.0, 0.5)
 """Of our grids [mm]."""
 LIMIT_SPACINGS = (0.5, 1 / 3, 0.25)
@@ -64,7 +64,8 @@ SHORT = 3.0
 PLANE_SPACING = 1e-3
 """Of the points behind the obstacles [m]."""
 
-PISTON_RADIUS, ARC_RADIUS = 4.5e-3, 0.2
+ARC_RADIUS = 0.2
+"""At which pistons are compared [m]."""
 ANGLES = (0, 20, 40, 60, 80)
 
 
@@ -80,17 +81,19 @@ class Row:
     seconds: float
 
 
-def rigid_cubes() -> at.Scene:
-    """The paper's three cubes, rigid."""
+def cube_scene(count: int) -> at.Scene:
+    """The paper's three cubes, rigid, or the middle one."""
     scene = load("three_cubes")
-    cubes = tuple(at.Box(one.center, one.size, rigid=True) for one in scene.obstacles)
-    return dataclasses.replace(scene, obstacles=cubes)
+    kept = scene.obstacles if count == 3 else scene.obstacles[1:2]
+    return dataclasses.replace(
+        scene, obstacles=tuple(at.Box(one.center, one.size, rigid=True) for one in kept)
+    )
 
 
-def cube_case(spacings: Sequence[float] = LIMIT_SPACINGS) -> Case:
-    """The rigid cubes, judged by the limit of our grids [mm]."""
-    scene = rigid_cubes()
-    unjudged = Case("rigid cubes", scene, scene.control_points, torch.zeros(()), None, CUBE_ORDER)
+def cube_case(count: int, spacings: Sequence[float] = LIMIT_SPACINGS) -> Case:
+    """Rigid cubes, judged by the limit of our grids [mm]."""
+    scene, name = cube_scene(count), "three rigid cubes" if count == 3 else "rigid cube"
+    unjudged = Case(name, scene, scene.control_points, torch.zeros(()), None, CUBE_ORDER)
     exact = extrapolate(spacings, [simulate(unjudged, h).matrix for h in spacings], CUBE_ORDER)
     scattered = exact - free_space_matrix(scene.control_points, scene.array, scene.wavenumber)
     return dataclasses.replace(unjudged, exact=exact, scattered=float(scattered.norm()))
@@ -178,44 +181,41 @@ def plane_times(case: Case, mesh: vedo.Mesh, spacing: float) -> str:
     points = at.Plane((80e-3, 50e-3, 50e-3), (1, 0, 0), (60e-3, 60e-3)).points(PLANE_SPACING).reshape(-1, 3)
     wide = dataclasses.replace(case, points=points)
     theirs, ours = timed_elements(wide, mesh, True), simulate(wide, spacing)
+    difference = percent(relative_error(ours.matrix, theirs.matrix))
     return (
         f"All {len(case.scene.array)} transducers to {len(points)} points of a plane behind the {case.name}: "
-        f"AcousTools with {mesh.ncells} triangles and CHIEF {theirs.seconds:.3g} s, autdtorch at {spacing:g} mm "
-        f"{ours.seconds:.3g} s; the two matrices differ by {percent(relative_error(ours.matrix, theirs.matrix))}."
+        f"AcousTools with {mesh.ncells} triangles and CHIEF takes {theirs.seconds:.3g} s, autdtorch at "
+        f"{spacing:g} mm {ours.seconds:.3g} s. The two matrices differ by {difference}."
     )
 
 
-def piston_lines() -> list[tuple[str, ...]]:
-    """The directivity of a piston by angle [degrees]: AcousTools', our disc's, and the exact far field."""
+def directivities() -> torch.Tensor:
+    """Of a piston at `ANGLES`, (3, angles): AcousTools', our disc's at `ARC_RADIUS`, the exact far field."""
     angles = torch.deg2rad(torch.tensor(ANGLES, dtype=torch.float64))
     arc = torch.stack((angles.sin(), torch.zeros_like(angles), angles.cos()), dim=1) * ARC_RADIUS
     k, origin, normal = 2 * math.pi * 40e3 / 340.0, torch.zeros((1, 3)), torch.tensor([[0.0, 0.0, 1.0]])
     theirs = forward_model_batched(
         arc.T[None].to(torch.complex64), origin, p_ref=1.0, norms=normal.to(torch.complex64), k=k,
-        transducer_radius=PISTON_RADIUS,
-    )[0, :, 0]  # fmt: skip
-    disc = at.TransducerArray(origin, normal, source_strength=1.0, radius=PISTON_RADIUS)
-    ours = free_space_matrix(arc, disc, k)[:, 0]
-    x = k * PISTON_RADIUS * angles.sin().clamp(min=1e-9)
-    exact = 2 * torch.special.bessel_j1(x) / x
-    return [
-        (f"{angle} degrees", *(f"{value:.4f}" for value in values))
-        for angle, *values in zip(
-            ANGLES,
-            (theirs.abs() * ARC_RADIUS).tolist(),
-            (ours.abs() * ARC_RADIUS).tolist(),
-            exact.tolist(),
-            strict=True,
+        transducer_radius=TRANSDUCER_RADIUS,
+    )  # fmt: skip
+    disc = at.TransducerArray(origin, normal, source_strength=1.0, radius=TRANSDUCER_RADIUS)
+    ours = free_space_matrix(arc, disc, k)
+    x = k * TRANSDUCER_RADIUS * angles.sin().clamp(min=1e-9)
+    return torch.stack(
+        (
+            ARC_RADIUS * theirs.flatten().abs(),
+            ARC_RADIUS * ours.flatten().abs(),
+            2 * torch.special.bessel_j1(x) / x,
         )
-    ]
+    )
 
 
 def report() -> list[str]:
     """The generated part of crosschecks.md."""
-    sphere, cubes = sphere_case("rigid sphere"), cube_case()
-    sphere_meshes = [sphere_mesh(sphere.scene, n) for n in SPHERE_SUBDIVISIONS]
-    cube_meshes = [cube_mesh(cubes.scene, n) for n in CUBE_SUBDIVISIONS]
-    rows = [*sweep(sphere, sphere_meshes), *sweep(cubes, cube_meshes)]
+    sphere, cube, cubes = sphere_case("rigid sphere"), cube_case(1), cube_case(3)
+    spheres = [sphere_mesh(sphere.scene, n) for n in SUBDIVISIONS]
+    both = [[cube_mesh(case.scene, n) for n in SUBDIVISIONS] for case in (cube, cubes)]
+    rows = [*sweep(sphere, spheres), *sweep(cube, both[0]), *sweep(cubes, both[1])]
     lines = [
         (
             one.scene,
@@ -227,12 +227,16 @@ def report() -> list[str]:
         )
         for one in rows
     ]
+    pistons = [
+        (f"{angle} degrees", *(f"{value:.4f}" for value in values))
+        for angle, values in zip(ANGLES, directivities().T.tolist(), strict=True)
+    ]
     packages = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
     return [
         f"{measured(COMMAND)}\n\n{packages}, threads of torch and numba: {torch.get_num_threads()}.",
         table(("scene", "program", "setting", "total", "scattered", "run time"), lines),
-        plane_times(cubes, cube_meshes[-2], SPACINGS[-1]),
-        table(("angle", "AcousTools", "autdtorch, at 0.2 m", "far field"), piston_lines()),
+        plane_times(cubes, both[1][1], 1.0),
+        table(("angle", "AcousTools", "autdtorch, at 0.2 m", "far field"), pistons),
     ]
 
 

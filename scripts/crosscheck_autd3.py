@@ -28,6 +28,7 @@ from generated_block import fill_in, measured, table
 from numpy.typing import NDArray
 
 import autdtorch as at
+from autdtorch.devices import TRANSDUCER_RADIUS
 from autdtorch.freespace import free_space_matrix
 from autdtorch.hardware.levels import AUTD3_FULL, Levels, autd3_drive, autd3_levels
 
@@ -40,13 +41,16 @@ WAVENUMBER = 2 * math.pi * FREQUENCY / SOUND_SPEED
 SOURCE_STRENGTH = 275.574_25 * 0.2 / (4 * math.pi)
 """Of a T4010A1 at full drive [Pa m], as their RMS field has it."""
 
+PITCH = 10.16e-3
+"""Of its transducers [m], 18 along x and 14 along y."""
 FOCUS = (60e-3, 80e-3, 150e-3)
 """In the coordinates of the device [m]."""
 PLANE = ((0.0, 172.0), 80.0, (50.0, 250.0))
 """Through the focus, x, y and z [mm]."""
 
-PISTON_RADIUS, ABSORPTION = 4.5e-3, 1.32
-"""Of a 10 mm transducer [m], and of air at 20 degrees and 50 % [dB/m]."""
+ABSORPTION = 1.32
+"""Of air at 20 degrees and 50 % [dB/m]."""
+DECIBELS_PER_NEPER = 20 / math.log(10)
 
 PERIOD = Duration.from_micros(25)
 PERIODS = 120
@@ -57,17 +61,15 @@ FULL_PULSE = 512
 
 @dataclass(frozen=True)
 class Emission:
-    """What the emulated device plays, and where its transducers are.
+    """What the emulated device plays.
 
     Attributes:
         record: of the emulator.
-        array: the transducers, in the order of the device.
         phases: levels (M,), 256 in a period.
         pulse_widths: (M,), 512 in a period.
     """
 
     record: Record
-    array: at.TransducerArray
     phases: NDArray[np.int64]
     pulse_widths: NDArray[np.int64]
 
@@ -89,8 +91,20 @@ class Row:
 
 
 def device() -> Geometry:
-    """One AUTD3 with transducer 0 in the origin, which emits along z."""
+    """One AUTD3 of theirs, with transducer 0 in the origin; it emits along z."""
     return Geometry([Autd3()])
+
+
+def our_array(radius: float = 0.0) -> at.TransducerArray:
+    """The same AUTD3 of ours, of points or discs [m]."""
+    middle = 8.5 * PITCH, 6.5 * PITCH, 0.0
+    return at.TransducerArray.autd3(middle, (0, 0, 1), source_strength=SOURCE_STRENGTH, radius=radius)
+
+
+def largest_shift() -> float:
+    """Between their transducers and ours, in the order of the device [m]."""
+    theirs = 1e-3 * torch.from_numpy(device()[0].positions().astype(np.float64))
+    return float((theirs - our_array().positions).norm(dim=1).max())
 
 
 def play(
@@ -103,10 +117,8 @@ def play(
         recorder.tick(Duration.from_nanos(PERIODS * PERIOD.as_nanos()))
 
     record = Emulator(geometry).record(send)
-    positions = 1e-3 * np.asarray(geometry[0].positions(), dtype=np.float64)
-    array = at.TransducerArray(positions, (0, 0, 1), SOURCE_STRENGTH)
     last = [one.to_numpy()[:, -1].astype(np.int64) for one in (record.phase(), record.pulse_width())]
-    return Emission(record, array, *last)
+    return Emission(record, *last)
 
 
 def play_focus() -> Emission:
@@ -173,11 +185,6 @@ def scaled(values: torch.Tensor, other: torch.Tensor) -> tuple[complex, float]:
     return factor, relative_difference(values, factor * other)
 
 
-def focus_phases(array: at.TransducerArray) -> torch.Tensor:
-    """Phases (M,) [rad] that focus."""
-    return at.focus_phases(array.positions, FOCUS, WAVENUMBER)
-
-
 def random_drive(transducers: int) -> torch.Tensor:
     """Amplitudes and phases anywhere, (M,)."""
     amplitude, phase = torch.rand((2, transducers), generator=torch.Generator().manual_seed(0)).double()
@@ -186,24 +193,23 @@ def random_drive(transducers: int) -> torch.Tensor:
 
 def rms_rows(grid: Grid) -> list[Row]:
     """Their RMS field of a focus and of a random drive, by what ours is told of the drive."""
-    emission = play_focus()
-    array, wanted = emission.array, at.drive_from_phases(focus_phases(emission.array))
-    rounded = autd3_levels(wanted)
-    same = int((rounded.phase.numpy() == emission.phases).sum())
-    levels = autd3_levels(random_drive(len(array)))
+    array, focused = our_array(), play_focus()
+    wanted = at.drive_from_phases(at.focus_phases(array.positions, FOCUS, WAVENUMBER))
+    rounded, levels = autd3_levels(wanted), autd3_levels(random_drive(len(array)))
+    same = int((rounded.phase.numpy() == focused.phases).sum())
     random = play_levels(levels)
     cases = (
-        (emission, "focus", "drive as recorded", emission.drive, "float32"),
+        ("focus", focused, "drive as recorded", focused.drive, "float32"),
         (
-            emission, "focus", "`autd3_levels` of `focus_phases`", autd3_drive(rounded),
+            "focus", focused, "`autd3_levels` of `focus_phases`", autd3_drive(rounded),
             f"float32; {same} of {len(array)} levels are those of `autd3_pattern.focus`",
         ),
-        (emission, "focus", "`focus_phases`, not rounded", wanted, "phases of 8 bits"),
-        (random, "random", "drive as recorded", random.drive, "float32"),
-        (random, "random", "`autd3_drive` of the levels", autd3_drive(levels), "pulse widths of 9 bits"),
+        ("focus", focused, "`focus_phases`, not rounded", wanted, "phases of 8 bits"),
+        ("random", random, "drive as recorded", random.drive, "float32"),
+        ("random", random, "`autd3_drive` of the levels", autd3_drive(levels), "pulse widths of 9 bits"),
     )  # fmt: skip
     rows = []
-    for emission, name, told, drive, reason in cases:
+    for name, emission, told, drive, reason in cases:
         points, theirs = rms(emission, grid)
         found = ours(array, drive, points).abs() / math.sqrt(2)
         rows.append(Row(f"RMS, {name}", told, relative_difference(found, theirs), reason))
@@ -214,7 +220,7 @@ def instant_row(grid: Grid) -> tuple[Row, complex]:
     """Their instant field of a focus, and its scale over ours."""
     emission = play_focus()
     points, theirs = phasor(emission, grid)
-    factor, left = scaled(theirs, ours(emission.array, emission.drive, points))
+    factor, left = scaled(theirs, ours(our_array(), emission.drive, points))
     return Row("instant, focus", "drive as recorded, scaled", left, "waveforms between samples"), factor
 
 
@@ -222,12 +228,13 @@ def left_out_rows(grid: Grid) -> list[Row]:
     """What their model leaves out, by how much it changes our field of a focus."""
     emission = play_focus()
     points, theirs = rms(emission, grid)
-    array, drive = emission.array, emission.drive
-    discs = at.TransducerArray(array.positions, array.normals, SOURCE_STRENGTH, radius=PISTON_RADIUS)
     cases = (
-        ("discs of radius 4.5 mm", "directivity", ours(discs, drive, points)),
-        ("air that absorbs 1.32 dB/m", "absorption", ours(array, drive, points, ABSORPTION / 8.686)),
-    )
+        ("discs of radius 4.5 mm", "directivity", ours(our_array(TRANSDUCER_RADIUS), emission.drive, points)),
+        (
+            f"air that absorbs {ABSORPTION:g} dB/m", "absorption",
+            ours(our_array(), emission.drive, points, ABSORPTION / DECIBELS_PER_NEPER),
+        ),
+    )  # fmt: skip
     return [
         Row("RMS, focus", what, relative_difference(field.abs() / math.sqrt(2), theirs), reason)
         for what, reason, field in cases
@@ -244,15 +251,12 @@ def seconds(action: Callable[[], object]) -> float:
 
 def run_times(grid: Grid) -> str:
     """Theirs and ours for all points, as a sentence."""
-    emission = play_focus()
+    array, emission = our_array(), play_focus()
     points, _ = rms(emission, grid)
-    both = [
-        seconds(lambda: rms(emission, grid)),
-        seconds(lambda: ours(emission.array, emission.drive, points)),
-    ]
+    theirs, own = seconds(lambda: rms(emission, grid)), seconds(lambda: ours(array, emission.drive, points))
     return (
-        f"The RMS field at {len(points)} points takes the emulator {both[0]:.2g} s (float32, all cores), ours "
-        f"{both[1]:.2g} s (float64, threads: {torch.get_num_threads()})."
+        f"Run times for {len(points)} points: the emulator's RMS field {theirs:.2g} s (float32, all cores), "
+        f"ours {own:.2g} s (float64, threads: {torch.get_num_threads()})."
     )
 
 
@@ -262,14 +266,16 @@ def report(resolution: float) -> list[str]:
     row, factor = instant_row(grid)
     rows = [*rms_rows(grid), row, *left_out_rows(grid)]
     lines = [(one.theirs, one.ours, f"{one.difference:.2g}", one.reason) for one in rows]
-    scale = (
-        f"The instant field is {abs(factor):.4f} times ours and {math.degrees(cmath.phase(factor)):.1f} degrees "
-        "late: by the emulator's model of a transducer. Its peaks are thus 2 and not the square root of 2 times "
-        "the emulator's own RMS field."
+    late = math.degrees(cmath.phase(factor))
+    notes = (
+        f"Our transducers lie within {1e9 * largest_shift():.0f} nm of theirs, in the same order. The instant "
+        f"field is {abs(factor):.4f} times ours and {late:.1f} degrees late, by the emulator's model of a "
+        f"transducer. Its peak is {math.sqrt(2) * abs(factor):.3f} times the emulator's own RMS field, where "
+        "a sine has the square root of 2."
     )
     packages = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
     header = ("theirs", "ours", "relative difference", "what explains it")
-    return [f"{measured(COMMAND)}\n\n{packages}.", table(header, lines), scale, run_times(grid)]
+    return [f"{measured(COMMAND)}\n\n{packages}.", table(header, lines), notes, run_times(grid)]
 
 
 def main() -> None:
