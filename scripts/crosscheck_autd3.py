@@ -268,7 +268,7 @@ def report(resolution: float) -> list[str]:
     lines = [(one.theirs, one.ours, f"{one.difference:.2g}", one.reason) for one in rows]
     late = math.degrees(cmath.phase(factor))
     notes = (
-        f"Our transducers lie within {1e9 * largest_shift():.0f} nm of theirs, in the same order. The instant "
+        f"Our transducers lie within {1e9 * largest_shift():.0f} nm of theirs, in their order. The instant "
         f"field is {abs(factor):.4f} times ours and {late:.1f} degrees late, by the emulator's model of a "
         f"transducer. Its peak is {math.sqrt(2) * abs(factor):.3f} times the emulator's own RMS field, where "
         "a sine has the square root of 2."
