@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from autdtorch.devices import (
+from autdtorch.device_layouts import (
     AUTD3_SOURCE_STRENGTH,
     OPENMPD_SOURCE_STRENGTH,
     SONICSURFACE_SOURCE_STRENGTH,

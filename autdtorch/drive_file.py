@@ -14,7 +14,7 @@ import torch
 from autdtorch.array import TransducerArray
 from autdtorch.array_file import NORMAL_COLUMNS, PLACE_COLUMNS, read_npz
 from autdtorch.csv_table import read_table, write_table
-from autdtorch.devices import AUTD3_TRANSDUCERS
+from autdtorch.device_layouts import AUTD3_TRANSDUCERS
 from autdtorch.drive import amplitudes_of, drive_from_phases, phases_of, validate_drive
 from autdtorch.hardware.levels import (
     Levels,
@@ -60,7 +60,7 @@ def save_drive(
 
     Without `device`, with all digits: `.csv` has the columns transducer, x, y, z [m], nx, ny, nz, phase [rad]
     and amplitude; `.npz` the arrays drive (M,), positions, normals, source_strength and radius. `load_array`
-    reads the array from both.
+    reads the array from both; .csv says neither strength nor radius.
 
     With `device`, rounded to its levels (`autdtorch.hardware.levels`), in the order of the array, which must
     be the device's: that of `TransducerArray.autd3`, `.sonicsurface` and `.openmpd`. `.csv` has the columns
@@ -94,6 +94,9 @@ def save_drive(
 
 def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
     """The drive (M,), complex128, from a file as `save_drive` writes it; levels as the device plays them.
+
+    Args:
+        path: of the file; its suffix says the format.
 
     Raises:
         FileNotFoundError: there is no such file.

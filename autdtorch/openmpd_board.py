@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 
 from autdtorch.array import TransducerArray
-from autdtorch.devices import OPENMPD_SOURCE_STRENGTH, TRANSDUCER_RADIUS
+from autdtorch.device_layouts import OPENMPD_SOURCE_STRENGTH, TRANSDUCER_RADIUS
 from autdtorch.drive import validate_drive
 from autdtorch.geometry import in_plane
 from autdtorch.validation import ArrayLike
@@ -38,7 +38,7 @@ class OpenMPDBoard:
     Attributes:
         name: first line of the file; drivers take it as the serial number of the USB chip.
         positions: (M, 3) [m], float64, in the board's own axes; it emits along z.
-        pins: place of each transducer in the message to the board, a permutation of 0 to M - 1.
+        pins: place of each transducer in a message to the board, a permutation of 0 to M - 1.
         phase_offsets: (M,) [rad], float64, by which each transducer is ahead in arg q.
             That the file counts them in degrees is inferred from its values.
         gains: (M,), float64, 0 to 1, by which amplitudes are multiplied.
@@ -54,12 +54,15 @@ class OpenMPDBoard:
     def load(cls, path: str | os.PathLike[str]) -> OpenMPDBoard:
         """Read a .pat file.
 
+        Args:
+            path: of the file.
+
         Raises:
             FileNotFoundError: there is no such file.
             ValueError: it is none of a board. The message names the file, the line and what is wrong.
         """
         try:
-            lines = Path(path).read_text(encoding="utf-8").splitlines()
+            lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
         except UnicodeDecodeError as error:
             raise ValueError(f"{path}: {error}; must be a text file in UTF-8") from error
         head = [_Item(number, line.strip()) for number, line in enumerate(lines, 1) if line.strip()]
@@ -126,6 +129,14 @@ class OpenMPDBoard:
         """
         wanted = validate_drive(drive, len(self.positions))
         return wanted * torch.polar(self.gains, -self.phase_offsets).to(wanted.device)
+
+    def by_pin(self, drive: ArrayLike) -> torch.Tensor:
+        """The `drive` (..., M) in the order of the pins, in which the board takes it.
+
+        Raises:
+            ValueError: not a drive of M transducers.
+        """
+        return validate_drive(drive, len(self.positions))[..., torch.tensor(self.pins).argsort()]
 
 
 def _tuples(items: list[_Item]) -> Iterator[_Item]:

@@ -6,7 +6,7 @@ import torch
 
 from autdtorch.array import PAPER_SOURCE_STRENGTH, TransducerArray
 from autdtorch.array_file import load_array
-from autdtorch.devices import OPENMPD_SOURCE_STRENGTH
+from autdtorch.device_layouts import OPENMPD_SOURCE_STRENGTH
 from autdtorch.openmpd_board import OpenMPDBoard
 from autdtorch.scene_file import load_scene
 
@@ -44,6 +44,11 @@ def test_calibrated_drive_takes_off_the_offsets_and_multiplies_by_the_gains(boar
     # A transducer that is a quarter of a period ahead in arg q is sent a quarter less.
     expected = torch.tensor([-1j, 0.5 * np.exp(0.25j * np.pi), 1j, -1 + 0j], dtype=torch.complex128)
     torch.testing.assert_close(sent, expected, rtol=0, atol=1e-15)
+
+
+def test_a_drive_by_pin_has_each_transducer_at_its_pin(board):
+    drive = torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.complex128)
+    assert OpenMPDBoard.load(board).by_pin(drive).tolist() == [0.2, 0.4, 0.1, 0.3]
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from autdtorch.array import TransducerArray
 from autdtorch.array_file import load_array
 from autdtorch.drive import amplitudes_of, drive_from_phases
 from autdtorch.drive_file import load_drive, save_drive
+from autdtorch.freespace import free_space_matrix
 from autdtorch.hardware.levels import autd3_levels
 
 ARRAYS = {
@@ -77,6 +78,18 @@ def test_autd3_gets_bytes_in_the_order_of_its_units(tmp_path):
         for name, level in zip(("phase", "intensity"), autd3_levels(drive), strict=True):
             assert (file[name].dtype, file[name].shape) == (np.uint8, (2, 249))
             assert np.array_equal(file[name].ravel(), level.numpy())
+
+
+def test_the_field_of_what_autd3_plays_is_that_of_the_drive_within_its_levels(tmp_path):
+    array = TransducerArray.autd3((0, 0, 0), normal=(0, 0, 1))
+    drive = some_drive(249)
+    save_drive(tmp_path / "drive.csv", drive, array, "autd3")
+    matrix = free_space_matrix([[0, 0, 0.1], [0.02, 0.03, 0.15]], array, wavenumber=739.0)
+
+    moved = (matrix @ (load_drive(tmp_path / "drive.csv") - drive)).abs()
+
+    # Each transducer is off by at most half a level of its phase and half of one of its amplitude.
+    assert (moved <= (math.pi / 256 + 1 / 510) * matrix.abs().sum(dim=1)).all()
 
 
 @pytest.mark.parametrize(

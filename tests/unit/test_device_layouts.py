@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from autdtorch.array import TransducerArray
-from autdtorch.devices import AUTD3_UNIT
+from autdtorch.device_layouts import AUTD3_UNIT
 from autdtorch.validation import distances
 
 PITCH = 10.16e-3
