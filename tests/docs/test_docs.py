@@ -38,8 +38,10 @@ class Page(HTMLParser):
 def built(tmp_path_factory):
     out = tmp_path_factory.mktemp("docs")
     environment = {key: value for key, value in os.environ.items() if key != "AUTDTORCH_CACHE_DIR"}
-    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-d", out / "doctrees", DOCS]
-    build = subprocess.run([*command, out / "html"], env=environment, capture_output=True, text=True)
+    environment |= dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS"), "1")  # a core for each notebook
+    options = ["-q", "-W", "--keep-going", "-j", "auto", "-d", out / "doctrees"]
+    command = [sys.executable, "-m", "sphinx", *options, DOCS, out / "html"]
+    build = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert build.returncode == 0, build.stdout + build.stderr
     return out / "html"
 
