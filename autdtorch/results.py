@@ -133,6 +133,11 @@ class StudyResult:
     scenes: dict[str, SceneResult]
 
 
+def median_trial(score: torch.Tensor) -> int:
+    """The trial of median score, of two middle ones the lower; `score` is (T,)."""
+    return int(score.argsort(stable=True)[(len(score) - 1) // 2])
+
+
 def provenance_now(config: str, seed: int) -> Provenance:
     """Provenance of a study that begins now, in this process and with this source.
 

@@ -54,8 +54,9 @@ def methods_of(scenes: Iterable[ByMethod]) -> list[str]:
 
 
 def label_of(method: str) -> str:
-    """A method's name in the paper, or its own."""
-    return METHOD_LABELS.get(method, readable(method))
+    """A method's name in the paper, or its own, and behind a comma the settings that were swept."""
+    name, comma, settings = method.partition(",")
+    return METHOD_LABELS.get(name, readable(name)) + comma + settings
 
 
 def readable(name: str) -> str:

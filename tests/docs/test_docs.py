@@ -13,6 +13,8 @@ from sphinx.util.inventory import InventoryFile
 
 import autdtorch
 
+pytestmark = pytest.mark.xdist_group("docs")  # one process builds them
+
 DOCS = Path(__file__).parents[2] / "docs"
 NOTEBOOKS = sorted(page for page in DOCS.rglob("*.md") if "\n```{code-cell}" in page.read_text("utf-8"))
 
