@@ -33,7 +33,7 @@ paper: $(INSTALLED)
 	$(BIN)/autdtorch experiment=paper $(OVERRIDES)
 
 test: $(INSTALLED)
-	$(BIN)/python -m pytest -n auto --maxprocesses 8 --dist loadgroup $(ARGS)
+	$(BIN)/python -m pytest -n auto --maxprocesses 8 --dist worksteal $(ARGS)
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -32,7 +32,7 @@ class EmulatedBench:
     def __init__(
         self,
         device: Device,
-        matrix: torch.Tensor,
+        transfer_matrix: torch.Tensor,
         transducers: Sequence[int] | None = None,
         serial: str = "EMULATED",
     ) -> None:
@@ -40,19 +40,19 @@ class EmulatedBench:
 
         Args:
             device: which.
-            matrix: transfer matrix (P, M) of the scene on the bench [Pa].
+            transfer_matrix: (P, M) of the scene on the bench [Pa].
             transducers: for each transducer of the scene, which of the device's it is; by default all in
                 order.
             serial: number of the USB chip.
 
         Raises:
-            ValueError: `transducers` that the device does not have, or as many as the matrix has not.
+            ValueError: `transducers` that the device does not have, or not as many as the matrix has.
         """
         self._transducers = wiring(transducers, device.transducers)
-        self.matrix = complex_tensor("matrix", matrix).to("cpu", torch.complex128)
-        if self.matrix.ndim != 2 or self.matrix.shape[1] != len(self._transducers):
-            shape = tuple(self.matrix.shape)
-            raise ValueError(f"matrix: shape {shape}; must be (P, {len(self._transducers)})")
+        self.transfer_matrix = complex_tensor("transfer_matrix", transfer_matrix).to("cpu", torch.complex128)
+        if self.transfer_matrix.ndim != 2 or self.transfer_matrix.shape[1] != len(self._transducers):
+            shape = tuple(self.transfer_matrix.shape)
+            raise ValueError(f"transfer_matrix: shape {shape}; must be (P, {len(self._transducers)})")
         self.firmware = _FIRMWARES[device.name]()
         self.chip = EmulatedChip(device.vendor, device.product, serial, self.firmware)
         self.bus = EmulatedBus([self.chip])
@@ -63,7 +63,7 @@ class EmulatedBench:
 
     def pressure(self) -> torch.Tensor:
         """Phasors (P,) [Pa] at the control points now, complex128."""
-        return self.matrix @ self.drive()
+        return self.transfer_matrix @ self.drive()
 
 
 class EmulatedSensor:
@@ -83,7 +83,7 @@ class EmulatedSensor:
         """
         self._bench = bench
         self._generator = np.random.default_rng(integer_at_least("seed", seed, 0))
-        rms = random_rms(bench.matrix)
+        rms = random_rms(bench.transfer_matrix)
         self._sigma = 0.0 if snr is None else rms * 10 ** (-finite_number("snr", snr, "dB") / 20)
 
     def read(self) -> torch.Tensor:

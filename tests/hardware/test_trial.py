@@ -96,7 +96,7 @@ def test_what_a_sensor_cannot_have_heard_ends_the_trial_with_the_outputs_off(tri
 def test_the_sensor_reads_with_the_noise_of_its_snr(trial):
     bench = trial.bench()
     sensor = EmulatedSensor(bench, snr=10.0)
-    variance = random_rms(bench.matrix) ** 2 / 10
+    variance = random_rms(bench.transfer_matrix) ** 2 / 10
     with trial.link(bench) as link:
         for drive in (full_on(), 0 * full_on()):
             link.play(drive)
