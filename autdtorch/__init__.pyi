@@ -20,7 +20,7 @@ from .optim.gradient import gradient_ascent
 from .optim.identify import identify
 from .optim.lssg import lss, lssg
 from .optim.random_search import random_search
-from .plot import plot_convergence, plot_plane, plot_trials
+from .plot import plot_convergence, plot_plane, plot_scene, plot_trials
 from .propagator import SteadyStateWarning, cell_centers, differentiable_field, make_propagator
 from .results import load_results
 from .scene import Medium, OverlapWarning, Scene
@@ -76,6 +76,7 @@ __all__ = [
     "phases_of",
     "plot_convergence",
     "plot_plane",
+    "plot_scene",
     "plot_trials",
     "random_search",
     "reference",

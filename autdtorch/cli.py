@@ -313,7 +313,7 @@ def _show(results: StudyResult, scenes: Mapping[str, Scene], folder: Path, singl
 
 
 def _table_lines(results: StudyResult) -> list[str]:
-    from autdtorch.report import summary_rows
+    from autdtorch.results import summary_rows
 
     rows = summary_rows(results)
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]

@@ -41,6 +41,10 @@ class Condition:
         self.scene = objective.scene
         self.evaluations = 0
 
+    def __repr__(self) -> str:
+        """What is wrapped, from the outside inwards."""
+        return f"{type(self).__name__}({self.inner!r}, {self.evaluations} evaluations)"
+
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
         """Observe drives (B, M) under the condition: pressure magnitudes (B, P) [Pa].
 

@@ -28,6 +28,15 @@ class FocusMetrics:
     uniformity: torch.Tensor
     area: torch.Tensor | None
 
+    def __repr__(self) -> str:
+        """The medians, with units."""
+        area = "none" if self.area is None else f"{1e6 * _median(self.area):.4g} mm²"
+        return (
+            f"FocusMetrics(mean {_median(self.mean):.4g} Pa, min {_median(self.min):.4g} Pa, "
+            f"std {_median(self.std):.4g} Pa, uniformity {_median(self.uniformity):.3g}, area {area}; "
+            f"medians of {self.mean.numel()})"
+        )
+
 
 def focus_metrics(
     pressure: ArrayLike, plane_pressure: ArrayLike | None = None, cell_area: float | None = None
@@ -75,6 +84,10 @@ def _area_per_focus(
         raise ValueError(f"plane_pressure: shape {tuple(plane.shape)}; must be ({expected}), like pressure")
     threshold = pressure.mean(dim=-1)[..., None, None] / math.sqrt(2)
     return (plane >= threshold).sum(dim=(-2, -1)) * cell_area / pressure.shape[-1]
+
+
+def _median(values: torch.Tensor) -> float:
+    return float(values.double().quantile(0.5)) if values.numel() else math.nan
 
 
 def _magnitudes(name: str, value: ArrayLike, axes: int) -> torch.Tensor:

@@ -74,6 +74,11 @@ class SimulatedObjective:
         if mode == "transfer":
             self.transfer_matrix = propagator.transfer_matrix().to("cpu", torch.complex128)
 
+    def __repr__(self) -> str:
+        """Scene, mode and evaluations so far."""
+        mode = "replay" if self.transfer_matrix is None else "transfer"
+        return f"SimulatedObjective(scene {self.scene.name!r}, mode {mode!r}, {self.evaluations} evaluations)"
+
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
         """Observe the control points under each of several drives.
 

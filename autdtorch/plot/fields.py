@@ -56,7 +56,9 @@ def plot_plane(
         ValueError: `pressure` is not (Nu, Nv), or `control_points` are not points.
     """
     if ax is None:
-        ax = new_figure(4.4, 3.6).add_subplot()
+        figure = new_figure(4.4, 3.6)
+        figure.set_layout_engine("compressed")  # "constrained" cuts off labels beside a square
+        ax = figure.add_subplot()
     figure = cast(Figure, ax.get_figure(root=True))
     magnitude = plane_magnitude("pressure", pressure)
     mesh = _draw_plane(ax, magnitude, plane, control_points, obstacles, magnitude.max())

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable, Mapping
 from typing import Any, TypeAlias
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from autdtorch.optim import METHOD_LABELS
+from autdtorch.optim import label_of as label_of
 from autdtorch.validation import ArrayLike
 
 ByMethod: TypeAlias = Mapping[str, ArrayLike]
@@ -29,11 +30,22 @@ styled = mpl.rc_context(_STYLE)
 TICK_SIZE = 8.0  # not in the style: ticks are made when the figure is drawn, after the style has gone
 
 _DPI = 150
+_SCREEN_DPI = 96  # where a notebook shows it
+
+
+class ShownFigure(Figure):
+    """A figure that Jupyter shows by itself, though pyplot does not know of it."""
+
+    def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
+        """PNG, and its width on screen [px]."""
+        picture = io.BytesIO()
+        self.savefig(picture)
+        return picture.getvalue(), {"width": round(_SCREEN_DPI * self.get_figwidth())}
 
 
 def new_figure(width: float, height: float) -> Figure:
     """An empty figure of that size [inch], which pyplot does not know of."""
-    return Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
+    return ShownFigure(figsize=(width, height), dpi=_DPI, layout="constrained")
 
 
 def require_scenes(name: str, scenes: Mapping[str, ByMethod]) -> None:
@@ -51,12 +63,6 @@ def require_scenes(name: str, scenes: Mapping[str, ByMethod]) -> None:
 def methods_of(scenes: Iterable[ByMethod]) -> list[str]:
     """The methods of all scenes, each once, in the order of their first mention."""
     return list(dict.fromkeys(method for by_method in scenes for method in by_method))
-
-
-def label_of(method: str) -> str:
-    """A method's name in the paper, or its own, and behind a comma the settings that were swept."""
-    name, comma, settings = method.partition(",")
-    return METHOD_LABELS.get(name, readable(name)) + comma + settings
 
 
 def readable(name: str) -> str:

@@ -111,6 +111,13 @@ class SimulatedPropagator(ABC):
         self._cache = cache
         self._assemblies = self._assembled(dtype, time_step)
 
+    def __repr__(self) -> str:
+        """Scene, settings and runs so far."""
+        return (
+            f"{type(self).__name__}(scene {self.scene.name!r}, spacing {1e3 * self.spacing:.4g} mm, "
+            f"tolerance {self.tolerance:g}, {len(self.runs)} runs)"
+        )
+
     @property
     def time_step(self) -> float:
         """The time step in use [s], of several boxes the shortest."""

@@ -31,6 +31,10 @@ class FreeSpacePropagator:
                 "free_space leaves out the %d obstacles of scene %r", len(scene.obstacles), scene.name
             )
 
+    def __repr__(self) -> str:
+        """The scene."""
+        return f"FreeSpacePropagator(scene {self.scene.name!r})"
+
     @overload
     def transfer_matrix(
         self, points: ArrayLike | None = None, return_error: Literal[False] = False
