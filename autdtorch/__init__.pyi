@@ -21,11 +21,17 @@ from .optim.identify import identify
 from .optim.lssg import lss, lssg
 from .optim.random_search import random_search
 from .plot import plot_convergence, plot_plane, plot_scene, plot_trials
-from .propagator import SteadyStateWarning, cell_centers, differentiable_field, make_propagator
+from .propagator import (
+    SteadyStateWarning,
+    cell_centers,
+    differentiable_field,
+    make_propagator,
+    volume_field,
+)
 from .results import load_results
 from .scene import Medium, OverlapWarning, Scene
 from .scene_file import load_scene
-from .view3d import view3d
+from .view3d import animate3d, view3d
 
 __all__ = [
     "PAPER_SOURCE_STRENGTH",
@@ -52,6 +58,7 @@ __all__ = [
     "TransducerArray",
     "VoxelMask",
     "amplitudes_of",
+    "animate3d",
     "bayes_opt",
     "cell_centers",
     "circle_points",
@@ -84,6 +91,7 @@ __all__ = [
     "save_field",
     "true_pressure",
     "view3d",
+    "volume_field",
     "weakest_focus",
 ]
 

@@ -27,6 +27,7 @@ MOST_EDGES = 500  # of one obstacle; more, as voxels have, would blacken it and 
 
 PHASE_MAP = "twilight"  # cyclic: 0 and 2 pi look the same
 PRESSURE_MAP = "inferno"
+WAVE_MAP = "RdBu_r"  # of pressures of both signs; white is 0
 
 
 def clipped(corners: Array, lower: Vector, upper: Vector) -> Array:

@@ -216,7 +216,7 @@ def _scene_figures(scenes: Mapping[str, Scene], folder: Path) -> str:
     problem = rendering_problem()
     for name, scene in scenes.items():
         if problem is None:
-            view3d(scene, screenshot=folder / f"fig1_{name}.png").close()
+            view3d(scene, save=folder / f"fig1_{name}.png").close()
         else:
             plot_scene(scene).savefig(folder / f"fig1_{name}.png")
     images = [f"![{name}](fig1_{name}.png)" for name in scenes]
