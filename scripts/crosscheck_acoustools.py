@@ -39,7 +39,7 @@ from benchmark_accuracy import (
 from generated_block import fill_in, measured, table
 
 import autdtorch as at
-from autdtorch.devices import TRANSDUCER_RADIUS
+from autdtorch.device_layouts import TRANSDUCER_RADIUS
 from autdtorch.freespace import free_space_matrix
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "crosschecks.md"

@@ -28,7 +28,7 @@ from generated_block import fill_in, measured, table
 from numpy.typing import NDArray
 
 import autdtorch as at
-from autdtorch.devices import TRANSDUCER_RADIUS
+from autdtorch.device_layouts import TRANSDUCER_RADIUS
 from autdtorch.freespace import free_space_matrix
 from autdtorch.hardware.levels import AUTD3_FULL, Levels, autd3_drive, autd3_levels
 

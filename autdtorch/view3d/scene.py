@@ -76,8 +76,8 @@ def add_transducers(plotter: pyvista.Plotter, scene: Scene, phases: Array | None
 
     positions = scene.array.positions
     apart = distances(positions, positions).fill_diagonal_(math.inf).min().item()
-    # The scene holds points, not apertures: draw discs that do not touch, of one wavelength at most.
-    radius = MM * 0.42 * min(apart, scene.wavelength)
+    # Those that are points are drawn as discs that do not touch, of one wavelength at most.
+    radius = MM * (scene.array.radius or 0.42 * min(apart, scene.wavelength))
     points = pyvista.PolyData(MM * positions.numpy())
     points["normals"] = scene.array.normals.numpy()
     if phases is not None:
@@ -181,7 +181,7 @@ def _add_control_points(plotter: pyvista.Plotter, scene: Scene) -> None:
 
 def _add_axes(plotter: pyvista.Plotter, scene: Scene) -> None:
     lower, upper = scene.domain
-    plotter.show_bounds(
+    axes = plotter.show_bounds(
         bounds=[MM * corner[axis] for axis in range(3) for corner in (lower, upper)],
         xtitle="x [mm]",
         ytitle="y [mm]",
@@ -189,12 +189,11 @@ def _add_axes(plotter: pyvista.Plotter, scene: Scene) -> None:
         grid="back",
         location="outer",
         fmt="%.0f",
-        n_xlabels=5,
-        n_ylabels=5,
-        n_zlabels=5,
         color="black",
         font_size=15,
     )
+    for axis in range(3):
+        axes.SetAxisLabels(axis, None)  # PyVista's: VTK's own are at round numbers
     plotter.view_vector(_CAMERA, viewup=(0.0, 0.0, 1.0))
     plotter.enable_parallel_projection()
     plotter.reset_camera()
