@@ -247,7 +247,7 @@ def load_provenance(folder: str | os.PathLike[str]) -> Provenance:
 
 
 def load_results(path: str | os.PathLike[str]) -> StudyResult:
-    """Read what `save_results` wrote.
+    """Read the results of a study.
 
     Args:
         path: the file, or the folder that holds `results.h5`.
