@@ -192,7 +192,7 @@ def points_tensor(name: str, value: object) -> torch.Tensor:
 
 
 def points_grid(name: str, value: object) -> tuple[torch.Tensor, torch.Size]:
-    """`value` as points (P, 3) [m], as `points_tensor` gives them, and the shape (...) of their grid (..., 3).
+    """`value` as points (P, 3) [m], as of `points_tensor`, and the shape (...) of their grid (..., 3).
 
     Raises:
         ValueError: another shape, no point, not real numbers, NaN or infinite.
