@@ -205,7 +205,8 @@ def _require_known(where: str, given: Mapping[str, Any], allowed: tuple[str, ...
 def _show(results: StudyResult, scenes: Mapping[str, Scene], folder: Path, single: bool) -> None:
     """Print the results' table; draw the plane of a single run, write the report of an experiment."""
     from autdtorch.plot import plot_plane
-    from autdtorch.report import summary_rows, write_report
+    from autdtorch.report import write_report
+    from autdtorch.report_tables import summary_rows
 
     rows = summary_rows(results)
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]

@@ -94,8 +94,8 @@ def new_panels(
 
 def add_legend(figure: Figure, handles: Sequence[Artist], title: str | None = None) -> None:
     """A legend above all panels, in as many rows as its entries need."""
-    column = 0.5 + _LETTER * max(len(str(handle.get_label())) for handle in handles)
-    rows = math.ceil(len(handles) * column / figure.get_figwidth())
+    width = sum(0.6 + _LETTER * len(str(handle.get_label())) for handle in handles)
+    rows = math.ceil(width / figure.get_figwidth())
     columns = math.ceil(len(handles) / rows)
     figure.legend(handles=handles, title=title, loc="outside upper center", ncols=columns)
 

@@ -15,7 +15,8 @@ from autdtorch.optim.bound import focus_bound
 from autdtorch.optim.gabs import gabs
 from autdtorch.optim.lssg import lssg
 from autdtorch.plot import plot_convergence
-from autdtorch.report import finding_rows, summary_rows, write_report
+from autdtorch.report import write_report
+from autdtorch.report_tables import finding_rows, summary_rows
 from autdtorch.results import StudyResult
 from autdtorch.scene import Box, Scene
 from autdtorch.study import run_study
