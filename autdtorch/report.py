@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from urllib.parse import quote
 
 import torch
 
@@ -161,7 +160,7 @@ def _scene_figures(scenes: Mapping[str, Scene], folder: Path) -> str:
             view3d(scene, screenshot=folder / file).close()
         else:
             plot_scene(scene).savefig(folder / file)
-        images[name] = f"![{name}]({quote(file)})"
+        images[name] = f"![{name}]({file})"
     rows = [table([part, [images[name] for name in part]]) for part in _parts(list(scenes), _SCENES_A_ROW)]
     below = [] if problem is None else [f"Drawn with Matplotlib. {problem}."]
     return "\n\n".join(["## Fig. 1: the scenes", *rows, *below])
@@ -215,7 +214,7 @@ def _trial_figures(results: StudyResult, folder: Path) -> str:
 def _levels(scene: SceneResult) -> dict[str, float]:
     """Scores that methods are compared with, by label."""
     levels = {"bound": scene.bound, f"{NEAR} of the bound": NEAR_BOUND * scene.bound}
-    if BASELINE in scene.methods:
+    if BASELINE in scene.methods.keys() - _competitors(scene.methods).keys():
         levels[label_of(BASELINE)] = float(scene.methods[BASELINE].solution.score.median())
     return levels
 

@@ -62,7 +62,7 @@ def plot_pareto(
     """
     require_scenes("points", points)
     looks = looks_of(methods_of(points.values()))
-    figure, panels = new_panels(points, _PANEL, _PANEL, xlabel, ylabel)
+    figure, panels = new_panels(points, _PANEL, _PANEL, xlabel, ylabel, sharey=higher_is_better)
     for ax, (scene, by_method) in zip(panels, points.items(), strict=True):
         drawn = {
             method: _points(f"points[{scene!r}][{method!r}]", given, higher_is_better)
@@ -77,10 +77,10 @@ def plot_pareto(
             for index in best:
                 _write_beside(ax, everything[index], texts[index], higher_is_better)
         ax.margins(0.15)
-        if higher_is_better:
-            ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]))
         log_axes(ax, "x" if higher_is_better else "xy")
         _draw_front(ax, everything[best])
+    if higher_is_better:  # once all panels are drawn, which share the axis
+        panels[0].set_ylim(bottom=min(0.0, panels[0].get_ylim()[0]))
     handles = [
         Line2D([], [], color=look.colour, marker=look.marker, markersize=5, label=label_of(method))
         for method, look in looks.items()
