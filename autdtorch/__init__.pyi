@@ -20,7 +20,15 @@ from .optim.gradient import gradient_ascent
 from .optim.identify import identify
 from .optim.lssg import lss, lssg
 from .optim.random_search import random_search
-from .plot import plot_convergence, plot_plane, plot_scene, plot_trials
+from .plot import (
+    plot_convergence,
+    plot_pareto,
+    plot_plane,
+    plot_planes,
+    plot_scaling,
+    plot_scene,
+    plot_trials,
+)
 from .propagator import (
     SteadyStateWarning,
     cell_centers,
@@ -82,7 +90,10 @@ __all__ = [
     "make_propagator",
     "phases_of",
     "plot_convergence",
+    "plot_pareto",
     "plot_plane",
+    "plot_planes",
+    "plot_scaling",
     "plot_scene",
     "plot_trials",
     "random_search",

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import torch
@@ -74,13 +74,21 @@ class Claim:
 
 
 def judge_claims(results: StudyResult) -> list[tuple[Claim, Verdict | None]]:
-    """Every claim with its verdict; None where the results lack a method or a kind of scene it is about."""
-    return [(claim, claim.judge(results) if _has_data(claim, results) else None) for claim in CLAIMS]
+    """Every claim with its verdict on the scenes that have the methods it is about.
 
-
-def _has_data(claim: Claim, results: StudyResult) -> bool:
-    methods = all(method in scene.methods for scene in results.scenes.values() for method in claim.methods)
-    return methods and all(scenes(results) for scenes in claim.needs)
+    None where these lack a kind of scene that it is about.
+    """
+    verdicts = []
+    for claim in CLAIMS:
+        scenes = {
+            name: scene
+            for name, scene in results.scenes.items()
+            if set(claim.methods) <= scene.methods.keys()
+        }
+        told = replace(results, scenes=scenes)
+        has_data = all(kind(told) for kind in claim.needs)
+        verdicts.append((claim, claim.judge(told) if has_data else None))
+    return verdicts
 
 
 def _all(results: StudyResult) -> list[str]:

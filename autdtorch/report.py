@@ -1,37 +1,35 @@
-"""The report of a study: ``report.md`` with the figures of the paper and a check of its claims."""
+"""The report of a study: figures of the paper, a check of its claims, and what is beyond it."""
 
 from __future__ import annotations
 
-import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
 import torch
 
-from autdtorch.claims import BO, GABS, judge_claims
+from autdtorch.claims import BO, GABS
 from autdtorch.findings import NEAR_BOUND, find
-from autdtorch.intervals import FEWEST_TRIALS
-from autdtorch.plot import plot_convergence, plot_planes, plot_scene, plot_trials
+from autdtorch.plot import plot_convergence, plot_pareto, plot_planes, plot_scene, plot_trials
 from autdtorch.plot.style import label_of
-from autdtorch.results import RESULTS_FILE, MethodResult, SceneResult, StudyResult, summary_rows
+from autdtorch.report_html import as_page
+from autdtorch.report_tables import BASELINE, NEAR, claims, extent, findings, simulations, summary, table
+from autdtorch.results import RESULTS_FILE, MethodResult, SceneResult, StudyResult
 from autdtorch.scene import Scene
 from autdtorch.trial_file import TRIALS_FILE
 from autdtorch.view3d import rendering_problem, view3d
 
 REPORT_FILE = "report.md"
 
+HTML_FILE = "report.html"
+"""Stands beside `REPORT_FILE`: the same in one file, its figures inside."""
+
+_SCENES_A_ROW = 2  # more would make the labels too small to read
+_PLANES_A_FIGURE = 4
 _FEW_TRIALS = 20  # below this, the spread of a method is not well known
-_NO_NUMBER = "-"
-_NEAR = f"{100 * NEAR_BOUND:.0f} %"
-
-_BASELINE = "gradient_ascent"
-"""The method that is no competitor but a line to compare with: it knows the transfer matrix."""
-
 _FIG2 = """## Fig. 2: pressure on the observation plane
 
-![pressure on the observation plane](fig2.png)
+{images}
 
 |p| of the trial of median score, the control points circled and obstacles outlined. A scene has one colour
 scale for all methods."""
@@ -46,33 +44,15 @@ _FIG3 = """## Fig. 3: the trials
 
 (d) best score so far against evaluations; a dot marks where a method ends."""
 
-_BELOW_SUMMARY = """Mean over the trials ± their standard deviation. *mean*, *weakest* and *std* are taken
-over the foci of a trial.
+_FIG4 = """![score and time](fig4.png)
 
-Pressures are amplitudes, for transducers of pressure S/r with the source strength S of the scene's array.
-The paper's scenes have that of its Eq. 2, S = 1/(4π) Pa m."""
-
-_BELOW_CLAIMS = f"""Computed from the data: means over the trials, and in brackets the 95 % confidence
-interval of each difference, ratio or share (bootstrap over the trials; Wilson's for shares of trials). LSSG
-has no chance in it: its one trial is exact. *Not clearly*: an interval leaves the verdict open, or there are
-fewer than {FEWEST_TRIALS} trials, which have no interval. Every interval is of one comparison alone."""
-
-_BELOW_FINDINGS = f"""*Score*: pressure of the weakest focus, its median over the trials, in brackets with its
-95 % confidence interval (bootstrap; none for fewer than {FEWEST_TRIALS} trials). *s a trial*: mean time of
-the search alone, without simulation."""
-
-_ABOUT_BOUND = f"""*Bound*: certified upper bound on the score of any drive with amplitudes up to 1, by the
-semidefinite relaxation. No method can be better, and the best drive may lie below it. *Gap*: 1 - score/bound.
-*To {_NEAR} of the bound*: evaluations until the best score so far was there, the median over the trials; in
-parentheses how many of them got there, if not all. A trial that did not counts as later than all that did;
-where that leaves the median open, there is a dash."""
-
-_ABOUT_BASELINE = """{label} is a line to compare with and no competitor: it reads gradients off the transfer
-matrix, which the others do not know, so that its evaluations are not listed."""
+Score over bound against the time of the search, medians and means over the trials as in the table. The grey
+line is the front: the best score that a method comes to in that time. On a device the
+evaluations take time of their own, see (d)."""
 
 _READINGS = """## How the paper was read
 
-- **Area a focus**: the cells of the observation plane where |p| is at least the mean pressure of the foci
+- **Area per focus**: the cells of the observation plane where |p| is at least the mean pressure of the foci
   over √2 (half the intensity), divided by the number of foci. The paper's words, a threshold "above √2 of
   the average sound pressure", taken as a factor would leave nearly no area.
 - **Evaluations** are those made, each an observation of all control points. GABS makes 1 + (M - 1) L of
@@ -83,10 +63,6 @@ _READINGS = """## How the paper was read
   observed.
 - **Frequency** (40 kHz) and **angle of the foci** on their circle are not in the paper; see the scenes'
   settings."""
-
-_BELOW_SIMULATION = """A run ends when its estimated relative distance to the steady state is at most
-{tolerance:g}; *to steady state* is the largest of a scene's runs. That says nothing of the error of the
-grid: repeat the study with a smaller `solver.spacing` to see it."""
 
 _ORIGIN = """## Origin
 
@@ -107,7 +83,7 @@ _ORIGIN = """## Origin
 def write_report(
     results: StudyResult, scenes: Mapping[str, Scene], folder: str | os.PathLike[str], command: str
 ) -> Path:
-    """Write `report.md` and its figures.
+    """Write `report.md` and its figures, and all of it as one file `report.html`.
 
     Args:
         results: what is reported.
@@ -116,7 +92,7 @@ def write_report(
         command: the command line that repeats the study.
 
     Returns:
-        The report.
+        The path of `report.md`.
 
     Raises:
         OSError: the folder cannot be made or written.
@@ -130,53 +106,21 @@ def write_report(
     parts = [
         _head(results, command),
         _scene_figures(scenes, folder),
-        _plane_figure(results, scenes, folder),
+        _plane_figures(results, scenes, folder),
         _trial_figures(results, folder),
-        _summary(results),
-        _claims(results),
-        _findings(results),
+        summary(results),
+        claims(results),
+        findings(results),
+        _cost_figure(results, folder),
         _READINGS,
-        _simulations(results),
+        simulations(results),
         _origin(results),
     ]
+    text = "\n\n".join(part for part in parts if part) + "\n"
     report = folder / REPORT_FILE
-    report.write_text("\n\n".join(part for part in parts if part) + "\n", encoding="utf-8")
+    report.write_text(text, encoding="utf-8")
+    (folder / HTML_FILE).write_text(as_page(text, folder), encoding="utf-8")
     return report
-
-
-def finding_rows(results: StudyResult) -> list[list[str]]:
-    """A table of how near to the bound the methods come and at what cost, its head first."""
-    head = ["scene", "method", "score [Pa]", "gap to the bound [%]", "evaluations"]
-    rows = [[*head, f"to {_NEAR} of the bound", "s a trial"]]
-    for scene_name, scene in results.scenes.items():
-        rows.append([scene_name, "*bound*", f"{scene.bound:.3g}", "0", *[_NO_NUMBER] * 3])
-        for name, method in scene.methods.items():
-            rows.append([scene_name, label_of(name), *_finding_cells(name, method, scene.bound)])
-    return rows
-
-
-def _finding_cells(name: str, method: MethodResult, bound: float) -> list[str]:
-    finding = find(method, bound)
-    gap = f"{finding.gap.mapped(lambda share: 100 * share):.1f}"
-    evaluations = f"{method.solution.evaluations.double().mean():.0f}"
-    near = _median_of_reached(finding.evaluations_near)
-    if name == _BASELINE:
-        evaluations = near = _NO_NUMBER
-    return [str(finding.score), gap, evaluations, near, f"{method.seconds.mean():.2g}"]
-
-
-def _median_of_reached(evaluations: torch.Tensor) -> str:
-    """The median, and how many trials got there if not all did; inf is a trial that did not."""
-    median, reached = float(np.median(evaluations.numpy())), int(evaluations.isfinite().sum())
-    shown = f"{median:g}" if math.isfinite(median) else _NO_NUMBER
-    every = len(evaluations) in (1, reached)
-    return shown if every else f"{shown} ({reached} of {len(evaluations)})"
-
-
-def _table(rows: Iterable[Sequence[str]]) -> str:
-    head, *body = rows
-    lines = [head, ["---"] * len(head), *body]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
 
 
 def _by_method(results: StudyResult) -> dict[str, dict[str, MethodResult]]:
@@ -190,7 +134,7 @@ def _head(results: StudyResult, command: str) -> str:
         f"Made by `{command}` with autdtorch {results.provenance.versions['autdtorch']}, begun "
         f"{results.provenance.date}.",
         "Trials: "
-        + ", ".join(f"{label_of(name)} {_range(numbers)}" for name, numbers in counts.items())
+        + ", ".join(f"{label_of(name)} {extent(numbers)}" for name, numbers in counts.items())
         + ".",
     ]
     few = [label_of(name) for name in (BO, GABS) if max(counts.get(name, [_FEW_TRIALS])) < _FEW_TRIALS]
@@ -207,24 +151,26 @@ def _trial_counts(results: StudyResult) -> dict[str, list[int]]:
     return counts
 
 
-def _range(numbers: Sequence[int]) -> str:
-    low, high = min(numbers), max(numbers)
-    return str(low) if low == high else f"{low} to {high}"
-
-
 def _scene_figures(scenes: Mapping[str, Scene], folder: Path) -> str:
     problem = rendering_problem()
+    images = {}
     for name, scene in scenes.items():
+        file = f"fig1_{name}.png"
         if problem is None:
-            view3d(scene, save=folder / f"fig1_{name}.png").close()
+            view3d(scene, save=folder / file).close()
         else:
-            plot_scene(scene).savefig(folder / f"fig1_{name}.png")
-    images = [f"![{name}](fig1_{name}.png)" for name in scenes]
+            plot_scene(scene).savefig(folder / file)
+        images[name] = f"![{name}]({file})"
+    rows = [table([part, [images[name] for name in part]]) for part in _parts(list(scenes), _SCENES_A_ROW)]
     below = [] if problem is None else [f"Drawn with Matplotlib. {problem}."]
-    return "\n\n".join(["## Fig. 1: the scenes", _table([list(scenes), images]), *below])
+    return "\n\n".join(["## Fig. 1: the scenes", *rows, *below])
 
 
-def _plane_figure(results: StudyResult, scenes: Mapping[str, Scene], folder: Path) -> str:
+def _parts(names: Sequence[str], most: int) -> list[Sequence[str]]:
+    return [names[start : start + most] for start in range(0, len(names), most)]
+
+
+def _plane_figures(results: StudyResult, scenes: Mapping[str, Scene], folder: Path) -> str:
     pressure = {
         name: {
             method: result.plane_pressure
@@ -233,29 +179,30 @@ def _plane_figure(results: StudyResult, scenes: Mapping[str, Scene], folder: Pat
         }
         for name, methods in _by_method(results).items()
     }
-    pressure = {name: fields for name, fields in pressure.items() if fields}
-    if not pressure:
-        return ""
     planes = {name: plane for name in pressure if (plane := scenes[name].observation_plane) is not None}
-    points = {name: scenes[name].control_points for name in pressure}
-    obstacles = {name: scenes[name].obstacles for name in pressure}
-    plot_planes(pressure, planes, points, obstacles).savefig(folder / "fig2.png")
-    return _FIG2
+    images: list[str] = []
+    for part in _parts([name for name in planes if pressure[name]], _PLANES_A_FIGURE):
+        images.append(f"fig2_{len(images) + 1}.png" if images else "fig2.png")
+        figure = plot_planes(
+            {name: pressure[name] for name in part},
+            planes,
+            {name: scenes[name].control_points for name in part},
+            {name: scenes[name].obstacles for name in part},
+        )
+        figure.savefig(folder / images[-1])
+    shown = "\n\n".join(f"![pressure on the observation plane]({image})" for image in images)
+    return _FIG2.format(images=shown) if images else ""
 
 
 def _trial_figures(results: StudyResult, folder: Path) -> str:
     methods = _by_method(results)
     quantities = {"mean pressure of the foci [Pa]": _metric(methods, "mean")}
     if areas := _metric(methods, "area", scale=1e6):
-        quantities["area a focus [mm²]"] = areas
+        quantities["area per focus [mm²]"] = areas
     quantities["std among the foci [Pa]"] = _metric(methods, "std")
     plot_trials(quantities).savefig(folder / "fig3abc.png")
     history = {
-        scene: {
-            name: method.solution.history
-            for name, method in by_name.items()
-            if name != _BASELINE or len(by_name) == 1
-        }
+        scene: {name: method.solution.history for name, method in _competitors(by_name).items()}
         for scene, by_name in methods.items()
     }
     levels = {name: _levels(scene) for name, scene in results.scenes.items()}
@@ -266,9 +213,9 @@ def _trial_figures(results: StudyResult, folder: Path) -> str:
 
 def _levels(scene: SceneResult) -> dict[str, float]:
     """Scores that methods are compared with, by label."""
-    levels = {"bound": scene.bound, f"{_NEAR} of the bound": NEAR_BOUND * scene.bound}
-    if _BASELINE in scene.methods:
-        levels[label_of(_BASELINE)] = float(scene.methods[_BASELINE].solution.score.median())
+    levels = {"bound": scene.bound, f"{NEAR} of the bound": NEAR_BOUND * scene.bound}
+    if BASELINE in scene.methods.keys() - _competitors(scene.methods).keys():
+        levels[label_of(BASELINE)] = float(scene.methods[BASELINE].solution.score.median())
     return levels
 
 
@@ -287,59 +234,24 @@ def _metric(
     return {scene: by_name for scene, by_name in values.items() if by_name}
 
 
-def _summary(results: StudyResult) -> str:
-    return "\n\n".join(["## Results", _table(summary_rows(results)), _BELOW_SUMMARY])
+def _cost_figure(results: StudyResult, folder: Path) -> str:
+    points = {
+        scene: {
+            name: [(float(method.seconds.mean()), 100 * (1 - find(method, found.bound).gap.value))]
+            for name, method in _competitors(found.methods).items()
+        }
+        for scene, found in results.scenes.items()
+    }
+    figure = plot_pareto(
+        points, "time of the search [s per trial]", "score / bound [%]", higher_is_better=True
+    )
+    figure.savefig(folder / "fig4.png")
+    return _FIG4
 
 
-def _claims(results: StudyResult) -> str:
-    rows = [["", "the paper's claim", "our reading", "our numbers", "verdict"]]
-    for number, (claim, verdict) in enumerate(judge_claims(results), start=1):
-        if verdict is None:
-            evidence, outcome = "", "no data"
-        else:
-            evidence = "<br>".join(verdict.evidence)
-            outcome = "**reproduced**" if verdict.holds else "**not reproduced**"
-            outcome += "" if verdict.clear else ", but not clearly"
-        rows.append([str(number), claim.text, claim.reading, evidence, outcome])
-    return "\n\n".join(["## The paper's claims", _table(rows), _BELOW_CLAIMS])
-
-
-def _findings(results: StudyResult) -> str:
-    text = ["## Beyond the paper", _table(finding_rows(results)), _BELOW_FINDINGS, _ABOUT_BOUND]
-    if any(_BASELINE in scene.methods for scene in results.scenes.values()):
-        text.append(_ABOUT_BASELINE.format(label=label_of(_BASELINE).capitalize()))
-    return "\n\n".join(text)
-
-
-def _simulations(results: StudyResult) -> str:
-    head = ["scene", "method", "spacing [mm]", "cells a wavelength", "runs", "periods", "to steady state"]
-    rows = [[*head, "reached", "matrix [s]", "plane [s]"]]
-    rows += [[name, *_simulation_cells(scene)] for name, scene in results.scenes.items()]
-    text = ["## Simulation", _table(rows)]
-    tolerances = [scene.simulation.tolerance for scene in results.scenes.values()]
-    if given := [tolerance for tolerance in tolerances if tolerance is not None]:
-        text.append(_BELOW_SIMULATION.format(tolerance=given[0]))
-    return "\n\n".join(text)
-
-
-def _simulation_cells(scene: SceneResult) -> list[str]:
-    simulation = scene.simulation
-    seconds = [f"{simulation.matrix_seconds:.1f}", f"{simulation.plane_seconds:.1f}"]
-    if simulation.spacing is None:
-        return [f"{simulation.method} (exact)", *["-"] * 6, *seconds]
-    cells = simulation.wavelength / simulation.spacing
-    head = [simulation.method, f"{1e3 * simulation.spacing:g}", f"{cells:.1f}"]
-    runs = simulation.runs
-    if not runs:
-        return [*head, "0, kept on disk", *["-"] * 3, *seconds]
-    return [
-        *head,
-        str(len(runs)),
-        _range([run.periods for run in runs]),
-        f"{max(run.remaining for run in runs):.1e}",
-        "yes" if all(run.reached for run in runs) else f"not in {sum(not run.reached for run in runs)} runs",
-        *seconds,
-    ]
+def _competitors(methods: Mapping[str, MethodResult]) -> Mapping[str, MethodResult]:
+    """All but the baseline, which stays where it is alone."""
+    return {name: method for name, method in methods.items() if name != BASELINE} or methods
 
 
 def _origin(results: StudyResult) -> str:

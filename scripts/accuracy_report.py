@@ -10,23 +10,17 @@ from datetime import date
 from pathlib import Path
 
 from generated_block import fill_in, measured, table
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from autdtorch.plot.style import TICK_SIZE, new_figure, readable, styled
+from autdtorch.plot import plot_pareto
+from autdtorch.plot.style import TICK_SIZE, readable
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "benchmarks.md"
 
 Orders = Mapping[str, Mapping[str, float]]
 
-# Okabe-Ito, and a marker each
-_LOOKS = {
-    "staircase": ("#D55E00", "s"),
-    "series bonds": ("#E69F00", "^"),
-    "default": ("#0072B2", "o"),
-    "extrapolated": ("#009E73", "D"),
-}
+DRAWN = ("default", "extrapolated", "staircase", "series bonds")
+"""Treatments in the plot."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +76,7 @@ def write_report(rows: Sequence[Row], orders: Orders, command: str, folder: Path
     made = {"command": command, "date": date.today().isoformat(), "cores": os.cpu_count()}
     content = {**made, "rows": [asdict(row) for row in rows], "orders": orders}
     (folder / "accuracy.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    plot_pareto(rows, command).savefig(folder / "accuracy.png")
+    figure(rows, command).savefig(folder / "accuracy.png")
     parts = (
         measured(command),
         "![Error over run time](accuracy.png)",
@@ -140,52 +134,29 @@ def percent(share: float) -> str:
     return f"{100 * share:.3g} %"
 
 
-@styled
-def plot_pareto(rows: Sequence[Row], command: str) -> Figure:
+def figure(rows: Sequence[Row], command: str) -> Figure:
     """Error of the field over run time, a panel for each case with more than one spacing."""
     cases = [
         case
         for case in dict.fromkeys(row.case for row in rows)
         if len({row.spacing for row in rows if row.case == case}) > 1
     ]
-    columns = min(3, len(cases))
-    lines = -(-len(cases) // columns)
-    figure = new_figure(0.5 + 2.6 * columns, 0.8 + 2.3 * lines)
-    panels = figure.subplots(lines, columns, squeeze=False).ravel()
-    for ax, case in zip(panels, cases, strict=False):
-        ax.set_title(readable(case), loc="left")
-        _draw_case(ax, [row for row in rows if row.case == case])
-    for ax in panels[len(cases) :]:
-        ax.remove()
-    handles = [line for ax in figure.axes for line in ax.lines]
-    named = {str(line.get_label()): line for line in handles}
-    names = [name for name in _LOOKS if name in named]
-    figure.legend([named[name] for name in names], names, loc="outside upper center", ncols=len(names))
-    figure.supxlabel(f"run time [s], points at the spacing in mm\n{command}", fontsize=TICK_SIZE)
-    figure.supylabel("relative error of the field [%]", fontsize=TICK_SIZE)
-    return figure
-
-
-def _draw_case(ax: Axes, rows: Sequence[Row]) -> None:
-    for name, (colour, marker) in _LOOKS.items():
-        mine = [row for row in rows if row.treatment == name]
-        if not mine:
-            continue
-        places = [(row.seconds, 100 * row.total) for row in mine]
-        if not ax.lines:  # the topmost, where no other line is above
-            for row, place in zip(mine, places, strict=True):
-                text = f"{row.spacing:g}"
-                ax.annotate(text, place, (2, 4), textcoords="offset points", fontsize=TICK_SIZE)
-        ax.plot(*zip(*places, strict=True), color=colour, marker=marker, ms=4, lw=1.2, label=name)
-    log_axes(ax, (1, 3), (1, 2, 5))
-    ax.tick_params(labelsize=TICK_SIZE)
-    ax.margins(0.12, 0.15)
-
-
-def log_axes(ax: Axes, across: Sequence[float], up: Sequence[float]) -> None:
-    """Make both axes logarithmic, with plain numbers at these multiples of each power of ten."""
-    ax.set(xscale="log", yscale="log")
-    for axis, ticks in ((ax.xaxis, across), (ax.yaxis, up)):
-        axis.set_major_locator(LogLocator(subs=ticks))
-        axis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        axis.set_minor_formatter(NullFormatter())
+    chosen = {
+        case: {
+            name: found
+            for name in DRAWN
+            if (found := [row for row in rows if (row.case, row.treatment) == (case, name)])
+        }
+        for case in cases
+    }
+    points = {
+        case: {name: [(row.seconds, 100 * row.total) for row in mine] for name, mine in by_name.items()}
+        for case, by_name in chosen.items()
+    }
+    spacings = {
+        case: {name: [f"{row.spacing:g}" for row in mine] for name, mine in by_name.items()}
+        for case, by_name in chosen.items()
+    }
+    drawn = plot_pareto(points, "run time [s]", "relative error of the field [%]", names=spacings)
+    drawn.supxlabel(f"numbers on the front: spacing [mm]\n{command}", fontsize=TICK_SIZE)
+    return drawn

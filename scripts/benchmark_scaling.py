@@ -24,7 +24,7 @@ from benchmark_accuracy import ROOT, SCENES, TOLERANCE
 from generated_block import fill_in, measured
 from large_arrays import MIDDLE, autd3_array, with_array
 from numba import get_num_threads
-from scaling_report import Point, exponents, measurements, plot_scaling
+from scaling_report import Point, exponents, figure, measurements
 
 import autdtorch as at
 from autdtorch.propagator import SimulatedPropagator
@@ -169,7 +169,7 @@ def main() -> None:
     """Measure, and write block and figure."""
     tasks = [*spacing_tasks(), *domain_tasks(), *transducer_tasks(), *foci_tasks()]
     points = list(measure_all(tasks))
-    plot_scaling(points, COMMAND).savefig(DOCS / "scaling.png")
+    figure(points, COMMAND).savefig(DOCS / "scaling.png")
     stated = measured(COMMAND) + f"\n\nThreads: {get_num_threads()}."
     parts = (
         stated,

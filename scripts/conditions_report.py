@@ -10,7 +10,7 @@ from generated_block import table
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from autdtorch.plot.style import TICK_SIZE, new_figure, readable, styled
+from autdtorch.plot.style import TICK_SIZE, Look, looks_of, new_figure, readable, styled
 
 AXES = {
     "signal-to-noise ratio [dB]": {
@@ -31,20 +31,6 @@ AXES = {
     },
 }
 """Rows of panels: label of the axis, then tick and condition."""
-
-# Okabe-Ito, and a marker each: in the order of the methods
-_LOOKS = (
-    ("0.5", "x"),
-    ("#000000", "v"),
-    ("#0072B2", "o"),
-    ("#56B4E9", "s"),
-    ("#009E73", "D"),
-    ("#CC79A7", "^"),
-    ("#D55E00", "P"),
-    ("#E69F00", "*"),
-    ("#B3A600", "p"),
-    ("#7A4FA3", "h"),
-)
 
 
 @dataclass(frozen=True)
@@ -112,7 +98,7 @@ def plot_conditions(outcomes: Outcomes, command: str) -> Figure:
     panels = figure.subplots(len(AXES), len(scenes), squeeze=False, sharex="row", sharey=True)
     for row, (label, ticks) in zip(panels, AXES.items(), strict=True):
         for ax, scene in zip(row, scenes, strict=True):
-            for look, method in zip(_LOOKS, methods, strict=False):
+            for method, look in looks_of(methods).items():
                 line = [outcomes[scene, condition, method] for condition in ticks.values()]
                 _draw(ax, line, look, method)
             ax.set_xticks(range(len(ticks)), list(ticks))
@@ -129,10 +115,10 @@ def plot_conditions(outcomes: Outcomes, command: str) -> Figure:
     return figure
 
 
-def _draw(ax: Axes, outcomes: list[Outcome], look: tuple[str, str], label: str) -> None:
-    colour, marker = look
+def _draw(ax: Axes, outcomes: list[Outcome], look: Look, label: str) -> None:
+    colour, marker, dashes = look
     means = torch.stack([outcome.true.mean() for outcome in outcomes]).numpy()
     errors = torch.tensor([outcome.error for outcome in outcomes]).numpy()
     places = range(len(outcomes))
     ax.fill_between(places, means - errors, means + errors, color=colour, alpha=0.2, lw=0)
-    ax.plot(places, means, color=colour, marker=marker, ms=4, lw=1.2, label=label)
+    ax.plot(places, means, color=colour, marker=marker, linestyle=dashes, ms=4, lw=1.2, label=label)

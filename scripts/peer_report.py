@@ -3,32 +3,22 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from datetime import date
 from pathlib import Path
 
-from accuracy_report import log_axes, percent
+from accuracy_report import percent
 from generated_block import fill_in, measured, table
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from autdtorch.plot.style import TICK_SIZE, new_figure, styled
+from autdtorch.plot import plot_pareto
+from autdtorch.plot.style import TICK_SIZE
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "peers.md"
 
 OURS = "autdtorch"
-
-# Okabe-Ito, and a marker each
-_LOOKS = {
-    OURS: ("#0072B2", "o"),
-    "deepwave": ("#D55E00", "s"),
-    "devito": ("#E69F00", "^"),
-    "jwave": ("#009E73", "D"),
-    "kwave": ("#CC79A7", "v"),
-}
 
 NAMES = {"deepwave": "Deepwave", "devito": "Devito", "jwave": "j-Wave", "kwave": "k-wave-python"}
 
@@ -88,7 +78,7 @@ def write_report(points: Sequence[Point], refusals: Sequence[Refusal], command: 
     rows = ",\n ".join(json.dumps(_rounded(asdict(one))) for one in (*points, *refusals))
     text = f'{json.dumps(made)[:-1]}, "rows": [\n {rows}\n]}}\n'
     (folder / "peers.json").write_text(text, encoding="utf-8")
-    plot_pareto(points, command).savefig(folder / "peers.png")
+    figure(points, command).savefig(folder / "peers.png")
     picture = "![Error over run time](peers.png)"
     parts = [measured(command), picture, requirements(points), times(points), ratios(points), figures(points)]
     fill_in(DOCUMENT, "benchmark_peers", [*parts, *refused(refusals)], folder)
@@ -194,51 +184,19 @@ def refused(refusals: Sequence[Refusal]) -> list[str]:
     return [table(["scene", "program", "setting", "did not run"], lines)]
 
 
-def front(points: Sequence[Point]) -> list[Point]:
-    """The points that no other one beats in time and in error, by time."""
-    kept: list[Point] = []
-    for point in sorted(points, key=lambda p: (p.seconds, p.error)):
-        if not kept or point.error < kept[-1].error:
-            kept.append(point)
-    return kept
-
-
-@styled
-def plot_pareto(points: Sequence[Point], command: str) -> Figure:
-    """Error over run time, a panel for each scene; the line of a program joins its best points."""
-    cases = list(dict.fromkeys(p.case for p in points))
-    columns = min(2, len(cases))
-    figure = new_figure(0.5 + 3.4 * columns, 0.9 + 2.6 * math.ceil(len(cases) / columns))
-    panels = figure.subplots(math.ceil(len(cases) / columns), columns, squeeze=False, sharex=True).ravel()
-    for ax, case in zip(panels, cases, strict=False):
-        ax.set_title(case, loc="left")
-        _draw_case(ax, [p for p in points if p.case == case])
-    for ax in panels[len(cases) :]:
-        ax.remove()
-    named = {str(line.get_label()): line for ax in figure.axes for line in ax.lines}
-    names = [NAMES.get(name, name) for name in _LOOKS if NAMES.get(name, name) in named]
-    figure.legend([named[name] for name in names], names, loc="outside upper center", ncols=len(names))
-    figure.supxlabel(f"run time of the transfer matrix of one focus [s]\n{command}", fontsize=TICK_SIZE)
-    figure.supylabel("relative error of the field [%]", fontsize=TICK_SIZE)
-    return figure
-
-
-def _draw_case(ax: Axes, points: Sequence[Point]) -> None:
-    for name, (colour, marker) in _LOOKS.items():
-        mine = [p for p in points if p.program == name and p.error <= 1]
-        if not mine:
-            continue
-        ax.plot(
-            *zip(*((p.seconds, 100 * p.error) for p in mine), strict=True),
-            color=colour, marker=marker, ms=2.5, lw=0, alpha=0.35,
-        )  # fmt: skip
-        ax.plot(
-            *zip(*((p.seconds, 100 * p.error) for p in front(mine)), strict=True),
-            color=colour, marker=marker, ms=4, lw=1.2, label=NAMES.get(name, name),
-        )  # fmt: skip
-    log_axes(ax, (1,), (1, 3))
-    ax.tick_params(labelsize=TICK_SIZE, labelbottom=True)
-    ax.margins(0.06, 0.1)
+def figure(points: Sequence[Point], command: str) -> Figure:
+    """Error over run time, a panel for each scene; errors over 100 % are left out."""
+    values: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    for point in points:
+        if point.error <= 1:
+            by_program = values.setdefault(point.case, {})
+            program = NAMES.get(point.program, point.program)
+            by_program.setdefault(program, []).append((point.seconds, 100 * point.error))
+    drawn = plot_pareto(
+        values, "run time of the transfer matrix of one focus [s]", "relative error of the field [%]"
+    )
+    drawn.supxlabel(command, fontsize=TICK_SIZE)
+    return drawn
 
 
 def _rounded(row: dict[str, object]) -> dict[str, object]:

@@ -1,23 +1,16 @@
-"""What benchmark_scaling.py writes: fitted exponents, tables and a plot of how cost grows."""
+"""What benchmark_scaling.py writes: fitted exponents, tables and a figure of how cost grows."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 from generated_block import table
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
 
-from autdtorch.plot.style import TICK_SIZE, new_figure, styled
-
-OVERHEAD = 2.0
-"""Costs from this many times the least one on are fitted: at most half of them is what costs always."""
-
-FEWEST = 3
-"""Points of a fit."""
+from autdtorch.plot import plot_scaling
+from autdtorch.plot.scaling import FEWEST, fit_power
+from autdtorch.plot.style import TICK_SIZE
 
 GROWTHS = {
     "spacing": ("spacing h [mm]", "h", "two cubes, one run"),
@@ -30,13 +23,6 @@ GROWTHS = {
 COSTS = {"time": ("seconds", "s"), "memory": ("megabytes", "MB")}
 """Attribute and unit of what is measured."""
 
-# Okabe-Ito, and a marker each
-_LOOKS = {
-    "box": ("#0072B2", "o"),
-    "full": ("#D55E00", "s"),
-    "box, mirror images": ("#009E73", "D"),
-}
-
 
 @dataclass(frozen=True)
 class Point:
@@ -44,7 +30,7 @@ class Point:
 
     Attributes:
         growth: what grows, a key of `GROWTHS`.
-        series: what is measured, a key of `_LOOKS`.
+        series: what is measured, its name.
         size: of what grows.
         seconds: time of a transfer matrix.
         megabytes: its peak memory.
@@ -59,27 +45,6 @@ class Point:
     megabytes: float
     runs: int
     periods: int
-
-
-@dataclass(frozen=True)
-class Fit:
-    """Cost factor * size^exponent, between the sizes that it was fitted to."""
-
-    exponent: float
-    factor: float
-    sizes: tuple[float, float]
-
-
-def fitted(sizes: Sequence[float], costs: Sequence[float]) -> Fit | None:
-    """Least-squares line in logarithms through costs that are not constant overhead.
-
-    These are at least `OVERHEAD` times the least one; None if they are fewer than `FEWEST`.
-    """
-    chosen = [pair for pair in zip(sizes, costs, strict=True) if pair[1] >= OVERHEAD * min(costs)]
-    if len(chosen) < FEWEST:
-        return None
-    exponent, logarithm = np.polyfit(*np.log(np.array(chosen)).T, 1)
-    return Fit(float(exponent), float(np.exp(logarithm)), (chosen[0][0], chosen[-1][0]))
 
 
 def each_series(points: Sequence[Point]) -> Iterator[list[Point]]:
@@ -108,7 +73,7 @@ def exponents(points: Sequence[Point]) -> str:
         row = [label, fixed, series[0].series]
         for cost in COSTS:
             sizes, costs = costs_of(series, cost)
-            fit = fitted(sizes, costs)
+            fit = fit_power(sizes, costs)
             if fit is None:
                 row += ["", f"none: within a factor {spread(costs):.2g}"]
             else:
@@ -128,48 +93,15 @@ def measurements(points: Sequence[Point]) -> str:
     return table(["growing", "method", "size", "time", "memory", "runs", "periods"], rows)
 
 
-@styled
-def plot_scaling(points: Sequence[Point], command: str) -> Figure:
+def figure(points: Sequence[Point], command: str) -> Figure:
     """Time and memory over what grows, with the fits."""
-    growths = list(dict.fromkeys(point.growth for point in points))
-    figure = new_figure(0.5 + 2.5 * len(growths), 5.6)
-    panels = figure.subplots(len(COSTS), len(growths), squeeze=False, sharex="col", sharey="row")
-    for line, (cost, (_, unit)) in zip(panels, COSTS.items(), strict=True):
-        line[0].set_ylabel(f"{cost} of a transfer matrix [{unit}]")
-        for ax, growth in zip(line, growths, strict=True):
-            _draw(ax, [point for point in points if point.growth == growth], cost)
-    for ax, growth in zip(panels[-1], growths, strict=True):
-        label, _, fixed = GROWTHS[growth]
-        ax.set_xlabel(f"{label}\n({fixed})")
-    figure.supxlabel(
-        f"broad lines: fitted powers; $\\times$: largest over least, where none was fitted\n{command}",
-        fontsize=TICK_SIZE,
-    )
-    return figure
-
-
-def _draw(ax: Axes, points: Sequence[Point], cost: str) -> None:
+    values: dict[str, dict[str, dict[str, list[tuple[float, float]]]]] = {}
     for series in each_series(points):
-        name, symbol = series[0].series, GROWTHS[series[0].growth][1]
-        colour, marker = _LOOKS[name]
-        sizes, costs = costs_of(series, cost)
-        fit = fitted(sizes, costs)
-        if len(series) < FEWEST:
-            label = name
-        elif fit is None:
-            label = f"{name}, within ${{\\times}}{spread(costs):.2g}$"
-        else:
-            label = f"{name}, ${symbol}^{{{fit.exponent:.1f}}}$"
-            ends = np.array(fit.sizes)
-            ax.plot(ends, fit.factor * ends**fit.exponent, color=colour, lw=5, alpha=0.3)
-        ax.plot(sizes, costs, color=colour, marker=marker, ms=4, lw=1, label=label)
-    ax.set(xscale="log", yscale="log")
-    ax.xaxis.set_major_locator(FixedLocator(sorted({point.size for point in points})))
-    ax.yaxis.set_major_locator(LogLocator(subs=(1, 3)))
-    ax.xaxis.set_minor_locator(NullLocator())
-    ax.yaxis.set_minor_formatter(NullFormatter())
-    for axis in (ax.xaxis, ax.yaxis):
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{round(value, 2):g}"))
-    ax.tick_params(labelsize=TICK_SIZE)
-    ax.grid(color="0.9", lw=0.6)
-    ax.legend(loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0)
+        label, _, fixed = GROWTHS[series[0].growth]
+        for cost, (_, unit) in COSTS.items():
+            by_size = values.setdefault(f"{cost} of a transfer matrix [{unit}]", {})
+            by_method = by_size.setdefault(f"{label}\n({fixed})", {})
+            by_method[series[0].series] = list(zip(*costs_of(series, cost), strict=True))
+    drawn = plot_scaling(values)
+    drawn.supxlabel(command, fontsize=TICK_SIZE)
+    return drawn

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -24,10 +24,13 @@ from autdtorch.plot.style import (
     readable,
     require_scenes,
     styled,
+    wrapped,
 )
 from autdtorch.validation import ArrayLike, points_tensor
 
 _AXIS_TOLERANCE = 1e-12  # by which a unit vector along x, y or z may miss length 1 in that coordinate
+
+_FLOOR = -30.0  # dB, the lower end of the colours, as in view3d
 
 _OUTLINE_CELLS = 400  # along the longer side of a plane, to find where obstacles cut it
 
@@ -39,6 +42,7 @@ def plot_plane(
     control_points: ArrayLike | None = None,
     obstacles: Iterable[Obstacle] = (),
     ax: Axes | None = None,
+    decibels: bool = False,
 ) -> Figure:
     """Map of the pressure magnitude on a plane, over the coordinates along its edges.
 
@@ -48,12 +52,14 @@ def plot_plane(
         control_points: (P, 3) [m]; those in the plane are circled.
         obstacles: where the plane cuts them, they are outlined.
         ax: axes to draw into; by default those of a new figure.
+        decibels: draws levels 20 lg(|p| / largest |p|) from -30 to 0 dB, not |p| in Pa.
 
     Returns:
         The figure.
 
     Raises:
-        ValueError: `pressure` is not (Nu, Nv), or `control_points` are not points.
+        ValueError: `pressure` is not (Nu, Nv), or 0 everywhere and to be drawn as a level, or
+            `control_points` are not points.
     """
     if ax is None:
         figure = new_figure(4.4, 3.6)
@@ -61,8 +67,15 @@ def plot_plane(
         ax = figure.add_subplot()
     figure = cast(Figure, ax.get_figure(root=True))
     magnitude = plane_magnitude("pressure", pressure)
-    mesh = _draw_plane(ax, magnitude, plane, control_points, obstacles, magnitude.max())
-    _add_colour_bar(figure, mesh, [ax], "vertical")
+    peak = magnitude.max()
+    values, limits, label = magnitude, (0.0, peak), "|p| [Pa]"
+    if decibels:
+        if peak == 0:
+            raise ValueError("pressure: 0 Pa everywhere; must be more somewhere to have a level in dB")
+        values = 20 * np.log10(np.maximum(magnitude / peak, 10 ** (_FLOOR / 20)))
+        limits, label = (_FLOOR, 0.0), f"level of |p| [dB], 0 dB = {peak:.3g} Pa"
+    mesh = _draw_plane(ax, values, plane, control_points, obstacles, limits)
+    _add_colour_bar(figure, mesh, [ax], "vertical", label)
     return figure
 
 
@@ -96,46 +109,54 @@ def plot_planes(
     methods = methods_of(pressure.values())
     full = all(method in maps for method in methods for maps in pressure.values())
     alike = full and len({planes[scene] for scene in pressure}) == 1
-    figure = new_figure(2.3 * len(pressure) + 0.4, 2.3 * len(methods) + 0.6)
+    figure = new_figure(2.2 * len(pressure) + 0.7, 2.2 * len(methods) + 0.8)
     axes = figure.subplots(len(methods), len(pressure), squeeze=False)
     for column, (scene, maps) in zip(axes.T, pressure.items(), strict=True):
         magnitudes = {
             method: plane_magnitude(f"pressure[{scene!r}][{method!r}]", field)
             for method, field in maps.items()
         }
-        peak = max(magnitude.max() for magnitude in magnitudes.values())
+        limits = (0.0, max(magnitude.max() for magnitude in magnitudes.values()))
         points = None if control_points is None else control_points[scene]
         outlined = () if obstacles is None else tuple(obstacles[scene])
         for ax, method in zip(column, methods, strict=True):
             if method not in magnitudes:
                 ax.set_axis_off()
                 continue
-            mesh = _draw_plane(ax, magnitudes[method], planes[scene], points, outlined, peak)
-            ax.set_title(f"{label_of(method)}, {readable(scene)}")
+            mesh = _draw_plane(ax, magnitudes[method], planes[scene], points, outlined, limits)
             if alike:
                 ax.label_outer()
-        _add_colour_bar(figure, mesh, list(column), "horizontal")
+        column[0].set_title(wrapped(readable(scene), 2.0), weight="bold")
+        _add_colour_bar(figure, mesh, list(column), "horizontal", "|p| [Pa]")
+    for ax, method in zip(axes[:, 0], methods, strict=True):
+        _name_row(ax, wrapped(label_of(method), 2.0))
     return figure
+
+
+def _name_row(ax: Axes, name: str) -> None:
+    """Write left of the axes, also where nothing is drawn in them."""
+    style: Any = {"rotation": 90, "ha": "right", "va": "center", "ma": "center", "weight": "bold"}
+    where: Any = {"xy": (0, 0.5), "xycoords": "axes fraction", "textcoords": "offset points"}
+    ax.annotate(name, xytext=(-40, 0), **where, **style)
 
 
 def _draw_plane(
     ax: Axes,
-    magnitude: Array,
+    values: Array,
     plane: Plane,
     control_points: ArrayLike | None,
     obstacles: Iterable[Obstacle],
-    peak: float,
+    limits: tuple[float, float],
 ) -> QuadMesh:
     (label_u, edges_u), (label_v, edges_v) = (
-        _plane_axis(plane, side, cells) for side, cells in enumerate(magnitude.shape)
+        _plane_axis(plane, side, cells) for side, cells in enumerate(values.shape)
     )
-    mesh = ax.pcolormesh(
-        edges_u, edges_v, magnitude.T, cmap=PRESSURE_MAP, vmin=0.0, vmax=peak, rasterized=True
-    )
+    low, high = limits
+    mesh = ax.pcolormesh(edges_u, edges_v, values.T, cmap=PRESSURE_MAP, vmin=low, vmax=high, rasterized=True)
     for obstacle in obstacles:
         _outline(ax, plane, obstacle)
     if control_points is not None:
-        _circle_points(ax, plane, points_tensor("control_points", control_points), max(magnitude.shape))
+        _circle_points(ax, plane, points_tensor("control_points", control_points), max(values.shape))
     ax.set(xlabel=label_u, ylabel=label_v, aspect="equal")
     ax.tick_params(labelsize=TICK_SIZE)
     return mesh
@@ -185,10 +206,10 @@ def _circle_points(ax: Axes, plane: Plane, points: torch.Tensor, cells: int) -> 
     )
 
 
-def _add_colour_bar(figure: Figure, mesh: QuadMesh, axes: list[Axes], orientation: str) -> None:
+def _add_colour_bar(figure: Figure, mesh: QuadMesh, axes: list[Axes], orientation: str, label: str) -> None:
     part = min(0.15, 0.45 / len(axes))  # of the height of all axes together
     bar = figure.colorbar(
-        mesh, ax=axes, orientation=orientation, shrink=0.9, aspect=25, fraction=part, pad=part / 3
+        mesh, ax=axes, orientation=orientation, shrink=0.9, aspect=25, fraction=part, pad=0.05 / len(axes)
     )
-    bar.set_label("|p| [Pa]")
+    bar.set_label(label)
     bar.ax.tick_params(labelsize=TICK_SIZE)

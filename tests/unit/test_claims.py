@@ -173,6 +173,10 @@ def test_claims_without_data_have_no_verdict() -> None:
     del results.scenes["homogeneous"]
     assert undecided(results) == [2, 3, 4, 6]
     del results.scenes["three_cubes"].methods["gabs"]
+    assert undecided(results) == [2, 3, 4, 6]
+    evidence = [line for _, verdict in judge_claims(results) if verdict for line in verdict.evidence]
+    assert not any("three_cubes" in line for line in evidence)
+    del results.scenes["two_cubes"].methods["gabs"]
     assert undecided(results) == list(range(1, 12))
     results = study()
     del results.scenes["three_cubes"], results.scenes["two_cubes"]

@@ -9,7 +9,7 @@ import pytest
 import torch
 from benchmark_accuracy import free_space_case, sphere_case
 from benchmark_peers import SETTINGS, reason
-from peer_report import OURS, Point, Refusal, front, requirements, settled, time_ratio, times, write_report
+from peer_report import OURS, Point, Refusal, requirements, settled, time_ratio, times, write_report
 from peer_scene import next_smooth, scene_grid, spread
 from peers.task import LOCK_IN_PERIODS, Answer, Task
 
@@ -118,11 +118,6 @@ def test_ratio_is_to_our_fastest_that_is_not_worse() -> None:
 def test_runs_stand_where_they_stay_in_the_steady_state() -> None:
     run = [point("jwave", 0.1, t, left) for t, left in ((1, 0.3), (2, 0.009), (3, 0.02), (4, 0.005), (5, 0))]
     assert [p.seconds for p in settled(run)] == [4]
-
-
-def test_front_has_no_point_that_another_beats() -> None:
-    points = [point("jwave", e, s) for s, e in ((1, 0.3), (2, 0.4), (3, 0.1), (3, 0.2), (4, 0.1))]
-    assert [(p.seconds, p.error) for p in front(points)] == [(1, 0.3), (3, 0.1)]
 
 
 def test_free_space_comes_first_and_settings_differ() -> None:

@@ -19,7 +19,17 @@ from small_scenes import scene_of_all_kinds, small_scene
 
 import autdtorch as at
 from autdtorch.drawing import clipped
-from autdtorch.plot import plot_convergence, plot_plane, plot_planes, plot_scene, plot_trials
+from autdtorch.plot import (
+    plot_convergence,
+    plot_pareto,
+    plot_plane,
+    plot_planes,
+    plot_scaling,
+    plot_scene,
+    plot_trials,
+)
+from autdtorch.plot.pareto import pareto_front
+from autdtorch.plot.style import looks_of
 
 PLANE = at.Plane(center=(80e-3, 50e-3, 40e-3), normal=(1, 0, 0), size=(60e-3, 40e-3))
 RANDOM = np.random.default_rng(7)
@@ -136,14 +146,27 @@ def test_plane_map_draws_into_given_axes() -> None:
     assert mesh_of(ax).get_array().shape == (2, 3)
 
 
+def test_a_level_is_told_from_the_peak_down_to_30_db() -> None:
+    figure = plot_plane(np.array([[2.0, 0.2], [0.0, 0.02]]), PLANE, decibels=True)
+    mesh = mesh_of(figure.axes[0])
+    np.testing.assert_allclose(mesh.get_array().T, [[0, -20], [-30, -30]], atol=1e-12)  # rounding
+    assert mesh.get_clim() == (-30, 0)
+    assert figure.axes[1].get_ylabel() == "level of |p| [dB], 0 dB = 2 Pa"
+
+
 def test_planes_of_a_scene_share_their_colour_scale() -> None:
     pressure = {
         "three_cubes": {"lssg": np.full((3, 2), 1.0), "gabs": np.full((3, 2), 4.0)},
         "empty": {"lssg": np.full((3, 2), 2.0)},
     }
     figure = plot_planes(pressure, dict.fromkeys(pressure, PLANE))
-    limits = {ax.get_title(): mesh_of(ax).get_clim() for ax in figure.axes if ax.get_title()}
-    assert limits == {"LSSG, three cubes": (0, 4), "GABS, three cubes": (0, 4), "LSSG, empty": (0, 2)}
+    (lssg, other), (gabs, empty) = np.reshape(
+        [ax for ax in figure.axes if ax.get_aspect() == 1 or not ax.axison], (2, 2)
+    )
+    assert [mesh_of(ax).get_clim() for ax in (lssg, gabs, other)] == [(0, 4), (0, 4), (0, 2)]
+    assert not empty.axison
+    assert [ax.get_title() for ax in (lssg, other)] == ["three cubes", "empty"]
+    assert [ax.texts[0].get_text() for ax in (lssg, gabs)] == ["LSSG", "GABS"]
     drawn = [ax for ax in maps(figure) if ax.axison]
     assert all(ax.get_xlabel() == "y [mm]" and ax.get_ylabel() == "z [mm]" for ax in drawn)
 
@@ -179,7 +202,7 @@ def test_a_method_has_one_colour_in_all_figures() -> None:
     assert len(set(colours.values())) == 3
 
 
-def test_convergence_draws_median_and_10_to_90_percent_band() -> None:
+def test_convergence_draws_median_and_quartile_band() -> None:
     history = np.maximum.accumulate(RANDOM.normal(size=(50, 30)) + 5, axis=1)
     figure = plot_convergence({"empty": {"gabs": history}, "two_cubes": {"gabs": history[:1]}})
     first, second = figure.axes
@@ -189,7 +212,7 @@ def test_convergence_draws_median_and_10_to_90_percent_band() -> None:
     (band,) = first.collections
     vertices = band.get_paths()[0].vertices
     for evaluation, low, high in zip(
-        line.get_xdata(), *np.percentile(history, [10, 90], axis=0), strict=True
+        line.get_xdata(), *np.percentile(history, [25, 75], axis=0), strict=True
     ):
         here = vertices[vertices[:, 0] == evaluation, 1]
         assert (here.min(), here.max()) == pytest.approx((low, high))
@@ -213,10 +236,49 @@ def test_levels_are_drawn_across_their_scene() -> None:
 METHODS = ("lssg", "bayes_opt", "gabs", "lss", "random_search", "identify", "gradient_ascent")
 
 
-def test_all_our_methods_have_colours_of_their_own() -> None:
-    figure = plot_convergence({"empty": {name: [[1.0, 2.0]] for name in METHODS}})
-    lines = figure.legends[0].get_lines()
-    assert len({line.get_color() for line in lines}) == len(METHODS) == len(lines)
+def test_methods_differ_in_colour_in_marker_and_in_dashes() -> None:
+    looks = looks_of([*METHODS, "a", "b", "c", "d"])
+    for part in zip(*looks.values(), strict=True):
+        assert len(set(part)) == len(looks)
+    assert len(set(looks_of(["a", "b", "c"]).values()) & set(looks_of(METHODS).values())) == 3
+
+
+def test_a_front_has_no_point_that_another_beats() -> None:
+    points = [(1, 0.3), (2, 0.4), (3, 0.1), (3, 0.2), (4, 0.1)]
+    assert pareto_front(points) == [0, 2]
+    assert pareto_front(points, higher_is_better=True) == [0, 1]
+
+
+def test_pareto_draws_the_front_of_all_as_steps_and_names_its_points() -> None:
+    points = {"a_b": {"gabs": [(1.0, 0.3), (2.0, 0.4)], "other": [(4.0, 0.1), (0.5, 0.9), (3.0, 0.5)]}}
+    names = {"a_b": {"gabs": ["g1", "g2"], "other": ["o1", "o2", "o3"]}}
+    figure = plot_pareto(points, "time [s]", "error [1]", names=names)
+    (ax,) = figure.axes
+    assert (ax.get_title(), ax.get_xlabel(), ax.get_ylabel()) == ("a b", "time [s]", "error [1]")
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+    assert [text.get_text() for text in ax.texts] == ["o2", "g1", "o1"]
+    (front,) = (line for line in ax.get_lines() if line.get_drawstyle() == "steps-post")
+    np.testing.assert_allclose(front.get_xydata(), [(0.5, 0.9), (1, 0.3), (4, 0.1), (ax.get_xlim()[1], 0.1)])
+
+
+def test_pareto_of_a_score_begins_at_0_and_costs_are_logarithmic() -> None:
+    points = {"a": {"gabs": [(1.0, 3.0)]}, "b": {"gabs": [(10.0, 5.0)]}}
+    figure = plot_pareto(points, "time [s]", "score [Pa]", higher_is_better=True)
+    for ax in figure.axes:
+        assert (ax.get_xscale(), ax.get_yscale()) == ("log", "linear")
+        assert ax.get_ylim()[0] == 0
+        assert ax.get_ylim()[1] >= 5
+
+
+def test_scaling_tells_slopes_and_marks_sizes() -> None:
+    sizes = np.array([1.0, 2.0, 4.0, 8.0])
+    square, flat = np.column_stack([sizes, 3 * sizes**2]), np.column_stack([sizes, sizes**0])
+    figure = plot_scaling({"time [s]": {"edge [mm]": {"box": square}, "foci": {"box": flat}}})
+    first, second = figure.axes
+    assert (first.get_xlabel(), second.get_xlabel(), first.get_ylabel()) == ("edge [mm]", "foci", "time [s]")
+    legends = [ax.get_legend().get_texts()[0].get_text() for ax in (first, second)]
+    assert legends == ["box, slope 2.0", "box, within a factor 1"]
+    assert list(first.get_xticks()) == pytest.approx(list(sizes))
 
 
 def test_nothing_is_cut_off_with_all_methods() -> None:
@@ -224,11 +286,14 @@ def test_nothing_is_cut_off_with_all_methods() -> None:
     values = {scene: {name: RANDOM.random(5) for name in METHODS} for scene in scenes}
     history = {scene: {name: np.ones((2, 256)) for name in METHODS} for scene in scenes}
     levels = {scene: {"bound": 4.0, "90 % of the bound": 3.6, "a third line": 3.0} for scene in scenes}
-    maps = {scene: {name: np.ones((3, 3)) for name in METHODS} for scene in scenes}
+    points = {scene: {name: 1 + RANDOM.random((4, 2)) for name in METHODS} for scene in scenes}
+    maps = {scene: {name: np.ones((3, 3)) for name in METHODS} for scene in scenes[:2]}
     for figure in (
-        plot_trials({"mean pressure of the foci [Pa]": values, "area a focus [mm²]": values}),
+        plot_trials({"mean pressure of the foci [Pa]": values, "area per focus [mm²]": values}),
         plot_convergence(history, levels),
-        plot_planes(maps, dict.fromkeys(scenes, PLANE)),
+        plot_planes(maps, dict.fromkeys(maps, PLANE)),
+        plot_pareto(points, "time of the search [s per trial]", "score / bound [%]", higher_is_better=True),
+        plot_scaling({"time [s]": {"edge of the domain [mm]\n(a note)": points["two_cubes"]}}),
     ):
         figure.draw_without_rendering()
         drawn = figure.get_tightbbox()
@@ -243,7 +308,14 @@ def test_nothing_is_cut_off_with_all_methods() -> None:
     ("call", "message"),
     [
         (lambda: plot_plane(np.ones(3), PLANE), r"pressure: shape \(3,\); must be \(Nu, Nv\)"),
+        (lambda: plot_plane(np.zeros((2, 2)), PLANE, decibels=True), "pressure: 0 Pa everywhere"),
         (lambda: plot_planes({}, {}), "pressure: scenes"),
+        (
+            lambda: plot_pareto({"a": {"b": [(1.0,)]}}, "", ""),
+            r"\['b'\]: shape \(1, 1\); must be \(points, 2",
+        ),
+        (lambda: plot_pareto({"a": {"b": [(0.0, 1.0)]}}, "", ""), "0; must be > 0"),
+        (lambda: plot_scaling({}), "costs: empty"),
         (lambda: plot_trials({}), "quantities: empty"),
         (
             lambda: plot_trials({"f [1]": {"empty": {"gabs": [[1.0]]}}}),

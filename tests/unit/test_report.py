@@ -1,9 +1,11 @@
 """The report holds every figure that it shows, and no number that is missing."""
 
+import base64
 import functools
 import re
 from dataclasses import replace
 from pathlib import Path
+from urllib.parse import unquote
 
 import pytest
 import torch
@@ -15,7 +17,8 @@ from autdtorch.optim.bound import focus_bound
 from autdtorch.optim.gabs import gabs
 from autdtorch.optim.lssg import lssg
 from autdtorch.plot import plot_convergence
-from autdtorch.report import finding_rows, write_report
+from autdtorch.report import HTML_FILE, write_report
+from autdtorch.report_tables import claims, finding_rows, findings
 from autdtorch.results import StudyResult, summary_rows
 from autdtorch.scene import Box, Scene
 from autdtorch.study import run_study
@@ -42,8 +45,12 @@ def without_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
     )
 
 
+def studied(scenes: dict[str, Scene], **settings: object) -> StudyResult:
+    return run_study(scenes, METHODS, solver={"method": "free_space"}, plane_spacing=2e-3, **settings)
+
+
 def reported(scenes: dict[str, Scene], folder: Path, **settings: object) -> tuple[StudyResult, str]:
-    results = run_study(scenes, METHODS, solver={"method": "free_space"}, plane_spacing=2e-3, **settings)
+    results = studied(scenes, **settings)
     path = write_report(results, scenes, folder, "autdtorch experiment=paper trials=3")
     assert path == folder / "report.md"
     return results, path.read_text(encoding="utf-8")
@@ -68,6 +75,7 @@ def test_all_figures_are_there_and_shown(tmp_path: Path) -> None:
         "fig2.png",
         "fig3abc.png",
         "fig3d.png",
+        "fig4.png",
     ]
     assert sorted(shown) == sorted(path.name for path in (tmp_path / "new").glob("*.png"))
     for name in shown:
@@ -83,11 +91,11 @@ def test_no_number_is_missing_and_the_tables_are_whole(tmp_path: Path) -> None:
     assert not re.search(r"\bnan\b|\binf\b|None|[{}]", report)
     for table in tables(report):
         assert len({len(row) for row in table}) == 1
-    _, summary, claims, beyond, simulation = tables(report)
+    _, summary, verdicts, beyond, simulation = tables(report)
     assert len(summary) == 2 + 2 * 3
     assert len(beyond) == 2 + 2 * (3 + 1)  # and the bound
-    assert [row[-1] for row in claims[2:]].count("no data") == 0
-    assert all(row[-1].startswith(("**reproduced**", "**not reproduced**")) for row in claims[2:])
+    assert [row[-1] for row in verdicts[2:]].count("no data") == 0
+    assert all(row[-1].startswith(("**reproduced**", "**not reproduced**")) for row in verdicts[2:])
     assert [row[0] for row in simulation[2:]] == ["homogeneous", "three_cubes"]
     provenance = results.provenance
     for text in (
@@ -101,8 +109,8 @@ def test_no_number_is_missing_and_the_tables_are_whole(tmp_path: Path) -> None:
     assert "Few of BO and GABS" in report
 
 
-def test_the_table_gives_the_mean_over_the_trials(tmp_path: Path) -> None:
-    results, _ = reported({"a": scene()}, tmp_path, trials=3)
+def test_the_table_gives_the_mean_over_the_trials() -> None:
+    results = studied({"a": scene()}, trials=3)
     head, lssg_row, _, gabs_row = summary_rows(results)
     metrics = results.scenes["a"].methods["gabs"].metrics
     assert head[2:5] == ["trials", "mean [Pa]", "weakest [Pa]"]
@@ -118,11 +126,11 @@ def with_bound(results: StudyResult, bound: float) -> StudyResult:
     return replace(results, scenes=scenes)
 
 
-def test_the_gap_to_the_bound_is_told_for_every_method(tmp_path: Path) -> None:
-    results, report = reported({"a": scene()}, tmp_path, trials=7)
+def test_the_gap_to_the_bound_is_told_for_every_method() -> None:
+    results = studied({"a": scene()}, trials=7)
     bound = focus_bound(results.scenes["a"].transfer_matrix)
     assert finding_rows(results)[1][:3] == ["a", "*bound*", f"{bound:.3g}"]
-    assert "semidefinite relaxation" in report
+    assert "semidefinite relaxation" in findings(results)
 
     solution = results.scenes["a"].methods["gabs"].solution
     median = float(solution.score.median())  # of seven trials, one of them
@@ -133,8 +141,8 @@ def test_the_gap_to_the_bound_is_told_for_every_method(tmp_path: Path) -> None:
     assert lssg_row[5] == "-"
 
 
-def test_a_median_of_evaluations_is_told_where_more_than_half_of_the_trials_got_there(tmp_path: Path) -> None:
-    results, _ = reported({"a": scene()}, tmp_path, trials=7)
+def test_a_median_of_evaluations_is_told_where_more_than_half_of_the_trials_got_there() -> None:
+    results = studied({"a": scene()}, trials=7)
     history = torch.ones(7, 5, dtype=torch.float64)
     for reaching, after, text in (
         (7, 3, "3"),
@@ -151,8 +159,8 @@ def test_a_median_of_evaluations_is_told_where_more_than_half_of_the_trials_got_
 
 
 def test_the_gradient_is_a_line_to_compare_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    results, report = reported({"a": scene()}, tmp_path, trials=2)
-    assert "no competitor" not in report
+    results = studied({"a": scene()}, trials=2)
+    assert "no competitor" not in findings(results)
     methods = results.scenes["a"].methods
     methods["gradient_ascent"] = methods.pop("lssg")
     score = float(methods["gradient_ascent"].solution.score)
@@ -178,12 +186,44 @@ def test_the_gradient_is_a_line_to_compare_with(tmp_path: Path, monkeypatch: pyt
 
 def test_a_scene_without_observation_plane_is_left_out_of_the_pictures_that_need_one(tmp_path: Path) -> None:
     _, report = reported({"plain": scene(plane=None)}, tmp_path)
-    assert figures(report) == ["fig1_plain.png", "fig3abc.png", "fig3d.png"]
+    assert figures(report) == ["fig1_plain.png", "fig3abc.png", "fig3d.png", "fig4.png"]
     assert not re.search(r"\bnan\b|\binf\b|None", report)
 
 
+def test_the_page_holds_the_same_and_needs_no_other_file(tmp_path: Path) -> None:
+    _, report = reported({"my_lab": scene()}, tmp_path, config="trials: 1\n")
+    page = (tmp_path / HTML_FILE).read_text(encoding="utf-8")
+    sources = re.findall(r'src="([^"]*)"', page)
+    assert len(sources) == len(figures(report)) == 5
+    for source, name in zip(sources, figures(report), strict=True):
+        kind, content = source.split(",")
+        assert kind == "data:image/png;base64"
+        assert base64.b64decode(content) == (tmp_path / unquote(name)).read_bytes()
+    assert not re.search(r"href=|url\(|<script|@import", page)
+    assert page.count('<div class="table"><table>') == len(tables(report))
+    for row in (cells for table in tables(report)[1:] for cells in table if cells[0] != "---"):
+        for cell in row:
+            assert re.sub(r"[*_]", "", cell) in re.sub(r"[*_]|</?(em|strong)>", "", page)
+    assert "trials: 1" in page
+
+
+def test_methods_may_differ_between_scenes_and_claims_without_data_are_no_table(tmp_path: Path) -> None:
+    scenes = {"lab": scene(obstacles=(CUBE,)), "other": scene(None), "third": scene()}
+    results = studied(scenes, trials=2)
+    lab, other, _ = (found.methods for found in results.scenes.values())
+    lab["my_method,levels=4"] = lab.pop("gabs")
+    lab["gradient_ascent"] = lab.pop("lssg")
+    for name in ("lssg", "gabs"):
+        other.pop(name)
+    assert "No data on the claims 2, 3, 4, 7 of 11." in claims(results)  # those of obstacles
+    del results.scenes["third"]
+    report = write_report(results, scenes, tmp_path, "autdtorch collect it").read_text("utf-8")
+    assert "No data: they are of LSSG, BO and GABS" in report
+    assert not re.search(r"\bnan\b|\binf\b|None|no data", report)
+
+
 def test_every_scene_of_the_results_must_be_given(tmp_path: Path) -> None:
-    results, _ = reported({"a": scene()}, tmp_path)
+    results = studied({"a": scene()})
     with pytest.raises(ValueError, match=r"scenes: none for \['a'\]"):
         write_report(results, {"b": scene()}, tmp_path, "")
 

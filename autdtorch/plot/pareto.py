@@ -1,0 +1,138 @@
+"""What results cost and how good they are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from autdtorch.drawing import Array
+from autdtorch.plot.style import (
+    TICK_SIZE,
+    ByMethod,
+    Look,
+    add_legend,
+    label_of,
+    log_axes,
+    looks_of,
+    methods_of,
+    new_panels,
+    numbers,
+    require_scenes,
+    styled,
+)
+from autdtorch.validation import ArrayLike
+
+_FRONT: dict[str, Any] = {"color": "0.8", "linewidth": 4.0, "solid_joinstyle": "miter", "zorder": 1.0}
+_PANEL = 2.6  # inch
+
+
+@styled
+def plot_pareto(
+    points: Mapping[str, ByMethod],
+    xlabel: str,
+    ylabel: str,
+    higher_is_better: bool = False,
+    names: Mapping[str, Mapping[str, Sequence[str]]] | None = None,
+) -> Figure:
+    """Cost and result of methods or programs, with the Pareto front, a panel for each scene.
+
+    Marked points that a line joins are the front of one method: no other point of its own is both cheaper
+    and better. The others of its points are small and pale. The broad grey line is the front of all methods
+    together, the best that can be had for a cost. Costs are on a logarithmic axis; so are errors, and scores
+    are on a linear one.
+
+    Args:
+        points: by scene and method, (N, 2): cost > 0, and error > 0 or score.
+        xlabel: what is paid, with its unit.
+        ylabel: what is had for it, with its unit.
+        higher_is_better: whether that is a score, not an error.
+        names: by scene and method, N names of the points; written at the front of all methods.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: no scene, points that are not (N, 2) finite numbers, or numbers <= 0 where only others
+            can be drawn.
+    """
+    require_scenes("points", points)
+    looks = looks_of(methods_of(points.values()))
+    figure, panels = new_panels(points, _PANEL, _PANEL, xlabel, ylabel, sharey=higher_is_better)
+    for ax, (scene, by_method) in zip(panels, points.items(), strict=True):
+        drawn = {
+            method: _points(f"points[{scene!r}][{method!r}]", given, higher_is_better)
+            for method, given in by_method.items()
+        }
+        for method, values in drawn.items():
+            _draw_points(ax, values, looks[method], higher_is_better)
+        everything = np.concatenate(list(drawn.values()))
+        best = pareto_front(everything, higher_is_better)
+        if names is not None:
+            texts = [text for method in drawn for text in names[scene][method]]
+            for index in best:
+                _write_beside(ax, everything[index], texts[index], higher_is_better)
+        ax.margins(0.15)
+        log_axes(ax, "x" if higher_is_better else "xy")
+        _draw_front(ax, everything[best])
+    if higher_is_better:  # once all panels are drawn, which share the axis
+        panels[0].set_ylim(bottom=min(0.0, panels[0].get_ylim()[0]))
+    handles = [
+        Line2D([], [], color=look.colour, marker=look.marker, markersize=5, label=label_of(method))
+        for method, look in looks.items()
+    ]
+    add_legend(figure, [*handles, Line2D([], [], label="front of all", **_FRONT)])
+    return figure
+
+
+def pareto_front(points: ArrayLike, higher_is_better: bool = False) -> list[int]:
+    """Which of the points no other one beats, by cost.
+
+    Args:
+        points: (N, 2): cost, and error or score.
+        higher_is_better: whether that is a score.
+
+    Returns:
+        Their indices; of points alike the first.
+    """
+    costs, results = numbers("points", points, "points", "2").T
+    worse = -results if higher_is_better else results
+    kept: list[int] = []
+    for index in np.lexsort((worse, costs)):
+        if not kept or worse[index] < worse[kept[-1]]:
+            kept.append(int(index))
+    return kept
+
+
+def _points(name: str, given: ArrayLike, higher_is_better: bool) -> Array:
+    values = numbers(name, given, "points", "2")
+    positive = values[:, 0] if higher_is_better else values
+    if positive.min() <= 0:
+        raise ValueError(f"{name}: {positive.min():g}; must be > 0 on a logarithmic axis")
+    return values
+
+
+def _draw_points(ax: Axes, points: Array, look: Look, higher_is_better: bool) -> None:
+    colour, marker, _ = look
+    front = pareto_front(points, higher_is_better)
+    beaten = np.delete(points, front, axis=0)
+    ax.plot(*beaten.T, color=colour, marker=marker, markersize=2.5, linewidth=0, alpha=0.35)
+    ax.plot(*points[front].T, color=colour, marker=marker, markersize=5, linewidth=1.2, clip_on=False)
+
+
+def _write_beside(ax: Axes, point: Array, text: str, higher_is_better: bool) -> None:
+    """On the side of the front where no point is."""
+    up, side = (3, "bottom") if higher_is_better else (-3, "top")
+    where: Any = {"xytext": (-4, up), "textcoords": "offset points", "ha": "right", "va": side}
+    ax.annotate(text, (point[0], point[1]), fontsize=TICK_SIZE, **where)
+
+
+def _draw_front(ax: Axes, front: Array) -> None:
+    """Steps to the edge of the panel: for a cost one has the best result that costs no more."""
+    right = ax.get_xlim()[1]
+    ends = np.vstack([front, (right, front[-1, 1])])
+    ax.step(*ends.T, where="post", scalex=False, scaley=False, **_FRONT)

@@ -1,0 +1,140 @@
+"""How costs grow."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, NullLocator
+
+from autdtorch.drawing import Array
+from autdtorch.plot.style import (
+    TICK_SIZE,
+    ByMethod,
+    Look,
+    label_of,
+    log_axes,
+    looks_of,
+    methods_of,
+    new_figure,
+    numbers,
+    require_scenes,
+    styled,
+)
+from autdtorch.validation import ArrayLike
+
+OVERHEAD = 2.0
+"""Costs from this many times the least one on are fitted: at most half of them is what costs always."""
+
+FEWEST = 3
+"""Points of a fit."""
+
+_TICKS_APART = 0.12  # at least, as a share of the axis
+
+
+@dataclass(frozen=True)
+class PowerLaw:
+    """Cost = factor * size^exponent, between the sizes that it was fitted to."""
+
+    exponent: float
+    factor: float
+    sizes: tuple[float, float]
+
+
+def fit_power(sizes: Sequence[float] | Array, costs: Sequence[float] | Array) -> PowerLaw | None:
+    """Least-squares line in logarithms through costs that are not constant overhead.
+
+    These are at least `OVERHEAD` times the least one; None if they are fewer than `FEWEST`.
+    """
+    chosen = [pair for pair in zip(sizes, costs, strict=True) if pair[1] >= OVERHEAD * min(costs)]
+    if len(chosen) < FEWEST:
+        return None
+    logarithms = np.log(np.array(chosen, dtype=np.float64))
+    exponent, logarithm = np.polyfit(logarithms[:, 0], logarithms[:, 1], 1)
+    return PowerLaw(float(exponent), float(np.exp(logarithm)), (float(chosen[0][0]), float(chosen[-1][0])))
+
+
+@styled
+def plot_scaling(costs: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
+    """Costs over sizes, both on logarithmic axes, with fitted powers; a row of panels for each cost.
+
+    The slope in the legend is the exponent of the broad pale line, a power of the size fitted to the costs
+    that are at least twice the least one, where there are three. Else it says how far the costs are apart.
+
+    Args:
+        costs: by label of the cost and label of the size (with units, for the axes), and method: (N, 2),
+            sizes and costs, all > 0.
+
+    Returns:
+        The figure.
+
+    Raises:
+        ValueError: no cost or size, or values that are not (N, 2) finite numbers > 0.
+    """
+    if not costs:
+        raise ValueError("costs: empty; must have at least one")
+    growths = methods_of(costs.values())
+    looks = looks_of(methods_of(scene for by_size in costs.values() for scene in by_size.values()))
+    figure = new_figure(0.6 + 2.5 * len(growths), 0.2 + 2.7 * len(costs))
+    panels = figure.subplots(len(costs), len(growths), squeeze=False, sharex="col", sharey="row")
+    for line, (label, by_size) in zip(panels, costs.items(), strict=True):
+        require_scenes(f"costs[{label!r}]", by_size)
+        for ax, growth in zip(line, growths, strict=True):
+            if growth not in by_size:
+                ax.set_axis_off()
+                continue
+            series = {
+                method: _series(f"costs[{label!r}][{growth!r}][{method!r}]", given)
+                for method, given in by_size[growth].items()
+            }
+            for method, values in series.items():
+                _draw_series(ax, label_of(method), values, looks[method])
+            _mark_sizes(ax, np.concatenate(list(series.values()))[:, 0])
+        line[0].set_ylabel(label)
+    for ax, growth in zip(panels[-1], growths, strict=True):
+        ax.set_xlabel(growth)
+    for line in panels:  # once all panels are drawn: those of a row share the axis
+        log_axes(line[0], "y")
+    return figure
+
+
+def _series(name: str, given: ArrayLike) -> Array:
+    values = numbers(name, given, "points", "2")
+    if values.min() <= 0:
+        raise ValueError(f"{name}: {values.min():g}; must be > 0 on logarithmic axes")
+    return values
+
+
+def _draw_series(ax: Axes, name: str, values: Array, look: Look) -> None:
+    sizes, costs = values.T
+    fit = fit_power(sizes, costs)
+    if fit is not None:
+        ends = np.array(fit.sizes)
+        ax.plot(ends, fit.factor * ends**fit.exponent, color=look.colour, linewidth=5, alpha=0.3)
+        name += f", slope {fit.exponent:.1f}".replace("-", "\N{MINUS SIGN}")
+    elif len(values) >= FEWEST:
+        name += f", within a factor {costs.max() / costs.min():.2g}"
+    ax.plot(
+        sizes, costs, color=look.colour, marker=look.marker, linestyle=look.dashes, ms=4, lw=1.2, label=name
+    )
+
+
+def _mark_sizes(ax: Axes, sizes: Array) -> None:
+    """Logarithmic axes, with ticks at the sizes themselves as far as there is place."""
+    log_axes(ax)
+    ax.set_xmargin(0.08)
+    logarithms = np.log(np.unique(sizes))
+    least = _TICKS_APART * np.ptp(logarithms)
+    kept: list[float] = []
+    for place in logarithms:
+        if not kept or place - kept[-1] >= least:
+            kept.append(place)
+    ax.xaxis.set_major_locator(FixedLocator(list(np.exp(kept))))
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.xaxis.set_major_formatter(lambda value, _: f"{value:.3g}")
+    ax.tick_params(labelsize=TICK_SIZE)
+    ax.grid(color="0.9", linewidth=0.6)
+    ax.legend(loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0)
