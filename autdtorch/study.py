@@ -256,7 +256,7 @@ def _plane_pressures(
         return {}, None
     # All drives in one call: the propagator then needs no more than one simulation a transducer.
     drives = torch.cat([solution.drive for solution in solutions.values()])
-    pressure = propagator.field(drives, points.reshape(-1, 3)).cpu().reshape(-1, *points.shape[:2])
+    pressure = propagator.field(drives, points).cpu()
     parts = torch.split(pressure, [len(solution.drive) for solution in solutions.values()])
     return dict(zip(solutions, parts, strict=True)), plane.size[0] * plane.size[1] / points[..., 0].numel()
 
