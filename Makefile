@@ -15,7 +15,7 @@ OVERRIDES = $(strip $(foreach name,$(filter-out PYTHON ARGS,$(.VARIABLES)),$(if 
 .PHONY: help paper test lint docs clean
 
 help:
-	@echo "make paper   run the paper's experiment and write outputs/paper/report.md"
+	@echo "make paper   run the paper's experiment and write outputs/paper/report.html"
 	@echo "             (make paper trials=5 changes a setting, as does ARGS='trials=5 seed=1')"
 	@echo "make test    run the tests (ARGS='-m unit' selects)"
 	@echo "make lint    ruff, mypy, import-linter"

@@ -207,9 +207,8 @@ def _collect(arguments: list[str]) -> None:
     folder = Path(arguments[0])
     sweep = collect_results(folder)
     save_summary(sweep.results, sweep.swept, folder / SUMMARY_FILE)
-    report = write_report(
-        sweep.results, sweep.scenes, folder, f"autdtorch collect {shlex.quote(arguments[0])}"
-    )
+    command = shlex.join(["autdtorch", "collect", *arguments])
+    report = write_report(sweep.results, sweep.scenes, folder, command)
     end = f"{sweep.studies} studies: the table is {folder / SUMMARY_FILE}, the report {report}"
     _print([*_table_lines(sweep.results), end])
 

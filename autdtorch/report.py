@@ -92,7 +92,7 @@ def write_report(
         command: the command line that repeats the study.
 
     Returns:
-        The path of `report.md`.
+        The path of `report.html`.
 
     Raises:
         OSError: the folder cannot be made or written.
@@ -117,10 +117,10 @@ def write_report(
         _origin(results),
     ]
     text = "\n\n".join(part for part in parts if part) + "\n"
-    report = folder / REPORT_FILE
-    report.write_text(text, encoding="utf-8")
-    (folder / HTML_FILE).write_text(as_page(text, folder), encoding="utf-8")
-    return report
+    (folder / REPORT_FILE).write_text(text, encoding="utf-8")
+    page = folder / HTML_FILE
+    page.write_text(as_page(text, folder), encoding="utf-8")
+    return page
 
 
 def _by_method(results: StudyResult) -> dict[str, dict[str, MethodResult]]:
@@ -237,13 +237,13 @@ def _metric(
 def _cost_figure(results: StudyResult, folder: Path) -> str:
     points = {
         scene: {
-            name: [(float(method.seconds.mean()), 100 * (1 - find(method, found.bound).gap.value))]
+            name: [(float(method.seconds.median()), 100 * (1 - find(method, found.bound).gap.value))]
             for name, method in _competitors(found.methods).items()
         }
         for scene, found in results.scenes.items()
     }
     figure = plot_pareto(
-        points, "time of the search [s per trial]", "score / bound [%]", higher_is_better=True
+        points, "median time of the search [s per trial]", "score / bound [%]", higher_is_better=True
     )
     figure.savefig(folder / "fig4.png")
     return _FIG4

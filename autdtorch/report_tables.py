@@ -35,8 +35,8 @@ fewer than {FEWEST_TRIALS} trials, which have no interval. Every interval is of 
 _NO_CLAIM = """No data: they are of LSSG, BO and GABS, each in the same scenes without and with obstacles."""
 
 _BELOW_FINDINGS = f"""*Score*: pressure of the weakest focus, its median over the trials, in brackets with its
-95 % confidence interval (bootstrap; none for fewer than {FEWEST_TRIALS} trials). *s per trial*: mean time of
-the search alone, without simulation."""
+95 % confidence interval (bootstrap; none for fewer than {FEWEST_TRIALS} trials). *s per trial*: median time
+of the search alone, without simulation."""
 
 _ABOUT_BOUND = f"""*Bound*: certified upper bound on the score of any drive with amplitudes up to 1, by the
 semidefinite relaxation. No method can be better, and the best drive may lie below it. *Gap*: 1 - score/bound.
@@ -70,7 +70,7 @@ def _finding_cells(name: str, method: MethodResult, bound: float) -> list[str]:
     near = _median_of_reached(finding.evaluations_near)
     if name == BASELINE:
         evaluations = near = _NO_NUMBER
-    return [str(finding.score), gap, evaluations, near, f"{method.seconds.mean():.2g}"]
+    return [str(finding.score), gap, evaluations, near, f"{method.seconds.median():.2g}"]
 
 
 def _median_of_reached(evaluations: torch.Tensor) -> str:

@@ -24,7 +24,7 @@ _COLUMNS: dict[str, Callable[[MethodResult, float], float | None]] = {
         None if method.metrics.area is None else float(method.metrics.area.mean())
     ),
     "evaluations": lambda method, _: float(method.solution.evaluations.double().mean()),
-    "seconds a trial": lambda method, _: float(method.seconds.mean()),
+    "median seconds a trial": lambda method, _: float(method.seconds.median()),
 }
 
 

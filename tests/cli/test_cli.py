@@ -247,7 +247,7 @@ def test_an_experiment_ends_with_its_report(
     )
     assert run(*command, "solver.method=free_space") == 0
     captured = capsys.readouterr()
-    assert captured.out.splitlines()[-1] == f"The report is {Path('outputs', 'paper', 'report.md')}"
+    assert captured.out.splitlines()[-1] == f"The report is {Path('outputs', 'paper', 'report.html')}"
     results = load_results(tmp_path / "outputs" / "paper")
     assert list(results.scenes) == ["homogeneous", "three_cubes"]
     assert [method.trials for method in results.scenes["three_cubes"].methods.values()] == [1, 2, 2, 2]

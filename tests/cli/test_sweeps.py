@@ -107,7 +107,7 @@ def test_collected_seeds_are_trials_and_other_settings_make_names(
     assert run("collect", "multirun") == 0
     output = capsys.readouterr().out.splitlines()
     assert output[-1].startswith(
-        "6 studies: the table is multirun/summary.csv, the report multirun/report.md"
+        "6 studies: the table is multirun/summary.csv, the report multirun/report.html"
     )
     sweep = collect_results(tmp_path)
     methods = sweep.results.scenes["homogeneous"].methods

@@ -52,8 +52,8 @@ def studied(scenes: dict[str, Scene], **settings: object) -> StudyResult:
 def reported(scenes: dict[str, Scene], folder: Path, **settings: object) -> tuple[StudyResult, str]:
     results = studied(scenes, **settings)
     path = write_report(results, scenes, folder, "autdtorch experiment=paper trials=3")
-    assert path == folder / "report.md"
-    return results, path.read_text(encoding="utf-8")
+    assert path == folder / "report.html"
+    return results, (folder / "report.md").read_text(encoding="utf-8")
 
 
 def figures(report: str) -> list[str]:
