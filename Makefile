@@ -12,13 +12,14 @@ OVERRIDES = $(strip $(foreach name,$(filter-out PYTHON ARGS,$(.VARIABLES)),$(if 
 	$(findstring command line,$(origin $(name))),'$(name)=$($(name))')) $(ARGS))
 
 .DEFAULT_GOAL := help
-.PHONY: help paper test lint clean
+.PHONY: help paper test lint docs clean
 
 help:
 	@echo "make paper   run the paper's experiment and write outputs/paper/report.md"
 	@echo "             (make paper trials=5 changes a setting, as does ARGS='trials=5 seed=1')"
 	@echo "make test    run the tests (ARGS='-m unit' selects)"
 	@echo "make lint    ruff, mypy, import-linter"
+	@echo "make docs    build the documentation in outputs/docs, executing its notebooks"
 	@echo "make clean   remove .venv and the tools' caches; outputs/ stays"
 	@echo "PYTHON=python3.12 chooses the interpreter that .venv is made with."
 
@@ -32,12 +33,15 @@ paper: $(INSTALLED)
 	$(BIN)/autdtorch experiment=paper $(OVERRIDES)
 
 test: $(INSTALLED)
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n auto --maxprocesses 8 --dist worksteal $(ARGS)
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+docs: $(INSTALLED)
+	$(BIN)/python -m sphinx -W --keep-going -d outputs/.doctrees docs outputs/docs
 
 clean:
 	rm -rf $(VENV) build dist .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache

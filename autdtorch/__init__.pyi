@@ -1,12 +1,17 @@
-from . import reference
+from . import hardware, reference
 from .array import PAPER_SOURCE_STRENGTH, TransducerArray
+from .array_file import load_array
+from .collect import Sweep, collect_results
 from .conditions import Dead, Drift, Noise, Quantised, true_pressure
 from .drive import amplitudes_of, drive_from_phases, focus_phases, phases_of
+from .drive_file import load_drive, save_drive
+from .field_file import save_field
 from .freespace import green
 from .geometry import Plane, circle_points
 from .metrics import FocusMetrics, focus_metrics
 from .objective import Objective, SimulatedObjective, weakest_focus
 from .obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
+from .openmpd_board import OpenMPDBoard
 from .optim.base import Solution
 from .optim.bayes import bayes_opt
 from .optim.bound import focus_bound
@@ -24,11 +29,17 @@ from .plot import (
     plot_scene,
     plot_trials,
 )
-from .propagator import SteadyStateWarning, cell_centers, differentiable_field, make_propagator
+from .propagator import (
+    SteadyStateWarning,
+    cell_centers,
+    differentiable_field,
+    make_propagator,
+    volume_field,
+)
 from .results import load_results
 from .scene import Medium, OverlapWarning, Scene
 from .scene_file import load_scene
-from .view3d import view3d
+from .view3d import animate3d, view3d
 
 __all__ = [
     "PAPER_SOURCE_STRENGTH",
@@ -42,6 +53,7 @@ __all__ = [
     "Noise",
     "Objective",
     "Obstacle",
+    "OpenMPDBoard",
     "OverlapWarning",
     "Plane",
     "Quantised",
@@ -50,12 +62,15 @@ __all__ = [
     "Solution",
     "Sphere",
     "SteadyStateWarning",
+    "Sweep",
     "TransducerArray",
     "VoxelMask",
     "amplitudes_of",
+    "animate3d",
     "bayes_opt",
     "cell_centers",
     "circle_points",
+    "collect_results",
     "differentiable_field",
     "drive_from_phases",
     "focus_bound",
@@ -64,7 +79,10 @@ __all__ = [
     "gabs",
     "gradient_ascent",
     "green",
+    "hardware",
     "identify",
+    "load_array",
+    "load_drive",
     "load_results",
     "load_scene",
     "lss",
@@ -80,8 +98,11 @@ __all__ = [
     "plot_trials",
     "random_search",
     "reference",
+    "save_drive",
+    "save_field",
     "true_pressure",
     "view3d",
+    "volume_field",
     "weakest_focus",
 ]
 

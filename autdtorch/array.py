@@ -9,7 +9,16 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from autdtorch.geometry import plane_basis
+from autdtorch.device_layouts import (
+    AUTD3_SOURCE_STRENGTH,
+    OPENMPD_SOURCE_STRENGTH,
+    SONICSURFACE_SOURCE_STRENGTH,
+    TRANSDUCER_RADIUS,
+    autd3_places,
+    openmpd_places,
+    sonicsurface_places,
+)
+from autdtorch.geometry import in_plane, plane_basis
 from autdtorch.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
@@ -122,9 +131,87 @@ class TransducerArray:
         positions = middle + along_u[:, None, None] * u + along_v[None, :, None] * v
         return cls(positions.reshape(-1, 3), normal, source_strength, radius)
 
+    @classmethod
+    def autd3(
+        cls,
+        center: ArrayLike,
+        normal: ArrayLike = (1.0, 0.0, 0.0),
+        angle: float = 0.0,
+        units: tuple[int, int] = (1, 1),
+        source_strength: float = AUTD3_SOURCE_STRENGTH,
+        radius: float | None = TRANSDUCER_RADIUS,
+    ) -> TransducerArray:
+        """AUTD3: 249 transducers a unit, in the order of the device, unit by unit.
+
+        Args:
+            center: middle of the 18 x 14 places of a unit, of several units the middle of all (3,) [m].
+            normal: direction of emission (3,), the device's z.
+            angle: of the device's x from u towards v [rad], (u, v) being `plane_basis(normal)`.
+            units: numbers of units side by side along the device's x and y; unit i * units[1] + j is the
+                i-th along x and the j-th along y.
+            source_strength: [Pa m], > 0; by default as the AUTD3 SDK assumes.
+            radius: of the discs [m]; None or 0 for point sources.
+
+        Raises:
+            ValueError: an argument is not finite, has the wrong shape or is out of range.
+        """
+        count_x, count_y = positive_integers("units", units, 2)
+        positions = in_plane(autd3_places((count_x, count_y)), center, normal, angle)
+        return cls(positions, normal, source_strength, radius)
+
+    @classmethod
+    def sonicsurface(
+        cls,
+        center: ArrayLike,
+        normal: ArrayLike = (1.0, 0.0, 0.0),
+        angle: float = 0.0,
+        source_strength: float = SONICSURFACE_SOURCE_STRENGTH,
+        radius: float | None = TRANSDUCER_RADIUS,
+    ) -> TransducerArray:
+        """SonicSurface: 16 x 16 transducers row by row, from the largest y down, x the fastest.
+
+        Its firmware wants them by channel: that is done where the bytes are made.
+
+        Args:
+            center: middle of the transducers (3,) [m].
+            normal: direction of emission (3,).
+            angle: of the device's x from u towards v [rad], (u, v) being `plane_basis(normal)`.
+            source_strength: [Pa m], > 0; by default as Ultraino assumes.
+            radius: of the discs [m]; None or 0 for point sources.
+
+        Raises:
+            ValueError: an argument is not finite, has the wrong shape or is out of range.
+        """
+        return cls(in_plane(sonicsurface_places(), center, normal, angle), normal, source_strength, radius)
+
+    @classmethod
+    def openmpd(
+        cls,
+        center: ArrayLike,
+        normal: ArrayLike = (1.0, 0.0, 0.0),
+        angle: float = 0.0,
+        source_strength: float = OPENMPD_SOURCE_STRENGTH,
+        radius: float | None = TRANSDUCER_RADIUS,
+    ) -> TransducerArray:
+        """A board of OpenMPD: 16 x 16 transducers column by column, each from the largest y down.
+
+        These are the nominal positions; `OpenMPDBoard.load` reads those of one board, with its calibration.
+
+        Args:
+            center: middle of the transducers (3,) [m].
+            normal: direction of emission (3,), the device's z.
+            angle: of the device's x from u towards v [rad], (u, v) being `plane_basis(normal)`.
+            source_strength: [Pa m], > 0; by default as AcousTools assumes.
+            radius: of the discs [m]; None or 0 for point sources.
+
+        Raises:
+            ValueError: an argument is not finite, has the wrong shape or is out of range.
+        """
+        return cls(in_plane(openmpd_places(), center, normal, angle), normal, source_strength, radius)
+
     @property
     def nodes(self) -> Nodes:
-        """The monopoles of each transducer: the point itself, or 80 of its disc.
+        """The monopoles of each transducer, the point itself or 80 of its disc.
 
         On a disc of radius a they are 5 rings, Gauss points in r^2, of 16 equal angles, each turned by half a
         step against the next (Peirce, J. SIAM 5 (1957) 66-73). For k a <= 6 the field is right to 1e-6 far

@@ -1,4 +1,4 @@
-"""The command line: ``autdtorch scene=three_cubes method=gabs``, ``autdtorch experiment=paper``.
+"""The command line: ``autdtorch scene=three_cubes method=gabs``, ``autdtorch collect multirun``.
 
 The only module that knows Hydra, which reads the settings from ``configs/`` and from the command line. What
 takes seconds to import is imported when a study starts, so that help is quick.
@@ -7,11 +7,14 @@ takes seconds to import is imported when a study starts, so that help is quick.
 from __future__ import annotations
 
 import functools
+import hashlib
 import inspect
+import logging
 import os
 import re
 import shlex
 import sys
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
@@ -20,12 +23,15 @@ import hydra
 import hydra.utils
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 if TYPE_CHECKING:
     from autdtorch.results import StudyResult
     from autdtorch.scene import Scene
+
+logger = logging.getLogger(__name__)
 
 Method: TypeAlias = "functools.partial[Any]"
 
@@ -37,6 +43,15 @@ _INTERRUPTED = 130  # as a shell reports a process that SIGINT ended
 _NO_METHOD_SETTINGS = ("objective", "trials", "seed", "score")  # the first three are the study's to give
 _FULL_ERROR = "HYDRA_FULL_ERROR"
 _SETTINGS = ("scene", "method", "scenes", "methods", "solver", "trials", "seed", "plane_spacing", "output")
+
+_LONGEST_NAME = 150  # of a job's folder; file systems allow 255 bytes
+
+_NO_SLURM = 'Could not detect "srun"'  # submitit, where it is to hand jobs to a Slurm that is not there
+
+_COLLECT_HELP = """autdtorch collect FOLDER
+
+Merges the finished studies in a folder and below it, such as those of a sweep in multirun, into one table
+(summary.csv) and one report (report.md, report.html), which are written there."""
 
 _HERE = Path(__file__).parent
 # A wheel carries the configs inside the package, a checkout beside it.
@@ -51,6 +66,10 @@ class _Refusal(BaseException):
         self.cause = cause
 
 
+class _FailedJob(Exception):
+    """Tells Hydra that a job of a sweep failed; the log says why."""
+
+
 def main() -> None:
     """Run the command line.
 
@@ -60,13 +79,23 @@ def main() -> None:
     """
     wanted = os.environ.get(_FULL_ERROR)
     os.environ[_FULL_ERROR] = "1"  # has Hydra pass exceptions on, where it would print them in its own way
+    error: Exception
     try:
-        _run()
+        if sys.argv[1:2] == ["collect"]:
+            _collect(sys.argv[2:])
+        else:
+            _run()
+            if {"-m", "--multirun"} & set(sys.argv[1:]):
+                print("autdtorch collect merges the results of a sweep into one table and one report")
     except KeyboardInterrupt:
         _stop(_INTERRUPTED, "interrupted; finished trials are kept, and the same command goes on after them")
     except _Refusal as refusal:
         error = refusal.cause
-    except _REFUSALS as refused:
+    except (_FailedJob, *_REFUSALS) as refused:
+        error = refused
+    except RuntimeError as refused:
+        if _NO_SLURM not in str(refused):
+            raise
         error = refused
     else:
         return
@@ -95,25 +124,60 @@ def _in_one_line(error: Exception) -> str:
     # Hydra would advise to add the key, which we would then refuse.
     if unknown := re.match(r"Could not override '(.+)'", text):
         return f"{unknown[1]}: unknown key; autdtorch --help lists the settings"
+    if "missing EQUAL" in text and (word := re.search(r"'(.*?)'", text)):
+        return f"{word[1]}: must be key=value, such as scene=three_cubes; autdtorch --help lists the settings"
     lines = [line.strip() for line in text.splitlines()]
     return "; ".join(line for line in lines if line and not line.startswith("See https://"))
 
 
 @hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name="config")
 def _run(config: DictConfig) -> None:
+    job = HydraConfig.get()
+    swept = job.mode == RunMode.MULTIRUN
+    if swept:
+        logger.info("job %s: %s", job.job.num, ", ".join(job.overrides.task))
     try:
-        _study(config)
+        with warnings.catch_warnings():
+            warnings.showwarning = lambda message, *_: logger.warning("%s", message)  # without our source
+            _study(config, Path(job.sweep.dir) if swept else None)
     except _REFUSALS as error:
-        raise _Refusal(error) from error
+        if not swept:
+            raise _Refusal(error) from error
+        # The other jobs go on.
+        logger.error("job %s failed: %s", job.job.num, _in_one_line(error))
+        raise _FailedJob(
+            "a job failed, as the log says; the same command repeats what is not finished"
+        ) from error
 
 
-def _study(config: DictConfig) -> None:
+def _job_folder(overrides: str) -> str:
+    """Name of the folder of a sweep's job, short and without characters that folders cannot have."""
+    name = re.sub(r"[^\w.,=+-]", "_", overrides) or "job"
+    if len(name) <= _LONGEST_NAME:
+        return name
+    digest = hashlib.sha256(overrides.encode()).hexdigest()[:12]
+    return f"{name[: _LONGEST_NAME - len(digest) - 1]}-{digest}"
+
+
+OmegaConf.register_new_resolver("job_folder", _job_folder, replace=True)
+
+
+def _study(config: DictConfig, sweep: Path | None) -> None:
+    """Run a study; `sweep` is the folder of the sweep that it is a job of."""
+    from autdtorch.propagator import CACHE_VARIABLE
     from autdtorch.study import run_study
 
     settings: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     _require_known("settings", settings, _SETTINGS)
     folder = Path(HydraConfig.get().runtime.output_dir)
     solver = _solver(settings)
+    if sweep is not None:
+        if any(override.startswith("output=") for override in HydraConfig.get().overrides.task):
+            raise ValueError(
+                f"output: {settings['output']}; a sweep has a folder for each job in hydra.sweep.dir"
+            )
+        if solver.get("cache") is None and CACHE_VARIABLE not in os.environ:
+            solver["cache"] = sweep / "matrices"  # jobs in the same scene share them
     del settings["output"]  # it is Hydra's folder by now, and changes no result
     settings["solver"] = {key: value for key, value in solver.items() if key != "cache"}  # nor does that
     single = "scenes" not in settings
@@ -127,6 +191,27 @@ def _study(config: DictConfig) -> None:
         config=_as_text(settings, scenes),
     )
     _show(results, scenes, folder, single)
+
+
+def _collect(arguments: list[str]) -> None:
+    from autdtorch.collect import collect_results
+    from autdtorch.report import write_report
+    from autdtorch.summary import SUMMARY_FILE, save_summary
+
+    if {"-h", "--help"} & set(arguments):
+        print(_COLLECT_HELP)
+        return
+    if len(arguments) != 1 or arguments[0].startswith("-"):
+        raise ValueError(f"collect: {shlex.join(arguments)!r}; must be one folder, such as multirun")
+    logging.basicConfig(format="%(message)s")
+    folder = Path(arguments[0])
+    sweep = collect_results(folder)
+    save_summary(sweep.results, sweep.swept, folder / SUMMARY_FILE)
+    report = write_report(
+        sweep.results, sweep.scenes, folder, f"autdtorch collect {shlex.quote(arguments[0])}"
+    )
+    end = f"{sweep.studies} studies: the table is {folder / SUMMARY_FILE}, the report {report}"
+    _print([*_table_lines(sweep.results), end])
 
 
 def _single(settings: Mapping[str, Any]) -> tuple[dict[str, Scene], dict[str, Method]]:
@@ -178,6 +263,8 @@ def _solver(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 def _method(where: str, section: Any) -> Method:
     """The optimiser that a section names by `_target_`, with the section's settings."""
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # where a method of one's own is looked for, behind what is installed
     method = hydra.utils.instantiate(section, _partial_=True)
     if not isinstance(method, functools.partial):
         raise ValueError(f"{where}: no _target_; must name a function such as autdtorch.gabs")
@@ -206,17 +293,13 @@ def _show(results: StudyResult, scenes: Mapping[str, Scene], folder: Path, singl
     """Print the results' table; draw the plane of a single run, write the report of an experiment."""
     from autdtorch.plot import plot_plane
     from autdtorch.report import write_report
-    from autdtorch.report_tables import summary_rows
 
-    rows = summary_rows(results)
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    for row in rows:
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    lines = _table_lines(results)
     # A relative path is shorter, and the same on every machine.
     shown = Path(os.path.relpath(folder))
     if not single:
         report = write_report(results, scenes, folder, shlex.join(["autdtorch", *sys.argv[1:]]))
-        print(f"The report is {shown / report.name}")
+        _print([*lines, f"The report is {shown / report.name}"])
         return
     (scene,) = scenes.values()
     (result,) = results.scenes.values()
@@ -226,4 +309,20 @@ def _show(results: StudyResult, scenes: Mapping[str, Scene], folder: Path, singl
             method.plane_pressure, scene.observation_plane, scene.control_points, scene.obstacles
         )
         figure.savefig(folder / PLANE_FILE)
-    print(f"The results are in {shown}")
+    _print([*lines, f"The results are in {shown}"])
+
+
+def _table_lines(results: StudyResult) -> list[str]:
+    from autdtorch.results import summary_rows
+
+    rows = summary_rows(results)
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    return [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    ]
+
+
+def _print(lines: list[str]) -> None:
+    """Print at once, so that jobs of a sweep do not come between each other's lines."""
+    sys.stdout.write("".join(f"{line}\n" for line in lines))
+    sys.stdout.flush()

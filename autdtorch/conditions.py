@@ -41,6 +41,10 @@ class Condition:
         self.scene = objective.scene
         self.evaluations = 0
 
+    def __repr__(self) -> str:
+        """What is wrapped, from the outside inwards."""
+        return f"{type(self).__name__}({self.inner!r}, {self.evaluations} evaluations)"
+
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
         """Observe drives (B, M) under the condition: pressure magnitudes (B, P) [Pa].
 
@@ -201,7 +205,7 @@ class Noise(Condition):
         """
         level = finite_number("snr", snr, "dB")
         self.reads = integer_at_least("reads", reads, 1)
-        reference = _random_rms(objective) if reference is None else positive("reference", reference, "Pa")
+        reference = _innermost_rms(objective) if reference is None else positive("reference", reference, "Pa")
         self.sigma = reference * 10 ** (-level / 20)
         self._generator = _generator(seed, "Noise")
         super().__init__(objective)
@@ -239,13 +243,18 @@ def playable(objective: Objective, drive: torch.Tensor) -> torch.Tensor:
     return drive
 
 
-def _random_rms(objective: Objective) -> float:
+def random_rms(matrix: torch.Tensor) -> float:
+    """Rms pressure [Pa] over control points and random phases, all transducers on, of a matrix (P, M)."""
+    return math.sqrt(float(matrix.abs().square().sum(dim=1).mean()))
+
+
+def _innermost_rms(objective: Objective) -> float:
     while isinstance(objective, Condition):
         objective = objective.inner
     matrix = objective.transfer_matrix if isinstance(objective, SimulatedObjective) else None
     if matrix is None:
         raise invalid("reference", None, "must be given where the objective has no transfer matrix", "Pa")
-    return math.sqrt(float(matrix.abs().square().sum(dim=1).mean()))
+    return random_rms(matrix)
 
 
 def _generator(seed: int, kind: str) -> np.random.Generator:

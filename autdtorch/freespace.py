@@ -56,7 +56,7 @@ def free_space_matrix(points: ArrayLike, array: TransducerArray, wavenumber: com
         wavenumber: k [rad/m], > 0, or k + i alpha with an attenuation alpha >= 0 [Np/m].
 
     Returns:
-        complex128 (P, M): pressure [Pa] per unit drive.
+        complex128 (P, M), pressure [Pa] per unit drive.
 
     Raises:
         ValueError: not finite, wrong shape, k <= 0, alpha < 0, or a point on a node of a transducer.

@@ -15,6 +15,7 @@ from autdtorch.validation import (
     integer_at_least,
     positive,
     positive_entries,
+    real_tensor,
     unit_vector,
 )
 
@@ -42,6 +43,41 @@ def plane_basis(normal: ArrayLike) -> tuple[torch.Tensor, torch.Tensor]:
     v = torch.linalg.cross(n, u)
     # Adding 0 turns -0 into 0, which would otherwise show in every printed point.
     return u + 0.0, v + 0.0
+
+
+def in_plane(places: ArrayLike, center: ArrayLike, normal: ArrayLike, angle: float = 0.0) -> torch.Tensor:
+    """Places of a flat device, given along its own x and y, in the plane through `center`.
+
+    Args:
+        places: (M, 2) [m], or (M, 3) with heights along `normal`.
+        center: where the device's origin goes (3,) [m].
+        normal: where its z axis points (3,).
+        angle: of its x axis from u towards v [rad], (u, v) being `plane_basis(normal)`.
+
+    Returns:
+        Points (M, 3) [m], float64.
+
+    Raises:
+        ValueError: an argument is not finite or has the wrong shape.
+    """
+    local = real_tensor("places", places, "m").detach().cpu()
+    if local.ndim != 2 or local.shape[1] not in (2, 3):
+        raise ValueError(f"places: shape {tuple(local.shape)}; must be (M, 2) or (M, 3)")
+    origin = torch.tensor(finite_vector("center", center), dtype=torch.float64)
+    return origin + local @ device_axes(normal, angle)[: local.shape[1]]
+
+
+def device_axes(normal: ArrayLike, angle: float = 0.0) -> torch.Tensor:
+    """Axes x, y and z (3, 3), one a row, of a device that faces `normal` and is turned by `angle` [rad].
+
+    Raises:
+        ValueError: `normal` is not three finite numbers, or is zero; `angle` is not finite.
+    """
+    turn = finite_number("angle", angle, "rad")
+    u, v = plane_basis(normal)
+    x = math.cos(turn) * u + math.sin(turn) * v
+    y = math.cos(turn) * v - math.sin(turn) * u
+    return torch.stack((x, y, torch.tensor(unit_vector("normal", normal), dtype=torch.float64)))
 
 
 def rotation_matrix(rotation: Vector) -> torch.Tensor:

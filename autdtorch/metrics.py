@@ -12,14 +12,14 @@ from autdtorch.validation import ArrayLike, positive, real_tensor
 
 @dataclass(frozen=True, eq=False)
 class FocusMetrics:
-    """Figures of merit of the foci, each of the leading shape (...) of the pressure they were computed from.
+    """Figures of merit of the foci; (...) is the leading shape of the pressure they were computed from.
 
     Attributes:
-        mean: mean pressure of the foci [Pa] (Fig. 3a).
-        min: pressure of the weakest focus [Pa].
-        std: standard deviation among the foci [Pa], of the population (Fig. 3c).
-        uniformity: 1 - (max - min) / (max + min), from 0 to 1; 1 where all foci are equal.
-        area: area a focus [m^2] (Fig. 3b), or None where no plane was given.
+        mean: mean pressure (...) of the foci [Pa] (Fig. 3a).
+        min: pressure (...) of the weakest focus [Pa].
+        std: standard deviation (...) among the foci [Pa], of the population (Fig. 3c).
+        uniformity: (...), 1 - (max - min) / (max + min), from 0 to 1; 1 where all foci are equal.
+        area: area (...) a focus [m^2] (Fig. 3b), or None where no plane was given.
     """
 
     mean: torch.Tensor
@@ -27,6 +27,15 @@ class FocusMetrics:
     std: torch.Tensor
     uniformity: torch.Tensor
     area: torch.Tensor | None
+
+    def __repr__(self) -> str:
+        """The medians, with units."""
+        area = "none" if self.area is None else f"{1e6 * _median(self.area):.4g} mm²"
+        return (
+            f"FocusMetrics(mean {_median(self.mean):.4g} Pa, min {_median(self.min):.4g} Pa, "
+            f"std {_median(self.std):.4g} Pa, uniformity {_median(self.uniformity):.3g}, area {area}; "
+            f"medians of {self.mean.numel()})"
+        )
 
 
 def focus_metrics(
@@ -75,6 +84,10 @@ def _area_per_focus(
         raise ValueError(f"plane_pressure: shape {tuple(plane.shape)}; must be ({expected}), like pressure")
     threshold = pressure.mean(dim=-1)[..., None, None] / math.sqrt(2)
     return (plane >= threshold).sum(dim=(-2, -1)) * cell_area / pressure.shape[-1]
+
+
+def _median(values: torch.Tensor) -> float:
+    return float(values.double().quantile(0.5)) if values.numel() else math.nan
 
 
 def _magnitudes(name: str, value: ArrayLike, axes: int) -> torch.Tensor:

@@ -42,7 +42,7 @@ class SimulatedObjective:
     Attributes:
         scene: its array plays the drives, its control points are observed.
         evaluations: number of observations so far.
-        transfer_matrix: G (P, M), complex128; None in mode "replay". Not for black-box methods.
+        transfer_matrix: G (P, M) [Pa], complex128; None in mode "replay". Not for black-box methods.
     """
 
     scene: Scene
@@ -73,6 +73,11 @@ class SimulatedObjective:
         self.transfer_matrix = None
         if mode == "transfer":
             self.transfer_matrix = propagator.transfer_matrix().to("cpu", torch.complex128)
+
+    def __repr__(self) -> str:
+        """Scene, mode and evaluations so far."""
+        mode = "replay" if self.transfer_matrix is None else "transfer"
+        return f"SimulatedObjective(scene {self.scene.name!r}, mode {mode!r}, {self.evaluations} evaluations)"
 
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
         """Observe the control points under each of several drives.
@@ -122,5 +127,5 @@ def validate_drives(drive: torch.Tensor, transducers: int) -> torch.Tensor:
 
 
 def weakest_focus(pressure: torch.Tensor) -> torch.Tensor:
-    """Pressure (...) [Pa] of the weakest of the foci (..., P): the paper's objective, f = min(p_n)."""
+    """The weakest (...) [Pa] of the foci of a `pressure` (..., P): the paper's objective, f = min(p_n)."""
     return pressure.amin(dim=-1)

@@ -1,9 +1,10 @@
-"""Progress of long work: a bar on a terminal, beside the log; elsewhere the log alone."""
+"""Progress of long work: a bar on a terminal, beside the log; elsewhere, and in workers, the log alone."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
+import multiprocessing
 import sys
 from collections.abc import Iterator
 
@@ -36,7 +37,7 @@ class Progress:
 @contextlib.contextmanager
 def show_progress(steps: int) -> Iterator[Progress]:
     """Show the progress of so many steps."""
-    if not sys.stderr.isatty():
+    if not sys.stderr.isatty() or multiprocessing.parent_process() is not None:
         yield Progress(None)
         return
     with logging_redirect_tqdm(), tqdm(total=steps, file=sys.stderr, dynamic_ncols=True) as bar:

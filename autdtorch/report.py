@@ -157,7 +157,7 @@ def _scene_figures(scenes: Mapping[str, Scene], folder: Path) -> str:
     for name, scene in scenes.items():
         file = f"fig1_{name}.png"
         if problem is None:
-            view3d(scene, screenshot=folder / file).close()
+            view3d(scene, save=folder / file).close()
         else:
             plot_scene(scene).savefig(folder / file)
         images[name] = f"![{name}]({file})"

@@ -12,7 +12,7 @@ from autdtorch.claims import CLAIMS, judge_claims
 from autdtorch.findings import NEAR_BOUND, find
 from autdtorch.intervals import FEWEST_TRIALS
 from autdtorch.plot.style import label_of
-from autdtorch.results import MethodResult, SceneResult, StudyResult
+from autdtorch.results import MethodResult, SceneResult, StudyResult, summary_rows
 
 BASELINE = "gradient_ascent"
 """The method that is no competitor but a line to compare with: it knows the transfer matrix."""
@@ -52,21 +52,6 @@ _BELOW_SIMULATION = """A run ends when its estimated relative distance to the st
 grid: repeat the study with a smaller `solver.spacing` to see it."""
 
 
-def summary_rows(results: StudyResult) -> list[list[str]]:
-    """A table of the results, its head first: mean over the trials, and ± their standard deviation."""
-    head = ["scene", "method", "trials", "mean [Pa]", "weakest [Pa]", "std [Pa]", "area [mm²]"]
-    rows = [[*head, "evaluations"]]
-    for scene_name, scene in results.scenes.items():
-        for name, method in scene.methods.items():
-            metrics = method.metrics
-            area = "none" if metrics.area is None else _over_trials(1e6 * metrics.area, ".0f")
-            pressures = (metrics.mean, metrics.min, metrics.std)
-            numbers = [str(method.trials), *(_over_trials(values, ".2f") for values in pressures), area]
-            evaluations = f"{method.solution.evaluations.double().mean():.0f}"
-            rows.append([scene_name, label_of(name), *numbers, evaluations])
-    return rows
-
-
 def finding_rows(results: StudyResult) -> list[list[str]]:
     """A table of how near to the bound the methods come and at what cost, its head first."""
     head = ["scene", "method", "score [Pa]", "gap to the bound [%]", "evaluations"]
@@ -94,11 +79,6 @@ def _median_of_reached(evaluations: torch.Tensor) -> str:
     shown = f"{median:g}" if math.isfinite(median) else _NO_NUMBER
     every = len(evaluations) in (1, reached)
     return shown if every else f"{shown} ({reached} of {len(evaluations)})"
-
-
-def _over_trials(values: torch.Tensor, form: str) -> str:
-    mean = f"{values.mean():{form}}"
-    return mean if len(values) == 1 else f"{mean} ± {values.std():{form}}"
 
 
 def extent(counts: Sequence[int]) -> str:

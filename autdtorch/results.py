@@ -18,7 +18,9 @@ import h5py
 import torch
 
 import autdtorch
+from autdtorch.display import html_table
 from autdtorch.metrics import FocusMetrics
+from autdtorch.optim import label_of
 from autdtorch.optim.base import Solution
 from autdtorch.propagator import Run
 from autdtorch.source import package_versions, source_digest
@@ -52,6 +54,10 @@ class Provenance:
         """Whether both lead to the same results: all but the date is equal."""
         return replace(self, date=other.date) == other
 
+    def __repr__(self) -> str:
+        """Version, seed and date, without the settings."""
+        return f"Provenance(autdtorch {self.versions.get('autdtorch')}, seed {self.seed}, begun {self.date})"
+
 
 @dataclass(frozen=True)
 class Simulation:
@@ -74,6 +80,14 @@ class Simulation:
     runs: tuple[Run, ...]
     matrix_seconds: float
     plane_seconds: float
+
+    def __repr__(self) -> str:
+        """Method, settings and times, with units."""
+        grid = "" if self.spacing is None else f"spacing {1e3 * self.spacing:.4g} mm, {len(self.runs)} runs, "
+        return (
+            f"Simulation({self.method}, {grid}matrix {self.matrix_seconds:.2g} s, "
+            f"plane {self.plane_seconds:.2g} s)"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +114,10 @@ class MethodResult:
         """Number of trials T."""
         return len(self.solution.score)
 
+    def __repr__(self) -> str:
+        """What was reached, with units."""
+        return f"MethodResult({self.solution!r}, {self.seconds.mean():.2g} s a trial)"
+
 
 @dataclass(frozen=True, eq=False)
 class SceneResult:
@@ -119,6 +137,14 @@ class SceneResult:
     simulation: Simulation
     methods: dict[str, MethodResult]
 
+    def __repr__(self) -> str:
+        """Counts, bound and methods, with units."""
+        points, transducers = self.transfer_matrix.shape
+        return (
+            f"SceneResult({self.obstacles} obstacles, {transducers} transducers, {points} control points, "
+            f"bound {self.bound:.4g} Pa, methods {', '.join(self.methods)})"
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class StudyResult:
@@ -131,6 +157,20 @@ class StudyResult:
 
     provenance: Provenance
     scenes: dict[str, SceneResult]
+
+    def __repr__(self) -> str:
+        """The methods of each scene."""
+        scenes = "; ".join(f"{name}: {', '.join(scene.methods)}" for name, scene in self.scenes.items())
+        return f"StudyResult({scenes})"
+
+    def _repr_html_(self) -> str:
+        """For Jupyter: the summary."""
+        return html_table(f"Study of {self.provenance.date}", summary_rows(self))
+
+
+def median_trial(score: torch.Tensor) -> int:
+    """The trial of median score, of two middle ones the lower; `score` is (T,)."""
+    return int(score.argsort(stable=True)[(len(score) - 1) // 2])
 
 
 def provenance_now(config: str, seed: int) -> Provenance:
@@ -145,6 +185,21 @@ def provenance_now(config: str, seed: int) -> Provenance:
     versions["platform"] = platform.platform()
     date = datetime.now(UTC).isoformat(timespec="seconds")
     return Provenance(config, seed, versions, source_digest(), date)
+
+
+def summary_rows(results: StudyResult) -> list[list[str]]:
+    """A table of the results, its head first: mean over the trials, and ± their standard deviation."""
+    head = ["scene", "method", "trials", "mean [Pa]", "weakest [Pa]", "std [Pa]", "area [mm²]"]
+    rows = [[*head, "evaluations"]]
+    for scene_name, scene in results.scenes.items():
+        for name, method in scene.methods.items():
+            metrics = method.metrics
+            area = "none" if metrics.area is None else _over_trials(1e6 * metrics.area, ".0f")
+            pressures = (metrics.mean, metrics.min, metrics.std)
+            numbers = [str(method.trials), *(_over_trials(values, ".2f") for values in pressures), area]
+            evaluations = f"{method.solution.evaluations.double().mean():.0f}"
+            rows.append([scene_name, label_of(name), *numbers, evaluations])
+    return rows
 
 
 def save_results(results: StudyResult, folder: str | os.PathLike[str]) -> None:
@@ -192,7 +247,7 @@ def load_provenance(folder: str | os.PathLike[str]) -> Provenance:
 
 
 def load_results(path: str | os.PathLike[str]) -> StudyResult:
-    """Read what `save_results` wrote.
+    """Read the results of a study.
 
     Args:
         path: the file, or the folder that holds `results.h5`.
@@ -213,6 +268,11 @@ def load_results(path: str | os.PathLike[str]) -> StudyResult:
     except (OSError, KeyError, ValueError) as error:
         accepted = f"must be a results file of autdtorch {autdtorch.__version__}"
         raise ValueError(f"{path}: {error}; {accepted}") from error
+
+
+def _over_trials(values: torch.Tensor, form: str) -> str:
+    mean = f"{values.mean():{form}}"
+    return mean if len(values) == 1 else f"{mean} ± {values.std():{form}}"
 
 
 def _write_provenance(file: Any, provenance: Provenance) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -11,9 +12,11 @@ import torch
 
 from autdtorch import air
 from autdtorch.array import TransducerArray
+from autdtorch.display import html_facts
 from autdtorch.geometry import Plane
 from autdtorch.obstacles import Box as Box
 from autdtorch.obstacles import Obstacle
+from autdtorch.sketch import sketch
 from autdtorch.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
@@ -177,12 +180,12 @@ class Scene:
 
     @property
     def attenuation(self) -> float:
-        """In the medium, alpha [Np/m]: a plane wave falls as e^{-alpha x}."""
+        """In the medium, alpha [Np/m]; a plane wave falls as e^{-alpha x}."""
         return self.medium.absorption / _DECIBELS
 
     @property
     def complex_wavenumber(self) -> complex:
-        """In the medium, k + i alpha [rad/m]: a plane wave is e^{i (k + i alpha) x}."""
+        """In the medium, k + i alpha [rad/m]; a plane wave is e^{i (k + i alpha) x}."""
         return complex(self.wavenumber, self.attenuation)
 
     @property
@@ -192,13 +195,34 @@ class Scene:
 
     def __repr__(self) -> str:
         """Name, frequency, counts and extent, with units."""
-        lower, upper = self.domain
-        extent = " x ".join(f"{1e3 * (high - low):.4g}" for low, high in zip(lower, upper, strict=True))
         return (
             f"Scene({self.name!r}, {self.frequency / 1e3:.4g} kHz, "
             f"wavelength {1e3 * self.wavelength:.4g} mm, {len(self.array)} transducers, "
-            f"{len(self.control_points)} control points, {len(self.obstacles)} obstacles, domain {extent} mm)"
+            f"{len(self.control_points)} control points, {len(self.obstacles)} obstacles, "
+            f"domain {self._size()} mm)"
         )
+
+    def _repr_html_(self) -> str:
+        """For Jupyter: a table of what the scene holds, and two views of it."""
+        medium = self.medium
+        facts = [
+            ("frequency", f"{self.frequency / 1e3:.4g} kHz, wavelength {1e3 * self.wavelength:.4g} mm"),
+            (
+                "medium",
+                f"{medium.density:.4g} kg/m³, {medium.sound_speed:.4g} m/s, {medium.absorption:.3g} dB/m",
+            ),
+            ("transducers", f"{len(self.array)}, of source strength {self.array.source_strength:.4g} Pa m"),
+            ("control points", str(len(self.control_points))),
+            ("obstacles", ", ".join(_kinds(self.obstacles)) or "none"),
+            ("domain", f"{self._size()} mm, {self._size(self.wavelength, 3)} wavelengths"),
+        ]
+        views = sketch(self.array, self.obstacles, self.control_points, self.observation_plane, self.domain)
+        return f"<div>{html_facts(f'Scene {self.name!r}', facts)}{views}</div>"
+
+    def _size(self, unit: float = 1e-3, digits: int = 4) -> str:
+        """Edges of the domain, in units of so many m."""
+        lower, upper = self.domain
+        return " x ".join(f"{(high - low) / unit:.{digits}g}" for low, high in zip(lower, upper, strict=True))
 
     def _bounds(self) -> tuple[Vector, Vector]:
         corners = [torch.tensor([o.lower, o.upper], dtype=torch.float64) for o in self.obstacles]
@@ -220,6 +244,16 @@ def _obstacles(given: Iterable[Obstacle]) -> tuple[Obstacle, ...]:
     for index, obstacle in enumerate(obstacles):
         _require_type(f"Scene.obstacles[{index}]", obstacle, Obstacle)
     return obstacles
+
+
+def _kinds(obstacles: tuple[Obstacle, ...]) -> list[str]:
+    """How many there are of each kind and material."""
+    counts = Counter(
+        f"{type(obstacle).__name__} "
+        + ("(rigid)" if obstacle.rigid else f"({obstacle.density:.4g} kg/m³, {obstacle.sound_speed:.4g} m/s)")
+        for obstacle in obstacles
+    )
+    return [f"{count} x {kind}" for kind, count in counts.items()]
 
 
 def _corners(domain: ArrayLike) -> tuple[Vector, Vector]:

@@ -16,6 +16,7 @@ from typing import Any
 import torch
 
 from autdtorch.array import TransducerArray
+from autdtorch.array_file import load_array
 from autdtorch.geometry import Plane, circle_points
 from autdtorch.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
 from autdtorch.scene import Medium, Scene
@@ -23,6 +24,14 @@ from autdtorch.validation import ArrayLike, Vector, finite_vector, invalid, poin
 
 Builder = Callable[..., Any]
 
+_ARRAYS: dict[str, Builder] = {
+    "grid": TransducerArray.grid,
+    "positions": TransducerArray,
+    "autd3": TransducerArray.autd3,
+    "sonicsurface": TransducerArray.sonicsurface,
+    "openmpd": TransducerArray.openmpd,
+    "file": load_array,
+}
 _OBSTACLES: dict[str, Builder] = {
     "box": Box,
     "sphere": Sphere,
@@ -93,11 +102,14 @@ def _part(where: str, key: str, value: object, air: Builder, folder: Path) -> ob
             section = _mapping(where, value)
             return _build(where, section, air if section.keys() & _parameters(air).keys() else Medium)
         case "array":
-            return _build_kind(where, value, {"grid": TransducerArray.grid, "positions": TransducerArray})
+            return _build_kind(where, _with_path(where, value, folder), _ARRAYS)
         case "obstacles":
             if not isinstance(value, list):
                 raise invalid(where, value, "must be a list of obstacles")
-            return [_obstacle(f"{where}[{index}]", entry, folder) for index, entry in enumerate(value)]
+            return [
+                _build_kind(f"{where}[{index}]", _with_path(f"{where}[{index}]", entry, folder), _OBSTACLES)
+                for index, entry in enumerate(value)
+            ]
         case "control_points":
             return _build_kind(where, value, {"circle": circle_points, "points": _points})
         case "observation_plane":
@@ -108,11 +120,12 @@ def _part(where: str, key: str, value: object, air: Builder, folder: Path) -> ob
             return value
 
 
-def _obstacle(where: str, value: object, folder: Path) -> Any:
+def _with_path(where: str, value: object, folder: Path) -> dict[str, Any]:
+    """The section, its `path` starting from `folder`."""
     section = _mapping(where, value)
     if isinstance(path := section.get("path"), str):
         section["path"] = str(folder / path)
-    return _build_kind(where, section, _OBSTACLES)
+    return section
 
 
 def _points(positions: ArrayLike) -> torch.Tensor:

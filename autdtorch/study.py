@@ -19,7 +19,7 @@ from autdtorch.optim.base import Solution, Trials
 from autdtorch.optim.bound import focus_bound
 from autdtorch.progress import Progress, show_progress
 from autdtorch.propagator import CACHE_VARIABLE, Propagator, SimulatedPropagator, make_propagator
-from autdtorch.results import MethodResult, SceneResult, Simulation, StudyResult, provenance_now
+from autdtorch.results import MethodResult, SceneResult, Simulation, StudyResult, median_trial, provenance_now
 from autdtorch.scene import Scene
 from autdtorch.study_folder import StudyFolder, open_folder
 from autdtorch.trial_file import TrialFile
@@ -64,7 +64,8 @@ def run_study(
         plane_spacing: edge of a cell of the observation plane [m].
         folder: where trials are saved as they end, scenes when they are finished; None to save nothing.
         config: all of the above as text. What the folder holds for the same text, made with the same source
-            and packages, is taken from there. Without text, everything is computed.
+            and packages, is taken from there. Without text, or with methods that are not autdtorch's own,
+            everything is computed.
 
     Returns:
         The results of all scenes.
@@ -80,11 +81,12 @@ def run_study(
         for scene in scenes.values():
             _check_method(name, method, scene, counts[name], seed)
     planes = {name: _plane_points(scene, plane_spacing) for name, scene in scenes.items()}
-    if any(_function(method).__module__.partition(".")[0] != "autdtorch" for method in methods.values()):
-        config = ""  # the digest of our source says nothing of theirs: nothing is re-used
-    with open_folder(folder, provenance_now(config, seed)) as kept:
+    # The digest of our source says nothing of others' methods.
+    ours = all(_function(method).__module__.partition(".")[0] == "autdtorch" for method in methods.values())
+    with open_folder(folder, provenance_now(config, seed), reuse=bool(config) and ours) as kept:
         missing = {name: scene for name, scene in scenes.items() if name not in kept.scenes}
         propagators = {name: _propagator(scene, solver or {}, kept) for name, scene in missing.items()}
+        kept.begin()
         with show_progress(len(missing) * (sum(counts.values()) + 2)) as progress:
             for name in missing:
                 finished = _run_scene(
@@ -254,7 +256,7 @@ def _plane_pressures(
         return {}, None
     # All drives in one call: the propagator then needs no more than one simulation a transducer.
     drives = torch.cat([solution.drive for solution in solutions.values()])
-    pressure = propagator.field(drives, points.reshape(-1, 3)).cpu().reshape(-1, *points.shape[:2])
+    pressure = propagator.field(drives, points).cpu()
     parts = torch.split(pressure, [len(solution.drive) for solution in solutions.values()])
     return dict(zip(solutions, parts, strict=True)), plane.size[0] * plane.size[1] / points[..., 0].numel()
 
@@ -263,7 +265,7 @@ def _method_result(
     solution: Solution, plane: torch.Tensor | None, cell_area: float | None, seconds: torch.Tensor
 ) -> MethodResult:
     metrics = focus_metrics(solution.pressure, None if plane is None else plane.abs(), cell_area)
-    shown = int(solution.score.argsort(stable=True)[(len(solution.score) - 1) // 2])
+    shown = median_trial(solution.score)
     return MethodResult(solution, metrics, seconds, shown, None if plane is None else plane[shown].clone())
 
 

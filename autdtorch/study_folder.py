@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import os
 from collections.abc import Iterator, Mapping
@@ -26,6 +27,8 @@ from autdtorch.trial_file import TRIALS_FILE, TrialFile
 logger = logging.getLogger(__name__)
 
 MATRICES_FOLDER = "matrices"
+PREVIOUS = "previous-"
+"""Start of the names of the folders where earlier studies are kept."""
 
 _LOCK_FILE = ".lock"
 
@@ -40,20 +43,34 @@ class StudyFolder:
         trials: finished trials of all scenes.
     """
 
-    def __init__(self, path: Path | None, provenance: Provenance) -> None:
-        """Read what the folder, which must be locked, holds of the study of this provenance.
+    def __init__(self, path: Path | None, provenance: Provenance, reuse: bool) -> None:
+        """Read what the folder, which must be locked, holds of the study of this provenance."""
+        self.path = path
+        self.provenance = provenance
+        self.scenes: dict[str, SceneResult] = {}
+        self.trials = TrialFile(None, provenance.seed)
+        stored = None if path is None or not reuse else _stored_provenance(path)
+        self._goes_on = stored is not None and stored.same_origin(provenance)
+        if path is not None and stored is not None and self._goes_on:
+            self.provenance = stored
+            self.scenes = _stored_scenes(path)
+
+    def begin(self) -> None:
+        """Set aside what the folder holds of another study, and open the file of trials.
+
+        Until then nothing is written: a study that is refused leaves the folder as it was.
 
         Raises:
             OSError: the folder cannot be read or written.
         """
-        self.path = path
-        self.provenance = provenance
-        self.scenes: dict[str, SceneResult] = {}
-        if path is not None:
-            self._take_over(path)
-        self.trials = TrialFile(None if path is None else path / TRIALS_FILE, provenance.seed)
+        if self.path is None:
+            return
+        if not self._goes_on:
+            _set_aside(self.path)
+            save_provenance(self.provenance, self.path)
+        self.trials = TrialFile(self.path / TRIALS_FILE, self.provenance.seed)
         if len(self.trials):
-            logger.info("re-using %d trials from %s", len(self.trials), path)
+            logger.info("re-using %d trials from %s", len(self.trials), self.path)
 
     @property
     def matrices(self) -> Path | None:
@@ -71,38 +88,24 @@ class StudyFolder:
         if self.path is not None:
             save_results(StudyResult(self.provenance, self.scenes), self.path)
 
-    def _take_over(self, path: Path) -> None:
-        stored = _stored_provenance(path)
-        if stored is None or not self.provenance.config or not stored.same_origin(self.provenance):
-            _set_aside(path)
-            save_provenance(self.provenance, path)
-            return
-        self.provenance = stored
-        if not (path / RESULTS_FILE).exists():
-            return
-        try:
-            self.scenes = dict(load_results(path).scenes)
-        except ValueError as error:
-            logger.warning("computing scenes again: %s", error)
-            return
-        logger.info("re-using %s from %s, same settings and same source", ", ".join(self.scenes), path)
-
 
 @contextlib.contextmanager
-def open_folder(folder: str | os.PathLike[str] | None, provenance: Provenance) -> Iterator[StudyFolder]:
+def open_folder(
+    folder: str | os.PathLike[str] | None, provenance: Provenance, reuse: bool
+) -> Iterator[StudyFolder]:
     """Have a folder to oneself for the time of a study; it is made if need be.
 
     Args:
         folder: None to keep the study in memory alone.
-        provenance: of the study; what the folder holds is used again if it is of the same origin and its
-            settings are known.
+        provenance: of the study.
+        reuse: whether what the folder holds of the same origin is used again.
 
     Raises:
         ValueError: another process writes into the folder.
         OSError: the folder cannot be made, read or written.
     """
     if folder is None:
-        yield StudyFolder(None, provenance)
+        yield StudyFolder(None, provenance, reuse)
         return
     path = Path(folder)
     path.mkdir(parents=True, exist_ok=True)
@@ -114,7 +117,7 @@ def open_folder(folder: str | os.PathLike[str] | None, provenance: Provenance) -
         accepted = "another process writes there; wait until it ends, or give another folder"
         raise ValueError(f"output: {path}; {accepted}") from error
     try:
-        yield StudyFolder(path, provenance)
+        yield StudyFolder(path, provenance, reuse)
     finally:
         lock.release()
 
@@ -129,11 +132,25 @@ def _stored_provenance(path: Path) -> Provenance | None:
         return None
 
 
+def _stored_scenes(path: Path) -> dict[str, SceneResult]:
+    if not (path / RESULTS_FILE).exists():
+        return {}
+    try:
+        scenes = dict(load_results(path).scenes)
+    except ValueError as error:
+        logger.warning("computing scenes again: %s", error)
+        return {}
+    logger.info("re-using %s from %s, same settings and same source", ", ".join(scenes), path)
+    return scenes
+
+
 def _set_aside(path: Path) -> None:
-    """Rename the files of another study, so that this one does not overwrite them."""
-    for name in (RESULTS_FILE, TRIALS_FILE, PROVENANCE_FILE):
-        file = path / name
-        if file.exists():
-            kept = file.with_name(f"previous-{name}")
-            file.replace(kept)
-            logger.warning("%s is not of the same settings, source and packages: kept as %s", file, kept.name)
+    """Move the files of another study, so that this one does not overwrite them."""
+    files = [file for name in (RESULTS_FILE, TRIALS_FILE, PROVENANCE_FILE) if (file := path / name).exists()]
+    if not files:
+        return
+    kept = next(place for n in itertools.count(1) if not (place := path / f"{PREVIOUS}{n}").exists())
+    kept.mkdir()
+    for file in files:
+        file.replace(kept / file.name)
+    logger.warning("another study was in %s (other settings, source or packages): kept in %s", path, kept)

@@ -191,6 +191,18 @@ def points_tensor(name: str, value: object) -> torch.Tensor:
     return points.detach().clone()
 
 
+def points_grid(name: str, value: object) -> tuple[torch.Tensor, torch.Size]:
+    """`value` as points (P, 3) [m], as of `points_tensor`, and the shape (...) of their grid (..., 3).
+
+    Raises:
+        ValueError: another shape, no point, not real numbers, NaN or infinite.
+    """
+    points = real_tensor(name, value, "m")
+    if points.ndim < 2 or points.shape[-1] != 3 or points.numel() == 0:
+        raise ValueError(f"{name}: shape {tuple(points.shape)}; must be (P, 3) or (..., P, 3) with P >= 1")
+    return points_tensor(name, points.reshape(-1, 3)), points.shape[:-1]
+
+
 def require_distinct(name: str, points: torch.Tensor) -> None:
     """Check that no two of the `points` (P, 3) [m] coincide.
 

@@ -1,9 +1,12 @@
 """Every test carries the marker named like its folder, so that ``pytest -m physics`` runs
-``tests/physics``. Where there is no GPU, Triton interprets the CUDA kernel on the CPU."""
+``tests/physics``. Where there is no GPU, Triton interprets the CUDA kernel on the CPU. Where pytest runs in
+several processes, these share the cores: threads that wait for each other on busy cores are many times
+slower."""
 
 import os
 from pathlib import Path
 
+import numba
 import pytest
 import torch
 
@@ -11,6 +14,12 @@ TESTS = Path(__file__).parent
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when Triton's functions are defined
+
+if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
+    THREADS = max(1, (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))
+    torch.set_num_threads(THREADS)
+    numba.set_num_threads(min(THREADS, numba.get_num_threads()))
+    os.environ["OMP_NUM_THREADS"] = str(THREADS)  # of the processes that tests start
 
 
 @pytest.fixture(autouse=True)

@@ -68,10 +68,10 @@ class VoxelMask(Obstacle):
 
         Args:
             path: .npy, or .npz that holds a single array.
-            spacing: as in `VoxelMask`, like all that follows.
-            origin: of voxel (0, 0, 0).
-            density: of the material.
-            sound_speed: of the material.
+            spacing: edge of a voxel [m], > 0.
+            origin: corner of voxel (0, 0, 0) with the smallest coordinates (3,) [m].
+            density: of the material [kg/m^3], > 0; None if rigid.
+            sound_speed: of the material [m/s], > 0; None if rigid.
             rigid: True for walls that do not move.
 
         Returns:

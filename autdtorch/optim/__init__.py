@@ -10,3 +10,9 @@ METHOD_LABELS = {
     "gradient_ascent": "gradient ascent",
 }
 """Names of the methods, the paper's where it has one, by the names of the functions."""
+
+
+def label_of(method: str) -> str:
+    """A method's name in the paper, or its own, and behind a comma the settings that were swept."""
+    name, comma, settings = method.partition(",")
+    return METHOD_LABELS.get(name, name.replace("_", " ")) + comma + settings

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from autdtorch.conditions import playable
+from autdtorch.display import html_facts
 from autdtorch.drive import amplitudes_of, phases_of
 from autdtorch.objective import Objective, Score
 from autdtorch.validation import integer_at_least, real_tensor
@@ -46,6 +47,28 @@ class Solution:
     def amplitudes(self) -> torch.Tensor:
         """Amplitudes of the drive (T, M)."""
         return amplitudes_of(self.drive)
+
+    def __repr__(self) -> str:
+        """Counts and what was reached, with units."""
+        return f"Solution({', '.join(f'{name} {value}' for name, value in self._facts())})"
+
+    def _repr_html_(self) -> str:
+        """For Jupyter: a table of what was reached."""
+        return html_facts("Solution", self._facts())
+
+    def _facts(self) -> list[tuple[str, str]]:
+        weakest = self.pressure.amin(dim=1)
+        reached = f"{weakest.max():.4g} Pa"
+        if len(weakest) > 1:
+            reached = f"best {reached}, median {weakest.quantile(0.5):.4g} Pa, worst {weakest.min():.4g} Pa"
+        low, high = int(self.evaluations.min()), int(self.evaluations.max())
+        return [
+            ("trials", str(len(weakest))),
+            ("transducers", str(self.drive.shape[1])),
+            ("foci", str(self.pressure.shape[1])),
+            ("weakest focus", reached),
+            ("evaluations", str(low) if low == high else f"{low} to {high}"),
+        ]
 
 
 class Ledger:

@@ -39,7 +39,7 @@ def identify(objective: Objective, evaluations: int = 64, trials: Trials = 1, se
         seed: of the random phases, >= 0; trial t is the same for every number of trials.
 
     Returns:
-        The last drive of each trial: with noise it is better than the one of the highest reading.
+        The last drive of each trial; with noise it is better than the one of the highest reading.
 
     Raises:
         ValueError: an argument out of range, or the objective's pressures are not finite.

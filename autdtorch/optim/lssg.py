@@ -25,7 +25,7 @@ def lss(objective: Objective, score: Score = weakest_focus) -> Solution:
         score: what is reported; nothing is searched.
 
     Returns:
-        One trial: the method has no randomness.
+        One trial, since the method has no randomness.
 
     Raises:
         ValueError: the objective's pressure or score is not finite.
@@ -64,7 +64,7 @@ def lssg(
         score: what is maximised.
 
     Returns:
-        One trial: the method has no randomness.
+        One trial, since the method has no randomness.
 
     Raises:
         ValueError: an argument out of range, or the objective's pressures or scores are not finite.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from autdtorch.drawing import Array
-from autdtorch.optim import METHOD_LABELS
+from autdtorch.optim import label_of as label_of
 from autdtorch.validation import ArrayLike, real_tensor
 
 ByMethod: TypeAlias = Mapping[str, ArrayLike]
@@ -65,11 +66,22 @@ TICK_SIZE = 8.0  # not in the style: ticks are made when the figure is drawn, af
 _DPI = 150
 _MOST_COLUMNS = 3  # of panels
 _LETTER = 0.08  # mean width [inch]
+_SCREEN_DPI = 96  # where a notebook shows it
+
+
+class ShownFigure(Figure):
+    """A figure that Jupyter shows by itself, though pyplot does not know of it."""
+
+    def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
+        """PNG, and its width on screen [px]."""
+        picture = io.BytesIO()
+        self.savefig(picture)
+        return picture.getvalue(), {"width": round(_SCREEN_DPI * self.get_figwidth())}
 
 
 def new_figure(width: float, height: float) -> Figure:
     """An empty figure of that size [inch], which pyplot does not know of."""
-    return Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
+    return ShownFigure(figsize=(width, height), dpi=_DPI, layout="constrained")
 
 
 def new_panels(
@@ -159,11 +171,6 @@ def looks_of(names: Iterable[str]) -> dict[str, Look]:
     free = [*_SPARE_LOOKS, *_LOOKS.values()] if beside else [*_LOOKS.values(), *_SPARE_LOOKS]
     left = cycle(look for look in free if look not in found.values())
     return {name: found[name] if name in found else next(left) for name in names}
-
-
-def label_of(method: str) -> str:
-    """A method's name in the paper, or its own."""
-    return METHOD_LABELS.get(method, readable(method))
 
 
 def readable(name: str) -> str:

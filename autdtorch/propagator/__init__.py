@@ -18,6 +18,7 @@ from autdtorch.propagator.differentiable import cell_centers, differentiable_fie
 from autdtorch.propagator.free_space import FreeSpacePropagator
 from autdtorch.propagator.full import FullPropagator
 from autdtorch.propagator.stepper import KERNELS, make_kernel, precision_of
+from autdtorch.propagator.volume import volume_field
 from autdtorch.scene import Scene
 from autdtorch.validation import integer_at_least, invalid, positive, require_one_of
 
@@ -32,6 +33,7 @@ __all__ = [
     "cell_centers",
     "differentiable_field",
     "make_propagator",
+    "volume_field",
 ]
 
 logger = logging.getLogger(__name__)

@@ -24,7 +24,7 @@ from autdtorch.fdtd.stepping import Assembly
 from autdtorch.propagator.symmetry import Plan, Symmetry, backward_plan, forward_plan, symmetries
 from autdtorch.scene import Scene
 from autdtorch.source import package_versions, source_digest
-from autdtorch.validation import ArrayLike
+from autdtorch.validation import ArrayLike, points_grid
 
 logger = logging.getLogger(__name__)
 
@@ -54,7 +54,12 @@ class Propagator(Protocol):
         ...
 
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
-        """Pressure [Pa] of drives (..., M) at points (P, 3) [m]: complex128 (..., P)."""
+        """Pressure [Pa] of drives (..., M) at points (P, 3) or on a grid of them: complex128 (..., P).
+
+        Args:
+            drive: (..., M) complex.
+            points: (P, 3) [m]; a grid such as (Nu, Nv, 3) gives (..., Nu, Nv).
+        """
         ...
 
 
@@ -110,6 +115,13 @@ class SimulatedPropagator(ABC):
         self._kernel = kernel
         self._cache = cache
         self._assemblies = self._assembled(dtype, time_step)
+
+    def __repr__(self) -> str:
+        """Scene, settings and runs so far."""
+        return (
+            f"{type(self).__name__}(scene {self.scene.name!r}, spacing {1e3 * self.spacing:.4g} mm, "
+            f"tolerance {self.tolerance:g}, {len(self.runs)} runs)"
+        )
 
     @property
     def time_step(self) -> float:
@@ -219,25 +231,28 @@ class SimulatedPropagator(ABC):
 
         Args:
             drive: (..., M) complex, |q| <= 1.
-            points: (P, 3) [m], for `FullPropagator` inside the domain.
+            points: (P, 3) or a grid such as (Nu, Nv, 3) [m], for `FullPropagator` inside the domain.
 
         Returns:
-            complex128 (..., P) [Pa]; differentiable by the drive, through the transfer matrix.
+            complex128 (..., P) or (..., Nu, Nv) [Pa]; differentiable by the drive, through the transfer
+            matrix.
 
         Raises:
             ValueError: drive or points of another shape or out of range.
         """
-        drive, points = validate_drive(drive, len(self.scene.array)), self._checked(points)
+        drive = validate_drive(drive, len(self.scene.array))
+        points, grid = points_grid("points", points)
+        points = self._checked(points)
         flat = drive.reshape(-1, drive.shape[-1])
         array, nodes = self.scene.array, self.scene.array.nodes
         if drive.requires_grad or len(flat) > self._plan(points).runs:
-            return drive @ self._kept_matrix(points)[0].mT
+            return (drive @ self._kept_matrix(points)[0].mT).reshape(*drive.shape[:-1], *grid)
         field = torch.zeros((len(flat), len(points)), dtype=torch.complex128)
         loud = flat.any(dim=1)
         runs = [nodes] * int(loud.sum())
         if runs:
             field[loud] = self._simulate(runs, array.source_strength * flat[loud], single_nodes(points))
-        return field.reshape(*drive.shape[:-1], len(points))
+        return field.reshape(*drive.shape[:-1], *grid)
 
     def _kept_matrix(self, points: torch.Tensor) -> tuple[torch.Tensor, float]:
         """Transfer matrix and its distance to the steady state, from disk if it is there."""

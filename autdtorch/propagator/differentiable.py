@@ -59,7 +59,7 @@ def differentiable_field(
             default sound crosses the domain twice. What resonates needs more.
         kernel: as in `make_propagator`.
         dtype: precision of the fields, float32 or float64.
-        time_step: as in `make_propagator`. By default the largest stable one, which may change with the
+        time_step: [s], as in `make_propagator`. By default the largest stable one, which may change with the
             medium from call to call, and the field with it by a little.
 
     Returns:

@@ -11,7 +11,7 @@ import torch
 from autdtorch.drive import validate_drive
 from autdtorch.freespace import free_space_matrix
 from autdtorch.scene import Scene
-from autdtorch.validation import ArrayLike
+from autdtorch.validation import ArrayLike, points_grid
 
 logger = logging.getLogger(__name__)
 
@@ -30,6 +30,10 @@ class FreeSpacePropagator:
             logger.warning(
                 "free_space leaves out the %d obstacles of scene %r", len(scene.obstacles), scene.name
             )
+
+    def __repr__(self) -> str:
+        """The scene."""
+        return f"FreeSpacePropagator(scene {self.scene.name!r})"
 
     @overload
     def transfer_matrix(
@@ -66,13 +70,14 @@ class FreeSpacePropagator:
 
         Args:
             drive: (..., M) complex, |q| <= 1.
-            points: (P, 3) [m].
+            points: (P, 3) or a grid such as (Nu, Nv, 3) [m].
 
         Returns:
-            complex128 (..., P) [Pa]; differentiable by the drive.
+            complex128 (..., P) or (..., Nu, Nv) [Pa]; differentiable by the drive.
 
         Raises:
             ValueError: drive or points of another shape or out of range.
         """
         drive = validate_drive(drive, len(self.scene.array))
-        return drive @ self.transfer_matrix(points).mT
+        points, grid = points_grid("points", points)
+        return (drive @ self.transfer_matrix(points).mT).reshape(*drive.shape[:-1], *grid)

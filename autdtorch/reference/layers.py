@@ -131,7 +131,7 @@ def step_coefficients(
         speed_ratio: c_1 / c > 0.
 
     Returns:
-        R and T, complex128 in the shape of `angle`: reflected and transmitted pressure over incident pressure
+        R and T, complex128 in the shape of `angle`, reflected and transmitted pressure over incident pressure
         at the face.
 
     Raises:
@@ -156,7 +156,7 @@ def slab_coefficients(
         speed_ratio: c_1 / c > 0.
 
     Returns:
-        R and T, complex128 in the shape of `angle`: the reflected pressure at the front face and the
+        R and T, complex128 in the shape of `angle`, the reflected pressure at the front face and the
         transmitted pressure at the back face, over the incident pressure at the front face.
 
     Raises:

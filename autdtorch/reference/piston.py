@@ -81,7 +81,7 @@ def piston_field(
         sources: (M, 3) centres of the pistons [m].
         wavenumber: k [rad/m], > 0.
         radius: a [m], > 0.
-        normal: axis of all pistons; any length.
+        normal: axis of all pistons (3,); any length.
 
     Returns:
         complex128 (P, M) [1/m]; e^{ikr} / (4 pi r) on the axis far away, as `freespace.green`.

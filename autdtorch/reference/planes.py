@@ -33,8 +33,8 @@ def rigid_plane(
         points: (P, 3) [m], in front of the plane or on it.
         sources: (M, 3) [m], in front of the plane or on it.
         wavenumber: k [rad/m], > 0.
-        origin: a point of the plane [m].
-        normal: of the plane, towards points and sources; any length.
+        origin: a point (3,) of the plane [m].
+        normal: of the plane (3,), towards points and sources; any length.
         scattered: the reflected wave alone.
 
     Returns:
@@ -83,8 +83,8 @@ def fluid_half_space(
         points: (P, 3) [m], anywhere.
         sources: (M, 3) [m], in front of the face.
         wavenumber: k of the medium in front [rad/m], > 0.
-        origin: a point of the face [m].
-        normal: of the face, towards the sources; any length.
+        origin: a point (3,) of the face [m].
+        normal: of the face (3,), towards the sources; any length.
         density_ratio: rho_1 / rho > 0.
         speed_ratio: c_1 / c > 0.
         scattered: the field less that of the sources in the medium without end.
@@ -119,8 +119,8 @@ def fluid_slab(
         points: (P, 3) [m], anywhere.
         sources: (M, 3) [m], in front of the front face.
         wavenumber: k of the medium [rad/m], > 0.
-        origin: a point of the front face [m].
-        normal: of the front face, towards the sources; any length.
+        origin: a point (3,) of the front face [m].
+        normal: of the front face (3,), towards the sources; any length.
         thickness: [m], > 0.
         density_ratio: rho_1 / rho > 0.
         speed_ratio: c_1 / c > 0.

@@ -51,7 +51,7 @@ def rigid_sphere(
         points: (P, 3) [m], outside the sphere or on it.
         sources: (M, 3) [m], outside the sphere.
         wavenumber: k [rad/m], > 0.
-        center: of the sphere [m].
+        center: of the sphere (3,) [m].
         radius: of the sphere [m], > 0.
         scattered: the scattered wave alone, which also exists at the sources.
 
@@ -105,7 +105,7 @@ def fluid_sphere(
         points: (P, 3) [m], anywhere.
         sources: (M, 3) [m], outside the sphere.
         wavenumber: k of the medium outside [rad/m], > 0.
-        center: of the sphere [m].
+        center: of the sphere (3,) [m].
         radius: of the sphere [m], > 0.
         density_ratio: rho_1 / rho > 0.
         speed_ratio: c_1 / c > 0.

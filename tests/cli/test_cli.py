@@ -1,12 +1,10 @@
-"""The command line, run in this process: a subprocess would import PyTorch anew for each."""
+"""The command line: one run, an experiment, and what it says of wrong settings."""
 
 import functools
 import inspect
 import json
-import logging
 import os
 import re
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -17,7 +15,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 import autdtorch.study
-from autdtorch.cli import CONFIGS, main
+from autdtorch.cli import CONFIGS
 from autdtorch.propagator import FreeSpacePropagator, make_propagator
 from autdtorch.results import load_results
 from autdtorch.scene_file import load_scene
@@ -36,29 +34,6 @@ SINGLE_FILES = ("results.h5", "trials.jsonl", "provenance.json", ".lock", "plane
 def written(folder: Path) -> set[str]:
     """All files below a folder, by their path in it."""
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
-
-
-@pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
-    """Runs a command line in an empty folder; returns its exit status."""
-    root, package = logging.getLogger(), logging.getLogger("autdtorch")
-    handlers, levels = root.handlers[:], (root.level, package.level)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
-
-    def command(*arguments: str) -> int:
-        monkeypatch.setattr(sys, "argv", ["autdtorch", *arguments])
-        try:
-            main()
-        except SystemExit as end:
-            return int(end.code or 0)
-        return 0
-
-    yield command
-    # Hydra's logging writes to the stderr of this test alone.
-    root.handlers[:] = handlers
-    root.setLevel(levels[0])
-    package.setLevel(levels[1])
 
 
 @pytest.fixture
@@ -152,6 +127,10 @@ WRONG = [
     (["experiment=paper", "scenes.two_cubes.frequency=0"], r"scenes\.two_cubes: Scene\.frequency: 0 Hz"),
     (["experiment=paper", "methods.gabs.levels=0"], "method gabs: levels: 0"),
     (["experiment=paper", "trials.gabs=0"], r"trials\.gabs: 0; must be an integer >= 1"),
+    (["three_cubes"], "three_cubes: must be key=value"),
+    (["hydra/launcher=nope"], "hydra/launcher: 'nope'; must be one of basic, joblib, slurm"),
+    (["collect"], "collect: ''; must be one folder"),
+    (["collect", "."], r"\.: no finished study \(results\.h5\) there or below"),
     (["experiment=paper", "scenes=3"], "scenes: 3; must be a mapping"),
 ]
 
@@ -286,14 +265,6 @@ def test_ctrl_c_ends_with_one_line_and_its_status(
     assert run("solver.method=free_space") == 130
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("autdtorch: interrupted; ")
-
-
-def test_a_sweep_has_a_folder_for_each_run(run: Run, tmp_path: Path) -> None:
-    assert run("-m", "method=gabs,lssg", "plane_spacing=0.02") == 0
-    jobs = [f"multirun/method={name},plane_spacing=0.02" for name in ("gabs", "lssg")]
-    assert written(tmp_path) == {f"{job}/{name}" for job in jobs for name in SINGLE_FILES} | {
-        "multirun/multirun.yaml"
-    }
 
 
 def test_help_tells_what_there_is(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

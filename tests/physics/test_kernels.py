@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 
+import numba
 import pytest
 import torch
 from small_scenes import CUBE, small_scene
@@ -71,7 +72,12 @@ def test_chunks_of_planes_are_the_whole(chunks: int, monkeypatch: pytest.MonkeyP
     """On any number of cores: rounding of the sums alone, which are taken in another order."""
     whole, heard = advance(CpuKernel(), torch.float64, 101)
     monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._chunks", lambda cells: chunks)
-    parts, heard_in_parts = advance(CpuKernel(), torch.float64, 101)
+    threads = numba.get_num_threads()
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)  # all there are, for two of them may collide
+    try:
+        parts, heard_in_parts = advance(CpuKernel(), torch.float64, 101)
+    finally:
+        numba.set_num_threads(threads)
     memories = zip((*parts.layers, parts.columns), (*whole.layers, whole.columns), strict=True)
     pairs = [pair for one, other in memories for pair in zip(one, other, strict=True)]
     for value, reference in ((parts.now, whole.now), (heard_in_parts, heard), *pairs):

@@ -190,6 +190,17 @@ def test_foretold_distance_to_the_steady_state_is_honest() -> None:
         assert relative_error(propagator.transfer_matrix(), settled) < tolerance
 
 
+@pytest.mark.parametrize("method", ["free_space", "full"])
+def test_a_grid_of_points_gives_a_grid_of_pressures(method: str) -> None:
+    propagator = make_propagator(small_scene(), method, 2e-3)
+    points = torch.stack(2 * [propagator.scene.control_points[:2]])
+    for drive in (random_drive(1, 4), random_drive(3, 4)):  # by simulation, and by the transfer matrix
+        row = propagator.field(drive, points.reshape(-1, 3))
+        assert torch.equal(propagator.field(drive, points), row.reshape(len(drive), 2, 2))
+    with pytest.raises(ValueError, match=r"points: shape \(3,\); must be \(P, 3\)"):
+        propagator.field(drive, points[0, 0])
+
+
 def test_field_is_linear_and_differentiable_in_the_drive() -> None:
     scene = small_scene((CUBE,))
     propagator = make_propagator(scene, "full", 2e-3)

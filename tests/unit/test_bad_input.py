@@ -375,7 +375,8 @@ WRONG = {
     ),
     "unknown type": (
         lambda: from_yaml(array__type="gird"),
-        "scene mapping: array: type: 'gird'; must be one of grid, positions (did you mean 'grid'?)",
+        "scene mapping: array: type: 'gird'; must be one of grid, positions, autd3, sonicsurface, openmpd, "
+        "file (did you mean 'grid'?)",
     ),
     "type a list": (lambda: from_yaml(array__type=["grid"]), "array: type: ('grid',); must be one of"),
     "section not a mapping": (lambda: from_yaml(medium=340.0), "medium: 340.0; must be a mapping of keys to"),

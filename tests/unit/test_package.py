@@ -25,6 +25,9 @@ plots = [name for name in autdtorch.__all__ if name.startswith("plot_")]
 for name in autdtorch.__all__:
     if name not in plots:
         getattr(autdtorch, name)
+for name in autdtorch.hardware.__all__:
+    if not name.startswith("Emulated"):
+        getattr(autdtorch.hardware, name)
 after_names = sorted(heavy & sys.modules.keys())
 for name in plots:
     getattr(autdtorch, name)

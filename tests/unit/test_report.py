@@ -18,8 +18,8 @@ from autdtorch.optim.gabs import gabs
 from autdtorch.optim.lssg import lssg
 from autdtorch.plot import plot_convergence
 from autdtorch.report import HTML_FILE, write_report
-from autdtorch.report_tables import claims, finding_rows, findings, summary_rows
-from autdtorch.results import StudyResult
+from autdtorch.report_tables import claims, finding_rows, findings
+from autdtorch.results import StudyResult, summary_rows
 from autdtorch.scene import Box, Scene
 from autdtorch.study import run_study
 

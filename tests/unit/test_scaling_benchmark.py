@@ -5,11 +5,10 @@ from pathlib import Path
 import pytest
 import torch
 from benchmark_scaling import foci
-from large_arrays import PITCH, SIZE, autd3_array, with_array
+from large_arrays import autd3_array, with_array
 from scaling_report import Point, exponents, figure, measurements
 
 from autdtorch.plot.scaling import fit_power
-from autdtorch.validation import distances
 
 SIZES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 
@@ -65,16 +64,6 @@ def test_plot_has_a_panel_for_each_cost_and_growth(tmp_path: Path) -> None:
         "box, mirror images",
     ]
     drawn.savefig(tmp_path / "scaling.png")
-
-
-def test_units_lie_side_by_side() -> None:
-    one, four = autd3_array(), autd3_array((2, 2))
-    assert (len(one), len(four)) == (249, 996)
-    assert four.positions.mean(0) == pytest.approx(one.positions.mean(0), abs=1e-12)  # rounding
-    extent = four.positions.amax(0) - four.positions.amin(0)
-    assert extent[1:] == pytest.approx([SIZE[0] + 17 * PITCH, SIZE[1] + 13 * PITCH], abs=1e-12)
-    nearest = distances(four.positions, four.positions).fill_diagonal_(1)
-    assert float(nearest.min()) == pytest.approx(PITCH, abs=1e-12)
 
 
 def test_domain_holds_paper_and_large_array() -> None:

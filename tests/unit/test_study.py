@@ -237,6 +237,18 @@ def test_settings_are_checked_before_anything_is_simulated(
         run_study(**arguments)
 
 
+def test_another_study_is_kept_and_a_refused_one_moves_nothing(
+    scenes: dict[str, Scene], tmp_path: Path
+) -> None:
+    study = functools.partial(run_study, scenes, METHODS, folder=tmp_path)
+    for config in ("a: 1", "a: 2", "a: 3"):
+        study(solver=FREE_SPACE, config=config)
+        with pytest.raises(ValueError, match="solver: dtype"):
+            study(solver=FREE_SPACE | {"dtype": "int"}, config="a: 4")
+    kept = [tmp_path / folder for folder in ("previous-1", "previous-2", ".")]
+    assert [load_results(folder).provenance.config for folder in kept] == ["a: 1", "a: 2", "a: 3"]
+
+
 @pytest.mark.parametrize("returned", [1, 3])
 def test_a_method_returns_the_trials_it_is_asked_for(returned: int) -> None:
     def method(objective: Objective, trials: Sequence[int], seed: int) -> Solution:

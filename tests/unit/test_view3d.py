@@ -1,5 +1,6 @@
 """The 3D view: rendered where an OpenGL driver is found; a missing driver is reported, not fatal."""
 
+import json
 import math
 import sys
 from collections.abc import Callable, Iterator
@@ -11,7 +12,7 @@ import torch
 from small_scenes import scene_of_all_kinds, small_scene
 
 import autdtorch as at
-from autdtorch.view3d import rendering_problem, view3d
+from autdtorch.view3d import animate3d, rendering_problem, view3d
 
 SPACING = 5e-3  # m, cells of the plane in the pictures
 
@@ -51,6 +52,7 @@ def broken_pyvista(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[
 def test_the_name_stays_the_function_after_its_module_has_been_imported() -> None:
     assert at.view3d is view3d
     assert sys.modules["autdtorch.view3d"] is not view3d
+    assert at.animate3d is animate3d
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
@@ -74,7 +76,7 @@ def test_a_probe_that_hangs_is_a_reason(
     broken_pyvista: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     broken_pyvista("import time\ntime.sleep(60)")
-    monkeypatch.setattr(sys.modules["autdtorch.view3d"], "_PROBE_TIMEOUT", 0.5)
+    monkeypatch.setattr(sys.modules["autdtorch.view3d.probe"], "_PROBE_TIMEOUT", 0.5)
     assert "did not end within 0.5 s" in str(rendering_problem())
 
 
@@ -92,6 +94,21 @@ def test_bad_input_is_refused_before_anything_is_rendered(
         view3d(scene, drive=torch.ones(2, 12, dtype=torch.complex128))
     with pytest.raises(ValueError, match=r"field: shape \(7,\); must be \(Nu, Nv\)"):
         view3d(scene, field=torch.ones(7))
+    with pytest.raises(ValueError, match=r"field\[0, 0\]: nan Pa; every entry must be finite"):
+        view3d(scene, field=torch.full((4, 4), torch.nan))
+    with pytest.raises(ValueError, match="field: 0 Pa everywhere has no level; give the reference"):
+        view3d(scene, field=torch.zeros(4, 4))
+    with pytest.raises(ValueError, match=r"volume: shape \(3, 3\); must be \(Nx, Ny, Nz\)"):
+        view3d(scene, volume=torch.ones(3, 3))
+    with pytest.raises(ValueError, match="isosurface: 3 dB; must be in -30 to 0"):
+        view3d(scene, isosurface=3)
+    with pytest.raises(ValueError, match=r"save: 'scene.bmp'; its suffix must be one of .png, .html, .gltf"):
+        view3d(scene, save="scene.bmp")
+    drive = torch.ones(12, dtype=torch.complex128)
+    with pytest.raises(ValueError, match=r"field: .* must be an array of complex numbers"):
+        animate3d(scene, drive, torch.ones(4, 4), "wave.gif")
+    with pytest.raises(ValueError, match="frames: 1; must be an integer >= 2"):
+        animate3d(scene, drive, torch.ones(4, 4, dtype=torch.complex128), "wave.gif", frames=1)
 
 
 def test_a_field_needs_an_observation_plane(scene: at.Scene) -> None:
@@ -104,9 +121,9 @@ def test_a_field_needs_an_observation_plane(scene: at.Scene) -> None:
 def test_a_picture_is_written_and_not_blank(scene: at.Scene, tmp_path: Path) -> None:
     import matplotlib.image
 
-    view3d(scene, screenshot=tmp_path / "scene.png").close()
+    view3d(scene, save=tmp_path / "scene.png").close()
     picture = matplotlib.image.imread(tmp_path / "scene.png")
-    assert picture.shape[:2] == (900, 1400)
+    assert picture.shape[:2] == (860, 1200)
     # The discs are drawn without lighting, so that their colour is exact: at least 100 pixels each, of 12.
     disc = np.abs(picture[..., :3] - np.array([0x00, 0x72, 0xB2]) / 255).max(axis=-1) < 0.01
     assert disc.sum() > 1200
@@ -135,25 +152,103 @@ def test_a_wall_is_drawn_as_far_as_the_domain() -> None:
 
 
 @pytest.mark.usefixtures("renderer")
-def test_meshes_hold_the_phases_and_pressures_given_in_millimetres(scene: at.Scene) -> None:
+def test_meshes_hold_the_phases_and_levels_given_in_millimetres(scene: at.Scene) -> None:
     assert scene.observation_plane is not None
     drive = at.drive_from_phases(torch.linspace(0, 6, len(scene.array)))
+    drive[3] = 0.0
     points = scene.observation_plane.points(SPACING)
-    pressure = at.green(points.reshape(-1, 3), scene.array.positions, scene.wavenumber) @ drive
-    pressure = pressure.reshape(points.shape[:2])
-    plotter = view3d(scene, drive=drive, field=pressure)
-    (sheet,) = (mesh for mesh in plotter.meshes if "pressure" in mesh.array_names)
-    discs, _arrows = (mesh for mesh in plotter.meshes if "phase" in mesh.array_names)
+    pressure = free_field(scene, drive, points)
+    plotter = view3d(scene, drive=drive, field=pressure, reference=2.0)
+    (sheet,) = (mesh for mesh in plotter.meshes if "field" in mesh.array_names)
+    discs = next(mesh for mesh in plotter.meshes if "phase" in mesh.array_names)
     limits = {title: bar.lookup_table.GetRange() for title, bar in plotter.scalar_bars.items()}
     plotter.close()
 
-    # Cell by cell: drawn at the point of the plane in mm (1e-4 mm: VTK keeps float32), with the |p| there.
-    order = np.lexsort(np.round(sheet.cell_centers().points, 3).T)
-    wanted = 1e3 * points.reshape(-1, 3).numpy()
-    wanted_order = np.lexsort(np.round(wanted, 3).T)
-    np.testing.assert_allclose(sheet.cell_centers().points[order], wanted[wanted_order], atol=1e-4)
-    np.testing.assert_allclose(sheet["pressure"][order], pressure.abs().reshape(-1).numpy()[wanted_order])
+    # At every point of the plane in mm (1e-4 mm: VTK keeps float32), the level there.
+    apart = torch.cdist(1e3 * points.reshape(-1, 3), torch.from_numpy(sheet.points).double())
+    nearest, index = apart.min(dim=1)
+    assert nearest.max() < 1e-4
+    level = (20 * (pressure.abs() / 2.0).log10()).clamp(min=-30).reshape(-1)
+    np.testing.assert_allclose(sheet["field"][index], level.numpy())
 
-    assert set(np.round(discs["phase"], 6)) == set(np.round(at.phases_of(drive).numpy(), 6))
-    assert limits["phase [rad]\n"] == pytest.approx((0, 2 * math.pi))
-    assert limits["pressure [Pa]\n"] == pytest.approx((0, pressure.abs().max().item()))
+    wanted = np.delete(at.phases_of(drive).numpy(), 3) / math.pi
+    assert set(np.round(discs["phase"][~np.isnan(discs["phase"])], 6)) == set(np.round(wanted, 6))
+    assert np.isnan(discs["phase"]).mean() == pytest.approx(1 / len(drive))  # the silent one
+    assert limits["phase / π\n"] == pytest.approx((0, 2))
+    assert limits["pressure [dB]\n"] == pytest.approx((-30, 0))
+
+
+@pytest.mark.usefixtures("renderer")
+def test_the_isosurface_lies_where_the_volume_has_its_level(scene: at.Scene) -> None:
+    # A field that falls as 1 / distance from control point 0, NaN on one side: of 1 Pa at 5 mm, the level of
+    # -6.0206 dB, half of that, is a sphere of 10 mm.
+    lower, upper = np.array(scene.domain)
+    counts = np.round((upper - lower) / 2e-3).astype(int)
+    axes = [
+        low + (high - low) * (np.arange(n) + 0.5) / n
+        for low, high, n in zip(lower, upper, counts, strict=True)
+    ]
+    center = scene.control_points[0].numpy()
+    away = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) - center
+    volume = 5e-3 / np.linalg.norm(away, axis=-1)
+    volume[away[..., 0] > 2e-3] = np.nan
+    plotter = view3d(scene, volume=volume, isosurface=20 * math.log10(0.5), reference=1.0)
+    surface = plotter.meshes[-1]
+    plotter.close()
+    radius = np.linalg.norm(surface.points - 1e3 * center, axis=1)
+    np.testing.assert_allclose(radius, 10.0, atol=0.1)  # linear in 2 mm cells: h^2 / 8 times the curvature
+    assert surface.points[:, 0].max() <= 1e3 * center[0] + 2.0 + 1e-4
+    assert surface.points[:, 0].min() == pytest.approx(1e3 * center[0] - 10.0, abs=0.1)
+
+
+@pytest.mark.usefixtures("renderer")
+def test_exports_are_self_contained(scene: at.Scene, tmp_path: Path) -> None:
+    field = torch.rand(4, 3, generator=torch.manual_seed(0))
+    view3d(scene, field=field, save=tmp_path / "scene.gltf").close()
+    content = json.loads((tmp_path / "scene.gltf").read_text(encoding="utf-8"))
+    assert all(buffer["uri"].startswith("data:") for buffer in content["buffers"])
+    corners = [accessor["max"] for accessor in content["accessors"] if "max" in accessor]
+    assert [80.0, 40.0, 30.0] in corners  # the corner of the plane [mm]
+
+
+@pytest.mark.usefixtures("renderer")
+def test_a_page_has_a_legend_of_its_own(scene: at.Scene, tmp_path: Path) -> None:
+    pytest.importorskip("trame_pyvista", reason="in the extra notebook")
+    view3d(scene, field=torch.ones(4, 3), reference=1.5, save=tmp_path / "scene.html").close()
+    page = (tmp_path / "scene.html").read_text(encoding="utf-8")
+    assert "pressure [dB]<div" in page
+    assert "0 dB = 1.5 Pa" in page
+    assert 'src="http' not in page
+
+
+def test_a_page_says_what_it_needs(scene: at.Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "trame_pyvista", None)
+    with pytest.raises(RuntimeError, match=r"needs trame-pyvista: pip install 'autdtorch\[notebook\]'"):
+        view3d(scene, save="scene.html")
+
+
+@pytest.mark.usefixtures("renderer")
+def test_an_animation_turns_the_wave_through_one_period(scene: at.Scene, tmp_path: Path) -> None:
+    from PIL import Image
+
+    assert scene.observation_plane is not None
+    drive = at.drive_from_phases(torch.zeros(len(scene.array)))
+    field = free_field(scene, drive, scene.observation_plane.points(SPACING))
+    animate3d(scene, drive, field, tmp_path / "wave.gif", frames=2)
+    with Image.open(tmp_path / "wave.gif") as wave:
+        assert (wave.n_frames, wave.info["loop"]) == (2, 0)
+        first = np.asarray(wave.convert("RGB"), float)
+        wave.seek(1)
+        second = np.asarray(wave.convert("RGB"), float)
+    # Half a period later the pressure has the other sign: red where blue was. Elsewhere nothing moves.
+    redness = first[..., 0] - first[..., 2], second[..., 0] - second[..., 2]
+    assert np.abs(redness[0]).max() > 100
+    moved = (first != second).any(axis=-1)
+    moved[:, :500] = False  # the transducers, whose colours turn on
+    assert moved.mean() > 0.02
+    assert np.corrcoef(redness[0][moved], redness[1][moved])[0, 1] < -0.95
+
+
+def free_field(scene: at.Scene, drive: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+    pressure = at.green(points.reshape(-1, 3), scene.array.positions, scene.wavenumber) @ drive
+    return pressure.reshape(points.shape[:2])

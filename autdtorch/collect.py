@@ -1,0 +1,234 @@
+"""The studies of a sweep, merged into one: scenes and methods side by side, trials of all seeds together."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import torch
+
+from autdtorch.metrics import FocusMetrics
+from autdtorch.optim import METHOD_LABELS
+from autdtorch.optim.base import Solution
+from autdtorch.results import (
+    PROVENANCE_FILE,
+    RESULTS_FILE,
+    MethodResult,
+    SceneResult,
+    StudyResult,
+    load_results,
+    median_trial,
+)
+from autdtorch.scene import Scene
+from autdtorch.scene_file import load_scene
+from autdtorch.study_folder import PREVIOUS
+
+logger = logging.getLogger(__name__)
+
+Settings: TypeAlias = Mapping[str, Any]
+"""Flat, by dotted keys such as ``solver.spacing``."""
+
+_METHODS = list(METHOD_LABELS)
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """The studies of a sweep as one.
+
+    Attributes:
+        results: of all studies. What was swept beside scene, method and seed is part of the names, such as
+            ``gabs,levels=8``. The provenance is that of the first study, with the settings of all.
+        scenes: the scenes of the results, by the same names.
+        swept: the settings that tell names apart, by name of scene and name of method.
+        studies: how many were merged.
+    """
+
+    results: StudyResult
+    scenes: dict[str, Scene]
+    swept: dict[tuple[str, str], Settings]
+    studies: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """What one study found with one method in one scene, and the settings that it depends on."""
+
+    scene: str
+    method: str
+    section: Mapping[str, Any]
+    place: Settings
+    search: Settings
+    seed: int
+    found: SceneResult
+
+    @property
+    def result(self) -> MethodResult:
+        return self.found.methods[self.method]
+
+
+def collect_results(folder: str | os.PathLike[str]) -> Sweep:
+    """Merge the studies in a folder and in the folders below it, such as those that a sweep left.
+
+    Studies that differ in nothing but seed and number of trials are taken as one, with the trials of all
+    seeds; a method without random choices keeps one trial. Studies that are not finished are left out, and
+    logged.
+
+    Args:
+        folder: where to look.
+
+    Returns:
+        The merged studies.
+
+    Raises:
+        FileNotFoundError: there is no such folder, no finished study in it, or a file that a scene names
+            is not there (paths start from the working directory, as they did for the sweep).
+        ValueError: results of another version, or of a study that did not come from the command line.
+    """
+    folder = Path(folder)
+    _log_unfinished(folder)
+    studies = {file.parent: load_results(file) for file in _files(folder, RESULTS_FILE)}
+    if not studies:
+        raise FileNotFoundError(f"{folder}: no finished study ({RESULTS_FILE}) there or below")
+    if len({study.provenance.source_digest for study in studies.values()}) > 1:
+        logger.warning("%s: the studies were made with different versions of the source", folder)
+    parts = [part for path, study in studies.items() for part in _parts(path, study)]
+    groups, swept = _groups(parts)
+    results = {scene: _merged_scene(methods) for scene, methods in groups.items()}
+    scenes = {scene: load_scene(next(iter(methods.values()))[0].section) for scene, methods in groups.items()}
+    origin = next(iter(studies.values())).provenance
+    texts = (f"# {path}\n{study.provenance.config.strip()}" for path, study in studies.items())
+    return Sweep(
+        StudyResult(replace(origin, config="\n\n".join(texts)), results), scenes, swept, len(studies)
+    )
+
+
+def _files(folder: Path, name: str) -> list[Path]:
+    """Files of that name in the folder and below, but for those of earlier studies."""
+    return sorted(file for file in folder.rglob(name) if not file.parent.name.startswith(PREVIOUS))
+
+
+def _log_unfinished(folder: Path) -> None:
+    for file in _files(folder, PROVENANCE_FILE):
+        if not file.with_name(RESULTS_FILE).exists():
+            logger.warning("%s: not finished, left out; the command that began it goes on", file.parent)
+
+
+def _parts(path: Path, study: StudyResult) -> Iterator[_Part]:
+    import yaml  # type: ignore[import-untyped]
+
+    settings = yaml.safe_load(study.provenance.config)
+    if not isinstance(settings, dict) or not {"scene", "scenes"} & settings.keys():
+        raise ValueError(f"{path / RESULTS_FILE}: no settings in it; must come from the command line")
+    common = {key: settings[key] for key in ("solver", "plane_spacing") if key in settings}
+    for name, found in study.scenes.items():
+        section = settings["scenes"][name] if "scenes" in settings else settings["scene"]
+        files = settings.get("obstacle_files", {}).get(name)
+        place = dict(_flat({"scene": section, "obstacle_files": files, **common}))
+        for method in found.methods:
+            search = settings["methods"][method] if "methods" in settings else settings["method"]
+            flat = dict(_flat({"method": search}))
+            yield _Part(name, method, section, place, flat, study.provenance.seed, found)
+
+
+def _flat(value: object, key: str = "") -> Iterator[tuple[str, Any]]:
+    items: Iterable[tuple[object, object]]
+    if isinstance(value, dict):
+        items = value.items()
+    elif isinstance(value, list):
+        items = enumerate(value)
+    else:
+        yield key, value
+        return
+    for name, entry in items:
+        yield from _flat(entry, f"{key}.{name}" if key else str(name))
+
+
+def _groups(
+    parts: Sequence[_Part],
+) -> tuple[dict[str, dict[str, list[_Part]]], dict[tuple[str, str], Settings]]:
+    """Parts of the same settings, by scene and method, and the settings that make their names."""
+    groups: dict[str, dict[str, list[_Part]]] = {}
+    swept: dict[tuple[str, str], Settings] = {}
+    for part in sorted(parts, key=lambda part: (part.scene, _rank(part.method))):
+        place = _told_apart(part.place, [other.place for other in parts if other.scene == part.scene])
+        search = _told_apart(part.search, [other.search for other in parts if other.method == part.method])
+        scene, method = _named(part.scene, place), _named(part.method, search)
+        groups.setdefault(scene, {}).setdefault(method, []).append(part)
+        swept[scene, method] = {**place, **search}
+    return groups, swept
+
+
+def _rank(method: str) -> int:
+    return _METHODS.index(method) if method in _METHODS else len(_METHODS)
+
+
+def _told_apart(settings: Settings, others: Sequence[Settings]) -> dict[str, Any]:
+    """The settings in which the others are not all alike."""
+    return {key: value for key, value in settings.items() if any(other.get(key) != value for other in others)}
+
+
+def _named(name: str, swept: Settings) -> str:
+    """The name with what was swept, in characters that can be part of a file's name."""
+    ends = [key.rpartition(".")[2] for key in swept]
+    shown = [end if ends.count(end) == 1 else key for key, end in zip(swept, ends, strict=True)]
+    text = ",".join([name, *(f"{key}={value}" for key, value in zip(shown, swept.values(), strict=True))])
+    return re.sub(r"[^\w.,=+-]", "_", text)
+
+
+def _merged_scene(methods: Mapping[str, Sequence[_Part]]) -> SceneResult:
+    found = [part.found for same in methods.values() for part in same]
+    simulated = max((scene.simulation for scene in found), key=lambda simulation: len(simulation.runs))
+    results = {name: _merged_trials(same) for name, same in methods.items()}
+    return replace(found[0], simulation=simulated, methods=results)
+
+
+def _merged_trials(parts: Sequence[_Part]) -> MethodResult:
+    """The trials of all seeds, of a seed those of the longest study."""
+    by_seed = {
+        part.seed: part.result for part in sorted(parts, key=lambda part: (part.seed, part.result.trials))
+    }
+    first, *others = by_seed.values()
+    kept = [
+        first,
+        *(other for other in others if not torch.equal(other.solution.drive, first.solution.drive)),
+    ]
+    solution = _joined_solution([result.solution for result in kept])
+    metrics = _joined_metrics([result.metrics for result in kept])
+    # A study keeps the observation plane of one trial: of those, the one nearest to the median is shown.
+    median = float(solution.score[median_trial(solution.score)])
+    shown = [float(result.solution.score[result.shown_trial]) for result in kept]
+    nearest = min(range(len(kept)), key=lambda index: abs(shown[index] - median))
+    before = sum(result.trials for result in kept[:nearest])
+    return MethodResult(
+        solution,
+        metrics,
+        torch.cat([result.seconds for result in kept]),
+        before + kept[nearest].shown_trial,
+        kept[nearest].plane_pressure,
+    )
+
+
+def _joined_solution(solutions: Sequence[Solution]) -> Solution:
+    longest = max(solution.history.shape[1] for solution in solutions)
+    columns = {
+        field.name: [getattr(solution, field.name) for solution in solutions] for field in fields(Solution)
+    }
+    columns["history"] = [
+        torch.cat([history, history[:, -1:].expand(-1, longest - history.shape[1])], dim=1)
+        for history in columns["history"]
+    ]
+    return Solution(**{name: torch.cat(parts) for name, parts in columns.items()})
+
+
+def _joined_metrics(metrics: Sequence[FocusMetrics]) -> FocusMetrics:
+    names = ("mean", "min", "std", "uniformity")
+    areas = [area for each in metrics if (area := each.area) is not None]
+    return FocusMetrics(
+        **{name: torch.cat([getattr(each, name) for each in metrics]) for name in names},
+        area=torch.cat(areas) if len(areas) == len(metrics) else None,
+    )

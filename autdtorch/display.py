@@ -1,0 +1,31 @@
+"""Tables for Jupyter, as HTML text."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+
+
+def html_facts(title: str, facts: Sequence[tuple[str, str]]) -> str:
+    """A table of names and values below a title."""
+    rows = "".join(
+        f'<tr><th style="text-align: left">{escape(name)}</th>'
+        f'<td style="text-align: left">{escape(value)}</td></tr>'
+        for name, value in facts
+    )
+    return f"<table>{_caption(title)}{rows}</table>"
+
+
+def html_table(title: str, rows: Sequence[Sequence[str]]) -> str:
+    """A table below a title; the first row is its head."""
+    head, *body = rows
+    lines = [_row("th", head), *(_row("td", row) for row in body)]
+    return f"<table>{_caption(title)}{''.join(lines)}</table>"
+
+
+def _caption(title: str) -> str:
+    return f'<caption style="text-align: left; font-weight: bold">{escape(title)}</caption>'
+
+
+def _row(tag: str, cells: Sequence[str]) -> str:
+    return "<tr>" + "".join(f"<{tag}>{escape(cell)}</{tag}>" for cell in cells) + "</tr>"

@@ -1,0 +1,9 @@
+"""Trials on real arrays: links to devices over USB, sensors, the objective that they make, and an emulator.
+
+Every public name is listed in ``__init__.pyi`` and imported when it is first used: only the emulator and an
+open link import pyusb.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,93 @@
+"""A bench without hardware: the device behind its USB chip, the air before it, and microphones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+
+from autdtorch.conditions import random_rms
+from autdtorch.hardware.devices import OPENMPD, SONICSURFACE, Device
+from autdtorch.hardware.emulated_bus import EmulatedBus, EmulatedChip
+from autdtorch.hardware.firmware import Firmware, OpenMPDFirmware, SonicSurfaceFirmware
+from autdtorch.hardware.link import wiring
+from autdtorch.validation import complex_tensor, finite_number, integer_at_least
+
+_FIRMWARES: dict[str, Callable[[], Firmware]] = {
+    SONICSURFACE.name: SonicSurfaceFirmware,
+    OPENMPD.name: OpenMPDFirmware,
+}
+
+
+class EmulatedBench:
+    """A device on an emulated USB bus, and the pressure it makes at the control points.
+
+    Attributes:
+        bus: backend for pyusb.
+        chip: the device's USB chip on the bus.
+        firmware: what takes the bytes behind the chip.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        transfer_matrix: torch.Tensor,
+        transducers: Sequence[int] | None = None,
+        serial: str = "EMULATED",
+    ) -> None:
+        """Plug the device in.
+
+        Args:
+            device: which.
+            transfer_matrix: (P, M) of the scene on the bench [Pa].
+            transducers: for each transducer of the scene, which of the device's it is; by default all in
+                order.
+            serial: number of the USB chip.
+
+        Raises:
+            ValueError: `transducers` that the device does not have, or not as many as the matrix has.
+        """
+        self._transducers = wiring(transducers, device.transducers)
+        self.transfer_matrix = complex_tensor("transfer_matrix", transfer_matrix).to("cpu", torch.complex128)
+        if self.transfer_matrix.ndim != 2 or self.transfer_matrix.shape[1] != len(self._transducers):
+            shape = tuple(self.transfer_matrix.shape)
+            raise ValueError(f"transfer_matrix: shape {shape}; must be (P, {len(self._transducers)})")
+        self.firmware = _FIRMWARES[device.name]()
+        self.chip = EmulatedChip(device.vendor, device.product, serial, self.firmware)
+        self.bus = EmulatedBus([self.chip])
+
+    def drive(self) -> torch.Tensor:
+        """What the scene's transducers now play (M,), complex128."""
+        return self.firmware.drive()[self._transducers]
+
+    def pressure(self) -> torch.Tensor:
+        """Phasors (P,) [Pa] at the control points now, complex128."""
+        return self.transfer_matrix @ self.drive()
+
+
+class EmulatedSensor:
+    """A microphone at each control point of an emulated bench, with the noise of `conditions.Noise`."""
+
+    def __init__(self, bench: EmulatedBench, snr: float | None = None, seed: int = 0) -> None:
+        """Set the microphones up.
+
+        Args:
+            bench: where they stand.
+            snr: 20 log10(reference / sigma) [dB], where the reference is the rms pressure over control points
+                and random phases, all transducers fully on; None for no noise.
+            seed: of the noise, >= 0.
+
+        Raises:
+            ValueError: an argument out of range.
+        """
+        self._bench = bench
+        self._generator = np.random.default_rng(integer_at_least("seed", seed, 0))
+        rms = random_rms(bench.transfer_matrix)
+        self._sigma = 0.0 if snr is None else rms * 10 ** (-finite_number("snr", snr, "dB") / 20)
+
+    def read(self) -> torch.Tensor:
+        """Magnitudes (P,) [Pa]."""
+        pressure = self._bench.pressure()
+        parts = torch.from_numpy(self._generator.standard_normal((len(pressure), 2)))
+        return (pressure + torch.view_as_complex(self._sigma / 2**0.5 * parts)).abs()

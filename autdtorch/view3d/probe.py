@@ -1,0 +1,61 @@
+"""Whether this machine can render in 3D."""
+
+from __future__ import annotations
+
+import functools
+import signal
+import subprocess
+import sys
+
+_PROBE = """
+import pyvista
+plotter = pyvista.Plotter(off_screen=True, window_size=(32, 32))
+plotter.add_mesh(pyvista.Sphere())
+if not plotter.screenshot(return_img=True).std():
+    raise SystemExit("the rendered picture is blank")
+"""
+_PROBE_TIMEOUT = 120.0  # s; a first import of PyVista from a cold disk takes tens of seconds
+
+
+@functools.cache
+def rendering_problem() -> str | None:
+    """Why this machine cannot render in 3D, or None if it can; found out once per process.
+
+    A child process tries it: where no OpenGL driver is found, VTK does not raise but its process is killed.
+    """
+    try:
+        child = subprocess.run(
+            [sys.executable, "-c", _PROBE],
+            capture_output=True,
+            text=True,
+            timeout=_PROBE_TIMEOUT,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        cause = f"a trial rendering did not end within {_PROBE_TIMEOUT:g} s"
+    else:
+        if child.returncode == 0:
+            return None
+        cause = _cause_of_death(child)
+    return (
+        f"3D rendering is not available: {cause}. It needs pip install 'autdtorch[viz]' and an OpenGL "
+        "driver, on Debian the packages libegl1 libgl1-mesa-dri libosmesa6"
+    )
+
+
+def require_rendering() -> None:
+    """Refuse to go on where it would kill the process.
+
+    Raises:
+        RuntimeError: this machine cannot render; the message says what is missing.
+    """
+    problem = rendering_problem()
+    if problem is not None:
+        raise RuntimeError(problem)
+
+
+def _cause_of_death(child: subprocess.CompletedProcess[str]) -> str:
+    if child.returncode < 0:
+        return f"a trial rendering was killed by {signal.Signals(-child.returncode).name}"
+    lines = child.stderr.strip().splitlines() or [f"exit status {child.returncode}"]
+    return f"a trial rendering failed with {lines[-1].strip()!r}"

@@ -1,0 +1,36 @@
+"""Running the command line in this process: a subprocess would import PyTorch anew for each."""
+
+import logging
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from autdtorch.cli import main
+
+Run = Callable[..., int]
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
+    """Runs a command line in an empty folder; returns its exit status."""
+    root, package = logging.getLogger(), logging.getLogger("autdtorch")
+    handlers, levels = root.handlers[:], (root.level, package.level)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
+    monkeypatch.setattr(sys, "path", sys.path[:])  # the command adds the working directory
+
+    def command(*arguments: str) -> int:
+        monkeypatch.setattr(sys, "argv", ["autdtorch", *arguments])
+        try:
+            main()
+        except SystemExit as end:
+            return int(end.code or 0)
+        return 0
+
+    yield command
+    # Hydra's logging writes to the stderr of this test alone.
+    root.handlers[:] = handlers
+    root.setLevel(levels[0])
+    package.setLevel(levels[1])

@@ -1,0 +1,144 @@
+"""Sweeps: a job for each scene and method, here and in other processes, and what a failure leaves of them."""
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+from autdtorch.cli import CONFIGS
+from autdtorch.collect import collect_results
+from autdtorch.results import load_results
+
+Run = Callable[..., int]
+
+QUICK = ("scene=homogeneous", "plane_spacing=0.02")
+
+
+def jobs(folder: Path) -> list[str]:
+    return sorted(file.parent.name for file in folder.rglob("results.h5"))
+
+
+@pytest.mark.parametrize("launcher", ["basic", "joblib", "submitit_local"])
+def test_a_sweep_has_a_folder_for_each_job(run: Run, tmp_path: Path, launcher: str) -> None:
+    assert run("-m", f"hydra/launcher={launcher}", *QUICK, "method=gabs,lssg") == 0
+    assert jobs(tmp_path) == [
+        f"method={name},plane_spacing=0.02,scene=homogeneous" for name in ("gabs", "lssg")
+    ]
+
+
+def test_jobs_in_one_scene_share_its_matrices(run: Run, tmp_path: Path) -> None:
+    coarse = ("scene=sphere", "solver.spacing=2.8e-3", "solver.tolerance=0.1", "plane_spacing=0.02")
+    assert run("-m", *coarse, "method=lss,lssg") == 0
+    (matrix,) = (tmp_path / "multirun" / "matrices").iterdir()
+    assert matrix.suffix == ".matrix"
+
+
+def test_a_real_cluster_has_its_config() -> None:
+    """All keys are those of the plugin, else Hydra refuses them; what runs out of time is queued again."""
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        launcher = compose("config", ["hydra/launcher=slurm"], return_hydra_config=True).hydra.launcher
+    assert launcher._target_.endswith("SlurmLauncher")
+    assert launcher.max_num_timeout > 0
+
+
+def test_without_slurm_it_says_so(
+    run: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", "")
+    assert run("-m", "hydra/launcher=slurm", *QUICK) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith('autdtorch: Could not detect "srun"')
+
+
+def test_where_a_job_fails_the_others_go_on(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("-m", *QUICK, "method.levels=1,4") == 2
+    (folder,) = jobs(tmp_path)
+    assert folder.startswith("method.levels=4,")
+    errors = capsys.readouterr().err.splitlines()
+    assert "job 0 failed: method gabs: levels: 1; must be an integer >= 2" in errors
+    assert errors[-1].startswith("autdtorch: a job failed")
+
+
+def test_the_folder_of_a_job_has_a_name_that_every_file_system_takes(run: Run, tmp_path: Path) -> None:
+    overrides = [f"scene.control_points.{key}" for key in ("center.0=8e-2", "radius=29e-3", "angle=0.1")]
+    overrides += ["scene.medium.sound_speed=341", "scene.array.pitch=11e-3", "solver.cache=some/where"]
+    assert run("-m", *QUICK, "method=lssg", *overrides) == 0
+    (folder,) = jobs(tmp_path)
+    assert len(folder) <= 150
+
+
+def test_a_sweep_says_where_its_folders_are_set(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("-m", *QUICK, "output=here") == 2
+    assert "a sweep has a folder for each job in hydra.sweep.dir" in capsys.readouterr().err
+
+
+def test_a_method_of_ones_own_is_found_in_the_working_directory(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "climbing.py").write_text(
+        "import autdtorch as at\n\n"
+        "def climb(objective, steps, trials, seed):\n"
+        "    return at.random_search(objective, evaluations=steps, trials=trials, seed=seed)\n",
+        encoding="utf-8",
+    )
+    (tmp_path / "mine" / "method").mkdir(parents=True)
+    (tmp_path / "mine" / "method" / "climb.yaml").write_text(
+        "_target_: climbing.climb\nsteps: 5\n", encoding="utf-8"
+    )
+    assert run("--config-dir", "mine", "-m", *QUICK, "method=climb", "trials=3") == 0
+    sweep = collect_results(tmp_path)
+    (method,) = sweep.results.scenes["homogeneous"].methods.items()
+    assert method[0] == "climb"
+    assert method[1].solution.evaluations.tolist() == [5, 5, 5]
+
+
+def test_collected_seeds_are_trials_and_other_settings_make_names(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("autdtorch.report.rendering_problem", lambda: "not tried")
+    assert run("-m", *QUICK, "method=gabs", "method.levels=4,8", "seed=0,1", "trials=2") == 0
+    assert run("-m", *QUICK, "method=lssg", "seed=0,1") == 0
+    alone = load_results(
+        next(path for path in tmp_path.rglob("results.h5") if "levels=8" in path.parent.name)
+    )
+    capsys.readouterr()
+    assert run("collect", "multirun") == 0
+    output = capsys.readouterr().out.splitlines()
+    assert output[-1].startswith(
+        "6 studies: the table is multirun/summary.csv, the report multirun/report.md"
+    )
+    sweep = collect_results(tmp_path)
+    methods = sweep.results.scenes["homogeneous"].methods
+    assert {name: method.trials for name, method in methods.items()} == {
+        "lssg": 1,  # no chance in it: two seeds give the same trial
+        "gabs,levels=4": 4,
+        "gabs,levels=8": 4,
+    }
+    one = alone.scenes["homogeneous"].methods["gabs"].solution.drive
+    drives = methods["gabs,levels=8"].solution.drive
+    assert any(drives[start : start + 2].equal(one) for start in (0, 2))
+    with (tmp_path / "multirun" / "summary.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["scene"], row["method"], row["method.levels"]) for row in rows] == [
+        ("homogeneous", "lssg", ""),
+        ("homogeneous", "gabs", "4"),
+        ("homogeneous", "gabs", "8"),
+    ]
+    # The summary's median is that of all trials.
+    assert float(rows[2]["median score [Pa]"]) == pytest.approx(
+        float(methods["gabs,levels=8"].solution.score.quantile(0.5)), rel=1e-12
+    )
+    assert (tmp_path / "multirun" / "report.md").exists()
+
+
+def test_an_unfinished_study_is_left_out(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("-m", *QUICK, "method=gabs,lssg") == 0
+    next(file for file in tmp_path.rglob("results.h5") if "lssg" in file.parent.name).unlink()
+    assert collect_results(tmp_path).studies == 1
+    assert (
+        "method=lssg,plane_spacing=0.02,scene=homogeneous: not finished, left out" in capsys.readouterr().err
+    )

@@ -1,0 +1,45 @@
+"""A bench that the tests share: 4 x 4 transducers of a device of 16 x 16, two control points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from autdtorch.array import TransducerArray
+from autdtorch.hardware import SONICSURFACE, Device, EmulatedBench, Link, open_link
+from autdtorch.objective import SimulatedObjective
+from autdtorch.propagator import make_propagator
+from autdtorch.scene import Medium, Scene
+
+#: The scene's transducers among the device's: four columns of four rows, not in the order of its channels.
+TRANSDUCERS = [16 * row + column for column in range(6, 10) for row in range(5, 9)]
+
+
+@dataclass
+class Trial:
+    """A scene, its simulation, and where its log goes."""
+
+    scene: Scene
+    simulated: SimulatedObjective
+    log: Path
+
+    def bench(self, device: Device = SONICSURFACE) -> EmulatedBench:
+        assert self.simulated.transfer_matrix is not None
+        return EmulatedBench(device, self.simulated.transfer_matrix, TRANSDUCERS)
+
+    def link(self, bench: EmulatedBench, device: Device = SONICSURFACE) -> Link:
+        return open_link(device, TRANSDUCERS, backend=bench.bus)
+
+
+@pytest.fixture
+def trial(tmp_path: Path) -> Trial:
+    scene = Scene(
+        TransducerArray.grid((4, 4), pitch=10.5e-3, center=(0, 0, 0)),
+        Medium(1.2, 340.0),
+        frequency=40e3,
+        control_points=[(80e-3, 10e-3, 0.0), (80e-3, -20e-3, 5e-3)],
+    )
+    simulated = SimulatedObjective(scene, make_propagator(scene, method="free_space"))
+    return Trial(scene, simulated, tmp_path / "trial.jsonl")

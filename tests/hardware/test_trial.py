@@ -1,0 +1,124 @@
+"""Trials on the emulated bench, against the simulation, and how they end."""
+
+import json
+
+import pytest
+import torch
+
+from autdtorch.conditions import Quantised, random_rms
+from autdtorch.drive import drive_from_phases
+from autdtorch.hardware import (
+    OPENMPD,
+    SONICSURFACE,
+    Device,
+    EmulatedSensor,
+    HardwareObjective,
+    LinkError,
+    open_link,
+)
+from autdtorch.optim.gabs import gabs
+
+
+def full_on() -> torch.Tensor:
+    return drive_from_phases(torch.zeros(16))
+
+
+@pytest.mark.parametrize(("device", "levels"), [(SONICSURFACE, 32), (OPENMPD, 128)])
+def test_without_noise_a_method_finds_the_same_drive_as_in_simulation(trial, device: Device, levels: int):
+    bench = trial.bench(device)
+    with trial.link(bench, device) as link:
+        measured = HardwareObjective(trial.scene, link, EmulatedSensor(bench), trial.log)
+        found = gabs(Quantised(measured, levels), levels=8)
+    expected = gabs(Quantised(trial.simulated, levels), levels=8)
+    assert torch.equal(found.drive, expected.drive)
+    # The same products, summed in another order.
+    torch.testing.assert_close(found.pressure, expected.pressure, rtol=1e-12, atol=0)
+    assert measured.evaluations == int(found.evaluations) == 1 + 15 * 8
+
+    lines = [json.loads(line) for line in trial.log.read_text().splitlines()]
+    assert len(lines) == measured.evaluations
+    asked = torch.view_as_complex(torch.tensor([line["drive"] for line in lines], dtype=torch.float64))
+    pressure = torch.tensor([line["pressure"] for line in lines], dtype=torch.float64)
+    torch.testing.assert_close(trial.simulated(asked), pressure, rtol=1e-12, atol=1e-12)
+
+
+def test_a_drive_between_the_levels_is_played_on_the_nearest(trial):
+    bench = trial.bench()
+    drive = drive_from_phases(torch.linspace(0, 3, 16, dtype=torch.float64), torch.linspace(0, 1, 16))
+    with trial.link(bench) as link:
+        link.play(drive)
+        played = Quantised(trial.simulated, levels=32, on_off=True).emitted(drive)
+        torch.testing.assert_close(bench.drive(), played, rtol=0, atol=1e-15)
+
+
+def test_an_evaluation_is_logged_before_the_next_is_played(trial):
+    class Watching(EmulatedSensor):
+        def read(self):
+            lines.append(trial.log.read_bytes().count(b"\n"))
+            return super().read()
+
+    lines: list[int] = []
+    bench = trial.bench()
+    with trial.link(bench) as link:
+        HardwareObjective(trial.scene, link, Watching(bench), trial.log)(full_on().expand(3, -1))
+    assert lines == [0, 1, 2]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError, SystemExit])
+def test_the_outputs_are_off_before_and_after_however_it_ends(trial, error: type[BaseException]):
+    def interrupted_trial() -> None:
+        with trial.link(bench) as link:
+            assert bench.firmware.drive().abs().max() == 0
+            link.play(full_on())
+            assert bench.drive().abs().min() > 0.9
+            raise error
+
+    bench = trial.bench()
+    assert bench.firmware.drive().abs().min() > 0.9  # the device starts with all transducers on
+    with pytest.raises(error):
+        interrupted_trial()
+    assert bench.firmware.drive().abs().max() == 0
+
+
+@pytest.mark.parametrize("pressure", [[1.0], [1.0, float("nan")], [1.0, -1.0]])
+def test_what_a_sensor_cannot_have_heard_ends_the_trial_with_the_outputs_off(trial, pressure):
+    class Broken:
+        def read(self):
+            return torch.tensor(pressure)
+
+    bench = trial.bench()
+    with pytest.raises(ValueError, match="pressure of the sensor"), trial.link(bench) as link:
+        HardwareObjective(trial.scene, link, Broken(), trial.log)(full_on()[None])
+    assert bench.firmware.drive().abs().max() == 0
+    assert trial.log.read_bytes() == b""
+
+
+def test_the_sensor_reads_with_the_noise_of_its_snr(trial):
+    bench = trial.bench()
+    sensor = EmulatedSensor(bench, snr=10.0)
+    variance = random_rms(bench.transfer_matrix) ** 2 / 10
+    with trial.link(bench) as link:
+        for drive in (full_on(), 0 * full_on()):
+            link.play(drive)
+            power = torch.stack([sensor.read() for _ in range(1000)]).square()
+            expected = bench.pressure().abs().square() + variance  # E|p + n|^2
+            # Five standard errors of the mean.
+            assert ((power.mean(dim=0) - expected).abs() < 5 * power.std(dim=0) / 1000**0.5).all()
+
+
+def test_a_scene_of_other_transducers_is_refused(trial):
+    bench = trial.bench()
+    with open_link(SONICSURFACE, backend=bench.bus) as link, pytest.raises(ValueError, match="must be 16"):
+        HardwareObjective(trial.scene, link, EmulatedSensor(bench), trial.log)
+    with pytest.raises(ValueError, match="from 0 to 255, each once"):
+        open_link(SONICSURFACE, [3, 3], backend=bench.bus)
+
+
+def test_an_unplugged_device_is_an_error_that_says_so(trial):
+    bench = trial.bench()
+    link = trial.link(bench)
+    bench.chip.present = False
+    with pytest.raises(LinkError, match="disconnected"):
+        link.play(full_on())
+    with pytest.raises(LinkError, match="disconnected"):
+        link.close()

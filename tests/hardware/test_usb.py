@@ -1,0 +1,81 @@
+"""The FTDI chip as pyusb sees it: which is found, how it is set up, what goes through."""
+
+import pytest
+
+from autdtorch.hardware import LinkError
+from autdtorch.hardware.emulated_bus import EmulatedBus, EmulatedChip
+from autdtorch.hardware.firmware import OpenMPDFirmware, SonicSurfaceFirmware
+from autdtorch.hardware.usb import FtdiPort, FtdiUart, baud_divisor, find_device
+
+UART, FIFO = (0x0403, 0x6001), (0x0403, 0x6014)
+
+
+def chip(serial: str = "A1", kind: type[EmulatedChip] = EmulatedChip) -> EmulatedChip:
+    return kind(*UART, serial, SonicSurfaceFirmware())
+
+
+def test_the_device_asked_for_is_found_by_its_numbers():
+    bus = EmulatedBus([chip("A1"), EmulatedChip(*FIFO, "B1", OpenMPDFirmware()), chip("A2")])
+    assert find_device(*FIFO, backend=bus).serial_number == "B1"
+    assert find_device(*UART, serial="A2", backend=bus).address == 2
+
+
+@pytest.mark.parametrize(
+    ("chips", "serial", "message"),
+    [
+        ([], None, "no USB devices are 0403:6001. Plugged in: none"),
+        (["A1"], "A2", r"no .* number 'A2'. Plugged in: 0403:6001 \(serial number A1\)"),
+        (["A1", "A2"], None, "2 USB devices .* by its serial number. Plugged in: .*A1.*, .*A2"),
+    ],
+)
+def test_none_or_several_are_an_error_that_lists_what_is_there(chips, serial, message):
+    with pytest.raises(LinkError, match=message):
+        find_device(*UART, serial=serial, backend=EmulatedBus([chip(name) for name in chips]))
+
+
+@pytest.mark.parametrize(
+    ("baud", "value", "index"),
+    [  # FTDI's application note AN232B-05
+        (300, 0x2710, 0),
+        (9600, 0x4138, 0),
+        (19200, 0x809C, 0),
+        (38400, 0xC04E, 0),
+        (55944, 0x4035, 1),
+        (115_200, 0x001A, 0),
+        (230_400, 0x000D, 0),
+        (460_800, 0x4006, 0),
+    ],
+)
+def test_baud_divisors_are_those_of_the_application_note(baud, value, index):
+    assert baud_divisor(baud) == (value, index)
+
+
+def test_at_another_rate_the_device_hears_nothing():
+    wired = chip()
+    device = find_device(*UART, backend=EmulatedBus([wired]))
+    before = wired.firmware.drive()
+    FtdiUart(device, baud=115_200).write(bytes([254, *[32] * 256, 253]))
+    assert wired.firmware.drive().equal(before)
+    FtdiUart(device, baud=230_400).write(bytes([254, *[32] * 256, 253]))
+    assert wired.firmware.drive().abs().max() == 0
+
+
+def test_status_bytes_are_stripped_from_every_packet():
+    class Talking(EmulatedChip):
+        def read(self) -> bytes:
+            return b"\x01\x60" + 62 * b"a" + b"\x01\x60bc"
+
+    quiet = FtdiPort(find_device(*UART, backend=EmulatedBus([chip()])))
+    assert quiet.read() == b""
+    talking = FtdiPort(find_device(*UART, backend=EmulatedBus([chip(kind=Talking)])))
+    assert talking.read(packets=2) == 62 * b"a" + b"bc"
+
+
+def test_a_chip_that_takes_nothing_more_is_an_error():
+    class Full(EmulatedBus):
+        def bulk_write(self, dev_handle, ep, intf, data, timeout):
+            return min(len(data), 60 if len(data) > 100 else 0)
+
+    port = FtdiPort(find_device(*UART, backend=Full([chip()])))
+    with pytest.raises(LinkError, match="took 60 of 160 bytes"):
+        port.write(bytes(160))

@@ -1,0 +1,124 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from autdtorch.array import TransducerArray
+from autdtorch.array_file import load_array
+from autdtorch.drive import amplitudes_of, drive_from_phases
+from autdtorch.drive_file import load_drive, save_drive
+from autdtorch.freespace import free_space_matrix
+from autdtorch.hardware.levels import autd3_levels
+
+ARRAYS = {
+    "autd3": TransducerArray.autd3((0, 0, 0), units=(2, 1)),
+    "openmpd": TransducerArray.openmpd((0, 0, 0)),
+    "sonicsurface": TransducerArray.sonicsurface((0, 0, 0)),
+}
+
+
+def some_drive(count):
+    generator = torch.Generator().manual_seed(0)
+    phases = 2 * math.pi * torch.rand(count, generator=generator, dtype=torch.float64)
+    return drive_from_phases(phases, torch.rand(count, generator=generator, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz"])
+def test_drive_and_array_come_back(tmp_path, suffix):
+    array = TransducerArray.autd3((0.1, 0.2, 0.3), normal=(1, 2, 3))
+    drive = some_drive(249)
+    save_drive(tmp_path / f"drive{suffix}", drive, array)
+
+    read, places = load_drive(tmp_path / f"drive{suffix}"), load_array(tmp_path / f"drive{suffix}")
+
+    # .npz keeps all bits; .csv keeps phase and amplitude, from which q is computed again.
+    torch.testing.assert_close(read, drive, rtol=0, atol=0 if suffix == ".npz" else 1e-14)
+    torch.testing.assert_close(places.positions, array.positions, rtol=0, atol=1e-15)
+    torch.testing.assert_close(places.normals, array.normals, rtol=0, atol=1e-15)
+    if suffix == ".npz":
+        assert (places.source_strength, places.radius) == (array.source_strength, array.radius)
+
+
+def test_csv_can_be_read_by_a_person(tmp_path):
+    array = TransducerArray([[0, 0, 0], [0, 10e-3, 0]], (1, 0, 0))
+    save_drive(tmp_path / "drive.csv", drive_from_phases([0.25, 1.5], [1, 0.5]), array)
+
+    assert (tmp_path / "drive.csv").read_text().splitlines() == [
+        "transducer,x [m],y [m],z [m],nx,ny,nz,phase [rad],amplitude",
+        "0,0.0,0.0,0.0,1.0,0.0,0.0,0.25,1.0",
+        "1,0.0,0.01,0.0,1.0,0.0,0.0,1.5,0.5",
+    ]
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz"])
+@pytest.mark.parametrize("device", ARRAYS)
+def test_levels_come_back_as_the_device_plays_them(tmp_path, device, suffix):
+    array, drive = ARRAYS[device], some_drive(len(ARRAYS[device]))
+    path = tmp_path / f"drive{suffix}"
+    save_drive(path, drive, array, device)
+    played = load_drive(path)
+    save_drive(path, played, array, device)
+
+    assert torch.equal(load_drive(path), played)
+    # Half a step of phase and of amplitude: of 256 and 255, 128 and pi/128 at most, 32 and on or off.
+    phase_error = {"autd3": math.pi / 256, "openmpd": math.pi / 128, "sonicsurface": math.pi / 32}[device]
+    amplitude_error = {"autd3": 1 / 510, "openmpd": math.pi / 256, "sonicsurface": 0.5}[device]
+    on = played.abs() > 0
+    assert (played / drive)[on].angle().abs().max() <= phase_error + 1e-9
+    assert (amplitudes_of(played) - amplitudes_of(drive)).abs().max() <= amplitude_error + 1e-9
+
+
+def test_autd3_gets_bytes_in_the_order_of_its_units(tmp_path):
+    drive = some_drive(498)
+    save_drive(tmp_path / "drive.npz", drive, ARRAYS["autd3"], "autd3")
+
+    with np.load(tmp_path / "drive.npz") as file:
+        assert str(file["device"]) == "autd3"
+        for name, level in zip(("phase", "intensity"), autd3_levels(drive), strict=True):
+            assert (file[name].dtype, file[name].shape) == (np.uint8, (2, 249))
+            assert np.array_equal(file[name].ravel(), level.numpy())
+
+
+def test_the_field_of_what_autd3_plays_is_that_of_the_drive_within_its_levels(tmp_path):
+    array = TransducerArray.autd3((0, 0, 0), normal=(0, 0, 1))
+    drive = some_drive(249)
+    save_drive(tmp_path / "drive.csv", drive, array, "autd3")
+    matrix = free_space_matrix([[0, 0, 0.1], [0.02, 0.03, 0.15]], array, wavenumber=739.0)
+
+    moved = (matrix @ (load_drive(tmp_path / "drive.csv") - drive)).abs()
+
+    # Each transducer is off by at most half a level of its phase and half of one of its amplitude.
+    assert (moved <= (math.pi / 256 + 1 / 510) * matrix.abs().sum(dim=1)).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("transducer,phase [rad]\n0,1\n", r"d.csv: no column amplitude; must have phase and amplitude"),
+        ("phase [rad],amplitude\n0,2\n", r"d.csv: amplitudes: from 2 to 2"),
+        (
+            "unit,transducer,autd3 phase\n0,0,1\n",
+            r"d.csv: no autd3 intensity; must have autd3 phase, autd3 int",
+        ),
+        ("autd3 phase,autd3 intensity\n256,0\n", r"d.csv: AUTD3 levels.phase: .*0 to 255"),
+        ("autd3 phase,autd3 intensity\n1.5,0\n", r"d.csv: AUTD3 levels.phase: .*0 to 255"),
+    ],
+)
+def test_what_is_wrong_with_a_drive_file_is_said(tmp_path, text, message):
+    (tmp_path / "d.csv").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        load_drive(tmp_path / "d.csv")
+
+
+def test_a_drive_that_is_not_the_devices_is_refused(tmp_path):
+    array = TransducerArray.grid((4, 4), 10e-3, (0, 0, 0))
+    drive = drive_from_phases(torch.zeros(16))
+    with pytest.raises(ValueError, match=r"16 transducers; must be a multiple of 249 for autd3"):
+        save_drive(tmp_path / "d.csv", drive, array, "autd3")
+    with pytest.raises(ValueError, match=r"device: 'autd'; must be one of autd3, openmpd, sonicsurface"):
+        save_drive(tmp_path / "d.csv", drive, array, "autd")
+    with pytest.raises(ValueError, match=r"path: .*; must end in .csv or .npz"):
+        save_drive(tmp_path / "d.txt", drive, array)
+    with pytest.raises(ValueError, match=r"drive: shape \(1, 16\); must be \(16,\), one drive"):
+        save_drive(tmp_path / "d.csv", drive[None], array)
