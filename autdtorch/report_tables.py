@@ -44,7 +44,7 @@ semidefinite relaxation. No method can be better, and the best drive may lie bel
 parentheses how many of them got there, if not all. A trial that did not counts as later than all that did;
 where that leaves the median open, there is a dash."""
 
-_ABOUTBASELINE = """{label} is a line to compare with and no competitor: it reads gradients off the transfer
+_ABOUT_BASELINE = """{label} is a line to compare with and no competitor: it reads gradients off the transfer
 matrix, which the others do not know, so that its evaluations are not listed."""
 
 _BELOW_SIMULATION = """A run ends when its estimated relative distance to the steady state is at most
@@ -123,7 +123,7 @@ def findings(results: StudyResult) -> str:
     """The section of what the paper does not have: gaps to the bound."""
     text = ["## Beyond the paper", table(finding_rows(results)), _BELOW_FINDINGS, _ABOUT_BOUND]
     if any(BASELINE in scene.methods for scene in results.scenes.values()):
-        text.append(_ABOUTBASELINE.format(label=label_of(BASELINE).capitalize()))
+        text.append(_ABOUT_BASELINE.format(label=label_of(BASELINE).capitalize()))
     return "\n\n".join(text)
 
 

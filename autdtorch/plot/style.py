@@ -64,9 +64,9 @@ styled = mpl.rc_context(_STYLE)
 TICK_SIZE = 8.0  # not in the style: ticks are made when the figure is drawn, after the style has gone
 
 _DPI = 150
+_SCREEN_DPI = 96  # where a notebook shows it
 _MOST_COLUMNS = 3  # of panels
 _LETTER = 0.08  # mean width [inch]
-_SCREEN_DPI = 96  # where a notebook shows it
 
 
 class ShownFigure(Figure):
