@@ -27,6 +27,7 @@ MOST_EDGES = 500  # of one obstacle; more, as voxels have, would blacken it and 
 
 PHASE_MAP = "twilight"  # cyclic: 0 and 2 pi look the same
 PRESSURE_MAP = "inferno"
+FLOOR = -30.0  # dB, the lower end of the colours of levels
 WAVE_MAP = "RdBu_r"  # of pressures of both signs; white is 0
 
 
@@ -60,6 +61,13 @@ def plane_magnitude(name: str, pressure: ArrayLike) -> Array:
     if magnitude.ndim != 2 or magnitude.size == 0:
         raise ValueError(f"{name}: shape {magnitude.shape}; must be (Nu, Nv), the points of a plane")
     return magnitude
+
+
+def in_decibels(magnitude: Array, zero: float) -> Array:
+    """Level 20 lg(|p| / zero) [dB]; of silence, minus infinity; NaN stays."""
+    with np.errstate(divide="ignore"):
+        level: Array = 20 * np.log10(magnitude / zero)
+    return level
 
 
 def single_drive_phases(drive: ArrayLike, transducers: int) -> Array:

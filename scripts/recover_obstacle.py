@@ -15,10 +15,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import torch
+from matplotlib.patches import Circle
 
 import autdtorch as at
+from autdtorch.plot.style import TICK_SIZE, log_axes, looks_of, new_figure, styled
 
 AIR = at.Medium(density=1.2, sound_speed=343.0)
 SIZE = (40e-3, 32e-3, 32e-3)
@@ -103,29 +104,35 @@ def recover(drive: torch.Tensor, heard: torch.Tensor, spacing: float, steps: int
         schedule.step()
 
 
+@styled
 def draw(way: list[Guess], picture: Path) -> None:
     """The way in two planes, and density and misfit along it."""
-    figure, axes = plt.subplots(1, 3, figsize=(11, 4), layout="constrained")
+    figure = new_figure(10.0, 3.6)
+    axes = figure.subplots(1, 3)
+    found, other_look = looks_of(("found", "other")).values()
     centers = 1e3 * torch.stack([guess.center for guess in way])
     truth = 1e3 * torch.tensor(TRUE_CENTER)
     scene = scene_of()
     for axis, (other, name) in zip(axes, ((1, "y"), (2, "z")), strict=False):
-        axis.add_patch(plt.Circle((truth[0], truth[other]), 1e3 * RADIUS, color="0.85", label="sphere"))
+        axis.add_patch(Circle((truth[0], truth[other]), 1e3 * RADIUS, color="0.85", label="sphere"))
         for points, mark, label in (
             (scene.array.positions, "s", "transducers"), (scene.control_points, "o", "microphones")
         ):  # fmt: skip
             axis.plot(1e3 * points[:, 0], 1e3 * points[:, other], mark, color="0.5", ms=4, label=label)
-        axis.plot(centers[:, 0], centers[:, other], ".-", color="C3", label="centre found")
+        axis.plot(centers[:, 0], centers[:, other], ".-", color=found.colour, label="centre found")
         axis.plot(truth[0], truth[other], "k+", ms=10, label="centre")
         axis.set(xlabel="x [mm]", ylabel=f"{name} [mm]", aspect="equal", xlim=(0, 40), ylim=(0, 32))
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower left", ncols=5, fontsize=8)
-    axes[2].semilogy([100 * guess.misfit for guess in way], ".-", color="C0", label="misfit [%]")
-    axes[2].semilogy([guess.density for guess in way], ".-", color="C1", label="density [kg/m$^3$]")
-    axes[2].axhline(TRUE_DENSITY, color="C1", ls=":", lw=1)
-    axes[2].set(xlabel="step")
-    axes[2].legend(fontsize=7)
-    figure.savefig(picture, dpi=120)
-    plt.close(figure)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower left", ncols=5)
+    misfit, density = [100 * guess.misfit for guess in way], [guess.density for guess in way]
+    axes[2].plot(misfit, ".-", color=found.colour, label="misfit [%]")
+    axes[2].plot(density, "s--", ms=3, color=other_look.colour, label="density [kg/m$^3$]")
+    axes[2].axhline(TRUE_DENSITY, color=other_look.colour, ls=":", lw=1, label="true density")
+    axes[2].set(xlabel="step", ylabel="misfit [%], density [kg/m$^3$]")
+    log_axes(axes[2], "y")
+    axes[2].legend()
+    for axis in axes:
+        axis.tick_params(labelsize=TICK_SIZE)
+    figure.savefig(picture)
 
 
 def main() -> None:

@@ -12,7 +12,7 @@ from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
-from autdtorch.drawing import MM, PRESSURE_MAP, Array, plane_magnitude
+from autdtorch.drawing import FLOOR, MM, PRESSURE_MAP, Array, in_decibels, plane_magnitude
 from autdtorch.geometry import Plane
 from autdtorch.obstacles import Obstacle
 from autdtorch.plot.style import (
@@ -29,8 +29,6 @@ from autdtorch.plot.style import (
 from autdtorch.validation import ArrayLike, points_tensor
 
 _AXIS_TOLERANCE = 1e-12  # by which a unit vector along x, y or z may miss length 1 in that coordinate
-
-_FLOOR = -30.0  # dB, the lower end of the colours, as in view3d
 
 _OUTLINE_CELLS = 400  # along the longer side of a plane, to find where obstacles cut it
 
@@ -72,8 +70,8 @@ def plot_plane(
     if decibels:
         if peak == 0:
             raise ValueError("pressure: 0 Pa everywhere; must be more somewhere to have a level in dB")
-        values = 20 * np.log10(np.maximum(magnitude / peak, 10 ** (_FLOOR / 20)))
-        limits, label = (_FLOOR, 0.0), f"level of |p| [dB], 0 dB = {peak:.3g} Pa"
+        values = np.maximum(in_decibels(magnitude, peak), FLOOR)
+        limits, label = (FLOOR, 0.0), f"level of |p| [dB], 0 dB = {peak:.3g} Pa"
     mesh = _draw_plane(ax, values, plane, control_points, obstacles, limits)
     _add_colour_bar(figure, mesh, [ax], "vertical", label)
     return figure

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from autdtorch.drawing import EDGE_COLOUR, MM, PLANE_COLOUR, PRESSURE_MAP, Array
+from autdtorch.drawing import EDGE_COLOUR, FLOOR, MM, PLANE_COLOUR, PRESSURE_MAP, Array
 from autdtorch.geometry import Plane
 from autdtorch.scene import Scene
 from autdtorch.validation import distances
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     import pyvista
 
 logger = logging.getLogger(__name__)
-
-FLOOR = -30.0  # dB, the lower end of the colours
 
 _REACH = 3.0  # wavelengths around a control point
 _SURFACE_COLOUR = "#8CD0FF"  # blue: a hue that the map of the pressure does not have

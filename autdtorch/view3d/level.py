@@ -11,13 +11,6 @@ from autdtorch.scene import Scene
 from autdtorch.validation import ArrayLike, positive, real_tensor
 
 
-def decibels(magnitude: Array, zero: float) -> Array:
-    """Level 20 lg(|p| / zero) [dB]; of silence, minus infinity; NaN stays."""
-    with np.errstate(divide="ignore"):
-        level: Array = 20 * np.log10(magnitude / zero)
-    return level
-
-
 def plane_pressure(scene: Scene, field: ArrayLike) -> tuple[Plane, torch.Tensor]:
     """The scene's observation plane, and `field` as a tensor, after checking that it can be drawn there.
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from autdtorch.drawing import FLOOR, in_decibels
 from autdtorch.scene import Scene
 from autdtorch.validation import ArrayLike, number_between
 from autdtorch.view3d.export import require_suffix, write
-from autdtorch.view3d.field import FLOOR, add_isosurface, add_plane
-from autdtorch.view3d.level import decibels, plane_pressure, volume_magnitude, zero_level
+from autdtorch.view3d.field import add_isosurface, add_plane
+from autdtorch.view3d.level import plane_pressure, volume_magnitude, zero_level
 from autdtorch.view3d.probe import require_rendering
 from autdtorch.view3d.scene import add_caption, add_transducers, emitted_phases, new_plotter
 
@@ -64,11 +65,11 @@ def view3d(
     plotter = new_plotter(scene, off_screen)
     add_transducers(plotter, scene, phases)
     if scene.observation_plane is not None:
-        level = None if on_plane is None else decibels(on_plane, zero)
+        level = None if on_plane is None else in_decibels(on_plane, zero)
         add_plane(plotter, scene.observation_plane, level)
     caption = [] if on_plane is None and in_domain is None else [f"0 dB = {zero:.3g} Pa"]
     if in_domain is not None:
-        add_isosurface(plotter, scene, decibels(in_domain, zero), height)
+        add_isosurface(plotter, scene, in_decibels(in_domain, zero), height)
         caption.append(f"surface: {height:g} dB")
     add_caption(plotter, *caption)
     if path is not None:
