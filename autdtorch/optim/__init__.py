@@ -15,4 +15,4 @@ METHOD_LABELS = {
 def label_of(method: str) -> str:
     """A method's name in the paper, or its own, and behind a comma the settings that were swept."""
     name, comma, settings = method.partition(",")
-    return METHOD_LABELS.get(name, name.replace("_", " ")) + comma + settings
+    return METHOD_LABELS.get(name, name.replace("_", " ")) + (comma + settings).replace(",", ", ")
