@@ -79,19 +79,27 @@ def without(
         shape: of the whole array.
         kappa: wavenumber times spacing [rad].
     """
+    rows = np.flatnonzero(missing.any(axis=1))
+    if len(rows) == 0:
+        return spread
     weight = spread.weight.copy()
-    shared = np.sinc(kappa / np.pi * np.arange(2 * _ONE_SIDED_REACH))
-    for row in np.flatnonzero(missing.any(axis=1)):
-        places = np.stack(np.unravel_index(spread.index[row], shape), axis=-1)
-        off = np.abs(places - cells[row])
-        left = ~missing[row] & (off < _ONE_SIDED_REACH).all(axis=1)
-        weight[row] = 0
+    weight[rows] = 0
+    # The cells of all points lie alike, so that one matrix holds the systems of all.
+    places = _places(spread.index[rows[0]], shape)
+    whole = np.sinc(kappa / np.pi * (places[:, None] - places)).prod(axis=-1)
+    whole += _ONE_SIDED_REGULARISATION**2 * np.eye(len(whole))
+    for row in rows:
+        off = np.abs(_places(spread.index[row], shape) - cells[row])
+        left = np.flatnonzero(~missing[row] & (off < _ONE_SIDED_REACH).all(axis=1))
         if (off[left] < 1).all(axis=1).any():
-            apart = np.abs(places[left][:, None] - places[left])
-            system = shared[apart].prod(axis=-1) + _ONE_SIDED_REGULARISATION**2 * np.eye(len(apart))
             target = np.sinc(kappa / np.pi * off[left]).prod(axis=-1)
-            weight[row, left] = solve(system, target, assume_a="pos")
+            weight[row, left] = solve(whole[np.ix_(left, left)], target, assume_a="pos", check_finite=False)
     return PointWeights(spread.index, weight)
+
+
+def _places(index: NDArray[np.int64], shape: Shape) -> NDArray[np.int64]:
+    """Positions (n, 3) of cells (n,) of an array of that shape."""
+    return np.stack(np.unravel_index(index, shape), axis=-1)
 
 
 @lru_cache(maxsize=64)

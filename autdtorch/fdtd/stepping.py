@@ -75,14 +75,19 @@ class Assembly:
 
     def _spread_nodes(self, points: torch.Tensor) -> PointWeights:
         grid = self.grid
+        spread = self._footprints(points)
         cells = grid.to_cells(points)
-        spread = point_weights(cells, grid.shape, grid.first, grid.last, grid.kappa)
         # the pressure of a rigid obstacle's closed cells means nothing
         return without(spread, cells, np.isin(spread.index, self.varying.rigid), grid.shape, grid.kappa)
 
+    def _footprints(self, points: torch.Tensor) -> PointWeights:
+        """As if all cells were of air."""
+        grid = self.grid
+        return point_weights(grid.to_cells(points), grid.shape, grid.first, grid.last, grid.kappa)
+
     def touches_varying(self, points: torch.Tensor) -> bool:
         """Whether any of the points (N, 3) [m], in the domain, is spread over cells that are not of air."""
-        return len(points) > 0 and bool(np.isin(self.spread(points).index, self.varying.index).any())
+        return len(points) > 0 and bool(np.isin(self._footprints(points).index, self.varying.index).any())
 
     def receivers(self, points: torch.Tensor, weights: torch.Tensor = _ONE_NODE) -> Receivers:
         """Receivers at points (P, 3) [m], or means over nodes (P, n, 3) with `weights` (n,)."""
