@@ -8,6 +8,7 @@ from typing import Any, cast
 import numpy as np
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import NDArray
@@ -31,6 +32,7 @@ from autdtorch.plot.style import TICK_SIZE, new_figure, styled
 from autdtorch.scene import Scene
 from autdtorch.validation import ArrayLike, Vector
 
+_TICKS = 5  # along the longest side; on a short one more would run into each other
 _ELEVATION, _AZIMUTH = 22.0, -118.0  # of the viewer [degrees]
 
 
@@ -75,6 +77,8 @@ def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
     ax.zaxis.set_rotate_label(False)  # which would set it upside down
     ax.set_zlabel("z [mm]", rotation=90)
     ax.set_box_aspect(upper - lower, zoom=0.85)
+    for axis, length in zip((ax.xaxis, ax.yaxis, ax.zaxis), upper - lower, strict=True):
+        axis.set_major_locator(MaxNLocator(max(2, round(_TICKS * length / max(upper - lower)))))
     ax.view_init(elev=_ELEVATION, azim=_AZIMUTH)
     ax.tick_params(labelsize=TICK_SIZE)
     ax.legend(loc="upper left")
