@@ -1,5 +1,7 @@
 """Optimisers: they see an objective (drives in, pressure magnitudes out) and nothing behind it."""
 
+import re
+
 METHOD_LABELS = {
     "lss": "LSS",
     "lssg": "LSSG",
@@ -15,4 +17,4 @@ METHOD_LABELS = {
 def label_of(method: str) -> str:
     """A method's name in the paper, or its own, and behind a comma the settings that were swept."""
     name, comma, settings = method.partition(",")
-    return METHOD_LABELS.get(name, name.replace("_", " ")) + (comma + settings).replace(",", ", ")
+    return METHOD_LABELS.get(name, name.replace("_", " ")) + re.sub(r",(?=\S)", ", ", comma + settings)

@@ -127,9 +127,11 @@ def plot_convergence(
     styles = {name: _LEVELS[index % len(_LEVELS)] for index, name in enumerate(level_labels)}
     looks = looks_of(methods_of(history.values()))
     figure, panels = new_panels(history, *_PANEL, "evaluations", label, sharey=True)
+    title = None
     for ax, (scene, by_method) in zip(panels, history.items(), strict=True):
         for method, given in by_method.items():
             values = numbers(f"history[{scene!r}][{method!r}]", given, "trials", "evaluations")
+            title = "median of the trials, band: quartiles" if len(values) > 1 else title
             _draw_history(ax, values, looks[method])
         for name, level in levels.get(scene, {}).items():
             ax.axhline(level, zorder=1, **styles[name])
@@ -141,7 +143,7 @@ def plot_convergence(
         for method, look in looks.items()
     ]
     handles += [Line2D([], [], label=name, **styles[name]) for name in level_labels]
-    add_legend(figure, handles, "median of the trials, band: quartiles")
+    add_legend(figure, handles, title)
     return figure
 
 
