@@ -1,7 +1,10 @@
 from .devices import OPENMPD, SONICSURFACE, Device
 from .emulator import EmulatedBench, EmulatedSensor
 from .link import Link, open_link
+from .log import Evaluation, EvaluationLog
 from .objective import HardwareObjective
+from .preflight import Preflight, check_transducers
+from .safety import LimitedLink, LimitError, Limits, Signalled, ended_by_signals
 from .sensor import Sensor
 from .usb import LinkError, Port
 
@@ -11,10 +14,19 @@ __all__ = [
     "Device",
     "EmulatedBench",
     "EmulatedSensor",
+    "Evaluation",
+    "EvaluationLog",
     "HardwareObjective",
+    "LimitError",
+    "LimitedLink",
+    "Limits",
     "Link",
     "LinkError",
     "Port",
+    "Preflight",
     "Sensor",
+    "Signalled",
+    "check_transducers",
+    "ended_by_signals",
     "open_link",
 ]

@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import torch
 
-from autdtorch.hardware.frames import BOARD, openmpd_frame, sonicsurface_frame
-from autdtorch.hardware.levels import openmpd_levels, sonicsurface_levels
+from autdtorch.hardware.frames import (
+    BOARD,
+    levels_of_openmpd_frame,
+    levels_of_sonicsurface_frame,
+    openmpd_frame,
+    sonicsurface_frame,
+)
+from autdtorch.hardware.levels import (
+    OPENMPD_PHASES,
+    SONICSURFACE_PHASES,
+    openmpd_drive,
+    openmpd_levels,
+    sonicsurface_drive,
+    sonicsurface_levels,
+)
 from autdtorch.hardware.usb import FtdiFifo, FtdiUart, Port
 
 SONICSURFACE_BAUD = 230_400
@@ -27,6 +40,8 @@ class Device:
         transducers: their number N.
         open_port: opens a `usb.core.Device`.
         frame: bytes for a drive (N,), |q| <= 1, on the nearest levels. All zeros switch the outputs off.
+        played: the drive (N,) that a frame has the device play.
+        quantised: the device as settings of `Quantised`.
     """
 
     name: str
@@ -35,20 +50,46 @@ class Device:
     transducers: int
     open_port: Callable[[Any], Port]
     frame: Callable[[torch.Tensor], bytes]
+    played: Callable[[bytes], torch.Tensor]
+    quantised: Mapping[str, Any]
 
 
 def _sonicsurface(drive: torch.Tensor) -> bytes:
     return sonicsurface_frame(sonicsurface_levels(drive))
 
 
+def _sonicsurface_played(frame: bytes) -> torch.Tensor:
+    return sonicsurface_drive(levels_of_sonicsurface_frame(frame))
+
+
 def _openmpd(drive: torch.Tensor) -> bytes:
     return openmpd_frame(openmpd_levels(drive))
 
 
+def _openmpd_played(frame: bytes) -> torch.Tensor:
+    return openmpd_drive(levels_of_openmpd_frame(frame))
+
+
 #: 16 x 16, pitch 10.5 mm; 32 phases, no amplitude. An FT232R is the adapter on most cables.
 SONICSURFACE = Device(
-    "SonicSurface", 0x0403, 0x6001, BOARD, partial(FtdiUart, baud=SONICSURFACE_BAUD), _sonicsurface
+    name="SonicSurface",
+    vendor=0x0403,
+    product=0x6001,
+    transducers=BOARD,
+    open_port=partial(FtdiUart, baud=SONICSURFACE_BAUD),
+    frame=_sonicsurface,
+    played=_sonicsurface_played,
+    quantised={"levels": SONICSURFACE_PHASES, "on_off": True},
 )
 
 #: 16 x 16, pitch 10.5 mm; 128 phases, 64 amplitudes. Transducers are in the order of the board's pins.
-OPENMPD = Device("OpenMPD", 0x0403, 0x6014, BOARD, FtdiFifo, _openmpd)
+OPENMPD = Device(
+    name="OpenMPD",
+    vendor=0x0403,
+    product=0x6014,
+    transducers=BOARD,
+    open_port=FtdiFifo,
+    frame=_openmpd,
+    played=_openmpd_played,
+    quantised={"levels": OPENMPD_PHASES},
+)

@@ -10,7 +10,7 @@ import torch
 
 from autdtorch.drive import validate_drive
 from autdtorch.hardware.devices import Device
-from autdtorch.hardware.usb import Port, find_device
+from autdtorch.hardware.usb import LinkError, Port, find_device
 from autdtorch.validation import integer_at_least, invalid
 
 
@@ -50,10 +50,15 @@ class Link:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
             LinkError: the device does not take the bytes.
         """
-        drive = validate_drive(drive, len(self.transducers))
-        everyone = torch.zeros(self.device.transducers, dtype=torch.complex128)
-        everyone[self.transducers] = drive
-        self._port.write(self.device.frame(everyone))
+        self._port.write(self._frame(drive))
+
+    def played(self, drive: torch.Tensor) -> torch.Tensor:
+        """What the device plays when asked for a drive (M,): the nearest on its levels.
+
+        Raises:
+            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+        """
+        return self.device.played(self._frame(drive))[self.transducers]
 
     def off(self) -> None:
         """Switch all outputs of the device off.
@@ -61,7 +66,15 @@ class Link:
         Raises:
             LinkError: the device does not take the bytes.
         """
-        self._port.write(self.device.frame(torch.zeros(self.device.transducers, dtype=torch.complex128)))
+        # Twice: the first completes a frame that broke off, and a device with two buffers is silent in both.
+        frames = 2 * self._frame(torch.zeros(len(self.transducers), dtype=torch.complex128))
+        try:
+            self._port.write(frames)
+        except BaseException as error:  # a fault of the bus that may pass, or a signal in mid-frame
+            self._port.recover()
+            self._port.write(frames)
+            if not isinstance(error, LinkError):
+                raise
 
     def close(self) -> None:
         """Switch all outputs off and let go of the device.
@@ -73,6 +86,11 @@ class Link:
             self.off()
         finally:
             self._port.close()
+
+    def _frame(self, drive: torch.Tensor) -> bytes:
+        everyone = torch.zeros(self.device.transducers, dtype=torch.complex128)
+        everyone[self.transducers] = validate_drive(drive, len(self.transducers))
+        return self.device.frame(everyone)
 
     def __enter__(self) -> Self:
         """The link."""

@@ -39,6 +39,14 @@ class Port(Protocol):
         """
         ...
 
+    def recover(self) -> None:
+        """Take up again after a write that broke off: clear a stall, drop what still waits.
+
+        Raises:
+            LinkError: the device is gone.
+        """
+        ...
+
     def close(self) -> None:
         """Let go of the device."""
         ...
@@ -104,6 +112,15 @@ class FtdiPort:
             if taken == 0:
                 raise LinkError(f"{_described(self._device)} took {sent} of {len(data)} bytes")
             sent += taken
+
+    def recover(self) -> None:
+        """Clear a stall, and drop what still waits in the chip.
+
+        Raises:
+            LinkError: the chip does not answer.
+        """
+        self._call("be recovered", self._device.clear_halt, _OUT)
+        self._request(RESET, PURGE_OUTPUT)
 
     def read(self, packets: int = 1) -> bytes:
         """What has arrived, at most so many packets, without the status bytes that begin each.

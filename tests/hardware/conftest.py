@@ -8,7 +8,17 @@ from pathlib import Path
 import pytest
 
 from autdtorch.array import TransducerArray
-from autdtorch.hardware import SONICSURFACE, Device, EmulatedBench, Link, open_link
+from autdtorch.hardware import (
+    SONICSURFACE,
+    Device,
+    EmulatedBench,
+    HardwareObjective,
+    LimitedLink,
+    Limits,
+    Link,
+    Sensor,
+    open_link,
+)
 from autdtorch.objective import SimulatedObjective
 from autdtorch.propagator import make_propagator
 from autdtorch.scene import Medium, Scene
@@ -31,6 +41,10 @@ class Trial:
 
     def link(self, bench: EmulatedBench, device: Device = SONICSURFACE) -> Link:
         return open_link(device, TRANSDUCERS, backend=bench.bus)
+
+    def objective(self, link: Link, sensor: Sensor, **settings: object) -> HardwareObjective:
+        limited = LimitedLink(link, Limits(amplitude=1.0))
+        return HardwareObjective(self.scene, limited, sensor, self.log, settings)
 
 
 @pytest.fixture
