@@ -195,7 +195,7 @@ class LimitedLink:
 
 def _largest_amplitude(link: Link, limit: float) -> float:
     """The largest amplitude that the device, on its levels, does not play above `limit`."""
-    asked = torch.arange(1, _CANDIDATES + 1, dtype=torch.complex128) / _CANDIDATES
+    asked = torch.arange(1, _CANDIDATES + 1).to(torch.complex128) / _CANDIDATES
     played = torch.stack([link.played(amplitude.expand(len(link.transducers))) for amplitude in asked])
     strongest = played.abs().amax(dim=1)
     allowed = (strongest > 0) & (strongest <= limit * (1 + 1e-9))  # 1 up to rounding
