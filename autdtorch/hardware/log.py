@@ -42,9 +42,11 @@ class EvaluationLog:
     costs at most the evaluation in flight.
 
     Attributes:
+        origin: what the trial is, by name.
         evaluations: what the file holds.
     """
 
+    origin: dict[str, Any]
     evaluations: list[Evaluation]
 
     def __init__(self, path: str | Path, origin: Mapping[str, Any]) -> None:
@@ -59,18 +61,19 @@ class EvaluationLog:
             OSError: the file cannot be read or written.
         """
         self._path = Path(path)
+        self.origin = json.loads(json.dumps(origin))  # as it will be read back
         self.evaluations = []
-        origin = json.loads(json.dumps(origin))  # as it will be read back
         whole = _whole_lines(self._path)
         if not whole:
-            self._append({_ORIGIN: origin})
+            self._append({_ORIGIN: self.origin})
             return
         stored, self.evaluations = _parsed(self._path, whole)
-        for name in sorted(stored.keys() | origin.keys()):
-            if stored.get(name) != origin.get(name):
+        for name in sorted(stored.keys() | self.origin.keys()):
+            there, here = stored.get(name), self.origin.get(name)
+            if there != here:
                 raise ValueError(
-                    f"{self._path}: of another trial, whose {name} is {stored.get(name)}, not "
-                    f"{origin.get(name)}; give the settings of that trial, or another file"
+                    f"{self._path}: of another trial, whose {name} is {there}, not {here}; give the settings "
+                    "of that trial, or another file"
                 )
 
     def append(self, drive: torch.Tensor, pressure: torch.Tensor, seconds_on: float) -> None:
