@@ -151,9 +151,9 @@ def _points(places: torch.Tensor, measured: torch.Tensor, simulated: torch.Tenso
 def _preflight(check: Preflight) -> str:
     heard = len(check.pressure) - len(check.dead)
     lines = [
-        f"The sensor hears {heard} of {len(check.pressure)} transducers, each alone, rms over control points: "
-        f"{check.pressure.min():.3g} to {check.pressure.max():.3g} Pa. Silence is {check.silence:.3g} Pa, the "
-        f"threshold {check.threshold:.3g} Pa."
+        f"The sensor hears {heard} of {len(check.pressure)} transducers, each alone, with "
+        f"{check.pressure.min():.3g} to {check.pressure.max():.3g} Pa (rms over the control points).\n"
+        f"Silence is {check.silence:.3g} Pa, and the threshold {check.threshold:.3g} Pa."
     ]
     if check.dead:
         lines.append(f"**Not heard**, counted from 0: {', '.join(map(str, check.dead))}.")

@@ -71,10 +71,16 @@ class Link:
         try:
             self._port.write(frames)
         except BaseException as error:  # a fault of the bus that may pass, or a signal in mid-frame
-            self._port.recover()
-            self._port.write(frames)
+            self._off_again(frames)
             if not isinstance(error, LinkError):
                 raise
+
+    def _off_again(self, frames: bytes) -> None:
+        try:
+            self._port.recover()
+            self._port.write(frames)
+        except LinkError as error:
+            raise LinkError(f"{error}; the outputs may still be on: switch the device's power off") from error
 
     def close(self) -> None:
         """Switch all outputs off and let go of the device.

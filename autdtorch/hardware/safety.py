@@ -141,10 +141,7 @@ class LimitedLink:
             self.off()
         if self._on_since is None:
             time.sleep(max(0.0, self._rested_at - time.monotonic()))
-        left = self.limits.seconds - self.seconds_on
-        if left <= 0:
-            self.off()
-            raise LimitError(f"the outputs were on for {self.limits.seconds:g} s, the limit")
+        left = self._seconds_left()
         with self._lock:
             self._raise_failure()
             if self._on_since is None:
@@ -158,6 +155,7 @@ class LimitedLink:
         """Raise a `LimitError` where the time was up since `play`: what was read meanwhile is void."""
         self._raise_failure()
         if self._on_since is None:
+            self._seconds_left()
             most = self.limits.seconds_in_a_row
             raise LimitError(f"the sensor took longer than the outputs may stay on, {most:g} s in a row")
 
@@ -182,6 +180,13 @@ class LimitedLink:
         since = self._on_since
         return 0.0 if since is None else time.monotonic() - since
 
+    def _seconds_left(self) -> float:
+        left = self.limits.seconds - self.seconds_on
+        if left <= 0:
+            self.off()
+            raise LimitError(f"the outputs were on for {self.limits.seconds:g} s, the limit")
+        return left
+
     def _time_is_up(self) -> None:
         try:
             self.off()
@@ -195,10 +200,12 @@ class LimitedLink:
 
 def _largest_amplitude(link: Link, limit: float) -> float:
     """The largest amplitude that the device, on its levels, does not play above `limit`."""
+    if limit == 1:
+        return 1.0
     asked = torch.arange(1, _CANDIDATES + 1).to(torch.complex128) / _CANDIDATES
     played = torch.stack([link.played(amplitude.expand(len(link.transducers))) for amplitude in asked])
     strongest = played.abs().amax(dim=1)
-    allowed = (strongest > 0) & (strongest <= limit * (1 + 1e-9))  # 1 up to rounding
+    allowed = (strongest > 0) & (strongest <= limit)
     if not allowed.any():
         least = strongest[strongest > 0].min()
         raise invalid("amplitude", limit, f"must be >= {least:.3g}, the least that {link.device.name} plays")
