@@ -1,4 +1,4 @@
-from .devices import OPENMPD, SONICSURFACE, Device
+from .devices import OPENMPD, SONICSURFACE, ULTRAINO, Device, openmpd, ultraino
 from .emulator import EmulatedBench, EmulatedSensor
 from .link import Link, open_link
 from .objective import HardwareObjective
@@ -8,6 +8,7 @@ from .usb import LinkError, Port
 __all__ = [
     "OPENMPD",
     "SONICSURFACE",
+    "ULTRAINO",
     "Device",
     "EmulatedBench",
     "EmulatedSensor",
@@ -17,4 +18,6 @@ __all__ = [
     "Port",
     "Sensor",
     "open_link",
+    "openmpd",
+    "ultraino",
 ]
