@@ -1,4 +1,4 @@
-from .devices import OPENMPD, SONICSURFACE, Device
+from .devices import OPENMPD, SONICSURFACE, ULTRAINO, Device, openmpd, ultraino
 from .emulator import EmulatedBench, EmulatedSensor
 from .link import Link, open_link
 from .log import Evaluation, EvaluationLog
@@ -11,6 +11,7 @@ from .usb import LinkError, Port
 __all__ = [
     "OPENMPD",
     "SONICSURFACE",
+    "ULTRAINO",
     "Device",
     "EmulatedBench",
     "EmulatedSensor",
@@ -29,4 +30,6 @@ __all__ = [
     "check_transducers",
     "ended_by_signals",
     "open_link",
+    "openmpd",
+    "ultraino",
 ]

@@ -1,32 +1,44 @@
-"""The devices that a link can drive: their USB chip, and how a drive becomes bytes."""
+"""The devices that a link can drive: what they hang on, and how a drive becomes bytes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 
+from autdtorch.hardware.adapters import FT232H, Adapter, arduino_mega, ch340, cp2102, ft232r
 from autdtorch.hardware.frames import (
     BOARD,
+    ULTRAINO_BOARD,
     levels_of_openmpd_frame,
     levels_of_sonicsurface_frame,
+    levels_of_ultraino_frame,
     openmpd_frame,
     sonicsurface_frame,
+    ultraino_frame,
 )
 from autdtorch.hardware.levels import (
     OPENMPD_PHASES,
     SONICSURFACE_PHASES,
+    ULTRAINO_PHASES,
     openmpd_drive,
     openmpd_levels,
     sonicsurface_drive,
     sonicsurface_levels,
+    ultraino_drive,
+    ultraino_levels,
 )
-from autdtorch.hardware.usb import FtdiFifo, FtdiUart, Port
+from autdtorch.openmpd_board import OpenMPDBoard
+from autdtorch.validation import integer_at_least, invalid
 
 SONICSURFACE_BAUD = 230_400
+ULTRAINO_BAUD = 115_200
+#: A board passes frames on to the next, numbered from 1 in four bits; Ultraino's program stops here.
+ULTRAINO_MOST_BOARDS = 14
+
+_BITS = 10  # that a byte takes on a serial line: start, 8, stop
 
 
 @dataclass(frozen=True)
@@ -35,23 +47,27 @@ class Device:
 
     Attributes:
         name: of the device.
-        vendor: idVendor of its USB chip.
-        product: idProduct of its USB chip.
+        adapters: USB chips that it may hang on; the first is the usual one.
         transducers: their number N.
-        open_port: opens a `usb.core.Device`.
         frame: bytes for a drive (N,), |q| <= 1, on the nearest levels. All zeros switch the outputs off.
         played: the drive (N,) that a frame has the device play.
         quantised: the device as settings of `Quantised`.
+        baud: of its serial line [bits/s]; None if it has none.
+        serials: number of the chip of each of its boards, which share the frame evenly; None takes any.
     """
 
     name: str
-    vendor: int
-    product: int
+    adapters: tuple[Adapter, ...]
     transducers: int
-    open_port: Callable[[Any], Port]
     frame: Callable[[torch.Tensor], bytes]
     played: Callable[[bytes], torch.Tensor]
     quantised: Mapping[str, Any]
+    baud: int | None = None
+    serials: tuple[str | None, ...] = (None,)
+
+    def wire_time(self, frame: bytes) -> float:
+        """How long a frame is on the serial line [s]; 0 without one."""
+        return 0.0 if self.baud is None else _BITS * len(frame) / self.baud
 
 
 def _sonicsurface(drive: torch.Tensor) -> bytes:
@@ -70,26 +86,87 @@ def _openmpd_played(frame: bytes) -> torch.Tensor:
     return openmpd_drive(levels_of_openmpd_frame(frame))
 
 
+def _ultraino(drive: torch.Tensor) -> bytes:
+    return ultraino_frame(ultraino_levels(drive))
+
+
+def _ultraino_played(frame: bytes) -> torch.Tensor:
+    return ultraino_drive(levels_of_ultraino_frame(frame))
+
+
+def openmpd(boards: Sequence[OpenMPDBoard]) -> Device:
+    """OpenMPD's boards as their files describe them: in the files' order, calibrated, by pin.
+
+    Each board is found by its name as the serial number of its chip. They play a drive as their messages
+    arrive, one after the other.
+
+    Args:
+        boards: one after the other, of 256 transducers each.
+
+    Raises:
+        ValueError: no board, one of another number of transducers, or two of the same name.
+    """
+    names = tuple(board.name for board in boards)
+    if not boards or len(set(names)) < len(names):
+        raise invalid("boards", names, "must be one or more, of different names")
+    for board in boards:
+        if len(board.pins) != BOARD:
+            raise ValueError(f"boards: {board.name} has {len(board.pins)} transducers; must be {BOARD}")
+
+    def frame(drive: torch.Tensor) -> bytes:
+        parts = zip(boards, drive.reshape(-1, BOARD), strict=True)
+        return b"".join(_openmpd(board.by_pin(board.calibrated(part))) for board, part in parts)
+
+    def played(frame: bytes) -> torch.Tensor:
+        messages = (frame[start : start + 2 * BOARD] for start in range(0, len(frame), 2 * BOARD))
+        parts = zip(boards, messages, strict=True)
+        return torch.cat([_openmpd_played(message)[torch.tensor(board.pins)] for board, message in parts])
+
+    return replace(OPENMPD, transducers=BOARD * len(boards), frame=frame, played=played, serials=names)
+
+
+def ultraino(boards: int = 1) -> Device:
+    """Boards Mega-64 of Ultraino in a row, 64 transducers each: 10 phases, 5 amplitudes.
+
+    Args:
+        boards: their number, 1 to 14; the first is on USB, and each passes on what is for the next.
+
+    Raises:
+        ValueError: `boards` out of range.
+    """
+    if integer_at_least("boards", boards, 1) > ULTRAINO_MOST_BOARDS:
+        raise invalid("boards", boards, f"must be 1 to {ULTRAINO_MOST_BOARDS}")
+    return Device(
+        name="Ultraino",
+        adapters=(arduino_mega(ULTRAINO_BAUD), ch340(ULTRAINO_BAUD)),
+        transducers=ULTRAINO_BOARD * boards,
+        frame=_ultraino,
+        played=_ultraino_played,
+        quantised={"levels": ULTRAINO_PHASES},
+        baud=ULTRAINO_BAUD,
+    )
+
+
 #: 16 x 16, pitch 10.5 mm; 32 phases, no amplitude. An FT232R is the adapter on most cables.
 SONICSURFACE = Device(
     name="SonicSurface",
-    vendor=0x0403,
-    product=0x6001,
+    adapters=(ft232r(SONICSURFACE_BAUD), ch340(SONICSURFACE_BAUD), cp2102(SONICSURFACE_BAUD)),
     transducers=BOARD,
-    open_port=partial(FtdiUart, baud=SONICSURFACE_BAUD),
     frame=_sonicsurface,
     played=_sonicsurface_played,
     quantised={"levels": SONICSURFACE_PHASES, "on_off": True},
+    baud=SONICSURFACE_BAUD,
 )
 
 #: 16 x 16, pitch 10.5 mm; 128 phases, 64 amplitudes. Transducers are in the order of the board's pins.
 OPENMPD = Device(
     name="OpenMPD",
-    vendor=0x0403,
-    product=0x6014,
+    adapters=(FT232H,),
     transducers=BOARD,
-    open_port=FtdiFifo,
     frame=_openmpd,
     played=_openmpd_played,
     quantised={"levels": OPENMPD_PHASES},
 )
+
+#: One board Mega-64: 10 phases, 5 amplitudes.
+ULTRAINO = ultraino()

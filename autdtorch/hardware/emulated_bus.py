@@ -1,6 +1,6 @@
 """A USB bus without hardware: pyusb talks to it as it talks to libusb.
 
-Everything above the wire is what drives a real device. The chips know FTDI's requests only.
+Everything above the wire is what drives a real device.
 """
 
 from __future__ import annotations
@@ -10,68 +10,37 @@ from array import array
 from collections.abc import Sequence
 from types import SimpleNamespace
 
-from usb.backend import IBackend
-from usb.core import USBError
+from autdtorch.hardware.emulated_chips import EmulatedChip
+from autdtorch.hardware.usb import INSTALL_HINT
 
-from autdtorch.hardware import usb
-from autdtorch.hardware.firmware import Firmware
+try:
+    from usb.backend import IBackend
+    from usb.core import USBError
+except ImportError as error:
+    raise ImportError(f"{error}; {INSTALL_HINT}") from error
 
-_STRINGS = ("", "autdtorch", "emulated device")  # by index; the serial number comes after
 _GET_DESCRIPTOR, _STRING_TYPE, _ENGLISH = 0x06, 0x03, 0x0409
-_ENDPOINTS = (0x81, 0x02)  # bulk in, bulk out
+_FROM_DEVICE, _STANDARD_FROM_DEVICE = 0x80, 0x80
 _PACKET = 64
-_BAUD_TOLERANCE = 0.03  # more, and a UART loses the last of its ten bits
-
-
-class EmulatedChip:
-    """An FTDI chip with one port, in front of a firmware.
-
-    Attributes:
-        vendor: idVendor.
-        product: idProduct.
-        strings: string descriptors by their index.
-        firmware: what takes the bytes behind the chip.
-        present: whether it is plugged in.
-    """
-
-    def __init__(self, vendor: int, product: int, serial: str, firmware: Firmware) -> None:
-        """Plug the chip in: 9600 baud, as after its power-up."""
-        self.vendor = vendor
-        self.product = product
-        self.strings = (*_STRINGS, serial)
-        self.present = True
-        self.firmware = firmware
-        self._format = usb.EIGHT_N_ONE
-        self._baud = 9600.0
-
-    def control(self, request: int, value: int, index: int) -> None:
-        """Take a request of FTDI's own."""
-        if request == usb.BAUD_RATE:
-            self._baud = _baud(value, index)
-        elif request == usb.DATA_FORMAT:
-            self._format = value
-
-    def write(self, data: bytes) -> None:
-        """Send bytes on to the firmware, which loses them at another rate or format than its own."""
-        wanted = self.firmware.baud
-        if wanted is not None:
-            off_rate = abs(self._baud / wanted - 1) > _BAUD_TOLERANCE
-            if off_rate or self._format != usb.EIGHT_N_ONE:
-                return
-        self.firmware.receive(data)
-
-    def read(self) -> bytes:
-        """An IN packet: no device here answers, so that it is the status alone."""
-        return b"\x01\x60"
 
 
 class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
-    """A backend of pyusb with emulated chips, numbered by their place."""
+    """A backend of pyusb with emulated chips, numbered by their place.
+
+    Attributes:
+        chips: what may be plugged in.
+        slept: time that has passed by `sleep` [s].
+    """
 
     def __init__(self, chips: Sequence[EmulatedChip]) -> None:
         """Plug the chips in."""
         super().__init__()
         self.chips = list(chips)
+        self.slept = 0.0
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass on the bench, where it takes none."""
+        self.slept += seconds
 
     def enumerate_devices(self) -> list[int]:
         """Addresses of what is plugged in."""
@@ -89,26 +58,28 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
 
     def get_configuration_descriptor(self, dev: int, config: int) -> SimpleNamespace:
         """The only one."""
-        _require_first(config)
+        _require(config == 0)
         return SimpleNamespace(
-            bLength=9, bDescriptorType=2, wTotalLength=32, bNumInterfaces=1, bConfigurationValue=1,
-            iConfiguration=0, bmAttributes=0x80, bMaxPower=45, extra_descriptors=[],
+            bLength=9, bDescriptorType=2, wTotalLength=32, bNumInterfaces=len(self.chips[dev].interfaces),
+            bConfigurationValue=1, iConfiguration=0, bmAttributes=0x80, bMaxPower=45, extra_descriptors=[],
         )  # fmt: skip
 
     def get_interface_descriptor(self, dev: int, intf: int, alt: int, config: int) -> SimpleNamespace:
-        """The only one, of the vendor's own class."""
-        _require_first(intf, alt, config)
+        """As the chip has it."""
+        _require(config == alt == 0)
+        kind, endpoints = self.chips[dev].interfaces[intf]
         return SimpleNamespace(
-            bLength=9, bDescriptorType=4, bInterfaceNumber=0, bAlternateSetting=0,
-            bNumEndpoints=len(_ENDPOINTS), bInterfaceClass=0xFF, bInterfaceSubClass=0xFF,
+            bLength=9, bDescriptorType=4, bInterfaceNumber=intf, bAlternateSetting=0,
+            bNumEndpoints=len(endpoints), bInterfaceClass=kind, bInterfaceSubClass=0xFF,
             bInterfaceProtocol=0xFF, iInterface=0, extra_descriptors=[],
         )  # fmt: skip
 
     def get_endpoint_descriptor(self, dev: int, ep: int, intf: int, alt: int, config: int) -> SimpleNamespace:
         """Bulk."""
         return SimpleNamespace(
-            bLength=7, bDescriptorType=5, bEndpointAddress=_ENDPOINTS[ep], bmAttributes=2,
-            wMaxPacketSize=_PACKET, bInterval=0, bRefresh=0, bSynchAddress=0, extra_descriptors=[],
+            bLength=7, bDescriptorType=5, bEndpointAddress=self.chips[dev].interfaces[intf][1][ep],
+            bmAttributes=2, wMaxPacketSize=_PACKET, bInterval=0, bRefresh=0, bSynchAddress=0,
+            extra_descriptors=[],
         )  # fmt: skip
 
     def open_device(self, dev: int) -> int:
@@ -154,13 +125,17 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
     ) -> int:
         """String descriptors, and requests to the chip; others stall."""
         chip = self._chip(dev_handle)
-        if bmRequestType == usb.VENDOR_REQUEST:
-            chip.control(bRequest, wValue, wIndex)
-            return 0
-        if bRequest == _GET_DESCRIPTOR and wValue >> 8 == _STRING_TYPE:
+        if bmRequestType == _STANDARD_FROM_DEVICE and (bRequest, wValue >> 8) == (
+            _GET_DESCRIPTOR,
+            _STRING_TYPE,
+        ):
             text = _string_descriptor(chip.strings, wValue & 0xFF)[: len(data)]
             data[: len(text)] = array("B", text)
             return len(text)
+        if not bmRequestType & _FROM_DEVICE and chip.control(
+            bmRequestType, bRequest, wValue, wIndex, data.tobytes()
+        ):
+            return len(data)
         raise USBError("Pipe error", errno=errno.EPIPE)
 
     def bulk_write(self, dev_handle: int, ep: int, intf: int, data: array[int], timeout: int) -> int:
@@ -181,18 +156,12 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
         return chip
 
 
-def _baud(value: int, index: int) -> float:
-    """Rate [bits/s] of a divisor as an FT232R reads it."""
-    eighths = {0: 0, 3: 1, 2: 2, 4: 3, 1: 4, 5: 5, 6: 6, 7: 7}
-    return 3e6 / ((value & 0x3FFF) + eighths[value >> 14 | (index & 1) << 2] / 8)
-
-
 def _string_descriptor(strings: Sequence[str], index: int) -> bytes:
     text = _ENGLISH.to_bytes(2, "little") if index == 0 else strings[index].encode("utf-16-le")
     return bytes([len(text) + 2, _STRING_TYPE]) + text
 
 
-def _require_first(*indices: int) -> None:
+def _require(there: bool) -> None:
     """Pyusb goes through what there is until an IndexError."""
-    if any(indices):
-        raise IndexError(indices)
+    if not there:
+        raise IndexError

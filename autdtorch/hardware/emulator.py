@@ -8,15 +8,18 @@ import numpy as np
 import torch
 
 from autdtorch.conditions import random_rms
-from autdtorch.hardware.devices import OPENMPD, SONICSURFACE, Device
-from autdtorch.hardware.emulated_bus import EmulatedBus, EmulatedChip
-from autdtorch.hardware.firmware import Firmware, OpenMPDFirmware, SonicSurfaceFirmware
+from autdtorch.hardware.adapters import Adapter
+from autdtorch.hardware.devices import OPENMPD, SONICSURFACE, ULTRAINO, Device
+from autdtorch.hardware.emulated_bus import EmulatedBus
+from autdtorch.hardware.emulated_chips import CHIPS
+from autdtorch.hardware.firmware import Firmware, OpenMPDFirmware, SonicSurfaceFirmware, UltrainoFirmware
 from autdtorch.hardware.link import wiring
 from autdtorch.validation import complex_tensor, finite_number, integer_at_least
 
-_FIRMWARES: dict[str, Callable[[], Firmware]] = {
-    SONICSURFACE.name: SonicSurfaceFirmware,
-    OPENMPD.name: OpenMPDFirmware,
+_FIRMWARES: dict[str, Callable[[int], Firmware]] = {
+    SONICSURFACE.name: lambda transducers: SonicSurfaceFirmware(),
+    OPENMPD.name: lambda transducers: OpenMPDFirmware(),
+    ULTRAINO.name: lambda transducers: UltrainoFirmware(transducers // ULTRAINO.transducers),
 }
 
 
@@ -25,8 +28,8 @@ class EmulatedBench:
 
     Attributes:
         bus: backend for pyusb.
-        chip: the device's USB chip on the bus.
-        firmware: what takes the bytes behind the chip.
+        chip: the device's USB chip on the bus; of several boards, that of the first.
+        firmware: what takes the bytes behind the chip; of several boards, that of the first.
     """
 
     def __init__(
@@ -34,7 +37,7 @@ class EmulatedBench:
         device: Device,
         transfer_matrix: torch.Tensor,
         transducers: Sequence[int] | None = None,
-        serial: str = "EMULATED",
+        adapter: Adapter | None = None,
         dead: Sequence[int] = (),
     ) -> None:
         """Plug the device in.
@@ -44,7 +47,7 @@ class EmulatedBench:
             transfer_matrix: (P, M) of the scene on the bench [Pa].
             transducers: for each transducer of the scene, which of the device's it is; by default all in
                 order.
-            serial: number of the USB chip.
+            adapter: the USB chip that it hangs on; by default the usual one.
             dead: transducers of the scene that are silent, whatever the device plays.
 
         Raises:
@@ -59,13 +62,21 @@ class EmulatedBench:
         self._alive = torch.ones(len(self._transducers))
         if dead:
             self._alive[wiring(dead, len(self._transducers))] = 0
-        self.firmware = _FIRMWARES[device.name]()
-        self.chip = EmulatedChip(device.vendor, device.product, serial, self.firmware)
-        self.bus = EmulatedBus([self.chip])
+        each = device.transducers // len(device.serials)
+        self._firmwares = [_FIRMWARES[device.name](each) for _ in device.serials]
+        vendor, product, _ = adapter or device.adapters[0]
+        self.bus = EmulatedBus(
+            [
+                CHIPS[vendor, product](vendor, product, serial or "EMULATED", firmware)
+                for serial, firmware in zip(device.serials, self._firmwares, strict=True)
+            ]
+        )
+        self.chip, self.firmware = self.bus.chips[0], self._firmwares[0]
 
     def drive(self) -> torch.Tensor:
         """What the scene's transducers now play (M,), complex128; 0 where they are dead."""
-        return self.firmware.drive()[self._transducers] * self._alive
+        played = torch.cat([firmware.drive() for firmware in self._firmwares])
+        return played[self._transducers] * self._alive
 
     def pressure(self) -> torch.Tensor:
         """Phasors (P,) [Pa] at the control points now, complex128."""

@@ -9,7 +9,8 @@ from typing import Literal, TypeAlias
 
 from usb.core import USBError, USBTimeoutError
 
-from autdtorch.hardware.emulated_bus import EmulatedBus, EmulatedChip
+from autdtorch.hardware.emulated_bus import EmulatedBus
+from autdtorch.hardware.emulated_chips import EmulatedChip
 from autdtorch.validation import integer_at_least, require_one_of
 
 #: "time-out" and "short write": a transfer ends in mid-frame, with an error or without, and the chip takes

@@ -6,12 +6,13 @@ Written from the firmwares alone, not from `frames`, so that the one checks the 
 from __future__ import annotations
 
 import cmath
+import itertools
 import math
 from typing import ClassVar, Protocol
 
 import torch
 
-from autdtorch.hardware.order import sonicsurface_channels
+from autdtorch.hardware.order import sonicsurface_channels, ultraino_pins
 
 
 class Firmware(Protocol):
@@ -99,6 +100,81 @@ class OpenMPDFirmware:
         """What the transducers play (256,): the fundamental of the pulses; 1 for phase 0 and duty 64."""
         pulses = zip(self._playing[:256], self._playing[256:], strict=True)
         return torch.tensor([_fundamental(phase, duty) for phase, duty in pulses], dtype=torch.complex128)
+
+
+class UltrainoFirmware:
+    """Boards Mega-64 of Ultraino in a row (DriverMEGA.ino).
+
+    A board starts with all pins high in the first half of the period. Bytes whose lower half is 1 are for it;
+    others it passes on, less 1, and commands as they are. There are two buffers of 32 patterns: one plays,
+    pattern after pattern for their durations in periods, the other is written to. Where it is written goes
+    back to the start by the switch alone.
+    """
+
+    baud: ClassVar[int | None] = 115_200
+
+    _PORTS, _TENTHS, _PATTERNS = 10, 10, 32
+    _SWITCH, _COMMIT_DURATIONS, _DURATION, _DURATION_MASK = 0x00, 0x10, 0x30, 0x3F
+
+    def __init__(self, boards: int = 1) -> None:
+        """Switch `boards` boards on."""
+        size = self._PATTERNS * self._TENTHS * self._PORTS
+        self._playing, self._waiting = bytearray(size), bytearray(size)
+        self._playing[: self._PORTS * self._TENTHS // 2] = b"\xff" * (self._PORTS * self._TENTHS // 2)
+        self._durations = self._waiting_durations = [1] + [0] * (self._PATTERNS - 1)
+        self._written = self._durations_written = 0
+        self._next = UltrainoFirmware(boards - 1) if boards > 1 else None
+
+    def receive(self, data: bytes) -> None:
+        """Take bytes, in pieces of any length."""
+        for byte in data:
+            self._take(byte)
+
+    def _take(self, byte: int) -> None:
+        passed_on = byte
+        if byte == self._SWITCH:
+            self._playing, self._waiting = self._waiting, self._playing
+            self._written = self._durations_written = 0
+        elif byte & 0x0F == 1:
+            place, lower = divmod(self._written, 2)
+            old = self._waiting[place] if lower else 0
+            self._waiting[place] = old | (byte >> 4 if lower else byte & 0xF0)
+            self._written += 1
+            return
+        elif byte & self._DURATION_MASK == self._DURATION:
+            place, part = divmod(self._durations_written, 4)
+            durations = list(self._waiting_durations)
+            durations[place] = (durations[place] if part else 0) | (byte & 0xC0) >> 2 * part
+            self._waiting_durations = durations
+            self._durations_written += 1
+        elif byte == self._COMMIT_DURATIONS:
+            self._durations = self._waiting_durations
+            self._durations_written = 0
+        else:
+            passed_on = byte - 1
+        if self._next is not None:
+            self._next._take(passed_on)
+
+    def drive(self) -> torch.Tensor:
+        """What the transducers play (64 n,): the fundamental; 1 for a pulse of the period's first half."""
+        durations = self._durations[:1] + list(itertools.takewhile(bool, self._durations[1:]))
+        size = self._TENTHS * self._PORTS
+        cycle = [
+            duration * self._fundamentals(self._playing[size * number :][:size])
+            for number, duration in enumerate(durations)
+        ]
+        own = torch.stack(cycle).sum(dim=0) / sum(durations)
+        return own if self._next is None else torch.cat([own, self._next.drive()])
+
+    def _fundamentals(self, pattern: bytearray) -> torch.Tensor:
+        turn = 2j * math.pi / self._TENTHS
+        played = [0j] * 64
+        for transducer, pin in enumerate(ultraino_pins()):
+            port, bit = divmod(int(pin), 8)
+            high = [pattern[self._PORTS * tenth + port] >> bit & 1 for tenth in range(self._TENTHS)]
+            sum_ = sum(on * cmath.exp(turn * (tenth - 2)) for tenth, on in enumerate(high))
+            played[transducer] = math.sin(math.pi / self._TENTHS) * sum_
+        return torch.tensor(played, dtype=torch.complex128)
 
 
 def _fundamental(phase: int, duty: int) -> complex:

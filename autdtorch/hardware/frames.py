@@ -1,17 +1,24 @@
-"""Bytes on the wire to and from the levels of a device, `levels`, of one board of 256 transducers."""
+"""Bytes on the wire to and from the levels of a device, `levels`."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
 
-from autdtorch.hardware.levels import Levels
-from autdtorch.hardware.order import sonicsurface_channels
+from autdtorch.hardware.levels import ULTRAINO_PHASES, Levels
+from autdtorch.hardware.order import sonicsurface_channels, ultraino_pins
 
-BOARD = 256
+#: Transducers of a board of SonicSurface or OpenMPD, and of Ultraino.
+BOARD, ULTRAINO_BOARD = 256, 64
 
 _START, _COMMIT = 0xFE, 0xFD
 _FIRST = 0x80  # on the first byte of a message to OpenMPD
+
+_ULTRAINO_PORTS = 10  # of 8 pins
+_ULTRAINO_BYTES = ULTRAINO_PHASES * _ULTRAINO_PORTS
+# What ends a frame: play the first pattern for 1 period, the second for 0, which ends the cycle (each in four
+# bytes, two bits in each), commit that, and switch to the new pattern.
+_ULTRAINO_END = bytes([0x30, 0x30, 0x30, 0x70, 0x30, 0x30, 0x30, 0x30, 0x10, 0x00])
 
 
 def sonicsurface_frame(levels: torch.Tensor) -> bytes:
@@ -67,6 +74,54 @@ def levels_of_openmpd_frame(frame: bytes) -> Levels:
     # Bit 7 of later bytes is for the lamp and the rate.
     levels = torch.from_numpy(np.frombuffer(frame, np.uint8).astype(np.int64) & ~_FIRST)
     return Levels(levels[:BOARD], levels[BOARD:])
+
+
+def ultraino_frame(levels: Levels) -> bytes:
+    """A frame for boards of Ultraino, Mega-64: what each pin does in a period, and the command to play it.
+
+    A pattern is a byte for each port in each tenth of a period; a byte goes out as its upper, then its lower
+    half, each above the number of the board, from 1.
+
+    Args:
+        levels: (64 n,) of n boards, from `ultraino_levels`.
+
+    Raises:
+        ValueError: another shape.
+    """
+    for name, values in levels._asdict().items():
+        if values.ndim != 1 or len(values) % ULTRAINO_BOARD or not len(values):
+            shape = tuple(values.shape)
+            raise ValueError(f"levels.{name}: shape {shape}; must be ({ULTRAINO_BOARD} n,) of n boards")
+    tenth = torch.arange(ULTRAINO_PHASES)[:, None]
+    high = (tenth - levels.phase) % ULTRAINO_PHASES < levels.amplitude
+    frame = bytearray()
+    for board in range(high.shape[1] // ULTRAINO_BOARD):
+        pins = np.zeros((ULTRAINO_PHASES, 8 * _ULTRAINO_PORTS), np.uint8)
+        pins[:, ultraino_pins()] = high[:, ULTRAINO_BOARD * board :][:, :ULTRAINO_BOARD].numpy()
+        halves = np.packbits(pins, bitorder="little")[:, None] << np.array([0, 4], np.uint8) & 0xF0
+        frame += (halves | board + 1).tobytes()
+    return bytes(frame) + _ULTRAINO_END
+
+
+def levels_of_ultraino_frame(frame: bytes) -> Levels:
+    """Levels (64 n,), int64, of a frame; inverse of `ultraino_frame`.
+
+    Raises:
+        ValueError: bytes that are not such a frame.
+    """
+    boards, rest = divmod(len(frame) - len(_ULTRAINO_END), 2 * _ULTRAINO_BYTES)
+    data = np.frombuffer(frame, np.uint8)[: len(frame) - len(_ULTRAINO_END)]
+    numbers = np.repeat(np.arange(1, boards + 1), 2 * _ULTRAINO_BYTES)
+    if boards < 1 or rest or not frame.endswith(_ULTRAINO_END) or (data & 0x0F != numbers).any():
+        raise ValueError(
+            f"frame: {_shown(frame)}; must be {2 * _ULTRAINO_BYTES} bytes a board, numbered from 1 in their "
+            f"lower half, then {_ULTRAINO_END.hex(' ')}"
+        )
+    halves = (data & 0xF0).astype(np.uint8).reshape(boards, ULTRAINO_PHASES, _ULTRAINO_PORTS, 2)
+    pins = np.unpackbits(halves[..., 0] | halves[..., 1] >> np.uint8(4), axis=-1, bitorder="little")
+    high = pins[..., ultraino_pins()].astype(np.int64)
+    begins = (high > np.roll(high, 1, axis=1)).argmax(axis=1)
+    return Levels(torch.from_numpy(begins.ravel()), torch.from_numpy(high.sum(axis=1).ravel()))
 
 
 def _require_board(name: str, values: torch.Tensor) -> None:

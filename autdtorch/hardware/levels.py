@@ -2,7 +2,8 @@
 
 Every device here counts its phase in the direction of arg q = -phi: at level n of N it emits
 a cos(w t - 2 pi n / N), so that a focus at distance d takes -k d. This is how their own programs focus
-(AUTD3's `focus`, OpenMPD's solver, SonicSurface's `phasesForFocus`). Levels are rounded to the nearest.
+(AUTD3's and Ultraino's `focus`, OpenMPD's solver, SonicSurface's `phasesForFocus`). Levels are rounded to the
+nearest.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ OPENMPD_PHASES, OPENMPD_FULL = 128, 64
 SONICSURFACE_PHASES = 32
 #: The phase level that switches a transducer of a SonicSurface off.
 SONICSURFACE_OFF = 32
+ULTRAINO_PHASES, ULTRAINO_FULL = 10, 5
 
 
 class Levels(NamedTuple):
@@ -75,9 +77,7 @@ def openmpd_levels(drive: ArrayLike) -> Levels:
     Raises:
         ValueError: not finite complex numbers, no axis, or an amplitude above 1.
     """
-    drive = _checked_drive(drive)
-    duty = _rounded(OPENMPD_PHASES / math.pi * torch.asin(drive.abs().clamp(max=1)))
-    return Levels(_phase_level(drive, OPENMPD_PHASES, duty > 0, _openmpd_shift(duty)), duty)
+    return _pulse_levels(_checked_drive(drive), OPENMPD_PHASES)
 
 
 def openmpd_drive(levels: Levels) -> torch.Tensor:
@@ -87,9 +87,32 @@ def openmpd_drive(levels: Levels) -> torch.Tensor:
         ValueError: phases that are not integers from 0 to 127, duties that are not integers from 0 to 64, or
             phases and duties of different shape.
     """
-    phase, duty = _checked_levels("OpenMPD", levels, OPENMPD_PHASES, OPENMPD_FULL)
-    angle = 2 * math.pi / OPENMPD_PHASES * (phase - _openmpd_shift(duty))
-    return torch.polar(torch.sin(math.pi / OPENMPD_PHASES * duty), angle)
+    return _pulse_drive(_checked_levels("OpenMPD", levels, OPENMPD_PHASES, OPENMPD_FULL), OPENMPD_PHASES)
+
+
+def ultraino_levels(drive: ArrayLike) -> Levels:
+    """Phases 0 to 9 and duties 0 to 5 for boards of Ultraino.
+
+    As for `openmpd_levels`, with duties of 10. Ultraino's own program makes the duty proportional to the
+    amplitude, and lets the centre of a pulse move with its duty.
+
+    Args:
+        drive: complex (..., M), |q| <= 1.
+
+    Raises:
+        ValueError: not finite complex numbers, no axis, or an amplitude above 1.
+    """
+    return _pulse_levels(_checked_drive(drive), ULTRAINO_PHASES)
+
+
+def ultraino_drive(levels: Levels) -> torch.Tensor:
+    """Drive (..., M), complex128, that boards of Ultraino play for `levels`; inverse of `ultraino_levels`.
+
+    Raises:
+        ValueError: phases that are not integers from 0 to 9, duties that are not integers from 0 to 5, or
+            phases and duties of different shape.
+    """
+    return _pulse_drive(_checked_levels("Ultraino", levels, ULTRAINO_PHASES, ULTRAINO_FULL), ULTRAINO_PHASES)
 
 
 def sonicsurface_levels(drive: ArrayLike) -> torch.Tensor:
@@ -154,8 +177,21 @@ def _phase_level(
     return torch.where(on, level, 0)
 
 
-def _openmpd_shift(duty: torch.Tensor) -> torch.Tensor:
-    return (OPENMPD_FULL - duty.double()) / 2
+def _pulse_levels(drive: torch.Tensor, phases: int) -> Levels:
+    """Pulses that begin at their phase, both in 1/phases of a period."""
+    duty = _rounded(phases / math.pi * torch.asin(drive.abs().clamp(max=1)))
+    return Levels(_phase_level(drive, phases, duty > 0, _pulse_shift(duty, phases)), duty)
+
+
+def _pulse_drive(levels: Levels, phases: int) -> torch.Tensor:
+    phase, duty = levels
+    angle = 2 * math.pi / phases * (phase - _pulse_shift(duty, phases))
+    return torch.polar(torch.sin(math.pi / phases * duty), angle)
+
+
+def _pulse_shift(duty: torch.Tensor, phases: int) -> torch.Tensor:
+    """By which a pulse begins later than one of half a period, for the same centre."""
+    return (phases / 2 - duty.double()) / 2
 
 
 def _rounded(values: torch.Tensor) -> torch.Tensor:

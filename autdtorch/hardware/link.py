@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Any, Self
 
@@ -11,7 +12,10 @@ import torch
 from autdtorch.drive import validate_drive
 from autdtorch.hardware.devices import Device
 from autdtorch.hardware.usb import LinkError, Port, find_device
-from autdtorch.validation import integer_at_least, invalid
+from autdtorch.validation import integer_at_least, invalid, not_negative
+
+#: Default settle time [s]: sound goes 1.7 m in it, transducers ring up in a fifth of it.
+SETTLE = 5e-3
 
 
 class Link:
@@ -23,9 +27,17 @@ class Link:
     Attributes:
         device: what hangs on the port.
         transducers: which of the device's transducers play the drive (M,), int64.
+        settle: how long a drive plays before `play` returns [s].
     """
 
-    def __init__(self, device: Device, port: Port, transducers: Sequence[int] | None = None) -> None:
+    def __init__(
+        self,
+        device: Device,
+        port: Port,
+        transducers: Sequence[int] | None = None,
+        settle: float = SETTLE,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
         """Switch the outputs off.
 
         Args:
@@ -33,27 +45,35 @@ class Link:
             port: takes its bytes.
             transducers: for each transducer of the scene, which of the device's it is; the others stay off.
                 By default the scene has all, in the order of the device.
+            settle: how long `play` waits, after the frame has gone over the wire, for the sound to stand at
+                the control points [s].
+            sleep: waits for a number of seconds.
 
         Raises:
-            ValueError: `transducers` that the device does not have, or one twice.
+            ValueError: `transducers` that the device does not have, or one twice; or a negative `settle`.
             LinkError: the device does not take the bytes.
         """
         self.device = device
         self.transducers = wiring(transducers, device.transducers)
+        self.settle = not_negative("settle", settle, "s")
         self._port = port
+        self._sleep = sleep
         self.off()
 
     def play(self, drive: torch.Tensor) -> None:
         """Play a drive (M,), |q| <= 1, on the nearest levels of the device, until the next.
 
+        It returns when the sound stands: a write ends before its bytes have gone over a serial line.
+
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
             LinkError: the device does not take the bytes.
         """
-        self._port.write(self._frame(drive))
+        self._send(self._frame(drive))
+        self._sleep(self.settle)
 
     def played(self, drive: torch.Tensor) -> torch.Tensor:
-        """What the device plays when asked for a drive (M,): the nearest on its levels.
+        """What the device is sent to play when asked for a drive (M,): the nearest on its levels.
 
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
@@ -63,24 +83,29 @@ class Link:
     def off(self) -> None:
         """Switch all outputs of the device off.
 
+        The frame is sent twice: a device that was left in mid-frame takes the first for the rest of that.
+
         Raises:
             LinkError: the device does not take the bytes.
         """
-        # Twice: the first completes a frame that broke off, and a device with two buffers is silent in both.
-        frames = 2 * self._frame(torch.zeros(len(self.transducers), dtype=torch.complex128))
         try:
-            self._port.write(frames)
-        except BaseException as error:  # a fault of the bus that may pass, or a signal in mid-frame
-            self._off_again(frames)
+            self._send_silence()
+        except BaseException as error:  # a fault of the bus that may pass, or a signal
+            self._recover()
             if not isinstance(error, LinkError):
                 raise
 
-    def _off_again(self, frames: bytes) -> None:
+    def _recover(self) -> None:
         try:
             self._port.recover()
-            self._port.write(frames)
+            self._send_silence()
         except LinkError as error:
             raise LinkError(f"{error}; the outputs may still be on: switch the device's power off") from error
+
+    def _send_silence(self) -> None:
+        # Twice also because a device with two buffers may be left with the last drive in the other.
+        for _ in range(2):
+            self._send(self._frame(torch.zeros(len(self.transducers), dtype=torch.complex128)))
 
     def close(self) -> None:
         """Switch all outputs off and let go of the device.
@@ -98,6 +123,10 @@ class Link:
         everyone[self.transducers] = validate_drive(drive, len(self.transducers))
         return self.device.frame(everyone)
 
+    def _send(self, frame: bytes) -> None:
+        self._port.write(frame)
+        self._sleep(self.device.wire_time(frame))
+
     def __enter__(self) -> Self:
         """The link."""
         return self
@@ -110,7 +139,11 @@ class Link:
 
 
 def open_link(
-    device: Device, transducers: Sequence[int] | None = None, serial: str | None = None, backend: Any = None
+    device: Device,
+    transducers: Sequence[int] | None = None,
+    serial: str | None = None,
+    backend: Any = None,
+    settle: float = SETTLE,
 ) -> Link:
     """Find a device on USB and switch its outputs off.
 
@@ -118,19 +151,72 @@ def open_link(
         device: which.
         transducers: for each transducer of the scene, which of the device's it is; by default all in order.
         serial: number of the USB chip, where several such devices are plugged in.
-        backend: of pyusb; by default libusb. An emulated bench has its own.
+        backend: of pyusb; by default libusb. An emulated bench has its own, on which waiting takes no time.
+        settle: how long a drive plays before its pressure is read [s]; the time that its frame is on the wire
+            comes on top.
 
     Raises:
         LinkError: none or several such devices, or it does not take the bytes.
         ImportError: pyusb or libusb-package is missing.
-        ValueError: `transducers` that the device does not have, or one twice.
+        ValueError: `transducers` that the device does not have, or one twice; a negative `settle`; or a
+            `serial` for a device of several boards.
     """
-    port = device.open_port(find_device(device.vendor, device.product, serial, backend))
+    if serial is not None and len(device.serials) > 1:
+        raise invalid("serial", serial, f"must be None, as {device.name} has {len(device.serials)} boards")
+    openers = {(vendor, product): open_port for vendor, product, open_port in device.adapters}
+    ports: list[Port] = []
     try:
-        return Link(device, port, transducers)
+        for own in device.serials if serial is None else (serial,):
+            found = find_device(openers, own, backend)
+            ports.append(openers[found.idVendor, found.idProduct](found))
+        port = ports[0] if len(ports) == 1 else SharedPort(ports)
+        return Link(device, port, transducers, settle, getattr(backend, "sleep", time.sleep))
     except BaseException:
-        port.close()
+        for port in ports:
+            port.close()
         raise
+
+
+class SharedPort:
+    """The ports of several boards, which share what is written evenly."""
+
+    def __init__(self, ports: Sequence[Port]) -> None:
+        """Take the `ports`, in the order of the boards."""
+        self._ports = ports
+
+    def write(self, data: bytes) -> None:
+        """Send each board its part of `data`; if one does not take it, the others are sent theirs.
+
+        Raises:
+            LinkError: a board did not take its part.
+        """
+        part = len(data) // len(self._ports)
+        parts = [data[start : start + part] for start in range(0, len(data), part)]
+        _each(lambda port, own: port.write(own), self._ports, parts)
+
+    def recover(self) -> None:
+        """Take all boards up again.
+
+        Raises:
+            LinkError: a board is gone.
+        """
+        _each(lambda port, _: port.recover(), self._ports, self._ports)
+
+    def close(self) -> None:
+        """Let go of all boards."""
+        _each(lambda port, _: port.close(), self._ports, self._ports)
+
+
+def _each(do: Callable[[Port, Any], None], ports: Sequence[Port], things: Sequence[Any]) -> None:
+    """Do it to every port, then raise the first error."""
+    errors = []
+    for port, thing in zip(ports, things, strict=True):
+        try:
+            do(port, thing)
+        except LinkError as error:
+            errors.append(error)
+    if errors:
+        raise errors[0]
 
 
 def wiring(transducers: Sequence[int] | None, count: int) -> torch.Tensor:

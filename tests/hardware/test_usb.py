@@ -3,21 +3,23 @@
 import pytest
 
 from autdtorch.hardware import LinkError
-from autdtorch.hardware.emulated_bus import EmulatedBus, EmulatedChip
+from autdtorch.hardware.adapters import FtdiPort, FtdiUart, baud_divisor
+from autdtorch.hardware.emulated_bus import EmulatedBus
+from autdtorch.hardware.emulated_chips import EmulatedChip, EmulatedFtdi
 from autdtorch.hardware.firmware import OpenMPDFirmware, SonicSurfaceFirmware
-from autdtorch.hardware.usb import FtdiPort, FtdiUart, baud_divisor, find_device
+from autdtorch.hardware.usb import find_device
 
 UART, FIFO = (0x0403, 0x6001), (0x0403, 0x6014)
 
 
-def chip(serial: str = "A1", kind: type[EmulatedChip] = EmulatedChip) -> EmulatedChip:
+def chip(serial: str = "A1", kind: type[EmulatedChip] = EmulatedFtdi) -> EmulatedChip:
     return kind(*UART, serial, SonicSurfaceFirmware())
 
 
 def test_the_device_asked_for_is_found_by_its_numbers():
-    bus = EmulatedBus([chip("A1"), EmulatedChip(*FIFO, "B1", OpenMPDFirmware()), chip("A2")])
-    assert find_device(*FIFO, backend=bus).serial_number == "B1"
-    assert find_device(*UART, serial="A2", backend=bus).address == 2
+    bus = EmulatedBus([chip("A1"), EmulatedFtdi(*FIFO, "B1", OpenMPDFirmware()), chip("A2")])
+    assert find_device([FIFO], backend=bus).serial_number == "B1"
+    assert find_device([UART], serial="A2", backend=bus).address == 2
 
 
 @pytest.mark.parametrize(
@@ -30,7 +32,7 @@ def test_the_device_asked_for_is_found_by_its_numbers():
 )
 def test_none_or_several_are_an_error_that_lists_what_is_there(chips, serial, message):
     with pytest.raises(LinkError, match=message):
-        find_device(*UART, serial=serial, backend=EmulatedBus([chip(name) for name in chips]))
+        find_device([UART], serial=serial, backend=EmulatedBus([chip(name) for name in chips]))
 
 
 @pytest.mark.parametrize(
@@ -52,7 +54,7 @@ def test_baud_divisors_are_those_of_the_application_note(baud, value, index):
 
 def test_at_another_rate_the_device_hears_nothing():
     wired = chip()
-    device = find_device(*UART, backend=EmulatedBus([wired]))
+    device = find_device([UART], backend=EmulatedBus([wired]))
     before = wired.firmware.drive()
     FtdiUart(device, baud=115_200).write(bytes([254, *[32] * 256, 253]))
     assert wired.firmware.drive().equal(before)
@@ -61,13 +63,13 @@ def test_at_another_rate_the_device_hears_nothing():
 
 
 def test_status_bytes_are_stripped_from_every_packet():
-    class Talking(EmulatedChip):
+    class Talking(EmulatedFtdi):
         def read(self) -> bytes:
             return b"\x01\x60" + 62 * b"a" + b"\x01\x60bc"
 
-    quiet = FtdiPort(find_device(*UART, backend=EmulatedBus([chip()])))
+    quiet = FtdiPort(find_device([UART], backend=EmulatedBus([chip()])))
     assert quiet.read() == b""
-    talking = FtdiPort(find_device(*UART, backend=EmulatedBus([chip(kind=Talking)])))
+    talking = FtdiPort(find_device([UART], backend=EmulatedBus([chip(kind=Talking)])))
     assert talking.read(packets=2) == 62 * b"a" + b"bc"
 
 
@@ -76,6 +78,6 @@ def test_a_chip_that_takes_nothing_more_is_an_error():
         def bulk_write(self, dev_handle, ep, intf, data, timeout):
             return min(len(data), 60 if len(data) > 100 else 0)
 
-    port = FtdiPort(find_device(*UART, backend=Full([chip()])))
+    port = FtdiPort(find_device([UART], backend=Full([chip()])))
     with pytest.raises(LinkError, match="took 60 of 160 bytes"):
         port.write(bytes(160))

@@ -1,0 +1,222 @@
+"""The USB chips that devices hang on, over pyusb.
+
+Control requests are those that the chips' Linux drivers make: ftdi_sio, ch341, cp210x, cdc_acm. None was
+tried on a real chip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+from autdtorch.hardware.usb import Port, UsbPort
+
+#: FTDI's requests.
+RESET, FLOW_CONTROL, BAUD_RATE, DATA_FORMAT, LATENCY = 0x00, 0x02, 0x03, 0x04, 0x09
+#: wValue of RESET.
+RESET_CHIP, PURGE_INPUT, PURGE_OUTPUT = 0, 1, 2
+#: wValue of DATA_FORMAT: 8 bits, no parity, 1 stop bit.
+EIGHT_N_ONE = 0x0008
+#: Every IN packet of FTDI's begins with modem and line status.
+STATUS_BYTES = 2
+
+_LATENCY_MS = 2
+_EIGHTHS = (0, 3, 2, 4, 1, 5, 6, 7)  # code of the fraction 0/8 ... 7/8 of a baud divisor
+
+_CH340_INIT, _CH340_WRITE = 0xA1, 0x9A
+_CH340_RATE, _CH340_LINE = 0x1312, 0x2518  # pairs of registers: divisor and prescaler, line control
+_CH340_AT_ONCE = 0x80  # do not wait until a packet is full
+_CH340_EIGHT_N_ONE = 0xC3  # receiver and sender on, 8 bits
+
+_CP2102_REQUEST = 0x41  # to the interface, vendor's own
+_CP2102_ENABLE, _CP2102_LINE, _CP2102_PURGE, _CP2102_BAUD = 0x00, 0x03, 0x12, 0x1E
+_CP2102_EIGHT_N_ONE, _CP2102_ALL_QUEUES = 0x0800, 0x000F
+
+_CDC_REQUEST, _CDC_LINE_CODING = 0x21, 0x20  # to the interface, of its class
+
+
+class FtdiPort(UsbPort):
+    """An FTDI chip with one port, as it is after a reset."""
+
+    def __init__(self, device: Any) -> None:
+        """Take the chip from the kernel's driver, and reset it.
+
+        Args:
+            device: `usb.core.Device`.
+
+        Raises:
+            LinkError: the chip refuses.
+        """
+        super().__init__(device)
+        self._request(RESET, RESET_CHIP)
+        self._request(LATENCY, _LATENCY_MS)
+        self._request(RESET, PURGE_INPUT)
+        self._request(RESET, PURGE_OUTPUT)
+
+    def recover(self) -> None:
+        """Clear a stall, and drop what still waits in the chip.
+
+        Raises:
+            LinkError: the chip does not answer.
+        """
+        super().recover()
+        self._request(RESET, PURGE_OUTPUT)
+
+    def read(self, packets: int = 1) -> bytes:
+        """What has arrived, at most so many packets, without the status bytes that begin each.
+
+        Raises:
+            LinkError: the chip does not answer within a second; one without data still sends its status.
+        """
+        length = self._in.wMaxPacketSize
+        received = bytes(self._call("be read", self._in.read, packets * length))
+        starts = range(0, len(received), length)
+        return b"".join(received[start + STATUS_BYTES : start + length] for start in starts)
+
+
+class FtdiUart(FtdiPort):
+    """An FT232R as a serial port: 8 bits, no parity, 1 stop bit, no flow control."""
+
+    def __init__(self, device: Any, baud: int) -> None:
+        """Take the chip and set its rate.
+
+        Args:
+            device: `usb.core.Device`.
+            baud: bits/s; the chip takes the nearest that 3 MHz over a number of eighths gives.
+
+        Raises:
+            LinkError: the chip refuses.
+        """
+        super().__init__(device)
+        self._request(DATA_FORMAT, EIGHT_N_ONE)
+        self._request(FLOW_CONTROL, 0)
+        self._request(BAUD_RATE, *baud_divisor(baud))
+
+
+class FtdiFifo(FtdiPort):
+    """An FT232H as a FIFO. That its EEPROM puts it into this mode is inferred, not verified."""
+
+
+class Ch340Uart(UsbPort):
+    """A CH340 as a serial port: 8 bits, no parity, 1 stop bit."""
+
+    def __init__(self, device: Any, baud: int) -> None:
+        """Take the chip and set its rate.
+
+        Args:
+            device: `usb.core.Device`.
+            baud: bits/s; the chip takes the nearest that its divisors of 48 MHz give.
+
+        Raises:
+            LinkError: the chip refuses.
+        """
+        super().__init__(device)
+        self._request(_CH340_INIT, 0)
+        self._request(_CH340_WRITE, _CH340_RATE, ch340_divisor(baud) | _CH340_AT_ONCE)
+        self._request(_CH340_WRITE, _CH340_LINE, _CH340_EIGHT_N_ONE)
+
+
+class Cp2102Uart(UsbPort):
+    """A CP2102 as a serial port: 8 bits, no parity, 1 stop bit."""
+
+    def __init__(self, device: Any, baud: int) -> None:
+        """Take the chip and set its rate.
+
+        Args:
+            device: `usb.core.Device`.
+            baud: bits/s; the chip takes the nearest that it has.
+
+        Raises:
+            LinkError: the chip refuses.
+        """
+        super().__init__(device)
+        self._request(_CP2102_ENABLE, 1, kind=_CP2102_REQUEST)
+        self._request(_CP2102_PURGE, _CP2102_ALL_QUEUES, kind=_CP2102_REQUEST)
+        self._request(_CP2102_BAUD, 0, data=baud.to_bytes(4, "little"), kind=_CP2102_REQUEST)
+        self._request(_CP2102_LINE, _CP2102_EIGHT_N_ONE, kind=_CP2102_REQUEST)
+
+
+class CdcUart(UsbPort):
+    """A serial port of USB's own class, as on an Arduino Mega 2560: 8 bits, no parity, 1 stop bit."""
+
+    def __init__(self, device: Any, baud: int) -> None:
+        """Take the chip and set its rate.
+
+        Args:
+            device: `usb.core.Device`.
+            baud: bits/s.
+
+        Raises:
+            LinkError: the chip refuses.
+        """
+        super().__init__(device)
+        one_stop_bit, no_parity, data_bits = 0, 0, 8
+        coding = baud.to_bytes(4, "little") + bytes([one_stop_bit, no_parity, data_bits])
+        self._request(_CDC_LINE_CODING, 0, data=coding, kind=_CDC_REQUEST)
+
+
+class Adapter(NamedTuple):
+    """A USB chip that a device may hang on.
+
+    Attributes:
+        vendor: idVendor.
+        product: idProduct.
+        open_port: opens a `usb.core.Device`.
+    """
+
+    vendor: int
+    product: int
+    open_port: Callable[[Any], Port]
+
+
+def ft232r(baud: int) -> Adapter:
+    """An FT232R at `baud` bits/s."""
+    return Adapter(0x0403, 0x6001, partial(FtdiUart, baud=baud))
+
+
+def ch340(baud: int) -> Adapter:
+    """A CH340 at `baud` bits/s."""
+    return Adapter(0x1A86, 0x7523, partial(Ch340Uart, baud=baud))
+
+
+def cp2102(baud: int) -> Adapter:
+    """A CP2102 at `baud` bits/s."""
+    return Adapter(0x10C4, 0xEA60, partial(Cp2102Uart, baud=baud))
+
+
+def arduino_mega(baud: int) -> Adapter:
+    """The chip of an Arduino Mega 2560, revision 3, at `baud` bits/s."""
+    return Adapter(0x2341, 0x0042, partial(CdcUart, baud=baud))
+
+
+#: An FT232H as a FIFO.
+FT232H = Adapter(0x0403, 0x6014, FtdiFifo)
+
+
+def baud_divisor(baud: int) -> tuple[int, int]:
+    """Value and index of the request that sets `baud` [bits/s] on an FT232R; below 1.5 Mbit/s.
+
+    The divisor of 3 MHz has 14 bits before the point and a code of three bits for its eighths.
+    """
+    whole, eighth = divmod(round(8 * 3_000_000 / baud), 8)
+    code = _EIGHTHS[eighth]
+    return whole | (code & 3) << 14, code >> 2
+
+
+def ch340_divisor(baud: int) -> int:
+    """Contents of the registers that set `baud` [bits/s] on a CH340, divisor and prescaler.
+
+    The rate is 48 MHz / (2^(12 - 3 ps - fact) div), with div to 256 from 2, or from 9 if fact = 1. Of equal
+    rates the driver takes fact = 0, which bears more error, then the largest ps.
+    """
+
+    def error(choice: tuple[int, int, int]) -> float:
+        fact, ps, div = choice
+        return abs(48e6 / (div << 12 - 3 * ps - fact) - baud)
+
+    choices = [
+        (fact, ps, div) for fact in (0, 1) for ps in (3, 2, 1, 0) for div in range(9 if fact else 2, 257)
+    ]
+    fact, ps, div = min(choices, key=error)
+    return (256 - div) << 8 | fact << 2 | ps

@@ -1,0 +1,148 @@
+"""The USB chips of `adapters`, emulated: they decode the requests, and send on what the firmware can hear.
+
+Written from the chips' Linux drivers and data sheets, not from `adapters`, so that the one checks the other.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from autdtorch.hardware.firmware import Firmware
+
+_STRINGS = ("", "autdtorch", "emulated device")  # by index; the serial number comes after
+_VENDOR_DEVICE, _VENDOR_INTERFACE, _CLASS_INTERFACE = 0x40, 0x41, 0x21
+_BAUD_TOLERANCE = 0.03  # more, and a UART loses the last of its ten bits
+
+
+class EmulatedChip:
+    """A USB chip with a serial port, in front of a firmware.
+
+    Attributes:
+        interfaces: class and endpoints of each, those for bulk transfers.
+        vendor: idVendor.
+        product: idProduct.
+        strings: string descriptors by their index.
+        firmware: what takes the bytes behind the chip.
+        present: whether it is plugged in.
+        baud: rate that it is set to [bits/s].
+        eight_n_one: whether it is set to 8 bits, no parity, 1 stop bit.
+    """
+
+    interfaces: ClassVar[tuple[tuple[int, tuple[int, ...]], ...]] = ((0xFF, (0x81, 0x02)),)
+
+    def __init__(self, vendor: int, product: int, serial: str, firmware: Firmware) -> None:
+        """Plug the chip in: 9600 baud, as after its power-up."""
+        self.vendor = vendor
+        self.product = product
+        self.strings = (*_STRINGS, serial)
+        self.present = True
+        self.firmware = firmware
+        self.baud = 9600.0
+        self.eight_n_one = True
+
+    def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
+        """Take a request with its data; False where the chip knows no such request, and stalls."""
+        raise NotImplementedError
+
+    def write(self, data: bytes) -> None:
+        """Send bytes on to the firmware, which loses them at another rate or format than its own."""
+        wanted = self.firmware.baud
+        if wanted is not None:
+            off_rate = abs(self.baud / wanted - 1) > _BAUD_TOLERANCE
+            if off_rate or not self.eight_n_one:
+                return
+        self.firmware.receive(data)
+
+    def read(self) -> bytes:
+        """An IN packet: no device here answers."""
+        return b""
+
+
+class EmulatedFtdi(EmulatedChip):
+    """An FT232R, or an FT232H as a FIFO."""
+
+    _BAUD, _FORMAT, _OTHERS = 0x03, 0x04, (0x00, 0x01, 0x02, 0x09)
+    _EIGHTHS: ClassVar[dict[int, int]] = {0: 0, 3: 1, 2: 2, 4: 3, 1: 4, 5: 5, 6: 6, 7: 7}
+
+    def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
+        """Baud rate by its divisor of 3 MHz, and data format."""
+        if request == self._BAUD:
+            self.baud = 3e6 / ((value & 0x3FFF) + self._EIGHTHS[value >> 14 | (index & 1) << 2] / 8)
+        elif request == self._FORMAT:
+            self.eight_n_one = value == 8
+        return kind == _VENDOR_DEVICE and request in (self._BAUD, self._FORMAT, *self._OTHERS)
+
+    def read(self) -> bytes:
+        """An IN packet: the status alone."""
+        return b"\x01\x60"
+
+
+class EmulatedCh340(EmulatedChip):
+    """A CH340: registers, written in pairs."""
+
+    interfaces = ((0xFF, (0x82, 0x02)),)
+
+    _INIT, _WRITE, _MODEM = 0xA1, 0x9A, 0xA4
+    _PRESCALER, _DIVISOR, _LINE = 0x12, 0x13, 0x18
+
+    def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
+        """Divisor and prescaler of 48 MHz, and line control."""
+        if request == self._INIT:
+            self._registers = {self._LINE: 0}
+        elif request == self._WRITE:
+            self._registers |= {value & 0xFF: index & 0xFF, value >> 8: index >> 8}
+            prescaler, line = self._registers.get(self._PRESCALER, 0), self._registers[self._LINE]
+            clock = 48e6 / (1 << 12 - 3 * (prescaler & 3) - (prescaler >> 2 & 1))
+            self.baud = clock / (256 - self._registers.get(self._DIVISOR, 0))
+            self.eight_n_one = line & 0x7F == 0x43  # sender on, eight bits, no parity, one stop bit
+        return kind == _VENDOR_DEVICE and request in (self._INIT, self._WRITE, self._MODEM)
+
+
+class EmulatedCp2102(EmulatedChip):
+    """A CP2102: it sends when its interface was enabled."""
+
+    interfaces = ((0xFF, (0x81, 0x01)),)
+
+    _ENABLE, _LINE, _HANDSHAKE, _PURGE, _BAUD = 0x00, 0x03, 0x07, 0x12, 0x1E
+    _enabled = False
+
+    def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
+        """Enabling, baud rate as a number, and line control."""
+        if request == self._ENABLE:
+            self._enabled = value == 1
+        elif request == self._BAUD:
+            self.baud = float(int.from_bytes(data, "little"))
+        elif request == self._LINE:
+            self.eight_n_one = value == 8 << 8
+        known = (self._ENABLE, self._LINE, self._HANDSHAKE, self._PURGE, self._BAUD)
+        return kind == _VENDOR_INTERFACE and request in known
+
+    def write(self, data: bytes) -> None:
+        """Send bytes on, if enabled."""
+        if self._enabled:
+            super().write(data)
+
+
+class EmulatedCdc(EmulatedChip):
+    """A serial port of USB's own class: one interface for control, one for data."""
+
+    interfaces = ((0x02, ()), (0x0A, (0x04, 0x83)))
+
+    _LINE_CODING, _LINE_STATE = 0x20, 0x22
+
+    def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
+        """Line coding: baud rate, stop bits, parity, bits."""
+        if request == self._LINE_CODING:
+            self.baud = float(int.from_bytes(data[:4], "little"))
+            self.eight_n_one = data[4:] == bytes([0, 0, 8])
+        return kind == _CLASS_INTERFACE and request in (self._LINE_CODING, self._LINE_STATE)
+
+
+CHIPS: dict[tuple[int, int], type[EmulatedChip]] = {
+    (0x0403, 0x6001): EmulatedFtdi,
+    (0x0403, 0x6014): EmulatedFtdi,
+    (0x1A86, 0x7523): EmulatedCh340,
+    (0x10C4, 0xEA60): EmulatedCp2102,
+    (0x2341, 0x0042): EmulatedCdc,
+}
+"""By idVendor and idProduct."""
