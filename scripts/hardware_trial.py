@@ -28,7 +28,11 @@ from autdtorch.progress import Progress, show_progress
 ROOT = Path(__file__).parents[1]
 
 METHODS = {"lssg": at.lssg, "gabs": at.gabs, "bo": at.bayes_opt, "identify": at.identify}
-DEVICES = {"sonicsurface": hardware.SONICSURFACE, "openmpd": hardware.OPENMPD}
+DEVICES = {
+    "sonicsurface": hardware.SONICSURFACE,
+    "openmpd": hardware.OPENMPD,
+    "ultraino": hardware.ULTRAINO,
+}
 EMULATED = {
     "emulated": hardware.SONICSURFACE,
     **{f"emulated:{name}": device for name, device in DEVICES.items()},
@@ -189,6 +193,9 @@ def measure(
         if preflight.dead:
             logging.warning("not heard, counted from 0: %s", ", ".join(map(str, preflight.dead)))
         found = method(at.Quantised(objective, **bench.device.quantised))
+        limited.off()
+        if not hardware.hears_silence(bench.sensor, preflight, len(scene.control_points)):
+            logging.warning("the sensor hears more than before the trial: are the outputs off?")
     return found, preflight, objective.log
 
 

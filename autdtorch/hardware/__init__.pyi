@@ -3,7 +3,7 @@ from .emulator import EmulatedBench, EmulatedSensor
 from .link import Link, open_link
 from .log import Evaluation, EvaluationLog
 from .objective import HardwareObjective
-from .preflight import Preflight, check_transducers
+from .preflight import Preflight, check_transducers, hears_silence
 from .safety import LimitedLink, LimitError, Limits, Signalled, ended_by_signals
 from .sensor import Sensor
 from .usb import LinkError, Port
@@ -29,6 +29,7 @@ __all__ = [
     "Signalled",
     "check_transducers",
     "ended_by_signals",
+    "hears_silence",
     "open_link",
     "openmpd",
     "ultraino",

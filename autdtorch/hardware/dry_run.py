@@ -33,6 +33,9 @@ class DryPort:
             self._show(described_frame(self._device, data[start : start + self._length]))
         self._bench.firmware.receive(data)
 
+    def flush(self) -> None:
+        """Nothing waits."""
+
     def recover(self) -> None:
         """Nothing breaks."""
 

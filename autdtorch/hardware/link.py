@@ -106,6 +106,7 @@ class Link:
         # Twice also because a device with two buffers may be left with the last drive in the other.
         for _ in range(2):
             self._send(self._frame(torch.zeros(len(self.transducers), dtype=torch.complex128)))
+        self._port.flush()
 
     def close(self) -> None:
         """Switch all outputs off and let go of the device.
@@ -193,6 +194,14 @@ class SharedPort:
         part = len(data) // len(self._ports)
         parts = [data[start : start + part] for start in range(0, len(data), part)]
         _each(lambda port, own: port.write(own), self._ports, parts)
+
+    def flush(self) -> None:
+        """Wait until all has left the chips of all boards, where they tell.
+
+        Raises:
+            LinkError: it does not leave one.
+        """
+        _each(lambda port, _: port.flush(), self._ports, self._ports)
 
     def recover(self) -> None:
         """Take all boards up again.

@@ -77,7 +77,12 @@ class EvaluationLog:
                 )
 
     def append(self, drive: torch.Tensor, pressure: torch.Tensor, seconds_on: float) -> None:
-        """Add an evaluation: its drive (M,), the pressure read (P,) [Pa], and the time on so far [s].
+        """Add an evaluation.
+
+        Args:
+            drive: (M,), as it was asked for.
+            pressure: (P,) [Pa], as it was read.
+            seconds_on: how long the outputs were on so far [s].
 
         Raises:
             OSError: the file cannot be written.

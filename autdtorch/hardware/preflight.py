@@ -65,6 +65,21 @@ def check_transducers(link: LimitedLink, sensor: Sensor, points: int, readings: 
     return Preflight(torch.tensor(powers).sqrt(), math.sqrt(silence), math.sqrt(threshold))
 
 
+def hears_silence(sensor: Sensor, check: Preflight, points: int, readings: int = 4) -> bool:
+    """Whether the sensor hears no more than before the trial, so that the outputs are truly off.
+
+    Args:
+        sensor: hears P points.
+        check: made before the trial.
+        points: P.
+        readings: >= 1.
+
+    Raises:
+        ValueError: the sensor does not give P finite magnitudes.
+    """
+    return math.sqrt(_power(sensor, points, readings)) <= check.threshold
+
+
 def _power(sensor: Sensor, points: int, readings: int) -> float:
     values = torch.stack([checked_reading(sensor, points) for _ in range(readings)])
     return float(values.square().mean())

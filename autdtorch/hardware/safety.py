@@ -33,7 +33,7 @@ class Signalled(KeyboardInterrupt):
     """
 
     def __init__(self, number: int) -> None:
-        """Name the signal."""
+        """Name the signal of this `number`."""
         super().__init__(signal.Signals(number).name)
         self.number = number
 
@@ -42,8 +42,11 @@ class Signalled(KeyboardInterrupt):
 def ended_by_signals() -> Iterator[None]:
     """Have Ctrl-C, SIGTERM and SIGHUP raise `Signalled`, so that links are closed on the way out.
 
-    Only the first does: what comes later must not interrupt the switching off. Use it in the main thread,
-    around the link.
+    Only the first does: what comes later must not interrupt the switching off. Use it around the link.
+
+    Raises:
+        Signalled: there was such a signal.
+        ValueError: it is used outside of the main thread, which alone hears signals.
     """
 
     def end(number: int, _: FrameType | None) -> None:
@@ -126,7 +129,11 @@ class LimitedLink:
         return self._seconds_before + self._stretch()
 
     def charge(self, seconds: float) -> None:
-        """Count the time [s] that the outputs were on before this process."""
+        """Count time that the outputs were on before this process.
+
+        Args:
+            seconds: [s].
+        """
         self._seconds_before += seconds
 
     def play(self, drive: torch.Tensor) -> None:
@@ -152,7 +159,12 @@ class LimitedLink:
             self.link.play(self._scale * drive)
 
     def require_on(self) -> None:
-        """Raise a `LimitError` where the time was up since `play`: what was read meanwhile is void."""
+        """Require that the outputs are on since `play`: otherwise what was read meanwhile is void.
+
+        Raises:
+            LimitError: they went off, as the time was up.
+            LinkError: they should have gone off, and the device did not take the bytes.
+        """
         self._raise_failure()
         if self._on_since is None:
             self._seconds_left()

@@ -33,6 +33,14 @@ class Port(Protocol):
         """
         ...
 
+    def flush(self) -> None:
+        """Wait until all has left the chip, where the chip tells.
+
+        Raises:
+            LinkError: it does not leave.
+        """
+        ...
+
     def recover(self) -> None:
         """Take up again after a write that broke off: clear a stall, drop what still waits.
 
@@ -109,6 +117,9 @@ class UsbPort:
             if taken == 0:
                 raise LinkError(f"{_described(self._device)} took {sent} of {len(data)} bytes")
             sent += taken
+
+    def flush(self) -> None:
+        """Not every chip tells what it still holds."""
 
     def recover(self) -> None:
         """Clear a stall.

@@ -12,7 +12,9 @@ from autdtorch.hardware import (
     LimitedLink,
     LimitError,
     Limits,
+    LinkError,
     check_transducers,
+    hears_silence,
 )
 
 
@@ -139,10 +141,23 @@ def test_a_log_of_other_drives_is_refused(trial):
             trial.objective(link, EmulatedSensor(bench))(0.5 * full_on())
 
 
+def test_a_chip_that_keeps_the_off_frame_is_told_of(trial, monkeypatch):
+    monkeypatch.setattr("autdtorch.hardware.adapters._FLUSH_SECONDS", 0.0)
+    bench = trial.bench()
+    link = trial.link(bench)
+    bench.chip.read = lambda: b"\x01\x20"  # there is room for more, but the transmitter is not empty
+    with pytest.raises(LinkError, match="outputs may still be on"):
+        link.close()
+
+
 @pytest.mark.parametrize("snr", [None, 30.0])
 def test_the_check_finds_the_dead_transducers(trial, snr):
     bench = trial.bench(dead=[3, 9])
+    sensor = EmulatedSensor(bench, snr)
     with trial.link(bench) as link:
-        check = check_transducers(LimitedLink(link, Limits(1.0)), EmulatedSensor(bench, snr), points=2)
+        check = check_transducers(LimitedLink(link, Limits(1.0)), sensor, points=2)
         assert check.dead == [3, 9]
         assert bench.firmware.drive().abs().max() == 0
+        assert hears_silence(sensor, check, points=2)
+        link.play(full_on()[0])
+        assert not hears_silence(sensor, check, points=2)

@@ -49,6 +49,7 @@ def test_a_drive_between_the_levels_is_played_on_the_nearest(trial):
         link.play(drive)
         played = Quantised(trial.simulated, levels=32, on_off=True).emitted(drive)
         torch.testing.assert_close(bench.drive(), played, rtol=0, atol=1e-15)
+        torch.testing.assert_close(link.played(drive), played, rtol=0, atol=1e-15)
 
 
 def test_an_evaluation_is_logged_before_the_next_is_played(trial):
