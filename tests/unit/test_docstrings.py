@@ -39,6 +39,7 @@ UNITS = {
     "Pa": {
         "G",
         "field",
+        "loudest",
         "mean",
         "min",
         "plane_pressure",
@@ -52,7 +53,11 @@ UNITS = {
     "rad": {"angle", "phase", "phase_offsets", "phases", "rotation"},
     "rad/m": {"complex_wavenumber", "wavenumber"},
     "rad/s": {"angular_frequency"},
-    "s": {"settle", "time_step"},
+    "s": {"settle", "time_step", "timeout"},
+    "s/division": {"time_scale"},
+    "V": {"dc_offset", "resolution", "volts"},
+    "V/Pa": {"sensitivity"},
+    "V/division": {"scales"},
 }
 UNIT_OF = {name: unit for unit, names in UNITS.items() for name in names}
 WITHOUT_UNIT = {
@@ -62,8 +67,10 @@ WITHOUT_UNIT = {
         "basis",
         "density_ratio",
         "drive",
+        "drift",
         "evaluations",
         "faces",
+        "gain",
         "gains",
         "loss",
         "mask",
