@@ -59,7 +59,7 @@ class EmulatedChip:
                 return
         self.firmware.receive(data)
 
-    def read(self) -> bytes:
+    def read(self, most: int) -> bytes:
         """An IN packet: no device here answers."""
         return b""
 
@@ -78,7 +78,7 @@ class EmulatedFtdi(EmulatedChip):
             self.eight_n_one = value == 8
         return kind == _VENDOR_DEVICE and request in (self._BAUD, self._FORMAT, *self._OTHERS)
 
-    def read(self) -> bytes:
+    def read(self, most: int) -> bytes:
         """An IN packet: the status alone."""
         return b"\x01\x60"
 

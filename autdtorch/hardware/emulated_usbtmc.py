@@ -14,6 +14,7 @@ from autdtorch.hardware.emulated_chips import Interfaces
 #: What can go wrong with a transfer from the instrument.
 Fault = Literal["time-out", "stall", "short", "garbage"]
 
+_PACKET = 64
 _CLASS_INTERFACE = 0xA1  # from the device
 _INITIATE_CLEAR, _CHECK_CLEAR_STATUS, _GET_CAPABILITIES = 5, 6, 7
 # success, versions 1.00, no options
@@ -39,6 +40,7 @@ class EmulatedInstrument:
         present: whether it is plugged in.
         fault: what goes wrong with every transfer from the instrument, from now on.
         longest: bytes of a message in a transfer; longer messages come in several.
+        sends_empty_packets: after a transfer of whole packets, as USB demands; some instruments do not.
     """
 
     interfaces: ClassVar[Interfaces] = (((0xFE, 0x03, 0x01), (0x82, 0x01)),)
@@ -51,10 +53,12 @@ class EmulatedInstrument:
         self.present = True
         self.fault: Fault | None = None
         self.longest = 512
+        self.sends_empty_packets = True
         self._instrument = instrument
         self._received = b""
         self._answer = b""
         self._asked: tuple[int, int] | None = None  # tag, bytes
+        self._sending: bytes | None = None
 
     def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
         """It takes no requests with data."""
@@ -65,7 +69,7 @@ class EmulatedInstrument:
         if kind != _CLASS_INTERFACE:
             return None
         if request == _INITIATE_CLEAR:
-            self._received, self._answer, self._asked = b"", b"", None
+            self._received, self._answer, self._asked, self._sending = b"", b"", None, None
         answers = {
             _INITIATE_CLEAR: b"\x01",
             _CHECK_CLEAR_STATUS: b"\x01\x00",
@@ -86,13 +90,26 @@ class EmulatedInstrument:
         else:
             raise stall()
 
-    def read(self) -> bytes:
-        """A transfer: as much of the answer as was asked for and goes into one."""
+    def read(self, most: int) -> bytes:
+        """What fits into `most` bytes of a transfer that was asked for."""
         if self.fault == "stall":
             raise stall()
         if self.fault == "garbage":
-            return random.Random(0).randbytes(64)
-        if self.fault == "time-out" or self._asked is None or not self._answer:
+            return random.Random(0).randbytes(_PACKET)
+        if self.fault == "time-out":
+            raise time_out()
+        transfer = self._transfer() if self._sending is None else self._sending
+        given, rest = transfer[:most], transfer[most:]
+        whole = len(given) % _PACKET == 0
+        if whole and len(given) < most and not self.sends_empty_packets:
+            raise time_out()  # the host waits for more
+        empty_is_due = whole and len(given) == most and self.sends_empty_packets
+        self._sending = rest if rest or empty_is_due else None
+        return given
+
+    def _transfer(self) -> bytes:
+        """As much of the answer as was asked for and goes into a transfer."""
+        if self._asked is None or not self._answer:
             raise time_out()
         tag, most = self._asked
         self._asked = None

@@ -23,7 +23,7 @@ INITIATE_CLEAR, CHECK_CLEAR_STATUS = 5, 6
 SUCCESS, PENDING = 1, 2
 
 _HEADER = struct.Struct("<BBBxLB3x")
-_MOST = 2**16 - 16  # bytes of a message in one transfer, so that header and padding fill whole packets
+_MOST = 2**16  # bytes of an answer in one transfer
 _TIMEOUT_MS = 3000
 _CHECKS = 100
 
@@ -41,26 +41,23 @@ def message(kind: int, tag: int, length: int, attributes: int, data: bytes = b""
     return _HEADER.pack(kind, tag, tag ^ 0xFF, length, attributes) + data + bytes(-len(data) % 4)
 
 
-def answer(transfer: bytes, tag: int) -> tuple[bytes, bool]:
-    """Data of an instrument's transfer, and whether its message ends with it.
+def announced(packet: bytes, tag: int) -> tuple[int, bool]:
+    """Length of the data in an instrument's transfer, and whether its message ends with it.
 
     Args:
-        transfer: as it was received.
+        packet: the transfer's first, with the header.
         tag: of the request that it answers.
 
     Raises:
-        LinkError: no such answer, or less data than its header says.
+        LinkError: it does not answer that, or has more data than can have been asked for.
     """
-    if len(transfer) < _HEADER.size:
-        raise LinkError(f"USBTMC: {len(transfer)} bytes {transfer.hex(' ')}; a header has {_HEADER.size}")
-    kind, number, complement, length, attributes = _HEADER.unpack_from(transfer)
-    if (kind, number, complement) != (ASK, tag, tag ^ 0xFF):
-        header = transfer[: _HEADER.size].hex(" ")
+    if len(packet) < _HEADER.size:
+        raise LinkError(f"USBTMC: {len(packet)} bytes {packet.hex(' ')}; a header has {_HEADER.size}")
+    kind, number, complement, length, attributes = _HEADER.unpack_from(packet)
+    if (kind, number, complement) != (ASK, tag, tag ^ 0xFF) or length > _MOST:
+        header = packet[: _HEADER.size].hex(" ")
         raise LinkError(f"USBTMC: header {header} does not answer request {tag}")
-    data = transfer[_HEADER.size : _HEADER.size + length]
-    if len(data) < length:
-        raise LinkError(f"USBTMC: {len(data)} of {length} bytes in a transfer")
-    return data, bool(attributes & END)
+    return length, bool(attributes & END)
 
 
 def block(data: bytes) -> bytes:
@@ -136,14 +133,33 @@ class UsbtmcPort(UsbPort):
         while not ended:
             tag = self._next()
             self.write(message(ASK, tag, _MOST, 0))
-            transfer = bytes(self._call(f"answer {question}", self._in.read, _MOST + 16, _TIMEOUT_MS))
-            data, ended = answer(transfer, tag)
+            data, ended = self._data(question, tag)
             if not data and not ended:
                 raise LinkError(
                     f"USBTMC: the answer to {question} does not go on after {len(received)} bytes"
                 )
             received += data
         return received
+
+    def _data(self, question: str, tag: int) -> tuple[bytes, bool]:
+        """Data of a transfer from the instrument, and whether its message ends with it.
+
+        The transfer is read to the length that its header says: not all instruments send an empty packet
+        after one of whole packets. If one does, that is read before the next transfer.
+        """
+        packet = self._in.wMaxPacketSize
+        received = self._piece(question, packet) or self._piece(question, packet)
+        length, ended = announced(received, tag)
+        left = _HEADER.size + length + -length % 4 - len(received)
+        if left > 0 and len(received) == packet:
+            received += self._piece(question, -(-left // packet) * packet)
+        data = received[_HEADER.size : _HEADER.size + length]
+        if len(data) < length:
+            raise LinkError(f"USBTMC: {len(data)} of {length} bytes in a transfer that answers {question}")
+        return data, ended
+
+    def _piece(self, question: str, size: int) -> bytes:
+        return bytes(self._call(f"answer {question}", self._in.read, size, _TIMEOUT_MS))
 
     def _number(self) -> int:
         for interface in self._device[0]:

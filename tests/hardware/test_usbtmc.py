@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from autdtorch.hardware import LinkError
@@ -10,7 +10,7 @@ from autdtorch.hardware.emulated_bus import EmulatedBus
 from autdtorch.hardware.emulated_usbtmc import EmulatedInstrument
 from autdtorch.hardware.scpi import KEYSIGHT, RIGOL
 from autdtorch.hardware.usb import find_device
-from autdtorch.hardware.usbtmc import END, TELL, UsbtmcPort, answer, block, message
+from autdtorch.hardware.usbtmc import END, TELL, UsbtmcPort, announced, block, message
 
 CHIP = (0x1AB1, 0x04CE)
 
@@ -27,10 +27,11 @@ class Echo:
         return self.said
 
 
-def port_to(said: bytes, longest: int = 512) -> tuple[UsbtmcPort, Echo]:
+def port_to(said: bytes, longest: int = 512, empty: bool = True) -> tuple[UsbtmcPort, Echo]:
     echo = Echo(said)
     instrument = EmulatedInstrument(*CHIP, "E1", echo)
     instrument.longest = longest
+    instrument.sends_empty_packets = empty
     return UsbtmcPort(find_device([CHIP], backend=EmulatedBus([instrument]))), echo
 
 
@@ -40,18 +41,36 @@ def test_a_message_is_header_text_and_padding():
     assert message(TELL, 2, 6, END, b"*IDN?\n").hex(" ") == expected
 
 
-def test_a_transfer_gives_its_data_without_padding_and_says_whether_more_follows():
-    header = bytes([2, 7, 0xF8, 0, 3, 0, 0, 0])
-    assert answer(header + b"\x01\0\0\0abc\0", 7) == (b"abc", True)
-    assert answer(header + b"\0\0\0\0abc\0", 7) == (b"abc", False)
+def test_a_header_says_how_much_follows_and_whether_that_is_all():
+    header = bytes([2, 7, 0xF8, 0, 3, 1, 0, 0])
+    assert announced(header + b"\x01\0\0\0abc", 7) == (0x103, True)
+    assert announced(header + b"\0\0\0\0abc", 7) == (0x103, False)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "02 07 f8 00 03 00 00 00 01 00 00",  # too short
+        "01 07 f8 00 03 00 00 00 01 00 00 00",  # another message
+        "02 06 f9 00 03 00 00 00 01 00 00 00",  # another request
+        "02 07 f9 00 03 00 00 00 01 00 00 00",  # tag and complement at odds
+        "02 07 f8 00 00 00 00 80 01 00 00 00",  # 2 GiB
+    ],
+)
+def test_a_header_that_is_no_answer_is_refused(header):
+    with pytest.raises(LinkError, match="does not answer request 7|a header has 12"):
+        announced(bytes.fromhex(header), 7)
 
 
 @settings(max_examples=30, deadline=None)
-@given(data=st.binary(max_size=600), longest=st.integers(1, 700))
-def test_a_block_of_any_bytes_comes_back_from_transfers_of_any_length(data, longest):
-    port, echo = port_to(f"#3{len(data):03d}".encode() + data + b"\n", longest)
-    assert port.ask_block(":WAV:DATA?") == data
-    assert echo.heard == [":WAV:DATA?"]
+@example(data=bytes(46), longest=52, empty=False)  # 12 + 52 bytes, a whole packet
+@example(data=bytes(174), longest=500, empty=True)  # three whole packets
+@given(data=st.binary(max_size=600), longest=st.integers(1, 700), empty=st.booleans())
+def test_a_block_of_any_bytes_comes_back_from_transfers_of_any_length(data, longest, empty):
+    port, echo = port_to(f"#3{len(data):03d}".encode() + data + b"\n", longest, empty)
+    for _ in range(2):
+        assert port.ask_block(":WAV:DATA?") == data
+    assert echo.heard == 2 * [":WAV:DATA?"]
 
 
 def test_tags_go_round():
