@@ -90,9 +90,7 @@ def compare(simulated: at.SimulatedObjective, device: hardware.Device, name: str
 
 def rate(simulated: at.SimulatedObjective, device: hardware.Device) -> list[str]:
     """A row of the table of rates: GABS, the median of its trials."""
-    trials = [
-        measure(simulated, device, partial(METHODS["GABS"], seed=seed), None, seed) for seed in SEEDS
-    ]
+    trials = [measure(simulated, device, partial(METHODS["GABS"], seed=seed), None, seed) for seed in SEEDS]
     count = int(trials[0].found.evaluations)
     seconds = float(torch.tensor([trial.seconds for trial in trials]).median())
     frame = device.frame(torch.zeros(device.transducers, dtype=torch.complex128))
@@ -113,16 +111,16 @@ def main() -> None:
     parts = (
         measured(COMMAND),
         f"The scene `{SCENE}` on emulated devices, {len(SEEDS)} seeds. Without noise: trials that find the\n"
-        f"same drive as in the simulation, to the last bit. With microphones of {SNR:g} dB: the weakest focus\n"
-        "that the drive found truly makes, against the simulated trial of the same seed; mean with its 95 %\n"
-        "interval, range, and trials within 5 %.",
+        f"same drive as in the simulation, to the last bit. With microphones of {SNR:g} dB: the weakest\n"
+        "focus that the drive found truly makes, against the simulated trial of the same seed; mean with\n"
+        "its 95 % interval, range, and trials within 5 %.",
         table(
             ["device", "method", "same drive", f"at {SNR:g} dB: mean [%]", "range [%]", "within 5 %"], rows
         ),
-        "Evaluations per second of GABS: as the emulated loop runs, with its log on disk and without waiting;\n"
-        "frames per second on the serial line; and evaluations per second with all that a bench would wait\n"
-        "for: frames on the line, the off frames between calls, and 5 ms for the sound to stand. A sensor's\n"
-        "own time comes on top.",
+        "Evaluations per second of GABS: as the emulated loop runs, with its log on disk and without\n"
+        "waiting; frames per second on the serial line; and evaluations per second with all that a bench\n"
+        "would wait for: frames on the line, the off frames between calls, and 5 ms for the sound to stand.\n"
+        "A sensor's own time comes on top.",
         table(["device", "emulated loop", "line", "with waits"], rates),
     )
     fill_in(DOCS / "hardware.md", "benchmark_hardware", parts, DOCS)
