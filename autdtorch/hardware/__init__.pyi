@@ -1,3 +1,4 @@
+from .autd3 import open_autd3
 from .devices import OPENMPD, SONICSURFACE, ULTRAINO, Device, openmpd, ultraino
 from .emulator import EmulatedBench, EmulatedSensor
 from .link import Link, open_link
@@ -17,6 +18,7 @@ __all__ = [
     "LinkError",
     "Port",
     "Sensor",
+    "open_autd3",
     "open_link",
     "openmpd",
     "ultraino",
