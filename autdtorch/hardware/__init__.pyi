@@ -1,5 +1,6 @@
+from .adapters import Adapter
 from .autd3 import open_autd3
-from .devices import OPENMPD, SONICSURFACE, ULTRAINO, Device, openmpd, ultraino
+from .devices import OPENMPD, SONICSURFACE, ULTRAINO, Device, openmpd_boards, ultraino_boards
 from .emulator import EmulatedBench, EmulatedSensor
 from .link import Link, open_link
 from .objective import HardwareObjective
@@ -10,6 +11,7 @@ __all__ = [
     "OPENMPD",
     "SONICSURFACE",
     "ULTRAINO",
+    "Adapter",
     "Device",
     "EmulatedBench",
     "EmulatedSensor",
@@ -20,6 +22,6 @@ __all__ = [
     "Sensor",
     "open_autd3",
     "open_link",
-    "openmpd",
-    "ultraino",
+    "openmpd_boards",
+    "ultraino_boards",
 ]

@@ -58,7 +58,7 @@ def _ultraino(drive: torch.Tensor) -> bytes:
     return ultraino_frame(ultraino_levels(drive))
 
 
-def openmpd(boards: Sequence[OpenMPDBoard]) -> Device:
+def openmpd_boards(boards: Sequence[OpenMPDBoard]) -> Device:
     """OpenMPD's boards as their files describe them: in the files' order, calibrated, by pin.
 
     Each board is found by its name as the serial number of its chip. They play a drive as their messages
@@ -84,7 +84,7 @@ def openmpd(boards: Sequence[OpenMPDBoard]) -> Device:
     return Device(OPENMPD.name, OPENMPD.adapters, BOARD * len(boards), frame, serials=names)
 
 
-def ultraino(boards: int = 1) -> Device:
+def ultraino_boards(boards: int = 1) -> Device:
     """Boards Mega-64 of Ultraino in a row, 64 transducers each: 10 phases, 5 amplitudes.
 
     Args:
@@ -112,4 +112,4 @@ SONICSURFACE = Device(
 OPENMPD = Device("OpenMPD", (FT232H,), BOARD, _openmpd)
 
 #: One board Mega-64: 10 phases, 5 amplitudes.
-ULTRAINO = ultraino()
+ULTRAINO = ultraino_boards()
