@@ -1,4 +1,6 @@
-from .devices import OPENMPD, SONICSURFACE, ULTRAINO, Device, openmpd, ultraino
+from .adapters import Adapter
+from .autd3 import open_autd3
+from .devices import OPENMPD, SONICSURFACE, ULTRAINO, Device, openmpd_boards, ultraino_boards
 from .emulated_scope import EmulatedScope
 from .emulator import EmulatedBench, EmulatedSensor
 from .link import Link, open_link
@@ -17,6 +19,7 @@ __all__ = [
     "RIGOL",
     "SONICSURFACE",
     "ULTRAINO",
+    "Adapter",
     "Device",
     "Dialect",
     "EmulatedBench",
@@ -45,8 +48,9 @@ __all__ = [
     "check_transducers",
     "ended_by_signals",
     "hears_silence",
+    "open_autd3",
     "open_link",
     "open_scope",
-    "openmpd",
-    "ultraino",
+    "openmpd_boards",
+    "ultraino_boards",
 ]

@@ -94,7 +94,7 @@ def _ultraino_played(frame: bytes) -> torch.Tensor:
     return ultraino_drive(levels_of_ultraino_frame(frame))
 
 
-def openmpd(boards: Sequence[OpenMPDBoard]) -> Device:
+def openmpd_boards(boards: Sequence[OpenMPDBoard]) -> Device:
     """OpenMPD's boards as their files describe them: in the files' order, calibrated, by pin.
 
     Each board is found by its name as the serial number of its chip. They play a drive as their messages
@@ -125,7 +125,7 @@ def openmpd(boards: Sequence[OpenMPDBoard]) -> Device:
     return replace(OPENMPD, transducers=BOARD * len(boards), frame=frame, played=played, serials=names)
 
 
-def ultraino(boards: int = 1) -> Device:
+def ultraino_boards(boards: int = 1) -> Device:
     """Boards Mega-64 of Ultraino in a row, 64 transducers each: 10 phases, 5 amplitudes.
 
     Args:
@@ -169,4 +169,4 @@ OPENMPD = Device(
 )
 
 #: One board Mega-64: 10 phases, 5 amplitudes.
-ULTRAINO = ultraino()
+ULTRAINO = ultraino_boards()

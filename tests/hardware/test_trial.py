@@ -15,7 +15,7 @@ from autdtorch.hardware import (
     HardwareObjective,
     LinkError,
     open_link,
-    ultraino,
+    ultraino_boards,
 )
 from autdtorch.optim.gabs import gabs
 
@@ -24,7 +24,7 @@ def full_on() -> torch.Tensor:
     return drive_from_phases(torch.zeros(16))
 
 
-@pytest.mark.parametrize(("device", "levels"), [(SONICSURFACE, 32), (OPENMPD, 128), (ultraino(3), 10)])
+@pytest.mark.parametrize(("device", "levels"), [(SONICSURFACE, 32), (OPENMPD, 128), (ultraino_boards(3), 10)])
 def test_without_noise_a_method_finds_the_same_drive_as_in_simulation(trial, device: Device, levels: int):
     bench = trial.bench(device)
     with trial.link(bench, device) as link:
