@@ -28,7 +28,6 @@ METHODS = {
     "LSSG": lambda objective, seed: at.lssg(objective),
     "GABS": lambda objective, seed: at.gabs(objective, seed=seed),
     "GABS, 3 passes": lambda objective, seed: at.gabs(objective, passes=3, seed=seed),
-    "BO": lambda objective, seed: at.bayes_opt(objective, seed=seed),
     "identify": lambda objective, seed: at.identify(objective, seed=seed),
 }
 SEEDS = range(10)
