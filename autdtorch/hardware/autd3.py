@@ -11,7 +11,7 @@ import torch
 
 from autdtorch.device_layouts import AUTD3_TRANSDUCERS
 from autdtorch.hardware.devices import Device
-from autdtorch.hardware.levels import autd3_levels
+from autdtorch.hardware.levels import AUTD3_PHASES, Levels, autd3_drive, autd3_levels
 from autdtorch.hardware.link import SETTLE, Link
 from autdtorch.hardware.usb import LinkError
 from autdtorch.validation import integer_at_least
@@ -26,7 +26,14 @@ def autd3_device(boards: int = 1) -> Device:
     Raises:
         ValueError: `boards` out of range.
     """
-    return Device("AUTD3", (), AUTD3_TRANSDUCERS * integer_at_least("boards", boards, 1), _autd3_frame)
+    return Device(
+        name="AUTD3",
+        adapters=(),
+        transducers=AUTD3_TRANSDUCERS * integer_at_least("boards", boards, 1),
+        frame=_autd3_frame,
+        played=_autd3_played,
+        quantised={"levels": AUTD3_PHASES},
+    )
 
 
 def open_autd3(
@@ -106,6 +113,12 @@ class Autd3Port:
         """
         self._send("be written to", autd3_pattern(data, self._boards))
 
+    def flush(self) -> None:
+        """Nothing waits: a write has been answered when it returns."""
+
+    def recover(self) -> None:
+        """The kit has found the boards again by itself, or the next write fails."""
+
     def close(self) -> None:
         """Let go of the boards.
 
@@ -146,3 +159,8 @@ def autd3_pattern(frame: bytes, boards: int) -> Any:
 
 def _autd3_frame(drive: torch.Tensor) -> bytes:
     return torch.cat(autd3_levels(drive)).to(torch.uint8).numpy().tobytes()
+
+
+def _autd3_played(frame: bytes) -> torch.Tensor:
+    phases, intensities = torch.from_numpy(np.frombuffer(frame, np.uint8).astype(np.int64)).reshape(2, -1)
+    return autd3_drive(Levels(phases, intensities))

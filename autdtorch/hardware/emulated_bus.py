@@ -105,6 +105,10 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
     def release_interface(self, dev_handle: int, intf: int) -> None:
         """Nobody else is there."""
 
+    def clear_halt(self, dev_handle: int, ep: int) -> None:
+        """Nothing stalls."""
+        self._chip(dev_handle)
+
     def is_kernel_driver_active(self, dev_handle: int, intf: int) -> bool:
         """There is no kernel."""
         return False

@@ -33,6 +33,22 @@ class Port(Protocol):
         """
         ...
 
+    def flush(self) -> None:
+        """Wait until all has left the chip, where the chip tells.
+
+        Raises:
+            LinkError: it does not leave.
+        """
+        ...
+
+    def recover(self) -> None:
+        """Take up again after a write that broke off: clear a stall, drop what still waits.
+
+        Raises:
+            LinkError: the device is gone.
+        """
+        ...
+
     def close(self) -> None:
         """Let go of the device."""
         ...
@@ -102,6 +118,17 @@ class UsbPort:
             if taken == 0:
                 raise LinkError(f"{_described(self._device)} took {sent} of {len(data)} bytes")
             sent += taken
+
+    def flush(self) -> None:
+        """Not every chip tells what it still holds."""
+
+    def recover(self) -> None:
+        """Clear a stall.
+
+        Raises:
+            LinkError: the chip does not answer.
+        """
+        self._call("be recovered", self._device.clear_halt, self._out.bEndpointAddress)
 
     def close(self) -> None:
         """Give the chip back to the kernel's drivers."""

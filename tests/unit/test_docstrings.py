@@ -44,7 +44,9 @@ UNITS = {
         "plane_pressure",
         "pressure",
         "reference",
+        "silence",
         "std",
+        "threshold",
         "transfer_matrix",
         "volume",
     },
@@ -52,16 +54,18 @@ UNITS = {
     "rad": {"angle", "phase", "phase_offsets", "phases", "rotation"},
     "rad/m": {"complex_wavenumber", "wavenumber"},
     "rad/s": {"angular_frequency"},
-    "s": {"settle", "time_step"},
+    "s": {"seconds", "seconds_in_a_row", "seconds_on", "settle", "time_step"},
 }
 UNIT_OF = {name: unit for unit, names in UNITS.items() for name in names}
 WITHOUT_UNIT = {
     *(
+        "amplitude",
         "amplitudes",
         "axis",
         "basis",
         "density_ratio",
         "drive",
+        "duty_cycle",
         "evaluations",
         "faces",
         "gains",
