@@ -15,7 +15,7 @@ import re
 import shlex
 import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
@@ -151,10 +151,11 @@ def _run(config: DictConfig) -> None:
 
 
 def _job_folder(overrides: str) -> str:
-    """Name of the folder of a sweep's job, short and without characters that folders cannot have."""
-    name = re.sub(r"[^\w.,=+-]", "_", overrides) or "job"
-    if len(name) <= _LONGEST_NAME:
+    """Name of the folder of a sweep's job, short and of characters that folders can have."""
+    name = re.sub(r"[^\w.,=+-]+", "_", overrides) or "job"
+    if name == overrides and len(name) <= _LONGEST_NAME:
         return name
+    # What was lost may be all that tells two jobs apart.
     digest = hashlib.sha256(overrides.encode()).hexdigest()[:12]
     return f"{name[: _LONGEST_NAME - len(digest) - 1]}-{digest}"
 
@@ -242,14 +243,18 @@ def _scene(where: str, section: Mapping[str, Any]) -> Scene:
 
 def _as_text(settings: Mapping[str, Any], scenes: Mapping[str, Scene]) -> str:
     """The settings as YAML, and digests of what they name only by the path of a file."""
-    from autdtorch.obstacles import Mesh, VoxelMask
-
-    contents = {
-        name: [obstacle.digest for obstacle in scene.obstacles if isinstance(obstacle, Mesh | VoxelMask)]
-        for name, scene in scenes.items()
+    sections = settings["scenes"] if "scenes" in settings else dict.fromkeys(scenes, settings["scene"])
+    files = {
+        name: digests for name, section in sections.items() if (digests := list(_file_digests(section)))
     }
-    files = {name: digests for name, digests in contents.items() if digests}
-    return OmegaConf.to_yaml(OmegaConf.create({**settings, **({"obstacle_files": files} if files else {})}))
+    return OmegaConf.to_yaml(OmegaConf.create({**settings, **({"files": files} if files else {})}))
+
+
+def _file_digests(section: Mapping[str, Any]) -> Iterator[str]:
+    """Digests of the files of the array and of the obstacles of a scene."""
+    for part in (section["array"], *(section.get("obstacles") or ())):
+        if part.get("path") is not None:
+            yield hashlib.sha256(Path(part["path"]).read_bytes()).hexdigest()[:16]
 
 
 def _solver(settings: Mapping[str, Any]) -> dict[str, Any]:

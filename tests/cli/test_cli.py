@@ -225,6 +225,17 @@ def test_a_changed_obstacle_file_is_computed_again(
         assert ("re-using" in capsys.readouterr().err) is reused
 
 
+def test_a_changed_array_file_is_computed_again(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    array = "{type: file, path: array.csv, center: [1e-3, 50e-3, 50e-3], normal: [1, 0, 0]}"
+    command = ("method=lssg", "plane_spacing=10e-3", "output=out", "~scene.array", f"+scene.array={array}")
+    for pitch, reused in ((10, False), (10, True), (11, False)):
+        (tmp_path / "array.csv").write_text(f"x [mm],y [mm],z [mm]\n0,0,0\n{pitch},0,0\n", encoding="utf-8")
+        assert run(*command) == 0
+        assert ("re-using" in capsys.readouterr().err) is reused
+
+
 def test_ones_own_scene_file(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mine" / "scene").mkdir(parents=True)
     text = (CONFIGS / "scene" / "homogeneous.yaml").read_text(encoding="utf-8")
