@@ -209,7 +209,7 @@ def _collect(arguments: list[str]) -> None:
     sweep = collect_results(folder)
     save_summary(sweep.results, sweep.swept, folder / SUMMARY_FILE)
     command = shlex.join(["autdtorch", "collect", *arguments])
-    report = write_report(sweep.results, sweep.scenes, folder, command)
+    report = write_report(sweep.results, sweep.scenes, folder, command, sweep.seeds)
     end = f"{sweep.studies} studies: the table is {folder / SUMMARY_FILE}, the report {report}"
     _print([*_table_lines(sweep.results), end])
 
@@ -244,9 +244,7 @@ def _scene(where: str, section: Mapping[str, Any]) -> Scene:
 def _as_text(settings: Mapping[str, Any], scenes: Mapping[str, Scene]) -> str:
     """The settings as YAML, and digests of what they name only by the path of a file."""
     sections = settings["scenes"] if "scenes" in settings else dict.fromkeys(scenes, settings["scene"])
-    files = {
-        name: digests for name, section in sections.items() if (digests := list(_file_digests(section)))
-    }
+    files = {name: digests for name, section in sections.items() if (digests := list(_file_digests(section)))}
     return OmegaConf.to_yaml(OmegaConf.create({**settings, **({"files": files} if files else {})}))
 
 

@@ -51,12 +51,14 @@ class Sweep:
         scenes: the scenes of the results, by the same names.
         swept: the settings that tell names apart, by name of scene and name of method.
         studies: how many were merged.
+        seeds: of these, each once.
     """
 
     results: StudyResult
     scenes: dict[str, Scene]
     swept: dict[tuple[str, str], Settings]
     studies: int
+    seeds: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,9 +109,8 @@ def collect_results(folder: str | os.PathLike[str]) -> Sweep:
     scenes = {scene: load_scene(next(iter(methods.values()))[0].section) for scene, methods in groups.items()}
     origin = next(iter(studies.values())).provenance
     texts = (f"# {path}\n{study.provenance.config.strip()}" for path, study in studies.items())
-    return Sweep(
-        StudyResult(replace(origin, config="\n\n".join(texts)), results), scenes, swept, len(studies)
-    )
+    merged = StudyResult(replace(origin, config="\n\n".join(texts)), results)
+    return Sweep(merged, scenes, swept, len(studies), tuple(sorted({part.seed for part in parts})))
 
 
 def _files(folder: Path, name: str) -> list[Path]:

@@ -39,9 +39,9 @@ class Link:
             LinkError: the device does not take the bytes.
         """
         self.device = device
-        self.transducers = wiring(transducers, device.transducers)
         self._port = port
         self.off()
+        self.transducers = wiring(transducers, device.transducers)
 
     def play(self, drive: torch.Tensor) -> None:
         """Play a drive (M,), |q| <= 1, on the nearest levels of the device, until the next.
@@ -61,7 +61,10 @@ class Link:
         Raises:
             LinkError: the device does not take the bytes.
         """
-        self._port.write(self.device.frame(torch.zeros(self.device.transducers, dtype=torch.complex128)))
+        silence = self.device.frame(torch.zeros(self.device.transducers, dtype=torch.complex128))
+        # Twice: the first may be taken for the rest of a frame that broke off. It also fills both buffers.
+        self._port.write(silence)
+        self._port.write(silence)
 
     def close(self) -> None:
         """Switch all outputs off and let go of the device.

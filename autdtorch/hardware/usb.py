@@ -5,6 +5,7 @@ Control requests are FTDI's own, as the Linux driver ftdi_sio states them; none 
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -40,7 +41,11 @@ class Port(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of the device."""
+        """Let go of the device.
+
+        Raises:
+            LinkError: it cannot be given back to the system.
+        """
         ...
 
 
@@ -76,7 +81,7 @@ class FtdiPort:
     """An FTDI chip with one port, as it is after a reset."""
 
     def __init__(self, device: Any) -> None:
-        """Take the chip from the kernel's driver, and reset it.
+        """Take the chip from the kernel's driver, and set it up; if that fails it is given back.
 
         Args:
             device: `usb.core.Device`.
@@ -86,11 +91,13 @@ class FtdiPort:
         """
         self._device = device
         self._detached = False
-        self._call("be opened", self._take)
-        self._request(RESET, RESET_CHIP)
-        self._request(LATENCY, _LATENCY_MS)
-        self._request(RESET, PURGE_INPUT)
-        self._request(RESET, PURGE_OUTPUT)
+        try:
+            self._call("be opened", self._take)
+            self._set_up()
+        except BaseException:
+            with contextlib.suppress(LinkError):  # the first error says more
+                self.close()
+            raise
 
     def write(self, data: bytes) -> None:
         """Send all of `data`.
@@ -117,13 +124,26 @@ class FtdiPort:
         return b"".join(received[start + STATUS_BYTES : start + length] for start in starts)
 
     def close(self) -> None:
-        """Give the chip back to the kernel's driver."""
+        """Give the chip back to the kernel's driver.
+
+        Raises:
+            LinkError: the driver does not take it.
+        """
         import usb.util
 
         usb.util.dispose_resources(self._device)
         if self._detached:
-            self._device.attach_kernel_driver(0)
-            usb.util.dispose_resources(self._device)
+            self._detached = False
+            try:
+                self._call("be given back", self._device.attach_kernel_driver, 0)
+            finally:
+                usb.util.dispose_resources(self._device)
+
+    def _set_up(self) -> None:
+        self._request(RESET, RESET_CHIP)
+        self._request(LATENCY, _LATENCY_MS)
+        self._request(RESET, PURGE_INPUT)
+        self._request(RESET, PURGE_OUTPUT)
 
     def _take(self) -> None:
         try:
@@ -159,10 +179,14 @@ class FtdiUart(FtdiPort):
         Raises:
             LinkError: the chip refuses.
         """
+        self._divisor = baud_divisor(baud)
         super().__init__(device)
+
+    def _set_up(self) -> None:
+        super()._set_up()
         self._request(DATA_FORMAT, EIGHT_N_ONE)
         self._request(FLOW_CONTROL, 0)
-        self._request(BAUD_RATE, *baud_divisor(baud))
+        self._request(BAUD_RATE, *self._divisor)
 
 
 class FtdiFifo(FtdiPort):

@@ -139,7 +139,9 @@ def test_collected_seeds_are_trials_and_other_settings_make_names(
     assert float(rows[2]["median score [Pa]"]) == pytest.approx(
         float(methods["gabs,levels=8"].solution.score.quantile(0.5)), rel=1e-12
     )
-    assert (tmp_path / "multirun" / "report.md").exists()
+    report = (tmp_path / "multirun" / "report.md").read_text(encoding="utf-8")
+    assert "- seeds: 0, 1\n" in report
+    assert "in the folders that the settings name: `results.h5`" in report
 
 
 def test_an_unfinished_study_is_left_out(
