@@ -75,7 +75,7 @@ def test_openmpd_bytes(transducer: int, phase: float, amplitude: float, byte: in
     assert OPENMPD.frame(one_on(transducer, phase, amplitude)) == expected
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seeds)
 def test_sonicsurface_frame_is_undone_by_its_inverse_and_by_the_firmware(seed: int) -> None:
     levels = random_integers(33, seed)
@@ -88,7 +88,7 @@ def test_sonicsurface_frame_is_undone_by_its_inverse_and_by_the_firmware(seed: i
     torch.testing.assert_close(firmware.drive(), sonicsurface_drive(levels), rtol=0, atol=1e-15)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seeds)
 def test_openmpd_frame_is_undone_by_its_inverse_and_by_the_firmware(seed: int) -> None:
     levels = Levels(random_integers(128, seed), random_integers(65, seed + 1))
