@@ -6,7 +6,7 @@ import math
 import pytest
 import scipy.special
 import torch
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
