@@ -26,6 +26,7 @@ from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError  # type: ignore[import-untyped]
 
 if TYPE_CHECKING:
     from autdtorch.results import StudyResult
@@ -38,7 +39,7 @@ Method: TypeAlias = "functools.partial[Any]"
 PLANE_FILE = "plane.png"
 
 _REFUSED = 2
-_REFUSALS = (ValueError, OSError, HydraException, OmegaConfBaseException)
+_REFUSALS = (ValueError, OSError, HydraException, OmegaConfBaseException, YAMLError)
 _INTERRUPTED = 130  # as a shell reports a process that SIGINT ended
 _NO_METHOD_SETTINGS = ("objective", "trials", "seed", "score")  # the first three are the study's to give
 _FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -123,7 +124,10 @@ def _in_one_line(error: Exception) -> str:
         return f"{group}: {name!r}; must be one of {', '.join(error.options)}"
     # Hydra would advise to add the key, which we would then refuse.
     if unknown := re.match(r"Could not override '(.+)'", text):
-        return f"{unknown[1]}: unknown key; autdtorch --help lists the settings"
+        key = getattr(error.__cause__, "full_key", None) or unknown[1]
+        return f"{key}: unknown key; autdtorch --help lists the settings"
+    if found := re.match(r"(Error (?:merging override|locating target) [^,\n]+)", text):
+        text = f"{found[1]}: {error.__cause__}"
     if "missing EQUAL" in text and (word := re.search(r"'(.*?)'", text)):
         return f"{word[1]}: must be key=value, such as scene=three_cubes; autdtorch --help lists the settings"
     lines = [line.strip() for line in text.splitlines()]

@@ -219,7 +219,8 @@ def _names(named: Sequence[_Named]) -> list[str]:
 def _name(name: str, swept: Settings) -> str:
     shown = {key: value for key, value in swept.items() if key != _FILES}  # of which the paths say more
     ends = [key.rpartition(".")[2] for key in shown]
-    keys = [end if ends.count(end) == 1 else key for key, end in zip(shown, ends, strict=True)]
+    alone = [ends.count(end) == 1 and end != "method" for end in ends]  # the solver has a method too
+    keys = [end if short else key for key, end, short in zip(shown, ends, alone, strict=True)]
     values = (re.sub(r"[^\w.+-]+", "_", str(value)).strip("_") for value in shown.values())
     return ",".join([name, *(f"{key}={value}" for key, value in zip(keys, values, strict=True))])
 

@@ -116,6 +116,13 @@ WRONG = [
     (["scene.array.pitch=nan"], "scene: array: pitch: nan m; must be finite"),
     (["method._target_=autdtorch.tabu"], r"Error locating target 'autdtorch\.tabu'"),
     (["~method._target_"], "method: no _target_"),
+    (["method._target_=nowhere.found"], "Error locating target 'nowhere.found': .*No module named 'nowhere'"),
+    (
+        ["scene.obstacles.0.density=5"],
+        "Error merging override scene.obstacles.0.density=5: list index out of",
+    ),
+    (["scene.array={type: file, path: a.csv}"], r"scene\.array\.path: unknown key"),
+    (["--config-dir", ".", "scene=torn"], "while parsing a flow .*torn.yaml"),
     (["solver.spacing=[1"], "no viable alternative at input"),
     (["seed=1,2"], "Ambiguous value for argument 'seed=1,2'"),
     (["--config-dir", "nowhere"], "Additional config directory '.*nowhere' not found"),
@@ -149,6 +156,8 @@ def test_a_wrong_command_gets_one_line(
 
     monkeypatch.setattr(autdtorch.study, "_run_scene", refuse)
     (tmp_path / "file").touch()
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "torn.yaml").write_text("frequency: [1\n", encoding="utf-8")
     assert run(*arguments) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
