@@ -190,15 +190,14 @@ def _order(settings: Settings) -> list[tuple[str, bool, float, str]]:
 
 def _told_apart(named: Sequence[_Named]) -> list[_Named]:
     """The same names with those settings alone in which others of the name are not all alike."""
+    first: dict[str, Settings] = {}
+    varying: dict[str, set[str]] = {}
+    for name, settings in named:
+        other = first.setdefault(name, settings)
+        keys = settings.keys() | other.keys()
+        varying.setdefault(name, set()).update(key for key in keys if settings.get(key) != other.get(key))
     return [
-        (
-            name,
-            {
-                key: value
-                for key, value in settings.items()
-                if any(other.get(key) != value for same, other in named if same == name)
-            },
-        )
+        (name, {key: value for key, value in settings.items() if key in varying[name]})
         for name, settings in named
     ]
 
@@ -221,7 +220,8 @@ def _name(name: str, swept: Settings) -> str:
     ends = [key.rpartition(".")[2] for key in shown]
     alone = [ends.count(end) == 1 and end != "method" for end in ends]  # the solver has a method too
     keys = [end if short else key for key, end, short in zip(shown, ends, alone, strict=True)]
-    values = (re.sub(r"[^\w.+-]+", "_", str(value)).strip("_") for value in shown.values())
+    texts = ("x".join(map(str, value)) if isinstance(value, list) else str(value) for value in shown.values())
+    values = (re.sub(r"[^\w.+-]+", "_", text).strip("_") for text in texts)
     return ",".join([name, *(f"{key}={value}" for key, value in zip(keys, values, strict=True))])
 
 

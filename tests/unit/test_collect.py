@@ -80,7 +80,7 @@ def test_a_swept_list_is_one_setting_in_the_order_of_its_values(study: Study, tm
     for pitch in (10e-3, 9e-3):
         study({**SCENE, "array": {**GRID, "pitch": pitch, "shape": [2, 3] if pitch == 9e-3 else [2, 2]}})
     sweep = collect_results(tmp_path)
-    assert names(sweep) == ["air,pitch=0.009,shape=2_3", "air,pitch=0.01,shape=2_2"]
+    assert names(sweep) == ["air,pitch=0.009,shape=2x3", "air,pitch=0.01,shape=2x2"]
     assert sweep.swept[names(sweep)[0], "gabs"] == {"scene.array.pitch": 0.009, "scene.array.shape": [2, 3]}
 
 
