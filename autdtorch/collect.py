@@ -130,6 +130,8 @@ def _parts(path: Path, study: StudyResult) -> Iterator[_Part]:
     settings = yaml.safe_load(study.provenance.config)
     if not isinstance(settings, dict) or not {"scene", "scenes"} & settings.keys():
         raise ValueError(f"{path / RESULTS_FILE}: no settings in it; must come from the command line")
+    if missing := [name for name in settings.get("scenes", ()) if name not in study.scenes]:
+        logger.warning("%s: scenes that are not finished are left out: %s", path, ", ".join(missing))
     common = {key: settings[key] for key in ("solver", "plane_spacing") if key in settings}
     for name, found in study.scenes.items():
         section = settings["scenes"][name] if "scenes" in settings else settings["scene"]

@@ -113,6 +113,15 @@ def test_scenes_without_the_same_keys_have_names_that_files_can_have(study: Stud
     assert max(map(len, found)) < 130
 
 
+def test_what_an_experiment_has_not_finished_is_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = {"scenes": {"air": SCENE, "lab": SCENE}, "methods": {"lssg": {"_target_": "autdtorch.lssg"}}}
+    run_study({"air": load_scene(SCENE)}, {"lssg": lssg}, folder=tmp_path, config=yaml.safe_dump(config))
+    assert names(collect_results(tmp_path)) == ["air"]
+    assert caplog.messages[-1].endswith("scenes that are not finished are left out: lab")
+
+
 def test_joined_histories_go_on_with_their_last_value() -> None:
     short, long = (
         Solution(
