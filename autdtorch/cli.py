@@ -156,9 +156,9 @@ def _run(config: DictConfig) -> None:
 
 def _job_folder(overrides: str) -> str:
     """Name of the folder of a sweep's job, short and of characters that folders can have."""
-    name = re.sub(r"[^\w.,=+-]+", "_", overrides) or "job"
+    name = re.sub(r"[^\w.,=+-]+", "_", overrides)
     if name == overrides and len(name) <= _LONGEST_NAME:
-        return name
+        return name or "job"
     # What was lost may be all that tells two jobs apart.
     digest = hashlib.sha256(overrides.encode()).hexdigest()[:12]
     return f"{name[: _LONGEST_NAME - len(digest) - 1]}-{digest}"
