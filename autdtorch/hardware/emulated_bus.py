@@ -9,31 +9,66 @@ import errno
 from array import array
 from collections.abc import Sequence
 from types import SimpleNamespace
+from typing import ClassVar, Protocol
 
-from autdtorch.hardware.emulated_chips import EmulatedChip
+from autdtorch.hardware.emulated_chips import Interfaces
 from autdtorch.hardware.usb import INSTALL_HINT
 
 try:
     from usb.backend import IBackend
-    from usb.core import USBError
+    from usb.core import USBError, USBTimeoutError
 except ImportError as error:
     raise ImportError(f"{error}; {INSTALL_HINT}") from error
 
-_GET_DESCRIPTOR, _STRING_TYPE, _ENGLISH = 0x06, 0x03, 0x0409
+_GET_DESCRIPTOR, _STRING, _ENGLISH = 0x06, 0x03, 0x0409
 _FROM_DEVICE, _STANDARD_FROM_DEVICE = 0x80, 0x80
 _PACKET = 64
 
 
+class EmulatedDevice(Protocol):
+    """What can be plugged in.
+
+    Attributes:
+        interfaces: class, subclass and protocol of each, and its endpoints, those for bulk transfers.
+        vendor: idVendor.
+        product: idProduct.
+        strings: string descriptors by their index.
+        present: whether it is plugged in.
+    """
+
+    interfaces: ClassVar[Interfaces]
+    vendor: int
+    product: int
+    strings: tuple[str, str, str, str]
+    present: bool
+
+    def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
+        """Take a request with its data; False where it knows no such request, and stalls."""
+        ...
+
+    def answer(self, kind: int, request: int) -> bytes | None:
+        """Answer a request; None where it knows no such request, and stalls."""
+        ...
+
+    def write(self, data: bytes) -> None:
+        """Take a bulk transfer."""
+        ...
+
+    def read(self, most: int) -> bytes:
+        """Give a bulk transfer of at most so many bytes."""
+        ...
+
+
 class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
-    """A backend of pyusb with emulated chips, numbered by their place.
+    """A backend of pyusb with emulated devices, numbered by their place.
 
     Attributes:
         chips: what may be plugged in.
         slept: time that has passed by `sleep` [s].
     """
 
-    def __init__(self, chips: Sequence[EmulatedChip]) -> None:
-        """Plug the chips in."""
+    def __init__(self, chips: Sequence[EmulatedDevice]) -> None:
+        """Plug the devices in."""
         super().__init__()
         self.chips = list(chips)
         self.slept = 0.0
@@ -67,11 +102,11 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
     def get_interface_descriptor(self, dev: int, intf: int, alt: int, config: int) -> SimpleNamespace:
         """As the chip has it."""
         _require(config == alt == 0)
-        kind, endpoints = self.chips[dev].interfaces[intf]
+        (kind, subclass, protocol), endpoints = self.chips[dev].interfaces[intf]
         return SimpleNamespace(
             bLength=9, bDescriptorType=4, bInterfaceNumber=intf, bAlternateSetting=0,
-            bNumEndpoints=len(endpoints), bInterfaceClass=kind, bInterfaceSubClass=0xFF,
-            bInterfaceProtocol=0xFF, iInterface=0, extra_descriptors=[],
+            bNumEndpoints=len(endpoints), bInterfaceClass=kind, bInterfaceSubClass=subclass,
+            bInterfaceProtocol=protocol, iInterface=0, extra_descriptors=[],
         )  # fmt: skip
 
     def get_endpoint_descriptor(self, dev: int, ep: int, intf: int, alt: int, config: int) -> SimpleNamespace:
@@ -105,10 +140,6 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
     def release_interface(self, dev_handle: int, intf: int) -> None:
         """Nobody else is there."""
 
-    def clear_halt(self, dev_handle: int, ep: int) -> None:
-        """Nothing stalls."""
-        self._chip(dev_handle)
-
     def is_kernel_driver_active(self, dev_handle: int, intf: int) -> bool:
         """There is no kernel."""
         return False
@@ -125,18 +156,21 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
     ) -> int:
         """String descriptors, and requests to the chip; others stall."""
         chip = self._chip(dev_handle)
-        if bmRequestType == _STANDARD_FROM_DEVICE and (bRequest, wValue >> 8) == (
-            _GET_DESCRIPTOR,
-            _STRING_TYPE,
-        ):
-            text = _string_descriptor(chip.strings, wValue & 0xFF)[: len(data)]
-            data[: len(text)] = array("B", text)
-            return len(text)
-        if not bmRequestType & _FROM_DEVICE and chip.control(
-            bmRequestType, bRequest, wValue, wIndex, data.tobytes()
-        ):
-            return len(data)
-        raise USBError("Pipe error", errno=errno.EPIPE)
+        if not bmRequestType & _FROM_DEVICE:
+            if chip.control(bmRequestType, bRequest, wValue, wIndex, data.tobytes()):
+                return len(data)
+            raise stall()
+        if bmRequestType == _STANDARD_FROM_DEVICE and (bRequest, wValue >> 8) == (_GET_DESCRIPTOR, _STRING):
+            answer: bytes | None = _string_descriptor(chip.strings, wValue & 0xFF)
+        else:
+            answer = chip.answer(bmRequestType, bRequest)
+        if answer is None:
+            raise stall()
+        return _fill(data, answer[: len(data)])
+
+    def clear_halt(self, dev_handle: int, ep: int) -> None:
+        """Nothing stalls."""
+        self._chip(dev_handle)
 
     def bulk_write(self, dev_handle: int, ep: int, intf: int, data: array[int], timeout: int) -> int:
         """All of it, at once."""
@@ -144,21 +178,34 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
         return len(data)
 
     def bulk_read(self, dev_handle: int, ep: int, intf: int, buff: array[int], timeout: int) -> int:
-        """A packet."""
-        packet = self._chip(dev_handle).read()
-        buff[: len(packet)] = array("B", packet)
-        return len(packet)
+        """What the device gives."""
+        return _fill(buff, self._chip(dev_handle).read(len(buff)))
 
-    def _chip(self, dev: int) -> EmulatedChip:
+    def _chip(self, dev: int) -> EmulatedDevice:
         chip = self.chips[dev]
         if not chip.present:
             raise USBError("No such device (it may have been disconnected)", errno=errno.ENODEV)
         return chip
 
 
+def stall() -> USBError:
+    """The error of a request that a device refuses."""
+    return USBError("Pipe error", errno=errno.EPIPE)
+
+
+def time_out() -> USBError:
+    """The error of a transfer that does not come to its end."""
+    return USBTimeoutError("Operation timed out", errno=errno.ETIMEDOUT)
+
+
+def _fill(buffer: array[int], data: bytes) -> int:
+    buffer[: len(data)] = array("B", data)
+    return len(data)
+
+
 def _string_descriptor(strings: Sequence[str], index: int) -> bytes:
     text = _ENGLISH.to_bytes(2, "little") if index == 0 else strings[index].encode("utf-16-le")
-    return bytes([len(text) + 2, _STRING_TYPE]) + text
+    return bytes([len(text) + 2, _STRING]) + text
 
 
 def _require(there: bool) -> None:

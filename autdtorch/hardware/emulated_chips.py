@@ -5,9 +5,12 @@ Written from the chips' Linux drivers and data sheets, not from `adapters`, so t
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import ClassVar, TypeAlias
 
 from autdtorch.hardware.firmware import Firmware
+
+#: Class, subclass and protocol of each interface, and its bulk endpoints.
+Interfaces: TypeAlias = tuple[tuple[tuple[int, int, int], tuple[int, ...]], ...]
 
 _STRINGS = ("", "autdtorch", "emulated device")  # by index; the serial number comes after
 _VENDOR_DEVICE, _VENDOR_INTERFACE, _CLASS_INTERFACE = 0x40, 0x41, 0x21
@@ -18,7 +21,7 @@ class EmulatedChip:
     """A USB chip with a serial port, in front of a firmware.
 
     Attributes:
-        interfaces: class and endpoints of each, those for bulk transfers.
+        interfaces: class, subclass and protocol of each, and its endpoints, those for bulk transfers.
         vendor: idVendor.
         product: idProduct.
         strings: string descriptors by their index.
@@ -28,7 +31,7 @@ class EmulatedChip:
         eight_n_one: whether it is set to 8 bits, no parity, 1 stop bit.
     """
 
-    interfaces: ClassVar[tuple[tuple[int, tuple[int, ...]], ...]] = ((0xFF, (0x81, 0x02)),)
+    interfaces: ClassVar[Interfaces] = (((0xFF, 0xFF, 0xFF), (0x81, 0x02)),)
 
     def __init__(self, vendor: int, product: int, serial: str, firmware: Firmware) -> None:
         """Plug the chip in: 9600 baud, as after its power-up."""
@@ -44,6 +47,9 @@ class EmulatedChip:
         """Take a request with its data; False where the chip knows no such request, and stalls."""
         raise NotImplementedError
 
+    def answer(self, kind: int, request: int) -> bytes | None:
+        """Answer a request; None, as no chip here has an answer."""
+
     def write(self, data: bytes) -> None:
         """Send bytes on to the firmware, which loses them at another rate or format than its own."""
         wanted = self.firmware.baud
@@ -53,7 +59,7 @@ class EmulatedChip:
                 return
         self.firmware.receive(data)
 
-    def read(self) -> bytes:
+    def read(self, most: int) -> bytes:
         """An IN packet: no device here answers."""
         return b""
 
@@ -72,7 +78,7 @@ class EmulatedFtdi(EmulatedChip):
             self.eight_n_one = value == 8
         return kind == _VENDOR_DEVICE and request in (self._BAUD, self._FORMAT, *self._OTHERS)
 
-    def read(self) -> bytes:
+    def read(self, most: int) -> bytes:
         """An IN packet: the status alone."""
         return b"\x01\x60"
 
@@ -80,7 +86,7 @@ class EmulatedFtdi(EmulatedChip):
 class EmulatedCh340(EmulatedChip):
     """A CH340: registers, written in pairs."""
 
-    interfaces = ((0xFF, (0x82, 0x02)),)
+    interfaces = (((0xFF, 0x01, 0x02), (0x82, 0x02)),)
 
     _INIT, _WRITE, _MODEM = 0xA1, 0x9A, 0xA4
     _PRESCALER, _DIVISOR, _LINE = 0x12, 0x13, 0x18
@@ -101,7 +107,7 @@ class EmulatedCh340(EmulatedChip):
 class EmulatedCp2102(EmulatedChip):
     """A CP2102: it sends when its interface was enabled."""
 
-    interfaces = ((0xFF, (0x81, 0x01)),)
+    interfaces = (((0xFF, 0x00, 0x00), (0x81, 0x01)),)
 
     _ENABLE, _LINE, _HANDSHAKE, _PURGE, _BAUD = 0x00, 0x03, 0x07, 0x12, 0x1E
     _enabled = False
@@ -126,7 +132,7 @@ class EmulatedCp2102(EmulatedChip):
 class EmulatedCdc(EmulatedChip):
     """A serial port of USB's own class: one interface for control, one for data."""
 
-    interfaces = ((0x02, ()), (0x0A, (0x04, 0x83)))
+    interfaces = (((0x02, 0x02, 0x01), ()), ((0x0A, 0x00, 0x00), (0x04, 0x83)))
 
     _LINE_CODING, _LINE_STATE = 0x20, 0x22
 

@@ -145,7 +145,7 @@ def test_a_chip_that_keeps_the_off_frame_is_told_of(trial, monkeypatch):
     monkeypatch.setattr("autdtorch.hardware.adapters._FLUSH_SECONDS", 0.0)
     bench = trial.bench()
     link = trial.link(bench)
-    bench.chip.read = lambda: b"\x01\x20"  # there is room for more, but the transmitter is not empty
+    bench.chip.read = lambda most: b"\x01\x20"  # there is room for more, but the transmitter is not empty
     with pytest.raises(LinkError, match="outputs may still be on"):
         link.close()
 

@@ -71,7 +71,7 @@ def test_at_another_rate_the_device_hears_nothing():
 
 def test_status_bytes_are_stripped_from_every_packet():
     class Talking(EmulatedFtdi):
-        def read(self) -> bytes:
+        def read(self, most: int) -> bytes:
             return b"\x01\x60" + 62 * b"a" + b"\x01\x60bc"
 
     quiet = FtdiPort(find_device([UART], backend=EmulatedBus([chip()])))

@@ -39,6 +39,7 @@ UNITS = {
     "Pa": {
         "G",
         "field",
+        "loudest",
         "mean",
         "min",
         "plane_pressure",
@@ -54,7 +55,11 @@ UNITS = {
     "rad": {"angle", "phase", "phase_offsets", "phases", "rotation"},
     "rad/m": {"complex_wavenumber", "wavenumber"},
     "rad/s": {"angular_frequency"},
-    "s": {"seconds", "seconds_in_a_row", "seconds_on", "settle", "time_step"},
+    "s": {"seconds", "seconds_in_a_row", "seconds_on", "settle", "time_step", "timeout"},
+    "s/division": {"time_scale"},
+    "V": {"dc_offset", "resolution", "volts"},
+    "V/Pa": {"sensitivity"},
+    "V/division": {"scales"},
 }
 UNIT_OF = {name: unit for unit, names in UNITS.items() for name in names}
 WITHOUT_UNIT = {
@@ -66,8 +71,10 @@ WITHOUT_UNIT = {
         "density_ratio",
         "drive",
         "duty_cycle",
+        "drift",
         "evaluations",
         "faces",
+        "gain",
         "gains",
         "loss",
         "mask",

@@ -1,0 +1,185 @@
+"""An oscilloscope without hardware: its commands, and the waveforms of microphones on an emulated bench.
+
+Its commands are those of the makers' programming guides, not of `scpi`, so that the one checks the other.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from autdtorch.hardware.emulated_bus import EmulatedBus
+from autdtorch.hardware.emulated_usbtmc import EmulatedInstrument
+from autdtorch.validation import finite_number, integer_at_least, invalid, not_negative, positive
+
+_PER = 1000  # captures after which a drift is stated
+
+
+@dataclass(frozen=True)
+class _Maker:
+    identity: str
+    time_scale: str
+    capture: str  # the command after which a capture is there
+    ignored: frozenset[str]  # settings and commands that change nothing here
+    answers: dict[str, str]
+    points: int
+    codes_per_division: int
+    middle: int
+    clipped: tuple[int, int]  # codes of samples below and above what the converter can follow
+    digits: int  # in the length of a block
+
+
+_MAKERS = {
+    "Keysight": _Maker(
+        "KEYSIGHT TECHNOLOGIES,DSO-X 3024T,EMULATED,07.50",
+        "TIM:SCAL", "DIG",
+        frozenset({"ACQ:TYPE", "TRIG:SWE", "WAV:FORM", "WAV:UNS", "WAV:POIN"}),
+        {"*OPC?": "1"},
+        points=1000, codes_per_division=32, middle=128, clipped=(1, 255), digits=8,
+    ),
+    "Rigol": _Maker(
+        "RIGOL TECHNOLOGIES,DS1104Z,EMULATED,00.04.04",
+        "TIM:MAIN:SCAL", "TFOR",
+        frozenset({"ACQ:TYPE", "SING", "WAV:FORM", "WAV:MODE"}),
+        {"TRIG:STAT?": "STOP"},
+        points=1200, codes_per_division=25, middle=127, clipped=(0, 255), digits=9,
+    ),
+}  # fmt: skip
+_INPUT_SETTINGS = frozenset({"DISP", "PROB", "COUP", "OFFS"})
+
+
+class EmulatedScope:
+    """An oscilloscope whose inputs hear microphones at the control points of a bench.
+
+    It samples with 8 bits, from a random moment on.
+
+    Attributes:
+        heard: for each input, from the first, the control point where its microphone is.
+        misunderstood: lines that it could do nothing with.
+    """
+
+    def __init__(
+        self,
+        pressure: Callable[[], torch.Tensor],
+        frequency: float,
+        sensitivity: float,
+        heard: Sequence[int],
+        maker: str = "Keysight",
+        noise: float = 0.0,
+        dc_offset: float = 0.0,
+        drift: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        """Set the bench up.
+
+        Args:
+            pressure: gives the phasors (P,) [Pa] at the control points now.
+            frequency: of the sound [Hz].
+            sensitivity: of all microphones, with their amplifiers [V/Pa].
+            heard: for each input, from the first, the control point where its microphone is, from 0.
+            maker: of the oscilloscope, Keysight or Rigol.
+            noise: rms of the white noise at every input [V].
+            dc_offset: voltage at every input without sound [V].
+            drift: the microphones' gain is e^u, u a random walk of this rms after 1000 captures.
+            seed: of noise, drift and the moments of capture, >= 0.
+
+        Raises:
+            ValueError: an argument out of range.
+        """
+        if maker not in _MAKERS:
+            raise invalid("maker", maker, f"must be one of {', '.join(_MAKERS)}")
+        self.heard = list(heard)
+        self.misunderstood: list[str] = []
+        self._maker = _MAKERS[maker]
+        self._pressure = pressure
+        self._frequency = positive("frequency", frequency, "Hz")
+        self._sensitivity = positive("sensitivity", sensitivity, "V/Pa")
+        self._noise = not_negative("noise", noise, "V")
+        self._offset = finite_number("dc_offset", dc_offset, "V")
+        self._drift = not_negative("drift", drift)
+        self._generator = np.random.default_rng(integer_at_least("seed", seed, 0))
+        self._walk = 0.0
+        self._time_scale = 1e-3
+        self._scales = [1.0] * len(self.heard)
+        self._source = 0
+        self._codes: list[bytes] = []
+
+    def plug_into(
+        self, bus: EmulatedBus, chip: tuple[int, int], serial: str = "EMULATED"
+    ) -> EmulatedInstrument:
+        """Appear on a bus with idVendor and idProduct of `chip` and a `serial` number."""
+        instrument = EmulatedInstrument(*chip, serial, self)
+        bus.chips.append(instrument)
+        return instrument
+
+    def execute(self, line: str) -> bytes | None:
+        """Do what a line says; the answer, if it asks for one that there is."""
+        header, _, argument = line.partition(" ")
+        header = _short(header)
+        found = re.fullmatch(r"CHAN(\d):(\w+)", header)
+        number = int(found[1]) - 1 if found and 1 <= int(found[1]) <= len(self.heard) else None
+        if header == self._maker.time_scale:
+            self._time_scale = float(argument)
+        elif found and number is not None and found[2] == "SCAL":
+            self._scales[number] = float(argument)
+        elif header == "WAV:SOUR":
+            self._source = int(argument[-1]) - 1
+        elif header == self._maker.capture:
+            self._capture()
+        elif header.endswith("?") and (answer := self._answer(header)) is not None:
+            return answer + b"\n"
+        elif header not in self._maker.ignored and not (
+            found and number is not None and found[2] in _INPUT_SETTINGS
+        ):
+            self.misunderstood.append(line)
+        return None
+
+    def _answer(self, header: str) -> bytes | None:
+        maker = self._maker
+        if header == "*IDN?":
+            return maker.identity.encode()
+        if header in maker.answers:
+            return maker.answers[header].encode()
+        if not 0 <= self._source < len(self._codes):
+            return None
+        codes = self._codes[self._source]
+        if header == "WAV:PRE?":
+            resolution = self._scales[self._source] / maker.codes_per_division
+            time = f"{self._step():+.6E},{-self._step() * maker.points / 2:+.6E},+0"
+            return f"+0,+0,{len(codes):+d},+1,{time},{resolution:+.6E},+0,{maker.middle:+d}".encode()
+        if header == "WAV:DATA?":
+            return f"#{maker.digits}{len(codes):0{maker.digits}d}".encode() + codes
+        return None
+
+    def _step(self) -> float:
+        return self._time_scale / 100
+
+    def _capture(self) -> None:
+        """Sample all inputs, from a random moment on."""
+        self._walk += self._drift / _PER**0.5 * self._generator.standard_normal()
+        moments = self._generator.uniform(0, 1 / self._frequency) + self._step() * np.arange(
+            self._maker.points
+        )
+        turns = np.exp(-2j * np.pi * self._frequency * moments)
+        phasors = self._pressure().numpy()[self.heard] * self._sensitivity * np.exp(self._walk)
+        noise = self._noise * self._generator.standard_normal((len(self.heard), len(moments)))
+        volts = (phasors[:, None] * turns).real + self._offset + noise
+        low, high = self._maker.clipped
+        steps = volts * self._maker.codes_per_division / np.array(self._scales)[:, None]
+        codes = np.clip(np.round(steps) + self._maker.middle, low, high).astype(np.uint8)
+        self._codes = [row.tobytes() for row in codes]
+
+
+def _short(header: str) -> str:
+    """A header in capitals, its words in the short form: four letters, or three if the fourth is a vowel."""
+    return re.sub(r"[A-Z]+", lambda word: _short_word(word[0]), header.upper().removeprefix(":"))
+
+
+def _short_word(word: str) -> str:
+    if len(word) <= 4:
+        return word
+    return word[:3] if word[3] in "AEIOU" else word[:4]

@@ -1,0 +1,126 @@
+"""A measuring instrument on the emulated bus: USBTMC around what it makes of a line of text.
+
+Written from the class's specification alone, not from `usbtmc`, so that the one checks the other.
+"""
+
+from __future__ import annotations
+
+import random
+from typing import ClassVar, Literal, Protocol
+
+from autdtorch.hardware.emulated_bus import stall, time_out
+from autdtorch.hardware.emulated_chips import Interfaces
+
+#: What can go wrong with a transfer from the instrument.
+Fault = Literal["time-out", "stall", "short", "garbage"]
+
+_PACKET = 64
+_CLASS_INTERFACE = 0xA1  # from the device
+_INITIATE_CLEAR, _CHECK_CLEAR_STATUS, _GET_CAPABILITIES = 5, 6, 7
+# success, versions 1.00, no options
+_CAPABILITIES = bytes([1, 0, 0, 1, 0, 0, *bytes(6), 0, 1, 0, 0, *bytes(8)])
+
+
+class Instrument(Protocol):
+    """An instrument behind its USB interface."""
+
+    def execute(self, line: str) -> bytes | None:
+        """Do what a line says; the answer, if it asks for one that there is."""
+        ...
+
+
+class EmulatedInstrument:
+    """The USB interface of an instrument: USB488, without its interrupt endpoint.
+
+    Attributes:
+        interfaces: class, subclass and protocol, and the bulk endpoints.
+        vendor: idVendor.
+        product: idProduct.
+        strings: string descriptors by their index.
+        present: whether it is plugged in.
+        fault: what goes wrong with every transfer from the instrument, from now on.
+        longest: bytes of a message in a transfer; longer messages come in several.
+        sends_empty_packets: after a transfer of whole packets, as USB demands; some instruments do not.
+    """
+
+    interfaces: ClassVar[Interfaces] = (((0xFE, 0x03, 0x01), (0x82, 0x01)),)
+
+    def __init__(self, vendor: int, product: int, serial: str, instrument: Instrument) -> None:
+        """Plug it in."""
+        self.vendor = vendor
+        self.product = product
+        self.strings = ("", "autdtorch", "emulated instrument", serial)
+        self.present = True
+        self.fault: Fault | None = None
+        self.longest = 512
+        self.sends_empty_packets = True
+        self._instrument = instrument
+        self._received = b""
+        self._answer = b""
+        self._asked: tuple[int, int] | None = None  # tag, bytes
+        self._sending: bytes | None = None
+
+    def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
+        """It takes no requests with data."""
+        return False
+
+    def answer(self, kind: int, request: int) -> bytes | None:
+        """INITIATE_CLEAR and CHECK_CLEAR_STATUS, which succeed at once, and GET_CAPABILITIES."""
+        if kind != _CLASS_INTERFACE:
+            return None
+        if request == _INITIATE_CLEAR:
+            self._received, self._answer, self._asked, self._sending = b"", b"", None, None
+        answers = {
+            _INITIATE_CLEAR: b"\x01",
+            _CHECK_CLEAR_STATUS: b"\x01\x00",
+            _GET_CAPABILITIES: _CAPABILITIES,
+        }
+        return answers.get(request)
+
+    def write(self, data: bytes) -> None:
+        """A transfer: part of a message, or the wish for an answer."""
+        kind, tag, complement = data[:3]
+        length = int.from_bytes(data[4:8], "little")
+        if tag == 0 or tag + complement != 255:
+            raise stall()
+        if kind == 2 and len(data) == 12:
+            self._asked = tag, length
+        elif kind == 1 and len(data) == 12 + length + -length % 4:
+            self._take(data[12 : 12 + length], ends=bool(data[8] & 1))
+        else:
+            raise stall()
+
+    def read(self, most: int) -> bytes:
+        """What fits into `most` bytes of a transfer that was asked for."""
+        if self.fault == "stall":
+            raise stall()
+        if self.fault == "garbage":
+            return random.Random(0).randbytes(_PACKET)
+        if self.fault == "time-out":
+            raise time_out()
+        transfer = self._transfer() if self._sending is None else self._sending
+        given, rest = transfer[:most], transfer[most:]
+        whole = len(given) % _PACKET == 0
+        if whole and len(given) < most and not self.sends_empty_packets:
+            raise time_out()  # the host waits for more
+        empty_is_due = whole and len(given) == most and self.sends_empty_packets
+        self._sending = rest if rest or empty_is_due else None
+        return given
+
+    def _transfer(self) -> bytes:
+        """As much of the answer as was asked for and goes into a transfer."""
+        if self._asked is None or not self._answer:
+            raise time_out()
+        tag, most = self._asked
+        self._asked = None
+        size = min(most, self.longest)
+        data, self._answer = self._answer[:size], self._answer[size:]
+        header = bytes([2, tag, 255 - tag, 0, *len(data).to_bytes(4, "little"), not self._answer, 0, 0, 0])
+        transfer = header + data + bytes(-len(data) % 4)
+        return transfer[: len(transfer) // 2] if self.fault == "short" else transfer
+
+    def _take(self, data: bytes, ends: bool) -> None:
+        self._received += data
+        if ends:
+            line, self._received = self._received.decode("ascii").strip(), b""
+            self._answer = self._instrument.execute(line) or b""

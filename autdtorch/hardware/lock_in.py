@@ -1,0 +1,70 @@
+"""The part of a sampled signal that is at one frequency."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+
+from autdtorch.validation import integer_at_least, invalid, positive
+
+
+class Heard(NamedTuple):
+    """What a lock-in found.
+
+    Attributes:
+        phasor: p (...,) of Re(p e^{-i w t}), t = 0 at the first sample; complex128, in the signal's unit.
+        residual: rms of what is neither at the frequency nor constant (...,), float64.
+    """
+
+    phasor: torch.Tensor
+    residual: torch.Tensor
+
+
+class LockIn:
+    """Fits an offset and a sine of known frequency to samples: least squares, weighted by a Hann window.
+
+    An offset and a sine are found exactly, whatever number of periods the samples hold. The window keeps
+    hum, slow drift and harmonics out, which a plain fit lets in where that number is not whole; the error
+    that white noise causes grows by sqrt(3/2) above the least that any unbiased estimate can have
+    (Rife and Boorstyn 1974, doi:10.1109/TIT.1974.1055282).
+
+    Attributes:
+        noise_gain: white noise of variance s^2 in every sample puts an error of E|e|^2 = noise_gain s^2 on
+            the phasor: 6 over the number of samples, if they hold many periods.
+    """
+
+    noise_gain: float
+
+    def __init__(self, frequency: float, step: float, samples: int) -> None:
+        """Prepare the fit.
+
+        Args:
+            frequency: of the sine [Hz].
+            step: time from sample to sample [s].
+            samples: their number S.
+
+        Raises:
+            ValueError: an argument out of range; less than two periods, or two samples a period or fewer.
+        """
+        cycles = positive("frequency", frequency, "Hz") * positive("step", step, "s")
+        samples = integer_at_least("samples", samples, 4)
+        if cycles >= 0.5:
+            raise invalid("step", step, f"must be < {0.5 / frequency:g}, half a period", "s")
+        if cycles * samples < 2:
+            raise invalid("samples", samples, f"must be >= {math.ceil(2 / cycles)}, two periods")
+        places = torch.arange(samples, dtype=torch.float64)
+        angle = 2 * math.pi * cycles * places
+        window = (math.pi * (places + 0.5) / samples).sin().square()
+        self._basis = torch.stack([torch.ones_like(angle), angle.cos(), angle.sin()])
+        weighted = self._basis * window
+        self._fit = torch.linalg.solve(weighted @ self._basis.T, weighted)
+        self.noise_gain = float(self._fit[1:].square().sum())
+
+    def __call__(self, signal: torch.Tensor) -> Heard:
+        """Phasors of signals (..., S)."""
+        coefficients = signal.to(torch.float64) @ self._fit.T
+        rest = signal - coefficients @ self._basis
+        residual = (rest.square().sum(dim=-1) / (rest.shape[-1] - len(self._basis))).sqrt()
+        return Heard(torch.complex(coefficients[..., 1], coefficients[..., 2]), residual)

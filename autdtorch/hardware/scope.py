@@ -1,0 +1,244 @@
+"""Microphones at an oscilloscope: captures of their voltages, and the pressure at the drive frequency."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+import torch
+
+from autdtorch.hardware.lock_in import LockIn
+from autdtorch.hardware.scpi import KEYSIGHT, Dialect, Waveform
+from autdtorch.hardware.sensor import SensorError
+from autdtorch.hardware.usb import LinkError, find_device
+from autdtorch.hardware.usbtmc import UsbtmcPort
+from autdtorch.validation import integer_at_least, invalid, positive
+
+logger = logging.getLogger(__name__)
+
+_PERIODS_A_DIVISION = 5  # 40 to 60 periods on a screen, some 20 samples each
+_DIVISIONS = 3.5  # that the loudest sound fills above and below the middle; there are 4 or more
+_CAPTURE_TIME = 2.0  # [s] after which a capture must be there
+_QUIET = 5  # standard errors
+
+
+@dataclass(frozen=True)
+class Microphone:
+    """A microphone at a control point, and its way into the oscilloscope.
+
+    Attributes:
+        input: number of the oscilloscope's input, from 1.
+        sensitivity: of the microphone at the drive frequency [V/Pa].
+        loudest: amplitude that the input must take [Pa].
+        gain: of the amplifier between, as a factor.
+    """
+
+    input: int
+    sensitivity: float
+    loudest: float
+    gain: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            ValueError: one is out of range.
+        """
+        integer_at_least("input", self.input, 1)
+        positive("sensitivity", self.sensitivity, "V/Pa")
+        positive("loudest", self.loudest, "Pa")
+        positive("gain", self.gain)
+
+
+class Oscilloscope:
+    """An oscilloscope that takes captures when it is asked to, whatever its inputs hear.
+
+    Use it as a context manager.
+
+    Attributes:
+        identity: what it says it is.
+    """
+
+    identity: str
+
+    def __init__(self, port: UsbtmcPort, dialect: Dialect = KEYSIGHT) -> None:
+        """Ask it what it is.
+
+        Args:
+            port: takes its commands.
+            dialect: of its maker.
+
+        Raises:
+            LinkError: it does not answer.
+        """
+        self._port = port
+        self._dialect = dialect
+        self.identity = port.ask("*IDN?")
+
+    def set_up(self, scales: dict[int, float], time_scale: float) -> None:
+        """Set inputs and time up.
+
+        Args:
+            scales: of each input [V/division].
+            time_scale: of all inputs [s/division].
+
+        Raises:
+            LinkError: it does not take the commands.
+        """
+        for command in self._dialect.set_up:
+            self._port.tell(command.format(time=time_scale))
+        for number, scale in scales.items():
+            for command in self._dialect.set_up_input:
+                self._port.tell(command.format(input=number, scale=scale))
+
+    def capture(self, inputs: Sequence[int]) -> list[Waveform]:
+        """A waveform for each of the inputs, all of the same time.
+
+        Raises:
+            LinkError: it does not take the commands, or does not capture or answer in time.
+        """
+        for command in self._dialect.capture:
+            self._port.tell(command)
+        deadline = time.monotonic() + _CAPTURE_TIME
+        while (status := self._port.ask(self._dialect.status)) != self._dialect.ready:
+            if time.monotonic() > deadline:
+                raise LinkError(f"{self.identity}: no capture within {_CAPTURE_TIME:g} s, status {status!r}")
+            time.sleep(0.01)
+        return [self._waveform(number) for number in inputs]
+
+    def close(self) -> None:
+        """Let go of it.
+
+        Raises:
+            LinkError: it cannot be given back to the system.
+        """
+        self._port.close()
+
+    def __enter__(self) -> Self:
+        """The oscilloscope."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Let go of it."""
+        self.close()
+
+    def _waveform(self, number: int) -> Waveform:
+        self._port.tell(self._dialect.source.format(input=number))
+        preamble = self._port.ask(self._dialect.preamble)
+        return self._dialect.waveform(preamble, self._port.ask_block(self._dialect.samples))
+
+
+class ScopeSensor:
+    """Microphones at an oscilloscope, one for each control point.
+
+    The amplitude at the drive frequency is taken from captures by a lock-in: hum, other tones and most of
+    the noise do not count. Readings of several captures are averaged as powers, less the power that the
+    noise has there, since the captures' phases are not known.
+    """
+
+    def __init__(
+        self,
+        scope: Oscilloscope,
+        frequency: float,
+        microphones: Sequence[Microphone],
+        captures: int = 1,
+    ) -> None:
+        """Set the oscilloscope up.
+
+        Args:
+            scope: takes the captures.
+            frequency: of the drive [Hz].
+            microphones: in the order of the control points.
+            captures: to average over.
+
+        Raises:
+            ValueError: an argument out of range, no microphone, or two at one input.
+            LinkError: the oscilloscope does not take the commands.
+        """
+        self._scope = scope
+        self._frequency = positive("frequency", frequency, "Hz")
+        self._microphones = list(microphones)
+        self._captures = integer_at_least("captures", captures, 1)
+        scales = {one.input: one.loudest * _volts(one) / _DIVISIONS for one in self._microphones}
+        if not scales or len(scales) < len(self._microphones):
+            inputs = [one.input for one in self._microphones]
+            raise invalid("microphones", inputs, "must be at inputs of their own, at least one")
+        scope.set_up(scales, _PERIODS_A_DIVISION / self._frequency)
+
+    def read(self) -> torch.Tensor:
+        """Magnitudes (P,) [Pa]; what cannot be told from noise is logged as a warning.
+
+        Raises:
+            SensorError: a capture is clipped, or too coarse or short for the frequency.
+            LinkError: the oscilloscope does not answer.
+        """
+        captures = torch.stack([self._capture() for _ in range(self._captures)])
+        power, noise = captures.mean(dim=0).unbind(dim=-1)
+        pressure = (power - noise).clamp(min=0).sqrt()
+        # The power of noise alone has a standard error of its own size, over the root of the captures.
+        quiet = power - noise < _QUIET * noise / self._captures**0.5
+        for place in quiet.nonzero().flatten().tolist():
+            logger.warning(
+                "input %d: %.3g Pa cannot be told from the noise of %.2g Pa",
+                *(self._microphones[place].input, float(pressure[place]), float(noise[place].sqrt())),
+            )
+        return pressure
+
+    def _capture(self) -> torch.Tensor:
+        """Powers (P, 2) [Pa^2]: what is heard at the frequency, and what the noise adds to that."""
+        waveforms = self._scope.capture([one.input for one in self._microphones])
+        return torch.stack([self._powers(*pair) for pair in zip(self._microphones, waveforms, strict=True)])
+
+    def _powers(self, microphone: Microphone, waveform: Waveform) -> torch.Tensor:
+        if waveform.clipped:
+            raise SensorError(
+                f"input {microphone.input}: {waveform.clipped} of {len(waveform.volts)} samples are clipped; "
+                f"its microphone hears more than {microphone.loudest:g} Pa: raise `loudest`"
+            )
+        try:
+            lock_in = LockIn(self._frequency, waveform.time_step, len(waveform.volts))
+        except ValueError as error:
+            raise SensorError(
+                f"input {microphone.input}: capture does not suit the frequency: {error}"
+            ) from error
+        heard = lock_in(waveform.volts)
+        # Samples that all have the same code do not show the noise of their rounding.
+        variance = heard.residual.square().clamp(min=waveform.resolution**2 / 12)
+        return (
+            torch.stack([heard.phasor.abs().square(), lock_in.noise_gain * variance])
+            / _volts(microphone) ** 2
+        )
+
+
+def open_scope(
+    chip: tuple[int, int], dialect: Dialect = KEYSIGHT, serial: str | None = None, backend: Any = None
+) -> Oscilloscope:
+    """Find an oscilloscope on USB.
+
+    Args:
+        chip: its idVendor and idProduct, as ``lsusb`` shows them.
+        dialect: of its maker.
+        serial: number, where several such are plugged in.
+        backend: of pyusb; by default libusb. An emulated bench has its own.
+
+    Raises:
+        LinkError: none or several such devices, or it does not answer.
+        ImportError: pyusb or libusb-package is missing.
+    """
+    port = UsbtmcPort(find_device([chip], serial, backend))
+    try:
+        return Oscilloscope(port, dialect)
+    except BaseException:
+        port.close()
+        raise
+
+
+def _volts(microphone: Microphone) -> float:
+    """Voltage at the input for 1 Pa."""
+    return microphone.sensitivity * microphone.gain

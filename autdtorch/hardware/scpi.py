@@ -1,0 +1,131 @@
+"""What oscilloscopes of different makers are told over SCPI, and how their samples become volts.
+
+From the makers' programming guides; none was tried on a device.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from autdtorch.hardware.usb import LinkError
+
+
+@dataclass(frozen=True)
+class Waveform:
+    """Samples of one input.
+
+    Attributes:
+        volts: (S,) [V], float64.
+        time_step: from sample to sample [s].
+        resolution: a step of the converter [V].
+        clipped: how many samples the converter could not follow.
+    """
+
+    volts: torch.Tensor
+    time_step: float
+    resolution: float
+    clipped: int
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """The commands of a maker.
+
+    Attributes:
+        name: of the oscilloscopes that take them.
+        set_up: once; ``{time}`` stands for the time scale [s/division].
+        set_up_input: for each ``{input}``; ``{scale}`` stands for its scale [V/division].
+        capture: takes a capture of all inputs at once, whatever they hear: no signal has to trigger it.
+        status: asks whether the capture is there.
+        ready: the answer, if it is.
+        source: says of which ``{input}`` preamble and samples are asked for.
+        preamble: asks for ten numbers; the fifth is the time step, the last three are step, origin and
+            reference of the voltage.
+        samples: asks for the samples, a byte each, as a definite-length block.
+        lowest: the least code that is no clipped sample.
+        highest: the greatest.
+        origin_in_codes: the voltage's origin is a number of codes, not of volts.
+    """
+
+    name: str
+    set_up: tuple[str, ...]
+    set_up_input: tuple[str, ...]
+    capture: tuple[str, ...]
+    status: str
+    ready: str
+    source: str = ":WAVeform:SOURce CHANnel{input}"
+    preamble: str = ":WAVeform:PREamble?"
+    samples: str = ":WAVeform:DATA?"
+    lowest: int = 1
+    highest: int = 254
+    origin_in_codes: bool = False
+
+    def waveform(self, preamble: str, codes: bytes) -> Waveform:
+        """The waveform that two answers describe.
+
+        Args:
+            preamble: ten numbers.
+            codes: the samples, a byte each.
+
+        Raises:
+            LinkError: the preamble is not ten numbers, with steps above 0, or there are no samples.
+        """
+        try:
+            numbers = [float(number) for number in preamble.split(",")]
+            time_step, resolution, origin, reference = numbers[4], *numbers[7:]
+        except (ValueError, IndexError) as error:
+            raise LinkError(f"oscilloscope: preamble {preamble[:80]!r}; must be ten numbers") from error
+        if not (time_step > 0 and resolution > 0 and codes):
+            raise LinkError(
+                f"oscilloscope: preamble {preamble[:80]!r} and {len(codes)} samples make no waveform"
+            )
+        values = torch.frombuffer(bytearray(codes), dtype=torch.uint8)
+        clipped = int(((values < self.lowest) | (values > self.highest)).sum())
+        steps = values.to(torch.float64) - reference
+        volts = (steps - origin) * resolution if self.origin_in_codes else steps * resolution + origin
+        return Waveform(volts, time_step, resolution, clipped)
+
+
+_INPUT = (
+    ":CHANnel{input}:DISPlay ON",
+    ":CHANnel{input}:PROBe 1",
+    ":CHANnel{input}:COUPling AC",
+    ":CHANnel{input}:SCALe {scale:.6g}",
+    ":CHANnel{input}:OFFSet 0",
+)
+
+#: InfiniiVision 2000, 3000 and 4000 X-Series Programmer's Guides.
+KEYSIGHT = Dialect(
+    "Keysight InfiniiVision",
+    set_up=(
+        ":ACQuire:TYPE NORMal",
+        ":TIMebase:SCALe {time:.6g}",
+        ":TRIGger:SWEep AUTO",
+        ":WAVeform:FORMat BYTE",
+        ":WAVeform:UNSigned ON",
+        ":WAVeform:POINts 1000",
+    ),
+    set_up_input=_INPUT,
+    capture=(":DIGitize",),
+    status="*OPC?",
+    ready="1",
+    lowest=2,  # 0 is a hole, 1 clipped
+)
+
+#: MSO1000Z/DS1000Z Programming Guide; the samples are those of the screen.
+RIGOL = Dialect(
+    "Rigol DS1000Z",
+    set_up=(
+        ":ACQuire:TYPE NORMal",
+        ":TIMebase:MAIN:SCALe {time:.6g}",
+        ":WAVeform:MODE NORMal",
+        ":WAVeform:FORMat BYTE",
+    ),
+    set_up_input=_INPUT,
+    capture=(":SINGle", ":TFORce"),
+    status=":TRIGger:STATus?",
+    ready="STOP",
+    origin_in_codes=True,
+)

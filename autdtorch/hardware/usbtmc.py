@@ -1,0 +1,188 @@
+"""Messages to and from measuring instruments of the USB class USBTMC, over its bulk endpoints.
+
+From the class's specification, revision 1.0 (USB Implementers Forum, 2003); tried on no instrument.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from typing import Any
+
+from autdtorch.hardware.usb import LinkError, UsbPort
+
+#: MsgID: a message to the instrument; asking for one, and the answer.
+TELL, ASK = 1, 2
+#: bmTransferAttributes: the message ends with this transfer.
+END = 1
+#: bInterfaceClass and bInterfaceSubClass.
+INTERFACE_CLASS = (0xFE, 0x03)
+#: bmRequestType: from the instrument, of the class, recipient interface; its bRequests, and their first byte.
+CLASS_REQUEST = 0xA1
+INITIATE_CLEAR, CHECK_CLEAR_STATUS = 5, 6
+SUCCESS, PENDING = 1, 2
+
+_HEADER = struct.Struct("<BBBxLB3x")
+_MOST = 2**16  # bytes of an answer in one transfer
+_TIMEOUT_MS = 3000
+_CHECKS = 100
+
+
+def message(kind: int, tag: int, length: int, attributes: int, data: bytes = b"") -> bytes:
+    """A bulk transfer: 12 bytes that say what it is, the data, and zeros up to a multiple of 4 bytes.
+
+    Args:
+        kind: MsgID.
+        tag: number of the transfer, 1 to 255; the header has its complement too.
+        length: of the data, or how much the instrument may send.
+        attributes: bmTransferAttributes.
+        data: what is sent.
+    """
+    return _HEADER.pack(kind, tag, tag ^ 0xFF, length, attributes) + data + bytes(-len(data) % 4)
+
+
+def announced(packet: bytes, tag: int) -> tuple[int, bool]:
+    """Length of the data in an instrument's transfer, and whether its message ends with it.
+
+    Args:
+        packet: the transfer's first, with the header.
+        tag: of the request that it answers.
+
+    Raises:
+        LinkError: it does not answer that, or has more data than can have been asked for.
+    """
+    if len(packet) < _HEADER.size:
+        raise LinkError(f"USBTMC: {len(packet)} bytes {packet.hex(' ')}; a header has {_HEADER.size}")
+    kind, number, complement, length, attributes = _HEADER.unpack_from(packet)
+    if (kind, number, complement) != (ASK, tag, tag ^ 0xFF) or length > _MOST:
+        header = packet[: _HEADER.size].hex(" ")
+        raise LinkError(f"USBTMC: header {header} does not answer request {tag}")
+    return length, bool(attributes & END)
+
+
+def block(data: bytes) -> bytes:
+    """What a definite-length block of IEEE 488.2 holds.
+
+    It is ``#``, a digit, so many digits that are the number of bytes, the bytes, and maybe a line end.
+
+    Raises:
+        LinkError: no such block, or a shorter one than it says.
+    """
+    digits = data[2 : 2 + int(data[1:2])] if data[:1] == b"#" and data[1:2].isdigit() else b""
+    if not digits.isdigit():
+        raise LinkError(f"USBTMC: {data[:20]!r} begins no definite-length block")
+    start, length = 2 + len(digits), int(digits)
+    if len(data) < start + length:
+        raise LinkError(f"USBTMC: {len(data) - start} of {length} bytes in a block")
+    return data[start : start + length]
+
+
+class UsbtmcPort(UsbPort):
+    """An instrument that takes commands and answers questions, as text."""
+
+    def __init__(self, device: Any) -> None:
+        """Take the instrument, and clear what it still has to say.
+
+        Args:
+            device: `usb.core.Device`.
+
+        Raises:
+            LinkError: it cannot be opened, is no such instrument, or does not clear.
+        """
+        super().__init__(device)
+        self._tag = 0
+        try:
+            self._interface = self._number()
+            self._clear()
+        except BaseException:
+            self.close()
+            raise
+
+    def tell(self, command: str) -> None:
+        """Send a command.
+
+        Raises:
+            LinkError: the instrument does not take it.
+        """
+        data = f"{command}\n".encode("ascii")
+        self.write(message(TELL, self._next(), len(data), END, data))
+
+    def ask(self, question: str) -> str:
+        """The answer to a question, as text.
+
+        Raises:
+            LinkError: the instrument does not take the question, or has no such answer.
+        """
+        data = self._answer(question)
+        try:
+            return data.decode("ascii").strip()
+        except UnicodeDecodeError as error:
+            raise LinkError(f"USBTMC: {question} is answered by {data[:40]!r}, which is no text") from error
+
+    def ask_block(self, question: str) -> bytes:
+        """The answer to a question, as what a definite-length block holds.
+
+        Raises:
+            LinkError: the instrument does not take the question, or has no such answer.
+        """
+        return block(self._answer(question))
+
+    def _answer(self, question: str) -> bytes:
+        self.tell(question)
+        received, ended = b"", False
+        while not ended:
+            tag = self._next()
+            self.write(message(ASK, tag, _MOST, 0))
+            data, ended = self._data(question, tag)
+            if not data and not ended:
+                raise LinkError(
+                    f"USBTMC: the answer to {question} does not go on after {len(received)} bytes"
+                )
+            received += data
+        return received
+
+    def _data(self, question: str, tag: int) -> tuple[bytes, bool]:
+        """Data of a transfer from the instrument, and whether its message ends with it.
+
+        The transfer is read to the length that its header says: not all instruments send an empty packet
+        after one of whole packets. If one does, that is read before the next transfer.
+        """
+        packet = self._in.wMaxPacketSize
+        received = self._piece(question, packet) or self._piece(question, packet)
+        length, ended = announced(received, tag)
+        left = _HEADER.size + length + -length % 4 - len(received)
+        if left > 0 and len(received) == packet:
+            received += self._piece(question, -(-left // packet) * packet)
+        data = received[_HEADER.size : _HEADER.size + length]
+        if len(data) < length:
+            raise LinkError(f"USBTMC: {len(data)} of {length} bytes in a transfer that answers {question}")
+        return data, ended
+
+    def _piece(self, question: str, size: int) -> bytes:
+        return bytes(self._call(f"answer {question}", self._in.read, size, _TIMEOUT_MS))
+
+    def _number(self) -> int:
+        for interface in self._device[0]:
+            if (interface.bInterfaceClass, interface.bInterfaceSubClass) == INTERFACE_CLASS:
+                return int(interface.bInterfaceNumber)
+        raise LinkError("USBTMC: the device is no measuring instrument of this class")
+
+    def _next(self) -> int:
+        self._tag = self._tag % 255 + 1
+        return self._tag
+
+    def _clear(self) -> None:
+        status = self._class_request(INITIATE_CLEAR, 1)
+        for _ in range(_CHECKS):
+            status = self._class_request(CHECK_CLEAR_STATUS, 2)
+            if status != PENDING:
+                break
+            time.sleep(0.01)
+        if status != SUCCESS:
+            raise LinkError(f"USBTMC: the instrument does not clear what it has to say: status {status:#04x}")
+        self._call("be cleared", self._out.clear_halt)
+
+    def _class_request(self, request: int, length: int) -> int:
+        """Status that the interface gives."""
+        arguments = (CLASS_REQUEST, request, 0, self._interface, length, _TIMEOUT_MS)
+        return int(self._call("be cleared", self._device.ctrl_transfer, *arguments)[0])

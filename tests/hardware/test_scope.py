@@ -1,0 +1,182 @@
+"""The oscilloscope on the emulated bus: what it hears against the pressure that is there."""
+
+import logging
+import math
+
+import pytest
+import torch
+
+from autdtorch.drive import drive_from_phases
+from autdtorch.hardware import (
+    KEYSIGHT,
+    RIGOL,
+    EmulatedScope,
+    LinkError,
+    Microphone,
+    MovedMicrophone,
+    ScopeSensor,
+    SensorError,
+    open_scope,
+)
+from autdtorch.hardware.emulated_bus import EmulatedBus
+from autdtorch.hardware.scpi import Dialect
+
+CHIP = (0x2A8D, 0x1770)
+FREQUENCY = 40e3
+SENSITIVITY = 0.01  # [V/Pa], with the amplifier
+LOUDEST = 4.0  # [Pa]
+RESOLUTION = LOUDEST / 3.5 / 32  # [Pa]: 3.5 divisions of 32 codes
+
+
+def sensor_at(scope, microphones: int, captures: int = 1) -> ScopeSensor:
+    inputs = range(1, 1 + microphones)
+    return ScopeSensor(
+        scope,
+        FREQUENCY,
+        [Microphone(number, SENSITIVITY / 10, LOUDEST, gain=10) for number in inputs],
+        captures,
+    )
+
+
+class Bench:
+    """A field that does not change, and an oscilloscope in it."""
+
+    def __init__(self, pressure, dialect: Dialect = KEYSIGHT, heard=(0, 1), **properties):
+        maker = dialect.name.partition(" ")[0]
+        self.field = torch.tensor(pressure, dtype=torch.complex128)
+        self.scope = EmulatedScope(lambda: self.field, FREQUENCY, SENSITIVITY, heard, maker, **properties)
+        self.bus = EmulatedBus([])
+        self.instrument = self.scope.plug_into(self.bus, CHIP)
+        self.open = open_scope(CHIP, dialect, backend=self.bus)
+
+    def sensor(self, captures: int = 1) -> ScopeSensor:
+        return sensor_at(self.open, len(self.scope.heard), captures)
+
+
+@pytest.mark.parametrize("dialect", [KEYSIGHT, RIGOL], ids=lambda dialect: dialect.name)
+def test_a_reading_is_the_pressure_within_the_quantisation(dialect):
+    pressure = [3.2 - 1j, 0.3j]
+    bench = Bench(pressure, dialect, dc_offset=0.003)
+    reading = bench.sensor().read()
+    # Rounding errs by at most half a code. All errors with the sign of the sine and of one phase make
+    # sum(2 w |sin| / 2) / sum(w) = 2 / pi codes, the mean of |sin|.
+    worst = 2 / math.pi * RESOLUTION * (1 if dialect is KEYSIGHT else 32 / 25)
+    assert (reading - torch.tensor(pressure).abs()).abs().max() < worst
+    assert bench.scope.misunderstood == []
+    assert "EMULATED" in bench.open.identity
+
+
+def test_noise_puts_the_error_on_a_reading_that_is_the_least_times_the_windows_loss():
+    # 30 dB: noise of 1/1000 of the power of the sine.
+    true = torch.tensor([3.0, 1.5], dtype=torch.float64)
+    noise = 3.0 / math.sqrt(2) * 10 ** (-30 / 20)
+    bench = Bench(true.tolist(), noise=noise * SENSITIVITY, seed=1)
+    sensor = bench.sensor()
+    readings = torch.stack([sensor.read() for _ in range(200)])
+    # Rounding adds the variance of a uniform error. Cramer and Rao: an amplitude's variance is 2 s^2 / N at
+    # least, with the Hann window 3 s^2 / N.
+    expected = math.sqrt(3 * (noise**2 + RESOLUTION**2 / 12) / 1000)
+    # Standard errors of a standard deviation, 1 / sqrt(2 * 200), and of a mean; four and five of them.
+    assert (readings.std(dim=0) / expected - 1).abs().max() < 4 / math.sqrt(400)
+    assert (readings.mean(dim=0) - true).abs().max() < 5 * expected / math.sqrt(200)
+
+
+def test_averaged_powers_less_the_noise_have_no_bias_where_the_noise_is_as_loud_as_the_sound():
+    true, noise = 0.05, 0.5
+    readings = Bench([true, 0], noise=noise * SENSITIVITY, seed=2).sensor(captures=200).read()
+    # Power of the phasor's error: 6 s^2 / N. Powers of captures have variance floor^2 + 2 floor true^2.
+    floor = 6 * noise**2 / 1000
+    assert floor**0.5 == pytest.approx(0.04, rel=0.05)
+    error = math.sqrt((floor**2 + 2 * floor * true**2) / 200)
+    assert abs(float(readings[0] ** 2) - true**2) < 4 * error
+    assert float(readings[1] ** 2) < 4 * floor / math.sqrt(200)
+
+
+def test_a_microphone_drifts_by_what_was_asked_for():
+    sensor = Bench([3.0], heard=[0], drift=0.5, seed=3).sensor()
+    steps = torch.cat([sensor.read() for _ in range(100)]).log().diff()
+    # A walk of rms 0.5 after 1000 captures; 99 steps tell theirs to 1 / sqrt(198), four times which are 28 %.
+    assert steps.std() == pytest.approx(0.5 / math.sqrt(1000), rel=0.28)
+
+
+def test_overload_is_an_error_that_names_input_and_pressure():
+    bench = Bench([1.0, 6.0])
+    with pytest.raises(
+        SensorError, match=r"input 2: \d+ of 1000 samples are clipped.* more than 4 Pa: raise"
+    ):
+        bench.sensor().read()
+
+
+def test_silence_is_a_warning_that_names_input_and_noise(caplog):
+    bench = Bench([1.0, 0.0], noise=0.1 * SENSITIVITY, seed=0)
+    with caplog.at_level(logging.WARNING):
+        bench.sensor(captures=10).read()
+    assert [record.getMessage()[:8] for record in caplog.records] == ["input 2:"]
+    # sqrt(6 / N) of the noise of a sample
+    assert "from the noise of 0.0078 Pa" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        ("time-out", "answer :WAVeform|answer .OPC|timed out"),
+        ("stall", "Pipe error"),
+        ("short", r"\d+ bytes .* a header has 12|\d+ of \d+ bytes in a transfer"),
+        ("garbage", r"header .* does not answer request \d+"),
+    ],
+)
+def test_a_fault_on_the_wire_is_an_error_and_a_new_start_helps(fault, message):
+    bench = Bench([1.0, 2.0])
+    sensor = bench.sensor()
+    bench.instrument.fault = fault
+    with pytest.raises(LinkError, match=message):
+        sensor.read()
+    bench.open.close()
+    bench.instrument.fault = None
+    again = open_scope(CHIP, backend=bench.bus)
+    assert sensor_at(again, 2).read() == pytest.approx([1.0, 2.0], abs=RESOLUTION)
+
+
+def test_an_unplugged_oscilloscope_and_one_of_another_maker_are_errors():
+    bench = Bench([1.0, 2.0])
+    with pytest.raises(LinkError, match="TRIGger:STATus"):  # a Keysight does not know it
+        sensor_at(open_scope(CHIP, RIGOL, backend=bench.bus), 2).read()
+    sensor = bench.sensor()
+    bench.instrument.present = False
+    with pytest.raises(LinkError, match="disconnected"):
+        sensor.read()
+
+
+def test_one_microphone_is_moved_from_point_to_point():
+    def move(question: str) -> str:
+        asked.append(question)
+        bench.scope.heard[0] = len(asked) - 1
+        return ""
+
+    asked: list[str] = []
+    bench = Bench([1.0, 2.0], heard=[0])
+    sensor = MovedMicrophone(bench.sensor(), [(0.08, 0.01, 0), (0.08, -0.02, 5e-3)], move)
+    assert sensor.read() == pytest.approx([1.0, 2.0], abs=RESOLUTION)
+    assert asked[1] == (
+        "Move the microphone to control point 2 of 2 at (80.0, -20.0, 5.0) mm, then press Enter. "
+    )
+
+
+def test_an_evaluation_through_device_and_oscilloscope_is_the_simulated_pressure(trial):
+    bench = trial.bench()
+    scope = EmulatedScope(bench.pressure, FREQUENCY, SENSITIVITY, heard=[0, 1])
+    scope.plug_into(bench.bus, CHIP)
+    drive = drive_from_phases(torch.arange(16) * 2 * math.pi / 32)
+    with trial.link(bench) as link, open_scope(CHIP, backend=bench.bus) as oscilloscope:
+        loudest = 1.1 * float(trial.simulated(drive[None]).max())
+        microphones = [Microphone(number, SENSITIVITY, loudest) for number in (1, 2)]
+        sensor = ScopeSensor(oscilloscope, FREQUENCY, microphones)
+        measured = trial.objective(link, sensor)(drive[None])
+    worst = 2 / math.pi * loudest / 3.5 / 32
+    torch.testing.assert_close(measured, trial.simulated(drive[None]), rtol=0, atol=worst)
+
+
+@pytest.mark.parametrize("microphones", [[], [Microphone(1, 0.01, 1.0), Microphone(1, 0.01, 1.0)]])
+def test_microphones_without_inputs_of_their_own_are_refused(microphones):
+    with pytest.raises(ValueError, match=r"microphones: .*at inputs of their own"):
+        ScopeSensor(Bench([1.0, 2.0]).open, FREQUENCY, microphones)
