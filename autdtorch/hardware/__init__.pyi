@@ -1,8 +1,13 @@
-from .devices import OPENMPD, SONICSURFACE, ULTRAINO, Device, openmpd, ultraino
+from .adapters import Adapter
+from .autd3 import open_autd3
+from .devices import OPENMPD, SONICSURFACE, ULTRAINO, Device, openmpd_boards, ultraino_boards
 from .emulated_scope import EmulatedScope
 from .emulator import EmulatedBench, EmulatedSensor
 from .link import Link, open_link
+from .log import Evaluation, EvaluationLog
 from .objective import HardwareObjective
+from .preflight import Preflight, check_transducers, hears_silence
+from .safety import LimitedLink, LimitError, Limits, Signalled, ended_by_signals
 from .scope import Microphone, Oscilloscope, ScopeSensor, open_scope
 from .scpi import KEYSIGHT, RIGOL, Dialect, Waveform
 from .sensor import FileSensor, ManualSensor, MovedMicrophone, Sensor, SensorError
@@ -14,13 +19,19 @@ __all__ = [
     "RIGOL",
     "SONICSURFACE",
     "ULTRAINO",
+    "Adapter",
     "Device",
     "Dialect",
     "EmulatedBench",
     "EmulatedScope",
     "EmulatedSensor",
+    "Evaluation",
+    "EvaluationLog",
     "FileSensor",
     "HardwareObjective",
+    "LimitError",
+    "LimitedLink",
+    "Limits",
     "Link",
     "LinkError",
     "ManualSensor",
@@ -28,12 +39,18 @@ __all__ = [
     "MovedMicrophone",
     "Oscilloscope",
     "Port",
+    "Preflight",
     "ScopeSensor",
     "Sensor",
     "SensorError",
+    "Signalled",
     "Waveform",
+    "check_transducers",
+    "ended_by_signals",
+    "hears_silence",
+    "open_autd3",
     "open_link",
     "open_scope",
-    "openmpd",
-    "ultraino",
+    "openmpd_boards",
+    "ultraino_boards",
 ]

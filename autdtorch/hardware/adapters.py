@@ -6,11 +6,12 @@ tried on a real chip.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-from autdtorch.hardware.usb import Port, UsbPort
+from autdtorch.hardware.usb import LinkError, Port, UsbPort
 
 #: FTDI's requests.
 RESET, FLOW_CONTROL, BAUD_RATE, DATA_FORMAT, LATENCY = 0x00, 0x02, 0x03, 0x04, 0x09
@@ -22,6 +23,8 @@ EIGHT_N_ONE = 0x0008
 STATUS_BYTES = 2
 
 _LATENCY_MS = 2
+_TRANSMITTER_EMPTY = 0x40  # of the second status byte
+_FLUSH_SECONDS = 1.0
 _EIGHTHS = (0, 3, 2, 4, 1, 5, 6, 7)  # code of the fraction 0/8 ... 7/8 of a baud divisor
 
 _CH340_INIT, _CH340_WRITE = 0xA1, 0x9A
@@ -54,6 +57,15 @@ class FtdiPort(UsbPort):
         self._request(RESET, PURGE_INPUT)
         self._request(RESET, PURGE_OUTPUT)
 
+    def recover(self) -> None:
+        """Clear a stall, and drop what still waits in the chip.
+
+        Raises:
+            LinkError: the chip does not answer.
+        """
+        super().recover()
+        self._request(RESET, PURGE_OUTPUT)
+
     def read(self, packets: int = 1) -> bytes:
         """What has arrived, at most so many packets, without the status bytes that begin each.
 
@@ -83,6 +95,21 @@ class FtdiUart(FtdiPort):
         self._request(DATA_FORMAT, EIGHT_N_ONE)
         self._request(FLOW_CONTROL, 0)
         self._request(BAUD_RATE, *baud_divisor(baud))
+
+    def flush(self) -> None:
+        """Wait until the chip says that its transmitter is empty.
+
+        Raises:
+            LinkError: it does not say so within a second.
+        """
+        deadline = time.monotonic() + _FLUSH_SECONDS
+        while not self._line_status() & _TRANSMITTER_EMPTY:
+            if time.monotonic() > deadline:
+                raise LinkError("the adapter does not send what it was given; is something else on its line?")
+
+    def _line_status(self) -> int:
+        packet = self._call("be read", self._in.read, self._in.wMaxPacketSize)
+        return int(packet[1])
 
 
 class FtdiFifo(FtdiPort):

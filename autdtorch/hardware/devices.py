@@ -2,14 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 
 from autdtorch.hardware.adapters import FT232H, Adapter, arduino_mega, ch340, cp2102, ft232r
-from autdtorch.hardware.frames import BOARD, ULTRAINO_BOARD, openmpd_frame, sonicsurface_frame, ultraino_frame
-from autdtorch.hardware.levels import openmpd_levels, sonicsurface_levels, ultraino_levels
+from autdtorch.hardware.frames import (
+    BOARD,
+    ULTRAINO_BOARD,
+    levels_of_openmpd_frame,
+    levels_of_sonicsurface_frame,
+    levels_of_ultraino_frame,
+    openmpd_frame,
+    sonicsurface_frame,
+    ultraino_frame,
+)
+from autdtorch.hardware.levels import (
+    OPENMPD_PHASES,
+    SONICSURFACE_PHASES,
+    ULTRAINO_PHASES,
+    openmpd_drive,
+    openmpd_levels,
+    sonicsurface_drive,
+    sonicsurface_levels,
+    ultraino_drive,
+    ultraino_levels,
+)
 from autdtorch.openmpd_board import OpenMPDBoard
 from autdtorch.validation import integer_at_least, invalid
 
@@ -30,6 +50,8 @@ class Device:
         adapters: USB chips that it may hang on; the first is the usual one.
         transducers: their number N.
         frame: bytes for a drive (N,), |q| <= 1, on the nearest levels. All zeros switch the outputs off.
+        played: the drive (N,) that a frame has the device play.
+        quantised: the device as settings of `Quantised`.
         baud: of its serial line [bits/s]; None if it has none.
         serials: number of the chip of each of its boards, which share the frame evenly; None takes any.
     """
@@ -38,6 +60,8 @@ class Device:
     adapters: tuple[Adapter, ...]
     transducers: int
     frame: Callable[[torch.Tensor], bytes]
+    played: Callable[[bytes], torch.Tensor]
+    quantised: Mapping[str, Any]
     baud: int | None = None
     serials: tuple[str | None, ...] = (None,)
 
@@ -50,15 +74,27 @@ def _sonicsurface(drive: torch.Tensor) -> bytes:
     return sonicsurface_frame(sonicsurface_levels(drive))
 
 
+def _sonicsurface_played(frame: bytes) -> torch.Tensor:
+    return sonicsurface_drive(levels_of_sonicsurface_frame(frame))
+
+
 def _openmpd(drive: torch.Tensor) -> bytes:
     return openmpd_frame(openmpd_levels(drive))
+
+
+def _openmpd_played(frame: bytes) -> torch.Tensor:
+    return openmpd_drive(levels_of_openmpd_frame(frame))
 
 
 def _ultraino(drive: torch.Tensor) -> bytes:
     return ultraino_frame(ultraino_levels(drive))
 
 
-def openmpd(boards: Sequence[OpenMPDBoard]) -> Device:
+def _ultraino_played(frame: bytes) -> torch.Tensor:
+    return ultraino_drive(levels_of_ultraino_frame(frame))
+
+
+def openmpd_boards(boards: Sequence[OpenMPDBoard]) -> Device:
     """OpenMPD's boards as their files describe them: in the files' order, calibrated, by pin.
 
     Each board is found by its name as the serial number of its chip. They play a drive as their messages
@@ -81,10 +117,21 @@ def openmpd(boards: Sequence[OpenMPDBoard]) -> Device:
         parts = zip(boards, drive.reshape(-1, BOARD), strict=True)
         return b"".join(_openmpd(board.by_pin(board.calibrated(part))) for board, part in parts)
 
-    return Device(OPENMPD.name, OPENMPD.adapters, BOARD * len(boards), frame, serials=names)
+    def played(frame: bytes) -> torch.Tensor:
+        messages = (frame[start : start + 2 * BOARD] for start in range(0, len(frame), 2 * BOARD))
+        return torch.cat([_heard(board, message) for board, message in zip(boards, messages, strict=True)])
+
+    return replace(OPENMPD, transducers=BOARD * len(boards), frame=frame, played=played, serials=names)
 
 
-def ultraino(boards: int = 1) -> Device:
+def _heard(board: OpenMPDBoard, message: bytes) -> torch.Tensor:
+    """The drive (256,) that a calibrated board makes of a message; rounding may not take it above 1."""
+    sent = _openmpd_played(message)[torch.tensor(board.pins)]
+    heard = torch.where(sent == 0, sent, sent / board.calibrated(torch.ones(BOARD, dtype=sent.dtype)))
+    return heard / heard.abs().clamp(min=1)
+
+
+def ultraino_boards(boards: int = 1) -> Device:
     """Boards Mega-64 of Ultraino in a row, 64 transducers each: 10 phases, 5 amplitudes.
 
     Args:
@@ -95,21 +142,37 @@ def ultraino(boards: int = 1) -> Device:
     """
     if integer_at_least("boards", boards, 1) > ULTRAINO_MOST_BOARDS:
         raise invalid("boards", boards, f"must be 1 to {ULTRAINO_MOST_BOARDS}")
-    adapters = arduino_mega(ULTRAINO_BAUD), ch340(ULTRAINO_BAUD)
-    return Device("Ultraino", adapters, ULTRAINO_BOARD * boards, _ultraino, ULTRAINO_BAUD)
+    return Device(
+        name="Ultraino",
+        adapters=(arduino_mega(ULTRAINO_BAUD), ch340(ULTRAINO_BAUD)),
+        transducers=ULTRAINO_BOARD * boards,
+        frame=_ultraino,
+        played=_ultraino_played,
+        quantised={"levels": ULTRAINO_PHASES},
+        baud=ULTRAINO_BAUD,
+    )
 
 
 #: 16 x 16, pitch 10.5 mm; 32 phases, no amplitude. An FT232R is the adapter on most cables.
 SONICSURFACE = Device(
-    "SonicSurface",
-    (ft232r(SONICSURFACE_BAUD), ch340(SONICSURFACE_BAUD), cp2102(SONICSURFACE_BAUD)),
-    BOARD,
-    _sonicsurface,
-    SONICSURFACE_BAUD,
+    name="SonicSurface",
+    adapters=(ft232r(SONICSURFACE_BAUD), ch340(SONICSURFACE_BAUD), cp2102(SONICSURFACE_BAUD)),
+    transducers=BOARD,
+    frame=_sonicsurface,
+    played=_sonicsurface_played,
+    quantised={"levels": SONICSURFACE_PHASES, "on_off": True},
+    baud=SONICSURFACE_BAUD,
 )
 
 #: 16 x 16, pitch 10.5 mm; 128 phases, 64 amplitudes. Transducers are in the order of the board's pins.
-OPENMPD = Device("OpenMPD", (FT232H,), BOARD, _openmpd)
+OPENMPD = Device(
+    name="OpenMPD",
+    adapters=(FT232H,),
+    transducers=BOARD,
+    frame=_openmpd,
+    played=_openmpd_played,
+    quantised={"levels": OPENMPD_PHASES},
+)
 
 #: One board Mega-64: 10 phases, 5 amplitudes.
-ULTRAINO = ultraino()
+ULTRAINO = ultraino_boards()

@@ -38,6 +38,7 @@ class EmulatedBench:
         transfer_matrix: torch.Tensor,
         transducers: Sequence[int] | None = None,
         adapter: Adapter | None = None,
+        dead: Sequence[int] = (),
     ) -> None:
         """Plug the device in.
 
@@ -47,15 +48,20 @@ class EmulatedBench:
             transducers: for each transducer of the scene, which of the device's it is; by default all in
                 order.
             adapter: the USB chip that it hangs on; by default the usual one.
+            dead: transducers of the scene that are silent, whatever the device plays.
 
         Raises:
-            ValueError: `transducers` that the device does not have, or not as many as the matrix has.
+            ValueError: `transducers` that the device does not have, not as many as the matrix has, or `dead`
+                ones that the scene does not have.
         """
         self._transducers = wiring(transducers, device.transducers)
         self.transfer_matrix = complex_tensor("transfer_matrix", transfer_matrix).to("cpu", torch.complex128)
         if self.transfer_matrix.ndim != 2 or self.transfer_matrix.shape[1] != len(self._transducers):
             shape = tuple(self.transfer_matrix.shape)
             raise ValueError(f"transfer_matrix: shape {shape}; must be (P, {len(self._transducers)})")
+        self._alive = torch.ones(len(self._transducers))
+        if dead:
+            self._alive[wiring(dead, len(self._transducers))] = 0
         each = device.transducers // len(device.serials)
         self._firmwares = [_FIRMWARES[device.name](each) for _ in device.serials]
         vendor, product, _ = adapter or device.adapters[0]
@@ -68,8 +74,9 @@ class EmulatedBench:
         self.chip, self.firmware = self.bus.chips[0], self._firmwares[0]
 
     def drive(self) -> torch.Tensor:
-        """What the scene's transducers now play (M,), complex128."""
-        return torch.cat([firmware.drive() for firmware in self._firmwares])[self._transducers]
+        """What the scene's transducers now play (M,), complex128; 0 where they are dead."""
+        played = torch.cat([firmware.drive() for firmware in self._firmwares])
+        return played[self._transducers] * self._alive
 
     def pressure(self) -> torch.Tensor:
         """Phasors (P,) [Pa] at the control points now, complex128."""

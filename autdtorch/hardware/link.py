@@ -69,11 +69,16 @@ class Link:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
             LinkError: the device does not take the bytes.
         """
-        drive = validate_drive(drive, len(self.transducers))
-        everyone = torch.zeros(self.device.transducers, dtype=torch.complex128)
-        everyone[self.transducers] = drive
-        self._send(self.device.frame(everyone))
+        self._send(self._frame(drive))
         self._sleep(self.settle)
+
+    def played(self, drive: torch.Tensor) -> torch.Tensor:
+        """What the device is sent to play when asked for a drive (M,): the nearest on its levels.
+
+        Raises:
+            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+        """
+        return self.device.played(self._frame(drive))[self.transducers]
 
     def off(self) -> None:
         """Switch all outputs of the device off.
@@ -83,11 +88,25 @@ class Link:
         Raises:
             LinkError: the device does not take the bytes.
         """
-        frame = self.device.frame(torch.zeros(self.device.transducers, dtype=torch.complex128))
         try:
-            self._send(frame)
-        finally:
-            self._send(frame)
+            self._send_silence()
+        except BaseException as error:  # a fault of the bus that may pass, or a signal
+            self._recover()
+            if not isinstance(error, LinkError):
+                raise
+
+    def _recover(self) -> None:
+        try:
+            self._port.recover()
+            self._send_silence()
+        except LinkError as error:
+            raise LinkError(f"{error}; the outputs may still be on: switch the device's power off") from error
+
+    def _send_silence(self) -> None:
+        # Twice also because a device with two buffers may be left with the last drive in the other.
+        for _ in range(2):
+            self._send(self._frame(torch.zeros(len(self.transducers), dtype=torch.complex128)))
+        self._port.flush()
 
     def close(self) -> None:
         """Switch all outputs off and let go of the device.
@@ -99,6 +118,11 @@ class Link:
             self.off()
         finally:
             self._port.close()
+
+    def _frame(self, drive: torch.Tensor) -> bytes:
+        everyone = torch.zeros(self.device.transducers, dtype=torch.complex128)
+        everyone[self.transducers] = validate_drive(drive, len(self.transducers))
+        return self.device.frame(everyone)
 
     def _send(self, frame: bytes) -> None:
         self._port.write(frame)
@@ -170,6 +194,22 @@ class SharedPort:
         part = len(data) // len(self._ports)
         parts = [data[start : start + part] for start in range(0, len(data), part)]
         _each(lambda port, own: port.write(own), self._ports, parts)
+
+    def flush(self) -> None:
+        """Wait until all has left the chips of all boards, where they tell.
+
+        Raises:
+            LinkError: it does not leave one.
+        """
+        _each(lambda port, _: port.flush(), self._ports, self._ports)
+
+    def recover(self) -> None:
+        """Take all boards up again.
+
+        Raises:
+            LinkError: a board is gone.
+        """
+        _each(lambda port, _: port.recover(), self._ports, self._ports)
 
     def close(self) -> None:
         """Let go of all boards."""

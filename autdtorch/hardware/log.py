@@ -1,50 +1,131 @@
-"""The evaluations of a hardware trial, on disk one by one."""
+"""The evaluations of a hardware trial, on disk one by one, and read back."""
 
 from __future__ import annotations
 
 import json
+import logging
 import os
+from collections.abc import Mapping
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import torch
 
+logger = logging.getLogger(__name__)
+
+_ORIGIN = "origin"
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """A line of the log.
+
+    Attributes:
+        time: when it was written, UTC, ISO 8601.
+        drive: (M,), complex128, as it was asked for.
+        pressure: (P,) [Pa], float64, as it was read.
+        seconds_on: how long the outputs were on so far [s].
+    """
+
+    time: str
+    drive: torch.Tensor
+    pressure: torch.Tensor
+    seconds_on: float
+
 
 class EvaluationLog:
-    """A JSON line for each evaluation: when, the drive asked for, the pressure read.
+    """A line of JSON that says what the trial is, then one for each evaluation.
 
     A line is on disk before the next evaluation begins, so that the end of the process, at whatever moment,
     costs at most the evaluation in flight.
+
+    Attributes:
+        origin: what the trial is, by name.
+        evaluations: what the file holds.
     """
 
-    def __init__(self, path: str | Path) -> None:
-        """Open the file for appending.
+    origin: dict[str, Any]
+    evaluations: list[Evaluation]
+
+    def __init__(self, path: str | Path, origin: Mapping[str, Any]) -> None:
+        """Begin the file, or read what it holds of the same trial. A last line that broke off is removed.
 
         Args:
-            path: of the file; what it holds already stays.
+            path: of the file.
+            origin: what the trial is: what JSON can hold, by name.
 
         Raises:
-            OSError: the file cannot be opened.
+            ValueError: the file is of a trial of another origin, or no such log.
+            OSError: the file cannot be read or written.
         """
         self._path = Path(path)
-        self._path.open("a", encoding="utf-8").close()
+        self.origin = json.loads(json.dumps(origin))  # as it will be read back
+        self.evaluations = []
+        whole = _whole_lines(self._path)
+        if not whole:
+            self._append({_ORIGIN: self.origin})
+            return
+        stored, self.evaluations = _parsed(self._path, whole)
+        for name in sorted(stored.keys() | self.origin.keys()):
+            there, here = stored.get(name), self.origin.get(name)
+            if there != here:
+                raise ValueError(
+                    f"{self._path}: of another trial, whose {name} is {there}, not {here}; give the settings "
+                    "of that trial, or another file"
+                )
 
-    def append(self, drive: torch.Tensor, pressure: torch.Tensor) -> None:
+    def append(self, drive: torch.Tensor, pressure: torch.Tensor, seconds_on: float) -> None:
         """Add an evaluation.
 
         Args:
             drive: (M,), as it was asked for.
             pressure: (P,) [Pa], as it was read.
+            seconds_on: how long the outputs were on so far [s].
 
         Raises:
             OSError: the file cannot be written.
         """
-        row = {
-            "time": datetime.now(UTC).isoformat(timespec="milliseconds"),
-            "drive": torch.view_as_real(drive).tolist(),
-            "pressure": pressure.tolist(),
-        }
+        time = datetime.now(UTC).isoformat(timespec="milliseconds")
+        self._append(
+            {
+                "time": time,
+                "drive": torch.view_as_real(drive).tolist(),
+                "pressure": pressure.tolist(),
+                "seconds_on": seconds_on,
+            }
+        )
+        self.evaluations.append(Evaluation(time, drive, pressure, seconds_on))
+
+    def _append(self, row: Mapping[str, Any]) -> None:
         with self._path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
             file.flush()
             os.fsync(file.fileno())
+
+
+def _whole_lines(path: Path) -> list[bytes]:
+    """The lines of the file, none where there is no file; what follows the last line's end is cut off."""
+    if not path.exists():
+        return []
+    content = path.read_bytes()
+    end = content.rfind(b"\n") + 1
+    if end < len(content):
+        logger.warning("%s: the last line broke off; its evaluation will be made again", path)
+        os.truncate(path, end)
+    return content[:end].splitlines()
+
+
+def _parsed(path: Path, lines: list[bytes]) -> tuple[dict[str, Any], list[Evaluation]]:
+    try:
+        origin = dict(json.loads(lines[0])[_ORIGIN])
+        return origin, [_evaluation(json.loads(line)) for line in lines[1:]]
+    except (ValueError, KeyError, TypeError, RuntimeError) as error:
+        raise ValueError(f"{path}: {error!r}; must be the log of a hardware trial") from error
+
+
+def _evaluation(row: Mapping[str, Any]) -> Evaluation:
+    drive = torch.view_as_complex(torch.tensor(row["drive"], dtype=torch.float64))
+    pressure = torch.tensor(row["pressure"], dtype=torch.float64)
+    return Evaluation(str(row["time"]), drive, pressure, float(row["seconds_on"]))

@@ -2,56 +2,87 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from autdtorch.hardware.link import Link
-from autdtorch.hardware.log import EvaluationLog
-from autdtorch.hardware.sensor import Sensor
+from autdtorch.cache import digest_of
+from autdtorch.hardware.log import Evaluation, EvaluationLog
+from autdtorch.hardware.safety import LimitedLink, LimitError
+from autdtorch.hardware.sensor import Sensor, checked_reading
 from autdtorch.objective import validate_drives
 from autdtorch.scene import Scene
-from autdtorch.validation import invalid, real_tensor
+from autdtorch.validation import invalid
 
 
 class HardwareObjective:
     """An objective whose observations are measured, one drive after the other.
 
     The device plays the nearest drive on its levels. To have a `Solution` hold what was played, wrap it as a
-    simulated one: ``Quantised(objective, levels=32, on_off=True)`` is a SonicSurface.
+    simulated one: ``Quantised(objective, **link.device.quantised)``.
+
+    A trial that was interrupted goes on where its log ends: run the same method with the same seed again, and
+    it is given what the log holds, without playing it once more. The outputs are off while a method thinks.
 
     Attributes:
         scene: its array plays the drives, its control points are observed.
-        evaluations: number of observations so far.
+        evaluations: number of observations so far, those from the log included.
+        log: holds them.
     """
 
     scene: Scene
     evaluations: int
+    log: EvaluationLog
 
-    def __init__(self, scene: Scene, link: Link, sensor: Sensor, log: str | Path) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        link: LimitedLink,
+        sensor: Sensor,
+        log: str | Path,
+        settings: Mapping[str, Any] | None = None,
+        watch: Callable[[Evaluation], None] | None = None,
+    ) -> None:
         """Prepare the observations.
 
         Args:
             scene: what is on the bench.
             link: plays the drives; its device's transducers stand where the scene says.
             sensor: reads the pressure at the scene's control points.
-            log: JSON lines file; every evaluation is appended before the next begins.
+            log: file of the evaluations (`EvaluationLog`); each is appended before the next begins.
+            settings: what else makes the trial what it is, as JSON can hold it: method, seed, sensor. A log
+                of other settings, of another scene, device or amplitude is refused.
+            watch: is shown every evaluation.
 
         Raises:
-            ValueError: the link plays another number of transducers than the scene has.
-            OSError: the log cannot be opened.
+            ValueError: the link plays another number of transducers than the scene has, or the log is of
+                another trial.
+            OSError: the log cannot be read or written.
         """
-        if len(link.transducers) != len(scene.array):
+        transducers = link.link.transducers.tolist()
+        if len(transducers) != len(scene.array):
             accepted = f"must be {len(scene.array)}, as many as the scene has"
-            raise invalid("link.transducers", len(link.transducers), accepted)
+            raise invalid("link.transducers", len(transducers), accepted)
         self.scene = scene
         self.evaluations = 0
         self._link = link
         self._sensor = sensor
-        self._log = EvaluationLog(log)
+        self._watch = watch
+        origin = {
+            "scene": f"{scene.name} {digest_of(scene)[:16]}",
+            "device": link.link.device.name,
+            "transducers": transducers,
+            "amplitude limit": link.limits.amplitude,
+            **(settings or {}),
+        }
+        self.log = EvaluationLog(log, origin)
+        if self.log.evaluations:
+            link.charge(self.log.evaluations[-1].seconds_on)
 
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
-        """Play each of several drives and read the control points.
+        """Play each of several drives and read the control points, then switch the outputs off.
 
         Args:
             drive: (B, M) complex, |q| <= 1.
@@ -60,19 +91,36 @@ class HardwareObjective:
             Pressure magnitudes (B, P) [Pa], float64.
 
         Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1; or a sensor that
-                does not give a finite magnitude for each control point.
+            ValueError: another shape, not finite complex numbers, or an amplitude above 1; a sensor that does
+                not give a finite magnitude for each control point; or a log of other drives.
+            LimitError: the trial has made all that it may.
             LinkError: the device does not take the bytes.
             OSError: the log cannot be written.
         """
-        return torch.stack([self._evaluate(row) for row in validate_drives(drive, len(self.scene.array))])
+        drives = validate_drives(drive, len(self.scene.array))
+        pressure = torch.stack([self._evaluate(row) for row in drives])
+        self._link.off()
+        return pressure
 
     def _evaluate(self, drive: torch.Tensor) -> torch.Tensor:
-        self._link.play(drive)
-        pressure = real_tensor("pressure of the sensor", self._sensor.read(), "Pa")
-        points = len(self.scene.control_points)
-        if pressure.shape != (points,) or pressure.min() < 0:
-            raise invalid("pressure of the sensor", pressure.tolist(), f"must be {points} numbers >= 0", "Pa")
-        self._log.append(drive, pressure)
+        most = self._link.limits.evaluations
+        if self.evaluations >= most:
+            raise LimitError(f"{most} evaluations are made, the limit")
+        if self.evaluations == len(self.log.evaluations):
+            self._measure(drive)
+        evaluation = self.log.evaluations[self.evaluations]
+        if not torch.equal(evaluation.drive, drive):
+            raise ValueError(
+                f"log: evaluation {self.evaluations + 1} is of another drive than the method asks for; must "
+                "be of the same method, seed and version of autdtorch"
+            )
         self.evaluations += 1
-        return pressure
+        if self._watch is not None:
+            self._watch(evaluation)
+        return evaluation.pressure
+
+    def _measure(self, drive: torch.Tensor) -> None:
+        self._link.play(drive)
+        pressure = checked_reading(self._sensor, len(self.scene.control_points))
+        self._link.require_on()
+        self.log.append(drive, pressure, self._link.seconds_on)

@@ -33,6 +33,22 @@ class Port(Protocol):
         """
         ...
 
+    def flush(self) -> None:
+        """Wait until all has left the chip, where the chip tells.
+
+        Raises:
+            LinkError: it does not leave.
+        """
+        ...
+
+    def recover(self) -> None:
+        """Take up again after a write that broke off: clear a stall, drop what still waits.
+
+        Raises:
+            LinkError: the device is gone.
+        """
+        ...
+
     def close(self) -> None:
         """Let go of the device."""
         ...
@@ -62,7 +78,8 @@ def find_device(chips: Collection[tuple[int, int]], serial: str | None = None, b
     if serial is not None:
         wanted += f" with serial number {serial!r}"
     listed = ", ".join(_described(device) for device in present) or "none"
-    number, hint = ("no", "") if not matching else (len(matching), "; say which by its serial number")
+    several = "; say which by its serial number, or unplug the others"
+    number, hint = (len(matching), several) if matching else ("no", "")
     unread = [device for device in fitting if serial is not None and _serial_of(device) is None]
     permission = f". To read an unknown serial number: {_udev(unread[0])}" if unread else ""
     raise LinkError(f"{number} USB devices are {wanted}{hint}. Plugged in: {listed}{permission}")
@@ -101,6 +118,17 @@ class UsbPort:
             if taken == 0:
                 raise LinkError(f"{_described(self._device)} took {sent} of {len(data)} bytes")
             sent += taken
+
+    def flush(self) -> None:
+        """Not every chip tells what it still holds."""
+
+    def recover(self) -> None:
+        """Clear a stall.
+
+        Raises:
+            LinkError: the chip does not answer.
+        """
+        self._call("be recovered", self._device.clear_halt, self._out.bEndpointAddress)
 
     def close(self) -> None:
         """Give the chip back to the kernel's drivers."""
@@ -151,6 +179,9 @@ class UsbPort:
         except USBError as error:
             reason = _reason(self._device, error.errno)
             raise LinkError(f"{_described(self._device)} cannot {what}: {reason}{error}") from error
+        except NotImplementedError as error:  # what pyusb makes of libusb's "not supported"
+            reason = "libusb cannot use its driver; on Windows, give it WinUSB, with Zadig"
+            raise LinkError(f"{_described(self._device)} cannot {what}: {reason}: {error}") from error
 
 
 def _reason(device: Any, number: int | None) -> str:

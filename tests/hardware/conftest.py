@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 from autdtorch.array import TransducerArray
-from autdtorch.hardware import SONICSURFACE, Device, EmulatedBench, Link, open_link
+from autdtorch.hardware import (
+    SONICSURFACE,
+    Device,
+    EmulatedBench,
+    HardwareObjective,
+    LimitedLink,
+    Limits,
+    Link,
+    Sensor,
+    open_link,
+)
 from autdtorch.objective import SimulatedObjective
 from autdtorch.propagator import make_propagator
 from autdtorch.scene import Medium, Scene
@@ -25,21 +36,28 @@ class Trial:
     simulated: SimulatedObjective
     log: Path
 
-    def bench(self, device: Device = SONICSURFACE) -> EmulatedBench:
+    def bench(self, device: Device = SONICSURFACE, dead: Sequence[int] = ()) -> EmulatedBench:
         assert self.simulated.transfer_matrix is not None
-        return EmulatedBench(device, self.simulated.transfer_matrix, TRANSDUCERS)
+        return EmulatedBench(device, self.simulated.transfer_matrix, TRANSDUCERS, dead=dead)
 
     def link(self, bench: EmulatedBench, device: Device = SONICSURFACE) -> Link:
         return open_link(device, TRANSDUCERS, backend=bench.bus)
 
+    def objective(self, link: Link, sensor: Sensor, **settings: object) -> HardwareObjective:
+        limited = LimitedLink(link, Limits(amplitude=1.0))
+        return HardwareObjective(self.scene, limited, sensor, self.log, settings)
 
-@pytest.fixture
-def trial(tmp_path: Path) -> Trial:
+
+def a_scene() -> tuple[Scene, SimulatedObjective]:
     scene = Scene(
         TransducerArray.grid((4, 4), pitch=10.5e-3, center=(0, 0, 0)),
         Medium(1.2, 340.0),
         frequency=40e3,
         control_points=[(80e-3, 10e-3, 0.0), (80e-3, -20e-3, 5e-3)],
     )
-    simulated = SimulatedObjective(scene, make_propagator(scene, method="free_space"))
-    return Trial(scene, simulated, tmp_path / "trial.jsonl")
+    return scene, SimulatedObjective(scene, make_propagator(scene, method="free_space"))
+
+
+@pytest.fixture
+def trial(tmp_path: Path) -> Trial:
+    return Trial(*a_scene(), tmp_path / "trial.jsonl")

@@ -1,12 +1,13 @@
 """Boards of OpenMPD by their files: pins, calibration, and several of them by their serial numbers."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 
 from autdtorch.drive import drive_from_phases
-from autdtorch.hardware import EmulatedBench, LinkError, open_link, openmpd
+from autdtorch.hardware import EmulatedBench, LinkError, open_link, openmpd_boards
 from autdtorch.openmpd_board import OpenMPDBoard
 
 
@@ -24,7 +25,7 @@ def board(name: str, seed: int, gain: float = 1.0) -> OpenMPDBoard:
 
 def test_boards_of_files_play_the_drive_that_was_asked_for():
     boards = board("left", 1), board("right", 2)
-    device = openmpd(boards)
+    device = openmpd_boards(boards)
     # On the bench, transducer m hangs on its pin, and is ahead by its offset.
     pins = [256 * number + pin for number, one in enumerate(boards) for pin in one.pins]
     ahead = torch.cat([one.phase_offsets for one in boards])
@@ -33,27 +34,33 @@ def test_boards_of_files_play_the_drive_that_was_asked_for():
     with open_link(device, backend=bench.bus) as link:
         link.play(drive)
         torch.testing.assert_close(bench.pressure(), drive, rtol=0, atol=1e-12)  # rounding of the angles
+        torch.testing.assert_close(link.played(drive), drive, rtol=0, atol=1e-12)
     assert bench.drive().abs().max() == 0
 
 
 def test_gains_lower_the_duty():
     one = board("half", 0, gain=0.5)
-    frame = openmpd([one]).frame(torch.ones(256).cdouble())
+    device = openmpd_boards([one])
+    frame = device.frame(torch.ones(256).cdouble())
     assert set(frame[256:]) == {21}  # 128 asin(1/2) / pi = 21.3
+    heard = torch.full((256,), 2 * math.sin(21 * math.pi / 128), dtype=torch.float64)
+    torch.testing.assert_close(device.played(frame).abs(), heard, rtol=1e-12, atol=0)
+    assert device.played(frame).angle().abs().max() < torch.pi / 128 + 1e-9
+    assert not device.played(device.frame(torch.zeros(256).cdouble())).any()
 
 
 def test_a_board_that_is_not_there_is_named_and_the_others_are_let_go():
-    present = EmulatedBench(openmpd([board("left", 1)]), torch.ones((1, 256)).cdouble())
+    present = EmulatedBench(openmpd_boards([board("left", 1)]), torch.ones((1, 256)).cdouble())
     with pytest.raises(
         LinkError, match=r"no USB devices .* 'right'. Plugged in: 0403:6014 \(serial number left\)"
     ):
-        open_link(openmpd([board("left", 1), board("right", 2)]), backend=present.bus)
-    with open_link(openmpd([board("left", 1)]), backend=present.bus):
+        open_link(openmpd_boards([board("left", 1), board("right", 2)]), backend=present.bus)
+    with open_link(openmpd_boards([board("left", 1)]), backend=present.bus):
         pass
 
 
 def test_one_board_unplugged_does_not_keep_the_others_on():
-    device = openmpd([board("left", 1), board("right", 2)])
+    device = openmpd_boards([board("left", 1), board("right", 2)])
     bench = EmulatedBench(device, torch.eye(512).cdouble())
     link = open_link(device, backend=bench.bus)
     link.play(torch.ones(512).cdouble())
@@ -65,9 +72,9 @@ def test_one_board_unplugged_does_not_keep_the_others_on():
 
 def test_boards_that_cannot_be_told_apart_or_are_no_boards_are_refused():
     with pytest.raises(ValueError, match=r"boards: \('a', 'a'\)"):
-        openmpd([board("a", 1), board("a", 2)])
+        openmpd_boards([board("a", 1), board("a", 2)])
     small = replace(board("small", 1), pins=(0, 1))
     with pytest.raises(ValueError, match=r"small has 2 transducers; must be 256"):
-        openmpd([small])
+        openmpd_boards([small])
     with pytest.raises(ValueError, match=r"serial: 'x'; must be None, as OpenMPD has 2 boards"):
-        open_link(openmpd([board("a", 1), board("b", 2)]), serial="x")
+        open_link(openmpd_boards([board("a", 1), board("b", 2)]), serial="x")

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autdtorch.drive import drive_from_phases
-from autdtorch.hardware.devices import OPENMPD, SONICSURFACE, ultraino
+from autdtorch.hardware.devices import OPENMPD, SONICSURFACE, ultraino_boards
 from autdtorch.hardware.firmware import OpenMPDFirmware, SonicSurfaceFirmware, UltrainoFirmware
 from autdtorch.hardware.frames import (
     levels_of_openmpd_frame,
@@ -104,7 +104,7 @@ def test_ultraino_bytes(
         upper_half_first = 0 if bit >= 4 else 1
         expected[200 * (transducer // 64) + 2 * (10 * tenth + port) + upper_half_first] |= 1 << 4 + bit % 4
     expected += bytes.fromhex("30303070 30303030 10 00")  # 1 period, 0 to end, commit, switch
-    assert ultraino(2).frame(one_on(transducer, phase, amplitude, 128)) == expected
+    assert ultraino_boards(2).frame(one_on(transducer, phase, amplitude, 128)) == expected
 
 
 @settings(max_examples=30, deadline=None)

@@ -23,7 +23,7 @@ TIME_OUT = USBTimeoutError("Operation timed out", -7, errno.ETIMEDOUT)
 OTHER = USBError("Overflow", -8, errno.EOVERFLOW)
 
 
-def failing(method: str, error: USBError) -> EmulatedBus:
+def failing(method: str, error: Exception) -> EmulatedBus:
     bus = EmulatedBus([EmulatedFtdi(0x0403, 0x6001, "A1", SonicSurfaceFirmware())])
 
     def fail(*arguments: object) -> None:
@@ -38,6 +38,7 @@ def failing(method: str, error: USBError) -> EmulatedBus:
     [
         ("open_device", ACCESS, r"cannot be opened: you may not write to it.* sudo cp .*70-autdtorch.rules"),
         ("open_device", ACCESS, r'ATTR{idVendor}=="0403", ATTR{idProduct}=="6001", MODE="0660"'),
+        ("set_configuration", NotImplementedError(), "on Windows, give it WinUSB"),
         ("set_configuration", BUSY, "cannot be opened: another program, or another link, has it open"),
         ("claim_interface", BUSY, "cannot be opened: another program, or another link, has it open"),
         ("bulk_write", GONE, "cannot be written to: it was unplugged"),
@@ -48,7 +49,7 @@ def failing(method: str, error: USBError) -> EmulatedBus:
         ("bulk_write", OTHER, r"cannot be written to: \[Errno \d+\] Overflow"),
     ],
 )
-def test_each_error_of_usb_has_a_message_of_its_own(method: str, error: USBError, message: str):
+def test_each_error_of_usb_has_a_message_of_its_own(method: str, error: Exception, message: str):
     with pytest.raises(LinkError, match=message):
         open_link(SONICSURFACE, backend=failing(method, error))
 

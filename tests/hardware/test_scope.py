@@ -11,7 +11,6 @@ from autdtorch.hardware import (
     KEYSIGHT,
     RIGOL,
     EmulatedScope,
-    HardwareObjective,
     LinkError,
     Microphone,
     MovedMicrophone,
@@ -182,7 +181,7 @@ def test_an_evaluation_through_device_and_oscilloscope_is_the_simulated_pressure
         loudest = 1.1 * float(trial.simulated(drive[None]).max())
         microphones = [Microphone(number, SENSITIVITY, loudest) for number in (1, 2)]
         sensor = ScopeSensor(oscilloscope, FREQUENCY, microphones)
-        measured = HardwareObjective(trial.scene, link, sensor, trial.log)(drive[None])
+        measured = trial.objective(link, sensor)(drive[None])
     worst = 2 / math.pi * loudest / 3.5 / 32
     torch.testing.assert_close(measured, trial.simulated(drive[None]), rtol=0, atol=worst)
 

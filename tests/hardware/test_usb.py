@@ -27,7 +27,11 @@ def test_the_device_asked_for_is_found_by_its_numbers():
     [
         ([], None, "no USB devices are 0403:6001. Plugged in: none"),
         (["A1"], "A2", r"no .* number 'A2'. Plugged in: 0403:6001 \(serial number A1\)"),
-        (["A1", "A2"], None, "2 USB devices .* by its serial number. Plugged in: .*A1.*, .*A2"),
+        (
+            ["A1", "A2"],
+            None,
+            "2 USB devices .* by its serial number, or unplug the others. Plugged in: .*A1.*, .*A2",
+        ),
     ],
 )
 def test_none_or_several_are_an_error_that_lists_what_is_there(chips, serial, message):

@@ -45,7 +45,9 @@ UNITS = {
         "plane_pressure",
         "pressure",
         "reference",
+        "silence",
         "std",
+        "threshold",
         "transfer_matrix",
         "volume",
     },
@@ -53,7 +55,7 @@ UNITS = {
     "rad": {"angle", "phase", "phase_offsets", "phases", "rotation"},
     "rad/m": {"complex_wavenumber", "wavenumber"},
     "rad/s": {"angular_frequency"},
-    "s": {"settle", "time_step", "timeout"},
+    "s": {"seconds", "seconds_in_a_row", "seconds_on", "settle", "time_step", "timeout"},
     "s/division": {"time_scale"},
     "V": {"dc_offset", "resolution", "volts"},
     "V/Pa": {"sensitivity"},
@@ -62,12 +64,14 @@ UNITS = {
 UNIT_OF = {name: unit for unit, names in UNITS.items() for name in names}
 WITHOUT_UNIT = {
     *(
+        "amplitude",
         "amplitudes",
         "axis",
         "basis",
         "density_ratio",
         "drive",
         "drift",
+        "duty_cycle",
         "evaluations",
         "faces",
         "gain",

@@ -1,0 +1,166 @@
+"""AUTD3 over its own software development kit, as it hangs on the network and not on USB."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Coroutine, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from autdtorch.device_layouts import AUTD3_TRANSDUCERS
+from autdtorch.hardware.devices import Device
+from autdtorch.hardware.levels import AUTD3_PHASES, Levels, autd3_drive, autd3_levels
+from autdtorch.hardware.link import SETTLE, Link
+from autdtorch.hardware.usb import LinkError
+from autdtorch.validation import integer_at_least
+
+
+def autd3_device(boards: int = 1) -> Device:
+    """Boards of AUTD3, 249 transducers each: 256 phases, 255 amplitudes; not on USB, but for `open_autd3`.
+
+    Args:
+        boards: their number, >= 1.
+
+    Raises:
+        ValueError: `boards` out of range.
+    """
+    return Device(
+        name="AUTD3",
+        adapters=(),
+        transducers=AUTD3_TRANSDUCERS * integer_at_least("boards", boards, 1),
+        frame=_autd3_frame,
+        played=_autd3_played,
+        quantised={"levels": AUTD3_PHASES},
+    )
+
+
+def open_autd3(
+    boards: int = 1,
+    transducers: Sequence[int] | None = None,
+    network: Any = None,
+    settle: float = SETTLE,
+) -> Link:
+    """Find boards of AUTD3 on the network and switch their outputs off.
+
+    Their firmware is reset to its defaults first; its silencer smooths every change over a millisecond.
+
+    Args:
+        boards: their number, >= 1.
+        transducers: for each transducer of the scene, which of the device's it is; by default all in order.
+        network: `autd3.UdpOption` or `autd3.ServerLink`; by default UDP on the interface that finds them.
+        settle: how long a drive plays before its pressure is read [s].
+
+    Raises:
+        LinkError: they are not there, or do not take the commands.
+        ImportError: the packages autd3 and autd3-pattern are missing.
+        ValueError: `boards` out of range; `transducers` that they do not have, or one twice; or a negative
+            `settle`.
+    """
+    device = autd3_device(boards)
+    port = Autd3Port(boards, network)
+    try:
+        return Link(device, port, transducers, settle)
+    except BaseException:
+        port.close()
+        raise
+
+
+class Autd3Port:
+    """Boards of AUTD3 on the network, by the client of their kit, which waits until they have answered."""
+
+    def __init__(self, boards: int, network: Any = None) -> None:
+        """Connect, and reset the firmware to its defaults.
+
+        Args:
+            boards: their number.
+            network: `autd3.UdpOption` or `autd3.ServerLink`; by default UDP on the interface that finds them.
+
+        Raises:
+            LinkError: they are not there.
+            ImportError: the packages autd3 and autd3-pattern are missing.
+        """
+        try:
+            import autd3
+            from autd3.commands import Clear
+            from autd3_core import Autd3, Geometry
+        except ImportError as error:
+            raise ImportError(f"{error}; pip install 'autdtorch[autd3]' brings what is needed") from error
+        # A pattern is by board and transducer: where the boards stand plays no part.
+        geometry = Geometry([Autd3() for _ in range(boards)])
+        option = autd3.UdpOption() if network is None else network
+        self._error: type[Exception] = autd3.Autd3Error
+        self._boards = boards
+        self._runner = asyncio.Runner()
+        self._client: Any = None
+
+        async def open_client() -> Any:
+            return await autd3.Client.open(geometry, option, autd3.ClientConfig())
+
+        try:
+            self._client = self._run("be opened", open_client())
+            self._send("be reset", Clear())
+        except BaseException:
+            self.close()
+            raise
+
+    def write(self, data: bytes) -> None:
+        """Play a frame; its boards have taken it when this returns.
+
+        Raises:
+            LinkError: a board did not take it.
+        """
+        self._send("be written to", autd3_pattern(data, self._boards))
+
+    def flush(self) -> None:
+        """Nothing waits: a write has been answered when it returns."""
+
+    def recover(self) -> None:
+        """The kit has found the boards again by itself, or the next write fails."""
+
+    def close(self) -> None:
+        """Let go of the boards.
+
+        Raises:
+            LinkError: they do not answer; they are let go all the same.
+        """
+
+        async def close_client() -> None:
+            await self._client.close()
+
+        try:
+            if self._client is not None:
+                self._run("be closed", close_client())
+        finally:
+            self._runner.close()
+
+    def _send(self, what: str, command: Any) -> None:
+        async def send() -> None:
+            await self._client.send(command)
+
+        self._run(what, send())
+
+    def _run(self, what: str, doing: Coroutine[Any, Any, Any]) -> Any:
+        try:
+            return self._runner.run(doing)
+        except self._error as error:
+            raise LinkError(f"AUTD3 cannot {what}: {error}") from error
+
+
+def autd3_pattern(frame: bytes, boards: int) -> Any:
+    """The kit's command (`autd3.commands.Pattern`) for a frame: all phases, then all intensities."""
+    from autd3.commands import Pattern
+    from autd3_pattern import IntensityBuffer, PhaseBuffer
+
+    phases, intensities = np.frombuffer(frame, np.uint8).reshape(2, boards, AUTD3_TRANSDUCERS)
+    return Pattern(PhaseBuffer.from_array(phases), IntensityBuffer.from_array(intensities))
+
+
+def _autd3_frame(drive: torch.Tensor) -> bytes:
+    return torch.cat(autd3_levels(drive)).to(torch.uint8).numpy().tobytes()
+
+
+def _autd3_played(frame: bytes) -> torch.Tensor:
+    phases, intensities = torch.from_numpy(np.frombuffer(frame, np.uint8).astype(np.int64)).reshape(2, -1)
+    return autd3_drive(Levels(phases, intensities))

@@ -1,0 +1,85 @@
+"""Before a trial: every transducer in turn, whether the sensor hears it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from autdtorch.hardware.safety import LimitedLink
+from autdtorch.hardware.sensor import Sensor, checked_reading
+from autdtorch.validation import integer_at_least
+
+#: How far above the noise a transducer is heard, in standard deviations of the noise's mean power.
+_DEVIATIONS = 6.0
+_BACKGROUND = 8  # readings of the silence for each of a transducer
+
+
+@dataclass(frozen=True, eq=False)
+class Preflight:
+    """What the sensor hears of each transducer alone, and of silence.
+
+    Attributes:
+        pressure: of each transducer (M,) [Pa], rms over readings and control points.
+        silence: the same with the outputs off [Pa].
+        threshold: below this a transducer is not heard [Pa].
+    """
+
+    pressure: torch.Tensor
+    silence: float
+    threshold: float
+
+    @property
+    def dead(self) -> list[int]:
+        """The transducers that are not heard."""
+        return torch.nonzero(self.pressure <= self.threshold)[:, 0].tolist()
+
+
+def check_transducers(link: LimitedLink, sensor: Sensor, points: int, readings: int = 4) -> Preflight:
+    """Play every transducer alone, after silence, and switch the outputs off.
+
+    The power of circular Gaussian noise, averaged over n readings, deviates by 1/sqrt(n) of its mean: that
+    says from which pressure on a transducer is heard.
+
+    Args:
+        link: plays them.
+        sensor: hears them.
+        points: number of control points P that the sensor reads.
+        readings: of every transducer, >= 1.
+
+    Raises:
+        ValueError: the sensor does not give P finite magnitudes.
+        LimitError: the outputs were on for as long as they may.
+        LinkError: the device does not take the bytes.
+    """
+    readings = integer_at_least("readings", readings, 1)
+    silence = _power(sensor, points, _BACKGROUND * readings)
+    powers = []
+    for alone in torch.eye(len(link.link.transducers), dtype=torch.complex128):
+        link.play(alone)
+        powers.append(_power(sensor, points, readings))
+        link.require_on()
+    link.off()
+    threshold = silence * (1 + _DEVIATIONS / math.sqrt(readings * points))
+    return Preflight(torch.tensor(powers).sqrt(), math.sqrt(silence), math.sqrt(threshold))
+
+
+def hears_silence(sensor: Sensor, check: Preflight, points: int, readings: int = 4) -> bool:
+    """Whether the sensor hears no more than before the trial, so that the outputs are truly off.
+
+    Args:
+        sensor: hears P points.
+        check: made before the trial.
+        points: P.
+        readings: >= 1.
+
+    Raises:
+        ValueError: the sensor does not give P finite magnitudes.
+    """
+    return math.sqrt(_power(sensor, points, readings)) <= check.threshold
+
+
+def _power(sensor: Sensor, points: int, readings: int) -> float:
+    values = torch.stack([checked_reading(sensor, points) for _ in range(readings)])
+    return float(values.square().mean())

@@ -1,0 +1,224 @@
+"""What keeps a bench from harm: limits on what is played, and outputs off however a trial ends."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from types import FrameType
+
+import torch
+
+from autdtorch.hardware.link import Link
+from autdtorch.hardware.usb import LinkError
+from autdtorch.validation import integer_at_least, invalid, number_between, positive
+
+_CANDIDATES = 256  # amplitudes to choose from; more than a device here has
+
+_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+
+
+class LimitError(RuntimeError):
+    """A limit of a trial is reached."""
+
+
+class Signalled(KeyboardInterrupt):
+    """A signal ends the trial.
+
+    Attributes:
+        number: of the signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        """Name the signal of this `number`."""
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+@contextlib.contextmanager
+def ended_by_signals() -> Iterator[None]:
+    """Have Ctrl-C, SIGTERM and SIGHUP raise `Signalled`, so that links are closed on the way out.
+
+    Only the first does: what comes later must not interrupt the switching off. Use it around the link.
+
+    Raises:
+        Signalled: there was such a signal.
+        ValueError: it is used outside of the main thread, which alone hears signals.
+    """
+
+    def end(number: int, _: FrameType | None) -> None:
+        for one in _SIGNALS:
+            signal.signal(one, signal.SIG_IGN)
+        raise Signalled(number)
+
+    before = {one: signal.signal(one, end) for one in _SIGNALS}
+    try:
+        yield
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a trial may ask of a device.
+
+    Attributes:
+        amplitude: the most that a transducer is driven at, above 0 up to 1. Drives are scaled by it: a
+            method's |q| = 1 is this.
+        evaluations: the most that a trial makes, those before it was interrupted included.
+        seconds: the most that the outputs are on in all [s].
+        seconds_in_a_row: the most that they are on without a rest [s].
+        duty_cycle: share of the time that they may be on, above 0 up to 1: after a stretch of t s they rest
+            for t (1 / duty_cycle - 1) s.
+
+    Raises:
+        ValueError: an attribute out of range.
+    """
+
+    amplitude: float
+    evaluations: int = 10_000
+    seconds: float = 3600.0
+    seconds_in_a_row: float = 60.0
+    duty_cycle: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check the attributes."""
+        integer_at_least("evaluations", self.evaluations, 1)
+        for field in fields(self):
+            if field.name != "evaluations":
+                positive(field.name, getattr(self, field.name))
+        for name in ("amplitude", "duty_cycle"):
+            number_between(name, getattr(self, name), 0.0, 1.0)
+
+
+class LimitedLink:
+    """A link that plays within limits, and switches off by itself when the time is up.
+
+    Attributes:
+        link: what plays.
+        limits: of what is played.
+    """
+
+    def __init__(self, link: Link, limits: Limits) -> None:
+        """Limit a link.
+
+        Args:
+            link: with its outputs off.
+            limits: of what is played.
+
+        Raises:
+            ValueError: the device has no amplitude up to the limit but 0.
+        """
+        self.link = link
+        self.limits = limits
+        self._scale = _largest_amplitude(link, limits.amplitude)
+        self._lock = threading.RLock()
+        self._timer: threading.Timer | None = None
+        self._on_since: float | None = None
+        self._seconds_before = 0.0
+        self._rested_at = 0.0
+        self._failure: LinkError | None = None
+
+    @property
+    def seconds_on(self) -> float:
+        """How long the outputs were on so far [s]."""
+        return self._seconds_before + self._stretch()
+
+    def charge(self, seconds: float) -> None:
+        """Count time that the outputs were on before this process.
+
+        Args:
+            seconds: [s].
+        """
+        self._seconds_before += seconds
+
+    def play(self, drive: torch.Tensor) -> None:
+        """Play a drive (M,), |q| <= 1, scaled to the limit, until the next, `off`, or the end of the time.
+
+        Raises:
+            LimitError: the outputs were on for as long as they may.
+            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+            LinkError: the device does not take the bytes.
+        """
+        if self._stretch() > self.limits.seconds_in_a_row / 2:  # leave the other half to the sensor
+            self.off()
+        if self._on_since is None:
+            time.sleep(max(0.0, self._rested_at - time.monotonic()))
+        left = self._seconds_left()
+        with self._lock:
+            self._raise_failure()
+            if self._on_since is None:
+                self._on_since = time.monotonic()
+                self._timer = threading.Timer(min(left, self.limits.seconds_in_a_row), self._time_is_up)
+                self._timer.daemon = True
+                self._timer.start()
+            self.link.play(self._scale * drive)
+
+    def require_on(self) -> None:
+        """Require that the outputs are on since `play`: otherwise what was read meanwhile is void.
+
+        Raises:
+            LimitError: they went off, as the time was up.
+            LinkError: they should have gone off, and the device did not take the bytes.
+        """
+        self._raise_failure()
+        if self._on_since is None:
+            self._seconds_left()
+            most = self.limits.seconds_in_a_row
+            raise LimitError(f"the sensor took longer than the outputs may stay on, {most:g} s in a row")
+
+    def off(self) -> None:
+        """Switch all outputs off, and begin the rest that the duty cycle asks for.
+
+        Raises:
+            LinkError: the device does not take the bytes.
+        """
+        with self._lock:
+            if self._on_since is None:
+                return
+            if self._timer is not None:
+                self._timer.cancel()
+            self.link.off()
+            stretch = self._stretch()
+            self._seconds_before += stretch
+            self._rested_at = time.monotonic() + stretch * (1 / self.limits.duty_cycle - 1)
+            self._on_since = None
+
+    def _stretch(self) -> float:
+        since = self._on_since
+        return 0.0 if since is None else time.monotonic() - since
+
+    def _seconds_left(self) -> float:
+        left = self.limits.seconds - self.seconds_on
+        if left <= 0:
+            self.off()
+            raise LimitError(f"the outputs were on for {self.limits.seconds:g} s, the limit")
+        return left
+
+    def _time_is_up(self) -> None:
+        try:
+            self.off()
+        except LinkError as error:  # for the main thread to raise
+            self._failure = error
+
+    def _raise_failure(self) -> None:
+        if self._failure is not None:
+            raise self._failure
+
+
+def _largest_amplitude(link: Link, limit: float) -> float:
+    """The largest amplitude that the device, on its levels, does not play above `limit`."""
+    if limit == 1:
+        return 1.0
+    asked = torch.arange(1, _CANDIDATES + 1).to(torch.complex128) / _CANDIDATES
+    played = torch.stack([link.played(amplitude.expand(len(link.transducers))) for amplitude in asked])
+    strongest = played.abs().amax(dim=1)
+    allowed = (strongest > 0) & (strongest <= limit)
+    if not allowed.any():
+        least = strongest[strongest > 0].min()
+        raise invalid("amplitude", limit, f"must be >= {least:.3g}, the least that {link.device.name} plays")
+    return float(asked[allowed].abs().max())

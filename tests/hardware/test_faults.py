@@ -1,0 +1,185 @@
+"""What goes wrong in mid-trial: outputs off, one clear line, a log that loads, and a trial that goes on."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+
+from autdtorch.conditions import Quantised
+from autdtorch.hardware import (
+    OPENMPD,
+    SONICSURFACE,
+    Device,
+    EmulatedBench,
+    EmulatedSensor,
+    LinkError,
+    Sensor,
+    Signalled,
+    ended_by_signals,
+)
+from autdtorch.hardware.emulated_bus import EmulatedBus
+from autdtorch.hardware.faults import FAULTS, FaultyBus
+from autdtorch.optim.base import Solution
+from autdtorch.optim.gabs import gabs
+
+METHOD = partial(gabs, levels=2, order="given")
+EVALUATIONS = 1 + 15 * 2
+SURVIVED = 10  # evaluations before the fault
+
+
+class Counting(EmulatedSensor):
+    """Counts its readings; `disturb` is called with their number before each."""
+
+    def __init__(self, bench: EmulatedBench, disturb: Callable[[int], object] = int) -> None:
+        super().__init__(bench)
+        self.readings = 0
+        self._disturb = disturb
+
+    def read(self):
+        self.readings += 1
+        self._disturb(self.readings)
+        return super().read()
+
+
+def measure(trial, bench: EmulatedBench, sensor: Sensor, device: Device = SONICSURFACE) -> Solution:
+    with ended_by_signals(), trial.link(bench, device) as link:
+        return METHOD(Quantised(trial.objective(link, sensor), **device.quantised))
+
+
+def bytes_before(device: Device, evaluations: int) -> int:
+    """How many bytes the device has taken in mid-frame of an evaluation: off frames are sent in pairs."""
+    frame = len(device.frame(torch.zeros(256, dtype=torch.complex128)))
+    calls = 1 + (evaluations - 1) // 2
+    return frame * (2 + evaluations + 2 * calls) + 3 * frame // 4
+
+
+def require_that_it_goes_on(trial, device: Device = SONICSURFACE) -> None:
+    """The log has what was measured, and the rest leads to what an undisturbed trial finds."""
+    bench = trial.bench(device)
+    sensor = Counting(bench)
+    found = measure(trial, bench, sensor, device)
+    assert sensor.readings == EVALUATIONS - SURVIVED
+    expected = METHOD(Quantised(trial.simulated, **device.quantised))
+    assert torch.equal(found.drive, expected.drive)
+    torch.testing.assert_close(found.history, expected.history, rtol=1e-12, atol=0)  # another order of sums
+
+
+@pytest.mark.parametrize("device", [SONICSURFACE, OPENMPD], ids=lambda device: device.name)
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_of_the_bus_ends_the_trial_with_the_outputs_off(trial, fault, device):
+    bench = trial.bench(device)
+    bench.bus = FaultyBus([bench.chip], fault, bytes_before(device, SURVIVED))
+    with pytest.raises(LinkError) as raised:
+        measure(trial, bench, EmulatedSensor(bench), device)
+    assert "\n" not in str(raised.value)
+    assert bench.bus.struck
+    if fault == "unplug":
+        assert "outputs may still be on" in str(raised.value)
+    else:
+        assert bench.firmware.drive().abs().max() == 0
+    require_that_it_goes_on(trial, device)
+
+
+@pytest.mark.parametrize("fault", ["time-out", "stall", "short write"])
+def test_a_fault_in_the_last_off_frame_is_mended(trial, fault):
+    bench = trial.bench()
+    bench.bus = FaultyBus([bench.chip], fault, 258 * (2 + 1) + 100)
+    with trial.link(bench) as link:
+        link.play(torch.ones(16, dtype=torch.complex128))
+    assert bench.bus.struck
+    assert bench.firmware.drive().abs().max() == 0
+
+
+@pytest.mark.parametrize("reading", [[1.0, float("nan")], ["noise", 1.0], OSError("gone")])
+def test_garbage_from_the_sensor_ends_the_trial_with_the_outputs_off(trial, reading):
+    class Garbled(Counting):
+        def read(self):
+            if self.readings < SURVIVED:
+                return super().read()
+            if isinstance(reading, OSError):
+                raise reading
+            return reading
+
+    bench = trial.bench()
+    with pytest.raises((ValueError, OSError), match=r"pressure of the sensor|gone"):
+        measure(trial, bench, Garbled(bench))
+    assert bench.firmware.drive().abs().max() == 0
+    require_that_it_goes_on(trial)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_trial_with_the_outputs_off(trial, number):
+    def disturb(readings: int) -> None:
+        if readings > SURVIVED:
+            os.kill(os.getpid(), number)
+
+    before = signal.getsignal(number)
+    bench = trial.bench()
+    with pytest.raises(Signalled, match=number.name):
+        measure(trial, bench, Counting(bench, disturb))
+    assert bench.firmware.drive().abs().max() == 0
+    assert signal.getsignal(number) is before
+    require_that_it_goes_on(trial)
+
+
+@pytest.mark.parametrize("device", [SONICSURFACE, OPENMPD], ids=lambda device: device.name)
+def test_signals_in_mid_frame_and_while_switching_off_leave_the_outputs_off(trial, device):
+    class Interrupting(EmulatedBus):
+        def bulk_write(self, dev_handle, ep, intf, data, timeout):
+            written = super().bulk_write(dev_handle, ep, intf, data[:300], timeout)
+            if loud:
+                os.kill(os.getpid(), signal.SIGTERM)
+            return written
+
+    def interrupted_trial() -> None:
+        with ended_by_signals(), trial.link(bench, device) as link:
+            loud.append(True)
+            link.play(torch.ones(16, dtype=torch.complex128))
+
+    loud: list[bool] = []
+    bench = trial.bench(device)
+    bench.bus = Interrupting([bench.chip])
+    with pytest.raises(Signalled):
+        interrupted_trial()
+    assert bench.firmware.drive().abs().max() == 0
+
+
+KILLED = f"""
+import os, signal, sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from pathlib import Path
+from conftest import Trial, a_scene
+from test_faults import Counting, SURVIVED, measure
+def kill(readings):
+    if readings > SURVIVED:
+        os.kill(os.getpid(), signal.SIGKILL)
+trial = Trial(*a_scene(), Path(sys.argv[1]))
+bench = trial.bench()
+measure(trial, bench, Counting(bench, kill))
+"""
+
+
+def test_sigkill_costs_the_evaluation_in_flight_alone(trial):
+    killed = subprocess.run([sys.executable, "-c", KILLED, trial.log], check=False)
+    assert killed.returncode == -signal.SIGKILL
+    require_that_it_goes_on(trial)
+
+
+@pytest.mark.parametrize("lost", [1, 200])
+def test_a_last_line_that_broke_off_costs_its_evaluation_alone(trial, lost, caplog):
+    def disturb(readings: int) -> None:
+        if readings > SURVIVED + 1:
+            raise KeyboardInterrupt
+
+    bench = trial.bench()
+    with pytest.raises(KeyboardInterrupt):
+        measure(trial, bench, Counting(bench, disturb))
+    trial.log.write_bytes(trial.log.read_bytes()[:-lost])
+    require_that_it_goes_on(trial)
+    assert "the last line broke off" in caplog.text

@@ -1,0 +1,163 @@
+"""Limits of a trial, and what a log is refused for."""
+
+import time
+
+import pytest
+import torch
+
+from autdtorch.hardware import (
+    OPENMPD,
+    EmulatedSensor,
+    HardwareObjective,
+    LimitedLink,
+    LimitError,
+    Limits,
+    LinkError,
+    check_transducers,
+    hears_silence,
+)
+
+
+def full_on(rows: int = 1) -> torch.Tensor:
+    return torch.ones(rows, 16, dtype=torch.complex128)
+
+
+@pytest.mark.parametrize("limit", [1.0, 0.9, 0.5, 0.03])
+def test_no_transducer_is_driven_above_the_limit(trial, limit: float):
+    bench = trial.bench(OPENMPD)
+    with trial.link(bench, OPENMPD) as link:
+        LimitedLink(link, Limits(amplitude=limit)).play(full_on()[0])
+        amplitudes = bench.drive().abs()
+        assert amplitudes.max() <= limit * (1 + 1e-9)
+        # A step of the duty is at most pi / 128 of the amplitude, and one of the candidates 1 / 256.
+        assert amplitudes.min() >= limit - 0.03
+
+
+def test_a_device_without_amplitude_plays_in_full_or_not_at_all(trial):
+    with trial.link(trial.bench()) as link:
+        LimitedLink(link, Limits(amplitude=1.0))
+        with pytest.raises(ValueError, match=r"amplitude: 0\.9; must be >= 1, .* SonicSurface"):
+            LimitedLink(link, Limits(amplitude=0.9))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("amplitude", 0), ("amplitude", 1.1), ("evaluations", 0), ("seconds", 0), ("duty_cycle", float("nan"))],
+)
+def test_limits_that_are_none_are_refused(name: str, value: float):
+    with pytest.raises(ValueError, match=name):
+        Limits(**{"amplitude": 1.0, name: value})
+    with pytest.raises(TypeError, match="amplitude"):
+        Limits()
+
+
+def test_the_number_of_evaluations_is_limited_over_all_of_a_trial(trial):
+    def observe(rows: int, most: int) -> None:
+        bench = trial.bench()
+        with trial.link(bench) as link:
+            limited = LimitedLink(link, Limits(1.0, evaluations=most))
+            HardwareObjective(trial.scene, limited, EmulatedSensor(bench), trial.log)(full_on(rows))
+
+    observe(3, most=3)
+    with pytest.raises(LimitError, match="4 evaluations are made, the limit"):
+        observe(5, most=4)
+    observe(5, most=5)
+
+
+def test_the_outputs_rest_as_the_duty_cycle_asks(trial):
+    bench = trial.bench()
+    sensor = EmulatedSensor(bench)
+    begin = time.monotonic()
+    with trial.link(bench) as link:
+        limited = LimitedLink(link, Limits(1.0, seconds_in_a_row=0.02, duty_cycle=0.25))
+        while limited.seconds_on < 0.05:
+            limited.play(full_on()[0])
+            sensor.read()
+            time.sleep(0.002)
+            limited.require_on()
+        # The last stretch has not rested yet; it is shorter than what is allowed in a row.
+        assert time.monotonic() - begin >= (limited.seconds_on - 0.02) / 0.25
+
+
+@pytest.mark.parametrize(
+    ("limits", "message"),
+    [
+        (Limits(1.0, seconds_in_a_row=0.02), r"longer than .* 0\.02 s in a row"),
+        (Limits(1.0, seconds=0.02), r"the outputs were on for 0\.02 s, the limit"),
+    ],
+)
+def test_while_a_sensor_takes_too_long_the_outputs_go_off(trial, limits: Limits, message: str):
+    class Slow(EmulatedSensor):
+        def read(self):
+            time.sleep(0.2)
+            heard.append(float(bench.drive().abs().max()))
+            return super().read()
+
+    heard: list[float] = []
+    bench = trial.bench()
+    with trial.link(bench) as link:
+        objective = HardwareObjective(trial.scene, LimitedLink(link, limits), Slow(bench), trial.log)
+        with pytest.raises(LimitError, match=message):
+            objective(full_on())
+        assert heard == [0.0]
+        assert not objective.log.evaluations
+
+
+def test_the_time_on_goes_on_with_the_trial(trial):
+    bench = trial.bench()
+    with trial.link(bench) as link:
+        trial.objective(link, EmulatedSensor(bench))(full_on())
+        limited = LimitedLink(link, Limits(1.0, seconds=1e-9))
+        objective = HardwareObjective(trial.scene, limited, EmulatedSensor(bench), trial.log)
+        objective(full_on())  # from the log
+        with pytest.raises(LimitError, match="the limit"):
+            objective(full_on())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda log: log.replace('"seed": 1', '"seed": 2'), "of another trial, whose seed is 2, not 1"),
+        (lambda log: log.replace("SonicSurface", "OpenMPD"), "whose device is OpenMPD, not SonicSurface"),
+        (lambda log: log.replace('"scene": "', '"scene": "x'), "of another trial, whose scene is x"),
+        (lambda log: "time,drive\n1,2\n", "must be the log of a hardware trial"),
+        (lambda log: log + "{}\n" + log, "must be the log of a hardware trial"),
+    ],
+)
+def test_the_log_of_another_trial_is_refused(trial, change, message: str):
+    bench = trial.bench()
+    with trial.link(bench) as link:
+        trial.objective(link, EmulatedSensor(bench), seed=1)(full_on())
+        trial.log.write_text(change(trial.log.read_text()))
+        with pytest.raises(ValueError, match=message):
+            trial.objective(link, EmulatedSensor(bench), seed=1)
+
+
+def test_a_log_of_other_drives_is_refused(trial):
+    bench = trial.bench()
+    with trial.link(bench) as link:
+        trial.objective(link, EmulatedSensor(bench))(full_on())
+        with pytest.raises(ValueError, match="evaluation 1 is of another drive"):
+            trial.objective(link, EmulatedSensor(bench))(0.5 * full_on())
+
+
+def test_a_chip_that_keeps_the_off_frame_is_told_of(trial, monkeypatch):
+    monkeypatch.setattr("autdtorch.hardware.adapters._FLUSH_SECONDS", 0.0)
+    bench = trial.bench()
+    link = trial.link(bench)
+    bench.chip.read = lambda most: b"\x01\x20"  # there is room for more, but the transmitter is not empty
+    with pytest.raises(LinkError, match="outputs may still be on"):
+        link.close()
+
+
+@pytest.mark.parametrize("snr", [None, 30.0])
+def test_the_check_finds_the_dead_transducers(trial, snr):
+    bench = trial.bench(dead=[3, 9])
+    sensor = EmulatedSensor(bench, snr)
+    with trial.link(bench) as link:
+        check = check_transducers(LimitedLink(link, Limits(1.0)), sensor, points=2)
+        assert check.dead == [3, 9]
+        assert bench.firmware.drive().abs().max() == 0
+        assert hears_silence(sensor, check, points=2)
+        link.play(full_on()[0])
+        assert not hears_silence(sensor, check, points=2)

@@ -1,0 +1,99 @@
+"""The script of a trial: what it leaves and shows, and how it ends."""
+
+import logging
+import re
+from pathlib import Path
+
+import hardware_trial
+import pytest
+import torch
+
+from autdtorch.drive_file import load_drive
+from autdtorch.hardware_report import compare
+
+SCENE = """
+name: two
+frequency: 40e3
+medium: {density: 1.2, sound_speed: 340.0}
+array: {type: grid, shape: [3, 3], pitch: 10.5e-3, center: [0, 0, 0], normal: [1, 0, 0]}
+control_points: {type: points, positions: [[80e-3, 10e-3, 0.0], [80e-3, -20e-3, 5e-3]]}
+"""
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture):
+    scene = tmp_path / "two.yaml"
+    scene.write_text(SCENE)
+    caplog.set_level(logging.INFO)
+
+    def run_script(*words: str) -> int:
+        given = ["hardware_trial.py", "--scene", str(scene), "--output", str(tmp_path / "out"), *words]
+        monkeypatch.setattr("sys.argv", given)
+        return hardware_trial.main()
+
+    return run_script
+
+
+EMULATED = ("--device", "emulated", "--method", "gabs", "--set", "levels=4", "--amplitude-limit", "1")
+
+
+def test_a_trial_leaves_log_drive_and_report_and_is_not_repeated(run, tmp_path: Path, caplog):
+    assert run(*EMULATED, "--dead", "4") == 0
+    assert "the sensor hears 8 of 9" in caplog.text
+    out = tmp_path / "out"
+    log = (out / "trial.jsonl").read_text()
+    assert log.count("\n") == 1 + 1 + 8 * 4
+    assert run(*EMULATED, "--dead", "4") == 0
+    assert (out / "trial.jsonl").read_text() == log
+    report = (out / "report.md").read_text()
+    assert "**Not heard**, counted from 0: 4." in report
+    assert (out / "convergence.png").exists()
+    assert len(load_drive(out / "drive.npz")) == 9
+
+    assert run(*EMULATED) == 2
+    assert "of another trial, whose dead is [4], not []" in caplog.text
+
+
+def test_without_noise_the_report_says_that_it_is_the_simulation(run, tmp_path: Path):
+    assert run(*EMULATED) == 0
+    report = (tmp_path / "out" / "report.md").read_text()
+    assert "transducers driven as in the simulated trial: 9 of 9" in report
+    assert report.count("| 1.000 |") == 3
+
+
+def test_a_dry_run_shows_the_frames_and_leaves_nothing(run, tmp_path: Path, capsys):
+    assert run(*EMULATED, "--dry-run", "--device", "sonicsurface", "--transducers", "0-2,16-18,32-34") == 0
+    lines = capsys.readouterr().out.splitlines()
+    frames, decoded = lines[::2], lines[1::2]
+    assert all(re.fullmatch("fe( [0-9a-f]{2}){256} fd", frame) for frame in frames)
+    assert decoded[0] == decoded[-1] == "  all off"
+    assert "  16: 1 at 0" in decoded  # each transducer alone, in the pre-flight check
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "message"),
+    [
+        (("--max-evaluations", "5"), 3, "5 evaluations are made, the limit: the outputs are off"),
+        (("--amplitude-limit", "0.5"), 2, "amplitude: 0.5; must be >= 1"),
+        (("--set", "level=4"), 2, "unknown key 'level'; gabs has first, levels, order, passes"),
+        (("--dead", "0-8"), 2, "the sensor hears no transducer"),
+        (("--device", "sonicsurface"), 2, "must say which 9 of the 256 transducers of SonicSurface"),
+    ],
+)
+def test_a_trial_that_may_not_be_made_ends_with_one_line(run, caplog, words, status, message):
+    assert run(*EMULATED, *words) == status
+    assert message in caplog.messages[-1]
+
+
+def test_no_trial_without_an_amplitude_limit(run, capsys):
+    with pytest.raises(SystemExit):
+        run("--device", "emulated", "--method", "gabs")
+    assert "--amplitude-limit" in capsys.readouterr().err
+
+
+def test_the_factor_between_simulation_and_bench_is_found():
+    simulated = torch.rand(20, 3, dtype=torch.float64) + 1
+    fit = compare(2.5 * simulated, simulated)
+    assert fit.scale == pytest.approx(2.5, rel=1e-12)
+    assert fit.misfit < 1e-12
