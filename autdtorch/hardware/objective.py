@@ -57,10 +57,12 @@ class HardwareObjective:
             watch: is shown every evaluation.
 
         Raises:
-            ValueError: the link plays another number of transducers than the scene has, or the log is of
-                another trial.
+            ValueError: the link is not limited, or plays another number of transducers than the scene has; or
+                the log is of another trial.
             OSError: the log cannot be read or written.
         """
+        if not isinstance(link, LimitedLink):
+            raise invalid("link", link, "must be a LimitedLink: no trial without an amplitude limit")
         transducers = link.link.transducers.tolist()
         if len(transducers) != len(scene.array):
             accepted = f"must be {len(scene.array)}, as many as the scene has"

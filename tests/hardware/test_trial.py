@@ -12,6 +12,7 @@ from autdtorch.hardware import (
     SONICSURFACE,
     Device,
     EmulatedSensor,
+    HardwareObjective,
     LinkError,
     open_link,
     ultraino_boards,
@@ -111,6 +112,8 @@ def test_a_scene_of_other_transducers_is_refused(trial):
     bench = trial.bench()
     with open_link(SONICSURFACE, backend=bench.bus) as link, pytest.raises(ValueError, match="must be 16"):
         trial.objective(link, EmulatedSensor(bench))
+    with trial.link(bench) as link, pytest.raises(ValueError, match="no trial without an amplitude limit"):
+        HardwareObjective(trial.scene, link, EmulatedSensor(bench), trial.log)
     with pytest.raises(ValueError, match="from 0 to 255, each once"):
         open_link(SONICSURFACE, [3, 3], backend=bench.bus)
 
