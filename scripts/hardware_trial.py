@@ -6,21 +6,22 @@ python scripts/hardware_trial.py --device emulated --method gabs --amplitude-lim
 from __future__ import annotations
 
 import argparse
+import contextlib
 import functools
 import inspect
 import logging
 import shlex
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from omegaconf import OmegaConf
+from trial_bench import Bench, add_options, bench_of, settings_of
 
 import autdtorch as at
 from autdtorch import hardware
-from autdtorch.hardware.dry_run import DryPort
 from autdtorch.hardware_report import write_hardware_report
 from autdtorch.optim.base import Solution
 from autdtorch.progress import Progress, show_progress
@@ -28,28 +29,10 @@ from autdtorch.progress import Progress, show_progress
 ROOT = Path(__file__).parents[1]
 
 METHODS = {"lssg": at.lssg, "gabs": at.gabs, "bo": at.bayes_opt, "identify": at.identify}
-DEVICES = {
-    "sonicsurface": hardware.SONICSURFACE,
-    "openmpd": hardware.OPENMPD,
-    "ultraino": hardware.ULTRAINO,
-}
-EMULATED = {
-    "emulated": hardware.SONICSURFACE,
-    **{f"emulated:{name}": device for name, device in DEVICES.items()},
-}
-
 _REFUSED, _LIMITED = 2, 3
 _LOG_FILE, _DRIVE_FILE = "trial.jsonl", "drive.npz"
 
 Method = Callable[[at.Objective], Solution]
-
-
-class Bench(NamedTuple):
-    """What a trial works with."""
-
-    device: hardware.Device
-    open_link: Callable[[], hardware.Link]
-    sensor: hardware.Sensor
 
 
 def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
@@ -58,14 +41,6 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
     add = parser.add_argument
-    add("--device", required=True, choices=[*DEVICES, *EMULATED])
-    add("--serial", help="number of the USB chip, where several are plugged in")
-    add(
-        "--transducers",
-        type=indices,
-        help="which of the device's the scene's are, as 102-105,118; by default the first",
-    )
-    add("--sensor", choices=["emulated"], default="emulated")
     add("--scene", default="three_cubes", help="a YAML file, or one of configs/scene by its name")
     add("--method", required=True, choices=list(METHODS))
     add("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings of the method, as levels=8")
@@ -83,16 +58,8 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
     limit("--duty-cycle", default=hardware.Limits.duty_cycle, help="share of the time on (%(default)s)")
     add("--output", type=Path, help="folder of log, drive and report; outputs/hardware_SCENE_METHOD")
     add("--dry-run", action="store_true", help="show the frames of an emulated trial; no device is opened")
-    emulated = parser.add_argument_group("emulated bench")
-    emulated.add_argument("--snr", type=float, help="of the microphones [dB]; none: no noise")
-    emulated.add_argument("--dead", type=indices, default=[], help="transducers of the scene that are silent")
+    add_options(parser)
     return parser.parse_args(words)
-
-
-def indices(text: str) -> list[int]:
-    """Numbers of transducers: `3,7-9` is 3, 7, 8, 9."""
-    parts = [part.partition("-") for part in text.split(",")]
-    return [one for low, _, high in parts for one in range(int(low), int(high or low) + 1)]
 
 
 def run(options: argparse.Namespace, command: str) -> None:
@@ -111,9 +78,7 @@ def run(options: argparse.Namespace, command: str) -> None:
         "method": options.method,
         "method settings": dict(OmegaConf.from_dotlist(options.set)),
         "seed": options.seed,
-        "sensor": options.sensor,
-        "snr [dB]": options.snr,
-        "dead": options.dead,
+        **settings_of(options),
     }
     method = method_of(options.method, settings["method settings"], options.seed)
     simulated = at.SimulatedObjective(scene, at.make_propagator(scene))
@@ -144,29 +109,6 @@ def method_of(name: str, settings: dict[str, Any], seed: int) -> Method:
     return functools.partial(function, **settings, **({"seed": seed} if "seed" in parameters else {}))
 
 
-def bench_of(options: argparse.Namespace, simulated: at.SimulatedObjective) -> Bench:
-    """The device, how it is opened, and the sensor."""
-    count = len(simulated.scene.array)
-    device = {**DEVICES, **EMULATED}[options.device]
-    transducers = options.transducers or list(range(count))
-    emulated = options.dry_run or options.device in EMULATED
-    if not emulated:
-        if options.transducers is None and count != device.transducers:
-            raise ValueError(
-                f"--transducers: none; must say which {count} of the {device.transducers} transducers of "
-                f"{device.name} the scene's are"
-            )
-        raise ValueError("--sensor: none for a real device yet")
-    matrix = simulated.transfer_matrix
-    bench = hardware.EmulatedBench(device, matrix, transducers, dead=options.dead)
-    sensor = hardware.EmulatedSensor(bench, options.snr, options.seed)
-    if options.dry_run:
-        return Bench(
-            device, lambda: hardware.Link(device, DryPort(bench, device, print), transducers), sensor
-        )
-    return Bench(device, lambda: hardware.open_link(device, transducers, backend=bench.bus), sensor)
-
-
 def measure(
     scene: at.Scene,
     bench: Bench,
@@ -178,15 +120,22 @@ def measure(
 ) -> tuple[Solution, hardware.Preflight, hardware.EvaluationLog]:
     """Check the transducers, and run the method on the device; it is silent afterwards."""
     steps = expected.history.shape[1]
-    with hardware.ended_by_signals(), bench.open_link() as link, show_progress(steps) as progress:
+    points = len(scene.control_points)
+    with (
+        hardware.ended_by_signals(),
+        bench.sensor() as sensor,
+        bench.link() as link,
+        show_progress(steps) as progress,
+    ):
         limited = hardware.LimitedLink(link, limits)
         objective = hardware.HardwareObjective(
-            scene, limited, bench.sensor, folder / _LOG_FILE, settings, watcher(progress)
+            scene, limited, sensor, folder / _LOG_FILE, settings, watcher(progress)
         )
         if objective.log.evaluations:
             logging.info("going on after %d evaluations", len(objective.log.evaluations))
         progress.begin("pre-flight check")
-        preflight = hardware.check_transducers(limited, bench.sensor, len(scene.control_points))
+        with silence_expected():
+            preflight = hardware.check_transducers(limited, sensor, points)
         if len(preflight.dead) == len(scene.array):
             raise ValueError("the sensor hears no transducer; check the device's power, and the sensor")
         logging.info("the sensor hears %d of %d", len(scene.array) - len(preflight.dead), len(scene.array))
@@ -194,9 +143,22 @@ def measure(
             logging.warning("not heard, counted from 0: %s", ", ".join(map(str, preflight.dead)))
         found = method(at.Quantised(objective, **bench.device.quantised))
         limited.off()
-        if not hardware.hears_silence(bench.sensor, preflight, len(scene.control_points)):
+        with silence_expected():
+            silent = hardware.hears_silence(sensor, preflight, points)
+        if not silent:
             logging.warning("the sensor hears more than before the trial: are the outputs off?")
     return found, preflight, objective.log
+
+
+@contextlib.contextmanager
+def silence_expected() -> Iterator[None]:
+    """Have an oscilloscope not warn that it hears nothing."""
+    scope = logging.getLogger("autdtorch.hardware.scope")
+    scope.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        scope.setLevel(logging.NOTSET)
 
 
 def watcher(progress: Progress) -> Callable[[hardware.Evaluation], None]:

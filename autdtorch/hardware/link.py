@@ -15,8 +15,8 @@ from autdtorch.hardware.devices import Device
 from autdtorch.hardware.usb import LinkError, Port, find_device
 from autdtorch.validation import integer_at_least, invalid, not_negative
 
-#: Default settle time [s]. Sound goes 1.7 m in it; a T4010A1 rings up in some 30 periods, 0.75 ms, by the model
-#: in the emulator of AUTD3's kit.
+#: Default settle time [s]. Sound goes 1.7 m in it; a T4010A1 rings up in some 30 periods, 0.75 ms, as the
+#: emulator of AUTD3's kit models it.
 SETTLE = 5e-3
 
 

@@ -61,6 +61,15 @@ def test_without_noise_the_report_says_that_it_is_the_simulation(run, tmp_path: 
     assert report.count("| 1.000 |") == 3
 
 
+def test_an_oscilloscope_on_the_emulated_bus_is_the_sensor(run, tmp_path: Path, caplog):
+    assert run(*EMULATED, "--sensor", "scope", "--method", "lssg") == 0
+    assert "the sensor hears 9 of 9" in caplog.text
+    assert "cannot be told from the noise" not in caplog.text  # of silence, nothing else is expected
+    misfit = re.search(r"differ by (\S+) %", (tmp_path / "out" / "report.md").read_text())
+    assert misfit is not None
+    assert 0 < float(misfit[1]) < 5  # 8 bits for 20 Pa, where there is 1 Pa
+
+
 def test_a_dry_run_shows_the_frames_and_leaves_nothing(run, tmp_path: Path, capsys):
     assert run(*EMULATED, "--dry-run", "--device", "sonicsurface", "--transducers", "0-2,16-18,32-34") == 0
     lines = capsys.readouterr().out.splitlines()
@@ -77,8 +86,13 @@ def test_a_dry_run_shows_the_frames_and_leaves_nothing(run, tmp_path: Path, caps
         (("--max-evaluations", "5"), 3, "5 evaluations are made, the limit: the outputs are off"),
         (("--amplitude-limit", "0.5"), 2, "amplitude: 0.5; must be >= 1"),
         (("--set", "level=4"), 2, "unknown key 'level'; gabs has first, levels, order, passes"),
+        (("--device", "openmpd"), 2, "--sensor: None; must be scope, file or manual on a real device"),
         (("--dead", "0-8"), 2, "the sensor hears no transducer"),
-        (("--device", "sonicsurface"), 2, "must say which 9 of the 256 transducers of SonicSurface"),
+        (
+            ("--device", "sonicsurface", "--sensor", "manual"),
+            2,
+            "must say which 9 of the 256 transducers of SonicSurface",
+        ),
     ],
 )
 def test_a_trial_that_may_not_be_made_ends_with_one_line(run, caplog, words, status, message):
