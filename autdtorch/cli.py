@@ -121,7 +121,8 @@ def _in_one_line(error: Exception) -> str:
     text = str(error)
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = error.missing_cfg_file.rpartition("/")
-        return f"{group}: {name!r}; must be one of {', '.join(error.options)}"
+        brings = "; pip install 'autdtorch[cluster]' brings more" if group == "hydra/launcher" else ""
+        return f"{group}: {name!r}; must be one of {', '.join(error.options)}{brings}"
     # Hydra would advise to add the key, which we would then refuse.
     if unknown := re.match(r"Could not override '(.+)'", text):
         key = getattr(error.__cause__, "full_key", None) or unknown[1]

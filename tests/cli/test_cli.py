@@ -135,7 +135,7 @@ WRONG = [
     (["experiment=paper", "methods.gabs.levels=0"], "method gabs: levels: 0"),
     (["experiment=paper", "trials.gabs=0"], r"trials\.gabs: 0; must be an integer >= 1"),
     (["three_cubes"], "three_cubes: must be key=value"),
-    (["hydra/launcher=nope"], "hydra/launcher: 'nope'; must be one of basic, joblib, slurm"),
+    (["hydra/launcher=nope"], r"hydra/launcher: 'nope'; must be one of basic, joblib.*autdtorch\[cluster\]"),
     (["collect"], "collect: ''; must be one folder"),
     (["collect", "."], r"\.: no finished study \(results\.h5\) there or below"),
     (["experiment=paper", "scenes=3"], "scenes: 3; must be a mapping"),
