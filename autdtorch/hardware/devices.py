@@ -119,10 +119,16 @@ def openmpd_boards(boards: Sequence[OpenMPDBoard]) -> Device:
 
     def played(frame: bytes) -> torch.Tensor:
         messages = (frame[start : start + 2 * BOARD] for start in range(0, len(frame), 2 * BOARD))
-        parts = zip(boards, messages, strict=True)
-        return torch.cat([_openmpd_played(message)[torch.tensor(board.pins)] for board, message in parts])
+        return torch.cat([_heard(board, message) for board, message in zip(boards, messages, strict=True)])
 
     return replace(OPENMPD, transducers=BOARD * len(boards), frame=frame, played=played, serials=names)
+
+
+def _heard(board: OpenMPDBoard, message: bytes) -> torch.Tensor:
+    """The drive (256,) that a calibrated board makes of a message; rounding may not take it above 1."""
+    sent = _openmpd_played(message)[torch.tensor(board.pins)]
+    heard = torch.where(sent == 0, sent, sent / board.calibrated(torch.ones(BOARD, dtype=sent.dtype)))
+    return heard / heard.abs().clamp(min=1)
 
 
 def ultraino_boards(boards: int = 1) -> Device:

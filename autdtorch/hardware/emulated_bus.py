@@ -140,6 +140,10 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
     def release_interface(self, dev_handle: int, intf: int) -> None:
         """Nobody else is there."""
 
+    def clear_halt(self, dev_handle: int, ep: int) -> None:
+        """Nothing stalls."""
+        self._chip(dev_handle)
+
     def is_kernel_driver_active(self, dev_handle: int, intf: int) -> bool:
         """There is no kernel."""
         return False
@@ -168,10 +172,6 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
             raise stall()
         return _fill(data, answer[: len(data)])
 
-    def clear_halt(self, dev_handle: int, ep: int) -> None:
-        """Nothing stalls."""
-        self._chip(dev_handle)
-
     def bulk_write(self, dev_handle: int, ep: int, intf: int, data: array[int], timeout: int) -> int:
         """All of it, at once."""
         self._chip(dev_handle).write(data.tobytes())
@@ -184,13 +184,18 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
     def _chip(self, dev: int) -> EmulatedDevice:
         chip = self.chips[dev]
         if not chip.present:
-            raise USBError("No such device (it may have been disconnected)", errno=errno.ENODEV)
+            raise unplugged()
         return chip
 
 
 def stall() -> USBError:
     """The error of a request that a device refuses."""
     return USBError("Pipe error", errno=errno.EPIPE)
+
+
+def unplugged() -> USBError:
+    """The error of a request to a device that is gone."""
+    return USBError("No such device (it may have been disconnected)", errno=errno.ENODEV)
 
 
 def time_out() -> USBError:

@@ -24,6 +24,7 @@ class _Maker:
     identity: str
     time_scale: str
     capture: str  # the command after which a capture is there
+    clear: str | None
     ignored: frozenset[str]  # settings and commands that change nothing here
     answers: dict[str, str]
     points: int
@@ -36,14 +37,14 @@ class _Maker:
 _MAKERS = {
     "Keysight": _Maker(
         "KEYSIGHT TECHNOLOGIES,DSO-X 3024T,EMULATED,07.50",
-        "TIM:SCAL", "DIG",
+        "TIM:SCAL", "DIG", None,
         frozenset({"ACQ:TYPE", "TRIG:SWE", "WAV:FORM", "WAV:UNS", "WAV:POIN"}),
         {"*OPC?": "1"},
         points=1000, codes_per_division=32, middle=128, clipped=(1, 255), digits=8,
     ),
     "Rigol": _Maker(
         "RIGOL TECHNOLOGIES,DS1104Z,EMULATED,00.04.04",
-        "TIM:MAIN:SCAL", "TFOR",
+        "TIM:MAIN:SCAL", "TFOR", "CLE",
         frozenset({"ACQ:TYPE", "SING", "WAV:FORM", "WAV:MODE"}),
         {"TRIG:STAT?": "STOP"},
         points=1200, codes_per_division=25, middle=127, clipped=(0, 255), digits=9,
@@ -128,6 +129,8 @@ class EmulatedScope:
             self._scales[number] = float(argument)
         elif header == "WAV:SOUR":
             self._source = int(argument[-1]) - 1
+        elif header == self._maker.clear:
+            self._codes = []
         elif header == self._maker.capture:
             self._capture()
         elif header.endswith("?") and (answer := self._answer(header)) is not None:

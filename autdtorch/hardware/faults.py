@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import errno
 from array import array
 from collections.abc import Sequence
 from typing import Literal, TypeAlias
 
-from usb.core import USBError, USBTimeoutError
-
-from autdtorch.hardware.emulated_bus import EmulatedBus
-from autdtorch.hardware.emulated_chips import EmulatedChip
+from autdtorch.hardware.emulated_bus import EmulatedBus, EmulatedDevice, stall, time_out, unplugged
 from autdtorch.validation import integer_at_least, require_one_of
 
 #: "time-out" and "short write": a transfer ends in mid-frame, with an error or without, and the chip takes
@@ -27,7 +23,7 @@ class FaultyBus(EmulatedBus):
         struck: whether it has.
     """
 
-    def __init__(self, chips: Sequence[EmulatedChip], fault: Fault, after: int) -> None:
+    def __init__(self, chips: Sequence[EmulatedDevice], fault: Fault, after: int) -> None:
         """Plug the chips in.
 
         Args:
@@ -70,7 +66,7 @@ class FaultyBus(EmulatedBus):
         if self._fault == "short write":
             return 0
         if self._fault == "time-out":
-            raise USBTimeoutError("Operation timed out", errno=errno.ETIMEDOUT)
+            raise time_out()
         if self._fault == "stall":
-            raise USBError("Pipe error", errno=errno.EPIPE)
-        raise USBError("No such device (it may have been disconnected)", errno=errno.ENODEV)
+            raise stall()
+        raise unplugged()

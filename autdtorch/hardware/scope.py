@@ -20,7 +20,7 @@ from autdtorch.validation import integer_at_least, invalid, positive
 
 logger = logging.getLogger(__name__)
 
-_PERIODS_A_DIVISION = 5  # 40 to 60 periods on a screen, some 20 samples each
+_PERIODS_A_DIVISION = 5  # 50 or 60 on a screen, 20 samples each
 _DIVISIONS = 3.5  # that the loudest sound fills above and below the middle; there are 4 or more
 _CAPTURE_TIME = 2.0  # [s] after which a capture must be there
 _QUIET = 5  # standard errors

@@ -124,7 +124,7 @@ RIGOL = Dialect(
         ":WAVeform:FORMat BYTE",
     ),
     set_up_input=_INPUT,
-    capture=(":SINGle", ":TFORce"),
+    capture=(":CLEar", ":SINGle", ":TFORce"),  # cleared, so that no old capture is taken for the new
     status=":TRIGger:STATus?",
     ready="STOP",
     origin_in_codes=True,

@@ -22,6 +22,8 @@ def test_a_frame_is_all_phases_then_all_intensities():
     frame = torch.tensor(list(autd3_device(boards=2).frame(drive)))
     assert all(map(torch.equal, Levels(frame[:498], frame[498:]), autd3_levels(drive)))
     assert not any(autd3_device().frame(0 * drive[:249]))
+    played = autd3_device(boards=2).played(autd3_device(boards=2).frame(drive))
+    torch.testing.assert_close(played, drive, rtol=0, atol=1 / 510 + torch.pi / 256)  # half a level each
 
 
 def test_without_the_kit_there_is_a_hint(monkeypatch):

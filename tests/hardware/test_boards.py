@@ -1,5 +1,6 @@
 """Boards of OpenMPD by their files: pins, calibration, and several of them by their serial numbers."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -42,7 +43,7 @@ def test_boards_of_files_play_the_drive_that_was_asked_for():
     with open_link(device, backend=bench.bus) as link:
         link.play(drive)
         torch.testing.assert_close(bench.pressure(), drive, rtol=0, atol=1e-12)  # rounding of the angles
-        torch.testing.assert_close(link.played(drive), bench.drive(), rtol=0, atol=1e-12)
+        torch.testing.assert_close(link.played(drive), drive, rtol=0, atol=1e-12)
     assert bench.drive().abs().max() == 0
 
 
@@ -59,8 +60,13 @@ def test_what_a_frame_has_a_device_play_is_read_back(device):
 
 def test_gains_lower_the_duty():
     one = board("half", 0, gain=0.5)
-    frame = openmpd_boards([one]).frame(torch.ones(256).cdouble())
+    device = openmpd_boards([one])
+    frame = device.frame(torch.ones(256).cdouble())
     assert set(frame[256:]) == {21}  # 128 asin(1/2) / pi = 21.3
+    heard = torch.full((256,), 2 * math.sin(21 * math.pi / 128), dtype=torch.float64)
+    torch.testing.assert_close(device.played(frame).abs(), heard, rtol=1e-12, atol=0)
+    assert device.played(frame).angle().abs().max() < torch.pi / 128 + 1e-9
+    assert not device.played(device.frame(torch.zeros(256).cdouble())).any()
 
 
 def test_a_board_that_is_not_there_is_named_and_the_others_are_let_go():

@@ -108,7 +108,7 @@ def test_overload_is_an_error_that_names_input_and_pressure():
 
 
 def test_silence_is_a_warning_that_names_input_and_noise(caplog):
-    bench = Bench([1.0, 0.0], noise=0.1 * SENSITIVITY, seed=0)
+    bench = Bench([0.1, 0.0], noise=0.1 * SENSITIVITY, seed=0)
     with caplog.at_level(logging.WARNING):
         bench.sensor(captures=10).read()
     assert [record.getMessage()[:8] for record in caplog.records] == ["input 2:"]
@@ -144,6 +144,16 @@ def test_an_unplugged_oscilloscope_and_one_of_another_maker_are_errors():
     sensor = bench.sensor()
     bench.instrument.present = False
     with pytest.raises(LinkError, match="disconnected"):
+        sensor.read()
+
+
+def test_a_capture_that_does_not_come_is_not_taken_for_the_last():
+    bench = Bench([1.0, 2.0], RIGOL)
+    sensor = bench.sensor()
+    sensor.read()
+    execute = bench.scope.execute
+    bench.scope.execute = lambda line: None if line == ":TFORce" else execute(line)
+    with pytest.raises(LinkError, match=r"answer :WAVeform:PREamble\?.*time-out"):
         sensor.read()
 
 

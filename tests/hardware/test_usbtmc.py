@@ -65,12 +65,21 @@ def test_a_header_that_is_no_answer_is_refused(header):
 @settings(max_examples=30, deadline=None)
 @example(data=bytes(46), longest=52, empty=False)  # 12 + 52 bytes, a whole packet
 @example(data=bytes(174), longest=500, empty=True)  # three whole packets
+@example(data=bytes(174), longest=500, empty=False)
 @given(data=st.binary(max_size=600), longest=st.integers(1, 700), empty=st.booleans())
 def test_a_block_of_any_bytes_comes_back_from_transfers_of_any_length(data, longest, empty):
     port, echo = port_to(f"#3{len(data):03d}".encode() + data + b"\n", longest, empty)
     for _ in range(2):
         assert port.ask_block(":WAV:DATA?") == data
     assert echo.heard == 2 * [":WAV:DATA?"]
+
+
+def test_what_broke_off_is_cleared_before_the_first_question():
+    echo = Echo(b"1\n")
+    instrument = EmulatedInstrument(*CHIP, "E1", echo)
+    instrument.write(message(TELL, 1, 4, 0, b"*RST"))  # a message that does not end
+    assert UsbtmcPort(find_device([CHIP], backend=EmulatedBus([instrument]))).ask("*OPC?") == "1"
+    assert echo.heard == ["*OPC?"]
 
 
 def test_tags_go_round():
