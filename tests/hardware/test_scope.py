@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 
+from autdtorch.conditions import Quantised, random_rms
 from autdtorch.drive import drive_from_phases
 from autdtorch.hardware import (
     KEYSIGHT,
@@ -20,6 +21,7 @@ from autdtorch.hardware import (
 )
 from autdtorch.hardware.emulated_bus import EmulatedBus
 from autdtorch.hardware.scpi import Dialect
+from autdtorch.optim.gabs import gabs
 
 CHIP = (0x2A8D, 0x1770)
 FREQUENCY = 40e3
@@ -184,6 +186,22 @@ def test_an_evaluation_through_device_and_oscilloscope_is_the_simulated_pressure
         measured = trial.objective(link, sensor)(drive[None])
     worst = 2 / math.pi * loudest / 3.5 / 32
     torch.testing.assert_close(measured, trial.simulated(drive[None]), rtol=0, atol=worst)
+
+
+def test_a_method_finds_the_simulations_focus_through_a_noisy_oscilloscope(trial):
+    bench = trial.bench()
+    matrix = trial.simulated.transfer_matrix
+    # 30 dB below the rms pressure over control points and random phases, in every sample.
+    noise = SENSITIVITY * random_rms(matrix) * 10 ** (-30 / 20)
+    scope = EmulatedScope(bench.pressure, FREQUENCY, SENSITIVITY, [0, 1], noise=noise, drift=0.01)
+    scope.plug_into(bench.bus, CHIP)
+    loudest = float(matrix.abs().sum(dim=1).max())
+    with trial.link(bench) as link, open_scope(CHIP, backend=bench.bus) as oscilloscope:
+        microphones = [Microphone(number, SENSITIVITY, loudest) for number in (1, 2)]
+        sensor = ScopeSensor(oscilloscope, FREQUENCY, microphones)
+        found = gabs(Quantised(trial.objective(link, sensor), levels=32), levels=4)
+    expected = gabs(Quantised(trial.simulated, levels=32), levels=4).score
+    assert float(trial.simulated(found.drive).min()) == pytest.approx(float(expected), rel=0.05)
 
 
 @pytest.mark.parametrize("microphones", [[], [Microphone(1, 0.01, 1.0), Microphone(1, 0.01, 1.0)]])
