@@ -20,6 +20,7 @@ from autdtorch.hardware import (
     open_scope,
 )
 from autdtorch.hardware.emulated_bus import EmulatedBus
+from autdtorch.hardware.emulated_usbtmc import Fault
 from autdtorch.hardware.scpi import Dialect
 from autdtorch.optim.gabs import gabs
 
@@ -127,16 +128,26 @@ def test_silence_is_a_warning_that_names_input_and_noise(caplog):
         ("garbage", r"header .* does not answer request \d+"),
     ],
 )
-def test_a_fault_on_the_wire_is_an_error_and_a_new_start_helps(fault, message):
-    bench = Bench([1.0, 2.0])
-    sensor = bench.sensor()
-    bench.instrument.fault = fault
+def test_a_fault_on_the_wire_ends_the_trial_silently_and_another_goes_on(trial, fault, message):
+    def measure(count: int, last: Fault | None) -> torch.Tensor:
+        instrument.fault = None
+        with trial.link(bench) as link, open_scope(CHIP, backend=bench.bus) as oscilloscope:
+            microphones = [Microphone(number, SENSITIVITY, loudest) for number in (1, 2)]
+            objective = trial.objective(link, ScopeSensor(oscilloscope, FREQUENCY, microphones))
+            objective(torch.stack(drives[: count - 1]))
+            instrument.fault = last
+            return objective(drives[count - 1][None])
+
+    bench = trial.bench()
+    instrument = EmulatedScope(bench.pressure, FREQUENCY, SENSITIVITY, [0, 1]).plug_into(bench.bus, CHIP)
+    drives = [drive_from_phases(torch.arange(16) * step * 2 * math.pi / 32) for step in range(3)]
+    loudest = float(trial.simulated(torch.stack(drives)).max())
     with pytest.raises(LinkError, match=message):
-        sensor.read()
-    bench.open.close()
-    bench.instrument.fault = None
-    again = open_scope(CHIP, backend=bench.bus)
-    assert sensor_at(again, 2).read() == pytest.approx([1.0, 2.0], abs=RESOLUTION)
+        measure(2, fault)
+    assert bench.firmware.drive().abs().max() == 0
+    assert len(trial.log.read_text().splitlines()) == 2  # what the trial is, and one evaluation
+    expected = trial.simulated(drives[2][None])
+    torch.testing.assert_close(measure(3, None), expected, rtol=0, atol=2 / math.pi * loudest / 3.5 / 32)
 
 
 def test_an_unplugged_oscilloscope_and_one_of_another_maker_are_errors():
