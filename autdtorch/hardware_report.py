@@ -35,16 +35,17 @@ Made by `{command}` with autdtorch {version}, {begin} to {end}.
 
 {points}
 
-The drive that was found. The simulation knows neither the strength of the transducers nor the calibration of
-the sensor, so that its pressures are multiplied by one factor, {scale:.4g}, fitted to all {evaluations}
-evaluations by least squares. These then differ by {misfit:.2g} % (rms, of the rms measured).
+The drive that was found, in the simulation without the transducers that are not heard. It knows neither the
+strength of the transducers nor the calibration of the sensor, so that its pressures are multiplied by one
+factor, {scale:.4g}, fitted to all {evaluations} evaluations by least squares. These then differ by
+{misfit:.2g} % (rms, of the rms measured).
 
 ## Convergence
 
 ![convergence](convergence.png)
 
-Best score so far. Simulated: the same method with the same seed in the simulation, without noise, times the
-factor.
+Best score so far. Simulated: the same method with the same seed in the simulation, all transducers heard and
+no noise, times the factor.
 
 ## Pre-flight check
 
@@ -108,9 +109,11 @@ def write_hardware_report(
     folder.mkdir(parents=True, exist_ok=True)
     begin, end = (datetime.fromisoformat(evaluations[place].time) for place in (0, -1))
     drives = torch.stack([evaluation.drive for evaluation in evaluations])
-    fit = compare(torch.stack([evaluation.pressure for evaluation in evaluations]), simulated(drives))
     scene = simulated.scene
-    histories = {"simulated": fit.scale * expected.history, "measured": found.history}
+    heard = torch.ones(len(scene.array), dtype=torch.float64)
+    heard[preflight.dead] = 0
+    fit = compare(torch.stack([evaluation.pressure for evaluation in evaluations]), simulated(heard * drives))
+    histories = {"measured": found.history, "simulated": fit.scale * expected.history}
     plot_convergence({scene.name or "scene": histories}).savefig(folder / _FIGURE)
     same = torch.isclose(found.drive, expected.drive, rtol=0, atol=1e-9)
     text = _TEXT.format(
@@ -124,7 +127,9 @@ def write_hardware_report(
         weakest=found.pressure.min(),
         same=int(same.sum()),
         transducers=same.numel(),
-        points=_points(scene.control_points, found.pressure[0], fit.scale * simulated(found.drive)[0]),
+        points=_points(
+            scene.control_points, found.pressure[0], fit.scale * simulated(heard * found.drive)[0]
+        ),
         scale=fit.scale,
         misfit=100 * fit.misfit,
         preflight=_preflight(preflight),

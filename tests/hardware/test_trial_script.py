@@ -47,6 +47,7 @@ def test_a_trial_leaves_log_drive_and_report_and_is_not_repeated(run, tmp_path: 
     assert (out / "trial.jsonl").read_text() == log
     report = (out / "report.md").read_text()
     assert "**Not heard**, counted from 0: 4." in report
+    assert report.count("| 1.000 |") == 3  # the simulation is told
     assert (out / "convergence.png").exists()
     assert len(load_drive(out / "drive.npz")) == 9
 
@@ -65,7 +66,7 @@ def test_an_oscilloscope_on_the_emulated_bus_is_the_sensor(run, tmp_path: Path, 
     assert run(*EMULATED, "--sensor", "scope", "--method", "lssg") == 0
     assert "the sensor hears 9 of 9" in caplog.text
     assert "cannot be told from the noise" not in caplog.text  # of silence, nothing else is expected
-    misfit = re.search(r"differ by (\S+) %", (tmp_path / "out" / "report.md").read_text())
+    misfit = re.search(r"differ by\s+(\S+) %", (tmp_path / "out" / "report.md").read_text())
     assert misfit is not None
     assert 0 < float(misfit[1]) < 5  # 8 bits for 20 Pa, where there is 1 Pa
 
