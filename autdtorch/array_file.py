@@ -103,7 +103,7 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray[Any, Any]]:
     try:
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
-    except (ValueError, BadZipFile, EOFError, AttributeError) as error:
+    except (ValueError, BadZipFile, EOFError, TypeError) as error:  # TypeError: a single array, .npy
         raise ValueError(f"{path}: {error}; must be a .npz file of plain arrays") from error
 
 

@@ -15,7 +15,7 @@ import re
 import shlex
 import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 
@@ -26,6 +26,7 @@ from hydra.errors import HydraException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError  # type: ignore[import-untyped]
 
 if TYPE_CHECKING:
     from autdtorch.results import StudyResult
@@ -38,7 +39,7 @@ Method: TypeAlias = "functools.partial[Any]"
 PLANE_FILE = "plane.png"
 
 _REFUSED = 2
-_REFUSALS = (ValueError, OSError, HydraException, OmegaConfBaseException)
+_REFUSALS = (ValueError, OSError, HydraException, OmegaConfBaseException, YAMLError)
 _INTERRUPTED = 130  # as a shell reports a process that SIGINT ended
 _NO_METHOD_SETTINGS = ("objective", "trials", "seed", "score")  # the first three are the study's to give
 _FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -120,10 +121,14 @@ def _in_one_line(error: Exception) -> str:
     text = str(error)
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = error.missing_cfg_file.rpartition("/")
-        return f"{group}: {name!r}; must be one of {', '.join(error.options)}"
+        brings = "; pip install 'autdtorch[cluster]' brings more" if group == "hydra/launcher" else ""
+        return f"{group}: {name!r}; must be one of {', '.join(error.options)}{brings}"
     # Hydra would advise to add the key, which we would then refuse.
     if unknown := re.match(r"Could not override '(.+)'", text):
-        return f"{unknown[1]}: unknown key; autdtorch --help lists the settings"
+        key = getattr(error.__cause__, "full_key", None) or unknown[1]
+        return f"{key}: unknown key; autdtorch --help lists the settings"
+    if found := re.match(r"(Error (?:merging override|locating target) [^,\n]+)", text):
+        text = f"{found[1]}: {error.__cause__}"
     if "missing EQUAL" in text and (word := re.search(r"'(.*?)'", text)):
         return f"{word[1]}: must be key=value, such as scene=three_cubes; autdtorch --help lists the settings"
     lines = [line.strip() for line in text.splitlines()]
@@ -151,10 +156,11 @@ def _run(config: DictConfig) -> None:
 
 
 def _job_folder(overrides: str) -> str:
-    """Name of the folder of a sweep's job, short and without characters that folders cannot have."""
-    name = re.sub(r"[^\w.,=+-]", "_", overrides) or "job"
-    if len(name) <= _LONGEST_NAME:
-        return name
+    """Name of the folder of a sweep's job, short and of characters that folders can have."""
+    name = re.sub(r"[^\w.,=+-]+", "_", overrides)
+    if name == overrides and len(name) <= _LONGEST_NAME:
+        return name or "job"
+    # What was lost may be all that tells two jobs apart.
     digest = hashlib.sha256(overrides.encode()).hexdigest()[:12]
     return f"{name[: _LONGEST_NAME - len(digest) - 1]}-{digest}"
 
@@ -208,7 +214,7 @@ def _collect(arguments: list[str]) -> None:
     sweep = collect_results(folder)
     save_summary(sweep.results, sweep.swept, folder / SUMMARY_FILE)
     command = shlex.join(["autdtorch", "collect", *arguments])
-    report = write_report(sweep.results, sweep.scenes, folder, command)
+    report = write_report(sweep.results, sweep.scenes, folder, command, sweep.seeds)
     end = f"{sweep.studies} studies: the table is {folder / SUMMARY_FILE}, the report {report}"
     _print([*_table_lines(sweep.results), end])
 
@@ -242,14 +248,16 @@ def _scene(where: str, section: Mapping[str, Any]) -> Scene:
 
 def _as_text(settings: Mapping[str, Any], scenes: Mapping[str, Scene]) -> str:
     """The settings as YAML, and digests of what they name only by the path of a file."""
-    from autdtorch.obstacles import Mesh, VoxelMask
+    sections = settings["scenes"] if "scenes" in settings else dict.fromkeys(scenes, settings["scene"])
+    files = {name: digests for name, section in sections.items() if (digests := list(_file_digests(section)))}
+    return OmegaConf.to_yaml(OmegaConf.create({**settings, **({"files": files} if files else {})}))
 
-    contents = {
-        name: [obstacle.digest for obstacle in scene.obstacles if isinstance(obstacle, Mesh | VoxelMask)]
-        for name, scene in scenes.items()
-    }
-    files = {name: digests for name, digests in contents.items() if digests}
-    return OmegaConf.to_yaml(OmegaConf.create({**settings, **({"obstacle_files": files} if files else {})}))
+
+def _file_digests(section: Mapping[str, Any]) -> Iterator[str]:
+    """Digests of the files of the array and of the obstacles of a scene."""
+    for part in (section["array"], *(section.get("obstacles") or ())):
+        if part.get("path") is not None:
+            yield hashlib.sha256(Path(part["path"]).read_bytes()).hexdigest()[:16]
 
 
 def _solver(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -6,15 +6,16 @@ import logging
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import torch
 
+from autdtorch.cache import digest_of
 from autdtorch.metrics import FocusMetrics
 from autdtorch.optim import METHOD_LABELS
-from autdtorch.optim.base import Solution
+from autdtorch.optim.base import Solution, joined
 from autdtorch.results import (
     PROVENANCE_FILE,
     RESULTS_FILE,
@@ -33,7 +34,11 @@ logger = logging.getLogger(__name__)
 Settings: TypeAlias = Mapping[str, Any]
 """Flat, by dotted keys such as ``solver.spacing``."""
 
+_Named: TypeAlias = tuple[str, Settings]
+
 _METHODS = list(METHOD_LABELS)
+_FILES = "files"  # digests of what the settings name only by the path of a file
+_LONGEST_NAME = 100  # of a scene or a method; it becomes part of the names of files
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +51,14 @@ class Sweep:
         scenes: the scenes of the results, by the same names.
         swept: the settings that tell names apart, by name of scene and name of method.
         studies: how many were merged.
+        seeds: of these, each once.
     """
 
     results: StudyResult
     scenes: dict[str, Scene]
     swept: dict[tuple[str, str], Settings]
     studies: int
+    seeds: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,9 +109,8 @@ def collect_results(folder: str | os.PathLike[str]) -> Sweep:
     scenes = {scene: load_scene(next(iter(methods.values()))[0].section) for scene, methods in groups.items()}
     origin = next(iter(studies.values())).provenance
     texts = (f"# {path}\n{study.provenance.config.strip()}" for path, study in studies.items())
-    return Sweep(
-        StudyResult(replace(origin, config="\n\n".join(texts)), results), scenes, swept, len(studies)
-    )
+    merged = StudyResult(replace(origin, config="\n\n".join(texts)), results)
+    return Sweep(merged, scenes, swept, len(studies), tuple(sorted({part.seed for part in parts})))
 
 
 def _files(folder: Path, name: str) -> list[Path]:
@@ -124,11 +130,12 @@ def _parts(path: Path, study: StudyResult) -> Iterator[_Part]:
     settings = yaml.safe_load(study.provenance.config)
     if not isinstance(settings, dict) or not {"scene", "scenes"} & settings.keys():
         raise ValueError(f"{path / RESULTS_FILE}: no settings in it; must come from the command line")
+    if missing := [name for name in settings.get("scenes", ()) if name not in study.scenes]:
+        logger.warning("%s: scenes that are not finished are left out: %s", path, ", ".join(missing))
     common = {key: settings[key] for key in ("solver", "plane_spacing") if key in settings}
     for name, found in study.scenes.items():
         section = settings["scenes"][name] if "scenes" in settings else settings["scene"]
-        files = settings.get("obstacle_files", {}).get(name)
-        place = dict(_flat({"scene": section, "obstacle_files": files, **common}))
+        place = dict(_flat({"scene": section, _FILES: settings.get(_FILES, {}).get(name), **common}))
         for method in found.methods:
             search = settings["methods"][method] if "methods" in settings else settings["method"]
             flat = dict(_flat({"method": search}))
@@ -139,45 +146,85 @@ def _flat(value: object, key: str = "") -> Iterator[tuple[str, Any]]:
     items: Iterable[tuple[object, object]]
     if isinstance(value, dict):
         items = value.items()
-    elif isinstance(value, list):
+    elif isinstance(value, list) and any(isinstance(entry, dict) for entry in value):
         items = enumerate(value)
     else:
-        yield key, value
+        yield key, [_whole(entry) for entry in value] if isinstance(value, list) else _whole(value)
         return
     for name, entry in items:
         yield from _flat(entry, f"{key}.{name}" if key else str(name))
+
+
+def _whole(value: object) -> object:
+    """A whole number as an int, so that 4 and 4.0 are alike also to the eye."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _groups(
     parts: Sequence[_Part],
 ) -> tuple[dict[str, dict[str, list[_Part]]], dict[tuple[str, str], Settings]]:
     """Parts of the same settings, by scene and method, and the settings that make their names."""
+    places = _told_apart([(part.scene, part.place) for part in parts])
+    searches = _told_apart([(part.method, part.search) for part in parts])
     groups: dict[str, dict[str, list[_Part]]] = {}
     swept: dict[tuple[str, str], Settings] = {}
-    for part in sorted(parts, key=lambda part: (part.scene, _rank(part.method))):
-        place = _told_apart(part.place, [other.place for other in parts if other.scene == part.scene])
-        search = _told_apart(part.search, [other.search for other in parts if other.method == part.method])
-        scene, method = _named(part.scene, place), _named(part.method, search)
+    named = zip(_names(places), _names(searches), places, searches, parts, strict=True)
+    for scene, method, (_, place), (_, search), part in sorted(named, key=_rank):
         groups.setdefault(scene, {}).setdefault(method, []).append(part)
         swept[scene, method] = {**place, **search}
     return groups, swept
 
 
-def _rank(method: str) -> int:
-    return _METHODS.index(method) if method in _METHODS else len(_METHODS)
+def _rank(named: tuple[str, str, _Named, _Named, _Part]) -> tuple[object, ...]:
+    """Scenes by name, methods in the order of ours, and each in the order of what was swept."""
+    _, _, (scene, place), (method, search), _ = named
+    rank = _METHODS.index(method) if method in _METHODS else len(_METHODS)
+    return scene, _order(place), rank, method, _order(search)
 
 
-def _told_apart(settings: Settings, others: Sequence[Settings]) -> dict[str, Any]:
-    """The settings in which the others are not all alike."""
-    return {key: value for key, value in settings.items() if any(other.get(key) != value for other in others)}
+def _order(settings: Settings) -> list[tuple[str, bool, float, str]]:
+    """For sorting: numbers by their size, and before all else."""
+    return [
+        (key, False, value, "") if isinstance(value, int | float) else (key, True, 0.0, str(value))
+        for key, value in sorted(settings.items())
+    ]
 
 
-def _named(name: str, swept: Settings) -> str:
-    """The name with what was swept, in characters that can be part of a file's name."""
-    ends = [key.rpartition(".")[2] for key in swept]
-    shown = [end if ends.count(end) == 1 else key for key, end in zip(swept, ends, strict=True)]
-    text = ",".join([name, *(f"{key}={value}" for key, value in zip(shown, swept.values(), strict=True))])
-    return re.sub(r"[^\w.,=+-]", "_", text)
+def _told_apart(named: Sequence[_Named]) -> list[_Named]:
+    """The same names with those settings alone in which others of the name are not all alike."""
+    first: dict[str, Settings] = {}
+    varying: dict[str, set[str]] = {}
+    for name, settings in named:
+        other = first.setdefault(name, settings)
+        keys = settings.keys() | other.keys()
+        varying.setdefault(name, set()).update(key for key in keys if settings.get(key) != other.get(key))
+    return [
+        (name, {key: value for key, value in settings.items() if key in varying[name]})
+        for name, settings in named
+    ]
+
+
+def _names(named: Sequence[_Named]) -> list[str]:
+    """The names with what was swept, different where that is, in characters that names of files can have."""
+    names = [_name(name, swept) for name, swept in named]
+    digests = [digest_of(sorted(swept.items()))[:8] for _, swept in named]
+    bearers: dict[str, set[str]] = {}
+    for name, digest in zip(names, digests, strict=True):
+        bearers.setdefault(name, set()).add(digest)
+    return [
+        f"{name[:_LONGEST_NAME]}-{digest}" if len(name) > _LONGEST_NAME or len(bearers[name]) > 1 else name
+        for name, digest in zip(names, digests, strict=True)
+    ]
+
+
+def _name(name: str, swept: Settings) -> str:
+    shown = {key: value for key, value in swept.items() if key != _FILES}  # of which the paths say more
+    ends = [key.rpartition(".")[2] for key in shown]
+    alone = [ends.count(end) == 1 and end != "method" for end in ends]  # the solver has a method too
+    keys = [end if short else key for key, end, short in zip(shown, ends, alone, strict=True)]
+    texts = ("x".join(map(str, value)) if isinstance(value, list) else str(value) for value in shown.values())
+    values = (re.sub(r"[^\w.+-]+", "_", text).strip("_") for text in texts)
+    return ",".join([name, *(f"{key}={value}" for key, value in zip(keys, values, strict=True))])
 
 
 def _merged_scene(methods: Mapping[str, Sequence[_Part]]) -> SceneResult:
@@ -192,12 +239,10 @@ def _merged_trials(parts: Sequence[_Part]) -> MethodResult:
     by_seed = {
         part.seed: part.result for part in sorted(parts, key=lambda part: (part.seed, part.result.trials))
     }
-    first, *others = by_seed.values()
-    kept = [
-        first,
-        *(other for other in others if not torch.equal(other.solution.drive, first.solution.drive)),
-    ]
-    solution = _joined_solution([result.solution for result in kept])
+    kept = list(by_seed.values())
+    if all(_same_trials(kept[0].solution, other.solution) for other in kept[1:]):
+        kept = kept[:1]  # no chance in it
+    solution = joined([result.solution for result in kept])
     metrics = _joined_metrics([result.metrics for result in kept])
     # A study keeps the observation plane of one trial: of those, the one nearest to the median is shown.
     median = float(solution.score[median_trial(solution.score)])
@@ -213,16 +258,9 @@ def _merged_trials(parts: Sequence[_Part]) -> MethodResult:
     )
 
 
-def _joined_solution(solutions: Sequence[Solution]) -> Solution:
-    longest = max(solution.history.shape[1] for solution in solutions)
-    columns = {
-        field.name: [getattr(solution, field.name) for solution in solutions] for field in fields(Solution)
-    }
-    columns["history"] = [
-        torch.cat([history, history[:, -1:].expand(-1, longest - history.shape[1])], dim=1)
-        for history in columns["history"]
-    ]
-    return Solution(**{name: torch.cat(parts) for name, parts in columns.items()})
+def _same_trials(one: Solution, other: Solution) -> bool:
+    """Whether all is alike that was tried, not only what was found."""
+    return torch.equal(one.drive, other.drive) and torch.equal(one.history, other.history)
 
 
 def _joined_metrics(metrics: Sequence[FocusMetrics]) -> FocusMetrics:

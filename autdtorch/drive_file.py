@@ -25,7 +25,7 @@ from autdtorch.hardware.levels import (
     sonicsurface_drive,
     sonicsurface_levels,
 )
-from autdtorch.validation import ArrayLike, invalid, require_one_of
+from autdtorch.validation import ArrayLike, invalid, real_tensor, require_one_of
 
 
 class _Device(NamedTuple):
@@ -89,7 +89,8 @@ def save_drive(
     if kind == ".csv":
         write_table(path, columns)
     else:
-        np.savez_compressed(path, allow_pickle=False, **arrays)
+        with Path(path).open("wb") as file:  # to a path, NumPy would add another .npz where it is .NPZ
+            np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
@@ -180,10 +181,15 @@ def _played(path: str | os.PathLike[str], name: str, stored: Mapping[str, npt.ND
     missing = [column for column in wanted if column not in stored]
     if missing:
         raise ValueError(f"{path}: no {', '.join(missing)}; must have {', '.join(wanted)}")
-    levels = [torch.from_numpy(stored[column]) for column in wanted]
-    # A table holds floats: whole ones become the integers they stand for, others are refused below.
-    whole = [level.long() if bool((level == level.long()).all()) else level for level in levels]
-    return _valid(path, lambda: device.drive(*whole))
+
+    def drive() -> torch.Tensor:
+        levels = [real_tensor(column, stored[column]) for column in wanted]
+        # Whole numbers become the integers they stand for; the device refuses others.
+        return device.drive(
+            *(level.long() if bool((level == level.long()).all()) else level for level in levels)
+        )
+
+    return _valid(path, drive)
 
 
 def _valid(path: str | os.PathLike[str], make: Callable[[], torch.Tensor]) -> torch.Tensor:

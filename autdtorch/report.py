@@ -13,7 +13,7 @@ from autdtorch.findings import NEAR_BOUND, find
 from autdtorch.plot import plot_convergence, plot_pareto, plot_planes, plot_scene, plot_trials
 from autdtorch.plot.style import label_of
 from autdtorch.report_html import as_page
-from autdtorch.report_tables import BASELINE, NEAR, claims, extent, findings, simulations, summary, table
+from autdtorch.report_tables import NEAR, claims, extent, findings, is_baseline, simulations, summary, table
 from autdtorch.results import RESULTS_FILE, MethodResult, SceneResult, StudyResult
 from autdtorch.scene import Scene
 from autdtorch.trial_file import TRIALS_FILE
@@ -67,9 +67,9 @@ _READINGS = """## How the paper was read
 _ORIGIN = """## Origin
 
 - versions: {versions}
-- seed: {seed}
+- {seeds}
 - source digest: `{digest}`
-- everything behind this report: `{results}` (HDF5); a line a trial: `{trials}`
+- everything behind this report{where}: `{results}` (HDF5); a line a trial: `{trials}`
 
 <details><summary>all settings</summary>
 
@@ -81,7 +81,11 @@ _ORIGIN = """## Origin
 
 
 def write_report(
-    results: StudyResult, scenes: Mapping[str, Scene], folder: str | os.PathLike[str], command: str
+    results: StudyResult,
+    scenes: Mapping[str, Scene],
+    folder: str | os.PathLike[str],
+    command: str,
+    seeds: Sequence[int] = (),
 ) -> Path:
     """Write `report.md` and its figures, and all of it as one file `report.html`.
 
@@ -90,6 +94,7 @@ def write_report(
         scenes: the scenes of `results`, by the same names.
         folder: for the report and its figures; made if need be.
         command: the command line that repeats the study.
+        seeds: of the studies that `results` were merged from; none if they are of one study, in `folder`.
 
     Returns:
         The path of `report.html`.
@@ -114,7 +119,7 @@ def write_report(
         _cost_figure(results, folder),
         _READINGS,
         simulations(results),
-        _origin(results),
+        _origin(results, seeds),
     ]
     text = "\n\n".join(part for part in parts if part) + "\n"
     (folder / REPORT_FILE).write_text(text, encoding="utf-8")
@@ -214,8 +219,9 @@ def _trial_figures(results: StudyResult, folder: Path) -> str:
 def _levels(scene: SceneResult) -> dict[str, float]:
     """Scores that methods are compared with, by label."""
     levels = {"bound": scene.bound, f"{NEAR} of the bound": NEAR_BOUND * scene.bound}
-    if BASELINE in scene.methods.keys() - _competitors(scene.methods).keys():
-        levels[label_of(BASELINE)] = float(scene.methods[BASELINE].solution.score.median())
+    for name in scene.methods:
+        if name not in _competitors(scene.methods):
+            levels[label_of(name)] = float(scene.methods[name].solution.score.median())
     return levels
 
 
@@ -251,14 +257,15 @@ def _cost_figure(results: StudyResult, folder: Path) -> str:
 
 def _competitors(methods: Mapping[str, MethodResult]) -> Mapping[str, MethodResult]:
     """All but the baseline, which stays where it is alone."""
-    return {name: method for name, method in methods.items() if name != BASELINE} or methods
+    return {name: method for name, method in methods.items() if not is_baseline(name)} or methods
 
 
-def _origin(results: StudyResult) -> str:
+def _origin(results: StudyResult, seeds: Sequence[int]) -> str:
     provenance = results.provenance
     return _ORIGIN.format(
         versions=", ".join(f"{name} {version}" for name, version in provenance.versions.items()),
-        seed=provenance.seed,
+        seeds=f"seeds: {', '.join(map(str, seeds))}" if seeds else f"seed: {provenance.seed}",
+        where=", in the folders that the settings name" if seeds else "",
         digest=provenance.source_digest,
         results=RESULTS_FILE,
         trials=TRIALS_FILE,

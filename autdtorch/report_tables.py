@@ -52,6 +52,11 @@ _BELOW_SIMULATION = """A run ends when its estimated relative distance to the st
 grid: repeat the study with a smaller `solver.spacing` to see it."""
 
 
+def is_baseline(method: str) -> bool:
+    """Whether a method is the baseline, with whatever settings."""
+    return method.partition(",")[0] == BASELINE
+
+
 def finding_rows(results: StudyResult) -> list[list[str]]:
     """A table of how near to the bound the methods come and at what cost, its head first."""
     head = ["scene", "method", "score [Pa]", "gap to the bound [%]", "evaluations"]
@@ -68,7 +73,7 @@ def _finding_cells(name: str, method: MethodResult, bound: float) -> list[str]:
     gap = f"{finding.gap.mapped(lambda share: 100 * share):.1f}"
     evaluations = f"{method.solution.evaluations.double().mean():.0f}"
     near = _median_of_reached(finding.evaluations_near)
-    if name == BASELINE:
+    if is_baseline(name):
         evaluations = near = _NO_NUMBER
     return [str(finding.score), gap, evaluations, near, f"{method.seconds.median():.2g}"]
 
@@ -122,7 +127,7 @@ def claims(results: StudyResult) -> str:
 def findings(results: StudyResult) -> str:
     """The section of what the paper does not have: gaps to the bound."""
     text = ["## Beyond the paper", table(finding_rows(results)), _BELOW_FINDINGS, _ABOUT_BOUND]
-    if any(BASELINE in scene.methods for scene in results.scenes.values()):
+    if any(is_baseline(name) for scene in results.scenes.values() for name in scene.methods):
         text.append(_ABOUT_BASELINE.format(label=label_of(BASELINE).capitalize()))
     return "\n\n".join(text)
 

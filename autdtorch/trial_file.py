@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 import torch
 
 from autdtorch.metrics import focus_metrics
-from autdtorch.optim.base import Solution
+from autdtorch.optim.base import Solution, joined
 
 logger = logging.getLogger(__name__)
 
@@ -83,7 +83,7 @@ class TrialFile:
         """What the first `trials` trials found, all of which must be there, and seconds (T,) of each."""
         each = [self._trials[scene, method, trial] for trial in range(trials)]
         seconds = torch.tensor([share for _, share in each], dtype=torch.float64)
-        return _together([solution for solution, _ in each]), seconds
+        return joined([solution for solution, _ in each]), seconds
 
     def _row(self, scene: str, method: str, trial: int) -> dict[str, Any]:
         solution, seconds = self._trials[scene, method, trial]
@@ -136,17 +136,3 @@ def _alone(found: Solution, place: int) -> Solution:
     evaluations = found.evaluations[row]
     history = found.history[row, : int(evaluations)]
     return Solution(found.drive[row], found.pressure[row], found.score[row], evaluations, history)
-
-
-def _together(trials: Sequence[Solution]) -> Solution:
-    """Trials of one row each as one solution; shorter histories go on with their last value."""
-    longest = max(trial.history.shape[1] for trial in trials)
-    histories = []
-    for trial in trials:
-        rest = trial.history[:, -1:].expand(1, longest - trial.history.shape[1])
-        histories.append(torch.cat([trial.history, rest], dim=1))
-    columns = {
-        name: torch.cat([getattr(trial, name) for trial in trials])
-        for name in ("drive", "pressure", "score", "evaluations")
-    }
-    return Solution(history=torch.cat(histories), **columns)

@@ -6,11 +6,16 @@ slower."""
 import os
 from pathlib import Path
 
+import hypothesis
 import numba
 import pytest
 import torch
 
 TESTS = Path(__file__).parent
+
+# An example may take long where the machine has other work; pytest's own limit stays.
+hypothesis.settings.register_profile("autdtorch", deadline=None)
+hypothesis.settings.load_profile("autdtorch")
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when Triton's functions are defined

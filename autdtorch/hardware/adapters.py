@@ -42,21 +42,6 @@ _CDC_REQUEST, _CDC_LINE_CODING = 0x21, 0x20  # to the interface, of its class
 class FtdiPort(UsbPort):
     """An FTDI chip with one port, as it is after a reset."""
 
-    def __init__(self, device: Any) -> None:
-        """Take the chip from the kernel's driver, and reset it.
-
-        Args:
-            device: `usb.core.Device`.
-
-        Raises:
-            LinkError: the chip refuses.
-        """
-        super().__init__(device)
-        self._request(RESET, RESET_CHIP)
-        self._request(LATENCY, _LATENCY_MS)
-        self._request(RESET, PURGE_INPUT)
-        self._request(RESET, PURGE_OUTPUT)
-
     def recover(self) -> None:
         """Clear a stall, and drop what still waits in the chip.
 
@@ -77,24 +62,15 @@ class FtdiPort(UsbPort):
         starts = range(0, len(received), length)
         return b"".join(received[start + STATUS_BYTES : start + length] for start in starts)
 
+    def _set_up(self) -> None:
+        self._request(RESET, RESET_CHIP)
+        self._request(LATENCY, _LATENCY_MS)
+        self._request(RESET, PURGE_INPUT)
+        self._request(RESET, PURGE_OUTPUT)
+
 
 class FtdiUart(FtdiPort):
     """An FT232R as a serial port: 8 bits, no parity, 1 stop bit, no flow control."""
-
-    def __init__(self, device: Any, baud: int) -> None:
-        """Take the chip and set its rate.
-
-        Args:
-            device: `usb.core.Device`.
-            baud: bits/s; the chip takes the nearest that 3 MHz over a number of eighths gives.
-
-        Raises:
-            LinkError: the chip refuses.
-        """
-        super().__init__(device)
-        self._request(DATA_FORMAT, EIGHT_N_ONE)
-        self._request(FLOW_CONTROL, 0)
-        self._request(BAUD_RATE, *baud_divisor(baud))
 
     def flush(self) -> None:
         """Wait until the chip says that its transmitter is empty.
@@ -111,6 +87,12 @@ class FtdiUart(FtdiPort):
         packet = self._call("be read", self._in.read, self._in.wMaxPacketSize)
         return int(packet[1])
 
+    def _set_up(self) -> None:
+        super()._set_up()
+        self._request(DATA_FORMAT, EIGHT_N_ONE)
+        self._request(FLOW_CONTROL, 0)
+        self._request(BAUD_RATE, *baud_divisor(self._baud))
+
 
 class FtdiFifo(FtdiPort):
     """An FT232H as a FIFO. That its EEPROM puts it into this mode is inferred, not verified."""
@@ -119,58 +101,28 @@ class FtdiFifo(FtdiPort):
 class Ch340Uart(UsbPort):
     """A CH340 as a serial port: 8 bits, no parity, 1 stop bit."""
 
-    def __init__(self, device: Any, baud: int) -> None:
-        """Take the chip and set its rate.
-
-        Args:
-            device: `usb.core.Device`.
-            baud: bits/s; the chip takes the nearest that its divisors of 48 MHz give.
-
-        Raises:
-            LinkError: the chip refuses.
-        """
-        super().__init__(device)
+    def _set_up(self) -> None:
         self._request(_CH340_INIT, 0)
-        self._request(_CH340_WRITE, _CH340_RATE, ch340_divisor(baud) | _CH340_AT_ONCE)
+        self._request(_CH340_WRITE, _CH340_RATE, ch340_divisor(self._baud) | _CH340_AT_ONCE)
         self._request(_CH340_WRITE, _CH340_LINE, _CH340_EIGHT_N_ONE)
 
 
 class Cp2102Uart(UsbPort):
     """A CP2102 as a serial port: 8 bits, no parity, 1 stop bit."""
 
-    def __init__(self, device: Any, baud: int) -> None:
-        """Take the chip and set its rate.
-
-        Args:
-            device: `usb.core.Device`.
-            baud: bits/s; the chip takes the nearest that it has.
-
-        Raises:
-            LinkError: the chip refuses.
-        """
-        super().__init__(device)
+    def _set_up(self) -> None:
         self._request(_CP2102_ENABLE, 1, kind=_CP2102_REQUEST)
         self._request(_CP2102_PURGE, _CP2102_ALL_QUEUES, kind=_CP2102_REQUEST)
-        self._request(_CP2102_BAUD, 0, data=baud.to_bytes(4, "little"), kind=_CP2102_REQUEST)
+        self._request(_CP2102_BAUD, 0, data=self._baud.to_bytes(4, "little"), kind=_CP2102_REQUEST)
         self._request(_CP2102_LINE, _CP2102_EIGHT_N_ONE, kind=_CP2102_REQUEST)
 
 
 class CdcUart(UsbPort):
     """A serial port of USB's own class, as on an Arduino Mega 2560: 8 bits, no parity, 1 stop bit."""
 
-    def __init__(self, device: Any, baud: int) -> None:
-        """Take the chip and set its rate.
-
-        Args:
-            device: `usb.core.Device`.
-            baud: bits/s.
-
-        Raises:
-            LinkError: the chip refuses.
-        """
-        super().__init__(device)
+    def _set_up(self) -> None:
         one_stop_bit, no_parity, data_bits = 0, 0, 8
-        coding = baud.to_bytes(4, "little") + bytes([one_stop_bit, no_parity, data_bits])
+        coding = self._baud.to_bytes(4, "little") + bytes([one_stop_bit, no_parity, data_bits])
         self._request(_CDC_LINE_CODING, 0, data=coding, kind=_CDC_REQUEST)
 
 

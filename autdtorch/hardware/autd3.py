@@ -114,10 +114,10 @@ class Autd3Port:
         self._send("be written to", autd3_pattern(data, self._boards))
 
     def flush(self) -> None:
-        """Nothing waits: a write has been answered when it returns."""
+        """`write` has waited for their answer."""
 
     def recover(self) -> None:
-        """The kit has found the boards again by itself, or the next write fails."""
+        """The kit leaves nothing half sent."""
 
     def close(self) -> None:
         """Let go of the boards.
@@ -162,5 +162,5 @@ def _autd3_frame(drive: torch.Tensor) -> bytes:
 
 
 def _autd3_played(frame: bytes) -> torch.Tensor:
-    phases, intensities = torch.from_numpy(np.frombuffer(frame, np.uint8).astype(np.int64)).reshape(2, -1)
-    return autd3_drive(Levels(phases, intensities))
+    values = torch.from_numpy(np.frombuffer(frame, np.uint8).astype(np.int64))
+    return autd3_drive(Levels(*values.reshape(2, -1)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 from collections.abc import Callable, Collection
 from pathlib import Path
@@ -50,7 +51,11 @@ class Port(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of the device."""
+        """Let go of the device.
+
+        Raises:
+            LinkError: it cannot be given back to the system.
+        """
         ...
 
 
@@ -88,22 +93,26 @@ def find_device(chips: Collection[tuple[int, int]], serial: str | None = None, b
 class UsbPort:
     """A chip with a bulk endpoint each way, taken from the kernel's drivers."""
 
-    def __init__(self, device: Any) -> None:
-        """Take the chip.
+    def __init__(self, device: Any, baud: int = 0) -> None:
+        """Take the chip and set it up; if that fails it is given back.
 
         Args:
             device: `usb.core.Device`.
+            baud: of its serial line [bits/s]; the chip takes the nearest that it has. 0 without one.
 
         Raises:
-            LinkError: it cannot be opened.
+            LinkError: it cannot be opened, or refuses.
         """
         self._device = device
+        self._baud = baud
         self._detached: list[int] = []
         try:
             self._call("be opened", self._take)
             self._out, self._in = self._bulk_endpoint(0), self._bulk_endpoint(_DIRECTION)
+            self._set_up()
         except BaseException:
-            self.close()
+            with contextlib.suppress(LinkError):  # the first error says more
+                self.close()
             raise
 
     def write(self, data: bytes) -> None:
@@ -131,17 +140,22 @@ class UsbPort:
         self._call("be recovered", self._device.clear_halt, self._out.bEndpointAddress)
 
     def close(self) -> None:
-        """Give the chip back to the kernel's drivers."""
+        """Give the chip back to the kernel's drivers.
+
+        Raises:
+            LinkError: a driver does not take it.
+        """
         import usb.util
-        from usb.core import USBError
 
         usb.util.dispose_resources(self._device)
-        for interface in self._detached:
-            try:
-                self._device.attach_kernel_driver(interface)
-            except USBError:  # unplugged, so that there is nothing to give back
-                break
-        usb.util.dispose_resources(self._device)
+        try:
+            while self._detached:
+                self._call("be given back", self._device.attach_kernel_driver, self._detached.pop())
+        finally:
+            usb.util.dispose_resources(self._device)
+
+    def _set_up(self) -> None:
+        """A chip without a serial line may need nothing."""
 
     def _take(self) -> None:
         import usb.util

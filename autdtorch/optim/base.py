@@ -71,6 +71,20 @@ class Solution:
         ]
 
 
+def joined(solutions: Sequence[Solution]) -> Solution:
+    """The trials of several solutions as those of one; shorter histories go on with their last value."""
+    longest = max(solution.history.shape[1] for solution in solutions)
+    histories = [
+        torch.cat([history, history[:, -1:].expand(-1, longest - history.shape[1])], dim=1)
+        for history in (solution.history for solution in solutions)
+    ]
+    columns = {
+        name: torch.cat([getattr(solution, name) for solution in solutions])
+        for name in ("drive", "pressure", "score", "evaluations")
+    }
+    return Solution(history=torch.cat(histories), **columns)
+
+
 class Ledger:
     """Evaluates drives for several trials at once, and keeps what was found.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from string import ascii_lowercase
 from typing import Any
 
 import numpy as np
@@ -66,7 +67,7 @@ def plot_trials(quantities: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
     figure = new_figure(width, 0.7 + 2.1 * len(quantities))
     axes = figure.subplots(len(quantities), squeeze=False, sharex=True)[:, 0]
     single = dict.fromkeys(methods, True)
-    for letter, ax, (label, by_scene) in zip("abcdefgh", axes, quantities.items(), strict=False):
+    for letter, ax, (label, by_scene) in zip(ascii_lowercase, axes, quantities.items(), strict=False):
         require_scenes(f"quantities[{label!r}]", by_scene)
         for scene, by_method in by_scene.items():
             for method, given in by_method.items():

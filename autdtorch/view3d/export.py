@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from autdtorch.drawing import MM
+
 if TYPE_CHECKING:
     import pyvista
 
@@ -47,9 +49,17 @@ def write(plotter: pyvista.Plotter, path: Path, caption: Sequence[str]) -> None:
 
 
 def _write_gltf(plotter: pyvista.Plotter, path: Path) -> None:
-    """With colours as drawn: VTK leaves a tint on what a texture colours, and what is translucent solid."""
+    """In metres and without camera, which PyVista does not turn with the scene; with colours as drawn.
+
+    VTK leaves a tint on what a texture colours, and what is translucent solid.
+    """
     plotter.export_gltf(str(path))
     content = json.loads(path.read_text(encoding="utf-8"))
+    del content["cameras"]
+    for node in content["nodes"]:
+        node.pop("camera", None)
+        if "children" in node:
+            node["scale"] = [1 / MM] * 3
     for material in content["materials"]:
         surface = material["pbrMetallicRoughness"]
         if "baseColorTexture" in surface:

@@ -44,7 +44,7 @@ def view3d(
         reference: the pressure of 0 dB [Pa], > 0. By default the largest on the plane or, without `field`, in
             the volume. Give one to compare pictures.
         save: file to write, by its suffix: ``.png``; ``.html`` to turn in a browser (extra ``notebook``);
-            ``.gltf`` for other 3D programs, without axes and bars.
+            ``.gltf`` for other 3D programs, in m and without axes and bars.
         off_screen: False for a plotter whose ``show()`` opens a window.
 
     Returns:

@@ -116,6 +116,13 @@ WRONG = [
     (["scene.array.pitch=nan"], "scene: array: pitch: nan m; must be finite"),
     (["method._target_=autdtorch.tabu"], r"Error locating target 'autdtorch\.tabu'"),
     (["~method._target_"], "method: no _target_"),
+    (["method._target_=nowhere.found"], "Error locating target 'nowhere.found': .*No module named 'nowhere'"),
+    (
+        ["scene.obstacles.0.density=5"],
+        "Error merging override scene.obstacles.0.density=5: list index out of",
+    ),
+    (["scene.array={type: file, path: a.csv}"], r"scene\.array\.path: unknown key"),
+    (["--config-dir", ".", "scene=torn"], "while parsing a flow .*torn.yaml"),
     (["solver.spacing=[1"], "no viable alternative at input"),
     (["seed=1,2"], "Ambiguous value for argument 'seed=1,2'"),
     (["--config-dir", "nowhere"], "Additional config directory '.*nowhere' not found"),
@@ -128,7 +135,7 @@ WRONG = [
     (["experiment=paper", "methods.gabs.levels=0"], "method gabs: levels: 0"),
     (["experiment=paper", "trials.gabs=0"], r"trials\.gabs: 0; must be an integer >= 1"),
     (["three_cubes"], "three_cubes: must be key=value"),
-    (["hydra/launcher=nope"], "hydra/launcher: 'nope'; must be one of basic, joblib, slurm"),
+    (["hydra/launcher=nope"], r"hydra/launcher: 'nope'; must be one of basic, joblib.*autdtorch\[cluster\]"),
     (["collect"], "collect: ''; must be one folder"),
     (["collect", "."], r"\.: no finished study \(results\.h5\) there or below"),
     (["experiment=paper", "scenes=3"], "scenes: 3; must be a mapping"),
@@ -149,6 +156,8 @@ def test_a_wrong_command_gets_one_line(
 
     monkeypatch.setattr(autdtorch.study, "_run_scene", refuse)
     (tmp_path / "file").touch()
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "torn.yaml").write_text("frequency: [1\n", encoding="utf-8")
     assert run(*arguments) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -221,6 +230,17 @@ def test_a_changed_obstacle_file_is_computed_again(
     )
     for size, reused in ((2, False), (2, True), (3, False)):
         np.save(tmp_path / "mask.npy", np.ones((size,) * 3, bool))
+        assert run(*command) == 0
+        assert ("re-using" in capsys.readouterr().err) is reused
+
+
+def test_a_changed_array_file_is_computed_again(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    array = "{type: file, path: array.csv, center: [1e-3, 50e-3, 50e-3], normal: [1, 0, 0]}"
+    command = ("method=lssg", "plane_spacing=10e-3", "output=out", "~scene.array", f"+scene.array={array}")
+    for pitch, reused in ((10, False), (10, True), (11, False)):
+        (tmp_path / "array.csv").write_text(f"x [mm],y [mm],z [mm]\n0,0,0\n{pitch},0,0\n", encoding="utf-8")
         assert run(*command) == 0
         assert ("re-using" in capsys.readouterr().err) is reused
 

@@ -71,6 +71,15 @@ def test_the_folder_of_a_job_has_a_name_that_every_file_system_takes(run: Run, t
     assert len(folder) <= 150
 
 
+def test_jobs_that_differ_in_a_character_that_folders_cannot_have_do_not_share_one(
+    run: Run, tmp_path: Path
+) -> None:
+    names = ("scene.name='a b'", "scene.name='a/b'")
+    for name in names:
+        assert run("-m", *QUICK, "method=lssg", name) == 0
+    assert len(jobs(tmp_path)) == 2
+
+
 def test_a_sweep_says_where_its_folders_are_set(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("-m", *QUICK, "output=here") == 2
     assert "a sweep has a folder for each job in hydra.sweep.dir" in capsys.readouterr().err
@@ -130,7 +139,9 @@ def test_collected_seeds_are_trials_and_other_settings_make_names(
     assert float(rows[2]["median score [Pa]"]) == pytest.approx(
         float(methods["gabs,levels=8"].solution.score.quantile(0.5)), rel=1e-12
     )
-    assert (tmp_path / "multirun" / "report.md").exists()
+    report = (tmp_path / "multirun" / "report.md").read_text(encoding="utf-8")
+    assert "- seeds: 0, 1\n" in report
+    assert "in the folders that the settings name: `results.h5`" in report
 
 
 def test_an_unfinished_study_is_left_out(

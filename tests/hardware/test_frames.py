@@ -107,7 +107,7 @@ def test_ultraino_bytes(
     assert ultraino_boards(2).frame(one_on(transducer, phase, amplitude, 128)) == expected
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seeds)
 def test_sonicsurface_frame_is_undone_by_its_inverse_and_by_the_firmware(seed: int) -> None:
     levels = random_integers(33, seed)
@@ -120,7 +120,7 @@ def test_sonicsurface_frame_is_undone_by_its_inverse_and_by_the_firmware(seed: i
     torch.testing.assert_close(firmware.drive(), sonicsurface_drive(levels), rtol=0, atol=1e-15)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seeds)
 def test_openmpd_frame_is_undone_by_its_inverse_and_by_the_firmware(seed: int) -> None:
     levels = Levels(random_integers(128, seed), random_integers(65, seed + 1))
@@ -133,7 +133,7 @@ def test_openmpd_frame_is_undone_by_its_inverse_and_by_the_firmware(seed: int) -
     torch.testing.assert_close(firmware.drive(), openmpd_drive(levels), rtol=0, atol=1e-15)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(seeds, st.integers(1, 3))
 def test_ultraino_frame_is_undone_by_its_inverse_and_by_the_firmware(seed: int, boards: int) -> None:
     duty = random_integers(6, seed, 64 * boards)

@@ -82,6 +82,19 @@ def test_the_outputs_are_off_before_and_after_however_it_ends(trial, error: type
     assert bench.firmware.drive().abs().max() == 0
 
 
+@pytest.mark.parametrize("device", [SONICSURFACE, OPENMPD])
+@pytest.mark.parametrize("sent", [1, 100, 257])
+def test_the_outputs_are_off_after_a_frame_that_broke_off(trial, device: Device, sent: int):
+    bench = trial.bench(device)
+    with trial.link(bench, device) as link:
+        link.play(full_on())
+        bench.chip.write(device.frame(torch.ones(device.transducers, dtype=torch.complex128))[:sent])
+    assert bench.firmware.drive().abs().max() == 0
+    if device is SONICSURFACE:
+        bench.chip.write(b"\xfd")  # swaps the two patterns
+        assert bench.firmware.drive().abs().max() == 0
+
+
 @pytest.mark.parametrize("pressure", [[1.0], [1.0, float("nan")], [1.0, -1.0]])
 def test_what_a_sensor_cannot_have_heard_ends_the_trial_with_the_outputs_off(trial, pressure):
     class Broken:
@@ -116,6 +129,7 @@ def test_a_scene_of_other_transducers_is_refused(trial):
         HardwareObjective(trial.scene, link, EmulatedSensor(bench), trial.log)
     with pytest.raises(ValueError, match="from 0 to 255, each once"):
         open_link(SONICSURFACE, [3, 3], backend=bench.bus)
+    assert bench.firmware.drive().abs().max() == 0
 
 
 def test_an_unplugged_device_is_an_error_that_says_so(trial):

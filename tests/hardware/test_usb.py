@@ -1,13 +1,16 @@
 """The FTDI chip as pyusb sees it: which is found, how it is set up, what goes through."""
 
+import errno
+
 import pytest
+from usb.core import USBError
 
 from autdtorch.hardware import LinkError
-from autdtorch.hardware.adapters import FtdiPort, FtdiUart, baud_divisor
+from autdtorch.hardware.adapters import BAUD_RATE, FtdiPort, FtdiUart, baud_divisor
 from autdtorch.hardware.emulated_bus import EmulatedBus
 from autdtorch.hardware.emulated_chips import EmulatedChip, EmulatedFtdi
 from autdtorch.hardware.firmware import OpenMPDFirmware, SonicSurfaceFirmware
-from autdtorch.hardware.usb import find_device
+from autdtorch.hardware.usb import VENDOR_REQUEST, find_device
 
 UART, FIFO = (0x0403, 0x6001), (0x0403, 0x6014)
 
@@ -75,6 +78,31 @@ def test_status_bytes_are_stripped_from_every_packet():
     assert quiet.read() == b""
     talking = FtdiPort(find_device([UART], backend=EmulatedBus([chip(kind=Talking)])))
     assert talking.read(packets=2) == 62 * b"a" + b"bc"
+
+
+def test_a_chip_that_refuses_its_settings_is_given_back_to_the_kernel():
+    class Refusing(EmulatedBus):
+        attached = True
+
+        def is_kernel_driver_active(self, dev_handle, intf):
+            return self.attached
+
+        def detach_kernel_driver(self, dev_handle, intf):
+            self.attached = False
+
+        def attach_kernel_driver(self, dev_handle, intf):
+            self.attached = True
+
+        def ctrl_transfer(self, dev_handle, bmRequestType, bRequest, wValue, wIndex, data, timeout):
+            if bRequest == BAUD_RATE:
+                raise USBError("Pipe error", errno=errno.EPIPE)
+            assert bmRequestType != VENDOR_REQUEST or not self.attached
+            return super().ctrl_transfer(dev_handle, bmRequestType, bRequest, wValue, wIndex, data, timeout)
+
+    bus = Refusing([chip()])
+    with pytest.raises(LinkError, match=r"cannot be set up: .*Pipe error"):
+        FtdiUart(find_device([UART], backend=bus), baud=230_400)
+    assert bus.attached
 
 
 def test_a_chip_that_takes_nothing_more_is_an_error():

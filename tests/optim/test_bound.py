@@ -11,7 +11,7 @@ from autdtorch.optim.gabs import gabs
 from autdtorch.optim.gradient import gradient_ascent, random_drives
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     points=st.integers(1, 8),
     transducers=st.integers(2, 32),

@@ -133,7 +133,7 @@ def test_a_trial_of_bayes_opt_is_the_same_in_any_block_and_on_any_number_of_thre
 
 
 @pytest.mark.parametrize("method", [lssg, partial(gabs, trials=3)], ids=["lssg", "gabs"])
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(
     turns=st.lists(st.floats(0, 2 * math.pi), min_size=3, max_size=3),
     seed=st.integers(0, 1000),

@@ -6,7 +6,7 @@ import math
 import pytest
 import scipy.special
 import torch
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -50,7 +50,6 @@ def test_green_is_outgoing_and_of_unit_strength():
     assert cmath.phase(values[2] / values[1]) == pytest.approx(math.pi / 2, rel=1e-12)
 
 
-@settings(deadline=None)
 @given(here=points, there=points)
 def test_green_is_reciprocal(here, there):
     assume(distances(torch.from_numpy(here), torch.from_numpy(there)).min() > 1e-6)
@@ -125,7 +124,6 @@ def test_disc_off_its_axis_near_by():
         assert (pressure - exact).abs().max() < tolerance * exact.abs().max()
 
 
-@settings(deadline=None)
 @given(
     focus=hnp.arrays(float, 3, elements=st.floats(5e-3, 0.1)),
     phases=hnp.arrays(float, 16, elements=st.floats(0, 2 * math.pi)),

@@ -101,7 +101,7 @@ OBSTACLES = st.one_of(
 )
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(OBSTACLES)
 def test_bonds_are_symmetric_with_an_energy_and_light_rows(obstacle: Obstacle) -> None:
     medium, cells = assembled(obstacle)
@@ -117,7 +117,7 @@ def test_bonds_are_symmetric_with_an_energy_and_light_rows(obstacle: Obstacle) -
     assert (cells.mass > 0).all()
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(CENTERS, st.floats(1.5, 2.5), st.sampled_from([0.1, 10.0, 77.0, 1e5]))
 def test_sharing_moves_mass_and_adds_none(center: tuple[float, ...], radius: float, ratio: float) -> None:
     medium, cells = assembled(sphere(center, radius, ratio))
@@ -223,7 +223,7 @@ def _duct_modes(a: float, b: float, z1: float, z2: float) -> np.ndarray:
     return k[crossing] - value[crossing] * (k[1] - k[0]) / (value[crossing + 1] - value[crossing])
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(st.floats(-6, 0), min_size=28, max_size=28), st.integers(1, 254))
 def test_condensed_elements_keep_their_energy_positive(exponents: list[float], gone: int) -> None:
     """Bonds of all sizes, as where three materials meet: no pressure may have an energy below zero."""

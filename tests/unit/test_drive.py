@@ -2,7 +2,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -31,7 +31,6 @@ def test_a_positive_phase_turns_the_drive_clockwise():
     torch.testing.assert_close(drive, expected, rtol=0, atol=1e-16)
 
 
-@settings(deadline=None)
 @given(phases=phases_arrays)
 def test_drive_and_phases_round_trip(phases):
     drive = drive_from_phases(phases)
@@ -43,7 +42,6 @@ def test_drive_and_phases_round_trip(phases):
     torch.testing.assert_close(amplitudes_of(drive), torch.ones(phases.shape).double(), rtol=0, atol=1e-15)
 
 
-@settings(deadline=None)
 @given(phases=phases_arrays, data=st.data())
 def test_amplitudes_round_trip(phases, data):
     amplitudes = data.draw(hnp.arrays(float, phases.shape, elements=st.floats(0, 1)))
@@ -74,7 +72,6 @@ def test_focus_phases_are_the_distance_in_radians():
     assert phases.tolist() == pytest.approx([5.0, 10 * math.sqrt(0.5)], rel=1e-15)
 
 
-@settings(deadline=None)
 @given(positions=places, focus=vectors, shift=vectors)
 def test_focus_phases_do_not_depend_on_where_the_origin_is(positions, focus, shift):
     phases = focus_phases(positions, focus, WAVENUMBER)
@@ -83,7 +80,6 @@ def test_focus_phases_do_not_depend_on_where_the_origin_is(positions, focus, shi
     torch.testing.assert_close(shifted, phases, rtol=0, atol=1e-12)
 
 
-@settings(deadline=None)
 @given(positions=places, focus=vectors)
 def test_focus_phases_do_not_depend_on_the_order_or_sign_of_the_axes(positions, focus):
     phases = focus_phases(positions, focus, WAVENUMBER)

@@ -111,6 +111,22 @@ def test_what_is_wrong_with_a_drive_file_is_said(tmp_path, text, message):
         load_drive(tmp_path / "d.csv")
 
 
+def test_what_is_wrong_with_an_npz_file_is_said(tmp_path):
+    np.savez(tmp_path / "d.npz", device="autd3", phase=np.array(["x"]), intensity=np.array([1]))
+    with pytest.raises(ValueError, match=r"d.npz: autd3 phase: \('x',\); must be an array of real numbers"):
+        load_drive(tmp_path / "d.npz")
+    with (tmp_path / "d.npz").open("wb") as file:
+        np.save(file, np.ones(3))  # a single array, as .npy
+    with pytest.raises(ValueError, match=r"d.npz: .*must be a .npz file of plain arrays"):
+        load_drive(tmp_path / "d.npz")
+
+
+def test_a_file_has_the_name_that_was_given(tmp_path):
+    array = TransducerArray.grid((4, 4), 10e-3, (0, 0, 0))
+    save_drive(tmp_path / "D.NPZ", drive_from_phases(torch.zeros(16)), array)
+    assert load_drive(tmp_path / "D.NPZ").shape == (16,)
+
+
 def test_a_drive_that_is_not_the_devices_is_refused(tmp_path):
     array = TransducerArray.grid((4, 4), 10e-3, (0, 0, 0))
     drive = drive_from_phases(torch.zeros(16))

@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -37,7 +37,6 @@ def test_axes_give_the_following_axes(normal, u, v):
     assert found_v.tolist() == list(v)
 
 
-@settings(deadline=None)
 @given(normal=normals())
 def test_basis_is_orthonormal_and_right_handed(normal):
     u, v = plane_basis(normal)
@@ -47,7 +46,6 @@ def test_basis_is_orthonormal_and_right_handed(normal):
     torch.testing.assert_close(basis @ basis.T, torch.eye(3).double(), rtol=0, atol=ROUNDING)
 
 
-@settings(deadline=None)
 @given(
     center=vectors,
     radius=st.floats(1e-3, 1),
@@ -91,7 +89,6 @@ def test_plane_points_are_the_centres_of_its_cells():
     assert (points[..., 0] == 80).all()
 
 
-@settings(deadline=None)
 @given(normal=normals(), center=vectors, spacing=st.floats(0.03, 1))
 def test_plane_points_fill_the_plane_symmetrically(normal, center, spacing):
     plane = Plane(center, normal, size=(0.3, 0.1))

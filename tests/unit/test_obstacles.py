@@ -47,7 +47,7 @@ def box_mesh(folder):
 
 
 @PRIMITIVES
-@settings(deadline=None, max_examples=50)  # the first call of torch takes long
+@settings(max_examples=50)  # the first call of torch takes long
 @given(st.tuples(*[st.floats(-2, 2)] * 3))
 def test_the_gradient_leads_back_to_the_nearest_point_of_the_surface(shape, point):
     # Outside a convex body the distance has a gradient everywhere: of length 1, away from the nearest point.

@@ -37,7 +37,7 @@ def after_center(scene: Scene, place: float, axis: int = 0) -> float:
     return float((place - grid.origin[axis]) / SPACING % 1)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     st.tuples(*[st.floats(3, 20)] * 3),
     st.tuples(*[st.integers(1, 7)] * 3),

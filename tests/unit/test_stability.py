@@ -51,7 +51,7 @@ def dense(index: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return matrix[np.ix_(rows, rows)]
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 10**6), st.floats(1, 1e4), st.sampled_from([0.0, 0.2]))
 def test_largest_eigenvalue_is_never_below_the_truth_and_close_to_it(
     seed: int, contrast: float, negative: float

@@ -73,7 +73,7 @@ def test_eight_elements_of_air_add_up_to_the_tuned_stencil() -> None:
     assert np.allclose(sums.ravel(), STENCIL.weights, rtol=1e-14)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(NORMALS, OFFSETS, CONTRASTS, st.one_of(st.none(), st.floats(1, 30)))
 def test_energy_is_never_negative_at_any_contrast(
     normal: np.ndarray, offset: float, density: float, radius: float | None
@@ -86,7 +86,7 @@ def test_energy_is_never_negative_at_any_contrast(
     assert np.abs(matrix @ np.ones(8)).max() < 1e-12 * size
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(NORMALS, OFFSETS, CONTRASTS)
 def test_a_field_along_a_plane_surface_has_its_exact_energy(
     normal: np.ndarray, offset: float, density: float
@@ -116,7 +116,7 @@ def test_a_flow_through_a_surface_along_the_grid_meets_its_exact_resistance(
     assert energy(cut, kinked) == pytest.approx(resistance, rel=1e-9)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(NORMALS, OFFSETS)
 def test_masses_stay_on_their_side(normal: np.ndarray, offset: float) -> None:
     distance = plane(normal, offset)

@@ -207,8 +207,16 @@ def test_exports_are_self_contained(scene: at.Scene, tmp_path: Path) -> None:
     view3d(scene, field=field, save=tmp_path / "scene.gltf").close()
     content = json.loads((tmp_path / "scene.gltf").read_text(encoding="utf-8"))
     assert all(buffer["uri"].startswith("data:") for buffer in content["buffers"])
-    corners = [accessor["max"] for accessor in content["accessors"] if "max" in accessor]
-    assert [80.0, 40.0, 30.0] in corners  # the corner of the plane [mm]
+    # The corner of the plane, in metres and with z upwards, which is the format's y.
+    nodes = content["nodes"]
+    (root,) = (nodes[index] for index in content["scenes"][0]["nodes"])
+    corners = []
+    for node in (nodes[index] for index in root["children"] if "mesh" in nodes[index]):
+        (part,) = content["meshes"][node["mesh"]]["primitives"]
+        corner = [*content["accessors"][part["attributes"]["POSITION"]]["max"], 1.0]
+        corners.append(np.diag([*root["scale"], 1]) @ np.reshape(node["matrix"], (4, 4)).T @ corner)
+    assert any(np.allclose(corner[:3], (40e-3, 30e-3, 80e-3)) for corner in corners)
+    assert "cameras" not in content
 
 
 @pytest.mark.usefixtures("renderer")

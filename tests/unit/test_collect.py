@@ -1,0 +1,138 @@
+"""What a sweep leaves, merged: which studies are one, and how the others are told apart."""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from autdtorch.collect import Sweep, collect_results
+from autdtorch.optim.base import Solution, joined
+from autdtorch.optim.gabs import gabs
+from autdtorch.optim.lssg import lssg
+from autdtorch.scene_file import load_scene
+from autdtorch.study import run_study
+from autdtorch.summary import save_summary
+
+Study = Callable[..., None]
+
+SCENE = {
+    "frequency": 40e3,
+    "medium": {"density": 1.2, "sound_speed": 340.0},
+    "array": {"type": "grid", "shape": [2, 2], "pitch": 10e-3, "center": [0, 0, 0]},
+    "control_points": {"type": "points", "positions": [[0.05, 0, 0], [0.05, 0.01, 0]]},
+}
+GRID = SCENE["array"]
+METHODS = {"gabs": partial(gabs, levels=2), "lssg": lssg}
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Study:
+    """Leaves a study in a folder of its own, as a job of a sweep does."""
+
+    def leave(
+        scene: dict = SCENE, method: str = "gabs", seed: int = 0, trials: int = 1, files: tuple = ()
+    ) -> None:
+        settings = {"scene": scene, "method": {"_target_": f"autdtorch.{method}"}, "files": {"air": [*files]}}
+        run_study(
+            {"air": load_scene(scene)},
+            {method: METHODS[method]},
+            solver={"method": "free_space"},
+            seed=seed,
+            trials=trials,
+            folder=tmp_path / str(len(list(tmp_path.iterdir()))),
+            config=yaml.safe_dump(settings),
+        )
+
+    return leave
+
+
+def names(sweep: Sweep) -> list[str]:
+    return list(sweep.results.scenes)
+
+
+def test_seeds_of_a_method_with_chance_are_trials_even_if_two_end_alike(study: Study, tmp_path: Path) -> None:
+    for seed in range(8):
+        study(seed=seed)
+    (method,) = collect_results(tmp_path).results.scenes["air"].methods.values()
+    assert method.trials == 8
+    # Three transducers of two levels each: some of eight searches end at the same drive.
+    assert len({tuple(drive.tolist()) for drive in method.solution.drive}) < 8
+
+
+def test_a_method_without_chance_has_one_trial(study: Study, tmp_path: Path) -> None:
+    for seed in (0, 1):
+        study(method="lssg", seed=seed)
+    (method,) = collect_results(tmp_path).results.scenes["air"].methods.values()
+    assert method.trials == 1
+
+
+def test_of_a_seed_the_longest_study_counts(study: Study, tmp_path: Path) -> None:
+    for trials in (3, 2):
+        study(trials=trials)
+    (method,) = collect_results(tmp_path).results.scenes["air"].methods.values()
+    assert method.trials == 3
+
+
+def test_a_swept_list_is_one_setting_in_the_order_of_its_values(study: Study, tmp_path: Path) -> None:
+    for pitch in (10e-3, 9e-3):
+        study({**SCENE, "array": {**GRID, "pitch": pitch, "shape": [2, 3] if pitch == 9e-3 else [2, 2]}})
+    sweep = collect_results(tmp_path)
+    assert names(sweep) == ["air,pitch=0.009,shape=2x3", "air,pitch=0.01,shape=2x2"]
+    assert sweep.swept[names(sweep)[0], "gabs"] == {"scene.array.pitch": 0.009, "scene.array.shape": [2, 3]}
+
+
+def test_a_number_is_the_same_however_it_is_written(study: Study, tmp_path: Path) -> None:
+    for seed, frequency in enumerate((40000, 40e3)):
+        study({**SCENE, "frequency": frequency}, seed=seed)
+    assert names(collect_results(tmp_path)) == ["air"]
+
+
+def test_names_that_would_be_alike_are_told_apart(study: Study, tmp_path: Path) -> None:
+    """Such as paths that differ in a separator, and a file that was changed between two jobs."""
+    study(files=("11",))
+    study(files=("22",), seed=1)
+    first, second = names(sweep := collect_results(tmp_path))
+    assert first != second
+    assert first.startswith("air-")
+    save_summary(sweep.results, sweep.swept, tmp_path / "summary.csv")
+    assert "['11']" in (tmp_path / "summary.csv").read_text(encoding="utf-8")
+
+
+def test_scenes_without_the_same_keys_have_names_that_files_can_have(study: Study, tmp_path: Path) -> None:
+    boxes = [
+        {"type": "box", "center": [0.02, 0.01 * place, 0], "size": [4e-3] * 3, "rigid": True}
+        for place in range(-2, 3)
+    ]
+    for count in (0, 4, 5):
+        study({**SCENE, "obstacles": boxes[:count]})
+    found = names(collect_results(tmp_path))
+    assert len(set(found)) == 3
+    assert max(map(len, found)) < 130
+
+
+def test_what_an_experiment_has_not_finished_is_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = {"scenes": {"air": SCENE, "lab": SCENE}, "methods": {"lssg": {"_target_": "autdtorch.lssg"}}}
+    run_study({"air": load_scene(SCENE)}, {"lssg": lssg}, folder=tmp_path, config=yaml.safe_dump(config))
+    assert names(collect_results(tmp_path)) == ["air"]
+    assert caplog.messages[-1].endswith("scenes that are not finished are left out: lab")
+
+
+def test_joined_histories_go_on_with_their_last_value() -> None:
+    short, long = (
+        Solution(
+            torch.ones(1, 2, dtype=torch.complex128),
+            torch.ones(1, 1),
+            torch.tensor([float(steps)]),
+            torch.tensor([steps]),
+            torch.arange(1.0, steps + 1)[None],
+        )
+        for steps in (2, 4)
+    )
+    both = joined([short, long])
+    assert both.history.tolist() == [[1, 2, 2, 2], [1, 2, 3, 4]]
+    assert both.score.tolist() == [2, 4]
