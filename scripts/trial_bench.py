@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import autdtorch as at
 from autdtorch import hardware
+from autdtorch.conditions import random_rms
 from autdtorch.hardware.dry_run import DryPort
 
 DEVICES = {
@@ -50,7 +51,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     sensor("--captures", type=int, default=1, help="to average over (%(default)s)")
     sensor("--moved", action="store_true", help="one microphone, moved from control point to control point")
     emulated = parser.add_argument_group("emulated device").add_argument
-    emulated("--snr", type=float, help="of the emulated sensor [dB]; without it, no noise")
+    emulated("--snr", type=float, help="of a reading, or of a scope's sample [dB]; without it, no noise")
     emulated("--dead", type=indices, default=[], help="transducers of the scene that are silent")
 
 
@@ -141,13 +142,15 @@ def _scope(
         if options.scope_chip is None:
             raise ValueError("--scope-chip: none; must be the VID:PID of the oscilloscope, as lsusb shows it")
         return hardware.open_scope(options.scope_chip, dialect)
+    rms = random_rms(bench.transfer_matrix)
     emulated = hardware.EmulatedScope(
         bench.pressure,
         scene.frequency,
         options.sensitivity,
         range(len(scene.control_points)),
         dialect.name.partition(" ")[0],
+        noise=0.0 if options.snr is None else options.sensitivity * rms * 10 ** (-options.snr / 20),
         seed=options.seed,
     )
-    emulated.plug_into(bench.bus, _EMULATED_SCOPE)
+    emulated.plug_into(bench, _EMULATED_SCOPE)
     return hardware.open_scope(_EMULATED_SCOPE, dialect, backend=bench.bus)

@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 
+from autdtorch.conditions import Quantised, random_rms
 from autdtorch.drive import drive_from_phases
 from autdtorch.hardware import (
     KEYSIGHT,
@@ -19,7 +20,9 @@ from autdtorch.hardware import (
     open_scope,
 )
 from autdtorch.hardware.emulated_bus import EmulatedBus
+from autdtorch.hardware.emulated_usbtmc import EmulatedInstrument, Fault
 from autdtorch.hardware.scpi import Dialect
+from autdtorch.optim.gabs import gabs
 
 CHIP = (0x2A8D, 0x1770)
 FREQUENCY = 40e3
@@ -45,8 +48,8 @@ class Bench:
         maker = dialect.name.partition(" ")[0]
         self.field = torch.tensor(pressure, dtype=torch.complex128)
         self.scope = EmulatedScope(lambda: self.field, FREQUENCY, SENSITIVITY, heard, maker, **properties)
-        self.bus = EmulatedBus([])
-        self.instrument = self.scope.plug_into(self.bus, CHIP)
+        self.instrument = EmulatedInstrument(*CHIP, "S1", self.scope)
+        self.bus = EmulatedBus([self.instrument])
         self.open = open_scope(CHIP, dialect, backend=self.bus)
 
     def sensor(self, captures: int = 1) -> ScopeSensor:
@@ -125,16 +128,29 @@ def test_silence_is_a_warning_that_names_input_and_noise(caplog):
         ("garbage", r"header .* does not answer request \d+"),
     ],
 )
-def test_a_fault_on_the_wire_is_an_error_and_a_new_start_helps(fault, message):
-    bench = Bench([1.0, 2.0])
-    sensor = bench.sensor()
-    bench.instrument.fault = fault
+def test_a_fault_on_the_wire_ends_the_trial_silently_and_another_goes_on(trial, fault, message):
+    def measure(count: int, last: Fault | None) -> torch.Tensor:
+        instrument.fault = None
+        with trial.link(bench) as link, open_scope(CHIP, backend=bench.bus) as oscilloscope:
+            microphones = [Microphone(number, SENSITIVITY, loudest) for number in (1, 2)]
+            objective = trial.objective(link, ScopeSensor(oscilloscope, FREQUENCY, microphones))
+            objective(torch.stack(drives[: count - 1]))
+            instrument.fault = last
+            return objective(drives[count - 1][None])
+
+    bench = trial.bench()
+    instrument = EmulatedInstrument(
+        *CHIP, "S1", EmulatedScope(bench.pressure, FREQUENCY, SENSITIVITY, [0, 1])
+    )
+    bench.bus.chips.append(instrument)
+    drives = [drive_from_phases(torch.arange(16) * step * 2 * math.pi / 32) for step in range(3)]
+    loudest = float(trial.simulated(torch.stack(drives)).max())
     with pytest.raises(LinkError, match=message):
-        sensor.read()
-    bench.open.close()
-    bench.instrument.fault = None
-    again = open_scope(CHIP, backend=bench.bus)
-    assert sensor_at(again, 2).read() == pytest.approx([1.0, 2.0], abs=RESOLUTION)
+        measure(2, fault)
+    assert bench.firmware.drive().abs().max() == 0
+    assert len(trial.log.read_text().splitlines()) == 2  # what the trial is, and one evaluation
+    expected = trial.simulated(drives[2][None])
+    torch.testing.assert_close(measure(3, None), expected, rtol=0, atol=2 / math.pi * loudest / 3.5 / 32)
 
 
 def test_an_unplugged_oscilloscope_and_one_of_another_maker_are_errors():
@@ -175,7 +191,7 @@ def test_one_microphone_is_moved_from_point_to_point():
 def test_an_evaluation_through_device_and_oscilloscope_is_the_simulated_pressure(trial):
     bench = trial.bench()
     scope = EmulatedScope(bench.pressure, FREQUENCY, SENSITIVITY, heard=[0, 1])
-    scope.plug_into(bench.bus, CHIP)
+    scope.plug_into(bench, CHIP)
     drive = drive_from_phases(torch.arange(16) * 2 * math.pi / 32)
     with trial.link(bench) as link, open_scope(CHIP, backend=bench.bus) as oscilloscope:
         loudest = 1.1 * float(trial.simulated(drive[None]).max())
@@ -184,6 +200,22 @@ def test_an_evaluation_through_device_and_oscilloscope_is_the_simulated_pressure
         measured = trial.objective(link, sensor)(drive[None])
     worst = 2 / math.pi * loudest / 3.5 / 32
     torch.testing.assert_close(measured, trial.simulated(drive[None]), rtol=0, atol=worst)
+
+
+def test_a_method_finds_the_simulations_focus_through_a_noisy_oscilloscope(trial):
+    bench = trial.bench()
+    matrix = trial.simulated.transfer_matrix
+    # 30 dB below the rms pressure over control points and random phases, in every sample.
+    noise = SENSITIVITY * random_rms(matrix) * 10 ** (-30 / 20)
+    scope = EmulatedScope(bench.pressure, FREQUENCY, SENSITIVITY, [0, 1], noise=noise, drift=0.01)
+    scope.plug_into(bench, CHIP)
+    loudest = float(matrix.abs().sum(dim=1).max())
+    with trial.link(bench) as link, open_scope(CHIP, backend=bench.bus) as oscilloscope:
+        microphones = [Microphone(number, SENSITIVITY, loudest) for number in (1, 2)]
+        sensor = ScopeSensor(oscilloscope, FREQUENCY, microphones)
+        found = gabs(Quantised(trial.objective(link, sensor), levels=32), levels=4)
+    expected = gabs(Quantised(trial.simulated, levels=32), levels=4).score
+    assert float(trial.simulated(found.drive).min()) == pytest.approx(float(expected), rel=0.05)
 
 
 @pytest.mark.parametrize("microphones", [[], [Microphone(1, 0.01, 1.0), Microphone(1, 0.01, 1.0)]])
