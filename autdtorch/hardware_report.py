@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -118,7 +119,7 @@ def write_hardware_report(
         begin=begin.isoformat(timespec="seconds"),
         end=end.isoformat(timespec="seconds"),
         evaluations=len(evaluations),
-        rate=_rate(len(evaluations) - 1, (end - begin).total_seconds()),
+        rate=_rate(evaluations),
         seconds_on=evaluations[-1].seconds_on,
         weakest=found.pressure.min(),
         same=int(same.sum()),
@@ -127,15 +128,23 @@ def write_hardware_report(
         scale=fit.scale,
         misfit=100 * fit.misfit,
         preflight=_preflight(preflight),
-        settings=table([["setting", "value"], *([name, str(value)] for name, value in settings.items())]),
+        settings=table(
+            [["setting", "value"], *([name, json.dumps(value)] for name, value in settings.items())]
+        ),
     )
     path = folder / REPORT_FILE
     path.write_text(text, encoding="utf-8")
     return path
 
 
-def _rate(steps: int, seconds: float) -> str:
-    return f"{steps / seconds:.3g} per second" if seconds > 0 else "at once"
+def _rate(evaluations: Sequence[Evaluation]) -> str:
+    """From the median interval, which an interruption does not change."""
+    times = torch.tensor(
+        [datetime.fromisoformat(evaluation.time).timestamp() for evaluation in evaluations],
+        dtype=torch.float64,
+    )
+    interval = float(times.diff().median()) if len(times) > 1 else 0.0
+    return f"one in {1e3 * interval:.3g} ms (median)"
 
 
 def _points(places: torch.Tensor, measured: torch.Tensor, simulated: torch.Tensor) -> str:

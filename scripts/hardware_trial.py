@@ -122,7 +122,6 @@ def measure(
     steps = expected.history.shape[1]
     points = len(scene.control_points)
     with (
-        hardware.ended_by_signals(),
         bench.sensor() as sensor,
         bench.link() as link,
         show_progress(steps) as progress,
@@ -183,14 +182,15 @@ def main() -> int:
     command = shlex.join(["python", *sys.argv])
     goes_on = "the outputs are off, and the same command goes on where the log ends"
     try:
-        run(options, command)
+        with hardware.ended_by_signals():
+            run(options, command)
     except hardware.Signalled as signalled:
         logging.error("hardware_trial: %s: %s", signalled, goes_on)
         return 128 + signalled.number
     except hardware.LimitError as error:
         logging.error("hardware_trial: %s: the outputs are off; a higher limit goes on from here", error)
         return _LIMITED
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ImportError) as error:
         logging.error("hardware_trial: %s", error)
         return _REFUSED
     return 0

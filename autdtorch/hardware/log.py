@@ -87,7 +87,7 @@ class EvaluationLog:
         Raises:
             OSError: the file cannot be written.
         """
-        time = datetime.now(UTC).isoformat(timespec="milliseconds")
+        time = datetime.now(UTC).isoformat(timespec="microseconds")
         self._append(
             {
                 "time": time,

@@ -13,6 +13,7 @@ from autdtorch.validation import integer_at_least
 
 #: How far above the noise a transducer is heard, in standard deviations of the noise's mean power.
 _DEVIATIONS = 6.0
+_WEAK = 0.1
 _BACKGROUND = 8  # readings of the silence for each of a transducer
 
 
@@ -40,7 +41,8 @@ def check_transducers(link: LimitedLink, sensor: Sensor, points: int, readings: 
     """Play every transducer alone, after silence, and switch the outputs off.
 
     The power of circular Gaussian noise, averaged over n readings, deviates by 1/sqrt(n) of its mean: that
-    says from which pressure on a transducer is heard.
+    says from which pressure on a transducer is heard. It must also be within 20 dB of the others' median, as
+    some sensors round silence to 0.
 
     Args:
         link: plays them.
@@ -61,8 +63,9 @@ def check_transducers(link: LimitedLink, sensor: Sensor, points: int, readings: 
         powers.append(_power(sensor, points, readings))
         link.require_on()
     link.off()
-    threshold = silence * (1 + _DEVIATIONS / math.sqrt(readings * points))
-    return Preflight(torch.tensor(powers).sqrt(), math.sqrt(silence), math.sqrt(threshold))
+    pressure = torch.tensor(powers, dtype=torch.float64).sqrt()
+    above_noise = math.sqrt(silence * (1 + _DEVIATIONS / math.sqrt(readings * points)))
+    return Preflight(pressure, math.sqrt(silence), max(above_noise, _WEAK * float(pressure.median())))
 
 
 def hears_silence(sensor: Sensor, check: Preflight, points: int, readings: int = 4) -> bool:

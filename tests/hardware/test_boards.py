@@ -7,7 +7,16 @@ import pytest
 import torch
 
 from autdtorch.drive import drive_from_phases
-from autdtorch.hardware import EmulatedBench, LinkError, open_link, openmpd_boards
+from autdtorch.hardware import (
+    OPENMPD,
+    SONICSURFACE,
+    EmulatedBench,
+    LinkError,
+    open_link,
+    openmpd_boards,
+    ultraino_boards,
+)
+from autdtorch.hardware.autd3 import autd3_device
 from autdtorch.openmpd_board import OpenMPDBoard
 
 
@@ -36,6 +45,17 @@ def test_boards_of_files_play_the_drive_that_was_asked_for():
         torch.testing.assert_close(bench.pressure(), drive, rtol=0, atol=1e-12)  # rounding of the angles
         torch.testing.assert_close(link.played(drive), drive, rtol=0, atol=1e-12)
     assert bench.drive().abs().max() == 0
+
+
+@pytest.mark.parametrize(
+    "device",
+    [SONICSURFACE, OPENMPD, ultraino_boards(2), autd3_device(2)],
+    ids=["SonicSurface", "OpenMPD", "Ultraino", "AUTD3"],
+)
+def test_what_a_frame_has_a_device_play_is_read_back(device):
+    phases = 2 * torch.pi / device.quantised["levels"] * torch.arange(device.transducers).double()
+    drive = drive_from_phases(phases)
+    torch.testing.assert_close(device.played(device.frame(drive)), drive, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(("gain", "heard"), [(0.5, 2 * math.sin(21 * math.pi / 128)), (0.49, 1.0)])
