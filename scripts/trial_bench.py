@@ -152,5 +152,5 @@ def _scope(
         noise=0.0 if options.snr is None else options.sensitivity * rms * 10 ** (-options.snr / 20),
         seed=options.seed,
     )
-    emulated.plug_into(bench.bus, _EMULATED_SCOPE)
+    emulated.plug_into(bench, _EMULATED_SCOPE)
     return hardware.open_scope(_EMULATED_SCOPE, dialect, backend=bench.bus)

@@ -12,6 +12,7 @@ from .scope import Microphone, Oscilloscope, ScopeSensor, open_scope
 from .scpi import KEYSIGHT, RIGOL, Dialect, Waveform
 from .sensor import FileSensor, ManualSensor, MovedMicrophone, Sensor, SensorError
 from .usb import LinkError, Port
+from .usbtmc import UsbtmcPort
 
 __all__ = [
     "KEYSIGHT",
@@ -44,6 +45,7 @@ __all__ = [
     "Sensor",
     "SensorError",
     "Signalled",
+    "UsbtmcPort",
     "Waveform",
     "check_transducers",
     "ended_by_signals",

@@ -29,7 +29,6 @@ _EIGHTHS = (0, 3, 2, 4, 1, 5, 6, 7)  # code of the fraction 0/8 ... 7/8 of a bau
 
 _CH340_INIT, _CH340_WRITE = 0xA1, 0x9A
 _CH340_RATE, _CH340_LINE = 0x1312, 0x2518  # pairs of registers: divisor and prescaler, line control
-_CH340_AT_ONCE = 0x80  # do not wait until a packet is full
 _CH340_EIGHT_N_ONE = 0xC3  # receiver and sender on, 8 bits
 
 _CP2102_REQUEST = 0x41  # to the interface, vendor's own
@@ -103,7 +102,7 @@ class Ch340Uart(UsbPort):
 
     def _set_up(self) -> None:
         self._request(_CH340_INIT, 0)
-        self._request(_CH340_WRITE, _CH340_RATE, ch340_divisor(self._baud) | _CH340_AT_ONCE)
+        self._request(_CH340_WRITE, _CH340_RATE, ch340_divisor(self._baud))
         self._request(_CH340_WRITE, _CH340_LINE, _CH340_EIGHT_N_ONE)
 
 

@@ -34,14 +34,14 @@ class EmulatedChip:
     interfaces: ClassVar[Interfaces] = (((0xFF, 0xFF, 0xFF), (0x81, 0x02)),)
 
     def __init__(self, vendor: int, product: int, serial: str, firmware: Firmware) -> None:
-        """Plug the chip in: 9600 baud, as after its power-up."""
+        """Plug the chip in, as somebody else has left it."""
         self.vendor = vendor
         self.product = product
         self.strings = (*_STRINGS, serial)
         self.present = True
         self.firmware = firmware
         self.baud = 9600.0
-        self.eight_n_one = True
+        self.eight_n_one = False
 
     def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
         """Take a request with its data; False where the chip knows no such request, and stalls."""

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from autdtorch.hardware.emulated_bus import EmulatedBus
 from autdtorch.hardware.emulated_usbtmc import EmulatedInstrument
+from autdtorch.hardware.emulator import EmulatedBench
 from autdtorch.validation import finite_number, integer_at_least, invalid, not_negative, positive
 
 _PER = 1000  # captures after which a drift is stated
@@ -109,13 +109,9 @@ class EmulatedScope:
         self._source = 0
         self._codes: list[bytes] = []
 
-    def plug_into(
-        self, bus: EmulatedBus, chip: tuple[int, int], serial: str = "EMULATED"
-    ) -> EmulatedInstrument:
-        """Appear on a bus with idVendor and idProduct of `chip` and a `serial` number."""
-        instrument = EmulatedInstrument(*chip, serial, self)
-        bus.chips.append(instrument)
-        return instrument
+    def plug_into(self, bench: EmulatedBench, chip: tuple[int, int], serial: str = "EMULATED") -> None:
+        """Appear on the bus of a bench, with idVendor and idProduct of `chip` and a `serial` number."""
+        bench.bus.chips.append(EmulatedInstrument(*chip, serial, self))
 
     def execute(self, line: str) -> bytes | None:
         """Do what a line says; the answer, if it asks for one that there is."""

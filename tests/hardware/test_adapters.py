@@ -19,8 +19,8 @@ def test_every_adapter_brings_the_frames_to_its_device(device: Device, adapter: 
     with open_link(device, range(16), backend=bench.bus) as link:
         assert bench.chip.eight_n_one
         assert bench.chip.baud == pytest.approx(device.baud, rel=0.002)  # the divisor's rounding
-        link.play(torch.ones(16, dtype=torch.complex128))
-        torch.testing.assert_close(bench.drive(), torch.ones(16).cdouble(), rtol=0, atol=1e-14)
+        link.play(-torch.ones(16).cdouble())  # not what they start with
+        torch.testing.assert_close(bench.drive(), -torch.ones(16).cdouble(), rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize(

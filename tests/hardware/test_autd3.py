@@ -7,7 +7,7 @@ import torch
 
 from autdtorch.drive import drive_from_phases
 from autdtorch.hardware import LinkError, open_autd3
-from autdtorch.hardware.autd3 import autd3_device
+from autdtorch.hardware.autd3 import Autd3Port, autd3_device
 from autdtorch.hardware.levels import Levels, autd3_levels
 
 
@@ -45,12 +45,18 @@ class TestWithTheKit:
         return pytest.importorskip("autd3", reason="the kit of AUTD3: install autdtorch[autd3]")
 
     def test_boards_on_the_network_take_the_drives_and_are_off_in_the_end(self, kit, monkeypatch):
+        from autd3.commands import Clear, Pattern
+
+        def send_and_note(port, what, command):
+            send(port, what, command)
+            sent.append(type(command))
+
+        send, sent = Autd3Port._send, []
+        monkeypatch.setattr(Autd3Port, "_send", send_and_note)
         boards = kit.UdpEmulator(2)
-        sent = []
         with open_autd3(2, range(300), boards.option(), settle=0) as link:
-            monkeypatch.setattr(link._port, "_send", send_and_note(link._port._send, sent))
             link.play(random_drive(300))
-        assert len(sent) == 3  # the drive, and off twice
+        assert sent == [Clear, *5 * [Pattern]]  # off twice, the drive, off twice
         with pytest.raises(ValueError, match=r"from 0 to 497"):
             open_autd3(2, [498], boards.option())
 
@@ -75,11 +81,3 @@ class TestWithTheKit:
         record = emulator.Emulator(Geometry([Autd3()])).record(play)
         played = torch.from_numpy(record.phase().to_numpy()[:, -1].astype("int64"))
         assert torch.equal(played, autd3_levels(drive).phase)
-
-
-def send_and_note(send, sent):
-    def both(what, command):
-        sent.append(command)
-        send(what, command)
-
-    return both

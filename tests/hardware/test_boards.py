@@ -58,13 +58,15 @@ def test_what_a_frame_has_a_device_play_is_read_back(device):
     torch.testing.assert_close(device.played(device.frame(drive)), drive, rtol=0, atol=1e-9)
 
 
-def test_gains_lower_the_duty():
-    one = board("half", 0, gain=0.5)
+@pytest.mark.parametrize(("gain", "heard"), [(0.5, 2 * math.sin(21 * math.pi / 128)), (0.49, 1.0)])
+def test_gains_lower_the_duty(gain: float, heard: float):
+    one = board("half", 0, gain)
     device = openmpd_boards([one])
     frame = device.frame(torch.ones(256).cdouble())
-    assert set(frame[256:]) == {21}  # 128 asin(1/2) / pi = 21.3
-    heard = torch.full((256,), 2 * math.sin(21 * math.pi / 128), dtype=torch.float64)
-    torch.testing.assert_close(device.played(frame).abs(), heard, rtol=1e-12, atol=0)
+    assert set(frame[256:]) == {21}  # 128 asin(gain) / pi = 21.3 and 20.9
+    # What the duty was rounded up by would be above full.
+    expected = torch.full((256,), heard, dtype=torch.float64)
+    torch.testing.assert_close(device.played(frame).abs(), expected, rtol=1e-12, atol=0)
     assert device.played(frame).angle().abs().max() < torch.pi / 128 + 1e-9
     assert not device.played(device.frame(torch.zeros(256).cdouble())).any()
 

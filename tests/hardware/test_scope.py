@@ -20,7 +20,7 @@ from autdtorch.hardware import (
     open_scope,
 )
 from autdtorch.hardware.emulated_bus import EmulatedBus
-from autdtorch.hardware.emulated_usbtmc import Fault
+from autdtorch.hardware.emulated_usbtmc import EmulatedInstrument, Fault
 from autdtorch.hardware.scpi import Dialect
 from autdtorch.optim.gabs import gabs
 
@@ -48,8 +48,8 @@ class Bench:
         maker = dialect.name.partition(" ")[0]
         self.field = torch.tensor(pressure, dtype=torch.complex128)
         self.scope = EmulatedScope(lambda: self.field, FREQUENCY, SENSITIVITY, heard, maker, **properties)
-        self.bus = EmulatedBus([])
-        self.instrument = self.scope.plug_into(self.bus, CHIP)
+        self.instrument = EmulatedInstrument(*CHIP, "S1", self.scope)
+        self.bus = EmulatedBus([self.instrument])
         self.open = open_scope(CHIP, dialect, backend=self.bus)
 
     def sensor(self, captures: int = 1) -> ScopeSensor:
@@ -139,7 +139,10 @@ def test_a_fault_on_the_wire_ends_the_trial_silently_and_another_goes_on(trial, 
             return objective(drives[count - 1][None])
 
     bench = trial.bench()
-    instrument = EmulatedScope(bench.pressure, FREQUENCY, SENSITIVITY, [0, 1]).plug_into(bench.bus, CHIP)
+    instrument = EmulatedInstrument(
+        *CHIP, "S1", EmulatedScope(bench.pressure, FREQUENCY, SENSITIVITY, [0, 1])
+    )
+    bench.bus.chips.append(instrument)
     drives = [drive_from_phases(torch.arange(16) * step * 2 * math.pi / 32) for step in range(3)]
     loudest = float(trial.simulated(torch.stack(drives)).max())
     with pytest.raises(LinkError, match=message):
@@ -188,7 +191,7 @@ def test_one_microphone_is_moved_from_point_to_point():
 def test_an_evaluation_through_device_and_oscilloscope_is_the_simulated_pressure(trial):
     bench = trial.bench()
     scope = EmulatedScope(bench.pressure, FREQUENCY, SENSITIVITY, heard=[0, 1])
-    scope.plug_into(bench.bus, CHIP)
+    scope.plug_into(bench, CHIP)
     drive = drive_from_phases(torch.arange(16) * 2 * math.pi / 32)
     with trial.link(bench) as link, open_scope(CHIP, backend=bench.bus) as oscilloscope:
         loudest = 1.1 * float(trial.simulated(drive[None]).max())
@@ -205,7 +208,7 @@ def test_a_method_finds_the_simulations_focus_through_a_noisy_oscilloscope(trial
     # 30 dB below the rms pressure over control points and random phases, in every sample.
     noise = SENSITIVITY * random_rms(matrix) * 10 ** (-30 / 20)
     scope = EmulatedScope(bench.pressure, FREQUENCY, SENSITIVITY, [0, 1], noise=noise, drift=0.01)
-    scope.plug_into(bench.bus, CHIP)
+    scope.plug_into(bench, CHIP)
     loudest = float(matrix.abs().sum(dim=1).max())
     with trial.link(bench) as link, open_scope(CHIP, backend=bench.bus) as oscilloscope:
         microphones = [Microphone(number, SENSITIVITY, loudest) for number in (1, 2)]
