@@ -42,7 +42,8 @@ def new_plotter(scene: Scene, off_screen: bool) -> pyvista.Plotter:
     """A plotter with obstacles, control points, axes and camera."""
     import pyvista
 
-    plotter = pyvista.Plotter(off_screen=off_screen, window_size=list(_WINDOW))
+    with pyvista.vtk_verbosity("error"):  # VTK warns where there is no X server, and takes another way
+        plotter = pyvista.Plotter(off_screen=off_screen, window_size=list(_WINDOW))
     plotter.set_background("white")
     for obstacle in scene.obstacles:
         _add_obstacle(plotter, obstacle, scene.domain)
