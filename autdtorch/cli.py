@@ -14,6 +14,7 @@ import os
 import re
 import shlex
 import sys
+import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -22,11 +23,13 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
 import hydra
 import hydra.utils
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, MissingConfigException
+from hydra.errors import HydraException, InstantiationException, MissingConfigException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError  # type: ignore[import-untyped]
+from yaml import MarkedYAMLError, YAMLError  # type: ignore[import-untyped]
+
+import autdtorch
 
 if TYPE_CHECKING:
     from autdtorch.results import StudyResult
@@ -38,6 +41,7 @@ Method: TypeAlias = "functools.partial[Any]"
 
 PLANE_FILE = "plane.png"
 
+_FAILED = 1
 _REFUSED = 2
 _REFUSALS = (ValueError, OSError, HydraException, OmegaConfBaseException, YAMLError)
 _INTERRUPTED = 130  # as a shell reports a process that SIGINT ended
@@ -75,8 +79,9 @@ def main() -> None:
     """Run the command line.
 
     Raises:
-        SystemExit: with status 2, after one line on stderr, where a setting is refused or a file cannot be
-            written; with status 130 after Ctrl-C.
+        SystemExit: after one line on stderr: with status 2 where a setting is refused or a file cannot be
+            written, with status 1 after any other error, such as of a method of one's own, with status 130
+            after Ctrl-C.
     """
     wanted = os.environ.get(_FULL_ERROR)
     os.environ[_FULL_ERROR] = "1"  # has Hydra pass exceptions on, where it would print them in its own way
@@ -84,6 +89,8 @@ def main() -> None:
     try:
         if sys.argv[1:2] == ["collect"]:
             _collect(sys.argv[2:])
+        elif sys.argv[1:] == ["--version"]:
+            print(f"autdtorch {autdtorch.__version__}")
         else:
             _run()
             if {"-m", "--multirun"} & set(sys.argv[1:]):
@@ -92,12 +99,8 @@ def main() -> None:
         _stop(_INTERRUPTED, "interrupted; finished trials are kept, and the same command goes on after them")
     except _Refusal as refusal:
         error = refusal.cause
-    except (_FailedJob, *_REFUSALS) as refused:
-        error = refused
-    except RuntimeError as refused:
-        if _NO_SLURM not in str(refused):
-            raise
-        error = refused
+    except Exception as failed:
+        error = failed
     else:
         return
     finally:
@@ -107,7 +110,11 @@ def main() -> None:
             os.environ[_FULL_ERROR] = wanted
     if wanted == "1":
         raise error
-    _stop(_REFUSED, _in_one_line(error))
+    _stop(_REFUSED if _is_refusal(error) else _FAILED, _in_one_line(error))
+
+
+def _is_refusal(error: Exception) -> bool:
+    return isinstance(error, (_FailedJob, *_REFUSALS)) or _NO_SLURM in str(error)
 
 
 def _stop(status: int, line: str) -> NoReturn:
@@ -118,7 +125,13 @@ def _stop(status: int, line: str) -> NoReturn:
 def _in_one_line(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
+    if isinstance(error, MarkedYAMLError) and (mark := error.problem_mark):
+        return f"{os.path.relpath(mark.name)}, line {mark.line + 1}: {error.problem}; must be valid YAML"
     text = str(error)
+    if not _is_refusal(error):
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        place = f"{os.path.relpath(where.filename)}, line {where.lineno}, in {where.name}"
+        text = f"{type(error).__name__}: {text} ({place}); with {_FULL_ERROR}=1 comes the traceback"
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = error.missing_cfg_file.rpartition("/")
         brings = "; pip install 'autdtorch[cluster]' brings more" if group == "hydra/launcher" else ""
@@ -127,7 +140,7 @@ def _in_one_line(error: Exception) -> str:
     if unknown := re.match(r"Could not override '(.+)'", text):
         key = getattr(error.__cause__, "full_key", None) or unknown[1]
         return f"{key}: unknown key; autdtorch --help lists the settings"
-    if found := re.match(r"(Error (?:merging override|locating target) [^,\n]+)", text):
+    if found := re.match(r"(Error merging override [^,\n]+)", text):
         text = f"{found[1]}: {error.__cause__}"
     if "missing EQUAL" in text and (word := re.search(r"'(.*?)'", text)):
         return f"{word[1]}: must be key=value, such as scene=three_cubes; autdtorch --help lists the settings"
@@ -145,7 +158,7 @@ def _run(config: DictConfig) -> None:
         with warnings.catch_warnings():
             warnings.showwarning = lambda message, *_: logger.warning("%s", message)  # without our source
             _study(config, Path(job.sweep.dir) if swept else None)
-    except _REFUSALS as error:
+    except Exception as error:
         if not swept:
             raise _Refusal(error) from error
         # The other jobs go on.
@@ -272,11 +285,31 @@ def _method(where: str, section: Any) -> Method:
     """The optimiser that a section names by `_target_`, with the section's settings."""
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # where a method of one's own is looked for, behind what is installed
-    method = hydra.utils.instantiate(section, _partial_=True)
+    try:
+        method = hydra.utils.instantiate(section, _partial_=True)
+    except InstantiationException as error:
+        cause = _first_cause(error)
+        reason = f" ({type(cause).__name__}: {cause})" if cause is not error else ""
+        raise ValueError(f"{where}: {section['_target_']!r}; must be a function{reason}") from error
     if not isinstance(method, functools.partial):
         raise ValueError(f"{where}: no _target_; must name a function such as autdtorch.gabs")
     _require_known(where, method.keywords, _parameters(method.func, but=_NO_METHOD_SETTINGS))
+    signature = inspect.signature(method)
+    given = [key for key in ("trials", "seed") if key in signature.parameters]
+    try:
+        signature.bind("objective", **dict.fromkeys(given))
+    except TypeError as error:
+        raise ValueError(
+            f"{where}: {section['_target_']!r}; {error}; must take an objective, the method's settings, "
+            "and trials and seed if it has random choices"
+        ) from error
     return method
+
+
+def _first_cause(error: BaseException) -> BaseException:
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return error
 
 
 def _section(settings: Mapping[str, Any], key: str) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import math
 import os
 import re
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import torch
@@ -217,10 +217,12 @@ def _run_trials(
     missing, size = trials.missing(*where), _FIRST_BLOCK
     while missing:
         block, missing = missing[:size], missing[size:]
-        progress.begin(f"{scene}: {method}, {len(block)} of {count} trials")
+        progress.begin(f"{scene}: {method}, {_numbered(block)} of {count}")
         begin = time.perf_counter()
         solution = solve(trials=block)
         seconds = time.perf_counter() - begin
+        if not isinstance(solution, Solution):
+            raise invalid(f"method {method}", solution, "must return a Solution")
         if len(solution.score) != len(block):
             accepted = f"must be the trials {list(block)}, or one where it has no random choices"
             raise invalid(f"method {method}", len(solution.score), accepted, "trials")
@@ -229,11 +231,21 @@ def _run_trials(
         size = max(1, int(size * min(_LARGEST_GROWTH, _BLOCK_SECONDS / seconds)))
 
 
+def _numbered(trials: Sequence[int]) -> str:
+    """Trials as people count them, from 1 on."""
+    first, last = trials[0] + 1, trials[-1] + 1
+    return f"trial {first}" if first == last else f"trials {first} to {last}"
+
+
 def _plane_points(scene: Scene, spacing: float) -> torch.Tensor | None:
     """Samples (Nu, Nv, 3) [m] of the observation plane, fit to be simulated."""
     plane = scene.observation_plane
     if plane is None:
         return None
+    if spacing > min(plane.size):
+        raise invalid(
+            "plane_spacing", spacing, f"must be at most {min(plane.size):g} m, the plane's edge", "m"
+        )
     count = math.prod(max(1, round(length / spacing)) for length in plane.size)
     if count > _MOST_SAMPLES:
         accepted = f"gives {count} samples of the observation plane, must be at most {_MOST_SAMPLES}"

@@ -5,6 +5,7 @@ import inspect
 import json
 import os
 import re
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -111,18 +112,22 @@ WRONG = [
     (["method.levels=1"], "method gabs: levels: 1; must be an integer >= 2"),
     (["trials=0"], "trials: 0; must be an integer >= 1"),
     (["seed=-1"], "seed: -1; must be an integer >= 0"),
+    (["plane_spacing=1"], r"plane_spacing: 1\.0 m; must be at most 0\.1 m, the plane's edge"),
     (["plane_spacing=0"], "plane_spacing: 0 m; must be finite and > 0"),
     (["scene.frequency=-40e3"], r"scene: Scene\.frequency: -40000\.0 Hz; must be finite and > 0"),
     (["scene.array.pitch=nan"], "scene: array: pitch: nan m; must be finite"),
-    (["method._target_=autdtorch.tabu"], r"Error locating target 'autdtorch\.tabu'"),
+    (
+        ["method._target_=autdtorch.tabu"],
+        r"method: 'autdtorch\.tabu'; must be a function \(ModuleNotFoundError: ",
+    ),
+    (["method._target_=tabu.search"], r"method: 'tabu\.search'; .*No module named 'tabu'"),
+    (["method._target_=autdtorch"], "method: 'autdtorch'; must be a function"),
     (["~method._target_"], "method: no _target_"),
-    (["method._target_=nowhere.found"], "Error locating target 'nowhere.found': .*No module named 'nowhere'"),
     (
         ["scene.obstacles.0.density=5"],
         "Error merging override scene.obstacles.0.density=5: list index out of",
     ),
     (["scene.array={type: file, path: a.csv}"], r"scene\.array\.path: unknown key"),
-    (["--config-dir", ".", "scene=torn"], "while parsing a flow .*torn.yaml"),
     (["solver.spacing=[1"], "no viable alternative at input"),
     (["seed=1,2"], "Ambiguous value for argument 'seed=1,2'"),
     (["--config-dir", "nowhere"], "Additional config directory '.*nowhere' not found"),
@@ -156,8 +161,6 @@ def test_a_wrong_command_gets_one_line(
 
     monkeypatch.setattr(autdtorch.study, "_run_scene", refuse)
     (tmp_path / "file").touch()
-    (tmp_path / "scene").mkdir()
-    (tmp_path / "scene" / "torn.yaml").write_text("frequency: [1\n", encoding="utf-8")
     assert run(*arguments) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -170,6 +173,50 @@ def test_the_traceback_comes_back_where_it_is_asked_for(run: Run, monkeypatch: p
     with pytest.raises(ValueError, match=r"^seed: -1; must be an integer >= 0$"):
         run("seed=-1")
     assert os.environ["HYDRA_FULL_ERROR"] == "1"
+
+
+def test_a_scene_that_is_not_yaml_is_named_with_its_line(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine" / "scene").mkdir(parents=True)
+    (tmp_path / "mine" / "scene" / "duct.yaml").write_text("frequency: 40e3\n\tarray: {}\n", encoding="utf-8")
+    assert run("--config-dir", "mine", "scene=duct") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("autdtorch: mine/scene/duct.yaml, line 2: ")
+    assert line.endswith("must be valid YAML")
+
+
+OWN_METHODS = """
+def greedy(objective, steps, trials, seed): ...
+def broken(objective): return objective.missing
+def empty(objective): ...
+"""
+BAD_METHODS = {
+    "greedy": (2, "autdtorch: method: 'own.greedy'; missing a required argument: 'steps'; must take an obj"),
+    "broken": (
+        1,
+        "autdtorch: AttributeError: .* 'missing' \\(own.py, line 3, in broken\\); with HYDRA_FULL_ERROR=1",
+    ),
+    "empty": (2, "autdtorch: method empty: None; must return a Solution"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_METHODS)
+def test_an_error_of_ones_own_method_is_told_in_one_line(
+    name: str, run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(sys.modules, "own", raising=False)
+    (tmp_path / "own.py").write_text(OWN_METHODS, encoding="utf-8")
+    status, message = BAD_METHODS[name]
+    (tmp_path / "method").mkdir()
+    (tmp_path / "method" / "own.yaml").write_text(f"_target_: own.{name}\n", encoding="utf-8")
+    assert run("--config-dir", str(tmp_path), "method=own") == status
+    assert re.match(message, capsys.readouterr().err.splitlines()[-1])
+
+
+def test_the_version_is_ours(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--version") == 0
+    assert capsys.readouterr().out == f"autdtorch {autdtorch.__version__}\n"
 
 
 def test_the_environment_is_left_as_it_was(run: Run) -> None:
@@ -191,7 +238,7 @@ def test_one_scene_and_one_method(run: Run, tmp_path: Path, capsys: pytest.Captu
     assert head.split()[:3] == ["scene", "method", "trials"]
     assert row.split()[:4] == ["homogeneous", "GABS", "2", f"{method.metrics.mean.mean():.2f}"]
     assert end == f"The results are in {Path('outputs', 'homogeneous_gabs')}"
-    assert "homogeneous: gabs, 2 of 2 trials" in captured.err
+    assert "homogeneous: gabs, trials 1 to 2 of 2" in captured.err
 
 
 def test_what_is_finished_is_not_computed_again(
