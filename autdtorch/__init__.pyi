@@ -37,7 +37,7 @@ from .propagator import (
     volume_field,
 )
 from .results import load_results
-from .scene import Medium, OverlapWarning, Scene
+from .scene import Medium, OverlapWarning, ScaleWarning, Scene
 from .scene_file import load_scene
 from .view3d import animate3d, view3d
 
@@ -57,6 +57,7 @@ __all__ = [
     "OverlapWarning",
     "Plane",
     "Quantised",
+    "ScaleWarning",
     "Scene",
     "SimulatedObjective",
     "Solution",

@@ -228,7 +228,8 @@ def _collect(arguments: list[str]) -> None:
     save_summary(sweep.results, sweep.swept, folder / SUMMARY_FILE)
     command = shlex.join(["autdtorch", "collect", *arguments])
     report = write_report(sweep.results, sweep.scenes, folder, command, sweep.seeds)
-    end = f"{sweep.studies} studies: the table is {folder / SUMMARY_FILE}, the report {report}"
+    count = "1 study" if sweep.studies == 1 else f"{sweep.studies} studies"
+    end = f"{count}: the table is {folder / SUMMARY_FILE}, the report {report}"
     _print([*_table_lines(sweep.results), end])
 
 

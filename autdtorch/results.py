@@ -6,6 +6,7 @@ written beside their place and then renamed, so that what is there is always com
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import platform
@@ -24,6 +25,7 @@ from autdtorch.optim import label_of
 from autdtorch.optim.base import Solution
 from autdtorch.propagator import Run
 from autdtorch.source import package_versions, source_digest
+from autdtorch.writing import replace_file
 
 RESULTS_FILE = "results.h5"
 PROVENANCE_FILE = "provenance.json"
@@ -210,13 +212,13 @@ def save_results(results: StudyResult, folder: str | os.PathLike[str]) -> None:
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    partial = folder / f"{RESULTS_FILE}.partial"
-    with h5py.File(partial, "w") as file:
+    content = io.BytesIO()  # HDF5 would not say that a disk is full, but fail when it closes the file
+    with h5py.File(content, "w") as file:
         _write_provenance(file, results.provenance)
         scenes = file.create_group("scenes", track_order=True)
         for name, scene in results.scenes.items():
             _write_scene(scenes.create_group(name), scene)
-    partial.replace(folder / RESULTS_FILE)
+    replace_file(folder / RESULTS_FILE, content.getvalue())
 
 
 def save_provenance(provenance: Provenance, folder: str | os.PathLike[str]) -> None:
@@ -225,10 +227,8 @@ def save_provenance(provenance: Provenance, folder: str | os.PathLike[str]) -> N
     Raises:
         OSError: the folder cannot be written.
     """
-    path = Path(folder) / PROVENANCE_FILE
-    partial = path.with_name(f"{path.name}.partial")
-    partial.write_text(json.dumps(asdict(provenance), indent=2) + "\n", encoding="utf-8")
-    partial.replace(path)
+    text = json.dumps(asdict(provenance), indent=2) + "\n"
+    replace_file(Path(folder) / PROVENANCE_FILE, text.encode())
 
 
 def load_provenance(folder: str | os.PathLike[str]) -> Provenance:

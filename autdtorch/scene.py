@@ -36,6 +36,8 @@ _DEFAULT_MARGIN = 2.0  # wavelengths of air on each side of everything, where no
 
 _DECIBELS = 20 / math.log(10)  # of a neper
 
+_USUAL_EXTENT = 0.1, 2000.0  # wavelengths from end to end of array and control points
+
 _MOST_ABSORPTION = 3.0  # dB per wavelength: absorption is to be a small part of the wavenumber
 
 
@@ -84,6 +86,10 @@ class Medium:
         density, sound_speed = air.density_and_sound_speed(temperature, relative_humidity, pressure)
         absorption = air.absorption(temperature, relative_humidity, pressure, frequency)
         return cls(density, sound_speed, absorption)
+
+
+class ScaleWarning(UserWarning):
+    """Lengths and frequency of a scene do not seem to be in metres and hertz."""
 
 
 class OverlapWarning(UserWarning):
@@ -147,6 +153,7 @@ class Scene:
 
         Warns:
             OverlapWarning: two obstacles of different materials overlap.
+            ScaleWarning: lengths beside the wavelength look as if in mm, or the frequency in kHz.
         """
         _require_type("Scene.array", array, TransducerArray)
         _require_type("Scene.medium", medium, Medium)
@@ -167,6 +174,7 @@ class Scene:
         _require_separate_points(self)
         _require_in_domain(self)
         _warn_of_overlaps(self.obstacles)
+        _warn_of_units(self)
 
     @property
     def angular_frequency(self) -> float:
@@ -309,6 +317,19 @@ def _require_separate_points(scene: Scene) -> None:
                 extent = _extent(obstacle.lower, obstacle.upper)
                 accepted = f"lies in or on obstacle {index}, {extent}, must be outside it"
                 raise invalid(f"{name}{list(first)}", group[first], accepted, "m")
+
+
+def _warn_of_units(scene: Scene) -> None:
+    points = torch.cat(list(_points(scene).values()))
+    extent = float((points.amax(dim=0) - points.amin(dim=0)).norm())
+    least, most = (bound * scene.wavelength for bound in _USUAL_EXTENT)
+    if not least <= extent <= most:
+        warnings.warn(
+            f"Scene: {extent:.4g} m from end to end of array and control points, but a wavelength of "
+            f"{scene.wavelength:.4g} m; are lengths in m and the frequency in Hz?",
+            ScaleWarning,
+            stacklevel=3,
+        )
 
 
 def _warn_of_overlaps(obstacles: tuple[Obstacle, ...]) -> None:

@@ -17,6 +17,7 @@ import torch
 
 from autdtorch.metrics import focus_metrics
 from autdtorch.optim.base import Solution, joined
+from autdtorch.writing import naming
 
 logger = logging.getLogger(__name__)
 
@@ -74,7 +75,7 @@ class TrialFile:
         if self._path is None:
             return
         rows = [self._row(scene, method, trial) for trial in trials]
-        with self._path.open("a", encoding="utf-8") as file:
+        with naming(self._path), self._path.open("a", encoding="utf-8") as file:
             file.write("".join(json.dumps(row) + "\n" for row in rows))
             file.flush()
             os.fsync(file.fileno())

@@ -28,6 +28,9 @@ MIN_CELLS_PER_WAVELENGTH = 3.0
 FAIR_CELLS_PER_WAVELENGTH = 4.0
 """Coarser grids are warned of: points would need over 10 cells a side, the layer reflects over -61 dB."""
 
+MAX_CELLS_PER_WAVELENGTH = 500
+"""Finer grids are refused: the fit of the boundary layer begins within its bounds up to some 700."""
+
 MAX_CELLS = 10**9
 """More would take over 30 GB in single precision."""
 
@@ -163,7 +166,8 @@ def make_grid(scene: Scene, spacing: float) -> Grid:
     """Cover the scene's domain with cells of `spacing`, placed as flat faces need it (`placement.py`).
 
     Raises:
-        ValueError: fewer than `MIN_CELLS_PER_WAVELENGTH` cells a wavelength, or more than `MAX_CELLS` in all.
+        ValueError: fewer than `MIN_CELLS_PER_WAVELENGTH` cells a wavelength, more than
+            `MAX_CELLS_PER_WAVELENGTH`, or more than `MAX_CELLS` in all.
     """
     return _covering(scene, spacing, domain_extent(scene, spacing))
 
@@ -179,6 +183,10 @@ def _covering(scene: Scene, spacing: float, extent: Extent) -> Grid:
     for index, obstacle in enumerate(scene.obstacles):
         if obstacle.sound_speed is not None:
             require_fine(f"obstacle {index}", obstacle.sound_speed, scene.frequency, spacing)
+    finest = scene.wavelength / MAX_CELLS_PER_WAVELENGTH
+    if spacing < finest:
+        accepted = f"must be at least {finest:.3g} m, {MAX_CELLS_PER_WAVELENGTH} cells per wavelength"
+        raise invalid("spacing", spacing, f"{accepted} in the medium at {scene.frequency:g} Hz", "m")
     kappa = scene.wavenumber * spacing
     offset = grid_offset(scene, spacing, extent.lower, extent.upper)
     rim = layer_cells(kappa) + 1 + extent.margin - 0.5

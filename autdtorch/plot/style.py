@@ -17,7 +17,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from autdtorch.drawing import Array
 from autdtorch.optim import label_of as label_of
-from autdtorch.validation import ArrayLike, real_tensor
+from autdtorch.validation import ArrayLike, invalid, real_tensor
 
 ByMethod: TypeAlias = Mapping[str, ArrayLike]
 Dashes: TypeAlias = tuple[float, tuple[float, ...]]
@@ -131,10 +131,14 @@ def require_scenes(name: str, scenes: Mapping[str, ByMethod]) -> None:
     Raises:
         ValueError: no scene, or a scene without method.
     """
+    accepted = "must have at least one scene, each with at least one method"
+    if not isinstance(scenes, Mapping):
+        raise invalid(name, scenes, accepted)
+    for scene, methods in scenes.items():
+        if not isinstance(methods, Mapping):
+            raise invalid(f"{name}[{scene!r}]", methods, "must be values by the names of methods")
     if not scenes or not all(scenes.values()):
-        raise ValueError(
-            f"{name}: scenes {list(scenes)}; must have at least one scene, each with at least one method"
-        )
+        raise ValueError(f"{name}: scenes {list(scenes)}; {accepted}")
 
 
 def numbers(name: str, given: ArrayLike, *axes: str) -> Array:

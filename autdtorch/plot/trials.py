@@ -60,6 +60,8 @@ def plot_trials(quantities: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
     """
     if not quantities:
         raise ValueError("quantities: empty; must have at least one")
+    for label, by_scene in quantities.items():
+        require_scenes(f"quantities[{label!r}]", by_scene)
     methods = methods_of(values for scenes in quantities.values() for values in scenes.values())
     scenes = methods_of(quantities.values())
     looks = looks_of(methods)
@@ -68,7 +70,6 @@ def plot_trials(quantities: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
     axes = figure.subplots(len(quantities), squeeze=False, sharex=True)[:, 0]
     single = dict.fromkeys(methods, True)
     for letter, ax, (label, by_scene) in zip(ascii_lowercase, axes, quantities.items(), strict=False):
-        require_scenes(f"quantities[{label!r}]", by_scene)
         for scene, by_method in by_scene.items():
             for method, given in by_method.items():
                 values = numbers(f"quantities[{label!r}][{scene!r}][{method!r}]", given, "trials")

@@ -21,7 +21,7 @@ from autdtorch.fdtd.stepping import Assembly, assemble_on
 from autdtorch.propagator.base import MOST_JUDGED, SimulatedPropagator
 from autdtorch.propagator.coupling import coupled_runs
 from autdtorch.propagator.groups import MOST_PASSES, cheapest_grouping, one_box
-from autdtorch.scene import OverlapWarning, Scene
+from autdtorch.scene import Scene
 from autdtorch.validation import LENGTH_TOLERANCE, ArrayLike, distances, invalid, points_tensor
 
 logger = logging.getLogger(__name__)
@@ -164,5 +164,5 @@ def _heard(matrix: torch.Tensor, incident: torch.Tensor) -> Judged:
 def _part(scene: Scene, group: Sequence[int]) -> Scene:
     """A scene with some of its obstacles."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", OverlapWarning)  # the whole scene has given it
+        warnings.simplefilter("ignore")  # the whole scene has given its own
         return dataclasses.replace(scene, obstacles=tuple(scene.obstacles[index] for index in group))

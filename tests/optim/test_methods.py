@@ -132,6 +132,25 @@ def test_a_trial_of_bayes_opt_is_the_same_in_any_block_and_on_any_number_of_thre
         torch.set_num_threads(threads)
 
 
+@pytest.mark.parametrize("method", [identify, gradient_ascent])
+def test_a_method_of_small_steps_takes_one_thread_and_gives_the_others_back(
+    make_objective, random_matrix, method, monkeypatch
+):
+    used = set()
+    monkeypatch.setattr(
+        "autdtorch.optim.gradient._pressure",
+        lambda matrix, drive: used.add(torch.get_num_threads()) or (drive[:, None] * matrix).sum(dim=-1),
+    )
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        method(make_objective(random_matrix(2, 3, 0)))
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+    assert used == {1}
+
+
 @pytest.mark.parametrize("method", [lssg, partial(gabs, trials=3)], ids=["lssg", "gabs"])
 @settings(max_examples=25)
 @given(

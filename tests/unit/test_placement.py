@@ -82,6 +82,13 @@ def test_voxels_have_faces_too() -> None:
     )
 
 
+def test_a_grid_far_finer_than_the_wavelength_is_refused() -> None:
+    with pytest.raises(
+        ValueError, match=r"spacing: 1e-05 m; must be at least 1\.\d+e-05 m, 500 cells per wave"
+    ):
+        make_grid(scene(), 1e-5)
+
+
 def test_the_grid_covers_the_domain_wherever_it_lies() -> None:
     grid = make_grid(scene(box((5.3, 6.7, 7.9), (8, 9, 10))), SPACING)
     margin = footprint(grid.kappa) // 2 - 1  # cells that points beside the rim of the domain need

@@ -322,6 +322,11 @@ def test_nothing_is_cut_off_with_all_methods() -> None:
             r"\['gabs'\]: shape \(1, 1\); must be \(trials",
         ),
         (lambda: plot_trials({"f [1]": {"empty": {"gabs": [np.nan]}}}), "every entry must be finite"),
+        (lambda: plot_trials({"f [1]": {"gabs": np.ones(3)}}), r"\['gabs'\]: .* by the names of methods"),
+        (
+            lambda: plot_convergence({"gabs": np.ones((3, 4))}),
+            r"history\['gabs'\]: .*; must be values by the names",
+        ),
         (lambda: plot_convergence({"empty": {}}), "at least one method"),
         (lambda: plot_convergence({"empty": {"gabs": [1.0]}}), r"must be \(trials, evaluations\)"),
         (lambda: plot_convergence({"empty": {"gabs": [[1.0]]}}, {"two": {}}), r"levels: of scenes \['two'\]"),

@@ -1,6 +1,8 @@
 """What a study found comes back from disk as it was."""
 
 import dataclasses
+import errno
+import os
 from pathlib import Path
 
 import pytest
@@ -87,6 +89,20 @@ def test_saving_again_replaces_what_was_there_and_leaves_nothing_else(
     save_results(fewer, tmp_path)
     assert list(load_results(tmp_path).scenes) == ["empty"]
     assert sorted(path.name for path in tmp_path.iterdir()) == [RESULTS_FILE]
+
+
+def test_a_full_disk_is_told_with_the_name_of_the_file(
+    results: StudyResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_results(results, tmp_path)
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_bytes", refuse)
+    with pytest.raises(OSError, match=r"No space left on device: '.*results\.h5'"):
+        save_results(results, tmp_path)
+    assert load_results(tmp_path).scenes.keys() == results.scenes.keys()
 
 
 def test_the_provenance_comes_back_or_is_refused_by_name(results: StudyResult, tmp_path: Path) -> None:

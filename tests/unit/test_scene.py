@@ -10,7 +10,7 @@ import torch
 from autdtorch.array import TransducerArray
 from autdtorch.geometry import Plane, circle_points
 from autdtorch.obstacles import Box, Sphere
-from autdtorch.scene import Medium, OverlapWarning, Scene
+from autdtorch.scene import Medium, OverlapWarning, ScaleWarning, Scene
 
 AIR = Medium(density=1.293, sound_speed=340.0)
 
@@ -80,6 +80,23 @@ def test_overlapping_obstacles_of_different_materials_are_named():
     ) as caught:
         paper_scene(obstacles=[ball(40, 8, 100.0), ball(60, 8, 50.0), ball(45, 8, 50.0)])
     assert len(caught) == 1  # and not 2 with 1, which are of one material
+    assert caught[0].filename == __file__
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"frequency": 40.0},
+        {
+            "array": TransducerArray.grid((4, 4), pitch=10.0, center=(1.0, 50.0, 50.0)),
+            "control_points": circle_points((80.0, 50.0, 50.0), 30.0, 4, (1, 0, 0)),
+        },
+    ],
+    ids=["kHz", "mm"],
+)
+def test_a_scene_that_seems_to_be_in_other_units_is_told(changes):
+    with pytest.warns(ScaleWarning, match="are lengths in m and the frequency in Hz") as caught:
+        paper_scene(**changes)
     assert caught[0].filename == __file__
 
 
