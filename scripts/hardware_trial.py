@@ -64,8 +64,8 @@ def arguments(words: Sequence[str] | None = None) -> argparse.Namespace:
 
 def run(options: argparse.Namespace, command: str) -> None:
     """Make the trial, from the scene to the report."""
-    path = Path(options.scene)
-    scene = at.load_scene(path if path.suffix else ROOT / "configs" / "scene" / f"{options.scene}.yaml")
+    path = scene_path(options.scene)
+    scene = at.load_scene(path)
     name = path.stem
     limits = hardware.Limits(
         options.amplitude_limit,
@@ -97,6 +97,16 @@ def run(options: argparse.Namespace, command: str) -> None:
         folder, log.evaluations, found, on_levels, expected, preflight, log.origin, command
     )
     print(f"weakest focus {float(found.pressure.min()):.4g} Pa as measured; the report is {report}")
+
+
+def scene_path(text: str) -> Path:
+    """The scene's file, by its path or by its name among ours."""
+    folder = ROOT / "configs" / "scene"
+    path = Path(text) if Path(text).suffix else folder / f"{text}.yaml"
+    if not path.is_file():
+        ours = ", ".join(sorted(file.stem for file in folder.glob("*.yaml")))
+        raise ValueError(f"--scene: {text}: no such file; must be a YAML file, or one of {ours}")
+    return path
 
 
 def method_of(name: str, settings: dict[str, Any], seed: int) -> Method:
@@ -134,7 +144,7 @@ def measure(
             logging.info("going on after %d evaluations", len(objective.log.evaluations))
         progress.begin("pre-flight check")
         with silence_expected():
-            preflight = hardware.check_transducers(limited, sensor, points)
+            preflight = hardware.check_transducers(limited, sensor, points, bench.readings, bench.background)
         if len(preflight.dead) == len(scene.array):
             raise ValueError("the sensor hears no transducer; check the device's power, and the sensor")
         logging.info("the sensor hears %d of %d", len(scene.array) - len(preflight.dead), len(scene.array))
@@ -143,7 +153,7 @@ def measure(
         found = method(at.Quantised(objective, **bench.device.quantised))
         limited.off()
         with silence_expected():
-            silent = hardware.hears_silence(sensor, preflight, points)
+            silent = hardware.hears_silence(sensor, preflight, points, bench.readings)
         if not silent:
             logging.warning("the sensor hears more than before the trial: are the outputs off?")
     return found, preflight, objective.log

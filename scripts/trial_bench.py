@@ -28,11 +28,13 @@ _EMULATED_SCOPE = (0x2A8D, 0x1770)
 
 
 class Bench(NamedTuple):
-    """What a trial works with."""
+    """What a trial works with, and how often the pre-flight check reads a transducer and the silence."""
 
     device: hardware.Device
     link: Callable[[], hardware.Link]
     sensor: Callable[[], contextlib.AbstractContextManager[hardware.Sensor]]
+    readings: int
+    background: int
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -58,7 +60,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def indices(text: str) -> list[int]:
     """Numbers of transducers: `3,7-9` is 3, 7, 8, 9."""
     parts = [part.partition("-") for part in text.split(",")]
-    return [one for low, _, high in parts for one in range(int(low), int(high or low) + 1)]
+    ranges = [range(int(low), int(high or low) + 1) for low, _, high in parts]
+    if not all(ranges):
+        raise argparse.ArgumentTypeError(f"{text!r}; must be numbers and ranges that go up, as 3,7-9")
+    return [one for some in ranges for one in some]
 
 
 def chip(text: str) -> tuple[int, int]:
@@ -88,7 +93,7 @@ def bench_of(options: argparse.Namespace, simulated: at.SimulatedObjective) -> B
             f"--transducers: none; must say which {count} of the {device.transducers} transducers of "
             f"{device.name} the scene's are"
         )
-    transducers = options.transducers or list(range(count))
+    transducers = list(range(count)) if options.transducers is None else options.transducers
     on_bench = None
     if emulated or options.dry_run:
         on_bench = hardware.EmulatedBench(device, simulated.transfer_matrix, transducers, dead=options.dead)
@@ -99,7 +104,10 @@ def bench_of(options: argparse.Namespace, simulated: at.SimulatedObjective) -> B
             return hardware.Link(device, DryPort(on_bench, device, print), transducers, sleep=backend.sleep)
         return hardware.open_link(device, transducers, options.serial, backend)
 
-    return Bench(device, link, lambda: _sensor(options, simulated.scene, on_bench))
+    kind = _kind(options)
+    by_hand = kind == "manual" or (kind == "scope" and options.moved)
+    check = (1, 1) if by_hand else (4, 32)
+    return Bench(device, link, lambda: _sensor(options, simulated.scene, on_bench), *check)
 
 
 def _kind(options: argparse.Namespace) -> str:

@@ -84,6 +84,8 @@ class FtdiUart(FtdiPort):
 
     def _line_status(self) -> int:
         packet = self._call("be read", self._in.read, self._in.wMaxPacketSize)
+        if len(packet) < STATUS_BYTES:
+            raise LinkError("the adapter gives no line status; is it an FT232R?")
         return int(packet[1])
 
     def _set_up(self) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
+import threading
 import time
 from collections.abc import Callable, Sequence
 from types import TracebackType
@@ -24,7 +26,7 @@ class Link:
     """A device at the end of a port: `play` a drive, and it plays until the next, or until `off`.
 
     Use it as a context manager. The outputs are switched off when it is opened, as some devices start with
-    all transducers on, and however the block ends.
+    all transducers on, and however the block ends; at the latest when Python exits. Threads may share it.
 
     Attributes:
         device: what hangs on the port.
@@ -58,9 +60,12 @@ class Link:
         self.device = device
         self._port = port
         self._sleep = sleep
+        self._lock = threading.RLock()
+        self._open = True
         self.off()
         self.transducers = wiring(transducers, device.transducers)
         self.settle = not_negative("settle", settle, "s")
+        atexit.register(self.close)
 
     def play(self, drive: torch.Tensor) -> None:
         """Play a drive (M,), |q| <= 1, on the nearest levels of the device, until the next.
@@ -69,10 +74,14 @@ class Link:
 
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-            LinkError: the device does not take the bytes.
+            LinkError: the device does not take the bytes, or was let go.
         """
-        self._send(self._frame(drive))
-        self._sleep(self.settle)
+        frame = self._frame(drive)
+        with self._lock:
+            if not self._open:
+                raise LinkError(f"{self.device.name} was let go; open it anew")
+            self._send(frame)
+            self._sleep(self.settle)
 
     def played(self, drive: torch.Tensor) -> torch.Tensor:
         """What the device is sent to play when asked for a drive (M,): the nearest on its levels.
@@ -83,19 +92,22 @@ class Link:
         return self.device.played(self._frame(drive))[self.transducers]
 
     def off(self) -> None:
-        """Switch all outputs of the device off.
+        """Switch all outputs of the device off; once it was let go they are.
 
         The frame is sent twice: a device that was left in mid-frame takes the first for the rest of that.
 
         Raises:
             LinkError: the device does not take the bytes.
         """
-        try:
-            self._send_silence()
-        except BaseException as error:  # a fault of the bus that may pass, or a signal
-            self._recover()
-            if not isinstance(error, LinkError):
-                raise
+        with self._lock:
+            if not self._open:  # pyusb would open it once more
+                return
+            try:
+                self._send_silence()
+            except BaseException as error:  # a fault of the bus that may pass, or a signal
+                self._recover()
+                if not isinstance(error, LinkError):
+                    raise
 
     def _recover(self) -> None:
         try:
@@ -117,10 +129,15 @@ class Link:
         Raises:
             LinkError: the device does not take the bytes; it is let go all the same.
         """
-        try:
-            self.off()
-        finally:
-            self._port.close()
+        with self._lock:
+            if not self._open:
+                return
+            try:
+                self.off()
+            finally:
+                self._open = False
+                atexit.unregister(self.close)
+                self._port.close()
 
     def _frame(self, drive: torch.Tensor) -> bytes:
         everyone = torch.zeros(self.device.transducers, dtype=torch.complex128)

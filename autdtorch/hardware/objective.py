@@ -84,7 +84,7 @@ class HardwareObjective:
             link.charge(self.log.evaluations[-1].seconds_on)
 
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
-        """Play each of several drives and read the control points, then switch the outputs off.
+        """Play each of several drives and read the control points; the outputs are off however it ends.
 
         Args:
             drive: (B, M) complex, |q| <= 1.
@@ -100,9 +100,10 @@ class HardwareObjective:
             OSError: the log cannot be written.
         """
         drives = validate_drives(drive, len(self.scene.array))
-        pressure = torch.stack([self._evaluate(row) for row in drives])
-        self._link.off()
-        return pressure
+        try:
+            return torch.stack([self._evaluate(row) for row in drives])
+        finally:
+            self._link.off()
 
     def _evaluate(self, drive: torch.Tensor) -> torch.Tensor:
         most = self._link.limits.evaluations

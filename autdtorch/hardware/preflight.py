@@ -14,7 +14,6 @@ from autdtorch.validation import integer_at_least
 #: How far above the noise a transducer is heard, in standard deviations of the noise's mean power.
 _DEVIATIONS = 6.0
 _WEAK = 0.1
-_BACKGROUND = 8  # readings of the silence for each of a transducer
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +36,10 @@ class Preflight:
         return torch.nonzero(self.pressure <= self.threshold)[:, 0].tolist()
 
 
-def check_transducers(link: LimitedLink, sensor: Sensor, points: int, readings: int = 4) -> Preflight:
-    """Play every transducer alone, after silence, and switch the outputs off.
+def check_transducers(
+    link: LimitedLink, sensor: Sensor, points: int, readings: int = 4, background: int = 32
+) -> Preflight:
+    """Play every transducer alone, after silence, and switch the outputs off, however it ends.
 
     The power of circular Gaussian noise, averaged over n readings, deviates by 1/sqrt(n) of its mean: that
     says from which pressure on a transducer is heard. It must also be within 20 dB of the others' median, as
@@ -49,20 +50,23 @@ def check_transducers(link: LimitedLink, sensor: Sensor, points: int, readings: 
         sensor: hears them.
         points: number of control points P that the sensor reads.
         readings: of every transducer, >= 1.
+        background: readings of the silence, >= 1.
 
     Raises:
-        ValueError: the sensor does not give P finite magnitudes.
+        ValueError: the sensor does not give P finite magnitudes, or fewer than 1 readings.
         LimitError: the outputs were on for as long as they may.
         LinkError: the device does not take the bytes.
     """
     readings = integer_at_least("readings", readings, 1)
-    silence = _power(sensor, points, _BACKGROUND * readings)
+    silence = _power(sensor, points, integer_at_least("background", background, 1))
     powers = []
-    for alone in torch.eye(len(link.link.transducers), dtype=torch.complex128):
-        link.play(alone)
-        powers.append(_power(sensor, points, readings))
-        link.require_on()
-    link.off()
+    try:
+        for alone in torch.eye(len(link.link.transducers), dtype=torch.complex128):
+            link.play(alone)
+            powers.append(_power(sensor, points, readings))
+            link.require_on()
+    finally:
+        link.off()
     pressure = torch.tensor(powers, dtype=torch.float64).sqrt()
     above_noise = math.sqrt(silence * (1 + _DEVIATIONS / math.sqrt(readings * points)))
     return Preflight(pressure, math.sqrt(silence), max(above_noise, _WEAK * float(pressure.median())))
@@ -78,9 +82,9 @@ def hears_silence(sensor: Sensor, check: Preflight, points: int, readings: int =
         readings: >= 1.
 
     Raises:
-        ValueError: the sensor does not give P finite magnitudes.
+        ValueError: the sensor does not give P finite magnitudes, or fewer than 1 readings.
     """
-    return math.sqrt(_power(sensor, points, readings)) <= check.threshold
+    return math.sqrt(_power(sensor, points, integer_at_least("readings", readings, 1))) <= check.threshold
 
 
 def _power(sensor: Sensor, points: int, readings: int) -> float:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import logging
 import signal
 import threading
 import time
@@ -13,12 +15,15 @@ from types import FrameType
 import torch
 
 from autdtorch.hardware.link import Link
-from autdtorch.hardware.usb import LinkError
 from autdtorch.validation import integer_at_least, invalid, number_between, positive
+
+logger = logging.getLogger(__name__)
 
 _CANDIDATES = 256  # amplitudes to choose from; more than a device here has
 
-_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+# SIGTSTP, Ctrl-Z, would stop the process, and its timer, with the outputs on.
+_ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGBREAK")
+_SIGNALS = [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
 
 
 class LimitError(RuntimeError):
@@ -40,9 +45,10 @@ class Signalled(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def ended_by_signals() -> Iterator[None]:
-    """Have Ctrl-C, SIGTERM and SIGHUP raise `Signalled`, so that links are closed on the way out.
+    """Have the signals that end or stop a process raise `Signalled`, so that links are closed on the way out.
 
-    Only the first does: what comes later must not interrupt the switching off. Use it around the link.
+    These are Ctrl-C, Ctrl-Z, SIGTERM, SIGHUP and SIGQUIT; one that is ignored, as by ``nohup``, stays so.
+    Only the first raises: what comes later must not interrupt the switching off. Use it around the link.
 
     Raises:
         Signalled: there was such a signal.
@@ -50,11 +56,14 @@ def ended_by_signals() -> Iterator[None]:
     """
 
     def end(number: int, _: FrameType | None) -> None:
-        for one in _SIGNALS:
+        for one in before:
             signal.signal(one, signal.SIG_IGN)
         raise Signalled(number)
 
-    before = {one: signal.signal(one, end) for one in _SIGNALS}
+    heard = [one for one in _SIGNALS if signal.getsignal(one) is not signal.SIG_IGN]
+    before = {one: signal.getsignal(one) for one in heard}
+    for one in heard:
+        signal.signal(one, end)
     try:
         yield
     finally:
@@ -121,7 +130,7 @@ class LimitedLink:
         self._on_since: float | None = None
         self._seconds_before = 0.0
         self._rested_at = 0.0
-        self._failure: LinkError | None = None
+        self._failure: Exception | None = None
 
     @property
     def seconds_on(self) -> float:
@@ -153,7 +162,8 @@ class LimitedLink:
             self._raise_failure()
             if self._on_since is None:
                 self._on_since = time.monotonic()
-                self._timer = threading.Timer(min(left, self.limits.seconds_in_a_row), self._time_is_up)
+                most = min(left, self.limits.seconds_in_a_row)
+                self._timer = threading.Timer(most, functools.partial(self._time_is_up, self._on_since))
                 self._timer.daemon = True
                 self._timer.start()
             self.link.play(self._scale * drive)
@@ -199,11 +209,17 @@ class LimitedLink:
             raise LimitError(f"the outputs were on for {self.limits.seconds:g} s, the limit")
         return left
 
-    def _time_is_up(self) -> None:
-        try:
-            self.off()
-        except LinkError as error:  # for the main thread to raise
-            self._failure = error
+    def _time_is_up(self, since: float) -> None:
+        with self._lock:
+            if self._on_since != since:  # switched off meanwhile, or on anew
+                return
+            try:
+                self.off()
+            except Exception as error:  # for the main thread to raise, once its sensor lets it
+                self._failure = error
+                logger.error("the time is up, but: %s", error)
+            else:
+                logger.warning("the time is up: the outputs are off, what is read now is void")
 
     def _raise_failure(self) -> None:
         if self._failure is not None:

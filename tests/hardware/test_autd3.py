@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from autdtorch.drive import drive_from_phases
-from autdtorch.hardware import LinkError, open_autd3
+from autdtorch.hardware import LimitedLink, LimitError, Limits, LinkError, open_autd3
 from autdtorch.hardware.autd3 import Autd3Port, autd3_device
 from autdtorch.hardware.levels import Levels, autd3_levels
 
@@ -59,6 +59,22 @@ class TestWithTheKit:
         assert sent == [Clear, *5 * [Pattern]]  # off twice, the drive, off twice
         with pytest.raises(ValueError, match=r"from 0 to 497"):
             open_autd3(2, [498], boards.option())
+
+    def test_the_timer_of_a_limited_link_switches_them_off(self, kit, monkeypatch):
+        def write(port, data):
+            real(port, data)
+            played.append(any(data))
+
+        real, played = Autd3Port.write, []
+        monkeypatch.setattr(Autd3Port, "write", write)
+        boards = kit.UdpEmulator(1)
+        with open_autd3(1, network=boards.option(), settle=0) as link:
+            limited = LimitedLink(link, Limits(1.0, seconds_in_a_row=0.02))
+            limited.play(random_drive(249))
+            limited._timer.join()
+            assert played[2:] == [True, False, False]  # after the two of opening; on, then off twice
+            with pytest.raises(LimitError, match="in a row"):
+                limited.require_on()
 
     def test_no_boards_are_an_error(self, kit):
         option = kit.UdpOption("127.0.0.1", enumeration_timeout=kit.Duration.from_millis(50))

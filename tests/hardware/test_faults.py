@@ -113,7 +113,7 @@ def test_garbage_from_the_sensor_ends_the_trial_with_the_outputs_off(trial, read
     require_that_it_goes_on(trial)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGTSTP])
 def test_a_signal_ends_the_trial_with_the_outputs_off(trial, number):
     def disturb(readings: int) -> None:
         if readings > SURVIVED:
@@ -148,6 +148,16 @@ def test_signals_in_mid_frame_and_while_switching_off_leave_the_outputs_off(tria
     with pytest.raises(Signalled):
         interrupted_trial()
     assert bench.firmware.drive().abs().max() == 0
+
+
+def test_a_signal_that_is_ignored_as_by_nohup_stays_so():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with ended_by_signals():
+            os.kill(os.getpid(), signal.SIGHUP)
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 KILLED = f"""

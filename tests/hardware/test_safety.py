@@ -103,6 +103,86 @@ def test_while_a_sensor_takes_too_long_the_outputs_go_off(trial, limits: Limits,
         assert not objective.log.evaluations
 
 
+def test_a_timer_of_an_earlier_link_does_not_reach_the_next(trial):
+    bench = trial.bench()
+    with trial.link(bench) as link:
+        limited = LimitedLink(link, Limits(1.0, seconds_in_a_row=0.05))
+        limited.play(full_on()[0])
+    with trial.link(bench) as link:
+        link.play(full_on()[0])
+        limited._timer.join()
+        assert bench.drive().abs().min() > 0.9
+    with pytest.raises(LinkError, match="SonicSurface was let go"):
+        link.play(full_on()[0])
+    assert bench.firmware.drive().abs().max() == 0
+
+
+@pytest.mark.parametrize("error", [LinkError("stuck"), RuntimeError("stuck")])
+def test_a_timer_that_cannot_switch_off_says_so_at_once_and_ends_the_trial(trial, error, monkeypatch, caplog):
+    class Asleep(EmulatedSensor):
+        def read(self):
+            limited._timer.join()
+            told.append("the time is up, but: stuck" in caplog.text)
+            return super().read()
+
+    def fail() -> None:
+        raise error
+
+    told: list[bool] = []
+    bench = trial.bench()
+    with trial.link(bench) as link:
+        limited = LimitedLink(link, Limits(1.0, seconds_in_a_row=0.02))
+        objective = HardwareObjective(trial.scene, limited, Asleep(bench), trial.log)
+        monkeypatch.setattr(link, "off", fail)
+        with pytest.raises(type(error), match="stuck"):
+            objective(full_on())
+        monkeypatch.undo()
+    assert told == [True]
+    assert not objective.log.evaluations
+    assert bench.firmware.drive().abs().max() == 0
+
+
+def test_a_timer_that_comes_too_late_leaves_the_next_stretch_alone(trial):
+    bench = trial.bench()
+    with trial.link(bench) as link:
+        limited = LimitedLink(link, Limits(1.0, seconds_in_a_row=0.05))
+        limited.play(full_on()[0])
+        with limited._lock:  # the timer waits for it
+            time.sleep(0.1)
+            limited.off()
+            limited.play(full_on()[0])
+        limited.require_on()
+        assert bench.drive().abs().min() > 0.9
+
+
+def test_an_error_of_the_sensor_leaves_the_outputs_off_on_an_open_link(trial):
+    class Broken(EmulatedSensor):
+        def read(self):
+            if bench.drive().abs().max() > 0:
+                raise OSError("gone")
+            return super().read()
+
+    bench = trial.bench()
+    with trial.link(bench) as link:
+        with pytest.raises(OSError, match="gone"):
+            trial.objective(link, Broken(bench))(full_on())
+        assert bench.firmware.drive().abs().max() == 0
+        with pytest.raises(OSError, match="gone"):
+            check_transducers(LimitedLink(link, Limits(1.0)), Broken(bench), points=2)
+        assert bench.firmware.drive().abs().max() == 0
+
+
+def test_a_link_left_open_is_switched_off_when_python_exits(trial, monkeypatch):
+    at_exit: list[object] = []
+    monkeypatch.setattr("atexit.register", at_exit.append)
+    bench = trial.bench()
+    link = trial.link(bench)
+    link.play(full_on()[0])
+    (close,) = at_exit
+    close()
+    assert bench.firmware.drive().abs().max() == 0
+
+
 def test_the_time_on_goes_on_with_the_trial(trial):
     bench = trial.bench()
     with trial.link(bench) as link:
@@ -147,6 +227,14 @@ def test_a_chip_that_keeps_the_off_frame_is_told_of(trial, monkeypatch):
     link = trial.link(bench)
     bench.chip.read = lambda most: b"\x01\x20"  # there is room for more, but the transmitter is not empty
     with pytest.raises(LinkError, match="outputs may still be on"):
+        link.close()
+
+
+def test_a_chip_without_line_status_is_told_of(trial):
+    bench = trial.bench()
+    link = trial.link(bench)
+    bench.chip.read = lambda most: b""
+    with pytest.raises(LinkError, match="no line status; is it an FT232R"):
         link.close()
 
 

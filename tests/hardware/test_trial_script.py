@@ -1,5 +1,6 @@
 """The script of a trial: what it leaves and shows, and how it ends."""
 
+import io
 import logging
 import re
 from pathlib import Path
@@ -89,6 +90,7 @@ def test_a_dry_run_shows_the_frames_and_leaves_nothing(run, tmp_path: Path, caps
         (("--set", "level=4"), 2, "unknown key 'level'; gabs has first, levels, order, passes"),
         (("--device", "openmpd"), 2, "--sensor: None; must be scope, file or manual on a real device"),
         (("--dead", "0-8"), 2, "the sensor hears no transducer"),
+        (("--scene", "nowhere"), 2, "--scene: nowhere: no such file; must be a YAML file, or one of homo"),
         (
             ("--device", "sonicsurface", "--sensor", "manual"),
             2,
@@ -105,6 +107,20 @@ def test_no_trial_without_an_amplitude_limit(run, capsys):
     with pytest.raises(SystemExit):
         run("--device", "emulated", "--method", "gabs")
     assert "--amplitude-limit" in capsys.readouterr().err
+
+
+def test_transducers_that_count_down_are_refused(run, capsys):
+    with pytest.raises(SystemExit):
+        run(*EMULATED, "--transducers", "5-3")
+    assert "'5-3'; must be numbers and ranges that go up" in capsys.readouterr().err
+
+
+def test_a_person_reads_each_transducer_and_the_silence_once(run, monkeypatch):
+    points, evaluations = 2, 1 + 8 * 4
+    answers = io.StringIO("0\n" * points + "1\n" * points * (9 + evaluations) + "0\n" * points)
+    monkeypatch.setattr("sys.stdin", answers)
+    assert run(*EMULATED, "--sensor", "manual") == 0
+    assert not answers.read()
 
 
 def test_the_factor_between_simulation_and_bench_is_found():
