@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import importlib.util
 import signal
 import subprocess
 import sys
@@ -44,7 +45,10 @@ def rendering_problem() -> str | None:
 
 
 def require_rendering() -> None:
-    """Refuse to go on where it would kill the process.
+    """Refuse to go on where it would kill the process, now or later.
+
+    Triton holds an LLVM of its own. Imported after Mesa's software driver has loaded another, as PyTorch's
+    optimisers do, it ends the process; imported before, it does not.
 
     Raises:
         RuntimeError: this machine cannot render; the message says what is missing.
@@ -52,6 +56,8 @@ def require_rendering() -> None:
     problem = rendering_problem()
     if problem is not None:
         raise RuntimeError(problem)
+    if importlib.util.find_spec("triton") is not None:
+        importlib.import_module("triton")
 
 
 def _cause_of_death(child: subprocess.CompletedProcess[str]) -> str:

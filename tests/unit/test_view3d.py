@@ -4,6 +4,7 @@ import json
 import math
 import sys
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -127,6 +128,12 @@ def test_a_picture_is_written_and_not_blank(scene: at.Scene, tmp_path: Path) -> 
     # The discs are drawn without lighting, so that their colour is exact: at least 100 pixels each, of 12.
     disc = np.abs(picture[..., :3] - np.array([0x00, 0x72, 0xB2]) / 255).max(axis=-1) < 0.01
     assert disc.sum() > 1200
+
+
+@pytest.mark.usefixtures("renderer")
+def test_triton_is_imported_before_a_driver_that_would_make_it_crash(scene: at.Scene) -> None:
+    view3d(scene).close()
+    assert find_spec("triton") is None or "triton" in sys.modules
 
 
 @pytest.mark.usefixtures("renderer")
