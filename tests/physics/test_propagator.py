@@ -234,7 +234,10 @@ def test_free_space_says_that_it_leaves_obstacles_out(caplog: pytest.LogCaptureF
             {"spacing": 2e-5, "method": "full"},
             r"spacing: 2e-05 m; gives 1216 x 1216 x 1216 cells, must be at most 1e\+09",
         ),
-        ({"spacing": 1e-5, "method": "full"}, r"spacing: 1e-05 m; must be at least 1\.7e-05 m, 500 cells per"),
+        (
+            {"spacing": 1e-5, "method": "full"},
+            r"spacing: 1e-05 m; must be at least 1\.7e-05 m, 500 cells per",
+        ),
         ({"spacing": float("nan")}, r"spacing: nan"),
         ({"spacing": -1e-3}, r"spacing: -0.001 m; must be finite and > 0"),
         ({"tolerance": 1.5}, r"tolerance: 1.5; must be in \(0, 1\)"),
