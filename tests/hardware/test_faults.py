@@ -113,6 +113,15 @@ def test_garbage_from_the_sensor_ends_the_trial_with_the_outputs_off(trial, read
     require_that_it_goes_on(trial)
 
 
+@pytest.fixture
+def not_ignored(number):
+    """A signal as a terminal's processes get it: those that a shell starts in the background ignore two."""
+    before = signal.signal(number, signal.SIG_DFL)
+    yield
+    signal.signal(number, before)
+
+
+@pytest.mark.usefixtures("not_ignored")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGTSTP])
 def test_a_signal_ends_the_trial_with_the_outputs_off(trial, number):
     def disturb(readings: int) -> None:
