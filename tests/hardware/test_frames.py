@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autdtorch.drive import drive_from_phases
-from autdtorch.hardware.devices import OPENMPD, SONICSURFACE, ultraino_boards
+from autdtorch.hardware.devices import OPENMPD, SONICSURFACE, Device, ultraino_boards
+from autdtorch.hardware.emulator import EmulatedBench
 from autdtorch.hardware.firmware import OpenMPDFirmware, SonicSurfaceFirmware, UltrainoFirmware
 from autdtorch.hardware.frames import (
     levels_of_openmpd_frame,
@@ -19,6 +20,7 @@ from autdtorch.hardware.frames import (
     ultraino_frame,
 )
 from autdtorch.hardware.levels import Levels, openmpd_drive, sonicsurface_drive, ultraino_drive
+from autdtorch.hardware.link import open_link
 from autdtorch.hardware.order import sonicsurface_channels, ultraino_pins
 
 seeds = st.integers(0, 2**32 - 1)
@@ -29,6 +31,16 @@ def one_on(transducer: int, phase: float, amplitude: float, count: int = 256) ->
     drive = torch.zeros(count, dtype=torch.complex128)
     drive[transducer] = drive_from_phases([phase], [amplitude])[0]
     return drive
+
+
+def on_the_wire(device: Device, drive: torch.Tensor) -> bytes:
+    """What the firmware behind the emulated USB chip receives when a link plays the drive."""
+    bench = EmulatedBench(device, torch.ones(1, device.transducers, dtype=torch.complex128))
+    received = bytearray()
+    with open_link(device, backend=bench.bus) as link, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bench.firmware, "receive", received.extend)
+        link.play(drive)
+    return bytes(received)
 
 
 # Phase phi [rad] and amplitude of one transducer, then place and value of its byte. The byte is
@@ -84,7 +96,7 @@ ULTRAINO_EXAMPLES = [
 def test_sonicsurface_bytes(transducer: int, phase: float, amplitude: float, place: int, byte: int) -> None:
     expected = bytearray([254, *[32] * 256, 253])
     expected[place] = byte
-    assert SONICSURFACE.frame(one_on(transducer, phase, amplitude)) == expected
+    assert on_the_wire(SONICSURFACE, one_on(transducer, phase, amplitude)) == expected
 
 
 @pytest.mark.parametrize(("transducer", "phase", "amplitude", "byte", "duty"), OPENMPD_EXAMPLES)
@@ -92,7 +104,7 @@ def test_openmpd_bytes(transducer: int, phase: float, amplitude: float, byte: in
     expected = bytearray(512)
     expected[0] = 128
     expected[transducer], expected[256 + transducer] = byte, duty
-    assert OPENMPD.frame(one_on(transducer, phase, amplitude)) == expected
+    assert on_the_wire(OPENMPD, one_on(transducer, phase, amplitude)) == expected
 
 
 @pytest.mark.parametrize(("transducer", "phase", "amplitude", "port", "bit", "tenths"), ULTRAINO_EXAMPLES)
@@ -104,7 +116,7 @@ def test_ultraino_bytes(
         upper_half_first = 0 if bit >= 4 else 1
         expected[200 * (transducer // 64) + 2 * (10 * tenth + port) + upper_half_first] |= 1 << 4 + bit % 4
     expected += bytes.fromhex("30303070 30303030 10 00")  # 1 period, 0 to end, commit, switch
-    assert ultraino_boards(2).frame(one_on(transducer, phase, amplitude, 128)) == expected
+    assert on_the_wire(ultraino_boards(2), one_on(transducer, phase, amplitude, 128)) == expected
 
 
 @settings(max_examples=30)
