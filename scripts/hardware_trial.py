@@ -16,7 +16,7 @@ _FAILED, _REFUSED, _LIMITED, _INTERRUPTED = 1, 2, 3, 130
 
 def main() -> int:
     """Run the command line; returns the status for the shell, after one line on stderr if it is not 0."""
-    logging.basicConfig(format="%(message)s", level=logging.INFO)
+    logging.basicConfig(format="%(message)s")
     try:
         return _run()
     except KeyboardInterrupt:  # while signals were not looked after yet
@@ -29,6 +29,7 @@ def _run() -> int:
 
     from autdtorch import hardware
 
+    logging.getLogger().setLevel(logging.INFO)  # only now: half of PyTorch would log its caches
     options = parsed()
     trial = None
     try:

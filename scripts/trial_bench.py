@@ -51,7 +51,7 @@ def settings_of(options: argparse.Namespace) -> dict[str, Any]:
     if kind == "scope":
         settings |= {"sensitivity [V/Pa]": options.sensitivity, "captures": options.captures}
     if options.device in EMULATED:
-        settings |= {"snr [dB]": options.snr, "dead": options.dead}
+        settings |= {"emulated": True, "snr [dB]": options.snr, "dead": options.dead}
     if device_name(options) == "openmpd" and options.boards:
         settings["boards"] = [f"{board.name} {digest_of(board)[:16]}" for board in _openmpd_boards(options)]
     return settings

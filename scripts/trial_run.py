@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import torch
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from trial_bench import bench_of, settings_of
@@ -19,6 +20,7 @@ from yaml import YAMLError
 
 import autdtorch as at
 from autdtorch import hardware
+from autdtorch.hardware.sensor import checked_reading
 from autdtorch.hardware_report import write_hardware_report
 from autdtorch.optim.base import Solution
 from autdtorch.progress import Progress, show_progress
@@ -73,15 +75,18 @@ class Trial:
             return
         folder = self._folder
         folder.mkdir(parents=True, exist_ok=True)
-        found, preflight, log = self._measure(folder / _LOG_FILE)
+        found, again, preflight, log = self._measure(folder / _LOG_FILE)
         at.save_drive(folder / _DRIVE_FILE, found.drive[0], self._scene.array)
         report = write_hardware_report(
-            folder, log.evaluations, found, self._simulated, self._expected, preflight, log.origin, command
+            folder, log, found, again, self._simulated, self._expected, preflight, command
         )
-        print(f"weakest focus {float(found.pressure.min()):.4g} Pa as measured; the report is {report}")
+        weakest = float(again.mean(dim=0).min())
+        print(f"weakest focus {weakest:.4g} Pa, measured once more; the report is {report}")
 
-    def _measure(self, log: Path) -> tuple[Solution, hardware.Preflight, hardware.EvaluationLog]:
-        """Check the transducers, and run the method on the device; it is silent afterwards."""
+    def _measure(
+        self, log: Path
+    ) -> tuple[Solution, torch.Tensor, hardware.Preflight, hardware.EvaluationLog]:
+        """Check the transducers, run the method on the device, and read what it found once more (R, P)."""
         bench = self._bench
         with (
             bench.sensor() as sensor,
@@ -101,13 +106,17 @@ class Trial:
             progress.begin("pre-flight check")
             preflight = self._preflight(limited, sensor)
             found = self._method(at.Quantised(objective, **bench.device.quantised))
+            points = len(self._scene.control_points)
+            progress.begin("the drive that was found, once more")
+            limited.play(found.drive[0])
+            again = torch.stack([checked_reading(sensor, points) for _ in range(bench.readings)])
+            limited.require_on()
             limited.off()
             with silence_expected():
-                points = len(self._scene.control_points)
                 silent = hardware.hears_silence(sensor, preflight, points, bench.readings)
             if not silent:
                 logging.warning("the sensor hears more than before the trial: are the outputs off?")
-        return found, preflight, objective.log
+        return found, again, preflight, objective.log
 
     def _preflight(self, limited: hardware.LimitedLink, sensor: hardware.Sensor) -> hardware.Preflight:
         points, count = len(self._scene.control_points), len(self._scene.array)

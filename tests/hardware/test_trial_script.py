@@ -67,6 +67,8 @@ def test_without_noise_the_report_says_that_it_is_the_simulation(run, tmp_path: 
     report = (tmp_path / "out" / "report.md").read_text()
     assert "transducers driven as in the simulated trial: 9 of 9" in report
     assert report.count("| 1.000 |") == 3
+    assert report.startswith("# Hardware trial: gabs on SonicSurface, emulated\n")
+    assert "| transducers | 0 to 8 |" in report
 
 
 def test_an_oscilloscope_on_the_emulated_bus_is_the_sensor(run, tmp_path: Path, caplog):
@@ -213,7 +215,7 @@ def test_a_signal_speaks_of_the_device_only_once_it_was_opened(run, monkeypatch,
 
 def test_a_person_reads_each_transducer_and_the_silence_once(run, monkeypatch):
     points, evaluations = 2, 1 + 8 * 4
-    answers = io.StringIO("0\n" * points + "1\n" * points * (9 + evaluations) + "0\n" * points)
+    answers = io.StringIO("0\n" * points + "1\n" * points * (9 + evaluations + 1) + "0\n" * points)
     monkeypatch.setattr("sys.stdin", answers)
     assert run(*EMULATED, "--sensor", "manual") == 0
     assert not answers.read()
