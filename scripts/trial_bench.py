@@ -26,7 +26,6 @@ SENSORS = ("emulated", "scope", "file", "manual")
 MAKERS = {"keysight": hardware.KEYSIGHT, "rigol": hardware.RIGOL}
 
 _EMULATED_SCOPE = (0x2A8D, 0x1770)
-_SERVER = "server:"
 
 
 class Bench(NamedTuple):
@@ -57,19 +56,31 @@ def settings_of(options: argparse.Namespace) -> dict[str, Any]:
     return settings
 
 
-def bench_of(options: argparse.Namespace, simulated: at.SimulatedObjective) -> Bench:
-    """The bench that the options describe; nothing is opened yet."""
-    count = len(simulated.scene.array)
+def wired_device(options: argparse.Namespace, count: int) -> tuple[hardware.Device, list[int]]:
+    """The device, and which of its transducers the scene's `count` are."""
     device = _device(options)
-    emulated = options.device in EMULATED
-    if options.transducers is None and not emulated and count != device.transducers:
+    if options.transducers is None and options.device not in EMULATED and count != device.transducers:
         raise ValueError(
             f"--transducers: none; must say which {count} of the {device.transducers} transducers of "
             f"{device.name} the scene's are"
         )
-    transducers = list(range(count)) if options.transducers is None else options.transducers
+    chosen = range(count) if options.transducers is None else options.transducers
+    if len(chosen) != count:
+        raise ValueError(f"--transducers: {len(chosen)}; must be {count}, as many as the scene has")
+    if max(options.dead, default=0) >= count:
+        raise ValueError(f"--dead: {max(options.dead)}; must be 0 to {count - 1}, as the scene has them")
+    return device, wiring(chosen, device.transducers).tolist()
+
+
+def bench_of(
+    options: argparse.Namespace,
+    device: hardware.Device,
+    transducers: list[int],
+    simulated: at.SimulatedObjective,
+) -> Bench:
+    """The bench that the options describe; nothing is opened yet."""
     on_bench = None
-    if emulated or options.dry_run:
+    if options.device in EMULATED or options.dry_run:
         on_bench = _emulated_bench(options, device, simulated.transfer_matrix, transducers)
     by_hand = _sensor_kind(options) == "manual" or options.moved
     return Bench(
@@ -105,7 +116,7 @@ def _emulated_bench(
     options: argparse.Namespace, device: hardware.Device, matrix: torch.Tensor, transducers: list[int]
 ) -> hardware.EmulatedBench:
     """A bench whose transducers are wired and deviate as the boards' files say."""
-    places = wiring(transducers, device.transducers)
+    places = torch.tensor(transducers)
     if device_name(options) == "openmpd" and options.boards:
         boards = _openmpd_boards(options)
         each = device.transducers // len(boards)
@@ -149,18 +160,13 @@ def _link(
     return hardware.Link(device, port, transducers, sleep=bench.bus.sleep)
 
 
-def _network(text: str | None) -> Any:
+def _network(network: str | int | None) -> Any:
     """What the kit of AUTD3 takes for `--network`."""
-    if text is None:
+    if network is None:
         return None
     import autd3
 
-    if not text.startswith(_SERVER):
-        return autd3.UdpOption(text)
-    port = text.removeprefix(_SERVER)
-    if not (port.isdecimal() and 0 < int(port) < 2**16):
-        raise ValueError(f"--network: {text!r}; must be server:PORT with a port from 1 to 65535")
-    return autd3.ServerLink(int(port))
+    return autd3.ServerLink(network) if isinstance(network, int) else autd3.UdpOption(network)
 
 
 def _sensor_kind(options: argparse.Namespace) -> str:

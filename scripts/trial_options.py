@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from trial_bench import DEVICES, EMULATED, MAKERS, SENSORS, device_name
-from trial_values import ABOVE_ZERO, COUNT, DECIBELS, SEED, SHARE, chip, indices
+from trial_values import ABOVE_ZERO, COUNT, DECIBELS, SEED, SHARE, chip, indices, network
 
 from autdtorch.hardware import Limits
 
@@ -59,7 +59,10 @@ def parsed(words: Sequence[str] | None = None) -> argparse.Namespace:
     _add_device(parser)
     _add_sensor(parser)
     # What is still None was not given.
-    options = parser.parse_args(words, argparse.Namespace(**dict.fromkeys(_BELONGS)))
+    try:
+        options = parser.parse_args(words, argparse.Namespace(**dict.fromkeys(_BELONGS)))
+    except UnicodeDecodeError as error:
+        parser.error(f"@FILE: {error}; must be text")
     for name, (bench, belongs) in _BELONGS.items():
         if getattr(options, name) is None:
             setattr(options, name, parser.get_default(name))
@@ -136,9 +139,10 @@ def _add_device(parser: argparse.ArgumentParser) -> None:
     add("--serial", metavar="TEXT", help="number of its USB chip, where several are plugged in")
     add(
         "--network",
-        metavar="TEXT",
-        help="of AUTD3: name or address of the interface for UDP (the one that finds the boards), "
-        "or server:PORT of the kit's server on this machine",
+        type=network,
+        metavar="NET",
+        help="of AUTD3: interface for UDP (the one that finds the boards), or server:PORT of the kit's "
+        "server on this machine",
     )
     add(
         "--snr",

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from trial_bench import bench_of, settings_of
+from trial_bench import bench_of, settings_of, wired_device
 from yaml import YAMLError
 
 import autdtorch as at
@@ -62,8 +62,9 @@ class Trial:
         self._folder = options.output or Path("outputs") / f"hardware_{path.stem}_{options.method}"
         self._dry = options.dry_run
         self.opened = False
+        device, transducers = wired_device(options, len(self._scene.array))
         simulated = at.SimulatedObjective(self._scene, at.make_propagator(self._scene))
-        self._bench = bench_of(options, simulated)
+        self._bench = bench_of(options, device, transducers, simulated)
         self._simulated = at.Quantised(simulated, **self._bench.device.quantised)
         self._expected = self._method(self._simulated)
 

@@ -48,3 +48,13 @@ def chip(text: str) -> tuple[int, int]:
     except ValueError as error:
         raise argparse.ArgumentTypeError(f"{text!r}; must be VID:PID, as 2a8d:1770") from error
     return vendor, product
+
+
+def network(text: str) -> str | int:
+    """Name of an interface, or the port of `server:PORT`."""
+    kind, separator, port = text.partition(":")
+    if (kind, separator) != ("server", ":"):
+        return text
+    if not (port.isdecimal() and 0 < int(port) < 2**16):
+        raise argparse.ArgumentTypeError(f"{text!r}; must be server:PORT with a port from 1 to 65535")
+    return int(port)
