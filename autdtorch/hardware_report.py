@@ -31,7 +31,7 @@ Scene {scene}, {begin} to {end}; autdtorch {version}. Made by
 
 - {evaluations} evaluations, {rate}
 - outputs on for {seconds_on:.1f} s in all, the pre-flight check included
-- weakest focus found: **{again:.4g} Pa**, the drive played once more; {weakest:.4g} Pa when it was found
+- weakest focus found: **{again:#.4g} Pa**, the drive played once more; {weakest:#.4g} Pa when it was found
 - transducers driven as in the simulated trial: {same} of {transducers}
 
 ## Measured beside simulated
@@ -41,8 +41,15 @@ Scene {scene}, {begin} to {end}; autdtorch {version}. Made by
 All are of the drive that was found. *When found* is the best of many readings, and so on average a little too
 high where they are noisy; *again* is the mean of {readings} after the search. *Simulated* is without the
 transducers that are not heard. The simulation knows neither the strength of the transducers nor the
-calibration of the sensor, so that its pressures are multiplied by one factor, {scale:.4g}, fitted to all
+calibration of the sensor, so that its pressures are multiplied by one factor, {scale:#.4g}, fitted to all
 {evaluations} evaluations by least squares. These then differ by {misfit:.2g} % (rms, of the rms measured).
+
+## By control point
+
+{fits}
+
+The factor that fits all evaluations at this point alone, and what then differs (rms, of the rms measured). A
+point that stands apart has another calibration or place than was said.
 
 ## Convergence
 
@@ -117,7 +124,8 @@ def write_hardware_report(
     scene = simulated.scene
     heard = torch.ones(len(scene.array), dtype=torch.float64)
     heard[preflight.dead] = 0
-    fit = compare(torch.stack([evaluation.pressure for evaluation in evaluations]), simulated(heard * drives))
+    measured, there = torch.stack([one.pressure for one in evaluations]), simulated(heard * drives)
+    fit = compare(measured, there)
     histories = {"bench": found.history, "simulation": fit.scale * expected.history}
     plot_convergence({scene.name or "scene": histories}).savefig(folder / _FIGURE)
     same = torch.isclose(found.drive, expected.drive, rtol=0, atol=1e-9)
@@ -141,6 +149,7 @@ def write_hardware_report(
         same=int(same.sum()),
         transducers=same.numel(),
         points=_points(scene.control_points, *pressures),
+        fits=_fits(scene.control_points, measured, there),
         scale=fit.scale,
         misfit=100 * fit.misfit,
         preflight=_preflight(preflight),
@@ -172,12 +181,23 @@ def _rate(evaluations: Sequence[Evaluation]) -> str:
 
 def _points(places: torch.Tensor, *pressures: torch.Tensor) -> str:
     rows = [["control point [mm]", "when found [Pa]", "again [Pa]", "simulated [Pa]", "again / simulated"]]
-    names = ["(" + ", ".join(f"{1e3 * one:.4g}" for one in place.tolist()) + ")" for place in places]
     columns = [[*pressure.tolist(), float(pressure.min())] for pressure in pressures]
-    for name, when_found, again, simulated in zip([*names, "weakest"], *columns, strict=True):
-        values = (f"{value:.4g}" for value in (when_found, again, simulated))
+    for name, when_found, again, simulated in zip([*_names(places), "weakest"], *columns, strict=True):
+        values = (f"{value:#.4g}" for value in (when_found, again, simulated))
         rows.append([name, *values, f"{again / simulated:.3f}"])
     return table(rows)
+
+
+def _fits(places: torch.Tensor, measured: torch.Tensor, simulated: torch.Tensor) -> str:
+    rows = [["control point [mm]", "factor", "differs by [%]"]]
+    for name, here, there in zip(_names(places), measured.T, simulated.T, strict=True):
+        fit = compare(here, there)
+        rows.append([name, f"{fit.scale:#.4g}", f"{100 * fit.misfit:.2g}"])
+    return table(rows)
+
+
+def _names(places: torch.Tensor) -> list[str]:
+    return ["(" + ", ".join(f"{1e3 * one:.4g}" for one in place.tolist()) + ")" for place in places]
 
 
 def _preflight(check: Preflight) -> str:

@@ -54,7 +54,7 @@ def test_a_trial_leaves_log_drive_and_report_and_is_not_repeated(run, tmp_path: 
     assert (out / "trial.jsonl").read_text().splitlines()[:-1] == log  # and the second run's end
     report = (out / "report.md").read_text()
     assert "**Not heard**, counted from 0: 4." in report
-    assert report.count("| 1.000 |") == 3  # the simulation is told
+    assert report.count("| 1.000 |\n") == 3  # the simulation is told
     assert (out / "convergence.png").exists()
     assert len(load_drive(out / "drive.npz")) == 9
 
@@ -66,9 +66,10 @@ def test_without_noise_the_report_says_that_it_is_the_simulation(run, tmp_path: 
     assert run(*EMULATED) == 0
     report = (tmp_path / "out" / "report.md").read_text()
     assert "transducers driven as in the simulated trial: 9 of 9" in report
-    assert report.count("| 1.000 |") == 3
+    assert report.count("| 1.000 |\n") == 3
     assert report.startswith("# Hardware trial: gabs on SonicSurface, emulated\n")
     assert "| transducers | 0 to 8 |" in report
+    assert report.count(") | 1.000 | ") == 2  # the factor at each point
 
 
 def test_an_oscilloscope_on_the_emulated_bus_is_the_sensor(run, tmp_path: Path, caplog):
@@ -161,7 +162,7 @@ def test_devices_of_boards_find_the_drive_of_the_simulation(run, tmp_path: Path,
     assert run(*EMULATED, *words) == 0
     report = (tmp_path / "out" / "report.md").read_text()
     assert "transducers driven as in the simulated trial: 9 of 9" in report
-    assert report.count("| 1.000 |") == 3
+    assert report.count("| 1.000 |\n") == 3
     if device == "openmpd":  # another file of the same name is another board
         write_board(tmp_path, "left", gain=0.5)
         assert run(*EMULATED, *words) == 2
