@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import NoReturn
 
 from trial_bench import DEVICES, EMULATED, MAKERS, SENSORS, device_name
+from trial_run import METHODS
 from trial_values import ABOVE_ZERO, COUNT, DECIBELS, SEED, SHARE, chip, indices, network
 
 from autdtorch.hardware import Limits
-
-METHODS = ("lssg", "gabs", "bo", "identify")
 
 _DESCRIPTION = """\
 Runs a method on a device, or on its emulator; an interrupted trial goes on with the same command.
@@ -78,7 +77,7 @@ def _add_trial(parser: argparse.ArgumentParser) -> None:
         default="three_cubes",
         help="a YAML file, or one of configs/scene by its name (%(default)s)",
     )
-    add("--method", required=True, choices=METHODS)
+    add("--method", required=True, choices=list(METHODS))
     add("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings of the method, as levels=8")
     add(
         "--seed", type=SEED, default=0, metavar="N", help="of the method, and of emulated noise (%(default)s)"
