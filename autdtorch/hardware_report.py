@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -12,40 +12,51 @@ from pathlib import Path
 import torch
 
 import autdtorch
-from autdtorch.hardware.log import Evaluation
+from autdtorch.hardware.log import Evaluation, EvaluationLog
 from autdtorch.hardware.preflight import Preflight
 from autdtorch.objective import Objective
 from autdtorch.optim.base import Solution
 from autdtorch.plot import plot_convergence
 from autdtorch.report_tables import table
+from autdtorch.writing import replace_file
 
 REPORT_FILE = "report.md"
 _FIGURE = "convergence.png"
 
-_TEXT = """# Hardware trial
+_TEXT = """# Hardware trial: {method} on {device}{emulated}
 
-Made by `{command}` with autdtorch {version}, {begin} to {end}.
+Scene {scene}, {begin} to {end}; autdtorch {version}. Made by
+
+    {command}
 
 - {evaluations} evaluations, {rate}
-- outputs on for {seconds_on:.1f} s in all
-- weakest focus found: **{weakest:.4g} Pa**, as measured
+- outputs on for {seconds_on:.1f} s in all, the pre-flight check included
+- weakest focus found: **{again:#.4g} Pa**, the drive played once more; {weakest:#.4g} Pa when it was found
 - transducers driven as in the simulated trial: {same} of {transducers}
 
 ## Measured beside simulated
 
 {points}
 
-The drive that was found, in the simulation without the transducers that are not heard. It knows neither the
-strength of the transducers nor the calibration of the sensor, so that its pressures are multiplied by one
-factor, {scale:.4g}, fitted to all {evaluations} evaluations by least squares. These then differ by
-{misfit:.2g} % (rms, of the rms measured).
+All are of the drive that was found. *When found* is the best of many readings, and so on average a little too
+high where they are noisy; *again* is the mean of {readings} after the search. *Simulated* is without the
+transducers that are not heard. The simulation knows neither the strength of the transducers nor the
+calibration of the sensor, so that its pressures are multiplied by one factor, {scale:#.4g}, fitted to all
+{evaluations} evaluations by least squares. These then differ by {misfit:.2g} % (rms, of the rms measured).
+
+## By control point
+
+{fits}
+
+The factor that fits all evaluations at this point alone, and what then differs (rms, of the rms measured). A
+point that stands apart has another calibration or place than was said.
 
 ## Convergence
 
 ![convergence](convergence.png)
 
-Best score so far. Simulated: the same method with the same seed in the simulation, all transducers heard and
-no noise, times the factor.
+Best score so far. The simulation's is another trial: the same method with the same seed, all transducers
+heard and no noise, times the factor.
 
 ## Pre-flight check
 
@@ -79,24 +90,24 @@ def compare(measured: torch.Tensor, simulated: torch.Tensor) -> Comparison:
 
 def write_hardware_report(
     folder: str | os.PathLike[str],
-    evaluations: Sequence[Evaluation],
+    log: EvaluationLog,
     found: Solution,
+    again: torch.Tensor,
     simulated: Objective,
     expected: Solution,
     preflight: Preflight,
-    settings: Mapping[str, object],
     command: str,
 ) -> Path:
     """Write `report.md` and its figure.
 
     Args:
         folder: for both; made if need be.
-        evaluations: the trial's log.
+        log: of the trial.
         found: what the method found on the bench, one trial.
+        again: (R, P) [Pa], readings of that drive after the search.
         simulated: the scene, simulated without noise on the levels of the device.
         expected: what the same method found there.
         preflight: the check before the trial.
-        settings: what made the trial what it is.
         command: the command line that repeats it.
 
     Returns:
@@ -107,39 +118,55 @@ def write_hardware_report(
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    evaluations = log.evaluations
     begin, end = (datetime.fromisoformat(evaluations[place].time) for place in (0, -1))
     drives = torch.stack([evaluation.drive for evaluation in evaluations])
     scene = simulated.scene
     heard = torch.ones(len(scene.array), dtype=torch.float64)
     heard[preflight.dead] = 0
-    fit = compare(torch.stack([evaluation.pressure for evaluation in evaluations]), simulated(heard * drives))
-    histories = {"measured": found.history, "simulated": fit.scale * expected.history}
+    measured, there = torch.stack([one.pressure for one in evaluations]), simulated(heard * drives)
+    fit = compare(measured, there)
+    histories = {"bench": found.history, "simulation": fit.scale * expected.history}
     plot_convergence({scene.name or "scene": histories}).savefig(folder / _FIGURE)
     same = torch.isclose(found.drive, expected.drive, rtol=0, atol=1e-9)
+    mean = again.mean(dim=0)
+    pressures = found.pressure[0], mean, fit.scale * simulated(heard * found.drive)[0]
     text = _TEXT.format(
+        method=log.origin.get("method", "a method"),
+        device=log.origin["device"],
+        emulated=", emulated" if log.origin.get("emulated") else "",
+        scene=scene.name or "without a name",
         command=command,
         version=autdtorch.__version__,
-        begin=begin.isoformat(timespec="seconds"),
-        end=end.isoformat(timespec="seconds"),
+        begin=f"{begin:%Y-%m-%d %H:%M:%S}",
+        end=f"{end:%Y-%m-%d %H:%M:%S} UTC",
         evaluations=len(evaluations),
         rate=_rate(evaluations),
-        seconds_on=evaluations[-1].seconds_on,
+        seconds_on=log.seconds_on,
+        again=mean.min(),
         weakest=found.pressure.min(),
+        readings=f"{len(again)} readings" if len(again) > 1 else "one reading",
         same=int(same.sum()),
         transducers=same.numel(),
-        points=_points(
-            scene.control_points, found.pressure[0], fit.scale * simulated(heard * found.drive)[0]
-        ),
+        points=_points(scene.control_points, *pressures),
+        fits=_fits(scene.control_points, measured, there),
         scale=fit.scale,
         misfit=100 * fit.misfit,
         preflight=_preflight(preflight),
-        settings=table(
-            [["setting", "value"], *([name, json.dumps(value)] for name, value in settings.items())]
-        ),
+        settings=table([["setting", "value"], *([name, _value(own)] for name, own in log.origin.items())]),
     )
     path = folder / REPORT_FILE
-    path.write_text(text, encoding="utf-8")
+    replace_file(path, text.encode())
     return path
+
+
+def _value(own: object) -> str:
+    """A setting, as JSON; numbers in a row as a range."""
+    if isinstance(own, list) and len(own) > 2 and all(isinstance(one, int) for one in own):
+        low, high = own[0], own[-1]
+        if own == list(range(low, high + 1)):
+            return f"{low} to {high}"
+    return json.dumps(own, ensure_ascii=False)
 
 
 def _rate(evaluations: Sequence[Evaluation]) -> str:
@@ -152,14 +179,25 @@ def _rate(evaluations: Sequence[Evaluation]) -> str:
     return f"one in {1e3 * interval:.3g} ms (median)"
 
 
-def _points(places: torch.Tensor, measured: torch.Tensor, simulated: torch.Tensor) -> str:
-    rows = [["control point [mm]", "measured [Pa]", "simulated [Pa]", "measured / simulated"]]
-    for place, here, there in zip(places, measured, simulated, strict=True):
-        name = "(" + ", ".join(f"{1e3 * coordinate:.4g}" for coordinate in place.tolist()) + ")"
-        rows.append([name, f"{here:.4g}", f"{there:.4g}", f"{here / there:.3f}"])
-    weakest = measured.min(), simulated.min()
-    rows.append(["weakest", *(f"{value:.4g}" for value in weakest), f"{weakest[0] / weakest[1]:.3f}"])
+def _points(places: torch.Tensor, *pressures: torch.Tensor) -> str:
+    rows = [["control point [mm]", "when found [Pa]", "again [Pa]", "simulated [Pa]", "again / simulated"]]
+    columns = [[*pressure.tolist(), float(pressure.min())] for pressure in pressures]
+    for name, when_found, again, simulated in zip([*_names(places), "weakest"], *columns, strict=True):
+        values = (f"{value:#.4g}" for value in (when_found, again, simulated))
+        rows.append([name, *values, f"{again / simulated:.3f}"])
     return table(rows)
+
+
+def _fits(places: torch.Tensor, measured: torch.Tensor, simulated: torch.Tensor) -> str:
+    rows = [["control point [mm]", "factor", "differs by [%]"]]
+    for name, here, there in zip(_names(places), measured.T, simulated.T, strict=True):
+        fit = compare(here, there)
+        rows.append([name, f"{fit.scale:#.4g}", f"{100 * fit.misfit:.2g}"])
+    return table(rows)
+
+
+def _names(places: torch.Tensor) -> list[str]:
+    return ["(" + ", ".join(f"{1e3 * one:.4g}" for one in place.tolist()) + ")" for place in places]
 
 
 def _preflight(check: Preflight) -> str:

@@ -5,22 +5,23 @@ from __future__ import annotations
 import argparse
 import contextlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
+
+import torch
 
 import autdtorch as at
 from autdtorch import hardware
+from autdtorch.cache import digest_of
 from autdtorch.conditions import random_rms
+from autdtorch.hardware.autd3 import autd3_device
 from autdtorch.hardware.dry_run import DryPort
+from autdtorch.hardware.emulated_autd3 import EmulatedAutd3Port
+from autdtorch.hardware.link import wiring
 
-DEVICES = {
-    "sonicsurface": hardware.SONICSURFACE,
-    "openmpd": hardware.OPENMPD,
-    "ultraino": hardware.ULTRAINO,
-}
-EMULATED = {
-    "emulated": hardware.SONICSURFACE,
-    **{f"emulated:{name}": device for name, device in DEVICES.items()},
-}
+DEVICES = ("sonicsurface", "openmpd", "ultraino", "autd3")
+_USUAL = "emulated"
+EMULATED = (_USUAL, *(f"emulated:{name}" for name in DEVICES))
 SENSORS = ("emulated", "scope", "file", "manual")
 MAKERS = {"keysight": hardware.KEYSIGHT, "rigol": hardware.RIGOL}
 
@@ -37,93 +38,152 @@ class Bench(NamedTuple):
     background: int
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options that say what the bench is."""
-    device = parser.add_argument_group("device").add_argument
-    device("--device", required=True, choices=[*DEVICES, *EMULATED])
-    device("--serial", help="number of its USB chip, where several are plugged in")
-    device("--transducers", type=indices, help="which of the device's the scene's are, as 102-105,118-121")
-    sensor = parser.add_argument_group("sensor").add_argument
-    sensor("--sensor", choices=SENSORS, help="by default emulated, on an emulated device")
-    sensor("--readings-file", help="of the sensor `file`: where another program writes each reading [Pa]")
-    sensor("--scope-chip", type=chip, help="of the sensor `scope`: VID:PID, as 2a8d:1770")
-    sensor("--scope-maker", choices=list(MAKERS), default="keysight", help="(%(default)s)")
-    sensor("--sensitivity", type=float, default=0.01, help="with the amplifier (%(default)s V/Pa)")
-    sensor("--loudest", type=float, default=20.0, help="that the inputs must take (%(default)s Pa)")
-    sensor("--captures", type=int, default=1, help="to average over (%(default)s)")
-    sensor("--moved", action="store_true", help="one microphone, moved from control point to control point")
-    emulated = parser.add_argument_group("emulated device").add_argument
-    emulated("--snr", type=float, help="of a reading, or of a scope's sample [dB]; without it, no noise")
-    emulated("--dead", type=indices, default=[], help="transducers of the scene that are silent")
-
-
-def indices(text: str) -> list[int]:
-    """Numbers of transducers: `3,7-9` is 3, 7, 8, 9."""
-    parts = [part.partition("-") for part in text.split(",")]
-    ranges = [range(int(low), int(high or low) + 1) for low, _, high in parts]
-    if not all(ranges):
-        raise argparse.ArgumentTypeError(f"{text!r}; must be numbers and ranges that go up, as 3,7-9")
-    return [one for some in ranges for one in some]
-
-
-def chip(text: str) -> tuple[int, int]:
-    """IdVendor and idProduct of `2a8d:1770`."""
-    vendor, product = text.split(":")
-    return int(vendor, 16), int(product, 16)
+def device_name(options: argparse.Namespace) -> str:
+    """Which of `DEVICES`, real or emulated."""
+    return "sonicsurface" if options.device == _USUAL else str(options.device).removeprefix("emulated:")
 
 
 def settings_of(options: argparse.Namespace) -> dict[str, Any]:
     """What of the bench makes a trial what it is, beside the device."""
-    kind = _kind(options)
+    kind = _sensor_kind(options)
     settings: dict[str, Any] = {"sensor": kind}
     if kind == "scope":
         settings |= {"sensitivity [V/Pa]": options.sensitivity, "captures": options.captures}
     if options.device in EMULATED:
-        settings |= {"snr [dB]": options.snr, "dead": options.dead}
+        settings |= {"emulated": True, "snr [dB]": options.snr, "dead": options.dead}
+    if device_name(options) == "openmpd" and options.boards:
+        settings["boards"] = [f"{board.name} {digest_of(board)[:16]}" for board in _openmpd_boards(options)]
     return settings
 
 
-def bench_of(options: argparse.Namespace, simulated: at.SimulatedObjective) -> Bench:
-    """The bench that the options describe; nothing is opened yet."""
-    count = len(simulated.scene.array)
-    device = {**DEVICES, **EMULATED}[options.device]
-    emulated = options.device in EMULATED
-    if options.transducers is None and not emulated and count != device.transducers:
+def wired_device(options: argparse.Namespace, count: int) -> tuple[hardware.Device, list[int]]:
+    """The device, and which of its transducers the scene's `count` are."""
+    device = _device(options)
+    if options.transducers is None and options.device not in EMULATED and count != device.transducers:
         raise ValueError(
             f"--transducers: none; must say which {count} of the {device.transducers} transducers of "
             f"{device.name} the scene's are"
         )
-    transducers = list(range(count)) if options.transducers is None else options.transducers
+    chosen = range(count) if options.transducers is None else options.transducers
+    if len(chosen) != count:
+        raise ValueError(f"--transducers: {len(chosen)}; must be {count}, as many as the scene has")
+    if max(options.dead, default=0) >= count:
+        raise ValueError(f"--dead: {max(options.dead)}; must be 0 to {count - 1}, as the scene has them")
+    return device, wiring(chosen, device.transducers).tolist()
+
+
+def bench_of(
+    options: argparse.Namespace,
+    device: hardware.Device,
+    transducers: list[int],
+    simulated: at.SimulatedObjective,
+) -> Bench:
+    """The bench that the options describe; nothing is opened yet."""
     on_bench = None
-    if emulated or options.dry_run:
-        on_bench = hardware.EmulatedBench(device, simulated.transfer_matrix, transducers, dead=options.dead)
-    backend = None if on_bench is None else on_bench.bus
-
-    def link() -> hardware.Link:
-        if options.dry_run:
-            return hardware.Link(device, DryPort(on_bench, device, print), transducers, sleep=backend.sleep)
-        return hardware.open_link(device, transducers, options.serial, backend)
-
-    kind = _kind(options)
-    by_hand = kind == "manual" or (kind == "scope" and options.moved)
-    check = (1, 1) if by_hand else (4, 32)
-    return Bench(device, link, lambda: _sensor(options, simulated.scene, on_bench), *check)
+    if options.device in EMULATED or options.dry_run:
+        on_bench = _emulated_bench(options, device, simulated.transfer_matrix, transducers)
+    by_hand = _sensor_kind(options) == "manual" or options.moved
+    return Bench(
+        device,
+        lambda: _link(options, device, transducers, on_bench),
+        lambda: _sensor(options, simulated.scene, on_bench),
+        *((1, 1) if by_hand else (4, 32)),
+    )
 
 
-def _kind(options: argparse.Namespace) -> str:
+def _device(options: argparse.Namespace) -> hardware.Device:
+    match device_name(options):
+        case "openmpd" if options.boards:
+            return hardware.openmpd_boards(_openmpd_boards(options))
+        case "openmpd":
+            return hardware.OPENMPD
+        case "ultraino":
+            return hardware.ultraino_boards(_board_count(options))
+        case "autd3":
+            return autd3_device(_board_count(options))
+        case _:
+            return hardware.SONICSURFACE
+
+
+def _openmpd_boards(options: argparse.Namespace) -> list[at.OpenMPDBoard]:
+    for name in options.boards:
+        if not Path(name).is_file():
+            raise ValueError(f"--boards: {name}: no such file; must be the .pat files of the boards")
+    return [at.OpenMPDBoard.load(name) for name in options.boards]
+
+
+def _emulated_bench(
+    options: argparse.Namespace, device: hardware.Device, matrix: torch.Tensor, transducers: list[int]
+) -> hardware.EmulatedBench:
+    """A bench whose transducers are wired and deviate as the boards' files say."""
+    places = torch.tensor(transducers)
+    if device_name(options) == "openmpd" and options.boards:
+        boards = _openmpd_boards(options)
+        each = device.transducers // len(boards)
+        asked = torch.ones(each, dtype=torch.complex128)
+        corrections = torch.cat([board.calibrated(asked) for board in boards])[places]
+        matrix = torch.where(corrections == 0, 0, matrix / corrections)
+        pins = torch.tensor(
+            [each * number + pin for number, board in enumerate(boards) for pin in board.pins]
+        )
+        places = pins[places]
+    return hardware.EmulatedBench(device, matrix, places.tolist(), dead=options.dead)
+
+
+def _board_count(options: argparse.Namespace) -> int:
+    match options.boards:
+        case None:
+            return 1
+        case [text] if text.isdecimal():
+            return int(text)
+    raise ValueError(f"--boards: {' '.join(options.boards)}; must be the number of boards, an integer")
+
+
+def _link(
+    options: argparse.Namespace,
+    device: hardware.Device,
+    transducers: list[int],
+    bench: hardware.EmulatedBench | None,
+) -> hardware.Link:
+    """The link, open."""
+    on_network = device_name(options) == "autd3"
+    if bench is None:
+        if on_network:
+            return hardware.open_autd3(_board_count(options), transducers, _network(options.network))
+        return hardware.open_link(device, transducers, options.serial)
+    if options.dry_run:
+        port: hardware.Port = DryPort(bench, device, print)
+    elif on_network:
+        port = EmulatedAutd3Port(_board_count(options), bench)
+    else:
+        return hardware.open_link(device, transducers, backend=bench.bus)
+    return hardware.Link(device, port, transducers, sleep=bench.bus.sleep)
+
+
+def _network(network: str | int | None) -> Any:
+    """What the kit of AUTD3 takes for `--network`."""
+    if network is None:
+        return None
+    import autd3
+
+    return autd3.ServerLink(network) if isinstance(network, int) else autd3.UdpOption(network)
+
+
+def _sensor_kind(options: argparse.Namespace) -> str:
     if options.dry_run:
         return "emulated"
     kind = options.sensor or "emulated"
     if kind == "emulated" and options.device not in EMULATED:
-        raise ValueError(f"--sensor: {options.sensor}; must be scope, file or manual on a real device")
-    return kind
+        given = options.sensor or "none"
+        raise ValueError(f"--sensor: {given}; must be scope, file or manual on a real device")
+    return str(kind)
 
 
 @contextlib.contextmanager
 def _sensor(options: argparse.Namespace, scene: at.Scene, bench: hardware.EmulatedBench | None) -> Any:
     """The sensor, open."""
     points = scene.control_points
-    match _kind(options):
+    match _sensor_kind(options):
         case "emulated":
             yield hardware.EmulatedSensor(bench, options.snr, options.seed)
         case "manual":

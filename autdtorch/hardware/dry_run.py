@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import torch
-
 from autdtorch.drive import amplitudes_of, phases_of
 from autdtorch.hardware.devices import Device
 from autdtorch.hardware.emulator import EmulatedBench
 
 
 class DryPort:
-    """A port that shows the frames it is given; an emulated device takes them, for the sensor to hear."""
+    """A port that shows each frame it is given; an emulated device takes it, for the sensor to hear."""
 
     def __init__(self, bench: EmulatedBench, device: Device, show: Callable[[str], object]) -> None:
         """Open no device.
@@ -25,13 +23,11 @@ class DryPort:
         self._bench = bench
         self._device = device
         self._show = show
-        self._length = len(device.frame(torch.zeros(device.transducers, dtype=torch.complex128)))
 
     def write(self, data: bytes) -> None:
-        """Show the frames."""
-        for start in range(0, len(data), self._length):
-            self._show(described_frame(self._device, data[start : start + self._length]))
-        self._bench.firmware.receive(data)
+        """Show the frame."""
+        self._show(described_frame(self._device, data))
+        self._bench.receive(data)
 
     def flush(self) -> None:
         """Nothing waits."""

@@ -9,10 +9,17 @@ import torch
 
 from autdtorch.conditions import random_rms
 from autdtorch.hardware.adapters import Adapter
+from autdtorch.hardware.autd3 import autd3_device
 from autdtorch.hardware.devices import OPENMPD, SONICSURFACE, ULTRAINO, Device
-from autdtorch.hardware.emulated_bus import EmulatedBus
+from autdtorch.hardware.emulated_bus import EmulatedBus, EmulatedDevice
 from autdtorch.hardware.emulated_chips import CHIPS
-from autdtorch.hardware.firmware import Firmware, OpenMPDFirmware, SonicSurfaceFirmware, UltrainoFirmware
+from autdtorch.hardware.firmware import (
+    Autd3Boards,
+    Firmware,
+    OpenMPDFirmware,
+    SonicSurfaceFirmware,
+    UltrainoFirmware,
+)
 from autdtorch.hardware.link import wiring
 from autdtorch.validation import complex_tensor, finite_number, integer_at_least
 
@@ -20,6 +27,7 @@ _FIRMWARES: dict[str, Callable[[int], Firmware]] = {
     SONICSURFACE.name: lambda transducers: SonicSurfaceFirmware(),
     OPENMPD.name: lambda transducers: OpenMPDFirmware(),
     ULTRAINO.name: lambda transducers: UltrainoFirmware(transducers // ULTRAINO.transducers),
+    autd3_device().name: Autd3Boards,
 }
 
 
@@ -27,8 +35,7 @@ class EmulatedBench:
     """A device on an emulated USB bus, and the pressure it makes at the control points.
 
     Attributes:
-        bus: backend for pyusb.
-        chip: the device's USB chip on the bus; of several boards, that of the first.
+        bus: backend for pyusb; without a device that is not on USB, which takes its frames by `receive`.
         firmware: what takes the bytes behind the chip; of several boards, that of the first.
     """
 
@@ -47,7 +54,7 @@ class EmulatedBench:
             transfer_matrix: (P, M) of the scene on the bench [Pa].
             transducers: for each transducer of the scene, which of the device's it is; by default all in
                 order.
-            adapter: the USB chip that it hangs on; by default the usual one.
+            adapter: the USB chip that it hangs on; by default the usual one, if any.
             dead: transducers of the scene that are silent, whatever the device plays.
 
         Raises:
@@ -64,14 +71,26 @@ class EmulatedBench:
             self._alive[wiring(dead, len(self._transducers))] = 0
         each = device.transducers // len(device.serials)
         self._firmwares = [_FIRMWARES[device.name](each) for _ in device.serials]
-        vendor, product, _ = adapter or device.adapters[0]
+        self.firmware = self._firmwares[0]
+        adapters = device.adapters[:1] if adapter is None else (adapter,)
         self.bus = EmulatedBus(
             [
                 CHIPS[vendor, product](vendor, product, serial or "EMULATED", firmware)
+                for vendor, product, _ in adapters
                 for serial, firmware in zip(device.serials, self._firmwares, strict=True)
             ]
         )
-        self.chip, self.firmware = self.bus.chips[0], self._firmwares[0]
+
+    @property
+    def chip(self) -> EmulatedDevice:
+        """The device's USB chip on the bus; of several boards, that of the first."""
+        return self.bus.chips[0]
+
+    def receive(self, frame: bytes) -> None:
+        """Have the device take a frame without USB; several boards share it evenly."""
+        each = len(frame) // len(self._firmwares)
+        for number, firmware in enumerate(self._firmwares):
+            firmware.receive(frame[each * number : each * (number + 1)])
 
     def drive(self) -> torch.Tensor:
         """What the scene's transducers now play (M,), complex128; 0 where they are dead."""

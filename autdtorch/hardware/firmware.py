@@ -177,6 +177,30 @@ class UltrainoFirmware:
         return torch.tensor(played, dtype=torch.complex128)
 
 
+class Autd3Boards:
+    """Boards of AUTD3 behind their kit, which hands over the phases of all, then the intensities of all.
+
+    What the kit sends in between is its own; its emulator (`autd3_emulator`) is the check of the levels.
+    """
+
+    baud: ClassVar[int | None] = None
+
+    def __init__(self, transducers: int) -> None:
+        """Switch boards of so many `transducers` on: they are silent until they are sent a pattern."""
+        self._playing = bytes(2 * transducers)
+
+    def receive(self, data: bytes) -> None:
+        """Take a pattern."""
+        self._playing = data
+
+    def drive(self) -> torch.Tensor:
+        """What the transducers play (N,): phase n / 256 of a period, amplitude i / 255."""
+        half = len(self._playing) // 2
+        levels = zip(self._playing[:half], self._playing[half:], strict=True)
+        played = [cmath.rect(intensity / 255, 2 * math.pi * phase / 256) for phase, intensity in levels]
+        return torch.tensor(played, dtype=torch.complex128)
+
+
 def _fundamental(phase: int, duty: int) -> complex:
     middle = phase + (duty - 64) / 2
     return cmath.rect(math.sin(math.pi * duty / 128), 2 * math.pi * middle / 128)

@@ -13,6 +13,8 @@ from typing import Any
 
 import torch
 
+from autdtorch.writing import naming
+
 logger = logging.getLogger(__name__)
 
 _ORIGIN = "origin"
@@ -36,7 +38,7 @@ class Evaluation:
 
 
 class EvaluationLog:
-    """A line of JSON that says what the trial is, then one for each evaluation.
+    """A line of JSON that says what the trial is, one for each evaluation, one for the end of each process.
 
     A line is on disk before the next evaluation begins, so that the end of the process, at whatever moment,
     costs at most the evaluation in flight.
@@ -44,10 +46,14 @@ class EvaluationLog:
     Attributes:
         origin: what the trial is, by name.
         evaluations: what the file holds.
+        goes_on: whether the file was there before.
+        seconds_on: how long the outputs were on in all, as its lines say [s].
     """
 
     origin: dict[str, Any]
     evaluations: list[Evaluation]
+    goes_on: bool
+    seconds_on: float
 
     def __init__(self, path: str | Path, origin: Mapping[str, Any]) -> None:
         """Begin the file, or read what it holds of the same trial. A last line that broke off is removed.
@@ -63,11 +69,13 @@ class EvaluationLog:
         self._path = Path(path)
         self.origin = json.loads(json.dumps(origin))  # as it will be read back
         self.evaluations = []
+        self.seconds_on = 0.0
         whole = _whole_lines(self._path)
+        self.goes_on = bool(whole)
         if not whole:
             self._append({_ORIGIN: self.origin})
             return
-        stored, self.evaluations = _parsed(self._path, whole)
+        stored, self.evaluations, self.seconds_on = _parsed(self._path, whole)
         for name in sorted(stored.keys() | self.origin.keys()):
             there, here = stored.get(name), self.origin.get(name)
             if there != here:
@@ -87,7 +95,7 @@ class EvaluationLog:
         Raises:
             OSError: the file cannot be written.
         """
-        time = datetime.now(UTC).isoformat(timespec="microseconds")
+        time = _now()
         self._append(
             {
                 "time": time,
@@ -97,12 +105,32 @@ class EvaluationLog:
             }
         )
         self.evaluations.append(Evaluation(time, drive, pressure, seconds_on))
+        self.seconds_on = seconds_on
+
+    def end(self, seconds_on: float) -> None:
+        """Say how long the outputs were on when the process ends, its other playing included.
+
+        Args:
+            seconds_on: how long the outputs were on so far [s].
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        self._append({"time": _now(), "seconds_on": seconds_on})
+        self.seconds_on = seconds_on
 
     def _append(self, row: Mapping[str, Any]) -> None:
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(row) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
+        """Add a line, or leave the file as it is: nothing may follow half a line."""
+        rest = memoryview(json.dumps(row).encode() + b"\n")
+        with naming(self._path), self._path.open("ab", buffering=0) as file:
+            end = file.tell()
+            try:
+                while rest:
+                    rest = rest[file.write(rest) :]
+                os.fsync(file.fileno())
+            except BaseException:
+                file.truncate(end)
+                raise
 
 
 def _whole_lines(path: Path) -> list[bytes]:
@@ -117,12 +145,18 @@ def _whole_lines(path: Path) -> list[bytes]:
     return content[:end].splitlines()
 
 
-def _parsed(path: Path, lines: list[bytes]) -> tuple[dict[str, Any], list[Evaluation]]:
+def _parsed(path: Path, lines: list[bytes]) -> tuple[dict[str, Any], list[Evaluation], float]:
+    """Origin, evaluations, and how long the outputs were on [s]."""
     try:
-        origin = dict(json.loads(lines[0])[_ORIGIN])
-        return origin, [_evaluation(json.loads(line)) for line in lines[1:]]
+        first, *rows = map(json.loads, lines)
+        evaluations = [_evaluation(row) for row in rows if "drive" in row]
+        return dict(first[_ORIGIN]), evaluations, max((float(row["seconds_on"]) for row in rows), default=0.0)
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         raise ValueError(f"{path}: {error!r}; must be the log of a hardware trial") from error
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="microseconds")
 
 
 def _evaluation(row: Mapping[str, Any]) -> Evaluation:

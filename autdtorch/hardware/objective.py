@@ -80,8 +80,8 @@ class HardwareObjective:
             **(settings or {}),
         }
         self.log = EvaluationLog(log, origin)
-        if self.log.evaluations:
-            link.charge(self.log.evaluations[-1].seconds_on)
+        if self.log.goes_on:
+            link.go_on(self.log.seconds_on)
 
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
         """Play each of several drives and read the control points; the outputs are off however it ends.

@@ -137,13 +137,20 @@ class LimitedLink:
         """How long the outputs were on so far [s]."""
         return self._seconds_before + self._stretch()
 
-    def charge(self, seconds: float) -> None:
-        """Count time that the outputs were on before this process.
+    def go_on(self, seconds: float) -> None:
+        """Go on with a trial of an earlier process.
+
+        The time that its outputs were on counts. How long its last stretch was is not known: the duty cycle's
+        rest is that of the longest.
 
         Args:
-            seconds: [s].
+            seconds: how long its outputs were on [s].
         """
         self._seconds_before += seconds
+        rest = self._rest(self.limits.seconds_in_a_row)
+        self._rested_at = time.monotonic() + rest
+        if rest > 0:
+            logger.info("resting for %.3g s first, as the duty cycle asks", rest)
 
     def play(self, drive: torch.Tensor) -> None:
         """Play a drive (M,), |q| <= 1, scaled to the limit, until the next, `off`, or the end of the time.
@@ -195,8 +202,11 @@ class LimitedLink:
             self.link.off()
             stretch = self._stretch()
             self._seconds_before += stretch
-            self._rested_at = time.monotonic() + stretch * (1 / self.limits.duty_cycle - 1)
+            self._rested_at = time.monotonic() + self._rest(stretch)
             self._on_since = None
+
+    def _rest(self, stretch: float) -> float:
+        return stretch * (1 / self.limits.duty_cycle - 1)
 
     def _stretch(self) -> float:
         since = self._on_since

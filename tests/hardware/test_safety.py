@@ -1,5 +1,7 @@
 """Limits of a trial, and what a log is refused for."""
 
+import errno
+import signal
 import time
 
 import pytest
@@ -8,6 +10,7 @@ import torch
 from autdtorch.hardware import (
     OPENMPD,
     EmulatedSensor,
+    EvaluationLog,
     HardwareObjective,
     LimitedLink,
     LimitError,
@@ -192,6 +195,58 @@ def test_the_time_on_goes_on_with_the_trial(trial):
         objective(full_on())  # from the log
         with pytest.raises(LimitError, match="the limit"):
             objective(full_on())
+
+
+def test_what_an_earlier_process_played_besides_counts_and_is_rested_from(trial):
+    bench = trial.bench()
+    sensor = EmulatedSensor(bench)
+    with trial.link(bench) as link:
+        limited = LimitedLink(link, Limits(1.0))
+        log = HardwareObjective(trial.scene, limited, sensor, trial.log).log
+        check_transducers(limited, sensor, points=2)
+        log.end(limited.seconds_on)
+        before = limited.seconds_on
+        again = LimitedLink(link, Limits(1.0, seconds_in_a_row=0.05, duty_cycle=0.25))
+        begin = time.monotonic()
+        objective = HardwareObjective(trial.scene, again, sensor, trial.log)
+        assert again.seconds_on == before > 0
+        objective(full_on())
+        assert time.monotonic() - begin >= 0.05 * (1 / 0.25 - 1)
+        assert EvaluationLog(trial.log, objective.log.origin).seconds_on > before
+
+
+@pytest.mark.parametrize("failing", ["write", "fsync"])
+def test_a_full_disk_leaves_no_half_line_to_go_on_after(trial, monkeypatch, failing: str):
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    def observe() -> None:
+        objective(full_on())
+
+    bench = trial.bench()
+    with trial.link(bench) as link:
+        objective = trial.objective(link, EmulatedSensor(bench))
+        objective(full_on())
+        whole = trial.log.read_bytes()
+        with monkeypatch.context() as context:
+            if failing == "fsync":
+                context.setattr("os.fsync", full)
+                with pytest.raises(OSError, match=r"No space left on device: .*trial\.jsonl"):
+                    observe()
+            else:
+                resource = pytest.importorskip("resource", reason="limits of processes are POSIX's")
+                most = resource.getrlimit(resource.RLIMIT_FSIZE)
+                before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+                resource.setrlimit(resource.RLIMIT_FSIZE, (len(whole) + 10, most[1]))  # ten bytes are left
+                try:
+                    with pytest.raises(OSError, match=r"File too large: .*trial\.jsonl"):
+                        observe()
+                finally:
+                    resource.setrlimit(resource.RLIMIT_FSIZE, most)
+                    signal.signal(signal.SIGXFSZ, before)
+        assert trial.log.read_bytes() == whole
+        observe()
+    assert len(EvaluationLog(trial.log, objective.log.origin).evaluations) == 2
 
 
 @pytest.mark.parametrize(

@@ -2,15 +2,21 @@
 
 import io
 import logging
+import os
 import re
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import hardware_trial
 import pytest
 import torch
+import trial_run
 
 from autdtorch.drive_file import load_drive
 from autdtorch.hardware_report import compare
+from autdtorch.optim.gabs import gabs
 
 SCENE = """
 name: two
@@ -42,13 +48,13 @@ def test_a_trial_leaves_log_drive_and_report_and_is_not_repeated(run, tmp_path: 
     assert run(*EMULATED, "--dead", "4") == 0
     assert "the sensor hears 8 of 9" in caplog.text
     out = tmp_path / "out"
-    log = (out / "trial.jsonl").read_text()
-    assert log.count("\n") == 1 + 1 + 8 * 4
+    _, *evaluations, _ = log = (out / "trial.jsonl").read_text().splitlines()
+    assert len(evaluations) == 1 + 8 * 4
     assert run(*EMULATED, "--dead", "4") == 0
-    assert (out / "trial.jsonl").read_text() == log
+    assert (out / "trial.jsonl").read_text().splitlines()[:-1] == log  # and the second run's end
     report = (out / "report.md").read_text()
     assert "**Not heard**, counted from 0: 4." in report
-    assert report.count("| 1.000 |") == 3  # the simulation is told
+    assert report.count("| 1.000 |\n") == 3  # the simulation is told
     assert (out / "convergence.png").exists()
     assert len(load_drive(out / "drive.npz")) == 9
 
@@ -60,7 +66,10 @@ def test_without_noise_the_report_says_that_it_is_the_simulation(run, tmp_path: 
     assert run(*EMULATED) == 0
     report = (tmp_path / "out" / "report.md").read_text()
     assert "transducers driven as in the simulated trial: 9 of 9" in report
-    assert report.count("| 1.000 |") == 3
+    assert report.count("| 1.000 |\n") == 3
+    assert report.startswith("# Hardware trial: gabs on SonicSurface, emulated\n")
+    assert "| transducers | 0 to 8 |" in report
+    assert report.count(") | 1.000 | ") == 2  # the factor at each point
 
 
 def test_an_oscilloscope_on_the_emulated_bus_is_the_sensor(run, tmp_path: Path, caplog):
@@ -88,7 +97,11 @@ def test_a_dry_run_shows_the_frames_and_leaves_nothing(run, tmp_path: Path, caps
         (("--max-evaluations", "5"), 3, "5 evaluations are made, the limit: the outputs are off"),
         (("--amplitude-limit", "0.5"), 2, "amplitude: 0.5; must be >= 1"),
         (("--set", "level=4"), 2, "unknown key 'level'; gabs has first, levels, order, passes"),
-        (("--device", "openmpd"), 2, "--sensor: None; must be scope, file or manual on a real device"),
+        (("--device", "openmpd"), 2, "--sensor: none; must be scope, file or manual on a real device"),
+        (("--dead", "0-9"), 2, "--dead: 9; must be 0 to 8, as the scene has them"),
+        (("--transducers", "0-7"), 2, "--transducers: 8; must be 9, as many as the scene has"),
+        (("--device", "emulated:openmpd", "--boards", "left.pat"), 2, "--boards: left.pat: no such file"),
+        (("--device", "emulated:autd3", "--boards", "two"), 2, "--boards: two; must be the number of boards"),
         (("--dead", "0-8"), 2, "the sensor hears no transducer"),
         (("--scene", "nowhere"), 2, "--scene: nowhere: no such file; must be a YAML file, or one of homo"),
         (
@@ -109,15 +122,105 @@ def test_no_trial_without_an_amplitude_limit(run, capsys):
     assert "--amplitude-limit" in capsys.readouterr().err
 
 
-def test_transducers_that_count_down_are_refused(run, capsys):
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--transducers", "5-3"), "--transducers: '5-3'; must be numbers and ranges that go up"),
+        (("--amplitude-limit", "0"), "--amplitude-limit: '0'; must be a number > 0 and <= 1"),
+        (("--sensor", "scope", "--captures", "0"), "--captures: '0'; must be an integer >= 1"),
+        (("--sensor", "scope", "--loudest", "-1"), "--loudest: '-1'; must be a number > 0"),
+        (("--snr", "nan"), "--snr: 'nan'; must be a finite number"),
+        (("--captures", "1"), "--captures: only for --sensor scope"),  # its default, but given
+        (("--sensor", "scope", "--scope-chip", "1:2"), "--scope-chip: only for --sensor scope beside a real"),
+        (("--sensor", "manual", "--snr", "30"), "--snr: only for emulated microphones"),
+        (("--device", "openmpd", "--sensor", "manual", "--dead", "1"), "--dead: only for an emulated device"),
+        (("--device", "sonicsurface", "--boards", "2"), "--boards: only for openmpd, ultraino and autd3"),
+        (("--device", "ultraino", "--network", "eth0"), "--network: only for --device autd3"),
+        (("@nowhere.txt",), "No such file or directory: 'nowhere.txt'"),
+    ],
+)
+def test_what_means_nothing_is_one_line_that_names_the_option(run, capsys, words, message):
     with pytest.raises(SystemExit):
-        run(*EMULATED, "--transducers", "5-3")
-    assert "'5-3'; must be numbers and ranges that go up" in capsys.readouterr().err
+        run(*EMULATED, *words)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line.replace("argument ", "")
+
+
+def test_a_bench_is_described_in_a_file(run, tmp_path: Path, caplog):
+    bench = tmp_path / "my bench.txt"
+    bench.write_text("# ours\n--device emulated:openmpd --dead 4  # it fell\n\n--amplitude-limit 0.5\n")
+    assert run(f"@{bench}", "--method", "lssg") == 0
+    assert "not heard, counted from 0: 4" in caplog.text
+
+
+@pytest.mark.parametrize("device", ["autd3", "openmpd"])
+def test_devices_of_boards_find_the_drive_of_the_simulation(run, tmp_path: Path, caplog, device: str):
+    if device == "autd3":
+        pytest.importorskip("autd3", reason="the kit of AUTD3: install autdtorch[autd3]")
+    boards = ["2"] if device == "autd3" else [write_board(tmp_path, name) for name in ("left", "right")]
+    words = ("--device", f"emulated:{device}", "--boards", *boards, "--transducers", "251-259")
+    assert run(*EMULATED, *words) == 0
+    report = (tmp_path / "out" / "report.md").read_text()
+    assert "transducers driven as in the simulated trial: 9 of 9" in report
+    assert report.count("| 1.000 |\n") == 3
+    if device == "openmpd":  # another file of the same name is another board
+        write_board(tmp_path, "left", gain=0.5)
+        assert run(*EMULATED, *words) == 2
+        assert "of another trial, whose boards is ['left " in caplog.text
+
+
+def write_board(folder: Path, name: str, gain: float = 1.0) -> str:
+    path = folder / f"{name}.pat"
+    positions = "\n".join(f"({0.0105 * (n % 16)}, {0.0105 * (n // 16)}, 0)" for n in range(256))
+    rest = "\n".join(" ".join(map(str, column)) for column in (range(255, -1, -1), [0] * 256, [gain] * 256))
+    path.write_text(f"{name}\n256\n128\n{positions}\n{rest}\n")
+    return str(path)
+
+
+INTERRUPTED_IMPORT = """
+import runpy, signal, sys
+class Finder:
+    def find_spec(self, name, path, target=None):
+        if name == "torch":
+            signal.raise_signal(signal.SIGINT)
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background processes ignore it
+sys.meta_path.insert(0, Finder())
+runpy.run_path(sys.argv[1], run_name="__main__")
+"""
+
+
+def test_ctrl_c_during_the_imports_is_one_line():
+    path = [str(Path(hardware_trial.__file__).parent), *sys.path]
+    ended = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED_IMPORT, hardware_trial.__file__],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(path)},
+        capture_output=True,
+        check=False,
+        text=True,
+    )
+    assert (ended.returncode, ended.stderr) == (130, "hardware_trial: SIGINT\n")
+
+
+@pytest.mark.parametrize(
+    ("calls", "message"),
+    [(0, ""), (1, ": the outputs are off, and the same command goes on where the log ends")],
+)
+def test_a_signal_speaks_of_the_device_only_once_it_was_opened(run, monkeypatch, caplog, calls, message):
+    def interrupted(objective, **_: object):
+        if not left:
+            signal.raise_signal(signal.SIGTERM)
+        left.pop()
+        return gabs(objective)
+
+    left = [None] * calls  # the first is in the simulation
+    monkeypatch.setitem(trial_run.METHODS, "gabs", interrupted)
+    assert run("--device", "emulated", "--method", "gabs", "--amplitude-limit", "1") == 143
+    assert caplog.messages[-1] == f"hardware_trial: SIGTERM{message}"
 
 
 def test_a_person_reads_each_transducer_and_the_silence_once(run, monkeypatch):
     points, evaluations = 2, 1 + 8 * 4
-    answers = io.StringIO("0\n" * points + "1\n" * points * (9 + evaluations) + "0\n" * points)
+    answers = io.StringIO("0\n" * points + "1\n" * points * (9 + evaluations + 1) + "0\n" * points)
     monkeypatch.setattr("sys.stdin", answers)
     assert run(*EMULATED, "--sensor", "manual") == 0
     assert not answers.read()

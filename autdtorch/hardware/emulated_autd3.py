@@ -1,0 +1,38 @@
+"""AUTD3 without hardware: the kit's own emulator answers on the network, and an emulated bench plays."""
+
+from __future__ import annotations
+
+from autdtorch.hardware.autd3 import Autd3Port
+from autdtorch.hardware.emulator import EmulatedBench
+
+
+class EmulatedAutd3Port(Autd3Port):
+    """The port of boards that are emulated on this machine: silent ones, so that a bench plays for them."""
+
+    def __init__(self, boards: int, bench: EmulatedBench) -> None:
+        """Start the emulator, and connect to it.
+
+        Args:
+            boards: their number.
+            bench: plays each frame that the boards have taken.
+
+        Raises:
+            LinkError: the emulator does not answer.
+            ImportError: the packages autd3 and autd3-pattern are missing.
+        """
+        try:
+            from autd3 import UdpEmulator
+        except ImportError as error:
+            raise ImportError(f"{error}; pip install 'autdtorch[autd3]' brings what is needed") from error
+        self._emulator = UdpEmulator(boards)
+        self._bench = bench
+        super().__init__(boards, self._emulator.option())
+
+    def write(self, data: bytes) -> None:
+        """Play a frame.
+
+        Raises:
+            LinkError: a board did not take it.
+        """
+        super().write(data)
+        self._bench.receive(data)
