@@ -19,7 +19,9 @@ from autdtorch.hardware.link import SETTLE, Link
 from autdtorch.hardware.usb import LinkError
 from autdtorch.validation import integer_at_least
 
-#: How long a command may take [s]; the kit gives up on boards that do not answer after 0.1 s.
+#: How long the kit waits for an answer [ms]; its own 10 ms run out on a computer that is busy.
+_ANSWER_MS = 100
+#: How long a command may take [s]; the kit asks boards that do not answer 8 times more before it gives up.
 _TIMEOUT = 5.0
 #: And opening [s]: the kit takes up to 10 s to find the boards and 30 s to synchronise them.
 _OPENING_TIMEOUT = 60.0
@@ -105,6 +107,7 @@ class Autd3Port:
         # A pattern is by board and transducer: where the boards stand plays no part.
         geometry = Geometry([Autd3() for _ in range(boards)])
         option = autd3.UdpOption() if network is None else network
+        config = autd3.ClientConfig(ack_timeout=autd3.Duration.from_millis(_ANSWER_MS))
         self._error: type[Exception] = autd3.Autd3Error
         self._boards = boards
         self._client: Any = None
@@ -113,7 +116,7 @@ class Autd3Port:
         threading.Thread(target=_obey, args=(self._commands,), name="AUTD3", daemon=True).start()
 
         async def open_client() -> None:  # kept here, as a signal may end the wait for it
-            self._client = await autd3.Client.open(geometry, option, autd3.ClientConfig())
+            self._client = await autd3.Client.open(geometry, option, config)
 
         try:
             self._run("be opened", open_client, _OPENING_TIMEOUT)
@@ -145,8 +148,9 @@ class Autd3Port:
         """
 
         async def close_client() -> None:
-            if self._client is not None:
-                await self._client.close()
+            client, self._client = self._client, None  # the kit lets go of boards that do not answer with it
+            if client is not None:
+                await client.close()
 
         try:
             self._run("be closed", close_client)

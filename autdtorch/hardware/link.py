@@ -134,10 +134,16 @@ class Link:
                 return
             try:
                 self.off()
-            finally:
-                self._open = False
-                atexit.unregister(self.close)
-                self._port.close()
+            except BaseException:
+                with contextlib.suppress(LinkError):  # the first error says more
+                    self._let_go()
+                raise
+            self._let_go()
+
+    def _let_go(self) -> None:
+        self._open = False
+        atexit.unregister(self.close)
+        self._port.close()
 
     def _frame(self, drive: torch.Tensor) -> bytes:
         everyone = torch.zeros(self.device.transducers, dtype=torch.complex128)
