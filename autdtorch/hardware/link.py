@@ -130,15 +130,24 @@ class Link:
             LinkError: the device does not take the bytes; it is let go all the same.
         """
         with self._lock:
-            if not self._open:
-                return
             try:
-                self.off()
-            except BaseException:
-                with contextlib.suppress(LinkError):  # the first error says more
-                    self._let_go()
+                self._off_and_let_go()
+            except LinkError:
                 raise
-            self._let_go()
+            except BaseException:  # a signal, which may come before anything is sent
+                self._off_and_let_go()
+                raise
+
+    def _off_and_let_go(self) -> None:
+        if not self._open:
+            return
+        try:
+            self.off()
+        except LinkError:
+            with contextlib.suppress(LinkError):  # the first error says more
+                self._let_go()
+            raise
+        self._let_go()
 
     def _let_go(self) -> None:
         self._open = False

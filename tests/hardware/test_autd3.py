@@ -4,8 +4,8 @@ import asyncio
 import builtins
 import contextlib
 import os
-import random
 import signal
+import subprocess
 import threading
 
 import pytest
@@ -66,8 +66,15 @@ def stray_signals_do_no_harm():
     signal.signal(signal.SIGTERM, before)
 
 
-def send_signal(after: float) -> None:
-    threading.Timer(after, os.kill, (os.getpid(), signal.SIGTERM)).start()
+@contextlib.contextmanager
+def signalled_all_the_time():
+    """SIGTERM every few ms, from without: a thread would send it only where it has the interpreter."""
+    sender = subprocess.Popen(["sh", "-c", "while kill -TERM $PPID; do sleep 0.002; done"])
+    try:
+        yield
+    finally:
+        sender.kill()
+        sender.wait()
 
 
 class Mute:
@@ -142,20 +149,18 @@ class TestWithTheKit:
     @pytest.mark.timeout(20)
     @pytest.mark.usefixtures("stray_signals_do_no_harm")
     def test_signals_at_any_moment_leave_the_boards_off(self, kit, monkeypatch):
-        chance, drive, boards = random.Random(0), random_drive(249), kit.UdpEmulator(1)
+        drive, boards = random_drive(249), kit.UdpEmulator(1)
         with open_autd3(1, network=boards.option(), settle=0) as link:
             link._port._client = client = Noting(link._port._client, monkeypatch)
-            for _ in range(150):
-                moment = chance.uniform(0, 4e-3)  # a drive and its switching off take 2 to 3 ms
-                with contextlib.suppress(Signalled), ended_by_signals():
-                    try:
-                        send_signal(after=moment)
-                        while True:
-                            link.play(drive)
+            with signalled_all_the_time():
+                for _ in range(200):
+                    with contextlib.suppress(Signalled), ended_by_signals():
+                        try:
+                            while True:
+                                link.play(drive)
+                        finally:
                             link.off()
-                    finally:
-                        link.off()
-                assert client.on[-2:] == [False, False]
+                    assert client.on[-2:] == [False, False]
         assert any(client.on)
 
     @pytest.mark.usefixtures("stray_signals_do_no_harm")
@@ -167,7 +172,7 @@ class TestWithTheKit:
         close, closed = Autd3Port.close, []
         monkeypatch.setattr(Autd3Port, "close", note_and_close)
         boards = kit.UdpEmulator(1)
-        send_signal(after=0.05)
+        threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGTERM)).start()
         with pytest.raises(Signalled), ended_by_signals():
             open_autd3(1, network=boards.option())  # takes 0.3 s
         assert len(closed) == 1
