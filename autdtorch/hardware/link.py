@@ -130,14 +130,29 @@ class Link:
             LinkError: the device does not take the bytes; it is let go all the same.
         """
         with self._lock:
-            if not self._open:
-                return
             try:
-                self.off()
-            finally:
-                self._open = False
-                atexit.unregister(self.close)
-                self._port.close()
+                self._off_and_let_go()
+            except LinkError:
+                raise
+            except BaseException:  # a signal, which may come before anything is sent
+                self._off_and_let_go()
+                raise
+
+    def _off_and_let_go(self) -> None:
+        if not self._open:
+            return
+        try:
+            self.off()
+        except LinkError:
+            with contextlib.suppress(LinkError):  # the first error says more
+                self._let_go()
+            raise
+        self._let_go()
+
+    def _let_go(self) -> None:
+        self._open = False
+        atexit.unregister(self.close)
+        self._port.close()
 
     def _frame(self, drive: torch.Tensor) -> bytes:
         everyone = torch.zeros(self.device.transducers, dtype=torch.complex128)

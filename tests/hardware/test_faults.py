@@ -18,6 +18,7 @@ from autdtorch.hardware import (
     Device,
     EmulatedBench,
     EmulatedSensor,
+    Link,
     LinkError,
     Sensor,
     Signalled,
@@ -157,6 +158,56 @@ def test_signals_in_mid_frame_and_while_switching_off_leave_the_outputs_off(tria
     with pytest.raises(Signalled):
         interrupted_trial()
     assert bench.firmware.drive().abs().max() == 0
+
+
+def test_a_signal_just_before_the_switching_off_leaves_the_outputs_off(trial):
+    class Interrupted(Link):
+        def off(self):
+            if loud and not signals:
+                signals.append(os.kill(os.getpid(), signal.SIGTERM))
+            super().off()
+
+    def interrupted_trial() -> None:
+        with ended_by_signals(), trial.link(bench) as link:
+            link.__class__ = Interrupted
+            loud.append(True)
+            link.play(torch.ones(16, dtype=torch.complex128))
+
+    loud: list[bool] = []
+    signals: list[None] = []
+    bench = trial.bench()
+    with pytest.raises(Signalled):
+        interrupted_trial()
+    assert bench.firmware.drive().abs().max() == 0
+
+
+@pytest.mark.parametrize("handlers_set", [2, 6], ids=["begins", "ends"])  # of 5, and 5 as they were
+def test_a_signal_as_the_listening_begins_or_ends_leaves_the_handlers_as_they_were(monkeypatch, handlers_set):
+    def set_and_interrupt(number, handler):
+        before = set_handler(number, handler)
+        changes.append(number)
+        if len(changes) == handlers_set:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return before
+
+    def listen() -> None:
+        with ended_by_signals():
+            pass
+
+    def harmless(*_) -> None: ...
+
+    changes: list[int] = []
+    set_handler = signal.signal
+    heard = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP]
+    before = [set_handler(number, harmless) for number in heard]
+    monkeypatch.setattr(signal, "signal", set_and_interrupt)
+    try:
+        with pytest.raises(Signalled):
+            listen()
+        assert all(signal.getsignal(number) is harmless for number in heard)
+    finally:
+        for number, handler in zip(heard, before, strict=True):
+            set_handler(number, handler)
 
 
 def test_a_signal_that_is_ignored_as_by_nohup_stays_so():
