@@ -111,7 +111,8 @@ class Link:
 
     def _recover(self) -> None:
         try:
-            self._port.recover()
+            with contextlib.suppress(LinkError):  # of several boards one may be gone, and the others play on
+                self._port.recover()
             self._send_silence()
         except LinkError as error:
             raise LinkError(f"{error}; the outputs may still be on: switch the device's power off") from error
@@ -133,11 +134,20 @@ class Link:
             if not self._open:
                 return
             try:
-                self.off()
+                self._off_for_good()
             finally:
                 self._open = False
                 atexit.unregister(self.close)
                 self._port.close()
+
+    def _off_for_good(self) -> None:
+        try:
+            self.off()
+        except LinkError:
+            raise
+        except BaseException:  # a signal, which may have come before the first byte, or amid a recovery
+            self.off()
+            raise
 
     def _frame(self, drive: torch.Tensor) -> bytes:
         everyone = torch.zeros(self.device.transducers, dtype=torch.complex128)

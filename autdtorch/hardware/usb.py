@@ -12,8 +12,8 @@ from typing import Any, Protocol
 UDEV_RULES = Path(__file__).with_name("70-autdtorch.rules")
 #: What brings pyusb and libusb.
 INSTALL_HINT = "pip install 'autdtorch[hardware]' brings what is needed"
-#: bmRequestType: to the device, vendor's own, recipient device.
-VENDOR_REQUEST = 0x40
+#: bmRequestType: vendor's own, recipient device; to the device, and from it.
+VENDOR_REQUEST, VENDOR_QUESTION = 0x40, 0xC0
 
 _TIMEOUT_MS = 1000
 _DIRECTION, _TRANSFER_TYPE, _BULK = 0x80, 0x03, 0x02
@@ -184,6 +184,21 @@ class UsbPort:
         self, request: int, value: int, index: int = 0, data: bytes = b"", kind: int = VENDOR_REQUEST
     ) -> None:
         self._call("be set up", self._device.ctrl_transfer, kind, request, value, index, data, _TIMEOUT_MS)
+
+    def _receive(self, wait_ms: int) -> bytes:
+        """A packet; empty if none comes within the time [ms]."""
+        from usb.core import USBTimeoutError
+
+        def read() -> bytes:
+            with contextlib.suppress(USBTimeoutError):
+                return bytes(self._in.read(self._in.wMaxPacketSize, wait_ms))
+            return b""
+
+        return bytes(self._call("be read", read))
+
+    def _ask(self, request: int, length: int) -> bytes:
+        transfer = self._device.ctrl_transfer
+        return bytes(self._call("be asked", transfer, VENDOR_QUESTION, request, 0, 0, length, _TIMEOUT_MS))
 
     def _call(self, what: str, call: Callable[..., Any], *arguments: object) -> Any:
         from usb.core import USBError

@@ -159,6 +159,28 @@ def test_signals_in_mid_frame_and_while_switching_off_leave_the_outputs_off(tria
     assert bench.firmware.drive().abs().max() == 0
 
 
+@pytest.mark.parametrize("moment", ["before the off frame", "while a time-out is mended"])
+def test_a_signal_amid_the_last_switching_off_leaves_the_outputs_off(trial, moment, monkeypatch):
+    def interrupted(*arguments: object) -> None:
+        monkeypatch.undo()
+        raise KeyboardInterrupt
+
+    def interrupted_trial() -> None:
+        with trial.link(bench) as link:
+            link.play(torch.ones(16, dtype=torch.complex128))
+            if moment == "before the off frame":
+                monkeypatch.setattr(link, "off", interrupted)
+            else:
+                monkeypatch.setattr(bench.bus, "clear_halt", interrupted)
+
+    bench = trial.bench()
+    if moment == "while a time-out is mended":
+        bench.bus = FaultyBus([bench.chip], "time-out", 258 * (2 + 1) + 100)
+    with pytest.raises(KeyboardInterrupt):
+        interrupted_trial()
+    assert bench.firmware.drive().abs().max() == 0
+
+
 def test_a_signal_that_is_ignored_as_by_nohup_stays_so():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
