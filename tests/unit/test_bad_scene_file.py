@@ -1,4 +1,4 @@
-"""What is wrong with a scene's file or mapping must be clear from the message: the place, and what is accepted."""
+"""What is wrong with a scene file or mapping must be clear from the message: where, and what is accepted."""
 
 import copy
 from pathlib import Path
