@@ -44,15 +44,6 @@ _READ_MS = 50
 class FtdiPort(UsbPort):
     """An FTDI chip with one port, as it is after a reset."""
 
-    def recover(self) -> None:
-        """Clear a stall, and drop what still waits in the chip.
-
-        Raises:
-            LinkError: the chip does not answer.
-        """
-        super().recover()
-        self._purge()
-
     def read(self, packets: int = 1) -> bytes:
         """What has arrived, at most so many packets, without the status bytes that begin each.
 
@@ -117,15 +108,6 @@ class Ch340Uart(UsbPort):
 
 class Cp2102Uart(UsbPort):
     """A CP2102 as a serial port: 8 bits, no parity, 1 stop bit."""
-
-    def recover(self) -> None:
-        """Clear a stall, and drop what still waits in the chip.
-
-        Raises:
-            LinkError: the chip does not answer.
-        """
-        super().recover()
-        self._purge()
 
     def _set_up(self) -> None:
         self._request(_CP2102_ENABLE, 1, kind=_CP2102_REQUEST)

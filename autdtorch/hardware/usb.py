@@ -132,12 +132,13 @@ class UsbPort:
         """Not every chip tells what it still holds."""
 
     def recover(self) -> None:
-        """Clear a stall.
+        """Clear a stall, and drop what still waits in the chip, where it can be told to.
 
         Raises:
             LinkError: the chip does not answer.
         """
         self._call("be recovered", self._device.clear_halt, self._out.bEndpointAddress)
+        self._purge()
 
     def close(self) -> None:
         """Give the chip back to the kernel's drivers.
@@ -156,6 +157,9 @@ class UsbPort:
 
     def _set_up(self) -> None:
         """A chip without a serial line may need nothing."""
+
+    def _purge(self) -> None:
+        """Not every chip can be told to."""
 
     def _take(self) -> None:
         import usb.util

@@ -18,7 +18,9 @@ from autdtorch.hardware import (
     Device,
     EmulatedBench,
     EmulatedSensor,
+    FileSensor,
     LinkError,
+    ManualSensor,
     Sensor,
     Signalled,
     ended_by_signals,
@@ -96,18 +98,26 @@ def test_a_fault_in_the_last_off_frame_is_mended(trial, fault):
     assert bench.firmware.drive().abs().max() == 0
 
 
-@pytest.mark.parametrize("reading", [[1.0, float("nan")], ["noise", 1.0], OSError("gone")])
-def test_garbage_from_the_sensor_ends_the_trial_with_the_outputs_off(trial, reading):
+def nobody(question: str) -> str:
+    raise EOFError
+
+
+@pytest.mark.parametrize(
+    ("reading", "message"),
+    [
+        (lambda: [1.0, float("nan")], "pressure of the sensor"),
+        (lambda: ["noise", 1.0], "pressure of the sensor"),
+        (ManualSensor([(0, 0, 0), (1, 0, 0)], nobody).read, "nobody answers"),
+        (FileSensor("no/such/file", 2, timeout=0.01).read, "did not change"),
+    ],
+)
+def test_garbage_from_the_sensor_ends_the_trial_with_the_outputs_off(trial, reading, message):
     class Garbled(Counting):
         def read(self):
-            if self.readings < SURVIVED:
-                return super().read()
-            if isinstance(reading, OSError):
-                raise reading
-            return reading
+            return super().read() if self.readings < SURVIVED else reading()
 
     bench = trial.bench()
-    with pytest.raises((ValueError, OSError), match=r"pressure of the sensor|gone"):
+    with pytest.raises((ValueError, OSError), match=message):
         measure(trial, bench, Garbled(bench))
     assert bench.firmware.drive().abs().max() == 0
     require_that_it_goes_on(trial)
