@@ -135,10 +135,16 @@ class Link:
                 return
             try:
                 self._off_for_good()
-            finally:
-                self._open = False
-                atexit.unregister(self.close)
-                self._port.close()
+            except BaseException:
+                with contextlib.suppress(LinkError):  # the first error says more
+                    self._let_go()
+                raise
+            self._let_go()
+
+    def _let_go(self) -> None:
+        self._open = False
+        atexit.unregister(self.close)
+        self._port.close()
 
     def _off_for_good(self) -> None:
         try:

@@ -86,6 +86,25 @@ def test_without_the_packages_there_is_a_hint(monkeypatch, package: str):
             import autdtorch.hardware.emulated_bus  # noqa: F401
 
 
+def test_that_the_outputs_may_be_on_is_not_hidden_by_a_driver_that_does_not_come_back():
+    class Bound(EmulatedBus):
+        def is_kernel_driver_active(self, dev_handle, intf):
+            return True
+
+        def detach_kernel_driver(self, dev_handle, intf):
+            pass
+
+        def attach_kernel_driver(self, dev_handle, intf):
+            raise GONE
+
+    bus = Bound([EmulatedFtdi(0x0403, 0x6001, "A1", SonicSurfaceFirmware())])
+    link = open_link(SONICSURFACE, backend=bus)
+    bus.chips[0].present = False
+    with pytest.raises(LinkError, match="the outputs may still be on"):
+        link.close()
+    link.close()  # nothing is left to do
+
+
 @pytest.mark.parametrize("device", [SONICSURFACE, OPENMPD, ULTRAINO])
 def test_a_device_left_in_mid_frame_is_switched_off_all_the_same(device: Device):
     bench = EmulatedBench(device, torch.ones((1, device.transducers)).cdouble())
