@@ -263,7 +263,8 @@ def _serial_of(device: Any) -> str | None:
 
     try:
         number = device.serial_number
-    except (USBError, ValueError):  # pyusb's ValueError where the device gives no languages
+    # pyusb's ValueError where the device gives no languages, and what it makes of libusb's "not supported"
+    except (USBError, ValueError, NotImplementedError):
         return None
     return None if number is None else str(number)
 

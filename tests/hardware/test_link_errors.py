@@ -54,6 +54,11 @@ def test_each_error_of_usb_has_a_message_of_its_own(method: str, error: Exceptio
         open_link(SONICSURFACE, backend=failing(method, error))
 
 
+def test_devices_that_libusb_cannot_open_as_on_windows_are_listed_all_the_same():
+    with pytest.raises(LinkError, match=r"no USB devices .*: 0403:6001 \(serial number unknown\)"):
+        open_link(OPENMPD, backend=failing("open_device", NotImplementedError()))
+
+
 def test_a_serial_number_that_may_not_be_read_is_said_to_be_a_matter_of_permission():
     with pytest.raises(
         LinkError, match=r"no USB devices .* number 'A1'.* unknown serial number: on Linux, sudo cp"
