@@ -132,7 +132,9 @@ def not_ignored(number):
 
 
 @pytest.mark.usefixtures("not_ignored")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGTSTP])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGTSTP, signal.SIGTTIN]
+)
 def test_a_signal_ends_the_trial_with_the_outputs_off(trial, number):
     def disturb(readings: int) -> None:
         if readings > SURVIVED:
@@ -189,6 +191,23 @@ def test_a_signal_amid_the_last_switching_off_leaves_the_outputs_off(trial, mome
     with pytest.raises(KeyboardInterrupt):
         interrupted_trial()
     assert bench.firmware.drive().abs().max() == 0
+
+
+@pytest.mark.usefixtures("not_ignored")
+@pytest.mark.parametrize("number", [signal.SIGINT])
+def test_two_signals_at_once_end_the_trial_without_a_word_of_the_second(monkeypatch, number):
+    def both() -> None:
+        with ended_by_signals():
+            signal.pthread_sigmask(signal.SIG_BLOCK, {number, signal.SIGTERM})
+            os.kill(os.getpid(), number)
+            os.kill(os.getpid(), signal.SIGTERM)
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {number, signal.SIGTERM})
+
+    lost: list[object] = []
+    monkeypatch.setattr(sys, "unraisablehook", lost.append)
+    with pytest.raises(Signalled, match="SIGINT"):
+        both()
+    assert not lost
 
 
 def test_a_signal_that_is_ignored_as_by_nohup_stays_so():
