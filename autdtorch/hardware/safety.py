@@ -48,8 +48,9 @@ class Signalled(KeyboardInterrupt):
 def ended_by_signals() -> Iterator[None]:
     """Have the signals that end or stop a process raise `Signalled`, so that links are closed on the way out.
 
-    These are Ctrl-C, Ctrl-Z, SIGTERM, SIGHUP, SIGQUIT and SIGTTIN; one that is ignored, as by ``nohup``, stays
-    so. Only the first raises: what comes later must not interrupt the switching off. Use it around the link.
+    These are Ctrl-C, Ctrl-Z, SIGTERM, SIGHUP, SIGQUIT and SIGTTIN; one that is ignored, as by ``nohup``,
+    stays so. Only the first raises: what comes later must not interrupt the switching off. Use it around the
+    link.
 
     Raises:
         Signalled: there was such a signal.
