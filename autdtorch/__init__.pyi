@@ -8,6 +8,7 @@ from .drive_file import load_drive, save_drive
 from .field_file import save_field
 from .freespace import green
 from .geometry import Plane, circle_points
+from .medium import Medium
 from .metrics import FocusMetrics, focus_metrics
 from .objective import Objective, SimulatedObjective, weakest_focus
 from .obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
@@ -37,7 +38,7 @@ from .propagator import (
     volume_field,
 )
 from .results import load_results
-from .scene import Medium, OverlapWarning, ScaleWarning, Scene
+from .scene import OverlapWarning, ScaleWarning, Scene
 from .scene_file import load_scene
 from .view3d import animate3d, view3d
 

@@ -13,6 +13,8 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from autdtorch.writing import replacing
+
 Column: TypeAlias = npt.NDArray[np.float64]
 
 #: What a column may be given in, by its SI unit, and what that is in SI.
@@ -55,7 +57,7 @@ def read_table(path: str | os.PathLike[str], columns: Mapping[str, str]) -> dict
 
 def write_table(path: str | os.PathLike[str], columns: Mapping[str, npt.NDArray[np.generic]]) -> None:
     """Write columns (R,) by header; floats with all digits that they need."""
-    with Path(path).open("w", encoding="utf-8", newline="") as file:
+    with replacing(Path(path)) as partial, partial.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
         writer.writerows(zip(*(values.tolist() for values in columns.values()), strict=True))

@@ -26,6 +26,7 @@ from autdtorch.hardware.levels import (
     sonicsurface_levels,
 )
 from autdtorch.validation import ArrayLike, invalid, real_tensor, require_one_of
+from autdtorch.writing import replacing
 
 
 class _Device(NamedTuple):
@@ -89,7 +90,7 @@ def save_drive(
     if kind == ".csv":
         write_table(path, columns)
     else:
-        with Path(path).open("wb") as file:  # to a path, NumPy would add another .npz where it is .NPZ
+        with replacing(Path(path)) as partial, partial.open("wb") as file:  # to a path, NumPy would add .npz
             np.savez_compressed(file, allow_pickle=False, **arrays)
 
 

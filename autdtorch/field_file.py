@@ -17,6 +17,7 @@ import numpy.typing as npt
 import torch
 
 from autdtorch.validation import LENGTH_TOLERANCE, ArrayLike, complex_tensor, invalid, positive, real_tensor
+from autdtorch.writing import replacing
 
 Array: TypeAlias = npt.NDArray[np.float64]
 
@@ -64,10 +65,9 @@ def save_field(
         raise ValueError(f"pressure: shape {tuple(values.shape)}; must be {places.shape[:-1]} as the points")
     frequency = positive("frequency", frequency, "Hz")
     grid = _grid(places)
-    if kind == ".vti":
-        _write_vti(Path(path), values, grid, frequency)
-    else:
-        _write_hdf5(Path(path), values, grid, frequency)
+    write = _write_vti if kind == ".vti" else _write_hdf5
+    with replacing(Path(path)) as partial:
+        write(partial, values, grid, frequency)
 
 
 def _grid(points: Array) -> _Grid:

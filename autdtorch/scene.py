@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import torch
 
-from autdtorch import air
 from autdtorch.array import TransducerArray
 from autdtorch.display import html_facts
 from autdtorch.geometry import Plane
+from autdtorch.medium import Medium as Medium
 from autdtorch.obstacles import Box as Box
 from autdtorch.obstacles import Obstacle
 from autdtorch.sketch import sketch
@@ -24,7 +24,6 @@ from autdtorch.validation import (
     distances,
     finite_vector,
     invalid,
-    not_negative,
     points_tensor,
     positive,
     real_tensor,
@@ -39,53 +38,6 @@ _DECIBELS = 20 / math.log(10)  # of a neper
 _USUAL_EXTENT = 0.1, 2000.0  # wavelengths from end to end of array and control points
 
 _MOST_ABSORPTION = 3.0  # dB per wavelength: absorption is to be a small part of the wavenumber
-
-
-@dataclass(frozen=True)
-class Medium:
-    """A uniform fluid.
-
-    Attributes:
-        density: [kg/m^3], > 0.
-        sound_speed: [m/s], > 0.
-        absorption: of a plane wave at the frequency of the drive [dB/m], >= 0.
-
-    Raises:
-        ValueError: an attribute is not finite or out of range.
-    """
-
-    density: float
-    sound_speed: float
-    absorption: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Check the attributes."""
-        object.__setattr__(self, "density", positive("Medium.density", self.density, "kg/m^3"))
-        object.__setattr__(self, "sound_speed", positive("Medium.sound_speed", self.sound_speed, "m/s"))
-        object.__setattr__(self, "absorption", not_negative("Medium.absorption", self.absorption, "dB/m"))
-
-    @classmethod
-    def air(
-        cls,
-        temperature: float = 20.0,
-        relative_humidity: float = 50.0,
-        pressure: float = 101325.0,
-        frequency: float = 40e3,
-    ) -> Medium:
-        """Humid air: an ideal gas that absorbs by ISO 9613-1:1993; `autdtorch.air` says how accurate that is.
-
-        Args:
-            temperature: [deg C], -20 to 50.
-            relative_humidity: [%], 0 to 100.
-            pressure: ambient [Pa], 50e3 to 200e3.
-            frequency: of the drive, for the absorption [Hz]; 4e-4 to 10 times the pressure in Pa.
-
-        Raises:
-            ValueError: an argument is not a number in its range.
-        """
-        density, sound_speed = air.density_and_sound_speed(temperature, relative_humidity, pressure)
-        absorption = air.absorption(temperature, relative_humidity, pressure, frequency)
-        return cls(density, sound_speed, absorption)
 
 
 class ScaleWarning(UserWarning):

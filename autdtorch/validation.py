@@ -167,6 +167,8 @@ def real_tensor(name: str, value: object, unit: str = "") -> torch.Tensor:
 def complex_tensor(name: str, value: object) -> torch.Tensor:
     """`value` as a finite complex128 tensor of any shape; a tensor keeps its device and its gradient.
 
+    A conjugate that PyTorch has only marked is carried out: not every function takes a marked one.
+
     Raises:
         ValueError: ragged, real (a drive is not its phases), NaN or infinite.
     """
@@ -174,7 +176,7 @@ def complex_tensor(name: str, value: object) -> torch.Tensor:
     tensor = _tensor(name, value, accepted)
     if not tensor.is_complex():
         raise invalid(name, value, accepted)
-    tensor = tensor.to(torch.complex128)
+    tensor = tensor.to(torch.complex128).resolve_conj()
     _require_finite(name, tensor)
     return tensor
 

@@ -18,13 +18,28 @@ def naming(path: Path) -> Iterator[None]:
         raise
 
 
-def replace_file(path: Path, content: bytes) -> None:
-    """Write a file under another name first, so that nobody finds half of it.
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give another name to write a file under, which then takes its place, so that nobody finds half of it.
 
     Raises:
         OSError: the file cannot be written.
     """
     partial = path.with_name(f"{path.name}.partial")
     with naming(path):
+        try:
+            yield partial
+            partial.replace(path)
+        except BaseException:
+            partial.unlink(missing_ok=True)
+            raise
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Write a file as `replacing` does.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    with replacing(path) as partial:
         partial.write_bytes(content)
-        partial.replace(path)

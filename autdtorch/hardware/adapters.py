@@ -6,6 +6,8 @@ tried on a real chip.
 
 from __future__ import annotations
 
+import contextlib
+import threading
 import time
 from collections.abc import Callable
 from functools import partial
@@ -14,9 +16,9 @@ from typing import Any, NamedTuple
 from autdtorch.hardware.usb import LinkError, Port, UsbPort
 
 #: FTDI's requests.
-RESET, FLOW_CONTROL, BAUD_RATE, DATA_FORMAT, LATENCY = 0x00, 0x02, 0x03, 0x04, 0x09
-#: wValue of RESET.
-RESET_CHIP, PURGE_INPUT, PURGE_OUTPUT = 0, 1, 2
+RESET, FLOW_CONTROL, BAUD_RATE, DATA_FORMAT, STATUS, LATENCY = 0x00, 0x02, 0x03, 0x04, 0x05, 0x09
+#: wValue of RESET. The names of the purges in ftdi_sio, RX and TX, are from the chip's side (libftdi 1.5).
+RESET_CHIP, PURGE_OUTPUT, PURGE_INPUT = 0, 1, 2
 #: wValue of DATA_FORMAT: 8 bits, no parity, 1 stop bit.
 EIGHT_N_ONE = 0x0008
 #: Every IN packet of FTDI's begins with modem and line status.
@@ -36,19 +38,11 @@ _CP2102_ENABLE, _CP2102_LINE, _CP2102_PURGE, _CP2102_BAUD = 0x00, 0x03, 0x12, 0x
 _CP2102_EIGHT_N_ONE, _CP2102_ALL_QUEUES = 0x0800, 0x000F
 
 _CDC_REQUEST, _CDC_LINE_CODING = 0x21, 0x20  # to the interface, of its class
+_READ_MS = 50
 
 
 class FtdiPort(UsbPort):
     """An FTDI chip with one port, as it is after a reset."""
-
-    def recover(self) -> None:
-        """Clear a stall, and drop what still waits in the chip.
-
-        Raises:
-            LinkError: the chip does not answer.
-        """
-        super().recover()
-        self._request(RESET, PURGE_OUTPUT)
 
     def read(self, packets: int = 1) -> bytes:
         """What has arrived, at most so many packets, without the status bytes that begin each.
@@ -64,8 +58,11 @@ class FtdiPort(UsbPort):
     def _set_up(self) -> None:
         self._request(RESET, RESET_CHIP)
         self._request(LATENCY, _LATENCY_MS)
-        self._request(RESET, PURGE_INPUT)
+        self._purge()
+
+    def _purge(self) -> None:
         self._request(RESET, PURGE_OUTPUT)
+        self._request(RESET, PURGE_INPUT)
 
 
 class FtdiUart(FtdiPort):
@@ -83,10 +80,11 @@ class FtdiUart(FtdiPort):
                 raise LinkError("the adapter does not send what it was given; is something else on its line?")
 
     def _line_status(self) -> int:
-        packet = self._call("be read", self._in.read, self._in.wMaxPacketSize)
-        if len(packet) < STATUS_BYTES:
+        # Asked for as ftdi_sio does: an IN packet may have waited in the chip since before the last bytes.
+        status = self._ask(STATUS, STATUS_BYTES)
+        if len(status) < STATUS_BYTES:
             raise LinkError("the adapter gives no line status; is it an FT232R?")
-        return int(packet[1])
+        return status[1]
 
     def _set_up(self) -> None:
         super()._set_up()
@@ -113,18 +111,60 @@ class Cp2102Uart(UsbPort):
 
     def _set_up(self) -> None:
         self._request(_CP2102_ENABLE, 1, kind=_CP2102_REQUEST)
-        self._request(_CP2102_PURGE, _CP2102_ALL_QUEUES, kind=_CP2102_REQUEST)
+        self._purge()
         self._request(_CP2102_BAUD, 0, data=self._baud.to_bytes(4, "little"), kind=_CP2102_REQUEST)
         self._request(_CP2102_LINE, _CP2102_EIGHT_N_ONE, kind=_CP2102_REQUEST)
 
+    def _purge(self) -> None:
+        self._request(_CP2102_PURGE, _CP2102_ALL_QUEUES, kind=_CP2102_REQUEST)
+
 
 class CdcUart(UsbPort):
-    """A serial port of USB's own class, as on an Arduino Mega 2560: 8 bits, no parity, 1 stop bit."""
+    """A serial port of USB's own class, as on an Arduino Mega 2560: 8 bits, no parity, 1 stop bit.
+
+    What comes in is read all the time, as cdc_acm does, and dropped: an Ultraino sends what is for its next
+    board, and its commands, on the line that leads back to USB too. Older firmwares of the Arduino's chip
+    (Arduino-usbserial on LUFA 100807) wait 0.1 s for every byte that nobody takes, and pass nothing on
+    meanwhile.
+    """
+
+    def __init__(self, device: Any, baud: int) -> None:
+        """Take the chip and set it up; if that fails it is given back.
+
+        Args:
+            device: `usb.core.Device`.
+            baud: of its serial line [bits/s].
+
+        Raises:
+            LinkError: it cannot be opened, or refuses.
+        """
+        self._closing = threading.Event()
+        self._reader = threading.Thread(target=self._drop_input, daemon=True)
+        super().__init__(device, baud)
+
+    def close(self) -> None:
+        """Give the chip back to the kernel's drivers.
+
+        Raises:
+            LinkError: a driver does not take it.
+        """
+        self._closing.set()
+        try:
+            if self._reader.is_alive():
+                self._reader.join()
+        finally:
+            super().close()
 
     def _set_up(self) -> None:
         one_stop_bit, no_parity, data_bits = 0, 0, 8
         coding = self._baud.to_bytes(4, "little") + bytes([one_stop_bit, no_parity, data_bits])
         self._request(_CDC_LINE_CODING, 0, data=coding, kind=_CDC_REQUEST)
+        self._reader.start()
+
+    def _drop_input(self) -> None:
+        with contextlib.suppress(LinkError):  # a write tells of it
+            while not self._closing.is_set():
+                self._receive(_READ_MS)
 
 
 class Adapter(NamedTuple):

@@ -5,6 +5,7 @@ Written from the chips' Linux drivers and data sheets, not from `adapters`, so t
 
 from __future__ import annotations
 
+import time
 from typing import ClassVar, TypeAlias
 
 from autdtorch.hardware.firmware import Firmware
@@ -14,6 +15,8 @@ Interfaces: TypeAlias = tuple[tuple[tuple[int, int, int], tuple[int, ...]], ...]
 
 _STRINGS = ("", "autdtorch", "emulated device")  # by index; the serial number comes after
 _VENDOR_DEVICE, _VENDOR_INTERFACE, _CLASS_INTERFACE = 0x40, 0x41, 0x21
+_VENDOR_QUESTION = 0xC0
+_WHILE = 0.01  # [s]
 _BAUD_TOLERANCE = 0.03  # more, and a UART loses the last of its ten bits
 
 
@@ -67,7 +70,8 @@ class EmulatedChip:
 class EmulatedFtdi(EmulatedChip):
     """An FT232R, or an FT232H as a FIFO."""
 
-    _BAUD, _FORMAT, _OTHERS = 0x03, 0x04, (0x00, 0x01, 0x02, 0x09)
+    _BAUD, _FORMAT, _STATUS, _OTHERS = 0x03, 0x04, 0x05, (0x00, 0x01, 0x02, 0x09)
+    _IDLE = b"\x01\x60"
     _EIGHTHS: ClassVar[dict[int, int]] = {0: 0, 3: 1, 2: 2, 4: 3, 1: 4, 5: 5, 6: 6, 7: 7}
 
     def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
@@ -78,9 +82,13 @@ class EmulatedFtdi(EmulatedChip):
             self.eight_n_one = value == 8
         return kind == _VENDOR_DEVICE and request in (self._BAUD, self._FORMAT, *self._OTHERS)
 
+    def answer(self, kind: int, request: int) -> bytes | None:
+        """The status of modem and line: all that was taken has been sent."""
+        return self._IDLE if (kind, request) == (_VENDOR_QUESTION, self._STATUS) else None
+
     def read(self, most: int) -> bytes:
         """An IN packet: the status alone."""
-        return b"\x01\x60"
+        return self._IDLE
 
 
 class EmulatedCh340(EmulatedChip):
@@ -142,6 +150,11 @@ class EmulatedCdc(EmulatedChip):
             self.baud = float(int.from_bytes(data[:4], "little"))
             self.eight_n_one = data[4:] == bytes([0, 0, 8])
         return kind == _CLASS_INTERFACE and request in (self._LINE_CODING, self._LINE_STATE)
+
+    def read(self, most: int) -> bytes:
+        """An IN packet: none comes within a while."""
+        time.sleep(_WHILE)
+        return b""
 
 
 CHIPS: dict[tuple[int, int], type[EmulatedChip]] = {

@@ -21,8 +21,9 @@ logger = logging.getLogger(__name__)
 
 _CANDIDATES = 256  # amplitudes to choose from; more than a device here has
 
-# SIGTSTP, Ctrl-Z, would stop the process, and its timer, with the outputs on.
-_ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGBREAK")
+# SIGTSTP, Ctrl-Z, would stop the process, and its timer, with the outputs on; so would SIGTTIN, where a trial
+# in the background of a shell asks somebody for a reading.
+_ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGTTIN", "SIGBREAK")
 _SIGNALS = [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
 
 
@@ -47,8 +48,9 @@ class Signalled(KeyboardInterrupt):
 def ended_by_signals() -> Iterator[None]:
     """Have the signals that end or stop a process raise `Signalled`, so that links are closed on the way out.
 
-    These are Ctrl-C, Ctrl-Z, SIGTERM, SIGHUP and SIGQUIT; one that is ignored, as by ``nohup``, stays so.
-    Only the first raises: what comes later must not interrupt the switching off. Use it around the link.
+    These are Ctrl-C, Ctrl-Z, SIGTERM, SIGHUP, SIGQUIT and SIGTTIN; one that is ignored, as by ``nohup``,
+    stays so. Only the first raises: what comes later must not interrupt the switching off. Use it around the
+    link.
 
     Raises:
         Signalled: there was such a signal.
@@ -57,7 +59,7 @@ def ended_by_signals() -> Iterator[None]:
 
     def end(number: int, _: FrameType | None) -> None:
         for one in before:
-            signal.signal(one, signal.SIG_IGN)
+            signal.signal(one, _pass)
         raise Signalled(number)
 
     def restore() -> None:
@@ -76,6 +78,10 @@ def ended_by_signals() -> Iterator[None]:
         except Signalled:  # there was none before, and now all are ignored
             restore()
             raise
+
+
+def _pass(number: int, _: FrameType | None) -> None:
+    """Not SIG_IGN: of a signal that waits already, Python would then report that it was lost."""
 
 
 @dataclass(frozen=True)

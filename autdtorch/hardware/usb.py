@@ -12,8 +12,8 @@ from typing import Any, Protocol
 UDEV_RULES = Path(__file__).with_name("70-autdtorch.rules")
 #: What brings pyusb and libusb.
 INSTALL_HINT = "pip install 'autdtorch[hardware]' brings what is needed"
-#: bmRequestType: to the device, vendor's own, recipient device.
-VENDOR_REQUEST = 0x40
+#: bmRequestType: vendor's own, recipient device; to the device, and from it.
+VENDOR_REQUEST, VENDOR_QUESTION = 0x40, 0xC0
 
 _TIMEOUT_MS = 1000
 _DIRECTION, _TRANSFER_TYPE, _BULK = 0x80, 0x03, 0x02
@@ -132,12 +132,13 @@ class UsbPort:
         """Not every chip tells what it still holds."""
 
     def recover(self) -> None:
-        """Clear a stall.
+        """Clear a stall, and drop what still waits in the chip, where it can be told to.
 
         Raises:
             LinkError: the chip does not answer.
         """
         self._call("be recovered", self._device.clear_halt, self._out.bEndpointAddress)
+        self._purge()
 
     def close(self) -> None:
         """Give the chip back to the kernel's drivers.
@@ -156,6 +157,9 @@ class UsbPort:
 
     def _set_up(self) -> None:
         """A chip without a serial line may need nothing."""
+
+    def _purge(self) -> None:
+        """Not every chip can be told to."""
 
     def _take(self) -> None:
         import usb.util
@@ -184,6 +188,21 @@ class UsbPort:
         self, request: int, value: int, index: int = 0, data: bytes = b"", kind: int = VENDOR_REQUEST
     ) -> None:
         self._call("be set up", self._device.ctrl_transfer, kind, request, value, index, data, _TIMEOUT_MS)
+
+    def _receive(self, wait_ms: int) -> bytes:
+        """A packet; empty if none comes within the time [ms]."""
+        from usb.core import USBTimeoutError
+
+        def read() -> bytes:
+            with contextlib.suppress(USBTimeoutError):
+                return bytes(self._in.read(self._in.wMaxPacketSize, wait_ms))
+            return b""
+
+        return bytes(self._call("be read", read))
+
+    def _ask(self, request: int, length: int) -> bytes:
+        transfer = self._device.ctrl_transfer
+        return bytes(self._call("be asked", transfer, VENDOR_QUESTION, request, 0, 0, length, _TIMEOUT_MS))
 
     def _call(self, what: str, call: Callable[..., Any], *arguments: object) -> Any:
         from usb.core import USBError
@@ -244,7 +263,8 @@ def _serial_of(device: Any) -> str | None:
 
     try:
         number = device.serial_number
-    except (USBError, ValueError):  # pyusb's ValueError where the device gives no languages
+    # pyusb's ValueError where the device gives no languages, and what it makes of libusb's "not supported"
+    except (USBError, ValueError, NotImplementedError):
         return None
     return None if number is None else str(number)
 

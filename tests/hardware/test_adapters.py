@@ -1,13 +1,15 @@
 """The chips that devices hang on: what they are told, and that the device behind them hears the frames."""
 
+import time
+
 import pytest
 import torch
 
-from autdtorch.hardware import SONICSURFACE, ULTRAINO, Device, EmulatedBench, open_link
+from autdtorch.hardware import SONICSURFACE, ULTRAINO, Device, EmulatedBench, open_link, ultraino_boards
 from autdtorch.hardware.adapters import Adapter, ch340_divisor
-from autdtorch.hardware.emulated_bus import EmulatedBus
-from autdtorch.hardware.emulated_chips import CHIPS, EmulatedCdc
-from autdtorch.hardware.firmware import SonicSurfaceFirmware
+from autdtorch.hardware.emulated_bus import EmulatedBus, time_out
+from autdtorch.hardware.emulated_chips import CHIPS, EmulatedCdc, EmulatedCp2102
+from autdtorch.hardware.firmware import SonicSurfaceFirmware, UltrainoFirmware
 from autdtorch.hardware.usb import UDEV_RULES, find_device
 
 WIRED = [(device, adapter) for device in (SONICSURFACE, ULTRAINO) for adapter in device.adapters]
@@ -29,6 +31,55 @@ def test_every_adapter_brings_the_frames_to_its_device(device: Device, adapter: 
 )
 def test_divisors_of_a_ch340_are_those_of_the_linux_driver(baud: int, value: int):
     assert ch340_divisor(baud) == value
+
+
+def test_what_a_row_of_boards_hands_on_is_read_and_dropped():
+    class Waiting(EmulatedCdc):
+        """As on LUFA 100807: what comes from the board goes first, and waits for the host to read it."""
+
+        unread = 0
+
+        def write(self, data: bytes) -> None:
+            until = time.monotonic() + 1.0
+            while self.unread > 64:
+                if time.monotonic() > until:
+                    raise time_out()
+                time.sleep(1e-3)
+            super().write(data)
+            self.unread += sum(byte & 0x0F != 1 for byte in data)
+
+        def read(self, most: int) -> bytes:
+            if not self.unread:
+                time.sleep(1e-3)
+                raise time_out()
+            taken = bytes(min(most, self.unread))
+            self.unread -= len(taken)
+            return taken
+
+    bus = EmulatedBus([Waiting(0x2341, 0x0042, "A1", UltrainoFirmware(2))])
+    with open_link(ultraino_boards(2), backend=bus) as link:
+        for _ in range(3):
+            link.play(torch.ones(128).cdouble())
+
+
+def test_a_cp2102_drops_what_waits_when_it_is_taken_and_when_it_recovers():
+    class Holding(EmulatedCp2102):
+        waits = b"\xfe"  # half a frame of another program
+
+        def write(self, data: bytes) -> None:
+            self.waits += data
+
+        def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
+            if (request, value) == (0x12, 0x000F):  # PURGE of Silicon Labs' AN571: all queues
+                self.waits = b""
+            return super().control(kind, request, value, index, data)
+
+    holding = Holding(0x10C4, 0xEA60, "A1", SonicSurfaceFirmware())
+    port = SONICSURFACE.adapters[2].open_port(find_device([(0x10C4, 0xEA60)], backend=EmulatedBus([holding])))
+    assert not holding.waits
+    port.write(bytes(100))
+    port.recover()
+    assert not holding.waits
 
 
 def test_every_chip_has_its_udev_rule():

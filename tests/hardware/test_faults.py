@@ -18,8 +18,9 @@ from autdtorch.hardware import (
     Device,
     EmulatedBench,
     EmulatedSensor,
-    Link,
+    FileSensor,
     LinkError,
+    ManualSensor,
     Sensor,
     Signalled,
     ended_by_signals,
@@ -97,18 +98,26 @@ def test_a_fault_in_the_last_off_frame_is_mended(trial, fault):
     assert bench.firmware.drive().abs().max() == 0
 
 
-@pytest.mark.parametrize("reading", [[1.0, float("nan")], ["noise", 1.0], OSError("gone")])
-def test_garbage_from_the_sensor_ends_the_trial_with_the_outputs_off(trial, reading):
+def nobody(question: str) -> str:
+    raise EOFError
+
+
+@pytest.mark.parametrize(
+    ("reading", "message"),
+    [
+        (lambda: [1.0, float("nan")], "pressure of the sensor"),
+        (lambda: ["noise", 1.0], "pressure of the sensor"),
+        (ManualSensor([(0, 0, 0), (1, 0, 0)], nobody).read, "nobody answers"),
+        (FileSensor("no/such/file", 2, timeout=0.01).read, "did not change"),
+    ],
+)
+def test_garbage_from_the_sensor_ends_the_trial_with_the_outputs_off(trial, reading, message):
     class Garbled(Counting):
         def read(self):
-            if self.readings < SURVIVED:
-                return super().read()
-            if isinstance(reading, OSError):
-                raise reading
-            return reading
+            return super().read() if self.readings < SURVIVED else reading()
 
     bench = trial.bench()
-    with pytest.raises((ValueError, OSError), match=r"pressure of the sensor|gone"):
+    with pytest.raises((ValueError, OSError), match=message):
         measure(trial, bench, Garbled(bench))
     assert bench.firmware.drive().abs().max() == 0
     require_that_it_goes_on(trial)
@@ -123,7 +132,9 @@ def not_ignored(number):
 
 
 @pytest.mark.usefixtures("not_ignored")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGTSTP])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT, signal.SIGTSTP, signal.SIGTTIN]
+)
 def test_a_signal_ends_the_trial_with_the_outputs_off(trial, number):
     def disturb(readings: int) -> None:
         if readings > SURVIVED:
@@ -160,28 +171,29 @@ def test_signals_in_mid_frame_and_while_switching_off_leave_the_outputs_off(tria
     assert bench.firmware.drive().abs().max() == 0
 
 
-def test_a_signal_just_before_the_switching_off_leaves_the_outputs_off(trial):
-    class Interrupted(Link):
-        def off(self):
-            if loud and not signals:
-                signals.append(os.kill(os.getpid(), signal.SIGTERM))
-            super().off()
+@pytest.mark.parametrize("moment", ["before the off frame", "while a time-out is mended"])
+def test_a_signal_amid_the_last_switching_off_leaves_the_outputs_off(trial, moment, monkeypatch):
+    def interrupted(*arguments: object) -> None:
+        monkeypatch.undo()
+        raise KeyboardInterrupt
 
     def interrupted_trial() -> None:
-        with ended_by_signals(), trial.link(bench) as link:
-            link.__class__ = Interrupted
-            loud.append(True)
+        with trial.link(bench) as link:
             link.play(torch.ones(16, dtype=torch.complex128))
+            if moment == "before the off frame":
+                monkeypatch.setattr(link, "off", interrupted)
+            else:
+                monkeypatch.setattr(bench.bus, "clear_halt", interrupted)
 
-    loud: list[bool] = []
-    signals: list[None] = []
     bench = trial.bench()
-    with pytest.raises(Signalled):
+    if moment == "while a time-out is mended":
+        bench.bus = FaultyBus([bench.chip], "time-out", 258 * (2 + 1) + 100)
+    with pytest.raises(KeyboardInterrupt):
         interrupted_trial()
     assert bench.firmware.drive().abs().max() == 0
 
 
-@pytest.mark.parametrize("handlers_set", [2, 6], ids=["begins", "ends"])  # of 5, and 5 as they were
+@pytest.mark.parametrize("handlers_set", [2, 8], ids=["begins", "ends"])  # of 6, and 6 as they were
 def test_a_signal_as_the_listening_begins_or_ends_leaves_the_handlers_as_they_were(monkeypatch, handlers_set):
     def set_and_interrupt(number, handler):
         before = set_handler(number, handler)
@@ -198,7 +210,8 @@ def test_a_signal_as_the_listening_begins_or_ends_leaves_the_handlers_as_they_we
 
     changes: list[int] = []
     set_handler = signal.signal
-    heard = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP]
+    names = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGTTIN")
+    heard = [getattr(signal, name) for name in names]
     before = [set_handler(number, harmless) for number in heard]
     monkeypatch.setattr(signal, "signal", set_and_interrupt)
     try:
@@ -208,6 +221,23 @@ def test_a_signal_as_the_listening_begins_or_ends_leaves_the_handlers_as_they_we
     finally:
         for number, handler in zip(heard, before, strict=True):
             set_handler(number, handler)
+
+
+@pytest.mark.usefixtures("not_ignored")
+@pytest.mark.parametrize("number", [signal.SIGINT])
+def test_two_signals_at_once_end_the_trial_without_a_word_of_the_second(monkeypatch, number):
+    def both() -> None:
+        with ended_by_signals():
+            signal.pthread_sigmask(signal.SIG_BLOCK, {number, signal.SIGTERM})
+            os.kill(os.getpid(), number)
+            os.kill(os.getpid(), signal.SIGTERM)
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {number, signal.SIGTERM})
+
+    lost: list[object] = []
+    monkeypatch.setattr(sys, "unraisablehook", lost.append)
+    with pytest.raises(Signalled, match="SIGINT"):
+        both()
+    assert not lost
 
 
 def test_a_signal_that_is_ignored_as_by_nohup_stays_so():

@@ -54,6 +54,11 @@ def test_each_error_of_usb_has_a_message_of_its_own(method: str, error: Exceptio
         open_link(SONICSURFACE, backend=failing(method, error))
 
 
+def test_devices_that_libusb_cannot_open_as_on_windows_are_listed_all_the_same():
+    with pytest.raises(LinkError, match=r"no USB devices .*: 0403:6001 \(serial number unknown\)"):
+        open_link(OPENMPD, backend=failing("open_device", NotImplementedError()))
+
+
 def test_a_serial_number_that_may_not_be_read_is_said_to_be_a_matter_of_permission():
     with pytest.raises(
         LinkError, match=r"no USB devices .* number 'A1'.* unknown serial number: on Linux, sudo cp"
@@ -84,6 +89,25 @@ def test_without_the_packages_there_is_a_hint(monkeypatch, package: str):
         monkeypatch.delitem(sys.modules, "autdtorch.hardware.emulated_bus")
         with pytest.raises(ImportError, match=r"pip install 'autdtorch\[hardware\]'"):
             import autdtorch.hardware.emulated_bus  # noqa: F401
+
+
+def test_that_the_outputs_may_be_on_is_not_hidden_by_a_driver_that_does_not_come_back():
+    class Bound(EmulatedBus):
+        def is_kernel_driver_active(self, dev_handle, intf):
+            return True
+
+        def detach_kernel_driver(self, dev_handle, intf):
+            pass
+
+        def attach_kernel_driver(self, dev_handle, intf):
+            raise GONE
+
+    bus = Bound([EmulatedFtdi(0x0403, 0x6001, "A1", SonicSurfaceFirmware())])
+    link = open_link(SONICSURFACE, backend=bus)
+    bus.chips[0].present = False
+    with pytest.raises(LinkError, match="the outputs may still be on"):
+        link.close()
+    link.close()  # nothing is left to do
 
 
 @pytest.mark.parametrize("device", [SONICSURFACE, OPENMPD, ULTRAINO])

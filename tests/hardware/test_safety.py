@@ -280,7 +280,7 @@ def test_a_chip_that_keeps_the_off_frame_is_told_of(trial, monkeypatch):
     monkeypatch.setattr("autdtorch.hardware.adapters._FLUSH_SECONDS", 0.0)
     bench = trial.bench()
     link = trial.link(bench)
-    bench.chip.read = lambda most: b"\x01\x20"  # there is room for more, but the transmitter is not empty
+    bench.chip.answer = lambda kind, request: b"\x01\x20"  # room for more, but not all is sent
     with pytest.raises(LinkError, match="outputs may still be on"):
         link.close()
 
@@ -288,7 +288,7 @@ def test_a_chip_that_keeps_the_off_frame_is_told_of(trial, monkeypatch):
 def test_a_chip_without_line_status_is_told_of(trial):
     bench = trial.bench()
     link = trial.link(bench)
-    bench.chip.read = lambda most: b""
+    bench.chip.answer = lambda kind, request: b""
     with pytest.raises(LinkError, match="no line status; is it an FT232R"):
         link.close()
 

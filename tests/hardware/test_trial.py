@@ -53,6 +53,21 @@ def test_a_drive_between_the_levels_is_played_on_the_nearest(trial):
         torch.testing.assert_close(link.played(drive), played, rtol=0, atol=1e-15)
 
 
+def test_a_drive_in_any_guise_is_measured_and_comes_back_from_the_log(trial):
+    phases = torch.linspace(-3, 3, 16)
+    drive = torch.polar(torch.ones(16), phases)
+    guises = [drive, drive.conj(), drive.cdouble().requires_grad_(), torch.stack([drive, drive]).T[:, 1]]
+    bench = trial.bench()
+    with trial.link(bench) as link:
+        objective = trial.objective(link, EmulatedSensor(bench))
+        measured = torch.cat([objective(one[None]) for one in guises])
+        again = trial.objective(link, EmulatedSensor(bench))
+        assert torch.equal(torch.cat([again(one[None]) for one in guises]), measured)
+    on_levels = Quantised(trial.simulated, levels=32, on_off=True)
+    expected = on_levels(torch.stack([drive, drive.conj(), drive, drive]))
+    torch.testing.assert_close(measured, expected, rtol=1e-12, atol=0)
+
+
 def test_an_evaluation_is_logged_before_the_next_is_played(trial):
     class Watching(EmulatedSensor):
         def read(self):

@@ -80,6 +80,49 @@ def test_status_bytes_are_stripped_from_every_packet():
     assert talking.read(packets=2) == 62 * b"a" + b"bc"
 
 
+def test_a_recovery_drops_what_waits_to_be_sent_and_flushing_asks_the_chip_itself():
+    class Slow(EmulatedFtdi):
+        waits = b""
+
+        def write(self, data: bytes) -> None:
+            self.waits += data
+
+        def read(self, most: int) -> bytes:
+            return b"\x01\x60"  # of the time before the write
+
+        def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
+            if (request, value) == (0, 1):  # SIO_TCOFLUSH of libftdi 1.5, from the host to the chip
+                self.waits = b""
+            return super().control(kind, request, value, index, data)
+
+        def answer(self, kind: int, request: int) -> bytes | None:
+            asked.append(len(self.waits))
+            self.waits = self.waits[100:]
+            return b"\x01\x20" if asked[-1] else super().answer(kind, request)
+
+    asked: list[int] = []
+    slow = chip(kind=Slow)
+    port = FtdiUart(find_device([UART], backend=EmulatedBus([slow])), baud=230_400)
+    port.write(bytes(150))
+    port.flush()
+    assert asked == [150, 50, 0]
+    port.write(bytes(150))
+    port.recover()
+    assert not slow.waits
+
+
+def test_an_ft232r_is_told_all_that_somebody_else_may_have_left_otherwise():
+    class Listening(EmulatedFtdi):
+        def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
+            told.append((request, value, index))
+            return super().control(kind, request, value, index, data)
+
+    told: list[tuple[int, int, int]] = []
+    FtdiUart(find_device([UART], backend=EmulatedBus([chip(kind=Listening)])), baud=230_400)
+    # By the comments of ftdi_sio.h: reset; timer of 2 ms, both purges; 8 bits; no flow control; 3 MHz / 13.
+    assert told == [(0, 0, 0), (9, 2, 0), (0, 1, 0), (0, 2, 0), (4, 8, 0), (2, 0, 0), (3, 13, 0)]
+
+
 def test_a_chip_that_refuses_its_settings_is_given_back_to_the_kernel():
     class Refusing(EmulatedBus):
         attached = True

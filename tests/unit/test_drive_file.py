@@ -127,6 +127,22 @@ def test_a_file_has_the_name_that_was_given(tmp_path):
     assert load_drive(tmp_path / "D.NPZ").shape == (16,)
 
 
+def test_a_write_that_breaks_off_leaves_the_file_that_was_there(tmp_path, monkeypatch):
+    def full(file, **arrays):
+        file.write(b"half of it")
+        raise OSError(28, "No space left on device")
+
+    array = TransducerArray.grid((2, 2), 10e-3, (0, 0, 0))
+    path = tmp_path / "drive.npz"
+    save_drive(path, torch.ones(4) * 1j, array)
+    monkeypatch.setattr(np, "savez_compressed", full)
+    with pytest.raises(OSError, match="No space left") as caught:
+        save_drive(path, torch.ones(4) + 0j, array)
+    assert caught.value.filename == str(path)
+    assert torch.equal(load_drive(path), torch.ones(4).double() * 1j)
+    assert [file.name for file in tmp_path.iterdir()] == ["drive.npz"]
+
+
 def test_a_drive_that_is_not_the_devices_is_refused(tmp_path):
     array = TransducerArray.grid((4, 4), 10e-3, (0, 0, 0))
     drive = drive_from_phases(torch.zeros(16))
