@@ -26,7 +26,8 @@ _TIMEOUT = 5.0
 #: And opening [s]: the kit takes up to 10 s to find the boards and 30 s to synchronise them.
 _OPENING_TIMEOUT = 60.0
 
-Command = Callable[[], Coroutine[Any, Any, None]]
+_Command = Callable[[], Coroutine[Any, Any, None]]
+_Asked = tuple[_Command, SimpleQueue[BaseException | None]]  # and to whom its end is told
 
 
 def autd3_device(boards: int = 1) -> Device:
@@ -111,7 +112,7 @@ class Autd3Port:
         self._error: type[Exception] = autd3.Autd3Error
         self._boards = boards
         self._client: Any = None
-        self._commands: SimpleQueue[tuple[Command, SimpleQueue[BaseException | None]] | None] = SimpleQueue()
+        self._commands: SimpleQueue[_Asked | None] = SimpleQueue()
         # A daemon: others are waited for before what `atexit` holds, the link's switching off, is called.
         threading.Thread(target=_obey, args=(self._commands,), name="AUTD3", daemon=True).start()
 
@@ -153,7 +154,7 @@ class Autd3Port:
                 await client.close()
 
         try:
-            self._run("be closed", close_client)
+            self._run("be closed", close_client, _TIMEOUT)
         finally:
             self._commands.put(None)
 
@@ -161,14 +162,13 @@ class Autd3Port:
         async def send() -> None:
             await self._client.send(command)
 
-        self._run(what, send)
+        self._run(what, send, _TIMEOUT)
 
-    def _run(self, what: str, command: Command, timeout: float | None = None) -> None:
+    def _run(self, what: str, command: _Command, seconds: float) -> None:
         """Have the thread do it, after all that was asked for before, and wait.
 
         Nothing here may be torn by a signal: a `SimpleQueue` puts and gets in one piece.
         """
-        seconds = _TIMEOUT if timeout is None else timeout
 
         async def timed() -> None:
             async with asyncio.timeout(seconds):
@@ -185,7 +185,7 @@ class Autd3Port:
             raise error
 
 
-def _obey(commands: SimpleQueue[tuple[Command, SimpleQueue[BaseException | None]] | None]) -> None:
+def _obey(commands: SimpleQueue[_Asked | None]) -> None:
     """Do one command after the other, until None, and say how each ended."""
     with asyncio.Runner() as runner:
         while (asked := commands.get()) is not None:
