@@ -226,45 +226,50 @@ class ScopeSensor:
         return pressure
 
     def _capture(self) -> torch.Tensor:
-        """Powers (P, 2) [Pa^2]: what is heard at the frequency, and what the noise adds to that."""
-        waveforms = self._waveforms()
-        return torch.stack([self._powers(*pair) for pair in zip(self._microphones, waveforms, strict=True)])
+        """Powers (P, 2) [Pa^2]: what is heard at the frequency, and what the noise adds to that.
 
-    def _waveforms(self) -> list[Waveform]:
-        """Waveforms of one capture, each on a scale that suits it."""
+        Each input is on a scale that suits it.
+        """
         once_clipped: set[int] = set()  # on no finer scale in this reading, so that it comes to an end
         while True:
             waveforms = self._scope.capture({number: one.now for number, one in self._scales.items()})
+            lock_in = self._lock_in(waveforms)
+            heard = lock_in(torch.stack([one.volts for one in waveforms]))
             fitted = dict(self._scales)
-            for (number, scale), waveform in zip(self._scales.items(), waveforms, strict=True):
+            for number, waveform, noise in zip(fitted, waveforms, heard.residual.tolist(), strict=True):
                 if waveform.clipped:
                     once_clipped.add(number)
                 if waveform.clipped or number not in once_clipped:
-                    fitted[number] = scale.fitted(waveform)
+                    fitted[number] = self._scales[number].fitted(waveform, noise)
             if fitted == self._scales:
-                return waveforms
+                break
             self._scales = fitted
             self.recaptures += 1
-
-    def _powers(self, microphone: Microphone, waveform: Waveform) -> torch.Tensor:
-        if waveform.clipped:
-            raise SensorError(
-                f"input {microphone.input}: {waveform.clipped} of {len(waveform.volts)} samples are clipped; "
-                f"its microphone hears more than {microphone.loudest:g} Pa: raise `loudest`"
-            )
-        try:
-            lock_in = LockIn(self._frequency, waveform.time_step, len(waveform.volts))
-        except ValueError as error:
-            raise SensorError(
-                f"input {microphone.input}: capture does not suit the frequency: {error}"
-            ) from error
-        heard = lock_in(waveform.volts)
+        self._require_unclipped(waveforms)
         # Samples that all have the same code do not show the noise of their rounding.
-        variance = heard.residual.square().clamp(min=waveform.resolution**2 / 12)
-        return (
-            torch.stack([heard.phasor.abs().square(), lock_in.noise_gain * variance])
-            / _volts(microphone) ** 2
-        )
+        rounding = torch.tensor([one.resolution for one in waveforms], dtype=torch.float64).square() / 12
+        variance = heard.residual.square().maximum(rounding)
+        volts = torch.tensor([_volts(one) for one in self._microphones], dtype=torch.float64)
+        powers = torch.stack([heard.phasor.abs().square(), lock_in.noise_gain * variance], dim=1)
+        return powers / volts[:, None].square()
+
+    def _lock_in(self, waveforms: Sequence[Waveform]) -> LockIn:
+        """For waveforms that all have the same moments."""
+        moments = {(one.time_step, len(one.volts)) for one in waveforms}
+        if len(moments) > 1:
+            raise SensorError(f"inputs differ in time step and number of samples: {sorted(moments)}")
+        try:
+            return LockIn(self._frequency, *moments.pop())
+        except ValueError as error:
+            raise SensorError(f"capture does not suit the frequency: {error}") from error
+
+    def _require_unclipped(self, waveforms: Sequence[Waveform]) -> None:
+        for microphone, waveform in zip(self._microphones, waveforms, strict=True):
+            if waveform.clipped:
+                raise SensorError(
+                    f"input {microphone.input}: {waveform.clipped} of {len(waveform.volts)} samples are "
+                    f"clipped; its microphone hears more than {microphone.loudest:g} Pa: raise `loudest`"
+                )
 
 
 def open_scope(

@@ -8,7 +8,7 @@ from autdtorch.hardware.scpi import Waveform
 
 _DIVISIONS = 3.5  # of a full screen, above and below the middle; there are 4 or more
 _QUIET = 0.25  # of a full screen: what fills less is put on a finer scale,
-_TARGET = 0.5  # so that it fills this
+_TARGET = 0.5  # so that it fills this much
 _COARSER = 4.0  # what clips here fills a quarter or more there, and so stays there
 
 
@@ -35,12 +35,18 @@ class VerticalScale:
         coarsest = volts / _DIVISIONS
         return cls(coarsest, finest, coarsest)
 
-    def fitted(self, waveform: Waveform) -> VerticalScale:
-        """A scale that suits what was captured on this one; this one, if it does or no other may be."""
+    def fitted(self, waveform: Waveform, noise: float) -> VerticalScale:
+        """A scale that suits what was captured on this one; this one, if it does or no other may be.
+
+        Args:
+            waveform: captured on this scale.
+            noise: its rms [V]. Where that is a step of the converter or more, no scale is finer: rounding
+                then adds 1/12 to the noise's variance at most, and no bias.
+        """
         peak = float(waveform.volts.abs().max()) + waveform.resolution
         wanted = self.now
         if waveform.clipped:
             wanted *= _COARSER
-        elif peak < _QUIET * _DIVISIONS * self.now:
+        elif peak < _QUIET * _DIVISIONS * self.now and noise < waveform.resolution:
             wanted = peak / (_TARGET * _DIVISIONS)
         return VerticalScale(min(max(wanted, self.finest), self.coarsest), self.finest, self.coarsest)
