@@ -32,6 +32,7 @@ class _Maker:
     middle: int
     clipped: tuple[int, int]  # codes of samples below and above what the converter can follow
     digits: int  # in the length of a block
+    scales: tuple[float, float]  # the finest and the coarsest [V/division]
 
 
 _MAKERS = {
@@ -41,6 +42,7 @@ _MAKERS = {
         frozenset({"ACQ:TYPE", "TRIG:SWE", "WAV:FORM", "WAV:UNS", "WAV:POIN"}),
         {"*OPC?": "1"},
         points=1000, codes_per_division=32, middle=128, clipped=(1, 255), digits=8,
+        scales=(1e-3, 5.0),
     ),
     "Rigol": _Maker(
         "RIGOL TECHNOLOGIES,DS1104Z,EMULATED,00.04.04",
@@ -48,9 +50,10 @@ _MAKERS = {
         frozenset({"ACQ:TYPE", "SING", "WAV:FORM", "WAV:MODE"}),
         {"TRIG:STAT?": "STOP"},
         points=1200, codes_per_division=25, middle=127, clipped=(0, 255), digits=9,
+        scales=(1e-3, 10.0),
     ),
 }  # fmt: skip
-_INPUT_SETTINGS = frozenset({"DISP", "PROB", "COUP", "OFFS"})
+_INPUT_SETTINGS = frozenset({"DISP", "PROB", "COUP", "OFFS", "VERN"})
 
 
 class EmulatedScope:
@@ -107,7 +110,7 @@ class EmulatedScope:
         self._time_scale = 1e-3
         self._scales = [1.0] * len(self.heard)
         self._source = 0
-        self._codes: list[bytes] = []
+        self._captured: list[tuple[bytes, float]] = []  # codes, and the scale they were taken on
 
     def plug_into(self, bench: EmulatedBench, chip: tuple[int, int], serial: str = "EMULATED") -> None:
         """Appear on the bus of a bench, with idVendor and idProduct of `chip` and a `serial` number."""
@@ -122,11 +125,11 @@ class EmulatedScope:
         if header == self._maker.time_scale:
             self._time_scale = float(argument)
         elif found and number is not None and found[2] == "SCAL":
-            self._scales[number] = float(argument)
+            self._scales[number] = min(max(float(argument), self._maker.scales[0]), self._maker.scales[1])
         elif header == "WAV:SOUR":
             self._source = int(argument[-1]) - 1
         elif header == self._maker.clear:
-            self._codes = []
+            self._captured = []
         elif header == self._maker.capture:
             self._capture()
         elif header.endswith("?") and (answer := self._answer(header)) is not None:
@@ -143,11 +146,11 @@ class EmulatedScope:
             return maker.identity.encode()
         if header in maker.answers:
             return maker.answers[header].encode()
-        if not 0 <= self._source < len(self._codes):
+        if not 0 <= self._source < len(self._captured):
             return None
-        codes = self._codes[self._source]
+        codes, scale = self._captured[self._source]
         if header == "WAV:PRE?":
-            resolution = self._scales[self._source] / maker.codes_per_division
+            resolution = scale / maker.codes_per_division
             time = f"{self._step():+.6E},{-self._step() * maker.points / 2:+.6E},+0"
             return f"+0,+0,{len(codes):+d},+1,{time},{resolution:+.6E},+0,{maker.middle:+d}".encode()
         if header == "WAV:DATA?":
@@ -170,7 +173,7 @@ class EmulatedScope:
         low, high = self._maker.clipped
         steps = volts * self._maker.codes_per_division / np.array(self._scales)[:, None]
         codes = np.clip(np.round(steps) + self._maker.middle, low, high).astype(np.uint8)
-        self._codes = [row.tobytes() for row in codes]
+        self._captured = [(row.tobytes(), scale) for row, scale in zip(codes, self._scales, strict=True)]
 
 
 def _short(header: str) -> str:

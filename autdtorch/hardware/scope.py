@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
@@ -16,12 +16,12 @@ from autdtorch.hardware.scpi import KEYSIGHT, Dialect, Waveform
 from autdtorch.hardware.sensor import SensorError
 from autdtorch.hardware.usb import LinkError, find_device
 from autdtorch.hardware.usbtmc import UsbtmcPort
+from autdtorch.hardware.vertical_scale import VerticalScale
 from autdtorch.validation import integer_at_least, invalid, positive
 
 logger = logging.getLogger(__name__)
 
 _PERIODS_A_DIVISION = 5  # 50 or 60 on a screen, 20 samples each
-_DIVISIONS = 3.5  # that the loudest sound fills above and below the middle; there are 4 or more
 _CAPTURE_TIME = 2.0  # [s] after which a capture must be there
 _QUIET = 5  # standard errors
 
@@ -61,9 +61,11 @@ class Oscilloscope:
 
     Attributes:
         identity: what it says it is.
+        finest: vertical scale that it has [V/division].
     """
 
     identity: str
+    finest: float
 
     def __init__(self, port: UsbtmcPort, dialect: Dialect = KEYSIGHT) -> None:
         """Ask it what it is.
@@ -77,13 +79,15 @@ class Oscilloscope:
         """
         self._port = port
         self._dialect = dialect
+        self._scales: dict[int, float] = {}  # that it was told
         self.identity = port.ask("*IDN?")
+        self.finest = dialect.finest
 
-    def set_up(self, scales: dict[int, float], time_scale: float) -> None:
+    def set_up(self, inputs: Collection[int], time_scale: float) -> None:
         """Set inputs and time up.
 
         Args:
-            scales: of each input [V/division].
+            inputs: their numbers, from 1.
             time_scale: of all inputs [s/division].
 
         Raises:
@@ -91,24 +95,29 @@ class Oscilloscope:
         """
         for command in self._dialect.set_up:
             self._port.tell(command.format(time=time_scale))
-        for number, scale in scales.items():
+        for number in inputs:
             for command in self._dialect.set_up_input:
-                self._port.tell(command.format(input=number, scale=scale))
+                self._port.tell(command.format(input=number))
 
-    def capture(self, inputs: Sequence[int]) -> list[Waveform]:
+    def capture(self, scales: Mapping[int, float]) -> list[Waveform]:
         """A waveform for each of the inputs, all of the same time.
 
+        What goes wrong once is logged as a warning; the oscilloscope is cleared, and captures once more.
+
+        Args:
+            scales: of the inputs [V/division].
+
         Raises:
-            LinkError: it does not take the commands, or does not capture or answer in time.
+            LinkError: twice in a row, it did not take the commands, or not capture or answer in time; or it
+                does not clear.
         """
-        for command in self._dialect.capture:
-            self._port.tell(command)
-        deadline = time.monotonic() + _CAPTURE_TIME
-        while (status := self._port.ask(self._dialect.status)) != self._dialect.ready:
-            if time.monotonic() > deadline:
-                raise LinkError(f"{self.identity}: no capture within {_CAPTURE_TIME:g} s, status {status!r}")
-            time.sleep(0.01)
-        return [self._waveform(number) for number in inputs]
+        try:
+            return self._capture(scales)
+        except LinkError as error:
+            logger.warning("%s: %s; it is cleared, and captures once more", self.identity, error)
+        self._port.recover()
+        self._scales.clear()  # a scale that was under way may be lost
+        return self._capture(scales)
 
     def close(self) -> None:
         """Let go of it.
@@ -128,6 +137,20 @@ class Oscilloscope:
         """Let go of it."""
         self.close()
 
+    def _capture(self, scales: Mapping[int, float]) -> list[Waveform]:
+        for number, scale in scales.items():
+            if self._scales.get(number) != scale:
+                self._port.tell(self._dialect.scale.format(input=number, scale=scale))
+                self._scales[number] = scale
+        for command in self._dialect.capture:
+            self._port.tell(command)
+        deadline = time.monotonic() + _CAPTURE_TIME
+        while (status := self._port.ask(self._dialect.status)) != self._dialect.ready:
+            if time.monotonic() > deadline:
+                raise LinkError(f"{self.identity}: no capture within {_CAPTURE_TIME:g} s, status {status!r}")
+            time.sleep(0.01)
+        return [self._waveform(number) for number in scales]
+
     def _waveform(self, number: int) -> Waveform:
         self._port.tell(self._dialect.source.format(input=number))
         preamble = self._port.ask(self._dialect.preamble)
@@ -140,7 +163,15 @@ class ScopeSensor:
     The amplitude at the drive frequency is taken from captures by a lock-in: hum, other tones and most of
     the noise do not count. Readings of several captures are averaged as powers, less the power that the
     noise has there, since the captures' phases are not known.
+
+    Each input keeps the vertical scale of its last capture. What is clipped there, or too small, is captured
+    again on another scale, up to that of the loudest sound.
+
+    Attributes:
+        recaptures: how often that was.
     """
+
+    recaptures: int
 
     def __init__(
         self,
@@ -165,17 +196,21 @@ class ScopeSensor:
         self._frequency = positive("frequency", frequency, "Hz")
         self._microphones = list(microphones)
         self._captures = integer_at_least("captures", captures, 1)
-        scales = {one.input: one.loudest * _volts(one) / _DIVISIONS for one in self._microphones}
-        if not scales or len(scales) < len(self._microphones):
+        self._scales = {
+            one.input: VerticalScale.up_to(one.loudest * _volts(one), scope.finest)
+            for one in self._microphones
+        }
+        self.recaptures = 0
+        if not self._scales or len(self._scales) < len(self._microphones):
             inputs = [one.input for one in self._microphones]
             raise invalid("microphones", inputs, "must be at inputs of their own, at least one")
-        scope.set_up(scales, _PERIODS_A_DIVISION / self._frequency)
+        scope.set_up(self._scales.keys(), _PERIODS_A_DIVISION / self._frequency)
 
     def read(self) -> torch.Tensor:
         """Magnitudes (P,) [Pa]; what cannot be told from noise is logged as a warning.
 
         Raises:
-            SensorError: a capture is clipped, or too coarse or short for the frequency.
+            SensorError: a capture is clipped on the coarsest scale, or too coarse or short for the frequency.
             LinkError: the oscilloscope does not answer.
         """
         captures = torch.stack([self._capture() for _ in range(self._captures)])
@@ -191,29 +226,50 @@ class ScopeSensor:
         return pressure
 
     def _capture(self) -> torch.Tensor:
-        """Powers (P, 2) [Pa^2]: what is heard at the frequency, and what the noise adds to that."""
-        waveforms = self._scope.capture([one.input for one in self._microphones])
-        return torch.stack([self._powers(*pair) for pair in zip(self._microphones, waveforms, strict=True)])
+        """Powers (P, 2) [Pa^2]: what is heard at the frequency, and what the noise adds to that.
 
-    def _powers(self, microphone: Microphone, waveform: Waveform) -> torch.Tensor:
-        if waveform.clipped:
-            raise SensorError(
-                f"input {microphone.input}: {waveform.clipped} of {len(waveform.volts)} samples are clipped; "
-                f"its microphone hears more than {microphone.loudest:g} Pa: raise `loudest`"
-            )
-        try:
-            lock_in = LockIn(self._frequency, waveform.time_step, len(waveform.volts))
-        except ValueError as error:
-            raise SensorError(
-                f"input {microphone.input}: capture does not suit the frequency: {error}"
-            ) from error
-        heard = lock_in(waveform.volts)
+        Each input is on a scale that suits it.
+        """
+        once_clipped: set[int] = set()  # on no finer scale in this reading, so that it comes to an end
+        while True:
+            waveforms = self._scope.capture({number: one.now for number, one in self._scales.items()})
+            lock_in = self._lock_in(waveforms)
+            heard = lock_in(torch.stack([one.volts for one in waveforms]))
+            fitted = dict(self._scales)
+            for number, waveform, noise in zip(fitted, waveforms, heard.residual.tolist(), strict=True):
+                if waveform.clipped:
+                    once_clipped.add(number)
+                if waveform.clipped or number not in once_clipped:
+                    fitted[number] = self._scales[number].fitted(waveform, noise)
+            if fitted == self._scales:
+                break
+            self._scales = fitted
+            self.recaptures += 1
+        self._require_unclipped(waveforms)
         # Samples that all have the same code do not show the noise of their rounding.
-        variance = heard.residual.square().clamp(min=waveform.resolution**2 / 12)
-        return (
-            torch.stack([heard.phasor.abs().square(), lock_in.noise_gain * variance])
-            / _volts(microphone) ** 2
-        )
+        rounding = torch.tensor([one.resolution for one in waveforms], dtype=torch.float64).square() / 12
+        variance = heard.residual.square().maximum(rounding)
+        volts = torch.tensor([_volts(one) for one in self._microphones], dtype=torch.float64)
+        powers = torch.stack([heard.phasor.abs().square(), lock_in.noise_gain * variance], dim=1)
+        return powers / volts[:, None].square()
+
+    def _lock_in(self, waveforms: Sequence[Waveform]) -> LockIn:
+        """For waveforms that all have the same moments."""
+        moments = {(one.time_step, len(one.volts)) for one in waveforms}
+        if len(moments) > 1:
+            raise SensorError(f"inputs differ in time step and number of samples: {sorted(moments)}")
+        try:
+            return LockIn(self._frequency, *moments.pop())
+        except ValueError as error:
+            raise SensorError(f"capture does not suit the frequency: {error}") from error
+
+    def _require_unclipped(self, waveforms: Sequence[Waveform]) -> None:
+        for microphone, waveform in zip(self._microphones, waveforms, strict=True):
+            if waveform.clipped:
+                raise SensorError(
+                    f"input {microphone.input}: {waveform.clipped} of {len(waveform.volts)} samples are "
+                    f"clipped; its microphone hears more than {microphone.loudest:g} Pa: raise `loudest`"
+                )
 
 
 def open_scope(

@@ -36,7 +36,7 @@ class Dialect:
     Attributes:
         name: of the oscilloscopes that take them.
         set_up: once; ``{time}`` stands for the time scale [s/division].
-        set_up_input: for each ``{input}``; ``{scale}`` stands for its scale [V/division].
+        set_up_input: once for each ``{input}``.
         capture: takes a capture of all inputs at once, whatever they hear: no signal has to trigger it.
         status: asks whether the capture is there.
         ready: the answer, if it is.
@@ -47,6 +47,8 @@ class Dialect:
         lowest: the least code that is no clipped sample.
         highest: the greatest.
         origin_in_codes: the voltage's origin is a number of codes, not of volts.
+        scale: sets the vertical ``{scale}`` of an ``{input}`` [V/division].
+        finest: scale that there is [V/division].
     """
 
     name: str
@@ -61,6 +63,8 @@ class Dialect:
     lowest: int = 1
     highest: int = 254
     origin_in_codes: bool = False
+    scale: str = ":CHANnel{input}:SCALe {scale:.6g}"
+    finest: float = 1e-3
 
     def waveform(self, preamble: str, codes: bytes) -> Waveform:
         """The waveform that two answers describe.
@@ -92,8 +96,8 @@ _INPUT = (
     ":CHANnel{input}:DISPlay ON",
     ":CHANnel{input}:PROBe 1",
     ":CHANnel{input}:COUPling AC",
-    ":CHANnel{input}:SCALe {scale:.6g}",
     ":CHANnel{input}:OFFSet 0",
+    ":CHANnel{input}:VERNier ON",  # else some scales would be rounded to 1, 2 or 5
 )
 
 #: InfiniiVision 2000, 3000 and 4000 X-Series Programmer's Guides.

@@ -21,6 +21,8 @@ INTERFACE_CLASS = (0xFE, 0x03)
 CLASS_REQUEST = 0xA1
 INITIATE_CLEAR, CHECK_CLEAR_STATUS = 5, 6
 SUCCESS, PENDING = 1, 2
+#: bmClear of a pending clear: the rest of an answer must be read first.
+IN_WAITS = 1
 
 _HEADER = struct.Struct("<BBBxLB3x")
 _MOST = 2**16  # bytes of an answer in one transfer
@@ -127,6 +129,15 @@ class UsbtmcPort(UsbPort):
         """
         return block(self._answer(question))
 
+    def recover(self) -> None:
+        """Clear a stall of an answer, and what else the instrument still has to take or say.
+
+        Raises:
+            LinkError: it does not clear.
+        """
+        self._call("be recovered", self._in.clear_halt)
+        self._clear()
+
     def _answer(self, question: str) -> bytes:
         self.tell(question)
         received, ended = b"", False
@@ -172,17 +183,19 @@ class UsbtmcPort(UsbPort):
         return self._tag
 
     def _clear(self) -> None:
-        status = self._class_request(INITIATE_CLEAR, 1)
+        status, *_ = self._class_request(INITIATE_CLEAR, 1)
         for _ in range(_CHECKS):
-            status = self._class_request(CHECK_CLEAR_STATUS, 2)
+            status, waits = self._class_request(CHECK_CLEAR_STATUS, 2)
             if status != PENDING:
                 break
+            if waits & IN_WAITS:
+                self._call("be cleared", self._in.read, _MOST, _TIMEOUT_MS)
             time.sleep(0.01)
         if status != SUCCESS:
             raise LinkError(f"USBTMC: the instrument does not clear what it has to say: status {status:#04x}")
         self._call("be cleared", self._out.clear_halt)
 
-    def _class_request(self, request: int, length: int) -> int:
-        """Status that the interface gives."""
+    def _class_request(self, request: int, length: int) -> bytes:
+        """What the interface answers, its status first."""
         arguments = (CLASS_REQUEST, request, 0, self._interface, length, _TIMEOUT_MS)
-        return int(self._call("be cleared", self._device.ctrl_transfer, *arguments)[0])
+        return bytes(self._call("be cleared", self._device.ctrl_transfer, *arguments))

@@ -1,7 +1,9 @@
 """The oscilloscope on the emulated bus: what it hears against the pressure that is there."""
 
+import itertools
 import logging
 import math
+import re
 
 import pytest
 import torch
@@ -28,7 +30,7 @@ CHIP = (0x2A8D, 0x1770)
 FREQUENCY = 40e3
 SENSITIVITY = 0.01  # [V/Pa], with the amplifier
 LOUDEST = 4.0  # [Pa]
-RESOLUTION = LOUDEST / 3.5 / 32  # [Pa]: 3.5 divisions of 32 codes
+RESOLUTION = LOUDEST / 3.5 / 32  # [Pa]: 3.5 divisions of 32 codes, on the coarsest scale
 
 
 def sensor_at(scope, microphones: int, captures: int = 1) -> ScopeSensor:
@@ -51,6 +53,13 @@ class Bench:
         self.instrument = EmulatedInstrument(*CHIP, "S1", self.scope)
         self.bus = EmulatedBus([self.instrument])
         self.open = open_scope(CHIP, dialect, backend=self.bus)
+
+    def listen(self) -> list[str]:
+        """What the oscilloscope is told from now on."""
+        told: list[str] = []
+        execute = self.scope.execute
+        self.scope.execute = lambda line: told.append(line) or execute(line)
+        return told
 
     def sensor(self, captures: int = 1) -> ScopeSensor:
         return sensor_at(self.open, len(self.scope.heard), captures)
@@ -102,6 +111,40 @@ def test_a_microphone_drifts_by_what_was_asked_for():
     assert steps.std() == pytest.approx(0.5 / math.sqrt(1000), rel=0.28)
 
 
+@pytest.mark.parametrize("dialect", [KEYSIGHT, RIGOL], ids=lambda dialect: dialect.name)
+def test_each_input_has_a_scale_on_which_it_uses_a_quarter_of_the_screen_or_more(dialect):
+    bench = Bench([0, 0], dialect)
+    told, sensor = bench.listen(), bench.sensor()
+    for quiet in (0.6, 0.4, 0.7, 0.15, 0.6):
+        bench.field.copy_(torch.tensor([3.2 - 1j, 1j * quiet]))
+        error = sensor.read() / bench.field.abs() - 1
+        # 2 / pi codes of a quarter of 3.5 divisions, as in the test above.
+        assert error.abs().max() < 2 / math.pi / (3.5 / 4 * (32 if dialect is KEYSIGHT else 25))
+    scales = [float(line.split()[1]) for line in told if line.startswith(":CHANnel2:SCALe")]
+    # For `loudest`; so that 6 mV fill half of 3.5 divisions, 1.5 mV on the finest; four times that for 6 mV.
+    # The first capture has 17 codes: what it shows is one and a half more, at most.
+    half = 6e-3 / 3.5 * 2
+    assert scales == pytest.approx([LOUDEST * SENSITIVITY / 3.5, half, 1e-3, 4e-3], rel=0.1)
+    assert sensor.recaptures == 3
+    assert sum(line.startswith(":CHANnel1:SCALe") for line in told) == 1
+    assert bench.scope.misunderstood == []
+
+
+def test_a_sound_that_is_loud_and_quiet_by_turns_is_read_on_some_scale():
+    bench = Bench([3.9], heard=[0])
+    execute, turns = bench.scope.execute, itertools.cycle([0.1, 3.9])
+
+    def turn(line: str) -> bytes | None:
+        if line == ":DIGitize":
+            bench.field.fill_(next(turns))
+        return execute(line)
+
+    bench.scope.execute = turn
+    sensor = bench.sensor()
+    for _ in range(5):
+        assert sensor.read() == pytest.approx(float(bench.field.abs()), abs=RESOLUTION)
+
+
 def test_overload_is_an_error_that_names_input_and_pressure():
     bench = Bench([1.0, 6.0])
     with pytest.raises(
@@ -119,7 +162,7 @@ def test_silence_is_a_warning_that_names_input_and_noise(caplog):
     assert "from the noise of 0.0078 Pa" in caplog.text
 
 
-@pytest.mark.parametrize(
+faults = pytest.mark.parametrize(
     ("fault", "message"),
     [
         ("time-out", "answer :WAVeform|answer .OPC|timed out"),
@@ -128,7 +171,10 @@ def test_silence_is_a_warning_that_names_input_and_noise(caplog):
         ("garbage", r"header .* does not answer request \d+"),
     ],
 )
-def test_a_fault_on_the_wire_ends_the_trial_silently_and_another_goes_on(trial, fault, message):
+
+
+@faults
+def test_a_fault_that_stays_on_the_wire_ends_the_trial_silently_and_another_goes_on(trial, fault, message):
     def measure(count: int, last: Fault | None) -> torch.Tensor:
         instrument.fault = None
         with trial.link(bench) as link, open_scope(CHIP, backend=bench.bus) as oscilloscope:
@@ -151,6 +197,26 @@ def test_a_fault_on_the_wire_ends_the_trial_silently_and_another_goes_on(trial, 
     assert len(trial.log.read_text().splitlines()) == 2  # what the trial is, and one evaluation
     expected = trial.simulated(drives[2][None])
     torch.testing.assert_close(measure(3, None), expected, rtol=0, atol=2 / math.pi * loudest / 3.5 / 32)
+
+
+@faults
+def test_a_fault_that_a_clear_mends_costs_a_warning_and_no_reading(fault, message, caplog):
+    bench = Bench([3.2, 0.3])
+    sensor = bench.sensor()
+    before = sensor.read()
+    answer, told = bench.instrument.answer, bench.listen()
+
+    def mended(kind: int, request: int) -> bytes | None:
+        bench.instrument.fault = None
+        return answer(kind, request)
+
+    bench.instrument.answer, bench.instrument.fault = mended, fault
+    # Each errs by 2 / pi codes of 28 at most, a quarter of the screen.
+    torch.testing.assert_close(sensor.read(), before, rtol=2 * 2 / math.pi / 28, atol=0)
+    (warning,) = caplog.messages
+    assert re.search(f"{message}.*; it is cleared, and captures once more", warning)
+    # The scales are told again, as they may have been what was lost.
+    assert sum("SCALe" in line for line in told) == 2
 
 
 def test_an_unplugged_oscilloscope_and_one_of_another_maker_are_errors():

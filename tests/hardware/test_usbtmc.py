@@ -82,6 +82,24 @@ def test_what_broke_off_is_cleared_before_the_first_question():
     assert echo.heard == ["*OPC?"]
 
 
+def test_an_answer_that_nobody_read_is_read_before_the_clear_is_done():
+    class Full(EmulatedInstrument):
+        """Clears only once its endpoint is empty."""
+
+        rest = b"1\n"
+
+        def answer(self, kind: int, request: int) -> bytes | None:
+            pending = request == 6 and self.rest  # CHECK_CLEAR_STATUS: STATUS_PENDING, bmClear
+            return b"\x02\x01" if pending else super().answer(kind, request)
+
+        def read(self, most: int) -> bytes:
+            rest, self.rest = self.rest, b""
+            return rest or super().read(most)
+
+    instrument = Full(*CHIP, "E1", Echo(b"2\n"))
+    assert UsbtmcPort(find_device([CHIP], backend=EmulatedBus([instrument]))).ask("*OPC?") == "2"
+
+
 def test_tags_go_round():
     port, _ = port_to(b"1\n")
     assert {port.ask("*OPC?") for _ in range(150)} == {"1"}  # two tags each, of 255
