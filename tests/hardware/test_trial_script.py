@@ -48,6 +48,9 @@ def test_a_trial_leaves_log_drive_and_report_and_is_not_repeated(run, tmp_path: 
     assert (out / "trial.jsonl").read_text() == log
     report = (out / "report.md").read_text()
     assert "**Not heard**, counted from 0: 4." in report
+    heard = re.search(r"with (\S+) to .* Pa, and the threshold (\S+) Pa", report, re.DOTALL)
+    assert heard is not None
+    assert float(heard[1]) > float(heard[2])  # the range is that of the transducers that are heard
     assert report.count("| 1.000 |") == 3  # the simulation is told
     assert (out / "convergence.png").exists()
     assert len(load_drive(out / "drive.npz")) == 9
