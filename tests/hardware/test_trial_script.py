@@ -2,15 +2,19 @@
 
 import io
 import logging
+import math
 import re
 from pathlib import Path
 
 import hardware_trial
 import pytest
 import torch
+import trial_bench
 
+from autdtorch.array import TransducerArray
 from autdtorch.drive_file import load_drive
 from autdtorch.hardware_report import compare
+from autdtorch.scene_file import load_scene
 
 SCENE = """
 name: two
@@ -131,3 +135,19 @@ def test_the_factor_between_simulation_and_bench_is_found():
     fit = compare(2.5 * simulated, simulated)
     assert fit.scale == pytest.approx(2.5, rel=1e-12)
     assert fit.misfit < 1e-12
+
+
+def test_the_documented_scene_lies_in_the_middle_of_a_sonicsurface(tmp_path: Path):
+    """With the device turned as the documentation says, for the transducers of its command."""
+    text = (Path(__file__).parents[2] / "docs" / "hardware.md").read_text("utf-8")
+    block = re.search(r"```yaml\n(.*?)```", text, re.DOTALL)
+    chosen = re.search(r"--transducers (\S+)", text)
+    assert block is not None
+    assert chosen is not None
+    path = tmp_path / "my_bench.yaml"
+    path.write_text(block[1], "utf-8")
+    device = TransducerArray.sonicsurface(center=(0, 0, 0), angle=math.pi / 2)
+    places = device.positions[trial_bench.indices(chosen[1])]
+    assert torch.allclose(
+        load_scene(path).array.positions, places, rtol=0, atol=1e-9
+    )  # rounding; pitch 1e-2 m
