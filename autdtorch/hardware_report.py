@@ -201,10 +201,10 @@ def _names(places: torch.Tensor) -> list[str]:
 
 
 def _preflight(check: Preflight) -> str:
-    heard = len(check.pressure) - len(check.dead)
+    heard = check.pressure[check.pressure > check.threshold]
     lines = [
-        f"The sensor hears {heard} of {len(check.pressure)} transducers, each alone, with "
-        f"{check.pressure.min():.3g} to {check.pressure.max():.3g} Pa (rms over the control points).\n"
+        f"The sensor hears {len(heard)} of {len(check.pressure)} transducers, each alone, with "
+        f"{heard.min():.3g} to {heard.max():.3g} Pa (rms over the control points).\n"
         f"Silence is {check.silence:.3g} Pa, and the threshold {check.threshold:.3g} Pa."
     ]
     if check.dead:

@@ -43,7 +43,7 @@ class EmulatedBench:
         self,
         device: Device,
         transfer_matrix: torch.Tensor,
-        transducers: Sequence[int] | None = None,
+        transducers: Sequence[int] | torch.Tensor | None = None,
         adapter: Adapter | None = None,
         dead: Sequence[int] = (),
     ) -> None:

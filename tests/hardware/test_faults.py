@@ -193,7 +193,7 @@ def test_a_signal_amid_the_last_switching_off_leaves_the_outputs_off(trial, mome
     assert bench.firmware.drive().abs().max() == 0
 
 
-@pytest.mark.parametrize("handlers_set", [2, 8], ids=["begins", "ends"])  # of 6, and 6 as they were
+@pytest.mark.parametrize("handlers_set", [2, 7], ids=["begins", "ends"])  # of 6, and 6 as they were
 def test_a_signal_as_the_listening_begins_or_ends_leaves_the_handlers_as_they_were(monkeypatch, handlers_set):
     def set_and_interrupt(number, handler):
         before = set_handler(number, handler)

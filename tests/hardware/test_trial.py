@@ -147,6 +147,11 @@ def test_a_scene_of_other_transducers_is_refused(trial):
     assert bench.firmware.drive().abs().max() == 0
 
 
+def test_the_transducers_may_be_a_tensor_as_a_link_has_them(trial):
+    with open_link(SONICSURFACE, torch.tensor([5, 3]), backend=trial.bench().bus) as link:
+        assert link.transducers.tolist() == [5, 3]
+
+
 def test_an_unplugged_device_is_an_error_that_says_so(trial):
     bench = trial.bench()
     link = trial.link(bench)

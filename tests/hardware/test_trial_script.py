@@ -2,6 +2,7 @@
 
 import io
 import logging
+import math
 import os
 import re
 import signal
@@ -13,10 +14,13 @@ import hardware_trial
 import pytest
 import torch
 import trial_run
+import trial_values
 
+from autdtorch.array import TransducerArray
 from autdtorch.drive_file import load_drive
 from autdtorch.hardware_report import compare
 from autdtorch.optim.gabs import gabs
+from autdtorch.scene_file import load_scene
 
 SCENE = """
 name: two
@@ -54,6 +58,9 @@ def test_a_trial_leaves_log_drive_and_report_and_is_not_repeated(run, tmp_path: 
     assert (out / "trial.jsonl").read_text().splitlines()[:-1] == log  # and the second run's end
     report = (out / "report.md").read_text()
     assert "**Not heard**, counted from 0: 4." in report
+    heard = re.search(r"with (\S+) to .* Pa, and the threshold (\S+) Pa", report, re.DOTALL)
+    assert heard is not None
+    assert float(heard[1]) > float(heard[2])  # the range is that of the transducers that are heard
     assert report.count("| 1.000 |\n") == 3  # the simulation is told
     assert (out / "convergence.png").exists()
     assert len(load_drive(out / "drive.npz")) == 9
@@ -231,3 +238,19 @@ def test_the_factor_between_simulation_and_bench_is_found():
     fit = compare(2.5 * simulated, simulated)
     assert fit.scale == pytest.approx(2.5, rel=1e-12)
     assert fit.misfit < 1e-12
+
+
+def test_the_documented_scene_lies_in_the_middle_of_a_sonicsurface(tmp_path: Path):
+    """With the device turned as the documentation says, for the transducers of its command."""
+    text = (Path(__file__).parents[2] / "docs" / "hardware.md").read_text("utf-8")
+    block = re.search(r"```yaml\n(.*?)```", text, re.DOTALL)
+    chosen = re.search(r"--transducers (\S+)", text)
+    assert block is not None
+    assert chosen is not None
+    path = tmp_path / "my_bench.yaml"
+    path.write_text(block[1], "utf-8")
+    device = TransducerArray.sonicsurface(center=(0, 0, 0), angle=math.pi / 2)
+    places = device.positions[trial_values.indices(chosen[1])]
+    assert torch.allclose(
+        load_scene(path).array.positions, places, rtol=0, atol=1e-9
+    )  # rounding; pitch 1e-2 m
