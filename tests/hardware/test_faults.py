@@ -229,8 +229,8 @@ def test_two_signals_at_once_end_the_trial_without_a_word_of_the_second(monkeypa
     def both() -> None:
         with ended_by_signals():
             signal.pthread_sigmask(signal.SIG_BLOCK, {number, signal.SIGTERM})
-            os.kill(os.getpid(), number)
-            os.kill(os.getpid(), signal.SIGTERM)
+            signal.raise_signal(number)  # to this thread, as other threads do not block it
+            signal.raise_signal(signal.SIGTERM)
             signal.pthread_sigmask(signal.SIG_UNBLOCK, {number, signal.SIGTERM})
 
     lost: list[object] = []
