@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine, Sequence
+import contextlib
+import threading
+from collections.abc import Callable, Coroutine, Sequence
+from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -15,6 +18,16 @@ from autdtorch.hardware.levels import AUTD3_PHASES, Levels, autd3_drive, autd3_l
 from autdtorch.hardware.link import SETTLE, Link
 from autdtorch.hardware.usb import LinkError
 from autdtorch.validation import integer_at_least
+
+#: How long the kit waits for an answer [ms]; its own 10 ms run out on a computer that is busy.
+_ANSWER_MS = 100
+#: How long a command may take [s]; the kit asks boards that do not answer 8 times more before it gives up.
+_TIMEOUT = 5.0
+#: And opening [s]: the kit takes up to 10 s to find the boards and 30 s to synchronise them.
+_OPENING_TIMEOUT = 60.0
+
+_Command = Callable[[], Coroutine[Any, Any, None]]
+_Asked = tuple[_Command, SimpleQueue[BaseException | None]]  # and to whom its end is told
 
 
 def autd3_device(boards: int = 1) -> Device:
@@ -68,7 +81,12 @@ def open_autd3(
 
 
 class Autd3Port:
-    """Boards of AUTD3 on the network, by the client of their kit, which waits until they have answered."""
+    """Boards of AUTD3 on the network, by the client of their kit, which waits until they have answered.
+
+    The kit's event loop runs in a thread of its own, where commands wait for their turn. Signals are heard in
+    the main thread, so that none breaks off a command: an exception in asyncio's own code loses what would
+    wake the command up, and closing the loop then waits for it for ever.
+    """
 
     def __init__(self, boards: int, network: Any = None) -> None:
         """Connect, and reset the firmware to its defaults.
@@ -90,19 +108,23 @@ class Autd3Port:
         # A pattern is by board and transducer: where the boards stand plays no part.
         geometry = Geometry([Autd3() for _ in range(boards)])
         option = autd3.UdpOption() if network is None else network
+        config = autd3.ClientConfig(ack_timeout=autd3.Duration.from_millis(_ANSWER_MS))
         self._error: type[Exception] = autd3.Autd3Error
         self._boards = boards
-        self._runner = asyncio.Runner()
         self._client: Any = None
+        self._commands: SimpleQueue[_Asked | None] = SimpleQueue()
+        # A daemon: others are waited for before what `atexit` holds, the link's switching off, is called.
+        threading.Thread(target=_obey, args=(self._commands,), name="AUTD3", daemon=True).start()
 
-        async def open_client() -> Any:
-            return await autd3.Client.open(geometry, option, autd3.ClientConfig())
+        async def open_client() -> None:  # kept here, as a signal may end the wait for it
+            self._client = await autd3.Client.open(geometry, option, config)
 
         try:
-            self._client = self._run("be opened", open_client())
+            self._run("be opened", open_client, _OPENING_TIMEOUT)
             self._send("be reset", Clear())
         except BaseException:
-            self.close()
+            with contextlib.suppress(LinkError):  # the first error says more
+                self.close()
             raise
 
     def write(self, data: bytes) -> None:
@@ -127,25 +149,53 @@ class Autd3Port:
         """
 
         async def close_client() -> None:
-            await self._client.close()
+            client, self._client = self._client, None  # the kit lets go of boards that do not answer with it
+            if client is not None:
+                await client.close()
 
         try:
-            if self._client is not None:
-                self._run("be closed", close_client())
+            self._run("be closed", close_client, _TIMEOUT)
         finally:
-            self._runner.close()
+            self._commands.put(None)
 
     def _send(self, what: str, command: Any) -> None:
         async def send() -> None:
             await self._client.send(command)
 
-        self._run(what, send())
+        self._run(what, send, _TIMEOUT)
 
-    def _run(self, what: str, doing: Coroutine[Any, Any, Any]) -> Any:
-        try:
-            return self._runner.run(doing)
-        except self._error as error:
+    def _run(self, what: str, command: _Command, seconds: float) -> None:
+        """Have the thread do it, after all that was asked for before, and wait.
+
+        Nothing here may be torn by a signal: a `SimpleQueue` puts and gets in one piece.
+        """
+
+        async def timed() -> None:
+            async with asyncio.timeout(seconds):
+                await command()
+
+        ended: SimpleQueue[BaseException | None] = SimpleQueue()
+        self._commands.put((timed, ended))
+        error = ended.get()
+        if isinstance(error, TimeoutError):
+            raise LinkError(f"AUTD3 cannot {what}: no answer within {seconds:g} s") from error
+        if isinstance(error, self._error):
             raise LinkError(f"AUTD3 cannot {what}: {error}") from error
+        if error is not None:
+            raise error
+
+
+def _obey(commands: SimpleQueue[_Asked | None]) -> None:
+    """Do one command after the other, until None, and say how each ended."""
+    with asyncio.Runner() as runner:
+        while (asked := commands.get()) is not None:
+            command, ended = asked
+            try:
+                runner.run(command())
+            except BaseException as error:  # whoever waits raises it
+                ended.put(error)
+            else:
+                ended.put(None)
 
 
 def autd3_pattern(frame: bytes, boards: int) -> Any:

@@ -131,29 +131,29 @@ class Link:
             LinkError: the device does not take the bytes; it is let go all the same.
         """
         with self._lock:
-            if not self._open:
-                return
             try:
-                self._off_for_good()
-            except BaseException:
-                with contextlib.suppress(LinkError):  # the first error says more
-                    self._let_go()
+                self._off_and_let_go()
+            except LinkError:
                 raise
-            self._let_go()
+            except BaseException:  # a signal, which may come before anything is sent, or amid a recovery
+                self._off_and_let_go()
+                raise
+
+    def _off_and_let_go(self) -> None:
+        if not self._open:
+            return
+        try:
+            self.off()
+        except LinkError:
+            with contextlib.suppress(LinkError):  # the first error says more
+                self._let_go()
+            raise
+        self._let_go()
 
     def _let_go(self) -> None:
         self._open = False
         atexit.unregister(self.close)
         self._port.close()
-
-    def _off_for_good(self) -> None:
-        try:
-            self.off()
-        except LinkError:
-            raise
-        except BaseException:  # a signal, which may have come before the first byte, or amid a recovery
-            self.off()
-            raise
 
     def _frame(self, drive: torch.Tensor) -> bytes:
         everyone = torch.zeros(self.device.transducers, dtype=torch.complex128)

@@ -62,15 +62,22 @@ def ended_by_signals() -> Iterator[None]:
             signal.signal(one, _pass)
         raise Signalled(number)
 
-    heard = [one for one in _SIGNALS if signal.getsignal(one) is not signal.SIG_IGN]
-    before = {one: signal.getsignal(one) for one in heard}
-    for one in heard:
-        signal.signal(one, end)
-    try:
-        yield
-    finally:
+    def restore() -> None:
         for one, handler in before.items():
             signal.signal(one, handler)
+
+    heard = [one for one in _SIGNALS if signal.getsignal(one) is not signal.SIG_IGN]
+    before = {one: signal.getsignal(one) for one in heard}
+    try:
+        for one in heard:
+            signal.signal(one, end)
+        yield
+    finally:
+        try:
+            restore()
+        except Signalled:  # there was none before, and now all are ignored
+            restore()
+            raise
 
 
 def _pass(number: int, _: FrameType | None) -> None:

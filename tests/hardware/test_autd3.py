@@ -1,12 +1,27 @@
 """AUTD3 by its kit, against the emulator of its network protocol that the kit brings."""
 
+import asyncio
 import builtins
+import contextlib
+import os
+import signal
+import subprocess
+import threading
 
 import pytest
 import torch
 
 from autdtorch.drive import drive_from_phases
-from autdtorch.hardware import LimitedLink, LimitError, Limits, LinkError, open_autd3
+from autdtorch.hardware import (
+    LimitedLink,
+    LimitError,
+    Limits,
+    LinkError,
+    Signalled,
+    ended_by_signals,
+    open_autd3,
+)
+from autdtorch.hardware import autd3 as module
 from autdtorch.hardware.autd3 import Autd3Port, autd3_device
 from autdtorch.hardware.levels import Levels, autd3_levels
 
@@ -15,6 +30,61 @@ def random_drive(count: int) -> torch.Tensor:
     generator = torch.Generator().manual_seed(0)
     phases, amplitudes = torch.rand((2, count), generator=generator, dtype=torch.float64)
     return drive_from_phases(2 * torch.pi * phases, amplitudes)
+
+
+class Noting:
+    """The kit's client, noting what the boards have taken: of each pattern, whether something is on."""
+
+    def __init__(self, client, monkeypatch):
+        def labelled(data, boards):
+            return any(data), pattern(data, boards)
+
+        pattern = module.autd3_pattern
+        monkeypatch.setattr(module, "autd3_pattern", labelled)
+        self.client = client
+        self.sending = False
+        self.on = []
+
+    async def send(self, labelled):
+        on, command = labelled
+        assert not self.sending, "two commands at once"
+        self.sending = True
+        try:
+            await self.client.send(command)
+        finally:
+            self.sending = False
+        self.on.append(on)
+
+    async def close(self):
+        await self.client.close()
+
+
+@pytest.fixture
+def stray_signals_do_no_harm():
+    before = signal.signal(signal.SIGTERM, lambda *_: None)
+    yield
+    signal.signal(signal.SIGTERM, before)
+
+
+@contextlib.contextmanager
+def signalled_all_the_time():
+    """SIGTERM every few ms, from without: a thread would send it only where it has the interpreter."""
+    sender = subprocess.Popen(["sh", "-c", "while kill -TERM $PPID; do sleep 0.002; done"])
+    try:
+        yield
+    finally:
+        sender.kill()
+        sender.wait()
+
+
+class Mute:
+    """A client whose boards never answer."""
+
+    async def send(self, command):
+        await asyncio.Event().wait()
+
+    async def close(self):
+        await asyncio.Event().wait()
 
 
 def test_a_frame_is_all_phases_then_all_intensities():
@@ -75,6 +145,65 @@ class TestWithTheKit:
             assert played[2:] == [True, False, False]  # after the two of opening; on, then off twice
             with pytest.raises(LimitError, match="in a row"):
                 limited.require_on()
+
+    @pytest.mark.timeout(20)
+    @pytest.mark.usefixtures("stray_signals_do_no_harm")
+    def test_signals_at_any_moment_leave_the_boards_off(self, kit, monkeypatch):
+        drive, boards = random_drive(249), kit.UdpEmulator(1)
+        with open_autd3(1, network=boards.option(), settle=0) as link:
+            link._port._client = client = Noting(link._port._client, monkeypatch)
+            with signalled_all_the_time():
+                for _ in range(200):
+                    with contextlib.suppress(Signalled), ended_by_signals():
+                        try:
+                            while True:
+                                link.play(drive)
+                        finally:
+                            link.off()
+                    assert client.on[-2:] == [False, False]
+        assert any(client.on)
+
+    @pytest.mark.usefixtures("stray_signals_do_no_harm")
+    def test_a_signal_while_boards_are_looked_for_lets_go_of_them(self, kit, monkeypatch):
+        def note_and_close(port):
+            close(port)
+            closed.append(port)
+
+        close, closed = Autd3Port.close, []
+        monkeypatch.setattr(Autd3Port, "close", note_and_close)
+        boards = kit.UdpEmulator(1)
+        threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGTERM)).start()
+        with pytest.raises(Signalled), ended_by_signals():
+            open_autd3(1, network=boards.option())  # takes 0.3 s
+        assert len(closed) == 1
+        with open_autd3(1, network=boards.option()):
+            pass
+
+    def test_boards_that_vanish_are_an_error_and_no_hang(self, kit):
+        boards = kit.UdpEmulator(1)
+        link = open_autd3(1, network=boards.option(), settle=0)
+        link.play(random_drive(249))
+        del boards
+        with pytest.raises(LinkError, match=r"AUTD3 cannot be written to: .*did not reply"):
+            link.play(random_drive(249))
+        with pytest.raises(LinkError, match=r"the outputs may still be on: switch the device's power off"):
+            link.close()
+
+    def test_no_answer_at_all_is_a_time_out(self, kit, monkeypatch):
+        boards = kit.UdpEmulator(1)
+        link = open_autd3(1, network=boards.option(), settle=0)
+        client, link._port._client = link._port._client, Mute()
+        monkeypatch.setattr(module, "_TIMEOUT", 0.02)
+        with pytest.raises(LinkError, match=r"AUTD3 cannot be written to: no answer within 0.02 s"):
+            link.play(random_drive(249))
+        link._port._client = client  # the cable is in again
+        link.play(random_drive(249))
+        link._port._client = Mute()
+        with pytest.raises(LinkError, match=r"no answer within 0.02 s; the outputs may still be on"):
+            link.close()
+        monkeypatch.setattr(module, "_OPENING_TIMEOUT", 0.02)
+        with pytest.raises(LinkError, match=r"AUTD3 cannot be opened: no answer within 0.02 s"):
+            open_autd3(1, network=boards.option())  # takes 0.3 s
 
     def test_no_boards_are_an_error(self, kit):
         option = kit.UdpOption("127.0.0.1", enumeration_timeout=kit.Duration.from_millis(50))
