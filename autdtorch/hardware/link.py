@@ -38,7 +38,7 @@ class Link:
         self,
         device: Device,
         port: Port,
-        transducers: Sequence[int] | torch.Tensor | None = None,
+        transducers: Sequence[int] | None = None,
         settle: float = SETTLE,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
@@ -131,29 +131,29 @@ class Link:
             LinkError: the device does not take the bytes; it is let go all the same.
         """
         with self._lock:
-            if not self._open:
-                return
             try:
-                self._off_for_good()
-            except BaseException:
-                with contextlib.suppress(LinkError):  # the first error says more
-                    self._let_go()
+                self._off_and_let_go()
+            except LinkError:
                 raise
-            self._let_go()
+            except BaseException:  # a signal, which may come before anything is sent, or amid a recovery
+                self._off_and_let_go()
+                raise
+
+    def _off_and_let_go(self) -> None:
+        if not self._open:
+            return
+        try:
+            self.off()
+        except LinkError:
+            with contextlib.suppress(LinkError):  # the first error says more
+                self._let_go()
+            raise
+        self._let_go()
 
     def _let_go(self) -> None:
         self._open = False
         atexit.unregister(self.close)
         self._port.close()
-
-    def _off_for_good(self) -> None:
-        try:
-            self.off()
-        except LinkError:
-            raise
-        except BaseException:  # a signal, which may have come before the first byte, or amid a recovery
-            self.off()
-            raise
 
     def _frame(self, drive: torch.Tensor) -> bytes:
         everyone = torch.zeros(self.device.transducers, dtype=torch.complex128)
@@ -177,7 +177,7 @@ class Link:
 
 def open_link(
     device: Device,
-    transducers: Sequence[int] | torch.Tensor | None = None,
+    transducers: Sequence[int] | None = None,
     serial: str | None = None,
     backend: Any = None,
     settle: float = SETTLE,
@@ -265,7 +265,7 @@ def _each(do: Callable[[Port, Any], None], ports: Sequence[Port], things: Sequen
         raise errors[0]
 
 
-def wiring(transducers: Sequence[int] | torch.Tensor | None, count: int) -> torch.Tensor:
+def wiring(transducers: Sequence[int] | None, count: int) -> torch.Tensor:
     """Which of a device's `count` transducers play a scene's (M,), int64.
 
     Raises:
@@ -273,8 +273,6 @@ def wiring(transducers: Sequence[int] | torch.Tensor | None, count: int) -> torc
     """
     if transducers is None:
         return torch.arange(count)
-    if isinstance(transducers, torch.Tensor):  # its elements are no Integral
-        transducers = transducers.tolist()
     chosen = [integer_at_least(f"transducers[{place}]", one, 0) for place, one in enumerate(transducers)]
     if not chosen or len(set(chosen)) < len(chosen) or max(chosen) >= count:
         raise invalid("transducers", chosen, f"must be indices from 0 to {count - 1}, each once")

@@ -19,6 +19,7 @@ from autdtorch.hardware import (
     EmulatedBench,
     EmulatedSensor,
     FileSensor,
+    Link,
     LinkError,
     ManualSensor,
     Sensor,
@@ -171,8 +172,7 @@ def test_signals_in_mid_frame_and_while_switching_off_leave_the_outputs_off(tria
     assert bench.firmware.drive().abs().max() == 0
 
 
-@pytest.mark.parametrize("moment", ["before the off frame", "while a time-out is mended"])
-def test_a_signal_amid_the_last_switching_off_leaves_the_outputs_off(trial, moment, monkeypatch):
+def test_a_signal_while_the_last_off_frame_is_mended_leaves_the_outputs_off(trial, monkeypatch):
     def interrupted(*arguments: object) -> None:
         monkeypatch.undo()
         raise KeyboardInterrupt
@@ -180,17 +180,51 @@ def test_a_signal_amid_the_last_switching_off_leaves_the_outputs_off(trial, mome
     def interrupted_trial() -> None:
         with trial.link(bench) as link:
             link.play(torch.ones(16, dtype=torch.complex128))
-            if moment == "before the off frame":
-                monkeypatch.setattr(link, "off", interrupted)
-            else:
-                monkeypatch.setattr(bench.bus, "clear_halt", interrupted)
+            monkeypatch.setattr(bench.bus, "clear_halt", interrupted)
 
     bench = trial.bench()
-    if moment == "while a time-out is mended":
-        bench.bus = FaultyBus([bench.chip], "time-out", 258 * (2 + 1) + 100)
+    bench.bus = FaultyBus([bench.chip], "time-out", 258 * (2 + 1) + 100)
     with pytest.raises(KeyboardInterrupt):
         interrupted_trial()
     assert bench.firmware.drive().abs().max() == 0
+
+
+def test_a_signal_just_before_the_switching_off_leaves_the_outputs_off(trial):
+    class Interrupted(Link):
+        def off(self):
+            if loud and not signals:
+                signals.append(os.kill(os.getpid(), signal.SIGTERM))
+            super().off()
+
+    def interrupted_trial() -> None:
+        with ended_by_signals(), trial.link(bench) as link:
+            link.__class__ = Interrupted
+            loud.append(True)
+            link.play(torch.ones(16, dtype=torch.complex128))
+
+    loud: list[bool] = []
+    signals: list[None] = []
+    bench = trial.bench()
+    with pytest.raises(Signalled):
+        interrupted_trial()
+    assert bench.firmware.drive().abs().max() == 0
+
+
+@pytest.mark.usefixtures("not_ignored")
+@pytest.mark.parametrize("number", [signal.SIGINT])
+def test_two_signals_at_once_end_the_trial_without_a_word_of_the_second(monkeypatch, number):
+    def both() -> None:
+        with ended_by_signals():
+            signal.pthread_sigmask(signal.SIG_BLOCK, {number, signal.SIGTERM})
+            signal.raise_signal(number)  # to this thread, as other threads do not block it
+            signal.raise_signal(signal.SIGTERM)
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {number, signal.SIGTERM})
+
+    lost: list[object] = []
+    monkeypatch.setattr(sys, "unraisablehook", lost.append)
+    with pytest.raises(Signalled, match="SIGINT"):
+        both()
+    assert not lost
 
 
 @pytest.mark.parametrize("handlers_set", [2, 7], ids=["begins", "ends"])  # of 6, and 6 as they were
@@ -210,8 +244,7 @@ def test_a_signal_as_the_listening_begins_or_ends_leaves_the_handlers_as_they_we
 
     changes: list[int] = []
     set_handler = signal.signal
-    names = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGTTIN")
-    heard = [getattr(signal, name) for name in names]
+    heard = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP, signal.SIGTTIN]
     before = [set_handler(number, harmless) for number in heard]
     monkeypatch.setattr(signal, "signal", set_and_interrupt)
     try:
@@ -221,23 +254,6 @@ def test_a_signal_as_the_listening_begins_or_ends_leaves_the_handlers_as_they_we
     finally:
         for number, handler in zip(heard, before, strict=True):
             set_handler(number, handler)
-
-
-@pytest.mark.usefixtures("not_ignored")
-@pytest.mark.parametrize("number", [signal.SIGINT])
-def test_two_signals_at_once_end_the_trial_without_a_word_of_the_second(monkeypatch, number):
-    def both() -> None:
-        with ended_by_signals():
-            signal.pthread_sigmask(signal.SIG_BLOCK, {number, signal.SIGTERM})
-            signal.raise_signal(number)  # to this thread, as other threads do not block it
-            signal.raise_signal(signal.SIGTERM)
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, {number, signal.SIGTERM})
-
-    lost: list[object] = []
-    monkeypatch.setattr(sys, "unraisablehook", lost.append)
-    with pytest.raises(Signalled, match="SIGINT"):
-        both()
-    assert not lost
 
 
 def test_a_signal_that_is_ignored_as_by_nohup_stays_so():
