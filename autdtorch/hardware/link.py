@@ -38,7 +38,7 @@ class Link:
         self,
         device: Device,
         port: Port,
-        transducers: Sequence[int] | None = None,
+        transducers: Sequence[int] | torch.Tensor | None = None,
         settle: float = SETTLE,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
@@ -177,7 +177,7 @@ class Link:
 
 def open_link(
     device: Device,
-    transducers: Sequence[int] | None = None,
+    transducers: Sequence[int] | torch.Tensor | None = None,
     serial: str | None = None,
     backend: Any = None,
     settle: float = SETTLE,
@@ -265,7 +265,7 @@ def _each(do: Callable[[Port, Any], None], ports: Sequence[Port], things: Sequen
         raise errors[0]
 
 
-def wiring(transducers: Sequence[int] | None, count: int) -> torch.Tensor:
+def wiring(transducers: Sequence[int] | torch.Tensor | None, count: int) -> torch.Tensor:
     """Which of a device's `count` transducers play a scene's (M,), int64.
 
     Raises:
@@ -273,6 +273,8 @@ def wiring(transducers: Sequence[int] | None, count: int) -> torch.Tensor:
     """
     if transducers is None:
         return torch.arange(count)
+    if isinstance(transducers, torch.Tensor):  # its elements are no Integral
+        transducers = transducers.tolist()
     chosen = [integer_at_least(f"transducers[{place}]", one, 0) for place, one in enumerate(transducers)]
     if not chosen or len(set(chosen)) < len(chosen) or max(chosen) >= count:
         raise invalid("transducers", chosen, f"must be indices from 0 to {count - 1}, each once")
