@@ -52,8 +52,8 @@ class EmulatedBench:
         Args:
             device: which.
             transfer_matrix: (P, M) of the scene on the bench [Pa].
-            transducers: for each transducer of the scene, which of the device's it is; by default all in
-                order.
+            transducers: for each transducer of the scene, which of the device's it is (M,); by default all
+                in order.
             adapter: the USB chip that it hangs on; by default the usual one, if any.
             dead: transducers of the scene that are silent, whatever the device plays.
 

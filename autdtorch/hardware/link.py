@@ -47,7 +47,7 @@ class Link:
         Args:
             device: what hangs on the port.
             port: takes its bytes.
-            transducers: for each transducer of the scene, which of the device's it is; the others stay off.
+            transducers: for each transducer of the scene, which of the device's it is (M,); others stay off.
                 By default the scene has all, in the order of the device.
             settle: how long `play` waits, after the frame has gone over the wire, for the sound to stand at
                 the control points [s].
@@ -186,7 +186,8 @@ def open_link(
 
     Args:
         device: which.
-        transducers: for each transducer of the scene, which of the device's it is; by default all in order.
+        transducers: for each transducer of the scene, which of the device's it is (M,); by default all in
+            order.
         serial: number of the USB chip, where several such devices are plugged in.
         backend: of pyusb; by default libusb. An emulated bench has its own, on which waiting takes no time.
         settle: how long a drive plays before its pressure is read [s]; the time that its frame is on the wire

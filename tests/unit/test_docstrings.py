@@ -59,7 +59,7 @@ UNITS = {
     "s/division": {"time_scale"},
     "V": {"dc_offset", "resolution", "volts"},
     "V/Pa": {"sensitivity"},
-    "V/division": {"scales"},
+    "V/division": {"finest", "scales"},
 }
 UNIT_OF = {name: unit for unit, names in UNITS.items() for name in names}
 WITHOUT_UNIT = {
@@ -80,7 +80,7 @@ WITHOUT_UNIT = {
         "mask",
         "noise",
     ),
-    *("normal", "normals", "scale", "sensor", "speed_ratio", "tolerance", "uniformity"),
+    *("normal", "normals", "scale", "sensor", "speed_ratio", "tolerance", "transducers", "uniformity"),
     *("history", "score"),  # whatever the score function's is
 }
 
