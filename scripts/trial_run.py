@@ -104,8 +104,7 @@ class Trial:
             at_the_end.callback(limited.off)
             if objective.log.evaluations:
                 logging.info("going on after %d evaluations", len(objective.log.evaluations))
-            progress.begin("pre-flight check")
-            preflight = self._preflight(limited, sensor)
+            preflight = self._preflight(limited, sensor, progress)
             found = self._method(at.Quantised(objective, **bench.device.quantised))
             points = len(self._scene.control_points)
             progress.begin("the drive that was found, once more")
@@ -113,20 +112,32 @@ class Trial:
             again = torch.stack([checked_reading(sensor, points) for _ in range(bench.readings)])
             limited.require_on()
             limited.off()
+            progress.begin("silence, outputs off, once more")
             with silence_expected():
                 silent = hardware.hears_silence(sensor, preflight, points, bench.readings)
             if not silent:
                 logging.warning("the sensor hears more than before the trial: are the outputs off?")
         return found, again, preflight, objective.log
 
-    def _preflight(self, limited: hardware.LimitedLink, sensor: hardware.Sensor) -> hardware.Preflight:
+    def _preflight(
+        self, limited: hardware.LimitedLink, sensor: hardware.Sensor, progress: Progress
+    ) -> hardware.Preflight:
         points, count = len(self._scene.control_points), len(self._scene.array)
         with silence_expected():
             check = hardware.check_transducers(
-                limited, sensor, points, self._bench.readings, self._bench.background
+                limited,
+                sensor,
+                points,
+                self._bench.readings,
+                self._bench.background,
+                watch=lambda what: progress.begin(f"pre-flight check: {what}"),
             )
         if len(check.dead) == count:
-            raise ValueError("the sensor hears no transducer; check the device's power, and the sensor")
+            loudest = ", and try a lower --loudest" if self._settings["sensor"] == "scope" else ""
+            raise ValueError(
+                f"the sensor hears no transducer: {float(check.pressure.max()):.3g} Pa is the most, and must be "
+                f"above {check.threshold:.3g} Pa; check the device's power, and the sensor{loudest}"
+            )
         logging.info("the sensor hears %d of %d", count - len(check.dead), count)
         if check.dead:
             logging.warning("not heard, counted from 0: %s", ", ".join(map(str, check.dead)))

@@ -31,7 +31,7 @@ from autdtorch.hardware.levels import (
     ultraino_levels,
 )
 from autdtorch.openmpd_board import OpenMPDBoard
-from autdtorch.validation import integer_at_least, invalid
+from autdtorch.validation import integer_at_least, invalid, require_kind
 
 SONICSURFACE_BAUD = 230_400
 ULTRAINO_BAUD = 115_200
@@ -104,8 +104,11 @@ def openmpd_boards(boards: Sequence[OpenMPDBoard]) -> Device:
         boards: one after the other, of 256 transducers each.
 
     Raises:
-        ValueError: no board, one of another number of transducers, or two of the same name.
+        ValueError: no board, one that is no `OpenMPDBoard`, one of another number of transducers, or two of
+            the same name.
     """
+    for number, board in enumerate(boards):
+        require_kind(f"boards[{number}]", board, OpenMPDBoard)
     names = tuple(board.name for board in boards)
     if not boards or len(set(names)) < len(names):
         raise invalid("boards", names, "must be one or more, of different names")

@@ -15,7 +15,7 @@ import torch
 from autdtorch.drive import validate_drive
 from autdtorch.hardware.devices import Device
 from autdtorch.hardware.usb import LinkError, Port, find_device
-from autdtorch.validation import integer_at_least, invalid, not_negative
+from autdtorch.validation import integer_at_least, invalid, not_negative, require_kind
 
 #: Default settle time [s]. Sound goes 1.7 m in it; a T4010A1 rings up in some 30 periods, 0.75 ms, as the
 #: emulator of AUTD3's kit models it.
@@ -76,12 +76,25 @@ class Link:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
             LinkError: the device does not take the bytes, or was let go.
         """
+        self.begin(drive)
+        self.wait_for_sound()
+
+    def begin(self, drive: torch.Tensor) -> None:
+        """Play a drive as `play` does, but return when its frame is on the device.
+
+        Raises:
+            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+            LinkError: the device does not take the bytes, or was let go.
+        """
         frame = self._frame(drive)
         with self._lock:
             if not self._open:
                 raise LinkError(f"{self.device.name} was let go; open it anew")
             self._send(frame)
-            self._sleep(self.settle)
+
+    def wait_for_sound(self) -> None:
+        """Wait for the settle time; other threads may switch the outputs off meanwhile."""
+        self._sleep(self.settle)
 
     def played(self, drive: torch.Tensor) -> torch.Tensor:
         """What the device is sent to play when asked for a drive (M,): the nearest on its levels.
@@ -157,7 +170,7 @@ class Link:
 
     def _frame(self, drive: torch.Tensor) -> bytes:
         everyone = torch.zeros(self.device.transducers, dtype=torch.complex128)
-        everyone[self.transducers] = validate_drive(drive, len(self.transducers))
+        everyone[self.transducers] = single_drive(drive, len(self.transducers))
         return self.device.frame(everyone)
 
     def _send(self, frame: bytes) -> None:
@@ -196,9 +209,10 @@ def open_link(
     Raises:
         LinkError: none or several such devices, or it does not take the bytes.
         ImportError: pyusb or libusb-package is missing.
-        ValueError: `transducers` that the device does not have, or one twice; a negative `settle`; or a
+        ValueError: no `Device`; `transducers` that it does not have, or one twice; a negative `settle`; or a
             `serial` for a device of several boards.
     """
+    require_kind("device", device, Device)
     if serial is not None and len(device.serials) > 1:
         raise invalid("serial", serial, f"must be None, as {device.name} has {len(device.serials)} boards")
     openers = {(vendor, product): open_port for vendor, product, open_port in device.adapters}
@@ -264,6 +278,18 @@ def _each(do: Callable[[Port, Any], None], ports: Sequence[Port], things: Sequen
             errors.append(error)
     if errors:
         raise errors[0]
+
+
+def single_drive(drive: torch.Tensor, transducers: int) -> torch.Tensor:
+    """`drive` (M,) as complex128, after checking that an array of M `transducers` can play it.
+
+    Raises:
+        ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+    """
+    checked = validate_drive(drive, transducers)
+    if checked.ndim != 1:
+        raise ValueError(f"drive: shape {tuple(checked.shape)}; must be ({transducers},), one drive")
+    return checked
 
 
 def wiring(transducers: Sequence[int] | torch.Tensor | None, count: int) -> torch.Tensor:

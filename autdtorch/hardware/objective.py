@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from autdtorch.hardware.safety import LimitedLink, LimitError
 from autdtorch.hardware.sensor import Sensor, checked_reading
 from autdtorch.objective import validate_drives
 from autdtorch.scene import Scene
-from autdtorch.validation import invalid
+from autdtorch.validation import invalid, require_kind
 
 
 class HardwareObjective:
@@ -57,16 +58,21 @@ class HardwareObjective:
             watch: is shown every evaluation.
 
         Raises:
-            ValueError: the link is not limited, or plays another number of transducers than the scene has; or
-                the log is of another trial.
+            ValueError: no scene; the link is not limited, or plays another number of transducers than the
+                scene has; `settings` that JSON cannot hold; or the log is of another trial.
             OSError: the log cannot be read or written.
         """
+        require_kind("scene", scene, Scene)
         if not isinstance(link, LimitedLink):
             raise invalid("link", link, "must be a LimitedLink: no trial without an amplitude limit")
         transducers = link.link.transducers.tolist()
         if len(transducers) != len(scene.array):
             accepted = f"must be {len(scene.array)}, as many as the scene has"
             raise invalid("link.transducers", len(transducers), accepted)
+        try:
+            json.dumps(named := {**(settings or {})})
+        except (TypeError, ValueError) as error:
+            raise invalid("settings", settings, "must be a mapping of what JSON can hold") from error
         self.scene = scene
         self.evaluations = 0
         self._link = link
@@ -77,7 +83,7 @@ class HardwareObjective:
             "device": link.link.device.name,
             "transducers": transducers,
             "amplitude limit": link.limits.amplitude,
-            **(settings or {}),
+            **named,
         }
         self.log = EvaluationLog(log, origin)
         if self.log.goes_on:

@@ -6,6 +6,7 @@ import contextlib
 import functools
 import logging
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -14,8 +15,8 @@ from types import FrameType
 
 import torch
 
-from autdtorch.hardware.link import Link
-from autdtorch.validation import integer_at_least, invalid, number_between, positive
+from autdtorch.hardware.link import Link, single_drive
+from autdtorch.validation import integer_at_least, invalid, number_between, positive, require_kind
 
 logger = logging.getLogger(__name__)
 
@@ -49,17 +50,22 @@ def ended_by_signals() -> Iterator[None]:
     """Have the signals that end or stop a process raise `Signalled`, so that links are closed on the way out.
 
     These are Ctrl-C, Ctrl-Z, SIGTERM, SIGHUP, SIGQUIT and SIGTTIN; one that is ignored, as by ``nohup``,
-    stays so. Only the first raises: what comes later must not interrupt the switching off. Use it around the
-    link.
+    stays so. One that comes on the way out does not raise: it must not interrupt the switching off. One that
+    comes later does, as Python drops what is raised in a ``__del__`` or a callback. Use it around the link.
 
     Raises:
         Signalled: there was such a signal.
         ValueError: it is used outside of the main thread, which alone hears signals.
     """
 
+    outside = sys.exception()
+
     def end(number: int, _: FrameType | None) -> None:
-        for one in before:
-            signal.signal(one, _pass)
+        error = sys.exception()
+        while error is not outside and error is not None:
+            if isinstance(error, Signalled):  # it is on its way out
+                return
+            error = error.__context__
         raise Signalled(number)
 
     def restore() -> None:
@@ -75,13 +81,9 @@ def ended_by_signals() -> Iterator[None]:
     finally:
         try:
             restore()
-        except Signalled:  # there was none before, and now all are ignored
+        except Signalled:  # there was none before, and none is raised while this one is handled
             restore()
             raise
-
-
-def _pass(number: int, _: FrameType | None) -> None:
-    """Not SIG_IGN: of a signal that waits already, Python would then report that it was lost."""
 
 
 @dataclass(frozen=True)
@@ -133,8 +135,10 @@ class LimitedLink:
             limits: of what is played.
 
         Raises:
-            ValueError: the device has no amplitude up to the limit but 0.
+            ValueError: no link or no limits, or the device has no amplitude up to the limit but 0.
         """
+        require_kind("link", link, Link)
+        require_kind("limits", limits, Limits)
         self.link = link
         self.limits = limits
         self._scale = _largest_amplitude(link, limits.amplitude)
@@ -173,6 +177,7 @@ class LimitedLink:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
             LinkError: the device does not take the bytes.
         """
+        scaled = self._scale * single_drive(drive, len(self.link.transducers))
         if self._stretch() > self.limits.seconds_in_a_row / 2:  # leave the other half to the sensor
             self.off()
         if self._on_since is None:
@@ -186,7 +191,8 @@ class LimitedLink:
                 self._timer = threading.Timer(most, functools.partial(self._time_is_up, self._on_since))
                 self._timer.daemon = True
                 self._timer.start()
-            self.link.play(self._scale * drive)
+            self.link.begin(scaled)
+        self.link.wait_for_sound()  # without the lock, which the timer needs
 
     def require_on(self) -> None:
         """Require that the outputs are on since `play`: otherwise what was read meanwhile is void.
@@ -199,7 +205,7 @@ class LimitedLink:
         if self._on_since is None:
             self._seconds_left()
             most = self.limits.seconds_in_a_row
-            raise LimitError(f"the sensor took longer than the outputs may stay on, {most:g} s in a row")
+            raise LimitError(f"settling and reading took longer than the outputs may stay on, {most:g} s in a row")
 
     def off(self) -> None:
         """Switch all outputs off, and begin the rest that the duty cycle asks for.
