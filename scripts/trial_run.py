@@ -135,8 +135,8 @@ class Trial:
         if len(check.dead) == count:
             loudest = ", and try a lower --loudest" if self._settings["sensor"] == "scope" else ""
             raise ValueError(
-                f"the sensor hears no transducer: {float(check.pressure.max()):.3g} Pa is the most, and must be "
-                f"above {check.threshold:.3g} Pa; check the device's power, and the sensor{loudest}"
+                f"the sensor hears no transducer: {float(check.pressure.max()):.3g} Pa is the most, and must "
+                f"be above {check.threshold:.3g} Pa; check the device's power, and the sensor{loudest}"
             )
         logging.info("the sensor hears %d of %d", count - len(check.dead), count)
         if check.dead:

@@ -60,7 +60,8 @@ def check_transducers(
         watch: is told what is read next: "silence, outputs off", then "transducer 1 of 16" and so on.
 
     Raises:
-        ValueError: the link is not limited, the sensor does not give P finite magnitudes, or fewer than 1 readings.
+        ValueError: the link is not limited, the sensor does not give P finite magnitudes, or fewer than 1
+            readings.
         LimitError: the outputs were on for as long as they may.
         LinkError: the device does not take the bytes.
     """

@@ -57,7 +57,6 @@ def ended_by_signals() -> Iterator[None]:
         Signalled: there was such a signal.
         ValueError: it is used outside of the main thread, which alone hears signals.
     """
-
     outside = sys.exception()
 
     def end(number: int, _: FrameType | None) -> None:
@@ -205,7 +204,9 @@ class LimitedLink:
         if self._on_since is None:
             self._seconds_left()
             most = self.limits.seconds_in_a_row
-            raise LimitError(f"settling and reading took longer than the outputs may stay on, {most:g} s in a row")
+            raise LimitError(
+                f"settling and reading took longer than the outputs may stay on, {most:g} s in a row"
+            )
 
     def off(self) -> None:
         """Switch all outputs off, and begin the rest that the duty cycle asks for.

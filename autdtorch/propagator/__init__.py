@@ -20,7 +20,7 @@ from autdtorch.propagator.full import FullPropagator
 from autdtorch.propagator.stepper import KERNELS, make_kernel, precision_of
 from autdtorch.propagator.volume import volume_field
 from autdtorch.scene import Scene
-from autdtorch.validation import integer_at_least, positive, require_kind, require_one_of
+from autdtorch.validation import integer_at_least, invalid, positive, require_kind, require_one_of
 
 __all__ = [
     "BoxPropagator",

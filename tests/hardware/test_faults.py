@@ -227,6 +227,28 @@ def test_two_signals_at_once_end_the_trial_without_a_word_of_the_second(monkeypa
     assert not lost
 
 
+def test_after_a_signal_that_python_drops_the_next_ends_the_trial(monkeypatch):
+    class Dropping:
+        def __del__(self):
+            signal.raise_signal(signal.SIGTERM)
+
+    def trial() -> None:
+        with ended_by_signals():
+            Dropping()
+            signal.raise_signal(signal.SIGTERM)
+
+    dropped: list[object] = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda event: dropped.append(event.exc_type))
+    with pytest.raises(Signalled) as first:
+        trial()
+    assert dropped == [Signalled]
+    try:
+        raise first.value
+    except Signalled:  # what is handled around a trial does not count
+        with pytest.raises(Signalled):
+            trial()
+
+
 @pytest.mark.parametrize("handlers_set", [2, 7], ids=["begins", "ends"])  # of 6, and 6 as they were
 def test_a_signal_as_the_listening_begins_or_ends_leaves_the_handlers_as_they_were(monkeypatch, handlers_set):
     def set_and_interrupt(number, handler):

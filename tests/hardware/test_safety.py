@@ -9,6 +9,7 @@ import torch
 
 from autdtorch.hardware import (
     OPENMPD,
+    SONICSURFACE,
     EmulatedSensor,
     EvaluationLog,
     HardwareObjective,
@@ -18,6 +19,7 @@ from autdtorch.hardware import (
     LinkError,
     check_transducers,
     hears_silence,
+    open_link,
 )
 
 
@@ -104,6 +106,23 @@ def test_while_a_sensor_takes_too_long_the_outputs_go_off(trial, limits: Limits,
             objective(full_on())
         assert heard == [0.0]
         assert not objective.log.evaluations
+
+
+def test_while_the_sound_settles_the_timer_may_switch_off(trial):
+    def sleep(seconds: float) -> None:
+        if seconds == 0.2:
+            time.sleep(seconds)
+            heard.append(float(bench.drive().abs().max()))
+
+    heard: list[float] = []
+    bench = trial.bench()
+    bench.bus.sleep = sleep
+    with open_link(SONICSURFACE, range(16), backend=bench.bus, settle=0.2) as link:
+        limited = LimitedLink(link, Limits(1.0, seconds_in_a_row=0.02))
+        limited.play(full_on()[0])
+        assert heard == [0.0]
+        with pytest.raises(LimitError, match="settling and reading took longer"):
+            limited.require_on()
 
 
 def test_a_timer_of_an_earlier_link_does_not_reach_the_next(trial):
@@ -297,10 +316,44 @@ def test_a_chip_without_line_status_is_told_of(trial):
 def test_the_check_finds_the_dead_transducers(trial, snr):
     bench = trial.bench(dead=[3, 9])
     sensor = EmulatedSensor(bench, snr)
+    read: list[str] = []
     with trial.link(bench) as link:
-        check = check_transducers(LimitedLink(link, Limits(1.0)), sensor, points=2)
+        check = check_transducers(LimitedLink(link, Limits(1.0)), sensor, points=2, watch=read.append)
         assert check.dead == [3, 9]
+        assert read == ["silence, outputs off", *(f"transducer {n} of 16" for n in range(1, 17))]
         assert bench.firmware.drive().abs().max() == 0
         assert hears_silence(sensor, check, points=2)
         link.play(full_on()[0])
         assert not hears_silence(sensor, check, points=2)
+
+
+def test_what_is_20_db_below_the_others_is_dead_where_silence_is_read_as_0(trial):
+    class Leaking(EmulatedSensor):
+        leak = 0.0
+
+        def read(self):
+            return super().read() + self.leak * float(bench.firmware.drive().abs().max())
+
+    bench = trial.bench(dead=[3])
+    sensor = Leaking(bench)
+    typical = float(trial.simulated.transfer_matrix.abs().median())
+    with trial.link(bench) as link:
+        limited = LimitedLink(link, Limits(1.0))
+        for share, dead in ((0.05, [3]), (0.2, [])):  # of the amplitude; 20 dB are 0.1
+            sensor.leak = share * typical
+            check = check_transducers(limited, sensor, points=2)
+            assert check.silence == 0
+            assert check.dead == dead
+
+
+def test_a_check_during_which_the_outputs_went_off_is_none(trial):
+    class Slow(EmulatedSensor):
+        def read(self):
+            time.sleep(0.05)
+            return super().read()
+
+    bench = trial.bench()
+    with trial.link(bench) as link:
+        limited = LimitedLink(link, Limits(1.0, seconds_in_a_row=0.02))
+        with pytest.raises(LimitError, match=r"longer than .* 0\.02 s in a row"):
+            check_transducers(limited, Slow(bench), points=2, readings=1, background=1)

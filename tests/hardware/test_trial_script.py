@@ -109,7 +109,12 @@ def test_a_dry_run_shows_the_frames_and_leaves_nothing(run, tmp_path: Path, caps
         (("--transducers", "0-7"), 2, "--transducers: 8; must be 9, as many as the scene has"),
         (("--device", "emulated:openmpd", "--boards", "left.pat"), 2, "--boards: left.pat: no such file"),
         (("--device", "emulated:autd3", "--boards", "two"), 2, "--boards: two; must be the number of boards"),
-        (("--dead", "0-8"), 2, "the sensor hears no transducer"),
+        (
+            ("--dead", "0-8"),
+            2,
+            "hears no transducer: 0 Pa is the most, and must be above 0 Pa; check",
+        ),
+        (("--dead", "0-8", "--sensor", "scope"), 2, "and the sensor, and try a lower --loudest"),
         (("--scene", "nowhere"), 2, "--scene: nowhere: no such file; must be a YAML file, or one of homo"),
         (
             ("--device", "sonicsurface", "--sensor", "manual"),
@@ -225,12 +230,25 @@ def test_a_signal_speaks_of_the_device_only_once_it_was_opened(run, monkeypatch,
     assert caplog.messages[-1] == f"hardware_trial: SIGTERM{message}"
 
 
-def test_a_person_reads_each_transducer_and_the_silence_once(run, monkeypatch):
+@pytest.mark.parametrize("words", [(), ("--dry-run",)])
+def test_without_pyusb_an_emulated_trial_ends_with_the_hint(run, monkeypatch, caplog, words):
+    emulated = "autdtorch.hardware.emulat", "autdtorch.hardware.dry_run", "trial_"
+    for name in [name for name in sys.modules if name.startswith(emulated)]:
+        monkeypatch.delitem(sys.modules, name)
+    for name in ("usb", "usb.core", "usb.backend"):
+        monkeypatch.setitem(sys.modules, name, None)
+    assert run(*EMULATED, *words) == 2
+    assert "pip install 'autdtorch[hardware]'" in caplog.messages[-1]
+
+
+def test_a_person_reads_each_transducer_and_the_silence_once(run, monkeypatch, capsys, caplog):
     points, evaluations = 2, 1 + 8 * 4
     answers = io.StringIO("0\n" * points + "1\n" * points * (9 + evaluations + 1) + "0\n" * points)
     monkeypatch.setattr("sys.stdin", answers)
     assert run(*EMULATED, "--sensor", "manual") == 0
     assert not answers.read()
+    assert capsys.readouterr().out.count("Pressure at control point 1 of 2") == 1 + 9 + evaluations + 2
+    assert "pre-flight check: transducer 3 of 9" in caplog.messages
 
 
 def test_the_factor_between_simulation_and_bench_is_found():
