@@ -68,14 +68,14 @@ def check_transducers(
     require_kind("link", link, LimitedLink)
     readings = integer_at_least("readings", readings, 1)
     background = integer_at_least("background", background, 1)
-    watch = watch or str
-    watch("silence, outputs off")
+    tell = watch or (lambda _: None)
+    tell("silence, outputs off")
     silence = _power(sensor, points, background)
     count = len(link.link.transducers)
     powers = []
     try:
         for number, alone in enumerate(torch.eye(count, dtype=torch.complex128), start=1):
-            watch(f"transducer {number} of {count}")
+            tell(f"transducer {number} of {count}")
             link.play(alone)
             powers.append(_power(sensor, points, readings))
             link.require_on()

@@ -171,6 +171,8 @@ class LimitedLink:
     def play(self, drive: torch.Tensor) -> None:
         """Play a drive (M,), |q| <= 1, scaled to the limit, until the next, `off`, or the end of the time.
 
+        The time may end while the sound settles: `require_on` says so.
+
         Raises:
             LimitError: the outputs were on for as long as they may.
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
