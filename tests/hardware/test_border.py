@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from autdtorch.hardware import (
+    OPENMPD,
     EmulatedSensor,
     HardwareObjective,
     LimitedLink,
@@ -52,10 +53,9 @@ def test_another_kind_of_thing_is_refused_by_name(trial, use: Callable[..., obje
     ],
 )
 def test_a_drive_that_is_none_is_not_scaled_into_one_and_starts_no_clock(trial, drive, message: str):
-    bench = trial.bench()
-    with trial.link(bench) as link:
-        limited = LimitedLink(link, Limits(1.0))
-        limited._scale = 0.5  # as on a device that plays amplitudes
+    bench = trial.bench(OPENMPD)
+    with trial.link(bench, OPENMPD) as link:
+        limited = LimitedLink(link, Limits(0.5))
         with pytest.raises(ValueError, match=message):
             limited.play(drive)
         assert limited.seconds_on == 0
