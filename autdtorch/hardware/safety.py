@@ -14,12 +14,11 @@ from types import FrameType
 
 import torch
 
+from autdtorch.hardware.amplitude_scale import AmplitudeScale
 from autdtorch.hardware.link import Link
-from autdtorch.validation import integer_at_least, invalid, number_between, positive
+from autdtorch.validation import integer_at_least, number_between, positive
 
 logger = logging.getLogger(__name__)
-
-_CANDIDATES = 256  # amplitudes to choose from; more than a device here has
 
 # SIGTSTP, Ctrl-Z, would stop the process, and its timer, with the outputs on; so would SIGTTIN, where a trial
 # in the background of a shell asks somebody for a reading.
@@ -89,8 +88,8 @@ class Limits:
     """What a trial may ask of a device.
 
     Attributes:
-        amplitude: the most that a transducer is driven at, above 0 up to 1. Drives are scaled by it: a
-            method's |q| = 1 is this.
+        amplitude: the most that a transducer is driven at, above 0 up to 1. Drives are scaled: a method's
+            |q| = 1 is the largest amplitude within it that the device plays.
         evaluations: the most that a trial makes, those before it was interrupted included.
         seconds: the most that the outputs are on in all [s].
         seconds_in_a_row: the most that they are on without a rest [s].
@@ -137,7 +136,7 @@ class LimitedLink:
         """
         self.link = link
         self.limits = limits
-        self._scale = _largest_amplitude(link, limits.amplitude)
+        self._scale = AmplitudeScale(link.wiring, limits.amplitude)
         self._lock = threading.RLock()
         self._timer: threading.Timer | None = None
         self._on_since: float | None = None
@@ -186,7 +185,15 @@ class LimitedLink:
                 self._timer = threading.Timer(most, functools.partial(self._time_is_up, self._on_since))
                 self._timer.daemon = True
                 self._timer.start()
-            self.link.play(self._scale * drive)
+            self.link.play(self._scale.asked(drive))
+
+    def played(self, drive: torch.Tensor) -> torch.Tensor:
+        """What the device plays (..., M), in the scale of `play`, when asked for drives (..., M).
+
+        Raises:
+            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+        """
+        return self._scale.played(drive)
 
     def require_on(self) -> None:
         """Require that the outputs are on since `play`: otherwise what was read meanwhile is void.
@@ -247,17 +254,3 @@ class LimitedLink:
     def _raise_failure(self) -> None:
         if self._failure is not None:
             raise self._failure
-
-
-def _largest_amplitude(link: Link, limit: float) -> float:
-    """The largest amplitude that the device, on its levels, does not play above `limit`."""
-    if limit == 1:
-        return 1.0
-    asked = torch.arange(1, _CANDIDATES + 1).to(torch.complex128) / _CANDIDATES
-    played = torch.stack([link.played(amplitude.expand(len(link.transducers))) for amplitude in asked])
-    strongest = played.abs().amax(dim=1)
-    allowed = (strongest > 0) & (strongest <= limit)
-    if not allowed.any():
-        least = strongest[strongest > 0].min()
-        raise invalid("amplitude", limit, f"must be >= {least:.3g}, the least that {link.device.name} plays")
-    return float(asked[allowed].abs().max())

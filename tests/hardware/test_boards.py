@@ -43,7 +43,7 @@ def test_boards_of_files_play_the_drive_that_was_asked_for():
     with open_link(device, backend=bench.bus) as link:
         link.play(drive)
         torch.testing.assert_close(bench.pressure(), drive, rtol=0, atol=1e-12)  # rounding of the angles
-        torch.testing.assert_close(link.played(drive), drive, rtol=0, atol=1e-12)
+        torch.testing.assert_close(link.wiring.played(drive), drive, rtol=0, atol=1e-12)
     assert bench.drive().abs().max() == 0
 
 
