@@ -28,7 +28,7 @@ class Player(Protocol):
     """An objective that knows its device's levels, as a `HardwareObjective` does."""
 
     def played(self, drive: torch.Tensor) -> torch.Tensor:
-        """What the device plays (..., M) when asked for drives (..., M); asked for that, it plays the same."""
+        """What the device plays (..., M) when asked for drives (..., M), and when asked for that."""
         ...
 
 

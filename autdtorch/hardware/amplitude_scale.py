@@ -37,8 +37,10 @@ class AmplitudeScale:
         self.largest = float(self._most.max())
         if self.largest == 0:
             above = self._amplitudes((self._highest(0.0) + 2 * _FINEST).clamp(max=1))
-            least = f"must be >= {above[above > 0].min():.3g}, the least that {wiring.device.name} plays"
-            raise invalid("amplitude", limit, least)
+            least = torch.where(above > 0, above, torch.inf).min()
+            raise invalid(
+                "amplitude", limit, f"must be >= {least:.3g}, the least that {wiring.device.name} plays"
+            )
 
     def asked(self, drive: torch.Tensor) -> torch.Tensor:
         """What to ask of the device, in its own scale, for a trial's drive (M,).

@@ -30,8 +30,7 @@ class Link:
 
     Attributes:
         device: what hangs on the port.
-        wiring: which of the device's transducers play the drive (M,).
-        transducers: the same, int64.
+        transducers: which of the device's transducers play the drive (M,), int64.
         settle: how long a drive plays before `play` returns [s].
     """
 
@@ -64,8 +63,8 @@ class Link:
         self._lock = threading.RLock()
         self._open = True
         self.off()
-        self.wiring = Wiring(device, transducers)
-        self.transducers = self.wiring.transducers
+        self._wiring = Wiring(device, transducers)
+        self.transducers = self._wiring.transducers
         self.settle = not_negative("settle", settle, "s")
         atexit.register(self.close)
 
@@ -78,7 +77,7 @@ class Link:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
             LinkError: the device does not take the bytes, or was let go.
         """
-        frame = self.wiring.frame(drive)
+        frame = self._wiring.frame(drive)
         with self._lock:
             if not self._open:
                 raise LinkError(f"{self.device.name} was let go; open it anew")

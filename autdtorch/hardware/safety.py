@@ -16,6 +16,7 @@ import torch
 
 from autdtorch.hardware.amplitude_scale import AmplitudeScale
 from autdtorch.hardware.link import Link
+from autdtorch.hardware.wiring import Wiring
 from autdtorch.validation import integer_at_least, number_between, positive
 
 logger = logging.getLogger(__name__)
@@ -136,7 +137,7 @@ class LimitedLink:
         """
         self.link = link
         self.limits = limits
-        self._scale = AmplitudeScale(link.wiring, limits.amplitude)
+        self._scale = AmplitudeScale(Wiring(link.device, link.transducers), limits.amplitude)
         self._lock = threading.RLock()
         self._timer: threading.Timer | None = None
         self._on_since: float | None = None
