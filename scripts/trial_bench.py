@@ -15,7 +15,7 @@ from autdtorch import hardware
 from autdtorch.cache import digest_of
 from autdtorch.conditions import random_rms
 from autdtorch.hardware.autd3 import autd3_device
-from autdtorch.hardware.link import wiring
+from autdtorch.hardware.wiring import places
 
 DEVICES = ("sonicsurface", "openmpd", "ultraino", "autd3")
 _USUAL = "emulated"
@@ -67,7 +67,7 @@ def wired_device(options: argparse.Namespace, count: int) -> tuple[hardware.Devi
         raise ValueError(f"--transducers: {len(chosen)}; must be {count}, as many as the scene has")
     if max(options.dead, default=0) >= count:
         raise ValueError(f"--dead: {max(options.dead)}; must be 0 to {count - 1}, as the scene has them")
-    return device, wiring(chosen, device.transducers).tolist()
+    return device, places(chosen, device.transducers).tolist()
 
 
 def bench_of(

@@ -65,7 +65,7 @@ class Trial:
         device, transducers = wired_device(options, len(self._scene.array))
         simulated = at.SimulatedObjective(self._scene, at.make_propagator(self._scene))
         self._bench = bench_of(options, device, transducers, simulated)
-        self._simulated = at.Quantised(simulated, **self._bench.device.quantised)
+        self._simulated = hardware.Played(simulated, device, transducers, self._limits.amplitude)
         self._expected = self._method(self._simulated)
 
     def run(self, command: str) -> None:
@@ -105,7 +105,7 @@ class Trial:
             if objective.log.evaluations:
                 logging.info("going on after %d evaluations", len(objective.log.evaluations))
             preflight = self._preflight(limited, sensor, progress)
-            found = self._method(at.Quantised(objective, **bench.device.quantised))
+            found = self._method(objective)
             points = len(self._scene.control_points)
             progress.begin("the drive that was found, once more")
             limited.play(found.drive[0])

@@ -6,6 +6,7 @@ from .emulator import EmulatedBench, EmulatedSensor
 from .link import Link, open_link
 from .log import Evaluation, EvaluationLog
 from .objective import HardwareObjective
+from .played import Played
 from .preflight import Preflight, check_transducers, hears_silence
 from .safety import LimitedLink, LimitError, Limits, Signalled, ended_by_signals
 from .scope import Microphone, Oscilloscope, ScopeSensor, open_scope
@@ -39,6 +40,7 @@ __all__ = [
     "Microphone",
     "MovedMicrophone",
     "Oscilloscope",
+    "Played",
     "Port",
     "Preflight",
     "ScopeSensor",

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 
@@ -20,9 +19,6 @@ from autdtorch.hardware.frames import (
     ultraino_frame,
 )
 from autdtorch.hardware.levels import (
-    OPENMPD_PHASES,
-    SONICSURFACE_PHASES,
-    ULTRAINO_PHASES,
     openmpd_drive,
     openmpd_levels,
     sonicsurface_drive,
@@ -51,7 +47,6 @@ class Device:
         transducers: their number N.
         frame: bytes for a drive (N,), |q| <= 1, on the nearest levels. All zeros switch the outputs off.
         played: the drive (N,) that a frame has the device play.
-        quantised: the device as settings of `Quantised`.
         baud: of its serial line [bits/s]; None if it has none.
         serials: number of the chip of each of its boards, which share the frame evenly; None takes any.
     """
@@ -61,7 +56,6 @@ class Device:
     transducers: int
     frame: Callable[[torch.Tensor], bytes]
     played: Callable[[bytes], torch.Tensor]
-    quantised: Mapping[str, Any]
     baud: int | None = None
     serials: tuple[str | None, ...] = (None,)
 
@@ -128,10 +122,9 @@ def openmpd_boards(boards: Sequence[OpenMPDBoard]) -> Device:
 
 
 def _heard(board: OpenMPDBoard, message: bytes) -> torch.Tensor:
-    """The drive (256,) that a calibrated board makes of a message; rounding may not take it above 1."""
+    """The drive (256,) that a calibrated board makes of a message; rounding may take it above 1."""
     sent = _openmpd_played(message)[torch.tensor(board.pins)]
-    heard = torch.where(sent == 0, sent, sent / board.calibrated(torch.ones(BOARD, dtype=sent.dtype)))
-    return heard / heard.abs().clamp(min=1)
+    return torch.where(sent == 0, sent, sent / board.calibrated(torch.ones(BOARD, dtype=sent.dtype)))
 
 
 def ultraino_boards(boards: int = 1) -> Device:
@@ -151,7 +144,6 @@ def ultraino_boards(boards: int = 1) -> Device:
         transducers=ULTRAINO_BOARD * boards,
         frame=_ultraino,
         played=_ultraino_played,
-        quantised={"levels": ULTRAINO_PHASES},
         baud=ULTRAINO_BAUD,
     )
 
@@ -163,7 +155,6 @@ SONICSURFACE = Device(
     transducers=BOARD,
     frame=_sonicsurface,
     played=_sonicsurface_played,
-    quantised={"levels": SONICSURFACE_PHASES, "on_off": True},
     baud=SONICSURFACE_BAUD,
 )
 
@@ -174,7 +165,6 @@ OPENMPD = Device(
     transducers=BOARD,
     frame=_openmpd,
     played=_openmpd_played,
-    quantised={"levels": OPENMPD_PHASES},
 )
 
 #: One board Mega-64: 10 phases, 5 amplitudes.

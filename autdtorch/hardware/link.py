@@ -12,10 +12,10 @@ from typing import Any, Self
 
 import torch
 
-from autdtorch.drive import validate_drive
 from autdtorch.hardware.devices import Device
 from autdtorch.hardware.usb import LinkError, Port, find_device
-from autdtorch.validation import integer_at_least, invalid, not_negative, require_kind
+from autdtorch.hardware.wiring import Wiring
+from autdtorch.validation import invalid, not_negative, require_kind
 
 #: Default settle time [s]. Sound goes 1.7 m in it; a T4010A1 rings up in some 30 periods, 0.75 ms, as the
 #: emulator of AUTD3's kit models it.
@@ -63,7 +63,8 @@ class Link:
         self._lock = threading.RLock()
         self._open = True
         self.off()
-        self.transducers = wiring(transducers, device.transducers)
+        self._wiring = Wiring(device, transducers)
+        self.transducers = self._wiring.transducers
         self.settle = not_negative("settle", settle, "s")
         atexit.register(self.close)
 
@@ -86,7 +87,7 @@ class Link:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
             LinkError: the device does not take the bytes, or was let go.
         """
-        frame = self._frame(drive)
+        frame = self._wiring.frame(drive)
         with self._lock:
             if not self._open:
                 raise LinkError(f"{self.device.name} was let go; open it anew")
@@ -95,14 +96,6 @@ class Link:
     def wait_for_sound(self) -> None:
         """Wait for the settle time; other threads may switch the outputs off meanwhile."""
         self._sleep(self.settle)
-
-    def played(self, drive: torch.Tensor) -> torch.Tensor:
-        """What the device is sent to play when asked for a drive (M,): the nearest on its levels.
-
-        Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-        """
-        return self.device.played(self._frame(drive))[self.transducers]
 
     def off(self) -> None:
         """Switch all outputs of the device off; once it was let go they are.
@@ -167,11 +160,6 @@ class Link:
         self._open = False
         atexit.unregister(self.close)
         self._port.close()
-
-    def _frame(self, drive: torch.Tensor) -> bytes:
-        everyone = torch.zeros(self.device.transducers, dtype=torch.complex128)
-        everyone[self.transducers] = single_drive(drive, len(self.transducers))
-        return self.device.frame(everyone)
 
     def _send(self, frame: bytes) -> None:
         self._port.write(frame)
@@ -278,31 +266,3 @@ def _each(do: Callable[[Port, Any], None], ports: Sequence[Port], things: Sequen
             errors.append(error)
     if errors:
         raise errors[0]
-
-
-def single_drive(drive: torch.Tensor, transducers: int) -> torch.Tensor:
-    """`drive` (M,) as complex128, after checking that an array of M `transducers` can play it.
-
-    Raises:
-        ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-    """
-    checked = validate_drive(drive, transducers)
-    if checked.ndim != 1:
-        raise ValueError(f"drive: shape {tuple(checked.shape)}; must be ({transducers},), one drive")
-    return checked
-
-
-def wiring(transducers: Sequence[int] | torch.Tensor | None, count: int) -> torch.Tensor:
-    """Which of a device's `count` transducers play a scene's (M,), int64.
-
-    Raises:
-        ValueError: transducers that the device does not have, or one twice.
-    """
-    if transducers is None:
-        return torch.arange(count)
-    if isinstance(transducers, torch.Tensor):  # its elements are no Integral
-        transducers = transducers.tolist()
-    chosen = [integer_at_least(f"transducers[{place}]", one, 0) for place, one in enumerate(transducers)]
-    if not chosen or len(set(chosen)) < len(chosen) or max(chosen) >= count:
-        raise invalid("transducers", chosen, f"must be indices from 0 to {count - 1}, each once")
-    return torch.tensor(chosen)

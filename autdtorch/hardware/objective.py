@@ -21,8 +21,8 @@ from autdtorch.validation import invalid, require_kind
 class HardwareObjective:
     """An objective whose observations are measured, one drive after the other.
 
-    The device plays the nearest drive on its levels. To have a `Solution` hold what was played, wrap it as a
-    simulated one: ``Quantised(objective, **link.device.quantised)``.
+    The device plays the nearest drive on its levels: that is what a `Solution` holds. The log holds what was
+    asked for.
 
     A trial that was interrupted goes on where its log ends: run the same method with the same seed again, and
     it is given what the log holds, without playing it once more. The outputs are off while a method thinks.
@@ -110,6 +110,14 @@ class HardwareObjective:
             return torch.stack([self._evaluate(row) for row in drives])
         finally:
             self._link.off()
+
+    def played(self, drive: torch.Tensor) -> torch.Tensor:
+        """What the device plays (..., M) when asked for drives (..., M); 1 is the most that the limit allows.
+
+        Raises:
+            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+        """
+        return self._link.played(drive)
 
     def _evaluate(self, drive: torch.Tensor) -> torch.Tensor:
         most = self._link.limits.evaluations

@@ -15,12 +15,12 @@ from types import FrameType
 
 import torch
 
-from autdtorch.hardware.link import Link, single_drive
-from autdtorch.validation import integer_at_least, invalid, number_between, positive, require_kind
+from autdtorch.hardware.amplitude_scale import AmplitudeScale
+from autdtorch.hardware.link import Link
+from autdtorch.hardware.wiring import Wiring
+from autdtorch.validation import integer_at_least, number_between, positive, require_kind
 
 logger = logging.getLogger(__name__)
-
-_CANDIDATES = 256  # amplitudes to choose from; more than a device here has
 
 # SIGTSTP, Ctrl-Z, would stop the process, and its timer, with the outputs on; so would SIGTTIN, where a trial
 # in the background of a shell asks somebody for a reading.
@@ -90,8 +90,8 @@ class Limits:
     """What a trial may ask of a device.
 
     Attributes:
-        amplitude: the most that a transducer is driven at, above 0 up to 1. Drives are scaled by it: a
-            method's |q| = 1 is this.
+        amplitude: the most that a transducer is driven at, above 0 up to 1. Drives are scaled: a method's
+            |q| = 1 is the largest amplitude within it that the device plays.
         evaluations: the most that a trial makes, those before it was interrupted included.
         seconds: the most that the outputs are on in all [s].
         seconds_in_a_row: the most that they are on without a rest [s].
@@ -140,7 +140,7 @@ class LimitedLink:
         require_kind("limits", limits, Limits)
         self.link = link
         self.limits = limits
-        self._scale = _largest_amplitude(link, limits.amplitude)
+        self._scale = AmplitudeScale(Wiring(link.device, link.transducers), limits.amplitude)
         self._lock = threading.RLock()
         self._timer: threading.Timer | None = None
         self._on_since: float | None = None
@@ -178,7 +178,7 @@ class LimitedLink:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
             LinkError: the device does not take the bytes.
         """
-        scaled = self._scale * single_drive(drive, len(self.link.transducers))
+        asked = self._scale.asked(drive)
         if self._stretch() > self.limits.seconds_in_a_row / 2:  # leave the other half to the sensor
             self.off()
         if self._on_since is None:
@@ -192,8 +192,16 @@ class LimitedLink:
                 self._timer = threading.Timer(most, functools.partial(self._time_is_up, self._on_since))
                 self._timer.daemon = True
                 self._timer.start()
-            self.link.begin(scaled)
+            self.link.begin(asked)
         self.link.wait_for_sound()  # without the lock, which the timer needs
+
+    def played(self, drive: torch.Tensor) -> torch.Tensor:
+        """What the device plays (..., M), in the scale of `play`, when asked for drives (..., M).
+
+        Raises:
+            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+        """
+        return self._scale.played(drive)
 
     def require_on(self) -> None:
         """Require that the outputs are on since `play`: otherwise what was read meanwhile is void.
@@ -256,17 +264,3 @@ class LimitedLink:
     def _raise_failure(self) -> None:
         if self._failure is not None:
             raise self._failure
-
-
-def _largest_amplitude(link: Link, limit: float) -> float:
-    """The largest amplitude that the device, on its levels, does not play above `limit`."""
-    if limit == 1:
-        return 1.0
-    asked = torch.arange(1, _CANDIDATES + 1).to(torch.complex128) / _CANDIDATES
-    played = torch.stack([link.played(amplitude.expand(len(link.transducers))) for amplitude in asked])
-    strongest = played.abs().amax(dim=1)
-    allowed = (strongest > 0) & (strongest <= limit)
-    if not allowed.any():
-        least = strongest[strongest > 0].min()
-        raise invalid("amplitude", limit, f"must be >= {least:.3g}, the least that {link.device.name} plays")
-    return float(asked[allowed].abs().max())

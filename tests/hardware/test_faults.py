@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from autdtorch.conditions import Quantised
 from autdtorch.hardware import (
     OPENMPD,
     SONICSURFACE,
@@ -52,7 +51,7 @@ class Counting(EmulatedSensor):
 
 def measure(trial, bench: EmulatedBench, sensor: Sensor, device: Device = SONICSURFACE) -> Solution:
     with ended_by_signals(), trial.link(bench, device) as link:
-        return METHOD(Quantised(trial.objective(link, sensor), **device.quantised))
+        return METHOD(trial.objective(link, sensor))
 
 
 def bytes_before(device: Device, evaluations: int) -> int:
@@ -68,7 +67,7 @@ def require_that_it_goes_on(trial, device: Device = SONICSURFACE) -> None:
     sensor = Counting(bench)
     found = measure(trial, bench, sensor, device)
     assert sensor.readings == EVALUATIONS - SURVIVED
-    expected = METHOD(Quantised(trial.simulated, **device.quantised))
+    expected = METHOD(trial.played(device))
     assert torch.equal(found.drive, expected.drive)
     torch.testing.assert_close(found.history, expected.history, rtol=1e-12, atol=0)  # another order of sums
 
