@@ -28,7 +28,7 @@ class Player(Protocol):
     """An objective that knows its device's levels, as a `HardwareObjective` does."""
 
     def played(self, drive: torch.Tensor) -> torch.Tensor:
-        """What the device plays (..., M) when asked for drives (..., M), and when asked for that."""
+        """What the device plays (..., M) when asked for drives (..., M); asked for that, it plays that."""
         ...
 
 
@@ -67,7 +67,7 @@ class Condition:
         return pressure
 
     def played(self, drive: torch.Tensor) -> torch.Tensor:
-        """What is known beforehand of `emitted`, of drives (..., M): a `Solution` holds that."""
+        """What of `emitted` is known beforehand, for drives (..., M): a `Solution` holds that."""
         return drive
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:

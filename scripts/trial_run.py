@@ -66,6 +66,7 @@ class Trial:
         simulated = at.SimulatedObjective(self._scene, at.make_propagator(self._scene))
         self._bench = bench_of(options, device, transducers, simulated)
         self._simulated = hardware.Played(simulated, device, transducers, self._limits.amplitude)
+        self._settings["largest amplitude"] = round(self._simulated.largest, 4)
         self._expected = self._method(self._simulated)
 
     def run(self, command: str) -> None:

@@ -1,4 +1,4 @@
-"""An objective that a device plays to, and nothing else of the device: for the simulation of a trial."""
+"""What a device plays of a drive, around any objective: for the simulation of a trial."""
 
 from __future__ import annotations
 
@@ -15,10 +15,13 @@ from autdtorch.validation import invalid
 
 
 class Played(Condition):
-    """What is asked for is rounded as a device rounds it: phases and amplitudes, calibrated, within a limit.
+    """A device that plays the nearest of its levels, as it is calibrated, within the limit of a trial.
 
-    A method sees in `Played(SimulatedObjective(...), device, ...)` what it would see in a `HardwareObjective`
-    without noise, but for the pressure's scale, and finds the very same drive.
+    What a method observes in ``Played(SimulatedObjective(...), device)`` is what it observes in a
+    `HardwareObjective` without noise, but for the pressures' scale, and it finds the very same drive.
+
+    Attributes:
+        largest: the amplitude of the device that is |q| = 1: its highest level within the limit.
     """
 
     def __init__(
@@ -48,6 +51,7 @@ class Played(Condition):
                 "transducers", len(wiring.transducers), f"must be {count}, as many as the scene has"
             )
         self._scale = AmplitudeScale(wiring, amplitude)
+        self.largest = self._scale.largest
         super().__init__(objective)
 
     def played(self, drive: torch.Tensor) -> torch.Tensor:
