@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
+from pathlib import Path
 from types import FrameType
 
 import torch
@@ -123,6 +124,7 @@ class LimitedLink:
     Attributes:
         link: what plays.
         limits: of what is played.
+        logs: of the trials that it plays for; the time on that each began with is counted.
     """
 
     def __init__(self, link: Link, limits: Limits) -> None:
@@ -137,6 +139,7 @@ class LimitedLink:
         """
         self.link = link
         self.limits = limits
+        self.logs: set[Path] = set()
         self._scale = _largest_amplitude(link, limits.amplitude)
         self._lock = threading.RLock()
         self._timer: threading.Timer | None = None
