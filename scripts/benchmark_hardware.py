@@ -90,7 +90,7 @@ def measure(
     transducers = range(len(simulated.scene.array))
     bench = hardware.EmulatedBench(device, simulated.transfer_matrix, transducers)
     with (
-        tempfile.TemporaryDirectory() as folder,
+        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder,
         sensor(bench, simulated.scene, seed) as opened,
         hardware.open_link(device, transducers, backend=bench.bus) as link,
     ):

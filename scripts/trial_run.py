@@ -37,7 +37,7 @@ class Trial:
     """A trial that was simulated; `run` plays it.
 
     Attributes:
-        opened: whether the device was opened.
+        begun: whether the device was opened, and the log is the trial's.
     """
 
     def __init__(self, options: argparse.Namespace) -> None:
@@ -61,7 +61,7 @@ class Trial:
         self._method = method_of(options.method, method_settings, options.seed)
         self._folder = options.output or Path("outputs") / f"hardware_{path.stem}_{options.method}"
         self._dry = options.dry_run
-        self.opened = False
+        self.begun = False
         device, transducers = wired_device(options, len(self._scene.array))
         simulated = at.SimulatedObjective(self._scene, at.make_propagator(self._scene))
         self._bench = bench_of(options, device, transducers, simulated)
@@ -91,16 +91,17 @@ class Trial:
         """Check the transducers, run the method on the device, and read what it found once more (R, P)."""
         bench = self._bench
         with (
+            hardware.lock_log(log),  # before a device is touched that plays for another trial
             bench.sensor() as sensor,
             bench.link() as link,
             show_progress(self._expected.history.shape[1]) as progress,
             contextlib.ExitStack() as at_the_end,
         ):
-            self.opened = not self._dry
             limited = hardware.LimitedLink(link, self._limits)
             objective = hardware.HardwareObjective(
                 self._scene, limited, sensor, log, self._settings, watcher(progress)
             )
+            self.begun = not self._dry
             at_the_end.callback(lambda: objective.log.end(limited.seconds_on))
             at_the_end.callback(limited.off)
             if objective.log.evaluations:

@@ -22,6 +22,10 @@ from autdtorch.validation import invalid, not_negative, require_kind
 SETTLE = 5e-3
 
 
+class OffError(LinkError):
+    """A device was not switched off: its outputs may still be on."""
+
+
 class Link:
     """A device at the end of a port: `play` a drive, and it plays until the next, or until `off`.
 
@@ -121,7 +125,7 @@ class Link:
                 self._port.recover()
             self._send_silence()
         except LinkError as error:
-            raise LinkError(f"{error}; the outputs may still be on: switch the device's power off") from error
+            raise OffError(f"{error}; the outputs may still be on: switch the device's power off") from error
 
     def _send_silence(self) -> None:
         silence = self.device.frame(torch.zeros(self.device.transducers, dtype=torch.complex128))

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
+from pathlib import Path
 from types import FrameType
 
 import torch
@@ -124,6 +125,7 @@ class LimitedLink:
     Attributes:
         link: what plays.
         limits: of what is played.
+        logs: of the trials that it plays for; the time on that each began with is counted.
     """
 
     def __init__(self, link: Link, limits: Limits) -> None:
@@ -140,6 +142,7 @@ class LimitedLink:
         require_kind("limits", limits, Limits)
         self.link = link
         self.limits = limits
+        self.logs: set[Path] = set()
         self._scale = AmplitudeScale(Wiring(link.device, link.transducers), limits.amplitude)
         self._lock = threading.RLock()
         self._timer: threading.Timer | None = None

@@ -1,5 +1,6 @@
 """The script of a trial: what it leaves and shows, and how it ends."""
 
+import errno
 import io
 import logging
 import math
@@ -18,6 +19,7 @@ import trial_values
 
 from autdtorch.array import TransducerArray
 from autdtorch.drive_file import load_drive
+from autdtorch.hardware import LinkError, OffError
 from autdtorch.hardware_report import compare
 from autdtorch.optim.gabs import gabs
 from autdtorch.scene_file import load_scene
@@ -67,6 +69,7 @@ def test_a_trial_leaves_log_drive_and_report_and_is_not_repeated(run, tmp_path: 
 
     assert run(*EMULATED) == 2
     assert "of another trial, whose dead is [4], not []" in caplog.text
+    assert caplog.messages[-1].endswith("or another log (--output)")
 
 
 def test_without_noise_the_report_says_that_it_is_the_simulation(run, tmp_path: Path):
@@ -239,6 +242,24 @@ def test_without_pyusb_an_emulated_trial_ends_with_the_hint(run, monkeypatch, ca
         monkeypatch.setitem(sys.modules, name, None)
     assert run(*EMULATED, *words) == 2
     assert "pip install 'autdtorch[hardware]'" in caplog.messages[-1]
+
+
+@pytest.mark.parametrize("left_on", [False, True])
+def test_an_error_in_mid_trial_says_that_the_outputs_are_off_if_they_are(run, monkeypatch, caplog, left_on):
+    def failing(objective, **_: object):
+        if simulated:
+            error = OSError(errno.ENOSPC, "No space left on device", "there.jsonl")
+            error.__context__ = OffError("stall") if left_on else LinkError("stall")
+            raise error
+        simulated.append(True)
+        return gabs(objective)
+
+    simulated: list[bool] = []
+    monkeypatch.setitem(trial_run.METHODS, "gabs", failing)
+    assert run("--device", "emulated", "--method", "gabs", "--amplitude-limit", "1") == 2
+    off = ": the outputs are off, and the same command goes on where the log ends"
+    expected = f"hardware_trial: [Errno 28] No space left on device: 'there.jsonl'{'' if left_on else off}"
+    assert caplog.messages[-1] == expected
 
 
 def test_a_person_reads_each_transducer_and_the_silence_once(run, monkeypatch, capsys, caplog):
