@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -20,6 +21,15 @@ from autdtorch.scene import Scene
 from autdtorch.validation import finite_number, integer_at_least, invalid, not_negative, positive
 
 _PER = 1000  # Evaluations over which the rms of a drift is stated.
+
+
+@runtime_checkable
+class Player(Protocol):
+    """An objective that knows its device's levels, as a `HardwareObjective` does."""
+
+    def played(self, drive: torch.Tensor) -> torch.Tensor:
+        """What the device plays (..., M) when asked for drives (..., M); asked for that, it plays that."""
+        ...
 
 
 class Condition:
@@ -56,9 +66,13 @@ class Condition:
         self.evaluations += len(drive)
         return pressure
 
+    def played(self, drive: torch.Tensor) -> torch.Tensor:
+        """What of `emitted` is known beforehand, for drives (..., M): a `Solution` holds that."""
+        return drive
+
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:
         """What is asked of `inner` now, when drives (B, M) are asked of this."""
-        return drive
+        return self.played(drive)
 
     def _observe(self, drive: torch.Tensor) -> torch.Tensor:
         return self.inner(self.emitted(drive))
@@ -88,8 +102,8 @@ class Quantised(Condition):
         self.on_off = on_off
         super().__init__(objective)
 
-    def emitted(self, drive: torch.Tensor) -> torch.Tensor:
-        """The nearest drives (B, M) that the device can play."""
+    def played(self, drive: torch.Tensor) -> torch.Tensor:
+        """The nearest drives (..., M) that the device can play."""
         step = 2 * math.pi / self.levels
         phases = (phases_of(drive) / step).round() % self.levels * step
         amplitudes = amplitudes_of(drive).clamp_max(1)  # above 1 by rounding alone
@@ -235,12 +249,11 @@ def true_pressure(objective: Objective, drive: torch.Tensor) -> torch.Tensor:
 
 
 def playable(objective: Objective, drive: torch.Tensor) -> torch.Tensor:
-    """The drives (B, M) that the device is known to play when asked for `drive`: on its levels."""
+    """The drives (..., M) that the device is known to play when asked for `drive`: on its levels."""
     while isinstance(objective, Condition):
-        if isinstance(objective, Quantised):
-            drive = objective.emitted(drive)
+        drive = objective.played(drive)
         objective = objective.inner
-    return drive
+    return objective.played(drive) if isinstance(objective, Player) else drive
 
 
 def random_rms(matrix: torch.Tensor) -> float:

@@ -18,7 +18,7 @@ from autdtorch.objective import Objective
 from autdtorch.optim.base import Solution
 from autdtorch.plot import plot_convergence
 from autdtorch.report_tables import table
-from autdtorch.writing import replace_file
+from autdtorch.writing import naming, replace_file
 
 REPORT_FILE = "report.md"
 _FIGURE = "convergence.png"
@@ -127,7 +127,8 @@ def write_hardware_report(
     measured, there = torch.stack([one.pressure for one in evaluations]), simulated(heard * drives)
     fit = compare(measured, there)
     histories = {"bench": found.history, "simulation": fit.scale * expected.history}
-    plot_convergence({scene.name or "scene": histories}).savefig(folder / _FIGURE)
+    with naming(folder / _FIGURE):
+        plot_convergence({scene.name or "scene": histories}).savefig(folder / _FIGURE)
     same = torch.isclose(found.drive, expected.drive, rtol=0, atol=1e-9)
     mean = again.mean(dim=0)
     pressures = found.pressure[0], mean, fit.scale * simulated(heard * found.drive)[0]

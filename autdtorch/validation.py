@@ -101,6 +101,17 @@ def require_one_of(name: str, value: object, accepted: tuple[str, ...]) -> None:
         raise invalid(name, value, f"must be one of {', '.join(accepted)}")
 
 
+def require_kind(name: str, value: object, kind: type) -> None:
+    """Check that `value` is of a class of ours.
+
+    Raises:
+        ValueError: it is not.
+    """
+    if not isinstance(value, kind):
+        article = "an" if kind.__name__[0] in "AEIOU" else "a"
+        raise invalid(name, value, f"must be {article} {kind.__name__}")
+
+
 def positive_integers(name: str, value: object, count: int) -> tuple[int, ...]:
     """`value` as `count` integers >= 1.
 

@@ -90,7 +90,7 @@ def measure(
     transducers = range(len(simulated.scene.array))
     bench = hardware.EmulatedBench(device, simulated.transfer_matrix, transducers)
     with (
-        tempfile.TemporaryDirectory() as folder,
+        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder,
         sensor(bench, simulated.scene, seed) as opened,
         hardware.open_link(device, transducers, backend=bench.bus) as link,
     ):
@@ -98,7 +98,7 @@ def measure(
         log = Path(folder) / "trial.jsonl"
         objective = hardware.HardwareObjective(simulated.scene, limited, opened, log)
         begin, slept = time.perf_counter(), bench.bus.slept
-        found = method(at.Quantised(objective, **device.quantised))
+        found = method(objective)
         return Trial(found, time.perf_counter() - begin, bench.bus.slept - slept)
 
 
@@ -107,7 +107,7 @@ def same_drives(simulated: at.SimulatedObjective, device: hardware.Device, name:
     same, foci = 0, []
     for seed in SEEDS:
         method = partial(METHODS[name], seed=seed)
-        expected = method(at.Quantised(simulated, **device.quantised))
+        expected = method(hardware.Played(simulated, device, range(len(simulated.scene.array))))
         foci.append(float(expected.pressure.min()))
         found = measure(simulated, device, noiseless, method, seed).found
         same += torch.allclose(found.drive, expected.drive, rtol=0, atol=1e-9)
@@ -118,7 +118,7 @@ def with_noise(
     simulated: at.SimulatedObjective, device: hardware.Device, sensor: Sensor, name: str
 ) -> list[str]:
     """A row of the table of what noise costs."""
-    on_levels = at.Quantised(simulated, **device.quantised)
+    on_levels = hardware.Played(simulated, device, range(len(simulated.scene.array)))
     deviations = []
     for seed in SEEDS:
         method = partial(METHODS[name], seed=seed)

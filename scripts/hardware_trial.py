@@ -36,19 +36,41 @@ def _run() -> int:
         with hardware.ended_by_signals():
             trial = Trial(options)
             trial.run(shlex.join(["python", *sys.argv]))
-    except hardware.Signalled as signalled:
-        goes_on = ": the outputs are off, and the same command goes on where the log ends"
-        opened = trial is not None and trial.opened
-        return _end(128 + signalled.number, f"{signalled}{goes_on if opened else ''}")
-    except hardware.LimitError as error:
-        return _end(_LIMITED, f"{error}: the outputs are off; a higher limit goes on from here")
-    except (ValueError, OSError, ImportError) as error:
-        return _end(_REFUSED, str(error))
-    except Exception as error:
-        where = traceback.extract_tb(error.__traceback__)[-1]
-        place = f"{os.path.relpath(where.filename)}, line {where.lineno}, in {where.name}"
-        return _end(_FAILED, f"{type(error).__name__}: {error} ({place})")
+    except (Exception, hardware.Signalled) as error:
+        status, text, then = _described(error)
+        if trial is not None and trial.begun and not _left_on(error):
+            text += f": the outputs are off{then}"
+        return _end(status, text)
     return 0
+
+
+def _described(error: BaseException) -> tuple[int, str, str]:
+    """Status, what happened, and how the trial goes on."""
+    from autdtorch import hardware
+
+    same = ", and the same command goes on where the log ends"
+    match error:
+        case hardware.Signalled():
+            return 128 + error.number, str(error), same
+        case hardware.LimitError():
+            return _LIMITED, str(error), "; a higher limit goes on from here"
+        case hardware.LogError():
+            return _REFUSED, f"{error} (--output)", ""
+        case ValueError() | OSError() | ImportError():
+            return _REFUSED, str(error), same
+        case _:
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            place = f"{os.path.relpath(where.filename)}, line {where.lineno}, in {where.name}"
+            return _FAILED, f"{type(error).__name__}: {error} ({place})", same
+
+
+def _left_on(error: BaseException | None) -> bool:
+    """Whether a device may play on: of that error, or of one that it came after."""
+    from autdtorch import hardware
+
+    while error is not None and not isinstance(error, hardware.OffError):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def _end(status: int, text: str) -> int:

@@ -15,9 +15,7 @@ from autdtorch import hardware
 from autdtorch.cache import digest_of
 from autdtorch.conditions import random_rms
 from autdtorch.hardware.autd3 import autd3_device
-from autdtorch.hardware.dry_run import DryPort
-from autdtorch.hardware.emulated_autd3 import EmulatedAutd3Port
-from autdtorch.hardware.link import wiring
+from autdtorch.hardware.wiring import places
 
 DEVICES = ("sonicsurface", "openmpd", "ultraino", "autd3")
 _USUAL = "emulated"
@@ -69,7 +67,7 @@ def wired_device(options: argparse.Namespace, count: int) -> tuple[hardware.Devi
         raise ValueError(f"--transducers: {len(chosen)}; must be {count}, as many as the scene has")
     if max(options.dead, default=0) >= count:
         raise ValueError(f"--dead: {max(options.dead)}; must be 0 to {count - 1}, as the scene has them")
-    return device, wiring(chosen, device.transducers).tolist()
+    return device, places(chosen, device.transducers).tolist()
 
 
 def bench_of(
@@ -151,9 +149,14 @@ def _link(
         if on_network:
             return hardware.open_autd3(_board_count(options), transducers, _network(options.network))
         return hardware.open_link(device, transducers, options.serial)
+    # Imported here, as both need pyusb: without it, no more than its hint is to be shown.
     if options.dry_run:
+        from autdtorch.hardware.dry_run import DryPort
+
         port: hardware.Port = DryPort(bench, device, print)
     elif on_network:
+        from autdtorch.hardware.emulated_autd3 import EmulatedAutd3Port
+
         port = EmulatedAutd3Port(_board_count(options), bench)
     else:
         return hardware.open_link(device, transducers, backend=bench.bus)
@@ -187,7 +190,7 @@ def _sensor(options: argparse.Namespace, scene: at.Scene, bench: hardware.Emulat
         case "emulated":
             yield hardware.EmulatedSensor(bench, options.snr, options.seed)
         case "manual":
-            yield hardware.ManualSensor(points)
+            yield hardware.ManualSensor(points, _ask)
         case "file":
             if options.readings_file is None:
                 raise ValueError("--readings-file: none; must be the file of the readings")
@@ -199,7 +202,12 @@ def _sensor(options: argparse.Namespace, scene: at.Scene, bench: hardware.Emulat
                     hardware.Microphone(number, options.sensitivity, options.loudest) for number in inputs
                 ]
                 sensor = hardware.ScopeSensor(scope, scene.frequency, microphones, options.captures)
-                yield hardware.MovedMicrophone(sensor, points) if options.moved else sensor
+                yield hardware.MovedMicrophone(sensor, points, _ask) if options.moved else sensor
+
+
+def _ask(question: str) -> str:
+    """Below the bar of the progress, which says what is played."""
+    return input(f"\n{question}")
 
 
 def _scope(

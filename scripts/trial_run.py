@@ -37,7 +37,7 @@ class Trial:
     """A trial that was simulated; `run` plays it.
 
     Attributes:
-        opened: whether the device was opened.
+        begun: whether the device was opened, and the log is the trial's.
     """
 
     def __init__(self, options: argparse.Namespace) -> None:
@@ -61,11 +61,12 @@ class Trial:
         self._method = method_of(options.method, method_settings, options.seed)
         self._folder = options.output or Path("outputs") / f"hardware_{path.stem}_{options.method}"
         self._dry = options.dry_run
-        self.opened = False
+        self.begun = False
         device, transducers = wired_device(options, len(self._scene.array))
         simulated = at.SimulatedObjective(self._scene, at.make_propagator(self._scene))
         self._bench = bench_of(options, device, transducers, simulated)
-        self._simulated = at.Quantised(simulated, **self._bench.device.quantised)
+        self._simulated = hardware.Played(simulated, device, transducers, self._limits.amplitude)
+        self._settings["largest amplitude"] = round(self._simulated.largest, 4)
         self._expected = self._method(self._simulated)
 
     def run(self, command: str) -> None:
@@ -90,43 +91,55 @@ class Trial:
         """Check the transducers, run the method on the device, and read what it found once more (R, P)."""
         bench = self._bench
         with (
+            hardware.lock_log(log),  # before a device is touched that plays for another trial
             bench.sensor() as sensor,
             bench.link() as link,
             show_progress(self._expected.history.shape[1]) as progress,
             contextlib.ExitStack() as at_the_end,
         ):
-            self.opened = not self._dry
             limited = hardware.LimitedLink(link, self._limits)
             objective = hardware.HardwareObjective(
                 self._scene, limited, sensor, log, self._settings, watcher(progress)
             )
+            self.begun = not self._dry
             at_the_end.callback(lambda: objective.log.end(limited.seconds_on))
             at_the_end.callback(limited.off)
             if objective.log.evaluations:
                 logging.info("going on after %d evaluations", len(objective.log.evaluations))
-            progress.begin("pre-flight check")
-            preflight = self._preflight(limited, sensor)
-            found = self._method(at.Quantised(objective, **bench.device.quantised))
+            preflight = self._preflight(limited, sensor, progress)
+            found = self._method(objective)
             points = len(self._scene.control_points)
             progress.begin("the drive that was found, once more")
             limited.play(found.drive[0])
             again = torch.stack([checked_reading(sensor, points) for _ in range(bench.readings)])
             limited.require_on()
             limited.off()
+            progress.begin("silence, outputs off, once more")
             with silence_expected():
                 silent = hardware.hears_silence(sensor, preflight, points, bench.readings)
             if not silent:
                 logging.warning("the sensor hears more than before the trial: are the outputs off?")
         return found, again, preflight, objective.log
 
-    def _preflight(self, limited: hardware.LimitedLink, sensor: hardware.Sensor) -> hardware.Preflight:
+    def _preflight(
+        self, limited: hardware.LimitedLink, sensor: hardware.Sensor, progress: Progress
+    ) -> hardware.Preflight:
         points, count = len(self._scene.control_points), len(self._scene.array)
         with silence_expected():
             check = hardware.check_transducers(
-                limited, sensor, points, self._bench.readings, self._bench.background
+                limited,
+                sensor,
+                points,
+                self._bench.readings,
+                self._bench.background,
+                watch=lambda what: progress.begin(f"pre-flight check: {what}"),
             )
         if len(check.dead) == count:
-            raise ValueError("the sensor hears no transducer; check the device's power, and the sensor")
+            loudest = ", and try a lower --loudest" if self._settings["sensor"] == "scope" else ""
+            raise ValueError(
+                f"the sensor hears no transducer: {float(check.pressure.max()):.3g} Pa is the most, and must "
+                f"be above {check.threshold:.3g} Pa; check the device's power, and the sensor{loudest}"
+            )
         logging.info("the sensor hears %d of %d", count - len(check.dead), count)
         if check.dead:
             logging.warning("not heard, counted from 0: %s", ", ".join(map(str, check.dead)))

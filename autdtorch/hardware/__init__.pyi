@@ -3,9 +3,10 @@ from .autd3 import open_autd3
 from .devices import OPENMPD, SONICSURFACE, ULTRAINO, Device, openmpd_boards, ultraino_boards
 from .emulated_scope import EmulatedScope
 from .emulator import EmulatedBench, EmulatedSensor
-from .link import Link, open_link
-from .log import Evaluation, EvaluationLog
+from .link import Link, OffError, open_link
+from .log import Evaluation, EvaluationLog, LogError, lock_log
 from .objective import HardwareObjective
+from .played import Played
 from .preflight import Preflight, check_transducers, hears_silence
 from .safety import LimitedLink, LimitError, Limits, Signalled, ended_by_signals
 from .scope import Microphone, Oscilloscope, ScopeSensor, open_scope
@@ -35,10 +36,13 @@ __all__ = [
     "Limits",
     "Link",
     "LinkError",
+    "LogError",
     "ManualSensor",
     "Microphone",
     "MovedMicrophone",
+    "OffError",
     "Oscilloscope",
+    "Played",
     "Port",
     "Preflight",
     "ScopeSensor",
@@ -50,6 +54,7 @@ __all__ = [
     "check_transducers",
     "ended_by_signals",
     "hears_silence",
+    "lock_log",
     "open_autd3",
     "open_link",
     "open_scope",

@@ -14,7 +14,7 @@ import torch
 
 from autdtorch.device_layouts import AUTD3_TRANSDUCERS
 from autdtorch.hardware.devices import Device
-from autdtorch.hardware.levels import AUTD3_PHASES, Levels, autd3_drive, autd3_levels
+from autdtorch.hardware.levels import Levels, autd3_drive, autd3_levels
 from autdtorch.hardware.link import SETTLE, Link
 from autdtorch.hardware.usb import LinkError
 from autdtorch.validation import integer_at_least
@@ -45,7 +45,6 @@ def autd3_device(boards: int = 1) -> Device:
         transducers=AUTD3_TRANSDUCERS * integer_at_least("boards", boards, 1),
         frame=_autd3_frame,
         played=_autd3_played,
-        quantised={"levels": AUTD3_PHASES},
     )
 
 

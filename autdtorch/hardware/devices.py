@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 
@@ -20,9 +19,6 @@ from autdtorch.hardware.frames import (
     ultraino_frame,
 )
 from autdtorch.hardware.levels import (
-    OPENMPD_PHASES,
-    SONICSURFACE_PHASES,
-    ULTRAINO_PHASES,
     openmpd_drive,
     openmpd_levels,
     sonicsurface_drive,
@@ -31,7 +27,7 @@ from autdtorch.hardware.levels import (
     ultraino_levels,
 )
 from autdtorch.openmpd_board import OpenMPDBoard
-from autdtorch.validation import integer_at_least, invalid
+from autdtorch.validation import integer_at_least, invalid, require_kind
 
 SONICSURFACE_BAUD = 230_400
 ULTRAINO_BAUD = 115_200
@@ -51,7 +47,6 @@ class Device:
         transducers: their number N.
         frame: bytes for a drive (N,), |q| <= 1, on the nearest levels. All zeros switch the outputs off.
         played: the drive (N,) that a frame has the device play.
-        quantised: the device as settings of `Quantised`.
         baud: of its serial line [bits/s]; None if it has none.
         serials: number of the chip of each of its boards, which share the frame evenly; None takes any.
     """
@@ -61,7 +56,6 @@ class Device:
     transducers: int
     frame: Callable[[torch.Tensor], bytes]
     played: Callable[[bytes], torch.Tensor]
-    quantised: Mapping[str, Any]
     baud: int | None = None
     serials: tuple[str | None, ...] = (None,)
 
@@ -104,8 +98,11 @@ def openmpd_boards(boards: Sequence[OpenMPDBoard]) -> Device:
         boards: one after the other, of 256 transducers each.
 
     Raises:
-        ValueError: no board, one of another number of transducers, or two of the same name.
+        ValueError: no board, one that is no `OpenMPDBoard`, one of another number of transducers, or two of
+            the same name.
     """
+    for number, board in enumerate(boards):
+        require_kind(f"boards[{number}]", board, OpenMPDBoard)
     names = tuple(board.name for board in boards)
     if not boards or len(set(names)) < len(names):
         raise invalid("boards", names, "must be one or more, of different names")
@@ -125,10 +122,9 @@ def openmpd_boards(boards: Sequence[OpenMPDBoard]) -> Device:
 
 
 def _heard(board: OpenMPDBoard, message: bytes) -> torch.Tensor:
-    """The drive (256,) that a calibrated board makes of a message; rounding may not take it above 1."""
+    """The drive (256,) that a calibrated board makes of a message; rounding may take it above 1."""
     sent = _openmpd_played(message)[torch.tensor(board.pins)]
-    heard = torch.where(sent == 0, sent, sent / board.calibrated(torch.ones(BOARD, dtype=sent.dtype)))
-    return heard / heard.abs().clamp(min=1)
+    return torch.where(sent == 0, sent, sent / board.calibrated(torch.ones(BOARD, dtype=sent.dtype)))
 
 
 def ultraino_boards(boards: int = 1) -> Device:
@@ -148,7 +144,6 @@ def ultraino_boards(boards: int = 1) -> Device:
         transducers=ULTRAINO_BOARD * boards,
         frame=_ultraino,
         played=_ultraino_played,
-        quantised={"levels": ULTRAINO_PHASES},
         baud=ULTRAINO_BAUD,
     )
 
@@ -160,7 +155,6 @@ SONICSURFACE = Device(
     transducers=BOARD,
     frame=_sonicsurface,
     played=_sonicsurface_played,
-    quantised={"levels": SONICSURFACE_PHASES, "on_off": True},
     baud=SONICSURFACE_BAUD,
 )
 
@@ -171,7 +165,6 @@ OPENMPD = Device(
     transducers=BOARD,
     frame=_openmpd,
     played=_openmpd_played,
-    quantised={"levels": OPENMPD_PHASES},
 )
 
 #: One board Mega-64: 10 phases, 5 amplitudes.

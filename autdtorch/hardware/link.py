@@ -12,14 +12,18 @@ from typing import Any, Self
 
 import torch
 
-from autdtorch.drive import validate_drive
 from autdtorch.hardware.devices import Device
 from autdtorch.hardware.usb import LinkError, Port, find_device
-from autdtorch.validation import integer_at_least, invalid, not_negative
+from autdtorch.hardware.wiring import Wiring
+from autdtorch.validation import invalid, not_negative, require_kind
 
 #: Default settle time [s]. Sound goes 1.7 m in it; a T4010A1 rings up in some 30 periods, 0.75 ms, as the
 #: emulator of AUTD3's kit models it.
 SETTLE = 5e-3
+
+
+class OffError(LinkError):
+    """A device was not switched off: its outputs may still be on."""
 
 
 class Link:
@@ -63,7 +67,8 @@ class Link:
         self._lock = threading.RLock()
         self._open = True
         self.off()
-        self.transducers = wiring(transducers, device.transducers)
+        self._wiring = Wiring(device, transducers)
+        self.transducers = self._wiring.transducers
         self.settle = not_negative("settle", settle, "s")
         atexit.register(self.close)
 
@@ -76,20 +81,25 @@ class Link:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
             LinkError: the device does not take the bytes, or was let go.
         """
-        frame = self._frame(drive)
+        self.begin(drive)
+        self.wait_for_sound()
+
+    def begin(self, drive: torch.Tensor) -> None:
+        """Play a drive as `play` does, but return when its frame is on the device.
+
+        Raises:
+            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+            LinkError: the device does not take the bytes, or was let go.
+        """
+        frame = self._wiring.frame(drive)
         with self._lock:
             if not self._open:
                 raise LinkError(f"{self.device.name} was let go; open it anew")
             self._send(frame)
-            self._sleep(self.settle)
 
-    def played(self, drive: torch.Tensor) -> torch.Tensor:
-        """What the device is sent to play when asked for a drive (M,): the nearest on its levels.
-
-        Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-        """
-        return self.device.played(self._frame(drive))[self.transducers]
+    def wait_for_sound(self) -> None:
+        """Wait for the settle time; other threads may switch the outputs off meanwhile."""
+        self._sleep(self.settle)
 
     def off(self) -> None:
         """Switch all outputs of the device off; once it was let go they are.
@@ -115,7 +125,7 @@ class Link:
                 self._port.recover()
             self._send_silence()
         except LinkError as error:
-            raise LinkError(f"{error}; the outputs may still be on: switch the device's power off") from error
+            raise OffError(f"{error}; the outputs may still be on: switch the device's power off") from error
 
     def _send_silence(self) -> None:
         silence = self.device.frame(torch.zeros(self.device.transducers, dtype=torch.complex128))
@@ -155,11 +165,6 @@ class Link:
         atexit.unregister(self.close)
         self._port.close()
 
-    def _frame(self, drive: torch.Tensor) -> bytes:
-        everyone = torch.zeros(self.device.transducers, dtype=torch.complex128)
-        everyone[self.transducers] = validate_drive(drive, len(self.transducers))
-        return self.device.frame(everyone)
-
     def _send(self, frame: bytes) -> None:
         self._port.write(frame)
         self._sleep(self.device.wire_time(frame))
@@ -196,9 +201,10 @@ def open_link(
     Raises:
         LinkError: none or several such devices, or it does not take the bytes.
         ImportError: pyusb or libusb-package is missing.
-        ValueError: `transducers` that the device does not have, or one twice; a negative `settle`; or a
+        ValueError: no `Device`; `transducers` that it does not have, or one twice; a negative `settle`; or a
             `serial` for a device of several boards.
     """
+    require_kind("device", device, Device)
     if serial is not None and len(device.serials) > 1:
         raise invalid("serial", serial, f"must be None, as {device.name} has {len(device.serials)} boards")
     openers = {(vendor, product): open_port for vendor, product, open_port in device.adapters}
@@ -264,19 +270,3 @@ def _each(do: Callable[[Port, Any], None], ports: Sequence[Port], things: Sequen
             errors.append(error)
     if errors:
         raise errors[0]
-
-
-def wiring(transducers: Sequence[int] | torch.Tensor | None, count: int) -> torch.Tensor:
-    """Which of a device's `count` transducers play a scene's (M,), int64.
-
-    Raises:
-        ValueError: transducers that the device does not have, or one twice.
-    """
-    if transducers is None:
-        return torch.arange(count)
-    if isinstance(transducers, torch.Tensor):  # its elements are no Integral
-        transducers = transducers.tolist()
-    chosen = [integer_at_least(f"transducers[{place}]", one, 0) for place, one in enumerate(transducers)]
-    if not chosen or len(set(chosen)) < len(chosen) or max(chosen) >= count:
-        raise invalid("transducers", chosen, f"must be indices from 0 to {count - 1}, each once")
-    return torch.tensor(chosen)

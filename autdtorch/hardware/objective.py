@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -9,26 +10,27 @@ from typing import Any
 import torch
 
 from autdtorch.cache import digest_of
-from autdtorch.hardware.log import Evaluation, EvaluationLog
+from autdtorch.hardware.log import Evaluation, EvaluationLog, LogError
 from autdtorch.hardware.safety import LimitedLink, LimitError
 from autdtorch.hardware.sensor import Sensor, checked_reading
 from autdtorch.objective import validate_drives
 from autdtorch.scene import Scene
-from autdtorch.validation import invalid
+from autdtorch.validation import invalid, require_kind
 
 
 class HardwareObjective:
     """An objective whose observations are measured, one drive after the other.
 
-    The device plays the nearest drive on its levels. To have a `Solution` hold what was played, wrap it as a
-    simulated one: ``Quantised(objective, **link.device.quantised)``.
+    The device plays the nearest drive on its levels: that is what a `Solution` holds. The log holds what was
+    asked for.
 
     A trial that was interrupted goes on where its log ends: run the same method with the same seed again, and
-    it is given what the log holds, without playing it once more. The outputs are off while a method thinks.
+    it is given what the log holds, without playing it once more; after an error that goes for this object
+    too. The outputs are off while a method thinks.
 
     Attributes:
         scene: its array plays the drives, its control points are observed.
-        evaluations: number of observations so far, those from the log included.
+        evaluations: number of observations so far, those from the log included; 0 again after an error.
         log: holds them.
     """
 
@@ -57,16 +59,22 @@ class HardwareObjective:
             watch: is shown every evaluation.
 
         Raises:
-            ValueError: the link is not limited, or plays another number of transducers than the scene has; or
-                the log is of another trial.
+            ValueError: no scene; the link is not limited, or plays another number of transducers than the
+                scene has; or `settings` that JSON cannot hold.
+            LogError: the log is of another trial, none, or open in another process.
             OSError: the log cannot be read or written.
         """
+        require_kind("scene", scene, Scene)
         if not isinstance(link, LimitedLink):
             raise invalid("link", link, "must be a LimitedLink: no trial without an amplitude limit")
         transducers = link.link.transducers.tolist()
         if len(transducers) != len(scene.array):
             accepted = f"must be {len(scene.array)}, as many as the scene has"
             raise invalid("link.transducers", len(transducers), accepted)
+        try:
+            json.dumps(named := {**(settings or {})})
+        except (TypeError, ValueError) as error:
+            raise invalid("settings", settings, "must be a mapping of what JSON can hold") from error
         self.scene = scene
         self.evaluations = 0
         self._link = link
@@ -77,11 +85,13 @@ class HardwareObjective:
             "device": link.link.device.name,
             "transducers": transducers,
             "amplitude limit": link.limits.amplitude,
-            **(settings or {}),
+            **named,
         }
-        self.log = EvaluationLog(log, origin)
-        if self.log.goes_on:
+        self.log = EvaluationLog(log, origin, len(scene.array), len(scene.control_points))
+        place = self.log.path.resolve()
+        if self.log.goes_on and place not in link.logs:
             link.go_on(self.log.seconds_on)
+        link.logs.add(place)
 
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
         """Play each of several drives and read the control points; the outputs are off however it ends.
@@ -93,8 +103,9 @@ class HardwareObjective:
             Pressure magnitudes (B, P) [Pa], float64.
 
         Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1; a sensor that does
-                not give a finite magnitude for each control point; or a log of other drives.
+            ValueError: another shape, not finite complex numbers, or an amplitude above 1; or a sensor that
+                does not give a finite magnitude for each control point.
+            LogError: the log is of other drives, or has changed meanwhile.
             LimitError: the trial has made all that it may.
             LinkError: the device does not take the bytes.
             OSError: the log cannot be written.
@@ -102,8 +113,19 @@ class HardwareObjective:
         drives = validate_drives(drive, len(self.scene.array))
         try:
             return torch.stack([self._evaluate(row) for row in drives])
+        except BaseException:
+            self.evaluations = 0  # the method has ended; begun once more, it is given what the log holds
+            raise
         finally:
             self._link.off()
+
+    def played(self, drive: torch.Tensor) -> torch.Tensor:
+        """What the device plays (..., M) when asked for drives (..., M); 1 is the most that the limit allows.
+
+        Raises:
+            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+        """
+        return self._link.played(drive)
 
     def _evaluate(self, drive: torch.Tensor) -> torch.Tensor:
         most = self._link.limits.evaluations
@@ -113,9 +135,9 @@ class HardwareObjective:
             self._measure(drive)
         evaluation = self.log.evaluations[self.evaluations]
         if not torch.equal(evaluation.drive, drive):
-            raise ValueError(
-                f"log: evaluation {self.evaluations + 1} is of another drive than the method asks for; must "
-                "be of the same method, seed and version of autdtorch"
+            raise LogError(
+                f"{self.log.path}: evaluation {self.evaluations + 1} is of another drive than the method "
+                "asks for; give the method, seed and version of autdtorch of that trial, or another log"
             )
         self.evaluations += 1
         if self._watch is not None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 
 from autdtorch.hardware.safety import LimitedLink
 from autdtorch.hardware.sensor import Sensor, checked_reading
-from autdtorch.validation import integer_at_least
+from autdtorch.validation import integer_at_least, require_kind
 
 #: How far above the noise a transducer is heard, in standard deviations of the noise's mean power.
 _DEVIATIONS = 6.0
@@ -37,7 +38,12 @@ class Preflight:
 
 
 def check_transducers(
-    link: LimitedLink, sensor: Sensor, points: int, readings: int = 4, background: int = 32
+    link: LimitedLink,
+    sensor: Sensor,
+    points: int,
+    readings: int = 4,
+    background: int = 32,
+    watch: Callable[[str], object] | None = None,
 ) -> Preflight:
     """Play every transducer alone, after silence, and switch the outputs off, however it ends.
 
@@ -51,17 +57,25 @@ def check_transducers(
         points: number of control points P that the sensor reads.
         readings: of every transducer, >= 1.
         background: readings of the silence, >= 1.
+        watch: is told what is read next: "silence, outputs off", then "transducer 1 of 16" and so on.
 
     Raises:
-        ValueError: the sensor does not give P finite magnitudes, or fewer than 1 readings.
+        ValueError: the link is not limited, the sensor does not give P finite magnitudes, or fewer than 1
+            readings.
         LimitError: the outputs were on for as long as they may.
         LinkError: the device does not take the bytes.
     """
+    require_kind("link", link, LimitedLink)
     readings = integer_at_least("readings", readings, 1)
-    silence = _power(sensor, points, integer_at_least("background", background, 1))
+    background = integer_at_least("background", background, 1)
+    tell = watch or (lambda _: None)
+    tell("silence, outputs off")
+    silence = _power(sensor, points, background)
+    count = len(link.link.transducers)
     powers = []
     try:
-        for alone in torch.eye(len(link.link.transducers), dtype=torch.complex128):
+        for number, alone in enumerate(torch.eye(count, dtype=torch.complex128), start=1):
+            tell(f"transducer {number} of {count}")
             link.play(alone)
             powers.append(_power(sensor, points, readings))
             link.require_on()

@@ -6,20 +6,22 @@ import contextlib
 import functools
 import logging
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
+from pathlib import Path
 from types import FrameType
 
 import torch
 
+from autdtorch.hardware.amplitude_scale import AmplitudeScale
 from autdtorch.hardware.link import Link
-from autdtorch.validation import integer_at_least, invalid, number_between, positive
+from autdtorch.hardware.wiring import Wiring
+from autdtorch.validation import integer_at_least, number_between, positive, require_kind
 
 logger = logging.getLogger(__name__)
-
-_CANDIDATES = 256  # amplitudes to choose from; more than a device here has
 
 # SIGTSTP, Ctrl-Z, would stop the process, and its timer, with the outputs on; so would SIGTTIN, where a trial
 # in the background of a shell asks somebody for a reading.
@@ -49,17 +51,21 @@ def ended_by_signals() -> Iterator[None]:
     """Have the signals that end or stop a process raise `Signalled`, so that links are closed on the way out.
 
     These are Ctrl-C, Ctrl-Z, SIGTERM, SIGHUP, SIGQUIT and SIGTTIN; one that is ignored, as by ``nohup``,
-    stays so. Only the first raises: what comes later must not interrupt the switching off. Use it around the
-    link.
+    stays so. One that comes on the way out does not raise: it must not interrupt the switching off. One that
+    comes later does, as Python drops what is raised in a ``__del__`` or a callback. Use it around the link.
 
     Raises:
         Signalled: there was such a signal.
         ValueError: it is used outside of the main thread, which alone hears signals.
     """
+    outside = sys.exception()
 
     def end(number: int, _: FrameType | None) -> None:
-        for one in before:
-            signal.signal(one, _pass)
+        error = sys.exception()
+        while error is not outside and error is not None:
+            if isinstance(error, Signalled):  # it is on its way out
+                return
+            error = error.__context__
         raise Signalled(number)
 
     def restore() -> None:
@@ -75,13 +81,9 @@ def ended_by_signals() -> Iterator[None]:
     finally:
         try:
             restore()
-        except Signalled:  # there was none before, and now all are ignored
+        except Signalled:  # there was none before, and none is raised while this one is handled
             restore()
             raise
-
-
-def _pass(number: int, _: FrameType | None) -> None:
-    """Not SIG_IGN: of a signal that waits already, Python would then report that it was lost."""
 
 
 @dataclass(frozen=True)
@@ -89,8 +91,8 @@ class Limits:
     """What a trial may ask of a device.
 
     Attributes:
-        amplitude: the most that a transducer is driven at, above 0 up to 1. Drives are scaled by it: a
-            method's |q| = 1 is this.
+        amplitude: the most that a transducer is driven at, above 0 up to 1. Drives are scaled: a method's
+            |q| = 1 is the largest amplitude within it that the device plays.
         evaluations: the most that a trial makes, those before it was interrupted included.
         seconds: the most that the outputs are on in all [s].
         seconds_in_a_row: the most that they are on without a rest [s].
@@ -123,6 +125,7 @@ class LimitedLink:
     Attributes:
         link: what plays.
         limits: of what is played.
+        logs: of the trials that it plays for; the time on that each began with is counted.
     """
 
     def __init__(self, link: Link, limits: Limits) -> None:
@@ -133,11 +136,14 @@ class LimitedLink:
             limits: of what is played.
 
         Raises:
-            ValueError: the device has no amplitude up to the limit but 0.
+            ValueError: no link or no limits, or the device has no amplitude up to the limit but 0.
         """
+        require_kind("link", link, Link)
+        require_kind("limits", limits, Limits)
         self.link = link
         self.limits = limits
-        self._scale = _largest_amplitude(link, limits.amplitude)
+        self.logs: set[Path] = set()
+        self._scale = AmplitudeScale(Wiring(link.device, link.transducers), limits.amplitude)
         self._lock = threading.RLock()
         self._timer: threading.Timer | None = None
         self._on_since: float | None = None
@@ -168,11 +174,14 @@ class LimitedLink:
     def play(self, drive: torch.Tensor) -> None:
         """Play a drive (M,), |q| <= 1, scaled to the limit, until the next, `off`, or the end of the time.
 
+        The time may end while the sound settles: `require_on` says so.
+
         Raises:
             LimitError: the outputs were on for as long as they may.
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
             LinkError: the device does not take the bytes.
         """
+        asked = self._scale.asked(drive)
         if self._stretch() > self.limits.seconds_in_a_row / 2:  # leave the other half to the sensor
             self.off()
         if self._on_since is None:
@@ -186,7 +195,16 @@ class LimitedLink:
                 self._timer = threading.Timer(most, functools.partial(self._time_is_up, self._on_since))
                 self._timer.daemon = True
                 self._timer.start()
-            self.link.play(self._scale * drive)
+            self.link.begin(asked)
+        self.link.wait_for_sound()  # without the lock, which the timer needs
+
+    def played(self, drive: torch.Tensor) -> torch.Tensor:
+        """What the device plays (..., M), in the scale of `play`, when asked for drives (..., M).
+
+        Raises:
+            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+        """
+        return self._scale.played(drive)
 
     def require_on(self) -> None:
         """Require that the outputs are on since `play`: otherwise what was read meanwhile is void.
@@ -199,7 +217,9 @@ class LimitedLink:
         if self._on_since is None:
             self._seconds_left()
             most = self.limits.seconds_in_a_row
-            raise LimitError(f"the sensor took longer than the outputs may stay on, {most:g} s in a row")
+            raise LimitError(
+                f"settling and reading took longer than the outputs may stay on, {most:g} s in a row"
+            )
 
     def off(self) -> None:
         """Switch all outputs off, and begin the rest that the duty cycle asks for.
@@ -247,17 +267,3 @@ class LimitedLink:
     def _raise_failure(self) -> None:
         if self._failure is not None:
             raise self._failure
-
-
-def _largest_amplitude(link: Link, limit: float) -> float:
-    """The largest amplitude that the device, on its levels, does not play above `limit`."""
-    if limit == 1:
-        return 1.0
-    asked = torch.arange(1, _CANDIDATES + 1).to(torch.complex128) / _CANDIDATES
-    played = torch.stack([link.played(amplitude.expand(len(link.transducers))) for amplitude in asked])
-    strongest = played.abs().amax(dim=1)
-    allowed = (strongest > 0) & (strongest <= limit)
-    if not allowed.any():
-        least = strongest[strongest > 0].min()
-        raise invalid("amplitude", limit, f"must be >= {least:.3g}, the least that {link.device.name} plays")
-    return float(asked[allowed].abs().max())

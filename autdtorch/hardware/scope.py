@@ -17,7 +17,7 @@ from autdtorch.hardware.sensor import SensorError
 from autdtorch.hardware.usb import LinkError, find_device
 from autdtorch.hardware.usbtmc import UsbtmcPort
 from autdtorch.hardware.vertical_scale import VerticalScale
-from autdtorch.validation import integer_at_least, invalid, positive
+from autdtorch.validation import integer_at_least, invalid, positive, positive_integers
 
 logger = logging.getLogger(__name__)
 
@@ -284,10 +284,12 @@ def open_scope(
         backend: of pyusb; by default libusb. An emulated bench has its own.
 
     Raises:
+        ValueError: `chip` is not two numbers.
         LinkError: none or several such devices, or it does not answer.
         ImportError: pyusb or libusb-package is missing.
     """
-    port = UsbtmcPort(find_device([chip], serial, backend))
+    vendor, product = positive_integers("chip", chip, 2)
+    port = UsbtmcPort(find_device([(vendor, product)], serial, backend))
     try:
         return Oscilloscope(port, dialect)
     except BaseException:

@@ -79,8 +79,8 @@ class ManualSensor:
             text = _asked(self._ask, hint + question)
             try:
                 return not_negative("pressure", float(text), "Pa")
-            except ValueError as error:
-                hint = f"{error}\n"
+            except ValueError:
+                hint = f"{text!r}: must be a number >= 0 with a decimal point, as 1.5\n"
 
 
 class MovedMicrophone:

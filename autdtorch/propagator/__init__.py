@@ -20,7 +20,7 @@ from autdtorch.propagator.full import FullPropagator
 from autdtorch.propagator.stepper import KERNELS, make_kernel, precision_of
 from autdtorch.propagator.volume import volume_field
 from autdtorch.scene import Scene
-from autdtorch.validation import integer_at_least, invalid, positive, require_one_of
+from autdtorch.validation import integer_at_least, invalid, positive, require_kind, require_one_of
 
 __all__ = [
     "BoxPropagator",
@@ -87,8 +87,7 @@ def make_propagator(
     Raises:
         ValueError: an argument out of range, or what a kernel needs is missing; the message names it.
     """
-    if not isinstance(scene, Scene):
-        raise invalid("scene", scene, "must be a Scene")
+    require_kind("scene", scene, Scene)
     require_one_of("method", method, METHODS)
     require_one_of("kernel", kernel, KERNELS)
     precision = precision_of(dtype)

@@ -23,6 +23,7 @@ from autdtorch.validation import (
     points_tensor,
     positive,
     real_tensor,
+    require_kind,
     require_one_of,
 )
 
@@ -69,8 +70,7 @@ def differentiable_field(
         ValueError: an argument of another shape or out of range, maps in a scene with obstacles, or an
             obstacle that is differentiated and not clear of the boundary layers.
     """
-    if not isinstance(scene, Scene):
-        raise invalid("scene", scene, "must be a Scene")
+    require_kind("scene", scene, Scene)
     require_one_of("kernel", kernel, KERNELS)
     precision = precision_of(dtype)
     drive = validate_drive(drive, len(scene.array))

@@ -17,6 +17,7 @@ from autdtorch.hardware import (
     LimitedLink,
     Limits,
     Link,
+    Played,
     Sensor,
     open_link,
 )
@@ -42,6 +43,9 @@ class Trial:
 
     def link(self, bench: EmulatedBench, device: Device = SONICSURFACE) -> Link:
         return open_link(device, TRANSDUCERS, backend=bench.bus)
+
+    def played(self, device: Device = SONICSURFACE, amplitude: float = 1.0) -> Played:
+        return Played(self.simulated, device, TRANSDUCERS, amplitude)
 
     def objective(self, link: Link, sensor: Sensor, **settings: object) -> HardwareObjective:
         limited = LimitedLink(link, Limits(amplitude=1.0))

@@ -1,5 +1,6 @@
 """The chips that devices hang on: what they are told, and that the device behind them hears the frames."""
 
+import threading
 import time
 
 import pytest
@@ -60,6 +61,27 @@ def test_what_a_row_of_boards_hands_on_is_read_and_dropped():
     with open_link(ultraino_boards(2), backend=bus) as link:
         for _ in range(3):
             link.play(torch.ones(128).cdouble())
+
+
+def test_a_chip_is_given_back_only_when_nobody_reads_from_it():
+    class Asleep(EmulatedCdc):
+        def read(self, most: int) -> bytes:
+            reading.set()
+            time.sleep(0.02)
+            reading.clear()
+            raise time_out()
+
+    class Bus(EmulatedBus):
+        def release_interface(self, dev_handle, intf):
+            released_while_reading.append(reading.is_set())
+
+    reading = threading.Event()
+    released_while_reading: list[bool] = []
+    bus = Bus([Asleep(0x2341, 0x0042, "A1", UltrainoFirmware())])
+    port = ULTRAINO.adapters[0].open_port(find_device([(0x2341, 0x0042)], backend=bus))
+    assert reading.wait(1)
+    port.close()
+    assert released_while_reading == [False, False]
 
 
 def test_a_cp2102_drops_what_waits_when_it_is_taken_and_when_it_recovers():

@@ -1,16 +1,16 @@
-"""Limits of a trial, and what a log is refused for."""
+"""Limits of a trial."""
 
-import errno
-import signal
+import threading
 import time
+import weakref
 
 import pytest
 import torch
 
 from autdtorch.hardware import (
     OPENMPD,
+    SONICSURFACE,
     EmulatedSensor,
-    EvaluationLog,
     HardwareObjective,
     LimitedLink,
     LimitError,
@@ -18,6 +18,7 @@ from autdtorch.hardware import (
     LinkError,
     check_transducers,
     hears_silence,
+    open_link,
 )
 
 
@@ -106,6 +107,23 @@ def test_while_a_sensor_takes_too_long_the_outputs_go_off(trial, limits: Limits,
         assert not objective.log.evaluations
 
 
+def test_while_the_sound_settles_the_timer_may_switch_off(trial):
+    def sleep(seconds: float) -> None:
+        if seconds == 0.2:
+            time.sleep(seconds)
+            heard.append(float(bench.drive().abs().max()))
+
+    heard: list[float] = []
+    bench = trial.bench()
+    bench.bus.sleep = sleep
+    with open_link(SONICSURFACE, range(16), backend=bench.bus, settle=0.2) as link:
+        limited = LimitedLink(link, Limits(1.0, seconds_in_a_row=0.02))
+        limited.play(full_on()[0])
+        assert heard == [0.0]
+        with pytest.raises(LimitError, match="settling and reading took longer"):
+            limited.require_on()
+
+
 def test_a_timer_of_an_earlier_link_does_not_reach_the_next(trial):
     bench = trial.bench()
     with trial.link(bench) as link:
@@ -150,6 +168,8 @@ def test_a_timer_that_comes_too_late_leaves_the_next_stretch_alone(trial):
     with trial.link(bench) as link:
         limited = LimitedLink(link, Limits(1.0, seconds_in_a_row=0.05))
         limited.play(full_on()[0])
+        # Python would wait for any other thread before it exits, and only then switch off.
+        assert all(thread.daemon for thread in threading.enumerate() if thread is not threading.main_thread())
         with limited._lock:  # the timer waits for it
             time.sleep(0.1)
             limited.off()
@@ -186,15 +206,23 @@ def test_a_link_left_open_is_switched_off_when_python_exits(trial, monkeypatch):
     assert bench.firmware.drive().abs().max() == 0
 
 
+def test_a_closed_link_is_not_kept_until_python_exits(trial):
+    link = trial.link(trial.bench())
+    kept = weakref.ref(link)
+    link.close()
+    del link
+    assert kept() is None
+
+
 def test_the_time_on_goes_on_with_the_trial(trial):
     bench = trial.bench()
     with trial.link(bench) as link:
-        trial.objective(link, EmulatedSensor(bench))(full_on())
-        limited = LimitedLink(link, Limits(1.0, seconds=1e-9))
+        trial.objective(link, EmulatedSensor(bench)).log.append(full_on()[0], torch.ones(2), 60.0)
+        limited = LimitedLink(link, Limits(1.0, seconds=60.0))  # a test does not take that long
         objective = HardwareObjective(trial.scene, limited, EmulatedSensor(bench), trial.log)
-        objective(full_on())  # from the log
-        with pytest.raises(LimitError, match="the limit"):
-            objective(full_on())
+        with pytest.raises(LimitError, match="on for 60 s, the limit"):
+            objective(full_on(2))  # one is in the log
+        assert limited.seconds_on == 60.0
 
 
 def test_what_an_earlier_process_played_besides_counts_and_is_rested_from(trial):
@@ -212,68 +240,11 @@ def test_what_an_earlier_process_played_besides_counts_and_is_rested_from(trial)
         assert again.seconds_on == before > 0
         objective(full_on())
         assert time.monotonic() - begin >= 0.05 * (1 / 0.25 - 1)
-        assert EvaluationLog(trial.log, objective.log.origin).seconds_on > before
-
-
-@pytest.mark.parametrize("failing", ["write", "fsync"])
-def test_a_full_disk_leaves_no_half_line_to_go_on_after(trial, monkeypatch, failing: str):
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    def observe() -> None:
-        objective(full_on())
-
-    bench = trial.bench()
-    with trial.link(bench) as link:
-        objective = trial.objective(link, EmulatedSensor(bench))
-        objective(full_on())
-        whole = trial.log.read_bytes()
-        with monkeypatch.context() as context:
-            if failing == "fsync":
-                context.setattr("os.fsync", full)
-                with pytest.raises(OSError, match=r"No space left on device: .*trial\.jsonl"):
-                    observe()
-            else:
-                resource = pytest.importorskip("resource", reason="limits of processes are POSIX's")
-                most = resource.getrlimit(resource.RLIMIT_FSIZE)
-                before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-                resource.setrlimit(resource.RLIMIT_FSIZE, (len(whole) + 10, most[1]))  # ten bytes are left
-                try:
-                    with pytest.raises(OSError, match=r"File too large: .*trial\.jsonl"):
-                        observe()
-                finally:
-                    resource.setrlimit(resource.RLIMIT_FSIZE, most)
-                    signal.signal(signal.SIGXFSZ, before)
-        assert trial.log.read_bytes() == whole
-        observe()
-    assert len(EvaluationLog(trial.log, objective.log.origin).evaluations) == 2
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda log: log.replace('"seed": 1', '"seed": 2'), "of another trial, whose seed is 2, not 1"),
-        (lambda log: log.replace("SonicSurface", "OpenMPD"), "whose device is OpenMPD, not SonicSurface"),
-        (lambda log: log.replace('"scene": "', '"scene": "x'), "of another trial, whose scene is x"),
-        (lambda log: "time,drive\n1,2\n", "must be the log of a hardware trial"),
-        (lambda log: log + "{}\n" + log, "must be the log of a hardware trial"),
-    ],
-)
-def test_the_log_of_another_trial_is_refused(trial, change, message: str):
-    bench = trial.bench()
-    with trial.link(bench) as link:
-        trial.objective(link, EmulatedSensor(bench), seed=1)(full_on())
-        trial.log.write_text(change(trial.log.read_text()))
-        with pytest.raises(ValueError, match=message):
-            trial.objective(link, EmulatedSensor(bench), seed=1)
-
-
-def test_a_log_of_other_drives_is_refused(trial):
-    bench = trial.bench()
-    with trial.link(bench) as link:
-        trial.objective(link, EmulatedSensor(bench))(full_on())
-        with pytest.raises(ValueError, match="evaluation 1 is of another drive"):
-            trial.objective(link, EmulatedSensor(bench))(0.5 * full_on())
+        assert objective.log.seconds_on > before
+        # Nor does a second objective on the same link count anything twice.
+        once = again.seconds_on
+        HardwareObjective(trial.scene, again, sensor, trial.log)
+        assert again.seconds_on == once
 
 
 def test_a_chip_that_keeps_the_off_frame_is_told_of(trial, monkeypatch):
@@ -297,10 +268,44 @@ def test_a_chip_without_line_status_is_told_of(trial):
 def test_the_check_finds_the_dead_transducers(trial, snr):
     bench = trial.bench(dead=[3, 9])
     sensor = EmulatedSensor(bench, snr)
+    read: list[str] = []
     with trial.link(bench) as link:
-        check = check_transducers(LimitedLink(link, Limits(1.0)), sensor, points=2)
+        check = check_transducers(LimitedLink(link, Limits(1.0)), sensor, points=2, watch=read.append)
         assert check.dead == [3, 9]
+        assert read == ["silence, outputs off", *(f"transducer {n} of 16" for n in range(1, 17))]
         assert bench.firmware.drive().abs().max() == 0
         assert hears_silence(sensor, check, points=2)
         link.play(full_on()[0])
         assert not hears_silence(sensor, check, points=2)
+
+
+def test_what_is_20_db_below_the_others_is_dead_where_silence_is_read_as_0(trial):
+    class Leaking(EmulatedSensor):
+        leak = 0.0
+
+        def read(self):
+            return super().read() + self.leak * float(bench.firmware.drive().abs().max())
+
+    bench = trial.bench(dead=[3])
+    sensor = Leaking(bench)
+    typical = float(trial.simulated.transfer_matrix.abs().median())
+    with trial.link(bench) as link:
+        limited = LimitedLink(link, Limits(1.0))
+        for share, dead in ((0.05, [3]), (0.2, [])):  # of the amplitude; 20 dB are 0.1
+            sensor.leak = share * typical
+            check = check_transducers(limited, sensor, points=2)
+            assert check.silence == 0
+            assert check.dead == dead
+
+
+def test_a_check_during_which_the_outputs_went_off_is_none(trial):
+    class Slow(EmulatedSensor):
+        def read(self):
+            time.sleep(0.05)
+            return super().read()
+
+    bench = trial.bench()
+    with trial.link(bench) as link:
+        limited = LimitedLink(link, Limits(1.0, seconds_in_a_row=0.02))
+        with pytest.raises(LimitError, match=r"longer than .* 0\.02 s in a row"):
+            check_transducers(limited, Slow(bench), points=2, readings=1, background=1)

@@ -8,7 +8,7 @@ import re
 import pytest
 import torch
 
-from autdtorch.conditions import Quantised, random_rms
+from autdtorch.conditions import random_rms
 from autdtorch.drive import drive_from_phases
 from autdtorch.hardware import (
     KEYSIGHT,
@@ -279,8 +279,8 @@ def test_a_method_finds_the_simulations_focus_through_a_noisy_oscilloscope(trial
     with trial.link(bench) as link, open_scope(CHIP, backend=bench.bus) as oscilloscope:
         microphones = [Microphone(number, SENSITIVITY, loudest) for number in (1, 2)]
         sensor = ScopeSensor(oscilloscope, FREQUENCY, microphones)
-        found = gabs(Quantised(trial.objective(link, sensor), levels=32), levels=4)
-    expected = gabs(Quantised(trial.simulated, levels=32), levels=4).score
+        found = gabs(trial.objective(link, sensor), levels=4)
+    expected = gabs(trial.played(), levels=4).score
     assert float(trial.simulated(found.drive).min()) == pytest.approx(float(expected), rel=0.05)
 
 

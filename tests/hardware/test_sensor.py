@@ -49,7 +49,7 @@ def test_too_few_samples_a_period_or_periods_are_refused(step, samples, message)
 
 
 def test_a_manual_sensor_asks_for_each_point_until_the_answer_is_a_pressure():
-    answers = iter(["12.5", "loud", "-1", "nan", "3e2"])
+    answers = iter(["12.5", "1,5", "-1", "nan", "3e2"])
     questions: list[str] = []
 
     def ask(question: str) -> str:
@@ -58,7 +58,8 @@ def test_a_manual_sensor_asks_for_each_point_until_the_answer_is_a_pressure():
 
     assert ManualSensor(POINTS, ask).read().tolist() == [12.5, 300.0]
     assert questions[0] == "Pressure at control point 1 of 2 at (80.0, 10.0, 0.0) mm [Pa]: "
-    assert "-1.0 Pa; must be finite and >= 0" in questions[3]
+    for question, answer in zip(questions[2:], ("1,5", "-1", "nan"), strict=True):
+        assert question.startswith(f"'{answer}': must be a number >= 0 with a decimal point, as 1.5\n")
 
 
 def test_the_end_of_the_input_is_an_error():

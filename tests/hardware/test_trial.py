@@ -1,6 +1,7 @@
 """Trials on the emulated bench, against the simulation, and how they end."""
 
 import json
+from functools import partial
 
 import pytest
 import torch
@@ -13,34 +14,51 @@ from autdtorch.hardware import (
     Device,
     EmulatedSensor,
     HardwareObjective,
+    LimitedLink,
+    Limits,
     LinkError,
     open_link,
     ultraino_boards,
 )
 from autdtorch.optim.gabs import gabs
+from autdtorch.optim.identify import identify
+from autdtorch.optim.lssg import lssg
 
 
 def full_on() -> torch.Tensor:
     return drive_from_phases(torch.zeros(16))
 
 
-@pytest.mark.parametrize(("device", "levels"), [(SONICSURFACE, 32), (OPENMPD, 128), (ultraino_boards(3), 10)])
-def test_without_noise_a_method_finds_the_same_drive_as_in_simulation(trial, device: Device, levels: int):
+@pytest.mark.parametrize(
+    ("device", "method", "amplitude"),
+    [
+        (SONICSURFACE, partial(gabs, levels=8), 1.0),
+        (OPENMPD, partial(identify, evaluations=64), 0.7),
+        (ultraino_boards(3), lssg, 0.8),
+    ],
+    ids=["SonicSurface", "OpenMPD", "Ultraino"],
+)
+def test_without_noise_a_method_finds_the_same_drive_as_in_simulation(trial, device, method, amplitude):
     bench = trial.bench(device)
     with trial.link(bench, device) as link:
-        measured = trial.objective(link, EmulatedSensor(bench))
-        found = gabs(Quantised(measured, levels), levels=8)
-    expected = gabs(Quantised(trial.simulated, levels), levels=8)
+        limited = LimitedLink(link, Limits(amplitude))
+        measured = HardwareObjective(trial.scene, limited, EmulatedSensor(bench), trial.log)
+        found = method(measured)
+        limited.play(found.drive[0])
+        full = bench.drive().abs().max()
+        torch.testing.assert_close(bench.drive(), full * found.drive[0], rtol=0, atol=1e-12)
+    played = trial.played(device, amplitude)
+    expected = method(played)
     assert torch.equal(found.drive, expected.drive)
     # The same products, summed in another order.
-    torch.testing.assert_close(found.pressure, expected.pressure, rtol=1e-12, atol=0)
-    assert measured.evaluations == int(found.evaluations) == 1 + 15 * 8
+    torch.testing.assert_close(found.pressure, full * expected.pressure, rtol=1e-12, atol=0)
+    assert measured.evaluations == played.evaluations == int(found.evaluations)
 
     lines = [json.loads(line) for line in trial.log.read_text().splitlines()[1:]]
     assert len(lines) == measured.evaluations
     asked = torch.view_as_complex(torch.tensor([line["drive"] for line in lines], dtype=torch.float64))
     pressure = torch.tensor([line["pressure"] for line in lines], dtype=torch.float64)
-    torch.testing.assert_close(trial.simulated(asked), pressure, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(full * played(asked), pressure, rtol=1e-12, atol=1e-12)
 
 
 def test_a_drive_between_the_levels_is_played_on_the_nearest(trial):
@@ -48,9 +66,9 @@ def test_a_drive_between_the_levels_is_played_on_the_nearest(trial):
     drive = drive_from_phases(torch.linspace(0, 3, 16, dtype=torch.float64), torch.linspace(0, 1, 16))
     with trial.link(bench) as link:
         link.play(drive)
-        played = Quantised(trial.simulated, levels=32, on_off=True).emitted(drive)
+        played = Quantised(trial.simulated, levels=32, on_off=True).emitted(drive)  # by another way
         torch.testing.assert_close(bench.drive(), played, rtol=0, atol=1e-15)
-        torch.testing.assert_close(link.played(drive), played, rtol=0, atol=1e-15)
+        torch.testing.assert_close(trial.played().emitted(drive[None])[0], played, rtol=0, atol=1e-15)
 
 
 def test_a_drive_in_any_guise_is_measured_and_comes_back_from_the_log(trial):
@@ -63,8 +81,7 @@ def test_a_drive_in_any_guise_is_measured_and_comes_back_from_the_log(trial):
         measured = torch.cat([objective(one[None]) for one in guises])
         again = trial.objective(link, EmulatedSensor(bench))
         assert torch.equal(torch.cat([again(one[None]) for one in guises]), measured)
-    on_levels = Quantised(trial.simulated, levels=32, on_off=True)
-    expected = on_levels(torch.stack([drive, drive.conj(), drive, drive]))
+    expected = trial.played()(torch.stack([drive, drive.conj(), drive, drive]))
     torch.testing.assert_close(measured, expected, rtol=1e-12, atol=0)
 
 

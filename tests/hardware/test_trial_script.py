@@ -1,5 +1,6 @@
 """The script of a trial: what it leaves and shows, and how it ends."""
 
+import errno
 import io
 import logging
 import math
@@ -18,6 +19,7 @@ import trial_values
 
 from autdtorch.array import TransducerArray
 from autdtorch.drive_file import load_drive
+from autdtorch.hardware import LinkError, OffError
 from autdtorch.hardware_report import compare
 from autdtorch.optim.gabs import gabs
 from autdtorch.scene_file import load_scene
@@ -67,6 +69,7 @@ def test_a_trial_leaves_log_drive_and_report_and_is_not_repeated(run, tmp_path: 
 
     assert run(*EMULATED) == 2
     assert "of another trial, whose dead is [4], not []" in caplog.text
+    assert caplog.messages[-1].endswith("or another log (--output)")
 
 
 def test_without_noise_the_report_says_that_it_is_the_simulation(run, tmp_path: Path):
@@ -109,7 +112,12 @@ def test_a_dry_run_shows_the_frames_and_leaves_nothing(run, tmp_path: Path, caps
         (("--transducers", "0-7"), 2, "--transducers: 8; must be 9, as many as the scene has"),
         (("--device", "emulated:openmpd", "--boards", "left.pat"), 2, "--boards: left.pat: no such file"),
         (("--device", "emulated:autd3", "--boards", "two"), 2, "--boards: two; must be the number of boards"),
-        (("--dead", "0-8"), 2, "the sensor hears no transducer"),
+        (
+            ("--dead", "0-8"),
+            2,
+            "hears no transducer: 0 Pa is the most, and must be above 0 Pa; check",
+        ),
+        (("--dead", "0-8", "--sensor", "scope"), 2, "and the sensor, and try a lower --loudest"),
         (("--scene", "nowhere"), 2, "--scene: nowhere: no such file; must be a YAML file, or one of homo"),
         (
             ("--device", "sonicsurface", "--sensor", "manual"),
@@ -225,12 +233,43 @@ def test_a_signal_speaks_of_the_device_only_once_it_was_opened(run, monkeypatch,
     assert caplog.messages[-1] == f"hardware_trial: SIGTERM{message}"
 
 
-def test_a_person_reads_each_transducer_and_the_silence_once(run, monkeypatch):
+@pytest.mark.parametrize("words", [(), ("--dry-run",)])
+def test_without_pyusb_an_emulated_trial_ends_with_the_hint(run, monkeypatch, caplog, words):
+    emulated = "autdtorch.hardware.emulat", "autdtorch.hardware.dry_run", "trial_"
+    for name in [name for name in sys.modules if name.startswith(emulated)]:
+        monkeypatch.delitem(sys.modules, name)
+    for name in ("usb", "usb.core", "usb.backend"):
+        monkeypatch.setitem(sys.modules, name, None)
+    assert run(*EMULATED, *words) == 2
+    assert "pip install 'autdtorch[hardware]'" in caplog.messages[-1]
+
+
+@pytest.mark.parametrize("left_on", [False, True])
+def test_an_error_in_mid_trial_says_that_the_outputs_are_off_if_they_are(run, monkeypatch, caplog, left_on):
+    def failing(objective, **_: object):
+        if simulated:
+            error = OSError(errno.ENOSPC, "No space left on device", "there.jsonl")
+            error.__context__ = OffError("stall") if left_on else LinkError("stall")
+            raise error
+        simulated.append(True)
+        return gabs(objective)
+
+    simulated: list[bool] = []
+    monkeypatch.setitem(trial_run.METHODS, "gabs", failing)
+    assert run("--device", "emulated", "--method", "gabs", "--amplitude-limit", "1") == 2
+    off = ": the outputs are off, and the same command goes on where the log ends"
+    expected = f"hardware_trial: [Errno 28] No space left on device: 'there.jsonl'{'' if left_on else off}"
+    assert caplog.messages[-1] == expected
+
+
+def test_a_person_reads_each_transducer_and_the_silence_once(run, monkeypatch, capsys, caplog):
     points, evaluations = 2, 1 + 8 * 4
     answers = io.StringIO("0\n" * points + "1\n" * points * (9 + evaluations + 1) + "0\n" * points)
     monkeypatch.setattr("sys.stdin", answers)
     assert run(*EMULATED, "--sensor", "manual") == 0
     assert not answers.read()
+    assert capsys.readouterr().out.count("Pressure at control point 1 of 2") == 1 + 9 + evaluations + 2
+    assert "pre-flight check: transducer 3 of 9" in caplog.messages
 
 
 def test_the_factor_between_simulation_and_bench_is_found():

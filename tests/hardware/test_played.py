@@ -1,0 +1,112 @@
+"""What a device is said to play, against the firmware that plays it."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from autdtorch.hardware import (
+    OPENMPD,
+    SONICSURFACE,
+    Device,
+    EmulatedBench,
+    LimitedLink,
+    Limits,
+    Link,
+    Played,
+    openmpd_boards,
+    ultraino_boards,
+)
+from autdtorch.hardware.autd3 import autd3_device
+from autdtorch.openmpd_board import OpenMPDBoard
+
+#: On two boards, where there are two, and in no order.
+TRANSDUCERS = [70, 3, *range(200, 186, -1)]
+
+
+def board() -> OpenMPDBoard:
+    """A board whose transducers all have other gains and offsets, and other pins."""
+    generator = torch.Generator().manual_seed(0)
+    return OpenMPDBoard(
+        "one",
+        torch.zeros((256, 3), dtype=torch.float64),
+        tuple(torch.randperm(256, generator=generator).tolist()),
+        2 * torch.pi * torch.rand(256, generator=generator).double(),
+        0.5 + 0.5 * torch.rand(256, generator=generator).double(),
+    )
+
+
+BOARD = board()
+#: Phases of each device, and the largest step of its amplitude: of a pulse's the first, by the least gain.
+DEVICES = {
+    "SonicSurface": (SONICSURFACE, 32, 1.0),
+    "OpenMPD": (OPENMPD, 128, math.pi / 128),
+    "OpenMPD, calibrated": (openmpd_boards([BOARD]), 128, math.pi / 128 / 0.5),
+    "Ultraino": (ultraino_boards(4), 10, math.pi / 10),
+    "AUTD3": (autd3_device(), 256, 1 / 255),
+}
+
+
+class Bench(EmulatedBench):
+    """A port too, so that a device needs no USB; its pressures are what the transducers emit."""
+
+    def __init__(self, device: Device) -> None:
+        calibrated = device.serials == (BOARD.name,)
+        emits = torch.ones(256).cdouble() / (BOARD.calibrated(torch.ones(256).cdouble()) if calibrated else 1)
+        pins = [BOARD.pins[place] if calibrated else place for place in TRANSDUCERS]
+        super().__init__(device, torch.diag(emits[TRANSDUCERS]), pins)
+
+    def write(self, data: bytes) -> None:
+        self.receive(data)
+
+    def flush(self) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class Silence:
+    """An objective that is never asked."""
+
+    scene = SimpleNamespace(array=TRANSDUCERS)
+
+
+def random_drives(seed: int) -> torch.Tensor:
+    """Three of them; the first has full amplitudes."""
+    generator = torch.Generator().manual_seed(seed)
+    amplitudes, angles = torch.rand(2, 3, 16, generator=generator, dtype=torch.float64)
+    amplitudes[0] = 1
+    return torch.polar(amplitudes, 7 * angles)
+
+
+@pytest.mark.parametrize("name", DEVICES)
+@settings(max_examples=15)
+@given(seed=st.integers(0, 2**31), limit=st.sampled_from([1.0, 0.8, 0.35]))
+def test_what_is_emitted_is_what_the_firmware_plays(name: str, seed: int, limit: float):
+    device, phases, step = DEVICES[name]
+    limit = 1.0 if device is SONICSURFACE else limit
+    drives = random_drives(seed)
+    played = Played(Silence(), device, TRANSDUCERS, limit)
+    emitted = played.emitted(drives)
+    # Rounding, of the levels' trigonometry.
+    torch.testing.assert_close(played.emitted(emitted), emitted, rtol=0, atol=1e-12)
+    assert torch.equal(played.emitted(drives.T.contiguous().T[1:2]), emitted[1:2])
+
+    bench = Bench(device)
+    with Link(device, bench, TRANSDUCERS, sleep=bench.bus.sleep) as link:
+        limited = LimitedLink(link, Limits(limit))
+        limited.play(torch.ones(16).cdouble())
+        full = bench.pressure().abs().max()
+        assert limit - step < full <= limit + 1e-6  # the tolerance of an amplitude
+        for asked, expected in zip(drives, emitted, strict=True):
+            limited.play(asked)
+            torch.testing.assert_close(bench.pressure(), full * expected, rtol=0, atol=1e-12)
+
+    turned = (emitted / drives)[emitted != 0].angle().abs()
+    assert turned.max() <= math.pi / phases + 1e-9
+    off = full * (emitted.abs() - drives.abs())
+    assert off.max() <= step / 2 + 1e-9
+    # Of a calibrated transducer the nearest level may be above the limit, and is then the one below.
+    assert -off.min() <= (step if name == "OpenMPD, calibrated" else step / 2) + 1e-9
