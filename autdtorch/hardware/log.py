@@ -184,6 +184,9 @@ class EvaluationLog:
 def lock_log(path: str | Path) -> Iterator[None]:
     """Keep other processes from a log; this one may lock it once more, as a notebook does.
 
+    Args:
+        path: of the file, which need not be there yet.
+
     Raises:
         LogError: another process has it.
         OSError: its folder cannot be written.

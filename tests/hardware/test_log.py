@@ -104,12 +104,19 @@ def test_a_line_that_cannot_have_been_measured_is_refused_by_its_number(trial, c
 
 
 @pytest.mark.parametrize(
-    "content", ["the notes of a week", '{"origin": "Kyoto"}\n', '{"origin": {}}\nnotes\n', "notes\nand more"]
+    "content",
+    [
+        "a week's notes",
+        '{"origin": "Kyoto"}\n',
+        '{"origin": {}}\n{"notes": 1}\n',
+        "notes\n",
+        '{"origin": {"a',
+    ],
 )
 def test_a_file_that_is_no_log_is_refused_and_left_as_it_is(trial, content: str):
     trial.log.write_text(content)
     bench = trial.bench()
-    with trial.link(bench) as link, pytest.raises(LogError, match=r"trial\.jsonl.*a hardware trial"):
+    with trial.link(bench) as link, pytest.raises(LogError, match=r"trial\.jsonl.* trial"):
         trial.objective(link, EmulatedSensor(bench))
     assert trial.log.read_text() == content
 
@@ -194,13 +201,21 @@ def test_a_log_is_open_in_one_process_alone_and_free_once_it_is_killed(trial):
             trial.objective(link, EmulatedSensor(bench))(full_on())
 
 
-def test_a_log_is_free_once_its_objective_is_gone(trial):
+def test_a_log_is_free_once_it_has_ended_or_its_objective_is_gone(trial):
+    def is_free() -> bool:
+        try:
+            with stranger.acquire(timeout=0):
+                return True
+        except Timeout:
+            return False
+
     bench = trial.bench()
     stranger = FileLock(trial.log.with_name(".trial.jsonl.lock"))  # as another process has it
     with trial.link(bench) as link:
-        objective = trial.objective(link, EmulatedSensor(bench))
-        with pytest.raises(Timeout):
-            stranger.acquire(timeout=0)
-        del objective
-        stranger.acquire(timeout=0)
-        stranger.release()
+        ended = trial.objective(link, EmulatedSensor(bench))
+        ended.log.end(seconds_on=0.0)
+        assert is_free()
+        gone = trial.objective(link, EmulatedSensor(bench))
+        assert not is_free()
+        del gone
+        assert is_free()

@@ -16,6 +16,7 @@ import pytest
 import torch
 import trial_run
 import trial_values
+from filelock import FileLock
 
 from autdtorch.array import TransducerArray
 from autdtorch.drive_file import load_drive
@@ -70,6 +71,17 @@ def test_a_trial_leaves_log_drive_and_report_and_is_not_repeated(run, tmp_path: 
     assert run(*EMULATED) == 2
     assert "of another trial, whose dead is [4], not []" in caplog.text
     assert caplog.messages[-1].endswith("or another log (--output)")
+
+
+def test_the_log_of_a_trial_that_runs_is_refused_before_a_device_is_touched(
+    run, tmp_path: Path, monkeypatch, caplog
+):
+    (tmp_path / "out").mkdir()
+    monkeypatch.setattr("autdtorch.hardware.open_link", None)
+    with FileLock(tmp_path / "out" / ".trial.jsonl.lock"):  # as another process has it
+        assert run(*EMULATED) == 2
+    assert "another process has it open for a trial" in caplog.messages[-1]
+    assert not (tmp_path / "out" / "trial.jsonl").exists()
 
 
 def test_without_noise_the_report_says_that_it_is_the_simulation(run, tmp_path: Path):
