@@ -110,3 +110,17 @@ def test_what_is_emitted_is_what_the_firmware_plays(name: str, seed: int, limit:
     assert off.max() <= step / 2 + 1e-9
     # Of a calibrated transducer the nearest level may be above the limit, and is then the one below.
     assert -off.min() <= (step if name == "OpenMPD, calibrated" else step / 2) + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("transducers", "amplitude", "message"),
+    [
+        (None, 1.0, "transducers: 64; must be 16, as many as the scene has"),
+        ([3] * 16, 1.0, "transducers: .* each once"),
+        (range(16), 1.1, "amplitude: 1.1"),
+        (range(16), 0.3, "amplitude: 0.3; must be >= 0.309, the least that Ultraino plays"),
+    ],
+)
+def test_what_a_device_cannot_play_is_refused(transducers, amplitude: float, message: str):
+    with pytest.raises(ValueError, match=message):
+        Played(Silence(), ultraino_boards(), transducers, amplitude)
