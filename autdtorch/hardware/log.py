@@ -174,10 +174,10 @@ class EvaluationLog:
                 while rest:
                     rest = rest[file.write(rest) :]
                 os.fsync(file.fileno())
+                self._size = file.tell()
             except BaseException:
                 file.truncate(self._size)
                 raise
-            self._size = file.tell()
 
 
 @contextlib.contextmanager
