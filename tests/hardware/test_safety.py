@@ -1,6 +1,5 @@
 """Limits of a trial."""
 
-import threading
 import time
 import weakref
 
@@ -168,8 +167,9 @@ def test_a_timer_that_comes_too_late_leaves_the_next_stretch_alone(trial):
     with trial.link(bench) as link:
         limited = LimitedLink(link, Limits(1.0, seconds_in_a_row=0.05))
         limited.play(full_on()[0])
-        # Python would wait for any other thread before it exits, and only then switch off.
-        assert all(thread.daemon for thread in threading.enumerate() if thread is not threading.main_thread())
+        assert (
+            limited._timer.daemon
+        )  # Python would wait for another before it exits, and only then switch off
         with limited._lock:  # the timer waits for it
             time.sleep(0.1)
             limited.off()
