@@ -167,9 +167,7 @@ def test_a_timer_that_comes_too_late_leaves_the_next_stretch_alone(trial):
     with trial.link(bench) as link:
         limited = LimitedLink(link, Limits(1.0, seconds_in_a_row=0.05))
         limited.play(full_on()[0])
-        assert (
-            limited._timer.daemon
-        )  # Python would wait for another before it exits, and only then switch off
+        assert limited._timer.daemon  # for another Python would wait before it exits and switches off
         with limited._lock:  # the timer waits for it
             time.sleep(0.1)
             limited.off()
