@@ -120,6 +120,16 @@ def test_a_dry_run_shows_the_frames_and_leaves_nothing(run, tmp_path: Path, caps
         (("--amplitude-limit", "0.5"), 2, "amplitude: 0.5; must be >= 1"),
         (("--set", "level=4"), 2, "unknown key 'level'; gabs has first, levels, order, passes"),
         (("--device", "openmpd"), 2, "--sensor: none; must be scope, file or manual on a real device"),
+        (
+            ("--device", "openmpd", "--transducers", "0-8", "--sensor", "file"),
+            2,
+            "--readings-file: none; must be the file of the readings",
+        ),
+        (
+            ("--device", "openmpd", "--transducers", "0-8", "--sensor", "scope"),
+            2,
+            "--scope-chip: none; must be the VID:PID of the oscilloscope",
+        ),
         (("--dead", "0-9"), 2, "--dead: 9; must be 0 to 8, as the scene has them"),
         (("--transducers", "0-7"), 2, "--transducers: 8; must be 9, as many as the scene has"),
         (("--device", "emulated:openmpd", "--boards", "left.pat"), 2, "--boards: left.pat: no such file"),
