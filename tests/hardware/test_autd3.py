@@ -3,7 +3,6 @@
 import asyncio
 import builtins
 import contextlib
-import os
 import signal
 import subprocess
 import threading
@@ -172,7 +171,8 @@ class TestWithTheKit:
         close, closed = Autd3Port.close, []
         monkeypatch.setattr(Autd3Port, "close", note_and_close)
         boards = kit.UdpEmulator(1)
-        threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGTERM)).start()
+        main = threading.main_thread().ident
+        threading.Timer(0.05, signal.pthread_kill, (main, signal.SIGTERM)).start()
         with pytest.raises(Signalled), ended_by_signals():
             open_autd3(1, network=boards.option())  # takes 0.3 s
         assert len(closed) == 1
