@@ -141,6 +141,9 @@ class TestWithTheKit:
             limited = LimitedLink(link, Limits(1.0, seconds_in_a_row=0.02))
             limited.play(random_drive(249))
             limited._timer.join()
+            loops = [thread for thread in threading.enumerate() if thread.name == "AUTD3"]
+            assert loops
+            assert all(one.daemon for one in loops)  # for others Python would wait before it exits
             assert played[2:] == [True, False, False]  # after the two of opening; on, then off twice
             with pytest.raises(LimitError, match="in a row"):
                 limited.require_on()
