@@ -18,7 +18,7 @@ import torch
 from autdtorch.drive import amplitudes_of, drive_from_phases, phases_of
 from autdtorch.objective import Objective, SimulatedObjective, validate_drives
 from autdtorch.scene import Scene
-from autdtorch.validation import finite_number, integer_at_least, invalid, not_negative, positive
+from autdtorch.validation import finite_number, indices, integer_at_least, invalid, not_negative, positive
 
 _PER = 1000  # Evaluations over which the rms of a drift is stated.
 
@@ -124,13 +124,8 @@ class Dead(Condition):
             ValueError: `transducers` is none of the above.
         """
         count = len(objective.scene.array)
-        if isinstance(transducers, str) or not isinstance(transducers, Sequence):
-            raise invalid("transducers", transducers, "must be indices of transducers")
-        dead = [integer_at_least(f"transducers[{place}]", one, 0) for place, one in enumerate(transducers)]
-        if not dead or len(set(dead)) < len(dead) or max(dead) >= count:
-            raise invalid("transducers", dead, f"must be indices from 0 to {count - 1}, each once")
         self._alive = torch.ones(count, dtype=torch.float64)
-        self._alive[dead] = 0
+        self._alive[indices("transducers", transducers, count)] = 0
         super().__init__(objective)
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from autdtorch.drive import phases_of, validate_drive
+from autdtorch.drive import phases_of, validate_single_drive
 from autdtorch.validation import ArrayLike, Vector
 
 Array: TypeAlias = npt.NDArray[np.float64]
@@ -76,8 +76,5 @@ def single_drive_phases(drive: ArrayLike, transducers: int) -> Array:
     Raises:
         ValueError: not one drive that the array can play.
     """
-    drive = validate_drive(drive, transducers)
-    if drive.ndim != 1:
-        raise ValueError(f"drive: shape {tuple(drive.shape)}; must be ({transducers},), a single drive")
-    phases: Array = phases_of(drive).detach().cpu().numpy()
+    phases: Array = phases_of(validate_single_drive(drive, transducers)).detach().cpu().numpy()
     return phases

@@ -128,3 +128,15 @@ def validate_drive(drive: ArrayLike, transducers: int) -> torch.Tensor:
         if largest > 1 + AMPLITUDE_TOLERANCE:
             raise ValueError(f"drive: amplitude {largest:.9g}; every |q| must be in [0, 1]")
     return drive
+
+
+def validate_single_drive(drive: ArrayLike, transducers: int) -> torch.Tensor:
+    """One `drive` (M,) as `validate_drive` gives it.
+
+    Raises:
+        ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+    """
+    drive = validate_drive(drive, transducers)
+    if drive.ndim != 1:
+        raise ValueError(f"drive: shape {tuple(drive.shape)}; must be ({transducers},), a single drive")
+    return drive

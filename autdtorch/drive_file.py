@@ -15,7 +15,7 @@ from autdtorch.array import TransducerArray
 from autdtorch.array_file import NORMAL_COLUMNS, PLACE_COLUMNS, read_npz
 from autdtorch.csv_table import read_table, write_table
 from autdtorch.device_layouts import AUTD3_TRANSDUCERS
-from autdtorch.drive import amplitudes_of, drive_from_phases, phases_of, validate_drive
+from autdtorch.drive import amplitudes_of, drive_from_phases, phases_of, validate_drive, validate_single_drive
 from autdtorch.hardware.levels import (
     Levels,
     autd3_drive,
@@ -79,9 +79,7 @@ def save_drive(
             unit of the device has.
     """
     kind = _kind(path)
-    checked = validate_drive(drive, len(array)).detach().cpu()
-    if checked.ndim != 1:
-        raise ValueError(f"drive: shape {tuple(checked.shape)}; must be ({len(array)},), one drive")
+    checked = validate_single_drive(drive, len(array)).detach().cpu()
     if device is None:
         columns, arrays = _plain(checked, array)
     else:

@@ -123,6 +123,22 @@ def positive_integers(name: str, value: object, count: int) -> tuple[int, ...]:
     return tuple(integer_at_least(f"{name}[{index}]", entry, 1) for index, entry in enumerate(value))
 
 
+def indices(name: str, value: object, count: int) -> list[int]:
+    """`value` as indices from 0 to `count` - 1: at least one, each once.
+
+    Raises:
+        ValueError: it is not.
+    """
+    if isinstance(value, torch.Tensor | np.ndarray):  # their entries are no Integral
+        value = value.tolist()
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        raise invalid(name, value, f"must be indices from 0 to {count - 1}")
+    chosen = [integer_at_least(f"{name}[{place}]", one, 0) for place, one in enumerate(value)]
+    if not chosen or len(set(chosen)) < len(chosen) or max(chosen) >= count:
+        raise invalid(name, chosen, f"must be indices from 0 to {count - 1}, each once")
+    return chosen
+
+
 def finite_vector(name: str, value: object, unit: str = "m") -> Vector:
     """`value` as three finite floats.
 

@@ -38,7 +38,9 @@ def _run() -> int:
             trial.run(shlex.join(["python", *sys.argv]))
     except (Exception, hardware.Signalled) as error:
         status, text, then = _described(error)
-        if trial is not None and trial.begun and not _left_on(error):
+        if (left_on := _left_on(error)) is not None:
+            text += "" if left_on is error else f"; {left_on}"
+        elif trial is not None and trial.begun:
             text += f": the outputs are off{then}"
         return _end(status, text)
     return 0
@@ -64,13 +66,13 @@ def _described(error: BaseException) -> tuple[int, str, str]:
             return _FAILED, f"{type(error).__name__}: {error} ({place})", same
 
 
-def _left_on(error: BaseException | None) -> bool:
-    """Whether a device may play on: of that error, or of one that it came after."""
+def _left_on(error: BaseException | None) -> BaseException | None:
+    """What says that a device may play on: that error, or one that it came after."""
     from autdtorch import hardware
 
     while error is not None and not isinstance(error, hardware.OffError):
         error = error.__cause__ or error.__context__
-    return error is not None
+    return error
 
 
 def _end(status: int, text: str) -> int:

@@ -15,7 +15,7 @@ from autdtorch import hardware
 from autdtorch.cache import digest_of
 from autdtorch.conditions import random_rms
 from autdtorch.hardware.autd3 import autd3_device
-from autdtorch.hardware.wiring import places
+from autdtorch.hardware.wiring import Wiring
 
 DEVICES = ("sonicsurface", "openmpd", "ultraino", "autd3")
 _USUAL = "emulated"
@@ -29,7 +29,6 @@ _EMULATED_SCOPE = (0x2A8D, 0x1770)
 class Bench(NamedTuple):
     """What a trial works with, and how often the pre-flight check reads a transducer and the silence."""
 
-    device: hardware.Device
     link: Callable[[], hardware.Link]
     sensor: Callable[[], contextlib.AbstractContextManager[hardware.Sensor]]
     readings: int
@@ -67,7 +66,7 @@ def wired_device(options: argparse.Namespace, count: int) -> tuple[hardware.Devi
         raise ValueError(f"--transducers: {len(chosen)}; must be {count}, as many as the scene has")
     if max(options.dead, default=0) >= count:
         raise ValueError(f"--dead: {max(options.dead)}; must be 0 to {count - 1}, as the scene has them")
-    return device, places(chosen, device.transducers).tolist()
+    return device, Wiring(device, chosen).transducers.tolist()
 
 
 def bench_of(
@@ -82,7 +81,6 @@ def bench_of(
         on_bench = _emulated_bench(options, device, simulated.transfer_matrix, transducers)
     by_hand = _sensor_kind(options) == "manual" or options.moved
     return Bench(
-        device,
         lambda: _link(options, device, transducers, on_bench),
         lambda: _sensor(options, simulated.scene, on_bench),
         *((1, 1) if by_hand else (4, 32)),
@@ -114,18 +112,18 @@ def _emulated_bench(
     options: argparse.Namespace, device: hardware.Device, matrix: torch.Tensor, transducers: list[int]
 ) -> hardware.EmulatedBench:
     """A bench whose transducers are wired and deviate as the boards' files say."""
-    places = torch.tensor(transducers)
+    wired = torch.tensor(transducers)
     if device_name(options) == "openmpd" and options.boards:
         boards = _openmpd_boards(options)
         each = device.transducers // len(boards)
         asked = torch.ones(each, dtype=torch.complex128)
-        corrections = torch.cat([board.calibrated(asked) for board in boards])[places]
+        corrections = torch.cat([board.calibrated(asked) for board in boards])[wired]
         matrix = torch.where(corrections == 0, 0, matrix / corrections)
         pins = torch.tensor(
             [each * number + pin for number, board in enumerate(boards) for pin in board.pins]
         )
-        places = pins[places]
-    return hardware.EmulatedBench(device, matrix, places.tolist(), dead=options.dead)
+        wired = pins[wired]
+    return hardware.EmulatedBench(device, matrix, wired, dead=options.dead)
 
 
 def _board_count(options: argparse.Namespace) -> int:
@@ -173,12 +171,17 @@ def _network(network: str | int | None) -> Any:
 
 
 def _sensor_kind(options: argparse.Namespace) -> str:
+    """Which of `SENSORS`; what it needs besides is given."""
     if options.dry_run:
         return "emulated"
     kind = options.sensor or "emulated"
     if kind == "emulated" and options.device not in EMULATED:
         given = options.sensor or "none"
         raise ValueError(f"--sensor: {given}; must be scope, file or manual on a real device")
+    if kind == "file" and options.readings_file is None:
+        raise ValueError("--readings-file: none; must be the file of the readings")
+    if kind == "scope" and options.device not in EMULATED and options.scope_chip is None:
+        raise ValueError("--scope-chip: none; must be the VID:PID of the oscilloscope, as lsusb shows it")
     return str(kind)
 
 
@@ -192,8 +195,6 @@ def _sensor(options: argparse.Namespace, scene: at.Scene, bench: hardware.Emulat
         case "manual":
             yield hardware.ManualSensor(points, _ask)
         case "file":
-            if options.readings_file is None:
-                raise ValueError("--readings-file: none; must be the file of the readings")
             yield hardware.FileSensor(options.readings_file, len(points))
         case "scope":
             with _scope(options, scene, bench) as scope:
@@ -215,8 +216,6 @@ def _scope(
 ) -> hardware.Oscilloscope:
     dialect = MAKERS[options.scope_maker]
     if bench is None:
-        if options.scope_chip is None:
-            raise ValueError("--scope-chip: none; must be the VID:PID of the oscilloscope, as lsusb shows it")
         return hardware.open_scope(options.scope_chip, dialect)
     rms = random_rms(bench.transfer_matrix)
     emulated = hardware.EmulatedScope(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from autdtorch.drive import AMPLITUDE_TOLERANCE
-from autdtorch.hardware.wiring import Wiring, single_drive
+from autdtorch.drive import AMPLITUDE_TOLERANCE, validate_single_drive
+from autdtorch.hardware.wiring import Wiring
 from autdtorch.validation import invalid, number_between, positive
 
 _FINEST = 2.0**-14  # of the amplitudes to choose from; two levels of a device here are further apart
@@ -48,7 +48,7 @@ class AmplitudeScale:
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
         """
-        wanted = self.largest * single_drive(drive, len(self._most))
+        wanted = self.largest * validate_single_drive(drive, len(self._most))
         return torch.polar(wanted.abs().minimum(self._most), wanted.angle())
 
     def played(self, drive: torch.Tensor) -> torch.Tensor:

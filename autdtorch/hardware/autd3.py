@@ -50,7 +50,7 @@ def autd3_device(boards: int = 1) -> Device:
 
 def open_autd3(
     boards: int = 1,
-    transducers: Sequence[int] | None = None,
+    transducers: Sequence[int] | torch.Tensor | None = None,
     network: Any = None,
     settle: float = SETTLE,
 ) -> Link:
@@ -60,7 +60,8 @@ def open_autd3(
 
     Args:
         boards: their number, >= 1.
-        transducers: for each transducer of the scene, which of the device's it is; by default all in order.
+        transducers: for each transducer of the scene, which of the device's it is (M,); by default all in
+            order.
         network: `autd3.UdpOption` or `autd3.ServerLink`; by default UDP on the interface that finds them.
         settle: how long a drive plays before its pressure is read [s].
 

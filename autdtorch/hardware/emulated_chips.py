@@ -51,7 +51,7 @@ class EmulatedChip:
         raise NotImplementedError
 
     def answer(self, kind: int, request: int) -> bytes | None:
-        """Answer a request; None, as no chip here has an answer."""
+        """Answer a request; None where the chip knows no such request, and stalls."""
 
     def write(self, data: bytes) -> None:
         """Send bytes on to the firmware, which loses them at another rate or format than its own."""

@@ -14,20 +14,20 @@ from autdtorch.hardware.devices import OPENMPD, SONICSURFACE, ULTRAINO, Device
 from autdtorch.hardware.emulated_bus import EmulatedBus, EmulatedDevice
 from autdtorch.hardware.emulated_chips import CHIPS
 from autdtorch.hardware.firmware import (
-    Autd3Boards,
+    Autd3Firmware,
     Firmware,
     OpenMPDFirmware,
     SonicSurfaceFirmware,
     UltrainoFirmware,
 )
-from autdtorch.hardware.wiring import places
-from autdtorch.validation import complex_tensor, finite_number, integer_at_least
+from autdtorch.hardware.wiring import Wiring
+from autdtorch.validation import complex_tensor, finite_number, indices, integer_at_least
 
 _FIRMWARES: dict[str, Callable[[int], Firmware]] = {
     SONICSURFACE.name: lambda transducers: SonicSurfaceFirmware(),
     OPENMPD.name: lambda transducers: OpenMPDFirmware(),
     ULTRAINO.name: lambda transducers: UltrainoFirmware(transducers // ULTRAINO.transducers),
-    autd3_device().name: Autd3Boards,
+    autd3_device().name: Autd3Firmware,
 }
 
 
@@ -61,14 +61,14 @@ class EmulatedBench:
             ValueError: `transducers` that the device does not have, not as many as the matrix has, or `dead`
                 ones that the scene does not have.
         """
-        self._transducers = places(transducers, device.transducers)
+        self._transducers = Wiring(device, transducers).transducers
         self.transfer_matrix = complex_tensor("transfer_matrix", transfer_matrix).to("cpu", torch.complex128)
         if self.transfer_matrix.ndim != 2 or self.transfer_matrix.shape[1] != len(self._transducers):
             shape = tuple(self.transfer_matrix.shape)
             raise ValueError(f"transfer_matrix: shape {shape}; must be (P, {len(self._transducers)})")
         self._alive = torch.ones(len(self._transducers))
         if dead:
-            self._alive[places(dead, len(self._transducers))] = 0
+            self._alive[indices("dead", dead, len(self._transducers))] = 0
         each = device.transducers // len(device.serials)
         self._firmwares = [_FIRMWARES[device.name](each) for _ in device.serials]
         self.firmware = self._firmwares[0]

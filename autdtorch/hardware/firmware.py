@@ -177,7 +177,7 @@ class UltrainoFirmware:
         return torch.tensor(played, dtype=torch.complex128)
 
 
-class Autd3Boards:
+class Autd3Firmware:
     """Boards of AUTD3 behind their kit, which hands over the phases of all, then the intensities of all.
 
     What the kit sends in between is its own; its emulator (`autd3_emulator`) is the check of the levels.

@@ -35,6 +35,7 @@ class Link:
     Attributes:
         device: what hangs on the port.
         transducers: which of the device's transducers play the drive (M,), int64.
+        wiring: of the two.
         settle: how long a drive plays before `play` returns [s].
     """
 
@@ -59,7 +60,7 @@ class Link:
 
         Raises:
             ValueError: `transducers` that the device does not have, or one twice; or a negative `settle`.
-            LinkError: the device does not take the bytes.
+            OffError: the device does not take the bytes.
         """
         self.device = device
         self._port = port
@@ -67,8 +68,8 @@ class Link:
         self._lock = threading.RLock()
         self._open = True
         self.off()
-        self._wiring = Wiring(device, transducers)
-        self.transducers = self._wiring.transducers
+        self.wiring = Wiring(device, transducers)
+        self.transducers = self.wiring.transducers
         self.settle = not_negative("settle", settle, "s")
         atexit.register(self.close)
 
@@ -91,7 +92,7 @@ class Link:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
             LinkError: the device does not take the bytes, or was let go.
         """
-        frame = self._wiring.frame(drive)
+        frame = self.wiring.frame(drive)
         with self._lock:
             if not self._open:
                 raise LinkError(f"{self.device.name} was let go; open it anew")
@@ -107,7 +108,7 @@ class Link:
         The frame is sent twice: a device that was left in mid-frame takes the first for the rest of that.
 
         Raises:
-            LinkError: the device does not take the bytes.
+            OffError: the device does not take the bytes, nor once it was recovered.
         """
         with self._lock:
             if not self._open:  # pyusb would open it once more
@@ -138,27 +139,22 @@ class Link:
         """Switch all outputs off and let go of the device.
 
         Raises:
-            LinkError: the device does not take the bytes; it is let go all the same.
+            OffError: the device does not take the bytes; it is let go all the same.
+            LinkError: the port cannot be given back to the system.
         """
         with self._lock:
+            if not self._open:
+                return
             try:
-                self._off_and_let_go()
+                self.off()
             except LinkError:
+                with contextlib.suppress(LinkError):  # the first error says more
+                    self._let_go()
                 raise
             except BaseException:  # a signal, which may come before anything is sent, or amid a recovery
-                self._off_and_let_go()
+                self.close()
                 raise
-
-    def _off_and_let_go(self) -> None:
-        if not self._open:
-            return
-        try:
-            self.off()
-        except LinkError:
-            with contextlib.suppress(LinkError):  # the first error says more
-                self._let_go()
-            raise
-        self._let_go()
+            self._let_go()
 
     def _let_go(self) -> None:
         self._open = False

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from filelock import FileLock, Timeout
 
-from autdtorch.drive import validate_drive
+from autdtorch.drive import validate_single_drive
 from autdtorch.validation import invalid, not_negative, real_tensor
 from autdtorch.writing import naming
 
@@ -245,9 +245,7 @@ def _now() -> str:
 def _evaluation(row: Mapping[str, Any], transducers: int, points: int) -> Evaluation:
     """The evaluation of a line, after checking it as what was asked for and read."""
     datetime.fromisoformat(row["time"])
-    drive = validate_drive(torch.view_as_complex(real_tensor("drive", row["drive"])), transducers)
-    if drive.ndim != 1:
-        raise ValueError(f"drive: shape {tuple(drive.shape)}; must be ({transducers},)")
+    drive = validate_single_drive(torch.view_as_complex(real_tensor("drive", row["drive"])), transducers)
     pressure = real_tensor("pressure", row["pressure"], "Pa")
     if pressure.shape != (points,) or pressure.min() < 0:
         raise invalid("pressure", row["pressure"], f"must be {points} numbers >= 0", "Pa")

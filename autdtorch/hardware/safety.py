@@ -18,7 +18,6 @@ import torch
 
 from autdtorch.hardware.amplitude_scale import AmplitudeScale
 from autdtorch.hardware.link import Link
-from autdtorch.hardware.wiring import Wiring
 from autdtorch.validation import integer_at_least, number_between, positive, require_kind
 
 logger = logging.getLogger(__name__)
@@ -143,7 +142,7 @@ class LimitedLink:
         self.link = link
         self.limits = limits
         self.logs: set[Path] = set()
-        self._scale = AmplitudeScale(Wiring(link.device, link.transducers), limits.amplitude)
+        self._scale = AmplitudeScale(link.wiring, limits.amplitude)
         self._lock = threading.RLock()
         self._timer: threading.Timer | None = None
         self._on_since: float | None = None
@@ -154,7 +153,8 @@ class LimitedLink:
     @property
     def seconds_on(self) -> float:
         """How long the outputs were on so far [s]."""
-        return self._seconds_before + self._stretch()
+        with self._lock:  # the timer adds the stretch to those before
+            return self._seconds_before + self._stretch()
 
     def go_on(self, seconds: float) -> None:
         """Go on with a trial of an earlier process.
@@ -225,7 +225,7 @@ class LimitedLink:
         """Switch all outputs off, and begin the rest that the duty cycle asks for.
 
         Raises:
-            LinkError: the device does not take the bytes.
+            OffError: the device does not take the bytes.
         """
         with self._lock:
             if self._on_since is None:

@@ -24,7 +24,7 @@ class Solution:
     """The drive that each of T trials chose: the best it observed, but where a method says otherwise.
 
     Attributes:
-        drive: (T, M), complex128, as it was played: on the levels of a `Quantised` objective.
+        drive: (T, M), complex128, as it was played: on the device's levels, if the objective knows them.
         pressure: magnitudes at the P control points (T, P) [Pa], as observed for `drive`.
         score: (T,), as observed for `drive`; in Pa for the weakest focus.
         evaluations: number of evaluations (T,), int64.

@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from autdtorch.drive import validate_drive
+from autdtorch.drive import validate_single_drive
 from autdtorch.propagator.base import Propagator
 from autdtorch.validation import ArrayLike, invalid, positive
 
@@ -35,9 +35,7 @@ def volume_field(propagator: Propagator, drive: ArrayLike, spacing: float | None
             million cells.
     """
     scene = propagator.scene
-    drive = validate_drive(drive, len(scene.array))
-    if drive.ndim != 1:
-        raise ValueError(f"drive: shape {tuple(drive.shape)}; must be ({len(scene.array)},), a single drive")
+    drive = validate_single_drive(drive, len(scene.array))
     spacing = scene.wavelength / 4 if spacing is None else positive("spacing", spacing, "m")
     lower, upper = torch.tensor(scene.domain, dtype=torch.float64)
     counts = [max(2, round(float(length) / spacing)) for length in upper - lower]

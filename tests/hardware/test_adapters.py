@@ -81,6 +81,7 @@ def test_a_chip_is_given_back_only_when_nobody_reads_from_it():
     port = ULTRAINO.adapters[0].open_port(find_device([(0x2341, 0x0042)], backend=bus))
     assert reading.wait(1)
     port.close()
+    assert port._reader.daemon  # for another Python would wait before it exits and switches off
     assert released_while_reading == [False, False]
 
 

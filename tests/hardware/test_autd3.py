@@ -3,7 +3,6 @@
 import asyncio
 import builtins
 import contextlib
-import os
 import signal
 import subprocess
 import threading
@@ -142,6 +141,9 @@ class TestWithTheKit:
             limited = LimitedLink(link, Limits(1.0, seconds_in_a_row=0.02))
             limited.play(random_drive(249))
             limited._timer.join()
+            loops = [thread for thread in threading.enumerate() if thread.name == "AUTD3"]
+            assert loops
+            assert all(one.daemon for one in loops)  # for others Python would wait before it exits
             assert played[2:] == [True, False, False]  # after the two of opening; on, then off twice
             with pytest.raises(LimitError, match="in a row"):
                 limited.require_on()
@@ -172,7 +174,8 @@ class TestWithTheKit:
         close, closed = Autd3Port.close, []
         monkeypatch.setattr(Autd3Port, "close", note_and_close)
         boards = kit.UdpEmulator(1)
-        threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGTERM)).start()
+        main = threading.main_thread().ident
+        threading.Timer(0.05, signal.pthread_kill, (main, signal.SIGTERM)).start()
         with pytest.raises(Signalled), ended_by_signals():
             open_autd3(1, network=boards.option())  # takes 0.3 s
         assert len(closed) == 1

@@ -48,7 +48,7 @@ def test_another_kind_of_thing_is_refused_by_name(trial, use: Callable[..., obje
 @pytest.mark.parametrize(
     ("drive", "message"),
     [
-        (torch.ones(2, 16).cdouble(), r"drive: shape \(2, 16\); must be \(16,\), one drive"),
+        (torch.ones(2, 16).cdouble(), r"drive: shape \(2, 16\); must be \(16,\), a single drive"),
         (1.5 * torch.ones(16).cdouble(), r"drive: amplitude 1\.5; every \|q\| must be in"),
     ],
 )

@@ -1,6 +1,5 @@
 """What goes wrong in mid-trial: outputs off, one clear line, a log that loads, and a trial that goes on."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -138,7 +137,7 @@ def not_ignored(number):
 def test_a_signal_ends_the_trial_with_the_outputs_off(trial, number):
     def disturb(readings: int) -> None:
         if readings > SURVIVED:
-            os.kill(os.getpid(), number)
+            signal.raise_signal(number)
 
     before = signal.getsignal(number)
     bench = trial.bench()
@@ -155,7 +154,7 @@ def test_signals_in_mid_frame_and_while_switching_off_leave_the_outputs_off(tria
         def bulk_write(self, dev_handle, ep, intf, data, timeout):
             written = super().bulk_write(dev_handle, ep, intf, data[:300], timeout)
             if loud:
-                os.kill(os.getpid(), signal.SIGTERM)
+                signal.raise_signal(signal.SIGTERM)
             return written
 
     def interrupted_trial() -> None:
@@ -191,8 +190,9 @@ def test_a_signal_while_the_last_off_frame_is_mended_leaves_the_outputs_off(tria
 def test_a_signal_just_before_the_switching_off_leaves_the_outputs_off(trial):
     class Interrupted(Link):
         def off(self):
-            if loud and not signals:
-                signals.append(os.kill(os.getpid(), signal.SIGTERM))
+            if loud:
+                loud.clear()
+                signal.raise_signal(signal.SIGTERM)
             super().off()
 
     def interrupted_trial() -> None:
@@ -202,7 +202,6 @@ def test_a_signal_just_before_the_switching_off_leaves_the_outputs_off(trial):
             link.play(torch.ones(16, dtype=torch.complex128))
 
     loud: list[bool] = []
-    signals: list[None] = []
     bench = trial.bench()
     with pytest.raises(Signalled):
         interrupted_trial()
@@ -254,7 +253,7 @@ def test_a_signal_as_the_listening_begins_or_ends_leaves_the_handlers_as_they_we
         before = set_handler(number, handler)
         changes.append(number)
         if len(changes) == handlers_set:
-            os.kill(os.getpid(), signal.SIGTERM)
+            signal.raise_signal(signal.SIGTERM)
         return before
 
     def listen() -> None:
@@ -281,7 +280,7 @@ def test_a_signal_that_is_ignored_as_by_nohup_stays_so():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with ended_by_signals():
-            os.kill(os.getpid(), signal.SIGHUP)
+            signal.raise_signal(signal.SIGHUP)
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)

@@ -5,6 +5,7 @@ import json
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -177,17 +178,21 @@ def test_of_two_objectives_on_one_log_the_second_to_measure_is_refused(trial):
 
 
 LOCKING = """
-import os, signal, sys
-from autdtorch.hardware.log import lock_log
-with lock_log(sys.argv[1]):
+import sys
+from filelock import FileLock
+with FileLock(sys.argv[1]):
     print(flush=True)
     sys.stdin.read()
 """
 
 
+def lock_of(log: Path) -> Path:
+    return log.with_name(f".{log.name}.lock")
+
+
 def test_a_log_is_open_in_one_process_alone_and_free_once_it_is_killed(trial):
     other = subprocess.Popen(
-        [sys.executable, "-c", LOCKING, trial.log], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        [sys.executable, "-c", LOCKING, lock_of(trial.log)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
     with other:
         other.stdout.readline()
@@ -210,7 +215,7 @@ def test_a_log_is_free_once_it_has_ended_or_its_objective_is_gone(trial):
             return False
 
     bench = trial.bench()
-    stranger = FileLock(trial.log.with_name(".trial.jsonl.lock"))  # as another process has it
+    stranger = FileLock(lock_of(trial.log))  # as another process has it
     with trial.link(bench) as link:
         ended = trial.objective(link, EmulatedSensor(bench))
         ended.log.end(seconds_on=0.0)

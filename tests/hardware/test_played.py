@@ -82,7 +82,7 @@ def random_drives(seed: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("name", DEVICES)
-@settings(max_examples=15)
+@settings(max_examples=6)
 @given(seed=st.integers(0, 2**31), limit=st.sampled_from([1.0, 0.8, 0.35]))
 def test_what_is_emitted_is_what_the_firmware_plays(name: str, seed: int, limit: float):
     device, phases, step = DEVICES[name]

@@ -1,6 +1,5 @@
 """Limits of a trial."""
 
-import threading
 import time
 import weakref
 
@@ -166,14 +165,13 @@ def test_a_timer_that_cannot_switch_off_says_so_at_once_and_ends_the_trial(trial
 def test_a_timer_that_comes_too_late_leaves_the_next_stretch_alone(trial):
     bench = trial.bench()
     with trial.link(bench) as link:
-        limited = LimitedLink(link, Limits(1.0, seconds_in_a_row=0.05))
+        limited = LimitedLink(link, Limits(1.0))
         limited.play(full_on()[0])
-        # Python would wait for any other thread before it exits, and only then switch off.
-        assert all(thread.daemon for thread in threading.enumerate() if thread is not threading.main_thread())
-        with limited._lock:  # the timer waits for it
-            time.sleep(0.1)
-            limited.off()
-            limited.play(full_on()[0])
+        late = limited._timer
+        assert late.daemon  # for another Python would wait before it exits and switches off
+        limited.off()
+        limited.play(full_on()[0])
+        late.function()  # it had waited for the lock
         limited.require_on()
         assert bench.drive().abs().min() > 0.9
 

@@ -152,5 +152,5 @@ def test_a_drive_that_is_not_the_devices_is_refused(tmp_path):
         save_drive(tmp_path / "d.csv", drive, array, "autd")
     with pytest.raises(ValueError, match=r"path: .*; must end in .csv or .npz"):
         save_drive(tmp_path / "d.txt", drive, array)
-    with pytest.raises(ValueError, match=r"drive: shape \(1, 16\); must be \(16,\), one drive"):
+    with pytest.raises(ValueError, match=r"drive: shape \(1, 16\); must be \(16,\), a single drive"):
         save_drive(tmp_path / "d.csv", drive[None], array)
