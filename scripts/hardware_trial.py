@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 import os
-import shlex
 import sys
 import traceback
 
@@ -30,12 +29,12 @@ def _run() -> int:
     from autdtorch import hardware
 
     logging.getLogger().setLevel(logging.INFO)  # only now: half of PyTorch would log its caches
-    options = parsed()
+    options = parsed(sys.argv[1:])
     trial = None
     try:
         with hardware.ended_by_signals():
             trial = Trial(options)
-            trial.run(shlex.join(["python", *sys.argv]))
+            trial.run(options.command)
     except (Exception, hardware.Signalled) as error:
         status, text, then = _described(error)
         if (left_on := _left_on(error)) is not None:

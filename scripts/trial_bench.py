@@ -15,6 +15,7 @@ from autdtorch import hardware
 from autdtorch.cache import digest_of
 from autdtorch.conditions import random_rms
 from autdtorch.hardware.autd3 import autd3_device
+from autdtorch.hardware.sensor import typed
 from autdtorch.hardware.wiring import Wiring
 
 DEVICES = ("sonicsurface", "openmpd", "ultraino", "autd3")
@@ -142,11 +143,11 @@ def _link(
     bench: hardware.EmulatedBench | None,
 ) -> hardware.Link:
     """The link, open."""
-    on_network = device_name(options) == "autd3"
+    on_network, settle = device_name(options) == "autd3", options.settle
     if bench is None:
         if on_network:
-            return hardware.open_autd3(_board_count(options), transducers, _network(options.network))
-        return hardware.open_link(device, transducers, options.serial)
+            return hardware.open_autd3(_board_count(options), transducers, _network(options.network), settle)
+        return hardware.open_link(device, transducers, options.serial, settle=settle)
     # Imported here, as both need pyusb: without it, no more than its hint is to be shown.
     if options.dry_run:
         from autdtorch.hardware.dry_run import DryPort
@@ -157,8 +158,8 @@ def _link(
 
         port = EmulatedAutd3Port(_board_count(options), bench)
     else:
-        return hardware.open_link(device, transducers, backend=bench.bus)
-    return hardware.Link(device, port, transducers, sleep=bench.bus.sleep)
+        return hardware.open_link(device, transducers, backend=bench.bus, settle=settle)
+    return hardware.Link(device, port, transducers, settle, bench.bus.sleep)
 
 
 def _network(network: str | int | None) -> Any:
@@ -208,7 +209,7 @@ def _sensor(options: argparse.Namespace, scene: at.Scene, bench: hardware.Emulat
 
 def _ask(question: str) -> str:
     """Below the bar of the progress, which says what is played."""
-    return input(f"\n{question}")
+    return typed(f"\n{question}")
 
 
 def _scope(
@@ -227,5 +228,6 @@ def _scope(
         noise=0.0 if options.snr is None else options.sensitivity * rms * 10 ** (-options.snr / 20),
         seed=options.seed,
     )
-    emulated.plug_into(bench, _EMULATED_SCOPE)
-    return hardware.open_scope(_EMULATED_SCOPE, dialect, backend=bench.bus)
+    chip = options.scope_chip or _EMULATED_SCOPE
+    emulated.plug_into(bench, chip)
+    return hardware.open_scope(chip, dialect, backend=bench.bus)

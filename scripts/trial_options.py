@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn
 
 from trial_bench import DEVICES, EMULATED, MAKERS, SENSORS, device_name
 from trial_run import METHODS
-from trial_values import ABOVE_ZERO, COUNT, DECIBELS, SEED, SHARE, chip, indices, network
+from trial_values import ABOVE_ZERO, COUNT, DECIBELS, NOT_NEGATIVE, SEED, SHARE, chip, indices, network
 
 from autdtorch.hardware import Limits
+from autdtorch.hardware.link import SETTLE
 
 _DESCRIPTION = """\
 Runs a method on a device, or on its emulator; an interrupted trial goes on with the same command.
@@ -31,16 +32,21 @@ class Parser(argparse.ArgumentParser):
         """End the script."""
         self.exit(2, f"hardware_trial: {message}; --help lists the options\n")
 
-    def convert_arg_line_to_args(self, arg_line: str) -> list[str]:
-        """The words of a line of a file, as a shell would read them."""
-        try:
-            return shlex.split(arg_line, comments=True)
-        except ValueError as error:
-            self.error(f"{arg_line!r}: {error}")
+    def expanded(self, words: Sequence[str]) -> Iterator[str]:
+        """`words`, with those in a file, as a shell would read them, in the place of its @FILE."""
+        for word in words:
+            if not word.startswith("@"):
+                yield word
+                continue
+            try:
+                yield from shlex.split(Path(word[1:]).read_text("utf-8"), comments=True)
+            except (OSError, ValueError) as error:
+                reason = getattr(error, "strerror", None) or error
+                self.error(f"{word}: {reason}; must be a text file of options")
 
 
-def parsed(words: Sequence[str] | None = None) -> argparse.Namespace:
-    """The options.
+def parsed(words: Sequence[str]) -> argparse.Namespace:
+    """The options that `words` say; `command` is how to say them without a file.
 
     Raises:
         SystemExit: after one line on stderr, where they are refused.
@@ -51,17 +57,15 @@ def parsed(words: Sequence[str] | None = None) -> argparse.Namespace:
         description=_DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
-        fromfile_prefix_chars="@",
     )
     _add_trial(parser)
     _add_limits(parser)
     _add_device(parser)
     _add_sensor(parser)
+    expanded = list(parser.expanded(words))
     # What is still None was not given.
-    try:
-        options = parser.parse_args(words, argparse.Namespace(**dict.fromkeys(_BELONGS)))
-    except UnicodeDecodeError as error:
-        parser.error(f"@FILE: {error}; must be text")
+    options = parser.parse_args(expanded, argparse.Namespace(**dict.fromkeys(_BELONGS)))
+    options.command = shlex.join(["python", "scripts/hardware_trial.py", *expanded])
     for name, (bench, belongs) in _BELONGS.items():
         if getattr(options, name) is None:
             setattr(options, name, parser.get_default(name))
@@ -144,6 +148,13 @@ def _add_device(parser: argparse.ArgumentParser) -> None:
         "server on this machine",
     )
     add(
+        "--settle",
+        type=NOT_NEGATIVE,
+        default=SETTLE,
+        metavar="S",
+        help="how long a drive plays before the sensor reads (%(default)g)",
+    )
+    add(
         "--snr",
         type=DECIBELS,
         metavar="DB",
@@ -205,10 +216,7 @@ _BELONGS: dict[str, tuple[str, Callable[[argparse.Namespace], bool]]] = {
     ),
     "dead": ("an emulated device", _is_played_in_emulated_air),
     "readings_file": ("--sensor file", lambda options: options.sensor == "file"),
-    "scope_chip": (
-        "--sensor scope beside a real device",
-        lambda options: _is_real(options) and _has_a_scope(options),
-    ),
+    "scope_chip": ("--sensor scope", _has_a_scope),
     "moved": (
         "--sensor scope beside a real device",
         lambda options: _is_real(options) and _has_a_scope(options),

@@ -27,6 +27,9 @@ SHARE = number("a number > 0 and <= 1", lambda value: 0 < value <= 1)
 DECIBELS = number("a finite number", math.isfinite)
 COUNT = number("an integer >= 1", lambda value: value >= 1, int)
 SEED = number("an integer >= 0", lambda value: value >= 0, int)
+NOT_NEGATIVE = number("a number >= 0", lambda value: 0 <= value < math.inf)
+
+_MOST = 100_000  # transducers; a slip of the finger must not fill the memory
 
 
 def indices(text: str) -> list[int]:
@@ -36,8 +39,10 @@ def indices(text: str) -> list[int]:
         ranges = [range(int(low), int(high or low) + 1) for low, _, high in parts]
     except ValueError:
         ranges = []
-    if not ranges or not all(ranges):
-        raise argparse.ArgumentTypeError(f"{text!r}; must be numbers and ranges that go up, as 3,7-9")
+    if not ranges or not all(ranges) or sum(map(len, ranges)) > _MOST:
+        raise argparse.ArgumentTypeError(
+            f"{text!r}; must be at most {_MOST} numbers, and ranges that go up, as 3,7-9"
+        )
     return [one for some in ranges for one in some]
 
 
@@ -47,6 +52,8 @@ def chip(text: str) -> tuple[int, int]:
         vendor, product = (int(part, 16) for part in text.split(":"))
     except ValueError as error:
         raise argparse.ArgumentTypeError(f"{text!r}; must be VID:PID, as 2a8d:1770") from error
+    if not (0 <= vendor < 2**16 and 0 <= product < 2**16):
+        raise argparse.ArgumentTypeError(f"{text!r}; must be VID:PID with four digits each, as 2a8d:1770")
     return vendor, product
 
 

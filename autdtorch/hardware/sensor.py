@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import select
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +23,7 @@ from autdtorch.validation import (
 )
 
 _POLL = 0.02  # [s] between looks at a file
+_HEARD_AFTER = 0.2  # [s], at most, is a signal heard
 
 
 class SensorError(OSError):
@@ -32,6 +36,22 @@ class Sensor(Protocol):
     def read(self) -> torch.Tensor:
         """Magnitudes (P,) [Pa] at the control points, once the field stands."""
         ...
+
+
+def typed(question: str) -> str:
+    """What somebody types to a question.
+
+    At a terminal `input` alone misses a signal that comes just before it begins to wait, until the answer.
+
+    Raises:
+        EOFError: the input has ended.
+    """
+    if not sys.stdin.isatty() or os.name != "posix":
+        return input(question)
+    print(question, end="", flush=True)
+    while not select.select([sys.stdin], [], [], _HEARD_AFTER)[0]:
+        pass
+    return input()
 
 
 def checked_reading(sensor: Sensor, points: int) -> torch.Tensor:
@@ -49,7 +69,7 @@ def checked_reading(sensor: Sensor, points: int) -> torch.Tensor:
 class ManualSensor:
     """Somebody who reads an instrument and types what it shows, point by point."""
 
-    def __init__(self, control_points: ArrayLike, ask: Callable[[str], str] = input) -> None:
+    def __init__(self, control_points: ArrayLike, ask: Callable[[str], str] = typed) -> None:
         """Say where to measure.
 
         Args:
@@ -89,7 +109,7 @@ class MovedMicrophone:
     The drive plays on all the while.
     """
 
-    def __init__(self, sensor: Sensor, control_points: ArrayLike, ask: Callable[[str], str] = input) -> None:
+    def __init__(self, sensor: Sensor, control_points: ArrayLike, ask: Callable[[str], str] = typed) -> None:
         """Say where to measure.
 
         Args:

@@ -1,6 +1,9 @@
 """The lock-in, and the sensors that people and other programs are."""
 
 import math
+import os
+import select
+import signal
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,6 +14,8 @@ from hypothesis import strategies as st
 
 from autdtorch.hardware import FileSensor, ManualSensor, MovedMicrophone, SensorError, sensor
 from autdtorch.hardware.lock_in import LockIn
+from autdtorch.hardware.safety import Signalled, ended_by_signals
+from autdtorch.hardware.sensor import typed
 
 POINTS = [(0.08, 0.01, 0.0), (0.08, -0.02, 5e-3)]
 
@@ -115,3 +120,19 @@ def test_a_file_that_does_not_change_or_holds_something_else_is_an_error_in_time
     running(monkeypatch, path, *contents)
     with pytest.raises(SensorError, match=message):
         FileSensor(path, 2, timeout=5).read()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a pseudo-terminal")
+def test_a_signal_just_before_somebody_is_waited_for_is_heard(monkeypatch):
+    def interrupted(*_: object) -> None:
+        signal.raise_signal(signal.SIGTERM)
+
+    terminal, behind = os.openpty()
+    with os.fdopen(terminal, "w") as keyboard, os.fdopen(behind) as answers:
+        monkeypatch.setattr("sys.stdin", answers)
+        keyboard.write("1.5\n")
+        keyboard.flush()
+        assert typed("how much? ") == "1.5"
+        monkeypatch.setattr(select, "select", interrupted)
+        with ended_by_signals(), pytest.raises(Signalled):
+            typed("how much? ")

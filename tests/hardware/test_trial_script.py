@@ -162,18 +162,20 @@ def test_no_trial_without_an_amplitude_limit(run, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--transducers", "5-3"), "--transducers: '5-3'; must be numbers and ranges that go up"),
+        (("--transducers", "5-3"), "--transducers: '5-3'; must be at most 100000 numbers"),
+        (("--dead", "0-99999999999999"), "must be at most 100000 numbers, and ranges that go up"),
         (("--amplitude-limit", "0"), "--amplitude-limit: '0'; must be a number > 0 and <= 1"),
         (("--sensor", "scope", "--captures", "0"), "--captures: '0'; must be an integer >= 1"),
         (("--sensor", "scope", "--loudest", "-1"), "--loudest: '-1'; must be a number > 0"),
         (("--snr", "nan"), "--snr: 'nan'; must be a finite number"),
         (("--captures", "1"), "--captures: only for --sensor scope"),  # its default, but given
-        (("--sensor", "scope", "--scope-chip", "1:2"), "--scope-chip: only for --sensor scope beside a real"),
+        (("--scope-chip", "1:2"), "--scope-chip: only for --sensor scope"),
+        (("--sensor", "scope", "--moved"), "--moved: only for --sensor scope beside a real device"),
         (("--sensor", "manual", "--snr", "30"), "--snr: only for emulated microphones"),
         (("--device", "openmpd", "--sensor", "manual", "--dead", "1"), "--dead: only for an emulated device"),
         (("--device", "sonicsurface", "--boards", "2"), "--boards: only for openmpd, ultraino and autd3"),
         (("--device", "ultraino", "--network", "eth0"), "--network: only for --device autd3"),
-        (("@nowhere.txt",), "No such file or directory: 'nowhere.txt'"),
+        (("@nowhere.txt",), "@nowhere.txt: No such file or directory; must be a text file of options"),
     ],
 )
 def test_what_means_nothing_is_one_line_that_names_the_option(run, capsys, words, message):
@@ -188,6 +190,9 @@ def test_a_bench_is_described_in_a_file(run, tmp_path: Path, caplog):
     bench.write_text("# ours\n--device emulated:openmpd --dead 4  # it fell\n\n--amplitude-limit 0.5\n")
     assert run(f"@{bench}", "--method", "lssg") == 0
     assert "not heard, counted from 0: 4" in caplog.text
+    assert (
+        "--device emulated:openmpd --dead 4 --amplitude-limit 0.5" in (tmp_path / "out/report.md").read_text()
+    )
 
 
 @pytest.mark.parametrize("device", ["autd3", "openmpd"])
