@@ -42,7 +42,7 @@ All are of the drive that was found. *When found* is the best of many readings, 
 high where they are noisy; *again* is the mean of {readings} after the search. *Simulated* is without the
 transducers that are not heard. The simulation knows neither the strength of the transducers nor the
 calibration of the sensor, so that its pressures are multiplied by one factor, {scale:#.4g}, fitted to all
-{evaluations} evaluations by least squares. These then differ by {misfit:.2g} % (rms, of the rms measured).
+{evaluations} evaluations by least squares. These then differ by {misfit} % (rms, of the rms measured).
 
 ## By control point
 
@@ -86,6 +86,10 @@ def compare(measured: torch.Tensor, simulated: torch.Tensor) -> Comparison:
     scale = (measured * simulated).sum() / simulated.square().sum()
     misfit = (measured - scale * simulated).square().mean().sqrt() / measured.square().mean().sqrt()
     return Comparison(float(scale), float(misfit))
+
+
+def _percent(share: float) -> str:
+    return f"{round(100 * share, 6):.2g}"  # less is rounding
 
 
 def write_hardware_report(
@@ -152,7 +156,7 @@ def write_hardware_report(
         points=_points(scene.control_points, *pressures),
         fits=_fits(scene.control_points, measured, there),
         scale=fit.scale,
-        misfit=100 * fit.misfit,
+        misfit=_percent(fit.misfit),
         preflight=_preflight(preflight),
         settings=table([["setting", "value"], *([name, _value(own)] for name, own in log.origin.items())]),
     )
@@ -193,7 +197,7 @@ def _fits(places: torch.Tensor, measured: torch.Tensor, simulated: torch.Tensor)
     rows = [["control point [mm]", "factor", "differs by [%]"]]
     for name, here, there in zip(_names(places), measured.T, simulated.T, strict=True):
         fit = compare(here, there)
-        rows.append([name, f"{fit.scale:#.4g}", f"{100 * fit.misfit:.2g}"])
+        rows.append([name, f"{fit.scale:#.4g}", _percent(fit.misfit)])
     return table(rows)
 
 
