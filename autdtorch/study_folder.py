@@ -9,8 +9,9 @@ import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from filelock import FileLock, Timeout
+from filelock import FileLock
 
+from autdtorch.locking import held
 from autdtorch.results import (
     PROVENANCE_FILE,
     RESULTS_FILE,
@@ -109,17 +110,9 @@ def open_folder(
         return
     path = Path(folder)
     path.mkdir(parents=True, exist_ok=True)
-    # The system frees the lock when the process ends, however it ends.
-    lock = FileLock(path / _LOCK_FILE)
-    try:
-        lock.acquire(timeout=0)
-    except Timeout as error:
-        accepted = "another process writes there; wait until it ends, or give another folder"
-        raise ValueError(f"output: {path}; {accepted}") from error
-    try:
+    accepted = "another process writes there; wait until it ends, or give another folder"
+    with held(FileLock(path / _LOCK_FILE), ValueError(f"output: {path}; {accepted}")):
         yield StudyFolder(path, provenance, reuse)
-    finally:
-        lock.release()
 
 
 def _stored_provenance(path: Path) -> Provenance | None:

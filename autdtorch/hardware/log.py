@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from filelock import FileLock, Timeout
+from filelock import FileLock
 
 from autdtorch.drive import validate_single_drive
+from autdtorch.locking import held
 from autdtorch.validation import invalid, not_negative, real_tensor
 from autdtorch.writing import naming
 
@@ -192,17 +193,10 @@ def lock_log(path: str | Path) -> Iterator[None]:
         OSError: its folder cannot be written.
     """
     place = Path(path).resolve()
-    # The system frees the lock when the process ends, however it ends.
     lock = FileLock(place.with_name(f".{place.name}.lock"), thread_local=False, is_singleton=True)
-    try:
-        lock.acquire(timeout=0)
-    except Timeout as error:
-        accepted = "another process has it open for a trial; wait until it ends, or give another log"
-        raise LogError(f"{path}: {accepted}") from error
-    try:
+    accepted = "another process has it open for a trial; wait until it ends, or give another log"
+    with held(lock, LogError(f"{path}: {accepted}")):
         yield
-    finally:
-        lock.release()
 
 
 def _line(row: Mapping[str, Any]) -> bytes:
