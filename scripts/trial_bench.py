@@ -14,7 +14,7 @@ import autdtorch as at
 from autdtorch import hardware
 from autdtorch.cache import digest_of
 from autdtorch.conditions import random_rms
-from autdtorch.hardware.autd3 import autd3_device
+from autdtorch.hardware.autd3 import autd3_device, autd3_kit
 from autdtorch.hardware.sensor import typed
 from autdtorch.hardware.wiring import Wiring
 
@@ -166,8 +166,7 @@ def _network(network: str | int | None) -> Any:
     """What the kit of AUTD3 takes for `--network`."""
     if network is None:
         return None
-    import autd3
-
+    autd3 = autd3_kit()
     return autd3.ServerLink(network) if isinstance(network, int) else autd3.UdpOption(network)
 
 

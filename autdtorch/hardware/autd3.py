@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import threading
 from collections.abc import Callable, Coroutine, Sequence
 from queue import SimpleQueue
@@ -16,7 +15,7 @@ from autdtorch.device_layouts import AUTD3_TRANSDUCERS
 from autdtorch.hardware.devices import Device
 from autdtorch.hardware.levels import Levels, autd3_drive, autd3_levels
 from autdtorch.hardware.link import SETTLE, Link
-from autdtorch.hardware.usb import LinkError
+from autdtorch.hardware.usb import LinkError, closed_on_error
 from autdtorch.validation import integer_at_least
 
 #: How long the kit waits for an answer [ms]; its own 10 ms run out on a computer that is busy.
@@ -73,11 +72,23 @@ def open_autd3(
     """
     device = autd3_device(boards)
     port = Autd3Port(boards, network)
-    try:
+    with closed_on_error(port.close):
         return Link(device, port, transducers, settle)
-    except BaseException:
-        port.close()
-        raise
+
+
+def autd3_kit() -> Any:
+    """The package autd3, if all that is needed of the kit is there.
+
+    Raises:
+        ImportError: the packages autd3 and autd3-pattern are missing.
+    """
+    try:
+        import autd3
+        import autd3_core  # noqa: F401
+        import autd3_pattern  # noqa: F401
+    except ImportError as error:
+        raise ImportError(f"{error}; pip install 'autdtorch[autd3]' brings what is needed") from error
+    return autd3
 
 
 class Autd3Port:
@@ -99,12 +110,10 @@ class Autd3Port:
             LinkError: they are not there.
             ImportError: the packages autd3 and autd3-pattern are missing.
         """
-        try:
-            import autd3
-            from autd3.commands import Clear
-            from autd3_core import Autd3, Geometry
-        except ImportError as error:
-            raise ImportError(f"{error}; pip install 'autdtorch[autd3]' brings what is needed") from error
+        autd3 = autd3_kit()
+        from autd3.commands import Clear
+        from autd3_core import Autd3, Geometry
+
         # A pattern is by board and transducer: where the boards stand plays no part.
         geometry = Geometry([Autd3() for _ in range(boards)])
         option = autd3.UdpOption() if network is None else network
@@ -119,13 +128,9 @@ class Autd3Port:
         async def open_client() -> None:  # kept here, as a signal may end the wait for it
             self._client = await autd3.Client.open(geometry, option, config)
 
-        try:
+        with closed_on_error(self.close):
             self._run("be opened", open_client, _OPENING_TIMEOUT)
             self._send("be reset", Clear())
-        except BaseException:
-            with contextlib.suppress(LinkError):  # the first error says more
-                self.close()
-            raise
 
     def write(self, data: bytes) -> None:
         """Play a frame; its boards have taken it when this returns.

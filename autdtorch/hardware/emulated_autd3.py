@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from autdtorch.hardware.autd3 import Autd3Port
+from autdtorch.hardware.autd3 import Autd3Port, autd3_kit
 from autdtorch.hardware.emulator import EmulatedBench
 
 
@@ -20,11 +20,7 @@ class EmulatedAutd3Port(Autd3Port):
             LinkError: the emulator does not answer.
             ImportError: the packages autd3 and autd3-pattern are missing.
         """
-        try:
-            from autd3 import UdpEmulator
-        except ImportError as error:
-            raise ImportError(f"{error}; pip install 'autdtorch[autd3]' brings what is needed") from error
-        self._emulator = UdpEmulator(boards)
+        self._emulator = autd3_kit().UdpEmulator(boards)
         self._bench = bench
         super().__init__(boards, self._emulator.option())
 

@@ -13,7 +13,7 @@ from typing import Any, Self
 import torch
 
 from autdtorch.hardware.devices import Device
-from autdtorch.hardware.usb import LinkError, Port, find_device
+from autdtorch.hardware.usb import LinkError, Port, closed_on_error, find_device
 from autdtorch.hardware.wiring import Wiring
 from autdtorch.validation import invalid, not_negative, require_kind
 
@@ -205,17 +205,12 @@ def open_link(
         raise invalid("serial", serial, f"must be None, as {device.name} has {len(device.serials)} boards")
     openers = {(vendor, product): open_port for vendor, product, open_port in device.adapters}
     ports: list[Port] = []
-    try:
+    with closed_on_error(SharedPort(ports).close):
         for own in device.serials if serial is None else (serial,):
             found = find_device(openers, own, backend)
             ports.append(openers[found.idVendor, found.idProduct](found))
         port = ports[0] if len(ports) == 1 else SharedPort(ports)
         return Link(device, port, transducers, settle, getattr(backend, "sleep", time.sleep))
-    except BaseException:
-        for port in ports:
-            with contextlib.suppress(LinkError):  # the first error says more
-                port.close()
-        raise
 
 
 class SharedPort:

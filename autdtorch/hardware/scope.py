@@ -14,7 +14,7 @@ import torch
 from autdtorch.hardware.lock_in import LockIn
 from autdtorch.hardware.scpi import KEYSIGHT, Dialect, Waveform
 from autdtorch.hardware.sensor import SensorError
-from autdtorch.hardware.usb import LinkError, find_device
+from autdtorch.hardware.usb import LinkError, closed_on_error, find_device
 from autdtorch.hardware.usbtmc import UsbtmcPort
 from autdtorch.hardware.vertical_scale import VerticalScale
 from autdtorch.validation import integer_at_least, invalid, positive, positive_integers
@@ -290,11 +290,8 @@ def open_scope(
     """
     vendor, product = positive_integers("chip", chip, 2)
     port = UsbtmcPort(find_device([(vendor, product)], serial, backend))
-    try:
+    with closed_on_error(port.close):
         return Oscilloscope(port, dialect)
-    except BaseException:
-        port.close()
-        raise
 
 
 def _volts(microphone: Microphone) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -21,6 +21,17 @@ _DIRECTION, _TRANSFER_TYPE, _BULK = 0x80, 0x03, 0x02
 
 class LinkError(OSError):
     """A device is missing, ambiguous, or does not do what it is asked for."""
+
+
+@contextlib.contextmanager
+def closed_on_error(close: Callable[[], None]) -> Iterator[None]:
+    """Call `close` if what follows fails; that error is raised, and says more than one of closing."""
+    try:
+        yield
+    except BaseException:
+        with contextlib.suppress(LinkError):
+            close()
+        raise
 
 
 class Port(Protocol):
@@ -106,14 +117,10 @@ class UsbPort:
         self._device = device
         self._baud = baud
         self._detached: list[int] = []
-        try:
+        with closed_on_error(self.close):
             self._call("be opened", self._take)
             self._out, self._in = self._bulk_endpoint(0), self._bulk_endpoint(_DIRECTION)
             self._set_up()
-        except BaseException:
-            with contextlib.suppress(LinkError):  # the first error says more
-                self.close()
-            raise
 
     def write(self, data: bytes) -> None:
         """Send all of `data`.

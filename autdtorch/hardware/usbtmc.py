@@ -9,7 +9,7 @@ import struct
 import time
 from typing import Any
 
-from autdtorch.hardware.usb import LinkError, UsbPort
+from autdtorch.hardware.usb import LinkError, UsbPort, closed_on_error
 
 #: MsgID: a message to the instrument; asking for one, and the answer.
 TELL, ASK = 1, 2
@@ -93,12 +93,9 @@ class UsbtmcPort(UsbPort):
         """
         super().__init__(device)
         self._tag = 0
-        try:
+        with closed_on_error(self.close):
             self._interface = self._number()
             self._clear()
-        except BaseException:
-            self.close()
-            raise
 
     def tell(self, command: str) -> None:
         """Send a command.
