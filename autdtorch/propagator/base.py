@@ -24,6 +24,7 @@ from autdtorch.fdtd.stepping import Assembly
 from autdtorch.propagator.symmetry import Plan, Symmetry, backward_plan, forward_plan, symmetries
 from autdtorch.scene import Scene
 from autdtorch.source import package_versions, source_digest
+from autdtorch.threads import one_torch_thread
 from autdtorch.validation import ArrayLike, points_grid
 
 logger = logging.getLogger(__name__)
@@ -95,6 +96,7 @@ class SimulatedPropagator(ABC):
 
     method: ClassVar[str]
 
+    @one_torch_thread()
     def __init__(
         self,
         scene: Scene,
@@ -195,6 +197,7 @@ class SimulatedPropagator(ABC):
         self, points: ArrayLike | None = None, *, return_error: Literal[True]
     ) -> tuple[torch.Tensor, float]: ...
 
+    @one_torch_thread()
     def transfer_matrix(
         self, points: ArrayLike | None = None, return_error: bool = False
     ) -> torch.Tensor | tuple[torch.Tensor, float]:
@@ -226,6 +229,7 @@ class SimulatedPropagator(ABC):
         second = self._second.transfer_matrix(points)
         return matrix, remaining + grid_error(matrix, second, coarser=self._second.spacing > self.spacing)
 
+    @one_torch_thread()
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
         """Pressure of drives at points, from a simulation a drive or from the transfer matrix.
 

@@ -8,7 +8,6 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import TypeAlias
 
 import torch
@@ -22,6 +21,7 @@ from autdtorch.propagator.base import MOST_JUDGED, SimulatedPropagator
 from autdtorch.propagator.coupling import coupled_runs
 from autdtorch.propagator.groups import MOST_PASSES, cheapest_grouping, one_box
 from autdtorch.scene import Scene
+from autdtorch.threads import spread
 from autdtorch.validation import LENGTH_TOLERANCE, ArrayLike, distances, invalid, points_tensor
 
 logger = logging.getLogger(__name__)
@@ -114,14 +114,13 @@ class BoxPropagator(SimulatedPropagator):
         matrix = reach.matrix(every)
 
         @torch.no_grad()  # which is each thread's own
-        def run(drive: Drive, direct: torch.Tensor) -> tuple[SteadyState, float]:
-            begin = time.perf_counter()
+        def run(given: tuple[Drive, torch.Tensor]) -> tuple[SteadyState, float]:
+            begin, (drive, direct) = time.perf_counter(), given
             steady = self._run(box, box.driving(*drive), reach, self.tolerance, _heard(matrix, direct))
             return steady, time.perf_counter() - begin
 
-        at_once = min(self._kernel.at_once(box.assembly.grid.shape), len(drives))
-        with ThreadPoolExecutor(at_once) as pool:
-            runs = list((pool.map if at_once > 1 else map)(run, drives, incident[::every].mT))
+        given = zip(drives, incident[::every].mT, strict=True)
+        runs = spread(run, given, self._kernel.at_once(box.assembly.grid.shape))
         for steady, seconds in runs:
             self._note(steady, seconds)
         return torch.stack([steady.pressure for steady, _ in runs], dim=1)
