@@ -12,12 +12,12 @@ from autdtorch.claims import BO, GABS
 from autdtorch.findings import NEAR_BOUND, find
 from autdtorch.plot import plot_convergence, plot_pareto, plot_planes, plot_scene, plot_trials
 from autdtorch.plot.style import label_of
+from autdtorch.rendering import rendering_problem, view3d
 from autdtorch.report_html import as_page
 from autdtorch.report_tables import NEAR, claims, extent, findings, is_baseline, simulations, summary, table
 from autdtorch.results import RESULTS_FILE, MethodResult, SceneResult, StudyResult
 from autdtorch.scene import Scene
 from autdtorch.trial_file import TRIALS_FILE
-from autdtorch.view3d import rendering_problem, view3d
 
 REPORT_FILE = "report.md"
 
