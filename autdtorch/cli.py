@@ -24,6 +24,7 @@ import hydra
 import hydra.utils
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, InstantiationException, MissingConfigException
+from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -51,7 +52,11 @@ _SETTINGS = ("scene", "method", "scenes", "methods", "solver", "trials", "seed",
 
 _LONGEST_NAME = 150  # of a job's folder; file systems allow 255 bytes
 
+_AGAIN = "the same command repeats what is not finished"
 _NO_SLURM = 'Could not detect "srun"'  # submitit, where it is to hand jobs to a Slurm that is not there
+# Of submitit, which may be missing: classes of errors, and a job that never came to report its own.
+_SUBMITIT_ERRORS = ("FailedJobError", "UncompletedJobError")
+_LOST_JOB = re.compile(r" (/.*/(\d[\d_]*))/\2_\d+_(?:result\.pkl|log\.err)$", re.MULTILINE)
 
 _COLLECT_HELP = """autdtorch collect FOLDER
 
@@ -72,7 +77,19 @@ class _Refusal(BaseException):
 
 
 class _FailedJob(Exception):
-    """Tells Hydra that a job of a sweep failed; the log says why."""
+    """Tells Hydra that a job of a sweep failed."""
+
+
+class SlurmCallback(Callback):
+    """Prepares a sweep on Slurm; `configs/config.yaml` names it to Hydra."""
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        """Have the sweep's jobs watched by `squeue`."""
+        launcher = config.hydra.launcher
+        if launcher._target_.endswith(".SlurmLauncher"):
+            from autdtorch.slurm import watch_queue
+
+            watch_queue(launcher.submitit_folder)
 
 
 def main() -> None:
@@ -114,7 +131,8 @@ def main() -> None:
 
 
 def _is_refusal(error: Exception) -> bool:
-    return isinstance(error, (_FailedJob, *_REFUSALS)) or _NO_SLURM in str(error)
+    of_submitit = type(error).__name__ in _SUBMITIT_ERRORS or _NO_SLURM in str(error)
+    return of_submitit or isinstance(error, (_FailedJob, *_REFUSALS))
 
 
 def _stop(status: int, line: str) -> NoReturn:
@@ -132,6 +150,8 @@ def _in_one_line(error: Exception) -> str:
         where = traceback.extract_tb(error.__traceback__)[-1]
         place = f"{os.path.relpath(where.filename)}, line {where.lineno}, in {where.name}"
         text = f"{type(error).__name__}: {text} ({place}); with {_FULL_ERROR}=1 comes the traceback"
+    if lost := _LOST_JOB.search(text):
+        return f"job {lost[2]} ended without results; its log is in {os.path.relpath(lost[1])}; {_AGAIN}"
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = error.missing_cfg_file.rpartition("/")
         brings = "; pip install 'autdtorch[cluster]' brings more" if group == "hydra/launcher" else ""
@@ -162,10 +182,9 @@ def _run(config: DictConfig) -> None:
         if not swept:
             raise _Refusal(error) from error
         # The other jobs go on.
-        logger.error("job %s failed: %s", job.job.num, _in_one_line(error))
-        raise _FailedJob(
-            "a job failed, as the log says; the same command repeats what is not finished"
-        ) from error
+        failure = f"job {job.job.num} failed: {_in_one_line(error)}"
+        logger.error(failure)
+        raise _FailedJob(f"{failure}; {_AGAIN}") from error
 
 
 def _job_folder(overrides: str) -> str:
