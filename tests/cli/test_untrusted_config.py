@@ -129,7 +129,7 @@ ATTACKS: dict[str, list[tuple[str, str]]] = {
 CASES = [(group, text, key) for group, cases in ATTACKS.items() for text, key in cases]
 
 
-@pytest.mark.parametrize(("group", "text", "key"), CASES)
+@pytest.mark.parametrize(("group", "text", "key"), CASES, ids=[f"{group} {key}" for group, _, key in CASES])
 def test_an_attack_by_a_config_ends_in_one_line(
     group: str,
     text: str,
