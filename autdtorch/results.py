@@ -10,6 +10,7 @@ import io
 import json
 import os
 import platform
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,11 +26,13 @@ from autdtorch.optim import label_of
 from autdtorch.optim.base import Solution
 from autdtorch.propagator import Run
 from autdtorch.source import package_versions, source_digest
+from autdtorch.validation import require_name, require_one_of
 from autdtorch.writing import replace_file
 
 RESULTS_FILE = "results.h5"
 PROVENANCE_FILE = "provenance.json"
 
+_SIMULATED_BY = ("free_space", "box", "full")
 _SOLUTION = ("drive", "pressure", "score", "evaluations", "history")
 _METRICS = ("mean", "min", "std", "uniformity", "area")
 
@@ -263,7 +266,7 @@ def load_results(path: str | os.PathLike[str]) -> StudyResult:
         raise FileNotFoundError(f"{path}: there is no such results file")
     try:
         with h5py.File(path, "r") as file:
-            scenes = {name: _read_scene(group) for name, group in file["scenes"].items()}
+            scenes = {name: _read_scene(group) for name, group in _named(file, "scenes")}
             return StudyResult(_read_provenance(file), scenes)
     except (OSError, KeyError, ValueError) as error:
         accepted = f"must be a results file of autdtorch {autdtorch.__version__}"
@@ -306,9 +309,17 @@ def _write_scene(group: Any, scene: SceneResult) -> None:
         _write_method(methods.create_group(name), method)
 
 
+def _named(group: Any, field: str) -> Iterator[tuple[str, Any]]:
+    """Groups and their names, which become part of the names of files."""
+    for name, entry in group[field].items():
+        require_name(field, name)
+        yield name, entry
+
+
 def _read_scene(group: Any) -> SceneResult:
     attributes = group.attrs
     columns = [group[f"runs/{key}"][()].tolist() for key in ("periods", "remaining", "reached", "seconds")]
+    require_one_of("method", attributes["method"], _SIMULATED_BY)
     simulation = Simulation(
         attributes["method"],
         float(attributes["wavelength"]),
@@ -318,7 +329,7 @@ def _read_scene(group: Any) -> SceneResult:
         float(attributes["matrix_seconds"]),
         float(attributes["plane_seconds"]),
     )
-    methods = {name: _read_method(entry) for name, entry in group["methods"].items()}
+    methods = {name: _read_method(entry) for name, entry in _named(group, "methods")}
     return SceneResult(
         int(attributes["obstacles"]),
         _tensor(group, "transfer_matrix"),

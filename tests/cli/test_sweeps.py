@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_dir
 
-from autdtorch.cli import CONFIGS
 from autdtorch.collect import collect_results
+from autdtorch.config_files import CONFIGS
 from autdtorch.results import load_results
 
 Run = Callable[..., int]
@@ -84,7 +84,10 @@ def test_a_sweep_says_where_its_folders_are_set(run: Run, capsys: pytest.Capture
     assert "a sweep has a folder for each job in hydra.sweep.dir" in capsys.readouterr().err
 
 
-def test_a_method_of_ones_own_is_found_in_the_working_directory(run: Run, tmp_path: Path) -> None:
+@pytest.mark.parametrize("launcher", ["basic", "joblib"])
+def test_a_method_of_ones_own_is_found_in_the_working_directory(
+    run: Run, tmp_path: Path, launcher: str
+) -> None:
     (tmp_path / "climbing.py").write_text(
         "import autdtorch as at\n\n"
         "def climb(objective, steps, trials, seed):\n"
@@ -95,7 +98,9 @@ def test_a_method_of_ones_own_is_found_in_the_working_directory(run: Run, tmp_pa
     (tmp_path / "mine" / "method" / "climb.yaml").write_text(
         "_target_: climbing.climb\nsteps: 5\n", encoding="utf-8"
     )
-    assert run("--config-dir", "mine", "-m", *QUICK, "method=climb", "trials=3") == 0
+    command = ("--config-dir", "mine", "-m", f"hydra/launcher={launcher}", "modules=climbing")
+    assert run(*command, *QUICK, "method=climb", "trials=3") == 0
+    assert jobs(tmp_path) == ["method=climb,plane_spacing=0.02,scene=homogeneous,trials=3"]
     sweep = collect_results(tmp_path)
     (method,) = sweep.results.scenes["homogeneous"].methods.items()
     assert method[0] == "climb"
