@@ -205,7 +205,7 @@ class _Recorded(torch.autograd.Function):
                 part = run.signal[start:end]
                 state, heard = run.advance(state, sources, read, signal[steps - end : steps - start])
                 adjoint = mass * heard.flip(0)
-                by_force += adjoint[:, :driven].T @ part
+                by_force += adjoint[:, :driven].double().T @ part.double()  # as in `lock_in`
                 if around is not None:
                     fields = ctx.last
                     if end < steps:

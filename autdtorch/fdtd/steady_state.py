@@ -88,7 +88,7 @@ def run_to_steady_state(
         stepped: is called with the number of periods after each block.
     """
     earliest = fewest_periods(assembly.grid.diagonal / assembly.grid.wavelength)
-    sequence = Extrapolation(min(max(_FEWEST_PHASORS, _MOST_NUMBERS // len(cells)), _MOST_PHASORS))
+    sequence = Extrapolation(phasors_kept(len(cells)))
     values: deque[torch.Tensor] = deque(maxlen=3)
     ramp = math.ceil(RAMP_PERIODS * assembly.steps_per_period)
     for count, windows in windows_of_run(assembly, kernel, sources, cells):

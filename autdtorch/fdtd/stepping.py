@@ -213,5 +213,6 @@ def lock_in(recorded: torch.Tensor, periods: int) -> torch.Tensor:
     steps = len(recorded)
     turn = 2 * math.pi * periods / steps * torch.arange(1, steps + 1, dtype=torch.float64)
     basis = 2 / steps * torch.stack((torch.cos(turn), torch.sin(turn)))
-    cosine, sine = (basis.to(recorded) @ recorded).double()
+    # in single precision PyTorch may take products of a few bits (torch.set_float32_matmul_precision)
+    cosine, sine = basis.to(recorded.device) @ recorded.double()
     return torch.complex(cosine, sine)

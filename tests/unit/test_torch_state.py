@@ -1,0 +1,117 @@
+"""PyTorch's global settings change no result: default dtype and device, inference mode, gradients, threads."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+
+import pytest
+import torch
+from small_scenes import CUBE, small_scene
+
+import autdtorch as at
+
+
+@contextlib.contextmanager
+def default_dtype(dtype: torch.dtype) -> Iterator[None]:
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)
+
+
+@contextlib.contextmanager
+def threads(count: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextlib.contextmanager
+def matmul_precision(name: str) -> Iterator[None]:
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision(name)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+STATES = {
+    "float16": lambda: default_dtype(torch.float16),
+    "float64": lambda: default_dtype(torch.float64),
+    "meta device": lambda: torch.device("meta"),
+    "inference mode": torch.inference_mode,
+    "no gradients": torch.no_grad,
+    "one thread": lambda: threads(1),
+    "three threads": lambda: threads(3),
+    "coarse products": lambda: matmul_precision("medium"),
+}
+
+
+def numbers(folder: Path) -> dict[str, torch.Tensor]:
+    """What a study goes through, from the scene to files and figures of merit."""
+    found: dict[str, torch.Tensor] = {}
+    ball = at.Sphere((12e-3, 20e-3, 5e-3), 3e-3, density=0.2, sound_speed=900.0)
+    scene = small_scene((CUBE, ball), radius=1e-3, absorption=2.0)
+    for method in ("box", "full", "free_space"):
+        propagator = at.make_propagator(scene, method, 2e-3, cache=False)
+        matrix, error = propagator.transfer_matrix(return_error=True)
+        found[method], found[f"{method} error"] = matrix, torch.tensor(error, dtype=torch.float64, device="cpu")
+        drive = at.drive_from_phases(torch.arange(4, dtype=torch.float64, device="cpu"))
+        found[f"{method} field"] = propagator.field(drive, scene.control_points + 1e-4)
+    objective = at.SimulatedObjective(scene, at.make_propagator(scene, "box", 2e-3, cache=False))
+    noisy = at.Noise(at.Quantised(at.Drift(at.Dead(objective, [1]), 0.1, 5), 16), 30.0)
+    for name, solution in {
+        "lss": at.lss(objective),
+        "lssg": at.lssg(objective, passes=2),
+        "gabs": at.gabs(objective, order="strength", trials=3),
+        "random": at.random_search(objective, levels=7, trials=2),
+        "bo": at.bayes_opt(objective, 20, trials=2, fixed_transducer=0),
+        "identify": at.identify(objective, trials=2),
+        "gradient": at.gradient_ascent(objective, starts=3, steps=20),
+        "noisy": at.gabs(noisy, trials=2),
+    }.items():
+        found |= {f"{name} {key}": getattr(solution, key) for key in ("drive", "pressure", "history")}
+    metrics = at.focus_metrics(found["gabs pressure"])
+    found |= {"mean": metrics.mean, "uniformity": metrics.uniformity}
+    found["bound"] = torch.tensor(at.focus_bound(found["box"]), dtype=torch.float64, device="cpu")
+    at.save_drive(folder / "drive.csv", found["gabs drive"][0], scene.array)
+    found["saved"] = at.load_drive(folder / "drive.csv")
+    found["gradient of the drive"] = at.differentiable_field(scene, drive, spacing=2e-3)
+    found["volume"] = at.volume_field(propagator, drive).nan_to_num()
+    return found
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, torch.Tensor]:
+    return numbers(tmp_path_factory.mktemp("expected"))
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_no_bit_changes(state: str, expected: dict[str, torch.Tensor], tmp_path: Path) -> None:
+    made: AbstractContextManager[object] = STATES[state]()
+    with made:
+        found = numbers(tmp_path)
+    for name, value in expected.items():
+        assert found[name].device.type == "cpu", name
+        assert found[name].dtype == value.dtype, name
+        assert torch.equal(found[name].detach(), value.detach()), name
+
+
+def test_what_inference_mode_has_made_serves_gradients_later() -> None:
+    with torch.inference_mode():
+        scene = small_scene((CUBE,))
+        propagator = at.make_propagator(scene, "box", 2e-3, cache=False)
+        propagator.transfer_matrix()
+    drive = torch.ones(4, dtype=torch.complex128, requires_grad=True)
+    propagator.field(drive, scene.control_points).abs().sum().backward()
+    assert drive.grad is not None
+    assert drive.grad.abs().sum() > 0
