@@ -24,10 +24,12 @@ from autdtorch.validation import (
     distances,
     finite_vector,
     invalid,
+    members,
     points_tensor,
     positive,
     real_tensor,
     require_distinct,
+    require_kind,
 )
 
 _OVERLAP_SAMPLES = 16  # along each axis of the space that two bounding boxes share
@@ -107,10 +109,10 @@ class Scene:
             OverlapWarning: two obstacles of different materials overlap.
             ScaleWarning: lengths beside the wavelength look as if in mm, or the frequency in kHz.
         """
-        _require_type("Scene.array", array, TransducerArray)
-        _require_type("Scene.medium", medium, Medium)
+        require_kind("Scene.array", array, TransducerArray)
+        require_kind("Scene.medium", medium, Medium)
         if observation_plane is not None:
-            _require_type("Scene.observation_plane", observation_plane, Plane)
+            require_kind("Scene.observation_plane", observation_plane, Plane)
         if not isinstance(name, str) or not name:
             raise invalid("Scene.name", name, "must be text of at least one character")
         object.__setattr__(self, "array", array)
@@ -118,7 +120,7 @@ class Scene:
         object.__setattr__(self, "frequency", positive("Scene.frequency", frequency, "Hz"))
         points = points_tensor("Scene.control_points", control_points).cpu()
         object.__setattr__(self, "control_points", points)
-        object.__setattr__(self, "obstacles", _obstacles(obstacles))
+        object.__setattr__(self, "obstacles", members("Scene.obstacles", obstacles, Obstacle))
         object.__setattr__(self, "observation_plane", observation_plane)
         object.__setattr__(self, "name", name)
         object.__setattr__(self, "domain", self._bounds() if domain is None else _corners(domain))
@@ -189,21 +191,6 @@ class Scene:
         points = torch.cat([points for _, points in _contents(self)] + corners)
         margin = _DEFAULT_MARGIN * self.wavelength
         return _corners(torch.stack([points.amin(dim=0) - margin, points.amax(dim=0) + margin]))
-
-
-def _require_type(name: str, value: object, kind: type) -> None:
-    if not isinstance(value, kind):
-        article = "an" if kind.__name__[0] in "AEIOU" else "a"
-        raise invalid(name, value, f"must be {article} {kind.__name__}")
-
-
-def _obstacles(given: Iterable[Obstacle]) -> tuple[Obstacle, ...]:
-    if not isinstance(given, Iterable):
-        raise invalid("Scene.obstacles", given, "must be a sequence of obstacles")
-    obstacles = tuple(given)
-    for index, obstacle in enumerate(obstacles):
-        _require_type(f"Scene.obstacles[{index}]", obstacle, Obstacle)
-    return obstacles
 
 
 def _kinds(obstacles: tuple[Obstacle, ...]) -> list[str]:

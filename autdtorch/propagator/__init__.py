@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 from typing import Literal
 
@@ -20,7 +21,14 @@ from autdtorch.propagator.full import FullPropagator
 from autdtorch.propagator.stepper import KERNELS, make_kernel, precision_of
 from autdtorch.propagator.volume import volume_field
 from autdtorch.scene import Scene
-from autdtorch.validation import integer_at_least, invalid, positive, require_kind, require_one_of
+from autdtorch.validation import (
+    integer_at_least,
+    invalid,
+    path_of,
+    positive,
+    require_kind,
+    require_one_of,
+)
 
 __all__ = [
     "BoxPropagator",
@@ -128,6 +136,9 @@ def _chosen_spacing(
     near_steady = max(tolerance, 1e-3)
     propagator = kind(scene, pilot, near_steady, kernel, dtype, max_periods, cache, None)
     _, error = propagator.transfer_matrix(return_error=True)
+    if not math.isfinite(error):
+        accepted = f"too few to choose a spacing: at {pilot:.3g} m no run came near its steady state"
+        raise invalid("max_periods", max_periods, accepted)
     spacing = min(spacing_for(tolerance, error, pilot), coarsest_spacing(scene))
     logger.info("spacing %.3g mm: the error at %.3g mm is about %.2g", 1e3 * spacing, 1e3 * pilot, error)
     return spacing
@@ -139,14 +150,11 @@ def _disk_cache(folder: str | os.PathLike[str] | Literal[False] | None) -> DiskC
         name, folder = CACHE_VARIABLE, os.environ.get(CACHE_VARIABLE) or False
     if folder is False:
         return None
-    if not isinstance(folder, str | os.PathLike) or not os.fspath(folder):
-        raise invalid(name, folder, "must be the path of a folder, or False")
+    path = path_of(name, folder, "a folder, or False")
     try:
-        return DiskCache(folder)
+        return DiskCache(path)
     except OSError as error:
-        raise invalid(
-            name, os.fspath(folder), f"must be a folder, or one that can be made ({error})"
-        ) from error
+        raise invalid(name, str(path), f"must be a folder, or one that can be made ({error})") from error
 
 
 def _pilot_spacing(scene: Scene) -> float:

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import ClassVar, Literal, Protocol, Self, overload
+from typing import ClassVar, Literal, Protocol, Self, overload, runtime_checkable
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from autdtorch.propagator.symmetry import Plan, Symmetry, backward_plan, forward
 from autdtorch.scene import Scene
 from autdtorch.source import package_versions, source_digest
 from autdtorch.threads import one_torch_thread
-from autdtorch.validation import ArrayLike, points_grid
+from autdtorch.validation import ArrayLike, boolean, points_grid
 
 logger = logging.getLogger(__name__)
 
@@ -44,6 +44,7 @@ class SteadyStateWarning(UserWarning):
     """A simulation ended before its steady state was reached."""
 
 
+@runtime_checkable
 class Propagator(Protocol):
     """What carries sound from a scene's transducers to points.
 
@@ -236,11 +237,12 @@ class SimulatedPropagator(ABC):
             ValueError: `points` are not finite, have another shape, leave the domain (`FullPropagator`) or
                 lie on a transducer (`BoxPropagator`).
         """
+        with_error = boolean("return_error", return_error)
         if points is None:
             matrix, remaining = self._control_matrix[0].clone(), self._control_matrix[1]
         else:
             matrix, remaining = self._kept_matrix(self._checked(points))
-        if not return_error:
+        if not with_error:
             return matrix
         second = self._second.transfer_matrix(points)
         return matrix, remaining + grid_error(matrix, second, coarser=self._second.spacing > self.spacing)

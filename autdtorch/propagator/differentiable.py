@@ -105,7 +105,8 @@ def cell_centers(scene: Scene, spacing: float = 1e-3) -> torch.Tensor:
     Raises:
         ValueError: the spacing is too coarse for the frequency.
     """
-    grid = make_grid(scene, spacing)
+    require_kind("scene", scene, Scene)
+    grid = make_grid(scene, positive("spacing", spacing, "m"))
     axes = [
         torch.from_numpy(axis[part])
         for axis, part in zip(grid.centers, domain_cells(scene, grid), strict=True)
