@@ -12,7 +12,7 @@ import torch
 
 from autdtorch.array import TransducerArray
 from autdtorch.display import html_facts
-from autdtorch.geometry import Plane
+from autdtorch.geometry import Coordinates, Plane
 from autdtorch.medium import Medium as Medium
 from autdtorch.obstacles import Box as Box
 from autdtorch.obstacles import Obstacle
@@ -119,7 +119,7 @@ class Scene:
         object.__setattr__(self, "medium", medium)
         object.__setattr__(self, "frequency", positive("Scene.frequency", frequency, "Hz"))
         points = points_tensor("Scene.control_points", control_points).cpu()
-        object.__setattr__(self, "control_points", points)
+        object.__setattr__(self, "control_points", points.as_subclass(Coordinates))
         object.__setattr__(self, "obstacles", members("Scene.obstacles", obstacles, Obstacle))
         object.__setattr__(self, "observation_plane", observation_plane)
         object.__setattr__(self, "name", name)
