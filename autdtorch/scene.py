@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import warnings
 from collections import Counter
@@ -276,15 +277,28 @@ def _warn_of_overlaps(obstacles: tuple[Obstacle, ...]) -> None:
 
     They are looked for at the centres of `_OVERLAP_SAMPLES`^3 cells of what two bounding boxes share.
     """
-    for index, obstacle in enumerate(obstacles):
-        for earlier_index, earlier in enumerate(obstacles[:index]):
-            if _material(obstacle) != _material(earlier) and _overlap(obstacle, earlier):
-                warnings.warn(
-                    f"Scene.obstacles[{index}] overlaps obstacle {earlier_index} of another material; "
-                    f"where both are, obstacle {index} counts",
-                    OverlapWarning,
-                    stacklevel=4,
-                )
+    pairs = [
+        f"{index} overlaps {earlier}"
+        for index, obstacle in enumerate(obstacles)
+        for earlier, other in enumerate(obstacles[:index])
+        if _material(obstacle) != _material(other) and _overlap(obstacle, other)
+    ]
+    if pairs:
+        warnings.warn(
+            f"Scene.obstacles: {', '.join(pairs)}, of another material; where both are, the later counts",
+            OverlapWarning,
+            stacklevel=3,
+        )
+
+
+def with_obstacles(scene: Scene, obstacles: Iterable[Obstacle]) -> Scene:
+    """Return a scene with some of its obstacles, or with all of them of other materials.
+
+    Their geometry is not checked, nor warned of, once more.
+    """
+    changed = copy.copy(scene)
+    object.__setattr__(changed, "obstacles", tuple(obstacles))
+    return changed
 
 
 def _material(obstacle: Obstacle) -> tuple[float | None, float | None, bool]:

@@ -10,7 +10,9 @@ from typing import Literal
 import torch
 
 from autdtorch.cache import DiskCache
+from autdtorch.fdtd.grid import speeds_of, warn_if_coarse
 from autdtorch.fdtd.kernels.contract import Kernel
+from autdtorch.fdtd.medium import warn_of_ending_walls
 from autdtorch.fdtd.spacing import PILOT_CELLS, coarsest_spacing, spacing_for
 from autdtorch.propagator.auto import chosen_method
 from autdtorch.propagator.base import Propagator, Run, SimulatedPropagator, SteadyStateWarning
@@ -119,7 +121,10 @@ def make_propagator(
     if spacing is None:
         tolerance /= 2
         spacing = _chosen_spacing(kind, scene, tolerance, *settings)
-    return kind(scene, spacing, tolerance, *settings, time_step)
+    propagator = kind(scene, spacing, tolerance, *settings, time_step)
+    warn_if_coarse(speeds_of(scene), scene.frequency, spacing)
+    warn_of_ending_walls(scene)
+    return propagator
 
 
 def _chosen_spacing(
@@ -135,7 +140,7 @@ def _chosen_spacing(
     pilot = _pilot_spacing(scene)
     near_steady = max(tolerance, 1e-3)
     propagator = kind(scene, pilot, near_steady, kernel, dtype, max_periods, cache, None)
-    _, error = propagator.transfer_matrix(return_error=True)
+    _, error, _ = propagator.estimated()
     if not math.isfinite(error):
         accepted = f"too few to choose a spacing: at {pilot:.3g} m no run came near its steady state"
         raise invalid("max_periods", max_periods, accepted)
