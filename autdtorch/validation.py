@@ -37,7 +37,8 @@ _LARGEST = 2**63 - 1  # integer that NumPy and PyTorch count with
 
 def invalid(name: str, value: object, accepted: str, unit: str = "") -> ValueError:
     """Return the error to raise for `value` of field `name`; `accepted` says what is allowed."""
-    return ValueError(f"{name}: {_shown(value)}{_suffix(unit)}; {accepted}")
+    message = f"{name}: {_shown(value)}{_suffix(unit)}; {accepted}"
+    return ValueError(" ".join(message.split("\n")))
 
 
 def finite_number(name: str, value: object, unit: str = "") -> float:
@@ -447,7 +448,7 @@ def _shown(value: object) -> str:
         value = value.tolist()
     if isinstance(value, list):
         value = tuple(value)
-    text = " ".join(_Short().repr(value).split("\n"))
+    text = _Short().repr(value)
     return text if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]}..."
 
 

@@ -140,7 +140,7 @@ def _chosen_spacing(
     pilot = _pilot_spacing(scene)
     near_steady = max(tolerance, 1e-3)
     propagator = kind(scene, pilot, near_steady, kernel, dtype, max_periods, cache, None)
-    _, error, _ = propagator.estimated()
+    _, error, _ = propagator._estimated()
     if not math.isfinite(error):
         accepted = f"too few to choose a spacing: at {pilot:.3g} m no run came near its steady state"
         raise invalid("max_periods", max_periods, accepted)

@@ -258,7 +258,7 @@ class SimulatedPropagator(ABC):
         if not self._plan(self.scene.control_points if places is None else places).backward:
             self._warn_near_obstacle()
         if with_error:
-            matrix, error, runs = self.estimated(places)
+            matrix, error, runs = self._estimated(places)
             self._warn_unsettled(runs)
             return matrix, error
         before = len(self.runs)
@@ -266,7 +266,7 @@ class SimulatedPropagator(ABC):
         self._warn_unsettled(self.runs[before:])
         return matrix
 
-    def estimated(self, points: torch.Tensor | None = None) -> tuple[torch.Tensor, float, list[Run]]:
+    def _estimated(self, points: torch.Tensor | None = None) -> tuple[torch.Tensor, float, list[Run]]:
         """Return what `transfer_matrix` does with the error, and the runs that it took; nothing is warned of.
 
         Args:
