@@ -83,7 +83,7 @@ class Condition:
         return pressure
 
     def played(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return what of `emitted` is known beforehand, for drives (..., M): a `Solution` holds that.
+        """Return the part of `emitted` that is known beforehand, for drives (..., M); a `Solution` holds it.
 
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.

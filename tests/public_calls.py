@@ -47,7 +47,7 @@ NOT_CALLED_BY_USERS = {
 
 
 class Made(NamedTuple):
-    """An argument that is made anew for each call."""
+    """An argument of which each call needs its own."""
 
     make: Callable[[Path], Any]
 
@@ -304,13 +304,13 @@ class Call(NamedTuple):
         return _annotations(self.function)
 
     def argument(self, parameter: str, folder: Path) -> Any:
-        """What it accepts for a parameter."""
+        """A value that it accepts for a parameter."""
         value = OTHERS.get(f"{self.name}.{parameter}", ARGUMENTS.get(parameter, LookupError))
         assert value is not LookupError, f"tests/public_calls.py: no argument for {self.name}.{parameter}"
         return value.make(folder) if isinstance(value, Made) else value
 
     def arguments(self, folder: Path) -> dict[str, Any]:
-        """What it accepts."""
+        """Values that it accepts, by parameter."""
         return {name: self.argument(name, folder) for name in self.parameters}
 
     def bound(self, folder: Path) -> Callable[..., Any]:

@@ -101,7 +101,7 @@ WRONG = [
 
 
 def spoiled(valid: object) -> Iterator[Wrong]:
-    """Arrays and lists like one that is accepted, but for an entry, a mask or their kind."""
+    """Arrays and lists like one that is accepted, with another entry, a mask or of another kind."""
     if isinstance(valid, bool | str | dict) or valid is None or callable(valid):
         return
     try:
