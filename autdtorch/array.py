@@ -18,7 +18,7 @@ from autdtorch.device_layouts import (
     openmpd_places,
     sonicsurface_places,
 )
-from autdtorch.geometry import in_plane, plane_basis
+from autdtorch.geometry import Coordinates, in_plane, plane_basis
 from autdtorch.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
@@ -93,8 +93,9 @@ class TransducerArray:
         """
         places = points_tensor("TransducerArray.positions", positions).cpu()
         require_distinct("TransducerArray.positions", places)
-        object.__setattr__(self, "positions", places)
-        object.__setattr__(self, "normals", _unit_normals(normals, len(places)))
+        object.__setattr__(self, "positions", places.as_subclass(Coordinates))
+        directions = _unit_normals(normals, len(places))
+        object.__setattr__(self, "normals", directions.as_subclass(Coordinates))
         strength = positive("TransducerArray.source_strength", source_strength, "Pa m")
         object.__setattr__(self, "source_strength", strength)
         object.__setattr__(self, "radius", _disc_radius(radius, places))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from autdtorch.csv_table import read_table
 from autdtorch.geometry import device_axes, in_plane
 from autdtorch.numpy_file import read_arrays
 from autdtorch.openmpd_board import OpenMPDBoard
-from autdtorch.validation import ArrayLike, invalid, points_tensor, real_tensor
+from autdtorch.validation import ArrayLike, invalid, path_of, points_tensor, real_tensor
 
 #: Columns of a CSV file that say where a transducer is and where it points, and their units.
 PLACE_COLUMNS = {"x": "m", "y": "m", "z": "m"}
@@ -53,7 +52,7 @@ def load_array(
         ValueError: another suffix, a file that is not of its kind, or an argument that is not accepted. The
             message names the file, and the line where it has lines.
     """
-    kind = Path(path).suffix.lower()
+    kind = path_of("path", path).suffix.lower()
     if kind == ".pat":
         file = OpenMPDBoard.load(path).array()
     elif kind == ".csv":

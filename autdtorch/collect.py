@@ -28,6 +28,7 @@ from autdtorch.results import (
 from autdtorch.scene import Scene
 from autdtorch.scene_file import load_scene
 from autdtorch.study_folder import PREVIOUS
+from autdtorch.validation import path_of
 from autdtorch.yaml_file import parse_yaml, unresolved
 
 logger = logging.getLogger(__name__)
@@ -97,7 +98,7 @@ def collect_results(folder: str | os.PathLike[str]) -> Sweep:
             is not there (paths start from the working directory, as they did for the sweep).
         ValueError: results of another version, or of a study that did not come from the command line.
     """
-    folder = Path(folder)
+    folder = path_of("folder", folder, "a folder")
     _log_unfinished(folder)
     studies = {file.parent: load_results(file) for file in _files(folder, RESULTS_FILE)}
     if not studies:

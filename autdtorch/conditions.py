@@ -15,10 +15,21 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import torch
 
-from autdtorch.drive import amplitudes_of, drive_from_phases, phases_of
-from autdtorch.objective import Objective, SimulatedObjective, validate_drives
+from autdtorch.drive import amplitudes_of, drive_from_phases, phases_of, validate_drive
+from autdtorch.objective import Objective, SimulatedObjective, require_objective, validate_drives
 from autdtorch.scene import Scene
-from autdtorch.validation import finite_number, indices, integer_at_least, invalid, not_negative, positive
+from autdtorch.validation import (
+    boolean,
+    indices,
+    integer_at_least,
+    invalid,
+    not_negative,
+    number_between,
+    positive,
+)
+
+SNRS = (-1000.0, 1000.0)
+"""Range of signal-to-noise ratios [dB]; far beyond it their powers overflow."""
 
 _PER = 1000  # Evaluations over which the rms of a drift is stated.
 
@@ -46,7 +57,12 @@ class Condition:
     evaluations: int
 
     def __init__(self, objective: Objective) -> None:
-        """Wrap an objective."""
+        """Wrap an objective.
+
+        Raises:
+            ValueError: no objective.
+        """
+        require_objective(objective)
         self.inner = objective
         self.scene = objective.scene
         self.evaluations = 0
@@ -67,11 +83,19 @@ class Condition:
         return pressure
 
     def played(self, drive: torch.Tensor) -> torch.Tensor:
-        """What of `emitted` is known beforehand, for drives (..., M): a `Solution` holds that."""
-        return drive
+        """Return the part of `emitted` that is known beforehand, for drives (..., M); a `Solution` holds it.
+
+        Raises:
+            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+        """
+        return validate_drive(drive, len(self.scene.array))
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:
-        """What is asked of `inner` now, when drives (B, M) are asked of this."""
+        """Return what is asked of `inner` now, when drives (B, M) are asked of this.
+
+        Raises:
+            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+        """
         return self.played(drive)
 
     def _observe(self, drive: torch.Tensor) -> torch.Tensor:
@@ -96,14 +120,17 @@ class Quantised(Condition):
         Raises:
             ValueError: `levels` is not an integer >= 2, or `on_off` no boolean.
         """
-        self.levels = integer_at_least("levels", levels, 2)
-        if not isinstance(on_off, bool):
-            raise invalid("on_off", on_off, "must be true or false")
-        self.on_off = on_off
         super().__init__(objective)
+        self.levels = integer_at_least("levels", levels, 2)
+        self.on_off = boolean("on_off", on_off)
 
     def played(self, drive: torch.Tensor) -> torch.Tensor:
-        """The nearest drives (..., M) that the device can play."""
+        """Return the nearest drives (..., M) that the device can play.
+
+        Raises:
+            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+        """
+        drive = super().played(drive)
         step = 2 * math.pi / self.levels
         phases = (phases_of(drive) / step).round() % self.levels * step
         amplitudes = amplitudes_of(drive).clamp_max(1)  # above 1 by rounding alone
@@ -123,14 +150,18 @@ class Dead(Condition):
         Raises:
             ValueError: `transducers` is none of the above.
         """
-        count = len(objective.scene.array)
+        super().__init__(objective)
+        count = len(self.scene.array)
         self._alive = torch.ones(count, dtype=torch.float64)
         self._alive[indices("transducers", transducers, count)] = 0
-        super().__init__(objective)
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:
-        """`drive` (B, M) without the silent transducers."""
-        return drive * self._alive
+        """Return `drive` (B, M) without the silent transducers.
+
+        Raises:
+            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+        """
+        return super().emitted(drive) * self._alive
 
 
 class Drift(Condition):
@@ -155,21 +186,25 @@ class Drift(Condition):
         Raises:
             ValueError: an argument out of range.
         """
+        super().__init__(objective)
         rms = (
             not_negative("phase", phase, "rad"),
             not_negative("loss", loss),
             not_negative("sensor", sensor),
         )
-        transducers = len(objective.scene.array)
+        transducers = len(self.scene.array)
         steps = np.repeat(rms, (transducers, transducers, 1)) / math.sqrt(_PER)
         self._generator = _generator(seed, "Drift")
         self._steps = torch.from_numpy(steps)
         self._walk = torch.zeros_like(self._steps)
-        super().__init__(objective)
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:
-        """`drive` (B, M) as the transducers turn it after the evaluations so far."""
-        return drive * self._factors(self._walk)[0]
+        """Return `drive` (B, M) as the transducers turn it after the evaluations so far.
+
+        Raises:
+            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+        """
+        return super().emitted(drive) * self._factors(self._walk)[0]
 
     def _observe(self, drive: torch.Tensor) -> torch.Tensor:
         size = (len(drive), len(self._steps))
@@ -201,7 +236,7 @@ class Noise(Condition):
 
         Args:
             objective: what is observed.
-            snr: 20 log10(reference / sigma) [dB], with sigma^2 = E |n|^2.
+            snr: 20 log10(reference / sigma) [dB], with sigma^2 = E |n|^2; -1000 to 1000.
             reads: readings of each drive, >= 1, of which the mean is observed. Each reading is an
                 evaluation, here and of `objective`, and drifts go on meanwhile; a `Solution` counts drives.
             seed: of the noise, >= 0.
@@ -212,12 +247,12 @@ class Noise(Condition):
         Raises:
             ValueError: an argument out of range, or no `reference` where there is no transfer matrix.
         """
-        level = finite_number("snr", snr, "dB")
+        super().__init__(objective)
+        level = number_between("snr", snr, *SNRS, "dB")
         self.reads = integer_at_least("reads", reads, 1)
         reference = _innermost_rms(objective) if reference is None else positive("reference", reference, "Pa")
         self.sigma = reference * 10 ** (-level / 20)
         self._generator = _generator(seed, "Noise")
-        super().__init__(objective)
 
     def _observe(self, drive: torch.Tensor) -> torch.Tensor:
         pressure = self.inner(drive.repeat_interleave(self.reads, dim=0))
@@ -236,6 +271,7 @@ def true_pressure(objective: Objective, drive: torch.Tensor) -> torch.Tensor:
     Raises:
         ValueError: another shape, not finite complex numbers, or an amplitude above 1.
     """
+    require_objective(objective)
     drive = validate_drives(drive, len(objective.scene.array))
     while isinstance(objective, Condition):
         drive = objective.emitted(drive)

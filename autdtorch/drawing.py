@@ -6,10 +6,9 @@ from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from autdtorch.drive import phases_of, validate_single_drive
-from autdtorch.validation import ArrayLike, Vector
+from autdtorch.validation import ArrayLike, Vector, magnitude_tensor, real_tensor
 
 Array: TypeAlias = npt.NDArray[np.float64]
 
@@ -52,12 +51,12 @@ def clipped(corners: Array, lower: Vector, upper: Vector) -> Array:
 
 
 def plane_magnitude(name: str, pressure: ArrayLike) -> Array:
-    """|p| (Nu, Nv) of complex pressure, or of its magnitude, on a plane.
+    """Return |p| (Nu, Nv) of complex pressure, or of its magnitude, on a plane.
 
     Raises:
-        ValueError: another number of axes, or no entry.
+        ValueError: not finite numbers, another number of axes, or no entry.
     """
-    magnitude: Array = torch.as_tensor(pressure).detach().cpu().abs().double().numpy()
+    magnitude: Array = real_tensor(name, magnitude_tensor(name, pressure, "Pa"), "Pa").detach().cpu().numpy()
     if magnitude.ndim != 2 or magnitude.size == 0:
         raise ValueError(f"{name}: shape {magnitude.shape}; must be (Nu, Nv), the points of a plane")
     return magnitude

@@ -26,7 +26,7 @@ from autdtorch.hardware.levels import (
     sonicsurface_levels,
 )
 from autdtorch.numpy_file import read_arrays
-from autdtorch.validation import ArrayLike, invalid, real_tensor, require_one_of
+from autdtorch.validation import ArrayLike, invalid, path_of, real_tensor, require_kind, require_one_of
 from autdtorch.writing import replacing
 
 
@@ -80,6 +80,7 @@ def save_drive(
             unit of the device has.
     """
     kind = _kind(path)
+    require_kind("array", array, TransducerArray)
     checked = validate_single_drive(drive, len(array)).detach().cpu()
     if device is None:
         columns, arrays = _plain(checked, array)
@@ -118,7 +119,7 @@ def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
 
 
 def _kind(path: str | os.PathLike[str]) -> str:
-    kind = Path(path).suffix.lower()
+    kind = path_of("path", path).suffix.lower()
     if kind not in (".csv", ".npz"):
         raise invalid("path", str(path), "must end in .csv or .npz")
     return kind

@@ -16,7 +16,15 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from autdtorch.validation import LENGTH_TOLERANCE, ArrayLike, complex_tensor, invalid, positive, real_tensor
+from autdtorch.validation import (
+    LENGTH_TOLERANCE,
+    ArrayLike,
+    complex_tensor,
+    invalid,
+    path_of,
+    positive,
+    real_tensor,
+)
 from autdtorch.writing import replacing
 
 Array: TypeAlias = npt.NDArray[np.float64]
@@ -54,7 +62,7 @@ def save_field(
         ValueError: another suffix, shapes that do not agree, or points that are no regular right-angled grid
             of at least two points along two axes.
     """
-    kind = Path(path).suffix.lower()
+    kind = path_of("path", path).suffix.lower()
     if kind not in (".vti", *_HDF5):
         raise invalid("path", str(path), "must end in .vti, .h5 or .hdf5")
     places = real_tensor("points", points, "m").detach().cpu().numpy()

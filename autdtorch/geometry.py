@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import torch
 
 from autdtorch.validation import (
@@ -18,6 +21,27 @@ from autdtorch.validation import (
     real_tensor,
     unit_vector,
 )
+
+
+class Coordinates(torch.Tensor):
+    """A tensor on the CPU that `numpy.array` takes without a warning; what is computed with it is plain.
+
+    NumPy 2 passes `copy` to `__array__`; PyTorch's own does not know it, of which NumPy warns.
+    """
+
+    __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
+
+    def __array__(self, dtype: npt.DTypeLike | None = None, copy: bool | None = None) -> npt.NDArray[Any]:
+        """Return the values, copied as `numpy.array` says."""
+        return np.array(self.numpy(), dtype=dtype, copy=copy)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Coordinates:
+        """Return a tensor with values of its own."""
+        return self.clone().as_subclass(Coordinates)
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Return what stores a plain tensor, the kind that `torch.load` takes."""
+        return self.as_subclass(torch.Tensor).__reduce_ex__(protocol)  # type: ignore[no-untyped-call]
 
 
 def plane_basis(normal: ArrayLike) -> tuple[torch.Tensor, torch.Tensor]:

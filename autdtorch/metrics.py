@@ -59,11 +59,11 @@ def focus_metrics(
     """
     pressure = _magnitudes("pressure", pressure, 1)
     largest, smallest = pressure.amax(dim=-1), pressure.amin(dim=-1)
-    total = largest + smallest
+    mean, total = pressure.mean(dim=-1), largest + smallest
     return FocusMetrics(
-        mean=pressure.mean(dim=-1),
+        mean=mean,
         min=smallest,
-        std=pressure.std(dim=-1, correction=0),
+        std=(pressure - mean[..., None]).square().mean(dim=-1).sqrt(),
         uniformity=1 - torch.where(total > 0, (largest - smallest) / total, 0.0),
         area=_area_per_focus(pressure, plane_pressure, cell_area),
     )

@@ -7,7 +7,7 @@ objective from a measured one.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, Protocol, TypeAlias
+from typing import Literal, Protocol, TypeAlias, runtime_checkable
 
 import torch
 
@@ -15,12 +15,13 @@ from autdtorch.drive import validate_drive
 from autdtorch.propagator import Propagator
 from autdtorch.scene import Scene
 from autdtorch.threads import one_torch_thread
-from autdtorch.validation import invalid
+from autdtorch.validation import invalid, real_tensor, require_kind, require_one_of
 
 #: What is maximised: pressure (..., P) [Pa] to score (...).
 Score: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
 
 
+@runtime_checkable
 class Objective(Protocol):
     """Observes the control points of a scene, simulated or real.
 
@@ -35,6 +36,16 @@ class Objective(Protocol):
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
         """Observe drives (B, M), complex, |q| <= 1: pressure magnitudes (B, P) [Pa], an evaluation a row."""
         ...
+
+
+def require_objective(objective: Objective) -> None:
+    """Check that `objective` is one, of a scene.
+
+    Raises:
+        ValueError: it is not.
+    """
+    require_kind("objective", objective, Objective)
+    require_kind("objective.scene", objective.scene, Scene)
 
 
 class SimulatedObjective:
@@ -62,10 +73,11 @@ class SimulatedObjective:
                 linear in the drive. "replay" runs a simulation for every evaluation, as the paper does.
 
         Raises:
-            ValueError: another mode, or a propagator of another scene.
+            ValueError: another mode, no propagator, or one of another scene.
         """
-        if mode not in ("transfer", "replay"):
-            raise invalid("mode", mode, 'must be "transfer" or "replay"')
+        require_kind("scene", scene, Scene)
+        require_kind("propagator", propagator, Propagator)
+        require_one_of("mode", mode, ("transfer", "replay"))
         if propagator.scene is not scene:
             raise invalid("scene", scene, f"must be the propagator's scene, {propagator.scene!r}")
         self.scene = scene
@@ -129,5 +141,12 @@ def validate_drives(drive: torch.Tensor, transducers: int) -> torch.Tensor:
 
 
 def weakest_focus(pressure: torch.Tensor) -> torch.Tensor:
-    """The weakest (...) [Pa] of the foci of a `pressure` (..., P): the paper's objective, f = min(p_n)."""
+    """Return the weakest (...) [Pa] of the foci of a `pressure` (..., P): the paper's f = min(p_n).
+
+    Raises:
+        ValueError: not finite real numbers, or no focus.
+    """
+    pressure = real_tensor("pressure", pressure, "Pa")
+    if pressure.ndim == 0 or pressure.shape[-1] == 0:
+        raise ValueError(f"pressure: shape {tuple(pressure.shape)}; must be (..., P) with P >= 1")
     return pressure.amin(dim=-1)

@@ -11,7 +11,6 @@ import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -20,7 +19,7 @@ from autdtorch.array import TransducerArray
 from autdtorch.device_layouts import OPENMPD_SOURCE_STRENGTH, TRANSDUCER_RADIUS
 from autdtorch.drive import validate_drive
 from autdtorch.geometry import in_plane
-from autdtorch.validation import ArrayLike
+from autdtorch.validation import ArrayLike, path_of
 
 #: Phase levels that the boards have, and `hardware.levels` makes.
 _LEVELS = 128
@@ -62,7 +61,7 @@ class OpenMPDBoard:
             ValueError: it is none of a board. The message names the file, the line and what is wrong.
         """
         try:
-            lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
+            lines = path_of("path", path).read_text(encoding="utf-8-sig").splitlines()
         except UnicodeDecodeError as error:
             raise ValueError(f"{path}: {error}; must be a text file in UTF-8") from error
         head = [_Item(number, line.strip()) for number, line in enumerate(lines, 1) if line.strip()]

@@ -26,7 +26,7 @@ from autdtorch.optim import label_of
 from autdtorch.optim.base import Solution
 from autdtorch.propagator import Run
 from autdtorch.source import package_versions, source_digest
-from autdtorch.validation import require_name, require_one_of
+from autdtorch.validation import path_of, require_name, require_one_of
 from autdtorch.writing import replace_file
 
 RESULTS_FILE = "results.h5"
@@ -259,7 +259,7 @@ def load_results(path: str | os.PathLike[str]) -> StudyResult:
         FileNotFoundError: there is no such file.
         ValueError: it is not a complete results file of this version.
     """
-    path = Path(path)
+    path = path_of("path", path)
     if path.is_dir():
         path = path / RESULTS_FILE
     if not path.exists():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import warnings
 from collections import Counter
@@ -12,7 +13,7 @@ import torch
 
 from autdtorch.array import TransducerArray
 from autdtorch.display import html_facts
-from autdtorch.geometry import Plane
+from autdtorch.geometry import Coordinates, Plane
 from autdtorch.medium import Medium as Medium
 from autdtorch.obstacles import Box as Box
 from autdtorch.obstacles import Obstacle
@@ -24,10 +25,12 @@ from autdtorch.validation import (
     distances,
     finite_vector,
     invalid,
+    members,
     points_tensor,
     positive,
     real_tensor,
     require_distinct,
+    require_kind,
 )
 
 _OVERLAP_SAMPLES = 16  # along each axis of the space that two bounding boxes share
@@ -107,18 +110,18 @@ class Scene:
             OverlapWarning: two obstacles of different materials overlap.
             ScaleWarning: lengths beside the wavelength look as if in mm, or the frequency in kHz.
         """
-        _require_type("Scene.array", array, TransducerArray)
-        _require_type("Scene.medium", medium, Medium)
+        require_kind("Scene.array", array, TransducerArray)
+        require_kind("Scene.medium", medium, Medium)
         if observation_plane is not None:
-            _require_type("Scene.observation_plane", observation_plane, Plane)
+            require_kind("Scene.observation_plane", observation_plane, Plane)
         if not isinstance(name, str) or not name:
             raise invalid("Scene.name", name, "must be text of at least one character")
         object.__setattr__(self, "array", array)
         object.__setattr__(self, "medium", medium)
         object.__setattr__(self, "frequency", positive("Scene.frequency", frequency, "Hz"))
         points = points_tensor("Scene.control_points", control_points).cpu()
-        object.__setattr__(self, "control_points", points)
-        object.__setattr__(self, "obstacles", _obstacles(obstacles))
+        object.__setattr__(self, "control_points", points.as_subclass(Coordinates))
+        object.__setattr__(self, "obstacles", members("Scene.obstacles", obstacles, Obstacle))
         object.__setattr__(self, "observation_plane", observation_plane)
         object.__setattr__(self, "name", name)
         object.__setattr__(self, "domain", self._bounds() if domain is None else _corners(domain))
@@ -189,21 +192,6 @@ class Scene:
         points = torch.cat([points for _, points in _contents(self)] + corners)
         margin = _DEFAULT_MARGIN * self.wavelength
         return _corners(torch.stack([points.amin(dim=0) - margin, points.amax(dim=0) + margin]))
-
-
-def _require_type(name: str, value: object, kind: type) -> None:
-    if not isinstance(value, kind):
-        article = "an" if kind.__name__[0] in "AEIOU" else "a"
-        raise invalid(name, value, f"must be {article} {kind.__name__}")
-
-
-def _obstacles(given: Iterable[Obstacle]) -> tuple[Obstacle, ...]:
-    if not isinstance(given, Iterable):
-        raise invalid("Scene.obstacles", given, "must be a sequence of obstacles")
-    obstacles = tuple(given)
-    for index, obstacle in enumerate(obstacles):
-        _require_type(f"Scene.obstacles[{index}]", obstacle, Obstacle)
-    return obstacles
 
 
 def _kinds(obstacles: tuple[Obstacle, ...]) -> list[str]:
@@ -289,15 +277,28 @@ def _warn_of_overlaps(obstacles: tuple[Obstacle, ...]) -> None:
 
     They are looked for at the centres of `_OVERLAP_SAMPLES`^3 cells of what two bounding boxes share.
     """
-    for index, obstacle in enumerate(obstacles):
-        for earlier_index, earlier in enumerate(obstacles[:index]):
-            if _material(obstacle) != _material(earlier) and _overlap(obstacle, earlier):
-                warnings.warn(
-                    f"Scene.obstacles[{index}] overlaps obstacle {earlier_index} of another material; "
-                    f"where both are, obstacle {index} counts",
-                    OverlapWarning,
-                    stacklevel=4,
-                )
+    pairs = [
+        f"{index} overlaps {earlier}"
+        for index, obstacle in enumerate(obstacles)
+        for earlier, other in enumerate(obstacles[:index])
+        if _material(obstacle) != _material(other) and _overlap(obstacle, other)
+    ]
+    if pairs:
+        warnings.warn(
+            f"Scene.obstacles: {', '.join(pairs)}, of another material; where both are, the later counts",
+            OverlapWarning,
+            stacklevel=3,
+        )
+
+
+def with_obstacles(scene: Scene, obstacles: Iterable[Obstacle]) -> Scene:
+    """Return a scene with some of its obstacles, or with all of them of other materials.
+
+    Their geometry is not checked, nor warned of, once more.
+    """
+    changed = copy.copy(scene)
+    object.__setattr__(changed, "obstacles", tuple(obstacles))
+    return changed
 
 
 def _material(obstacle: Obstacle) -> tuple[float | None, float | None, bool]:

@@ -20,7 +20,7 @@ from autdtorch.array_file import load_array
 from autdtorch.geometry import Plane, circle_points
 from autdtorch.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
 from autdtorch.scene import Medium, Scene
-from autdtorch.validation import ArrayLike, Vector, finite_vector, invalid, points_tensor
+from autdtorch.validation import ArrayLike, Vector, finite_vector, invalid, path_of, points_tensor
 from autdtorch.yaml_file import load_yaml, plain, unresolved
 
 Builder = Callable[..., Any]
@@ -58,7 +58,7 @@ def load_scene(source: str | os.PathLike[str] | Mapping[str, Any]) -> Scene:
         ValueError: not YAML, larger or deeper than a scene is, an unknown or missing key, or a value that is
             not accepted. The message names the file and the section.
     """
-    where = "scene mapping" if isinstance(source, Mapping) else os.fspath(source)
+    where = "scene mapping" if isinstance(source, Mapping) else str(path_of("source", source))
     section = _mapping(where, _read(where, source))
     _check_keys(where, section, Scene)
     air = partial(Medium.air, frequency=section["frequency"])

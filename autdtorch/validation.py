@@ -1,15 +1,19 @@
 """Checks made once, where a value enters the package.
 
 Every function takes the name of the field first and returns the checked value in one canonical form. What is
-wrong is reported as a `ValueError` of the shape ``field: value unit; accepted range``.
+wrong is reported as a `ValueError` of the shape ``field: value unit; accepted range``, in one line.
 """
 
 from __future__ import annotations
 
+import math
 import numbers
+import os
 import re
-from collections.abc import Sequence
-from typing import TypeAlias
+import reprlib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -26,30 +30,38 @@ _LONGEST_NAME = 100
 
 _SHOWN_ENTRIES = 9
 _SHOWN_CHARACTERS = 120
+_SHOWN_BITS = 128  # of an integer; Python refuses to write out very large ones
+_DEEPEST = 16  # axes of an array, or lists in lists; not every function of PyTorch takes more than 25
+_LARGEST = 2**63 - 1  # integer that NumPy and PyTorch count with
 
 
 def invalid(name: str, value: object, accepted: str, unit: str = "") -> ValueError:
-    """The error to raise for `value` of field `name`; `accepted` says what is allowed."""
-    return ValueError(f"{name}: {_shown(value)}{_suffix(unit)}; {accepted}")
+    """Return the error to raise for `value` of field `name`; `accepted` says what is allowed."""
+    message = f"{name}: {_shown(value)}{_suffix(unit)}; {accepted}"
+    return ValueError(" ".join(message.split("\n")))
 
 
 def finite_number(name: str, value: object, unit: str = "") -> float:
-    """`value` as a finite float.
+    """Return `value` as a finite float.
 
     Raises:
         ValueError: not a real number (text, booleans and complex numbers are none), NaN or infinite.
     """
-    if isinstance(value, torch.Tensor | np.ndarray) and value.ndim == 0:
+    if isinstance(value, torch.Tensor | np.ndarray) and value.ndim == 0 and _is_plain(value):
         value = value.item()
-    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+    if not _is_plain(value) or not isinstance(value, numbers.Real):
         raise invalid(name, value, f"must be a real number{_in_unit(unit)}")
-    if not np.isfinite(float(value)):
+    try:
+        number = float(value)
+    except OverflowError:  # an integer or a fraction, too large for a float
+        number = math.inf
+    if not math.isfinite(number):
         raise invalid(name, value, "must be finite", unit)
-    return float(value)
+    return number
 
 
 def positive(name: str, value: object, unit: str = "") -> float:
-    """`value` as a finite float > 0.
+    """Return `value` as a finite float > 0.
 
     Raises:
         ValueError: not a finite real number, or <= 0.
@@ -61,7 +73,7 @@ def positive(name: str, value: object, unit: str = "") -> float:
 
 
 def number_between(name: str, value: object, least: float, most: float, unit: str = "") -> float:
-    """`value` as a float in `least` to `most`, ends included.
+    """Return `value` as a float in `least` to `most`, ends included.
 
     Raises:
         ValueError: not a real number, NaN or outside.
@@ -73,7 +85,7 @@ def number_between(name: str, value: object, least: float, most: float, unit: st
 
 
 def not_negative(name: str, value: object, unit: str = "") -> float:
-    """`value` as a finite float >= 0.
+    """Return `value` as a finite float >= 0.
 
     Raises:
         ValueError: not a finite real number, or < 0.
@@ -85,14 +97,16 @@ def not_negative(name: str, value: object, unit: str = "") -> float:
 
 
 def integer_at_least(name: str, value: object, minimum: int) -> int:
-    """`value` as an int >= `minimum`; floats are refused even where they are whole.
+    """Return `value` as an int >= `minimum`; floats are refused even where they are whole.
 
     Raises:
-        ValueError: not an integer, or below `minimum`.
+        ValueError: not an integer, below `minimum`, or 2^63 and more.
     """
-    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < minimum:
-        raise invalid(name, value, f"must be an integer >= {minimum}")
-    return int(value)
+    number = int(value) if _is_plain(value) and isinstance(value, numbers.Integral) else minimum - 1
+    if not minimum <= number <= _LARGEST:
+        most = " and < 2^63" if number > _LARGEST else ""
+        raise invalid(name, value, f"must be an integer >= {minimum}{most}")
+    return number
 
 
 def require_name(field: str, name: str) -> None:
@@ -106,18 +120,42 @@ def require_name(field: str, name: str) -> None:
         raise invalid(field, name, f"{accepted}, and have at most {_LONGEST_NAME} bytes")
 
 
-def require_one_of(name: str, value: object, accepted: tuple[str, ...]) -> None:
+def boolean(name: str, value: object) -> bool:
+    """Return `value`, which must be true or false itself, as a bool.
+
+    Raises:
+        ValueError: another kind of value, numbers included.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise invalid(name, value, "must be true or false")
+    return bool(value)
+
+
+def path_of(name: str, value: object, what: str = "a file") -> Path:
+    """Return `value` as the path of `what`, which need not be there.
+
+    Raises:
+        ValueError: neither text nor a path, empty, or with a character that no path has.
+    """
+    text = os.fspath(value) if isinstance(value, str | os.PathLike) else None
+    if not isinstance(text, str) or not text or "\0" in text:
+        raise invalid(name, value, f"must be the path of {what}")
+    return Path(text)
+
+
+def require_one_of(name: str, value: object, accepted: Iterable[str]) -> None:
     """Check that `value` is one of the texts accepted.
 
     Raises:
         ValueError: it is not.
     """
-    if value not in accepted:
+    accepted = tuple(accepted)
+    if not isinstance(value, str) or value not in accepted:
         raise invalid(name, value, f"must be one of {', '.join(accepted)}")
 
 
 def require_kind(name: str, value: object, kind: type) -> None:
-    """Check that `value` is of a class of ours.
+    """Check that `value` is of a class or protocol.
 
     Raises:
         ValueError: it is not.
@@ -127,35 +165,74 @@ def require_kind(name: str, value: object, kind: type) -> None:
         raise invalid(name, value, f"must be {article} {kind.__name__}")
 
 
+def members(name: str, value: object, kind: type) -> tuple[Any, ...]:
+    """Return `value`, an iterable, as a tuple of members of a class.
+
+    Raises:
+        ValueError: text, no iterable, or a member of another class.
+    """
+    accepted = f"must be a sequence, each entry of class {kind.__name__}"
+    if isinstance(value, str | bytes):
+        raise invalid(name, value, accepted)
+    try:
+        entries: tuple[Any, ...] = tuple(value)  # type: ignore[arg-type]
+    except TypeError as error:
+        raise invalid(name, value, accepted) from error
+    for index, entry in enumerate(entries):
+        require_kind(f"{name}[{index}]", entry, kind)
+    return entries
+
+
+def require_callable(name: str, value: object) -> None:
+    """Check that `value` can be called.
+
+    Raises:
+        ValueError: it cannot.
+    """
+    if not callable(value):
+        raise invalid(name, value, "must be a function")
+
+
+def integers(name: str, value: object, minimum: int, accepted: str) -> list[int]:
+    """Return `value`, a sequence or an array with one axis, as integers >= `minimum`.
+
+    Raises:
+        ValueError: another kind of value, of which `accepted` says what is allowed, or an entry out of range.
+    """
+    if isinstance(value, torch.Tensor | np.ndarray) and is_dense(value):  # their entries are no Integral
+        value = value.tolist()
+    if isinstance(value, str | bytes) or not isinstance(value, Sequence):
+        raise invalid(name, value, accepted)
+    return [integer_at_least(f"{name}[{place}]", entry, minimum) for place, entry in enumerate(value)]
+
+
 def positive_integers(name: str, value: object, count: int) -> tuple[int, ...]:
-    """`value` as `count` integers >= 1.
+    """Return `value` as `count` integers >= 1.
 
     Raises:
         ValueError: another number of entries, or an entry that is not an integer >= 1.
     """
-    if isinstance(value, str) or not isinstance(value, Sequence) or len(value) != count:
-        raise invalid(name, value, f"must be {count} integers >= 1")
-    return tuple(integer_at_least(f"{name}[{index}]", entry, 1) for index, entry in enumerate(value))
+    accepted = f"must be {count} integers >= 1"
+    entries = integers(name, value, 1, accepted)
+    if len(entries) != count:
+        raise invalid(name, entries, accepted)
+    return tuple(entries)
 
 
 def indices(name: str, value: object, count: int) -> list[int]:
-    """`value` as indices from 0 to `count` - 1: at least one, each once.
+    """Return `value` as indices from 0 to `count` - 1: at least one, each once.
 
     Raises:
         ValueError: it is not.
     """
-    if isinstance(value, torch.Tensor | np.ndarray):  # their entries are no Integral
-        value = value.tolist()
-    if isinstance(value, str) or not isinstance(value, Sequence):
-        raise invalid(name, value, f"must be indices from 0 to {count - 1}")
-    chosen = [integer_at_least(f"{name}[{place}]", one, 0) for place, one in enumerate(value)]
+    chosen = integers(name, value, 0, f"must be indices from 0 to {count - 1}")
     if not chosen or len(set(chosen)) < len(chosen) or max(chosen) >= count:
         raise invalid(name, chosen, f"must be indices from 0 to {count - 1}, each once")
     return chosen
 
 
 def finite_vector(name: str, value: object, unit: str = "m") -> Vector:
-    """`value` as three finite floats.
+    """Return `value` as three finite floats.
 
     Raises:
         ValueError: not three real numbers, NaN or infinite.
@@ -165,7 +242,7 @@ def finite_vector(name: str, value: object, unit: str = "m") -> Vector:
 
 
 def positive_entries(name: str, value: object, count: int, unit: str = "m") -> tuple[float, ...]:
-    """`value` as `count` finite floats > 0.
+    """Return `value` as `count` finite floats > 0.
 
     Raises:
         ValueError: not `count` real numbers, or an entry that is NaN, infinite or <= 0.
@@ -177,25 +254,25 @@ def positive_entries(name: str, value: object, count: int, unit: str = "m") -> t
 
 
 def unit_vector(name: str, value: object) -> Vector:
-    """`value`, three finite floats, scaled to length 1.
+    """Return `value`, three finite floats, scaled to length 1.
 
     Raises:
         ValueError: not three finite real numbers, or too short to have a direction.
     """
-    vector = np.array(finite_vector(name, value, unit=""))
-    length = float(np.linalg.norm(vector))
+    vector = finite_vector(name, value, unit="")
+    length = math.hypot(*vector)
     # A direction is what rounding leaves of it: below this length it is noise of a difference of metres.
-    if not LENGTH_TOLERANCE < length < np.inf:
+    if not LENGTH_TOLERANCE < length < math.inf:
         raise invalid(name, value, f"must be a vector of finite length > {LENGTH_TOLERANCE:g}")
-    x, y, z = (vector / length).tolist()
+    x, y, z = (entry / length for entry in vector)
     return x, y, z
 
 
 def real_tensor(name: str, value: object, unit: str = "") -> torch.Tensor:
-    """`value` as a finite float64 tensor of any shape; a tensor keeps its device and its gradient.
+    """Return `value` as a finite float64 tensor of any shape; a tensor keeps its device and its gradient.
 
     Raises:
-        ValueError: ragged, not real numbers, NaN or infinite.
+        ValueError: ragged, not real numbers, masked, not dense, NaN or infinite.
     """
     accepted = f"must be an array of real numbers{_in_unit(unit)}"
     tensor = _tensor(name, value, accepted)
@@ -207,12 +284,12 @@ def real_tensor(name: str, value: object, unit: str = "") -> torch.Tensor:
 
 
 def complex_tensor(name: str, value: object) -> torch.Tensor:
-    """`value` as a finite complex128 tensor of any shape; a tensor keeps its device and its gradient.
+    """Return `value` as a finite complex128 tensor of any shape; a tensor keeps its device and its gradient.
 
     A conjugate that PyTorch has only marked is carried out: not every function takes a marked one.
 
     Raises:
-        ValueError: ragged, real (a drive is not its phases), NaN or infinite.
+        ValueError: ragged, real (a drive is not its phases), masked, not dense, NaN or infinite.
     """
     accepted = "must be an array of complex numbers"
     tensor = _tensor(name, value, accepted)
@@ -223,8 +300,27 @@ def complex_tensor(name: str, value: object) -> torch.Tensor:
     return tensor
 
 
+def magnitude_tensor(name: str, value: object, unit: str = "") -> torch.Tensor:
+    """Return |value|, of real or complex numbers, as a float64 tensor of any shape; NaN and infinity stay.
+
+    Raises:
+        ValueError: ragged, not numbers, masked or not dense.
+    """
+    tensor = _tensor(name, value, f"must be an array of numbers{_in_unit(unit)}")
+    return tensor.to(torch.complex128 if tensor.is_complex() else torch.float64).abs()
+
+
+def is_dense(value: torch.Tensor | npt.NDArray[Any] | np.generic) -> bool:
+    """Check that an array of few axes holds numbers or booleans, all of them in memory and none masked."""
+    if isinstance(value, torch.Tensor):
+        plain = value.layout == torch.strided and not (value.is_quantized or value.is_nested or value.is_meta)
+    else:
+        plain = value.dtype.kind in "biufc" and not np.ma.is_masked(value)
+    return plain and value.ndim <= _DEEPEST
+
+
 def points_tensor(name: str, value: object) -> torch.Tensor:
-    """`value` as points (P, 3) [m], P >= 1: a float64 copy without gradient, on the device of `value`.
+    """Return `value` as points (P, 3) [m], P >= 1: a float64 copy without gradient, on the device of `value`.
 
     Raises:
         ValueError: another shape, no point, not real numbers, NaN or infinite.
@@ -236,7 +332,7 @@ def points_tensor(name: str, value: object) -> torch.Tensor:
 
 
 def points_grid(name: str, value: object) -> tuple[torch.Tensor, torch.Size]:
-    """`value` as points (P, 3) [m], as of `points_tensor`, and the shape (...) of their grid (..., 3).
+    """Return `value` as points (P, 3) [m], as of `points_tensor`, and the shape (...) of their grid (..., 3).
 
     Raises:
         ValueError: another shape, no point, not real numbers, NaN or infinite.
@@ -263,7 +359,7 @@ def require_distinct(name: str, points: torch.Tensor) -> None:
 
 
 def distances(points: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
-    """Distances (P, M) [m] between `points` (P, 3) and `others` (M, 3)."""
+    """Return the distances (P, M) [m] between `points` (P, 3) and `others` (M, 3)."""
     # The default of cdist expands the square, which loses half the digits of short distances.
     return torch.cdist(points, others, compute_mode="donot_use_mm_for_euclid_dist")
 
@@ -276,27 +372,46 @@ def _entries(name: str, value: object, count: int, unit: str) -> tuple[float, ..
 
 
 def _tensor(name: str, value: object, accepted: str) -> torch.Tensor:
-    if not isinstance(value, torch.Tensor):
-        # numpy would take a boolean among numbers as 0 or 1.
-        if _has_boolean(value):
-            raise invalid(name, value, accepted)
-        try:
-            array = np.asarray(value)
-        except (ValueError, TypeError, RuntimeError) as error:
-            raise invalid(name, value, accepted) from error
-        if array.dtype.kind not in "iufc":
-            raise invalid(name, value, accepted)
-        # A copy: the caller's array may be read-only, or may change later.
-        value = torch.from_numpy(array.astype(np.complex128 if array.dtype.kind == "c" else np.float64))
-    if value.dtype == torch.bool:
+    if not _holds_numbers(value):
         raise invalid(name, value, accepted)
-    return value
+    if isinstance(value, torch.Tensor):
+        return value.as_subclass(torch.Tensor)  # free of what a class of its own does
+    try:
+        array = np.asarray(value)
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise invalid(name, value, accepted) from error
+    if array.dtype.kind not in "iufc":
+        raise invalid(name, value, accepted)
+    # A copy: the caller's array may be read-only, or may change later.
+    with np.errstate(over="ignore"):  # more than a double holds becomes infinite, which is refused
+        array = array.astype(np.complex128 if array.dtype.kind == "c" else np.float64)
+    return torch.from_numpy(array)
 
 
-def _has_boolean(value: object) -> bool:
-    if isinstance(value, list | tuple):
-        return any(_has_boolean(entry) for entry in value)
-    return isinstance(value, bool | np.bool_)
+def _holds_numbers(value: object) -> bool:
+    """Check that NumPy neither alters what it converts nor goes on for ever.
+
+    It takes a boolean among numbers as 0 or 1, and drops masks. A list that holds itself twice keeps it busy
+    for ever.
+    """
+    entries = [value]
+    for _ in range(_DEEPEST):
+        if not all(map(_is_plain, entries)):
+            return False
+        lists = {id(entry): entry for entry in entries if isinstance(entry, list | tuple)}
+        if not lists:
+            return True
+        entries = [entry for one in lists.values() for entry in one]
+    return False
+
+
+def _is_plain(value: object) -> bool:
+    """Check that `value` is no boolean and, if it is an array, a dense one of numbers."""
+    if isinstance(value, torch.Tensor):
+        return is_dense(value) and value.dtype != torch.bool
+    if isinstance(value, np.ndarray | np.generic):
+        return is_dense(value) and value.dtype != np.bool_
+    return not isinstance(value, bool)
 
 
 def _require_finite(name: str, tensor: torch.Tensor, unit: str = "") -> None:
@@ -309,14 +424,31 @@ def _require_finite(name: str, tensor: torch.Tensor, unit: str = "") -> None:
     raise invalid(f"{name}{index}", tensor[tuple(index)].item(), "every entry must be finite", unit)
 
 
+class _Short(reprlib.Repr):
+    """The text of a value, however large or deep the value is."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxlevel, self.maxtuple, self.maxlist = 3, _SHOWN_ENTRIES, _SHOWN_ENTRIES
+        self.maxstring = self.maxother = _SHOWN_CHARACTERS
+
+    def repr_int(self, value: int, level: int) -> str:
+        bits = value.bit_length()
+        return repr(value) if bits <= _SHOWN_BITS else f"integer of {bits} bits"
+
+
 def _shown(value: object) -> str:
+    if isinstance(value, torch.Tensor) and not is_dense(value):
+        return f"tensor of {value.dtype}, {value.layout}, on {value.device}"
+    if isinstance(value, np.ma.MaskedArray):
+        return f"masked array of shape {value.shape}"
     if isinstance(value, torch.Tensor | np.ndarray):
-        if value.size > _SHOWN_ENTRIES if isinstance(value, np.ndarray) else value.numel() > _SHOWN_ENTRIES:
+        if math.prod(value.shape) > _SHOWN_ENTRIES:
             return f"array of shape {tuple(value.shape)}"
         value = value.tolist()
     if isinstance(value, list):
         value = tuple(value)
-    text = repr(value)
+    text = _Short().repr(value)
     return text if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]}..."
 
 

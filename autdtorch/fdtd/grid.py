@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -179,10 +179,7 @@ def make_box(scene: Scene, spacing: float) -> Grid:
 
 def _covering(scene: Scene, spacing: float, extent: Extent) -> Grid:
     positive("spacing", spacing, "m")
-    require_fine("the medium", scene.medium.sound_speed, scene.frequency, spacing)
-    for index, obstacle in enumerate(scene.obstacles):
-        if obstacle.sound_speed is not None:
-            require_fine(f"obstacle {index}", obstacle.sound_speed, scene.frequency, spacing)
+    require_fine(speeds_of(scene), scene.frequency, spacing)
     finest = scene.wavelength / MAX_CELLS_PER_WAVELENGTH
     if spacing < finest:
         accepted = f"must be at least {finest:.3g} m, {MAX_CELLS_PER_WAVELENGTH} cells per wavelength"
@@ -198,20 +195,39 @@ def _covering(scene: Scene, spacing: float, extent: Extent) -> Grid:
     return grid
 
 
-def require_fine(where: str, sound_speed: float, frequency: float, spacing: float) -> None:
-    """Refuse a spacing [m] that is too coarse for a sound speed [m/s] somewhere; warn if it is nearly.
+def speeds_of(scene: Scene) -> dict[str, float]:
+    """Return the sound speeds [m/s] in a scene, by where."""
+    fluid = {
+        f"obstacle {index}": obstacle.sound_speed
+        for index, obstacle in enumerate(scene.obstacles)
+        if obstacle.sound_speed is not None
+    }
+    return {"the medium": scene.medium.sound_speed} | fluid
+
+
+def require_fine(speeds: Mapping[str, float], frequency: float, spacing: float) -> None:
+    """Refuse a spacing [m] that is too coarse for one of the sound speeds [m/s], by where.
 
     Raises:
         ValueError: fewer than `MIN_CELLS_PER_WAVELENGTH` cells a wavelength.
     """
-    wavelength = sound_speed / frequency
-    coarsest = wavelength / MIN_CELLS_PER_WAVELENGTH
-    if spacing > coarsest:
-        reason = f"{MIN_CELLS_PER_WAVELENGTH:g} cells per wavelength in {where} at {frequency:g} Hz"
-        raise invalid("spacing", spacing, f"must be at most {coarsest:.3g} m, {reason}", "m")
-    if spacing > wavelength / FAIR_CELLS_PER_WAVELENGTH:
+    for where, speed in speeds.items():
+        coarsest = speed / frequency / MIN_CELLS_PER_WAVELENGTH
+        if spacing > coarsest:
+            reason = f"{MIN_CELLS_PER_WAVELENGTH:g} cells per wavelength in {where} at {frequency:g} Hz"
+            raise invalid("spacing", spacing, f"must be at most {coarsest:.3g} m, {reason}", "m")
+
+
+def warn_if_coarse(speeds: Mapping[str, float], frequency: float, spacing: float) -> None:
+    """Log where a spacing [m] is coarse for the sound speeds [m/s], by where."""
+    places: dict[float, list[str]] = {}
+    for where, speed in speeds.items():
+        if spacing > speed / frequency / FAIR_CELLS_PER_WAVELENGTH:
+            places.setdefault(speed / frequency / spacing, []).append(where)
+    coarse = [f"{cells:.3g} cells per wavelength in {', '.join(where)}" for cells, where in places.items()]
+    if coarse:
         logger.warning(
-            "spacing %.3g mm is coarse, %.3g cells per wavelength in %s: from %g cells to %g the error in "
-            "air rises from 0.5 to 3 %%, that of the sound speed in obstacles from 0.3 to 1 %%",
-            spacing * 1e3, wavelength / spacing, where, FAIR_CELLS_PER_WAVELENGTH, MIN_CELLS_PER_WAVELENGTH,
+            "spacing %.3g mm is coarse, %s: from %g cells to %g the error in air rises from 0.5 to 3 %%, that"
+            " of the sound speed in obstacles from 0.3 to 1 %%",
+            spacing * 1e3, ", ".join(coarse), FAIR_CELLS_PER_WAVELENGTH, MIN_CELLS_PER_WAVELENGTH,
         )  # fmt: skip

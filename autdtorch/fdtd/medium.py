@@ -168,17 +168,23 @@ def _going_on(scene: Scene) -> list[bool]:
     the first to come decides the direction.
     """
     going, normal = [], None
-    for number, obstacle in enumerate(scene.obstacles):
+    for obstacle in scene.obstacles:
         wall, ends = is_wall(scene, obstacle), _ends(scene, obstacle)
         going.append(wall and (not ends or normal in (None, ends[0])))
         if going[-1] and ends:
             normal = ends[0]
-        elif wall and ends:
-            logger.warning(
-                "obstacle %d crosses the domain in another direction than the wall before it: it ends where"
-                " the boundary layer begins, and its end reflects", number,
-            )  # fmt: skip
     return going
+
+
+def warn_of_ending_walls(scene: Scene) -> None:
+    """Log which walls end before the boundary layers, as another wall decides the direction."""
+    goes_on = zip(scene.obstacles, _going_on(scene), strict=True)
+    ending = [index for index, (one, going) in enumerate(goes_on) if is_wall(scene, one) and not going]
+    if ending:
+        logger.warning(
+            "obstacle %s crosses the domain in another direction than a wall before: it ends where the"
+            " boundary layer begins, and its end reflects", ", ".join(map(str, ending)),
+        )  # fmt: skip
 
 
 def _windows(body: Body, grid: Grid) -> Iterator[tuple[tuple[slice, ...], Array]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
 from autdtorch.fdtd.grid import FAIR_CELLS_PER_WAVELENGTH
@@ -39,5 +41,5 @@ def grid_error(matrix: torch.Tensor, second: torch.Tensor, coarser: bool) -> flo
 
 
 def spacing_for(tolerance: float, error: float, spacing: float) -> float:
-    """Spacing [m] at which the error should be `tolerance`, from that at another spacing."""
-    return float(spacing * (tolerance / error) ** (1 / ORDER))
+    """Return the spacing [m] at which the error should be `tolerance`, from that at another spacing."""
+    return float(spacing * (tolerance / error) ** (1 / ORDER)) if error > 0 else math.inf

@@ -76,7 +76,7 @@ def largest_eigenvalue(
     if bound <= CLOSE * air:
         return bound
     if len(index) > MOST_CELLS:
-        logger.warning(
+        logger.info(
             "the time step comes from a bound, up to a quarter short of the limit: the largest eigenvalue of"
             " %d varying cells is not worked out, only of up to %d", len(index), MOST_CELLS,
         )  # fmt: skip

@@ -13,8 +13,8 @@ tuned stencil's. A cut element gets
   for it bonds in series are right. Its matrix is
   C^T (A - N^T L N) C with L that of the bonds, N the fields at the vertices, A their exact energies, and
   C = (N^T L N)^-1 N^T L the projection on them: the consistency of virtual element methods (Beirao da Veiga
-  et al. 2013) for the local solutions of immersed finite elements (Li 1998). The fields follow the curvature
-  of the surface;
+  et al. 2013) for the local solutions of immersed finite elements (Li 1998). The two along the surface follow
+  its curvature;
 - masses that stay on their side: a sliver of air gives its mass to the vertices in air, as its pressure is
   theirs, also where the cell it lies in has its centre in a heavy obstacle.
 
@@ -298,13 +298,12 @@ def _correction(
     normal = fit[:, 1:4] / steep[:, None]
     tangents = _tangents(normal)
     bend = _curvature(fit, tangents)
-    trace = np.trace(bend, axis1=1, axis2=2)[:, None]
 
     # The fields at the vertices: surface coordinates of the foot of the vertex, and the kinked one.
     depth = level[:, _CORNERS]
     along = (VERTICES - 0.5) @ tangents.transpose(0, 2, 1)
     along = along - depth[:, :, None] * (along @ bend)
-    kinked = np.where(depth < 0, sides[:, 1:], sides[:, :1]) * (depth - trace * depth**2 / 2)
+    kinked = np.where(depth < 0, sides[:, 1:], sides[:, :1]) * depth
     fields = np.concatenate((along, kinked[:, :, None]), axis=2)
 
     # The energies of the first two, summed over the sub-cells.

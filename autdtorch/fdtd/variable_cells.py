@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -17,7 +16,7 @@ from autdtorch.fdtd.medium import fill_elements
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.fdtd.stepping import Assembly, air_stencil, assembly_of
 from autdtorch.obstacles import Obstacle
-from autdtorch.scene import Scene
+from autdtorch.scene import Scene, with_obstacles
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -151,8 +150,7 @@ def _assembled(
     density: torch.Tensor | None,
     sound_speed: torch.Tensor | None,
 ) -> VaryingCells:
-    changed = copy.copy(scene)  # without another look at its geometry, which is the same
-    object.__setattr__(changed, "obstacles", with_materials(scene, density, sound_speed))
+    changed = with_obstacles(scene, with_materials(scene, density, sound_speed))
     return varying_cells(fill_elements(changed, grid, stencil), stencil)
 
 

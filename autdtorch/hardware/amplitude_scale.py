@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from autdtorch.drive import AMPLITUDE_TOLERANCE, validate_single_drive
+from autdtorch.drive import AMPLITUDE_TOLERANCE, validate_drive, validate_single_drive
 from autdtorch.hardware.wiring import Wiring
 from autdtorch.validation import invalid, number_between, positive
 
@@ -57,6 +57,7 @@ class AmplitudeScale:
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
         """
+        drive = validate_drive(drive, len(self._most))
         # One by one, as the link plays them: no rounding may depend on the rows beside.
         rows = [self._wiring.played(self.asked(row)) for row in drive.reshape(-1, drive.shape[-1])]
         return torch.stack(rows).reshape(drive.shape) / self.largest

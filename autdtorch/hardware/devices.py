@@ -27,7 +27,7 @@ from autdtorch.hardware.levels import (
     ultraino_levels,
 )
 from autdtorch.openmpd_board import OpenMPDBoard
-from autdtorch.validation import integer_at_least, invalid, require_kind
+from autdtorch.validation import integer_at_least, invalid, members
 
 SONICSURFACE_BAUD = 230_400
 ULTRAINO_BAUD = 115_200
@@ -101,8 +101,7 @@ def openmpd_boards(boards: Sequence[OpenMPDBoard]) -> Device:
         ValueError: no board, one that is no `OpenMPDBoard`, one of another number of transducers, or two of
             the same name.
     """
-    for number, board in enumerate(boards):
-        require_kind(f"boards[{number}]", board, OpenMPDBoard)
+    boards = members("boards", boards, OpenMPDBoard)
     names = tuple(board.name for board in boards)
     if not boards or len(set(names)) < len(names):
         raise invalid("boards", names, "must be one or more, of different names")

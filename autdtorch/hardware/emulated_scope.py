@@ -14,7 +14,15 @@ import torch
 
 from autdtorch.hardware.emulated_usbtmc import EmulatedInstrument
 from autdtorch.hardware.emulator import EmulatedBench
-from autdtorch.validation import finite_number, integer_at_least, invalid, not_negative, positive
+from autdtorch.validation import (
+    finite_number,
+    integer_at_least,
+    integers,
+    not_negative,
+    positive,
+    require_callable,
+    require_one_of,
+)
 
 _PER = 1000  # captures after which a drift is stated
 
@@ -94,9 +102,9 @@ class EmulatedScope:
         Raises:
             ValueError: an argument out of range.
         """
-        if maker not in _MAKERS:
-            raise invalid("maker", maker, f"must be one of {', '.join(_MAKERS)}")
-        self.heard = list(heard)
+        require_callable("pressure", pressure)
+        require_one_of("maker", maker, _MAKERS)
+        self.heard = integers("heard", heard, 0, "must be numbers of control points, from 0")
         self.misunderstood: list[str] = []
         self._maker = _MAKERS[maker]
         self._pressure = pressure

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
-from autdtorch.conditions import random_rms
+from autdtorch.conditions import SNRS, random_rms
 from autdtorch.hardware.adapters import Adapter
 from autdtorch.hardware.autd3 import autd3_device
 from autdtorch.hardware.devices import OPENMPD, SONICSURFACE, ULTRAINO, Device
@@ -21,7 +21,14 @@ from autdtorch.hardware.firmware import (
     UltrainoFirmware,
 )
 from autdtorch.hardware.wiring import Wiring
-from autdtorch.validation import complex_tensor, finite_number, indices, integer_at_least
+from autdtorch.validation import (
+    complex_tensor,
+    indices,
+    integer_at_least,
+    integers,
+    number_between,
+    require_kind,
+)
 
 _FIRMWARES: dict[str, Callable[[int], Firmware]] = {
     SONICSURFACE.name: lambda transducers: SonicSurfaceFirmware(),
@@ -61,14 +68,16 @@ class EmulatedBench:
             ValueError: `transducers` that the device does not have, not as many as the matrix has, or `dead`
                 ones that the scene does not have.
         """
+        if adapter is not None:
+            require_kind("adapter", adapter, Adapter)
         self._transducers = Wiring(device, transducers).transducers
         self.transfer_matrix = complex_tensor("transfer_matrix", transfer_matrix).to("cpu", torch.complex128)
         if self.transfer_matrix.ndim != 2 or self.transfer_matrix.shape[1] != len(self._transducers):
             shape = tuple(self.transfer_matrix.shape)
             raise ValueError(f"transfer_matrix: shape {shape}; must be (P, {len(self._transducers)})")
         self._alive = torch.ones(len(self._transducers))
-        if dead:
-            self._alive[indices("dead", dead, len(self._transducers))] = 0
+        if silent := integers("dead", dead, 0, "must be indices of transducers"):
+            self._alive[indices("dead", silent, len(self._transducers))] = 0
         each = device.transducers // len(device.serials)
         self._firmwares = [_FIRMWARES[device.name](each) for _ in device.serials]
         self.firmware = self._firmwares[0]
@@ -110,17 +119,18 @@ class EmulatedSensor:
 
         Args:
             bench: where they stand.
-            snr: 20 log10(reference / sigma) [dB], where the reference is the rms pressure over control points
-                and random phases, all transducers fully on; None for no noise.
+            snr: 20 log10(reference / sigma) [dB], -1000 to 1000, where the reference is the rms pressure over
+                control points and random phases, all transducers fully on; None for no noise.
             seed: of the noise, >= 0.
 
         Raises:
             ValueError: an argument out of range.
         """
+        require_kind("bench", bench, EmulatedBench)
         self._bench = bench
         self._generator = np.random.default_rng(integer_at_least("seed", seed, 0))
         rms = random_rms(bench.transfer_matrix)
-        self._sigma = 0.0 if snr is None else rms * 10 ** (-finite_number("snr", snr, "dB") / 20)
+        self._sigma = 0.0 if snr is None else rms * 10 ** (-number_between("snr", snr, *SNRS, "dB") / 20)
 
     def read(self) -> torch.Tensor:
         """Magnitudes (P,) [Pa]."""

@@ -15,7 +15,7 @@ import torch
 from autdtorch.hardware.devices import Device
 from autdtorch.hardware.usb import LinkError, Port, closed_on_error, find_device
 from autdtorch.hardware.wiring import Wiring
-from autdtorch.validation import invalid, not_negative, require_kind
+from autdtorch.validation import invalid, not_negative, require_callable, require_kind
 
 #: Default settle time [s]. Sound goes 1.7 m in it; a T4010A1 rings up in some 30 periods, 0.75 ms, as the
 #: emulator of AUTD3's kit models it.
@@ -59,9 +59,13 @@ class Link:
             sleep: waits for a number of seconds.
 
         Raises:
-            ValueError: `transducers` that the device does not have, or one twice; or a negative `settle`.
+            ValueError: no device, port or function; `transducers` that the device does not have, or one
+                twice; or a negative `settle`.
             OffError: the device does not take the bytes.
         """
+        require_kind("device", device, Device)
+        require_kind("port", port, Port)
+        require_callable("sleep", sleep)
         self.device = device
         self._port = port
         self._sleep = sleep

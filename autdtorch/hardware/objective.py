@@ -15,7 +15,7 @@ from autdtorch.hardware.safety import LimitedLink, LimitError
 from autdtorch.hardware.sensor import Sensor, checked_reading
 from autdtorch.objective import validate_drives
 from autdtorch.scene import Scene
-from autdtorch.validation import invalid, require_kind
+from autdtorch.validation import invalid, path_of, require_callable, require_kind
 
 
 class HardwareObjective:
@@ -59,12 +59,15 @@ class HardwareObjective:
             watch: is shown every evaluation.
 
         Raises:
-            ValueError: no scene; the link is not limited, or plays another number of transducers than the
-                scene has; or `settings` that JSON cannot hold.
+            ValueError: no scene or sensor; the link is not limited, or plays another number of transducers
+                than the scene has; or `settings` that JSON cannot hold.
             LogError: the log is of another trial, none, or open in another process.
             OSError: the log cannot be read or written.
         """
         require_kind("scene", scene, Scene)
+        require_kind("sensor", sensor, Sensor)
+        if watch is not None:
+            require_callable("watch", watch)
         if not isinstance(link, LimitedLink):
             raise invalid("link", link, "must be a LimitedLink: no trial without an amplitude limit")
         transducers = link.link.transducers.tolist()
@@ -72,7 +75,7 @@ class HardwareObjective:
             accepted = f"must be {len(scene.array)}, as many as the scene has"
             raise invalid("link.transducers", len(transducers), accepted)
         try:
-            json.dumps(named := {**(settings or {})})
+            json.dumps(named := {} if settings is None else {**settings})
         except (TypeError, ValueError) as error:
             raise invalid("settings", settings, "must be a mapping of what JSON can hold") from error
         self.scene = scene
@@ -87,7 +90,7 @@ class HardwareObjective:
             "amplitude limit": link.limits.amplitude,
             **named,
         }
-        self.log = EvaluationLog(log, origin, len(scene.array), len(scene.control_points))
+        self.log = EvaluationLog(path_of("log", log), origin, len(scene.array), len(scene.control_points))
         place = self.log.path.resolve()
         if self.log.goes_on and place not in link.logs:
             link.go_on(self.log.seconds_on)

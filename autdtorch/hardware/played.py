@@ -44,15 +44,15 @@ class Played(Condition):
             ValueError: `transducers` that the device does not have, one twice, or not as many as the scene
                 has; `amplitude` out of range, or the device has none up to it but 0.
         """
+        super().__init__(objective)
         wiring = Wiring(device, transducers)
-        count = len(objective.scene.array)
+        count = len(self.scene.array)
         if len(wiring.transducers) != count:
             raise invalid(
                 "transducers", len(wiring.transducers), f"must be {count}, as many as the scene has"
             )
         self._scale = AmplitudeScale(wiring, amplitude)
         self.largest = self._scale.largest
-        super().__init__(objective)
 
     def played(self, drive: torch.Tensor) -> torch.Tensor:
         """What the device plays (..., M), in the trial's scale, when asked for drives (..., M)."""

@@ -10,7 +10,7 @@ import torch
 
 from autdtorch.hardware.safety import LimitedLink
 from autdtorch.hardware.sensor import Sensor, checked_reading
-from autdtorch.validation import integer_at_least, require_kind
+from autdtorch.validation import integer_at_least, require_callable, require_kind
 
 #: How far above the noise a transducer is heard, in standard deviations of the noise's mean power.
 _DEVIATIONS = 6.0
@@ -60,12 +60,16 @@ def check_transducers(
         watch: is told what is read next: "silence, outputs off", then "transducer 1 of 16" and so on.
 
     Raises:
-        ValueError: the link is not limited, the sensor does not give P finite magnitudes, or fewer than 1
-            readings.
+        ValueError: the link is not limited, there is no sensor or it does not give P finite magnitudes, or
+            fewer than 1 readings.
         LimitError: the outputs were on for as long as they may.
         LinkError: the device does not take the bytes.
     """
     require_kind("link", link, LimitedLink)
+    require_kind("sensor", sensor, Sensor)
+    if watch is not None:
+        require_callable("watch", watch)
+    points = integer_at_least("points", points, 1)
     readings = integer_at_least("readings", readings, 1)
     background = integer_at_least("background", background, 1)
     tell = watch or (lambda _: None)
@@ -98,6 +102,9 @@ def hears_silence(sensor: Sensor, check: Preflight, points: int, readings: int =
     Raises:
         ValueError: the sensor does not give P finite magnitudes, or fewer than 1 readings.
     """
+    require_kind("sensor", sensor, Sensor)
+    require_kind("check", check, Preflight)
+    points = integer_at_least("points", points, 1)
     return math.sqrt(_power(sensor, points, integer_at_least("readings", readings, 1))) <= check.threshold
 
 

@@ -18,7 +18,7 @@ import torch
 
 from autdtorch.hardware.amplitude_scale import AmplitudeScale
 from autdtorch.hardware.link import Link
-from autdtorch.validation import integer_at_least, number_between, positive, require_kind
+from autdtorch.validation import integer_at_least, not_negative, number_between, positive, require_kind
 
 logger = logging.getLogger(__name__)
 
@@ -163,9 +163,12 @@ class LimitedLink:
         rest is that of the longest.
 
         Args:
-            seconds: how long its outputs were on [s].
+            seconds: how long its outputs were on [s], >= 0.
+
+        Raises:
+            ValueError: `seconds` out of range.
         """
-        self._seconds_before += seconds
+        self._seconds_before += not_negative("seconds", seconds, "s")
         rest = self._rest(self.limits.seconds_in_a_row)
         self._rested_at = time.monotonic() + rest
         if rest > 0:

@@ -17,7 +17,7 @@ from autdtorch.hardware.sensor import SensorError
 from autdtorch.hardware.usb import LinkError, closed_on_error, find_device
 from autdtorch.hardware.usbtmc import UsbtmcPort
 from autdtorch.hardware.vertical_scale import VerticalScale
-from autdtorch.validation import integer_at_least, invalid, positive, positive_integers
+from autdtorch.validation import integer_at_least, invalid, members, positive, positive_integers, require_kind
 
 logger = logging.getLogger(__name__)
 
@@ -76,7 +76,10 @@ class Oscilloscope:
 
         Raises:
             LinkError: it does not answer.
+            ValueError: no port or dialect.
         """
+        require_kind("port", port, UsbtmcPort)
+        require_kind("dialect", dialect, Dialect)
         self._port = port
         self._dialect = dialect
         self._scales: dict[int, float] = {}  # that it was told
@@ -192,9 +195,10 @@ class ScopeSensor:
             ValueError: an argument out of range, no microphone, or two at one input.
             LinkError: the oscilloscope does not take the commands.
         """
+        require_kind("scope", scope, Oscilloscope)
         self._scope = scope
         self._frequency = positive("frequency", frequency, "Hz")
-        self._microphones = list(microphones)
+        self._microphones = members("microphones", microphones, Microphone)
         self._captures = integer_at_least("captures", captures, 1)
         self._scales = {
             one.input: VerticalScale.up_to(one.loudest * _volts(one), scope.finest)

@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 
@@ -17,9 +17,12 @@ from autdtorch.validation import (
     integer_at_least,
     invalid,
     not_negative,
+    path_of,
     points_tensor,
     positive,
     real_tensor,
+    require_callable,
+    require_kind,
 )
 
 _POLL = 0.02  # [s] between looks at a file
@@ -30,6 +33,7 @@ class SensorError(OSError):
     """A sensor gives no reading that could be trusted."""
 
 
+@runtime_checkable
 class Sensor(Protocol):
     """Reads the pressure at the control points while a drive is played."""
 
@@ -77,8 +81,9 @@ class ManualSensor:
             ask: shows a question and gives the answer.
 
         Raises:
-            ValueError: other control points.
+            ValueError: other control points, or `ask` is no function.
         """
+        require_callable("ask", ask)
         self._points = points_tensor("control_points", control_points)
         self._ask = ask
 
@@ -118,8 +123,10 @@ class MovedMicrophone:
             ask: shows where the microphone must go, and returns once it is there.
 
         Raises:
-            ValueError: other control points.
+            ValueError: no sensor, other control points, or `ask` is no function.
         """
+        require_kind("sensor", sensor, Sensor)
+        require_callable("ask", ask)
         self._sensor = sensor
         self._points = points_tensor("control_points", control_points)
         self._ask = ask
@@ -157,7 +164,7 @@ class FileSensor:
         Raises:
             ValueError: an argument out of range.
         """
-        self._path = Path(path)
+        self._path = path_of("path", path)
         self._points = integer_at_least("points", points, 1)
         self._settle = not_negative("settle", settle, "s")
         self._timeout = positive("timeout", timeout, "s")

@@ -6,7 +6,9 @@ import contextlib
 import errno
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
+
+from autdtorch.validation import require_kind
 
 #: Lets users write to the devices on Linux; to be copied to /etc/udev/rules.d.
 UDEV_RULES = Path(__file__).with_name("70-autdtorch.rules")
@@ -34,6 +36,7 @@ def closed_on_error(close: Callable[[], None]) -> Iterator[None]:
         raise
 
 
+@runtime_checkable
 class Port(Protocol):
     """Takes the bytes for one device."""
 
@@ -81,7 +84,10 @@ def find_device(chips: Collection[tuple[int, int]], serial: str | None = None, b
     Raises:
         LinkError: none or several such devices, with a list of what there is, or no libusb.
         ImportError: pyusb or libusb-package is missing.
+        ValueError: a `serial` that is no text.
     """
+    if serial is not None:
+        require_kind("serial", serial, str)
     usb_core = _pyusb()
     if backend is None:
         backend = _libusb()

@@ -8,7 +8,7 @@ import torch
 
 from autdtorch.drive import validate_single_drive
 from autdtorch.hardware.devices import Device
-from autdtorch.validation import indices
+from autdtorch.validation import indices, require_kind
 
 
 class Wiring:
@@ -28,8 +28,9 @@ class Wiring:
                 in order.
 
         Raises:
-            ValueError: `transducers` that the device does not have, or one twice.
+            ValueError: no device, `transducers` that it does not have, or one twice.
         """
+        require_kind("device", device, Device)
         self.device = device
         chosen = range(device.transducers) if transducers is None else transducers
         self.transducers = torch.tensor(indices("transducers", chosen, device.transducers))

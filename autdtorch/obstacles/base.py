@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from numpy.typing import NDArray
 
-from autdtorch.validation import ArrayLike, Vector, finite_number, invalid, positive, real_tensor
+from autdtorch.validation import ArrayLike, Vector, boolean, invalid, not_negative, positive, real_tensor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,8 +33,7 @@ class Obstacle(ABC):
     def __post_init__(self) -> None:
         """Check the material."""
         kind = type(self).__name__
-        if not isinstance(self.rigid, bool):
-            raise invalid(f"{kind}.rigid", self.rigid, "must be true or false")
+        object.__setattr__(self, "rigid", boolean(f"{kind}.rigid", self.rigid))
         if self.rigid:
             if self.density is not None or self.sound_speed is not None:
                 material = (self.density, self.sound_speed)
@@ -72,9 +71,7 @@ class Obstacle(ABC):
             ValueError: `points` are not finite real numbers or have another last axis, or `margin` is < 0.
         """
         points = _points(points)
-        margin = finite_number("margin", margin, "m")
-        if margin < 0:
-            raise invalid("margin", margin, "must be finite and >= 0", "m")
+        margin = not_negative("margin", margin, "m")
         return self._inside(points.reshape(-1, 3), margin).reshape(points.shape[:-1])
 
     def signed_distance(self, points: ArrayLike) -> torch.Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from autdtorch.geometry import rotation_matrix
 from autdtorch.obstacles.base import Obstacle, content_digest
 from autdtorch.obstacles.mesh_file import read_obj, read_ply
-from autdtorch.validation import Vector, finite_vector, invalid, positive
+from autdtorch.validation import Vector, finite_vector, invalid, path_of, positive
 
 _FORMATS = (".stl", ".obj", ".ply")
 
@@ -90,9 +89,7 @@ class Mesh(Obstacle):
 
 
 def _checked_path(given: object) -> str:
-    if not isinstance(given, str | os.PathLike):
-        raise invalid("Mesh.path", given, "must be the path of a file")
-    path = Path(given)
+    path = path_of("Mesh.path", given)
     if path.suffix.lower() not in _FORMATS:
         raise invalid("Mesh.path", str(path), f"must end in one of {', '.join(_FORMATS)}")
     if not path.is_file():

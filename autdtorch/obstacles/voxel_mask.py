@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from autdtorch.numpy_file import read_arrays
 from autdtorch.obstacles.base import Obstacle, content_digest
 from autdtorch.obstacles.triangles import BOX_TRIANGLES
-from autdtorch.validation import Vector, finite_vector, invalid, positive
+from autdtorch.validation import Vector, finite_vector, invalid, is_dense, path_of, positive
 
 _AIR = 2
 """Voxels of air around the body in the distance transform; farther away, distances are searched for."""
@@ -80,7 +80,7 @@ class VoxelMask(Obstacle):
         Raises:
             ValueError: no such file, or another content; see also `VoxelMask`.
         """
-        mask = _read(Path(path))
+        mask = _read(path_of("VoxelMask.path", path))
         return cls(mask, spacing, origin, density=density, sound_speed=sound_speed, rigid=rigid)
 
     @property
@@ -175,13 +175,17 @@ def _to_cube(offset: NDArray[Any], axis: int) -> NDArray[np.float64]:
 
 
 def _checked_mask(given: object) -> NDArray[np.bool_]:
-    mask = given.cpu().numpy() if isinstance(given, torch.Tensor) else np.asarray(given)
-    if mask.dtype != np.bool_ or mask.ndim != 3:
-        shown = f"array of shape {mask.shape} and type {mask.dtype}"
-        raise ValueError(f"VoxelMask.mask: {shown}; must be (nx, ny, nz) of booleans")
+    if (
+        not isinstance(given, torch.Tensor | np.ndarray)
+        or given.dtype not in (torch.bool, np.bool_)
+        or not is_dense(given)
+        or given.ndim != 3
+    ):
+        raise invalid("VoxelMask.mask", given, "must be an array (nx, ny, nz) of booleans")
+    mask = given.cpu().numpy() if isinstance(given, torch.Tensor) else given
     if not mask.any():
         raise ValueError(f"VoxelMask.mask: array of shape {mask.shape}; must be True somewhere")
-    mask = mask.copy()
+    mask = np.array(mask)
     mask.flags.writeable = False
     return mask
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -12,8 +13,8 @@ import torch
 from autdtorch.conditions import playable
 from autdtorch.display import html_facts
 from autdtorch.drive import amplitudes_of, phases_of
-from autdtorch.objective import Objective, Score
-from autdtorch.validation import integer_at_least, real_tensor
+from autdtorch.objective import Objective, Score, require_objective
+from autdtorch.validation import integer_at_least, integers, invalid, real_tensor, require_callable
 
 Trials: TypeAlias = int | Sequence[int]
 """A number of trials T, or the numbers of the T trials to run, so that a study can be run in parts."""
@@ -109,7 +110,12 @@ class Ledger:
     """Evaluates drives for several trials at once, and keeps what was found.
 
     Optimisers evaluate through a ledger only, so that every evaluation is counted and none is forgotten.
+
+    Attributes:
+        transducers: their number M.
     """
+
+    transducers: int
 
     def __init__(self, objective: Objective, trials: int, score: Score) -> None:
         """Open the ledger.
@@ -118,11 +124,16 @@ class Ledger:
             objective: what is evaluated.
             trials: number of trials T.
             score: what is maximised.
+
+        Raises:
+            ValueError: no objective, or a score that is no function.
         """
-        transducers, foci = len(objective.scene.array), len(objective.scene.control_points)
+        require_objective(objective)
+        require_callable("score", score)
+        self.transducers, foci = len(objective.scene.array), len(objective.scene.control_points)
         self._objective = objective
         self._score = score
-        self._drive = torch.zeros(trials, transducers, dtype=torch.complex128)
+        self._drive = torch.zeros(trials, self.transducers, dtype=torch.complex128)
         self._pressure = torch.zeros(trials, foci, dtype=torch.float64)
         self._best = torch.full((trials,), -torch.inf, dtype=torch.float64)
         self._evaluations = torch.zeros(trials, dtype=torch.int64)
@@ -196,13 +207,14 @@ def trial_seeds(seed: int, trials: Trials) -> list[int]:
         ValueError: a seed below 0, no trial, a trial twice, or a trial below 0.
     """
     seed = integer_at_least("seed", seed, 0)
-    if isinstance(trials, Sequence) and not isinstance(trials, str):
-        numbers = [integer_at_least(f"trials[{place}]", trial, 0) for place, trial in enumerate(trials)]
-        if not numbers or len(set(numbers)) < len(numbers):
-            raise ValueError(f"trials: {numbers}; must be an integer >= 1, or trial numbers, each once")
+    if isinstance(trials, numbers.Integral):
+        chosen = list(range(integer_at_least("trials", trials, 1)))
     else:
-        numbers = list(range(integer_at_least("trials", trials, 1)))
-    return [trial_seed(seed, trial) for trial in numbers]
+        accepted = "must be an integer >= 1, or trial numbers, each once"
+        chosen = integers("trials", trials, 0, accepted)
+        if not chosen or len(set(chosen)) < len(chosen):
+            raise invalid("trials", chosen, accepted)
+    return [trial_seed(seed, trial) for trial in chosen]
 
 
 def trial_seed(seed: int, trial: int) -> int:

@@ -73,7 +73,8 @@ def bayes_opt(
     if isinstance(noise, str):
         require_one_of("noise", noise, ("inferred",))
     variance = None if isinstance(noise, str) else number_between("noise", noise, 1e-6, 1)
-    transducers = integer_at_least("transducers of the objective's array", len(objective.scene.array), 2)
+    ledger = Ledger(objective, len(seeds), score)
+    transducers = integer_at_least("transducers of the objective's array", ledger.transducers, 2)
     if integer_at_least("fixed_transducer", fixed_transducer, 0) >= transducers:
         raise invalid("fixed_transducer", fixed_transducer, f"must be an integer from 0 to {transducers - 1}")
 
@@ -88,7 +89,6 @@ def bayes_opt(
         sobol=initial_points == "sobol",
         noise=variance,
     )
-    ledger = Ledger(objective, len(seeds), score)
     searches = [BayesTrial(settings, trial) for trial in seeds]
     points = torch.stack([search.initial_points() for search in searches])
     scores = ledger.evaluate(_drive(points, fixed_transducer))

@@ -9,7 +9,7 @@ import torch
 
 from autdtorch.drive import drive_from_phases
 from autdtorch.optim.base import Ledger, first_of_best
-from autdtorch.validation import integer_at_least, invalid
+from autdtorch.validation import integers, invalid
 
 
 def indices_of(order: str | Sequence[int], count: int, names: Sequence[str] = ("given",)) -> torch.Tensor:
@@ -23,14 +23,14 @@ def indices_of(order: str | Sequence[int], count: int, names: Sequence[str] = ("
     Raises:
         ValueError: anything else.
     """
-    if order == "given":
+    if isinstance(order, str) and order == "given":
         return torch.arange(count)
-    if isinstance(order, Sequence) and not isinstance(order, str):
-        indices = [integer_at_least(f"order[{place}]", index, 0) for place, index in enumerate(order)]
-        if sorted(indices) == list(range(count)):
-            return torch.tensor(indices)
     named = ", ".join(f'"{name}"' for name in names)
-    raise invalid("order", order, f"must be {named} or the indices 0 to {count - 1}, each once")
+    accepted = f"must be {named} or the indices 0 to {count - 1}, each once"
+    indices = integers("order", order, 0, accepted)
+    if sorted(indices) != list(range(count)):
+        raise invalid("order", indices, accepted)
+    return torch.tensor(indices)
 
 
 def take_best_levels(

@@ -56,12 +56,12 @@ def gabs(
     levels = integer_at_least("levels", levels, 2)
     passes = integer_at_least("passes", passes, 1)
     seeds = trial_seeds(seed, trials)
-    transducers = len(objective.scene.array)
+    ledger = Ledger(objective, len(seeds), score)
+    transducers = ledger.transducers
     orders = _known_orders(order, transducers, seeds)
     if first is not None and integer_at_least("first", first, 0) >= transducers:
         raise invalid("first", first, f"must be an integer from 0 to {transducers - 1}")
 
-    ledger = Ledger(objective, len(seeds), score)
     alone = torch.eye(transducers, dtype=torch.complex128)
     if orders is None:
         scores = ledger.evaluate(alone.expand(len(seeds), -1, -1))
@@ -77,9 +77,9 @@ def gabs(
 
 def _known_orders(order: str | Sequence[int], transducers: int, seeds: Sequence[int]) -> torch.Tensor | None:
     """The order of each trial (T, M), or None for what only evaluations can tell."""
-    if order == "strength":
+    if isinstance(order, str) and order == "strength":
         return None
-    if order == "random":
+    if isinstance(order, str) and order == "random":
         generators = [torch.Generator().manual_seed(seed) for seed in seeds]
         return torch.stack([torch.randperm(transducers, generator=own) for own in generators])
     return indices_of(order, transducers, ("random", "given", "strength")).expand(len(seeds), -1)

@@ -46,6 +46,7 @@ def gradient_ascent(
     starts = integer_at_least("starts", starts, 1)
     steps = integer_at_least("steps", steps, 2)
     seeds = trial_seeds(seed, trials)
+    ledger = Ledger(objective, len(seeds), weakest_focus)
     matrix = getattr(objective, "transfer_matrix", None)
     if matrix is None:
         raise invalid(
@@ -53,7 +54,6 @@ def gradient_ascent(
             objective,
             'must have a transfer matrix, as SimulatedObjective has in mode "transfer"',
         )
-    ledger = Ledger(objective, len(seeds), weakest_focus)
     generators = [torch.Generator().manual_seed(own) for own in seeds]
     highest = [climb(matrix, random_drives(starts, matrix.shape[1], own), steps) for own in generators]
     ledger.evaluate(torch.stack(highest)[:, None])

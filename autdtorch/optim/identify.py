@@ -45,7 +45,9 @@ def identify(objective: Objective, evaluations: int = 64, trials: Trials = 1, se
     Raises:
         ValueError: an argument out of range, or the objective's pressures are not finite.
     """
-    transducers = len(objective.scene.array)
+    generators = [torch.Generator().manual_seed(own) for own in trial_seeds(seed, trials)]
+    ledger = Ledger(objective, len(generators), weakest_focus)
+    transducers = ledger.transducers
     evaluations = integer_at_least("evaluations", evaluations, 1)
     if evaluations < 3 * transducers - 1:
         raise invalid(
@@ -53,9 +55,6 @@ def identify(objective: Objective, evaluations: int = 64, trials: Trials = 1, se
             evaluations,
             f"must be an integer >= {3 * transducers - 1}, to identify {transducers} transducers",
         )
-    generators = [torch.Generator().manual_seed(own) for own in trial_seeds(seed, trials)]
-    ledger = Ledger(objective, len(generators), weakest_focus)
-
     first = max(3 * transducers - 2, evaluations // 2)
     drives = playable(objective, torch.stack([random_drives(first, transducers, own) for own in generators]))
     observed = ledger.observe(drives)

@@ -71,9 +71,9 @@ def lssg(
     """
     levels = integer_at_least("levels", levels, 2)
     passes = integer_at_least("passes", passes, 1)
+    ledger = Ledger(objective, trials=1, score=score)
     foci = _focus_drives(objective.scene)
     places = indices_of(order, len(foci))
-    ledger = Ledger(objective, trials=1, score=score)
     start = torch.ones(1, len(foci), dtype=torch.complex128)
     repeat_passes(ledger, start, places[None], levels, passes, lambda weights: normalise(weights @ foci))
     return ledger.solution(most=passes * len(foci) * levels)

@@ -22,11 +22,12 @@ from autdtorch.plot.style import (
     methods_of,
     new_figure,
     readable,
+    require_each,
     require_scenes,
     styled,
     wrapped,
 )
-from autdtorch.validation import ArrayLike, points_tensor
+from autdtorch.validation import ArrayLike, boolean, members, points_tensor, require_kind
 
 _AXIS_TOLERANCE = 1e-12  # by which a unit vector along x, y or z may miss length 1 in that coordinate
 
@@ -59,12 +60,17 @@ def plot_plane(
         ValueError: `pressure` is not (Nu, Nv), or 0 everywhere and to be drawn as a level, or
             `control_points` are not points.
     """
+    require_kind("plane", plane, Plane)
+    if ax is not None:
+        require_kind("ax", ax, Axes)
+    obstacles, decibels = members("obstacles", obstacles, Obstacle), boolean("decibels", decibels)
+    magnitude = plane_magnitude("pressure", pressure)
+    points = None if control_points is None else points_tensor("control_points", control_points)
     if ax is None:
         figure = new_figure(4.4, 3.6)
         figure.set_layout_engine("compressed")  # "constrained" cuts off labels beside a square
         ax = figure.add_subplot()
     figure = cast(Figure, ax.get_figure(root=True))
-    magnitude = plane_magnitude("pressure", pressure)
     peak = magnitude.max()
     values, limits, label = magnitude, (0.0, peak), "|p| [Pa]"
     if decibels:
@@ -72,7 +78,7 @@ def plot_plane(
             raise ValueError("pressure: 0 Pa everywhere; must be more somewhere to have a level in dB")
         values = np.maximum(in_decibels(magnitude, peak), FLOOR)
         limits, label = (FLOOR, 0.0), f"level of |p| [dB], 0 dB = {peak:.3g} Pa"
-    mesh = _draw_plane(ax, values, plane, control_points, obstacles, limits)
+    mesh = _draw_plane(ax, values, plane, points, obstacles, limits)
     _add_colour_bar(figure, mesh, [ax], "vertical", label)
     return figure
 
@@ -102,8 +108,13 @@ def plot_planes(
         ValueError: no scene, a scene without plane, or an argument of the wrong shape.
     """
     require_scenes("pressure", pressure)
-    if missing := pressure.keys() - planes.keys():
-        raise ValueError(f"planes: none for {sorted(missing)}; must have one for each scene in pressure")
+    require_each("planes", planes, pressure)
+    for scene in pressure:
+        require_kind(f"planes[{scene!r}]", planes[scene], Plane)
+    if control_points is not None:
+        require_each("control_points", control_points, pressure)
+    if obstacles is not None:
+        require_each("obstacles", obstacles, pressure)
     methods = methods_of(pressure.values())
     full = all(method in maps for method in methods for maps in pressure.values())
     alike = full and len({planes[scene] for scene in pressure}) == 1
@@ -115,8 +126,10 @@ def plot_planes(
             for method, field in maps.items()
         }
         limits = (0.0, max(magnitude.max() for magnitude in magnitudes.values()))
-        points = None if control_points is None else control_points[scene]
-        outlined = () if obstacles is None else tuple(obstacles[scene])
+        points = None
+        if control_points is not None:
+            points = points_tensor(f"control_points[{scene!r}]", control_points[scene])
+        outlined = () if obstacles is None else members(f"obstacles[{scene!r}]", obstacles[scene], Obstacle)
         for ax, method in zip(column, methods, strict=True):
             if method not in magnitudes:
                 ax.set_axis_off()
@@ -142,7 +155,7 @@ def _draw_plane(
     ax: Axes,
     values: Array,
     plane: Plane,
-    control_points: ArrayLike | None,
+    points: torch.Tensor | None,
     obstacles: Iterable[Obstacle],
     limits: tuple[float, float],
 ) -> QuadMesh:
@@ -153,8 +166,8 @@ def _draw_plane(
     mesh = ax.pcolormesh(edges_u, edges_v, values.T, cmap=PRESSURE_MAP, vmin=low, vmax=high, rasterized=True)
     for obstacle in obstacles:
         _outline(ax, plane, obstacle)
-    if control_points is not None:
-        _circle_points(ax, plane, points_tensor("control_points", control_points), max(values.shape))
+    if points is not None:
+        _circle_points(ax, plane, points, max(values.shape))
     ax.set(xlabel=label_u, ylabel=label_v, aspect="equal")
     ax.tick_params(labelsize=TICK_SIZE)
     return mesh

@@ -22,10 +22,11 @@ from autdtorch.plot.style import (
     methods_of,
     new_panels,
     numbers,
+    require_each,
     require_scenes,
     styled,
 )
-from autdtorch.validation import ArrayLike
+from autdtorch.validation import ArrayLike, boolean, invalid, members, require_kind
 
 _FRONT: dict[str, Any] = {"color": "0.8", "linewidth": 4.0, "solid_joinstyle": "miter", "zorder": 1.0}
 _PANEL = 2.6  # inch
@@ -61,6 +62,11 @@ def plot_pareto(
             can be drawn.
     """
     require_scenes("points", points)
+    require_kind("xlabel", xlabel, str)
+    require_kind("ylabel", ylabel, str)
+    higher_is_better = boolean("higher_is_better", higher_is_better)
+    if names is not None:
+        require_each("names", names, points)
     looks = looks_of(methods_of(points.values()))
     figure, panels = new_panels(points, _PANEL, _PANEL, xlabel, ylabel, sharey=higher_is_better)
     for ax, (scene, by_method) in zip(panels, points.items(), strict=True):
@@ -73,7 +79,12 @@ def plot_pareto(
         everything = np.concatenate(list(drawn.values()))
         best = pareto_front(everything, higher_is_better)
         if names is not None:
-            texts = [text for method in drawn for text in names[scene][method]]
+            require_each(f"names[{scene!r}]", names[scene], drawn)
+            texts = [
+                text
+                for method, values in drawn.items()
+                for text in _texts(f"names[{scene!r}][{method!r}]", names[scene][method], len(values))
+            ]
             for index in best:
                 _write_beside(ax, everything[index], texts[index], higher_is_better)
         ax.margins(0.15)
@@ -114,6 +125,13 @@ def _points(name: str, given: ArrayLike, higher_is_better: bool) -> Array:
     if positive.min() <= 0:
         raise ValueError(f"{name}: {positive.min():g}; must be > 0 on a logarithmic axis")
     return values
+
+
+def _texts(name: str, given: Sequence[str], count: int) -> tuple[str, ...]:
+    texts = members(name, given, str)
+    if len(texts) != count:
+        raise invalid(name, texts, f"must be {count} names, one for each point")
+    return texts
 
 
 def _draw_points(ax: Axes, points: Array, look: Look, higher_is_better: bool) -> None:

@@ -24,7 +24,7 @@ from autdtorch.plot.style import (
     require_scenes,
     styled,
 )
-from autdtorch.validation import ArrayLike
+from autdtorch.validation import ArrayLike, require_kind
 
 OVERHEAD = 2.0
 """Costs from this many times the least one on are fitted: at most half of them is what costs always."""
@@ -74,14 +74,16 @@ def plot_scaling(costs: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
     Raises:
         ValueError: no cost or size, or values that are not (N, 2) finite numbers > 0.
     """
+    require_kind("costs", costs, Mapping)
     if not costs:
         raise ValueError("costs: empty; must have at least one")
+    for label, by_size in costs.items():
+        require_scenes(f"costs[{label!r}]", by_size)
     growths = methods_of(costs.values())
     looks = looks_of(methods_of(scene for by_size in costs.values() for scene in by_size.values()))
     figure = new_figure(0.6 + 2.5 * len(growths), 0.2 + 2.7 * len(costs))
     panels = figure.subplots(len(costs), len(growths), squeeze=False, sharex="col", sharey="row")
     for line, (label, by_size) in zip(panels, costs.items(), strict=True):
-        require_scenes(f"costs[{label!r}]", by_size)
         for ax, growth in zip(line, growths, strict=True):
             if growth not in by_size:
                 ax.set_axis_off()

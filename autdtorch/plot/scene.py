@@ -30,7 +30,7 @@ from autdtorch.drawing import (
 from autdtorch.obstacles import Obstacle
 from autdtorch.plot.style import TICK_SIZE, new_figure, styled
 from autdtorch.scene import Scene
-from autdtorch.validation import ArrayLike, Vector
+from autdtorch.validation import ArrayLike, Vector, require_kind
 
 _TICKS = 5  # along the longest side; on a short one more would run into each other
 _ELEVATION, _AZIMUTH = 22.0, -118.0  # of the viewer [degrees]
@@ -60,6 +60,8 @@ def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
     Raises:
         ValueError: `drive` does not fit the array.
     """
+    require_kind("scene", scene, Scene)
+    phases = None if drive is None else single_drive_phases(drive, len(scene.array))
     figure = new_figure(5.2, 4.2)
     ax = cast(Axes3D, figure.add_subplot(projection="3d", computed_zorder=False))
     if scene.observation_plane is not None:
@@ -70,7 +72,7 @@ def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
         _add_obstacle(ax, obstacle, scene.domain)
     foci = MM * scene.control_points.numpy()
     ax.scatter(*foci.T, color=FOCUS_COLOUR, s=22, depthshade=False, label="control points", zorder=3)
-    _scatter_transducers(ax, scene, drive)
+    _scatter_transducers(ax, scene, phases)
     lower, upper = (MM * np.array(corner) for corner in scene.domain)
     ax.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), zlim=(lower[2], upper[2]))
     ax.set(xlabel="x [mm]", ylabel="y [mm]")
@@ -145,7 +147,7 @@ def _sharp_edges(faces: NDArray[np.int64], normals: Array, front: NDArray[np.boo
     return edges
 
 
-def _scatter_transducers(ax: Axes3D, scene: Scene, drive: ArrayLike | None) -> None:
+def _scatter_transducers(ax: Axes3D, scene: Scene, phases: Array | None) -> None:
     positions = MM * scene.array.positions.numpy()
     style: Any = {
         "edgecolors": EDGE_COLOUR,
@@ -154,10 +156,9 @@ def _scatter_transducers(ax: Axes3D, scene: Scene, drive: ArrayLike | None) -> N
         "zorder": 1,
         "label": "transducers",
     }
-    if drive is None:
+    if phases is None:
         ax.scatter(*positions.T, color=TRANSDUCER_COLOUR, **style)
         return
-    phases = single_drive_phases(drive, len(scene.array))
     dots = ax.scatter(*positions.T, c=phases, cmap=PHASE_MAP, vmin=0, vmax=2 * np.pi, **style)
     bar = ax.get_figure().colorbar(dots, ax=ax, shrink=0.6, pad=0.12)
     bar.set_ticks([0, np.pi, 2 * np.pi], labels=["0", "π", "2π"])

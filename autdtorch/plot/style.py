@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import cycle
 from typing import Any, NamedTuple, TypeAlias
 
@@ -17,7 +17,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from autdtorch.drawing import Array
 from autdtorch.optim import label_of as label_of
-from autdtorch.validation import ArrayLike, invalid, real_tensor
+from autdtorch.validation import ArrayLike, invalid, real_tensor, require_kind
 
 ByMethod: TypeAlias = Mapping[str, ArrayLike]
 Dashes: TypeAlias = tuple[float, tuple[float, ...]]
@@ -139,6 +139,17 @@ def require_scenes(name: str, scenes: Mapping[str, ByMethod]) -> None:
             raise invalid(f"{name}[{scene!r}]", methods, "must be values by the names of methods")
     if not scenes or not all(scenes.values()):
         raise ValueError(f"{name}: scenes {list(scenes)}; {accepted}")
+
+
+def require_each(name: str, given: Mapping[str, object], wanted: Collection[str]) -> None:
+    """Check that a mapping has an entry for each name of `wanted`.
+
+    Raises:
+        ValueError: no mapping, or one without some entry.
+    """
+    require_kind(name, given, Mapping)
+    if missing := [one for one in wanted if one not in given]:
+        raise ValueError(f"{name}: none for {missing}; must have one for each of {list(wanted)}")
 
 
 def numbers(name: str, given: ArrayLike, *axes: str) -> Array:

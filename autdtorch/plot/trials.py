@@ -29,6 +29,7 @@ from autdtorch.plot.style import (
     styled,
     wrapped,
 )
+from autdtorch.validation import finite_number, require_kind
 
 # The first is broad and pale, so that what lies on it is seen.
 _LEVELS: tuple[dict[str, Any], ...] = (
@@ -58,6 +59,7 @@ def plot_trials(quantities: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
     Raises:
         ValueError: no quantity or scene, or values that are not (trials,) finite numbers.
     """
+    require_kind("quantities", quantities, Mapping)
     if not quantities:
         raise ValueError("quantities: empty; must have at least one")
     for label, by_scene in quantities.items():
@@ -120,10 +122,14 @@ def plot_convergence(
             without history.
     """
     require_scenes("history", history)
-    levels = levels or {}
+    require_kind("label", label, str)
+    levels = {} if levels is None else levels
+    require_kind("levels", levels, Mapping)
+    for scene, by_label in levels.items():
+        require_kind(f"levels[{scene!r}]", by_label, Mapping)
     if unknown := levels.keys() - history.keys():
         raise ValueError(
-            f"levels: of scenes {sorted(unknown)}; must be of scenes in history: {list(history)}"
+            f"levels: of scenes {list(unknown)}; must be of scenes in history: {list(history)}"
         )
     level_labels = list(dict.fromkeys(name for by_label in levels.values() for name in by_label))
     styles = {name: _LEVELS[index % len(_LEVELS)] for index, name in enumerate(level_labels)}
@@ -136,7 +142,8 @@ def plot_convergence(
             title = "median of the trials, band: quartiles" if len(values) > 1 else title
             _draw_history(ax, values, looks[method])
         for name, level in levels.get(scene, {}).items():
-            ax.axhline(level, zorder=1, **styles[name])
+            height = finite_number(f"levels[{scene!r}][{name!r}]", level)
+            ax.axhline(height, zorder=1, **styles[name])
         ax.set_xlim(left=0.0)
     # Once all panels are drawn: they share the axis, and a limit set earlier would keep it from growing.
     panels[0].set_ylim(bottom=min(0.0, panels[0].get_ylim()[0]))

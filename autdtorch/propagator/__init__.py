@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 from typing import Literal
 
 import torch
 
 from autdtorch.cache import DiskCache
+from autdtorch.fdtd.grid import speeds_of, warn_if_coarse
 from autdtorch.fdtd.kernels.contract import Kernel
+from autdtorch.fdtd.medium import warn_of_ending_walls
 from autdtorch.fdtd.spacing import PILOT_CELLS, coarsest_spacing, spacing_for
 from autdtorch.propagator.auto import chosen_method
 from autdtorch.propagator.base import Propagator, Run, SimulatedPropagator, SteadyStateWarning
@@ -20,7 +23,14 @@ from autdtorch.propagator.full import FullPropagator
 from autdtorch.propagator.stepper import KERNELS, make_kernel, precision_of
 from autdtorch.propagator.volume import volume_field
 from autdtorch.scene import Scene
-from autdtorch.validation import integer_at_least, invalid, positive, require_kind, require_one_of
+from autdtorch.validation import (
+    integer_at_least,
+    invalid,
+    path_of,
+    positive,
+    require_kind,
+    require_one_of,
+)
 
 __all__ = [
     "BoxPropagator",
@@ -111,7 +121,10 @@ def make_propagator(
     if spacing is None:
         tolerance /= 2
         spacing = _chosen_spacing(kind, scene, tolerance, *settings)
-    return kind(scene, spacing, tolerance, *settings, time_step)
+    propagator = kind(scene, spacing, tolerance, *settings, time_step)
+    warn_if_coarse(speeds_of(scene), scene.frequency, spacing)
+    warn_of_ending_walls(scene)
+    return propagator
 
 
 def _chosen_spacing(
@@ -127,7 +140,10 @@ def _chosen_spacing(
     pilot = _pilot_spacing(scene)
     near_steady = max(tolerance, 1e-3)
     propagator = kind(scene, pilot, near_steady, kernel, dtype, max_periods, cache, None)
-    _, error = propagator.transfer_matrix(return_error=True)
+    _, error, _ = propagator._estimated()
+    if not math.isfinite(error):
+        accepted = f"too few to choose a spacing: at {pilot:.3g} m no run came near its steady state"
+        raise invalid("max_periods", max_periods, accepted)
     spacing = min(spacing_for(tolerance, error, pilot), coarsest_spacing(scene))
     logger.info("spacing %.3g mm: the error at %.3g mm is about %.2g", 1e3 * spacing, 1e3 * pilot, error)
     return spacing
@@ -139,14 +155,11 @@ def _disk_cache(folder: str | os.PathLike[str] | Literal[False] | None) -> DiskC
         name, folder = CACHE_VARIABLE, os.environ.get(CACHE_VARIABLE) or False
     if folder is False:
         return None
-    if not isinstance(folder, str | os.PathLike) or not os.fspath(folder):
-        raise invalid(name, folder, "must be the path of a folder, or False")
+    path = path_of(name, folder, "a folder, or False")
     try:
-        return DiskCache(folder)
+        return DiskCache(path)
     except OSError as error:
-        raise invalid(
-            name, os.fspath(folder), f"must be a folder, or one that can be made ({error})"
-        ) from error
+        raise invalid(name, str(path), f"must be a folder, or one that can be made ({error})") from error
 
 
 def _pilot_spacing(scene: Scene) -> float:

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import ClassVar, Literal, Protocol, Self, overload
+from typing import ClassVar, Literal, Protocol, Self, overload, runtime_checkable
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from autdtorch.propagator.symmetry import Plan, Symmetry, backward_plan, forward
 from autdtorch.scene import Scene
 from autdtorch.source import package_versions, source_digest
 from autdtorch.threads import one_torch_thread
-from autdtorch.validation import ArrayLike, points_grid
+from autdtorch.validation import ArrayLike, boolean, points_grid
 
 logger = logging.getLogger(__name__)
 
@@ -44,6 +44,7 @@ class SteadyStateWarning(UserWarning):
     """A simulation ended before its steady state was reached."""
 
 
+@runtime_checkable
 class Propagator(Protocol):
     """What carries sound from a scene's transducers to points.
 
@@ -117,6 +118,7 @@ class SimulatedPropagator(ABC):
         self.tolerance = tolerance
         self.max_periods = max_periods
         self.runs: list[Run] = []
+        self._near_told = False
         self._kernel = kernel
         self._cache = cache
         self._assemblies = self._assembled(dtype, time_step)
@@ -178,13 +180,28 @@ class SimulatedPropagator(ABC):
         fewer = (backward.runs, len(points)) < (forward.runs, len(self.scene.array))
         return backward if fewer else forward
 
-    def _warn_near_obstacle(self, origins: Nodes) -> None:
-        grid = self._assemblies[0].grid
-        if self._near_obstacle(origins.positions.reshape(-1, 3)):
+    def _warn_near_obstacle(self) -> None:
+        """Log once, for runs from the transducers, that one is next to an obstacle."""
+        if self._near_told:
+            return
+        self._near_told = True
+        if any(self._near_obstacle(nodes) for nodes in self.scene.array.nodes.positions):
+            grid = self._assemblies[0].grid
             logger.warning(
                 "a source is within %.2g mm of an obstacle: less accurate; use a finer spacing than %.2g mm",
                 1e3 * grid.spacing * footprint(grid.kappa) / 2, 1e3 * grid.spacing,
             )  # fmt: skip
+
+    def _warn_unsettled(self, runs: Sequence[Run]) -> None:
+        unsettled = [run for run in runs if not run.reached]
+        if unsettled:
+            warnings.warn(
+                f"no steady state after {max(run.periods for run in unsettled)} periods in {len(unsettled)} "
+                f"of {len(runs)} runs: still up to about {max(run.remaining for run in unsettled):.1e} away "
+                f"(relative), tolerance {self.tolerance:g}; raise max_periods or tolerance",
+                SteadyStateWarning,
+                stacklevel=4,  # the caller of the public method, beyond its decorator
+            )
 
     @cached_property
     def _control_matrix(self) -> tuple[torch.Tensor, float]:
@@ -236,14 +253,40 @@ class SimulatedPropagator(ABC):
             ValueError: `points` are not finite, have another shape, leave the domain (`FullPropagator`) or
                 lie on a transducer (`BoxPropagator`).
         """
-        if points is None:
-            matrix, remaining = self._control_matrix[0].clone(), self._control_matrix[1]
-        else:
-            matrix, remaining = self._kept_matrix(self._checked(points))
-        if not return_error:
-            return matrix
-        second = self._second.transfer_matrix(points)
-        return matrix, remaining + grid_error(matrix, second, coarser=self._second.spacing > self.spacing)
+        with_error = boolean("return_error", return_error)
+        places = None if points is None else self._checked(points)
+        if not self._plan(self.scene.control_points if places is None else places).backward:
+            self._warn_near_obstacle()
+        if with_error:
+            matrix, error, runs = self._estimated(places)
+            self._warn_unsettled(runs)
+            return matrix, error
+        before = len(self.runs)
+        matrix, _ = self._matrix(places)
+        self._warn_unsettled(self.runs[before:])
+        return matrix
+
+    def _estimated(self, points: torch.Tensor | None = None) -> tuple[torch.Tensor, float, list[Run]]:
+        """Return what `transfer_matrix` does with the error, and the runs that it took; nothing is warned of.
+
+        Args:
+            points: (P, 3) [m], checked; by default the scene's control points.
+
+        Returns:
+            complex128 (P, M) [Pa], the error, and the runs on both grids.
+        """
+        begun = len(self.runs), len(self._second.runs)
+        matrix, remaining = self._matrix(points)
+        second, _ = self._second._matrix(points)
+        error = remaining + grid_error(matrix, second, coarser=self._second.spacing > self.spacing)
+        return matrix, error, self.runs[begun[0] :] + self._second.runs[begun[1] :]
+
+    def _matrix(self, points: torch.Tensor | None) -> tuple[torch.Tensor, float]:
+        """Matrix of points, by default the control points, and its distance to the steady state."""
+        if points is not None:
+            return self._kept_matrix(points)
+        matrix, remaining = self._control_matrix
+        return matrix.clone(), remaining
 
     @one_torch_thread()
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
@@ -265,13 +308,20 @@ class SimulatedPropagator(ABC):
         points = self._checked(points)
         flat = drive.reshape(-1, drive.shape[-1])
         array, nodes = self.scene.array, self.scene.array.nodes
-        if drive.requires_grad or len(flat) > self._plan(points).runs:
-            return (drive @ self._kept_matrix(points)[0].mT).reshape(*drive.shape[:-1], *grid)
+        plan, before = self._plan(points), len(self.runs)
+        by_matrix = drive.requires_grad or len(flat) > plan.runs
+        if not (by_matrix and plan.backward):
+            self._warn_near_obstacle()
+        if by_matrix:
+            field = drive @ self._kept_matrix(points)[0].mT
+            self._warn_unsettled(self.runs[before:])
+            return field.reshape(*drive.shape[:-1], *grid)
         field = torch.zeros((len(flat), len(points)), dtype=torch.complex128)
         loud = flat.any(dim=1)
         runs = [nodes] * int(loud.sum())
         if runs:
             field[loud] = self._watched(runs, array.source_strength * flat[loud], single_nodes(points))
+            self._warn_unsettled(self.runs[before:])
         return field.reshape(*drive.shape[:-1], *grid)
 
     def _kept_matrix(self, points: torch.Tensor) -> tuple[torch.Tensor, float]:
@@ -323,13 +373,6 @@ class SimulatedPropagator(ABC):
     def _note(self, steady: SteadyState, seconds: float) -> None:
         self.runs.append(Run(steady.periods, steady.remaining, steady.reached, seconds))
         logger.info("run of %d periods, %.1e from steady, %.1f s", steady.periods, steady.remaining, seconds)
-        if not steady.reached:
-            warnings.warn(
-                f"no steady state after {steady.periods} periods: still about {steady.remaining:.1e} away "
-                f"(relative), tolerance {self.tolerance:g}; raise max_periods or tolerance",
-                SteadyStateWarning,
-                stacklevel=2,
-            )
 
 
 def single_nodes(points: torch.Tensor) -> Nodes:

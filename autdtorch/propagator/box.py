@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import math
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
@@ -20,7 +18,7 @@ from autdtorch.fdtd.stepping import Assembly, assemble_on
 from autdtorch.propagator.base import MOST_JUDGED, SimulatedPropagator
 from autdtorch.propagator.coupling import coupled_runs
 from autdtorch.propagator.groups import MOST_PASSES, cheapest_grouping, one_box
-from autdtorch.scene import Scene
+from autdtorch.scene import with_obstacles
 from autdtorch.threads import spread
 from autdtorch.validation import LENGTH_TOLERANCE, ArrayLike, distances, invalid, points_tensor
 
@@ -56,7 +54,10 @@ class BoxPropagator(SimulatedPropagator):
 
     def _boxed(self, groups: Sequence[Sequence[int]]) -> Sequence[Assembly]:
         """The obstacles of each group in a box."""
-        scenes = [self.scene] if len(groups) == 1 else [_part(self.scene, group) for group in groups]
+        scenes = [self.scene]
+        if len(groups) > 1:
+            obstacles = self.scene.obstacles
+            scenes = [with_obstacles(self.scene, [obstacles[one] for one in group]) for group in groups]
         assemblies = [assemble_on(make_box(scene, self.spacing), scene, *self._wanted) for scene in scenes]
         self._boxes = [Scattering(assembly, self.scene.complex_wavenumber) for assembly in assemblies]
         return assemblies
@@ -91,15 +92,13 @@ class BoxPropagator(SimulatedPropagator):
             ],
             dim=1,
         )
-        for nodes in origins:
-            self._warn_near_obstacle(nodes)
         reaches = [box.reach(targets) for box in self._boxes]
         if len(self._boxes) == 1:
             phasors = self._in_one_box(drives, incident, reaches[0], stepped)
         else:
             coupled = self._in_several_boxes(drives, incident, reaches, stepped)
             if coupled is None:
-                logger.warning(
+                logger.info(
                     "%d boxes hear too much of each other: not settled after %d passes; one box instead",
                     len(self._boxes), MOST_PASSES,
                 )  # fmt: skip
@@ -177,10 +176,3 @@ class BoxPropagator(SimulatedPropagator):
 
 def _heard(matrix: torch.Tensor, incident: torch.Tensor) -> Judged:
     return lambda phasors: incident + matrix @ phasors
-
-
-def _part(scene: Scene, group: Sequence[int]) -> Scene:
-    """A scene with some of its obstacles."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the whole scene has given its own
-        return dataclasses.replace(scene, obstacles=tuple(scene.obstacles[index] for index in group))

@@ -9,8 +9,9 @@ import torch
 from autdtorch.drive import validate_drive
 from autdtorch.fdtd.adjoint import recorded
 from autdtorch.fdtd.cell_maps import cells_of_maps, domain_cells
-from autdtorch.fdtd.grid import Grid, make_grid, require_fine
+from autdtorch.fdtd.grid import Grid, make_grid, require_fine, speeds_of, warn_if_coarse
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources
+from autdtorch.fdtd.medium import warn_of_ending_walls
 from autdtorch.fdtd.steady_state import block_of, fewest_periods
 from autdtorch.fdtd.stepping import Assembly, drive_signal, lock_in
 from autdtorch.fdtd.variable_cells import VariableCells, cells_of_obstacles
@@ -76,15 +77,18 @@ def differentiable_field(
     drive = validate_drive(drive, len(scene.array))
     targets = scene.control_points if points is None else points_tensor("points", points).cpu()
     require_inside(scene.domain, "points", targets)
+    given = _material("density", density, scene), _material("sound_speed", sound_speed, scene)
     grid = make_grid(scene, positive("spacing", spacing, "m"))
+    speeds = speeds_of(scene) | _slowest(scene, given[1])
+    require_fine(speeds, scene.frequency, spacing)
+    warn_if_coarse(speeds, scene.frequency, spacing)
+    warn_of_ending_walls(scene)
     if periods is None:
         periods = fewest_periods(grid.diagonal / grid.wavelength)
     periods = integer_at_least("periods", periods, 1)
     if time_step is not None:
         time_step = positive("time_step", time_step, "s")
-    cells = _cells(
-        scene, grid, _material("density", density, scene), _material("sound_speed", sound_speed, scene)
-    )  # fmt: skip
+    cells = _cells(scene, grid, *given)
     assembly = cells.assembly(grid, scene, precision, time_step)
     receivers, stepper = assembly.receivers(targets), make_kernel(kernel)
     fields = [
@@ -105,7 +109,8 @@ def cell_centers(scene: Scene, spacing: float = 1e-3) -> torch.Tensor:
     Raises:
         ValueError: the spacing is too coarse for the frequency.
     """
-    grid = make_grid(scene, spacing)
+    require_kind("scene", scene, Scene)
+    grid = make_grid(scene, positive("spacing", spacing, "m"))
     axes = [
         torch.from_numpy(axis[part])
         for axis, part in zip(grid.centers, domain_cells(scene, grid), strict=True)
@@ -126,14 +131,18 @@ def _material(name: str, given: ArrayLike | None, scene: Scene) -> torch.Tensor 
     return values
 
 
+def _slowest(scene: Scene, sound_speed: torch.Tensor | None) -> dict[str, float]:
+    """Return the least of the sound speeds [m/s] that are given and count, if there is one."""
+    if sound_speed is None:
+        return {}
+    rigid = torch.tensor([obstacle.rigid for obstacle in scene.obstacles], dtype=torch.bool)
+    speeds = sound_speed.detach() if sound_speed.ndim == 3 else sound_speed.detach()[~rigid]
+    return {"the medium given": float(speeds.min())} if speeds.numel() else {}
+
+
 def _cells(
     scene: Scene, grid: Grid, density: torch.Tensor | None, sound_speed: torch.Tensor | None
 ) -> VariableCells:
-    if sound_speed is not None:
-        rigid = torch.tensor([obstacle.rigid for obstacle in scene.obstacles], dtype=torch.bool)
-        speeds = sound_speed.detach() if sound_speed.ndim == 3 else sound_speed.detach()[~rigid]
-        for slowest in speeds.reshape(-1).sort().values[:1].tolist():
-            require_fine("the medium given", slowest, scene.frequency, grid.spacing)
     if any(given is not None and given.ndim == 3 for given in (density, sound_speed)):
         return cells_of_maps(scene, grid, density, sound_speed)
     return cells_of_obstacles(scene, grid, density, sound_speed)

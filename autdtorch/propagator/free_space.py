@@ -11,7 +11,7 @@ import torch
 from autdtorch.drive import validate_drive
 from autdtorch.freespace import free_space_matrix
 from autdtorch.scene import Scene
-from autdtorch.validation import ArrayLike, points_grid
+from autdtorch.validation import ArrayLike, boolean, points_grid, require_kind
 
 logger = logging.getLogger(__name__)
 
@@ -25,6 +25,7 @@ class FreeSpacePropagator:
 
     def __init__(self, scene: Scene) -> None:
         """Remember the scene; a scene with obstacles is logged as such."""
+        require_kind("scene", scene, Scene)
         self.scene = scene
         if scene.obstacles:
             logger.warning(
@@ -63,7 +64,8 @@ class FreeSpacePropagator:
         """
         points = self.scene.control_points if points is None else points
         matrix = free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber)
-        return (matrix, math.inf if self.scene.obstacles else 0.0) if return_error else matrix
+        error = math.inf if self.scene.obstacles else 0.0
+        return (matrix, error) if boolean("return_error", return_error) else matrix
 
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
         """Pressure of drives at points.

@@ -49,7 +49,6 @@ class FullPropagator(SimulatedPropagator):
         rows = []
         for nodes, own in zip(origins, strength, strict=True):
             begin = time.perf_counter()
-            self._warn_near_obstacle(nodes)
             steady = run_to_steady_state(
                 assembly, self._kernel, assembly.sources(nodes.positions, own, nodes.weights), cells,
                 self.tolerance, self.max_periods, lambda phasor: torch.from_numpy(some @ phasor.numpy()),

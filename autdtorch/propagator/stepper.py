@@ -48,6 +48,6 @@ def precision_of(dtype: str | torch.dtype) -> torch.dtype:
     Raises:
         ValueError: another.
     """
-    name = str(dtype).removeprefix("torch.")
+    name = str(dtype).removeprefix("torch.") if isinstance(dtype, torch.dtype) else dtype
     require_one_of("dtype", name, tuple(DTYPES))
     return DTYPES[name]

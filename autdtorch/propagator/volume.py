@@ -8,7 +8,7 @@ import torch
 
 from autdtorch.drive import validate_single_drive
 from autdtorch.propagator.base import Propagator
-from autdtorch.validation import ArrayLike, invalid, positive
+from autdtorch.validation import ArrayLike, invalid, positive, require_kind
 
 _CLEARANCE = 0.5  # wavelengths around a transducer, where its own 1/r would hide the field of the others
 
@@ -34,6 +34,7 @@ def volume_field(propagator: Propagator, drive: ArrayLike, spacing: float | None
         ValueError: `drive` is not one that the array can play, `spacing` is not > 0, or gives more than 10
             million cells.
     """
+    require_kind("propagator", propagator, Propagator)
     scene = propagator.scene
     drive = validate_single_drive(drive, len(scene.array))
     spacing = scene.wavelength / 4 if spacing is None else positive("spacing", spacing, "m")

@@ -12,6 +12,7 @@ from autdtorch.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
     Vector,
+    boolean,
     finite_vector,
     points_tensor,
     unit_vector,
@@ -46,7 +47,7 @@ def rigid_plane(
     Source: Pierce, Acoustics, section 5-1.
     """
     image = _image_wave(points, sources, wavenumber, origin, normal)
-    return image if scattered else green(points, sources, wavenumber) + image
+    return image if boolean("scattered", scattered) else green(points, sources, wavenumber) + image
 
 
 def soft_plane(
@@ -63,7 +64,7 @@ def soft_plane(
     Arguments, returns and errors as for `rigid_plane`.
     """
     image = _image_wave(points, sources, wavenumber, origin, normal)
-    return -image if scattered else green(points, sources, wavenumber) - image
+    return -image if boolean("scattered", scattered) else green(points, sources, wavenumber) - image
 
 
 def fluid_half_space(
@@ -153,6 +154,7 @@ def _image_wave(
 def _layered_field(
     points: ArrayLike, sources: ArrayLike, layering: Layering, origin: Vector, normal: Vector, scattered: bool
 ) -> torch.Tensor:
+    scattered = boolean("scattered", scattered)
     targets = points_tensor("points", points)
     origins = points_tensor("sources", sources).to(targets.device)
     axis = targets.new_tensor(unit_vector("normal", normal))

@@ -19,7 +19,15 @@ from typing import TypeAlias
 import torch
 
 from autdtorch.freespace import green
-from autdtorch.validation import LENGTH_TOLERANCE, ArrayLike, Vector, finite_vector, points_tensor, positive
+from autdtorch.validation import (
+    LENGTH_TOLERANCE,
+    ArrayLike,
+    Vector,
+    boolean,
+    finite_vector,
+    points_tensor,
+    positive,
+)
 
 #: Of N, for orders 0 to N: (slope, pressure) such that slope * dp/d(kr) + pressure * p = 0 on the surface.
 Boundary: TypeAlias = Callable[[int], tuple[torch.Tensor | float, torch.Tensor | float]]
@@ -66,7 +74,7 @@ def rigid_sphere(
         rho_1 -> infinity.
     """
     setup = _setup(points, sources, wavenumber, center, radius)
-    return _field_outside(setup, lambda _: (1.0, 0.0), scattered)
+    return _field_outside(setup, lambda _: (1.0, 0.0), boolean("scattered", scattered))
 
 
 def soft_sphere(
@@ -85,7 +93,7 @@ def soft_sphere(
     Source: Anderson (1950), JASA 22, 426, for rho_1 -> 0.
     """
     setup = _setup(points, sources, wavenumber, center, radius)
-    return _field_outside(setup, lambda _: (0.0, 1.0), scattered)
+    return _field_outside(setup, lambda _: (0.0, 1.0), boolean("scattered", scattered))
 
 
 def fluid_sphere(
@@ -121,6 +129,7 @@ def fluid_sphere(
     """
     density_ratio = positive("density_ratio", density_ratio)
     speed_ratio = positive("speed_ratio", speed_ratio)
+    scattered = boolean("scattered", scattered)
     setup = _setup(points, sources, wavenumber, center, radius)
     inside = setup.point_distances < setup.radius
     field = torch.empty(setup.cosines.shape, dtype=torch.complex128, device=setup.points.device)

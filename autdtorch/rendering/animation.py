@@ -25,7 +25,7 @@ from autdtorch.rendering.scene import (
     new_plotter,
 )
 from autdtorch.scene import Scene
-from autdtorch.validation import ArrayLike, complex_tensor, integer_at_least
+from autdtorch.validation import ArrayLike, complex_tensor, integer_at_least, require_kind
 
 if TYPE_CHECKING:
     import pyvista
@@ -55,9 +55,10 @@ def animate3d(
         ValueError: `drive` or `field` does not fit the scene, `field` is a magnitude, `path` has another
             suffix, or `frames` is less than 2.
     """
+    require_kind("scene", scene, Scene)
     phases = emitted_phases(drive, len(scene.array))
-    plane, given = plane_pressure(scene, field)
-    pressure = complex_tensor("field", given).numpy()
+    plane, _ = plane_pressure(scene, field)
+    pressure = complex_tensor("field", field).detach().cpu().numpy()
     frames = integer_at_least("frames", frames, 2)
     path = require_suffix("path", path, (".gif",))
     require_rendering()

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from autdtorch.drawing import MM
+from autdtorch.validation import path_of
 
 if TYPE_CHECKING:
     import pyvista
@@ -30,7 +31,7 @@ def require_suffix(name: str, path: str | Path, suffixes: tuple[str, ...] = _SUF
         ValueError: another suffix.
         RuntimeError: what writes that file is not installed.
     """
-    path = Path(path)
+    path = path_of(name, path)
     if path.suffix not in suffixes:
         raise ValueError(f"{name}: {str(path)!r}; its suffix must be one of {', '.join(suffixes)}")
     if path.suffix == ".html" and importlib.util.find_spec("trame_pyvista") is None:

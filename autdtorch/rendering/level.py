@@ -3,33 +3,32 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from autdtorch.drawing import Array, plane_magnitude
 from autdtorch.geometry import Plane
 from autdtorch.scene import Scene
-from autdtorch.validation import ArrayLike, positive, real_tensor
+from autdtorch.validation import ArrayLike, magnitude_tensor, positive
 
 
-def plane_pressure(scene: Scene, field: ArrayLike) -> tuple[Plane, torch.Tensor]:
-    """The scene's observation plane, and `field` as a tensor, after checking that it can be drawn there.
+def plane_pressure(scene: Scene, field: ArrayLike) -> tuple[Plane, Array]:
+    """Return the scene's observation plane, and the magnitude of a `field` (Nu, Nv) on it.
 
     Raises:
         ValueError: not (Nu, Nv) finite numbers, or the scene has no plane.
     """
-    real_tensor("field", plane_magnitude("field", field), "Pa")
+    magnitude = plane_magnitude("field", field)
     if scene.observation_plane is None:
         raise ValueError("field: given for a scene without observation plane; must be None")
-    return scene.observation_plane, torch.as_tensor(field).detach().cpu()
+    return scene.observation_plane, magnitude
 
 
 def volume_magnitude(volume: ArrayLike) -> Array:
-    """|p| (Nx, Ny, Nz) of complex pressure, or of its magnitude, in a domain; NaN where it is not known.
+    """Return |p| (Nx, Ny, Nz) of complex pressure or its magnitude in a domain; NaN where it is not known.
 
     Raises:
-        ValueError: another number of axes, a single layer of cells, infinite, or nothing known.
+        ValueError: not numbers, another number of axes, a single layer of cells, infinite, or nothing known.
     """
-    magnitude: Array = torch.as_tensor(volume).detach().cpu().abs().double().numpy()
+    magnitude: Array = magnitude_tensor("volume", volume, "Pa").detach().cpu().numpy()
     if magnitude.ndim != 3 or min(magnitude.shape) < 2:
         raise ValueError(f"volume: shape {magnitude.shape}; must be (Nx, Ny, Nz), each at least 2")
     if np.isnan(magnitude).all() or np.isinf(magnitude).any():

@@ -12,7 +12,7 @@ from autdtorch.rendering.level import plane_pressure, volume_magnitude, zero_lev
 from autdtorch.rendering.probe import require_rendering
 from autdtorch.rendering.scene import add_caption, add_transducers, emitted_phases, new_plotter
 from autdtorch.scene import Scene
-from autdtorch.validation import ArrayLike, number_between
+from autdtorch.validation import ArrayLike, boolean, number_between, require_kind
 
 if TYPE_CHECKING:
     import pyvista
@@ -55,8 +55,10 @@ def view3d(
         ValueError: `drive`, `field` or `volume` does not fit the scene, another argument is out of range, or
             the suffix of `save` is another.
     """
+    require_kind("scene", scene, Scene)
+    off_screen = boolean("off_screen", off_screen)
     phases = None if drive is None else emitted_phases(drive, len(scene.array))
-    on_plane = None if field is None else plane_pressure(scene, field)[1].abs().double().numpy()
+    on_plane = None if field is None else plane_pressure(scene, field)[1]
     in_domain = None if volume is None else volume_magnitude(volume)
     height = number_between("isosurface", isosurface, FLOOR, 0.0, "dB")
     zero = zero_level(reference, on_plane, in_domain)

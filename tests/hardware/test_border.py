@@ -8,6 +8,7 @@ import torch
 from autdtorch.hardware import (
     OPENMPD,
     EmulatedSensor,
+    FileSensor,
     HardwareObjective,
     LimitedLink,
     Limits,
@@ -16,6 +17,8 @@ from autdtorch.hardware import (
     open_scope,
     openmpd_boards,
 )
+
+SENSOR = FileSensor("never-read", points=2)
 
 
 @pytest.mark.parametrize(
@@ -27,10 +30,11 @@ from autdtorch.hardware import (
         (lambda trial, link: open_link("sonicsurface"), "device: 'sonicsurface'; must be a Device"),
         (lambda trial, link: openmpd_boards(["left.pat"]), r"boards\[0\]: 'left.pat'; must be an OpenMPDB"),
         (lambda trial, link: open_scope("2a8d:1770"), "chip: '2a8d:1770'; must be 2 integers"),
-        (lambda trial, link: HardwareObjective("x.yaml", link, None, "log"), "scene: 'x.yaml'; must be a Sc"),
+        (lambda trial, link: HardwareObjective("x.yaml", link, SENSOR, "log"), "scene: 'x.yaml'; must be a"),
+        (lambda trial, link: HardwareObjective(trial.scene, link, 1, trial.log), "sensor: 1; must be a S"),
         *(
             (
-                lambda trial, link, bad=bad: HardwareObjective(trial.scene, link, None, trial.log, bad),
+                lambda trial, link, bad=bad: HardwareObjective(trial.scene, link, SENSOR, trial.log, bad),
                 "settings: .*; must be a mapping of what JSON can hold",
             )
             for bad in ({1}, {"gain": torch.ones(1)})

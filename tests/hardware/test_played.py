@@ -1,13 +1,13 @@
 """What a device is said to play, against the firmware that plays it."""
 
 import math
-from types import SimpleNamespace
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from autdtorch.array import TransducerArray
 from autdtorch.hardware import (
     OPENMPD,
     SONICSURFACE,
@@ -22,6 +22,7 @@ from autdtorch.hardware import (
 )
 from autdtorch.hardware.autd3 import autd3_device
 from autdtorch.openmpd_board import OpenMPDBoard
+from autdtorch.scene import Medium, Scene
 
 #: On two boards, where there are two, and in no order.
 TRANSDUCERS = [70, 3, *range(200, 186, -1)]
@@ -64,13 +65,19 @@ class Bench(EmulatedBench):
 
     def flush(self) -> None: ...
 
+    def recover(self) -> None: ...
+
     def close(self) -> None: ...
 
 
 class Silence:
     """An objective that is never asked."""
 
-    scene = SimpleNamespace(array=TRANSDUCERS)
+    scene = Scene(TransducerArray.grid((4, 4), 10e-3, (0, 0, 0)), Medium(1.2, 340.0), 40e3, [(80e-3, 0, 0)])
+    evaluations = 0
+
+    def __call__(self, drive: torch.Tensor) -> torch.Tensor:
+        raise NotImplementedError
 
 
 def random_drives(seed: int) -> torch.Tensor:

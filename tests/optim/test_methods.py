@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autdtorch.conditions import Quantised
+from autdtorch.optim.base import NEAR_TIE
 from autdtorch.optim.bayes import bayes_opt
 from autdtorch.optim.gabs import gabs
 from autdtorch.optim.gradient import gradient_ascent
@@ -54,7 +55,8 @@ def test_solution_is_consistent(make_objective, random_matrix, method):
     assert (solution.history.diff(dim=1) >= 0).all()
     # The last drive, which identify returns, is the best but for rounding.
     torch.testing.assert_close(solution.history[:, -1], solution.score, rtol=1e-4, atol=0)
-    assert (solution.history[:, -1] >= solution.score).all()
+    # A near tie is no improvement, so that the history may end so little below.
+    assert (solution.history[:, -1] >= solution.score * (1 - NEAR_TIE)).all()
     assert torch.equal(solution.score, solution.pressure.amin(dim=1))
     assert torch.equal(objective(solution.drive), solution.pressure)
 
@@ -188,8 +190,8 @@ def test_phases_at_the_control_points_are_never_seen(make_objective, random_matr
         (gabs, {"levels": 0}, "levels: 0; must be an integer >= 2"),
         (gabs, {"trials": 0}, "trials: 0; must be an integer >= 1"),
         (gabs, {"trials": True}, "trials: True; must be an integer"),
-        (gabs, {"trials": []}, r"trials: \[\]; must be an integer >= 1, or trial numbers, each once"),
-        (gabs, {"trials": [2, 2]}, r"trials: \[2, 2\]; must be an integer >= 1, or trial numbers, each"),
+        (gabs, {"trials": []}, r"trials: \(\); must be an integer >= 1, or trial numbers, each once"),
+        (gabs, {"trials": [2, 2]}, r"trials: \(2, 2\); must be an integer >= 1, or trial numbers, each"),
         (gabs, {"trials": [0, -1]}, r"trials\[1\]: -1; must be an integer >= 0"),
         (gabs, {"seed": -1}, "seed: -1; must be an integer >= 0"),
         (gradient_ascent, {"starts": 0}, "starts: 0; must be an integer >= 1"),

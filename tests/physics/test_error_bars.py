@@ -64,6 +64,20 @@ def test_a_tolerance_chooses_a_spacing_that_meets_it() -> None:
     assert relative_error(tight.transfer_matrix(), exact) < 0.06
 
 
+def test_a_spacing_is_chosen_also_where_nothing_scatters() -> None:
+    like_air = Sphere(CENTER, RADIUS, density=AIR.density, sound_speed=AIR.sound_speed)
+    scene = small_scene((like_air,))
+    propagator = make_propagator(scene, "box", None, tolerance=0.1)
+    assert propagator.spacing == coarsest_spacing(scene)
+
+
+@pytest.mark.filterwarnings("ignore:no steady state")
+def test_without_an_estimate_no_spacing_is_chosen() -> None:
+    sphere, _ = exact_sphere(rigid=True)
+    with pytest.raises(ValueError, match=r"^max_periods: 1; "):
+        make_propagator(small_scene((sphere,)), "box", None, tolerance=0.1, max_periods=1)
+
+
 def test_spacings_and_errors_scale_with_the_order() -> None:
     exact, h = torch.ones(2, 3, dtype=torch.complex128), 1e-3
     fine, coarse = (exact * (1 + 1e-3 * scale ** (4 / 3)) for scale in (1, RATIO))

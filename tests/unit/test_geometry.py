@@ -1,4 +1,7 @@
+import copy
+import io
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -6,6 +9,7 @@ import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from small_scenes import small_scene
 
 from autdtorch.geometry import Plane, circle_points, plane_basis
 
@@ -104,6 +108,34 @@ def test_plane_points_fill_the_plane_symmetrically(normal, center, spacing):
 def test_plane_corners_span_its_size():
     corners = Plane(center=(0.5, 0.5, 0.0), normal=(0, 0, 2), size=(1.0, 0.5)).corners
     assert corners.tolist() == [[0.0, 0.25, 0.0], [0.0, 0.75, 0.0], [1.0, 0.25, 0.0], [1.0, 0.75, 0.0]]
+
+
+@pytest.mark.parametrize("name", ["positions", "normals", "control_points"])
+def test_numpy_takes_the_coordinates_of_a_scene_as_its_own(name):
+    """PyTorch's tensors make NumPy 2 warn, and warnings are errors here."""
+    scene = small_scene()
+    tensor = scene.control_points if name == "control_points" else getattr(scene.array, name)
+    for array, shared in (
+        (np.array(tensor), False),
+        (np.array(tensor, copy=False), True),
+        (np.asarray(tensor), True),
+        (np.array(tensor, dtype=np.float32), False),
+    ):
+        assert np.array_equal(array, tensor.numpy().astype(array.dtype))
+        assert np.shares_memory(array, tensor.numpy()) is shared
+    with pytest.raises(ValueError, match="copy"):
+        np.array(tensor, dtype=np.float32, copy=False)
+    assert type(tensor + 0) is torch.Tensor
+    for other in (copy.deepcopy(tensor), pickle.loads(pickle.dumps(tensor)), stored(tensor)):
+        assert torch.equal(other, tensor)
+        assert not np.shares_memory(other.numpy(), tensor.numpy())
+
+
+def stored(tensor):
+    file = io.BytesIO()
+    torch.save(tensor, file)
+    file.seek(0)
+    return torch.load(file)
 
 
 def test_equal_planes_are_equal():

@@ -20,7 +20,7 @@ from autdtorch.objective import Objective
 from autdtorch.optim.base import Solution
 from autdtorch.optim.gabs import gabs
 from autdtorch.optim.lssg import lssg
-from autdtorch.propagator import FreeSpacePropagator, FullPropagator, Run
+from autdtorch.propagator import FreeSpacePropagator, FullPropagator, Run, SteadyStateWarning
 from autdtorch.results import RESULTS_FILE, load_results
 from autdtorch.scene import Box, Scene
 from autdtorch.study import run_study
@@ -113,7 +113,8 @@ def test_the_runs_of_a_simulation_are_recorded(monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(FullPropagator, "_simulate", simulate)
     solver = {"method": "full", "spacing": 2e-3, "tolerance": 0.2, "kernel": "reference"}
-    result = run_study({"a": scene()}, METHODS, solver=solver).scenes["a"]
+    with pytest.warns(SteadyStateWarning):
+        result = run_study({"a": scene()}, METHODS, solver=solver).scenes["a"]
     simulation = result.simulation
     assert (simulation.method, simulation.spacing, simulation.tolerance) == ("full", 2e-3, 0.2)
     # The transfer matrix of 3 control points, and the plane, in which one transducer stands for all four.

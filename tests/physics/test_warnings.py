@@ -1,0 +1,119 @@
+"""Warnings of a scene and its grid: each once, for all obstacles, and none of grids that nobody asked for."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+
+import pytest
+import torch
+from small_scenes import AIR, CUBE, small_scene
+
+from autdtorch.obstacles import Box, Sphere
+from autdtorch.propagator import (
+    BoxPropagator,
+    SimulatedPropagator,
+    SteadyStateWarning,
+    differentiable_field,
+    make_propagator,
+)
+from autdtorch.scene import OverlapWarning, Scene
+
+DRIVE = torch.ones(4, dtype=torch.complex128)
+
+#: A cell and a half from the transducers, at 1.4 mm.
+BESIDE_ARRAY = Box(center=(5.3e-3, 12e-3, 12e-3), size=(4e-3, 14e-3, 14e-3), rigid=True)
+
+
+def messages(caplog: pytest.LogCaptureFixture, text: str) -> list[str]:
+    return [message for message in caplog.messages if text in message]
+
+
+def simulated(scene: Scene, method: str, spacing: float | None, **settings: float) -> SimulatedPropagator:
+    propagator = make_propagator(scene, method, spacing, **{"tolerance": 0.1, **settings})
+    assert isinstance(propagator, SimulatedPropagator)
+    return propagator
+
+
+def of_two_speeds(extent: float) -> Scene:
+    """A rigid sphere and, in the opposite corner, a slow one around another of another material."""
+    near, far = (14e-3,) * 3, (extent - 14e-3,) * 3
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", OverlapWarning)
+        return small_scene(
+            (
+                Sphere(near, 4e-3, rigid=True),
+                Sphere(far, 4e-3, density=100.0, sound_speed=320.0),
+                Sphere(far, 2e-3, density=50.0, sound_speed=330.0),
+            ),
+            extent,
+        )
+
+
+@pytest.mark.parametrize(("method", "extent"), [("box", 200e-3), ("full", 48e-3)])
+def test_a_coarse_spacing_is_told_once_for_all_obstacles(
+    method: str, extent: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    propagator = simulated(of_two_speeds(extent), method, 2.5e-3)
+    if isinstance(propagator, BoxPropagator):
+        assert len(propagator._boxes) == 2  # of copies of the scene, which give no OverlapWarning either
+    assert propagator._second.spacing < propagator.spacing
+    (message,) = messages(caplog, "coarse")
+    assert "2.5 mm" in message
+    for where in ("the medium", "obstacle 1", "obstacle 2"):
+        assert where in message
+    assert "obstacle 0" not in message  # which is rigid
+
+
+def test_a_coarse_spacing_is_told_once_where_the_medium_is_differentiated(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    speed = torch.tensor([335.0], dtype=torch.float64, requires_grad=True)
+    field = differentiable_field(small_scene((CUBE,)), DRIVE, sound_speed=speed, spacing=2.5e-3)
+    field.abs().sum().backward()
+    (message,) = messages(caplog, "coarse")
+    assert "the medium given" in message
+
+
+def test_no_grid_is_told_of_that_a_spacing_is_chosen_from(caplog: pytest.LogCaptureFixture) -> None:
+    scene = small_scene((BESIDE_ARRAY,))
+    points = torch.cat((scene.control_points, scene.control_points - 0.5e-3))  # more than transducers
+    simulated(dataclasses.replace(scene, control_points=points), "box", None, tolerance=0.5)
+    assert not messages(caplog, "coarse") + messages(caplog, "of an obstacle")
+
+
+@pytest.mark.parametrize("method", ["box", "full"])
+def test_a_source_beside_an_obstacle_is_told_once(method: str, caplog: pytest.LogCaptureFixture) -> None:
+    propagator = simulated(small_scene((BESIDE_ARRAY,)), method, 1.4e-3, tolerance=0.5)
+    points = propagator.scene.control_points
+    propagator.transfer_matrix()
+    assert not messages(caplog, "of an obstacle")  # the runs begin at the three points
+    for turn in (1, 1j, -1):
+        propagator.field(turn * DRIVE, points)
+    everywhere = torch.cat((points, points - 0.5e-3))
+    propagator.transfer_matrix(everywhere, return_error=True)
+    assert len(propagator.runs) > 3 + 3
+    assert len(messages(caplog, "of an obstacle")) == 1
+
+
+def test_runs_that_do_not_settle_are_told_of_together() -> None:
+    propagator = simulated(small_scene((CUBE,)), "full", 1.4e-3, tolerance=1e-6, max_periods=8)
+    with pytest.warns(SteadyStateWarning, match=r" in (\d+) of \1 runs: ") as caught:  # on both grids
+        propagator.transfer_matrix(return_error=True)
+    assert len(caught) == 1
+    assert caught[0].filename == __file__
+    with pytest.warns(SteadyStateWarning, match=r" in 2 of 2 runs: ") as caught:
+        propagator.field(torch.stack((DRIVE, 1j * DRIVE)), propagator.scene.control_points)
+    assert len(caught) == 1
+    assert caught[0].filename == __file__
+
+
+def test_walls_that_end_are_told_of_once(caplog: pytest.LogCaptureFixture) -> None:
+    walls = [
+        Box((22e-3, 12e-3, 12e-3), (1e-3, 1.0, 1.0), density=2.0, sound_speed=AIR.sound_speed),
+        *(Box((12e-3, y, 12e-3), (1.0, 1e-3, 1.0), density=2.0, sound_speed=340.0) for y in (1e-3, 23e-3)),
+    ]
+    scene = dataclasses.replace(small_scene(), control_points=[(10e-3, 12e-3, 11e-3)], obstacles=walls)
+    assert simulated(scene, "full", 2e-3)._second
+    (message,) = messages(caplog, "another direction")
+    assert "obstacle 1, 2 " in message

@@ -1,0 +1,356 @@
+"""Every public function and method, and for each of its parameters an argument that it accepts.
+
+Arguments go by the names of parameters, which mean the same almost everywhere. A new function is called as
+soon as it is public; only a parameter of a new name, or of another meaning, must be added here.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from small_scenes import AIR, CUBE, small_scene
+
+import autdtorch as at
+from autdtorch import hardware, propagator
+from autdtorch.hardware.emulated_bus import EmulatedBus
+from autdtorch.hardware.emulated_usbtmc import EmulatedInstrument
+
+PLANE = at.Plane(center=(20e-3, 12e-3, 12e-3), normal=(1, 0, 0), size=(8e-3, 8e-3))
+AIR_ALONE = small_scene()
+SCENE = replace(small_scene((CUBE,)), observation_plane=PLANE)
+MATRIX = torch.randn(3, 4, dtype=torch.complex128, generator=torch.Generator().manual_seed(0))
+DRIVE = torch.ones(4, dtype=torch.complex128)
+GRID = np.stack(np.meshgrid(*(1e-3 * np.arange(count) for count in (2, 3, 4)), indexing="ij"), axis=-1)
+CHIP = (1, 2)
+SCENE_FILE = """
+array: {type: grid, shape: [2, 2], pitch: 0.01, center: [0, 0, 0]}
+medium: {density: 1.2, sound_speed: 340}
+frequency: 40000
+control_points: {type: points, positions: [[0.08, 0, 0]]}
+"""
+
+#: What the package itself makes, and what drivers are made of.
+NOT_CALLED_BY_USERS = {
+    *("FocusMetrics", "Solution", "Sweep", "Run", "Evaluation", "EvaluationLog", "Preflight", "Waveform"),
+    *("Adapter", "Device", "Dialect", "Obstacle", "OpenMPDBoard", "SimulatedPropagator", "UsbtmcPort"),
+    *("BoxPropagator", "FullPropagator", "EmulatedBench.receive", "EmulatedScope.execute"),
+    *("EmulatedScope.plug_into", "Oscilloscope.capture", "Oscilloscope.set_up"),
+    *("lock_log", "open_autd3"),  # the one only makes a context, the other asks the network
+}
+
+
+class Made(NamedTuple):
+    """An argument of which each call needs its own."""
+
+    make: Callable[[Path], Any]
+
+
+class Silent:
+    """A port that nothing hangs on, and a sensor that always reads the same."""
+
+    def write(self, data: bytes) -> None: ...
+    def flush(self) -> None: ...
+    def recover(self) -> None: ...
+    def close(self) -> None: ...
+    def read(self) -> torch.Tensor:
+        return torch.ones(3, dtype=torch.float64)
+
+
+def written(folder: Path, name: str, content: str) -> Path:
+    path = folder / name
+    path.write_text(content, encoding="utf-8")
+    return path
+
+
+def saved(folder: Path, name: str, array: Any) -> Path:
+    np.save(folder / name, array)
+    return folder / name
+
+
+def array_file(folder: Path) -> Path:
+    return written(folder, "array.csv", "x [m],y [m],z [m]\n0,0,0\n0,0.01,0\n")
+
+
+def drive_file(folder: Path) -> Path:
+    return written(folder, "drive.csv", "phase [rad],amplitude\n0,1\n1,0.5\n")
+
+
+def mesh_file(folder: Path) -> Path:
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+    return written(folder, "corner.obj", f"{corners}f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+
+
+def board_file(folder: Path) -> Path:
+    places = (f"({1e-2 * (number % 16)}, {1e-2 * (number // 16)}, 0)" for number in range(256))
+    lines = ["board", "256", "128", *places, *map(str, range(256)), *["0"] * 256, *["1"] * 256]
+    return written(folder, "board.pat", "\n".join(lines))
+
+
+def objective() -> at.SimulatedObjective:
+    return at.SimulatedObjective(AIR_ALONE, at.make_propagator(AIR_ALONE))
+
+
+def link() -> hardware.Link:
+    return hardware.Link(hardware.SONICSURFACE, Silent(), [3, 1, 7, 5], sleep=lambda _: None)
+
+
+@cache  # it takes a while to find the levels within a limit
+def limited_link() -> hardware.LimitedLink:
+    return hardware.LimitedLink(link(), hardware.Limits(1.0))
+
+
+def bench() -> hardware.EmulatedBench:
+    return hardware.EmulatedBench(hardware.SONICSURFACE, MATRIX, [3, 1, 7, 5])
+
+
+def scope() -> hardware.Oscilloscope:
+    return hardware.open_scope(CHIP, backend=scope_bus())
+
+
+def scope_bus() -> EmulatedBus:
+    heard = hardware.EmulatedScope(lambda: MATRIX[:, 0], 40e3, 0.01, (0, 1))
+    return EmulatedBus([EmulatedInstrument(*CHIP, "EMULATED", heard)])
+
+
+#: By name of the parameter.
+ARGUMENTS: dict[str, Any] = {
+    **dict.fromkeys(("adapter", "ax", "cache", "device", "first", "reference", "save", "serial"), None),
+    **dict.fromkeys(("time_step", "watch"), None),
+    **dict.fromkeys(("decibels", "higher_is_better", "on_off", "return_error", "scattered"), False),
+    **dict.fromkeys(("background", "boards", "captures", "input", "passes", "readings"), 1),
+    **dict.fromkeys(("reads", "trials"), 1),
+    **dict.fromkeys(("absorption", "dc_offset", "drift", "margin", "settle"), 0.0),
+    **dict.fromkeys(("amplitude", "duty_cycle", "gain", "loudest", "source_strength"), 1.0),
+    **dict.fromkeys(("center", "focus", "offset", "origin"), (12e-3, 11e-3, 13e-3)),
+    **dict.fromkeys(("axis", "normal", "normals"), (1.0, 0.1, 0.2)),
+    **dict.fromkeys(("label", "name", "xlabel", "ylabel"), "text"),
+    **dict.fromkeys(("phase", "loss"), 0.1),
+    **dict.fromkeys(("fixed_transducer", "seed"), 0),
+    "acquisition": "ei",
+    "amplitudes": [1.0, 0.5, 1.0, 1.0],
+    "angle": 0.3,
+    "array": SCENE.array,
+    "ask": lambda question: "1",
+    "backend": Made(lambda _: bench().bus),
+    "bench": Made(lambda _: bench()),
+    "cell_area": 1e-6,
+    "check": hardware.Preflight(torch.ones(4), silence=1.0, threshold=2.0),
+    "chip": CHIP,
+    "control_points": SCENE.control_points,
+    "costs": {"time [s]": {"size": {"gabs": [[1.0, 1.0], [2.0, 3.0]]}}},
+    "count": 3,
+    "dead": [1],
+    "density": 100.0,
+    "density_ratio": 2.0,
+    "dialect": hardware.KEYSIGHT,
+    "distance": [0.1, 0.2],
+    "domain": SCENE.domain,
+    "drive": DRIVE,
+    "dtype": "float32",
+    "embedding": "phases",
+    "evaluations": 11,
+    "field": torch.ones(4, 4, dtype=torch.complex128),
+    "folder": Made(lambda folder: folder),
+    "frames": 2,
+    "frequency": 40e3,
+    "G": MATRIX,
+    "heard": (0, 1),
+    "height": 5e-3,
+    "history": {"scene": {"gabs": [[1.0, 2.0]]}},
+    "initial": 3,
+    "initial_points": "sobol",
+    "isosurface": -3.0,
+    "kernel": "cpu",
+    "levels": 4,
+    "limits": hardware.Limits(1.0),
+    "link": Made(lambda _: limited_link()),
+    "log": Made(lambda folder: folder / "log.jsonl"),
+    "maker": "Keysight",
+    "mask": np.ones((2, 2, 2), bool),
+    "max_periods": 3,
+    "medium": AIR,
+    "method": "box",
+    "microphones": [hardware.Microphone(1, 0.01, 1.0)],
+    "mode": "transfer",
+    "names": {"scene": {"gabs": ["a", "b"]}},
+    "noise": 1e-4,
+    "objective": Made(lambda _: objective()),
+    "observation_plane": PLANE,
+    "obstacles": (CUBE,),
+    "off_screen": True,
+    "order": "given",
+    "path": Made(lambda folder: folder / "file.npz"),
+    "periods": 4,
+    "phases": [0.0, 1.0, 2.0, 3.0],
+    "pitch": 0.01,
+    "plane": PLANE,
+    "plane_pressure": [[1.0, 2.0], [1.0, 2.0]],
+    "planes": {"scene": PLANE},
+    "points": [[22e-3, 7e-3, 14e-3], [20e-3, 16e-3, 12e-3]],
+    "port": Silent(),
+    "positions": [[0.0, 0.0, 0.0], [0.0, 0.01, 0.0]],
+    "pressure": [1.0, 2.0],
+    "propagator": Made(lambda _: at.make_propagator(AIR_ALONE)),
+    "quantities": {"pressure [Pa]": {"scene": {"gabs": [1.0, 2.0]}}},
+    "radius": 3e-3,
+    "relative_humidity": 50.0,
+    "rigid": False,
+    "rotation": (0.0, 0.0, 0.1),
+    "scale": 1e-3,
+    "scene": SCENE,
+    "scope": Made(lambda _: scope()),
+    "score": at.weakest_focus,
+    "seconds": 10.0,
+    "seconds_in_a_row": 5.0,
+    "sensitivity": 0.01,
+    "sensor": Silent(),
+    "settings": {"a": 1},
+    "shape": (2, 2),
+    "size": (4e-3, 4e-3, 4e-3),
+    "sleep": lambda seconds: None,
+    "snr": 20.0,
+    "sound_speed": 340.0,
+    "source": Made(lambda folder: written(folder, "scene.yaml", SCENE_FILE)),
+    "sources": [[0.1, 0.02, 0.03], [0.2, 0.0, 0.0]],
+    "spacing": 2e-3,
+    "speed_ratio": 1.5,
+    "starts": 2,
+    "steps": 3,
+    "temperature": 20.0,
+    "thickness": 0.01,
+    "timeout": 0.1,
+    "tolerance": 2e-3,
+    "transducers": [3, 1, 7, 5],
+    "transfer_matrix": MATRIX,
+    "units": (1, 1),
+    "volume": torch.ones(3, 3, 3, dtype=torch.complex128),
+    "wavenumber": 7.0,
+}
+
+#: Where a name means something else.
+OTHERS: dict[str, Any] = {
+    "BoxPropagator.field.drive": torch.stack([DRIVE, DRIVE]),
+    "Dead.transducers": [1],
+    "Drift.sensor": 0.1,
+    "EmulatedScope.noise": 0.0,
+    "EmulatedScope.pressure": lambda: MATRIX[:, 0],
+    "HardwareObjective.scene": AIR_ALONE,
+    "LimitedLink.link": Made(lambda _: link()),
+    "LimitedLink.go_on.seconds": 0.1,
+    "Medium.air.pressure": 1e5,
+    "Mesh.path": Made(mesh_file),
+    "OpenMPDBoard.load.path": Made(board_file),
+    "Oscilloscope.port": Made(lambda _: scope()._port),
+    "Plane.size": (0.1, 0.1),
+    "SimulatedObjective.scene": AIR_ALONE,
+    "VoxelMask.load.path": Made(lambda folder: saved(folder, "mask.npy", np.ones((2, 2, 2), bool))),
+    "animate3d.path": Made(lambda folder: folder / "wave.gif"),
+    "cell_centers.scene": AIR_ALONE,
+    "differentiable_field.density": [50.0],
+    "differentiable_field.sound_speed": [340.0],
+    "load_array.path": Made(array_file),
+    "load_drive.path": Made(drive_file),
+    "open_scope.backend": Made(lambda _: scope_bus()),
+    "openmpd_boards.boards": Made(lambda folder: [at.OpenMPDBoard.load(board_file(folder))]),
+    "plot_convergence.levels": {"scene": {"bound": 3.0}},
+    "plot_pareto.points": {"scene": {"gabs": [[1.0, 1.0], [2.0, 3.0]]}},
+    "plot_plane.pressure": np.ones((4, 4)),
+    "plot_planes.control_points": {"scene": SCENE.control_points},
+    "plot_planes.obstacles": {"scene": (CUBE,)},
+    "plot_planes.pressure": {"scene": {"gabs": np.ones((4, 4))}},
+    "save_field.path": Made(lambda folder: folder / "field.vti"),
+    "save_field.points": GRID,
+    "save_field.pressure": torch.ones(2, 3, 4, dtype=torch.complex128),
+    "true_pressure.drive": DRIVE[None],
+    "weakest_focus.pressure": torch.ones(2, 3),
+    **{
+        f"{kind}.device": hardware.SONICSURFACE for kind in ("EmulatedBench", "Link", "Played", "open_link")
+    },
+    **{f"{kind}_sphere.center": (0.0, 0.0, 0.0) for kind in ("fluid", "rigid", "soft")},
+    **{
+        f"{kind}.{method}.drive": DRIVE[None]
+        for kind in ("Dead", "Drift", "Noise", "Played", "Quantised")
+        for method in ("__call__", "emitted")
+    },
+    "HardwareObjective.__call__.drive": DRIVE[None],
+    "SimulatedObjective.__call__.drive": DRIVE[None],
+}
+
+#: Of classes that users do not make themselves.
+INSTANCES = {
+    "BoxPropagator": Made(lambda _: at.make_propagator(SCENE, "box", 2e-3, 0.5, max_periods=6)),
+    "FullPropagator": Made(lambda _: at.make_propagator(SCENE, "full", 2e-3, 0.5, max_periods=6)),
+    "OpenMPDBoard": Made(lambda folder: at.OpenMPDBoard.load(board_file(folder))),
+}
+
+
+class Call(NamedTuple):
+    """A public function, class or method; `owner` is the class of a method that needs an instance."""
+
+    name: str
+    function: Callable[..., Any]
+    owner: type | None = None
+
+    @property
+    def parameters(self) -> dict[str, str]:
+        """Annotations by name."""
+        return _annotations(self.function)
+
+    def argument(self, parameter: str, folder: Path) -> Any:
+        """A value that it accepts for a parameter."""
+        value = OTHERS.get(f"{self.name}.{parameter}", ARGUMENTS.get(parameter, LookupError))
+        assert value is not LookupError, f"tests/public_calls.py: no argument for {self.name}.{parameter}"
+        return value.make(folder) if isinstance(value, Made) else value
+
+    def arguments(self, folder: Path) -> dict[str, Any]:
+        """Values that it accepts, by parameter."""
+        return {name: self.argument(name, folder) for name in self.parameters}
+
+    def bound(self, folder: Path) -> Callable[..., Any]:
+        """The function, of an instance if it needs one."""
+        if self.owner is None:
+            return self.function
+        maker = INSTANCES.get(self.owner.__name__)
+        own = Call(self.owner.__name__, self.owner)
+        instance = own.function(**own.arguments(folder)) if maker is None else maker.make(folder)
+        return getattr(instance, self.function.__name__)
+
+
+@cache
+def _annotations(function: Callable[..., Any]) -> dict[str, str]:
+    given = inspect.signature(function).parameters.values()
+    return {one.name: str(one.annotation) for one in given if one.name != "self"}
+
+
+def public_calls() -> dict[str, Call]:
+    """All that have parameters, by name."""
+    found = [
+        call
+        for module in (at, at.reference, hardware, propagator)
+        for name in module.__all__
+        if callable(thing := getattr(module, name))
+        for call in (_calls_of(thing) if inspect.isclass(thing) else [Call(name, thing)])
+    ]
+    return {call.name: call for call in found if call.parameters and call.name not in NOT_CALLED_BY_USERS}
+
+
+def _calls_of(kind: type) -> Iterator[Call]:
+    """The constructor and the methods of a class."""
+    protocol = getattr(kind, "_is_protocol", False)
+    not_made = kind.__name__ in NOT_CALLED_BY_USERS and kind.__name__ not in INSTANCES
+    if issubclass(kind, BaseException) or protocol or not_made:
+        return
+    yield Call(kind.__name__, kind)
+    for name in dir(kind):
+        member = inspect.getattr_static(kind, name)
+        if isinstance(member, classmethod):
+            yield Call(f"{kind.__name__}.{name}", getattr(kind, name))
+        elif inspect.isfunction(member) and (name == "__call__" or not name.startswith("_")):
+            yield Call(f"{kind.__name__}.{name}", member, kind)
