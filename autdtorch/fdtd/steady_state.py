@@ -116,6 +116,11 @@ def fewest_periods(crossing: float) -> int:
     return RAMP_PERIODS + math.ceil(2 * crossing)
 
 
+def phasors_kept(cells: int) -> int:
+    """Return the number of phasors of so many cells that a run keeps."""
+    return min(max(_FEWEST_PHASORS, _MOST_NUMBERS // max(1, cells)), _MOST_PHASORS)
+
+
 class Extrapolation:
     """The limit of a sequence of which the last numbers are kept, `most` of them."""
 
@@ -168,7 +173,7 @@ def windows_of_run(
         first = block * steps
         signal = drive_signal(steps_per_period, first, steps).to(assembly.dtype)
         state, recorded = kernel.advance(state, assembly.coefficients, sources, receivers, signal)
-        both = torch.cat((earlier.to(recorded.device), recorded))
+        both = torch.cat((earlier.to(recorded.device), recorded)).double()
         ends = range(-(-(first + 1) // shift) * shift, first + steps + 1, shift)
         windows = [(end - steps, both[end - first : end - first + steps]) for end in ends]
         yield (

@@ -35,11 +35,13 @@ class GridCost:
         interior: cells per axis inside the boundary layer.
         cells: of the grid, boundary layers included.
         steps: of a run.
+        steps_per_period: time steps a period of the drive.
     """
 
     interior: tuple[int, int, int]
     cells: int
     steps: int
+    steps_per_period: float
 
     @property
     def work(self) -> float:
@@ -55,8 +57,11 @@ def grid_cost(scene: Scene, extent: Extent, spacing: float) -> GridCost:
     rim = layer_cells(kappa) + 1
     stencil = tuned_stencil(kappa, scene.attenuation * spacing)
     periods = fewest_periods(spacing * math.hypot(*interior) / scene.wavelength)
-    steps = math.ceil(periods * fewest_steps(stencil, stencil.largest_symbol))
-    return GridCost(interior, math.prod(cells + 2 * rim for cells in interior), steps)
+    speeds = [obstacle.sound_speed or 0.0 for obstacle in scene.obstacles]
+    fastest = max(1.0, *(speed / scene.medium.sound_speed for speed in speeds), 0.0)
+    steps_per_period = fewest_steps(stencil, stencil.largest_symbol * fastest**2)
+    cells = math.prod(cells + 2 * rim for cells in interior)
+    return GridCost(interior, cells, math.ceil(periods * steps_per_period), steps_per_period)
 
 
 def full_cost(grid: GridCost, runs: int) -> float:
@@ -71,10 +76,15 @@ def box_cost(grids: Sequence[GridCost], passes: int, runs: int) -> float:
     obstacle, for all runs at once.
     """
     steps = sum(grid.work + _BESIDE for grid in grids)
-    radiating = [_shrunk(grid, 4) - _shrunk(grid, 8) for grid in grids]
+    radiating = [radiating_cells(grid) for grid in grids]
     heard = [_shrunk(grid, 8) for grid in grids]
     pairs = sum(radiating) * sum(heard) - sum(map(math.prod, zip(radiating, heard, strict=True)))
     return runs * passes * steps + (passes - 1) * _PAIR * pairs
+
+
+def radiating_cells(grid: GridCost) -> int:
+    """Return the number of cells of a box that radiate, and whose phasors a run keeps."""
+    return _shrunk(grid, 4) - _shrunk(grid, 8)
 
 
 def _shrunk(grid: GridCost, cells: int) -> int:
