@@ -14,7 +14,7 @@ import torch
 from autdtorch.drive import validate_drive
 from autdtorch.propagator import Propagator
 from autdtorch.scene import Scene
-from autdtorch.validation import invalid
+from autdtorch.validation import invalid, real_tensor
 
 #: What is maximised: pressure (..., P) [Pa] to score (...).
 Score: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
@@ -124,6 +124,23 @@ def validate_drives(drive: torch.Tensor, transducers: int) -> torch.Tensor:
     if drive.ndim != 2 or len(drive) == 0:
         raise ValueError(f"drive: shape {tuple(drive.shape)}; must be (B, {transducers}) with B >= 1")
     return drive
+
+
+def validate_magnitudes(name: str, value: object, points: int) -> torch.Tensor:
+    """Return observed magnitudes (P,) [Pa], float64, after checking them.
+
+    Args:
+        name: of the field, for the message.
+        value: what was observed.
+        points: number of control points P.
+
+    Raises:
+        ValueError: not P finite real numbers >= 0.
+    """
+    pressure = real_tensor(name, value, "Pa")
+    if pressure.shape != (points,) or pressure.min() < 0:
+        raise invalid(name, value, f"must be {points} numbers >= 0", "Pa")
+    return pressure
 
 
 def weakest_focus(pressure: torch.Tensor) -> torch.Tensor:
