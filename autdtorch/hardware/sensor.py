@@ -12,6 +12,7 @@ from typing import Protocol
 
 import torch
 
+from autdtorch.objective import validate_magnitudes
 from autdtorch.validation import (
     ArrayLike,
     integer_at_least,
@@ -19,7 +20,6 @@ from autdtorch.validation import (
     not_negative,
     points_tensor,
     positive,
-    real_tensor,
 )
 
 _POLL = 0.02  # [s] between looks at a file
@@ -60,10 +60,7 @@ def checked_reading(sensor: Sensor, points: int) -> torch.Tensor:
     Raises:
         ValueError: not P finite magnitudes.
     """
-    pressure = real_tensor("pressure of the sensor", sensor.read(), "Pa")
-    if pressure.shape != (points,) or pressure.min() < 0:
-        raise invalid("pressure of the sensor", pressure.tolist(), f"must be {points} numbers >= 0", "Pa")
-    return pressure
+    return validate_magnitudes("pressure of the sensor", sensor.read(), points)
 
 
 class ManualSensor:
