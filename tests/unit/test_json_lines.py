@@ -101,17 +101,49 @@ def test_whatever_was_put_into_a_file_is_set_aside_once_and_the_whole_lines_are_
 
 def test_what_is_set_aside_is_told_in_one_line(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     first, second, third = written(path).splitlines(keepends=True)
-    path.write_bytes(first[:-9] + b"\n" + b"\xff" + second + third + b"torn")
+    path.write_bytes(first + b"\xff" + second + third + b"torn")
     lines, rows = read(path)
-    assert rows == ROWS[2:]
+    assert rows == [ROWS[0], ROWS[2]]
     assert not caplog.messages
     lines.mend()
     refused, torn = caplog.messages
-    assert "line 1 and 1 more" in refused
+    assert "line 2: set aside" in refused
     assert "broke off" in torn
     caplog.clear()
     read(path)[0].mend()
     assert not caplog.messages
+
+
+def test_lines_are_set_aside_on_disk_before_they_leave_the_file(
+    path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    damaged = b"damaged\n" + written(path, HEAD)
+    path.write_bytes(damaged)
+    aside = path.with_name(path.name + SET_ASIDE)
+    synced: list[tuple[bytes, bytes]] = []
+    monkeypatch.setattr(os, "fsync", lambda _: synced.append((aside.read_bytes(), path.read_bytes())))
+    read(path, head=HEAD)[0].mend()
+    assert synced[0] == (b"damaged\n" + HEAD, damaged)
+    assert "line 1 and 1 more" in caplog.text
+    path.write_bytes(path.read_bytes().replace(HEAD, b"damaged\n"))
+    read(path, head=HEAD)[0].mend()
+    assert f"line 1: set aside in {aside}" in caplog.text
+    assert read(path, head=HEAD)[1] == ROWS
+
+
+def test_nothing_follows_half_a_line(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    content = written(path)
+    lines, _ = read(path)
+    with monkeypatch.context() as context:
+        context.setattr(os, "fsync", full)
+        with pytest.raises(OSError, match=r"No space left on device: '.*rows\.jsonl"):
+            lines.append(ROWS[0])
+    assert path.read_bytes() == content
+    lines.append(ROWS[0])
+    assert read(path)[1] == [*ROWS, ROWS[0]]
 
 
 def test_a_row_that_its_reader_refuses_is_set_aside(path: Path) -> None:
