@@ -118,8 +118,9 @@ class JsonLines:
 
     def _set_aside(self) -> None:
         path = self._path.with_name(self._path.name + SET_ASIDE)
-        with naming(path), path.open("ab", buffering=0) as file:
-            file.write(b"".join(line + b"\n" for _, line, _ in self._refused))
+        with naming(path), path.open("ab") as file:
+            file.writelines(line + b"\n" for _, line, _ in self._refused)
+            file.flush()
             os.fsync(file.fileno())
         number, _, error = self._refused[0]
         reason = f"no {error}" if isinstance(error, KeyError) else error
