@@ -9,6 +9,7 @@ whole, keep what was damaged, and be silent when it is begun once more.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import functools
 import logging
 import random
@@ -16,7 +17,7 @@ import shutil
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from unittest import mock
@@ -187,22 +188,17 @@ def _keep_lines(path: Path, count: int) -> None:
     path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:count]))
 
 
-class Warned(logging.Handler):
-    """Collects what is logged as a warning or worse.
-
-    Attributes:
-        lines: messages since they were last cleared.
-    """
-
-    def __init__(self) -> None:
-        """Listen to the package."""
-        super().__init__(logging.WARNING)
-        self.lines: list[str] = []
-        logging.getLogger("autdtorch").addHandler(self)
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Keep a message."""
-        self.lines.append(record.getMessage())
+@contextlib.contextmanager
+def warnings_listed() -> Iterator[list[str]]:
+    """Give a list that grows with what the package warns of."""
+    lines: list[str] = []
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: lines.append(record.getMessage())  # type: ignore[method-assign]
+    logging.getLogger("autdtorch").addHandler(handler)
+    try:
+        yield lines
+    finally:
+        logging.getLogger("autdtorch").removeHandler(handler)
 
 
 def _lines(path: Path) -> list[bytes]:
@@ -215,9 +211,7 @@ def _rows(lines: list[bytes]) -> set[bytes]:
     return {line for line in lines if b'"drive": ' in line}
 
 
-def problems(
-    subject: Subject, state: Path, folder: Path, damaged: bytes, name: str, warned: Warned
-) -> list[str]:
+def problems(subject: Subject, state: Path, folder: Path, damaged: bytes, name: str) -> list[str]:
     """Begin anew in a copy of a state with one damaged file, and return what is not as promised."""
     shutil.copytree(state, folder)
     (folder / name).write_bytes(damaged)
@@ -241,9 +235,10 @@ def problems(
         wrong.append("damaged lines not kept")
     if name in (RESULTS_FILE, PROVENANCE_FILE) and (folder / f"{PREVIOUS}1" / name).read_bytes() != damaged:
         wrong.append("the damaged file is not kept")
-    warned.lines.clear()
-    if not all(map(torch.equal, subject.begin(folder), subject.numbers)) or warned.lines:
-        wrong.append(f"the next start is not clean: {warned.lines}")
+    with warnings_listed() as warned:
+        numbers = subject.begin(folder)
+    if not all(map(torch.equal, numbers, subject.numbers)) or warned:
+        wrong.append(f"the next start is not clean: {warned}")
     return wrong
 
 
@@ -257,7 +252,6 @@ def check(damages: int, seed: int, folder: Path) -> tuple[Counter[str], list[str
     subjects = [study_subject(folder), trial_subject(folder)]
     counts: Counter[str] = Counter()
     wrong: list[str] = []
-    warned = Warned()
     for number in range(damages):
         subject = subjects[number % 3 // 2]
         state = rng.choice(subject.states)
@@ -276,7 +270,7 @@ def check(damages: int, seed: int, folder: Path) -> tuple[Counter[str], list[str
         try:
             wrong += [
                 f"{number} {state.name} {case}: {one}"
-                for one in problems(subject, state, folder / str(number), damaged, name, warned)
+                for one in problems(subject, state, folder / str(number), damaged, name)
             ]
         except Exception as error:
             wrong.append(f"{number} {state.name} {case}: {type(error).__name__}: {error}")

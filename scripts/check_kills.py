@@ -78,9 +78,10 @@ def of_studies(folder: Path) -> list[torch.Tensor]:
     """The numbers of all studies below a folder."""
     studies = [load_results(path) for path in sorted(folder.rglob("results.h5"))]
     scenes = [scene for study in studies for scene in study.scenes.values()]
-    solutions = [method.solution for scene in scenes for method in scene.methods.values()]
-    numbers = [getattr(solution, field.name) for solution in solutions for field in fields(solution)]
-    return [*(scene.transfer_matrix for scene in scenes), *numbers]
+    methods = [method for scene in scenes for method in scene.methods.values()]
+    parts = [getattr(method.solution, field.name) for method in methods for field in fields(method.solution)]
+    planes = [method.plane_pressure for method in methods if method.plane_pressure is not None]
+    return [*(scene.transfer_matrix for scene in scenes), *parts, *planes]
 
 
 def of_trial(folder: Path) -> list[torch.Tensor]:
@@ -116,9 +117,9 @@ def calm_run(subject: Subject, folder: Path) -> Calm:
     """Run to the end, undisturbed."""
     begin = time.monotonic()
     process = subject.start(folder)
-    _wait(lambda: subject.lines(folder) > 0, process)
+    wait(lambda: subject.lines(folder) > 0, process)
     first = time.monotonic() - begin
-    _finish(process, folder)
+    finish(process, folder)
     return Calm(subject.numbers(folder), subject.lines(folder), first, time.monotonic() - begin)
 
 
@@ -134,17 +135,17 @@ def killed_run(
     while kills < most:
         process = subject.start(folder)
         if kills == 0:
-            _wait(lambda process=process: subject.lines(folder) > 0, process)
+            wait(lambda process=process: subject.lines(folder) > 0, process)
             delay = rng.uniform(0, calm.seconds - calm.first)
         else:
             delay = rng.uniform(0.5 * calm.first, calm.seconds)  # the first half is Python's start
         moment = time.monotonic() + delay
-        _wait(lambda moment=moment: time.monotonic() > moment, process)
+        wait(lambda moment=moment: time.monotonic() > moment, process)
         process.kill()
         if process.wait() != -signal.SIGKILL:
             break
         kills += 1
-    _finish(subject.start(folder), folder)
+    finish(subject.start(folder), folder)
     numbers, lines = subject.numbers(folder), subject.lines(folder)
     wrong = []
     if len(numbers) != len(calm.numbers) or not all(map(torch.equal, numbers, calm.numbers)):
@@ -176,7 +177,7 @@ def check(name: str, kills: int, seed: int, folder: Path) -> tuple[int, list[str
     return runs, wrong
 
 
-def _wait(condition: Callable[[], bool], process: subprocess.Popen[bytes]) -> None:
+def wait(condition: Callable[[], bool], process: subprocess.Popen[bytes]) -> None:
     """Wait until a condition holds or the process has ended."""
     end = time.monotonic() + _LONGEST
     while not condition() and process.poll() is None:
@@ -185,7 +186,8 @@ def _wait(condition: Callable[[], bool], process: subprocess.Popen[bytes]) -> No
         time.sleep(_POLL)
 
 
-def _finish(process: subprocess.Popen[bytes], folder: Path) -> None:
+def finish(process: subprocess.Popen[bytes], folder: Path) -> None:
+    """Wait until a process, begun in a folder, has ended well."""
     if process.wait(_LONGEST):
         raise RuntimeError((folder / _SAID).read_text(encoding="utf-8"))
 

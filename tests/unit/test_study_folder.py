@@ -21,22 +21,23 @@ from autdtorch.study_folder import MATRICES_FOLDER, PREVIOUS
 from autdtorch.trial_file import TRIALS_FILE
 
 FILES = (RESULTS_FILE, TRIALS_FILE, PROVENANCE_FILE)
-SOLVER = {"method": "auto", "spacing": 2e-3, "tolerance": 0.2, "kernel": "reference"}
+SIMULATED = {"method": "auto", "spacing": 2e-3, "tolerance": 0.2, "kernel": "reference"}
 
 
 def study(folder: Path, seed: int = 0, config: str = "config", **changes: object) -> StudyResult:
     arguments = {
-        "scenes": {"empty": small_scene(), "cube": small_scene((CUBE,))},
+        "scenes": {"one": small_scene(), "two": small_scene(extent=30e-3)},
         "methods": {"gabs": functools.partial(gabs, levels=4)},
-        "solver": SOLVER,
+        "solver": {"method": "free_space"},
         "trials": 3,
         **changes,
     }
     return run_study(**arguments, folder=folder, config=f"{config} {seed}", seed=seed)  # type: ignore[arg-type]
 
 
-def drives(results: StudyResult) -> torch.Tensor:
-    return torch.cat([scene.methods["gabs"].solution.drive for scene in results.scenes.values()])
+def numbers(results: StudyResult) -> torch.Tensor:
+    solutions = [scene.methods["gabs"].solution for scene in results.scenes.values()]
+    return torch.cat([torch.cat([solution.drive, solution.history], dim=1) for solution in solutions])
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -72,7 +73,7 @@ def test_a_damaged_file_is_kept_and_costs_no_trial(
     damaged = damage(before[name])
     (tmp_path / name).write_bytes(damaged)
     again = study(tmp_path)
-    assert torch.equal(drives(again), drives(undisturbed))
+    assert torch.equal(numbers(again), numbers(undisturbed))
     assert again.provenance == undisturbed.provenance == load_provenance(tmp_path)
     assert contents(tmp_path)[TRIALS_FILE] == before[TRIALS_FILE]
     (line,) = warnings()
@@ -88,10 +89,10 @@ def test_a_damaged_file_is_kept_and_costs_no_trial(
 def test_a_file_of_another_study_is_not_used_and_costs_no_other(tmp_path: Path, name: str) -> None:
     own, other = tmp_path / "own", tmp_path / "other"
     undisturbed, before = study(own), contents(own)
-    assert not torch.equal(drives(study(other, seed=1)), drives(undisturbed))
+    assert not torch.equal(numbers(study(other, seed=1)), numbers(undisturbed))
     swapped = contents(other)[name]
     (own / name).write_bytes(swapped)
-    assert torch.equal(drives(study(own)), drives(undisturbed))
+    assert torch.equal(numbers(study(own)), numbers(undisturbed))
     assert load_results(own).provenance == undisturbed.provenance
     if name == TRIALS_FILE:
         assert contents(own)[TRIALS_FILE + SET_ASIDE] == swapped
@@ -108,7 +109,7 @@ def test_trials_alone_are_used_and_a_damaged_one_is_run_again(
     (tmp_path / RESULTS_FILE).unlink()
     (tmp_path / PROVENANCE_FILE).unlink()
     (tmp_path / TRIALS_FILE).write_bytes(b"".join([lines[0], b"{}\n", *lines[2:]]))
-    assert torch.equal(drives(study(tmp_path)), drives(undisturbed))
+    assert torch.equal(numbers(study(tmp_path)), numbers(undisturbed))
     (line,) = warnings()
     assert f"{TRIALS_FILE}, line 2" in line
     again = (tmp_path / TRIALS_FILE).read_bytes().splitlines(keepends=True)
@@ -116,12 +117,13 @@ def test_trials_alone_are_used_and_a_damaged_one_is_run_again(
 
 
 def test_a_damaged_matrix_is_computed_again(tmp_path: Path, warnings: Callable[[], list[str]]) -> None:
-    undisturbed = study(tmp_path)
+    simulated = functools.partial(study, tmp_path, scenes={"cube": small_scene((CUBE,))}, solver=SIMULATED)
+    undisturbed = simulated()
     matrices = contents(tmp_path / MATRICES_FOLDER)
     for name, content in matrices.items():
         (tmp_path / MATRICES_FOLDER / name).write_bytes(content[:-1] + b"\1")
     (tmp_path / RESULTS_FILE).unlink()
-    again = study(tmp_path)
+    again = simulated()
     for name, scene in again.scenes.items():
         assert torch.equal(scene.transfer_matrix, undisturbed.scenes[name].transfer_matrix)
     assert len(warnings()) == len(matrices) > 0
@@ -134,7 +136,8 @@ def test_trials_of_other_shapes_do_not_count_though_the_settings_are_called_the_
     small = small_scene()
     array = TransducerArray.grid((2, 3), pitch=8e-3, center=(1.2e-3, 12e-3, 12e-3))
     other = Scene(array, small.medium, 40e3, small.control_points)
-    assert drives(study(tmp_path, scenes={"one": other})).shape == (3, 6)
+    (found,) = study(tmp_path, scenes={"one": other}).scenes.values()
+    assert found.methods["gabs"].solution.drive.shape == (3, 6)
 
 
 def test_with_a_method_of_ones_own_everything_is_computed_again(tmp_path: Path) -> None:
