@@ -76,9 +76,9 @@ class StudyFolder:
         if self.path is None:
             return
         _set_aside(self.path, self._not_used)
-        if PROVENANCE_FILE in self._not_used:
-            save_provenance(self.provenance, self.path)
-        self.trials = self._trial_file(self.path)
+        save_provenance(self.provenance, self.path)
+        if TRIALS_FILE in self._not_used:
+            self.trials = self._trial_file(self.path)
         self.trials.mend()
         if len(self.trials):
             logger.info("re-using %d trials from %s", len(self.trials), self.path)
@@ -91,7 +91,8 @@ class StudyFolder:
             logger.info("re-using %s from %s, same settings and same source", ", ".join(self.scenes), path)
         if stored is not None:
             self.provenance = stored
-        if stored is not None or results is not None or len(self._trial_file(path)):
+        self.trials = self._trial_file(path)
+        if stored is not None or results is not None or len(self.trials):
             del self._not_used[TRIALS_FILE]  # of which single lines are set aside
 
     def _stored(self, name: str, load: Callable[[Path], _Stored], path: Path) -> _Stored | None:

@@ -24,7 +24,7 @@ FILES = (RESULTS_FILE, TRIALS_FILE, PROVENANCE_FILE)
 SIMULATED = {"method": "auto", "spacing": 2e-3, "tolerance": 0.2, "kernel": "reference"}
 
 
-def study(folder: Path, seed: int = 0, config: str = "config", **changes: object) -> StudyResult:
+def study(folder: Path | None, seed: int = 0, config: str = "config", **changes: object) -> StudyResult:
     arguments = {
         "scenes": {"one": small_scene(), "two": small_scene(extent=30e-3)},
         "methods": {"gabs": functools.partial(gabs, levels=4)},
@@ -102,18 +102,29 @@ def test_a_file_of_another_study_is_not_used_and_costs_no_other(tmp_path: Path, 
 
 
 def test_trials_alone_are_used_and_a_damaged_one_is_run_again(
-    tmp_path: Path, warnings: Callable[[], list[str]]
+    tmp_path: Path, warnings: Callable[[], list[str]], caplog: pytest.LogCaptureFixture
 ) -> None:
+    caplog.set_level(logging.INFO)
     undisturbed = study(tmp_path)
+    assert "re-using" not in caplog.text
     lines = (tmp_path / TRIALS_FILE).read_bytes().splitlines(keepends=True)
     (tmp_path / RESULTS_FILE).unlink()
     (tmp_path / PROVENANCE_FILE).unlink()
     (tmp_path / TRIALS_FILE).write_bytes(b"".join([lines[0], b"{}\n", *lines[2:]]))
     assert torch.equal(numbers(study(tmp_path)), numbers(undisturbed))
+    assert "re-using 5 trials" in caplog.text
     (line,) = warnings()
     assert f"{TRIALS_FILE}, line 2" in line
     again = (tmp_path / TRIALS_FILE).read_bytes().splitlines(keepends=True)
     assert again[:-1] == [lines[0], *lines[2:]]
+
+
+def test_a_study_that_is_kept_in_memory_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert torch.equal(numbers(study(None)), numbers(study(tmp_path / "kept")))
+    assert [path.name for path in tmp_path.iterdir()] == ["kept"]
 
 
 def test_a_damaged_matrix_is_computed_again(tmp_path: Path, warnings: Callable[[], list[str]]) -> None:
