@@ -193,7 +193,7 @@ def warnings_listed() -> Iterator[list[str]]:
     """Give a list that grows with what the package warns of."""
     lines: list[str] = []
     handler = logging.Handler(logging.WARNING)
-    handler.emit = lambda record: lines.append(record.getMessage())  # type: ignore[method-assign]
+    handler.emit = lambda record: lines.append(record.getMessage())
     logging.getLogger("autdtorch").addHandler(handler)
     try:
         yield lines

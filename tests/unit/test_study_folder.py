@@ -101,6 +101,28 @@ def test_a_file_of_another_study_is_not_used_and_costs_no_other(tmp_path: Path, 
         assert contents(own)[TRIALS_FILE] == before[TRIALS_FILE]
 
 
+def test_another_study_is_kept_whole(tmp_path: Path, warnings: Callable[[], list[str]]) -> None:
+    study(tmp_path)
+    before = contents(tmp_path)
+    study(tmp_path, seed=1)
+    assert contents(tmp_path / f"{PREVIOUS}1") == {name: before[name] for name in FILES}
+    assert {name for name in contents(tmp_path) if not name.startswith(".")} == set(FILES)
+    assert len(warnings()) == 1
+
+
+@pytest.mark.parametrize("missing", [RESULTS_FILE, PROVENANCE_FILE])
+def test_lines_of_trials_are_set_aside_where_another_file_is_of_the_study(
+    tmp_path: Path, missing: str
+) -> None:
+    undisturbed = study(tmp_path)
+    (tmp_path / missing).unlink()
+    damaged = (tmp_path / TRIALS_FILE).read_bytes().replace(b'"trial"', b'"tria1"')
+    (tmp_path / TRIALS_FILE).write_bytes(damaged)
+    assert torch.equal(numbers(study(tmp_path)), numbers(undisturbed))
+    assert contents(tmp_path)[TRIALS_FILE + SET_ASIDE] == damaged
+    assert not (tmp_path / f"{PREVIOUS}1").exists()
+
+
 def test_trials_alone_are_used_and_a_damaged_one_is_run_again(
     tmp_path: Path, warnings: Callable[[], list[str]], caplog: pytest.LogCaptureFixture
 ) -> None:
