@@ -30,6 +30,7 @@ TRIAL = SCRIPTS / "hardware_trial.py"
 
 _SAID = "said.txt"
 _POLL = 0.005  # [s]
+_LATER = 0.2  # [s], about what a trial takes
 _LONGEST = 600.0  # [s]
 
 
@@ -65,13 +66,11 @@ class Calm:
         numbers: that it found.
         lines: trials or evaluations in its journals.
         first: time until the first of them [s].
-        seconds: time it took in all [s].
     """
 
     numbers: list[torch.Tensor]
     lines: int
     first: float
-    seconds: float
 
 
 def of_studies(folder: Path) -> list[torch.Tensor]:
@@ -120,7 +119,7 @@ def calm_run(subject: Subject, folder: Path) -> Calm:
     wait(lambda: subject.lines(folder) > 0, process)
     first = time.monotonic() - begin
     finish(process, folder)
-    return Calm(subject.numbers(folder), subject.lines(folder), first, time.monotonic() - begin)
+    return Calm(subject.numbers(folder), subject.lines(folder), first)
 
 
 def killed_run(
@@ -133,16 +132,16 @@ def killed_run(
     """
     kills = 0
     while kills < most:
+        done = subject.lines(folder)
+        enough = rng.randint(max(1, done), calm.lines)
         process = subject.start(folder)
-        if kills == 0:
-            wait(lambda process=process: subject.lines(folder) > 0, process)
-            delay = rng.uniform(0, calm.seconds - calm.first)
-        else:
-            delay = rng.uniform(0.5 * calm.first, calm.seconds)  # the first half is Python's start
-        moment = time.monotonic() + delay
+        wait(lambda enough=enough: subject.lines(folder) >= enough, process)
+        # A moment later; of nothing new, anywhere in the start.
+        moment = time.monotonic() + rng.uniform(0, calm.first if enough == done else _LATER)
         wait(lambda moment=moment: time.monotonic() > moment, process)
         process.kill()
         if process.wait() != -signal.SIGKILL:
+            finish(process, folder)
             break
         kills += 1
     finish(subject.start(folder), folder)
@@ -187,7 +186,11 @@ def wait(condition: Callable[[], bool], process: subprocess.Popen[bytes]) -> Non
 
 
 def finish(process: subprocess.Popen[bytes], folder: Path) -> None:
-    """Wait until a process, begun in a folder, has ended well."""
+    """Wait until a process, begun in a folder, has ended.
+
+    Raises:
+        RuntimeError: it failed.
+    """
     if process.wait(_LONGEST):
         raise RuntimeError((folder / _SAID).read_text(encoding="utf-8"))
 
