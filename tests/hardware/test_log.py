@@ -76,8 +76,11 @@ def test_a_log_of_other_drives_is_refused(trial):
     bench = trial.bench()
     with trial.link(bench) as link:
         trial.objective(link, EmulatedSensor(bench))(full_on())
-        with pytest.raises(ValueError, match="evaluation 1 is of another drive"):
+        with pytest.raises(LogError, match="evaluation 1 is of another drive"):
             trial.objective(link, EmulatedSensor(bench))(0.5 * full_on())
+        trial.objective(link, EmulatedSensor(bench))(full_on(3))
+        with pytest.raises(LogError, match="evaluation 3 is of another drive"):
+            trial.objective(link, EmulatedSensor(bench))(torch.cat([full_on(2), 0.5 * full_on()]))
 
 
 def drives() -> torch.Tensor:
@@ -204,16 +207,26 @@ def test_a_folder_in_the_place_of_the_log_is_told(trial):
 
 
 @pytest.mark.parametrize("ended", [True, False])
-def test_a_log_without_evaluations_is_begun_anew_by_other_settings(trial, ended: bool):
+def test_a_log_without_evaluations_is_begun_anew_by_other_settings(trial, ended: bool, caplog):
     bench = trial.bench()
     with trial.link(bench) as link:
         first = trial.objective(link, EmulatedSensor(bench), seed=1)
         if ended:
             first.log.end(seconds_on=1.0)
         second = trial.objective(link, EmulatedSensor(bench), seed=2)
+        assert not second.log.goes_on
         second(full_on())
         assert second.log.seconds_on < 1
         assert len(trial.objective(link, EmulatedSensor(bench), seed=2).log.evaluations) == 1
+    assert not caplog.messages
+    assert [path.name for path in trial.log.parent.iterdir() if path.suffix == SET_ASIDE] == []
+
+
+def test_a_trial_killed_before_its_first_evaluation_goes_on(trial):
+    bench = trial.bench()
+    with trial.link(bench) as link:
+        assert not trial.objective(link, EmulatedSensor(bench)).log.goes_on
+        assert trial.objective(link, EmulatedSensor(bench)).log.goes_on
 
 
 def test_another_trial_is_named_by_what_was_said_first(trial):
