@@ -37,10 +37,10 @@ from .propagator import (
     make_propagator,
     volume_field,
 )
+from .rendering import animate3d, view3d
 from .results import load_results
 from .scene import OverlapWarning, ScaleWarning, Scene
 from .scene_file import load_scene
-from .view3d import animate3d, view3d
 
 __all__ = [
     "PAPER_SOURCE_STRENGTH",

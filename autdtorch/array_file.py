@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
 from autdtorch.array import PAPER_SOURCE_STRENGTH, TransducerArray
 from autdtorch.csv_table import read_table
 from autdtorch.geometry import device_axes, in_plane
+from autdtorch.numpy_file import read_arrays
 from autdtorch.openmpd_board import OpenMPDBoard
 from autdtorch.validation import ArrayLike, invalid, points_tensor, real_tensor
 
@@ -84,27 +84,13 @@ def _from_csv(path: str | os.PathLike[str]) -> TransducerArray:
 
 
 def _from_npz(path: str | os.PathLike[str]) -> TransducerArray:
-    arrays = read_npz(path)
+    arrays = read_arrays(path)
     for name in ("positions", "normals"):
         if name not in arrays:
             raise ValueError(f"{path}: no array {name!r}; must have positions and normals")
     strength = arrays.get("source_strength", np.array(PAPER_SOURCE_STRENGTH))
     radius = arrays.get("radius", np.array(0.0))
     return _built(path, arrays["positions"], arrays["normals"], strength, radius)
-
-
-def read_npz(path: str | os.PathLike[str]) -> dict[str, np.ndarray[Any, Any]]:
-    """The arrays of a .npz file by name.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is not .npz, or holds Python objects.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except (ValueError, BadZipFile, EOFError, TypeError) as error:  # TypeError: a single array, .npy
-        raise ValueError(f"{path}: {error}; must be a .npz file of plain arrays") from error
 
 
 def _built(

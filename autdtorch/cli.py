@@ -1,14 +1,12 @@
 """The command line: ``autdtorch scene=three_cubes method=gabs``, ``autdtorch collect multirun``.
 
-The only module that knows Hydra, which reads the settings from ``configs/`` and from the command line. What
+Hydra reads the settings from ``configs/``, from files of the user's choice and from the command line. What
 takes seconds to import is imported when a study starts, so that help is quick.
 """
 
 from __future__ import annotations
 
-import functools
 import hashlib
-import inspect
 import logging
 import os
 import re
@@ -16,20 +14,22 @@ import shlex
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import hydra
-import hydra.utils
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, InstantiationException, MissingConfigException
+from hydra.errors import HydraException, MissingConfigException
+from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from yaml import MarkedYAMLError, YAMLError  # type: ignore[import-untyped]
 
 import autdtorch
+from autdtorch.config_files import CONFIGS, register
+from autdtorch.method_section import TARGET, Method, load_method, parameters, require_known
+from autdtorch.yaml_file import plain
 
 if TYPE_CHECKING:
     from autdtorch.results import StudyResult
@@ -37,30 +37,29 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-Method: TypeAlias = "functools.partial[Any]"
-
 PLANE_FILE = "plane.png"
 
 _FAILED = 1
 _REFUSED = 2
-_REFUSALS = (ValueError, OSError, HydraException, OmegaConfBaseException, YAMLError)
+_REFUSALS = (ValueError, OSError, HydraException, OmegaConfBaseException)
 _INTERRUPTED = 130  # as a shell reports a process that SIGINT ended
-_NO_METHOD_SETTINGS = ("objective", "trials", "seed", "score")  # the first three are the study's to give
 _FULL_ERROR = "HYDRA_FULL_ERROR"
-_SETTINGS = ("scene", "method", "scenes", "methods", "solver", "trials", "seed", "plane_spacing", "output")
+_SETTINGS = ("scene", "method", "scenes", "methods", "solver", "trials", "seed", "plane_spacing")
+_PLACES = ("modules", "output")  # settings that change no result
+_CALLS = (TARGET, "_args_", "_convert_", "_partial_", "_recursive_")  # keys by which Hydra calls functions
 
 _LONGEST_NAME = 150  # of a job's folder; file systems allow 255 bytes
 
+_AGAIN = "the same command repeats what is not finished"
 _NO_SLURM = 'Could not detect "srun"'  # submitit, where it is to hand jobs to a Slurm that is not there
+# Of submitit, which may be missing: classes of errors, and a job that never came to report its own.
+_SUBMITIT_ERRORS = ("FailedJobError", "UncompletedJobError")
+_LOST_JOB = re.compile(r" (/.*/(\d[\d_]*))/\2_\d+_(?:result\.pkl|log\.err)$", re.MULTILINE)
 
 _COLLECT_HELP = """autdtorch collect FOLDER
 
 Merges the finished studies in a folder and below it, such as those of a sweep in multirun, into one table
 (summary.csv) and one report (report.md, report.html), which are written there."""
-
-_HERE = Path(__file__).parent
-# A wheel carries the configs inside the package, a checkout beside it.
-CONFIGS = _HERE / "configs" if (_HERE / "configs").is_dir() else _HERE.parent / "configs"
 
 
 class _Refusal(BaseException):
@@ -72,7 +71,19 @@ class _Refusal(BaseException):
 
 
 class _FailedJob(Exception):
-    """Tells Hydra that a job of a sweep failed; the log says why."""
+    """Tells Hydra that a job of a sweep failed."""
+
+
+class SlurmCallback(Callback):
+    """Prepares a sweep on Slurm; `configs/config.yaml` names it to Hydra."""
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        """Have the sweep's jobs watched by `squeue`."""
+        launcher = config.hydra.launcher
+        if launcher._target_.endswith(".SlurmLauncher"):
+            from autdtorch.slurm import watch_queue
+
+            watch_queue(launcher.submitit_folder)
 
 
 def main() -> None:
@@ -92,6 +103,7 @@ def main() -> None:
         elif sys.argv[1:] == ["--version"]:
             print(f"autdtorch {autdtorch.__version__}")
         else:
+            register()
             _run()
             if {"-m", "--multirun"} & set(sys.argv[1:]):
                 print("autdtorch collect merges the results of a sweep into one table and one report")
@@ -114,7 +126,8 @@ def main() -> None:
 
 
 def _is_refusal(error: Exception) -> bool:
-    return isinstance(error, (_FailedJob, *_REFUSALS)) or _NO_SLURM in str(error)
+    of_submitit = type(error).__name__ in _SUBMITIT_ERRORS or _NO_SLURM in str(error)
+    return of_submitit or isinstance(error, (_FailedJob, *_REFUSALS))
 
 
 def _stop(status: int, line: str) -> NoReturn:
@@ -125,17 +138,18 @@ def _stop(status: int, line: str) -> NoReturn:
 def _in_one_line(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
-    if isinstance(error, MarkedYAMLError) and (mark := error.problem_mark):
-        return f"{os.path.relpath(mark.name)}, line {mark.line + 1}: {error.problem}; must be valid YAML"
     text = str(error)
     if not _is_refusal(error):
         where = traceback.extract_tb(error.__traceback__)[-1]
         place = f"{os.path.relpath(where.filename)}, line {where.lineno}, in {where.name}"
         text = f"{type(error).__name__}: {text} ({place}); with {_FULL_ERROR}=1 comes the traceback"
+    if lost := _LOST_JOB.search(text):
+        return f"job {lost[2]} ended without results; its log is in {os.path.relpath(lost[1])}; {_AGAIN}"
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = error.missing_cfg_file.rpartition("/")
-        brings = "; pip install 'autdtorch[cluster]' brings more" if group == "hydra/launcher" else ""
-        return f"{group}: {name!r}; must be one of {', '.join(error.options)}{brings}"
+        more = "; pip install 'autdtorch[cluster]' brings more, hydra.searchpath=[FOLDER] your own"
+        more = more if group == "hydra/launcher" else ""
+        return f"{group}: {name!r}; must be one of {', '.join(error.options)}{more}"
     # Hydra would advise to add the key, which we would then refuse.
     if unknown := re.match(r"Could not override '(.+)'", text):
         key = getattr(error.__cause__, "full_key", None) or unknown[1]
@@ -162,15 +176,14 @@ def _run(config: DictConfig) -> None:
         if not swept:
             raise _Refusal(error) from error
         # The other jobs go on.
-        logger.error("job %s failed: %s", job.job.num, _in_one_line(error))
-        raise _FailedJob(
-            "a job failed, as the log says; the same command repeats what is not finished"
-        ) from error
+        failure = f"job {job.job.num} failed: {_in_one_line(error)}"
+        logger.error(failure)
+        raise _FailedJob(f"{failure}; {_AGAIN}") from error
 
 
 def _job_folder(overrides: str) -> str:
     """Name of the folder of a sweep's job, short and of characters that folders can have."""
-    name = re.sub(r"[^\w.,=+-]+", "_", overrides)
+    name = re.sub(r"[^\w.,=+-]+", "_", overrides, flags=re.ASCII)
     if name == overrides and len(name) <= _LONGEST_NAME:
         return name or "job"
     # What was lost may be all that tells two jobs apart.
@@ -186,21 +199,25 @@ def _study(config: DictConfig, sweep: Path | None) -> None:
     from autdtorch.propagator import CACHE_VARIABLE
     from autdtorch.study import run_study
 
-    settings: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    _require_known("settings", settings, _SETTINGS)
-    folder = Path(HydraConfig.get().runtime.output_dir)
+    settings = plain(config, "settings")
+    require_known("settings", settings, (*_SETTINGS, *_PLACES))
+    _require_no_calls(settings)
+    modules, output = (settings.pop(key, None) for key in _PLACES)
+    if modules and not _is_given("modules"):
+        raise ValueError(f"modules: {modules!r}; must be given on the command line, as modules=NAME")
     solver = _solver(settings)
-    if sweep is not None:
-        if any(override.startswith("output=") for override in HydraConfig.get().overrides.task):
-            raise ValueError(
-                f"output: {settings['output']}; a sweep has a folder for each job in hydra.sweep.dir"
-            )
+    if sweep is None:
+        folder = _folder("output", output)
+    else:
+        folder = Path(HydraConfig.get().runtime.output_dir)
+        if _is_given("output"):
+            raise ValueError(f"output: {output}; a sweep has a folder for each job in hydra.sweep.dir")
         if solver.get("cache") is None and CACHE_VARIABLE not in os.environ:
             solver["cache"] = sweep / "matrices"  # jobs in the same scene share them
-    del settings["output"]  # it is Hydra's folder by now, and changes no result
-    settings["solver"] = {key: value for key, value in solver.items() if key != "cache"}  # nor does that
+    settings["solver"] = {key: value for key, value in solver.items() if key != "cache"}  # changes no result
     single = "scenes" not in settings
-    scenes, methods = _single(settings) if single else _experiment(settings)
+    build = _single if single else _experiment
+    scenes, methods = build(settings, modules if isinstance(modules, list) else [modules])
     results = run_study(
         scenes,
         methods,
@@ -233,21 +250,24 @@ def _collect(arguments: list[str]) -> None:
     _print([*_table_lines(sweep.results), end])
 
 
-def _single(settings: Mapping[str, Any]) -> tuple[dict[str, Scene], dict[str, Method]]:
+def _single(settings: Mapping[str, Any], modules: list[Any]) -> tuple[dict[str, Scene], dict[str, Method]]:
     """The one scene and the one method, each by its name."""
     scene = _scene("scene", _section(settings, "scene"))
-    method = _method("method", _section(settings, "method"))
+    method = load_method("method", _section(settings, "method"), modules)
     return {HydraConfig.get().runtime.choices["scene"]: scene}, {method.func.__name__: method}
 
 
-def _experiment(settings: Mapping[str, Any]) -> tuple[dict[str, Scene], dict[str, Method]]:
+def _experiment(
+    settings: Mapping[str, Any], modules: list[Any]
+) -> tuple[dict[str, Scene], dict[str, Method]]:
     """The scenes and the methods of an experiment, by name."""
     for key in ("scene", "method"):
         if key in settings:
             names = ", ".join(_section(settings, f"{key}s"))
             raise ValueError(f"{key}: given beside an experiment, which has its own {key}s: {names}")
     scenes = {name: _scene(f"scenes.{name}", part) for name, part in _section(settings, "scenes").items()}
-    methods = {name: _method(f"methods.{name}", part) for name, part in _section(settings, "methods").items()}
+    sections = _section(settings, "methods")
+    methods = {name: load_method(f"methods.{name}", _section(sections, name), modules) for name in sections}
     return scenes, methods
 
 
@@ -278,39 +298,37 @@ def _solver(settings: Mapping[str, Any]) -> dict[str, Any]:
     from autdtorch.propagator import make_propagator
 
     solver = _section(settings, "solver")
-    _require_known("solver", solver, _parameters(make_propagator, but=("scene",)))
+    require_known("solver", solver, parameters(make_propagator, but=("scene",)))
+    if isinstance(cache := solver.get("cache"), str):
+        solver["cache"] = _folder("solver.cache", cache)
     return solver
 
 
-def _method(where: str, section: Any) -> Method:
-    """The optimiser that a section names by `_target_`, with the section's settings."""
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # where a method of one's own is looked for, behind what is installed
-    try:
-        method = hydra.utils.instantiate(section, _partial_=True)
-    except InstantiationException as error:
-        cause = _first_cause(error)
-        reason = f" ({type(cause).__name__}: {cause})" if cause is not error else ""
-        raise ValueError(f"{where}: {section['_target_']!r}; must be a function{reason}") from error
-    if not isinstance(method, functools.partial):
-        raise ValueError(f"{where}: no _target_; must name a function such as autdtorch.gabs")
-    _require_known(where, method.keywords, _parameters(method.func, but=_NO_METHOD_SETTINGS))
-    signature = inspect.signature(method)
-    given = [key for key in ("trials", "seed") if key in signature.parameters]
-    try:
-        signature.bind("objective", **dict.fromkeys(given))
-    except TypeError as error:
-        raise ValueError(
-            f"{where}: {section['_target_']!r}; {error}; must take an objective, the method's settings, "
-            "and trials and seed if it has random choices"
-        ) from error
-    return method
+def _require_no_calls(value: object, *path: str) -> None:
+    """Refuse the keys by which Hydra calls functions, but for the target of a method."""
+    if isinstance(value, list):
+        value = dict(enumerate(value))
+    for key, entry in value.items() if isinstance(value, dict) else ():
+        place = (*path, str(key))
+        is_method = place[:-1] == ("method",) or (place[:1] == ("methods",) and len(place) == 3)
+        if key in _CALLS and not (is_method and key == TARGET):
+            accepted = "must not be given; a method alone has a _target_"
+            raise ValueError(f"{'.'.join(place)}: {entry!r}; {accepted}")
+        _require_no_calls(entry, *place)
 
 
-def _first_cause(error: BaseException) -> BaseException:
-    while error.__cause__ is not None:
-        error = error.__cause__
-    return error
+def _is_given(key: str) -> bool:
+    """Whether the command line itself sets the key, and no config file."""
+    return any(re.match(rf"\+*{re.escape(key)}=", override) for override in HydraConfig.get().overrides.task)
+
+
+def _folder(key: str, value: object) -> Path:
+    """The folder that a setting names: below the working directory, where a config file does."""
+    folder = Path(str(value))
+    if not _is_given(key) and (folder.is_absolute() or ".." in folder.parts or not folder.parts):
+        accepted = f"must be below the working directory, or given on the command line, as {key}=FOLDER"
+        raise ValueError(f"{key}: {value!r}; {accepted}")
+    return folder
 
 
 def _section(settings: Mapping[str, Any], key: str) -> dict[str, Any]:
@@ -318,16 +336,6 @@ def _section(settings: Mapping[str, Any], key: str) -> dict[str, Any]:
     if not isinstance(section, dict):
         raise ValueError(f"{key}: {section!r}; must be a mapping of keys to values")
     return section
-
-
-def _parameters(function: Callable[..., Any], but: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(name for name in inspect.signature(function).parameters if name not in but)
-
-
-def _require_known(where: str, given: Mapping[str, Any], allowed: tuple[str, ...]) -> None:
-    for key in given:
-        if key not in allowed:
-            raise ValueError(f"{where}: unknown key {key!r}; allowed keys: {', '.join(allowed)}")
 
 
 def _show(results: StudyResult, scenes: Mapping[str, Scene], folder: Path, single: bool) -> None:

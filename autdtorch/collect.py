@@ -28,6 +28,7 @@ from autdtorch.results import (
 from autdtorch.scene import Scene
 from autdtorch.scene_file import load_scene
 from autdtorch.study_folder import PREVIOUS
+from autdtorch.yaml_file import parse_yaml, unresolved
 
 logger = logging.getLogger(__name__)
 
@@ -129,11 +130,11 @@ def _log_unfinished(folder: Path) -> None:
 
 
 def _parts(path: Path, study: StudyResult) -> list[_Part]:
-    import yaml  # type: ignore[import-untyped]
-
+    where = f"{path / RESULTS_FILE}: settings"
+    settings = unresolved(parse_yaml(study.provenance.config, where), where)
     try:
-        return list(_parts_by(yaml.safe_load(study.provenance.config), path, study))
-    except (yaml.YAMLError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        return list(_parts_by(settings, path, study))
+    except (KeyError, TypeError, AttributeError) as error:
         accepted = "must come from the command line"
         raise ValueError(f"{path / RESULTS_FILE}: no settings of a study in it; {accepted}") from error
 
@@ -231,9 +232,14 @@ def _name(name: str, swept: Settings) -> str:
     ends = [key.rpartition(".")[2] for key in shown]
     alone = [ends.count(end) == 1 and end != "method" for end in ends]  # the solver has a method too
     keys = [end if short else key for key, end, short in zip(shown, ends, alone, strict=True)]
-    texts = ("x".join(map(str, value)) if isinstance(value, list) else str(value) for value in shown.values())
-    values = (re.sub(r"[^\w.+-]+", "_", text).strip("_") for text in texts)
-    return ",".join([name, *(f"{key}={value}" for key, value in zip(keys, values, strict=True))])
+    values = ("x".join(map(str, value)) if isinstance(value, list) else value for value in shown.values())
+    swept_to = (f"{_word(key)}={_word(value)}" for key, value in zip(keys, values, strict=True))
+    return ",".join([name, *swept_to])
+
+
+def _word(text: object) -> str:
+    """A text in characters that names of files can have, in one byte each."""
+    return re.sub(r"[^\w.+-]+", "_", str(text), flags=re.ASCII).strip("_")
 
 
 def _merged_scene(methods: Mapping[str, Sequence[_Part]]) -> SceneResult:

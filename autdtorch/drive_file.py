@@ -12,7 +12,7 @@ import numpy.typing as npt
 import torch
 
 from autdtorch.array import TransducerArray
-from autdtorch.array_file import NORMAL_COLUMNS, PLACE_COLUMNS, read_npz
+from autdtorch.array_file import NORMAL_COLUMNS, PLACE_COLUMNS
 from autdtorch.csv_table import read_table, write_table
 from autdtorch.device_layouts import AUTD3_TRANSDUCERS
 from autdtorch.drive import amplitudes_of, drive_from_phases, phases_of, validate_drive, validate_single_drive
@@ -25,6 +25,7 @@ from autdtorch.hardware.levels import (
     sonicsurface_drive,
     sonicsurface_levels,
 )
+from autdtorch.numpy_file import read_arrays
 from autdtorch.validation import ArrayLike, invalid, real_tensor, require_one_of
 from autdtorch.writing import replacing
 
@@ -105,7 +106,7 @@ def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
     """
     if _kind(path) == ".csv":
         return _from_columns(path, read_table(path, _all_columns()))
-    arrays = read_npz(path)
+    arrays = read_arrays(path)
     if "device" in arrays:
         name = str(arrays["device"])
         require_one_of(f"{path}: device", name, tuple(_DEVICES))

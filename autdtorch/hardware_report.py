@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -17,7 +17,7 @@ from autdtorch.hardware.preflight import Preflight
 from autdtorch.objective import Objective
 from autdtorch.optim.base import Solution
 from autdtorch.plot import plot_convergence
-from autdtorch.report_tables import table
+from autdtorch.report_tables import code, fenced, table
 from autdtorch.writing import naming, replace_file
 
 REPORT_FILE = "report.md"
@@ -27,7 +27,7 @@ _TEXT = """# Hardware trial: {method} on {device}{emulated}
 
 Scene {scene}, {begin} to {end}; autdtorch {version}. Made by
 
-    {command}
+{command}
 
 - {evaluations} evaluations, {rate}
 - outputs on for {seconds_on:.1f} s in all, the pre-flight check included
@@ -132,7 +132,7 @@ def write_hardware_report(
     fit = compare(measured, there)
     histories = {"bench": found.history, "simulation": fit.scale * expected.history}
     with naming(folder / _FIGURE):
-        plot_convergence({scene.name or "scene": histories}).savefig(folder / _FIGURE)
+        plot_convergence({scene.name: histories}).savefig(folder / _FIGURE)
     same = torch.isclose(found.drive, expected.drive, rtol=0, atol=1e-9)
     mean = again.mean(dim=0)
     pressures = found.pressure[0], mean, fit.scale * simulated(heard * found.drive)[0]
@@ -140,8 +140,8 @@ def write_hardware_report(
         method=log.origin.get("method", "a method"),
         device=log.origin["device"],
         emulated=", emulated" if log.origin.get("emulated") else "",
-        scene=scene.name or "without a name",
-        command=command,
+        scene=code(scene.name),
+        command=fenced(command),
         version=autdtorch.__version__,
         begin=f"{begin:%Y-%m-%d %H:%M:%S}",
         end=f"{end:%Y-%m-%d %H:%M:%S} UTC",
@@ -158,11 +158,15 @@ def write_hardware_report(
         scale=fit.scale,
         misfit=_percent(fit.misfit),
         preflight=_preflight(preflight),
-        settings=table([["setting", "value"], *([name, _value(own)] for name, own in log.origin.items())]),
+        settings=table([["setting", "value"], *_settings(log.origin)]),
     )
     path = folder / REPORT_FILE
     replace_file(path, text.encode())
     return path
+
+
+def _settings(origin: Mapping[str, object]) -> list[list[str]]:
+    return [[name, code(_value(own))] for name, own in origin.items()]
 
 
 def _value(own: object) -> str:

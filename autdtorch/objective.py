@@ -14,6 +14,7 @@ import torch
 from autdtorch.drive import validate_drive
 from autdtorch.propagator import Propagator
 from autdtorch.scene import Scene
+from autdtorch.threads import one_torch_thread
 from autdtorch.validation import invalid, real_tensor
 
 #: What is maximised: pressure (..., P) [Pa] to score (...).
@@ -79,6 +80,7 @@ class SimulatedObjective:
         mode = "replay" if self.transfer_matrix is None else "transfer"
         return f"SimulatedObjective(scene {self.scene.name!r}, mode {mode!r}, {self.evaluations} evaluations)"
 
+    @one_torch_thread()
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
         """Observe the control points under each of several drives.
 

@@ -1,4 +1,4 @@
-"""Progress of long work: a bar on a terminal, beside the log; elsewhere, and in workers, the log alone."""
+"""Progress of long work, with a forecast: a bar on a terminal; elsewhere and in workers lines of the log."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import contextlib
 import logging
 import multiprocessing
 import sys
+import time
 from collections.abc import Iterator
 
 from tqdm import tqdm
@@ -13,16 +14,25 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 logger = logging.getLogger(__name__)
 
+_PATIENCE = 3.0
+"""Time [s] that work may take before its bar appears or the log has a forecast."""
+
 
 class Progress:
-    """Counts steps, and says what is being done."""
+    """Counts steps, and says what is being done and how long it will take."""
 
-    def __init__(self, bar: tqdm[None] | None) -> None:
-        """Show it on a bar, or in the log."""
+    def __init__(self, steps: int, what: str, bar: tqdm[None] | None) -> None:
+        """Show the progress of so many steps, more or less, on a bar or in the log."""
         self._bar = bar
+        self._steps = steps
+        self._what = what
+        self._done = 0
+        self._begun = time.monotonic()
+        self._next = _PATIENCE
 
     def begin(self, what: str) -> None:
         """Say what is being done from now on."""
+        self._what = what
         if self._bar is None:
             logger.info(what)
         else:
@@ -30,15 +40,34 @@ class Progress:
 
     def advance(self, steps: int) -> None:
         """Count steps that are done."""
+        self._done += steps
         if self._bar is not None:
+            self._bar.total = max(self._bar.total, self._done)
             self._bar.update(steps)
+            return
+        spent = time.monotonic() - self._begun
+        if spent >= self._next and 0 < self._done < self._steps:
+            left = spent * (self._steps / self._done - 1)
+            logger.info("%s: %.0f s so far, about %.0f s left", self._what, spent, left)
+            self._next = 4 * spent  # ever fewer lines
 
 
 @contextlib.contextmanager
-def show_progress(steps: int) -> Iterator[Progress]:
-    """Show the progress of so many steps."""
+def show_progress(steps: int, what: str = "") -> Iterator[Progress]:
+    """Show the progress of so many steps of `what`.
+
+    Args:
+        steps: an estimate will do.
+        what: is being done first.
+    """
     if not sys.stderr.isatty() or multiprocessing.parent_process() is not None:
-        yield Progress(None)
+        yield Progress(steps, what, None)
         return
-    with logging_redirect_tqdm(), tqdm(total=steps, file=sys.stderr, dynamic_ncols=True) as bar:
-        yield Progress(bar)
+    with (
+        logging_redirect_tqdm(),
+        tqdm(
+            desc=what, total=steps, file=sys.stderr, dynamic_ncols=True, delay=_PATIENCE,
+            leave=None,  # the outermost bar stays
+        ) as bar,
+    ):  # fmt: skip
+        yield Progress(steps, what, bar)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -12,12 +13,23 @@ from autdtorch.claims import BO, GABS
 from autdtorch.findings import NEAR_BOUND, find
 from autdtorch.plot import plot_convergence, plot_pareto, plot_planes, plot_scene, plot_trials
 from autdtorch.plot.style import label_of
+from autdtorch.rendering import rendering_problem, view3d
 from autdtorch.report_html import as_page
-from autdtorch.report_tables import NEAR, claims, extent, findings, is_baseline, simulations, summary, table
+from autdtorch.report_tables import (
+    NEAR,
+    claims,
+    code,
+    extent,
+    fenced,
+    findings,
+    is_baseline,
+    simulations,
+    summary,
+    table,
+)
 from autdtorch.results import RESULTS_FILE, MethodResult, SceneResult, StudyResult
 from autdtorch.scene import Scene
 from autdtorch.trial_file import TRIALS_FILE
-from autdtorch.view3d import rendering_problem, view3d
 
 REPORT_FILE = "report.md"
 
@@ -68,14 +80,12 @@ _ORIGIN = """## Origin
 
 - versions: {versions}
 - {seeds}
-- source digest: `{digest}`
+- source digest: {digest}
 - everything behind this report{where}: `{results}` (HDF5); a line a trial: `{trials}`
 
 <details><summary>all settings</summary>
 
-```yaml
 {config}
-```
 
 </details>"""
 
@@ -108,6 +118,17 @@ def write_report(
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     scenes = {name: scenes[name] for name in results.scenes}
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".report-") as new:
+        _write(results, scenes, Path(new), command, seeds)
+        # A file takes the place of one that is there, and of a link: none is written through.
+        for file in Path(new).iterdir():
+            file.replace(folder / file.name)
+    return folder / HTML_FILE
+
+
+def _write(
+    results: StudyResult, scenes: Mapping[str, Scene], folder: Path, command: str, seeds: Sequence[int]
+) -> None:
     parts = [
         _head(results, command),
         _scene_figures(scenes, folder),
@@ -123,9 +144,7 @@ def write_report(
     ]
     text = "\n\n".join(part for part in parts if part) + "\n"
     (folder / REPORT_FILE).write_text(text, encoding="utf-8")
-    page = folder / HTML_FILE
-    page.write_text(as_page(text, folder), encoding="utf-8")
-    return page
+    (folder / HTML_FILE).write_text(as_page(text, folder), encoding="utf-8")
 
 
 def _by_method(results: StudyResult) -> dict[str, dict[str, MethodResult]]:
@@ -136,8 +155,8 @@ def _head(results: StudyResult, command: str) -> str:
     counts = _trial_counts(results)
     lines = [
         "# Foci behind obstacles",
-        f"Made by `{command}` with autdtorch {results.provenance.versions['autdtorch']}, begun "
-        f"{results.provenance.date}.",
+        f"Made by {code(command)} with autdtorch {code(results.provenance.versions['autdtorch'])}, begun "
+        f"{code(results.provenance.date)}.",
         "Trials: "
         + ", ".join(f"{label_of(name)} {extent(numbers)}" for name, numbers in counts.items())
         + ".",
@@ -263,11 +282,11 @@ def _competitors(methods: Mapping[str, MethodResult]) -> Mapping[str, MethodResu
 def _origin(results: StudyResult, seeds: Sequence[int]) -> str:
     provenance = results.provenance
     return _ORIGIN.format(
-        versions=", ".join(f"{name} {version}" for name, version in provenance.versions.items()),
+        versions=code(", ".join(f"{name} {version}" for name, version in provenance.versions.items())),
         seeds=f"seeds: {', '.join(map(str, seeds))}" if seeds else f"seed: {provenance.seed}",
         where=", in the folders that the settings name" if seeds else "",
-        digest=provenance.source_digest,
+        digest=code(provenance.source_digest),
         results=RESULTS_FILE,
         trials=TRIALS_FILE,
-        config=provenance.config.strip(),
+        config=fenced(provenance.config.strip(), "yaml"),
     )

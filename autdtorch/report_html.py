@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import base64
 import html
+from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import unquote
 
 from markdown_it import MarkdownIt
+from markdown_it.token import Token
 
 _PAGE = """<!DOCTYPE html>
 <html lang="en">
@@ -22,6 +24,9 @@ _PAGE = """<!DOCTYPE html>
 {body}</body>
 </html>
 """
+
+_TAGS = ("<br>", "<details><summary>all settings</summary>", "</details>")
+"""What a report itself has of HTML; the names and settings that it shows may come from others."""
 
 _STYLE = """
 body { max-width: 64rem; margin: 0 auto; padding: 1rem 1.5rem 4rem; color: #1a1a1a; background: #fff;
@@ -62,7 +67,8 @@ def as_page(text: str, folder: Path) -> str:
     """The report as HTML.
 
     Args:
-        text: Markdown, with HTML of its own; its first line is the title.
+        text: Markdown without links; its first line is the title. HTML is shown as text, but for the few
+            tags of the report.
         folder: of its images, which are PNG files.
 
     Returns:
@@ -70,22 +76,33 @@ def as_page(text: str, folder: Path) -> str:
 
     Raises:
         OSError: an image cannot be read.
+        ValueError: an image is not in the folder.
     """
     markdown = MarkdownIt("commonmark", {"html": True}).enable("table")
+    markdown.disable(["link", "autolink", "reference"])
+    markdown.add_render_rule("html_inline", _html)
+    markdown.add_render_rule("html_block", _html)
     markdown.add_render_rule("table_open", _table_open)
     markdown.add_render_rule("table_close", _table_close)
     tokens = markdown.parse(text)
     for token in tokens:
         for part in token.children or ():
             if part.type == "image":
-                part.attrSet("src", _embedded(folder / unquote(str(part.attrGet("src")))))
+                part.attrSet("src", _embedded(folder, unquote(str(part.attrGet("src")))))
     body = markdown.renderer.render(tokens, markdown.options, {})
     title = text.partition("\n")[0].lstrip("# ")
     return _PAGE.format(title=html.escape(title), style=_STYLE, body=body)
 
 
-def _embedded(image: Path) -> str:
-    return f"data:image/png;base64,{base64.b64encode(image.read_bytes()).decode('ascii')}"
+def _embedded(folder: Path, name: str) -> str:
+    if Path(name).name != name:
+        raise ValueError(f"image: {name!r}; must be a file in the folder of the report")
+    return f"data:image/png;base64,{base64.b64encode((folder / name).read_bytes()).decode('ascii')}"
+
+
+def _html(_: object, tokens: Sequence[Token], index: int, *__: object) -> str:
+    content = tokens[index].content
+    return content if content.strip() in _TAGS else html.escape(content)
 
 
 def _table_open(*_: object) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -97,6 +98,25 @@ def table(rows: Iterable[Sequence[str]]) -> str:
     head, *body = rows
     lines = [head, ["---"] * len(head), *body]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+
+
+def code(text: str) -> str:
+    """Return text as a code span, where neither Markdown nor HTML means anything."""
+    line = re.sub(r"[\r\n]+", " ", text)
+    ticks = _longer_than_any(line, 0)
+    pad = " " if line.startswith("`") or line.endswith("`") else ""
+    return f"{ticks}{pad}{line}{pad}{ticks}"
+
+
+def fenced(text: str, language: str = "") -> str:
+    """Return text as a code block, where neither Markdown nor HTML means anything."""
+    ticks = _longer_than_any(text, 2)
+    return f"{ticks}{language}\n{text}\n{ticks}"
+
+
+def _longer_than_any(text: str, least: int) -> str:
+    """More backticks than stand together anywhere in the text, and more than `least`."""
+    return "`" * (1 + max([least, *map(len, re.findall("`+", text))]))
 
 
 def summary(results: StudyResult) -> str:

@@ -11,6 +11,7 @@ import hashlib
 import io
 import os
 import platform
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -28,11 +29,13 @@ from autdtorch.optim import label_of
 from autdtorch.optim.base import Solution
 from autdtorch.propagator import Run
 from autdtorch.source import package_versions, source_digest
+from autdtorch.validation import require_name, require_one_of
 from autdtorch.writing import replace_file
 
 RESULTS_FILE = "results.h5"
 PROVENANCE_FILE = "provenance.json"
 
+_SIMULATED_BY = ("free_space", "box", "full")
 _SOLUTION = ("drive", "pressure", "score", "evaluations", "history")
 _METRICS = ("mean", "min", "std", "uniformity", "area")
 _PROVENANCE = {"config": str, "seed": int, "versions": dict, "source_digest": str, "date": str}
@@ -279,7 +282,7 @@ def load_results(path: str | os.PathLike[str]) -> StudyResult:
         if content[:_USER_BLOCK] != _user_block(content[_USER_BLOCK:]):
             raise ValueError("its checksum is wrong")
         with h5py.File(io.BytesIO(content), "r") as file:
-            scenes = {name: _read_scene(group) for name, group in file["scenes"].items()}
+            scenes = {name: _read_scene(group) for name, group in _named(file, "scenes")}
             return StudyResult(_read_provenance(file), scenes)
     except _DAMAGE as error:
         accepted = f"must be a results file of autdtorch {autdtorch.__version__}"
@@ -332,9 +335,17 @@ def _write_scene(group: Any, scene: SceneResult) -> None:
         _write_method(methods.create_group(name), method)
 
 
+def _named(group: Any, field: str) -> Iterator[tuple[str, Any]]:
+    """Groups and their names, which become part of the names of files."""
+    for name, entry in group[field].items():
+        require_name(field, name)
+        yield name, entry
+
+
 def _read_scene(group: Any) -> SceneResult:
     attributes = group.attrs
     columns = [group[f"runs/{key}"][()].tolist() for key in ("periods", "remaining", "reached", "seconds")]
+    require_one_of("method", attributes["method"], _SIMULATED_BY)
     simulation = Simulation(
         attributes["method"],
         float(attributes["wavelength"]),
@@ -344,7 +355,7 @@ def _read_scene(group: Any) -> SceneResult:
         float(attributes["matrix_seconds"]),
         float(attributes["plane_seconds"]),
     )
-    methods = {name: _read_method(entry) for name, entry in group["methods"].items()}
+    methods = {name: _read_method(entry) for name, entry in _named(group, "methods")}
     return SceneResult(
         int(attributes["obstacles"]),
         _tensor(group, "transfer_matrix"),

@@ -21,6 +21,7 @@ from autdtorch.geometry import Plane, circle_points
 from autdtorch.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
 from autdtorch.scene import Medium, Scene
 from autdtorch.validation import ArrayLike, Vector, finite_vector, invalid, points_tensor
+from autdtorch.yaml_file import load_yaml, plain, unresolved
 
 Builder = Callable[..., Any]
 
@@ -45,17 +46,17 @@ def load_scene(source: str | os.PathLike[str] | Mapping[str, Any]) -> Scene:
     """Read a scene from a YAML file, or from a mapping of the same layout such as Hydra's `cfg.scene`.
 
     Args:
-        source: path of the file, or the mapping. Interpolations (`${...}`) are resolved. A key without a
-            value counts as left out. Paths in it start from the folder of the file; in a mapping, from the
-            working directory.
+        source: path of the file, or the mapping. A value may be an interpolation of another key, `${key}`;
+            resolvers such as `${oc.env:HOME}` are refused. A key without a value counts as left out. Paths
+            in it start from the folder of the file; in a mapping, from the working directory.
 
     Returns:
         The scene.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: not YAML, an unknown or missing key, or a value that is not accepted. The message names
-            the file and the section.
+        ValueError: not YAML, larger or deeper than a scene is, an unknown or missing key, or a value that is
+            not accepted. The message names the file and the section.
     """
     where = "scene mapping" if isinstance(source, Mapping) else os.fspath(source)
     section = _mapping(where, _read(where, source))
@@ -69,30 +70,19 @@ def load_scene(source: str | os.PathLike[str] | Mapping[str, Any]) -> Scene:
 
 def _read(where: str, source: str | os.PathLike[str] | Mapping[str, Any]) -> object:
     """What the file or mapping holds, as plain Python containers."""
-    from omegaconf import DictConfig, ListConfig, OmegaConf
+    from omegaconf import DictConfig, OmegaConf
     from omegaconf.errors import OmegaConfBaseException
-    from yaml import MarkedYAMLError, YAMLError  # type: ignore[import-untyped]
 
-    config: DictConfig | ListConfig
     try:
-        if isinstance(source, Mapping):
-            # A node of a larger configuration stays in its place, where its interpolations resolve.
-            config = source if isinstance(source, DictConfig) else OmegaConf.create(dict(source))
-        else:
-            config = OmegaConf.load(Path(source))
-        return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    except MarkedYAMLError as error:
-        line = error.problem_mark.line + 1 if error.problem_mark else 0
-        raise ValueError(f"{where}, line {line}: {error.problem}; must be valid YAML") from error
-    except (YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{where}: {error}; must be valid YAML in UTF-8") from error
+        config: Any = source  # a node of a larger configuration stays there, where its interpolations resolve
+        if not isinstance(source, Mapping):
+            config = load_yaml(source)
+        elif not isinstance(source, DictConfig):
+            config = OmegaConf.create(plain(source, where))
+        unresolved(config, where)
+        return plain(config, where)
     except OmegaConfBaseException as error:
         raise ValueError(f"{where}: {error}") from error
-    except OSError as error:
-        if error.errno is not None:
-            raise
-        # OmegaConf's way to refuse a file that holds a bare number.
-        raise ValueError(f"{where}: {error}; must hold a mapping of keys to values") from error
 
 
 def _part(where: str, key: str, value: object, air: Builder, folder: Path) -> object:

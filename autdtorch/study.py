@@ -6,7 +6,6 @@ import functools
 import inspect
 import math
 import os
-import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
@@ -23,7 +22,14 @@ from autdtorch.results import MethodResult, SceneResult, Simulation, StudyResult
 from autdtorch.scene import Scene
 from autdtorch.study_folder import StudyFolder, open_folder
 from autdtorch.trial_file import TrialFile
-from autdtorch.validation import LENGTH_TOLERANCE, distances, integer_at_least, invalid, positive
+from autdtorch.validation import (
+    LENGTH_TOLERANCE,
+    distances,
+    integer_at_least,
+    invalid,
+    positive,
+    require_name,
+)
 
 #: An optimiser with its settings bound. Where it has parameters `trials` and `seed` it gets a sequence of the
 #: numbers of the trials to run, of which it is to return as many, and the study's seed.
@@ -35,8 +41,6 @@ _BLOCK_SECONDS = 10.0  # so that about as much is lost when the process is kille
 
 _LARGEST_SEED = 2**63 - 1  # the largest integer that a results file holds
 _MOST_SAMPLES = 10**6  # of an observation plane: 16 complex columns of them are 256 MB
-
-_NAME = re.compile(r"[\w.+-]+")  # of scenes and methods: they become names of files and of groups in them
 
 
 def run_study(
@@ -105,8 +109,7 @@ def _check(
         if not named:
             raise ValueError(f"{field}: empty; must have at least one")
         for name in named:
-            if not _NAME.fullmatch(name):
-                raise invalid(field, name, "a name must consist of letters, digits and _ . + -")
+            require_name(field, name)
     if integer_at_least("seed", seed, 0) > _LARGEST_SEED:
         raise invalid("seed", seed, f"must be an integer from 0 to {_LARGEST_SEED}")
     random = [name for name, method in methods.items() if "trials" in inspect.signature(method).parameters]

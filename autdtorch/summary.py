@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Callable, Mapping
+from pathlib import Path
 
 from autdtorch.collect import Settings
 from autdtorch.findings import find
 from autdtorch.results import MethodResult, StudyResult
+from autdtorch.writing import replacing
 
 SUMMARY_FILE = "summary.csv"
 
@@ -43,7 +45,7 @@ def save_summary(
         OSError: the file cannot be written.
     """
     keys = sorted({key for settings in swept.values() for key in settings})
-    with open(path, "w", newline="", encoding="utf-8") as file:
+    with replacing(Path(path)) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         lines = csv.writer(file)
         lines.writerow(["scene", "method", *keys, *_COLUMNS])
         for name, scene in results.scenes.items():

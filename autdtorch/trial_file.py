@@ -16,7 +16,7 @@ from autdtorch.drive import validate_single_drive
 from autdtorch.json_lines import JsonLines
 from autdtorch.metrics import focus_metrics
 from autdtorch.objective import validate_magnitudes
-from autdtorch.optim.base import Solution, joined
+from autdtorch.optim.base import NEAR_TIE, Solution, joined
 from autdtorch.validation import finite_number, integer_at_least, invalid, not_negative, real_tensor
 
 TRIALS_FILE = "trials.jsonl"
@@ -122,8 +122,9 @@ class TrialFile:
         if history.shape != (evaluations,) or (history.diff() < 0).any():
             raise invalid("history", history, f"must be {evaluations} numbers, none below the one before")
         score = finite_number("score", row["score"])
-        if score > history[-1]:
-            raise invalid("score", score, f"must be at most {history[-1]:g}, the best of the history")
+        best = float(history[-1])
+        if score > best + NEAR_TIE * abs(best):  # the last drive, of `identify`
+            raise invalid("score", score, f"must be at most {best:g}, the best of the history")
         solution = Solution(
             validate_single_drive(drive, transducers)[None],
             validate_magnitudes("pressure", row["pressure"], foci)[None],

@@ -7,6 +7,7 @@ wrong is reported as a `ValueError` of the shape ``field: value unit; accepted r
 from __future__ import annotations
 
 import numbers
+import re
 from collections.abc import Sequence
 from typing import TypeAlias
 
@@ -19,6 +20,9 @@ Vector: TypeAlias = tuple[float, float, float]
 
 #: Lengths that differ by less are the same [m]: far above rounding at metre scale, far below any wavelength.
 LENGTH_TOLERANCE = 1e-9
+
+_NAME = re.compile(r"(?!\.+$)[\w.+-]+")
+_LONGEST_NAME = 100
 
 _SHOWN_ENTRIES = 9
 _SHOWN_CHARACTERS = 120
@@ -89,6 +93,17 @@ def integer_at_least(name: str, value: object, minimum: int) -> int:
     if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < minimum:
         raise invalid(name, value, f"must be an integer >= {minimum}")
     return int(value)
+
+
+def require_name(field: str, name: str) -> None:
+    """Check a name that becomes part of the names of files and of groups in them.
+
+    Raises:
+        ValueError: other characters than letters, digits and _ . + -, dots alone, or more than 100 bytes.
+    """
+    if not _NAME.fullmatch(name) or len(name.encode()) > _LONGEST_NAME:
+        accepted = "a name must consist of letters, digits and _ . + -, not of dots alone"
+        raise invalid(field, name, f"{accepted}, and have at most {_LONGEST_NAME} bytes")
 
 
 def require_one_of(name: str, value: object, accepted: tuple[str, ...]) -> None:

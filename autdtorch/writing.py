@@ -28,6 +28,7 @@ def replacing(path: Path) -> Iterator[Path]:
     """
     partial = path.with_name(f"{path.name}.partial")
     with naming(path):
+        partial.unlink(missing_ok=True)  # it may be a link to another file
         try:
             yield partial
             with partial.open("rb+") as file:

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from generated_block import fill_in, measured, table
-from numba import get_num_threads, njit, prange
+from numba import njit, prange
+from torch import get_num_threads
 
 import autdtorch as at
 from autdtorch.fdtd.grid import make_box

@@ -7,7 +7,6 @@ import os
 from pathlib import Path
 
 import hypothesis
-import numba
 import pytest
 import torch
 
@@ -23,7 +22,6 @@ if not torch.cuda.is_available():
 if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
     THREADS = max(1, (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))
     torch.set_num_threads(THREADS)
-    numba.set_num_threads(min(THREADS, numba.get_num_threads()))
     os.environ["OMP_NUM_THREADS"] = str(THREADS)  # of the processes that tests start
 
 

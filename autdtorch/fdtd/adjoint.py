@@ -27,9 +27,13 @@ from autdtorch.fdtd.kernels.contract import Kernel, Layer, Receivers, Sources, S
 from autdtorch.fdtd.points import PointWeights
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
+from autdtorch.threads import spread
 
 _SEGMENT_BYTES = 128 * 2**20
 """Of what is recorded in a segment at once; longer ones only where the states kept would take more."""
+
+_CELLS_AT_ONCE = 1000
+"""Cells whose derivatives are a piece of work."""
 
 _ROUNDING = 4
 """Roundings of the largest singular value below which others are nothing else."""
@@ -153,10 +157,10 @@ class _Neighbourhood:
         field[:, 0], field[:, 1:] = first[0], after[:-1].T
         place = torch.zeros(int(self.cells[-1]) + 1, dtype=torch.int32)
         place[self.cells] = torch.arange(len(self.cells), dtype=torch.int32)
-        correlate(
-            adjoint.T.contiguous().numpy(), field.numpy(), self.index.numpy(), self.offsets.numpy(),
-            place.numpy(), total.numpy(),
-        )  # fmt: skip
+        tensors = adjoint.T.contiguous(), field, self.index, self.offsets, place, total
+        arrays = [tensor.numpy() for tensor in tensors]
+        ends = pairwise([*range(0, len(self.index), _CELLS_AT_ONCE), len(self.index)])
+        spread(lambda rows: correlate(*rows, *arrays), ends)
 
 
 class _Recorded(torch.autograd.Function):

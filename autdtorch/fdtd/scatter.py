@@ -22,7 +22,7 @@ from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.points import PointWeights
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
-from autdtorch.freespace import superposition
+from autdtorch.fdtd.superposition import superposition
 
 _BESIDE = 1.25
 """Cells from the rim of the interior up to which points are not read. The outermost are not interpolated
@@ -111,15 +111,16 @@ class Scattering:
         """Positions (n, 3) of the radiating cells, the cells (m,) they read, and with what weights (n, m)."""
         assembly = self.assembly
         grid, stencil = assembly.grid, assembly.stencil
-        chi = np.zeros(grid.shape)
-        chi[tuple(slice(first + 3, last - 3) for first, last in zip(grid.first, grid.last, strict=True))] = 1
-        interior = np.zeros(grid.shape, bool)
-        interior[tuple(map(slice, grid.first, grid.last))] = True
-        index = np.flatnonzero(interior)
+
+        def inside(depth: int) -> tuple[slice, ...]:
+            ends = zip(grid.first, grid.last, strict=True)
+            return tuple(slice(first + depth, last - depth) for first, last in ends)
+
+        chi, radiating = np.zeros(grid.shape), np.zeros(grid.shape, bool)
+        chi[inside(3)], radiating[inside(2)], radiating[inside(4)] = 1, True, False
+        index = np.flatnonzero(radiating)
         around = index[:, None] + flat_offsets(grid.shape)
         step = chi.ravel()[around] - chi.ravel()[index, None]
-        radiating = step.any(axis=1)
-        index, around, step = index[radiating], around[radiating], step[radiating]
         cells, place = np.unique(around[step != 0], return_inverse=True)
         row, column = np.nonzero(step)
         factor = assembly.coefficients.face / stencil.face * grid.spacing

@@ -72,6 +72,7 @@ def run_to_steady_state(
     tolerance: float,
     max_periods: int,
     judged: Callable[[torch.Tensor], torch.Tensor],
+    stepped: Callable[[int], None],
 ) -> SteadyState:
     """Step until the limit of what is wanted stands, or `max_periods` have passed.
 
@@ -84,12 +85,14 @@ def run_to_steady_state(
         max_periods: after which to stop in any case.
         judged: what of the phasors (k,) must stand. A run is not judged before sound has crossed the grid
             twice.
+        stepped: is called with the number of periods after each block.
     """
     earliest = fewest_periods(assembly.grid.diagonal / assembly.grid.wavelength)
     sequence = Extrapolation(min(max(_FEWEST_PHASORS, _MOST_NUMBERS // len(cells)), _MOST_PHASORS))
     values: deque[torch.Tensor] = deque(maxlen=3)
     ramp = math.ceil(RAMP_PERIODS * assembly.steps_per_period)
     for count, windows in windows_of_run(assembly, kernel, sources, cells):
+        stepped(block_of(assembly.steps_per_period)[1])
         for start, phasor in windows:
             if start >= ramp:
                 sequence.append(phasor)

@@ -1,4 +1,4 @@
-"""The body that a triangle mesh encloses. libigl reads the file and measures distances."""
+"""The body that a triangle mesh encloses. libigl reads STL files and measures distances."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from autdtorch.geometry import rotation_matrix
 from autdtorch.obstacles.base import Obstacle, content_digest
+from autdtorch.obstacles.mesh_file import read_obj, read_ply
 from autdtorch.validation import Vector, finite_vector, invalid, positive
 
 _FORMATS = (".stl", ".obj", ".ply")
@@ -107,9 +108,10 @@ def _read(path: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """
     import igl
 
+    readers = {".obj": read_obj, ".ply": read_ply}
     try:
-        corners, triangles = igl.read_triangle_mesh(path)
-    except RuntimeError as error:
+        corners, triangles = readers.get(Path(path).suffix.lower(), igl.read_triangle_mesh)(path)
+    except (RuntimeError, ValueError, LookupError, OverflowError) as error:
         raise invalid("Mesh.path", path, f"must be a mesh file ({error})") from error
     whole = triangles.size > 0 and 0 <= triangles.min() <= triangles.max() < len(corners)
     if not whole or triangles.shape[1] != 3 or not np.isfinite(corners).all():

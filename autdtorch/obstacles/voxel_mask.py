@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import zipfile
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from autdtorch.numpy_file import read_arrays
 from autdtorch.obstacles.base import Obstacle, content_digest
 from autdtorch.obstacles.triangles import BOX_TRIANGLES
 from autdtorch.validation import Vector, finite_vector, invalid, positive
@@ -188,10 +188,8 @@ def _checked_mask(given: object) -> NDArray[np.bool_]:
 
 def _read(path: Path) -> NDArray[Any]:
     try:
-        with path.open("rb") as file:
-            content = np.load(file, allow_pickle=False)
-            arrays = [content] if isinstance(content, np.ndarray) else list(content.values())
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
+        arrays = list(read_arrays(path).values())
+    except (OSError, ValueError) as error:
         raise invalid("VoxelMask.path", str(path), f"must be a .npy or .npz file ({error})") from error
     if len(arrays) != 1:
         raise invalid("VoxelMask.path", str(path), f"holds {len(arrays)} arrays, must hold a single one")

@@ -85,6 +85,26 @@ def joined(solutions: Sequence[Solution]) -> Solution:
     return Solution(history=torch.cat(histories), **columns)
 
 
+NEAR_TIE = 1e-5
+"""Relative difference of scores that count as equal. In symmetric scenes many are, but for the rounding of
+the simulation, which another machine does otherwise."""
+
+
+def first_of_best(score: torch.Tensor) -> torch.Tensor:
+    """Return the index (T,) of the first of scores (T, B) within `NEAR_TIE` of the best."""
+    best = score.amax(dim=1, keepdim=True)
+    return (score >= best - NEAR_TIE * best.abs()).byte().argmax(dim=1)
+
+
+def best_first(score: torch.Tensor) -> torch.Tensor:
+    """Return the indices (T, B) of scores (T, B) from the best on, near ties in ascending order."""
+    order = score.argsort(dim=1, descending=True, stable=True)
+    ranked = score.gather(1, order)
+    apart = ranked[:, :-1] - ranked[:, 1:] > NEAR_TIE * ranked[:, :-1].abs()
+    group = torch.nn.functional.pad(apart.cumsum(dim=1), (1, 0))
+    return order.gather(1, (group * score.shape[1] + order).argsort(dim=1))
+
+
 class Ledger:
     """Evaluates drives for several trials at once, and keeps what was found.
 
@@ -136,8 +156,9 @@ class Ledger:
         _require_shape("score", score, batch)
 
         trials = torch.arange(len(self._best)) if trials is None else trials
-        best, index = score.max(dim=1)
-        row = torch.nonzero(best > self._best[trials])[:, 0]
+        index = first_of_best(score)
+        best = score.gather(1, index[:, None])[:, 0]
+        row = torch.nonzero(best - NEAR_TIE * best.abs() > self._best[trials])[:, 0]
         better = trials[row]
         self._best[better] = best[row]
         self._drive[better] = drive[row, index[row]]
@@ -160,7 +181,7 @@ class Ledger:
             most: evaluations that a trial could have made, where trials may end early: with it the history
                 of a trial is as long whatever trials are run beside it.
         """
-        history = torch.cat(self._scores, dim=1).cummax(dim=1).values
+        history = torch.cat(self._scores, dim=1).cummax(dim=1).values.minimum(self._best[:, None])
         if most is not None:
             ended = history[:, -1:].expand(-1, most - history.shape[1])
             history = torch.cat([history, ended], dim=1)

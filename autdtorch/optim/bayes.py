@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from typing import Literal
 
 import torch
@@ -11,6 +10,7 @@ import torch
 from autdtorch.drive import drive_from_phases
 from autdtorch.objective import Objective, Score, weakest_focus
 from autdtorch.optim.base import Ledger, Solution, Trials, trial_seeds
+from autdtorch.threads import spread
 from autdtorch.validation import integer_at_least, invalid, number_between, require_one_of
 
 #: Variance of the observation noise that the Gaussian process assumes, in its own variances. Fitted, it takes
@@ -90,13 +90,12 @@ def bayes_opt(
     )
     ledger = Ledger(objective, len(seeds), score)
     searches = [BayesTrial(settings, trial) for trial in seeds]
-    # What is compiled does not hold the interpreter's lock.
-    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        points = torch.stack([search.initial_points() for search in searches])
+    points = torch.stack([search.initial_points() for search in searches])
+    scores = ledger.evaluate(_drive(points, fixed_transducer))
+    for _ in range(initial, evaluations):
+        told = zip(searches, points, scores, strict=True)
+        points = torch.stack(spread(lambda one: one[0].next_point(*one[1:]), told))[:, None]
         scores = ledger.evaluate(_drive(points, fixed_transducer))
-        for _ in range(initial, evaluations):
-            points = torch.stack(list(pool.map(BayesTrial.next_point, searches, points, scores)))[:, None]
-            scores = ledger.evaluate(_drive(points, fixed_transducer))
     return ledger.solution()
 
 

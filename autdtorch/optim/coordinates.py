@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import torch
 
 from autdtorch.drive import drive_from_phases
-from autdtorch.optim.base import Ledger
+from autdtorch.optim.base import Ledger, first_of_best
 from autdtorch.validation import integer_at_least, invalid
 
 
@@ -43,7 +43,8 @@ def take_best_levels(
 ) -> torch.Tensor:
     """Go through the weights of every trial in its `order`; each takes the best of `levels` phases.
 
-    A step takes `levels` evaluations a trial, in one call of the objective for all trials.
+    A step takes `levels` evaluations a trial, in one call of the objective for all trials. Of near ties the
+    first level is taken (`first_of_best`).
 
     Args:
         ledger: counts the evaluations.
@@ -61,7 +62,7 @@ def take_best_levels(
     for index in order.T:
         candidates = weights[:, None].repeat(1, levels, 1)
         candidates[rows, :, index] = choices
-        best = ledger.evaluate(drive(candidates), trials).argmax(dim=1)
+        best = first_of_best(ledger.evaluate(drive(candidates), trials))
         weights = candidates[rows, best]
     return weights
 

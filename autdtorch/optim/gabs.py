@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 
 from autdtorch.objective import Objective, Score, weakest_focus
-from autdtorch.optim.base import Ledger, Solution, Trials, trial_seeds
+from autdtorch.optim.base import Ledger, Solution, Trials, best_first, trial_seeds
 from autdtorch.optim.coordinates import indices_of, repeat_passes, take_best_levels
 from autdtorch.validation import integer_at_least, invalid
 
@@ -65,7 +65,7 @@ def gabs(
     alone = torch.eye(transducers, dtype=torch.complex128)
     if orders is None:
         scores = ledger.evaluate(alone.expand(len(seeds), -1, -1))
-        orders = _with_first(scores.argsort(dim=1, descending=True, stable=True), first)
+        orders = _with_first(best_first(scores), first)
     else:
         orders = _with_first(orders, first)
         ledger.evaluate(alone[orders[:, :1]])

@@ -11,7 +11,7 @@ import torch
 
 from autdtorch.objective import Objective, weakest_focus
 from autdtorch.optim.base import Ledger, Solution, Trials, trial_seeds
-from autdtorch.optim.threads import one_thread
+from autdtorch.threads import one_torch_thread
 from autdtorch.validation import integer_at_least, invalid
 
 # From first to last in equal ratios: temperature of the smooth minimum, in mean pressures of the foci, and
@@ -66,7 +66,7 @@ def random_drives(count: int, transducers: int, generator: torch.Generator) -> t
     return torch.polar(torch.ones_like(phases), phases)
 
 
-@one_thread()
+@one_torch_thread()
 def climb(matrix: torch.Tensor, drive: torch.Tensor, steps: int) -> torch.Tensor:
     """The drive of the strongest weakest focus that projected gradient ascent with momentum finds.
 

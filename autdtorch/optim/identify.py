@@ -14,7 +14,7 @@ from autdtorch.conditions import playable
 from autdtorch.objective import Objective, weakest_focus
 from autdtorch.optim.base import Ledger, Solution, Trials, trial_seeds
 from autdtorch.optim.gradient import climb, random_drives
-from autdtorch.optim.threads import one_thread
+from autdtorch.threads import one_torch_thread
 from autdtorch.validation import integer_at_least, invalid
 
 _GUESSES = 16  # rows from which the search for each row begins
@@ -79,7 +79,7 @@ def identify(objective: Objective, evaluations: int = 64, trials: Trials = 1, se
     return replace(ledger.solution(), drive=chosen, pressure=pressure, score=weakest_focus(pressure))
 
 
-@one_thread()
+@one_torch_thread()
 def _search(drives: torch.Tensor, observed: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
     """Rows of the transfer matrix (M, P) that explain magnitudes (N, P) observed under `drives` (N, M).
 
@@ -99,7 +99,7 @@ def _search(drives: torch.Tensor, observed: torch.Tensor, generator: torch.Gener
     return rows.reshape(transducers, foci, _GUESSES)[:, torch.arange(foci), misfit.argmin(dim=1)]
 
 
-@one_thread()
+@one_torch_thread()
 def _fit(drives: torch.Tensor, observed: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
     """Least-squares fit of rows (M, K) to magnitudes (N, K), from `rows` on: phases and rows in turn."""
     inverse = torch.linalg.pinv(drives)

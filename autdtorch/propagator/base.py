@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
+import math
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import ClassVar, Literal, Protocol, Self, overload
@@ -19,11 +20,14 @@ from autdtorch.drive import validate_drive
 from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.points import footprint
 from autdtorch.fdtd.spacing import grid_error, second_spacing
-from autdtorch.fdtd.steady_state import SteadyState
+from autdtorch.fdtd.steady_state import SteadyState, fewest_periods
 from autdtorch.fdtd.stepping import Assembly
+from autdtorch.progress import show_progress
+from autdtorch.propagator.cost import USUAL_PERIODS
 from autdtorch.propagator.symmetry import Plan, Symmetry, backward_plan, forward_plan, symmetries
 from autdtorch.scene import Scene
 from autdtorch.source import package_versions, source_digest
+from autdtorch.threads import one_torch_thread
 from autdtorch.validation import ArrayLike, points_grid
 
 logger = logging.getLogger(__name__)
@@ -95,6 +99,7 @@ class SimulatedPropagator(ABC):
 
     method: ClassVar[str]
 
+    @one_torch_thread()
     def __init__(
         self,
         scene: Scene,
@@ -142,11 +147,24 @@ class SimulatedPropagator(ABC):
         """Whether a source at any of the points (N, 3) would not be all in air, on the grid."""
 
     @abstractmethod
-    def _simulate(self, origins: Sequence[Nodes], strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
+    def _simulate(
+        self,
+        origins: Sequence[Nodes],
+        strength: torch.Tensor,
+        targets: Nodes,
+        stepped: Callable[[int], None],
+    ) -> torch.Tensor:
         """Pressure (R, P) of R runs, each with N origins of strengths (R, N), none of them silent.
 
-        Of each of P targets it is the mean over the nodes.
+        Of each of P targets it is the mean over the nodes. `stepped` is called with numbers of periods.
         """
+
+    def _watched(self, origins: Sequence[Nodes], strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
+        """`_simulate`, with its progress shown."""
+        crossing = max(assembly.grid.diagonal / assembly.grid.wavelength for assembly in self._assemblies)
+        periods = math.ceil(len(origins) * USUAL_PERIODS * fewest_periods(crossing))
+        with show_progress(periods, f"simulating {self.scene.name}") as progress:
+            return self._simulate(origins, strength, targets, progress.advance)
 
     def _plan(self, points: torch.Tensor) -> Plan:
         """The fewest simulations for a transfer matrix: from the transducers or, by reciprocity, from points.
@@ -195,6 +213,7 @@ class SimulatedPropagator(ABC):
         self, points: ArrayLike | None = None, *, return_error: Literal[True]
     ) -> tuple[torch.Tensor, float]: ...
 
+    @one_torch_thread()
     def transfer_matrix(
         self, points: ArrayLike | None = None, return_error: bool = False
     ) -> torch.Tensor | tuple[torch.Tensor, float]:
@@ -226,6 +245,7 @@ class SimulatedPropagator(ABC):
         second = self._second.transfer_matrix(points)
         return matrix, remaining + grid_error(matrix, second, coarser=self._second.spacing > self.spacing)
 
+    @one_torch_thread()
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
         """Pressure of drives at points, from a simulation a drive or from the transfer matrix.
 
@@ -251,7 +271,7 @@ class SimulatedPropagator(ABC):
         loud = flat.any(dim=1)
         runs = [nodes] * int(loud.sum())
         if runs:
-            field[loud] = self._simulate(runs, array.source_strength * flat[loud], single_nodes(points))
+            field[loud] = self._watched(runs, array.source_strength * flat[loud], single_nodes(points))
         return field.reshape(*drive.shape[:-1], *grid)
 
     def _kept_matrix(self, points: torch.Tensor) -> tuple[torch.Tensor, float]:
@@ -296,7 +316,7 @@ class SimulatedPropagator(ABC):
         runs = [Nodes(origins.positions[index : index + 1], origins.weights) for index in own]
         strength = torch.full((len(runs), 1), self.scene.array.source_strength, dtype=torch.complex128)
         rows = torch.zeros((count, len(heard.positions)), dtype=torch.complex128)
-        rows[own] = self._simulate(runs, strength, heard)
+        rows[own] = self._watched(runs, strength, heard)
         for index in np.flatnonzero(plan.stands != np.arange(count)):
             rows[index] = rows[plan.stands[index], plan.images[plan.by[index]]]
         return rows if plan.backward else rows.mT.contiguous()

@@ -8,7 +8,6 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import TypeAlias
 
 import torch
@@ -22,6 +21,7 @@ from autdtorch.propagator.base import MOST_JUDGED, SimulatedPropagator
 from autdtorch.propagator.coupling import coupled_runs
 from autdtorch.propagator.groups import MOST_PASSES, cheapest_grouping, one_box
 from autdtorch.scene import Scene
+from autdtorch.threads import spread
 from autdtorch.validation import LENGTH_TOLERANCE, ArrayLike, distances, invalid, points_tensor
 
 logger = logging.getLogger(__name__)
@@ -75,7 +75,13 @@ class BoxPropagator(SimulatedPropagator):
         return any(box.assembly.touches_varying(points[box.inside(points)]) for box in self._boxes)
 
     @torch.no_grad()
-    def _simulate(self, origins: Sequence[Nodes], strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
+    def _simulate(
+        self,
+        origins: Sequence[Nodes],
+        strength: torch.Tensor,
+        targets: Nodes,
+        stepped: Callable[[int], None],
+    ) -> torch.Tensor:
         points, weights = targets.positions, targets.weights.to(torch.complex128)
         drives = list(zip(origins, strength, strict=True))
         incident = torch.stack(
@@ -89,16 +95,16 @@ class BoxPropagator(SimulatedPropagator):
             self._warn_near_obstacle(nodes)
         reaches = [box.reach(targets) for box in self._boxes]
         if len(self._boxes) == 1:
-            phasors = self._in_one_box(drives, incident, reaches[0])
+            phasors = self._in_one_box(drives, incident, reaches[0], stepped)
         else:
-            coupled = self._in_several_boxes(drives, incident, reaches)
+            coupled = self._in_several_boxes(drives, incident, reaches, stepped)
             if coupled is None:
                 logger.warning(
                     "%d boxes hear too much of each other: not settled after %d passes; one box instead",
                     len(self._boxes), MOST_PASSES,
                 )  # fmt: skip
                 self._assemblies = self._boxed([range(len(self.scene.obstacles))])
-                return self._simulate(origins, strength, targets)
+                return self._simulate(origins, strength, targets, stepped)
             phasors = coupled
         parts = torch.split(phasors, [len(reach.cells) for reach in reaches])
         total = incident + sum(reach.field(part) for reach, part in zip(reaches, parts, strict=True))
@@ -107,27 +113,33 @@ class BoxPropagator(SimulatedPropagator):
             silent = torch.where(obstacle.contains(points).any(dim=1), obstacle.rigid, silent)
         return total.mT.masked_fill(silent, 0)
 
-    def _in_one_box(self, drives: Sequence[Drive], incident: torch.Tensor, reach: Reach) -> torch.Tensor:
+    def _in_one_box(
+        self, drives: Sequence[Drive], incident: torch.Tensor, reach: Reach, stepped: Callable[[int], None]
+    ) -> torch.Tensor:
         """Phasors (k, R) of the cells that `reach` reads, incident (P, R) being the field at its targets."""
         (box,) = self._boxes
         every = math.ceil(len(incident) / MOST_JUDGED)
         matrix = reach.matrix(every)
 
         @torch.no_grad()  # which is each thread's own
-        def run(drive: Drive, direct: torch.Tensor) -> tuple[SteadyState, float]:
-            begin = time.perf_counter()
-            steady = self._run(box, box.driving(*drive), reach, self.tolerance, _heard(matrix, direct))
+        def run(given: tuple[Drive, torch.Tensor]) -> tuple[SteadyState, float]:
+            begin, (drive, direct) = time.perf_counter(), given
+            judged = _heard(matrix, direct)
+            steady = self._run(box, box.driving(*drive), reach, self.tolerance, judged, stepped)
             return steady, time.perf_counter() - begin
 
-        at_once = min(self._kernel.at_once(box.assembly.grid.shape), len(drives))
-        with ThreadPoolExecutor(at_once) as pool:
-            runs = list((pool.map if at_once > 1 else map)(run, drives, incident[::every].mT))
+        given = zip(drives, incident[::every].mT, strict=True)
+        runs = spread(run, given, self._kernel.at_once(box.assembly.grid.shape))
         for steady, seconds in runs:
             self._note(steady, seconds)
         return torch.stack([steady.pressure for steady, _ in runs], dim=1)
 
     def _in_several_boxes(
-        self, drives: Sequence[Drive], incident: torch.Tensor, reaches: Sequence[Reach]
+        self,
+        drives: Sequence[Drive],
+        incident: torch.Tensor,
+        reaches: Sequence[Reach],
+        stepped: Callable[[int], None],
     ) -> torch.Tensor | None:
         """The same for the cells of all boxes, one after the other; None if they do not settle."""
         every = math.ceil(len(incident) / MOST_JUDGED)
@@ -135,7 +147,7 @@ class BoxPropagator(SimulatedPropagator):
 
         def simulate(index: int, field: torch.Tensor, tolerance: float) -> SteadyState:
             reach = reaches[index]  # judged by all that leaves the box
-            return self._run(self._boxes[index], field, reach, tolerance, reach.amplitudes)
+            return self._run(self._boxes[index], field, reach, tolerance, reach.amplitudes, stepped)
 
         driving = [torch.stack([box.driving(*drive) for drive in drives], dim=1) for box in self._boxes]
         heard = _heard(matrix, incident[::every])
@@ -147,13 +159,19 @@ class BoxPropagator(SimulatedPropagator):
         return torch.stack([run.steady.pressure for run in coupled], dim=1)
 
     def _run(
-        self, box: Scattering, field: torch.Tensor, reach: Reach, tolerance: float, judged: Judged
+        self,
+        box: Scattering,
+        field: torch.Tensor,
+        reach: Reach,
+        tolerance: float,
+        judged: Judged,
+        stepped: Callable[[int], None],
     ) -> SteadyState:
         sources = box.sources(field)
         if not sources.force.any():  # obstacles like air, or drives that cancel
             return SteadyState(torch.zeros(len(reach.cells), dtype=torch.complex128), 0, 0.0, True)
         return run_to_steady_state(
-            box.assembly, self._kernel, sources, reach.cells, tolerance, self.max_periods, judged
+            box.assembly, self._kernel, sources, reach.cells, tolerance, self.max_periods, judged, stepped
         )
 
 

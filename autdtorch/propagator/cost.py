@@ -23,6 +23,10 @@ _PAIR = 1.0
 """What a term of a sum over Green's function costs, in steps of a cell: 6 ns and 2 to 8 ns on one core."""
 
 
+USUAL_PERIODS = 1.6
+"""Periods of a usual run over the fewest: most obstacles ring a little."""
+
+
 @dataclass(frozen=True)
 class GridCost:
     """What a run on a grid takes, at least. Cavities that ring take more steps, on any grid.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -34,7 +34,13 @@ class FullPropagator(SimulatedPropagator):
         return self._assemblies[0].touches_varying(points)
 
     @torch.no_grad()
-    def _simulate(self, origins: Sequence[Nodes], strength: torch.Tensor, targets: Nodes) -> torch.Tensor:
+    def _simulate(
+        self,
+        origins: Sequence[Nodes],
+        strength: torch.Tensor,
+        targets: Nodes,
+        stepped: Callable[[int], None],
+    ) -> torch.Tensor:
         (assembly,) = self._assemblies
         spread = assembly.spread(targets.positions, targets.weights)
         cells = np.unique(spread.index)
@@ -47,6 +53,7 @@ class FullPropagator(SimulatedPropagator):
             steady = run_to_steady_state(
                 assembly, self._kernel, assembly.sources(nodes.positions, own, nodes.weights), cells,
                 self.tolerance, self.max_periods, lambda phasor: torch.from_numpy(some @ phasor.numpy()),
+                stepped,
             )  # fmt: skip
             self._note(steady, time.perf_counter() - begin)
             rows.append(torch.from_numpy(read @ steady.pressure.numpy()))

@@ -30,6 +30,10 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
         return 0
 
     yield command
+    if "joblib" in sys.modules:  # else the next test would get workers in the folder of this one
+        from joblib.externals.loky import get_reusable_executor
+
+        get_reusable_executor().shutdown(kill_workers=True)
     # Hydra's logging writes to the stderr of this test alone.
     root.handlers[:] = handlers
     root.setLevel(levels[0])

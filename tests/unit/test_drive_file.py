@@ -117,7 +117,7 @@ def test_what_is_wrong_with_an_npz_file_is_said(tmp_path):
         load_drive(tmp_path / "d.npz")
     with (tmp_path / "d.npz").open("wb") as file:
         np.save(file, np.ones(3))  # a single array, as .npy
-    with pytest.raises(ValueError, match=r"d.npz: .*must be a .npz file of plain arrays"):
+    with pytest.raises(ValueError, match=r"d.npz: no array 'drive'"):
         load_drive(tmp_path / "d.npz")
 
 

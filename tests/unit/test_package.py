@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import types
 import zipfile
 from pathlib import Path
 
@@ -57,9 +58,9 @@ def test_import_loads_no_heavy_package(imported: tuple[float, list[str], list[st
     assert after_plots == ["matplotlib"]
 
 
-def test_view3d_is_the_function_even_if_its_module_is_imported_first() -> None:
-    code = "import autdtorch.view3d\nassert callable(autdtorch.view3d)"
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+def test_no_public_name_is_that_of_a_module() -> None:
+    """Where one is, lazy_loader replaces the package's type, which pickle then refuses (joblib's workers)."""
+    assert type(at) is types.ModuleType
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:

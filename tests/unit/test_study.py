@@ -5,7 +5,7 @@ import itertools
 import logging
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
@@ -99,7 +99,11 @@ def test_a_scene_without_observation_plane_has_no_areas() -> None:
 
 def test_the_runs_of_a_simulation_are_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     def simulate(
-        self: FullPropagator, origins: Sequence[Nodes], strength: torch.Tensor, targets: Nodes
+        self: FullPropagator,
+        origins: Sequence[Nodes],
+        strength: torch.Tensor,
+        targets: Nodes,
+        stepped: Callable[[int], None],
     ) -> torch.Tensor:
         rows = []
         for nodes, own in zip(origins, strength, strict=True):

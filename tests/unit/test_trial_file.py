@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from autdtorch.json_lines import SET_ASIDE, line_of, row_of
-from autdtorch.optim.base import Solution
+from autdtorch.optim.base import NEAR_TIE, Solution
 from autdtorch.trial_file import TRIALS_FILE, TrialFile
 
 ORIGIN = "the study's"
@@ -184,9 +184,10 @@ def test_the_trials_of_another_study_do_not_count(path: Path, lines: list[bytes]
     assert path.read_bytes().splitlines() == lines
 
 
-def test_a_last_drive_that_scored_below_the_best_comes_back(path: Path) -> None:
+@pytest.mark.parametrize("score", [0.5, 1 + NEAR_TIE / 2])
+def test_a_last_drive_that_scored_below_the_best_or_near_it_comes_back(path: Path, score: float) -> None:
     """As `identify` returns it."""
     solution = found(1, 4)
-    solution.score[0] = solution.history[0, 1]
+    solution.score[0] = score * solution.history[0, -1]
     opened(path).append("a", "identify", [0], solution, 1.0)
     assert_equal(opened(path).found("a", "identify", 1)[0], solution)

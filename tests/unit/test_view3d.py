@@ -13,7 +13,7 @@ import torch
 from small_scenes import scene_of_all_kinds, small_scene
 
 import autdtorch as at
-from autdtorch.view3d import animate3d, rendering_problem, view3d
+from autdtorch.rendering import animate3d, rendering_problem, view3d
 
 SPACING = 5e-3  # m, cells of the plane in the pictures
 
@@ -50,12 +50,6 @@ def broken_pyvista(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[
     rendering_problem.cache_clear()
 
 
-def test_the_name_stays_the_function_after_its_module_has_been_imported() -> None:
-    assert at.view3d is view3d
-    assert sys.modules["autdtorch.view3d"] is not view3d
-    assert at.animate3d is animate3d
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 def test_a_probe_killed_by_a_signal_is_a_reason(broken_pyvista: Callable[[str], None]) -> None:
     broken_pyvista("import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)")
@@ -77,7 +71,7 @@ def test_a_probe_that_hangs_is_a_reason(
     broken_pyvista: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     broken_pyvista("import time\ntime.sleep(60)")
-    monkeypatch.setattr(sys.modules["autdtorch.view3d.probe"], "_PROBE_TIMEOUT", 0.5)
+    monkeypatch.setattr(sys.modules["autdtorch.rendering.probe"], "_PROBE_TIMEOUT", 0.5)
     assert "did not end within 0.5 s" in str(rendering_problem())
 
 

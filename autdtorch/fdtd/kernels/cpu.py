@@ -1,37 +1,44 @@
-"""The kernel for CPUs, in numba: the same contract as the reference, in place, on all cores.
+"""The kernel for CPUs, in numba: the same contract as the reference, in place, on several cores.
 
-The planes of the grid are split into chunks, one for each core that has enough to do (`_cuts`); a step goes
-through each of them once (`cpu_sweep.py`). Then the outermost planes of a chunk get what its neighbours owe
-them, and single cells what concerns them. A small grid is one chunk, stepped without waking another thread:
-several of its runs can go side by side.
-
-numba's threads do not survive a fork: start processes that use this module by spawn.
+The planes of the grid are cut into chunks by its shape alone (`_cuts`), so that results do not depend on
+the number of threads. A step goes through each chunk once (`cpu_sweep.py`). Then the outermost planes of a
+chunk get what its neighbours owe them, and single cells what concerns them. Workers take up the chunks one by
+one (`cpu_workers.py`). A small grid is one chunk, stepped without another thread: several of its runs can go
+side by side.
 """
 
 from __future__ import annotations
 
 import math
-import os
-
-# What an idle OpenMP thread does while it waits for the next loop is decided when numba starts its threads.
-# If it sleeps at once it is not there when it is needed, on a busy machine least of all; it spins for a few
-# milliseconds here, which was best on an idle machine and on a busy one (docs/decisions/cpu-kernel.md).
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-os.environ.setdefault("GOMP_SPINCOUNT", "1000000")
+from collections.abc import Callable
 
 import numpy as np
 import torch
-from numba import get_num_threads, njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
+from autdtorch.fdtd.kernels.compiled import INNER, entry
 from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Receivers, Sources, State
 from autdtorch.fdtd.kernels.cpu_layout import Memory, plane_profiles, rows_profile
-from autdtorch.fdtd.kernels.cpu_sweep import INNER, stretch, sweep_planes
+from autdtorch.fdtd.kernels.cpu_sweep import stretch, sweep_planes
+from autdtorch.fdtd.kernels.cpu_workers import (
+    claim,
+    finish,
+    new_counters,
+    share_of_processors,
+    wait_for,
+    yield_address,
+)
+from autdtorch.threads import thread_count
 
 Array = NDArray[np.generic]
 
-_CHUNK_CELLS = 200_000
-"""Cells of a chunk at least: what a second thread needs to be woken for."""
+_CHUNK_CELLS, _CHUNK_PLANES = 200_000, 32
+"""Fewest cells and planes of a chunk: what a second thread is worth, and the sums at its ends."""
+
+_CROWDED, _FREE = 0.75, 0.9
+"""Shares of the processors' time that workers had: below the first one works alone, above the second several
+do again."""
 
 
 @njit(**INNER)
@@ -118,58 +125,58 @@ def _stretch_columns(p, columns, beside, place, memory, terms):  # type: ignore[
 
 
 @njit(**INNER)
-def _finish_step(p, q, columns, memory, closed):  # type: ignore[no-untyped-def]
-    """Add what surfaces through the layers differ by, and silence the closed cells."""
+def _finish_columns(p, q, columns, memory):  # type: ignore[no-untyped-def]
+    """Add what surfaces through the layers differ by."""
     (cut, crossed, crossing), (cut_memory, crossed_memory) = columns, memory
-    if len(cut[0]):
-        shares, beside = np.zeros_like(cut_memory[1]), np.zeros_like(crossed_memory[1])
-        alone, nothing = np.zeros_like(crossed[0]), np.zeros((0, 0), p.dtype)
-        _stretch_columns(p, crossed, nothing, alone, crossed_memory, beside)
-        _stretch_columns(p, cut, beside, crossing, cut_memory, shares)
-        for n in range(len(cut[0])):
-            for depth in range(len(shares)):
-                q[cut[0][n, depth + 1]] += shares[depth, n]
-    for n in range(len(closed)):
-        q[closed[n]] = 0
+    shares, beside = np.zeros_like(cut_memory[1]), np.zeros_like(crossed_memory[1])
+    alone, nothing = np.zeros_like(crossed[0]), np.zeros((0, 0), p.dtype)
+    _stretch_columns(p, crossed, nothing, alone, crossed_memory, beside)
+    _stretch_columns(p, cut, beside, crossing, cut_memory, shares)
+    for n in range(len(cut[0])):
+        for depth in range(len(shares)):
+            q[cut[0][n, depth + 1]] += shares[depth, n]
 
 
-@njit(cache=True, nogil=True)
-def _advance_alone(  # type: ignore[no-untyped-def]
-    p, q, medium, layers, cells, room, columns, memory, closed, sources, receivers, signal, recorded
-):
-    for step in range(len(signal)):
-        _sweep_chunk(0, p, q, medium, layers, cells, room)
-        _finish_chunk(0, q, medium, cells, room[-1], sources, signal[step])
-        _finish_step(p, q, columns, memory, closed)
-        _record(q, receivers, 0, recorded.shape[1], recorded[step])
-        p, q = q, p
+@entry()
+def _advance(  # type: ignore[no-untyped-def]
+    p, q, medium, layers, cells, room, columns, memory, closed, sources, receivers, signal, recorded,
+    counters, give_way,
+):  # fmt: skip
+    """Do tasks until none is left: each worker calls this with the same arguments.
+
+    A step has three phases of a task for each chunk: sweep it, finish it, silence closed cells. The first one
+    records the step before.
+    """
+    chunks, steps, read = len(medium[0]) - 1, len(signal), recorded.shape[1]
+    for _ in range((3 * steps + 1) * chunks):
+        task = claim(counters)
+        phase, c = task // chunks, task % chunks
+        if phase > 3 * steps:
+            break
+        wait_for(counters, phase * chunks, give_way)
+        step, kind = phase // 3, phase % 3
+        now, new = (p, q) if step % 2 == 0 else (q, p)
+        if kind == 0:
+            if step > 0:
+                first, last = c * read // chunks, (c + 1) * read // chunks
+                _record(now, receivers, first, last, recorded[step - 1])
+            if step < steps:
+                _sweep_chunk(c, now, new, medium, layers, cells, room)
+        elif kind == 1:
+            _finish_chunk(c, new, medium, cells, room[-1], sources, signal[step])
+        elif c == 0:
+            if len(columns[0][0]):
+                _finish_columns(now, new, columns, memory)
+            for n in range(len(closed)):
+                new[closed[n]] = 0
+        finish(counters)
 
 
-@njit(parallel=True, cache=True, nogil=True)
-def _advance_together(  # type: ignore[no-untyped-def]
-    p, q, medium, layers, cells, room, columns, memory, closed, sources, receivers, signal, recorded
-):
-    chunks, heard = len(medium[0]) - 1, recorded.shape[1]
-    for step in range(len(signal)):
-        for c in prange(chunks):
-            if step:
-                _record(p, receivers, c * heard // chunks, (c + 1) * heard // chunks, recorded[step - 1])
-            _sweep_chunk(c, p, q, medium, layers, cells, room)
-        for c in prange(chunks):
-            _finish_chunk(c, q, medium, cells, room[-1], sources, signal[step])
-        _finish_step(p, q, columns, memory, closed)
-        p, q = q, p
-    _record(p, receivers, 0, heard, recorded[-1])
-
-
-def _chunks(cells: int) -> int:
-    return max(1, min(get_num_threads(), cells // _CHUNK_CELLS))
-
-
-def _cuts(shape: torch.Size, layer_cells: int) -> NDArray[np.int64]:
-    """First planes of the chunks, and one past the last: the layers across x are not cut."""
+def _cuts(shape: tuple[int, ...]) -> NDArray[np.int64]:
+    """Return the first planes of the chunks, each thicker than a boundary layer, and one past the last."""
     planes = shape[0] - 2
-    chunks = max(1, min(_chunks(shape.numel()), planes // (layer_cells + 2)))
+    most = min(math.prod(shape) // _CHUNK_CELLS, planes // _CHUNK_PLANES)
+    chunks = 1 << max(0, most.bit_length() - 1)  # a power of two, which most numbers of cores divide
     return np.linspace(1, 1 + planes, chunks + 1).astype(np.int64)
 
 
@@ -201,9 +208,13 @@ def _varying_cells(c: Coefficients, strides: NDArray[np.int64]) -> tuple[Array, 
 class CpuKernel:
     """See `kernels.contract`; updates the state in place."""
 
+    def __init__(self) -> None:
+        """A kernel that has found the processors free so far."""
+        self._crowded = False
+
     def at_once(self, shape: tuple[int, int, int]) -> int:
         """One for each core, if the grid is one chunk."""
-        return get_num_threads() if _chunks(math.prod(shape)) == 1 else 1
+        return thread_count() if len(_cuts(shape)) == 2 else 1
 
     def advance(
         self,
@@ -215,7 +226,7 @@ class CpuKernel:
     ) -> tuple[State, torch.Tensor]:
         """See `Kernel.advance`."""
         c = coefficients
-        shape, cuts = state.now.shape, _cuts(state.now.shape, c.layer_cells)
+        shape, cuts = state.now.shape, _cuts(state.now.shape)
         plane = shape[1] * shape[2]
         dtype = c.varying_weight.numpy().dtype.type
         recorded = torch.empty((len(signal), len(receivers.index)), dtype=signal.dtype)
@@ -230,8 +241,7 @@ class CpuKernel:
             *plane_profiles(c, shape),
         )
         memory = Memory(state.layers)
-        advance = _advance_alone if len(cuts) == 2 else _advance_together
-        advance(
+        arguments = (
             state.now.numpy().reshape(-1),
             state.before.numpy().reshape(-1),
             medium,
@@ -246,7 +256,20 @@ class CpuKernel:
             (receivers.index.contiguous().numpy(), receivers.weight.contiguous().numpy()),
             signal.contiguous().numpy(),
             recorded.numpy(),
+            new_counters(),
+            yield_address(),
         )
+        self._work(lambda: _advance(*arguments), len(cuts) - 1)
         memory.give_back()
         now, before = (state.now, state.before) if len(signal) % 2 == 0 else (state.before, state.now)
         return State(now, before, state.layers, state.columns, state.crossed), recorded
+
+    def _work(self, advance: Callable[[], object], chunks: int) -> None:
+        """Step on as many threads as there are chunks, and processors that are free.
+
+        On a busy machine workers that wait for each other are slower than one alone.
+        """
+        workers = 1 if self._crowded else min(thread_count(), chunks)
+        share = share_of_processors(advance, workers)
+        if chunks > 1:
+            self._crowded = share < (_FREE if self._crowded else _CROWDED)

@@ -1,18 +1,18 @@
-"""Derivatives by the varying cells' weights, summed over the steps: in numba, on all cores."""
+"""Derivatives by the varying cells' weights, summed over the steps, on one core."""
 
 from __future__ import annotations
 
-from numba import njit, prange
+from autdtorch.fdtd.kernels.compiled import entry
 
 
-@njit(parallel=True, cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
-def correlate(adjoint, field, index, offsets, place, total):  # type: ignore[no-untyped-def]
-    """Add to `total` (n, 27) what lambda_i (p_j - p_i) sums up to over the steps.
+@entry(fastmath={"reassoc", "nsz"})  # sums of products fill vectors; nothing is called that could be inlined
+def correlate(first, last, adjoint, field, index, offsets, place, total):  # type: ignore[no-untyped-def]
+    """Add to rows `first` to `last` of `total` (n, 27) what lambda_i (p_j - p_i) sums up to over the steps.
 
     Of lambda (n, steps) in the cells `index` (n,) and p (k, steps) in these and their neighbours, at
     `offsets` (27,); `place` tells where a cell is in p.
     """
-    for i in prange(len(index)):
+    for i in range(first, last):
         own = place[index[i]]
         for j in range(len(offsets)):
             other, product = place[index[i] + offsets[j]], total[i, j]

@@ -18,23 +18,12 @@ inwards, L + 2, then as many of the high end, outwards.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numba import njit
 
+from autdtorch.fdtd.kernels.compiled import INNER
+
 _U = np.uint64
-
-INNER: dict[str, Any] = {
-    "fastmath": {"contract", "reassoc", "nsz"},
-    "error_model": "numpy",
-    "cache": True,
-    "nogil": True,
-    "no_cpython_wrapper": True,
-    "no_cfunc_wrapper": True,
-}
-"""Of functions that others call: what only Python needs, and tests for division by zero, are left out."""
-
 
 @njit(**INNER)
 def _sweep(p, at, n, row, old, old_at, total, across, weights):  # type: ignore[no-untyped-def]
@@ -169,15 +158,14 @@ def _absorb_plane(q, i, shape, cells, terms, ends, weights):  # type: ignore[no-
 
 
 @njit(**INNER)
-def _stretched_across(across, out, i, shape, cells, terms, ends, weights):  # type: ignore[no-untyped-def]
-    """Write A of plane i, with the terms of the layers across y and z, to its place among three planes."""
+def _stretched_across(across, out, base, i, shape, cells, terms, ends, weights):  # type: ignore[no-untyped-def]
+    """Write A of plane i, with the terms of the layers across y and z, to `out` from `base` on."""
     _, ny, nz = shape
     e_y, e_z, e_yz = terms
     _, _, edge, corner, _ = weights
     one, two = _U(1), _U(2)
     reach, slot = cells + two, i % _U(3)
     lanes, plane = two * reach, ny * nz
-    base = slot * plane
     for k in range(plane):
         out[base + k] = across[k]
     e = slot * ny * lanes
@@ -235,20 +223,23 @@ def _absorb_x(q, i, shape, memory, u, profile):  # type: ignore[no-untyped-def]
 def sweep_planes(  # type: ignore[no-untyped-def]
     p, q, first, last, shape, weights, layer, layers, profile, profiles, cells, starts, room
 ):
-    """Step the planes first .. last - 1 as if those beyond were silent; `room` then has the outermost A."""
+    """Step planes first .. last - 1 as if those beyond were silent; `room` then has A for the neighbours."""
     nx, ny, nz = shape
     terms, ends, total, across, u, outermost = room
     one, two, three = _U(1), _U(2), _U(3)
     depth, plane = _U(len(profile[0]) // 2), ny * nz
-    for silent in (total, across, u, *terms):
+    for silent in (total, across, *terms):
         silent[:] = 0
+    if first <= depth or last + depth >= nx:
+        u[:] = 0
     n, keep = plane - nz - nz - two, weights[4]
     for i in range(first, last + one):
-        done, here = i - one, i % three * plane
+        done = i - one
         if i < last:
             _varying(p, q, cells, starts[i], starts[i + one], keep)
             if depth:
                 _stretch_plane(p, i, shape, depth, layers, terms, ends, profiles)
+            # what is worked out before the first plane goes where A of that plane will be
             old, at = (outermost, _U(0)) if i == first else (q, done * plane + nz + one)
             _sweep(p, i * plane + nz + one, n, nz, old, at, total, across, weights)
         else:
@@ -259,12 +250,12 @@ def sweep_planes(  # type: ignore[no-untyped-def]
                 size = _U(len(term)) // three
                 for k in range(size):
                     term[i % three * size + k] = 0
-        if i == first or i + one == last or i <= depth + one or i + depth + two >= nx:
-            _stretched_across(across, u, i, shape, depth, terms, ends, weights)
-        for k in range(plane if i == first else _U(0)):
-            outermost[k] = u[here + k]
-        for k in range(plane if i + one == last else _U(0)):
-            outermost[plane + k] = u[here + k]
+        if i <= depth + one or i + depth + two >= nx:
+            _stretched_across(across, u, i % three * plane, i, shape, depth, terms, ends, weights)
+        elif i == first:
+            _stretched_across(across, outermost, _U(0), i, shape, depth, terms, ends, weights)
+        elif i + one == last:
+            _stretched_across(across, outermost, plane, i, shape, depth, terms, ends, weights)
         if i > first:
             if depth:
                 _absorb_plane(q, done, shape, depth, terms, ends, weights)

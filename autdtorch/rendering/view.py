@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from autdtorch.drawing import FLOOR, in_decibels
+from autdtorch.rendering.export import require_suffix, write
+from autdtorch.rendering.field import add_isosurface, add_plane
+from autdtorch.rendering.level import plane_pressure, volume_magnitude, zero_level
+from autdtorch.rendering.probe import require_rendering
+from autdtorch.rendering.scene import add_caption, add_transducers, emitted_phases, new_plotter
 from autdtorch.scene import Scene
 from autdtorch.validation import ArrayLike, number_between
-from autdtorch.view3d.export import require_suffix, write
-from autdtorch.view3d.field import add_isosurface, add_plane
-from autdtorch.view3d.level import plane_pressure, volume_magnitude, zero_level
-from autdtorch.view3d.probe import require_rendering
-from autdtorch.view3d.scene import add_caption, add_transducers, emitted_phases, new_plotter
 
 if TYPE_CHECKING:
     import pyvista

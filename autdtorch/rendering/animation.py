@@ -11,13 +11,11 @@ from numpy.typing import NDArray
 from PIL import Image, ImageColor
 
 from autdtorch.drawing import WAVE_MAP
-from autdtorch.scene import Scene
-from autdtorch.validation import ArrayLike, complex_tensor, integer_at_least
-from autdtorch.view3d.export import require_suffix
-from autdtorch.view3d.field import add_sheet, plane_mesh
-from autdtorch.view3d.level import plane_pressure
-from autdtorch.view3d.probe import require_rendering
-from autdtorch.view3d.scene import (
+from autdtorch.rendering.export import require_suffix
+from autdtorch.rendering.field import add_sheet, plane_mesh
+from autdtorch.rendering.level import plane_pressure
+from autdtorch.rendering.probe import require_rendering
+from autdtorch.rendering.scene import (
     FIELD_BAR,
     POINT_COLOUR,
     add_bar,
@@ -26,6 +24,8 @@ from autdtorch.view3d.scene import (
     emitted_phases,
     new_plotter,
 )
+from autdtorch.scene import Scene
+from autdtorch.validation import ArrayLike, complex_tensor, integer_at_least
 
 if TYPE_CHECKING:
     import pyvista

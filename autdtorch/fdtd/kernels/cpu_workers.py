@@ -1,0 +1,116 @@
+"""Workers that step the chunks of a grid together: tasks claimed in order, and a wait that yields.
+
+Tasks are numbered phase by phase. A worker claims the next one, waits until all tasks of earlier phases are
+finished, and does it. A worker that is kept from its processor delays the others by one task, and those that
+wait give way to it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+from numpy.typing import NDArray
+
+from autdtorch.fdtd.kernels.compiled import INNER
+from autdtorch.threads import spread
+
+_CLAIMED, _FINISHED = 0, 16
+"""Places of the two counters, on cache lines of their own."""
+
+_LOOKS = 2000
+"""Looks at the counter before a waiting worker yields: a few microseconds, less than waking costs."""
+
+
+def new_counters() -> NDArray[np.int64]:
+    """Return the counters of tasks, all 0."""
+    return np.zeros(32, np.int64)
+
+
+def yield_address() -> int:
+    """Return the address of the system's function by which a thread gives way to others."""
+    windows = os.name == "nt"
+    function = ctypes.CDLL("kernel32").SwitchToThread if windows else ctypes.CDLL(None).sched_yield
+    return int(ctypes.cast(function, ctypes.c_void_p).value or 0)
+
+
+def share_of_processors(work: Callable[[], object], workers: int) -> float:
+    """Have several workers do the same, and return for how much of that time they had a processor, 0 to 1."""
+
+    def timed(_: int) -> float:
+        begin = time.thread_time()
+        work()
+        return time.thread_time() - begin
+
+    begin = time.perf_counter()
+    spent = sum(spread(timed, range(workers), workers))
+    return spent / (workers * max(time.perf_counter() - begin, 1e-9))
+
+
+def _pointer(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+    kind = signature.args[0]
+    array = context.make_array(kind)(context, builder, given[0])
+    return cgutils.get_item_pointer(context, builder, kind, array, [given[1]], wraparound=False)  # type: ignore[no-untyped-call]
+
+
+def _add_atomically(typing_context: Any, counters: Any, place: Any, amount: Any) -> Any:
+    """Add to a counter, and return what it was."""
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return builder.atomic_rmw("add", _pointer(context, builder, signature, given), given[2], "seq_cst")
+
+    return types.int64(counters, types.int64, types.int64), generate
+
+
+def _read_atomically(typing_context: Any, counters: Any, place: Any) -> Any:
+    """Return a counter, and see all that was written before it was last added to."""
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return builder.load_atomic(_pointer(context, builder, signature, given), "acquire", 8)
+
+    return types.int64(counters, types.int64), generate
+
+
+def _call(typing_context: Any, address: Any) -> Any:
+    """Call the function at an address, which takes nothing."""
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        function = ir.FunctionType(ir.IntType(32), [])
+        return builder.call(builder.inttoptr(given[0], function.as_pointer()), [])
+
+    return types.int32(types.int64), generate
+
+
+_add: Any = intrinsic(_add_atomically)
+_read: Any = intrinsic(_read_atomically)
+_give_way: Any = intrinsic(_call)
+
+
+@njit(**INNER)
+def claim(counters):  # type: ignore[no-untyped-def]
+    """Return the number of the next task."""
+    return _add(counters, _CLAIMED, 1)
+
+
+@njit(**INNER)
+def finish(counters):  # type: ignore[no-untyped-def]
+    """Count a task as finished."""
+    _add(counters, _FINISHED, 1)
+
+
+@njit(**INNER)
+def wait_for(counters, tasks, give_way):  # type: ignore[no-untyped-def]
+    """Wait until so many tasks are finished; `give_way` is `yield_address()`."""
+    looks = 0
+    while _read(counters, _FINISHED) < tasks:
+        looks += 1
+        if looks > _LOOKS:
+            _give_way(give_way)

@@ -1,0 +1,80 @@
+"""The fields of many point sources in free space."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from autdtorch.threads import spread
+from autdtorch.validation import LENGTH_TOLERANCE
+
+Array = NDArray[np.floating]
+
+_PAIRS = 100_000
+"""Pairs of a point and a source in a piece of work: less than a millisecond."""
+
+
+def superposition(
+    points: torch.Tensor,
+    sources: torch.Tensor,
+    amplitude: torch.Tensor,
+    wavenumber: complex,
+    nearest: float = 0.0,
+    dtype: torch.dtype = torch.float64,
+) -> torch.Tensor:
+    """Sum the fields of many point sources: amplitude e^{i k r} / r. Any number of fields costs little more.
+
+    Args:
+        points: (P, 3) [m].
+        sources: (N, 3) [m].
+        amplitude: complex (N, R) [Pa m] of R fields.
+        wavenumber: k + i alpha [rad/m].
+        nearest: distances below this are taken as that [m].
+        dtype: float64, or float32, which takes half the time and gives each wave to 3e-7.
+
+    Returns:
+        complex128 (P, R) [Pa], whatever the number of threads.
+    """
+    from autdtorch.fdtd.kernels.cpu_waves import (  # with numba, which takes its time
+        LANES,
+        room_for,
+        sum_at_points,
+        sum_over_sources,
+        wave_of,
+    )
+
+    number = np.float32 if dtype == torch.float32 else np.float64
+    wave = wave_of(complex(wavenumber), max(nearest, LENGTH_TOLERANCE))
+    strength = np.stack([_rows(part.numpy().astype(number)) for part in (amplitude.real, amplitude.imag)])
+    runs, count = strength.shape[1], len(points)
+    places, origins = _rows(points.numpy()), _rows(sources.numpy())
+    if count >= len(sources):
+        places = _filled(places, LANES, "edge")
+        add, fields = sum_at_points, np.zeros((2, runs, places.shape[1] // LANES, LANES))
+    else:
+        origins, strength = _filled(origins, LANES, "edge"), _filled(strength, LANES, "constant")
+        add, fields = sum_over_sources, np.zeros((2, runs, count))
+        strength = strength.reshape(2, runs, -1, LANES)
+    units = fields.shape[2]
+    pieces = max(1, min(units, 1 + count * len(sources) // _PAIRS))
+    cuts = [units * piece // pieces for piece in range(pieces + 1)]
+
+    def piece(ends: tuple[int, int]) -> None:
+        add(places, *ends, origins, strength, wave, room_for(number), fields)
+
+    spread(piece, pairwise(cuts))
+    real, imaginary = fields.reshape(2, runs, -1)[:, :, :count]
+    return torch.from_numpy((real + 1j * imaginary).T)
+
+
+def _rows(columns: Array) -> Array:
+    return np.ascontiguousarray(columns.T)
+
+
+def _filled(rows: Array, size: int, mode: Literal["edge", "constant"]) -> Array:
+    """Fill rows (..., N) up to a multiple of `size`, by their last entry or by zeros."""
+    return np.pad(rows, (*((0, 0),) * (rows.ndim - 1), (0, -rows.shape[-1] % size)), mode)

@@ -1,0 +1,76 @@
+"""Arrays from NumPy's files, checked before they are allocated."""
+
+from __future__ import annotations
+
+import math
+import os
+import tokenize
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+Array: TypeAlias = NDArray[Any]
+
+_LARGEST = 2**30  # bytes in a .npz file: a small one can hold many zeros
+_LONGEST_HEADER = 1000  # bytes; what NumPy writes for plain arrays has 128
+_PLAIN = "biufcU"  # kinds of values: numbers and text
+
+#: What NumPy and zipfile raise of a damaged file.
+_DAMAGE = (
+    OSError,
+    ValueError,
+    EOFError,
+    OverflowError,
+    RuntimeError,
+    SyntaxError,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+
+
+def read_arrays(path: str | os.PathLike[str]) -> dict[str, Array]:
+    """Read the arrays of a .npz file by name; a .npy file holds one without a name.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is neither, is damaged, holds Python objects, or unpacks to more than 1 GiB. The
+            message names the file.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{os.fspath(path)}: there is no such file")
+    try:
+        if not zipfile.is_zipfile(path):
+            with Path(path).open("rb") as file:
+                return {"": _read(file, Path(path).stat().st_size)}
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+            if (size := sum(member.file_size for member in members)) > _LARGEST:
+                raise ValueError(f"{size} bytes, more than {_LARGEST}")
+            return {member.filename.removesuffix(".npy"): _member(archive, member) for member in members}
+    except _DAMAGE as error:
+        raise ValueError(f"{os.fspath(path)}: {error}; must hold plain NumPy arrays") from error
+
+
+def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Array:
+    with archive.open(member) as file:
+        return _read(file, member.file_size)
+
+
+def _read(file: Any, size: int) -> Array:
+    """Read the array of a file of `size` bytes."""
+    version = npy.read_magic(file)
+    if version not in _HEADERS:
+        raise ValueError(f"format {version} of an array; must be 1.0 or 2.0")
+    shape, _, dtype = _HEADERS[version](file, max_header_size=_LONGEST_HEADER)
+    if dtype.kind not in _PLAIN or file.tell() + math.prod(shape) * dtype.itemsize != size:
+        raise ValueError(f"array of shape {shape} and type {dtype} in {size} bytes")
+    file.seek(0)
+    return np.asarray(npy.read_array(file, allow_pickle=False))

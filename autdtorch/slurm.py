@@ -1,0 +1,86 @@
+"""The jobs of a sweep in Slurm's queue.
+
+submitit asks `sacct` for them, which answers only on clusters that keep accounts. Elsewhere every question
+leaves two warnings, and a job that was killed is awaited for ever. `squeue` answers on every cluster.
+"""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import time
+
+from submitit.slurm.slurm import SlurmInfoWatcher, SlurmJob
+
+logger = logging.getLogger(__name__)
+
+_PAUSE = 10.0  # [s] between questions to the queue; clusters want few
+
+
+class QueueWatcher(SlurmInfoWatcher):
+    """Tells submitit when the jobs have left the queue, and the user why they wait there."""
+
+    def __init__(self, logs: str) -> None:
+        """Watch no job yet.
+
+        Args:
+            logs: folder of the log of a job, with "%j" for the job's number.
+        """
+        super().__init__()
+        self._logs = logs
+        self._numbers: set[str] = set()
+        self._queued = True
+        self._next_question = 0.0
+        self._told = ""
+
+    def register_job(self, job_id: str) -> None:
+        """Watch a job, such as "7", or "7_0" of the array 7."""
+        number = job_id.partition("_")[0]
+        if number not in self._numbers:
+            self._numbers.add(number)
+            logs = self._logs.replace("%j", f"{number}*")
+            stay = f"Ctrl-C leaves it running, scancel {number} ends it"
+            logger.info("Slurm job %s, logs in %s; %s", number, logs, stay)
+
+    def is_done(self, job_id: str, mode: str = "standard") -> bool:
+        """Return whether all jobs have left the queue.
+
+        submitit asks for a job without a result, and gives up the sweep if that job has ended. A job that was
+        killed is therefore not done before the others.
+        """
+        if time.monotonic() >= self._next_question:
+            self._next_question = time.monotonic() + _PAUSE
+            self._ask()
+        return not self._queued
+
+    def get_state(self, job_id: str, mode: str = "standard") -> str:
+        """Return whether jobs are in the queue, for submitit's messages."""
+        return "in the queue" if self._queued else "ended"
+
+    def _ask(self) -> None:
+        command = ["squeue", "--me", "--noheader", "--format=%F %T %r"]
+        answer = subprocess.run(command, capture_output=True, text=True)
+        if answer.returncode:
+            self._tell(f"{answer.stderr.strip()}: asking again")
+            return
+        jobs = [line.split(maxsplit=2) for line in answer.stdout.splitlines()]
+        ours = [(state, reason) for number, state, reason in jobs if number in self._numbers]
+        self._queued = bool(ours)
+        reasons = {reason for state, reason in ours if state == "PENDING"} - {"None"}
+        if reasons:
+            self._tell(f"jobs wait in the queue: {', '.join(sorted(reasons))}")
+
+    def _tell(self, line: str) -> None:
+        """Log a line, unless it is the last one again."""
+        if line != self._told:
+            logger.info(line)
+            self._told = line
+
+
+def watch_queue(logs: str) -> None:
+    """Have submitit ask the queue for all jobs that it submits from now on.
+
+    Args:
+        logs: folder of the log of a job, with "%j" for the job's number.
+    """
+    SlurmJob.watcher = QueueWatcher(logs)

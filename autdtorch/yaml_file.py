@@ -1,0 +1,179 @@
+"""YAML that others may have written: values within bounds, which name no function and no variable."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig, ListConfig
+
+    Config: TypeAlias = DictConfig | ListConfig
+
+_LARGEST = 2_000_000  # characters, aliases expanded: OmegaConf takes 50 MB and 5 s for them
+_LEAST = 32  # characters that every key, value and collection counts for
+_INTERPOLATION = 10_000  # characters that one counts for: OmegaConf takes 0.3 ms to resolve it
+_LONGEST = 10_000  # characters of one key or value
+_DEEPEST = 32  # collections in collections, aliases expanded
+_SHOWN = 80  # characters of what is refused, in messages
+
+_ACCEPTED = (
+    "must be valid YAML: a mapping without tags, "
+    f"of at most {_LARGEST} characters and {_DEEPEST} levels with aliases expanded"
+)
+
+_REFERENCE = re.compile(r"\$\{[\w.\[\]]+\}")
+
+
+@dataclass
+class _Extent:
+    """Size [characters] and depth of a YAML node, aliases expanded."""
+
+    anchor: str | None
+    size: int = _LEAST
+    depth: int = 0
+
+    def add(self, child: _Extent) -> None:
+        self.size += child.size
+        self.depth = max(self.depth, child.depth + 1)
+
+
+def load_yaml(path: str | os.PathLike[str]) -> Config:
+    """Read a YAML file as `parse_yaml` reads a text.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: its content is not accepted. The message names the file, and the line where there is one.
+    """
+    with Path(path).open(encoding="utf-8") as file:
+        try:
+            text = file.read(_LARGEST + 1)
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{os.fspath(path)}: {error}; must be valid YAML in UTF-8") from error
+    return parse_yaml(text, os.fspath(path))
+
+
+def parse_yaml(text: str, where: str) -> Config:
+    """Read YAML as OmegaConf does, after bounding what it expands to.
+
+    Args:
+        text: a mapping or a list.
+        where: name of the text, for messages.
+
+    Raises:
+        ValueError: not YAML, a tag, too large or too deep.
+    """
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+    from yaml import MarkedYAMLError, YAMLError  # type: ignore[import-untyped]
+
+    try:
+        _require_bounded(text)
+        config = OmegaConf.load(io.StringIO(text))
+    except MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 0
+        raise ValueError(f"{where}, line {line}: {error.problem}; {_ACCEPTED}") from error
+    except (YAMLError, OmegaConfBaseException, ValueError) as error:
+        raise ValueError(f"{where}: {str(error).splitlines()[0]}; {_ACCEPTED}") from error
+    return config
+
+
+def unresolved(config: Config, where: str) -> Any:
+    """Return what a configuration holds as plain dictionaries and lists, its interpolations as they stand.
+
+    Args:
+        config: it may come from others.
+        where: its name, for messages.
+
+    Raises:
+        ValueError: as of `plain`.
+    """
+    from omegaconf import OmegaConf
+
+    return plain(OmegaConf.to_container(config, resolve=False), where)
+
+
+def plain(value: Any, where: str) -> Any:
+    """Return mappings, sequences and scalars as plain dictionaries and lists, after checking them.
+
+    Args:
+        value: interpolations of an OmegaConf node are resolved; those of others are to be checked before
+            by `unresolved`.
+        where: name of the value, for messages.
+
+    Raises:
+        ValueError: too large, too deep, or a text with an interpolation other than one whole `${key}`. Any
+            other could call a resolver, which reads the environment, or grow without limit.
+    """
+    from omegaconf import OmegaConf
+
+    left = _LARGEST
+
+    def entry(node: Any, key: Any) -> Any:
+        nonlocal left
+        if OmegaConf.is_config(node) and OmegaConf.is_interpolation(node, key):
+            left -= _INTERPOLATION
+        return node[key]
+
+    def checked(node: Any, *path: str) -> Any:
+        nonlocal left
+        left -= max(_LEAST, len(node) if isinstance(node, str) else 0)
+        place = f"{where}: {'.'.join(path)[:_SHOWN]}"
+        if left < 0 or len(path) > _DEEPEST:
+            accepted = f"must be at most {_LARGEST} characters in {_DEEPEST} levels"
+            raise ValueError(f"{place}: too large or too deep; {accepted}")
+        if isinstance(node, Mapping):
+            return {checked(key, *path): checked(entry(node, key), *path, str(key)) for key in node}
+        if isinstance(node, Sequence) and not isinstance(node, str | bytes):
+            return [checked(entry(node, index), *path, str(index)) for index in range(len(node))]
+        if isinstance(node, str) and "${" in node and not _REFERENCE.fullmatch(node):
+            accepted = "an interpolation must be a whole ${key}, without resolver"
+            raise ValueError(f"{place}: {node[:_SHOWN]!r}; {accepted}")
+        return node
+
+    return checked(value)
+
+
+def _require_bounded(text: str) -> None:
+    """Check the extent of what the text expands to, before anything is built from it."""
+    import yaml
+
+    if len(text) > _LARGEST:
+        raise ValueError("too large")
+    named: dict[str | None, _Extent] = {}
+    unfinished = [_Extent(None)]
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        match event:
+            case yaml.CollectionStartEvent():
+                unfinished.append(_Extent(event.anchor))
+                named[event.anchor] = _Extent(None, size=_LARGEST + 1)  # in itself, it would have no end
+            case yaml.CollectionEndEvent():
+                node = unfinished.pop()
+                named[node.anchor] = node
+                unfinished[-1].add(node)
+            case yaml.ScalarEvent():
+                named[event.anchor] = node = _Extent(event.anchor, max(_LEAST, len(event.value)))
+                unfinished[-1].add(node)
+            case yaml.AliasEvent() if event.anchor in named:
+                unfinished[-1].add(named[event.anchor])
+        if problem := _problem(event, len(unfinished) - 1, unfinished[-1]):
+            raise yaml.MarkedYAMLError(problem=problem, problem_mark=event.start_mark)
+
+
+def _problem(event: Any, level: int, collection: _Extent) -> str:
+    """Text on what is wrong with an event in a collection at that level; empty if nothing is."""
+    text = getattr(event, "value", "")
+    if text and level == 0:  # OmegaConf would parse it as YAML once more
+        return f"{text[:_SHOWN]!r} is no mapping"
+    if len(text) > _LONGEST:
+        return f"a text of {len(text)} characters, more than {_LONGEST}"
+    if (tag := getattr(event, "tag", None)) is not None:
+        return f"tag {tag!r}"
+    if collection.size > _LARGEST or level + collection.depth > _DEEPEST:
+        return "too large or too deep"
+    return ""

@@ -1,0 +1,127 @@
+"""Sweeps on a Slurm of this machine alone: jobs that are killed and that run out of time lose nothing."""
+
+import contextlib
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from one_node_slurm import missing_programs, one_node_slurm
+
+from autdtorch.cli import CONFIGS
+from autdtorch.results import load_results
+from autdtorch.slurm import QueueWatcher
+
+Run = Callable[..., int]
+
+TRIALS = 20
+SWEEP = ("scene=sphere", "solver.spacing=2.8e-3", "solver.tolerance=0.1", "plane_spacing=0.02", "seed=0,1")
+SWEEP += ("method=identify", f"trials={TRIALS}")
+# With a limit below ten minutes, submitit takes every signal for the one that Slurm sends before the limit.
+LAUNCHER = ("hydra/launcher=slurm", "hydra.launcher.timeout_min=5", "hydra.launcher.mem_gb=1")
+
+
+@pytest.fixture
+def slurm() -> Iterator[dict[str, str]]:
+    """The environment in which Slurm's commands find the cluster."""
+    if missing := missing_programs():
+        pytest.skip(f"no {', '.join(missing)}; python scripts/one_node_slurm.py true installs them")
+    with one_node_slurm() as environment:
+        yield environment
+
+
+def job_folder(sweep: Path, seed: int) -> Path:
+    (folder,) = sweep.glob(f"*seed={seed}*")
+    return folder
+
+
+def finished_trials(sweep: Path, seed: int) -> int:
+    return sum(file.read_bytes().count(b"\n") for file in sweep.glob(f"*seed={seed}*/trials.jsonl"))
+
+
+def answer(slurm: dict[str, str], *command: str) -> str:
+    return subprocess.check_output(command, env=slurm, text=True)
+
+
+def kill(job: str, slurm: dict[str, str]) -> None:
+    """Kill the process of a job, as a node short of memory does."""
+    number = answer(slurm, "squeue", "--noheader", "--format=%A", f"--job={job}").strip()
+    rows = [line.split() for line in answer(slurm, "scontrol", "listpids", number).splitlines()]
+    (process,) = (int(pid) for pid, _, step, task, _ in rows if (step, task) == ("0", "0"))
+    os.kill(process, signal.SIGKILL)
+
+
+def run_out_of_time(job: str, slurm: dict[str, str]) -> None:
+    """Send a job what Slurm sends before the time limit."""
+    answer(slurm, "scancel", "--signal=USR2", job)
+
+
+def test_disturbed_jobs_end_with_the_numbers_of_undisturbed_ones(
+    slurm: dict[str, str], tmp_path: Path, run: Run
+) -> None:
+    assert run("-m", *SWEEP) == 0
+    undisturbed, disturbed = tmp_path / "multirun", tmp_path / "auf Slurm, gestört"
+    command = [sys.executable, "-m", "autdtorch", "-m", *LAUNCHER, "hydra.launcher.cpus_per_task=1"]
+    command += [*SWEEP, f"hydra.sweep.dir='{disturbed}'"]
+
+    popen = subprocess.Popen(command, env=slurm, stderr=subprocess.PIPE, text=True)
+    with popen as sweep, contextlib.ExitStack() as ending:
+        ending.callback(sweep.kill)  # a failure would otherwise wait for it
+        for seed, disturb in ((0, kill), (1, run_out_of_time)):
+            while not finished_trials(disturbed, seed):
+                assert sweep.poll() is None
+                time.sleep(0.1)
+            (number,) = (path.name[:-2] for path in (disturbed / ".submitit").glob("*_0"))
+            disturb(f"{number}_{seed}", slurm)
+            assert finished_trials(disturbed, seed) < TRIALS
+        _, errors = sweep.communicate()
+    assert sweep.returncode == 2
+    assert f"job {number}_0" in errors.splitlines()[-1]
+    assert "sacct" not in errors
+    assert not (job_folder(disturbed, 0) / "results.h5").exists()
+    assert (job_folder(disturbed, 1) / "results.h5").exists()
+    assert "Restarts=1" in answer(slurm, "scontrol", "show", "job", f"{number}_1")
+
+    subprocess.run(command, env=slurm, check=True)
+    for seed in (0, 1):
+        sweeps = (undisturbed, disturbed)
+        one, other = (load_results(job_folder(sweep, seed)).scenes["sphere"] for sweep in sweeps)
+        assert one.transfer_matrix.equal(other.transfer_matrix)
+        for key in ("drive", "pressure", "score", "evaluations", "history"):
+            values = [getattr(scene.methods["identify"].solution, key) for scene in (one, other)]
+            assert values[0].equal(values[1]), key
+
+
+def test_a_job_may_use_the_cores_that_it_asks_for(slurm: dict[str, str], tmp_path: Path) -> None:
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        launcher = compose("config", ["hydra/launcher=slurm"], return_hydra_config=True).hydra.launcher
+    cores, output = len(os.sched_getaffinity(0)), tmp_path / "cores"
+    count = "import os; print(len(os.sched_getaffinity(0)), os.environ['OMP_NUM_THREADS'])"
+    script = "\n".join(["#!/bin/bash", *launcher.setup, shlex.join(["srun", sys.executable, "-c", count])])
+    asked = ["--nodes=1", "--ntasks-per-node=1", f"--cpus-per-task={cores}"]  # as submitit asks
+    submit = ["sbatch", "--wait", f"--output={output}", *asked]
+    subprocess.run(submit, input=script, env=slurm, text=True, check=True)
+    assert output.read_text(encoding="utf-8").split() == [str(cores), str(cores)]
+
+
+def test_jobs_have_ended_when_slurm_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    squeue = tmp_path / "squeue"
+    squeue.touch(mode=0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setattr("autdtorch.slurm._PAUSE", 0.0)
+    watcher = QueueWatcher("multirun/.submitit/%j")
+    watcher.register_job("7_0")
+    watcher.register_job("7_1")
+    for answer, ended in (
+        ("echo '7 PENDING Resources\n8 RUNNING None'", False),
+        ("exit 1", False),  # its controller does not answer
+        ("echo '8 RUNNING None'", True),
+    ):
+        squeue.write_text(f"#!/bin/sh\n{answer}\n", encoding="utf-8")
+        assert watcher.is_done("7_0") is ended

@@ -1,0 +1,202 @@
+"""A folder of configs that somebody sent runs no function, reads no variable and writes nowhere else."""
+
+import pickle
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from autdtorch.config_files import CONFIGS
+
+Run = Callable[..., int]
+Send = Callable[[dict[str, str]], None]
+
+SCENE = (CONFIGS / "scene" / "homogeneous.yaml").read_text(encoding="utf-8")
+CALL = "{_target_: torch.load, f: evil.pt, weights_only: false}"
+LINES = "_target_: torch.load\nf: evil.pt\nweights_only: false\n"
+GLOBAL = "# @package _global_\n"
+DEFAULT = ["/scene@scenes.x: homogeneous", "override /scene: null", "override /method: null"]
+EXPERIMENT = f"{GLOBAL}defaults: [{', '.join(DEFAULT)}]\n"
+
+
+class Touch:
+    """When it is unpickled, it leaves the file `canary`."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return Path.touch, (Path("canary"),)
+
+
+@pytest.fixture
+def send(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Send:
+    """Writes files below a folder `sent`; beside it are a pickle and a module that leave `canary`."""
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    monkeypatch.setenv("SECRET", "hunter2")
+    monkeypatch.delitem(sys.modules, "evil", raising=False)
+    (here / "evil.pt").write_bytes(pickle.dumps(Touch()))
+    (here / "evil.py").write_text(
+        "from pathlib import Path\nfrom torch import load\nPath('canary').touch()\n", encoding="utf-8"
+    )
+
+    def write(files: dict[str, str]) -> None:
+        for name, text in files.items():
+            path = here / "sent" / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+
+    return write
+
+
+def bomb(first: str, line: str) -> str:
+    """Ten levels, each of ten times the one before."""
+    return "".join([first, *(line.format(this=n, all=", ".join([f"*a{n - 1}"] * 10)) for n in range(1, 10))])
+
+
+LAUGHS = bomb("a0: &a0 [lol, lol]\n", "a{this}: &a{this} [{all}]\n")
+MERGES = bomb("a0: &a0 {x: 1}\n", "a{this}: &a{this} {{<<: [{all}]}}\n")
+REFERENCES = "a0: [lol, lol]\n" + "".join(
+    f"a{n}: {[f'${{scene.a{n - 1}}}'] * 10}\n" for n in range(1, 10)
+)
+
+HYDRA = {
+    "callbacks": f"{{x: {CALL}}}",
+    "launcher": f"{{x: {CALL}}}",
+    "sweeper": f"{{x: {CALL}}}",
+    "job_logging": "{version: 1, root: {}, filters: {x: {(): torch.load, f: evil.pt, weights_only: false}}}",
+    "job": "{env_set: {PYTHONPATH: sent}}",
+    "searchpath": "[sent/more]",
+    "run": "{dir: ../elsewhere}",
+}
+DEFAULTS = (
+    "/evil@hydra.callbacks: run",
+    "/evil@_global_.hydra.callbacks: run",
+    "optional /evil@hydra.callbacks: [run]",
+    "/evil/run@hydra.callbacks",
+    "override /hydra/launcher: joblib",
+    "/hydra/launcher/joblib",
+    "/evil@${x}.callbacks: run",
+    "override /scene: ../../evil/run",
+)
+
+
+def scene(name: str) -> str:
+    return SCENE.replace("name: homogeneous", f"name: {name}")
+
+
+#: By folder of the file that is sent: its text, and the key that the one line names.
+ATTACKS: dict[str, list[tuple[str, str]]] = {
+    "method": [
+        (LINES, "method._target_"),
+        (f"_target_: autdtorch.lssg\nlevels: {CALL}\n", "method.levels._target_"),
+        (f"_target_: autdtorch.lssg\nextra: [{CALL}]\n", "method.extra.0._target_"),
+        ("_target_: autdtorch.lssg\n_partial_: false\n", "method._partial_"),
+        ("_target_: autdtorch.load_results\n", "method._target_"),
+        ("_target_: evil.load\nf: evil.pt\n", "method._target_"),
+        ("_target_: autdtorch.lssg\nlevels: ${oc.decode:'4'}\n", "levels"),
+        (MERGES, "line"),
+    ],
+    "scene": [
+        (f"{SCENE}extra: {CALL}\n", "scene.extra._target_"),
+        *((f"{GLOBAL}hydra: {{{key}: {value}}}\n", "hydra") for key, value in HYDRA.items()),
+        *((f"{GLOBAL}defaults:\n  - {entry}\n", "defaults") for entry in DEFAULTS),
+        (f"# @package hydra.callbacks\nx: {CALL}\n", "@package hydra.callbacks"),
+        (f"# @package _global_.hydra.callbacks\nx: {CALL}\n", "@package _global_.hydra"),
+        (scene("${oc.env:SECRET}"), "name"),
+        (scene(r"\${oc.env:SECRET}"), "name"),
+        (scene("${scene.dollar}{oc.env:SECRET}\ndollar: $"), "name"),
+        ("x: !!python/object/apply:pathlib.Path.touch [canary]\n", "line 1"),
+        (SCENE + LAUGHS, "line"),
+        (SCENE + REFERENCES, "settings: scene.a"),
+        ("a: &a [*a]\n", "line 1"),
+        (f"a: {'[' * 10_000}", "line 1"),
+    ],
+    "solver": [
+        (f"spacing: {CALL}\n", "solver.spacing._target_"),
+        ("cache: ../elsewhere\n", "solver.cache"),
+        ("cache: /proc/elsewhere\n", "solver.cache"),
+    ],
+    "experiment": [
+        (f"{EXPERIMENT}methods: {{x: {CALL}}}\n", "methods.x._target_"),
+        (f"{EXPERIMENT}methods: {{x: {{levels: {CALL}}}}}\n", "methods.x.levels._target_"),
+        (f"{GLOBAL}modules: [evil]\nmethod: {{_target_: evil.load}}\n", "modules"),
+        (f"{GLOBAL}output: ../elsewhere\n", "output"),
+        (f"{GLOBAL}output: /proc/elsewhere\n", "output"),
+        (f"{GLOBAL}output: .\n", "output"),
+    ],
+}
+CASES = [(group, text, key) for group, cases in ATTACKS.items() for text, key in cases]
+
+
+@pytest.mark.parametrize(("group", "text", "key"), CASES, ids=[f"{group} {key}" for group, _, key in CASES])
+def test_an_attack_by_a_config_ends_in_one_line(
+    group: str,
+    text: str,
+    key: str,
+    run: Run,
+    send: Send,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    send({f"{group}/x.yaml": text, "evil/run.yaml": f"x: {CALL}\n"})
+    before = set(tmp_path.rglob("*"))
+    assert run("--config-dir", "sent", f"{group}=x", "plane_spacing=0.02") == 2
+    captured = capsys.readouterr()
+    (line,) = captured.err.splitlines()
+    assert key in line
+    assert len(line) < 600
+    assert "hunter2" not in captured.out + line
+    assert set(tmp_path.rglob("*")) == before  # no canary, nothing elsewhere
+
+
+def test_a_primary_config_sets_nothing_of_hydras(
+    run: Run, send: Send, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    send({"x.yaml": f"hydra: {{callbacks: {{x: {CALL}}}}}\n"})
+    assert run("--config-dir", "sent", "--config-name", "x") == 2
+    assert "x.yaml: hydra" in capsys.readouterr().err
+    assert not list(tmp_path.rglob("canary"))
+
+
+def test_a_name_that_goes_up_does_not_move_the_output(
+    run: Run, send: Send, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    send({"x.yaml": SCENE})
+    assert run("--config-dir", "sent", "scene=../x", "plane_spacing=0.02") == 2
+    assert "output: 'outputs/../x_gabs'" in capsys.readouterr().err
+
+
+def test_what_hydra_is_made_of_is_not_taken_from_a_folder_of_configs(
+    run: Run, send: Send, tmp_path: Path
+) -> None:
+    """Hydra looks there before it asks its plugins for what they are called."""
+    groups = ("config", "launcher/basic", "launcher/joblib", "sweeper/basic", "job_logging/stdout")
+    send({f"hydra/{group}.yaml": f"{GLOBAL}hydra: {{callbacks: {{x: {CALL}}}}}\n" for group in groups})
+    assert run("--config-dir", "sent", "-m", "method=lssg", "plane_spacing=0.02") == 0
+    assert not list(tmp_path.rglob("canary"))
+
+
+def test_a_launcher_of_ones_own_comes_from_a_folder_that_is_trusted(run: Run, send: Send) -> None:
+    send({"hydra/launcher/mine.yaml": "defaults: [joblib]\nn_jobs: 2\n"})
+    command = ("-m", "hydra/launcher=mine", "method=lssg", "plane_spacing=0.02")
+    assert run("--config-dir", "sent", *command) == 2
+    assert run(*command, "hydra.searchpath=[sent]") == 0
+
+
+@pytest.mark.parametrize("target", ["climbing.load", "climbing.torch", "climbing.no", "climbing.torch.load"])
+def test_of_a_trusted_module_only_its_own_functions_are_methods(
+    target: str, run: Run, send: Send, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "here" / "climbing.py").write_text("import torch\nfrom torch import load\n", encoding="utf-8")
+    send({"method/x.yaml": LINES.replace("torch.load", target)})
+    assert run("--config-dir", "sent", "method=x", "modules=[climbing, evil]") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"method._target_: '{target}'" in line
+    assert not list(tmp_path.rglob("canary"))  # nor is a module imported that no method needs
+
+
+def test_the_command_line_may_name_any_folder(run: Run, tmp_path: Path) -> None:
+    command = ("method=lssg", "plane_spacing=0.02", f"output={tmp_path / 'out'}")
+    assert run(*command, f"solver.cache={tmp_path / 'cache'}") == 0
+    assert (tmp_path / "out" / "results.h5").is_file()

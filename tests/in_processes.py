@@ -1,0 +1,43 @@
+"""Simulate and search in this process, then in two others of one kind, and count what differs; a program."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import sys
+
+import torch
+from joblib import Parallel, delayed
+from small_scenes import CUBE, small_scene
+from torch.utils.data import DataLoader
+
+import autdtorch as at
+
+
+def found(seed: int) -> list[float]:
+    """Numbers of a simulation, and of methods that work on threads of PyTorch and of their own."""
+    logging.disable()
+    objective = at.SimulatedObjective(
+        scene := small_scene((CUBE,)), at.make_propagator(scene, "box", 2e-3, cache=False)
+    )
+    assert objective.transfer_matrix is not None
+    scores = [at.gabs(objective, trials=40, seed=seed), at.identify(objective, seed=seed)]
+    scores += [at.bayes_opt(objective, 20, trials=2, fixed_transducer=0, seed=seed)]
+    return [objective.transfer_matrix.abs().sum().item(), *(each.score.sum().item() for each in scores)]
+
+
+def in_processes(kind: str) -> list[list[float]]:
+    """`found` of seeds 0 and 1, each in a process of its own."""
+    if kind == "dataloader":
+        loader = DataLoader([0, 1], batch_size=None, num_workers=2, collate_fn=found)
+        return list(loader)
+    if kind == "loky":
+        return list(Parallel(n_jobs=2, backend="loky")(delayed(found)(seed) for seed in (0, 1)))
+    with multiprocessing.get_context(kind).Pool(2) as pool:
+        return pool.map_async(found, (0, 1), chunksize=1).get(timeout=100)
+
+
+if __name__ == "__main__":
+    torch.randn(1500, 1500).matmul(torch.randn(1500, 1500))  # starts PyTorch's threads
+    expected = [found(0), found(1)]
+    print(sum(one != other for one, other in zip(in_processes(sys.argv[1]), expected, strict=True)))

@@ -1,0 +1,190 @@
+"""Results that somebody sent: their names stay names, and their texts stay texts in a report."""
+
+import functools
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from markdown_it import MarkdownIt
+
+from autdtorch.collect import collect_results
+from autdtorch.optim.gabs import gabs
+from autdtorch.report import write_report
+from autdtorch.report_html import as_page
+from autdtorch.report_tables import code, fenced, table
+from autdtorch.results import StudyResult, load_results, save_results
+from autdtorch.scene_file import load_scene
+from autdtorch.study import run_study
+from autdtorch.summary import SUMMARY_FILE, save_summary
+
+SCENE = {
+    "frequency": 40e3,
+    "medium": {"density": 1.2, "sound_speed": 340.0},
+    "array": {"type": "grid", "shape": [2, 2], "pitch": 10e-3, "center": [0, 0, 0]},
+    "control_points": {"type": "points", "positions": [[0.05, 0, 0], [0.05, 0.01, 0]]},
+}
+HTML = "<img src=x onerror=alert(1)>\n\n<script>alert(1)</script>\n\na ` <b onclick=alert(1)>b</b>"
+MARKDOWN = "![a](https://evil.example/a.png) [b](https://evil.example) <https://evil.example> `` ``` ~~~"
+HOSTILE = f"{HTML}\n{MARKDOWN}\n\n</details>\n```\n{HTML}\n[x]: https://evil.example\n[x]"
+
+
+@pytest.fixture(autouse=True)
+def without_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("autdtorch.report.rendering_problem", lambda: "not tried")
+
+
+def study(solver: dict[str, object] | None = None, seed: int = 0) -> StudyResult:
+    settings = {"scene": SCENE, "method": {"_target_": "autdtorch.gabs"}, "solver": solver or {}}
+    methods = {"gabs": functools.partial(gabs, levels=2)}
+    return run_study({"air": load_scene(SCENE)}, methods, seed=seed, config=yaml.safe_dump(settings))
+
+
+#: HDF5 itself has no groups of the first four names.
+NAMES = ["", ".", "a/b", "a\0b", "..", "...", "..\\a", "a\nb", "a b", "x" * 101, "é" * 51, "<b>", "![a](b)"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_study_refuses_a_name_that_is_no_part_of_a_file_name(name: str) -> None:
+    scene, method = load_scene(SCENE), functools.partial(gabs, levels=2)
+    with pytest.raises(ValueError, match=r"^scenes: "):
+        run_study({name: scene}, {"gabs": method})
+    with pytest.raises(ValueError, match=r"^methods: "):
+        run_study({"air": scene}, {name: method})
+
+
+@pytest.mark.parametrize("name", NAMES[4:])
+@pytest.mark.parametrize("field", ["scenes", "methods"])
+def test_results_with_such_a_name_are_refused(tmp_path: Path, name: str, field: str) -> None:
+    results = study()
+    (scene,) = results.scenes.values()
+    if field == "scenes":
+        scenes = {name: scene}
+    else:
+        scenes = {"air": replace(scene, methods={name: scene.methods["gabs"]})}
+    save_results(replace(results, scenes=scenes), tmp_path)
+    with pytest.raises(ValueError, match=rf"results\.h5: {field}: "):
+        load_results(tmp_path)
+
+
+def left(folder: Path, *studies: StudyResult) -> Path:
+    """A sweep of these studies, in a folder that stands alone in `folder`."""
+    sweep = folder / "sweep"
+    for number, results in enumerate(studies):
+        save_results(results, sweep / str(number))
+    return sweep
+
+
+def collect(sweep: Path) -> str:
+    """Do what `autdtorch collect` does; returns the page."""
+    found = collect_results(sweep)
+    save_summary(found.results, found.swept, sweep / SUMMARY_FILE)
+    page = write_report(found.results, found.scenes, sweep, "autdtorch collect", found.seeds)
+    return page.read_text(encoding="utf-8")
+
+
+def test_the_names_of_what_was_swept_stay_in_the_folder(tmp_path: Path) -> None:
+    solvers = ({"../../elsewhere": 1, "<b>": 1}, {"../../elsewhere": "../<b>", "語" * 300: "a\0b"})
+    page = collect(left(tmp_path, *map(study, solvers)))
+    assert [path.name for path in tmp_path.iterdir()] == ["sweep"]
+    assert len(list((tmp_path / "sweep").glob("fig1_*.png"))) == len(solvers)
+    assert "<b>" not in page
+
+
+def test_settings_that_expand_are_refused(tmp_path: Path) -> None:
+    bomb = "scene: &a0 [lol, lol]\n" + "".join(
+        f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 11)
+    )
+    results = study()
+    sweep = left(tmp_path, replace(results, provenance=replace(results.provenance, config=bomb)))
+    with pytest.raises(ValueError, match=r"results\.h5.*line"):
+        collect_results(sweep)
+
+
+def test_the_scene_of_results_reads_no_variable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SECRET", "hunter2")
+    results = study()
+    config = yaml.safe_dump({"scene": {**SCENE, "name": "${oc.env:SECRET}"}, "method": {}})
+    sweep = left(tmp_path, replace(results, provenance=replace(results.provenance, config=config)))
+    with pytest.raises(ValueError, match=r"name: '\$\{oc\.env:SECRET\}'"):
+        collect_results(sweep)
+
+
+@pytest.mark.parametrize("end", ["", ".partial"])
+def test_a_report_is_not_written_through_a_link(tmp_path: Path, end: str) -> None:
+    sweep = left(tmp_path, study())
+    mine = tmp_path / "mine"
+    mine.write_text("mine", encoding="utf-8")
+    for name in (SUMMARY_FILE, "report.md", "report.html", "fig1_air.png", "fig3d.png"):
+        (sweep / f"{name}{end}").symlink_to(mine)
+    collect(sweep)
+    assert mine.read_text(encoding="utf-8") == "mine"
+    assert not any((sweep / name).is_symlink() for name in (SUMMARY_FILE, "report.md", "report.html"))
+
+
+class Tags(HTMLParser):
+    """Tags and attributes of a page."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.found: list[tuple[str, str, str]] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.found += [(tag, "", ""), *((tag, name, value or "") for name, value in attributes)]
+
+
+OURS = {"html", "head", "meta", "title", "style", "body", "h1", "h2", "p", "br", "em", "strong", "code"}
+OURS |= {"pre", "img", "div", "table", "thead", "tbody", "tr", "th", "td", "ul", "li", "details", "summary"}
+ATTRIBUTES = {"lang", "charset", "name", "content", "class", "src", "alt"}
+
+
+def test_a_report_shows_hostile_texts_as_texts(tmp_path: Path) -> None:
+    results = study()
+    provenance = results.provenance
+    versions = {"autdtorch": HOSTILE, HOSTILE: "1"}
+    hostile = replace(provenance, config=HOSTILE, versions=versions, source_digest=HOSTILE, date=HOSTILE)
+    scenes = {"air": load_scene(SCENE)}
+    page = write_report(replace(results, provenance=hostile), scenes, tmp_path, HOSTILE).read_text("utf-8")
+    found = Tags(page).found
+    assert {tag for tag, _, _ in found} <= OURS
+    assert {name for _, name, _ in found if name} <= ATTRIBUTES
+    assert all(value.startswith("data:image/png;base64,") for _, name, value in found if name == "src")
+    # Each of the texts is there, and the version of autdtorch twice.
+    assert page.count("alert(1)") == 7 * HOSTILE.count("alert(1)")
+    text = (tmp_path / "report.md").read_text(encoding="utf-8")
+    tokens = MarkdownIt("commonmark").enable("table").parse(text)  # as others show it: with links and HTML
+    parts = [part for token in tokens for part in (token, *(token.children or ()))]
+    assert not any(part.type == "link_open" for part in parts)
+    assert not any("alert" in part.content for part in parts if part.type.startswith("html"))
+    images = {str(part.attrGet("src")) for part in parts if part.type == "image"}
+    assert images == {path.name for path in tmp_path.glob("*.png")}
+
+
+@pytest.mark.parametrize("text", [HTML, MARKDOWN[1:], "&lt;b&gt; <!-- c --> <?d?> <![CDATA[e]]>"])
+def test_a_page_has_no_html_and_no_links_but_its_own(tmp_path: Path, text: str) -> None:
+    assert {tag for tag, _, _ in Tags(as_page(f"# {text}\n\n{text}\n", tmp_path)).found} <= OURS
+
+
+@pytest.mark.parametrize("source", ["../secret.png", "/etc/passwd", "https://a.example", "%2e%2e/secret.png"])
+def test_a_page_takes_images_of_its_folder_alone(tmp_path: Path, source: str) -> None:
+    (tmp_path / "page").mkdir()
+    (tmp_path / "secret.png").write_bytes(b"secret")
+    with pytest.raises(ValueError, match=r"^image: "):
+        as_page(f"# Title\n\n![a]({source})\n", tmp_path / "page")
+
+
+@given(st.text() | st.text("`|\\<b>![a](c)\n\r "))
+def test_code_is_code_whatever_the_text(text: str) -> None:
+    parse = MarkdownIt("commonmark").enable("table").parse
+    (inline,) = (token for token in parse(f"x {code(text)} y") if token.type == "inline")
+    assert {part.type for part in inline.children or ()} <= {"text", "code_inline"}
+    (block,) = parse(fenced(text))
+    assert block.type == "fence"
+    rows = [["head", "value"], ["x", code(text)]]
+    cells = [token for token in parse(table(rows)) if token.type == "inline"]
+    assert len(cells) == 4
+    assert {part.type for part in cells[-1].children or ()} <= {"text", "code_inline"}

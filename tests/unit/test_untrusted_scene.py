@@ -1,0 +1,236 @@
+"""A scene that somebody sent, and the files it names, read no variable, run nothing and stay small."""
+
+import io
+import pickle
+import struct
+import time
+import tracemalloc
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from autdtorch.array_file import load_array
+from autdtorch.drive_file import load_drive
+from autdtorch.obstacles import Mesh, VoxelMask
+from autdtorch.scene_file import load_scene
+from autdtorch.yaml_file import parse_yaml
+
+SCENE = """
+frequency: 40e3
+medium: {density: 1.293, sound_speed: 340.0}
+array: {type: positions, positions: [[0, 0, 0], [0, 10e-3, 0]], normals: [1, 0, 0]}
+control_points: {type: points, positions: [[80e-3, 0, 0]]}
+"""
+
+
+def levels(line: str) -> str:
+    """Ten lines, in each of which `line` names the one before ten times."""
+    return "\n".join(line.format(this=n, before=", ".join([f"*a{n - 1}"] * 10)) for n in range(1, 11))
+
+
+LARGE = {
+    "aliases": "a0: &a0 [lol, lol]\n" + levels("a{this}: &a{this} [{before}]"),
+    "merged mappings": "a0: &a0 {x: 1}\n" + levels("a{this}: &a{this} {{<<: [{before}]}}"),
+    "long text in aliases": f"a0: &a0 {'x' * 9_000}\n" + levels("a{this}: &a{this} [{before}]"),
+    "an alias in itself": "a: &a {b: *a}\n",
+    "depth": f"a: {'[' * 10_000}",
+    "depth by aliases": "a0: &a0 []\n" + "\n".join(f"a{n}: &a{n} [*a{n - 1}]" for n in range(1, 200)),
+    "YAML in a text": f'"a: {"[" * 9_000}"',
+    "a huge file": "a: 1\n" * 1_000_000,
+    "a huge number": f"frequency: {'1:' * 4_000}1\n",
+    "references": "a0: [lol, lol]\n" + "\n".join(f"a{n}: {[f'${{a{n - 1}}}'] * 10}" for n in range(1, 11)),
+    "a chain of references": "".join(f"a{n}: ${{a{n + 1}}}\n" for n in range(1_000)),
+}
+
+
+@pytest.mark.parametrize("text", LARGE.values(), ids=LARGE.keys())
+def test_what_expands_is_refused_before_it_does(tmp_path: Path, text: str) -> None:
+    refused(tmp_path, SCENE + "x: 1\n")  # what has to be imported, is
+    begin = time.process_time()
+    refused(tmp_path, text)
+    assert time.process_time() - begin < 2  # at most 0.5; expanded, it would take hours
+    tracemalloc.start()
+    try:
+        refused(tmp_path, text)
+        assert tracemalloc.get_traced_memory()[1] < 30e6  # of it, 10 MB are the largest text that is read
+    finally:
+        tracemalloc.stop()
+
+
+def refused(folder: Path, text: str) -> str:
+    path = folder / "sent.yaml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ValueError, match=r"sent\.yaml") as caught:
+        load_scene(path)
+    return str(caught.value)
+
+
+def shared(value: object) -> object:
+    """Ten levels of lists, each of which holds the one below ten times: small in memory, large if copied."""
+    for _ in range(10):
+        value = [value] * 10
+    return value
+
+
+def itself() -> list[object]:
+    value: list[object] = []
+    value.append(value)
+    return value
+
+
+@pytest.mark.parametrize("value", [shared("lol"), itself()], ids=["shared", "itself"])
+def test_a_mapping_that_expands_is_refused(value: object) -> None:
+    with pytest.raises(ValueError, match=r"scene mapping: domain\.\d"):
+        load_scene({**OmegaConf.to_container(OmegaConf.create(SCENE)), "domain": value})
+
+
+def test_aliases_of_moderate_size_are_values() -> None:
+    config = parse_yaml("a: &a {x: 1, y: [2, 3]}\nb: *a\nc: {<<: *a, x: 4}\n", "text")
+    assert config == {"a": {"x": 1, "y": [2, 3]}, "b": {"x": 1, "y": [2, 3]}, "c": {"x": 4, "y": [2, 3]}}
+
+
+def test_a_scene_of_a_thousand_transducers_is_read() -> None:
+    positions = [[0.0, 1.0 * n, 0.012345678901234] for n in range(1_000)]
+    text = OmegaConf.to_yaml({"array": {"positions": positions}})
+    assert parse_yaml(text, "text").array.positions == positions
+
+
+READS = {
+    "resolver": "${oc.env:SECRET}",
+    "with a default": "${oc.env:SECRET,none}",
+    "nested": "${${kind}:SECRET}",
+    "in a text": "x${oc.env:SECRET}",
+    "escaped": r"\${oc.env:SECRET}",
+    "another resolver": "${oc.decode:SECRET}",
+    "no resolver, but a text that grows": "${name}${name}",
+}
+
+
+@pytest.mark.parametrize("kind", ["file", "mapping", "node"])
+@pytest.mark.parametrize("text", READS.values(), ids=READS.keys())
+def test_an_interpolation_is_a_whole_key_without_resolver(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, text: str
+) -> None:
+    monkeypatch.setenv("SECRET", "hunter2")
+    given = {**OmegaConf.to_container(OmegaConf.create(SCENE)), "name": text, "array": {"path": "x"}}
+    source: object = given
+    if kind == "file":
+        source = tmp_path / "sent.yaml"
+        OmegaConf.save(given, source)
+    elif kind == "node":
+        source = OmegaConf.create(given)
+    with pytest.raises(ValueError, match=": name: ") as caught:
+        load_scene(source)
+    assert "hunter2" not in str(caught.value)
+
+
+@pytest.mark.parametrize("tag", ["!!python/object/apply:pathlib.Path", "!!python/name:os.system", "!mine"])
+def test_tags_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tag: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert "line 1" in refused(tmp_path, f"x: {tag} [canary]\n")
+    assert not (tmp_path / "canary").exists()
+
+
+class Touch:
+    """When it is unpickled, it leaves a file."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return Path.touch, (Path("canary"),)
+
+
+def npy(header: str, body: bytes = b"") -> bytes:
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header.encode() + body
+
+
+def npz(content: bytes) -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in ("positions.npy", "normals.npy", "drive.npy"):
+            archive.writestr(name, content)
+    return file.getvalue()
+
+
+def declared(shape: str, dtype: str = "|b1") -> str:
+    return f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': ({shape}), }}\n"
+
+
+def objects() -> bytes:
+    file = io.BytesIO()
+    np.save(file, np.array([Touch()], object), allow_pickle=True)
+    return file.getvalue()
+
+
+ARRAYS = {
+    "pickle": pickle.dumps(Touch()),
+    "pickled objects": objects(),
+    "more than it holds": npy(declared("10000000000,"), b"\x01"),
+    "more than memory has": npy(declared("1000000, 1000000, 1000000")),
+    "nothing of many": npy(declared("100000000000,", "|V0")),
+    "a header that is code": npy("__import__('pathlib').Path('canary').touch()"),
+    "a header that does not end": npy("(" * 900),
+    "negative": npy(declared("-1,"), b"\x01"),
+}
+
+
+@pytest.mark.parametrize("content", ARRAYS.values(), ids=ARRAYS.keys())
+def test_arrays_in_files_are_checked_before_they_are_allocated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: bytes
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mask.npy").write_bytes(content)
+    Path("array.npz").write_bytes(npz(content))
+    tracemalloc.start()
+    try:
+        for load, name in ((load_array, "array.npz"), (load_drive, "array.npz")):
+            with pytest.raises(ValueError, match=name):
+                load(name)
+        for name in ("mask.npy", "array.npz"):
+            with pytest.raises(ValueError, match=name):
+                VoxelMask.load(name, 1e-3, rigid=True)
+        assert tracemalloc.get_traced_memory()[1] < 5e6
+    finally:
+        tracemalloc.stop()
+    assert not Path("canary").exists()
+
+
+def test_a_small_file_of_many_zeros_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("autdtorch.numpy_file._LARGEST", 10**6)
+    np.savez_compressed(tmp_path / "zeros.npz", mask=np.ones((100, 100, 101), bool))
+    with pytest.raises(ValueError, match=r"zeros\.npz.*1010128 bytes"):
+        VoxelMask.load(tmp_path / "zeros.npz", 1e-3, rigid=True)
+
+
+HEAD = """ply
+format {kind} 1.0
+element vertex {vertices}
+property float x
+property float y
+property float z
+element face {faces}
+property list uchar int vertex_indices
+end_header
+"""
+CORNERS = "0 0 0\n1 0 0\n0 1 0\n0 0 1\n"
+MESHES = {
+    "ply": HEAD.format(kind="binary_little_endian", vertices=4_000_000_000, faces=4_000_000_000),
+    "ply in text": HEAD.format(kind="ascii", vertices=10**12, faces=10**12) + CORNERS,
+    "ply beyond integers": HEAD.format(kind="binary_little_endian", vertices=10**30, faces=1),
+    "ply of quads": HEAD.format(kind="ascii", vertices=4, faces=4)
+    + f"{CORNERS}3 0 2 1\n3 0 1 3\n3 0 3 2\n4 1 2 3 0\n",
+    "ply of nothing": "ply\nformat ascii 1.0\nend_header\n",
+    "obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1\n",
+    "obj beyond integers": f"v 0 0 0\nf 1 1 {10**30}\n",
+    "stl": "\0" * 80 + "\x7f" * 4 + "\0" * 50,
+}
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_a_mesh_that_declares_what_it_does_not_hold_is_refused(tmp_path: Path, name: str) -> None:
+    """libigl's readers end the process, or take all memory, on some of these."""
+    path = tmp_path / f"sent.{name.partition(' ')[0]}"
+    path.write_bytes(MESHES[name].encode("ascii"))
+    with pytest.raises(ValueError, match=r"Mesh\.path: .*sent"):
+        Mesh(path, rigid=True)
