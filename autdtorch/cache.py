@@ -1,7 +1,7 @@
-"""Arrays that took long to compute, kept on disk under a digest of all that decides them.
+"""Matrices that took long to compute, kept on disk under a digest of all that decides them.
 
 A file is written beside its place and then renamed: whoever reads finds nothing or all of it, whatever other
-processes do and whenever one is killed. Its first line is a checksum of the rest.
+processes do and whenever one is killed. Its first line is a checksum of its name, its shape and the rest.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
-import io
 import logging
 import os
 import time
@@ -67,7 +66,7 @@ def _add(digest: Any, part: Any) -> None:
 
 
 class DiskCache:
-    """A folder of arrays, each with one number, under their digests.
+    """A folder of complex matrices, each with one number, under their digests.
 
     Attributes:
         folder: where they are.
@@ -82,8 +81,8 @@ class DiskCache:
         self.folder = Path(folder)
         self.folder.mkdir(parents=True, exist_ok=True)
 
-    def load(self, digest: str) -> tuple[NDArray[Any], float] | None:
-        """What `save` was given; None if nothing is there, or what is there is damaged."""
+    def load(self, digest: str, shape: tuple[int, ...]) -> tuple[NDArray[np.complex128], float] | None:
+        """Return what `save` was given, or None: nothing is there, or it is damaged or of another shape."""
         path = self._path(digest)
         try:
             content = path.read_bytes()
@@ -92,24 +91,21 @@ class DiskCache:
         except OSError as error:
             logger.warning("%s cannot be read (%s): computing again", path, error.strerror)
             return None
-        checksum, _, body = content.partition(b"\n")
-        if hashlib.sha256(body).hexdigest().encode() != checksum:
+        _, _, body = content.partition(b"\n")
+        if content != _with_checksum(digest, shape, body):
             logger.warning("%s is damaged (its checksum is wrong): computing again", path)
             return None
-        stream = io.BytesIO(body)
-        return np.load(stream, allow_pickle=False), float(np.load(stream, allow_pickle=False))
+        values = np.frombuffer(body, np.complex128)
+        return values[:-1].reshape(shape).copy(), float(values[-1].real)
 
-    def save(self, digest: str, array: NDArray[Any], number: float) -> None:
-        """Keep an array and a number. What cannot be written is left out, and logged."""
-        stream = io.BytesIO()
-        np.save(stream, array, allow_pickle=False)
-        np.save(stream, np.float64(number), allow_pickle=False)
-        body = stream.getvalue()
+    def save(self, digest: str, matrix: NDArray[Any], number: float) -> None:
+        """Keep a matrix and a number. What cannot be written is left out, and logged."""
+        body = np.append(matrix, number).astype(np.complex128).tobytes()
         path = self._path(digest)
         try:
             self._remove_abandoned()
             with _partial_file(path) as file:
-                file.write(hashlib.sha256(body).hexdigest().encode() + b"\n" + body)
+                file.write(_with_checksum(digest, matrix.shape, body))
         except OSError as error:
             logger.warning("%s cannot be written (%s): not kept", path, error.strerror)
 
@@ -121,6 +117,11 @@ class DiskCache:
             with contextlib.suppress(OSError):  # another process removes it as well, or it is another user's
                 if time.time() - path.stat().st_mtime > ABANDONED:
                     path.unlink()
+
+
+def _with_checksum(digest: str, shape: tuple[int, ...], body: bytes) -> bytes:
+    named = f"{digest} {shape}\n".encode()
+    return hashlib.sha256(named + body).hexdigest().encode() + b"\n" + body
 
 
 @contextlib.contextmanager

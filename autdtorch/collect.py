@@ -105,6 +105,10 @@ def collect_results(folder: str | os.PathLike[str]) -> Sweep:
         raise FileNotFoundError(f"{folder}: no finished study ({RESULTS_FILE}) there or below")
     if len({study.provenance.source_digest for study in studies.values()}) > 1:
         logger.warning("%s: the studies were made with different versions of the source", folder)
+    first: dict[str, Path] = {}
+    for path, study in studies.items():
+        if (other := first.setdefault(study.provenance.origin, path)) != path:
+            logger.warning("%s: the same study as %s, counted once", path, other)
     parts = [part for path, study in studies.items() for part in _parts(path, study)]
     groups, swept = _groups(parts)
     results = {scene: _merged_scene(methods) for scene, methods in groups.items()}
@@ -126,11 +130,17 @@ def _log_unfinished(folder: Path) -> None:
             logger.warning("%s: not finished, left out; the command that began it goes on", file.parent)
 
 
-def _parts(path: Path, study: StudyResult) -> Iterator[_Part]:
+def _parts(path: Path, study: StudyResult) -> list[_Part]:
     where = f"{path / RESULTS_FILE}: settings"
     settings = unresolved(parse_yaml(study.provenance.config, where), where)
-    if not isinstance(settings, dict) or not {"scene", "scenes"} & settings.keys():
-        raise ValueError(f"{path / RESULTS_FILE}: no settings in it; must come from the command line")
+    try:
+        return list(_parts_by(settings, path, study))
+    except (KeyError, TypeError, AttributeError) as error:
+        accepted = "must come from the command line"
+        raise ValueError(f"{path / RESULTS_FILE}: no settings of a study in it; {accepted}") from error
+
+
+def _parts_by(settings: Any, path: Path, study: StudyResult) -> Iterator[_Part]:
     if missing := [name for name in settings.get("scenes", ()) if name not in study.scenes]:
         logger.warning("%s: scenes that are not finished are left out: %s", path, ", ".join(missing))
     common = {key: settings[key] for key in ("solver", "plane_spacing") if key in settings}

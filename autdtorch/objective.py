@@ -140,6 +140,23 @@ def validate_drives(drive: torch.Tensor, transducers: int) -> torch.Tensor:
     return drive
 
 
+def validate_magnitudes(name: str, value: object, points: int) -> torch.Tensor:
+    """Return observed magnitudes (P,) [Pa], float64, after checking them.
+
+    Args:
+        name: of the field, for the message.
+        value: what was observed.
+        points: number of control points P.
+
+    Raises:
+        ValueError: not P finite real numbers >= 0.
+    """
+    pressure = real_tensor(name, value, "Pa")
+    if pressure.shape != (points,) or pressure.min() < 0:
+        raise invalid(name, value, f"must be {points} numbers >= 0", "Pa")
+    return pressure
+
+
 def weakest_focus(pressure: torch.Tensor) -> torch.Tensor:
     """Return the weakest (...) [Pa] of the foci of a `pressure` (..., P): the paper's f = min(p_n).
 

@@ -1,17 +1,18 @@
 """What a study leaves on disk, and how it is read back.
 
 ``results.h5`` holds everything of the finished scenes, ``provenance.json`` where it comes from. Both are
-written beside their place and then renamed, so that what is there is always complete.
+written beside their place and then renamed, so that what is there is always complete. Both have a checksum:
+the second as a line of `json_lines`, the first in the block that HDF5 leaves to the user in front of a file.
 """
 
 from __future__ import annotations
 
+import hashlib
 import io
-import json
 import os
 import platform
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,9 @@ import h5py
 import torch
 
 import autdtorch
+from autdtorch.cache import digest_of
 from autdtorch.display import html_table
+from autdtorch.json_lines import line_of, row_of
 from autdtorch.metrics import FocusMetrics
 from autdtorch.optim import label_of
 from autdtorch.optim.base import Solution
@@ -35,6 +38,9 @@ PROVENANCE_FILE = "provenance.json"
 _SIMULATED_BY = ("free_space", "box", "full")
 _SOLUTION = ("drive", "pressure", "score", "evaluations", "history")
 _METRICS = ("mean", "min", "std", "uniformity", "area")
+_PROVENANCE = {"config": str, "seed": int, "versions": dict, "source_digest": str, "date": str}
+_USER_BLOCK = 512  # bytes, the fewest that HDF5 allows
+_DAMAGE = (OSError, KeyError, ValueError, TypeError, AttributeError, OverflowError, RuntimeError)  # of h5py
 
 
 @dataclass(frozen=True)
@@ -55,9 +61,14 @@ class Provenance:
     source_digest: str
     date: str
 
+    @property
+    def origin(self) -> str:
+        """The SHA-256 of all but the date: equal for studies that lead to the same results."""
+        return digest_of(self.config, self.seed, sorted(self.versions.items()), self.source_digest)
+
     def same_origin(self, other: Provenance) -> bool:
-        """Whether both lead to the same results: all but the date is equal."""
-        return replace(self, date=other.date) == other
+        """Return whether both lead to the same results: all but the date is equal."""
+        return self.origin == other.origin
 
     def __repr__(self) -> str:
         """Version, seed and date, without the settings."""
@@ -216,12 +227,13 @@ def save_results(results: StudyResult, folder: str | os.PathLike[str]) -> None:
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     content = io.BytesIO()  # HDF5 would not say that a disk is full, but fail when it closes the file
-    with h5py.File(content, "w") as file:
+    with h5py.File(content, "w", userblock_size=_USER_BLOCK) as file:
         _write_provenance(file, results.provenance)
         scenes = file.create_group("scenes", track_order=True)
         for name, scene in results.scenes.items():
             _write_scene(scenes.create_group(name), scene)
-    replace_file(folder / RESULTS_FILE, content.getvalue())
+    body = content.getvalue()[_USER_BLOCK:]
+    replace_file(folder / RESULTS_FILE, _user_block(body) + body)
 
 
 def save_provenance(provenance: Provenance, folder: str | os.PathLike[str]) -> None:
@@ -230,21 +242,21 @@ def save_provenance(provenance: Provenance, folder: str | os.PathLike[str]) -> N
     Raises:
         OSError: the folder cannot be written.
     """
-    text = json.dumps(asdict(provenance), indent=2) + "\n"
-    replace_file(Path(folder) / PROVENANCE_FILE, text.encode())
+    replace_file(Path(folder) / PROVENANCE_FILE, line_of(asdict(provenance)) + b"\n")
 
 
 def load_provenance(folder: str | os.PathLike[str]) -> Provenance:
     """Read what `save_provenance` wrote.
 
     Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is not a complete one of this version.
+        ValueError: the file is damaged, or of another version.
+        OSError: it cannot be read; a `FileNotFoundError` where there is none.
     """
     path = Path(folder) / PROVENANCE_FILE
+    content = path.read_bytes()
     try:
-        return Provenance(**json.loads(path.read_text(encoding="utf-8")))
-    except (ValueError, TypeError) as error:
+        return _provenance(row_of(content.removesuffix(b"\n")))
+    except (ValueError, RecursionError) as error:
         accepted = f"must be a provenance file of autdtorch {autdtorch.__version__}"
         raise ValueError(f"{path}: {error}; {accepted}") from error
 
@@ -257,25 +269,40 @@ def load_results(path: str | os.PathLike[str]) -> StudyResult:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is not a complete results file of this version.
+        ValueError: it is damaged, no results file, or one of another version.
+        OSError: it cannot be read.
     """
     path = path_of("path", path)
     if path.is_dir():
         path = path / RESULTS_FILE
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such results file")
+    content = path.read_bytes()
     try:
-        with h5py.File(path, "r") as file:
+        if content[:_USER_BLOCK] != _user_block(content[_USER_BLOCK:]):
+            raise ValueError("its checksum is wrong")
+        with h5py.File(io.BytesIO(content), "r") as file:
             scenes = {name: _read_scene(group) for name, group in _named(file, "scenes")}
             return StudyResult(_read_provenance(file), scenes)
-    except (OSError, KeyError, ValueError) as error:
+    except _DAMAGE as error:
         accepted = f"must be a results file of autdtorch {autdtorch.__version__}"
         raise ValueError(f"{path}: {error}; {accepted}") from error
+
+
+def _user_block(body: bytes) -> bytes:
+    """Return the block that goes before HDF5 content: its SHA-256, in hexadecimal."""
+    return hashlib.sha256(body).hexdigest().encode().ljust(_USER_BLOCK, b"\0")
 
 
 def _over_trials(values: torch.Tensor, form: str) -> str:
     mean = f"{values.mean():{form}}"
     return mean if len(values) == 1 else f"{mean} ± {values.std():{form}}"
+
+
+def _provenance(row: dict[str, Any]) -> Provenance:
+    if {key: type(value) for key, value in row.items()} != _PROVENANCE:
+        raise ValueError(f"fields {', '.join(row)} that are not as they were written")
+    return Provenance(**row)
 
 
 def _write_provenance(file: Any, provenance: Provenance) -> None:
@@ -288,10 +315,9 @@ def _write_provenance(file: Any, provenance: Provenance) -> None:
 def _read_provenance(file: Any) -> Provenance:
     prefix = "version_"
     values = file.attrs
+    row = {key: values[key] for key in ("config", "source_digest", "date")}
     versions = {key.removeprefix(prefix): values[key] for key in values if key.startswith(prefix)}
-    return Provenance(
-        values["config"], int(values["seed"]), versions, values["source_digest"], values["date"]
-    )
+    return _provenance({**row, "seed": int(values["seed"]), "versions": versions})
 
 
 def _write_scene(group: Any, scene: SceneResult) -> None:

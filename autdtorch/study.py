@@ -87,7 +87,8 @@ def run_study(
     planes = {name: _plane_points(scene, plane_spacing) for name, scene in scenes.items()}
     # The digest of our source says nothing of others' methods.
     ours = all(_function(method).__module__.partition(".")[0] == "autdtorch" for method in methods.values())
-    with open_folder(folder, provenance_now(config, seed), reuse=bool(config) and ours) as kept:
+    provenance = provenance_now(config, seed)
+    with open_folder(folder, provenance, scenes, reuse=bool(config) and ours) as kept:
         missing = {name: scene for name, scene in scenes.items() if name not in kept.scenes}
         propagators = {name: _propagator(scene, solver or {}, kept) for name, scene in missing.items()}
         kept.begin()

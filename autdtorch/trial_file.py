@@ -6,25 +6,26 @@ whatever moment it comes, and a study that is begun again goes on after it.
 
 from __future__ import annotations
 
-import json
-import logging
-import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import torch
 
+from autdtorch.drive import validate_single_drive
+from autdtorch.json_lines import JsonLines
 from autdtorch.metrics import focus_metrics
-from autdtorch.optim.base import Solution, joined
-from autdtorch.writing import naming
-
-logger = logging.getLogger(__name__)
+from autdtorch.objective import validate_magnitudes
+from autdtorch.optim.base import NEAR_TIE, Solution, joined
+from autdtorch.validation import finite_number, integer_at_least, invalid, not_negative, real_tensor
 
 TRIALS_FILE = "trials.jsonl"
 
 Trial: TypeAlias = tuple[Solution, float]
 """What one trial found, and the seconds it took."""
+
+Shapes: TypeAlias = Mapping[str, tuple[int, int]]
+"""Numbers of transducers M and of control points P, by name of the scene."""
 
 _METRICS = ("mean", "min", "std", "uniformity")
 
@@ -32,25 +33,35 @@ _METRICS = ("mean", "min", "std", "uniformity")
 class TrialFile:
     """Trials by scene, method and number: those that the file holds, and those that are added."""
 
-    def __init__(self, path: Path | None, seed: int) -> None:
-        """Read what the file holds; a line that is not complete, and all behind it, is cut off.
+    def __init__(self, path: Path | None, origin: str, seed: int, shapes: Shapes) -> None:
+        """Read what the file holds of the study; it is left as it is until `mend`.
 
         Args:
             path: of the file; None to keep the trials in memory alone.
+            origin: of the study, which its lines are told by.
             seed: of the study, for the rows.
+            shapes: of its scenes.
 
         Raises:
-            OSError: the file cannot be read or cut.
+            OSError: the file cannot be read.
         """
-        self._path = path
         self._seed = seed
+        self._shapes = shapes
         self._trials: dict[tuple[str, str, int], Trial] = {}
-        if path is not None and path.exists():
-            self._read(path)
+        self._lines = None if path is None else JsonLines(path, origin, self._use)
 
     def __len__(self) -> int:
         """Number of trials."""
         return len(self._trials)
+
+    def mend(self) -> None:
+        """Set aside the lines that are damaged or not of this study, which comes before the first `append`.
+
+        Raises:
+            OSError: a file cannot be written.
+        """
+        if self._lines is not None:
+            self._lines.mend()
 
     def missing(self, scene: str, method: str, trials: int) -> list[int]:
         """Which of the first `trials` trials are not there."""
@@ -67,18 +78,14 @@ class TrialFile:
             seconds: what they took together; each is given an equal share.
 
         Raises:
+            ValueError: the file has changed meanwhile.
             OSError: the file cannot be written.
         """
         share = seconds / len(trials)
         for place, trial in enumerate(trials):
             self._trials[scene, method, trial] = _alone(found, place), share
-        if self._path is None:
-            return
-        rows = [self._row(scene, method, trial) for trial in trials]
-        with naming(self._path), self._path.open("a", encoding="utf-8") as file:
-            file.write("".join(json.dumps(row) + "\n" for row in rows))
-            file.flush()
-            os.fsync(file.fileno())
+        if self._lines is not None:
+            self._lines.append(*(self._row(scene, method, trial) for trial in trials))
 
     def found(self, scene: str, method: str, trials: int) -> tuple[Solution, torch.Tensor]:
         """What the first `trials` trials found, all of which must be there, and seconds (T,) of each."""
@@ -103,32 +110,29 @@ class TrialFile:
             "history": solution.history[0].tolist(),
         }
 
-    def _read(self, path: Path) -> None:
-        content = path.read_bytes()
-        complete = 0
-        for line in content.splitlines(keepends=True):
-            if not line.endswith(b"\n"):  # its last number may lack digits
-                break
-            try:
-                self._take(json.loads(line))
-            except (ValueError, KeyError, TypeError):
-                break
-            complete += len(line)
-        if complete < len(content):
-            logger.warning(
-                "%s: line %d is not complete: cut off there", path, content[:complete].count(b"\n") + 1
-            )
-            os.truncate(path, complete)
-
-    def _take(self, row: dict[str, Any]) -> None:
-        real = {
-            key: torch.tensor([row[key]], dtype=torch.float64) for key in ("pressure", "score", "history")
-        }
-        drive = torch.view_as_complex(torch.tensor([row["drive"]], dtype=torch.float64))
+    def _use(self, row: dict[str, Any]) -> None:
+        """Add the trial of a row, after checking it as what a method found in a scene of the study."""
+        where = row["scene"], row["method"], integer_at_least("trial", row["trial"], 0)
+        if where in self._trials:
+            raise invalid("trial", where, "must be there once")
+        transducers, foci = self._shapes[row["scene"]]
+        drive = torch.view_as_complex(real_tensor("drive", row["drive"]))
+        evaluations = integer_at_least("evaluations", row["evaluations"], 1)
+        history = real_tensor("history", row["history"])
+        if history.shape != (evaluations,) or (history.diff() < 0).any():
+            raise invalid("history", history, f"must be {evaluations} numbers, none below the one before")
+        score = finite_number("score", row["score"])
+        best = float(history[-1])
+        if score > best + NEAR_TIE * abs(best):  # the last drive, of `identify`
+            raise invalid("score", score, f"must be at most {best:g}, the best of the history")
         solution = Solution(
-            drive, real["pressure"], real["score"], torch.tensor([row["evaluations"]]), real["history"]
+            validate_single_drive(drive, transducers)[None],
+            validate_magnitudes("pressure", row["pressure"], foci)[None],
+            torch.tensor([score], dtype=torch.float64),
+            torch.tensor([evaluations]),
+            history[None],
         )
-        self._trials[row["scene"], row["method"], row["trial"]] = solution, row["seconds"]
+        self._trials[where] = solution, not_negative("seconds", row["seconds"], "s")
 
 
 def _alone(found: Solution, place: int) -> Solution:

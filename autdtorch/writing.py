@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -30,6 +31,8 @@ def replacing(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)  # it may be a link to another file
         try:
             yield partial
+            with partial.open("rb+") as file:
+                os.fsync(file.fileno())  # or a power failure could leave the name without the content
             partial.replace(path)
         except BaseException:
             partial.unlink(missing_ok=True)

@@ -270,9 +270,7 @@ OTHERS: dict[str, Any] = {
     "save_field.pressure": torch.ones(2, 3, 4, dtype=torch.complex128),
     "true_pressure.drive": DRIVE[None],
     "weakest_focus.pressure": torch.ones(2, 3),
-    **{
-        f"{kind}.device": hardware.SONICSURFACE for kind in ("EmulatedBench", "Link", "Played", "open_link")
-    },
+    **{f"{kind}.device": hardware.SONICSURFACE for kind in ("EmulatedBench", "Link", "Played", "open_link")},
     **{f"{kind}_sphere.center": (0.0, 0.0, 0.0) for kind in ("fluid", "rigid", "soft")},
     **{
         f"{kind}.{method}.drive": DRIVE[None]

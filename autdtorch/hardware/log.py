@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-import logging
+import math
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -15,14 +15,14 @@ from typing import Any
 import torch
 from filelock import FileLock
 
+from autdtorch.cache import digest_of
 from autdtorch.drive import validate_single_drive
+from autdtorch.json_lines import JsonLines, line_of, row_of
 from autdtorch.locking import held
-from autdtorch.validation import invalid, not_negative, real_tensor
-from autdtorch.writing import naming
+from autdtorch.objective import validate_magnitudes
+from autdtorch.validation import integer_at_least, not_negative, real_tensor
 
-logger = logging.getLogger(__name__)
-
-_ORIGIN = "origin"
+_ORIGIN, _NUMBER = "origin", "evaluation"
 
 
 class LogError(ValueError):
@@ -56,21 +56,20 @@ class EvaluationLog:
     Attributes:
         path: of the file.
         origin: what the trial is, by name.
-        evaluations: what the file holds.
         goes_on: whether the file was there before.
         seconds_on: how long the outputs were on in all, as its lines say [s].
     """
 
     path: Path
     origin: dict[str, Any]
-    evaluations: list[Evaluation]
     goes_on: bool
     seconds_on: float
 
     def __init__(self, path: str | Path, origin: Mapping[str, Any], transducers: int, points: int) -> None:
         """Begin the file, or read what it holds of the same trial.
 
-        A last line that broke off is removed. A log without evaluations, of another trial, is begun anew.
+        A last line that broke off is removed, and damaged ones are set aside; their evaluations will be made
+        again. A log without evaluations, of another trial, is begun anew.
 
         Args:
             path: of the file.
@@ -84,36 +83,75 @@ class EvaluationLog:
         """
         self.path = Path(path)
         self.origin = json.loads(json.dumps(origin))  # as it will be read back
-        self.evaluations = []
         self.seconds_on = 0.0
+        self._shape = transducers, points
+        self._evaluations: dict[int, Evaluation] = {}
+        self._first_again = math.inf  # number of the first evaluation that was made after later ones
         with contextlib.ExitStack() as held:
             held.enter_context(lock_log(path))
-            self.goes_on = self._take_up(transducers, points)
+            self._lines, self.goes_on = self._take_up()
+            self._lines.mend()
             self._held = held.pop_all()
 
-    def append(self, drive: torch.Tensor, pressure: torch.Tensor, seconds_on: float) -> None:
+    @property
+    def evaluations(self) -> list[Evaluation]:
+        """The evaluations that the file holds, in the order of their numbers."""
+        return [evaluation for _, evaluation in sorted(self._evaluations.items())]
+
+    def recorded(self, number: int, drive: torch.Tensor) -> Evaluation | None:
+        """Return an evaluation, or None where it has to be made.
+
+        An evaluation whose line was lost is made again, and may be read differently. What was recorded after
+        it is still valid where the method asks for the recorded drive, and is made again where it does not.
+
+        Args:
+            number: of the evaluation in the trial, counted from 0.
+            drive: (M,), as it is asked for.
+
+        Raises:
+            LogError: it was of another drive, though all before it is as it was.
+        """
+        evaluation = self._evaluations.get(number)
+        if evaluation is None or torch.equal(evaluation.drive, drive):
+            return evaluation
+        if number > self._first_again:
+            return None
+        raise LogError(
+            f"{self.path}: evaluation {number + 1} is of another drive than the method asks for; "
+            "give the method, seed and version of autdtorch of that trial, or another log"
+        )
+
+    def append(
+        self, number: int, drive: torch.Tensor, pressure: torch.Tensor, seconds_on: float
+    ) -> Evaluation:
         """Add an evaluation.
 
         Args:
+            number: of the evaluation in the trial, counted from 0.
             drive: (M,), as it was asked for.
             pressure: (P,) [Pa], as it was read.
             seconds_on: how long the outputs were on so far [s].
+
+        Returns:
+            The evaluation, with its time.
 
         Raises:
             LogError: the file has changed meanwhile.
             OSError: the file cannot be written.
         """
-        time = _now()
+        evaluation = Evaluation(_now(), drive, pressure, seconds_on)
         self._append(
             {
-                "time": time,
+                _NUMBER: number,
+                "time": evaluation.time,
                 "drive": torch.view_as_real(drive).tolist(),
                 "pressure": pressure.tolist(),
                 "seconds_on": seconds_on,
             }
         )
-        self.evaluations.append(Evaluation(time, drive, pressure, seconds_on))
+        self._keep(number, evaluation)
         self.seconds_on = seconds_on
+        return evaluation
 
     def end(self, seconds_on: float) -> None:
         """Say how long the outputs were on when the process ends, its other playing included.
@@ -129,56 +167,59 @@ class EvaluationLog:
             self._append({"time": _now(), "seconds_on": seconds_on})
         self.seconds_on = seconds_on
 
-    def _take_up(self, transducers: int, points: int) -> bool:
-        """Read the file if it is of this trial, else begin it; returns whether it was there."""
+    def _take_up(self) -> tuple[JsonLines, bool]:
+        """Read the file if it is of this trial, else empty it; also returns whether it was there."""
+        head = line_of({_ORIGIN: self.origin}) + b"\n"
         content = self.path.read_bytes() if self.path.exists() else b""
-        self._size = content.rfind(b"\n") + 1
-        if not self._size and _line({_ORIGIN: self.origin}).startswith(content):
-            self._begin()
-            return False
-        stored, *rows = _rows(self.path, content[: self._size])
-        if stored[_ORIGIN] != self.origin:
-            if any(row.keys() != {"time", "seconds_on"} for row in rows):
-                raise self._of_another_trial(stored[_ORIGIN])
-            self._begin()
-            return False
-        for number, row in enumerate(rows, 2):
-            with _line_named(self.path, number):
-                if "drive" in row:
-                    self.evaluations.append(_evaluation(row, transducers, points))
-                self.seconds_on = max(self.seconds_on, not_negative("seconds_on", row["seconds_on"], "s"))
-        if self._size < len(content):
-            logger.warning("%s: the last line broke off; its evaluation will be made again", self.path)
-            os.truncate(self.path, self._size)
-        return True
-
-    def _begin(self) -> None:
-        if self.path.exists():
+        lines = JsonLines(self.path, digest_of(self.origin), self._use, head)
+        if lines.used or content.startswith(head):
+            return lines, True
+        if not head.startswith(content):
+            self._require_empty(content)
+        if content:
             os.truncate(self.path, 0)
-        self._size = 0
-        self._append({_ORIGIN: self.origin})
+        return JsonLines(self.path, digest_of(self.origin), self._use, head), False
 
-    def _of_another_trial(self, stored: Mapping[str, Any]) -> LogError:
-        name = next(one for one in (*self.origin, *stored) if stored.get(one) != self.origin.get(one))
-        return LogError(
-            f"{self.path}: of another trial, whose {name} is {stored.get(name)}, not "
-            f"{self.origin.get(name)}; give the settings of that trial, or another log"
-        )
+    def _require_empty(self, content: bytes) -> None:
+        """Check that a file, of which no line is of this trial, is the log of another without evaluations."""
+        try:
+            stored = row_of(content.partition(b"\n")[0])[_ORIGIN]
+        except (ValueError, KeyError) as error:
+            accepted = "must be the log of a hardware trial, written by this version: give another log"
+            raise LogError(f"{self.path}: its first line cannot be read ({error}); {accepted}") from error
+        if f'"{_NUMBER}": '.encode() in content:
+            name = next(one for one in (*self.origin, *stored) if stored.get(one) != self.origin.get(one))
+            raise LogError(
+                f"{self.path}: of another trial, whose {name} is {stored.get(name)}, not "
+                f"{self.origin.get(name)}; give the settings of that trial, or another log"
+            )
+
+    def _use(self, row: dict[str, Any]) -> None:
+        """Take up the evaluation of a line, or its time alone, after checking it as what was measured."""
+        datetime.fromisoformat(row["time"])
+        seconds_on = not_negative("seconds_on", row["seconds_on"], "s")
+        if _NUMBER in row:
+            transducers, points = self._shape
+            drive = torch.view_as_complex(real_tensor("drive", row["drive"]))
+            evaluation = Evaluation(
+                row["time"],
+                validate_single_drive(drive, transducers),
+                validate_magnitudes("pressure", row["pressure"], points),
+                seconds_on,
+            )
+            self._keep(integer_at_least(_NUMBER, row[_NUMBER], 0), evaluation)
+        self.seconds_on = max(self.seconds_on, seconds_on)
+
+    def _keep(self, number: int, evaluation: Evaluation) -> None:
+        if number < next(reversed(self._evaluations), 0):
+            self._first_again = min(self._first_again, number)
+        self._evaluations[number] = evaluation
 
     def _append(self, row: Mapping[str, Any]) -> None:
-        """Add a line, or leave the file as it is: nothing may follow half a line."""
-        rest = memoryview(_line(row))
-        with naming(self.path), self.path.open("ab", buffering=0) as file:
-            if file.tell() != self._size:  # the lock does not part objects of one process
-                raise LogError(f"{self.path}: has changed meanwhile; open it anew, or give another log")
-            try:
-                while rest:
-                    rest = rest[file.write(rest) :]
-                os.fsync(file.fileno())
-                self._size = file.tell()
-            except BaseException:
-                file.truncate(self._size)
-                raise
+        try:
+            self._lines.append(row)
+        except ValueError as error:
+            raise LogError(str(error)) from error
 
 
 @contextlib.contextmanager
@@ -199,48 +240,5 @@ def lock_log(path: str | Path) -> Iterator[None]:
         yield
 
 
-def _line(row: Mapping[str, Any]) -> bytes:
-    return json.dumps(row).encode() + b"\n"
-
-
-def _rows(path: Path, content: bytes) -> list[dict[str, Any]]:
-    """The lines; the first is of the origin alone."""
-    rows = []
-    for number, line in enumerate(content.splitlines(), 1):
-        with _line_named(path, number):
-            rows.append(_object(line))
-    if not rows or rows[0].keys() != {_ORIGIN} or not isinstance(rows[0][_ORIGIN], dict):
-        raise LogError(f"{path}: not the log of a hardware trial; give another log")
-    return rows
-
-
-def _object(line: bytes) -> dict[str, Any]:
-    with contextlib.suppress(ValueError):
-        if isinstance(row := json.loads(line), dict):
-            return row
-    raise ValueError("no JSON object")
-
-
-@contextlib.contextmanager
-def _line_named(path: Path, number: int) -> Iterator[None]:
-    """Have what is wrong with a line say where it is."""
-    try:
-        yield
-    except (ValueError, KeyError, TypeError, RuntimeError) as error:
-        reason = f"no {error}" if isinstance(error, KeyError) else error
-        accepted = "must be the log of a hardware trial: mend it, or give another log"
-        raise LogError(f"{path}, line {number}: {reason}; {accepted}") from error
-
-
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="microseconds")
-
-
-def _evaluation(row: Mapping[str, Any], transducers: int, points: int) -> Evaluation:
-    """The evaluation of a line, after checking it as what was asked for and read."""
-    datetime.fromisoformat(row["time"])
-    drive = validate_single_drive(torch.view_as_complex(real_tensor("drive", row["drive"])), transducers)
-    pressure = real_tensor("pressure", row["pressure"], "Pa")
-    if pressure.shape != (points,) or pressure.min() < 0:
-        raise invalid("pressure", row["pressure"], f"must be {points} numbers >= 0", "Pa")
-    return Evaluation(row["time"], drive, pressure, not_negative("seconds_on", row["seconds_on"], "s"))

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from autdtorch.cache import digest_of
-from autdtorch.hardware.log import Evaluation, EvaluationLog, LogError
+from autdtorch.hardware.log import Evaluation, EvaluationLog
 from autdtorch.hardware.safety import LimitedLink, LimitError
 from autdtorch.hardware.sensor import Sensor, checked_reading
 from autdtorch.objective import validate_drives
@@ -134,21 +134,16 @@ class HardwareObjective:
         most = self._link.limits.evaluations
         if self.evaluations >= most:
             raise LimitError(f"{most} evaluations are made, the limit")
-        if self.evaluations == len(self.log.evaluations):
-            self._measure(drive)
-        evaluation = self.log.evaluations[self.evaluations]
-        if not torch.equal(evaluation.drive, drive):
-            raise LogError(
-                f"{self.log.path}: evaluation {self.evaluations + 1} is of another drive than the method "
-                "asks for; give the method, seed and version of autdtorch of that trial, or another log"
-            )
+        evaluation = self.log.recorded(self.evaluations, drive)
+        if evaluation is None:
+            evaluation = self._measure(drive)
         self.evaluations += 1
         if self._watch is not None:
             self._watch(evaluation)
         return evaluation.pressure
 
-    def _measure(self, drive: torch.Tensor) -> None:
+    def _measure(self, drive: torch.Tensor) -> Evaluation:
         self._link.play(drive)
         pressure = checked_reading(self._sensor, len(self.scene.control_points))
         self._link.require_on()
-        self.log.append(drive, pressure, self._link.seconds_on)
+        return self.log.append(self.evaluations, drive, pressure, self._link.seconds_on)

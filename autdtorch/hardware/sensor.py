@@ -12,6 +12,7 @@ from typing import Protocol, runtime_checkable
 
 import torch
 
+from autdtorch.objective import validate_magnitudes
 from autdtorch.validation import (
     ArrayLike,
     integer_at_least,
@@ -20,7 +21,6 @@ from autdtorch.validation import (
     path_of,
     points_tensor,
     positive,
-    real_tensor,
     require_callable,
     require_kind,
 )
@@ -64,10 +64,7 @@ def checked_reading(sensor: Sensor, points: int) -> torch.Tensor:
     Raises:
         ValueError: not P finite magnitudes.
     """
-    pressure = real_tensor("pressure of the sensor", sensor.read(), "Pa")
-    if pressure.shape != (points,) or pressure.min() < 0:
-        raise invalid("pressure of the sensor", pressure.tolist(), f"must be {points} numbers >= 0", "Pa")
-    return pressure
+    return validate_magnitudes("pressure of the sensor", sensor.read(), points)
 
 
 class ManualSensor:

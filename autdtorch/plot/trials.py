@@ -128,9 +128,7 @@ def plot_convergence(
     for scene, by_label in levels.items():
         require_kind(f"levels[{scene!r}]", by_label, Mapping)
     if unknown := levels.keys() - history.keys():
-        raise ValueError(
-            f"levels: of scenes {list(unknown)}; must be of scenes in history: {list(history)}"
-        )
+        raise ValueError(f"levels: of scenes {list(unknown)}; must be of scenes in history: {list(history)}")
     level_labels = list(dict.fromkeys(name for by_label in levels.values() for name in by_label))
     styles = {name: _LEVELS[index % len(_LEVELS)] for index, name in enumerate(level_labels)}
     looks = looks_of(methods_of(history.values()))

@@ -327,7 +327,8 @@ class SimulatedPropagator(ABC):
     def _kept_matrix(self, points: torch.Tensor) -> tuple[torch.Tensor, float]:
         """Transfer matrix and its distance to the steady state, from disk if it is there."""
         digest = "" if self._cache is None else self._digest(points)
-        if self._cache is not None and (found := self._cache.load(digest)) is not None:
+        shape = len(points), len(self.scene.array)
+        if self._cache is not None and (found := self._cache.load(digest, shape)) is not None:
             logger.info("transfer matrix from %s: no run", self._cache.folder)
             return torch.from_numpy(found[0]), found[1]
         before = len(self.runs)

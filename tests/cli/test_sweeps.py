@@ -1,10 +1,14 @@
 """Sweeps: a job for each scene and method, here and in other processes, and what a failure leaves of them."""
 
 import csv
+import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
+from check_kills import Subject, of_studies, wait
 from hydra import compose, initialize_config_dir
 
 from autdtorch.collect import collect_results
@@ -33,6 +37,22 @@ def test_jobs_in_one_scene_share_its_matrices(run: Run, tmp_path: Path) -> None:
     assert run("-m", *coarse, "method=lss,lssg") == 0
     (matrix,) = (tmp_path / "multirun" / "matrices").iterdir()
     assert matrix.suffix == ".matrix"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="SIGKILL is of POSIX")
+def test_a_killed_sweep_goes_on_with_the_same_command(run: Run, tmp_path: Path) -> None:
+    command = ("-m", *QUICK, "method=gabs,identify", "trials=2")
+    sweep = Subject(("-m", "autdtorch", *command), "multirun/*/trials.jsonl", of_studies)
+    process = sweep.start(tmp_path)
+    wait(lambda: sweep.lines(tmp_path) > 0, process)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL
+    assert run(*command) == 0
+    assert run(*command, "hydra.sweep.dir=calm") == 0
+    assert sweep.lines(tmp_path) == 4
+    found, undisturbed = of_studies(tmp_path / "multirun"), of_studies(tmp_path / "calm")
+    assert len(found) == len(undisturbed) > 0
+    assert all(map(torch.equal, found, undisturbed))
 
 
 def test_a_real_cluster_has_its_config() -> None:

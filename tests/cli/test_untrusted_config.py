@@ -56,9 +56,7 @@ def bomb(first: str, line: str) -> str:
 
 LAUGHS = bomb("a0: &a0 [lol, lol]\n", "a{this}: &a{this} [{all}]\n")
 MERGES = bomb("a0: &a0 {x: 1}\n", "a{this}: &a{this} {{<<: [{all}]}}\n")
-REFERENCES = "a0: [lol, lol]\n" + "".join(
-    f"a{n}: {[f'${{scene.a{n - 1}}}'] * 10}\n" for n in range(1, 10)
-)
+REFERENCES = "a0: [lol, lol]\n" + "".join(f"a{n}: {[f'${{scene.a{n - 1}}}'] * 10}\n" for n in range(1, 10))
 
 HYDRA = {
     "callbacks": f"{{x: {CALL}}}",

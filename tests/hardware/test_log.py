@@ -1,7 +1,6 @@
 """What a log is refused for, and what is done to its file."""
 
 import errno
-import json
 import signal
 import subprocess
 import sys
@@ -11,7 +10,9 @@ import pytest
 import torch
 from filelock import FileLock, Timeout
 
+from autdtorch.cache import digest_of
 from autdtorch.hardware import EmulatedSensor, LogError
+from autdtorch.json_lines import SET_ASIDE, line_of, row_of
 
 
 def full_on(rows: int = 1) -> torch.Tensor:
@@ -54,54 +55,128 @@ def test_a_full_disk_leaves_no_half_line_to_go_on_after(trial, monkeypatch, fail
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("settings", "message"),
     [
-        (lambda log: log.replace('"seed": 1', '"seed": 2'), "of another trial, whose seed is 2, not 1"),
-        (lambda log: log.replace("SonicSurface", "OpenMPD"), "whose device is OpenMPD, not SonicSurface"),
-        (lambda log: log.replace('"scene": "', '"scene": "x'), "of another trial, whose scene is x"),
-        (lambda log: "time,drive\n1,2\n", "must be the log of a hardware trial"),
-        (lambda log: log + "{}\n" + log, "must be the log of a hardware trial"),
+        ({"seed": 2}, "of another trial, whose seed is 2, not 1"),
+        ({"seed": 1, "dead": []}, r"of another trial, whose dead is \[\], not None"),
+        ({}, "of another trial, whose seed is None, not 1"),
     ],
 )
-def test_the_log_of_another_trial_is_refused(trial, change, message: str):
+def test_the_log_of_another_trial_is_refused_and_left_as_it_is(trial, settings, message: str):
     bench = trial.bench()
     with trial.link(bench) as link:
-        trial.objective(link, EmulatedSensor(bench), seed=1)(full_on())
-        trial.log.write_text(change(trial.log.read_text()))
-        with pytest.raises(ValueError, match=message):
+        trial.objective(link, EmulatedSensor(bench), **settings)(full_on())
+        content = trial.log.read_bytes()
+        with pytest.raises(LogError, match=message):
             trial.objective(link, EmulatedSensor(bench), seed=1)
+    assert trial.log.read_bytes() == content
 
 
 def test_a_log_of_other_drives_is_refused(trial):
     bench = trial.bench()
     with trial.link(bench) as link:
         trial.objective(link, EmulatedSensor(bench))(full_on())
-        with pytest.raises(ValueError, match="evaluation 1 is of another drive"):
+        with pytest.raises(LogError, match="evaluation 1 is of another drive"):
             trial.objective(link, EmulatedSensor(bench))(0.5 * full_on())
+        trial.objective(link, EmulatedSensor(bench))(full_on(3))
+        with pytest.raises(LogError, match="evaluation 3 is of another drive"):
+            trial.objective(link, EmulatedSensor(bench))(torch.cat([full_on(2), 0.5 * full_on()]))
+
+
+def drives() -> torch.Tensor:
+    return torch.linspace(0.5, 1, 6)[:, None] * full_on()
+
+
+class Noisy(EmulatedSensor):
+    """Reads something else every time; `readings` is their number."""
+
+    readings = 0
+
+    def read(self) -> torch.Tensor:
+        self.readings += 1
+        return super().read() + self.readings
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    "change",
     [
-        ({"pressure": [1.0, float("nan")]}, "pressure"),
-        ({"pressure": [1.0, float("inf")]}, "pressure"),
-        ({"pressure": [1.0, -1.0]}, r"pressure: .* must be 2 numbers >= 0"),
-        ({"pressure": [1.0]}, r"must be 2 numbers >= 0"),
-        ({"drive": [[1.0, 0.0]] * 15}, r"drive: shape \(15,\)"),
-        ({"drive": [[1.0, 0.0]] * 15 + [[1.0, 1.0]]}, r"every \|q\| must be in \[0, 1\]"),
-        ({"drive": [1.0] * 16}, ""),
-        ({"seconds_on": -1.0}, "seconds_on"),
-        ({"time": "noon"}, "noon"),
+        {"pressure": [1.0, float("nan")]},
+        {"pressure": [1.0, float("inf")]},
+        {"pressure": [1.0, -1.0]},
+        {"pressure": [1.0]},
+        {"drive": [[1.0, 0.0]] * 15},
+        {"drive": [[1.0, 0.0]] * 15 + [[1.0, 1.0]]},
+        {"drive": [1.0] * 16},
+        {"seconds_on": -1.0},
+        {"seconds_on": 10**400},
+        {"time": "noon"},
+        {"time": 12},
+        {"evaluation": -1},
+        {"evaluation": 2.0},
     ],
 )
-def test_a_line_that_cannot_have_been_measured_is_refused_by_its_number(trial, change, message: str):
+def test_an_evaluation_that_cannot_have_been_measured_is_measured_again(trial, change):
     bench = trial.bench()
     with trial.link(bench) as link:
-        trial.objective(link, EmulatedSensor(bench))(full_on(2))
-        *lines, last = trial.log.read_text().splitlines()
-        trial.log.write_text("\n".join([*lines, json.dumps(json.loads(last) | change), ""]))
-        with pytest.raises(LogError, match=rf"trial\.jsonl, line 3: .*{message}"):
-            trial.objective(link, EmulatedSensor(bench))
+        log = trial.objective(link, EmulatedSensor(bench)).log
+        trial.objective(link, EmulatedSensor(bench))(drives())
+        key = digest_of(log.origin)
+        lines = trial.log.read_bytes().splitlines()
+        whole, lines[3] = lines[3], line_of(row_of(lines[3], key) | change, key)
+        trial.log.write_bytes(b"\n".join([*lines, b""]))
+        sensor = Noisy(bench)
+        trial.objective(link, sensor)(drives())
+        assert sensor.readings == 1
+    assert trial.log.with_name(trial.log.name + SET_ASIDE).read_bytes() == lines[3] + b"\n"
+    again = row_of(trial.log.read_bytes().splitlines()[-1], key)
+    assert again["evaluation"] == row_of(whole, key)["evaluation"]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda lines: lines[1:],  # the first line says what the trial is
+        lambda lines: [b"[" * 10**6, *lines[1:]],
+        lambda lines: [lines[3], *lines[1:3], lines[0], *lines[4:]],
+        lambda lines: [*lines[:3], *lines[4:]],
+        lambda lines: [*lines[:3], b"\0" * 99, *lines[4:]],
+        lambda lines: [*lines[:4], lines[3], *lines[4:]],
+        lambda lines: [*lines[:3], lines[5], lines[4], lines[3], *lines[6:]],
+        lambda lines: [*lines, *lines],
+    ],
+)
+def test_damage_costs_the_evaluations_it_touches_alone(trial, damage, caplog):
+    bench = trial.bench()
+    with trial.link(bench) as link:
+        measured = trial.objective(link, EmulatedSensor(bench))(drives())
+        lines = trial.log.read_bytes().splitlines()
+        damaged = damage(lines)
+        trial.log.write_bytes(b"\n".join([*damaged, b""]))
+        sensor = Noisy(bench)
+        again = trial.objective(link, sensor)(drives())
+        assert sensor.readings == len(set(lines[1:]) - set(damaged))
+        kept = (again == measured).all(dim=1)
+        assert int(kept.sum()) == len(set(lines[1:]) & set(damaged))
+        caplog.clear()
+        assert torch.equal(trial.objective(link, sensor)(drives()), again)
+        assert not caplog.messages
+        with pytest.raises(LogError, match="evaluation 1 is of another drive"):
+            trial.objective(link, sensor)(0.5 * drives())
+
+
+def test_where_a_reading_made_again_leads_elsewhere_the_trial_follows_it(trial):
+    bench = trial.bench()
+    others = drives()
+    others[4:] *= 0.5
+    with trial.link(bench) as link:
+        trial.objective(link, EmulatedSensor(bench))(drives())
+        lines = trial.log.read_bytes().splitlines(keepends=True)
+        trial.log.write_bytes(b"".join([*lines[:3], *lines[4:]]))
+        sensor = Noisy(bench)
+        pressure = trial.objective(link, sensor)(others)
+        assert sensor.readings == 1 + 2
+        assert torch.equal(trial.objective(link, sensor)(others), pressure)
+        assert sensor.readings == 1 + 2
 
 
 @pytest.mark.parametrize(
@@ -111,7 +186,9 @@ def test_a_line_that_cannot_have_been_measured_is_refused_by_its_number(trial, c
         '{"origin": "Kyoto"}\n',
         '{"origin": {}}\n{"notes": 1}\n',
         "notes\n",
+        "time,drive\n1,2\n",
         '{"origin": {"a',
+        "[" * 10**6 + "\n",
     ],
 )
 def test_a_file_that_is_no_log_is_refused_and_left_as_it_is(trial, content: str):
@@ -122,17 +199,34 @@ def test_a_file_that_is_no_log_is_refused_and_left_as_it_is(trial, content: str)
     assert trial.log.read_text() == content
 
 
+def test_a_folder_in_the_place_of_the_log_is_told(trial):
+    trial.log.mkdir()
+    bench = trial.bench()
+    with trial.link(bench) as link, pytest.raises(IsADirectoryError, match="trial\\.jsonl"):
+        trial.objective(link, EmulatedSensor(bench))
+
+
 @pytest.mark.parametrize("ended", [True, False])
-def test_a_log_without_evaluations_is_begun_anew_by_other_settings(trial, ended: bool):
+def test_a_log_without_evaluations_is_begun_anew_by_other_settings(trial, ended: bool, caplog):
     bench = trial.bench()
     with trial.link(bench) as link:
         first = trial.objective(link, EmulatedSensor(bench), seed=1)
         if ended:
             first.log.end(seconds_on=1.0)
         second = trial.objective(link, EmulatedSensor(bench), seed=2)
+        assert not second.log.goes_on
         second(full_on())
         assert second.log.seconds_on < 1
         assert len(trial.objective(link, EmulatedSensor(bench), seed=2).log.evaluations) == 1
+    assert not caplog.messages
+    assert [path.name for path in trial.log.parent.iterdir() if path.suffix == SET_ASIDE] == []
+
+
+def test_a_trial_killed_before_its_first_evaluation_goes_on(trial):
+    bench = trial.bench()
+    with trial.link(bench) as link:
+        assert not trial.objective(link, EmulatedSensor(bench)).log.goes_on
+        assert trial.objective(link, EmulatedSensor(bench)).log.goes_on
 
 
 def test_another_trial_is_named_by_what_was_said_first(trial):

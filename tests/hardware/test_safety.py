@@ -215,7 +215,7 @@ def test_a_closed_link_is_not_kept_until_python_exits(trial):
 def test_the_time_on_goes_on_with_the_trial(trial):
     bench = trial.bench()
     with trial.link(bench) as link:
-        trial.objective(link, EmulatedSensor(bench)).log.append(full_on()[0], torch.ones(2), 60.0)
+        trial.objective(link, EmulatedSensor(bench)).log.append(0, full_on()[0], torch.ones(2), 60.0)
         limited = LimitedLink(link, Limits(1.0, seconds=60.0))  # a test does not take that long
         objective = HardwareObjective(trial.scene, limited, EmulatedSensor(bench), trial.log)
         with pytest.raises(LimitError, match="on for 60 s, the limit"):

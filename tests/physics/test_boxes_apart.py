@@ -175,9 +175,7 @@ def test_what_boxes_hear_of_each_other_is_counted_from_their_geometry(
     propagator = make_propagator(scene, "box", spacing, tolerance=TOLERANCE)
     assert isinstance(propagator, BoxPropagator)
     one, other = propagator._boxes
-    pairs = sum(
-        len(hearing.driven) * len(box._surface[0]) for hearing, box in ((one, other), (other, one))
-    )
+    pairs = sum(len(hearing.driven) * len(box._surface[0]) for hearing, box in ((one, other), (other, one)))
     # for all runs at once, between two passes; measured: 1.5 and 0.8 times, as the grid's place is not known
     assert 0.5 < pairs / (box_cost(apart.grids, 2, runs=0) / _PAIR) < 2
     assert box_cost(apart.grids, 3, runs=0) == 2 * box_cost(apart.grids, 2, runs=0)

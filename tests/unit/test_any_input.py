@@ -60,9 +60,7 @@ def refusal(function: Callable[..., Any], arguments: dict[str, Any]) -> Exceptio
 def complaint(call: Call, parameter: str, wrong: Wrong, error: Exception | None) -> str | None:
     """What is not as promised, if anything."""
     annotation = call.parameters[parameter]
-    barred = type(wrong.value) in LET_IN and not any(
-        kind in annotation for kind in LET_IN[type(wrong.value)]
-    )
+    barred = type(wrong.value) in LET_IN and not any(kind in annotation for kind in LET_IN[type(wrong.value)])
     if error is None:
         return "taken" if wrong.never or barred else None
     if isinstance(error, OSError) and isinstance(wrong.value, str):

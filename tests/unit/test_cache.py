@@ -214,13 +214,32 @@ def test_a_damaged_file_is_not_trusted(
     cache.save("one", np.arange(6.0).reshape(2, 3), 0.5)
     (path,) = files(tmp_path)
     path.write_bytes(damage(path.read_bytes()))  # type: ignore[operator]
-    assert cache.load("one") is None
+    assert cache.load("one", (2, 3)) is None
     assert "damaged (its checksum is wrong)" in caplog.text
     cache.save("one", np.arange(6.0).reshape(2, 3), 0.5)
-    found = cache.load("one")
+    found = cache.load("one", (2, 3))
     assert found is not None
     assert np.array_equal(found[0], np.arange(6.0).reshape(2, 3))
     assert found[1] == 0.5
+
+
+def test_a_matrix_of_another_shape_or_name_is_not_taken(tmp_path: Path) -> None:
+    cache = DiskCache(tmp_path)
+    cache.save("one", np.arange(6.0).reshape(2, 3), 0.5)
+    assert cache.load("one", (3, 2)) is None
+    (path,) = files(tmp_path)
+    path.replace(path.with_stem("two"))
+    assert cache.load("two", (2, 3)) is None
+
+
+def test_a_flipped_bit_anywhere_is_noticed(tmp_path: Path) -> None:
+    cache = DiskCache(tmp_path)
+    cache.save("one", np.arange(6.0).reshape(2, 3), 0.5)
+    (path,) = files(tmp_path)
+    content = path.read_bytes()
+    for place, byte in enumerate(content):
+        path.write_bytes(content[:place] + bytes([byte ^ 1 << place % 8]) + content[place + 1 :])
+        assert cache.load("one", (2, 3)) is None
 
 
 def test_a_folder_that_cannot_be_used_costs_no_result(
@@ -228,11 +247,11 @@ def test_a_folder_that_cannot_be_used_costs_no_result(
 ) -> None:
     cache = DiskCache(tmp_path / "folder")
     (tmp_path / "folder").rmdir()
-    cache.save("one", np.ones(3), 0.0)
+    cache.save("one", np.ones((2, 3)), 0.0)
     assert re.search("cannot be written .*: not kept", caplog.text)
-    assert cache.load("one") is None
+    assert cache.load("one", (2, 3)) is None
     (tmp_path / "folder" / f"one{SUFFIX}").mkdir(parents=True)
-    assert cache.load("one") is None
+    assert cache.load("one", (2, 3)) is None
     assert re.search("cannot be read .*: computing again", caplog.text)
     cache.save("one", np.ones(3), 0.0)
     assert not list((tmp_path / "folder").glob(f"*{PARTIAL}"))
@@ -250,7 +269,7 @@ def test_writers_that_run_together_and_are_killed(tmp_path: Path) -> None:
         cache, seen = DiskCache(folder), set()
         end = time.monotonic() + 60
         while len(seen) < 3 and time.monotonic() < end:
-            found = cache.load("shared")
+            found = cache.load("shared", (200_000,))
             assert found is not None
             assert (found[0] == found[1]).all()
             seen.add(found[1])
@@ -259,7 +278,7 @@ def test_writers_that_run_together_and_are_killed(tmp_path: Path) -> None:
         for writer in writers:
             writer.kill()
             writer.wait()
-    found = cache.load("shared")
+    found = cache.load("shared", (200_000,))
     assert found is not None
     assert (found[0] == found[1]).all()
 
@@ -277,11 +296,11 @@ def test_a_writer_killed_before_it_is_done_leaves_nothing_that_is_read(tmp_path:
         writer.wait()
     cache = DiskCache(tmp_path)
     (left,) = tmp_path.glob(f"*{PARTIAL}")
-    assert cache.load("shared") is None
-    cache.save("shared", np.ones(2), 0.0)
+    assert cache.load("shared", (200_000,)) is None
+    cache.save("shared", np.ones(200_000), 0.0)
     assert left.exists()  # it might be that of a process that writes
     old = time.time() - 2 * ABANDONED
     os.utime(left, (old, old))
-    cache.save("shared", np.ones(2), 0.0)
+    cache.save("shared", np.ones(200_000), 0.0)
     assert not left.exists()
-    assert cache.load("shared") is not None
+    assert cache.load("shared", (200_000,)) is not None

@@ -12,6 +12,7 @@ from autdtorch.collect import Sweep, collect_results
 from autdtorch.optim.base import Solution, joined
 from autdtorch.optim.gabs import gabs
 from autdtorch.optim.lssg import lssg
+from autdtorch.results import RESULTS_FILE
 from autdtorch.scene_file import load_scene
 from autdtorch.study import run_study
 from autdtorch.summary import save_summary
@@ -120,6 +121,29 @@ def test_what_an_experiment_has_not_finished_is_said(
     run_study({"air": load_scene(SCENE)}, {"lssg": lssg}, folder=tmp_path, config=yaml.safe_dump(config))
     assert names(collect_results(tmp_path)) == ["air"]
     assert caplog.messages[-1].endswith("scenes that are not finished are left out: lab")
+
+
+@pytest.mark.parametrize(
+    "config",
+    ["", "text", "[1, 2]", "{", "scene: 1", "scenes: [air]", "scenes: {air: {}}", "scene: {}\nfiles: 3"],
+)
+def test_a_study_without_the_settings_of_the_command_line_is_refused(tmp_path: Path, config: str) -> None:
+    run_study({"air": load_scene(SCENE)}, {"lssg": lssg}, folder=tmp_path, config=config)
+    with pytest.raises(ValueError, match=r"results\.h5: "):
+        collect_results(tmp_path)
+
+
+def test_a_study_that_is_there_twice_is_counted_once_and_told(
+    study: Study, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for seed in (0, 1):
+        study(seed=seed)
+    (tmp_path / "0" / RESULTS_FILE).write_bytes((tmp_path / "1" / RESULTS_FILE).read_bytes())
+    (method,) = collect_results(tmp_path).results.scenes["air"].methods.values()
+    assert method.trials == 1
+    (line,) = caplog.messages
+    assert str(tmp_path / "0") in line
+    assert str(tmp_path / "1") in line
 
 
 def test_joined_histories_go_on_with_their_last_value() -> None:

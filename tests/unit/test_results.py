@@ -2,12 +2,17 @@
 
 import dataclasses
 import errno
+import hashlib
 import os
+from collections.abc import Callable
 from pathlib import Path
 
+import h5py
+import numpy as np
 import pytest
 import torch
 
+from autdtorch.json_lines import line_of
 from autdtorch.metrics import focus_metrics
 from autdtorch.optim.base import Solution
 from autdtorch.propagator import Run
@@ -114,6 +119,97 @@ def test_the_provenance_comes_back_or_is_refused_by_name(results: StudyResult, t
         (tmp_path / PROVENANCE_FILE).write_text(wrong, encoding="utf-8")
         with pytest.raises(ValueError, match=rf"{PROVENANCE_FILE}: .*must be a provenance file"):
             load_provenance(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"config": 3}, {"seed": "3"}, {"seed": True}, {"versions": []}, {"date": None}, {"more": 1}],
+)
+def test_a_provenance_of_other_fields_or_types_is_refused(
+    results: StudyResult, tmp_path: Path, change: dict[str, object]
+) -> None:
+    row = dataclasses.asdict(results.provenance) | change
+    (tmp_path / PROVENANCE_FILE).write_bytes(line_of(row) + b"\n")
+    with pytest.raises(ValueError, match=PROVENANCE_FILE):
+        load_provenance(tmp_path)
+
+
+@pytest.mark.parametrize("name", [RESULTS_FILE, PROVENANCE_FILE])
+def test_a_flipped_bit_anywhere_is_noticed(results: StudyResult, tmp_path: Path, name: str) -> None:
+    save_results(results, tmp_path)
+    save_provenance(results.provenance, tmp_path)
+    content = (tmp_path / name).read_bytes()
+    for place in range(0, len(content), 1 + len(content) // 500):
+        flipped = bytes([content[place] ^ 1 << place % 8])
+        (tmp_path / name).write_bytes(content[:place] + flipped + content[place + 1 :])
+        with pytest.raises(ValueError, match=f"{name}: its checksum is wrong"):
+            load_results(tmp_path) if name == RESULTS_FILE else load_provenance(tmp_path)
+
+
+def test_a_file_is_on_disk_before_it_takes_its_place(
+    results: StudyResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[int] = []
+    replace = Path.replace
+
+    def check(self: Path, target: Path) -> Path:
+        assert synced == [self.stat().st_size]
+        return replace(self, target)
+
+    monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append(os.fstat(descriptor).st_size))
+    monkeypatch.setattr(Path, "replace", check)
+    save_results(results, tmp_path)
+    assert synced
+
+
+def test_other_programs_read_the_file_as_any_of_hdf5(results: StudyResult, tmp_path: Path) -> None:
+    save_results(results, tmp_path)
+    with h5py.File(tmp_path / RESULTS_FILE) as file:
+        matrix = file["scenes/two_cubes/transfer_matrix"][()]
+    assert np.array_equal(matrix, results.scenes["two_cubes"].transfer_matrix.numpy())
+
+
+def a_dataset(file: h5py.File, name: str) -> None:
+    del file[name]
+    file[name] = [1.0, 2.0]
+
+
+def an_attribute(file: h5py.File, name: str, value: object) -> None:
+    file.attrs[name] = value
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda file: file.pop("scenes"),
+        lambda file: a_dataset(file, "scenes"),
+        lambda file: a_dataset(file, "scenes/empty"),
+        lambda file: a_dataset(file, "scenes/empty/methods"),
+        lambda file: a_dataset(file, "scenes/empty/methods/gabs"),
+        lambda file: file.pop("scenes/empty/transfer_matrix"),
+        lambda file: file.pop("scenes/two_cubes/runs/seconds"),
+        lambda file: a_dataset(file, "scenes/empty/runs/seconds"),  # of another length
+        lambda file: file["scenes/empty"].attrs.pop("bound"),
+        lambda file: an_attribute(file["scenes/empty"], "bound", "high"),
+        lambda file: an_attribute(file["scenes/empty"], "bound", np.ones(2)),
+        lambda file: an_attribute(file["scenes/empty"], "obstacles", np.inf),
+        lambda file: an_attribute(file, "config", np.bytes_(b"\xff")),
+        lambda file: an_attribute(file, "date", 3),
+        lambda file: an_attribute(file, "seed", "three"),
+        lambda file: file.attrs.pop("source_digest"),
+    ],
+)
+def test_a_file_of_other_content_is_refused_in_one_line(
+    results: StudyResult, tmp_path: Path, change: Callable[[h5py.File], object]
+) -> None:
+    path = tmp_path / RESULTS_FILE
+    save_results(results, tmp_path)
+    with h5py.File(path, "r+") as file:
+        change(file)
+    body = path.read_bytes()[512:]
+    path.write_bytes(hashlib.sha256(body).hexdigest().encode().ljust(512, b"\0") + body)
+    with pytest.raises(ValueError, match=rf"^.*{RESULTS_FILE}: .*; must be a results file of .*$"):
+        load_results(path)
 
 
 def test_only_the_date_may_differ_between_results_of_the_same_origin(results: StudyResult) -> None:

@@ -78,9 +78,7 @@ def test_overlapping_obstacles_of_different_materials_are_named():
     with pytest.warns(
         OverlapWarning, match=r"^Scene\.obstacles: 2 overlaps 0, 3 overlaps 0, 3 overlaps 2, of"
     ) as caught:
-        paper_scene(
-            obstacles=[ball(40, 8, 100.0), ball(60, 8, 50.0), ball(45, 8, 50.0), ball(43, 2, 10.0)]
-        )
+        paper_scene(obstacles=[ball(40, 8, 100.0), ball(60, 8, 50.0), ball(45, 8, 50.0), ball(43, 2, 10.0)])
     assert len(caught) == 1  # and not 2 with 1, which are of one material
     assert caught[0].filename == __file__
 

@@ -64,7 +64,10 @@ def numbers(folder: Path) -> dict[str, torch.Tensor]:
     for method in ("box", "full", "free_space"):
         propagator = at.make_propagator(scene, method, 2e-3, cache=False)
         matrix, error = propagator.transfer_matrix(return_error=True)
-        found[method], found[f"{method} error"] = matrix, torch.tensor(error, dtype=torch.float64, device="cpu")
+        found[method], found[f"{method} error"] = (
+            matrix,
+            torch.tensor(error, dtype=torch.float64, device="cpu"),
+        )
         drive = at.drive_from_phases(torch.arange(4, dtype=torch.float64, device="cpu"))
         found[f"{method} field"] = propagator.field(drive, scene.control_points + 1e-4)
     objective = at.SimulatedObjective(scene, at.make_propagator(scene, "box", 2e-3, cache=False))

@@ -1,4 +1,4 @@
-"""Finished trials come back bit for bit, whatever a killed process left at the end of the file."""
+"""Finished trials come back bit for bit, and only what a method can have found in a scene of the study."""
 
 import json
 from pathlib import Path
@@ -6,13 +6,23 @@ from pathlib import Path
 import pytest
 import torch
 
-from autdtorch.optim.base import Solution
+from autdtorch.json_lines import SET_ASIDE, line_of, row_of
+from autdtorch.optim.base import NEAR_TIE, Solution
 from autdtorch.trial_file import TRIALS_FILE, TrialFile
+
+ORIGIN = "the study's"
+SHAPES = {"a": (3, 2)}
+
+
+def opened(path: Path | None, seed: int = 0) -> TrialFile:
+    file = TrialFile(path, ORIGIN, seed, SHAPES)
+    file.mend()
+    return file
 
 
 def found(trials: int, evaluations: int, seed: int = 0) -> Solution:
     generator = torch.Generator().manual_seed(seed)
-    drive = torch.randn(trials, 3, dtype=torch.complex128, generator=generator)
+    drive = torch.randn(trials, 3, dtype=torch.complex128, generator=generator).sgn()
     pressure = torch.rand(trials, 2, dtype=torch.float64, generator=generator)
     history = torch.rand(trials, evaluations, dtype=torch.float64, generator=generator).cummax(dim=1).values
     score = history[:, -1].clone()
@@ -33,11 +43,11 @@ def test_trials_come_back_bit_for_bit_in_their_order(path: Path) -> None:
     solution = found(4, 5)
     order = torch.tensor([2, 0, 3, 1])
     parts = [order[:3], order[3:]]
-    file = TrialFile(path, 7)
+    file = opened(path, 7)
     for part in parts:
         columns = [getattr(solution, name)[part] for name in ("drive", "pressure", "score", "evaluations")]
         file.append("a", "gabs", part.tolist(), Solution(*columns, solution.history[part]), 6.0)
-    for read in (file, TrialFile(path, 7)):
+    for read in (file, opened(path, 7)):
         assert read.missing("a", "gabs", 6) == [4, 5]
         assert read.missing("a", "lssg", 1) == [0]
         back, seconds = read.found("a", "gabs", 4)
@@ -47,20 +57,20 @@ def test_trials_come_back_bit_for_bit_in_their_order(path: Path) -> None:
 
 
 def test_trials_that_ended_early_go_on_with_their_last_value(path: Path) -> None:
-    file = TrialFile(path, 0)
+    file = opened(path)
     file.append("a", "gabs", [0], found(1, 3), 1.0)
     file.append("a", "gabs", [1], found(1, 5, seed=1), 1.0)
-    back, _ = TrialFile(path, 0).found("a", "gabs", 2)
+    back, _ = opened(path).found("a", "gabs", 2)
     assert back.evaluations.tolist() == [3, 5]
     assert back.history.shape == (2, 5)
     assert back.history[0, 3:].tolist() == [back.score[0].item()] * 2
 
 
 def test_a_line_a_trial_with_its_figures(path: Path) -> None:
-    TrialFile(path, 3).append("two_cubes", "lssg", [0], found(1, 2), 1.5)
+    opened(path, 3).append("a", "lssg", [0], found(1, 2), 1.5)
     row = json.loads(path.read_text(encoding="utf-8"))
     weakest, strongest = sorted(row["pressure"])
-    assert (row["scene"], row["method"], row["trial"], row["seed"]) == ("two_cubes", "lssg", 0, 3)
+    assert (row["scene"], row["method"], row["trial"], row["seed"]) == ("a", "lssg", 0, 3)
     assert (row["evaluations"], row["seconds"]) == (2, 1.5)
     assert row["min"] == weakest
     assert row["mean"] == pytest.approx((weakest + strongest) / 2, rel=1e-15)
@@ -69,7 +79,7 @@ def test_a_line_a_trial_with_its_figures(path: Path) -> None:
 
 
 def test_whatever_is_cut_off_costs_no_earlier_trial(path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    file = TrialFile(path, 0)
+    file = opened(path)
     for trial in range(3):
         file.append("a", "gabs", [trial], found(1, 2, seed=trial), 1.0)
     content = path.read_bytes()
@@ -77,18 +87,107 @@ def test_whatever_is_cut_off_costs_no_earlier_trial(path: Path, caplog: pytest.L
     for length in (first, first + 1, (first + second) // 2, second - 1, second, len(content) - 1):
         path.write_bytes(content[:length])
         complete = content[:length].count(b"\n")
-        file = TrialFile(path, 0)
+        file = opened(path)
         assert file.missing("a", "gabs", 3) == list(range(complete, 3))
         for trial in file.missing("a", "gabs", 3):
             file.append("a", "gabs", [trial], found(1, 2, seed=trial), 1.0)
         assert path.read_bytes() == content
-    assert "is not complete: cut off there" in caplog.text
+    assert "the last line broke off: cut off" in caplog.text
 
 
 def test_without_a_path_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    file = TrialFile(None, 0)
+    file = opened(None)
     solution = found(2, 2)
     file.append("a", "gabs", [0, 1], solution, 1.0)
     assert_equal(file.found("a", "gabs", 2)[0], solution)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def lines(path: Path) -> list[bytes]:
+    """Lines of three trials, in the file."""
+    opened(path).append("a", "gabs", range(3), found(3, 4), 3.0)
+    return path.read_bytes().splitlines()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"drive": [[7.0, 0.0]] + [[1.0, 0.0]] * 2},
+        {"drive": [[1.0, 0.0]] * 4},
+        {"drive": [1.0] * 3},
+        {"drive": [["1", "0"]] * 3},
+        {"pressure": [1.0]},
+        {"pressure": [1.0, -1.0]},
+        {"pressure": [1.0, float("nan")]},
+        {"history": [1.0] * 3},
+        {"history": [1.0, 0.5, 1.0, 2.0]},
+        {"history": [10**400] * 4},
+        {"history": 1.0},
+        {"score": float("inf")},
+        {"score": 10**400},
+        {"score": 2.0},  # the history's are below 1
+        {"evaluations": 4.0},
+        {"seconds": -1.0},
+        {"seconds": None},
+        {"trial": -1},
+        {"trial": True},
+        {"trial": 0},  # is there already
+        {"scene": "b"},
+        {"scene": ["a"]},
+        {"method": {"a": 1}},
+    ],
+)
+def test_what_no_method_can_have_found_does_not_count(
+    path: Path, lines: list[bytes], change: dict[str, object]
+) -> None:
+    lines[1] = line_of(row_of(lines[1], ORIGIN) | change, ORIGIN)
+    path.write_bytes(b"\n".join([*lines, b""]))
+    file = opened(path)
+    assert file.missing("a", "gabs", 3) == [1]
+    assert len(file) == 2
+    assert path.with_name(path.name + SET_ASIDE).read_bytes() == lines[1] + b"\n"
+
+
+def test_a_row_without_one_of_its_fields_does_not_count(path: Path, lines: list[bytes]) -> None:
+    row = row_of(lines[1], ORIGIN)
+    names = "scene", "method", "trial", "score", "evaluations", "seconds", "pressure", "drive", "history"
+    for name in names:
+        lines[1] = line_of({key: value for key, value in row.items() if key != name}, ORIGIN)
+        path.write_bytes(b"\n".join([*lines, b""]))
+        assert opened(path).missing("a", "gabs", 3) == [1]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda line: b"[" * 10**6,
+        lambda line: line.replace(b'"trial": 1', b'"trial": 1' + b"0" * 10_000),
+        lambda line: line.replace(b'"trial": 1', b'"trial": NaN'),
+        lambda line: line.replace(b'"trial": 1', b'"trial": 1, "trial": 7'),
+        lambda line: line.replace(b"gabs", b"g\xffbs"),
+        lambda line: line.replace(b"gabs", b"g\0bs"),
+        lambda line: line + b"\r",
+        lambda line: line + b" ",
+        lambda line: b"",
+    ],
+)
+def test_a_line_that_was_not_written_so_does_not_count(path: Path, lines: list[bytes], damage) -> None:
+    path.write_bytes(b"\n".join([lines[0], damage(lines[1]), lines[2], b""]))
+    assert opened(path).missing("a", "gabs", 3) == [1]
+
+
+def test_the_trials_of_another_study_do_not_count(path: Path, lines: list[bytes]) -> None:
+    other = TrialFile(path, "another", 0, SHAPES)
+    assert len(other) == 0
+    assert path.read_bytes().splitlines() == lines
+
+
+@pytest.mark.parametrize("score", [0.5, 1 + NEAR_TIE / 2])
+def test_a_last_drive_that_scored_below_the_best_or_near_it_comes_back(path: Path, score: float) -> None:
+    """As `identify` returns it."""
+    solution = found(1, 4)
+    solution.score[0] = score * solution.history[0, -1]
+    opened(path).append("a", "identify", [0], solution, 1.0)
+    assert_equal(opened(path).found("a", "identify", 1)[0], solution)

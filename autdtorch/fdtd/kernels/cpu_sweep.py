@@ -25,6 +25,7 @@ from autdtorch.fdtd.kernels.compiled import INNER
 
 _U = np.uint64
 
+
 @njit(**INNER)
 def _sweep(p, at, n, row, old, old_at, total, across, weights):  # type: ignore[no-untyped-def]
     """Finish the plane before: old = total + A - keep old; then total = B + A before, across = A."""

@@ -1,0 +1,298 @@
+"""Damage the files of a study and of an emulated hardware trial at random, and begin them again.
+
+Each must end with the numbers of the undisturbed one, bit for bit, keep every line that the damage left
+whole, keep what was damaged, and be silent when it is begun once more.
+
+    python scripts/check_damage.py --damages 300
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import functools
+import logging
+import random
+import shutil
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from unittest import mock
+
+import torch
+
+import autdtorch as at
+from autdtorch import hardware
+from autdtorch.json_lines import SET_ASIDE
+from autdtorch.optim.base import Solution
+from autdtorch.results import PROVENANCE_FILE, RESULTS_FILE
+from autdtorch.study import run_study
+from autdtorch.study_folder import PREVIOUS
+from autdtorch.trial_file import TRIALS_FILE
+
+LOG_FILE = "trial.jsonl"
+
+AIR = at.Medium(density=1.2, sound_speed=340.0)
+CUBE = at.Box(center=(12e-3, 0, 0), size=(6e-3, 8e-3, 4e-3), density=100.0, sound_speed=340.0)
+SOLVER = {"spacing": 2e-3, "tolerance": 0.1}
+METHODS = {
+    "gabs": functools.partial(at.gabs, levels=4),
+    "identify": functools.partial(at.identify, evaluations=12),
+}
+
+Damage = Callable[[random.Random, bytes, bytes], bytes]
+
+
+def _scene(*obstacles: at.Box) -> at.Scene:
+    array = at.TransducerArray.grid((2, 2), pitch=8e-3, center=(0, 0, 0), normal=(1, 0, 0))
+    return at.Scene(array, AIR, 40e3, [(22e-3, 3e-3, 1e-3), (20e-3, -5e-3, 4e-3)], obstacles)
+
+
+def study(folder: Path, seed: int = 0) -> list[torch.Tensor]:
+    """Begin a study, or go on with it; returns all numbers that it found. Each seed has a cube of its own."""
+    results = run_study(
+        {"empty": _scene(), "cube": _scene(replace(CUBE, density=100.0 + seed))},
+        METHODS,
+        solver=SOLVER,
+        trials={"gabs": 5, "identify": 2},
+        seed=seed,
+        folder=folder,
+        config=f"seed: {seed}",
+    )
+    solutions = [result.solution for scene in results.scenes.values() for result in scene.methods.values()]
+    matrices = [scene.transfer_matrix for scene in results.scenes.values()]
+    return [*matrices, *(number for solution in solutions for number in _numbers(solution))]
+
+
+def trial(folder: Path, seed: int = 0) -> list[torch.Tensor]:
+    """Begin a hardware trial on the emulated bench, or go on with it; returns all numbers that it found."""
+    scene = _scene()
+    matrix = at.SimulatedObjective(scene, at.make_propagator(scene)).transfer_matrix
+    assert matrix is not None
+    channels = list(range(len(scene.array)))
+    bench = hardware.EmulatedBench(hardware.SONICSURFACE, matrix, channels)
+    with hardware.open_link(hardware.SONICSURFACE, channels, backend=bench.bus) as link:
+        limited = hardware.LimitedLink(link, hardware.Limits(amplitude=1.0))
+        sensor = hardware.EmulatedSensor(bench)
+        objective = hardware.HardwareObjective(scene, limited, sensor, folder / LOG_FILE, {"seed": seed})
+        try:
+            return _numbers(at.gabs(objective, levels=8, seed=seed))
+        finally:
+            objective.log.end(limited.seconds_on)
+
+
+def _numbers(solution: Solution) -> list[torch.Tensor]:
+    return [getattr(solution, field.name) for field in fields(solution)]
+
+
+def _place(rng: random.Random, content: bytes) -> int:
+    return rng.randrange(len(content))
+
+
+def _changed(rng: random.Random, content: bytes, change: int) -> bytes:
+    place = _place(rng, content)
+    return content[:place] + bytes([content[place] ^ change]) + content[place + 1 :]
+
+
+def _zeroed(rng: random.Random, content: bytes, _: bytes) -> bytes:
+    place = _place(rng, content)
+    block = content[place : place + rng.choice((8, 64, 512))]
+    return content[:place] + b"\0" * len(block) + content[place + len(block) :]
+
+
+def _lines_changed(change: Callable[[random.Random, list[bytes], list[bytes]], None]) -> Damage:
+    def damage(rng: random.Random, content: bytes, other: bytes) -> bytes:
+        lines = content.splitlines(keepends=True)
+        change(rng, lines, other.splitlines(keepends=True))
+        return b"".join(lines)
+
+    return damage
+
+
+def _swap(rng: random.Random, lines: list[bytes], _: list[bytes]) -> None:
+    one, two = rng.randrange(len(lines)), rng.randrange(len(lines))
+    lines[one], lines[two] = lines[two], lines[one]
+
+
+#: Ways to damage the content of a file, given that of the same file of another study or trial.
+ANY: dict[str, Damage] = {
+    "bit flipped": lambda rng, content, _: _changed(rng, content, 1 << rng.randrange(8)),
+    "byte changed": lambda rng, content, _: _changed(rng, content, rng.randrange(1, 256)),
+    "cut": lambda rng, content, _: content[: _place(rng, content)],
+    "block zeroed": _zeroed,
+    "garbage appended": lambda rng, content, _: content + rng.randbytes(rng.choice((1, 50, 5000))),
+    "emptied": lambda *_: b"",
+    "file of another": lambda _, __, other: other,
+}
+OF_LINES: dict[str, Damage] = {
+    "line removed": _lines_changed(lambda rng, lines, _: lines.pop(rng.randrange(len(lines)))),
+    "line doubled": _lines_changed(lambda rng, lines, _: lines.insert(rng.randrange(len(lines)), lines[-1])),
+    "lines swapped": _lines_changed(_swap),
+    "garbage line": _lines_changed(
+        lambda rng, lines, _: lines.insert(rng.randrange(len(lines)), rng.randbytes(80) + b"\n")
+    ),
+    "line of another": _lines_changed(
+        lambda rng, lines, other: lines.insert(rng.randrange(len(lines)), rng.choice(other))
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is damaged.
+
+    Attributes:
+        journal: name of its file of lines.
+        begin: begins it in a folder, or goes on there, and returns all numbers that it found.
+        numbers: of the undisturbed one.
+        states: folders with what it leaves: finished, and half-finished.
+        another: the folder of another one.
+    """
+
+    journal: str
+    begin: Callable[[Path], list[torch.Tensor]]
+    numbers: list[torch.Tensor]
+    states: tuple[Path, Path]
+    another: Path
+
+
+def study_subject(folder: Path) -> Subject:
+    """A study: finished, and killed in its second scene."""
+    finished, half, another = (folder / name for name in ("study", "half-study", "another-study"))
+    numbers = study(finished)
+    study(another, seed=1)
+    with mock.patch("autdtorch.study.focus_bound", side_effect=[0.0, KeyboardInterrupt]):
+        try:
+            study(half)
+        except KeyboardInterrupt:
+            _keep_lines(half / TRIALS_FILE, 10)
+    return Subject(TRIALS_FILE, study, numbers, (finished, half), another)
+
+
+def trial_subject(folder: Path) -> Subject:
+    """A hardware trial: finished, and killed in the midst."""
+    finished, half, another = (folder / name for name in ("trial", "half-trial", "another-trial"))
+    for place in (finished, another):
+        place.mkdir()
+    numbers = trial(finished)
+    trial(another, seed=1)
+    shutil.copytree(finished, half)
+    _keep_lines(half / LOG_FILE, 12)
+    return Subject(LOG_FILE, trial, numbers, (finished, half), another)
+
+
+def _keep_lines(path: Path, count: int) -> None:
+    path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:count]))
+
+
+@contextlib.contextmanager
+def warnings_listed() -> Iterator[list[str]]:
+    """Give a list that grows with what the package warns of."""
+    lines: list[str] = []
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: lines.append(record.getMessage())
+    logging.getLogger("autdtorch").addHandler(handler)
+    try:
+        yield lines
+    finally:
+        logging.getLogger("autdtorch").removeHandler(handler)
+
+
+def _lines(path: Path) -> list[bytes]:
+    """The whole lines of a file."""
+    return path.read_bytes().split(b"\n")[:-1] if path.exists() else []
+
+
+def _rows(lines: list[bytes]) -> set[bytes]:
+    """The lines of trials or evaluations: not the first of a log, nor one that tells of its end."""
+    return {line for line in lines if b'"drive": ' in line}
+
+
+def problems(subject: Subject, state: Path, folder: Path, damaged: bytes, name: str) -> list[str]:
+    """Begin anew in a copy of a state with one damaged file, and return what is not as promised."""
+    shutil.copytree(state, folder)
+    (folder / name).write_bytes(damaged)
+    journal = folder / subject.journal
+    whole = _rows(_lines(state / subject.journal)) & set(found := _lines(journal))
+    total = len(_rows(_lines(subject.states[0] / subject.journal)))
+    try:
+        numbers = subject.begin(folder)
+    except hardware.LogError as error:
+        refused = "of another trial" in str(error) and (folder / name).read_bytes() == damaged
+        return [] if refused else [f"refused: {error}"]
+    wrong = []
+    after = _lines(journal)
+    if not all(map(torch.equal, numbers, subject.numbers)):
+        wrong.append("other numbers")
+    if lost := whole - set(after):
+        wrong.append(f"{len(lost)} whole lines lost")
+    if len(again := _rows(after) - whole) > total - len(whole):  # fewer where results have them
+        wrong.append(f"{len(again)} trials or evaluations made where {total - len(whole)} were missing")
+    if set(found) - set(after) - set(_lines(journal.with_name(journal.name + SET_ASIDE))):
+        wrong.append("damaged lines not kept")
+    if name in (RESULTS_FILE, PROVENANCE_FILE) and (folder / f"{PREVIOUS}1" / name).read_bytes() != damaged:
+        wrong.append("the damaged file is not kept")
+    with warnings_listed() as warned:
+        numbers = subject.begin(folder)
+    if not all(map(torch.equal, numbers, subject.numbers)) or warned:
+        wrong.append(f"the next start is not clean: {warned}")
+    return wrong
+
+
+def check(damages: int, seed: int, folder: Path) -> tuple[Counter[str], list[str]]:
+    """Damage and begin again so many times.
+
+    Returns:
+        How often each kind of damage befell each file, and what was not as promised.
+    """
+    rng = random.Random(seed)
+    subjects = [study_subject(folder), trial_subject(folder)]
+    counts: Counter[str] = Counter()
+    wrong: list[str] = []
+    for number in range(damages):
+        subject = subjects[number % 3 // 2]
+        state = rng.choice(subject.states)
+        files = [path for path in state.rglob("*.*") if path.suffix != ".lock" and path.name != ".lock"]
+        name = str(rng.choice(sorted(files)).relative_to(state))
+        kinds = ANY | OF_LINES if name == subject.journal else ANY
+        kind = rng.choice(list(kinds))
+        twin = subject.another / name
+        if not twin.exists():  # a matrix, which has a name of its own
+            (twin,) = twin.parent.iterdir()
+        damaged = before = (state / name).read_bytes()
+        while damaged == before:
+            damaged = kinds[kind](rng, before, twin.read_bytes())
+        case = f"{Path(name).suffix} {kind}"
+        counts[case] += 1
+        try:
+            wrong += [
+                f"{number} {state.name} {case}: {one}"
+                for one in problems(subject, state, folder / str(number), damaged, name)
+            ]
+        except Exception as error:
+            wrong.append(f"{number} {state.name} {case}: {type(error).__name__}: {error}")
+        shutil.rmtree(folder / str(number))
+    return counts, wrong
+
+
+def main() -> int:
+    """Run the command line; returns 1 if anything was not as promised."""
+    parser = argparse.ArgumentParser(description="Damage files at random, and begin again.")
+    parser.add_argument("--damages", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    logging.getLogger("autdtorch").propagate = False  # hundreds of warnings, as they should be
+    with tempfile.TemporaryDirectory() as folder:
+        counts, wrong = check(options.damages, options.seed, Path(folder))
+    for case, count in sorted(counts.items()):
+        print(f"{count:4d} {case}")
+    for line in (*wrong, f"{sum(counts.values())} damages, {len(wrong)} problems"):
+        print(line)
+    return bool(wrong)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,11 @@
+"""Some of the damages of `scripts/check_damage.py`, which does hundreds."""
+
+from pathlib import Path
+
+from check_damage import check
+
+
+def test_damaged_files_change_no_number_and_cost_no_undamaged_line(tmp_path: Path) -> None:
+    counts, wrong = check(damages=15, seed=1, folder=tmp_path)
+    assert counts.total() == 15
+    assert wrong == []

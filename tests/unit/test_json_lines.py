@@ -1,0 +1,186 @@
+"""A line comes back as it was written or not at all, and what happens to one line costs no other."""
+
+import errno
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from autdtorch.json_lines import SET_ASIDE, JsonLines, line_of
+
+ROWS = [{"number": 0, "text": "°\n"}, {"number": 1, "values": [0.1, -0.0, 5e-324]}, {"number": 2}]
+HEAD = line_of({"origin": "here"}) + b"\n"
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "rows.jsonl"
+
+
+def read(path: Path, key: str = "key", head: bytes = b"") -> tuple[JsonLines, list[dict[str, Any]]]:
+    rows: list[dict[str, Any]] = []
+    return JsonLines(path, key, rows.append, head), rows
+
+
+def written(path: Path, head: bytes = b"") -> bytes:
+    lines, _ = read(path, head=head)
+    lines.mend()
+    for row in ROWS:
+        lines.append(row)
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("head", [b"", HEAD], ids=["no head", "head"])
+def test_rows_come_back_and_others_follow(path: Path, head: bytes) -> None:
+    content = written(path, head)
+    lines, rows = read(path, head=head)
+    assert rows == ROWS
+    lines.mend()
+    assert path.read_bytes() == content
+    lines.append(*ROWS)
+    assert read(path, head=head)[1] == ROWS + ROWS
+
+
+def test_a_line_is_on_disk_when_append_returns(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: list[bytes] = []
+    monkeypatch.setattr(os, "fsync", lambda _: synced.append(path.read_bytes()))
+    lines, _ = read(path)
+    for row in ROWS:
+        lines.append(row)
+        assert synced[-1] == path.read_bytes()
+    assert len(synced) == len(ROWS)
+
+
+def test_a_flipped_bit_anywhere_is_noticed_and_costs_the_lines_it_touches_alone(path: Path) -> None:
+    content = written(path, HEAD)
+    for place, byte in enumerate(content):
+        flipped = content[:place] + bytes([byte ^ 1 << place % 8]) + content[place + 1 :]
+        path.write_bytes(flipped)
+        _, rows = read(path, head=HEAD)
+        kept = set(flipped.split(b"\n")[:-1])
+        assert rows == [row for row in ROWS if line_of(row, "key") in kept]
+        assert len(rows) < len(ROWS) or not flipped.startswith(HEAD)
+
+
+@given(
+    cuts=st.lists(st.integers(0, 600), min_size=2, max_size=2),
+    rubbish=st.one_of(
+        st.binary(max_size=200),
+        st.sampled_from([b"\n", b"\r\n", b"{}\n", b"\0" * 99, b"[" * 99_999 + b"\n", b'{"a": 1' + b"0" * 99]),
+        st.integers(0, 2).map(lambda number: line_of(ROWS[number], "another key") + b"\n"),
+    ),
+)
+def test_whatever_was_put_into_a_file_is_set_aside_once_and_the_whole_lines_are_used(
+    tmp_path_factory: pytest.TempPathFactory, cuts: list[int], rubbish: bytes
+) -> None:
+    path = tmp_path_factory.mktemp("damage") / "rows.jsonl"
+    content = written(path)
+    begin, end = sorted(min(cut, len(content)) for cut in cuts)
+    damaged = content[:begin] + rubbish + content[end:]
+    path.write_bytes(damaged)
+    lines, rows = read(path)
+    complete = damaged.split(b"\n")[:-1]
+    assert [line_of(row, "key") for row in rows] == [
+        line for line in complete if line in {line_of(row, "key") for row in ROWS}
+    ]
+    assert path.read_bytes() == damaged
+    lines.mend()
+    aside = path.with_name(path.name + SET_ASIDE)
+    refused = aside.read_bytes().split(b"\n")[:-1] if aside.exists() else []
+    assert sorted(refused + [line_of(row, "key") for row in rows]) == sorted(complete)
+    lines.append(ROWS[0])
+    lines, again = read(path)
+    assert again == [*rows, ROWS[0]]
+    content = path.read_bytes()
+    lines.mend()
+    assert path.read_bytes() == content
+
+
+def test_what_is_set_aside_is_told_in_one_line(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    first, second, third = written(path).splitlines(keepends=True)
+    path.write_bytes(first + b"\xff" + second + third + b"torn")
+    lines, rows = read(path)
+    assert rows == [ROWS[0], ROWS[2]]
+    assert not caplog.messages
+    lines.mend()
+    refused, torn = caplog.messages
+    assert "line 2: set aside" in refused
+    assert "broke off" in torn
+    caplog.clear()
+    read(path)[0].mend()
+    assert not caplog.messages
+
+
+def test_lines_are_set_aside_on_disk_before_they_leave_the_file(
+    path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    damaged = b"damaged\n" + written(path, HEAD)
+    path.write_bytes(damaged)
+    aside = path.with_name(path.name + SET_ASIDE)
+    synced: list[tuple[bytes, bytes]] = []
+    monkeypatch.setattr(os, "fsync", lambda _: synced.append((aside.read_bytes(), path.read_bytes())))
+    read(path, head=HEAD)[0].mend()
+    assert synced[0] == (b"damaged\n" + HEAD, damaged)
+    assert "line 1 and 1 more" in caplog.text
+    path.write_bytes(path.read_bytes().replace(HEAD, b"damaged\n"))
+    read(path, head=HEAD)[0].mend()
+    assert f"line 1: set aside in {aside}" in caplog.text
+    assert read(path, head=HEAD)[1] == ROWS
+
+
+def test_nothing_follows_half_a_line(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    content = written(path)
+    lines, _ = read(path)
+    with monkeypatch.context() as context:
+        context.setattr(os, "fsync", full)
+        with pytest.raises(OSError, match=r"No space left on device: '.*rows\.jsonl"):
+            lines.append(ROWS[0])
+    assert path.read_bytes() == content
+    lines.append(ROWS[0])
+    assert read(path)[1] == [*ROWS, ROWS[0]]
+
+
+def test_a_row_that_its_reader_refuses_is_set_aside(path: Path) -> None:
+    def use(row: dict[str, Any]) -> None:
+        if row["number"] == 1:
+            row["missing"]
+
+    written(path)
+    JsonLines(path, "key", use).mend()
+    assert read(path)[1] == [ROWS[0], ROWS[2]]
+
+
+def test_the_lines_of_a_file_with_another_key_are_not_used(path: Path) -> None:
+    written(path)
+    assert read(path, "another")[1] == []
+
+
+def test_nothing_is_lost_where_lines_cannot_be_set_aside(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    damaged = b"damaged\n" + written(path)
+    path.write_bytes(damaged)
+    lines, _ = read(path)
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match=r"No space left on device: '.*rows\.jsonl"):
+        lines.mend()
+    assert path.read_bytes() == damaged
+    monkeypatch.undo()
+    read(path)[0].mend()
+    assert read(path)[1] == ROWS
+
+
+def test_a_file_that_another_has_written_to_meanwhile_is_left_alone(path: Path) -> None:
+    lines, other = read(path)[0], read(path)[0]
+    other.append(ROWS[0])
+    content = path.read_bytes()
+    with pytest.raises(ValueError, match=r"rows\.jsonl: has changed meanwhile"):
+        lines.append(ROWS[1])
+    assert path.read_bytes() == content

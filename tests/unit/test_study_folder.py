@@ -1,0 +1,209 @@
+"""A study takes from its folder what is its own and undamaged, and keeps all else."""
+
+import functools
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from small_scenes import CUBE, small_scene
+
+from autdtorch.array import TransducerArray
+from autdtorch.json_lines import SET_ASIDE
+from autdtorch.objective import Objective
+from autdtorch.optim.base import Solution, Trials
+from autdtorch.optim.gabs import gabs
+from autdtorch.results import PROVENANCE_FILE, RESULTS_FILE, StudyResult, load_provenance, load_results
+from autdtorch.scene import Scene
+from autdtorch.study import run_study
+from autdtorch.study_folder import MATRICES_FOLDER, PREVIOUS
+from autdtorch.trial_file import TRIALS_FILE
+
+FILES = (RESULTS_FILE, TRIALS_FILE, PROVENANCE_FILE)
+SIMULATED = {"method": "auto", "spacing": 2e-3, "tolerance": 0.2, "kernel": "reference"}
+
+
+def study(folder: Path | None, seed: int = 0, config: str = "config", **changes: object) -> StudyResult:
+    arguments = {
+        "scenes": {"one": small_scene(), "two": small_scene(extent=30e-3)},
+        "methods": {"gabs": functools.partial(gabs, levels=4)},
+        "solver": {"method": "free_space"},
+        "trials": 3,
+        **changes,
+    }
+    return run_study(**arguments, folder=folder, config=f"{config} {seed}", seed=seed)  # type: ignore[arg-type]
+
+
+def numbers(results: StudyResult) -> torch.Tensor:
+    solutions = [scene.methods["gabs"].solution for scene in results.scenes.values()]
+    return torch.cat([torch.cat([solution.drive, solution.history], dim=1) for solution in solutions])
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+@pytest.fixture
+def warnings(caplog: pytest.LogCaptureFixture) -> Callable[[], list[str]]:
+    """Gives what was warned of since it was asked last."""
+
+    def since() -> list[str]:
+        messages = [one.getMessage() for one in caplog.records if one.levelno >= logging.WARNING]
+        caplog.clear()
+        return messages
+
+    return since
+
+
+@pytest.mark.parametrize("name", [RESULTS_FILE, PROVENANCE_FILE])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda content: content[:-2],
+        lambda content: b"",
+        lambda content: content[:700] + b"\xff" + content[701:],
+        lambda content: b"{" * 10**6,
+    ],
+)
+def test_a_damaged_file_is_kept_and_costs_no_trial(
+    tmp_path: Path, warnings: Callable[[], list[str]], name: str, damage: Callable[[bytes], bytes]
+) -> None:
+    undisturbed, before = study(tmp_path), contents(tmp_path)
+    damaged = damage(before[name])
+    (tmp_path / name).write_bytes(damaged)
+    again = study(tmp_path)
+    assert torch.equal(numbers(again), numbers(undisturbed))
+    assert again.provenance == undisturbed.provenance == load_provenance(tmp_path)
+    assert contents(tmp_path)[TRIALS_FILE] == before[TRIALS_FILE]
+    (line,) = warnings()
+    assert name in line
+    assert contents(tmp_path / f"{PREVIOUS}1") == {name: damaged}
+    mended = contents(tmp_path)
+    study(tmp_path)
+    assert warnings() == []
+    assert contents(tmp_path) == mended
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_of_another_study_is_not_used_and_costs_no_other(tmp_path: Path, name: str) -> None:
+    own, other = tmp_path / "own", tmp_path / "other"
+    undisturbed, before = study(own), contents(own)
+    assert not torch.equal(numbers(study(other, seed=1)), numbers(undisturbed))
+    swapped = contents(other)[name]
+    (own / name).write_bytes(swapped)
+    assert torch.equal(numbers(study(own)), numbers(undisturbed))
+    assert load_results(own).provenance == undisturbed.provenance
+    if name == TRIALS_FILE:
+        assert contents(own)[TRIALS_FILE + SET_ASIDE] == swapped
+    else:
+        assert contents(own / f"{PREVIOUS}1") == {name: swapped}
+        assert contents(own)[TRIALS_FILE] == before[TRIALS_FILE]
+
+
+def test_another_study_is_kept_whole(tmp_path: Path, warnings: Callable[[], list[str]]) -> None:
+    study(tmp_path)
+    before = contents(tmp_path)
+    study(tmp_path, seed=1)
+    assert contents(tmp_path / f"{PREVIOUS}1") == {name: before[name] for name in FILES}
+    assert {name for name in contents(tmp_path) if not name.startswith(".")} == set(FILES)
+    assert len(warnings()) == 1
+
+
+@pytest.mark.parametrize("missing", [RESULTS_FILE, PROVENANCE_FILE])
+def test_lines_of_trials_are_set_aside_where_another_file_is_of_the_study(
+    tmp_path: Path, missing: str
+) -> None:
+    undisturbed = study(tmp_path)
+    (tmp_path / missing).unlink()
+    damaged = (tmp_path / TRIALS_FILE).read_bytes().replace(b'"trial"', b'"tria1"')
+    (tmp_path / TRIALS_FILE).write_bytes(damaged)
+    assert torch.equal(numbers(study(tmp_path)), numbers(undisturbed))
+    assert contents(tmp_path)[TRIALS_FILE + SET_ASIDE] == damaged
+    assert not (tmp_path / f"{PREVIOUS}1").exists()
+
+
+def test_trials_alone_are_used_and_a_damaged_one_is_run_again(
+    tmp_path: Path, warnings: Callable[[], list[str]], caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    undisturbed = study(tmp_path)
+    assert "re-using" not in caplog.text
+    lines = (tmp_path / TRIALS_FILE).read_bytes().splitlines(keepends=True)
+    (tmp_path / RESULTS_FILE).unlink()
+    (tmp_path / PROVENANCE_FILE).unlink()
+    (tmp_path / TRIALS_FILE).write_bytes(b"".join([lines[0], b"{}\n", *lines[2:]]))
+    assert torch.equal(numbers(study(tmp_path)), numbers(undisturbed))
+    assert "re-using 5 trials" in caplog.text
+    (line,) = warnings()
+    assert f"{TRIALS_FILE}, line 2" in line
+    again = (tmp_path / TRIALS_FILE).read_bytes().splitlines(keepends=True)
+    assert again[:-1] == [lines[0], *lines[2:]]
+
+
+def test_a_study_that_is_kept_in_memory_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert torch.equal(numbers(study(None)), numbers(study(tmp_path / "kept")))
+    assert [path.name for path in tmp_path.iterdir()] == ["kept"]
+
+
+def test_a_damaged_matrix_is_computed_again(tmp_path: Path, warnings: Callable[[], list[str]]) -> None:
+    simulated = functools.partial(study, tmp_path, scenes={"cube": small_scene((CUBE,))}, solver=SIMULATED)
+    undisturbed = simulated()
+    matrices = contents(tmp_path / MATRICES_FOLDER)
+    for name, content in matrices.items():
+        (tmp_path / MATRICES_FOLDER / name).write_bytes(content[:-1] + b"\1")
+    (tmp_path / RESULTS_FILE).unlink()
+    again = simulated()
+    for name, scene in again.scenes.items():
+        assert torch.equal(scene.transfer_matrix, undisturbed.scenes[name].transfer_matrix)
+    assert len(warnings()) == len(matrices) > 0
+    assert contents(tmp_path / MATRICES_FOLDER) == matrices
+
+
+def test_trials_of_other_shapes_do_not_count_though_the_settings_are_called_the_same(tmp_path: Path) -> None:
+    study(tmp_path, scenes={"one": small_scene()})
+    (tmp_path / RESULTS_FILE).unlink()
+    small = small_scene()
+    array = TransducerArray.grid((2, 3), pitch=8e-3, center=(1.2e-3, 12e-3, 12e-3))
+    other = Scene(array, small.medium, 40e3, small.control_points)
+    (found,) = study(tmp_path, scenes={"one": other}).scenes.values()
+    assert found.methods["gabs"].solution.drive.shape == (3, 6)
+
+
+def test_with_a_method_of_ones_own_everything_is_computed_again(tmp_path: Path) -> None:
+    def own(objective: Objective, trials: Trials, seed: int) -> Solution:
+        found = gabs(objective, levels=2, trials=trials, seed=seed)
+        calls.append(trials)  # not where only the settings are checked
+        return found
+
+    calls: list[Trials] = []
+    for count in (1, 2):
+        study(tmp_path, methods={"gabs": functools.partial(own)})
+        assert len(calls) == count * 2 * 2  # two scenes, two blocks of trials
+    assert sorted(contents(tmp_path / f"{PREVIOUS}1")) == sorted(FILES)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_folder_in_the_place_of_a_file_is_told_and_nothing_is_lost(tmp_path: Path, name: str) -> None:
+    study(tmp_path)
+    (tmp_path / name).unlink()
+    (tmp_path / name).mkdir()
+    before = contents(tmp_path)
+    with pytest.raises(IsADirectoryError, match=name):
+        study(tmp_path)
+    assert contents(tmp_path) == before
+
+
+def test_a_link_to_a_file_is_used_as_the_file(tmp_path: Path, warnings: Callable[[], list[str]]) -> None:
+    folder = tmp_path / "study"
+    study(folder)
+    for name in FILES:
+        (folder / name).replace(tmp_path / name)
+        (folder / name).symlink_to(tmp_path / name)
+    before = contents(folder)
+    study(folder)
+    assert contents(folder) == before
+    assert warnings() == []
