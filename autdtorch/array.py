@@ -125,10 +125,10 @@ class TransducerArray:
         """
         count_u, count_v = positive_integers("shape", shape, 2)
         pitch = positive("pitch", pitch, "m")
-        middle = torch.tensor(finite_vector("center", center), dtype=torch.float64)
+        middle = torch.tensor(finite_vector("center", center), dtype=torch.float64, device="cpu")
         u, v = plane_basis(normal)
-        along_u = pitch * (torch.arange(count_u, dtype=torch.float64) - (count_u - 1) / 2)
-        along_v = pitch * (torch.arange(count_v, dtype=torch.float64) - (count_v - 1) / 2)
+        along_u = pitch * (torch.arange(count_u, dtype=torch.float64, device="cpu") - (count_u - 1) / 2)
+        along_v = pitch * (torch.arange(count_v, dtype=torch.float64, device="cpu") - (count_v - 1) / 2)
         positions = middle + along_u[:, None, None] * u + along_v[None, :, None] * v
         return cls(positions.reshape(-1, 3), normal, source_strength, radius)
 
@@ -219,7 +219,7 @@ class TransducerArray:
         away, at all angles, and to 1e-4 of the largest pressure at a distance of a/2 from the disc.
         """
         if self.radius == 0:
-            return Nodes(self.positions[:, None], torch.ones(1, dtype=torch.float64))
+            return Nodes(self.positions[:, None], torch.ones(1, dtype=torch.float64, device="cpu"))
         disc, weights = _disc_rule()
         axes = torch.stack([torch.stack(plane_basis(normal)) for normal in self.normals])
         return Nodes(self.positions[:, None] + self.radius * disc @ axes, weights)
@@ -267,7 +267,9 @@ def _unit_normals(normals: ArrayLike, count: int) -> torch.Tensor:
     name = "TransducerArray.normals"
     rows = real_tensor(name, normals).detach().cpu()
     if rows.shape == (3,):
-        return torch.tensor(unit_vector(name, rows), dtype=torch.float64).repeat(count, 1)
+        return torch.tensor(unit_vector(name, rows), dtype=torch.float64, device="cpu").repeat(count, 1)
     if rows.shape != (count, 3):
         raise ValueError(f"{name}: shape {tuple(rows.shape)}; must be (3,) or ({count}, 3) as positions")
-    return torch.tensor([unit_vector(f"{name}[{m}]", row) for m, row in enumerate(rows)], dtype=torch.float64)
+    return torch.tensor(
+        [unit_vector(f"{name}[{m}]", row) for m, row in enumerate(rows)], dtype=torch.float64, device="cpu"
+    )

@@ -152,7 +152,7 @@ class Dead(Condition):
         """
         super().__init__(objective)
         count = len(self.scene.array)
-        self._alive = torch.ones(count, dtype=torch.float64)
+        self._alive = torch.ones(count, dtype=torch.float64, device="cpu")
         self._alive[indices("transducers", transducers, count)] = 0
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:

@@ -39,7 +39,7 @@ def autd3_places(units: tuple[int, int] = (1, 1)) -> torch.Tensor:
     shifts = torch.cartesian_prod(
         *(size * _centred(count) for size, count in zip(AUTD3_UNIT, units, strict=True))
     )
-    return (shifts[:, None] + torch.tensor(unit, dtype=torch.float64)).reshape(-1, 2)
+    return (shifts[:, None] + torch.tensor(unit, dtype=torch.float64, device="cpu")).reshape(-1, 2)
 
 
 def sonicsurface_places() -> torch.Tensor:
@@ -61,4 +61,4 @@ def openmpd_places() -> torch.Tensor:
 
 
 def _centred(count: int) -> torch.Tensor:
-    return torch.arange(count, dtype=torch.float64) - (count - 1) / 2
+    return torch.arange(count, dtype=torch.float64, device="cpu") - (count - 1) / 2

@@ -61,7 +61,8 @@ def free_space_matrix(points: ArrayLike, array: TransducerArray, wavenumber: com
     positions, weights = array.nodes
     # Node by node: memory for one matrix only.
     terms = (w * green(points, at, wavenumber) for at, w in zip(positions.unbind(1), weights, strict=True))
-    return 4 * math.pi * array.source_strength * sum(terms, start=torch.zeros(()))
+    none = torch.zeros((), dtype=torch.complex128, device="cpu")
+    return 4 * math.pi * array.source_strength * sum(terms, start=none)
 
 
 def _wavenumber(value: complex) -> tuple[float, float]:

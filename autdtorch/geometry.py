@@ -59,7 +59,7 @@ def plane_basis(normal: ArrayLike) -> tuple[torch.Tensor, torch.Tensor]:
     Raises:
         ValueError: `normal` is not three finite numbers, or is zero.
     """
-    n = torch.tensor(unit_vector("normal", normal), dtype=torch.float64)
+    n = torch.tensor(unit_vector("normal", normal), dtype=torch.float64, device="cpu")
     axis = (int(n.abs().argmax()) + 1) % 3
     u = -n[axis] * n
     u[axis] += 1.0
@@ -87,7 +87,7 @@ def in_plane(places: ArrayLike, center: ArrayLike, normal: ArrayLike, angle: flo
     local = real_tensor("places", places, "m").detach().cpu()
     if local.ndim != 2 or local.shape[1] not in (2, 3):
         raise ValueError(f"places: shape {tuple(local.shape)}; must be (M, 2) or (M, 3)")
-    origin = torch.tensor(finite_vector("center", center), dtype=torch.float64)
+    origin = torch.tensor(finite_vector("center", center), dtype=torch.float64, device="cpu")
     return origin + local @ device_axes(normal, angle)[: local.shape[1]]
 
 
@@ -101,7 +101,7 @@ def device_axes(normal: ArrayLike, angle: float = 0.0) -> torch.Tensor:
     u, v = plane_basis(normal)
     x = math.cos(turn) * u + math.sin(turn) * v
     y = math.cos(turn) * v - math.sin(turn) * u
-    return torch.stack((x, y, torch.tensor(unit_vector("normal", normal), dtype=torch.float64)))
+    return torch.stack((x, y, torch.tensor(unit_vector("normal", normal), dtype=torch.float64, device="cpu")))
 
 
 def rotation_matrix(rotation: Vector) -> torch.Tensor:
@@ -115,10 +115,10 @@ def rotation_matrix(rotation: Vector) -> torch.Tensor:
     Returns:
         (3, 3), float64; a column vector r is turned into R r.
     """
-    matrix = torch.eye(3, dtype=torch.float64)
+    matrix = torch.eye(3, dtype=torch.float64, device="cpu")
     for axis, angle in enumerate(rotation):
         first, second = (axis + 1) % 3, (axis + 2) % 3
-        turn = torch.eye(3, dtype=torch.float64)
+        turn = torch.eye(3, dtype=torch.float64, device="cpu")
         turn[first, first] = turn[second, second] = math.cos(angle)
         turn[second, first] = math.sin(angle)
         turn[first, second] = -math.sin(angle)
@@ -144,12 +144,12 @@ def circle_points(
     Raises:
         ValueError: an argument is not finite, has the wrong shape or is out of range.
     """
-    origin = torch.tensor(finite_vector("center", center), dtype=torch.float64)
+    origin = torch.tensor(finite_vector("center", center), dtype=torch.float64, device="cpu")
     radius = positive("radius", radius, "m")
     count = integer_at_least("count", count, 1)
     u, v = plane_basis(normal)
     start = finite_number("angle", angle, "rad")
-    angles = start + 2 * math.pi * torch.arange(count, dtype=torch.float64) / count
+    angles = start + 2 * math.pi * torch.arange(count, dtype=torch.float64, device="cpu") / count
     return origin + radius * (angles.cos()[:, None] * u + angles.sin()[:, None] * v)
 
 
@@ -184,7 +184,7 @@ class Plane:
     @property
     def corners(self) -> torch.Tensor:
         """The four corners (4, 3) [m]."""
-        signs = torch.tensor([-1.0, 1.0], dtype=torch.float64)
+        signs = torch.tensor([-1.0, 1.0], dtype=torch.float64, device="cpu")
         return self._at(signs * self.size[0] / 2, signs * self.size[1] / 2).reshape(4, 3)
 
     def points(self, spacing: float) -> torch.Tensor:
@@ -203,10 +203,12 @@ class Plane:
         along = []
         for length in self.size:
             count = max(1, round(length / spacing))
-            along.append(length * ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5))
+            along.append(
+                length * ((torch.arange(count, dtype=torch.float64, device="cpu") + 0.5) / count - 0.5)
+            )
         return self._at(along[0], along[1])
 
     def _at(self, along_u: torch.Tensor, along_v: torch.Tensor) -> torch.Tensor:
         u, v = self.basis
-        center = torch.tensor(self.center, dtype=torch.float64)
+        center = torch.tensor(self.center, dtype=torch.float64, device="cpu")
         return center + along_u[:, None, None] * u + along_v[None, :, None] * v

@@ -126,7 +126,7 @@ def write_hardware_report(
     begin, end = (datetime.fromisoformat(evaluations[place].time) for place in (0, -1))
     drives = torch.stack([evaluation.drive for evaluation in evaluations])
     scene = simulated.scene
-    heard = torch.ones(len(scene.array), dtype=torch.float64)
+    heard = torch.ones(len(scene.array), dtype=torch.float64, device="cpu")
     heard[preflight.dead] = 0
     measured, there = torch.stack([one.pressure for one in evaluations]), simulated(heard * drives)
     fit = compare(measured, there)
@@ -183,6 +183,7 @@ def _rate(evaluations: Sequence[Evaluation]) -> str:
     times = torch.tensor(
         [datetime.fromisoformat(evaluation.time).timestamp() for evaluation in evaluations],
         dtype=torch.float64,
+        device="cpu",
     )
     interval = float(times.diff().median()) if len(times) > 1 else 0.0
     return f"one in {1e3 * interval:.3g} ms (median)"

@@ -90,10 +90,10 @@ class OpenMPDBoard:
         pins, offsets, gains = (numbers[part * transducers :][:transducers] for part in range(3))
         return cls(
             name.text,
-            torch.tensor(positions, dtype=torch.float64),
+            torch.tensor(positions, dtype=torch.float64, device="cpu"),
             _pins(path, pins),
             torch.deg2rad(_floats(path, "phase offset", offsets)),
-            torch.tensor([_gain(path, item) for item in gains], dtype=torch.float64),
+            torch.tensor([_gain(path, item) for item in gains], dtype=torch.float64, device="cpu"),
         )
 
     def array(
@@ -135,7 +135,9 @@ class OpenMPDBoard:
         Raises:
             ValueError: not a drive of M transducers.
         """
-        return validate_drive(drive, len(self.positions))[..., torch.tensor(self.pins).argsort()]
+        return validate_drive(drive, len(self.positions))[
+            ..., torch.tensor(self.pins, dtype=torch.int64, device="cpu").argsort()
+        ]
 
 
 def _tuples(items: list[_Item]) -> Iterator[_Item]:
@@ -172,7 +174,7 @@ def _pins(path: str | os.PathLike[str], items: list[_Item]) -> tuple[int, ...]:
 
 
 def _floats(path: str | os.PathLike[str], field: str, items: list[_Item]) -> torch.Tensor:
-    return torch.tensor([_float(path, field, item) for item in items], dtype=torch.float64)
+    return torch.tensor([_float(path, field, item) for item in items], dtype=torch.float64, device="cpu")
 
 
 def _gain(path: str | os.PathLike[str], item: _Item) -> float:

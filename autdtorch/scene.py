@@ -188,7 +188,9 @@ class Scene:
         return " x ".join(f"{(high - low) / unit:.{digits}g}" for low, high in zip(lower, upper, strict=True))
 
     def _bounds(self) -> tuple[Vector, Vector]:
-        corners = [torch.tensor([o.lower, o.upper], dtype=torch.float64) for o in self.obstacles]
+        corners = [
+            torch.tensor([o.lower, o.upper], dtype=torch.float64, device="cpu") for o in self.obstacles
+        ]
         points = torch.cat([points for _, points in _contents(self)] + corners)
         margin = _DEFAULT_MARGIN * self.wavelength
         return _corners(torch.stack([points.amin(dim=0) - margin, points.amax(dim=0) + margin]))
@@ -310,7 +312,7 @@ def _overlap(obstacle: Obstacle, other: Obstacle) -> bool:
     if shared is None:
         return False
     lower, upper = shared
-    share = (torch.arange(_OVERLAP_SAMPLES, dtype=torch.float64) + 0.5) / _OVERLAP_SAMPLES
+    share = (torch.arange(_OVERLAP_SAMPLES, dtype=torch.float64, device="cpu") + 0.5) / _OVERLAP_SAMPLES
     points = lower + (upper - lower) * torch.cartesian_prod(share, share, share)
     return bool((obstacle.contains(points) & other.contains(points)).any())
 
@@ -319,7 +321,7 @@ def _shared(
     box: tuple[Vector, Vector], other: tuple[Vector, Vector]
 ) -> tuple[torch.Tensor, torch.Tensor] | None:
     """Corners of the space that two boxes (lower, upper) share; None if there is none, or they only touch."""
-    corners = torch.tensor([box, other], dtype=torch.float64)
+    corners = torch.tensor([box, other], dtype=torch.float64, device="cpu")
     lower, upper = corners[:, 0].amax(dim=0), corners[:, 1].amin(dim=0)
     return (lower, upper) if (upper - lower).min() > LENGTH_TOLERANCE else None
 
@@ -336,7 +338,7 @@ def require_inside(domain: tuple[Vector, Vector], name: str, points: torch.Tenso
     Raises:
         ValueError: names the first point outside, as an entry of `name`.
     """
-    lower, upper = (torch.tensor(corner, dtype=torch.float64) for corner in domain)
+    lower, upper = (torch.tensor(corner, dtype=torch.float64, device="cpu") for corner in domain)
     outside = ((points < lower - LENGTH_TOLERANCE) | (points > upper + LENGTH_TOLERANCE)).any(dim=-1)
     if outside.any():
         first = int(outside.nonzero()[0, 0])

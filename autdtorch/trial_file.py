@@ -90,7 +90,7 @@ class TrialFile:
     def found(self, scene: str, method: str, trials: int) -> tuple[Solution, torch.Tensor]:
         """What the first `trials` trials found, all of which must be there, and seconds (T,) of each."""
         each = [self._trials[scene, method, trial] for trial in range(trials)]
-        seconds = torch.tensor([share for _, share in each], dtype=torch.float64)
+        seconds = torch.tensor([share for _, share in each], dtype=torch.float64, device="cpu")
         return joined([solution for solution, _ in each]), seconds
 
     def _row(self, scene: str, method: str, trial: int) -> dict[str, Any]:
@@ -128,8 +128,8 @@ class TrialFile:
         solution = Solution(
             validate_single_drive(drive, transducers)[None],
             validate_magnitudes("pressure", row["pressure"], foci)[None],
-            torch.tensor([score], dtype=torch.float64),
-            torch.tensor([evaluations]),
+            torch.tensor([score], dtype=torch.float64, device="cpu"),
+            torch.tensor([evaluations], dtype=torch.int64, device="cpu"),
             history[None],
         )
         self._trials[where] = solution, not_negative("seconds", row["seconds"], "s")

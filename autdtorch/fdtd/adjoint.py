@@ -81,7 +81,7 @@ class _Run:
 
     def single(self, cells: torch.Tensor) -> Receivers:
         """Cells (k,) as receivers."""
-        return Receivers(cells[:, None], torch.ones((len(cells), 1), dtype=self.assembly.dtype))
+        return Receivers(cells[:, None], torch.ones((len(cells), 1), dtype=self.assembly.dtype, device="cpu"))
 
     def fields(
         self, state: State, sources: Sources, cells: torch.Tensor, signal: torch.Tensor
@@ -103,11 +103,11 @@ class _Run:
         loud = slope.any(dim=1)
         left, size, right = torch.linalg.svd(slope[loud], full_matrices=False)
         rank = int((size > _ROUNDING * torch.finfo(slope.dtype).eps * size[:1]).sum())
-        signal = torch.zeros((len(slope), rank), dtype=slope.dtype)
+        signal = torch.zeros((len(slope), rank), dtype=slope.dtype, device="cpu")
         signal[loud] = left[:, :rank]
         amplitude = (size[:rank, None] * right[:rank]).T
         cells, place = torch.unique(self.receivers.index, return_inverse=True)
-        force = torch.zeros((len(cells), rank), dtype=slope.dtype)
+        force = torch.zeros((len(cells), rank), dtype=slope.dtype, device="cpu")
         for point, weight, own in zip(place, self.receivers.weight, amplitude, strict=True):
             force.index_add_(0, point, weight[:, None] * own)
         return Sources(cells, force / self.mass(cells)[:, None]), signal.flip(0)
@@ -136,7 +136,7 @@ class _Neighbourhood:
         grid, varying = run.assembly.grid, run.assembly.coefficients.varying_index
         own = torch.from_numpy(grid.inside(varying.numpy()))
         index, offsets = varying[own], torch.from_numpy(flat_offsets(grid.shape))
-        used = torch.zeros(math.prod(grid.shape), dtype=torch.bool)
+        used = torch.zeros(math.prod(grid.shape), dtype=torch.bool, device="cpu")
         used[run.receivers.index] = True
         for offset in offsets:
             used[index + offset] = True
@@ -153,10 +153,10 @@ class _Neighbourhood:
         """Add to `total` (n, 27) the sums of lambda_i (p_j - p_i), of lambda (steps, n) and `_Run.fields`."""
         from autdtorch.fdtd.kernels.cpu_correlation import correlate  # with numba, which takes its time
 
-        field = torch.empty(after.shape[::-1], dtype=after.dtype)
+        field = torch.empty(after.shape[::-1], dtype=after.dtype, device="cpu")
         field[:, 0], field[:, 1:] = first[0], after[:-1].T
-        place = torch.zeros(int(self.cells[-1]) + 1, dtype=torch.int32)
-        place[self.cells] = torch.arange(len(self.cells), dtype=torch.int32)
+        place = torch.zeros(int(self.cells[-1]) + 1, dtype=torch.int32, device="cpu")
+        place[self.cells] = torch.arange(len(self.cells), dtype=torch.int32, device="cpu")
         tensors = adjoint.T.contiguous(), field, self.index, self.offsets, place, total
         arrays = [tensor.numpy() for tensor in tensors]
         ends = pairwise([*range(0, len(self.index), _CELLS_AT_ONCE), len(self.index)])
@@ -194,7 +194,9 @@ class _Recorded(torch.autograd.Function):
         """Step the adjoint run, and again the segments that go with it."""
         run, around, steps, driven = ctx.run, ctx.around, len(slope), len(ctx.run.driven)
         by_force = torch.zeros_like(ctx.sources.force)
-        by_row = torch.zeros((0 if around is None else len(around.index), 27), dtype=by_force.dtype)
+        by_row = torch.zeros(
+            (0 if around is None else len(around.index), 27), dtype=by_force.dtype, device="cpu"
+        )
         if slope.any():
             cells = [run.driven] if around is None else [run.driven, around.index]
             mass, read = torch.cat([run.mass(group) for group in cells]), run.single(torch.cat(cells))

@@ -43,7 +43,7 @@ def cells_of_maps(
         if given is not None and given.shape != shape:
             raise ValueError(f"{name}: shape {tuple(given.shape)}; must be {shape}, the cells of the domain")
     stencil = air_stencil(grid, scene)
-    air = torch.ones(shape, dtype=torch.float64)
+    air = torch.ones(shape, dtype=torch.float64, device="cpu")
     relative = air if density is None else density / scene.medium.density
     speed = air if sound_speed is None else sound_speed / scene.medium.sound_speed
     relative = relative / _flow_factor(stencil, speed)

@@ -96,7 +96,7 @@ class Scattering:
         """Which points (..., 3) are read from the grid; others are far enough from the cells that radiate."""
         grid = self.assembly.grid
         cells = torch.from_numpy(grid.to_cells(points))
-        first, last = torch.tensor(grid.first), torch.tensor(grid.last)
+        first, last = torch.tensor([grid.first, grid.last], dtype=torch.int64, device="cpu").unbind()
         return ((cells > first + _BESIDE) & (cells < last - 1 - _BESIDE)).all(dim=-1)
 
     @cached_property
@@ -162,7 +162,7 @@ class Reach:
 
     def field(self, phasors: torch.Tensor) -> torch.Tensor:
         """Scattered fields (P, R) at the targets, from the cells' phasors (k, R) in R runs."""
-        field = torch.zeros((*self.within.shape, phasors.shape[1]), dtype=torch.complex128)
+        field = torch.zeros((*self.within.shape, phasors.shape[1]), dtype=torch.complex128, device="cpu")
         field[self.within] = torch.from_numpy(self.inward @ phasors.numpy())
         amplitude = self.amplitudes(phasors)
         field[~self.within] = self.scattering.radiated(amplitude, self.targets.positions[~self.within])
@@ -175,13 +175,15 @@ class Reach:
     def matrix(self, every: int) -> torch.Tensor:
         """Matrix from phasors (k,) to the scattered field at each `every`-th target."""
         within, share = self.within[::every], self.targets.weights.expand(self.within[::every].shape)
-        target = torch.arange(len(within))[:, None].expand(within.shape)
+        target = torch.arange(len(within), device="cpu")[:, None].expand(within.shape)
         outside = self.targets.positions[::every][~within]
-        amplitude = torch.zeros((len(outside), len(within)), dtype=torch.complex128)
-        amplitude[torch.arange(len(outside)), target[~within]] = share[~within].to(amplitude.dtype)
+        amplitude = torch.zeros((len(outside), len(within)), dtype=torch.complex128, device="cpu")
+        amplitude[torch.arange(len(outside), device="cpu"), target[~within]] = share[~within].to(
+            amplitude.dtype
+        )
         heard = self.scattering.at_surface(outside, amplitude)  # as from there: Green's function is symmetric
-        number = torch.zeros(self.within.shape, dtype=torch.int64)
-        number[self.within] = torch.arange(int(self.within.sum()))
+        number = torch.zeros(self.within.shape, dtype=torch.int64, device="cpu")
+        number[self.within] = torch.arange(int(self.within.sum()), device="cpu")
         picked = csr_array(
             (share[within].numpy(), (target[within].numpy(), number[::every][within].numpy())),
             (len(within), self.inward.shape[0]),

@@ -167,8 +167,13 @@ def windows_of_run(
     steps_per_period = assembly.steps_per_period
     steps, periods = block_of(steps_per_period)
     shift = max(1, steps // _PARTS)
-    receivers = Receivers(torch.from_numpy(cells[:, None]), torch.ones((len(cells), 1), dtype=assembly.dtype))
-    state, earlier = assembly.silence(sources), torch.zeros((steps, len(cells)), dtype=assembly.dtype)
+    receivers = Receivers(
+        torch.from_numpy(cells[:, None]), torch.ones((len(cells), 1), dtype=assembly.dtype, device="cpu")
+    )
+    state, earlier = (
+        assembly.silence(sources),
+        torch.zeros((steps, len(cells)), dtype=assembly.dtype, device="cpu"),
+    )
     for block in itertools.count():
         first = block * steps
         signal = drive_signal(steps_per_period, first, steps).to(assembly.dtype)

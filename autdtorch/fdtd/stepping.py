@@ -32,7 +32,7 @@ periods left changes of 1e-3 a period after 60 periods, this one 5e-5)."""
 _FAINT = 1e-20
 """Pressure of the silence before a run, relative to the strongest force."""
 
-_ONE_NODE = torch.ones(1, dtype=torch.float64)
+_ONE_NODE = torch.ones(1, dtype=torch.float64, device="cpu")
 """Weights of the nodes of a point."""
 
 
@@ -105,7 +105,7 @@ class Assembly:
         factor = self.stencil.source_factor(float(self.steps_per_period)) / self.grid.spacing
         index, inverse = np.unique(spread.index, return_inverse=True)
         force = (strength[:, None] * torch.from_numpy(factor * spread.weight)).reshape(-1)
-        total = torch.zeros(len(index), dtype=force.dtype).index_add(
+        total = torch.zeros(len(index), dtype=force.dtype, device="cpu").index_add(
             0, torch.from_numpy(inverse.reshape(-1)), force
         )
         total = total / torch.from_numpy(self.varying.mass_of(index))
@@ -200,7 +200,7 @@ def _wanted_steps(fewest: float, time_step: float | None, frequency: float) -> f
 
 def drive_signal(steps_per_period: Fraction, first: int, count: int) -> torch.Tensor:
     """Rows (count, 2) of cos(w t) and sin(w t) under the switch-on envelope, from step `first` on."""
-    step = torch.arange(first, first + count)
+    step = torch.arange(first, first + count, device="cpu")
     block, turns = steps_per_period.numerator, steps_per_period.denominator
     phase = 2 * math.pi / block * torch.remainder(step * turns, block).double()
     ramp = (step.double() / float(RAMP_PERIODS * steps_per_period)).clamp(max=1)
@@ -211,7 +211,7 @@ def drive_signal(steps_per_period: Fraction, first: int, count: int) -> torch.Te
 def lock_in(recorded: torch.Tensor, periods: int) -> torch.Tensor:
     """Phasors (R,) of one block of `periods`, recorded after each of its steps (steps, R)."""
     steps = len(recorded)
-    turn = 2 * math.pi * periods / steps * torch.arange(1, steps + 1, dtype=torch.float64)
+    turn = 2 * math.pi * periods / steps * torch.arange(1, steps + 1, dtype=torch.float64, device="cpu")
     basis = 2 / steps * torch.stack((torch.cos(turn), torch.sin(turn)))
     # in single precision PyTorch may take products of a few bits (torch.set_float32_matmul_precision)
     cosine, sine = basis.to(recorded.device) @ recorded.double()

@@ -50,7 +50,7 @@ class VariableCells:
     def driven(self, sources: Sources) -> Sources:
         """Sources of the assembly, differentiable also by the mass of the cells they are in."""
         _, place, own = np.intersect1d(self.varying.index, sources.index.numpy(), return_indices=True)
-        share = torch.ones(len(sources.index), dtype=self.mass.dtype)
+        share = torch.ones(len(sources.index), dtype=self.mass.dtype, device="cpu")
         share[own] = torch.from_numpy(self.varying.mass[place]) / self.mass[place]
         return Sources(sources.index, share.to(sources.force)[:, None] * sources.force)
 

@@ -64,7 +64,7 @@ class AmplitudeScale:
 
     def _highest(self, limit: float) -> torch.Tensor:
         """What to ask each transducer for (M,), to have it play the highest of its levels up to `limit`."""
-        asked = torch.zeros(len(self._wiring.transducers), dtype=torch.float64)
+        asked = torch.zeros(len(self._wiring.transducers), dtype=torch.float64, device="cpu")
         step = 1.0
         while step >= _FINEST:
             more = (asked + step).clamp(max=1)

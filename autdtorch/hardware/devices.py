@@ -122,8 +122,10 @@ def openmpd_boards(boards: Sequence[OpenMPDBoard]) -> Device:
 
 def _heard(board: OpenMPDBoard, message: bytes) -> torch.Tensor:
     """The drive (256,) that a calibrated board makes of a message; rounding may take it above 1."""
-    sent = _openmpd_played(message)[torch.tensor(board.pins)]
-    return torch.where(sent == 0, sent, sent / board.calibrated(torch.ones(BOARD, dtype=sent.dtype)))
+    sent = _openmpd_played(message)[torch.tensor(board.pins, dtype=torch.int64, device="cpu")]
+    return torch.where(
+        sent == 0, sent, sent / board.calibrated(torch.ones(BOARD, dtype=sent.dtype, device="cpu"))
+    )
 
 
 def ultraino_boards(boards: int = 1) -> Device:

@@ -75,7 +75,7 @@ class EmulatedBench:
         if self.transfer_matrix.ndim != 2 or self.transfer_matrix.shape[1] != len(self._transducers):
             shape = tuple(self.transfer_matrix.shape)
             raise ValueError(f"transfer_matrix: shape {shape}; must be (P, {len(self._transducers)})")
-        self._alive = torch.ones(len(self._transducers))
+        self._alive = torch.ones(len(self._transducers), dtype=torch.float64, device="cpu")
         if silent := integers("dead", dead, 0, "must be indices of transducers"):
             self._alive[indices("dead", silent, len(self._transducers))] = 0
         each = device.transducers // len(device.serials)

@@ -68,7 +68,9 @@ class SonicSurfaceFirmware:
     def drive(self) -> torch.Tensor:
         """What the transducers play (256,): the pulse of phase n begins n / 32 of a period late."""
         played = [self._played(phase) for phase in self._playing]
-        return torch.tensor(played, dtype=torch.complex128)[torch.from_numpy(sonicsurface_channels())]
+        return torch.tensor(played, dtype=torch.complex128, device="cpu")[
+            torch.from_numpy(sonicsurface_channels())
+        ]
 
     def _played(self, phase: int) -> complex:
         return 0j if phase == self._OFF else cmath.exp(2j * math.pi * phase / 32)
@@ -99,7 +101,9 @@ class OpenMPDFirmware:
     def drive(self) -> torch.Tensor:
         """What the transducers play (256,): the fundamental of the pulses; 1 for phase 0 and duty 64."""
         pulses = zip(self._playing[:256], self._playing[256:], strict=True)
-        return torch.tensor([_fundamental(phase, duty) for phase, duty in pulses], dtype=torch.complex128)
+        return torch.tensor(
+            [_fundamental(phase, duty) for phase, duty in pulses], dtype=torch.complex128, device="cpu"
+        )
 
 
 class UltrainoFirmware:
@@ -174,7 +178,7 @@ class UltrainoFirmware:
             high = [pattern[self._PORTS * tenth + port] >> bit & 1 for tenth in range(self._TENTHS)]
             sum_ = sum(on * cmath.exp(turn * (tenth - 2)) for tenth, on in enumerate(high))
             played[transducer] = math.sin(math.pi / self._TENTHS) * sum_
-        return torch.tensor(played, dtype=torch.complex128)
+        return torch.tensor(played, dtype=torch.complex128, device="cpu")
 
 
 class Autd3Firmware:
@@ -198,7 +202,7 @@ class Autd3Firmware:
         half = len(self._playing) // 2
         levels = zip(self._playing[:half], self._playing[half:], strict=True)
         played = [cmath.rect(intensity / 255, 2 * math.pi * phase / 256) for phase, intensity in levels]
-        return torch.tensor(played, dtype=torch.complex128)
+        return torch.tensor(played, dtype=torch.complex128, device="cpu")
 
 
 def _fundamental(phase: int, duty: int) -> complex:

@@ -92,7 +92,7 @@ def ultraino_frame(levels: Levels) -> bytes:
         if values.ndim != 1 or len(values) % ULTRAINO_BOARD or not len(values):
             shape = tuple(values.shape)
             raise ValueError(f"levels.{name}: shape {shape}; must be ({ULTRAINO_BOARD} n,) of n boards")
-    tenth = torch.arange(ULTRAINO_PHASES)[:, None]
+    tenth = torch.arange(ULTRAINO_PHASES, device="cpu")[:, None]
     high = (tenth - levels.phase) % ULTRAINO_PHASES < levels.amplitude
     frame = bytearray()
     for board in range(high.shape[1] // ULTRAINO_BOARD):

@@ -163,7 +163,7 @@ def _checked_levels(device: str, levels: Levels, phases: int, full: int) -> Leve
 
 
 def _integers(name: str, values: ArrayLike, most: int) -> torch.Tensor:
-    tensor = torch.as_tensor(values)
+    tensor = torch.as_tensor(values, device="cpu")
     integer = not (tensor.is_floating_point() or tensor.is_complex() or tensor.dtype == torch.bool)
     if not integer or (tensor.numel() and (tensor.min() < 0 or tensor.max() > most)):
         raise invalid(name, tensor, f"must be integers from 0 to {most}")

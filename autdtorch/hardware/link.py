@@ -133,7 +133,9 @@ class Link:
             raise OffError(f"{error}; the outputs may still be on: switch the device's power off") from error
 
     def _send_silence(self) -> None:
-        silence = self.device.frame(torch.zeros(self.device.transducers, dtype=torch.complex128))
+        silence = self.device.frame(
+            torch.zeros(self.device.transducers, dtype=torch.complex128, device="cpu")
+        )
         # Twice also because a device with two buffers may be left with the last drive in the other.
         for _ in range(2):
             self._send(silence)

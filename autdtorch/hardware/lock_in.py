@@ -54,7 +54,7 @@ class LockIn:
             raise invalid("step", step, f"must be < {0.5 / frequency:g}, half a period", "s")
         if cycles * samples < 2:
             raise invalid("samples", samples, f"must be >= {math.ceil(2 / cycles)}, two periods")
-        places = torch.arange(samples, dtype=torch.float64)
+        places = torch.arange(samples, dtype=torch.float64, device="cpu")
         angle = 2 * math.pi * cycles * places
         window = (math.pi * (places + 0.5) / samples).sin().square()
         self._basis = torch.stack([torch.ones_like(angle), angle.cos(), angle.sin()])

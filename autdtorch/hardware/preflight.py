@@ -78,14 +78,14 @@ def check_transducers(
     count = len(link.link.transducers)
     powers = []
     try:
-        for number, alone in enumerate(torch.eye(count, dtype=torch.complex128), start=1):
+        for number, alone in enumerate(torch.eye(count, dtype=torch.complex128, device="cpu"), start=1):
             tell(f"transducer {number} of {count}")
             link.play(alone)
             powers.append(_power(sensor, points, readings))
             link.require_on()
     finally:
         link.off()
-    pressure = torch.tensor(powers, dtype=torch.float64).sqrt()
+    pressure = torch.tensor(powers, dtype=torch.float64, device="cpu").sqrt()
     above_noise = math.sqrt(silence * (1 + _DEVIATIONS / math.sqrt(readings * points)))
     return Preflight(pressure, math.sqrt(silence), max(above_noise, _WEAK * float(pressure.median())))
 

@@ -251,9 +251,12 @@ class ScopeSensor:
             self.recaptures += 1
         self._require_unclipped(waveforms)
         # Samples that all have the same code do not show the noise of their rounding.
-        rounding = torch.tensor([one.resolution for one in waveforms], dtype=torch.float64).square() / 12
+        rounding = (
+            torch.tensor([one.resolution for one in waveforms], dtype=torch.float64, device="cpu").square()
+            / 12
+        )
         variance = heard.residual.square().maximum(rounding)
-        volts = torch.tensor([_volts(one) for one in self._microphones], dtype=torch.float64)
+        volts = torch.tensor([_volts(one) for one in self._microphones], dtype=torch.float64, device="cpu")
         powers = torch.stack([heard.phasor.abs().square(), lock_in.noise_gain * variance], dim=1)
         return powers / volts[:, None].square()
 

@@ -92,7 +92,9 @@ class ManualSensor:
         """
         places = (_place(number, self._points) for number in range(len(self._points)))
         return torch.tensor(
-            [self._answer(f"Pressure at {place} [Pa]: ") for place in places], dtype=torch.float64
+            [self._answer(f"Pressure at {place} [Pa]: ") for place in places],
+            dtype=torch.float64,
+            device="cpu",
         )
 
     def _answer(self, question: str) -> float:
@@ -199,7 +201,7 @@ class FileSensor:
         numbers = [not_negative("pressure", float(word), "Pa") for word in text.replace(",", " ").split()]
         if len(numbers) != self._points:
             raise invalid("pressure", numbers, f"must be {self._points} numbers", "Pa")
-        return torch.tensor(numbers, dtype=torch.float64)
+        return torch.tensor(numbers, dtype=torch.float64, device="cpu")
 
 
 def _asked(ask: Callable[[str], str], question: str) -> str:

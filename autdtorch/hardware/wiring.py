@@ -33,7 +33,8 @@ class Wiring:
         require_kind("device", device, Device)
         self.device = device
         chosen = range(device.transducers) if transducers is None else transducers
-        self.transducers = torch.tensor(indices("transducers", chosen, device.transducers))
+        places = indices("transducers", chosen, device.transducers)
+        self.transducers = torch.tensor(places, dtype=torch.int64, device="cpu")
 
     def frame(self, drive: torch.Tensor) -> bytes:
         """Bytes for a drive (M,), |q| <= 1, on the nearest levels.
@@ -41,7 +42,7 @@ class Wiring:
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
         """
-        everyone = torch.zeros(self.device.transducers, dtype=torch.complex128)
+        everyone = torch.zeros(self.device.transducers, dtype=torch.complex128, device="cpu")
         everyone[self.transducers] = validate_single_drive(drive, len(self.transducers))
         return self.device.frame(everyone)
 

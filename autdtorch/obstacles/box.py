@@ -48,13 +48,17 @@ class Box(Obstacle):
 
     def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Two triangles a face; see `Obstacle.surface`."""
-        signs = torch.tensor([-0.5, 0.5], dtype=torch.float64)
-        corners = torch.cartesian_prod(signs, signs, signs) * torch.tensor(self.size, dtype=torch.float64)
-        center = torch.tensor(self.center, dtype=torch.float64)
+        signs = torch.tensor([-0.5, 0.5], dtype=torch.float64, device="cpu")
+        corners = torch.cartesian_prod(signs, signs, signs) * torch.tensor(
+            self.size, dtype=torch.float64, device="cpu"
+        )
+        center = torch.tensor(self.center, dtype=torch.float64, device="cpu")
         return center + corners @ rotation_matrix(self.rotation).T, BOX_TRIANGLES.clone()
 
     def _corner(self, share: float) -> Vector:
-        extent = rotation_matrix(self.rotation).abs() @ torch.tensor(self.size, dtype=torch.float64)
+        extent = rotation_matrix(self.rotation).abs() @ torch.tensor(
+            self.size, dtype=torch.float64, device="cpu"
+        )
         x, y, z = (
             middle + share * length for middle, length in zip(self.center, extent.tolist(), strict=True)
         )

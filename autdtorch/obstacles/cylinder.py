@@ -52,7 +52,9 @@ class Cylinder(Obstacle):
     def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
         """A prism with its edges on the cylinder; see `Obstacle.surface`."""
         radius, half = self.radius, self.height / 2
-        profile = torch.tensor([(0, -half), (radius, -half), (radius, half), (0, half)], dtype=torch.float64)
+        profile = torch.tensor(
+            [(0, -half), (radius, -half), (radius, half), (0, half)], dtype=torch.float64, device="cpu"
+        )
         return revolved(profile, self.center, self.axis)
 
     def _corner(self, sign: float) -> Vector:

@@ -55,7 +55,7 @@ class Mesh(Obstacle):
         object.__setattr__(self, "path", _checked_path(self.path))
         points, faces = _read(self.path)
         vertices = self.scale * torch.from_numpy(points) @ rotation_matrix(self.rotation).T
-        vertices = vertices + torch.tensor(self.offset, dtype=torch.float64)
+        vertices = vertices + torch.tensor(self.offset, dtype=torch.float64, device="cpu")
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", torch.from_numpy(faces))
         object.__setattr__(self, "digest", content_digest(vertices.numpy(), faces))

@@ -21,7 +21,9 @@ BOX_TRIANGLES = torch.tensor(
         *((2, 3, 7), (2, 7, 6)),
         *((0, 2, 6), (0, 6, 4)),
         *((1, 5, 7), (1, 7, 3)),
-    ]
+    ],
+    dtype=torch.int64,
+    device="cpu",
 )
 
 
@@ -38,13 +40,13 @@ def revolved(profile: torch.Tensor, center: Vector, axis: Vector) -> tuple[torch
     """
     rings, count = len(profile) - 2, SEGMENTS
     u, v = plane_basis(axis)
-    angles = 2 * math.pi * torch.arange(count, dtype=torch.float64) / count
+    angles = 2 * math.pi * torch.arange(count, dtype=torch.float64, device="cpu") / count
     circle = angles.cos()[:, None] * u + angles.sin()[:, None] * v
-    upwards = torch.tensor(axis, dtype=torch.float64)
+    upwards = torch.tensor(axis, dtype=torch.float64, device="cpu")
     bottom, top = (profile[end, 1] * upwards for end in (0, -1))
     sides = profile[1:-1, :1, None] * circle + profile[1:-1, 1:, None] * upwards
     vertices = torch.cat([bottom[None], sides.reshape(-1, 3), top[None]])
-    ring = 1 + torch.arange(rings * count).reshape(rings, count)
+    ring = 1 + torch.arange(rings * count, device="cpu").reshape(rings, count)
     turned = ring.roll(-1, dims=1)
     triangles = [
         torch.stack([torch.zeros_like(ring[0]), turned[0], ring[0]], dim=-1),
@@ -52,4 +54,4 @@ def revolved(profile: torch.Tensor, center: Vector, axis: Vector) -> tuple[torch
         torch.stack([ring[:-1], turned[1:], ring[1:]], dim=-1).reshape(-1, 3),
         torch.stack([torch.full_like(ring[0], rings * count + 1), ring[-1], turned[-1]], dim=-1),
     ]
-    return torch.tensor(center, dtype=torch.float64) + vertices, torch.cat(triangles)
+    return torch.tensor(center, dtype=torch.float64, device="cpu") + vertices, torch.cat(triangles)

@@ -133,10 +133,10 @@ class Ledger:
         self.transducers, foci = len(objective.scene.array), len(objective.scene.control_points)
         self._objective = objective
         self._score = score
-        self._drive = torch.zeros(trials, self.transducers, dtype=torch.complex128)
-        self._pressure = torch.zeros(trials, foci, dtype=torch.float64)
-        self._best = torch.full((trials,), -torch.inf, dtype=torch.float64)
-        self._evaluations = torch.zeros(trials, dtype=torch.int64)
+        self._drive = torch.zeros(trials, self.transducers, dtype=torch.complex128, device="cpu")
+        self._pressure = torch.zeros(trials, foci, dtype=torch.float64, device="cpu")
+        self._best = torch.full((trials,), -torch.inf, dtype=torch.float64, device="cpu")
+        self._evaluations = torch.zeros(trials, dtype=torch.int64, device="cpu")
         self._scores: list[torch.Tensor] = []
 
     def evaluate(self, drive: torch.Tensor, trials: torch.Tensor | None = None) -> torch.Tensor:
@@ -166,7 +166,7 @@ class Ledger:
         score = _observed("score", self._score(pressure))
         _require_shape("score", score, batch)
 
-        trials = torch.arange(len(self._best)) if trials is None else trials
+        trials = torch.arange(len(self._best), device="cpu") if trials is None else trials
         index = first_of_best(score)
         best = score.gather(1, index[:, None])[:, 0]
         row = torch.nonzero(best - NEAR_TIE * best.abs() > self._best[trials])[:, 0]
@@ -175,7 +175,7 @@ class Ledger:
         self._drive[better] = drive[row, index[row]]
         self._pressure[better] = pressure[row, index[row]]
         self._evaluations[trials] += batch[1]
-        everyone = torch.full((len(self._best), batch[1]), -torch.inf, dtype=torch.float64)
+        everyone = torch.full((len(self._best), batch[1]), -torch.inf, dtype=torch.float64, device="cpu")
         everyone[trials] = score
         self._scores.append(everyone)
         return pressure

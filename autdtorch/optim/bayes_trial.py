@@ -48,7 +48,7 @@ class BayesTrial:
         """A trial that has observed nothing; `seed` is for its random choices."""
         self._settings = settings
         self._seed = seed
-        self._generator = torch.Generator().manual_seed(seed)
+        self._generator = torch.Generator("cpu").manual_seed(seed)
         self._process = Process(settings.dimensions, settings.evaluations, settings.circle, settings.noise)
         self._next_fit = settings.initial
         self._best_score = -math.inf
@@ -57,9 +57,11 @@ class BayesTrial:
         """Points (initial, D) all over the space."""
         initial, dimensions = self._settings.initial, self._settings.dimensions
         if not self._settings.sobol:
-            return torch.rand(initial, dimensions, dtype=torch.float64, generator=self._generator)
+            return self._uniform(initial, dimensions)
         sequence = torch.quasirandom.SobolEngine(dimensions, scramble=True, seed=self._seed)  # type: ignore[no-untyped-call]
-        return sequence.draw(initial, dtype=torch.float64)
+        points = sequence.draw(initial, dtype=torch.float64)
+        points[0] = sequence.shift.double() / 2**sequence.MAXBIT  # the engine rounds it to PyTorch's default
+        return points
 
     def next_point(self, points: torch.Tensor, scores: torch.Tensor) -> torch.Tensor:
         """The next point (D,), after the scores (B,) of points (B, D) have been observed."""
@@ -81,11 +83,12 @@ class BayesTrial:
 
     def _candidates(self) -> torch.Tensor:
         """Points (_CANDIDATES, D): half of them anywhere, half at all distances around the best point."""
-        drawn = torch.rand(
-            2, _CANDIDATES // 2, len(self._best_point), dtype=torch.float64, generator=self._generator
-        )
-        anywhere, near = drawn
+        anywhere, near = self._uniform(2, _CANDIDATES // 2, len(self._best_point))
         # Normally distributed steps; their lengths are spread evenly in logarithm, from 0.001 to 0.3.
-        scale = 10 ** (-3 + 2.5 * torch.rand(len(near), 1, dtype=torch.float64, generator=self._generator))
-        steps = scale * torch.randn(near.shape, dtype=torch.float64, generator=self._generator)
+        scale = 10 ** (-3 + 2.5 * self._uniform(len(near), 1))
+        steps = scale * torch.randn(near.shape, dtype=torch.float64, generator=self._generator, device="cpu")
         return torch.cat([anywhere, self._best_point + steps])
+
+    def _uniform(self, *shape: int) -> torch.Tensor:
+        """Random numbers in [0, 1)."""
+        return torch.rand(shape, dtype=torch.float64, generator=self._generator, device="cpu")

@@ -24,13 +24,13 @@ def indices_of(order: str | Sequence[int], count: int, names: Sequence[str] = ("
         ValueError: anything else.
     """
     if isinstance(order, str) and order == "given":
-        return torch.arange(count)
+        return torch.arange(count, device="cpu")
     named = ", ".join(f'"{name}"' for name in names)
     accepted = f"must be {named} or the indices 0 to {count - 1}, each once"
     indices = integers("order", order, 0, accepted)
     if sorted(indices) != list(range(count)):
         raise invalid("order", indices, accepted)
-    return torch.tensor(indices)
+    return torch.tensor(indices, dtype=torch.int64, device="cpu")
 
 
 def take_best_levels(
@@ -57,8 +57,10 @@ def take_best_levels(
     Returns:
         The weights (T, N) after the last step.
     """
-    choices = drive_from_phases(2 * math.pi * torch.arange(levels, dtype=torch.float64) / levels)
-    rows = torch.arange(len(weights))
+    choices = drive_from_phases(
+        2 * math.pi * torch.arange(levels, dtype=torch.float64, device="cpu") / levels
+    )
+    rows = torch.arange(len(weights), device="cpu")
     for index in order.T:
         candidates = weights[:, None].repeat(1, levels, 1)
         candidates[rows, :, index] = choices
@@ -89,7 +91,7 @@ def repeat_passes(
         passes: most passes, >= 0.
         drive: makes drives (..., M) of weights (..., N).
     """
-    trials = torch.arange(len(weights))
+    trials = torch.arange(len(weights), device="cpu")
     for _ in range(passes):
         passed = take_best_levels(ledger, weights, order[trials], levels, drive, trials)
         changed = (passed != weights).any(dim=1)

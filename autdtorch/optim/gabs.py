@@ -62,7 +62,7 @@ def gabs(
     if first is not None and integer_at_least("first", first, 0) >= transducers:
         raise invalid("first", first, f"must be an integer from 0 to {transducers - 1}")
 
-    alone = torch.eye(transducers, dtype=torch.complex128)
+    alone = torch.eye(transducers, dtype=torch.complex128, device="cpu")
     if orders is None:
         scores = ledger.evaluate(alone.expand(len(seeds), -1, -1))
         orders = _with_first(best_first(scores), first)
@@ -80,8 +80,8 @@ def _known_orders(order: str | Sequence[int], transducers: int, seeds: Sequence[
     if isinstance(order, str) and order == "strength":
         return None
     if isinstance(order, str) and order == "random":
-        generators = [torch.Generator().manual_seed(seed) for seed in seeds]
-        return torch.stack([torch.randperm(transducers, generator=own) for own in generators])
+        generators = [torch.Generator("cpu").manual_seed(seed) for seed in seeds]
+        return torch.stack([torch.randperm(transducers, generator=own, device="cpu") for own in generators])
     return indices_of(order, transducers, ("random", "given", "strength")).expand(len(seeds), -1)
 
 
@@ -90,7 +90,7 @@ def _with_first(orders: torch.Tensor, first: int | None) -> torch.Tensor:
     if first is None:
         return orders
     others = orders[orders != first].reshape(len(orders), -1)
-    return torch.cat([torch.full((len(orders), 1), first), others], dim=1)
+    return torch.cat([orders.new_full((len(orders), 1), first), others], dim=1)
 
 
 def _itself(drive: torch.Tensor) -> torch.Tensor:

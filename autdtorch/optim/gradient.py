@@ -54,7 +54,7 @@ def gradient_ascent(
             objective,
             'must have a transfer matrix, as SimulatedObjective has in mode "transfer"',
         )
-    generators = [torch.Generator().manual_seed(own) for own in seeds]
+    generators = [torch.Generator("cpu").manual_seed(own) for own in seeds]
     highest = [climb(matrix, random_drives(starts, matrix.shape[1], own), steps) for own in generators]
     ledger.evaluate(torch.stack(highest)[:, None])
     return ledger.solution()
@@ -62,7 +62,9 @@ def gradient_ascent(
 
 def random_drives(count: int, transducers: int, generator: torch.Generator) -> torch.Tensor:
     """Drives (count, M) of amplitudes 1 and random phases."""
-    phases = 2 * math.pi * torch.rand(count, transducers, dtype=torch.float64, generator=generator)
+    phases = (
+        2 * math.pi * torch.rand(count, transducers, dtype=torch.float64, generator=generator, device="cpu")
+    )
     return torch.polar(torch.ones_like(phases), phases)
 
 
@@ -82,7 +84,7 @@ def climb(matrix: torch.Tensor, drive: torch.Tensor, steps: int) -> torch.Tensor
         Drive (M,), amplitudes <= 1.
     """
     velocity = torch.zeros_like(drive)
-    for progress in torch.linspace(0, 1, steps).tolist():
+    for progress in torch.linspace(0, 1, steps, dtype=torch.float64, device="cpu").tolist():
         temperature, step = (first * (last / first) ** progress for first, last in (_TEMPERATURE, _STEP))
         pressure = _pressure(matrix, drive)
         magnitude = pressure.abs()

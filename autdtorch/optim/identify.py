@@ -45,7 +45,7 @@ def identify(objective: Objective, evaluations: int = 64, trials: Trials = 1, se
     Raises:
         ValueError: an argument out of range, or the objective's pressures are not finite.
     """
-    generators = [torch.Generator().manual_seed(own) for own in trial_seeds(seed, trials)]
+    generators = [torch.Generator("cpu").manual_seed(own) for own in trial_seeds(seed, trials)]
     ledger = Ledger(objective, len(generators), weakest_focus)
     transducers = ledger.transducers
     evaluations = integer_at_least("evaluations", evaluations, 1)
@@ -86,7 +86,9 @@ def _search(drives: torch.Tensor, observed: torch.Tensor, generator: torch.Gener
     splitting, which leaves the local minima that trap a fit; then they are fitted. The best fit is taken.
     """
     transducers, foci = drives.shape[1], observed.shape[1]
-    guesses = torch.randn(transducers, foci * _GUESSES, dtype=torch.complex128, generator=generator)
+    guesses = torch.randn(
+        transducers, foci * _GUESSES, dtype=torch.complex128, generator=generator, device="cpu"
+    )
     magnitudes = observed.repeat_interleave(_GUESSES, dim=1)
     inverse = torch.linalg.pinv(drives)
     phasors = drives @ guesses
@@ -95,7 +97,9 @@ def _search(drives: torch.Tensor, observed: torch.Tensor, generator: torch.Gener
         phasors = phasors + drives @ (inverse @ (2 * right - phasors)) - right
     rows = _fit(drives, magnitudes, inverse @ phasors)
     misfit = ((drives @ rows).abs() - magnitudes).square().sum(dim=0).reshape(foci, _GUESSES)
-    return rows.reshape(transducers, foci, _GUESSES)[:, torch.arange(foci), misfit.argmin(dim=1)]
+    return rows.reshape(transducers, foci, _GUESSES)[
+        :, torch.arange(foci, device="cpu"), misfit.argmin(dim=1)
+    ]
 
 
 @one_torch_thread()
@@ -118,6 +122,6 @@ def _strongest(rows: list[torch.Tensor], generators: list[torch.Generator]) -> t
 
 def _nearby(drive: torch.Tensor, generator: torch.Generator, count: int) -> torch.Tensor:
     """The `drive` (M,) itself, and count - 1 others around it."""
-    turns = _SPREAD * torch.randn(count, len(drive), dtype=torch.float64, generator=generator)
+    turns = _SPREAD * torch.randn(count, len(drive), dtype=torch.float64, generator=generator, device="cpu")
     turns[0] = 0
     return drive * torch.polar(torch.ones_like(turns), turns)

@@ -74,7 +74,7 @@ def lssg(
     ledger = Ledger(objective, trials=1, score=score)
     foci = _focus_drives(objective.scene)
     places = indices_of(order, len(foci))
-    start = torch.ones(1, len(foci), dtype=torch.complex128)
+    start = torch.ones(1, len(foci), dtype=torch.complex128, device="cpu")
     repeat_passes(ledger, start, places[None], levels, passes, lambda weights: normalise(weights @ foci))
     return ledger.solution(most=passes * len(foci) * levels)
 

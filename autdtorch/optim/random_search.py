@@ -40,12 +40,15 @@ def random_search(
     """
     evaluations = integer_at_least("evaluations", evaluations, 1)
     levels = None if levels is None else integer_at_least("levels", levels, 2)
-    generators = [torch.Generator().manual_seed(own) for own in trial_seeds(seed, trials)]
+    generators = [torch.Generator("cpu").manual_seed(own) for own in trial_seeds(seed, trials)]
     ledger = Ledger(objective, len(generators), score)
     for begin in range(0, evaluations, _AT_ONCE):
         count = min(_AT_ONCE, evaluations - begin)
         turns = torch.stack(
-            [torch.rand(count, ledger.transducers, dtype=torch.float64, generator=own) for own in generators]
+            [
+                torch.rand(count, ledger.transducers, dtype=torch.float64, generator=own, device="cpu")
+                for own in generators
+            ]
         )
         if levels is not None:
             turns = (levels * turns).floor() / levels

@@ -316,7 +316,7 @@ class SimulatedPropagator(ABC):
             field = drive @ self._kept_matrix(points)[0].mT
             self._warn_unsettled(self.runs[before:])
             return field.reshape(*drive.shape[:-1], *grid)
-        field = torch.zeros((len(flat), len(points)), dtype=torch.complex128)
+        field = torch.zeros((len(flat), len(points)), dtype=torch.complex128, device="cpu")
         loud = flat.any(dim=1)
         runs = [nodes] * int(loud.sum())
         if runs:
@@ -364,8 +364,10 @@ class SimulatedPropagator(ABC):
             logger.info("by symmetry, %d of %d %s stand for all", plan.runs, count, whence)
         own = np.flatnonzero(plan.stands == np.arange(count))
         runs = [Nodes(origins.positions[index : index + 1], origins.weights) for index in own]
-        strength = torch.full((len(runs), 1), self.scene.array.source_strength, dtype=torch.complex128)
-        rows = torch.zeros((count, len(heard.positions)), dtype=torch.complex128)
+        strength = torch.full(
+            (len(runs), 1), self.scene.array.source_strength, dtype=torch.complex128, device="cpu"
+        )
+        rows = torch.zeros((count, len(heard.positions)), dtype=torch.complex128, device="cpu")
         rows[own] = self._watched(runs, strength, heard)
         for index in np.flatnonzero(plan.stands != np.arange(count)):
             rows[index] = rows[plan.stands[index], plan.images[plan.by[index]]]
@@ -378,4 +380,4 @@ class SimulatedPropagator(ABC):
 
 def single_nodes(points: torch.Tensor) -> Nodes:
     """Points (P, 3) as sources or receivers of one node each."""
-    return Nodes(points[:, None], torch.ones(1, dtype=torch.float64))
+    return Nodes(points[:, None], torch.ones(1, dtype=torch.float64, device="cpu"))

@@ -107,7 +107,7 @@ class BoxPropagator(SimulatedPropagator):
             phasors = coupled
         parts = torch.split(phasors, [len(reach.cells) for reach in reaches])
         total = incident + sum(reach.field(part) for reach, part in zip(reaches, parts, strict=True))
-        silent = torch.zeros(len(points), dtype=torch.bool)
+        silent = torch.zeros(len(points), dtype=torch.bool, device="cpu")
         for obstacle in self.scene.obstacles:  # the later counts
             silent = torch.where(obstacle.contains(points).any(dim=1), obstacle.rigid, silent)
         return total.mT.masked_fill(silent, 0)
@@ -168,7 +168,9 @@ class BoxPropagator(SimulatedPropagator):
     ) -> SteadyState:
         sources = box.sources(field)
         if not sources.force.any():  # obstacles like air, or drives that cancel
-            return SteadyState(torch.zeros(len(reach.cells), dtype=torch.complex128), 0, 0.0, True)
+            return SteadyState(
+                torch.zeros(len(reach.cells), dtype=torch.complex128, device="cpu"), 0, 0.0, True
+            )
         return run_to_steady_state(
             box.assembly, self._kernel, sources, reach.cells, tolerance, self.max_periods, judged, stepped
         )

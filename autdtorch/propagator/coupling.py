@@ -68,14 +68,16 @@ def coupled_runs(
     begin = time.perf_counter()
     runs = driving[0].shape[1]
     largest = torch.stack([field.norm(dim=0) for field in driving]).amax(dim=0)
-    sums, sequences = torch.zeros(()), [Extrapolation(MOST_PASSES) for _ in range(runs)]
+    sums = torch.zeros((), dtype=torch.complex128, device="cpu")
+    sequences = [Extrapolation(MOST_PASSES) for _ in range(runs)]
     periods, reached = np.zeros(runs, np.int64), np.ones(runs, bool)
-    value, size = heard(torch.zeros((sum(len(reach.cells) for reach in reaches), runs)).to(driving[0])), None
-    left = torch.zeros(runs, dtype=torch.float64)
+    cells = sum(len(reach.cells) for reach in reaches)
+    value, size = heard(driving[0].new_zeros((cells, runs))), None
+    left = torch.zeros(runs, dtype=torch.float64, device="cpu")
     for number in range(1, MOST_PASSES + 1):
         parts = []
         own = tolerance / 2 ** (number + 1)  # half the tolerance in all passes
-        unsettled = torch.zeros((len(boxes), runs), dtype=torch.float64)
+        unsettled = torch.zeros((len(boxes), runs), dtype=torch.float64, device="cpu")
         for index, field in enumerate(driving):
             share = field.norm(dim=0) / largest
             loose = (own / share).clamp(max=_LOOSEST).tolist()
@@ -83,7 +85,8 @@ def coupled_runs(
             parts.append(torch.stack([each.pressure for each in steady], dim=1))
             periods += [each.periods for each in steady]
             reached &= [each.reached for each in steady]
-            unsettled[index] = share * torch.tensor([each.remaining for each in steady])
+            remaining = [each.remaining for each in steady]
+            unsettled[index] = share * torch.tensor(remaining, dtype=torch.float64, device="cpu")
         left += unsettled.amax(dim=0)
         sums = sums + torch.cat(parts)
         for sequence, column in zip(sequences, sums.mT.numpy(), strict=True):

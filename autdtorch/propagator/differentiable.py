@@ -95,7 +95,11 @@ def differentiable_field(
         _phasors(stepper, assembly, cells.driven(_sources(assembly, scene, row)), receivers, periods)
         for row in drive.reshape(-1, drive.shape[-1])
     ]
-    found = torch.stack(fields) if fields else torch.zeros((0, len(targets)), dtype=torch.complex128)
+    found = (
+        torch.stack(fields)
+        if fields
+        else torch.zeros((0, len(targets)), dtype=torch.complex128, device="cpu")
+    )
     return found.reshape(*drive.shape[:-1], len(targets))
 
 
@@ -135,7 +139,7 @@ def _slowest(scene: Scene, sound_speed: torch.Tensor | None) -> dict[str, float]
     """Return the least of the sound speeds [m/s] that are given and count, if there is one."""
     if sound_speed is None:
         return {}
-    rigid = torch.tensor([obstacle.rigid for obstacle in scene.obstacles], dtype=torch.bool)
+    rigid = torch.tensor([obstacle.rigid for obstacle in scene.obstacles], dtype=torch.bool, device="cpu")
     speeds = sound_speed.detach() if sound_speed.ndim == 3 else sound_speed.detach()[~rigid]
     return {"the medium given": float(speeds.min())} if speeds.numel() else {}
 

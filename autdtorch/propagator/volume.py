@@ -38,21 +38,21 @@ def volume_field(propagator: Propagator, drive: ArrayLike, spacing: float | None
     scene = propagator.scene
     drive = validate_single_drive(drive, len(scene.array))
     spacing = scene.wavelength / 4 if spacing is None else positive("spacing", spacing, "m")
-    lower, upper = torch.tensor(scene.domain, dtype=torch.float64)
+    lower, upper = torch.tensor(scene.domain, dtype=torch.float64, device="cpu")
     counts = [max(2, round(float(length) / spacing)) for length in upper - lower]
     if math.prod(counts) > _MOST_CELLS:
         raise invalid("spacing", spacing, f"gives {counts} cells, must give at most {_MOST_CELLS}", "m")
     axes = [
-        low + (high - low) * (torch.arange(count, dtype=torch.float64) + 0.5) / count
+        low + (high - low) * (torch.arange(count, dtype=torch.float64, device="cpu") + 0.5) / count
         for low, high, count in zip(lower, upper, counts, strict=True)
     ]
     points = torch.cartesian_prod(*axes)
     nodes = scene.array.nodes.positions.reshape(-1, 3)
-    heard = torch.ones(len(points), dtype=torch.bool)
+    heard = torch.ones(len(points), dtype=torch.bool, device="cpu")
     for node in nodes:
         heard &= torch.linalg.vector_norm(points - node, dim=1) > _CLEARANCE * scene.wavelength
     for obstacle in scene.obstacles:
         heard &= ~obstacle.contains(points)
-    field = torch.full((len(points),), complex(math.nan, math.nan), dtype=torch.complex128)
+    field = torch.full((len(points),), complex(math.nan, math.nan), dtype=torch.complex128, device="cpu")
     field[heard] = propagator.field(drive, points[heard])
     return field.reshape(counts)

@@ -192,8 +192,8 @@ def _coefficients(angle: ArrayLike, layering: Layering) -> tuple[torch.Tensor, t
     if ((angles < 0) | (angles >= math.pi / 2)).any():
         raise invalid("angle", angles, "every entry must be in [0, pi/2)", "rad")
     kappa = layering.wavenumber * np.sin(angles.cpu().numpy()).astype(np.complex128)
-    reflected = torch.as_tensor(layering.reflected(kappa))
-    transmitted = torch.as_tensor(layering.transmitted(kappa, layering.thickness))
+    reflected = torch.from_numpy(np.asarray(layering.reflected(kappa)))
+    transmitted = torch.from_numpy(np.asarray(layering.transmitted(kappa, layering.thickness)))
     return reflected.to(angles.device), transmitted.to(angles.device)
 
 

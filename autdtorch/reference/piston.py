@@ -38,7 +38,7 @@ def piston_directivity(angle: ArrayLike, wavenumber: float, radius: float) -> to
     argument = reach * np.sin(angles.cpu().numpy())
     safe = np.where(argument == 0, 1, argument)
     ratio = np.where(argument == 0, 1, 2 * j1(safe) / safe)
-    return torch.as_tensor(ratio, dtype=torch.complex128).to(angles.device)
+    return torch.as_tensor(ratio, dtype=torch.complex128, device="cpu").to(angles.device)
 
 
 def piston_on_axis(distance: ArrayLike, wavenumber: float, radius: float) -> torch.Tensor:

@@ -1,7 +1,8 @@
-"""PyTorch's global settings change no result: default dtype and device, inference mode, gradients, threads."""
+"""PyTorch's global settings change no result: default dtype and device, inference mode, threads."""
 
 from __future__ import annotations
 
+import ast
 import contextlib
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
@@ -12,6 +13,8 @@ import torch
 from small_scenes import CUBE, small_scene
 
 import autdtorch as at
+
+PACKAGE = Path(at.__file__).parent
 
 
 @contextlib.contextmanager
@@ -64,10 +67,8 @@ def numbers(folder: Path) -> dict[str, torch.Tensor]:
     for method in ("box", "full", "free_space"):
         propagator = at.make_propagator(scene, method, 2e-3, cache=False)
         matrix, error = propagator.transfer_matrix(return_error=True)
-        found[method], found[f"{method} error"] = (
-            matrix,
-            torch.tensor(error, dtype=torch.float64, device="cpu"),
-        )
+        found[method] = matrix
+        found[f"{method} error"] = torch.tensor(error, dtype=torch.float64, device="cpu")
         drive = at.drive_from_phases(torch.arange(4, dtype=torch.float64, device="cpu"))
         found[f"{method} field"] = propagator.field(drive, scene.control_points + 1e-4)
     objective = at.SimulatedObjective(scene, at.make_propagator(scene, "box", 2e-3, cache=False))
@@ -118,3 +119,32 @@ def test_what_inference_mode_has_made_serves_gradients_later() -> None:
     propagator.field(drive, scene.control_points).abs().sum().backward()
     assert drive.grad is not None
     assert drive.grad.abs().sum() > 0
+
+
+MAKERS = {
+    "arange",
+    "as_tensor",
+    "empty",
+    "eye",
+    "full",
+    "linspace",
+    "ones",
+    "rand",
+    "randn",
+    "tensor",
+    "zeros",
+}
+
+
+def test_every_tensor_is_made_with_its_dtype_and_device() -> None:
+    found = 0
+    for path in PACKAGE.rglob("*.py"):
+        for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            match call:
+                case ast.Call(func=ast.Attribute(value=ast.Name("torch"), attr=name)) if name in MAKERS:
+                    given = {keyword.arg for keyword in call.keywords}
+                    # integers have one dtype, and what is there keeps its own
+                    required = {"device"} if name in ("arange", "as_tensor") else {"device", "dtype"}
+                    assert required <= given, f"{path}:{call.lineno}: {ast.unparse(call)}"
+                    found += 1
+    assert found > 100

@@ -40,8 +40,10 @@ class Columns:
     @classmethod
     def none(cls, layer_cells: int, dtype: torch.dtype, width: int = 9) -> Columns:
         """No columns: nothing but air in the layers."""
-        index, offset = (torch.zeros((0, cells), dtype=torch.int64) for cells in (layer_cells + 2, width))
-        return cls(index, offset, torch.zeros((0, width), dtype=dtype))
+        index, offset = (
+            torch.zeros((0, cells), dtype=torch.int64, device="cpu") for cells in (layer_cells + 2, width)
+        )
+        return cls(index, offset, torch.zeros((0, width), dtype=dtype, device="cpu"))
 
 
 @dataclass(frozen=True)
@@ -113,11 +115,16 @@ def uniform_state(shape: tuple[int, int, int], coefficients: Coefficients, press
     for axis, size in zip((0, 1, 2, 1), sizes, strict=True):
         half, full = [2, *size], [2, *size]
         half[axis + 1], full[axis + 1] = layer_cells + 1, layer_cells
-        layers.append((torch.zeros(half, dtype=dtype), torch.zeros(full, dtype=dtype)))
-    core = torch.full([cells - 2 for cells in shape], pressure, dtype=dtype)
+        layers.append(
+            (torch.zeros(half, dtype=dtype, device="cpu"), torch.zeros(full, dtype=dtype, device="cpu"))
+        )
+    core = torch.full([cells - 2 for cells in shape], pressure, dtype=dtype, device="cpu")
     now = torch.nn.functional.pad(core, (1,) * 6)
     columns, crossed = (
-        (torch.zeros((layer_cells + 1, count), dtype=dtype), torch.zeros((layer_cells, count), dtype=dtype))
+        (
+            torch.zeros((layer_cells + 1, count), dtype=dtype, device="cpu"),
+            torch.zeros((layer_cells, count), dtype=dtype, device="cpu"),
+        )
         for count in (len(coefficients.columns.index), len(coefficients.crossed.index))
     )
     return State(now, now.clone(), tuple(layers), columns, crossed)

@@ -229,7 +229,7 @@ class CpuKernel:
         shape, cuts = state.now.shape, _cuts(state.now.shape)
         plane = shape[1] * shape[2]
         dtype = c.varying_weight.numpy().dtype.type
-        recorded = torch.empty((len(signal), len(receivers.index)), dtype=signal.dtype)
+        recorded = torch.empty((len(signal), len(receivers.index)), dtype=signal.dtype, device="cpu")
         medium = (
             cuts,
             np.searchsorted(c.varying_index.numpy(), plane * np.arange(shape[0] + 1)),

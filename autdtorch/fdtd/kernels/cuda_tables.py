@@ -166,7 +166,7 @@ def settled_table(c: Coefficients, device: torch.device) -> Settled:
     count = torch.bincount(taker, minlength=len(cell))
     nth = torch.arange(len(inside), device=device) - (count.cumsum(0) - count)[taker]
     width = int(count.max()) if len(inside) else 0
-    share = torch.full((width, len(cell)), len(inside), device=device)
+    share = torch.full((width, len(cell)), len(inside), dtype=torch.int64, device=device)
     share[nth, taker] = order
     return Settled(cell, place, share, shut)
 

@@ -54,7 +54,7 @@ class ReferenceKernel:
         term = flat_term.index_copy(0, c.layer_index, c.layer_scale * flat_term[c.layer_index]).reshape(
             term.shape
         )
-        nothing = torch.zeros(c.crossed.index.T[1:].shape, dtype=flat_now.dtype)
+        nothing = torch.zeros(c.crossed.index.T[1:].shape, dtype=flat_now.dtype, device="cpu")
         crossed, beside = _absorb_columns(flat_now, c.crossed, nothing, state.crossed, c)
         beside = torch.nn.functional.pad(beside.reshape(-1), (0, 1))[c.crossing.T[1:]]
         columns, shares = _absorb_columns(flat_now, c.columns, beside, state.columns, c)
@@ -70,7 +70,7 @@ def _core(field: torch.Tensor) -> torch.Tensor:
 
 def _offsets(field: torch.Tensor) -> torch.Tensor:
     """Flat offsets of the 27 neighbours, row-major."""
-    step = torch.arange(-1, 2)
+    step = torch.arange(-1, 2, device="cpu")
     strides = field.stride()
     return (
         (step * strides[0])[:, None, None]
