@@ -41,6 +41,7 @@ from .rendering import animate3d, view3d
 from .results import load_results
 from .scene import OverlapWarning, ScaleWarning, Scene
 from .scene_file import load_scene
+from .simulation_estimate import Estimate, estimate
 
 __all__ = [
     "PAPER_SOURCE_STRENGTH",
@@ -48,6 +49,7 @@ __all__ = [
     "Cylinder",
     "Dead",
     "Drift",
+    "Estimate",
     "FocusMetrics",
     "Medium",
     "Mesh",
@@ -75,6 +77,7 @@ __all__ = [
     "collect_results",
     "differentiable_field",
     "drive_from_phases",
+    "estimate",
     "focus_bound",
     "focus_metrics",
     "focus_phases",

@@ -11,6 +11,7 @@ import torch
 
 from autdtorch.device_layouts import (
     AUTD3_SOURCE_STRENGTH,
+    AUTD3_TRANSDUCERS,
     OPENMPD_SOURCE_STRENGTH,
     SONICSURFACE_SOURCE_STRENGTH,
     TRANSDUCER_RADIUS,
@@ -19,6 +20,7 @@ from autdtorch.device_layouts import (
     sonicsurface_places,
 )
 from autdtorch.geometry import Coordinates, in_plane, plane_basis
+from autdtorch.memory import require_memory
 from autdtorch.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
@@ -36,6 +38,9 @@ from autdtorch.validation import (
 
 #: On-axis pressure of a transducer at full drive, times distance [Pa m], in the paper's Eq. 2.
 PAPER_SOURCE_STRENGTH = 1 / (4 * math.pi)
+
+_TRANSDUCER_BYTES = 500.0
+"""Memory [bytes] of a transducer: its place and direction, and the search for its neighbours."""
 
 _RINGS, _RING_NODES = 5, 16
 
@@ -124,6 +129,7 @@ class TransducerArray:
             ValueError: an argument is not finite, has the wrong shape or is out of range.
         """
         count_u, count_v = positive_integers("shape", shape, 2)
+        require_memory("shape", shape, _TRANSDUCER_BYTES * count_u * count_v)
         pitch = positive("pitch", pitch, "m")
         middle = torch.tensor(finite_vector("center", center), dtype=torch.float64, device="cpu")
         u, v = plane_basis(normal)
@@ -157,6 +163,7 @@ class TransducerArray:
             ValueError: an argument is not finite, has the wrong shape or is out of range.
         """
         count_x, count_y = positive_integers("units", units, 2)
+        require_memory("units", units, _TRANSDUCER_BYTES * AUTD3_TRANSDUCERS * count_x * count_y)
         positions = in_plane(autd3_places((count_x, count_y)), center, normal, angle)
         return cls(positions, normal, source_strength, radius)
 

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from autdtorch.memory import require_memory
 from autdtorch.validation import (
     ArrayLike,
     Vector,
@@ -21,6 +22,9 @@ from autdtorch.validation import (
     real_tensor,
     unit_vector,
 )
+
+_POINT_BYTES = 100.0
+"""Memory [bytes] of a point while it is placed."""
 
 
 class Coordinates(torch.Tensor):
@@ -147,6 +151,7 @@ def circle_points(
     origin = torch.tensor(finite_vector("center", center), dtype=torch.float64, device="cpu")
     radius = positive("radius", radius, "m")
     count = integer_at_least("count", count, 1)
+    require_memory("count", count, _POINT_BYTES * count)
     u, v = plane_basis(normal)
     start = finite_number("angle", angle, "rad")
     angles = start + 2 * math.pi * torch.arange(count, dtype=torch.float64, device="cpu") / count
@@ -200,12 +205,12 @@ class Plane:
             ValueError: `spacing` is not a finite number > 0.
         """
         spacing = positive("spacing", spacing, "m")
-        along = []
-        for length in self.size:
-            count = max(1, round(length / spacing))
-            along.append(
-                length * ((torch.arange(count, dtype=torch.float64, device="cpu") + 0.5) / count - 0.5)
-            )
+        counts = [max(1.0, round(length / spacing, 0)) for length in self.size]
+        require_memory("spacing", spacing, _POINT_BYTES * math.prod(counts), "m")
+        along = [
+            length * ((torch.arange(int(count), dtype=torch.float64, device="cpu") + 0.5) / count - 0.5)
+            for length, count in zip(self.size, counts, strict=True)
+        ]
         return self._at(along[0], along[1])
 
     def _at(self, along_u: torch.Tensor, along_v: torch.Tensor) -> torch.Tensor:

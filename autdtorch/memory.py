@@ -21,8 +21,8 @@ _FILES = {
 
 def available_memory() -> int:
     """Return the memory [bytes] that the machine, control groups and limits leave to this process."""
-    left: int = min(psutil.virtual_memory().available, *_left_in_groups(), *_left_to_process())
-    return max(0, left)
+    left = [psutil.virtual_memory().available, *_left_in_groups(), *_left_to_process()]
+    return int(max(0, min(left)))
 
 
 def require_memory(field: str, value: object, needed: float, unit: str = "") -> None:

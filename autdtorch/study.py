@@ -12,9 +12,10 @@ from typing import Any, TypeAlias
 
 import torch
 
+from autdtorch.memory import require_memory
 from autdtorch.metrics import focus_metrics
 from autdtorch.objective import Objective, SimulatedObjective
-from autdtorch.optim.base import Solution, Trials
+from autdtorch.optim.base import TRIAL_BYTES, Solution, Trials
 from autdtorch.optim.bound import focus_bound
 from autdtorch.progress import Progress, show_progress
 from autdtorch.propagator import CACHE_VARIABLE, Propagator, SimulatedPropagator, make_propagator
@@ -122,7 +123,10 @@ def _check(
             raise invalid("trials", name, accepted)
     if absent := [name for name in random if name not in trials]:
         raise invalid("trials", dict(trials), f"must also give the number for {', '.join(absent)}")
-    return {name: integer_at_least(f"trials.{name}", trials.get(name, 1), 1) for name in methods}
+    counts = {name: integer_at_least(f"trials.{name}", trials.get(name, 1), 1) for name in methods}
+    for name, count in counts.items():
+        require_memory(f"trials.{name}", count, TRIAL_BYTES * count)
+    return counts
 
 
 def _propagator(scene: Scene, solver: Mapping[str, Any], kept: StudyFolder) -> Propagator:

@@ -38,7 +38,7 @@ control_points: {type: points, positions: [[0.08, 0, 0]]}
 
 #: What the package itself makes, and what drivers are made of.
 NOT_CALLED_BY_USERS = {
-    *("FocusMetrics", "Solution", "Sweep", "Run", "Evaluation", "EvaluationLog", "Preflight", "Waveform"),
+    *("Estimate", "FocusMetrics", "Solution", "Sweep", "Run", "Evaluation", "EvaluationLog", "Preflight", "Waveform"),
     *("Adapter", "Device", "Dialect", "Obstacle", "OpenMPDBoard", "SimulatedPropagator", "UsbtmcPort"),
     *("BoxPropagator", "FullPropagator", "EmulatedBench.receive", "EmulatedScope.execute"),
     *("EmulatedScope.plug_into", "Oscilloscope.capture", "Oscilloscope.set_up"),

@@ -177,13 +177,23 @@ def make_box(scene: Scene, spacing: float) -> Grid:
     return _covering(scene, spacing, obstacles_extent(scene.obstacles))
 
 
-def _covering(scene: Scene, spacing: float, extent: Extent) -> Grid:
+def require_spacing(scene: Scene, spacing: float) -> None:
+    """Refuse a spacing [m] of cells that are too large or too small for a scene.
+
+    Raises:
+        ValueError: fewer than `MIN_CELLS_PER_WAVELENGTH` cells a wavelength, or more than
+            `MAX_CELLS_PER_WAVELENGTH`.
+    """
     positive("spacing", spacing, "m")
     require_fine(speeds_of(scene), scene.frequency, spacing)
     finest = scene.wavelength / MAX_CELLS_PER_WAVELENGTH
     if spacing < finest:
         accepted = f"must be at least {finest:.3g} m, {MAX_CELLS_PER_WAVELENGTH} cells per wavelength"
         raise invalid("spacing", spacing, f"{accepted} in the medium at {scene.frequency:g} Hz", "m")
+
+
+def _covering(scene: Scene, spacing: float, extent: Extent) -> Grid:
+    require_spacing(scene, spacing)
     kappa = scene.wavenumber * spacing
     offset = grid_offset(scene, spacing, extent.lower, extent.upper)
     rim = layer_cells(kappa) + 1 + extent.margin - 0.5

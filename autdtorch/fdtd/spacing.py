@@ -16,7 +16,7 @@ ORDER = 4 / 3
 """Order of convergence that estimates assume: that of the field at sharp edges (a rigid wedge's, r^(2/3),
 squared). Curved surfaces converge with order two, and their error is then overestimated by three quarters."""
 
-PILOT_CELLS = 6.0
+_PILOT_CELLS = 6.0
 """Cells per wavelength of the finer of the two grids that a spacing is chosen from."""
 
 
@@ -25,6 +25,11 @@ def coarsest_spacing(scene: Scene) -> float:
     speeds = [scene.medium.sound_speed]
     speeds += [obstacle.sound_speed for obstacle in scene.obstacles if obstacle.sound_speed is not None]
     return min(speeds) / scene.frequency / FAIR_CELLS_PER_WAVELENGTH
+
+
+def pilot_spacing(scene: Scene) -> float:
+    """Spacing [m] of a coarse grid that tells what a scene takes: the finer of two that choose a spacing."""
+    return min(scene.wavelength / _PILOT_CELLS, coarsest_spacing(scene))
 
 
 def second_spacing(scene: Scene, spacing: float) -> float:

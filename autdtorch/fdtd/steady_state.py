@@ -137,7 +137,8 @@ class Extrapolation:
     def append(self, value: Phasors) -> None:
         """Go on with the next (k,)."""
         if self._values:
-            step = (value - self._values[-1])[:: -(-len(value) // _MOST_FITTED)]
+            every = -(-len(value) // _MOST_FITTED)
+            step = value[::every] - self._values[-1][::every]
             self._steps.append(step)
             old = self._product[-len(self._steps) + 1 :, -len(self._steps) + 1 :]
             self._product = np.empty((len(self._steps),) * 2, np.complex128)
@@ -170,22 +171,20 @@ def windows_of_run(
     receivers = Receivers(
         torch.from_numpy(cells[:, None]), torch.ones((len(cells), 1), dtype=assembly.dtype, device="cpu")
     )
-    state, earlier = (
-        assembly.silence(sources),
-        torch.zeros((steps, len(cells)), dtype=assembly.dtype, device="cpu"),
-    )
+    state = assembly.silence(sources)
+    both = None  # what was recorded in the last two blocks (2 * steps, k)
     for block in itertools.count():
         first = block * steps
         signal = drive_signal(steps_per_period, first, steps).to(assembly.dtype)
         state, recorded = kernel.advance(state, assembly.coefficients, sources, receivers, signal)
-        both = torch.cat((earlier.to(recorded.device), recorded)).double()
-        ends = range(-(-(first + 1) // shift) * shift, first + steps + 1, shift)
-        windows = [(end - steps, both[end - first : end - first + steps]) for end in ends]
-        yield (
-            (block + 1) * periods,
-            [(start, _turned(window, start, periods)) for start, window in windows],
-        )
-        earlier = recorded
+        if both is None:
+            both = recorded.new_zeros((2 * steps, len(cells)), dtype=torch.float64)
+        both[:steps] = both[steps:]
+        both[steps:] = recorded
+        starts = range(-(-(first + 1) // shift) * shift - steps, first + 1, shift)
+        windows = [(start, both[start - first + steps :][:steps]) for start in starts]
+        phasors = [(start, _turned(window, start, periods)) for start, window in windows]
+        yield (block + 1) * periods, phasors
 
 
 def _turned(window: torch.Tensor, start: int, periods: int) -> Phasors:

@@ -13,6 +13,7 @@ import torch
 from autdtorch.conditions import playable
 from autdtorch.display import html_facts
 from autdtorch.drive import amplitudes_of, phases_of
+from autdtorch.memory import require_memory
 from autdtorch.objective import Objective, Score, require_objective
 from autdtorch.validation import integer_at_least, integers, invalid, real_tensor, require_callable
 
@@ -91,6 +92,13 @@ NEAR_TIE = 1e-5
 the simulation, which another machine does otherwise."""
 
 
+TRIAL_BYTES = 6_000.0
+"""Memory [bytes] of a trial: its generator of random numbers above all."""
+
+_SCORE_NUMBERS = 4.0
+"""Numbers for each evaluation: its score, and those from which a history is made."""
+
+
 def first_of_best(score: torch.Tensor) -> torch.Tensor:
     """Return the index (T,) of the first of scores (T, B) within `NEAR_TIE` of the best."""
     best = score.amax(dim=1, keepdim=True)
@@ -138,6 +146,23 @@ class Ledger:
         self._best = torch.full((trials,), -torch.inf, dtype=torch.float64, device="cpu")
         self._evaluations = torch.zeros(trials, dtype=torch.int64, device="cpu")
         self._scores: list[torch.Tensor] = []
+
+    def require_memory(self, field: str, value: object, evaluations: float, at_once: float = 1.0) -> None:
+        """Refuse an argument that leads to more evaluations than there is memory for.
+
+        Args:
+            field: name of the argument.
+            value: its value.
+            evaluations: of each trial.
+            at_once: of these in one call of the objective.
+
+        Raises:
+            ValueError: names the field.
+        """
+        numbers = _SCORE_NUMBERS * evaluations + at_once * (
+            4 * self.transducers + 2 * self._pressure.shape[1]
+        )
+        require_memory(field, value, 8 * len(self._best) * numbers)
 
     def evaluate(self, drive: torch.Tensor, trials: torch.Tensor | None = None) -> torch.Tensor:
         """Scores (T, B), float64, of drives (T, B, M): `observe`, where only the score counts."""
@@ -208,7 +233,9 @@ def trial_seeds(seed: int, trials: Trials) -> list[int]:
     """
     seed = integer_at_least("seed", seed, 0)
     if isinstance(trials, numbers.Integral):
-        chosen = list(range(integer_at_least("trials", trials, 1)))
+        count = integer_at_least("trials", trials, 1)
+        require_memory("trials", count, TRIAL_BYTES * count)
+        chosen = list(range(count))
     else:
         accepted = "must be an integer >= 1, or trial numbers, each once"
         chosen = integers("trials", trials, 0, accepted)

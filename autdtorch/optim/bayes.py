@@ -77,6 +77,8 @@ def bayes_opt(
     transducers = integer_at_least("transducers of the objective's array", ledger.transducers, 2)
     if integer_at_least("fixed_transducer", fixed_transducer, 0) >= transducers:
         raise invalid("fixed_transducer", fixed_transducer, f"must be an integer from 0 to {transducers - 1}")
+    # each trial's process holds a matrix of all pairs of evaluations
+    ledger.require_memory("evaluations", evaluations, float(evaluations) ** 2 / 2)
 
     from autdtorch.optim.bayes_trial import BayesTrial, Settings  # loads Numba
 

@@ -13,15 +13,17 @@ from autdtorch.cache import DiskCache
 from autdtorch.fdtd.grid import speeds_of, warn_if_coarse
 from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.medium import warn_of_ending_walls
-from autdtorch.fdtd.spacing import PILOT_CELLS, coarsest_spacing, spacing_for
-from autdtorch.propagator.auto import chosen_method
+from autdtorch.fdtd.spacing import coarsest_spacing, pilot_spacing, spacing_for
+from autdtorch.memory import require_memory
+from autdtorch.propagator.auto import method_for
 from autdtorch.propagator.base import Propagator, Run, SimulatedPropagator, SteadyStateWarning
 from autdtorch.propagator.box import BoxPropagator
 from autdtorch.propagator.differentiable import cell_centers, differentiable_field
 from autdtorch.propagator.free_space import FreeSpacePropagator
 from autdtorch.propagator.full import FullPropagator
-from autdtorch.propagator.stepper import KERNELS, make_kernel, precision_of
+from autdtorch.propagator.stepper import make_kernel, precision_of, relative_tolerance
 from autdtorch.propagator.volume import volume_field
+from autdtorch.propagator.workload import memory_for
 from autdtorch.scene import Scene
 from autdtorch.validation import (
     integer_at_least,
@@ -29,7 +31,6 @@ from autdtorch.validation import (
     path_of,
     positive,
     require_kind,
-    require_one_of,
 )
 
 __all__ = [
@@ -48,7 +49,7 @@ __all__ = [
 
 logger = logging.getLogger(__name__)
 
-METHODS = ("auto", "free_space", "box", "full")
+SIMULATED = {kind.method: kind for kind in (BoxPropagator, FullPropagator)}
 CACHE_VARIABLE = "AUTDTORCH_CACHE_DIR"
 
 
@@ -98,25 +99,18 @@ def make_propagator(
         ValueError: an argument out of range, or what a kernel needs is missing; the message names it.
     """
     require_kind("scene", scene, Scene)
-    require_one_of("method", method, METHODS)
-    require_one_of("kernel", kernel, KERNELS)
     precision = precision_of(dtype)
     if spacing is not None:
         spacing = positive("spacing", spacing, "m")
-    tolerance = positive("tolerance", tolerance)
-    if tolerance >= 1:
-        raise invalid("tolerance", tolerance, "must be in (0, 1)")
+    tolerance = relative_tolerance(tolerance)
     max_periods = integer_at_least("max_periods", max_periods, 1)
     if time_step is not None:
         time_step = positive("time_step", time_step, "s")
     disk_cache = _disk_cache(cache)
-    if method == "auto":
-        method = chosen_method(scene, _pilot_spacing(scene) if spacing is None else spacing, tolerance)
-    if method == "box" and not scene.obstacles:
-        raise invalid("method", method, "needs a scene with obstacles; take free_space")
+    method = method_for(scene, method, pilot_spacing(scene) if spacing is None else spacing, tolerance)
     if method == "free_space":
         return FreeSpacePropagator(scene)
-    kind = BoxPropagator if method == "box" else FullPropagator
+    kind = SIMULATED[method]
     settings = make_kernel(kernel), precision, max_periods, disk_cache
     if spacing is None:
         tolerance /= 2
@@ -137,7 +131,7 @@ def _chosen_spacing(
     cache: DiskCache | None,
 ) -> float:
     """Spacing [m] at which the grid's error should be `tolerance`, told from two coarse grids."""
-    pilot = _pilot_spacing(scene)
+    pilot = pilot_spacing(scene)
     near_steady = max(tolerance, 1e-3)
     propagator = kind(scene, pilot, near_steady, kernel, dtype, max_periods, cache, None)
     _, error, _ = propagator._estimated()
@@ -145,6 +139,8 @@ def _chosen_spacing(
         accepted = f"too few to choose a spacing: at {pilot:.3g} m no run came near its steady state"
         raise invalid("max_periods", max_periods, accepted)
     spacing = min(spacing_for(tolerance, error, pilot), coarsest_spacing(scene))
+    needed = memory_for(scene, kind.method, spacing, tolerance, dtype, kernel)
+    require_memory("tolerance", 2 * tolerance, needed)
     logger.info("spacing %.3g mm: the error at %.3g mm is about %.2g", 1e3 * spacing, 1e3 * pilot, error)
     return spacing
 
@@ -160,7 +156,3 @@ def _disk_cache(folder: str | os.PathLike[str] | Literal[False] | None) -> DiskC
         return DiskCache(path)
     except OSError as error:
         raise invalid(name, str(path), f"must be a folder, or one that can be made ({error})") from error
-
-
-def _pilot_spacing(scene: Scene) -> float:
-    return min(scene.wavelength / PILOT_CELLS, coarsest_spacing(scene))

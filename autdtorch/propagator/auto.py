@@ -1,4 +1,4 @@
-"""The cheapest method that is right for a scene."""
+"""The method by which a scene is simulated."""
 
 from __future__ import annotations
 
@@ -9,11 +9,27 @@ from autdtorch.fdtd.medium import is_wall
 from autdtorch.propagator.cost import full_cost, grid_cost
 from autdtorch.propagator.groups import cheapest_grouping
 from autdtorch.scene import Scene
+from autdtorch.validation import invalid, require_one_of
 
 logger = logging.getLogger(__name__)
 
 
-def chosen_method(scene: Scene, spacing: float, tolerance: float) -> str:
+METHODS = ("auto", "free_space", "box", "full")
+
+
+def method_for(scene: Scene, method: str, spacing: float, tolerance: float) -> str:
+    """Return the method that was asked for, "auto" being the cheapest that is right for the scene.
+
+    Raises:
+        ValueError: no such method, or a box around nothing.
+    """
+    require_one_of("method", method, METHODS)
+    if method == "box" and not scene.obstacles:
+        raise invalid("method", method, "needs a scene with obstacles; take free_space")
+    return _chosen_method(scene, spacing, tolerance) if method == "auto" else method
+
+
+def _chosen_method(scene: Scene, spacing: float, tolerance: float) -> str:
     """The cheapest method that is right for a scene, and why, in the log.
 
     Args:

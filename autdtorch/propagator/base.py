@@ -17,14 +17,17 @@ import torch
 from autdtorch.array import Nodes
 from autdtorch.cache import DiskCache, digest_of
 from autdtorch.drive import validate_drive
+from autdtorch.fdtd.grid import require_spacing
 from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.points import footprint
 from autdtorch.fdtd.spacing import grid_error, second_spacing
 from autdtorch.fdtd.steady_state import SteadyState, fewest_periods
 from autdtorch.fdtd.stepping import Assembly
+from autdtorch.memory import require_memory
 from autdtorch.progress import show_progress
 from autdtorch.propagator.cost import USUAL_PERIODS
 from autdtorch.propagator.symmetry import Plan, Symmetry, backward_plan, forward_plan, symmetries
+from autdtorch.propagator.workload import memory_for
 from autdtorch.scene import Scene
 from autdtorch.source import package_versions, source_digest
 from autdtorch.threads import one_torch_thread
@@ -32,9 +35,6 @@ from autdtorch.validation import ArrayLike, boolean, points_grid
 
 logger = logging.getLogger(__name__)
 
-
-MOST_JUDGED = 64
-"""Targets whose pressure decides when a run has settled."""
 
 _NOT_HEARD = ("control_points", "observation_plane", "name")
 """What of a scene decides nothing of what is heard in it."""
@@ -112,7 +112,11 @@ class SimulatedPropagator(ABC):
         cache: DiskCache | None,
         time_step: float | None,
     ) -> None:
-        """Use `make_propagator`, which checks its arguments."""
+        """Use `make_propagator`, which checks its arguments.
+
+        Raises:
+            ValueError: it would need more memory than there is.
+        """
         self.scene = scene
         self.spacing = spacing
         self.tolerance = tolerance
@@ -121,6 +125,9 @@ class SimulatedPropagator(ABC):
         self._near_told = False
         self._kernel = kernel
         self._cache = cache
+        require_spacing(scene, spacing)
+        needed = memory_for(scene, self.method, spacing, tolerance, dtype, kernel)
+        require_memory("spacing", spacing, needed, "m")
         self._assemblies = self._assembled(dtype, time_step)
 
     def __repr__(self) -> str:
@@ -135,6 +142,11 @@ class SimulatedPropagator(ABC):
         """The time step in use [s], of several boxes the shortest."""
         most = max(assembly.steps_per_period for assembly in self._assemblies)
         return 1 / (self.scene.frequency * float(most))
+
+    @property
+    def planned_runs(self) -> int:
+        """Simulations that the transfer matrix of the control points takes, or took."""
+        return self._plan(self.scene.control_points).runs
 
     @abstractmethod
     def _assembled(self, dtype: torch.dtype, time_step: float | None) -> Sequence[Assembly]:

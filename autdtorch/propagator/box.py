@@ -15,9 +15,10 @@ from autdtorch.fdtd.grid import make_box
 from autdtorch.fdtd.scatter import Reach, Scattering
 from autdtorch.fdtd.steady_state import SteadyState, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble_on
-from autdtorch.propagator.base import MOST_JUDGED, SimulatedPropagator
+from autdtorch.propagator.base import SimulatedPropagator
 from autdtorch.propagator.coupling import coupled_runs
 from autdtorch.propagator.groups import MOST_PASSES, cheapest_grouping, one_box
+from autdtorch.propagator.workload import MOST_JUDGED
 from autdtorch.scene import with_obstacles
 from autdtorch.threads import spread
 from autdtorch.validation import LENGTH_TOLERANCE, ArrayLike, distances, invalid, points_tensor

@@ -22,9 +22,8 @@ _BESIDE = 2_000_000
 _PAIR = 1.0
 """What a term of a sum over Green's function costs, in steps of a cell: 6 ns and 2 to 8 ns on one core."""
 
-
-USUAL_PERIODS = 1.6
-"""Periods of a usual run over the fewest: most obstacles ring a little."""
+USUAL_PERIODS = 1.7
+"""Periods of a usual run among obstacles over the fewest: 1.0 to 3.5, by how long they ring."""
 
 
 @dataclass(frozen=True)
@@ -33,15 +32,25 @@ class GridCost:
 
     Attributes:
         interior: cells per axis inside the boundary layer.
-        cells: of the grid, boundary layers included.
+        shape: of the whole array, boundary layers included.
         steps: of a run.
         steps_per_period: time steps a period of the drive.
     """
 
     interior: tuple[int, int, int]
-    cells: int
+    shape: tuple[int, int, int]
     steps: int
     steps_per_period: float
+
+    @property
+    def cells(self) -> int:
+        """Cells of the whole array."""
+        return math.prod(self.shape)
+
+    @property
+    def radiating(self) -> int:
+        """Cells of a box that radiate, and whose phasors a run keeps."""
+        return _shrunk(self, 4) - _shrunk(self, 8)
 
     @property
     def work(self) -> float:
@@ -53,15 +62,15 @@ def grid_cost(scene: Scene, extent: Extent, spacing: float) -> GridCost:
     """What a run takes on a grid of `spacing` [m] over an extent of a scene."""
     spacing = min(spacing, scene.wavelength / MIN_CELLS_PER_WAVELENGTH)  # coarser grids are refused later
     kappa = scene.wavenumber * spacing
-    interior = extent.interior(spacing)
+    interior = x, y, z = extent.interior(spacing)
     rim = layer_cells(kappa) + 1
     stencil = tuned_stencil(kappa, scene.attenuation * spacing)
     periods = fewest_periods(spacing * math.hypot(*interior) / scene.wavelength)
     speeds = [obstacle.sound_speed or 0.0 for obstacle in scene.obstacles]
     fastest = max(1.0, *(speed / scene.medium.sound_speed for speed in speeds), 0.0)
     steps_per_period = fewest_steps(stencil, stencil.largest_symbol * fastest**2)
-    cells = math.prod(cells + 2 * rim for cells in interior)
-    return GridCost(interior, cells, math.ceil(periods * steps_per_period), steps_per_period)
+    shape = x + 2 * rim, y + 2 * rim, z + 2 * rim
+    return GridCost(interior, shape, math.ceil(periods * steps_per_period), steps_per_period)
 
 
 def full_cost(grid: GridCost, runs: int) -> float:
@@ -76,15 +85,10 @@ def box_cost(grids: Sequence[GridCost], passes: int, runs: int) -> float:
     obstacle, for all runs at once.
     """
     steps = sum(grid.work + _BESIDE for grid in grids)
-    radiating = [radiating_cells(grid) for grid in grids]
+    radiating = [grid.radiating for grid in grids]
     heard = [_shrunk(grid, 8) for grid in grids]
     pairs = sum(radiating) * sum(heard) - sum(map(math.prod, zip(radiating, heard, strict=True)))
     return runs * passes * steps + (passes - 1) * _PAIR * pairs
-
-
-def radiating_cells(grid: GridCost) -> int:
-    """Return the number of cells of a box that radiate, and whose phasors a run keeps."""
-    return _shrunk(grid, 4) - _shrunk(grid, 8)
 
 
 def _shrunk(grid: GridCost, cells: int) -> int:

@@ -12,7 +12,8 @@ import torch
 from autdtorch.array import Nodes
 from autdtorch.fdtd.steady_state import run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble
-from autdtorch.propagator.base import MOST_JUDGED, SimulatedPropagator
+from autdtorch.propagator.base import SimulatedPropagator
+from autdtorch.propagator.workload import MOST_JUDGED
 from autdtorch.scene import require_inside
 from autdtorch.validation import ArrayLike, points_tensor
 

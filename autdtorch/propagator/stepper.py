@@ -8,7 +8,7 @@ from importlib.util import find_spec
 import torch
 
 from autdtorch.fdtd.kernels.contract import Kernel
-from autdtorch.validation import invalid, require_one_of
+from autdtorch.validation import invalid, positive, require_one_of
 
 logger = logging.getLogger(__name__)
 
@@ -20,8 +20,9 @@ def make_kernel(name: str) -> Kernel:
     """The kernel of a name, one of `KERNELS`; "auto" takes the fastest there is.
 
     Raises:
-        ValueError: what it needs is missing.
+        ValueError: no such kernel, or what it needs is missing.
     """
+    require_one_of("kernel", name, KERNELS)
     if name == "reference":
         from autdtorch.fdtd.kernels.reference import ReferenceKernel
 
@@ -51,3 +52,15 @@ def precision_of(dtype: str | torch.dtype) -> torch.dtype:
     name = str(dtype).removeprefix("torch.") if isinstance(dtype, torch.dtype) else dtype
     require_one_of("dtype", name, tuple(DTYPES))
     return DTYPES[name]
+
+
+def relative_tolerance(value: float) -> float:
+    """Return a relative error that is aimed at, after checking it.
+
+    Raises:
+        ValueError: it is not in (0, 1).
+    """
+    tolerance = positive("tolerance", value)
+    if tolerance >= 1:
+        raise invalid("tolerance", tolerance, "must be in (0, 1)")
+    return tolerance

@@ -13,7 +13,7 @@ from small_scenes import CUBE, relative_error, small_scene
 from autdtorch.fdtd.grid import make_box, make_grid
 from autdtorch.obstacles import Box, Obstacle, Sphere
 from autdtorch.propagator import FreeSpacePropagator, SimulatedPropagator, make_propagator
-from autdtorch.propagator.auto import chosen_method
+from autdtorch.propagator.auto import method_for
 
 
 def test_nothing_is_simulated_where_nothing_scatters(caplog: pytest.LogCaptureFixture) -> None:
@@ -37,7 +37,7 @@ def test_the_cheapest_that_is_right(
     obstacle: Obstacle, method: str, reason: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level(logging.INFO):
-        assert chosen_method(small_scene((obstacle,)), 1e-3, 2e-3) == method
+        assert method_for(small_scene((obstacle,)), "auto", 1e-3, 2e-3) == method
     assert reason in caplog.text
 
 

@@ -55,6 +55,7 @@ UNITS = {
     "rad": {"angle", "phase", "phase_offsets", "phases", "rotation"},
     "rad/m": {"complex_wavenumber", "wavenumber"},
     "rad/s": {"angular_frequency"},
+    "bytes": {"memory"},
     "s": {"seconds", "seconds_in_a_row", "seconds_on", "settle", "time_step", "timeout"},
     "s/division": {"time_scale"},
     "V": {"dc_offset", "resolution", "volts"},

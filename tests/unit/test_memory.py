@@ -1,0 +1,96 @@
+"""What would not fit into memory is refused before it is allocated, and control groups count."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from small_scenes import CUBE, small_scene
+
+import autdtorch as at
+from autdtorch import memory
+from autdtorch.study import run_study
+
+AIR = small_scene()
+OBJECTIVE = at.SimulatedObjective(AIR, at.make_propagator(AIR))
+WIDE = small_scene((at.Box((0.1, 0.1, 0.1), (0.09, 0.09, 0.09), rigid=True),), extent=0.2)
+
+HUGE: dict[str, tuple[str, Callable[[], object]]] = {
+    "cells": ("spacing", lambda: at.make_propagator(WIDE, "full", 1.8e-5)),
+    "cells of a box": ("spacing", lambda: at.make_propagator(WIDE, "box", 1.8e-5)),
+    "transducers": ("shape", lambda: at.TransducerArray.grid((10**5, 10**5), 1e-3, (0, 0, 0))),
+    "units": ("units", lambda: at.TransducerArray.autd3((0, 0, 0), units=(10**5, 10**5))),
+    "points": ("count", lambda: at.circle_points((0, 0, 0), 0.1, 10**18, (1, 0, 0))),
+    "samples": ("spacing", lambda: at.Plane((0, 0, 0), (1, 0, 0), (1, 1)).points(1e-9)),
+    "trials of gabs": ("trials", lambda: at.gabs(OBJECTIVE, trials=10**11)),
+    "levels of gabs": ("levels", lambda: at.gabs(OBJECTIVE, levels=10**10)),
+    "passes of gabs": ("passes", lambda: at.gabs(OBJECTIVE, passes=10**12)),
+    "levels of lssg": ("levels", lambda: at.lssg(OBJECTIVE, levels=10**10)),
+    "random drives": ("evaluations", lambda: at.random_search(OBJECTIVE, evaluations=10**12)),
+    "random trials": ("trials", lambda: at.random_search(OBJECTIVE, trials=10**11)),
+    "bayes_opt": ("evaluations", lambda: at.bayes_opt(OBJECTIVE, 10**9, fixed_transducer=0)),
+    "identify": ("evaluations", lambda: at.identify(OBJECTIVE, evaluations=10**11)),
+    "starts": ("starts", lambda: at.gradient_ascent(OBJECTIVE, starts=10**11)),
+    "steps": ("steps", lambda: at.gradient_ascent(OBJECTIVE, steps=10**12)),
+    "study": ("trials.gabs", lambda: run_study({"a": AIR}, {"gabs": at.gabs}, trials=10**11)),
+}
+
+
+@pytest.mark.parametrize("what", HUGE)
+def test_what_would_not_fit_is_refused_with_both_figures(what: str) -> None:
+    field, call = HUGE[what]
+    with pytest.raises(ValueError, match=rf"^{field}: .* needs about .* GB of memory, .* may use .* GB$"):
+        call()
+
+
+def test_a_spacing_that_is_chosen_is_refused_by_the_tolerance(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = small_scene((CUBE,))
+    coarse = at.estimate(scene, 2e-3, method="box").memory
+    monkeypatch.setattr(memory, "available_memory", lambda: int(3 * coarse))
+    with pytest.raises(ValueError, match=r"^tolerance: 0\.0001; needs about"):
+        at.make_propagator(scene, "box", spacing=None, tolerance=1e-4)
+
+
+def group(folder: Path, most: object, used: int, inactive: int) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    files = {"memory.max": most, "memory.current": used, "memory.stat": f"inactive_file {inactive}"}
+    for name, content in files.items():
+        (folder / name).write_text(f"{content}\n", encoding="ascii")
+
+
+@pytest.fixture
+def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where control groups are; of the process nothing else limits it."""
+    monkeypatch.setattr(memory, "_MOUNT", tmp_path / "fs")
+    monkeypatch.setattr(memory, "_CGROUP", tmp_path / "cgroup")
+    monkeypatch.setattr(memory, "_left_to_process", lambda: iter(()))
+    (tmp_path / "fs").mkdir()
+    return tmp_path
+
+
+def test_the_tightest_of_nested_groups_counts(groups: Path) -> None:
+    (groups / "cgroup").write_text("0::/job/step\n", encoding="utf-8")
+    group(groups / "fs/job", most=5_000_000, used=4_000_000, inactive=500_000)
+    group(groups / "fs/job/step", most="max", used=1_000_000, inactive=0)
+    assert memory.available_memory() == 1_500_000  # what is cached of files can be dropped
+
+
+def test_groups_of_the_first_version_count(groups: Path) -> None:
+    (groups / "cgroup").write_text("5:cpu:/\n4:memory:/job\n", encoding="utf-8")
+    own = groups / "fs/memory/job"
+    own.mkdir(parents=True)
+    (own / "memory.limit_in_bytes").write_text("3000000\n", encoding="ascii")
+    (own / "memory.usage_in_bytes").write_text("2000000\n", encoding="ascii")
+    (own / "memory.stat").write_text("cache 7\ntotal_inactive_file 0\n", encoding="ascii")
+    assert memory.available_memory() == 1_000_000
+
+
+def test_nothing_is_left_of_a_group_that_is_full(groups: Path) -> None:
+    (groups / "cgroup").write_text("0::/\n", encoding="utf-8")
+    group(groups / "fs", most=1_000_000, used=2_000_000, inactive=0)
+    assert memory.available_memory() == 0
+
+
+def test_without_groups_the_machine_counts(groups: Path) -> None:
+    assert memory.available_memory() > 10_000_000
