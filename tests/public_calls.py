@@ -38,7 +38,8 @@ control_points: {type: points, positions: [[0.08, 0, 0]]}
 
 #: What the package itself makes, and what drivers are made of.
 NOT_CALLED_BY_USERS = {
-    *("Estimate", "FocusMetrics", "Solution", "Sweep", "Run", "Evaluation", "EvaluationLog", "Preflight", "Waveform"),
+    *("Estimate", "Evaluation", "EvaluationLog", "FocusMetrics", "Preflight", "Run", "Solution", "Sweep"),
+    "Waveform",
     *("Adapter", "Device", "Dialect", "Obstacle", "OpenMPDBoard", "SimulatedPropagator", "UsbtmcPort"),
     *("BoxPropagator", "FullPropagator", "EmulatedBench.receive", "EmulatedScope.execute"),
     *("EmulatedScope.plug_into", "Oscilloscope.capture", "Oscilloscope.set_up"),
