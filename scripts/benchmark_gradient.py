@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import torch
 from generated_block import fill_in, measured, table
-from numba import get_num_threads
 
 import autdtorch as at
+from autdtorch.threads import thread_count
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -93,7 +93,7 @@ def main() -> None:
         rows.append([CHANGED[case], *times, *memory])
         print(rows[-1], flush=True)
     header = ["gradient by", "run without", "times that", "largest resident set", "before"]
-    stated = measured("python scripts/benchmark_gradient.py") + f"\n\nThreads: {get_num_threads()}."
+    stated = measured("python scripts/benchmark_gradient.py") + f"\n\nThreads: {thread_count()}."
     fill_in(DOCS / "performance.md", "benchmark_gradient", (stated, table(header, rows)), DOCS)
 
 

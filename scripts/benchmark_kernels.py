@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from generated_block import fill_in, measured, table
 from numba import njit, prange
-from torch import get_num_threads
 
 import autdtorch as at
 from autdtorch.fdtd.grid import make_box
@@ -24,6 +23,7 @@ from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Kernel, Recei
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import Assembly, assemble, assemble_on
+from autdtorch.threads import thread_count
 
 ROOT = Path(__file__).parents[1]
 SCENES, DOCS = ROOT / "configs" / "scene", ROOT / "docs"
@@ -134,7 +134,7 @@ def main() -> None:
             rows.append([name, f"{scene}, {shape}", f"{rate / 1e9:.3f}", f"{rate / uniform_rate:.2f}"])
             print(rows[-1], flush=True)
     rates = table(["kernel", "grid", "Gcell/s", "of the uniform rate"], rows)
-    stated = measured("python scripts/benchmark_kernels.py") + f"\n\nThreads: {get_num_threads()}."
+    stated = measured("python scripts/benchmark_kernels.py") + f"\n\nThreads: {thread_count()}."
     print(stated, memory, rates, sep="\n\n")
     fill_in(DOCS / "performance.md", "benchmark_kernels", (stated, memory, rates), DOCS)
 

@@ -23,11 +23,11 @@ from typing import TypeVar
 from benchmark_accuracy import ROOT, SCENES, TOLERANCE
 from generated_block import fill_in, measured
 from large_arrays import MIDDLE, autd3_array, with_array
-from numba import get_num_threads
 from scaling_report import Point, exponents, figure, measurements
 
 import autdtorch as at
 from autdtorch.propagator import SimulatedPropagator
+from autdtorch.threads import thread_count
 
 DOCS = ROOT / "docs"
 
@@ -170,7 +170,7 @@ def main() -> None:
     tasks = [*spacing_tasks(), *domain_tasks(), *transducer_tasks(), *foci_tasks()]
     points = list(measure_all(tasks))
     figure(points, COMMAND).savefig(DOCS / "scaling.png")
-    stated = measured(COMMAND) + f"\n\nThreads: {get_num_threads()}."
+    stated = measured(COMMAND) + f"\n\nThreads: {thread_count()}."
     parts = (
         stated,
         '"Box, mirror images" is the paper\'s array of 16 and its four foci, one run standing for all.',

@@ -20,7 +20,6 @@ import torch
 from benchmark_accuracy import CUBES, ROOT, SCENES, TOLERANCE, cube_case, relative_error
 from generated_block import fill_in, measured, table
 from large_arrays import autd3_array, with_array
-from numba import get_num_threads
 
 import autdtorch as at
 from autdtorch.fdtd.kernels.cpu import CpuKernel
@@ -28,6 +27,7 @@ from autdtorch.fdtd.steady_state import Extrapolation, windows_of_run
 from autdtorch.fdtd.stepping import RAMP_PERIODS
 from autdtorch.propagator import BoxPropagator, SimulatedPropagator
 from autdtorch.propagator.base import single_nodes
+from autdtorch.threads import thread_count
 
 SPACINGS = (1.0, 0.8, 2 / 3, 0.5)  # [mm]
 REPEATS = 3
@@ -173,7 +173,7 @@ def main() -> None:
         ["scene", "periods stepped to 1e-3", "extrapolated", "ratio"],
         [periods_to_limit(name) for name in CUBES],
     )
-    stated = measured("python scripts/benchmark_speed.py") + f"\n\nThreads: {get_num_threads()}."
+    stated = measured("python scripts/benchmark_speed.py") + f"\n\nThreads: {thread_count()}."
     parts = (
         stated,
         "Transfer matrix of all four foci and 16 transducers, 1e-3 from the steady state:",
