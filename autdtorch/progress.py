@@ -28,6 +28,7 @@ class Progress:
         self._what = what
         self._done = 0
         self._begun = time.monotonic()
+        self._first: tuple[float, int] | None = None  # when steps were first done, and how many
         self._next = _PATIENCE
 
     def begin(self, what: str) -> None:
@@ -45,9 +46,13 @@ class Progress:
             self._bar.total = max(self._bar.total, self._done)
             self._bar.update(steps)
             return
-        spent = time.monotonic() - self._begun
-        if spent >= self._next and 0 < self._done < self._steps:
-            left = spent * (self._steps / self._done - 1)
+        now = time.monotonic()
+        if self._first is None:  # kernels may have been compiled before it, and will not be again
+            self._first = now, self._done
+        begun, done = self._first
+        spent = now - self._begun
+        if spent >= self._next and done < self._done < self._steps:
+            left = (now - begun) * (self._steps - self._done) / (self._done - done)
             logger.info("%s: %.0f s so far, about %.0f s left", self._what, spent, left)
             self._next = 4 * spent  # ever fewer lines
 

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from numba import njit
+from numba.core import event
+
+logger = logging.getLogger(__name__)
 
 INNER: dict[str, Any] = {
     "error_model": "numpy",
@@ -19,6 +23,23 @@ INNER: dict[str, Any] = {
 
 `fastmath` must stay off in them. It lets the compiler reorder sums, otherwise in each function that a call is
 inlined into: a kernel loaded from disk then rounds otherwise than the one just compiled."""
+
+
+_entries: set[Any] = set()
+
+
+class _Told(event.Listener):
+    """Says in the log that a kernel is compiled, which takes seconds; to load one from disk takes none."""
+
+    def on_start(self, event: Any) -> None:
+        if event.data["dispatcher"] in _entries:
+            logger.info("compiling a kernel (%s): once on a machine", event.data["dispatcher"].__name__)
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+event.register("numba:compile", _Told())  # type: ignore[no-untyped-call]
 
 
 def entry(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -33,7 +54,9 @@ def entry(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def compiled(function: Callable[..., Any]) -> Any:
         function.__qualname__ += f"_{_SOURCE}"
-        return njit(cache=True, nogil=True, error_model="numpy", **options)(function)
+        dispatcher = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
+        _entries.add(dispatcher)
+        return dispatcher
 
     return compiled
 
