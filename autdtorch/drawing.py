@@ -1,4 +1,4 @@
-"""What the pictures of `plot` and `view3d` share: units, colours, and checks of what is drawn."""
+"""What the pictures of `plot` and `rendering` share: units, colours, and checks of what is drawn."""
 
 from __future__ import annotations
 

@@ -232,7 +232,7 @@ def report() -> list[str]:
     ]
     packages = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
     return [
-        f"{measured(COMMAND)}\n\n{packages}, threads of torch and numba: {torch.get_num_threads()}.",
+        f"{measured(COMMAND)}\n\n{packages}, threads: {torch.get_num_threads()}.",
         table(("scene", "program", "setting", "total", "scattered", "run time"), lines),
         plane_times(cubes, both[1][1], 1.0),
         table(("angle", "AcousTools", "autdtorch, at 0.2 m", "far field"), pistons),

@@ -15,7 +15,6 @@ import argparse
 import logging
 import math
 import multiprocessing
-import os
 import sys
 from dataclasses import dataclass
 
@@ -223,7 +222,6 @@ def main() -> int:
         print(outcome)
         return int(outcome.failed)
     tasks = [(given.seed, number, given.long_share) for number in range(given.scenes)]
-    os.environ["NUMBA_NUM_THREADS"] = "1"  # read by the processes that are started below
     with multiprocessing.get_context("spawn").Pool(given.processes) as pool:
         outcomes = []
         for outcome in tqdm(pool.imap(_numbered, tasks), total=len(tasks)):

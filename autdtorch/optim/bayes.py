@@ -39,7 +39,7 @@ def bayes_opt(
     phases are periodic, as in the paper.
 
     Trials take each step together, in one call of the objective, and search for the next phases side by side
-    on `torch.get_num_threads()` threads.
+    on threads of their own, as many as PyTorch has.
 
     Args:
         objective: what is evaluated.

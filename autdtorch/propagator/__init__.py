@@ -96,7 +96,8 @@ def make_propagator(
         A propagator for the scene.
 
     Raises:
-        ValueError: an argument out of range, or what a kernel needs is missing; the message names it.
+        ValueError: an argument out of range, what a kernel needs is missing, or more memory would be needed
+            than there is; the message names it.
     """
     require_kind("scene", scene, Scene)
     precision = precision_of(dtype)

@@ -43,9 +43,7 @@ def built(tmp_path_factory):
     if "PYTEST_XDIST_WORKER" in os.environ:  # the first of several processes builds for all
         out = tmp_path_factory.getbasetemp().parent / "docs"
     environment = {key: value for key, value in os.environ.items() if key != "AUTDTORCH_CACHE_DIR"}
-    environment |= dict.fromkeys(
-        ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS"), "1"
-    )  # other tests have the other cores
+    environment["OMP_NUM_THREADS"] = "1"  # other tests have the other cores
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-d", out / "doctrees", DOCS]
     with FileLock(f"{out}.lock"):
         if not (out / "html" / "objects.inv").exists():

@@ -21,7 +21,7 @@ class ReferenceKernel:
     """One torch expression per line of the contract, none in place, so that autograd can go back."""
 
     def at_once(self, shape: tuple[int, int, int]) -> int:
-        """One: torch itself uses all cores."""
+        """One: it is there to be read, not to be fast."""
         return 1
 
     def advance(
