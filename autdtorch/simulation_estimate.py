@@ -18,10 +18,10 @@ from autdtorch.medium import Medium
 from autdtorch.propagator import SIMULATED
 from autdtorch.propagator.auto import method_for
 from autdtorch.propagator.cost import grid_cost
-from autdtorch.propagator.stepper import make_kernel, precision_of, relative_tolerance
+from autdtorch.propagator.stepper import KERNELS, make_kernel, precision_of, relative_tolerance
 from autdtorch.propagator.workload import Workload
 from autdtorch.scene import Scene
-from autdtorch.validation import positive, require_kind
+from autdtorch.validation import positive, require_kind, require_one_of
 
 _MEASURED_STEPS, _MEASURED_CELLS = 80, (300_000, 1_000_000)
 """Steps that are timed, and fewest and most cells of the grid that they are timed on."""
@@ -29,8 +29,8 @@ _MEASURED_STEPS, _MEASURED_CELLS = 80, (300_000, 1_000_000)
 _AIR_SPACING, _AIR_RIM = 1e-3, 28
 """Spacing [m] of that grid, and cells on each side of its domain."""
 
-_PAIR_BYTES, _PAIR_SECONDS = 200.0, 5e-8
-"""Memory [bytes] and time [s] of a point and a node of a transducer in free space."""
+_PAIR_BYTES, _NODE_SECONDS = 80.0, 4e-8
+"""Memory [bytes] of a point and a transducer in free space, and time [s] of each of its nodes."""
 
 
 @dataclass(frozen=True)
@@ -93,11 +93,12 @@ def estimate(
     """
     require_kind("scene", scene, Scene)
     spacing, tolerance = positive("spacing", spacing, "m"), relative_tolerance(tolerance)
+    require_one_of("kernel", kernel, KERNELS)
     precision = precision_of(dtype)
     method = method_for(scene, method, spacing, tolerance)
     if method == "free_space":
-        nodes, points = scene.array.nodes.positions[..., 0].numel(), len(scene.control_points)
-        return Estimate(method, None, 0, 0, _PAIR_BYTES * nodes * points, _PAIR_SECONDS * nodes * points)
+        pairs, nodes = len(scene.array) * len(scene.control_points), len(scene.array.nodes.weights)
+        return Estimate(method, None, 0, 0, _PAIR_BYTES * pairs, _NODE_SECONDS * nodes * pairs)
     require_spacing(scene, spacing)
     stepper = make_kernel(kernel)
     # a multiple: what is symmetric on the one grid is mostly so on the other

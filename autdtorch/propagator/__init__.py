@@ -21,7 +21,7 @@ from autdtorch.propagator.box import BoxPropagator
 from autdtorch.propagator.differentiable import cell_centers, differentiable_field
 from autdtorch.propagator.free_space import FreeSpacePropagator
 from autdtorch.propagator.full import FullPropagator
-from autdtorch.propagator.stepper import make_kernel, precision_of, relative_tolerance
+from autdtorch.propagator.stepper import KERNELS, make_kernel, precision_of, relative_tolerance
 from autdtorch.propagator.volume import volume_field
 from autdtorch.propagator.workload import memory_for
 from autdtorch.scene import Scene
@@ -31,6 +31,7 @@ from autdtorch.validation import (
     path_of,
     positive,
     require_kind,
+    require_one_of,
 )
 
 __all__ = [
@@ -100,6 +101,7 @@ def make_propagator(
             than there is; the message names it.
     """
     require_kind("scene", scene, Scene)
+    require_one_of("kernel", kernel, KERNELS)
     precision = precision_of(dtype)
     if spacing is not None:
         spacing = positive("spacing", spacing, "m")
