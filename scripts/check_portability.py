@@ -1,6 +1,6 @@
 """Run the tests as other machines would: other instruction sets, thread counts, linear algebra, odd paths.
 
-    python scripts/check_portability.py                        all variants, about half an hour on 2 cores
+    python scripts/check_portability.py                        all variants, about an hour on 2 cores
     python scripts/check_portability.py other-cpu -m optim     one variant, some tests: arguments of pytest
 
 Prints what failed under each variant; the status is 0 if nothing did.
