@@ -21,10 +21,10 @@ from autdtorch.device_layouts import (
 )
 from autdtorch.geometry import Coordinates, in_plane, plane_basis
 from autdtorch.memory import require_memory
+from autdtorch.neighbours import nearest_other, require_distinct
 from autdtorch.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
-    distances,
     finite_vector,
     invalid,
     not_negative,
@@ -32,7 +32,6 @@ from autdtorch.validation import (
     positive,
     positive_integers,
     real_tensor,
-    require_distinct,
     unit_vector,
 )
 
@@ -264,7 +263,7 @@ def _disc_radius(given: float | None, positions: torch.Tensor) -> float:
     name = "TransducerArray.radius"
     radius = 0.0 if given is None else not_negative(name, given, "m")
     if radius > 0 and len(positions) > 1:
-        most = float(distances(positions, positions).fill_diagonal_(torch.inf).min()) / 2
+        most = float(nearest_other(positions)[0].min()) / 2
         if radius > most + LENGTH_TOLERANCE:
             raise invalid(name, radius, f"must be at most {most:.6g} m, half the distance of neighbours", "m")
     return radius

@@ -7,10 +7,10 @@ import math
 import numpy as np
 import torch
 
+from autdtorch.neighbours import distances
 from autdtorch.validation import (
     ArrayLike,
     complex_tensor,
-    distances,
     finite_vector,
     points_tensor,
     positive,

@@ -7,14 +7,12 @@ import math
 import torch
 
 from autdtorch.array import TransducerArray
-from autdtorch.validation import (
-    LENGTH_TOLERANCE,
-    ArrayLike,
-    distances,
-    not_negative,
-    points_tensor,
-    positive,
-)
+from autdtorch.memory import require_memory
+from autdtorch.neighbours import distances
+from autdtorch.validation import LENGTH_TOLERANCE, ArrayLike, not_negative, points_tensor, positive
+
+PAIR_BYTES = 80.0
+"""Memory [bytes] that a point and a transducer take while their entry of a matrix is worked out."""
 
 
 def green(points: ArrayLike, sources: ArrayLike, wavenumber: complex) -> torch.Tensor:
@@ -59,6 +57,8 @@ def free_space_matrix(points: ArrayLike, array: TransducerArray, wavenumber: com
         ValueError: not finite, wrong shape, k <= 0, alpha < 0, or a point on a node of a transducer.
     """
     positions, weights = array.nodes
+    points = points_tensor("points", points)
+    require_memory("points", tuple(points.shape), PAIR_BYTES * len(points) * len(array))
     # Node by node: memory for one matrix only.
     terms = (w * green(points, at, wavenumber) for at, w in zip(positions.unbind(1), weights, strict=True))
     none = torch.zeros((), dtype=torch.complex128, device="cpu")

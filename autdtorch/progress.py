@@ -6,6 +6,7 @@ import contextlib
 import logging
 import multiprocessing
 import sys
+import threading
 import time
 from collections.abc import Iterator
 
@@ -30,6 +31,7 @@ class Progress:
         self._begun = time.monotonic()
         self._first: tuple[float, int] | None = None  # when steps were first done, and how many
         self._next = _PATIENCE
+        self._lock = threading.Lock()  # runs go side by side
 
     def begin(self, what: str) -> None:
         """Say what is being done from now on."""
@@ -40,7 +42,11 @@ class Progress:
             self._bar.set_description(what)
 
     def advance(self, steps: int) -> None:
-        """Count steps that are done."""
+        """Count steps that are done, by any thread."""
+        with self._lock:
+            self._advance(steps)
+
+    def _advance(self, steps: int) -> None:
         self._done += steps
         if self._bar is not None:
             self._bar.total = max(self._bar.total, self._done)

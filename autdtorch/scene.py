@@ -15,6 +15,7 @@ from autdtorch.array import TransducerArray
 from autdtorch.display import html_facts
 from autdtorch.geometry import Coordinates, Plane
 from autdtorch.medium import Medium as Medium
+from autdtorch.neighbours import nearest, require_distinct
 from autdtorch.obstacles import Box as Box
 from autdtorch.obstacles import Obstacle
 from autdtorch.sketch import sketch
@@ -22,14 +23,12 @@ from autdtorch.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
     Vector,
-    distances,
     finite_vector,
     invalid,
     members,
     points_tensor,
     positive,
     real_tensor,
-    require_distinct,
     require_kind,
 )
 
@@ -242,15 +241,12 @@ def _require_separate_points(scene: Scene) -> None:
     """No two points in one place, none in an obstacle or on it, where rounding would choose the side."""
     require_distinct("Scene.control_points", scene.control_points)
     nodes = scene.array.nodes.positions
-    gap = distances(scene.control_points, nodes.reshape(-1, 3)).reshape(-1, *nodes.shape[:2]).amin(dim=2)
+    gap, node = nearest(scene.control_points, nodes.reshape(-1, 3))
     if gap.min() < LENGTH_TOLERANCE:
-        point, transducer = divmod(int(gap.argmin()), len(scene.array))
-        raise invalid(
-            f"Scene.control_points[{point}]",
-            scene.control_points[point],
-            f"lies on transducer {transducer}, must be at least {LENGTH_TOLERANCE:g} m away",
-            "m",
-        )
+        point = int(gap.argmin())
+        transducer = int(node[point]) // nodes.shape[1]
+        accepted = f"lies on transducer {transducer}, must be at least {LENGTH_TOLERANCE:g} m away"
+        raise invalid(f"Scene.control_points[{point}]", scene.control_points[point], accepted, "m")
     for name, group in (_points(scene) | {"Scene.array.nodes": nodes}).items():
         for index, obstacle in enumerate(scene.obstacles):
             inside = obstacle.contains(group, margin=LENGTH_TOLERANCE)

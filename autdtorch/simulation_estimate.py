@@ -14,23 +14,25 @@ from autdtorch.fdtd.grid import domain_extent, require_spacing
 from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.spacing import pilot_spacing
 from autdtorch.fdtd.stepping import assemble, drive_signal
+from autdtorch.freespace import PAIR_BYTES
 from autdtorch.medium import Medium
+from autdtorch.memory import available_memory
 from autdtorch.propagator import SIMULATED
 from autdtorch.propagator.auto import method_for
 from autdtorch.propagator.cost import grid_cost
 from autdtorch.propagator.stepper import KERNELS, make_kernel, precision_of, relative_tolerance
-from autdtorch.propagator.workload import Workload
+from autdtorch.propagator.workload import Workload, memory_for
 from autdtorch.scene import Scene
 from autdtorch.validation import positive, require_kind, require_one_of
 
 _MEASURED_STEPS, _MEASURED_CELLS = 80, (300_000, 1_000_000)
-"""Steps that are timed, and fewest and most cells of the grid that they are timed on."""
+"""Steps that are timed, and cells of the grids that they are timed on."""
 
 _AIR_SPACING, _AIR_RIM = 1e-3, 28
 """Spacing [m] of that grid, and cells on each side of its domain."""
 
-_PAIR_BYTES, _NODE_SECONDS = 80.0, 4e-8
-"""Memory [bytes] of a point and a transducer in free space, and time [s] of each of its nodes."""
+_NODE_SECONDS = 4e-8
+"""Time [s] of a point and a node of a transducer in free space."""
 
 
 @dataclass(frozen=True)
@@ -73,9 +75,10 @@ def estimate(
 ) -> Estimate:
     """Tell what the transfer matrix of a scene's control points takes, from its geometry.
 
-    The runs are counted on a coarse grid, and how fast cells are stepped is measured once in a process, on a
-    small box of air. How long obstacles ring is not known beforehand: the time is that of a usual scene, and
-    right within a factor of two for most. Its error estimate (`return_error`) takes a fifth more.
+    The runs are counted on a coarse grid; where not even that fits into memory, without symmetries. How fast
+    cells are stepped is measured once in a process, on a box of air. How long obstacles ring is not known
+    beforehand: the time is that of a usual scene, and right within a factor of two for most. Its error
+    estimate (`return_error`) takes a fifth more.
 
     Args:
         scene: what would be simulated.
@@ -98,16 +101,17 @@ def estimate(
     method = method_for(scene, method, spacing, tolerance)
     if method == "free_space":
         pairs, nodes = len(scene.array) * len(scene.control_points), len(scene.array.nodes.weights)
-        return Estimate(method, None, 0, 0, _PAIR_BYTES * pairs, _NODE_SECONDS * nodes * pairs)
+        return Estimate(method, None, 0, 0, PAIR_BYTES * pairs, _NODE_SECONDS * nodes * pairs)
     require_spacing(scene, spacing)
     stepper = make_kernel(kernel)
     # a multiple: what is symmetric on the one grid is mostly so on the other
     pilot = spacing * max(1, math.floor(pilot_spacing(scene) / spacing))
-    coarse = SIMULATED[method](scene, pilot, tolerance, stepper, precision, 1, None, None)
-    runs = coarse.planned_runs
+    runs = min(len(scene.control_points), len(scene.array))
+    if memory_for(scene, method, pilot, tolerance, precision, stepper) < available_memory():
+        runs = SIMULATED[method](scene, pilot, tolerance, stepper, precision, 1, None, None).planned_runs
     workload = Workload.of(scene, method, spacing, tolerance)
-    fewest, most = _MEASURED_CELLS
-    cells = min(max(fewest, workload.cells // len(workload.grids)), most)
+    small, large = _MEASURED_CELLS
+    cells = small if max(grid.cells for grid in workload.grids) < large / 2 else large
     seconds = workload.steps(runs, stepper) / _rate(type(stepper), precision, cells)
     memory = workload.memory(precision.itemsize, stepper, runs)
     return Estimate(method, spacing, workload.cells, runs, memory, seconds)

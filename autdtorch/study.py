@@ -14,6 +14,7 @@ import torch
 
 from autdtorch.memory import require_memory
 from autdtorch.metrics import focus_metrics
+from autdtorch.neighbours import nearest
 from autdtorch.objective import Objective, SimulatedObjective
 from autdtorch.optim.base import TRIAL_BYTES, Solution, Trials
 from autdtorch.optim.bound import focus_bound
@@ -23,14 +24,7 @@ from autdtorch.results import MethodResult, SceneResult, Simulation, StudyResult
 from autdtorch.scene import Scene
 from autdtorch.study_folder import StudyFolder, open_folder
 from autdtorch.trial_file import TrialFile
-from autdtorch.validation import (
-    LENGTH_TOLERANCE,
-    distances,
-    integer_at_least,
-    invalid,
-    positive,
-    require_name,
-)
+from autdtorch.validation import LENGTH_TOLERANCE, integer_at_least, invalid, positive, require_name
 
 #: An optimiser with its settings bound. Where it has parameters `trials` and `seed` it gets a sequence of the
 #: numbers of the trials to run, of which it is to return as many, and the study's seed.
@@ -39,6 +33,7 @@ Method: TypeAlias = Callable[..., Solution]
 _FIRST_BLOCK = 2  # Trials are run so many at a time at first,
 _LARGEST_GROWTH = 4  # then up to so many times more,
 _BLOCK_SECONDS = 10.0  # so that about as much is lost when the process is killed.
+_LARGEST_BLOCK = 64  # More at once take more memory, and hardly less time each.
 
 _LARGEST_SEED = 2**63 - 1  # the largest integer that a results file holds
 _MOST_SAMPLES = 10**6  # of an observation plane: 16 complex columns of them are 256 MB
@@ -162,7 +157,7 @@ class _Probe:
 def _check_method(name: str, method: Method, scene: Scene, trials: int, seed: int) -> None:
     """Have the method check its settings now, not after minutes of simulation."""
     try:
-        _solve(method, _Probe(scene), range(trials), seed)
+        _solve(method, _Probe(scene), range(min(trials, _FIRST_BLOCK)), seed)
     except _FirstEvaluationError:
         pass
     except ValueError as error:
@@ -236,7 +231,7 @@ def _run_trials(
             raise invalid(f"method {method}", len(solution.score), accepted, "trials")
         trials.append(scene, method, block, solution, seconds)
         progress.advance(len(block))
-        size = max(1, int(size * min(_LARGEST_GROWTH, _BLOCK_SECONDS / seconds)))
+        size = max(1, int(size * min(_LARGEST_GROWTH, _BLOCK_SECONDS / seconds, _LARGEST_BLOCK / size)))
 
 
 def _numbered(trials: Sequence[int]) -> str:
@@ -259,9 +254,9 @@ def _plane_points(scene: Scene, spacing: float) -> torch.Tensor | None:
         accepted = f"gives {count} samples of the observation plane, must be at most {_MOST_SAMPLES}"
         raise invalid("plane_spacing", spacing, accepted, "m")
     points = plane.points(spacing)
-    gap = distances(points.reshape(-1, 3), scene.array.positions)
+    gap, transducers = nearest(points.reshape(-1, 3), scene.array.positions)
     if gap.min() < LENGTH_TOLERANCE:
-        transducer = int(gap.argmin()) % len(scene.array)
+        transducer = int(transducers[gap.argmin()])
         accepted = f"puts a sample of the observation plane on transducer {transducer}; shift the plane"
         raise invalid("plane_spacing", spacing, accepted, "m")
     return points

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
@@ -20,6 +21,47 @@ R = TypeVar("R")
 _given: ContextVar[int | None] = ContextVar("threads", default=None)
 
 
+class _Outside:
+    """PyTorch's number of threads outside `one_torch_thread`, where several threads may be at once."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._threads = self._inside = 0
+
+    def threads(self) -> int:
+        """Return PyTorch's threads, or what they were before anyone entered."""
+        with self._lock:
+            return self._threads if self._inside else torch.get_num_threads()
+
+    def enter(self) -> int:
+        """Have one thread from now on; returns how many this thread had."""
+        with self._lock:
+            before = torch.get_num_threads()
+            if not self._inside:
+                self._threads = before
+            self._inside += 1
+            torch.set_num_threads(1)
+            return before
+
+    def leave(self, before: int) -> None:
+        """Have as many as before; the last to leave also restores what new threads will have."""
+        with self._lock:
+            self._inside -= 1
+            torch.set_num_threads(before if self._inside else self._threads)
+
+    def begin_forked(self) -> None:
+        """Have one thread in a child process, also after leaving what its parent had entered."""
+        # PyTorch's threads do not survive a fork: a forked process would wait for them without end.
+        self._lock, self._threads = threading.Lock(), 1
+        torch.set_num_threads(1)
+
+
+_outside = _Outside()
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_outside.begin_forked)
+
+
 def thread_count() -> int:
     """Return the number of threads that work may be spread over.
 
@@ -27,7 +69,7 @@ def thread_count() -> int:
     processor that this process may use.
     """
     given = _given.get()
-    return min(torch.get_num_threads(), _processors()) if given is None else given
+    return min(_outside.threads(), _processors()) if given is None else given
 
 
 @contextlib.contextmanager
@@ -38,12 +80,11 @@ def one_torch_thread() -> Iterator[None]:
     processor, thousands of small operations take many times longer (docs/decisions/threads.md).
     """
     token = _given.set(thread_count())
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+    before = _outside.enter()
     try:
         yield
     finally:
-        torch.set_num_threads(threads)
+        _outside.leave(before)
         _given.reset(token)
 
 
@@ -76,8 +117,3 @@ def _processors() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-if hasattr(os, "register_at_fork"):
-    # PyTorch's threads do not survive a fork: a forked process would wait for them without end.
-    os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))

@@ -343,27 +343,6 @@ def points_grid(name: str, value: object) -> tuple[torch.Tensor, torch.Size]:
     return points_tensor(name, points.reshape(-1, 3)), points.shape[:-1]
 
 
-def require_distinct(name: str, points: torch.Tensor) -> None:
-    """Check that no two of the `points` (P, 3) [m] coincide.
-
-    Raises:
-        ValueError: two points closer than `LENGTH_TOLERANCE`.
-    """
-    distance = distances(points, points).fill_diagonal_(torch.inf)
-    first, second = divmod(int(distance.argmin()), len(points))
-    if distance[first, second] < LENGTH_TOLERANCE:
-        raise ValueError(
-            f"{name}: points {first} and {second} coincide at {_shown(points[first])} m; "
-            f"they must be at least {LENGTH_TOLERANCE:g} m apart"
-        )
-
-
-def distances(points: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
-    """Return the distances (P, M) [m] between `points` (P, 3) and `others` (M, 3)."""
-    # The default of cdist expands the square, which loses half the digits of short distances.
-    return torch.cdist(points, others, compute_mode="donot_use_mm_for_euclid_dist")
-
-
 def _entries(name: str, value: object, count: int, unit: str) -> tuple[float, ...]:
     tensor = real_tensor(name, value, unit)
     if tensor.shape != (count,):

@@ -36,12 +36,9 @@ def paper(name: str) -> Callable[[], at.Scene]:
 
 
 def behind(
-    *obstacles: at.Obstacle,
-    array: at.TransducerArray | None = None,
-    points: object = None,
-    domain: object = None,
+    *obstacles: at.Obstacle, array: at.TransducerArray | None = None, points: object = None
 ) -> Callable[[], at.Scene]:
-    """Return a scene like the paper's with other obstacles, array, control points or domain."""
+    """Return a scene like the paper's with other obstacles, array or control points."""
 
     def made() -> at.Scene:
         own = paper("two_cubes")()

@@ -15,6 +15,7 @@ from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.fdtd.surface import FAR, LATTICE, CutElements, Materials, cut_elements
 from autdtorch.obstacles import Box, Obstacle
+from autdtorch.progress import show_progress
 from autdtorch.scene import Medium, Scene
 
 logger = logging.getLogger(__name__)
@@ -200,6 +201,19 @@ def _windows(body: Body, grid: Grid) -> Iterator[tuple[tuple[slice, ...], Array]
         yield window, body.distance(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1), grid)
 
 
+def _distances(bodies: list[Body], first: NDArray[np.int64], grid: Grid) -> NDArray[np.float64]:
+    """Distances (B, n, L) of bodies from the lattices of elements, by their first cells (n, 3)."""
+    cell = first[:, None] + LATTICE
+    center = np.array(grid.origin) + grid.spacing * grid.clip(np.asarray(first + 0.5))
+    distance = np.full((len(bodies), *cell.shape[:2]), FAR)
+    for far, body in zip(distance, bodies, strict=True):
+        low, high = body.lower - 2 * grid.spacing, body.upper + 2 * grid.spacing
+        near = ((center > low) & (center < high)).all(axis=1)
+        if near.any():
+            far[near] = body.distance(cell[near], grid)
+    return distance
+
+
 def _cut(
     bodies: list[Body],
     index: NDArray[np.int64],
@@ -210,17 +224,11 @@ def _cut(
     parts = [CutElements(np.zeros((0, 28)), np.zeros((0, 8)), np.zeros((0, 8), np.int64))]
     numbers = np.array([body.number for body in bodies], np.int64)
     shape = tuple(cells - 1 for cells in grid.shape)
-    for start in range(0, len(index), _ELEMENTS_AT_ONCE):
-        first = np.stack(np.unravel_index(index[start : start + _ELEMENTS_AT_ONCE], shape), axis=-1)
-        cell = first[:, None] + LATTICE
-        center = np.array(grid.origin) + grid.spacing * grid.clip(np.asarray(first + 0.5))
-        distance = np.full((len(bodies), *cell.shape[:2]), FAR)
-        for far, body in zip(distance, bodies, strict=True):
-            low, high = body.lower - 2 * grid.spacing, body.upper + 2 * grid.spacing
-            near = ((center > low) & (center < high)).all(axis=1)
-            if near.any():
-                far[near] = body.distance(cell[near], grid)
-        parts.append(cut_elements(distance, numbers, materials, stencil))
+    with show_progress(len(index), "measuring surfaces") as progress:
+        for start in range(0, len(index), _ELEMENTS_AT_ONCE):
+            first = np.stack(np.unravel_index(index[start : start + _ELEMENTS_AT_ONCE], shape), axis=-1)
+            parts.append(cut_elements(_distances(bodies, first, grid), numbers, materials, stencil))
+            progress.advance(len(first))
     return CutElements(
         np.concatenate([part.bonds for part in parts]),
         np.concatenate([part.mass for part in parts]),

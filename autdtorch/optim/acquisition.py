@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from autdtorch.optim.process import (
-    COMPILED,
     Known,
     Vector,
     add_rows,
+    compiled,
     covariances,
     features_of,
     matern,
@@ -41,7 +40,7 @@ def largest(known: Known, log: bool, candidates: Vector, lower: Vector, upper: V
     return np.asarray(max(climbed, key=lambda found: found[1])[0])
 
 
-@njit(**COMPILED)
+@compiled
 def posterior(known, points):  # type: ignore[no-untyped-def]
     """Mean (C,) and standard deviation (C,) of the process, without noise, at points (C, D)."""
     total, count = len(points), known.size
@@ -73,13 +72,13 @@ def posterior(known, points):  # type: ignore[no-untyped-def]
     return mean, deviation
 
 
-@njit(**COMPILED)
+@compiled
 def _deviation(variance):  # type: ignore[no-untyped-def]
     # Rounding may leave a variance below 0 at a point that is known.
     return math.sqrt(max(variance, 1e-12))
 
 
-@njit(**COMPILED)
+@compiled
 def expected_improvement(mean, deviation, best):  # type: ignore[no-untyped-def]
     """E[max(f - best, 0)], and its derivatives by mean and deviation."""
     u = (mean - best) / deviation
@@ -87,7 +86,7 @@ def expected_improvement(mean, deviation, best):  # type: ignore[no-untyped-def]
     return deviation * (density + u * share), share, density
 
 
-@njit(**COMPILED)
+@compiled
 def log_expected_improvement(mean, deviation, best):  # type: ignore[no-untyped-def]
     """Logarithm of the expected improvement, precise where that rounds to 0; its derivatives.
 
@@ -110,20 +109,20 @@ def log_expected_improvement(mean, deviation, best):  # type: ignore[no-untyped-
     return value, ratio / (deviation * gain), 1 / (deviation * gain)
 
 
-@njit(**COMPILED)
+@compiled
 def _normal(u):  # type: ignore[no-untyped-def]
     """Density and distribution function of the standard normal distribution."""
     return math.exp(-0.5 * u * u) / math.sqrt(2 * math.pi), 0.5 * math.erfc(-u / math.sqrt(2))
 
 
-@njit(**COMPILED)
+@compiled
 def _improvement(mean, deviation, best, log):  # type: ignore[no-untyped-def]
     if log:
         return log_expected_improvement(mean, deviation, best)
     return expected_improvement(mean, deviation, best)
 
 
-@njit(**COMPILED)
+@compiled
 def _expected_improvements(mean, deviation, best, log):  # type: ignore[no-untyped-def]
     values = np.empty(len(mean))
     for c in range(len(mean)):
@@ -131,7 +130,7 @@ def _expected_improvements(mean, deviation, best, log):  # type: ignore[no-untyp
     return values
 
 
-@njit(**COMPILED)
+@compiled
 def _value(known, log, point, gradient, room):  # type: ignore[no-untyped-def]
     """Acquisition function at a point (D,), its gradient written to `gradient` (D,)."""
     count, dimensions = known.size, len(point)
@@ -165,7 +164,7 @@ def _value(known, log, point, gradient, room):  # type: ignore[no-untyped-def]
     return value
 
 
-@njit(**COMPILED)
+@compiled
 def _climb(known, log, start, lower, upper):  # type: ignore[no-untyped-def]
     """Spectral projected gradient (Birgin, Martinez and Raydan 2000): the best point (D,), and its value."""
     dimensions = len(start)

@@ -58,8 +58,9 @@ def gabs(
     seeds = trial_seeds(seed, trials)
     ledger = Ledger(objective, len(seeds), score)
     transducers = ledger.transducers
-    evaluations = transducers * (1.0 + passes * levels)
-    ledger.require_memory("passes" if passes > levels else "levels", max(passes, levels), evaluations, levels)
+    evaluations, at_once = transducers * (1.0 + passes * levels), max(levels, transducers)
+    field, value = ("passes", passes) if passes > levels else ("levels", levels)
+    ledger.require_memory(field, value, evaluations, at_once)
     orders = _known_orders(order, transducers, seeds)
     if first is not None and integer_at_least("first", first, 0) >= transducers:
         raise invalid("first", first, f"must be an integer from 0 to {transducers - 1}")

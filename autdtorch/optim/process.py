@@ -15,16 +15,18 @@ beside it, and on however many threads.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from autdtorch.fdtd.kernels.compiled import entry
 
 Vector = NDArray[np.float64]
 
-#: No `fastmath`: what is loaded from disk rounds like what was just compiled (fdtd/kernels/compiled.py).
-COMPILED: dict[str, Any] = {"error_model": "numpy", "cache": True, "nogil": True}
+#: Compiles a function of this folder.
+compiled = entry(Path(__file__).parent)
 
 LEAST_NOISE = 1e-6
 """With less, rounding (1e-16 N / noise) shows in the posterior."""
@@ -133,7 +135,7 @@ class Process:
         return np.asarray((scores - scores.mean()) / deviation)
 
 
-@njit(**COMPILED)
+@compiled
 def features_of(point, circle):  # type: ignore[no-untyped-def]
     """What the distance is measured between: the phases (D,) in turns, or (cos, sin) of them (2 D,)."""
     if not circle:
@@ -146,7 +148,7 @@ def features_of(point, circle):  # type: ignore[no-untyped-def]
     return features
 
 
-@njit(**COMPILED)
+@compiled
 def matern(square):  # type: ignore[no-untyped-def]
     """Kernel of the squared distance in length scales, and its derivative by that."""
     a = math.sqrt(5 * square)
@@ -154,7 +156,7 @@ def matern(square):  # type: ignore[no-untyped-def]
     return (1 + a + a * a / 3) * decay, -5 / 6 * (1 + a) * decay
 
 
-@njit(**COMPILED)
+@compiled
 def add_rows(out, begin, end, factors, rows, first, last):  # type: ignore[no-untyped-def]
     """Add factors[k] rows[k] for k from first to last, in columns begin to end."""
     k = first
@@ -170,7 +172,7 @@ def add_rows(out, begin, end, factors, rows, first, last):  # type: ignore[no-un
         k += 1
 
 
-@njit(**COMPILED)
+@compiled
 def covariances(features, count, at, length_scale, kernel, slope):  # type: ignore[no-untyped-def]
     """Kernel (N,) between the points and features `at` (F,), and its derivative by the squared distance."""
     kernel[:count] = 0.0
@@ -183,7 +185,7 @@ def covariances(features, count, at, length_scale, kernel, slope):  # type: igno
         slope[n] *= scale
 
 
-@njit(**COMPILED)
+@compiled
 def whiten(factor, count, kernel, out):  # type: ignore[no-untyped-def]
     """W k(x) (N,)."""
     for i in range(count):
@@ -193,7 +195,7 @@ def whiten(factor, count, kernel, out):  # type: ignore[no-untyped-def]
         out[i] = total
 
 
-@njit(**COMPILED)
+@compiled
 def _append(features, factor, count, at, length_scale, noise):  # type: ignore[no-untyped-def]
     """Add a point to the features and its row to W."""
     kernel, slope, white = np.empty(count), np.empty(count), np.empty(count)
@@ -213,7 +215,7 @@ def _append(features, factor, count, at, length_scale, noise):  # type: ignore[n
     features[:, count] = at
 
 
-@njit(**COMPILED)
+@compiled
 def _weights(factor, standard):  # type: ignore[no-untyped-def]
     """W^T W y (capacity,) and |W y|^2, without BLAS: that rounds by where vectors lie in memory."""
     count = len(standard)
@@ -226,7 +228,7 @@ def _weights(factor, standard):  # type: ignore[no-untyped-def]
     return weights, explained
 
 
-@njit(**COMPILED)
+@compiled
 def _squared_distances(features, count):  # type: ignore[no-untyped-def]
     """Between the points (N, N); above the diagonal only."""
     squares = np.zeros((count, count))
@@ -238,7 +240,7 @@ def _squared_distances(features, count):  # type: ignore[no-untyped-def]
     return squares
 
 
-@njit(**COMPILED)
+@compiled
 def _cholesky(squares, length_scale, noise):  # type: ignore[no-untyped-def]
     """R (N, N), upper triangular, with R^T R = K + noise."""
     count = len(squares)
@@ -259,7 +261,7 @@ def _cholesky(squares, length_scale, noise):  # type: ignore[no-untyped-def]
     return root
 
 
-@njit(**COMPILED)
+@compiled
 def _log_likelihood(squares, standard, length_scale, noise):  # type: ignore[no-untyped-def]
     root = _cholesky(squares, length_scale, noise)
     count = len(standard)
@@ -275,7 +277,7 @@ def _log_likelihood(squares, standard, length_scale, noise):  # type: ignore[no-
     return total - 0.5 * count * math.log(2 * math.pi * variance) - 0.5 * explained / variance
 
 
-@njit(**COMPILED)
+@compiled
 def _fit(features, count, standard, first, warm, noise_is_fitted):  # type: ignore[no-untyped-def]
     """Compass search in the logarithms, from the best of the last hyperparameters and the first ones."""
     squares = _squared_distances(features, count)
@@ -306,7 +308,7 @@ def _fit(features, count, standard, first, warm, noise_is_fitted):  # type: igno
     return math.exp(place[0]), math.exp(place[1])
 
 
-@njit(**COMPILED)
+@compiled
 def _invert(features, count, length_scale, noise, factor):  # type: ignore[no-untyped-def]
     """W = R^-T."""
     root = _cholesky(_squared_distances(features, count), length_scale, noise)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 
-from autdtorch.fdtd.grid import Extent, domain_extent, obstacles_extent
+from autdtorch.fdtd.grid import Extent, domain_extent, obstacles_extent, require_spacing
 from autdtorch.fdtd.medium import is_wall
 from autdtorch.propagator.cost import full_cost, grid_cost
 from autdtorch.propagator.groups import cheapest_grouping
@@ -21,7 +21,7 @@ def method_for(scene: Scene, method: str, spacing: float, tolerance: float) -> s
     """Return the method that was asked for, "auto" being the cheapest that is right for the scene.
 
     Raises:
-        ValueError: no such method, or a box around nothing.
+        ValueError: no such method, a box around nothing, or cells too large or too small for what is chosen.
     """
     require_one_of("method", method, METHODS)
     if method == "box" and not scene.obstacles:
@@ -40,6 +40,7 @@ def _chosen_method(scene: Scene, spacing: float, tolerance: float) -> str:
     if not scene.obstacles:
         logger.info("method auto: free_space (no obstacles: nothing to simulate)")
         return "free_space"
+    require_spacing(scene, spacing)
     runs = min(len(scene.control_points), len(scene.array))
     domain = grid_cost(scene, domain_extent(scene, spacing), spacing)
     boxes = cheapest_grouping(scene, spacing, tolerance, runs)

@@ -23,6 +23,7 @@ from autdtorch.fdtd.points import footprint
 from autdtorch.fdtd.spacing import grid_error, second_spacing
 from autdtorch.fdtd.steady_state import SteadyState, fewest_periods
 from autdtorch.fdtd.stepping import Assembly
+from autdtorch.freespace import PAIR_BYTES
 from autdtorch.memory import require_memory
 from autdtorch.progress import show_progress
 from autdtorch.propagator.cost import USUAL_PERIODS
@@ -267,6 +268,8 @@ class SimulatedPropagator(ABC):
         """
         with_error = boolean("return_error", return_error)
         places = None if points is None else self._checked(points)
+        if places is not None:
+            require_memory("points", (len(places), 3), PAIR_BYTES * len(self.scene.array) * len(places))
         if not self._plan(self.scene.control_points if places is None else places).backward:
             self._warn_near_obstacle()
         if with_error:
@@ -322,6 +325,8 @@ class SimulatedPropagator(ABC):
         array, nodes = self.scene.array, self.scene.array.nodes
         plan, before = self._plan(points), len(self.runs)
         by_matrix = drive.requires_grad or len(flat) > plan.runs
+        rows = len(self.scene.array) if by_matrix else len(flat)
+        require_memory("points", (*grid, 3), PAIR_BYTES * rows * len(points))
         if not (by_matrix and plan.backward):
             self._warn_near_obstacle()
         if by_matrix:

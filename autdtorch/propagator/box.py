@@ -15,13 +15,14 @@ from autdtorch.fdtd.grid import make_box
 from autdtorch.fdtd.scatter import Reach, Scattering
 from autdtorch.fdtd.steady_state import SteadyState, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble_on
+from autdtorch.neighbours import nearest
 from autdtorch.propagator.base import SimulatedPropagator
 from autdtorch.propagator.coupling import coupled_runs
 from autdtorch.propagator.groups import MOST_PASSES, cheapest_grouping, one_box
 from autdtorch.propagator.workload import MOST_JUDGED
 from autdtorch.scene import with_obstacles
 from autdtorch.threads import spread
-from autdtorch.validation import LENGTH_TOLERANCE, ArrayLike, distances, invalid, points_tensor
+from autdtorch.validation import LENGTH_TOLERANCE, ArrayLike, invalid, points_tensor
 
 logger = logging.getLogger(__name__)
 
@@ -65,10 +66,9 @@ class BoxPropagator(SimulatedPropagator):
 
     def _checked(self, points: ArrayLike) -> torch.Tensor:
         points = points_tensor("points", points).cpu()
-        each = [distances(points, nodes) for nodes in self.scene.array.nodes.positions.unbind(1)]
-        nearest = torch.stack([apart.amin(dim=1) for apart in each]).amin(dim=0)
-        if nearest.min() < LENGTH_TOLERANCE:
-            index = int(nearest.argmin())
+        gap, _ = nearest(points, self.scene.array.nodes.positions.reshape(-1, 3))
+        if gap.min() < LENGTH_TOLERANCE:
+            index = int(gap.argmin())
             accepted = f"lies on a transducer, must be at least {LENGTH_TOLERANCE:g} m away"
             raise invalid(f"points[{index}]", points[index], accepted, "m")
         return points

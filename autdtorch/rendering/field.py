@@ -10,9 +10,9 @@ import torch
 
 from autdtorch.drawing import EDGE_COLOUR, FLOOR, MM, PLANE_COLOUR, PRESSURE_MAP, Array
 from autdtorch.geometry import Plane
+from autdtorch.neighbours import distances
 from autdtorch.rendering.scene import FIELD_BAR, add_bar
 from autdtorch.scene import Scene
-from autdtorch.validation import distances
 
 if TYPE_CHECKING:
     import pyvista

@@ -21,9 +21,10 @@ from autdtorch.drawing import (
     single_drive_phases,
 )
 from autdtorch.drive import amplitudes_of
+from autdtorch.neighbours import nearest_other
 from autdtorch.obstacles import Obstacle
 from autdtorch.scene import Scene
-from autdtorch.validation import ArrayLike, Vector, distances
+from autdtorch.validation import ArrayLike, Vector
 
 if TYPE_CHECKING:
     import pyvista
@@ -76,7 +77,7 @@ def add_transducers(plotter: pyvista.Plotter, scene: Scene, phases: Array | None
     import pyvista
 
     positions = scene.array.positions
-    apart = distances(positions, positions).fill_diagonal_(math.inf).min().item()
+    apart = nearest_other(positions)[0].min().item() if len(positions) > 1 else math.inf
     # Those that are points are drawn as discs that do not touch, of one wavelength at most.
     radius = MM * (scene.array.radius or 0.42 * min(apart, scene.wavelength))
     points = pyvista.PolyData(MM * positions.numpy())

@@ -8,6 +8,7 @@ import pytest
 from small_scenes import CUBE, small_scene
 
 import autdtorch as at
+from autdtorch import simulation_estimate
 
 BALL = at.Sphere((12e-3, 20e-3, 5e-3), 3e-3, density=0.2, sound_speed=900.0)
 
@@ -34,7 +35,13 @@ def test_symmetric_points_share_a_run() -> None:
     assert at.estimate(replace(scene, control_points=points), 2e-3, method="box").runs == 1
 
 
-def test_memory_and_time_grow_with_the_cells() -> None:
+def test_what_does_not_fit_even_coarsely_is_told_without_symmetries(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(simulation_estimate, "available_memory", lambda: 0)
+    assert at.estimate(small_scene((CUBE,)), 1e-3, method="full").runs == 3  # one for each control point
+
+
+def test_memory_and_time_grow_with_the_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(simulation_estimate, "_rate", lambda *_: 1e9)  # whatever else the machine does
     scene = small_scene()
     coarse, fine = (at.estimate(scene, spacing, method="full") for spacing in (0.3e-3, 0.1e-3))
     assert fine.cells > 5 * coarse.cells

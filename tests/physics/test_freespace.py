@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 from autdtorch.array import TransducerArray
 from autdtorch.drive import drive_from_phases, focus_phases
 from autdtorch.freespace import free_space_matrix, green
-from autdtorch.validation import distances
+from autdtorch.neighbours import distances
 
 WAVELENGTH = 8.5e-3
 WAVENUMBER = 2 * math.pi / WAVELENGTH

@@ -5,7 +5,7 @@ import torch
 
 from autdtorch.array import TransducerArray
 from autdtorch.device_layouts import AUTD3_UNIT
-from autdtorch.validation import distances
+from autdtorch.neighbours import distances
 
 PITCH = 10.16e-3
 ROUNDING = 1e-12  # of lengths below 1 m in float64, with margin

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import torch
 from small_scenes import CUBE, small_scene
 
 import autdtorch as at
 from autdtorch import memory
+from autdtorch.propagator import Propagator
 from autdtorch.study import run_study
 
 AIR = small_scene()
 OBJECTIVE = at.SimulatedObjective(AIR, at.make_propagator(AIR))
+FREE = at.make_propagator(AIR)
+BOX = at.make_propagator(small_scene((CUBE,)), "box", 2e-3)
+DRIVE = at.drive_from_phases(torch.zeros(4, dtype=torch.float64))
 WIDE = small_scene((at.Box((0.1, 0.1, 0.1), (0.09, 0.09, 0.09), rigid=True),), extent=0.2)
 
 HUGE: dict[str, tuple[str, Callable[[], object]]] = {
@@ -33,6 +39,7 @@ HUGE: dict[str, tuple[str, Callable[[], object]]] = {
     "identify": ("evaluations", lambda: at.identify(OBJECTIVE, evaluations=10**11)),
     "starts": ("starts", lambda: at.gradient_ascent(OBJECTIVE, starts=10**11)),
     "steps": ("steps", lambda: at.gradient_ascent(OBJECTIVE, steps=10**12)),
+    "numbers of trials": ("trials", lambda: at.gabs(OBJECTIVE, trials=range(10**11))),
     "study": ("trials.gabs", lambda: run_study({"a": AIR}, {"gabs": at.gabs}, trials=10**11)),
 }
 
@@ -42,6 +49,41 @@ def test_what_would_not_fit_is_refused_with_both_figures(what: str) -> None:
     field, call = HUGE[what]
     with pytest.raises(ValueError, match=rf"^{field}: .* needs about .* GB of memory, .* may use .* GB$"):
         call()
+
+
+@pytest.mark.parametrize("propagator", [FREE, BOX], ids=["free space", "box"])
+def test_many_points_are_refused(propagator: Propagator, monkeypatch: pytest.MonkeyPatch) -> None:
+    points = at.circle_points((0.1, 0, 0), 0.02, 5000, (1, 0, 0))
+    monkeypatch.setattr(memory, "available_memory", lambda: 1_000_000)
+    with pytest.raises(ValueError, match=r"^points: \(5000, 3\); needs about"):
+        propagator.transfer_matrix(points)
+    with pytest.raises(ValueError, match=r"^points: \(5000, 3\); needs about"):
+        propagator.field(DRIVE.expand(3, 4), points)
+
+
+def test_many_transducers_are_told_apart_without_a_matrix_of_them() -> None:
+    array = at.TransducerArray.grid((300, 300), 10e-3, (0, 0, 0))  # 65 GB, if it took one
+    assert len(array) == 90_000
+
+
+def test_the_first_evaluations_by_strength_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    # each trial plays every transducer alone, all in one call of the objective: 16 bytes x M^2, and copies
+    monkeypatch.setattr(memory, "available_memory", lambda: 10_000_000)
+    array = at.TransducerArray.grid((16, 16), 10e-3, (0, 0, 0))
+    scene = at.Scene(array, AIR.medium, 40e3, [(0.1, 0.0, 0.0)])
+    objective = at.SimulatedObjective(scene, at.make_propagator(scene))
+    at.gabs(objective, levels=2)
+    with pytest.raises(ValueError, match=r"^levels: 2; needs about"):
+        at.gabs(objective, levels=2, order="strength", trials=20)
+
+
+def test_a_study_needs_the_memory_of_a_block_of_its_trials(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "available_memory", lambda: 20_000_000)
+    with pytest.raises(ValueError, match=r"^evaluations: 3000; needs about"):
+        at.random_search(OBJECTIVE, evaluations=3000, trials=300)
+    method = functools.partial(at.random_search, evaluations=3000)
+    study = run_study({"a": AIR}, {"random": method}, trials=300)
+    assert len(study.scenes["a"].methods["random"].solution.score) == 300
 
 
 def test_a_spacing_that_is_chosen_is_refused_by_the_tolerance(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,6 +26,9 @@ from autdtorch.threads import spread
 _CLAIMED, _FINISHED = 0, 16
 """Places of the two counters, on cache lines of their own."""
 
+_TICKS = 10
+"""Of the clock of a thread's time, for that to tell anything."""
+
 _LOOKS = 2000
 """Looks at the counter before a waiting worker yields: a few microseconds, less than waking costs."""
 
@@ -51,8 +54,10 @@ def share_of_processors(work: Callable[[], object], workers: int) -> float:
         return time.thread_time() - begin
 
     begin = time.perf_counter()
-    spent = sum(spread(timed, range(workers), workers))
-    return spent / (workers * max(time.perf_counter() - begin, 1e-9))
+    spent, took = sum(spread(timed, range(workers), workers)), time.perf_counter() - begin
+    if took < _TICKS * time.get_clock_info("thread_time").resolution:  # 16 ms on Windows
+        return 1.0
+    return spent / (workers * took)
 
 
 def _pointer(context: Any, builder: Any, signature: Any, given: Any) -> Any:

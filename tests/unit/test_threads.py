@@ -1,0 +1,70 @@
+"""PyTorch's number of threads, kept to one by several threads at once and across a fork."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+from autdtorch import threads
+
+
+@pytest.fixture(autouse=True)
+def four_threads(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(threads, "_processors", lambda: 8)
+    before = torch.get_num_threads()
+    torch.set_num_threads(4)
+    yield
+    torch.set_num_threads(before)
+
+
+def in_new_thread() -> int:
+    found = []
+    new = threading.Thread(target=lambda: found.append(torch.get_num_threads()))
+    new.start()
+    new.join()
+    return found[0]
+
+
+def test_it_is_one_inside_and_what_it_was_outside() -> None:
+    with threads.one_torch_thread():
+        assert torch.get_num_threads() == 1
+        assert threads.thread_count() == 4
+        with threads.one_torch_thread():
+            assert threads.thread_count() == 4
+        assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == in_new_thread() == 4
+
+
+def test_threads_that_leave_in_the_order_they_entered_leave_nothing_behind() -> None:
+    entered, left = threading.Event(), threading.Event()
+    seen = []
+
+    def second() -> None:
+        with threads.one_torch_thread():
+            seen.append(threads.thread_count())
+            entered.set()
+            left.wait(10)
+
+    other = threading.Thread(target=second)
+    with threads.one_torch_thread():
+        other.start()
+        assert entered.wait(10)
+    left.set()
+    other.join()
+    assert seen == [4]
+    assert torch.get_num_threads() == in_new_thread() == 4
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no forks here")
+@pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning")
+def test_a_child_has_one_thread_also_after_leaving_what_its_parent_had_entered() -> None:
+    with threads.one_torch_thread():
+        child = os.fork()
+    if child == 0:
+        os._exit(torch.get_num_threads())
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 1
+    assert torch.get_num_threads() == 4
