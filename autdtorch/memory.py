@@ -43,7 +43,7 @@ def require_memory(field: str, value: object, needed: float, unit: str = "") -> 
 
 
 def _left_in_groups() -> Iterator[int]:
-    """What is left in each control group that this process is in."""
+    """Yield what is left in each control group that this process is in."""
     with contextlib.suppress(OSError):  # not Linux
         for line in _CGROUP.read_text("utf-8").splitlines():
             _, controllers, path = line.split(":", 2)
@@ -68,7 +68,7 @@ def _left_in_group(folder: Path, limit: str, usage: str, inactive: str) -> Itera
 
 
 def _left_to_process() -> Iterator[int]:
-    """What `ulimit -v` leaves."""
+    """Yield what `ulimit -v` leaves."""
     with contextlib.suppress(ImportError):  # Windows
         import resource
 

@@ -1,4 +1,4 @@
-"""What a simulation takes on this machine, before anything is allocated."""
+"""The cost of a simulation on this machine, told before anything is allocated."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _NODE_SECONDS = 4e-8
 
 @dataclass(frozen=True)
 class Estimate:
-    """What the transfer matrix of a scene's control points takes.
+    """The cost of the transfer matrix of a scene's control points.
 
     Attributes:
         method: "free_space", "box" or "full".

@@ -1,4 +1,4 @@
-"""What a transfer matrix takes, counted from the geometry before anything is allocated."""
+"""The cost of a transfer matrix, counted from the geometry before anything is allocated."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ _BESIDE_RIGID, _BESIDE_FLUID, _SHARE_INSIDE = 1.5, 2.0, 0.5
 cuboid around an obstacle of another sound speed."""
 
 _VARYING_STEPS, _COLUMN_STEPS = 35.0, 280.0
-"""Time of a step of a cell that is not of uniform air, and of one where a surface goes through a boundary
-layer, in steps of a cell."""
+"""Time of a step of a varying cell, and of one where a surface goes through a boundary layer, in steps of a
+cell."""
 
 _PAIR_STEPS, _ASSEMBLY_STEPS = 11.0, 60_000.0
-"""Time of a radiating cell at a place where it is heard, and of a cell that is not of uniform air until it
-can be stepped, in steps of a cell."""
+"""Time of one term of a sum over radiating cells, and of the assembly of one varying cell, in steps of a
+cell."""
 
 _MESH_STEPS = 200_000.0
-"""Time that a cell at a mesh takes more until it can be stepped, in steps of a cell."""
+"""Time that the assembly of a cell at a mesh takes more, in steps of a cell."""
 
 _RUN_STEPS, _SCENE_STEPS = 4e7, 1e8
 """Time of what a run and a scene take beside all that, in steps of a cell."""
@@ -54,11 +54,11 @@ _RUN_STEPS, _SCENE_STEPS = 4e7, 1e8
 
 @dataclass(frozen=True)
 class Matter:
-    """How much of a grid is not of uniform air.
+    """The parts of a grid that are not of uniform air.
 
     Attributes:
         cut: elements of the grid that surfaces go through.
-        varying: cells beside those, and all of another sound speed than that of air.
+        varying: cells whose weights are not those of air: beside surfaces, and inside another medium.
         columns: elements that surfaces go through in the boundary layers.
         meshed: those of `varying` that are at meshes.
     """
@@ -105,7 +105,7 @@ class Matter:
 
 @dataclass(frozen=True)
 class Workload:
-    """What a transfer matrix takes, on grids that are not there yet.
+    """The work of a transfer matrix, on grids that are not there yet.
 
     Attributes:
         grids: all that are assembled.
@@ -113,7 +113,7 @@ class Workload:
         matter: on all of them.
         kept: cells whose phasors a run keeps, at most.
         judged: places by which a run tells whether it is steady.
-        pairs: of radiating cells and places where they are heard.
+        pairs: terms of the sums over radiating cells, at all places where they are heard.
     """
 
     grids: tuple[GridCost, ...]
