@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import hashlib
 import logging
+import math
 import os
 import time
 import uuid
@@ -95,7 +96,10 @@ class DiskCache:
         if content != _with_checksum(digest, shape, body):
             logger.warning("%s is damaged (its checksum is wrong): computing again", path)
             return None
-        values = np.frombuffer(body, np.complex128)
+        values = np.frombuffer(body, np.complex128) if len(body) == _bytes_of(shape) else None
+        if values is None or not np.isfinite(values).all():
+            logger.warning("%s holds no finite matrix of shape %s: computing again", path, shape)
+            return None
         return values[:-1].reshape(shape).copy(), float(values[-1].real)
 
     def save(self, digest: str, matrix: NDArray[Any], number: float) -> None:
@@ -117,6 +121,11 @@ class DiskCache:
             with contextlib.suppress(OSError):  # another process removes it as well, or it is another user's
                 if time.time() - path.stat().st_mtime > ABANDONED:
                     path.unlink()
+
+
+def _bytes_of(shape: tuple[int, ...]) -> int:
+    """Of a matrix and its number."""
+    return np.dtype(np.complex128).itemsize * (math.prod(shape) + 1)
 
 
 def _with_checksum(digest: str, shape: tuple[int, ...], body: bytes) -> bytes:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import logging
 import os
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,9 @@ logger = logging.getLogger(__name__)
 SET_ASIDE = ".damaged"
 """End of the name of the file, beside the first, that keeps the lines which cannot be used."""
 
+_SEAM = re.compile(rb'(?=\{")|(?<="\})')  # where a row can begin or end, if no object is in it
+_WRONG_CHECKSUM = "its checksum is wrong"
+_BROKE_OFF = "the last line broke off"
 _DAMAGE = (ValueError, KeyError, TypeError, OverflowError, RuntimeError)  # by which a reader refuses a row
 
 
@@ -36,18 +41,19 @@ def row_of(line: bytes, key: str = "") -> dict[str, Any]:
     Raises:
         ValueError: the line is damaged, or of another key.
     """
-    body = line[: -len(_with_checksum(b"", ""))]
-    if line != _with_checksum(body, key):
-        raise ValueError("its checksum is wrong")
-    row: dict[str, Any] = json.loads(body + b"}")
+    if not _is_whole(line, key):
+        raise ValueError(_WRONG_CHECKSUM)
+    row: dict[str, Any] = json.loads(_body(line) + b"}")
     return row
 
 
 class JsonLines:
     """An append-only file of JSON objects, one a line; `mend` comes before the first `append`.
 
+    A row whose checksum is right counts, also where the end of its line is damaged or missing.
+
     Attributes:
-        used: number of the lines that were read and used.
+        used: number of the rows that were read and used.
     """
 
     def __init__(
@@ -66,46 +72,51 @@ class JsonLines:
             OSError: the file cannot be read.
         """
         content = path.read_bytes() if path.exists() else b""
-        *lines, self._tail = content.removeprefix(head).split(b"\n")
+        lines = content.removeprefix(head).split(b"\n")
+        first = 2 if head and content.startswith(head) else 1
         good: list[bytes] = []
-        self._refused: list[tuple[int, bytes, Exception]] = []
-        for number, line in enumerate(lines, 2 if head and content.startswith(head) else 1):
-            try:
-                use(row_of(line, key))
-            except _DAMAGE as error:
-                self._refused.append((number, line, error))
-            else:
-                good.append(line)
+        self._refused: list[tuple[int, bytes, str]] = []
+        for number, line in enumerate(lines, first):
+            reason = _WRONG_CHECKSUM if number < first + len(lines) - 1 else _BROKE_OFF
+            for whole, part in _parts(line, key):
+                refusal = _refusal(use, part, key) if whole else reason
+                if refusal is None:
+                    good.append(part)
+                else:
+                    self._refused.append((number, part, refusal))
         self.used = len(good)
         self._path, self._key = path, key
         mended = head + b"".join(line + b"\n" for line in good)
         self._mended = None if content == mended else mended
+        self._was_there = bool(content)
         self._size = len(mended)
 
     def mend(self) -> None:
-        """Set aside the lines that were refused, cut off a last line that broke off, write a missing head.
+        """Set aside what is no row or was refused, restore ends of lines, write a missing head.
 
         Raises:
             OSError: a file cannot be written; the one that was read is then as it was.
         """
+        if self._mended is None:
+            return
         if self._refused:
             self._set_aside()
-        if self._tail:
-            logger.warning("%s: the last line broke off: cut off", self._path)
-        if self._mended is not None:
-            replace_file(self._path, self._mended)
-            self._mended = None
+        elif self._was_there:
+            logger.warning("%s: the first line or an end of line was damaged: restored", self._path)
+        replace_file(self._path, self._mended)
+        self._mended = None
 
     def append(self, *rows: Mapping[str, Any]) -> None:
         """Add lines, which are on disk on return, or leave the file as it is: nothing may follow half a line.
 
         Raises:
             ValueError: the file has changed since it was read or last appended to.
-            OSError: the file cannot be written.
+            OSError: the file cannot be written, or was removed.
         """
         rest = memoryview(b"".join(line_of(row, self._key) + b"\n" for row in rows))
-        with naming(self._path), self._path.open("ab", buffering=0) as file:
-            if file.tell() != self._size:
+        mode = "r+b" if self._size else "ab"  # the second would make a file anew that was removed
+        with naming(self._path), self._path.open(mode, buffering=0) as file:
+            if file.seek(0, os.SEEK_END) != self._size:
                 raise ValueError(f"{self._path}: has changed meanwhile; open it anew, or give another file")
             try:
                 while rest:
@@ -122,11 +133,44 @@ class JsonLines:
             file.writelines(line + b"\n" for _, line, _ in self._refused)
             file.flush()
             os.fsync(file.fileno())
-        number, _, error = self._refused[0]
-        reason = f"no {error}" if isinstance(error, KeyError) else error
-        count = len(self._refused)
-        more = f" and {count - 1} more" if count > 1 else ""
-        logger.warning("%s, line %d%s: set aside in %s: %s", self._path, number, more, path, reason)
+        numbers = list(dict.fromkeys(number for number, _, _ in self._refused))
+        more = f" and {len(numbers) - 1} more" if len(numbers) > 1 else ""
+        reasons = "; ".join(dict.fromkeys((self._refused[0][2], self._refused[-1][2])))
+        logger.warning("%s, line %d%s: set aside in %s: %s", self._path, numbers[0], more, path, reasons)
+
+
+def _parts(line: bytes, key: str) -> Iterator[tuple[bool, bytes]]:
+    """Take a line apart where the end of another was lost in it.
+
+    Yields:
+        Whole rows (True) and what is between them (False), in their order.
+    """
+    if _is_whole(line, key):
+        yield True, line
+        return
+    pieces = filter(None, _SEAM.split(line))
+    for are_whole, alike in itertools.groupby(pieces, lambda piece: _is_whole(piece, key)):
+        for part in alike if are_whole else (b"".join(alike),):
+            yield are_whole, part
+
+
+def _refusal(use: Callable[[dict[str, Any]], None], line: bytes, key: str) -> str | None:
+    """Give a row to its reader; returns why that refused it, or None."""
+    try:
+        use(row_of(line, key))
+    except KeyError as error:
+        return f"it has no {error}"
+    except _DAMAGE as error:
+        return str(error)
+    return None
+
+
+def _body(line: bytes) -> bytes:
+    return line[: -len(_with_checksum(b"", ""))]
+
+
+def _is_whole(line: bytes, key: str) -> bool:
+    return line == _with_checksum(_body(line), key)
 
 
 def _with_checksum(body: bytes, key: str) -> bytes:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 import torch
 
 import autdtorch
@@ -25,11 +26,23 @@ from autdtorch.cache import digest_of
 from autdtorch.display import html_table
 from autdtorch.json_lines import line_of, row_of
 from autdtorch.metrics import FocusMetrics
+from autdtorch.objective import validate_drives
 from autdtorch.optim import label_of
-from autdtorch.optim.base import Solution
+from autdtorch.optim.base import NEAR_TIE, Solution
 from autdtorch.propagator import Run
 from autdtorch.source import package_versions, source_digest
-from autdtorch.validation import path_of, require_name, require_one_of
+from autdtorch.validation import (
+    boolean,
+    complex_tensor,
+    integer_at_least,
+    invalid,
+    not_negative,
+    path_of,
+    positive,
+    real_tensor,
+    require_name,
+    require_one_of,
+)
 from autdtorch.writing import replace_file
 
 RESULTS_FILE = "results.h5"
@@ -317,7 +330,7 @@ def _read_provenance(file: Any) -> Provenance:
     values = file.attrs
     row = {key: values[key] for key in ("config", "source_digest", "date")}
     versions = {key.removeprefix(prefix): values[key] for key in values if key.startswith(prefix)}
-    return _provenance({**row, "seed": int(values["seed"]), "versions": versions})
+    return _provenance({**row, "seed": integer_at_least("seed", values["seed"], 0), "versions": versions})
 
 
 def _write_scene(group: Any, scene: SceneResult) -> None:
@@ -337,31 +350,51 @@ def _write_scene(group: Any, scene: SceneResult) -> None:
 
 def _named(group: Any, field: str) -> Iterator[tuple[str, Any]]:
     """Groups and their names, which become part of the names of files."""
-    for name, entry in group[field].items():
+    entries = _entry(group, field)
+    for name in entries:
         require_name(field, name)
-        yield name, entry
+        yield name, _entry(entries, name)
 
 
 def _read_scene(group: Any) -> SceneResult:
     attributes = group.attrs
-    columns = [group[f"runs/{key}"][()].tolist() for key in ("periods", "remaining", "reached", "seconds")]
-    require_one_of("method", attributes["method"], _SIMULATED_BY)
-    simulation = Simulation(
-        attributes["method"],
-        float(attributes["wavelength"]),
-        float(attributes["spacing"]) if "spacing" in attributes else None,
-        float(attributes["tolerance"]) if "tolerance" in attributes else None,
-        tuple(Run(*row) for row in zip(*columns, strict=True)),
-        float(attributes["matrix_seconds"]),
-        float(attributes["plane_seconds"]),
-    )
-    methods = {name: _read_method(entry) for name, entry in _named(group, "methods")}
+    matrix = complex_tensor("transfer_matrix", _array(group, "transfer_matrix"))
+    if matrix.ndim != 2 or matrix.numel() == 0:
+        raise ValueError(f"transfer_matrix: shape {tuple(matrix.shape)}; must be (P, M) with P, M >= 1")
+    points, transducers = matrix.shape
+    methods = {name: _read_method(entry, points, transducers) for name, entry in _named(group, "methods")}
     return SceneResult(
-        int(attributes["obstacles"]),
-        _tensor(group, "transfer_matrix"),
-        float(attributes["bound"]),
-        simulation,
+        integer_at_least("obstacles", attributes["obstacles"], 0),
+        matrix,
+        not_negative("bound", attributes["bound"], "Pa"),
+        _read_simulation(group),
         methods,
+    )
+
+
+def _read_simulation(group: Any) -> Simulation:
+    attributes, runs = group.attrs, _entry(group, "runs")
+    columns = [_array(runs, key).tolist() for key in ("periods", "remaining", "reached", "seconds")]
+    require_one_of("method", attributes["method"], _SIMULATED_BY)
+    return Simulation(
+        attributes["method"],
+        positive("wavelength", attributes["wavelength"], "m"),
+        positive("spacing", attributes["spacing"], "m") if "spacing" in attributes else None,
+        positive("tolerance", attributes["tolerance"]) if "tolerance" in attributes else None,
+        tuple(_run(*row) for row in zip(*columns, strict=True)),
+        not_negative("matrix_seconds", attributes["matrix_seconds"], "s"),
+        not_negative("plane_seconds", attributes["plane_seconds"], "s"),
+    )
+
+
+def _run(periods: Any, remaining: Any, reached: Any, seconds: Any) -> Run:
+    if not remaining >= 0:  # infinite where it could not be told
+        raise invalid("remaining", remaining, "must be >= 0")
+    return Run(
+        integer_at_least("periods", periods, 1),
+        float(remaining),
+        boolean("reached", reached),
+        not_negative("seconds", seconds, "s"),
     )
 
 
@@ -375,19 +408,72 @@ def _write_method(group: Any, method: MethodResult) -> None:
             group[key] = tensor.numpy()
 
 
-def _read_method(group: Any) -> MethodResult:
-    return MethodResult(
-        Solution(*(_tensor(group, key) for key in _SOLUTION)),
-        FocusMetrics(*(_optional_tensor(group, key) for key in _METRICS)),  # only the area may be missing
-        _tensor(group, "seconds"),
-        int(group.attrs["shown_trial"]),
-        _optional_tensor(group, "plane_pressure"),
-    )
+def _read_method(group: Any, points: int, transducers: int) -> MethodResult:
+    solution = _read_solution(group, points, transducers)
+    trials = (len(solution.score),)
+    shown = integer_at_least("shown_trial", group.attrs["shown_trial"], 0)
+    if shown >= trials[0]:
+        raise invalid("shown_trial", shown, f"must be one of {trials[0]} trials, counted from 0")
+    mean, least, std, uniformity = (_magnitudes(group, key, trials) for key in _METRICS[:-1])
+    area = _magnitudes(group, "area", trials) if "area" in group else None
+    plane = None
+    if "plane_pressure" in group:
+        plane = complex_tensor("plane_pressure", _array(group, "plane_pressure"))
+        if plane.ndim != 2 or plane.numel() == 0:
+            raise ValueError(f"plane_pressure: shape {tuple(plane.shape)}; must be (Nu, Nv), none of them 0")
+    metrics = FocusMetrics(mean, least, std, uniformity, area)
+    return MethodResult(solution, metrics, _magnitudes(group, "seconds", trials), shown, plane)
 
 
-def _tensor(group: Any, key: str) -> torch.Tensor:
-    return torch.from_numpy(group[key][()])
+def _read_solution(group: Any, points: int, transducers: int) -> Solution:
+    """The solution of a method, after checking it as `TrialFile` does that of each trial."""
+    drive = validate_drives(torch.from_numpy(_array(group, "drive")), transducers)
+    trials = len(drive)
+    evaluations = _array(group, "evaluations")
+    if evaluations.shape != (trials,) or evaluations.dtype != np.int64 or evaluations.min() < 1:
+        raise invalid("evaluations", evaluations, f"must be {trials} integers >= 1")
+    most = int(evaluations.max())
+    history = real_tensor("history", _array(group, "history"))
+    shape = tuple(history.shape)
+    if history.ndim != 2 or shape[0] != trials or shape[1] < most or (history.diff() < 0).any():
+        accepted = f"must be ({trials}, {most}) or longer, no number below the one before"
+        raise ValueError(f"history: shape {shape}; {accepted}")
+    score = _numbers(group, "score", (trials,))
+    best = history[:, -1]
+    if (score > best + NEAR_TIE * best.abs()).any():
+        raise invalid("score", score, f"must be at most {best.tolist()}, the best of the history")
+    pressure = _magnitudes(group, "pressure", (trials, points))
+    return Solution(drive, pressure, score, torch.from_numpy(evaluations), history)
 
 
-def _optional_tensor(group: Any, key: str) -> Any:
-    return _tensor(group, key) if key in group else None
+def _magnitudes(group: Any, key: str, shape: tuple[int, ...]) -> torch.Tensor:
+    numbers = _numbers(group, key, shape)
+    if numbers.min() < 0:
+        raise invalid(key, numbers, "every number must be >= 0")
+    return numbers
+
+
+def _numbers(group: Any, key: str, shape: tuple[int, ...]) -> torch.Tensor:
+    numbers = torch.from_numpy(_array(group, key))
+    real_tensor(key, numbers)
+    if numbers.shape != shape or not numbers.is_floating_point():
+        raise ValueError(f"{key}: {numbers.dtype} of shape {tuple(numbers.shape)}; must be floats {shape}")
+    return numbers  # of the precision they were written in
+
+
+def _array(group: Any, key: str) -> Any:
+    """The numbers of a dataset, which cannot be more than the file holds: nothing in it is compressed."""
+    dataset = _entry(group, key)
+    most = group.file.id.get_filesize()
+    if dataset.nbytes > most:
+        raise invalid(key, dataset.nbytes, f"must be at most {most}, as many as the file has", "bytes")
+    if dataset.external or dataset.is_virtual:
+        raise ValueError(f"{key}: kept in another file; must be in this one")
+    return dataset[()]
+
+
+def _entry(group: Any, key: str) -> Any:
+    """What a group itself has under a name: a link might lead to another file."""
+    if isinstance(group.get(key, getlink=True), h5py.SoftLink | h5py.ExternalLink):
+        raise ValueError(f"{key}: a link; must be in the file itself")
+    return group[key]

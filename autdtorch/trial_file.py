@@ -17,7 +17,14 @@ from autdtorch.json_lines import JsonLines
 from autdtorch.metrics import focus_metrics
 from autdtorch.objective import validate_magnitudes
 from autdtorch.optim.base import NEAR_TIE, Solution, joined
-from autdtorch.validation import finite_number, integer_at_least, invalid, not_negative, real_tensor
+from autdtorch.validation import (
+    finite_number,
+    integer_at_least,
+    invalid,
+    not_negative,
+    real_tensor,
+    require_kind,
+)
 
 TRIALS_FILE = "trials.jsonl"
 
@@ -112,6 +119,10 @@ class TrialFile:
 
     def _use(self, row: dict[str, Any]) -> None:
         """Add the trial of a row, after checking it as what a method found in a scene of the study."""
+        for name in ("scene", "method"):
+            require_kind(name, row[name], str)
+        if row["scene"] not in self._shapes:
+            raise invalid("scene", row["scene"], f"must be one of this study: {', '.join(self._shapes)}")
         where = row["scene"], row["method"], integer_at_least("trial", row["trial"], 0)
         if where in self._trials:
             raise invalid("trial", where, "must be there once")

@@ -1,7 +1,7 @@
 """Damage the files of a study and of an emulated hardware trial at random, and begin them again.
 
-Each must end with the numbers of the undisturbed one, bit for bit, keep every line that the damage left
-whole, keep what was damaged, and be silent when it is begun once more.
+Each must end with the numbers of the undisturbed one, bit for bit, keep every row that the damage left
+whole wherever it is in a line, keep what was damaged, and be silent when it is begun once more.
 
     python scripts/check_damage.py --damages 300
 """
@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
+import json
 import logging
 import random
 import shutil
@@ -117,6 +118,11 @@ def _swap(rng: random.Random, lines: list[bytes], _: list[bytes]) -> None:
     lines[one], lines[two] = lines[two], lines[one]
 
 
+def _damage_end(rng: random.Random, lines: list[bytes], _: list[bytes]) -> None:
+    line = rng.randrange(len(lines))
+    lines[line] = lines[line].removesuffix(b"\n") + rng.choice((b"", b"\0", rng.randbytes(1)))
+
+
 #: Ways to damage the content of a file, given that of the same file of another study or trial.
 ANY: dict[str, Damage] = {
     "bit flipped": lambda rng, content, _: _changed(rng, content, 1 << rng.randrange(8)),
@@ -130,6 +136,7 @@ ANY: dict[str, Damage] = {
 OF_LINES: dict[str, Damage] = {
     "line removed": _lines_changed(lambda rng, lines, _: lines.pop(rng.randrange(len(lines)))),
     "line doubled": _lines_changed(lambda rng, lines, _: lines.insert(rng.randrange(len(lines)), lines[-1])),
+    "end of a line damaged": _lines_changed(_damage_end),
     "lines swapped": _lines_changed(_swap),
     "garbage line": _lines_changed(
         lambda rng, lines, _: lines.insert(rng.randrange(len(lines)), rng.randbytes(80) + b"\n")
@@ -138,6 +145,8 @@ OF_LINES: dict[str, Damage] = {
         lambda rng, lines, other: lines.insert(rng.randrange(len(lines)), rng.choice(other))
     ),
 }
+#: Rows that these can cost; others as many as they touch.
+MOST_LOST = {"bit flipped": 1, "byte changed": 1, "end of a line damaged": 0}
 
 
 @dataclass(frozen=True)
@@ -201,38 +210,80 @@ def warnings_listed() -> Iterator[list[str]]:
         logging.getLogger("autdtorch").removeHandler(handler)
 
 
-def _lines(path: Path) -> list[bytes]:
-    """The whole lines of a file."""
-    return path.read_bytes().split(b"\n")[:-1] if path.exists() else []
+def _content(path: Path) -> bytes:
+    return path.read_bytes() if path.exists() else b""
 
 
-def _rows(lines: list[bytes]) -> set[bytes]:
-    """The lines of trials or evaluations: not the first of a log, nor one that tells of its end."""
-    return {line for line in lines if b'"drive": ' in line}
+def _rows(content: bytes) -> set[bytes]:
+    """The whole lines of a file, but not the first of a log."""
+    return {line for line in content.split(b"\n")[:-1] if not line.startswith(b'{"origin": ')}
 
 
-def problems(subject: Subject, state: Path, folder: Path, damaged: bytes, name: str) -> list[str]:
+def _made(rows: set[bytes]) -> set[bytes]:
+    """The rows of trials or evaluations, not one that tells of the end of a log."""
+    return {row for row in rows if b'"drive": ' in row}
+
+
+def _seconds_on(rows: set[bytes]) -> float:
+    """What the rows of a log say; 0 of those of a study."""
+    return max((json.loads(row).get("seconds_on", 0.0) for row in rows), default=0.0)
+
+
+def _debris(damaged: bytes, rows: set[bytes]) -> list[bytes]:
+    """What a damaged file of lines has beside these rows, the end of a last line that broke off as well."""
+    for row in rows:
+        damaged = damaged.replace(row, b"\n")
+    return [line for line in damaged.split(b"\n") if line]
+
+
+def journal_problems(before: bytes, damaged: bytes, journal: Path, most_lost: int) -> list[str]:
+    """What is not as promised of a file of lines, after what it belongs to was begun anew.
+
+    Args:
+        before: its content before the damage.
+        damaged: its content after the damage.
+        journal: its path.
+        most_lost: rows that the damage can have cost.
+    """
+    wrong = []
+    left = {row for row in _rows(before) if row in damaged}
+    after = _content(journal)
+    if lost := left - _rows(after):
+        wrong.append(f"{len(lost)} whole rows lost")
+    if len(lost := _rows(before) - _rows(after)) > most_lost:
+        wrong.append(f"{len(lost)} rows lost where the damage touched {most_lost}")
+    if _seconds_on(_rows(after)) < _seconds_on(left):
+        wrong.append(f"on for {_seconds_on(_rows(after))} s, where {_seconds_on(left)} s were left")
+    aside = _content(journal.with_name(journal.name + SET_ASIDE))
+    begun = before.partition(b"\n")[
+        0
+    ]  # of a log, which is begun anew where no more is there than a part of it
+    if not begun.startswith(damaged) and any(
+        one not in aside and one not in after for one in _debris(damaged, left)
+    ):
+        wrong.append("what was damaged is not kept")
+    return wrong
+
+
+def problems(subject: Subject, state: Path, folder: Path, damaged: bytes, name: str, kind: str) -> list[str]:
     """Begin anew in a copy of a state with one damaged file, and return what is not as promised."""
     shutil.copytree(state, folder)
     (folder / name).write_bytes(damaged)
-    journal = folder / subject.journal
-    whole = _rows(_lines(state / subject.journal)) & set(found := _lines(journal))
-    total = len(_rows(_lines(subject.states[0] / subject.journal)))
+    before, journal = _content(state / subject.journal), folder / subject.journal
+    found = _content(journal)
+    left = {row for row in _rows(before) if row in found}
+    missing = len(_made(_rows(_content(subject.states[0] / subject.journal)))) - len(_made(left))
     try:
         numbers = subject.begin(folder)
     except hardware.LogError as error:
         refused = "of another trial" in str(error) and (folder / name).read_bytes() == damaged
         return [] if refused else [f"refused: {error}"]
     wrong = []
-    after = _lines(journal)
     if not all(map(torch.equal, numbers, subject.numbers)):
         wrong.append("other numbers")
-    if lost := whole - set(after):
-        wrong.append(f"{len(lost)} whole lines lost")
-    if len(again := _rows(after) - whole) > total - len(whole):  # fewer where results have them
-        wrong.append(f"{len(again)} trials or evaluations made where {total - len(whole)} were missing")
-    if set(found) - set(after) - set(_lines(journal.with_name(journal.name + SET_ASIDE))):
-        wrong.append("damaged lines not kept")
+    wrong += journal_problems(before, found, journal, MOST_LOST.get(kind, len(_rows(before))))
+    if len(again := _made(_rows(_content(journal)) - left)) > missing:  # fewer where results have them
+        wrong.append(f"{len(again)} trials or evaluations made where {missing} were missing")
     if name in (RESULTS_FILE, PROVENANCE_FILE) and (folder / f"{PREVIOUS}1" / name).read_bytes() != damaged:
         wrong.append("the damaged file is not kept")
     with warnings_listed() as warned:
@@ -270,7 +321,7 @@ def check(damages: int, seed: int, folder: Path) -> tuple[Counter[str], list[str
         try:
             wrong += [
                 f"{number} {state.name} {case}: {one}"
-                for one in problems(subject, state, folder / str(number), damaged, name)
+                for one in problems(subject, state, folder / str(number), damaged, name, kind)
             ]
         except Exception as error:
             wrong.append(f"{number} {state.name} {case}: {type(error).__name__}: {error}")

@@ -20,7 +20,7 @@ from autdtorch.drive import validate_single_drive
 from autdtorch.json_lines import JsonLines, line_of, row_of
 from autdtorch.locking import held
 from autdtorch.objective import validate_magnitudes
-from autdtorch.validation import integer_at_least, not_negative, real_tensor
+from autdtorch.validation import integer_at_least, not_negative, real_tensor, require_kind
 
 _ORIGIN, _NUMBER = "origin", "evaluation"
 
@@ -68,8 +68,8 @@ class EvaluationLog:
     def __init__(self, path: str | Path, origin: Mapping[str, Any], transducers: int, points: int) -> None:
         """Begin the file, or read what it holds of the same trial.
 
-        A last line that broke off is removed, and damaged ones are set aside; their evaluations will be made
-        again. A log without evaluations, of another trial, is begun anew.
+        Damaged lines, and a last one that broke off, are set aside; their evaluations will be made again. A
+        log without evaluations, of another trial, is begun anew.
 
         Args:
             path: of the file.
@@ -184,14 +184,14 @@ class EvaluationLog:
         """Check that a file, of which no line is of this trial, is the log of another without evaluations."""
         try:
             stored = row_of(content.partition(b"\n")[0])[_ORIGIN]
-        except (ValueError, KeyError) as error:
+            require_kind(_ORIGIN, stored, dict)
+        except (ValueError, KeyError, RecursionError) as error:
             accepted = "must be the log of a hardware trial, written by this version: give another log"
             raise LogError(f"{self.path}: its first line cannot be read ({error}); {accepted}") from error
         if f'"{_NUMBER}": '.encode() in content:
-            name = next(one for one in (*self.origin, *stored) if stored.get(one) != self.origin.get(one))
             raise LogError(
-                f"{self.path}: of another trial, whose {name} is {stored.get(name)}, not "
-                f"{self.origin.get(name)}; give the settings of that trial, or another log"
+                f"{self.path}: of another trial, whose {_difference(stored, self.origin)}; "
+                "give the settings of that trial, or another log"
             )
 
     def _use(self, row: dict[str, Any]) -> None:
@@ -238,6 +238,15 @@ def lock_log(path: str | Path) -> Iterator[None]:
     accepted = "another process has it open for a trial; wait until it ends, or give another log"
     with held(lock, LogError(f"{path}: {accepted}")):
         yield
+
+
+def _difference(stored: Mapping[str, Any], origin: Mapping[str, Any]) -> str:
+    """How two origins differ in JSON, where 1, 1.0 and true are not the same, and the order counts."""
+    for name in (*origin, *stored):
+        texts = [json.dumps(one[name]) if name in one else None for one in (stored, origin)]
+        if texts[0] != texts[1]:
+            return f"{name} is {stored.get(name, 'absent')}, not {origin.get(name, 'absent')}"
+    return f"settings come in another order: {', '.join(stored)}"
 
 
 def _now() -> str:

@@ -307,7 +307,7 @@ def test_sigkill_costs_the_evaluation_in_flight_alone(trial):
     require_that_it_goes_on(trial)
 
 
-@pytest.mark.parametrize("lost", [1, 200])
+@pytest.mark.parametrize("lost", [2, 200])
 def test_a_last_line_that_broke_off_costs_its_evaluation_alone(trial, lost, caplog):
     def disturb(readings: int) -> None:
         if readings > SURVIVED + 1:

@@ -58,8 +58,11 @@ def test_a_full_disk_leaves_no_half_line_to_go_on_after(trial, monkeypatch, fail
     ("settings", "message"),
     [
         ({"seed": 2}, "of another trial, whose seed is 2, not 1"),
-        ({"seed": 1, "dead": []}, r"of another trial, whose dead is \[\], not None"),
-        ({}, "of another trial, whose seed is None, not 1"),
+        ({"seed": 1.0}, r"of another trial, whose seed is 1\.0, not 1;"),
+        ({"seed": True}, "of another trial, whose seed is True, not 1;"),
+        ({"seed": 1, "dead": []}, r"of another trial, whose dead is \[\], not absent"),
+        ({"seed": 1, "dead": None}, "of another trial, whose dead is None, not absent"),
+        ({}, "of another trial, whose seed is absent, not 1"),
     ],
 )
 def test_the_log_of_another_trial_is_refused_and_left_as_it_is(trial, settings, message: str):
@@ -164,6 +167,42 @@ def test_damage_costs_the_evaluations_it_touches_alone(trial, damage, caplog):
             trial.objective(link, sensor)(0.5 * drives())
 
 
+@pytest.mark.parametrize("end", [b"", b"\x0b"])
+@pytest.mark.parametrize("line", [0, 3, -1])
+def test_the_damaged_end_of_a_line_costs_no_evaluation_and_no_second(trial, line: int, end: bytes):
+    bench = trial.bench()
+    with trial.link(bench) as link:
+        objective = trial.objective(link, EmulatedSensor(bench))
+        measured = objective(drives())
+        whole = trial.log.read_bytes()
+        lines = whole.splitlines(keepends=True)
+        lines[line] = lines[line][:-1] + end
+        trial.log.write_bytes(b"".join(lines))
+        sensor = Noisy(bench)
+        again = trial.objective(link, sensor)
+        assert again.log.seconds_on == objective.log.seconds_on > 0
+        assert torch.equal(again(drives()), measured)
+        assert sensor.readings == 0
+    assert trial.log.read_bytes() == whole
+
+
+def test_settings_in_another_order_are_another_trial(trial):
+    bench = trial.bench()
+    with trial.link(bench) as link:
+        trial.objective(link, EmulatedSensor(bench), seed=1, captures=4)(full_on())
+        with pytest.raises(LogError, match=r"settings come in another order: .*seed, captures;"):
+            trial.objective(link, EmulatedSensor(bench), captures=4, seed=1)
+
+
+def test_a_forged_first_line_is_refused_as_no_log(trial):
+    forged = line_of({"origin": "Kyoto"}) + b'\n{"evaluation": 0}\n'
+    trial.log.write_bytes(forged)
+    bench = trial.bench()
+    with trial.link(bench) as link, pytest.raises(LogError, match="first line cannot be read"):
+        trial.objective(link, EmulatedSensor(bench))
+    assert trial.log.read_bytes() == forged
+
+
 def test_where_a_reading_made_again_leads_elsewhere_the_trial_follows_it(trial):
     bench = trial.bench()
     others = drives()
@@ -235,7 +274,7 @@ def test_another_trial_is_named_by_what_was_said_first(trial):
         trial.objective(link, EmulatedSensor(bench), microphone="scope", captures=4)(full_on())
         with pytest.raises(LogError, match="whose microphone is scope, not file"):
             trial.objective(link, EmulatedSensor(bench), microphone="file")
-        with pytest.raises(LogError, match="whose captures is 4, not None"):
+        with pytest.raises(LogError, match="whose captures is 4, not absent"):
             trial.objective(link, EmulatedSensor(bench), microphone="scope")
 
 

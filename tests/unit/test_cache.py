@@ -17,7 +17,7 @@ import torch
 from small_scenes import AIR, CUBE, small_scene
 
 from autdtorch.array import TransducerArray
-from autdtorch.cache import ABANDONED, PARTIAL, SUFFIX, DiskCache, digest_of
+from autdtorch.cache import ABANDONED, PARTIAL, SUFFIX, DiskCache, _with_checksum, digest_of
 from autdtorch.obstacles import Mesh, Obstacle, Sphere, VoxelMask
 from autdtorch.propagator import SimulatedPropagator, SteadyStateWarning, make_propagator
 from autdtorch.scene import Medium, Scene
@@ -240,6 +240,19 @@ def test_a_flipped_bit_anywhere_is_noticed(tmp_path: Path) -> None:
     for place, byte in enumerate(content):
         path.write_bytes(content[:place] + bytes([byte ^ 1 << place % 8]) + content[place + 1 :])
         assert cache.load("one", (2, 3)) is None
+
+
+@pytest.mark.parametrize(
+    "body",
+    [b"", b"\0" * 15, np.zeros(6, complex).tobytes(), np.zeros(8, complex).tobytes(), b"\xff" * 112],
+)
+def test_a_forged_matrix_of_another_length_or_not_finite_is_computed_again(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, body: bytes
+) -> None:
+    cache = DiskCache(tmp_path)
+    (tmp_path / f"one{SUFFIX}").write_bytes(_with_checksum("one", (2, 3), body))
+    assert cache.load("one", (2, 3)) is None
+    assert "holds no finite matrix of shape (2, 3): computing again" in caplog.text
 
 
 def test_a_folder_that_cannot_be_used_costs_no_result(

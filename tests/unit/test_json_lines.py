@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -60,9 +61,8 @@ def test_a_flipped_bit_anywhere_is_noticed_and_costs_the_lines_it_touches_alone(
         flipped = content[:place] + bytes([byte ^ 1 << place % 8]) + content[place + 1 :]
         path.write_bytes(flipped)
         _, rows = read(path, head=HEAD)
-        kept = set(flipped.split(b"\n")[:-1])
-        assert rows == [row for row in ROWS if line_of(row, "key") in kept]
-        assert len(rows) < len(ROWS) or not flipped.startswith(HEAD)
+        assert rows == [row for row in ROWS if line_of(row, "key") in flipped]
+        assert len(rows) == len(ROWS) - (place >= len(HEAD) and byte != ord("\n"))
 
 
 @given(
@@ -73,7 +73,7 @@ def test_a_flipped_bit_anywhere_is_noticed_and_costs_the_lines_it_touches_alone(
         st.integers(0, 2).map(lambda number: line_of(ROWS[number], "another key") + b"\n"),
     ),
 )
-def test_whatever_was_put_into_a_file_is_set_aside_once_and_the_whole_lines_are_used(
+def test_whatever_was_put_into_a_file_is_set_aside_once_and_the_whole_rows_are_used(
     tmp_path_factory: pytest.TempPathFactory, cuts: list[int], rubbish: bytes
 ) -> None:
     path = tmp_path_factory.mktemp("damage") / "rows.jsonl"
@@ -82,15 +82,14 @@ def test_whatever_was_put_into_a_file_is_set_aside_once_and_the_whole_lines_are_
     damaged = content[:begin] + rubbish + content[end:]
     path.write_bytes(damaged)
     lines, rows = read(path)
-    complete = damaged.split(b"\n")[:-1]
-    assert [line_of(row, "key") for row in rows] == [
-        line for line in complete if line in {line_of(row, "key") for row in ROWS}
-    ]
+    used = [line_of(row, "key") for row in rows]
+    assert used == re.findall(b"|".join(re.escape(line_of(row, "key")) for row in ROWS), damaged)
     assert path.read_bytes() == damaged
     lines.mend()
     aside = path.with_name(path.name + SET_ASIDE)
-    refused = aside.read_bytes().split(b"\n")[:-1] if aside.exists() else []
-    assert sorted(refused + [line_of(row, "key") for row in rows]) == sorted(complete)
+    refused = aside.read_bytes() if aside.exists() else b""
+    kept = refused + b"".join(used)
+    assert sorted(kept.replace(b"\n", b"")) == sorted(damaged.replace(b"\n", b""))
     lines.append(ROWS[0])
     lines, again = read(path)
     assert again == [*rows, ROWS[0]]
@@ -101,17 +100,54 @@ def test_whatever_was_put_into_a_file_is_set_aside_once_and_the_whole_lines_are_
 
 def test_what_is_set_aside_is_told_in_one_line(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     first, second, third = written(path).splitlines(keepends=True)
-    path.write_bytes(first + b"\xff" + second + third + b"torn")
+    path.write_bytes(first + b"\xff" + second[1:] + third + b"torn")
     lines, rows = read(path)
     assert rows == [ROWS[0], ROWS[2]]
     assert not caplog.messages
     lines.mend()
-    refused, torn = caplog.messages
-    assert "line 2: set aside" in refused
-    assert "broke off" in torn
+    (told,) = caplog.messages
+    assert "line 2 and 1 more: set aside" in told
+    assert told.endswith(": its checksum is wrong; the last line broke off")
     caplog.clear()
     read(path)[0].mend()
     assert not caplog.messages
+
+
+@pytest.mark.parametrize("head", [b"", HEAD], ids=["no head", "head"])
+def test_the_end_of_a_line_costs_no_row(path: Path, head: bytes, caplog: pytest.LogCaptureFixture) -> None:
+    """Whether it is missing, another byte, or in the midst of others."""
+    content = written(path, head)
+    aside = path.with_name(path.name + SET_ASIDE)
+    for place in (place for place, byte in enumerate(content) if byte == ord("\n")):
+        for end in (b"", b"\x0b", b"{", b'"', b"\0" * 8, b'{"torn": 1', b"\r\n", b"\n\n"):
+            path.write_bytes(content[:place] + end + content[place + 1 :])
+            caplog.clear()
+            lines, rows = read(path, head=head)
+            assert rows == ROWS
+            lines.mend()
+            assert path.read_bytes() == content
+            debris = end.replace(b"\n", b"")
+            assert len(caplog.messages) == 1
+            assert not debris or debris in aside.read_bytes()
+
+
+def test_a_last_line_that_broke_off_is_kept_aside(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    *whole, last = written(path).splitlines(keepends=True)
+    path.write_bytes(b"".join(whole) + last[:-2])
+    lines, rows = read(path)
+    assert rows == ROWS[:2]
+    lines.mend()
+    assert path.read_bytes() == b"".join(whole)
+    assert path.with_name(path.name + SET_ASIDE).read_bytes() == last[:-2] + b"\n"
+    (told,) = caplog.messages
+    assert "line 3: set aside" in told
+    assert told.endswith(": the last line broke off")
+
+
+def test_whatever_is_in_a_line_it_takes_no_time_to_take_it_apart(path: Path) -> None:
+    content = written(path)
+    path.write_bytes(b'{"' * 200_000 + content.replace(b"\n", b"") + b'"}' * 200_000)
+    assert read(path)[1] == ROWS
 
 
 def test_lines_are_set_aside_on_disk_before_they_leave_the_file(
@@ -154,6 +190,22 @@ def test_a_row_that_its_reader_refuses_is_set_aside(path: Path) -> None:
     written(path)
     JsonLines(path, "key", use).mend()
     assert read(path)[1] == [ROWS[0], ROWS[2]]
+
+
+def test_why_a_row_was_refused_is_told(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    written(path)
+    JsonLines(path, "key", lambda row: row["missing"]).mend()
+    (told,) = caplog.messages
+    assert told.endswith("it has no 'missing'")
+
+
+def test_a_file_that_was_removed_meanwhile_is_not_begun_anew_by_its_next_line(path: Path) -> None:
+    lines = read(path)[0]
+    lines.append(ROWS[0])
+    path.unlink()
+    with pytest.raises(FileNotFoundError, match=r"rows\.jsonl"):
+        lines.append(ROWS[1])
+    assert not path.exists()
 
 
 def test_the_lines_of_a_file_with_another_key_are_not_used(path: Path) -> None:

@@ -39,7 +39,7 @@ FULL = Simulation(
 
 def method_result(trials: int, plane: bool, seed: int) -> MethodResult:
     generator = torch.Generator().manual_seed(seed)
-    drive = torch.randn(trials, 3, dtype=torch.complex128, generator=generator)
+    drive = torch.randn(trials, 3, dtype=torch.complex128, generator=generator).sgn()
     pressure = torch.rand(trials, 2, dtype=torch.float64, generator=generator)
     field = torch.randn(trials, 4, 5, dtype=torch.complex128, generator=generator)
     history = pressure.amin(dim=1, keepdim=True) * torch.tensor([0.5, 1.0], dtype=torch.float64)
@@ -169,13 +169,30 @@ def test_other_programs_read_the_file_as_any_of_hdf5(results: StudyResult, tmp_p
     assert np.array_equal(matrix, results.scenes["two_cubes"].transfer_matrix.numpy())
 
 
-def a_dataset(file: h5py.File, name: str) -> None:
+def a_dataset(file: h5py.File, name: str, values: object = (1.0, 2.0)) -> None:
     del file[name]
-    file[name] = [1.0, 2.0]
+    file[name] = values
+
+
+def an_entry(file: h5py.File, name: str, place: tuple[int, ...], value: complex) -> None:
+    file[name][place] = value
+
+
+def of_another_file(file: h5py.File, name: str) -> None:
+    del file[name]
+    file.create_dataset(name, (2, 3), "c16", external=[(__file__, 0, 96)])
+
+
+METHOD = "scenes/empty/methods/gabs"  # of 2 trials, 3 transducers, 2 points
 
 
 def an_attribute(file: h5py.File, name: str, value: object) -> None:
     file.attrs[name] = value
+
+
+def with_checksum(path: Path) -> None:
+    body = path.read_bytes()[512:]
+    path.write_bytes(hashlib.sha256(body).hexdigest().encode().ljust(512, b"\0") + body)
 
 
 @pytest.mark.parametrize(
@@ -197,6 +214,53 @@ def an_attribute(file: h5py.File, name: str, value: object) -> None:
         lambda file: an_attribute(file, "date", 3),
         lambda file: an_attribute(file, "seed", "three"),
         lambda file: file.attrs.pop("source_digest"),
+        lambda file: an_attribute(file, "seed", 1.5),
+        lambda file: an_attribute(file["scenes/empty"], "obstacles", -(10**9)),
+        lambda file: an_attribute(file["scenes/empty"], "obstacles", 0.5),
+        lambda file: an_attribute(file["scenes/empty"], "bound", np.nan),
+        lambda file: an_attribute(file["scenes/empty"], "bound", -1.0),
+        lambda file: an_attribute(file["scenes/empty"], "wavelength", 0.0),
+        lambda file: an_attribute(file["scenes/empty"], "plane_seconds", -1.0),
+        lambda file: an_attribute(file["scenes/two_cubes"], "spacing", np.inf),
+        lambda file: an_attribute(file["scenes/two_cubes"], "tolerance", -1.0),
+        lambda file: an_entry(file, "scenes/two_cubes/runs/periods", (0,), -1),
+        lambda file: an_entry(file, "scenes/two_cubes/runs/seconds", (0,), np.nan),
+        lambda file: a_dataset(file, "scenes/two_cubes/runs/remaining", [0.1, np.nan]),
+        lambda file: a_dataset(file, "scenes/two_cubes/runs/reached", [2, 3]),
+        lambda file: an_attribute(file[METHOD], "shown_trial", 2),
+        lambda file: an_attribute(file[METHOD], "shown_trial", -1),
+        lambda file: a_dataset(file, "scenes/empty/transfer_matrix", np.ones((3, 3), complex)),
+        lambda file: a_dataset(file, "scenes/empty/transfer_matrix", np.ones((2, 4), complex)),
+        lambda file: a_dataset(file, "scenes/empty/transfer_matrix", np.ones((2, 3))),
+        lambda file: an_entry(file, "scenes/empty/transfer_matrix", (0, 0), np.inf),
+        lambda file: a_dataset(file, f"{METHOD}/drive", np.ones((1, 1), complex)),
+        lambda file: a_dataset(file, f"{METHOD}/drive", np.ones((3, 3), complex)),
+        lambda file: an_entry(file, f"{METHOD}/drive", (0, 0), 7),
+        lambda file: a_dataset(file, f"{METHOD}/pressure", np.ones((2, 3))),
+        lambda file: an_entry(file, f"{METHOD}/pressure", (0, 0), -1),
+        lambda file: a_dataset(file, f"{METHOD}/score", np.zeros(7)),
+        lambda file: an_entry(file, f"{METHOD}/score", (0,), np.nan),
+        lambda file: an_entry(file, f"{METHOD}/score", (0,), 2.0),  # the history's are below 1
+        lambda file: a_dataset(file, f"{METHOD}/evaluations", [2.0, 2.0]),
+        lambda file: a_dataset(file, f"{METHOD}/evaluations", [2, 2, 2]),
+        lambda file: an_entry(file, f"{METHOD}/evaluations", (0,), 0),
+        lambda file: an_entry(file, f"{METHOD}/evaluations", (0,), 3),  # the history has 2
+        lambda file: a_dataset(file, f"{METHOD}/history", np.ones((3, 2))),
+        lambda file: an_entry(file, f"{METHOD}/history", (0, 0), 2.0),
+        lambda file: a_dataset(file, f"{METHOD}/seconds", np.ones(3)),
+        lambda file: an_entry(file, f"{METHOD}/seconds", (0,), -1.0),
+        lambda file: a_dataset(file, f"{METHOD}/mean", np.ones(3)),
+        lambda file: an_entry(file, f"{METHOD}/std", (1,), np.nan),
+        lambda file: a_dataset(file, "scenes/two_cubes/methods/lssg/area", np.ones(2)),
+        lambda file: a_dataset(file, "scenes/two_cubes/methods/lssg/plane_pressure", np.ones(2, complex)),
+        lambda file: an_entry(file, "scenes/two_cubes/methods/lssg/plane_pressure", (0, 0), np.nan),
+        lambda file: of_another_file(file, "scenes/empty/transfer_matrix"),
+        lambda file: a_dataset(
+            file, "scenes/empty/transfer_matrix", h5py.SoftLink("/scenes/two_cubes/transfer_matrix")
+        ),
+        lambda file: a_dataset(file, "scenes/empty", h5py.SoftLink("/scenes/two_cubes")),
+        lambda file: a_dataset(file, "scenes/empty/methods", h5py.SoftLink("/scenes/two_cubes/methods")),
+        lambda file: a_dataset(file, "scenes/empty/runs", h5py.SoftLink("/scenes/two_cubes/runs")),
     ],
 )
 def test_a_file_of_other_content_is_refused_in_one_line(
@@ -206,9 +270,25 @@ def test_a_file_of_other_content_is_refused_in_one_line(
     save_results(results, tmp_path)
     with h5py.File(path, "r+") as file:
         change(file)
-    body = path.read_bytes()[512:]
-    path.write_bytes(hashlib.sha256(body).hexdigest().encode().ljust(512, b"\0") + body)
+    with_checksum(path)
     with pytest.raises(ValueError, match=rf"^.*{RESULTS_FILE}: .*; must be a results file of .*$"):
+        load_results(path)
+
+
+@pytest.mark.parametrize("side", [10**6, 10**3])
+def test_a_small_file_that_claims_to_hold_much_is_refused_before_it_is_read(
+    results: StudyResult, tmp_path: Path, side: int
+) -> None:
+    path = tmp_path / RESULTS_FILE
+    save_results(results, tmp_path)
+    with h5py.File(path, "r+") as file:
+        for name in ("transfer_matrix", "runs/seconds", "methods/gabs/score"):
+            del file["scenes/empty"][name]
+            file["scenes/empty"].create_dataset(name, (side, side), "c16", chunks=(100, 100))
+    with_checksum(path)
+    with pytest.raises(
+        ValueError, match=rf"{16 * side * side} bytes; must be at most \d+, as many as the file"
+    ):
         load_results(path)
 
 
