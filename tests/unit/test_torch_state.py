@@ -84,8 +84,11 @@ def numbers(folder: Path) -> dict[str, torch.Tensor]:
         "noisy": at.gabs(noisy, trials=2),
     }.items():
         found |= {f"{name} {key}": getattr(solution, key) for key in ("drive", "pressure", "history")}
-    metrics = at.focus_metrics(found["gabs pressure"])
-    found |= {"mean": metrics.mean, "uniformity": metrics.uniformity}
+    metrics = at.focus_metrics(
+        found["gabs pressure"][0], found["gabs pressure"][:1].repeat(7, 1), cell_area=1e-6 / 3
+    )
+    assert metrics.area is not None
+    found |= {"mean": metrics.mean, "uniformity": metrics.uniformity, "area": metrics.area}
     found["bound"] = torch.tensor(at.focus_bound(found["box"]), dtype=torch.float64, device="cpu")
     at.save_drive(folder / "drive.csv", found["gabs drive"][0], scene.array)
     found["saved"] = at.load_drive(folder / "drive.csv")
