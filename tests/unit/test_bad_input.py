@@ -4,6 +4,7 @@ Values of a wrong kind are in test_any_input.py; these are out of range, or do n
 """
 
 import math
+from collections import UserList, deque
 
 import numpy as np
 import pytest
@@ -320,3 +321,8 @@ def test_what_is_no_mask_file_is_refused(tmp_path):
     path.write_bytes(b"PK\x03\x04 and then nothing")
     with pytest.raises(ValueError, match=r"VoxelMask\.path: .* must be a \.npy or \.npz file"):
         VoxelMask.load(path, 1e-3, rigid=True)
+
+
+@pytest.mark.parametrize("kind", [deque, UserList, tuple])
+def test_a_list_of_any_class_is_a_list(kind):
+    assert circle(center=kind([80e-3, 50e-3, 50e-3])).equal(circle())
