@@ -112,14 +112,15 @@ def integer_at_least(name: str, value: object, minimum: int) -> int:
     return number
 
 
-def require_name(field: str, name: str) -> None:
+def require_name(field: str, name: object) -> None:
     """Check a name that becomes part of the names of files and of groups in them.
 
     Raises:
-        ValueError: other characters than letters, digits and _ . + -, dots alone, or more than 100 bytes.
+        ValueError: no text, other characters than letters, digits and _ . + -, dots alone, or more than 100
+            bytes.
     """
-    if not _NAME.fullmatch(name) or len(name.encode()) > _LONGEST_NAME:
-        accepted = "a name must consist of letters, digits and _ . + -, not of dots alone"
+    if not isinstance(name, str) or not _NAME.fullmatch(name) or len(name.encode()) > _LONGEST_NAME:
+        accepted = "a name must be text, consist of letters, digits and _ . + -, not of dots alone"
         raise invalid(field, name, f"{accepted}, and have at most {_LONGEST_NAME} bytes")
 
 
