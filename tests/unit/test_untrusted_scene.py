@@ -279,6 +279,11 @@ MESHES = {
     "ply of quads": HEAD.format(kind="ascii", vertices=4, faces=4)
     + f"{CORNERS}3 0 2 1\n3 0 1 3\n3 0 3 2\n4 1 2 3 0\n",
     "ply of nothing": "ply\nformat ascii 1.0\nend_header\n",
+    "ply of less than nothing": HEAD.format(kind="binary_little_endian", vertices=-1, faces=0),
+    "ply of halves": HEAD.format(kind="ascii", vertices=4, faces=4)
+    + f"{CORNERS}3 0 2.5 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n",
+    "ply of no numbers": HEAD.format(kind="ascii", vertices=4, faces=4)
+    + f"{CORNERS}3 0 nan 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n",
     "obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1\n",
     "obj beyond integers": f"v 0 0 0\nf 1 1 {10**30}\n",
     "stl": "\0" * 80 + "\x7f" * 4 + "\0" * 50,
