@@ -5,7 +5,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from autdtorch import air
-from autdtorch.validation import not_negative, positive
+from autdtorch.validation import not_negative, number_between, positive
+
+_DENSITIES = 1e-9, 1e9  # [kg/m^3]; far beyond all materials, and near enough for squares of ratios
+_SOUND_SPEEDS = 1e-3, 1e6  # [m/s]
+
+
+def fluid(kind: str, density: object, sound_speed: object) -> tuple[float, float]:
+    """Return the density [kg/m^3] and sound speed [m/s] of a fluid, checked; `kind` is of what, for messages.
+
+    Raises:
+        ValueError: not a number, or out of range.
+    """
+    rho = positive(f"{kind}.density", density, "kg/m^3")
+    c = positive(f"{kind}.sound_speed", sound_speed, "m/s")
+    return (
+        number_between(f"{kind}.density", rho, *_DENSITIES, "kg/m^3"),
+        number_between(f"{kind}.sound_speed", c, *_SOUND_SPEEDS, "m/s"),
+    )
 
 
 @dataclass(frozen=True)
@@ -13,8 +30,8 @@ class Medium:
     """A uniform fluid.
 
     Attributes:
-        density: [kg/m^3], > 0.
-        sound_speed: [m/s], > 0.
+        density: [kg/m^3], 1e-9 to 1e9.
+        sound_speed: [m/s], 1e-3 to 1e6.
         absorption: of a plane wave at the frequency of the drive [dB/m], >= 0.
 
     Raises:
@@ -27,8 +44,9 @@ class Medium:
 
     def __post_init__(self) -> None:
         """Check the attributes."""
-        object.__setattr__(self, "density", positive("Medium.density", self.density, "kg/m^3"))
-        object.__setattr__(self, "sound_speed", positive("Medium.sound_speed", self.sound_speed, "m/s"))
+        density, sound_speed = fluid("Medium", self.density, self.sound_speed)
+        object.__setattr__(self, "density", density)
+        object.__setattr__(self, "sound_speed", sound_speed)
         object.__setattr__(self, "absorption", not_negative("Medium.absorption", self.absorption, "dB/m"))
 
     @classmethod
