@@ -5,24 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from autdtorch import air
-from autdtorch.validation import not_negative, number_between, positive
-
-_DENSITIES = 1e-9, 1e9  # [kg/m^3]; far beyond all materials, and near enough for squares of ratios
-_SOUND_SPEEDS = 1e-3, 1e6  # [m/s]
-
-
-def fluid(kind: str, density: object, sound_speed: object) -> tuple[float, float]:
-    """Return the density [kg/m^3] and sound speed [m/s] of a fluid, checked; `kind` is of what, for messages.
-
-    Raises:
-        ValueError: not a number, or out of range.
-    """
-    rho = positive(f"{kind}.density", density, "kg/m^3")
-    c = positive(f"{kind}.sound_speed", sound_speed, "m/s")
-    return (
-        number_between(f"{kind}.density", rho, *_DENSITIES, "kg/m^3"),
-        number_between(f"{kind}.sound_speed", c, *_SOUND_SPEEDS, "m/s"),
-    )
+from autdtorch.validation import fluid, not_negative
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ from typing import Any, TypeAlias
 import torch
 
 from autdtorch.memory import require_memory
-from autdtorch.method_section import parameters, require_known
 from autdtorch.metrics import focus_metrics
 from autdtorch.objective import Objective, SimulatedObjective
 from autdtorch.optim.base import TRIAL_BYTES, Solution, Trials
@@ -125,7 +124,10 @@ def _check_kinds(scenes: object, methods: object, solver: object, config: object
     if solver is not None:
         if not isinstance(solver, Mapping):
             raise invalid("solver", solver, "must be a mapping of arguments of make_propagator")
-        require_known("solver", solver, parameters(make_propagator, but=("scene",)))
+        _, *allowed = inspect.signature(make_propagator).parameters  # all but the scene
+        for key in solver:
+            if key not in allowed:
+                raise ValueError(f"solver: unknown key {key!r}; allowed keys: {', '.join(allowed)}")
     if not isinstance(config, str):
         raise invalid("config", config, "must be text")
 

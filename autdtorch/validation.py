@@ -35,6 +35,9 @@ _SHOWN_BITS = 128  # of an integer; Python refuses to write out very large ones
 _DEEPEST = 16  # axes of an array, or lists in lists; not every function of PyTorch takes more than 25
 _LARGEST = 2**63 - 1  # integer that NumPy and PyTorch count with
 
+_DENSITIES = 1e-9, 1e9  # [kg/m^3]; far beyond all materials, and near enough for squares of ratios
+_SOUND_SPEEDS = 1e-3, 1e6  # [m/s]
+
 
 def invalid(name: str, value: object, accepted: str, unit: str = "") -> ValueError:
     """Return the error to raise for `value` of field `name`; `accepted` says what is allowed."""
@@ -85,6 +88,20 @@ def number_between(name: str, value: object, least: float, most: float, unit: st
     if not least <= number <= most:
         raise invalid(name, value, f"must be in {least:g} to {most:g}", unit)
     return number
+
+
+def fluid(kind: str, density: object, sound_speed: object) -> tuple[float, float]:
+    """Return the density [kg/m^3] and sound speed [m/s] of a fluid, checked; `kind` is of what, for messages.
+
+    Raises:
+        ValueError: not a number, or out of range.
+    """
+    rho = positive(f"{kind}.density", density, "kg/m^3")
+    c = positive(f"{kind}.sound_speed", sound_speed, "m/s")
+    return (
+        number_between(f"{kind}.density", rho, *_DENSITIES, "kg/m^3"),
+        number_between(f"{kind}.sound_speed", c, *_SOUND_SPEEDS, "m/s"),
+    )
 
 
 def not_negative(name: str, value: object, unit: str = "") -> float:

@@ -10,8 +10,7 @@ from typing import Any
 import torch
 from numpy.typing import NDArray
 
-from autdtorch.medium import fluid
-from autdtorch.validation import ArrayLike, Vector, boolean, invalid, not_negative, real_tensor
+from autdtorch.validation import ArrayLike, Vector, boolean, fluid, invalid, not_negative, real_tensor
 
 
 @dataclass(frozen=True, kw_only=True)
