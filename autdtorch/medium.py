@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from autdtorch import air
-from autdtorch.validation import not_negative, positive
+from autdtorch.validation import fluid, not_negative
 
 
 @dataclass(frozen=True)
@@ -13,8 +13,8 @@ class Medium:
     """A uniform fluid.
 
     Attributes:
-        density: [kg/m^3], > 0.
-        sound_speed: [m/s], > 0.
+        density: [kg/m^3], 1e-9 to 1e9.
+        sound_speed: [m/s], 1e-3 to 1e6.
         absorption: of a plane wave at the frequency of the drive [dB/m], >= 0.
 
     Raises:
@@ -27,8 +27,9 @@ class Medium:
 
     def __post_init__(self) -> None:
         """Check the attributes."""
-        object.__setattr__(self, "density", positive("Medium.density", self.density, "kg/m^3"))
-        object.__setattr__(self, "sound_speed", positive("Medium.sound_speed", self.sound_speed, "m/s"))
+        density, sound_speed = fluid("Medium", self.density, self.sound_speed)
+        object.__setattr__(self, "density", density)
+        object.__setattr__(self, "sound_speed", sound_speed)
         object.__setattr__(self, "absorption", not_negative("Medium.absorption", self.absorption, "dB/m"))
 
     @classmethod

@@ -8,6 +8,7 @@ import inspect
 import os
 import sys
 from collections.abc import Callable, Collection, Mapping
+from types import ModuleType
 from typing import Any, TypeAlias, cast
 
 import autdtorch
@@ -58,16 +59,25 @@ def _function(where: str, target: object, modules: Collection[Any]) -> Callable[
         ours = ", ".join(f"autdtorch.{method}" for method in METHOD_LABELS)
         accepted = "or a function of a module that the command line names, as modules=MODULE"
         raise ValueError(f"{where}: {target!r}; must be one of {ours}, {accepted}")
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # where a module of one's own is looked for, behind what is installed
-    try:
-        function = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"{where}: {target!r}; must be a function ({error})") from error
+    if not all(map(str.isidentifier, [*module.split("."), name])):
+        raise ValueError(
+            f"{where}: {target!r}; must be a module and a function, as in package.module.function"
+        )
+    function = getattr(_imported(where, target, module), name, None)
     # A function that the module imports is not one that the user trusts.
     if not inspect.isfunction(function) or not f"{function.__module__}.".startswith(f"{module}."):
         raise ValueError(f"{where}: {target!r}; must be a function that {module} defines")
     return function
+
+
+def _imported(where: str, target: object, module: str) -> ModuleType:
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # where a module of one's own is looked for, behind what is installed
+    try:
+        return importlib.import_module(module)
+    except (Exception, SystemExit) as error:  # whatever a module of one's own raises
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise ValueError(f"{where}: {target!r}; {module} cannot be imported ({reason})") from error
 
 
 def parameters(function: Callable[..., Any], but: tuple[str, ...]) -> tuple[str, ...]:

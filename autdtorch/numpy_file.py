@@ -24,6 +24,8 @@ _PLAIN = "biufcU"  # kinds of values: numbers and text
 _DAMAGE = (
     OSError,
     ValueError,
+    TypeError,
+    LookupError,
     EOFError,
     OverflowError,
     RuntimeError,

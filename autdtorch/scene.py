@@ -26,6 +26,7 @@ from autdtorch.validation import (
     finite_vector,
     invalid,
     members,
+    number_between,
     points_tensor,
     positive,
     real_tensor,
@@ -34,6 +35,9 @@ from autdtorch.validation import (
 
 _OVERLAP_SAMPLES = 16  # along each axis of the space that two bounding boxes share
 _DEFAULT_MARGIN = 2.0  # wavelengths of air on each side of everything, where no domain is given
+
+_FARTHEST = 1e6  # m from the origin along an axis; far beyond any simulation, and near enough for cubes
+_FREQUENCIES = 1e-3, 1e12  # Hz
 
 _DECIBELS = 20 / math.log(10)  # of a neper
 
@@ -54,10 +58,12 @@ class OverlapWarning(UserWarning):
 class Scene:
     """All that determines a field. The tensors are the scene's own copies, on the CPU.
 
+    No coordinate of anything may be beyond 1e6 m.
+
     Attributes:
         array: the transducers.
         medium: what surrounds the obstacles.
-        frequency: [Hz], > 0.
+        frequency: [Hz], 1e-3 to 1e12.
         control_points: (P, 3) [m], float64, where pressure is observed; all different.
         obstacles: may touch and overlap; where they do, the later one counts.
         observation_plane: where pictures and areas are taken, or None.
@@ -90,7 +96,7 @@ class Scene:
         Args:
             array: the transducers, outside the obstacles.
             medium: what surrounds the obstacles.
-            frequency: [Hz], > 0.
+            frequency: [Hz], 1e-3 to 1e12.
             control_points: (P, 3) [m], P >= 1, outside the obstacles.
             obstacles: may touch and overlap; where they do, the later one counts.
             observation_plane: where pictures and areas are taken.
@@ -101,9 +107,9 @@ class Scene:
             name: for titles and file names.
 
         Raises:
-            ValueError: a field of the wrong type or out of range, a transducer or control point in or on an
-                obstacle, two points in one place, something outside the domain, or a medium that absorbs more
-                than 3 dB per wavelength.
+            ValueError: a field of the wrong type or out of range, a coordinate beyond 1e6 m, a transducer or
+                control point in or on an obstacle, two points in one place, something outside the domain, or
+                a medium that absorbs more than 3 dB per wavelength.
 
         Warns:
             OverlapWarning: two obstacles of different materials overlap.
@@ -117,12 +123,16 @@ class Scene:
             raise invalid("Scene.name", name, "must be text of at least one character")
         object.__setattr__(self, "array", array)
         object.__setattr__(self, "medium", medium)
-        object.__setattr__(self, "frequency", positive("Scene.frequency", frequency, "Hz"))
+        frequency = number_between(
+            "Scene.frequency", positive("Scene.frequency", frequency, "Hz"), *_FREQUENCIES, "Hz"
+        )
+        object.__setattr__(self, "frequency", frequency)
         points = points_tensor("Scene.control_points", control_points).cpu()
         object.__setattr__(self, "control_points", points.as_subclass(Coordinates))
         object.__setattr__(self, "obstacles", members("Scene.obstacles", obstacles, Obstacle))
         object.__setattr__(self, "observation_plane", observation_plane)
         object.__setattr__(self, "name", name)
+        _require_near(self)
         object.__setattr__(self, "domain", self._bounds() if domain is None else _corners(domain))
         _require_propagating(self)
         _require_separate_points(self)
@@ -212,6 +222,7 @@ def _corners(domain: ArrayLike) -> tuple[Vector, Vector]:
     lower, upper = (finite_vector("Scene.domain", corner) for corner in corners)
     if not all(low < high for low, high in zip(lower, upper, strict=True)):
         raise invalid("Scene.domain", (lower, upper), "lower must be below upper on every axis", "m")
+    _require_within("Scene.domain", corners)
     return lower, upper
 
 
@@ -235,6 +246,22 @@ def _contents(scene: Scene) -> list[tuple[str, torch.Tensor]]:
     if scene.observation_plane is not None:
         contents.append(("Scene.observation_plane corner", scene.observation_plane.corners))
     return contents
+
+
+def _require_near(scene: Scene) -> None:
+    """Nothing so far away that its cells could not be counted."""
+    for name, points in _contents(scene):
+        _require_within(name, points)
+    for index, obstacle in enumerate(scene.obstacles):
+        corners = torch.tensor([obstacle.lower, obstacle.upper], dtype=torch.float64, device="cpu")
+        _require_within(f"Scene.obstacles[{index}] corner", corners)
+
+
+def _require_within(name: str, points: torch.Tensor) -> None:
+    far = ~(points.abs() <= _FARTHEST).all(dim=-1)
+    if far.any():
+        first = points[far][0].detach()
+        raise invalid(name, first, f"every coordinate must be in {-_FARTHEST:g} to {_FARTHEST:g}", "m")
 
 
 def _require_separate_points(scene: Scene) -> None:

@@ -81,8 +81,12 @@ def _read(where: str, source: str | os.PathLike[str] | Mapping[str, Any]) -> obj
             config = OmegaConf.create(plain(source, where))
         unresolved(config, where)
         return plain(config, where)
-    except OmegaConfBaseException as error:
-        raise ValueError(f"{where}: {error}") from error
+    except (OmegaConfBaseException, TypeError) as error:  # TypeError: a key that no dictionary takes
+        key = getattr(error, "full_key", None)
+        place = f"{where}: {key}" if key else where
+        reason = str(error).partition("\n    full_key:")[0]
+        accepted = "must be a number, text, list or mapping with keys of text, or the ${key} of one"
+        raise ValueError(" ".join(f"{place}: {reason}; {accepted}".split())) from error
 
 
 def _part(where: str, key: str, value: object, air: Builder, folder: Path) -> object:

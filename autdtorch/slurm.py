@@ -15,6 +15,7 @@ from submitit.slurm.slurm import SlurmInfoWatcher, SlurmJob
 logger = logging.getLogger(__name__)
 
 _PAUSE = 10.0  # [s] between questions to the queue; clusters want few
+_MOST_FAILURES = 30  # of squeue in a row, 5 min; a controller that starts anew is back before
 
 
 class QueueWatcher(SlurmInfoWatcher):
@@ -32,6 +33,7 @@ class QueueWatcher(SlurmInfoWatcher):
         self._queued = True
         self._next_question = 0.0
         self._told = ""
+        self._failures = 0
 
     def register_job(self, job_id: str) -> None:
         """Watch a job, such as "7", or "7_0" of the array 7."""
@@ -47,6 +49,9 @@ class QueueWatcher(SlurmInfoWatcher):
 
         submitit asks for a job without a result, and gives up the sweep if that job has ended. A job that was
         killed is therefore not done before the others.
+
+        Raises:
+            ChildProcessError: `squeue` fails, time and again.
         """
         if time.monotonic() >= self._next_question:
             self._next_question = time.monotonic() + _PAUSE
@@ -58,17 +63,29 @@ class QueueWatcher(SlurmInfoWatcher):
         return "in the queue" if self._queued else "ended"
 
     def _ask(self) -> None:
-        command = ["squeue", "--me", "--noheader", "--format=%F %T %r"]
-        answer = subprocess.run(command, capture_output=True, text=True)
-        if answer.returncode:
-            self._tell(f"{answer.stderr.strip()}: asking again")
+        command = ["squeue", "--me", "--noheader", "--format=%F|%T|%r"]
+        try:
+            answer = subprocess.run(command, capture_output=True, text=True, check=True)
+        except (OSError, subprocess.CalledProcessError) as error:
+            self._failed(getattr(error, "stderr", None) or str(error))
             return
-        jobs = [line.split(maxsplit=2) for line in answer.stdout.splitlines()]
+        self._failures = 0
+        jobs = [line.split("|", maxsplit=2) for line in answer.stdout.splitlines()]
         ours = [(state, reason) for number, state, reason in jobs if number in self._numbers]
         self._queued = bool(ours)
-        reasons = {reason for state, reason in ours if state == "PENDING"} - {"None"}
+        reasons = {reason for state, reason in ours if state == "PENDING"} - {"None", ""}
         if reasons:
             self._tell(f"jobs wait in the queue: {', '.join(sorted(reasons))}")
+
+    def _failed(self, reason: str) -> None:
+        """Ask again, but not for ever."""
+        reason = " ".join(reason.split())
+        self._failures += 1
+        if self._failures >= _MOST_FAILURES:
+            stay = f"the jobs {', '.join(sorted(self._numbers))} may still run"
+            again = "when squeue answers and they have ended, the same command repeats what is not finished"
+            raise ChildProcessError(f"squeue: {reason}, {self._failures} times in a row; {stay}; {again}")
+        self._tell(f"squeue: {reason}; asking again")
 
     def _tell(self, line: str) -> None:
         """Log a line, unless it is the last one again."""

@@ -24,11 +24,21 @@ from autdtorch.results import MethodResult, SceneResult, Simulation, StudyResult
 from autdtorch.scene import Scene
 from autdtorch.study_folder import StudyFolder, open_folder
 from autdtorch.trial_file import TrialFile
-from autdtorch.validation import LENGTH_TOLERANCE, integer_at_least, invalid, positive, require_name
+from autdtorch.validation import (
+    LENGTH_TOLERANCE,
+    integer_at_least,
+    invalid,
+    path_of,
+    positive,
+    require_kind,
+    require_name,
+)
 
 #: An optimiser with its settings bound. Where it has parameters `trials` and `seed` it gets a sequence of the
 #: numbers of the trials to run, of which it is to return as many, and the study's seed.
 Method: TypeAlias = Callable[..., Solution]
+
+_GIVEN = ("trials", "seed")  # parameters of a method that the study gives, if it has them
 
 _FIRST_BLOCK = 2  # Trials are run so many at a time at first,
 _LARGEST_GROWTH = 4  # then up to so many times more,
@@ -71,18 +81,20 @@ def run_study(
         The results of all scenes.
 
     Raises:
-        ValueError: an argument out of range, a solver's and a method's included, or another process writes
-            into the folder.
+        ValueError: an argument of another kind or out of range, a solver's and a method's included, or
+            another process writes into the folder.
         OSError: the folder cannot be written.
     """
-    counts = _check(scenes, methods, trials, seed)
+    _check_kinds(scenes, methods, solver, config)
+    folder = None if folder is None else path_of("folder", folder, "a folder")
+    counts = _check(methods, trials, seed)
     plane_spacing = positive("plane_spacing", plane_spacing, "m")
     for name, method in methods.items():
         for scene in scenes.values():
             _check_method(name, method, scene, counts[name], seed)
     planes = {name: _plane_points(scene, plane_spacing) for name, scene in scenes.items()}
     # The digest of our source says nothing of others' methods.
-    ours = all(_function(method).__module__.partition(".")[0] == "autdtorch" for method in methods.values())
+    ours = all(_package(method) == "autdtorch" for method in methods.values())
     provenance = provenance_now(config, seed)
     with open_folder(folder, provenance, scenes, reuse=bool(config) and ours) as kept:
         missing = {name: scene for name, scene in scenes.items() if name not in kept.scenes}
@@ -97,15 +109,43 @@ def run_study(
         return StudyResult(kept.provenance, {name: kept.scenes[name] for name in scenes})
 
 
-def _check(
-    scenes: Mapping[str, Scene], methods: Mapping[str, Method], trials: int | Mapping[str, int], seed: int
-) -> dict[str, int]:
-    """Check names and counts; returns the number of trials of each method."""
+def _check_kinds(scenes: object, methods: object, solver: object, config: object) -> None:
+    """Check that names are names, and what they name, scenes and methods; and the settings' kinds."""
     for field, named in (("scenes", scenes), ("methods", methods)):
+        if not isinstance(named, Mapping):
+            raise invalid(field, named, f"must be a mapping of names to {field}")
         if not named:
             raise ValueError(f"{field}: empty; must have at least one")
-        for name in named:
+        for name, entry in named.items():
             require_name(field, name)
+            if field == "scenes":
+                require_kind(f"scenes.{name}", entry, Scene)
+            else:
+                _require_method(f"methods.{name}", entry)
+    if solver is not None:
+        if not isinstance(solver, Mapping):
+            raise invalid("solver", solver, "must be a mapping of arguments of make_propagator")
+        _, *allowed = inspect.signature(make_propagator).parameters  # all but the scene
+        for key in solver:
+            if key not in allowed:
+                raise ValueError(f"solver: unknown key {key!r}; allowed keys: {', '.join(allowed)}")
+    if not isinstance(config, str):
+        raise invalid("config", config, "must be text")
+
+
+def _require_method(where: str, method: object) -> None:
+    accepted = "must be a function of an objective, and of trials and seed if it has random choices"
+    if not callable(method):
+        raise invalid(where, method, accepted)
+    try:
+        signature = inspect.signature(method)
+        signature.bind("objective", **{key: None for key in _GIVEN if key in signature.parameters})
+    except (TypeError, ValueError) as error:
+        raise invalid(where, method, f"{accepted} ({error})") from error
+
+
+def _check(methods: Mapping[str, Method], trials: int | Mapping[str, int], seed: int) -> dict[str, int]:
+    """Check seed and counts; returns the number of trials of each method."""
     if integer_at_least("seed", seed, 0) > _LARGEST_SEED:
         raise invalid("seed", seed, f"must be an integer from 0 to {_LARGEST_SEED}")
     random = [name for name, method in methods.items() if "trials" in inspect.signature(method).parameters]
@@ -164,14 +204,15 @@ def _check_method(name: str, method: Method, scene: Scene, trials: int, seed: in
         raise ValueError(f"method {name}: {error}") from error
 
 
-def _function(method: Method) -> Callable[..., Any]:
-    return method.func if isinstance(method, functools.partial) else method
+def _package(method: Method) -> str:
+    function = method.func if isinstance(method, functools.partial) else method
+    return str(getattr(function, "__module__", "")).partition(".")[0]
 
 
 def _solve(method: Method, objective: Objective, trials: Trials, seed: int) -> Solution:
-    parameters = inspect.signature(method).parameters
-    given = {"trials": trials, "seed": seed}
-    return method(objective, **{key: value for key, value in given.items() if key in parameters})
+    taken = inspect.signature(method).parameters
+    given = zip(_GIVEN, (trials, seed), strict=True)
+    return method(objective, **{key: value for key, value in given if key in taken})
 
 
 def _run_scene(

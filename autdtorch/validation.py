@@ -6,6 +6,7 @@ wrong is reported as a `ValueError` of the shape ``field: value unit; accepted r
 
 from __future__ import annotations
 
+import contextlib
 import math
 import numbers
 import os
@@ -13,7 +14,7 @@ import re
 import reprlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeGuard
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +34,9 @@ _SHOWN_CHARACTERS = 120
 _SHOWN_BITS = 128  # of an integer; Python refuses to write out very large ones
 _DEEPEST = 16  # axes of an array, or lists in lists; not every function of PyTorch takes more than 25
 _LARGEST = 2**63 - 1  # integer that NumPy and PyTorch count with
+
+_DENSITIES = 1e-9, 1e9  # [kg/m^3]; far beyond all materials, and near enough for squares of ratios
+_SOUND_SPEEDS = 1e-3, 1e6  # [m/s]
 
 
 def invalid(name: str, value: object, accepted: str, unit: str = "") -> ValueError:
@@ -55,6 +59,8 @@ def finite_number(name: str, value: object, unit: str = "") -> float:
         number = float(value)
     except OverflowError:  # an integer or a fraction, too large for a float
         number = math.inf
+    except Exception as error:  # of a class of the user's own
+        raise invalid(name, value, f"must be a real number{_in_unit(unit)}") from error
     if not math.isfinite(number):
         raise invalid(name, value, "must be finite", unit)
     return number
@@ -84,6 +90,20 @@ def number_between(name: str, value: object, least: float, most: float, unit: st
     return number
 
 
+def fluid(kind: str, density: object, sound_speed: object) -> tuple[float, float]:
+    """Return the density [kg/m^3] and sound speed [m/s] of a fluid, checked; `kind` is of what, for messages.
+
+    Raises:
+        ValueError: not a number, or out of range.
+    """
+    rho = positive(f"{kind}.density", density, "kg/m^3")
+    c = positive(f"{kind}.sound_speed", sound_speed, "m/s")
+    return (
+        number_between(f"{kind}.density", rho, *_DENSITIES, "kg/m^3"),
+        number_between(f"{kind}.sound_speed", c, *_SOUND_SPEEDS, "m/s"),
+    )
+
+
 def not_negative(name: str, value: object, unit: str = "") -> float:
     """Return `value` as a finite float >= 0.
 
@@ -109,14 +129,15 @@ def integer_at_least(name: str, value: object, minimum: int) -> int:
     return number
 
 
-def require_name(field: str, name: str) -> None:
+def require_name(field: str, name: object) -> None:
     """Check a name that becomes part of the names of files and of groups in them.
 
     Raises:
-        ValueError: other characters than letters, digits and _ . + -, dots alone, or more than 100 bytes.
+        ValueError: no text, other characters than letters, digits and _ . + -, dots alone, or more than 100
+            bytes.
     """
-    if not _NAME.fullmatch(name) or len(name.encode()) > _LONGEST_NAME:
-        accepted = "a name must consist of letters, digits and _ . + -, not of dots alone"
+    if not isinstance(name, str) or not _NAME.fullmatch(name) or len(name.encode()) > _LONGEST_NAME:
+        accepted = "a name must be text, consist of letters, digits and _ . + -, not of dots alone"
         raise invalid(field, name, f"{accepted}, and have at most {_LONGEST_NAME} bytes")
 
 
@@ -176,7 +197,7 @@ def members(name: str, value: object, kind: type) -> tuple[Any, ...]:
         raise invalid(name, value, accepted)
     try:
         entries: tuple[Any, ...] = tuple(value)  # type: ignore[arg-type]
-    except TypeError as error:
+    except Exception as error:  # of a class of the user's own, too
         raise invalid(name, value, accepted) from error
     for index, entry in enumerate(entries):
         require_kind(f"{name}[{index}]", entry, kind)
@@ -203,7 +224,11 @@ def integers(name: str, value: object, minimum: int, accepted: str) -> list[int]
         value = value.tolist()
     if isinstance(value, str | bytes) or not isinstance(value, Sequence):
         raise invalid(name, value, accepted)
-    return [integer_at_least(f"{name}[{place}]", entry, minimum) for place, entry in enumerate(value)]
+    try:
+        entries = list(value)
+    except Exception as error:  # of a class of the user's own
+        raise invalid(name, value, accepted) from error
+    return [integer_at_least(f"{name}[{place}]", entry, minimum) for place, entry in enumerate(entries)]
 
 
 def positive_integers(name: str, value: object, count: int) -> tuple[int, ...]:
@@ -351,13 +376,12 @@ def _entries(name: str, value: object, count: int, unit: str) -> tuple[float, ..
 
 
 def _tensor(name: str, value: object, accepted: str) -> torch.Tensor:
-    if not _holds_numbers(value):
-        raise invalid(name, value, accepted)
-    if isinstance(value, torch.Tensor):
-        return value.as_subclass(torch.Tensor)  # free of what a class of its own does
     try:
-        array = np.asarray(value)
-    except (ValueError, TypeError, RuntimeError) as error:
+        numeric = _holds_numbers(value)
+        if numeric and isinstance(value, torch.Tensor):
+            return value.as_subclass(torch.Tensor)  # free of what a class of its own does
+        array = np.asarray(value if numeric else None)
+    except Exception as error:  # of a class of the user's own, too
         raise invalid(name, value, accepted) from error
     if array.dtype.kind not in "iufc":
         raise invalid(name, value, accepted)
@@ -371,17 +395,25 @@ def _holds_numbers(value: object) -> bool:
     """Check that NumPy neither alters what it converts nor goes on for ever.
 
     It takes a boolean among numbers as 0 or 1, and drops masks. A list that holds itself twice keeps it busy
-    for ever.
+    for ever, of whatever class it is.
     """
     entries = [value]
     for _ in range(_DEEPEST):
         if not all(map(_is_plain, entries)):
             return False
-        lists = {id(entry): entry for entry in entries if isinstance(entry, list | tuple)}
+        lists = {id(entry): entry for entry in entries if _is_list(entry)}
         if not lists:
             return True
         entries = [entry for one in lists.values() for entry in one]
     return False
+
+
+def _is_list(value: object) -> TypeGuard[Iterable[Any]]:
+    """Check that NumPy goes through the entries of `value`: for that it needs to be of no class."""
+    kind = type(value)
+    if issubclass(kind, str | bytes | memoryview) or hasattr(kind, "__array__"):
+        return False
+    return hasattr(kind, "__getitem__") and hasattr(kind, "__len__")
 
 
 def _is_plain(value: object) -> bool:
@@ -414,6 +446,12 @@ class _Short(reprlib.Repr):
     def repr_int(self, value: int, level: int) -> str:
         bits = value.bit_length()
         return repr(value) if bits <= _SHOWN_BITS else f"integer of {bits} bits"
+
+    def repr_instance(self, value: Any, level: int) -> str:
+        with contextlib.suppress(Exception):  # of a class of the user's own
+            if isinstance(value, Sequence) and not isinstance(value, memoryview):
+                return self.repr_list(value, level)  # type: ignore[arg-type]
+        return super().repr_instance(value, level)
 
 
 def _shown(value: object) -> str:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import datetime
 import math
 import warnings
-from collections.abc import Iterator
+from collections import UserList, deque
+from collections.abc import Callable, Iterator, Sequence
 from decimal import Decimal
 from fractions import Fraction
 from typing import Any, NamedTuple
@@ -34,11 +35,52 @@ def deep(levels: int) -> list[Any]:
     return nested
 
 
-def holding_itself(times: int) -> list[Any]:
+class OwnList:
+    """What NumPy takes for a list though it is no `Sequence`."""
+
+    def __init__(self) -> None:
+        self.entries: list[Any] = []
+
+    def extend(self, entries: list[Any]) -> None:
+        self.entries.extend(entries)
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def __getitem__(self, index: int) -> Any:
+        return self.entries[index]
+
+
+class Broken(Sequence[Any]):
+    """A list whose entries cannot be read."""
+
+    def __len__(self) -> int:
+        return 3
+
+    def __getitem__(self, index: Any) -> Any:
+        raise KeyError(index)
+
+
+class BrokenArray:
+    """An array that has no numbers."""
+
+    def __array__(self, *_: Any, **__: Any) -> Any:
+        raise KeyError("numbers")
+
+
+def holding_itself(times: int, kind: Callable[[], Any] = list) -> Any:
     """A list whose entries are the list itself."""
-    loop: list[Any] = []
+    loop = kind()
     loop.extend([loop] * times)
     return loop
+
+
+def sharing(kind: Callable[[list[Any]], Any], levels: int = 15) -> Any:
+    """A list that holds one below it ten times, and so on: small in memory, large as text."""
+    value: Any = kind([1.0])
+    for _ in range(levels):
+        value = kind([value] * 10)
+    return value
 
 
 def quantised() -> torch.Tensor:
@@ -71,6 +113,13 @@ WRONG = [
     Wrong("a list of text", ["a", "b"]),
     Wrong("a list in itself", holding_itself(1), never=True),
     Wrong("a list twice in itself", holding_itself(2), never=True),  # which keeps NumPy busy for ever
+    *(
+        Wrong(f"a {kind.__name__} twice in itself", holding_itself(2, kind), never=True)
+        for kind in (UserList, deque, OwnList)
+    ),
+    Wrong("lists that share", sharing(UserList), never=True),
+    Wrong("a list that cannot be read", Broken(), never=True),
+    Wrong("an array that cannot be read", BrokenArray(), never=True),
     Wrong("a deep list", deep(100_000), never=True),
     Wrong("masked", np.ma.masked, never=True),
     Wrong("a masked number", np.ma.array(1.0, mask=True), never=True),

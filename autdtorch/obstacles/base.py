@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from numpy.typing import NDArray
 
-from autdtorch.validation import ArrayLike, Vector, boolean, invalid, not_negative, positive, real_tensor
+from autdtorch.validation import ArrayLike, Vector, boolean, fluid, invalid, not_negative, real_tensor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,12 +18,12 @@ class Obstacle(ABC):
     """A body in the way of sound: of a fluid material, or rigid. Unions are made by listing several.
 
     Attributes:
-        density: of the material [kg/m^3], > 0; None if rigid.
-        sound_speed: of the material [m/s], > 0; None if rigid.
+        density: of the material [kg/m^3], 1e-9 to 1e9; None if rigid.
+        sound_speed: of the material [m/s], 1e-3 to 1e6; None if rigid.
         rigid: True for walls that do not move.
 
     Raises:
-        ValueError: density or sound speed is not a finite number > 0; a material and rigid, or neither.
+        ValueError: density or sound speed is not a number in its range; a material and rigid, or neither.
     """
 
     density: float | None = None
@@ -44,8 +44,9 @@ class Obstacle(ABC):
         if self.density is None or self.sound_speed is None:
             missing = "density" if self.density is None else "sound_speed"
             raise invalid(f"{kind}.{missing}", None, "must have both density and sound_speed, or rigid=True")
-        object.__setattr__(self, "density", positive(f"{kind}.density", self.density, "kg/m^3"))
-        object.__setattr__(self, "sound_speed", positive(f"{kind}.sound_speed", self.sound_speed, "m/s"))
+        density, sound_speed = fluid(kind, self.density, self.sound_speed)
+        object.__setattr__(self, "density", density)
+        object.__setattr__(self, "sound_speed", sound_speed)
 
     @property
     @abstractmethod

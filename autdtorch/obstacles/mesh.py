@@ -16,6 +16,8 @@ from autdtorch.validation import Vector, finite_vector, invalid, path_of, positi
 
 _FORMATS = (".stl", ".obj", ".ply")
 
+_FARTHEST = 1e100  # of a vertex, in units of the file: volumes do not overflow
+
 
 @dataclass(frozen=True)
 class Mesh(Obstacle):
@@ -111,8 +113,9 @@ def _read(path: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     except (RuntimeError, ValueError, LookupError, OverflowError) as error:
         raise invalid("Mesh.path", path, f"must be a mesh file ({error})") from error
     whole = triangles.size > 0 and 0 <= triangles.min() <= triangles.max() < len(corners)
-    if not whole or triangles.shape[1] != 3 or not np.isfinite(corners).all():
-        raise invalid("Mesh.path", path, "must be a mesh file that holds triangles with finite vertices")
+    if not whole or triangles.shape[1] != 3 or not (np.abs(corners) <= _FARTHEST).all():
+        accepted = f"triangles with finite vertices, none beyond {_FARTHEST:g}"
+        raise invalid("Mesh.path", path, f"must be a mesh file that holds {accepted}")
     # STL repeats a vertex for every triangle at it.
     vertices, index = np.unique(corners + 0.0, axis=0, return_inverse=True)
     faces = index.reshape(-1)[triangles].astype(np.int64)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.lib.recfunctions import unstructured_to_structured
+from numpy.lib.recfunctions import structured_to_unstructured, unstructured_to_structured
 from numpy.typing import NDArray
 
 Triangles: TypeAlias = tuple[NDArray[np.float64], NDArray[np.int64]]
@@ -41,6 +41,8 @@ def read_obj(path: str) -> Triangles:
                     x, y, z = map(float, words[:3])
                     vertices.append([x, y, z])
                 elif kind == "f":
+                    if len(words) < 3:
+                        raise ValueError(f"a face of {len(words)} vertices; must be at least 3")
                     first, *others = (_index(word, len(vertices)) for word in words)
                     faces += [[first, *pair] for pair in itertools.pairwise(others)]
             except ValueError as error:
@@ -54,7 +56,8 @@ def read_ply(path: str) -> Triangles:
     Raises:
         LookupError: an unknown type, or no vertices or faces.
         OverflowError: a number is too large.
-        ValueError: no PLY file, faces other than triangles, or less data than it declares.
+        ValueError: no PLY file, faces other than triangles, indices that are no whole numbers, numbers that
+            are not of the type declared, counts below 0, or less data than is declared.
     """
     content = Path(path).read_bytes()
     if (head := _HEAD.match(content)) is None:
@@ -68,6 +71,8 @@ def read_ply(path: str) -> Triangles:
             raise ValueError("lists of other than three entries")
     vertex, face = tables["vertex"], tables["face"]
     corners = face["vertex_indices" if "vertex_indices" in face.dtype.names else "vertex_index"]
+    if not (np.isfinite(corners) & (corners == np.trunc(corners))).all():
+        raise ValueError("indices of vertices that are no whole numbers")
     return np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float64), corners.astype(np.int64)
 
 
@@ -91,6 +96,8 @@ def _elements(head: str) -> tuple[str, list[_Element]]:
             case ["format", kind, *_]:
                 order = _ORDERS.get(kind, "")
             case ["element", name, count]:
+                if int(count) < 0:
+                    raise ValueError(f"{count} elements {name!r}; must be at least 0")
                 columns.append((name, int(count), []))
             case ["property", "list", length, entry, name]:
                 columns[-1][2].append((name + _LENGTH, order + _CODES[length]))
@@ -111,7 +118,12 @@ def _binary(body: bytes, elements: list[_Element]) -> dict[str, Any]:
 def _text(body: bytes, elements: list[_Element]) -> dict[str, Any]:
     tables, numbers = {}, np.array(body.split(), np.float64)
     for name, count, dtype in elements:
-        width = sum(dtype[column].shape[0] if dtype[column].shape else 1 for column in dtype.names)
-        rows, numbers = numbers[: count * width], numbers[count * width :]
-        tables[name] = unstructured_to_structured(rows.reshape(count, width), dtype)
+        widths = [dtype[column].shape[0] if dtype[column].shape else 1 for column in dtype.names]
+        rows, numbers = numbers[: count * sum(widths)], numbers[count * sum(widths) :]
+        rows = rows.reshape(count, sum(widths))
+        with np.errstate(invalid="ignore"):  # what is no integer is refused below
+            tables[name] = unstructured_to_structured(rows, dtype)
+        integer = np.repeat([dtype[column].base.kind in "iu" for column in dtype.names], widths)
+        if (structured_to_unstructured(tables[name], np.float64) != rows)[:, integer].any():
+            raise ValueError(f"elements {name!r} with numbers that are not of the type declared")
     return tables

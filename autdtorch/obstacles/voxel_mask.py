@@ -70,8 +70,8 @@ class VoxelMask(Obstacle):
             path: .npy, or .npz that holds a single array.
             spacing: edge of a voxel [m], > 0.
             origin: corner of voxel (0, 0, 0) with the smallest coordinates (3,) [m].
-            density: of the material [kg/m^3], > 0; None if rigid.
-            sound_speed: of the material [m/s], > 0; None if rigid.
+            density: of the material [kg/m^3], 1e-9 to 1e9; None if rigid.
+            sound_speed: of the material [m/s], 1e-3 to 1e6; None if rigid.
             rigid: True for walls that do not move.
 
         Returns:

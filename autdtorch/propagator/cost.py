@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from autdtorch.fdtd.grid import MIN_CELLS_PER_WAVELENGTH, Extent, layer_cells
+from autdtorch.fdtd.grid import MAX_CELLS_PER_WAVELENGTH, MIN_CELLS_PER_WAVELENGTH, Extent, layer_cells
 from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.steady_state import fewest_periods
 from autdtorch.fdtd.stencil import tuned_stencil
@@ -60,7 +60,10 @@ class GridCost:
 
 def grid_cost(scene: Scene, extent: Extent, spacing: float) -> GridCost:
     """What a run takes on a grid of `spacing` [m] over an extent of a scene."""
-    spacing = min(spacing, scene.wavelength / MIN_CELLS_PER_WAVELENGTH)  # coarser grids are refused later
+    finest, coarsest = (
+        scene.wavelength / cells for cells in (MAX_CELLS_PER_WAVELENGTH, MIN_CELLS_PER_WAVELENGTH)
+    )
+    spacing = max(finest, min(spacing, coarsest))  # others are refused later
     kappa = scene.wavenumber * spacing
     interior = x, y, z = extent.interior(spacing)
     rim = layer_cells(kappa) + 1

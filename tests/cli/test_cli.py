@@ -119,6 +119,9 @@ WRONG = [
         ["method._target_=tabu.search", "modules=tabu"],
         r"method\._target_: 'tabu\.search'; .*No module named 'tabu'",
     ),
+    (["method._target_=.foo.gabs", "modules=.foo"], r"method\._target_: '\.foo\.gabs'; must be a module and"),
+    (["method._target_=gabs", "modules=''"], r"method\._target_: 'gabs'; must be a module and"),
+    (["method._target_='a b.gabs'", "modules='a b'"], r"method\._target_: 'a b\.gabs'; must be a module and"),
     (["method._target_=autdtorch"], r"method\._target_: 'autdtorch'; must be one of"),
     (["~method._target_"], "method: no _target_"),
     (
@@ -210,6 +213,28 @@ def test_an_error_of_ones_own_method_is_told_in_one_line(
     (tmp_path / "method" / "own.yaml").write_text(f"_target_: own.{name}\n", encoding="utf-8")
     assert run("--config-dir", str(tmp_path), "method=own", "modules=own") == status
     assert re.match(message, capsys.readouterr().err.splitlines()[-1])
+
+
+BAD_MODULES = {
+    "unfinished": ("def search(objective:\n", "SyntaxError: '\\(' was never closed"),
+    "divides": ("1 / 0\n", "ZeroDivisionError: division by zero"),
+    "long": ("raise ValueError('two\\nlines')\n", "ValueError: two lines"),
+    "ends": ("raise SystemExit(1)\n", "SystemExit: 1"),
+    "imports": ("import nothing_such\n", "ModuleNotFoundError: No module named 'nothing_such'"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_MODULES)
+def test_a_module_that_cannot_be_imported_is_told_in_one_line_with_the_reason(
+    name: str, run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content, reason = BAD_MODULES[name]
+    (tmp_path / f"{name}.py").write_text(content, encoding="utf-8")
+    assert run(f"method._target_={name}.search", f"modules={name}") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.match(
+        rf"autdtorch: method\._target_: '{name}\.search'; {name} cannot be imported \({reason}", line
+    )
 
 
 def test_the_version_is_ours(run: Run, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,6 +4,7 @@ Values of a wrong kind are in test_any_input.py; these are out of range, or do n
 """
 
 import math
+from collections import UserList, deque
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from autdtorch.drive import drive_from_phases, focus_phases, normalise, validate
 from autdtorch.freespace import green
 from autdtorch.geometry import Plane, circle_points, plane_basis
 from autdtorch.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
+from autdtorch.propagator import make_propagator
 from autdtorch.scene import Medium, Scene
 
 NAN, INF = math.nan, math.inf
@@ -298,6 +300,10 @@ MESHES = {
     "twice.obj": (ONE_TRIANGLE + "f 1 2 3\n", "3 of its 3 edges do not join"),
     "no_vertex.obj": ("v 0 0 0\nv 1 0 0\nf 1 2 7\n", "must be a mesh file that holds triangles"),
     "empty.obj": ("", "must be a mesh file"),
+    "far.obj": (
+        "v 0 0 0\nv 1e200 0 0\nv 0 1e200 0\nv 0 0 1e200\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n",
+        "must be a mesh file that holds triangles with finite vertices, none beyond 1e+100",
+    ),
     "text.stl": ("hello", "must be a mesh file"),
     "text.ply": ("hello", "must be a mesh file"),
 }
@@ -320,3 +326,72 @@ def test_what_is_no_mask_file_is_refused(tmp_path):
     path.write_bytes(b"PK\x03\x04 and then nothing")
     with pytest.raises(ValueError, match=r"VoxelMask\.path: .* must be a \.npy or \.npz file"):
         VoxelMask.load(path, 1e-3, rigid=True)
+
+
+@pytest.mark.parametrize("kind", [deque, UserList, tuple])
+def test_a_list_of_any_class_is_a_list(kind):
+    assert circle(center=kind([80e-3, 50e-3, 50e-3])).equal(circle())
+
+
+FAR = 1e200
+ABSURD = {
+    "domain": (
+        lambda: scene(domain=((-FAR,) * 3, (FAR,) * 3)),
+        "Scene.domain: (-1e+200, -1e+200, -1e+200) m; every coordinate must be in -1e+06 to 1e+06",
+    ),
+    "control point": (
+        lambda: scene(control_points=[[FAR, 0, 0]]),
+        "Scene.control_points: (1e+200, 0.0, 0.0) m; every coordinate",
+    ),
+    "transducer": (
+        lambda: scene(array=grid(pitch=FAR)),
+        "Scene.array.positions: (0.001, -1.5e+200, -1.5e+200) m; every coordinate",
+    ),
+    "plane": (
+        lambda: scene(observation_plane=plane(size=(FAR, 0.1))),
+        "Scene.observation_plane corner: (0.08, ",
+    ),
+    "large box": (
+        lambda: scene(obstacles=[box(center=(FAR, 0, 0), size=(FAR,) * 3)]),
+        "Scene.obstacles[0] corner: (5e+199, -5e+199, -5e+199) m; every coordinate",
+    ),
+    "box beyond floats": (
+        lambda: scene(obstacles=[box(center=(1e308, 0, 0), size=(1.7e308,) * 3)]),
+        "Scene.obstacles[0] corner: (",
+    ),
+    "far sphere": (
+        lambda: scene(obstacles=[Sphere((0, FAR, 0), 1.0, rigid=True)]),
+        "Scene.obstacles[0] corner: (-1.0, 1e+200, -1.0) m; every coordinate",
+    ),
+    "fast medium": (
+        lambda: medium(sound_speed=FAR),
+        "Medium.sound_speed: 1e+200 m/s; must be in 0.001 to 1e+06",
+    ),
+    "slow medium": (lambda: medium(sound_speed=1 / FAR), "Medium.sound_speed: 1e-200 m/s; must be in 0.001"),
+    "fast box": (lambda: box(sound_speed=FAR), "Box.sound_speed: 1e+200 m/s; must be in 0.001 to 1e+06"),
+    "heavy medium": (lambda: medium(density=FAR), "Medium.density: 1e+200 kg/m^3; must be in 1e-09 to 1e+09"),
+    "light box": (lambda: box(density=1 / FAR), "Box.density: 1e-200 kg/m^3; must be in 1e-09 to 1e+09"),
+    "high frequency": (lambda: scene(frequency=FAR), "Scene.frequency: 1e+200 Hz; must be in 0.001 to 1e+12"),
+    "low frequency": (lambda: scene(frequency=1 / FAR), "Scene.frequency: 1e-200 Hz; must be in 0.001 to"),
+    "fine cells": (
+        lambda: make_propagator(scene(obstacles=[box()]), spacing=1 / FAR),
+        "spacing: 1e-200 m; must be at least 1.7e-05 m",
+    ),
+}
+
+
+@pytest.mark.parametrize(("call", "message"), ABSURD.values(), ids=ABSURD.keys())
+def test_what_would_overflow_later_is_refused_where_it_comes_in(call, message):
+    with pytest.raises(ValueError) as caught:  # noqa: PT011  (compared as plain text below)
+        call()
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("method", ["box", "full"])
+def test_the_largest_scene_is_refused_for_its_memory(method):
+    far = 1e6
+    wall = box(center=(0, 0, far / 2), size=(far, far, far - 2))
+    wide = scene(domain=((-far,) * 3, (far,) * 3), obstacles=[wall])
+    with pytest.raises(ValueError, match=r"^spacing: 0\.001 m; (needs about|gives) "):
+        make_propagator(wide, method)

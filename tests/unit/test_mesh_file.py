@@ -72,3 +72,39 @@ def test_ply(tmp_path: Path, kind: str, corners: str) -> None:
     assert (vertices.dtype, faces.dtype) == (np.float64, np.int64)
     assert vertices.tolist() == [list(corner) for corner in CORNERS]
     assert faces.tolist() == [list(face) for face in FACES]
+
+
+@pytest.mark.parametrize("face", ["f", "f 1", "f 1 2"])
+def test_a_face_of_fewer_than_three_vertices_is_refused_with_its_line(tmp_path: Path, face: str) -> None:
+    (tmp_path / "body.obj").write_text(f"{OBJ['plain']}{face}\n", encoding="utf-8")
+    with pytest.raises(ValueError, match=r"line 12: .* vertices; must be at least 3"):
+        read_obj(str(tmp_path / "body.obj"))
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
+def test_a_count_below_zero_is_refused(tmp_path: Path, kind: str) -> None:
+    (tmp_path / "body.ply").write_bytes(ply(kind).replace(b"vertex 4", b"vertex -1"))
+    with pytest.raises(ValueError, match="-1 elements 'vertex'; must be at least 0"):
+        read_ply(str(tmp_path / "body.ply"))
+
+
+@pytest.mark.parametrize(("kind", "declared"), [("ascii", "int"), ("ascii", "float"), ("binary", "float")])
+@pytest.mark.parametrize("index", ["nan", "inf", "2.5"])
+def test_an_index_that_is_no_whole_number_is_refused(
+    tmp_path: Path, kind: str, declared: str, index: str
+) -> None:
+    head = f"""ply
+format {kind if kind == "ascii" else "binary_little_endian"} 1.0
+element vertex 3
+property float x
+property float y
+property float z
+element face 1
+property list uchar {declared} vertex_index
+end_header
+"""
+    text = f"0 0 0\n1 0 0\n0 1 0\n3 0 1 {index}\n".encode()
+    numbers = struct.pack("<9fB3f", 0, 0, 0, 1, 0, 0, 0, 1, 0, 3, 0, 1, float(index))
+    (tmp_path / "body.ply").write_bytes(head.encode() + (text if kind == "ascii" else numbers))
+    with pytest.raises(ValueError, match=r"no whole numbers|not of the type declared"):
+        read_ply(str(tmp_path / "body.ply"))

@@ -216,6 +216,20 @@ def test_an_unreadable_file_is_computed_again(
         ({"scenes": {}}, "scenes: empty"),
         ({"methods": {}}, "methods: empty"),
         ({"scenes": {"a/b": scene()}}, r"scenes: 'a/b'; .*letters, digits"),
+        ({"scenes": {3: scene()}}, "scenes: 3; a name must be text"),
+        ({"scenes": [scene()]}, "scenes: .*; must be a mapping of names to scenes"),
+        ({"scenes": {"a": None}}, r"scenes\.a: None; must be a Scene"),
+        ({"methods": {3: gabs}}, "methods: 3; a name must be text"),
+        ({"methods": gabs}, "methods: .*; must be a mapping of names to methods"),
+        ({"methods": {"m": None}}, r"methods\.m: None; must be a function of an objective"),
+        ({"methods": {"m": lambda: None}}, r"methods\.m: .*; must be a function .*too many positional"),
+        ({"methods": {"m": dict}}, r"methods\.m: .*; must be a function of an objective"),
+        ({"solver": [1]}, r"solver: \(1,\); must be a mapping of arguments"),
+        ({"solver": {"x": 1}}, "solver: unknown key 'x'; allowed keys: method, spacing"),
+        ({"solver": {1: 1}}, "solver: unknown key 1; allowed keys"),
+        ({"config": 3}, "config: 3; must be text"),
+        ({"folder": 3}, "folder: 3; must be the path of a folder"),
+        ({"folder": ""}, "folder: ''; must be the path of a folder"),
         ({"trials": 0}, "trials: 0; must be an integer >= 1"),
         ({"trials": 1.5}, r"trials: 1\.5; must be an integer >= 1"),
         ({"trials": {"gabs": -1}}, r"trials\.gabs: -1"),
@@ -238,8 +252,9 @@ def test_settings_are_checked_before_anything_is_simulated(
 
     monkeypatch.setattr(autdtorch.study, "_run_scene", refuse)
     arguments = {"scenes": {"a": scene()}, "methods": METHODS} | changes
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=message) as caught:
         run_study(**arguments)
+    assert "\n" not in str(caught.value)
 
 
 def test_another_study_is_kept_and_a_refused_one_moves_nothing(

@@ -2,11 +2,13 @@
 
 import io
 import pickle
+import re
 import struct
 import time
 import tracemalloc
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +26,20 @@ medium: {density: 1.293, sound_speed: 340.0}
 array: {type: positions, positions: [[0, 0, 0], [0, 10e-3, 0]], normals: [1, 0, 0]}
 control_points: {type: points, positions: [[80e-3, 0, 0]]}
 """
+
+
+def scene() -> dict[Any, Any]:
+    container: dict[Any, Any] = OmegaConf.to_container(OmegaConf.create(SCENE))
+    return container
+
+
+def given(kind: str, mapping: dict[Any, Any], folder: Path) -> tuple[Any, str]:
+    """A scene as a file, a mapping or a node, and what messages call it."""
+    if kind == "file":
+        path = folder / "sent.yaml"
+        OmegaConf.save(mapping, path)
+        return path, str(path)
+    return (OmegaConf.create(mapping) if kind == "node" else mapping), "scene mapping"
 
 
 def levels(line: str) -> str:
@@ -65,7 +81,13 @@ def refused(folder: Path, text: str) -> str:
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ValueError, match=r"sent\.yaml") as caught:
         load_scene(path)
-    return str(caught.value)
+    return one_line(caught.value)
+
+
+def one_line(error: Exception) -> str:
+    text = str(error)
+    assert "\n" not in text
+    return text
 
 
 def shared(value: object) -> object:
@@ -83,8 +105,45 @@ def itself() -> list[object]:
 
 @pytest.mark.parametrize("value", [shared("lol"), itself()], ids=["shared", "itself"])
 def test_a_mapping_that_expands_is_refused(value: object) -> None:
-    with pytest.raises(ValueError, match=r"scene mapping: domain\.\d"):
-        load_scene({**OmegaConf.to_container(OmegaConf.create(SCENE)), "domain": value})
+    with pytest.raises(ValueError, match=r"scene mapping: domain\.\d") as caught:
+        load_scene({**scene(), "domain": value})
+    one_line(caught.value)
+
+
+UNKNOWN = {
+    "mandatory": ("???", "Missing mandatory value: array"),
+    "itself": ("${array}", "Recursive interpolation detected"),
+    "in itself": ("${array.type}", "RecursionError"),
+    "nowhere": ("${x}", "Interpolation key 'x' not found"),
+    "nowhere in a section": ("${medium.a}", "Interpolation key 'medium.a' not found"),
+}
+
+
+@pytest.mark.parametrize("kind", ["file", "mapping", "node"])
+@pytest.mark.parametrize(("value", "reason"), UNKNOWN.values(), ids=UNKNOWN.keys())
+def test_a_value_that_is_not_there_is_told_in_a_line_with_its_key(
+    tmp_path: Path, kind: str, value: str, reason: str
+) -> None:
+    source, where = given(kind, scene() | {"array": value}, tmp_path)
+    with pytest.raises(ValueError, match=re.escape(f"{where}: array: {reason}")) as caught:
+        load_scene(source)
+    one_line(caught.value)
+
+
+OBJECTS = {
+    "an array": ({"array": np.zeros(3)}, "array: Value 'ndarray'"),
+    "an object": ({"array": object()}, "array: Value 'object'"),
+    "an array in a list": ({"domain": [[0, 0, 0], np.ones(3)]}, r"domain[1]: Value 'ndarray'"),
+    "an object as a key": ({object(): 1}, "Incompatible key type 'object'"),
+    "a tuple as a key": ({("array",): 1}, "unhashable type"),
+}
+
+
+@pytest.mark.parametrize(("changes", "reason"), OBJECTS.values(), ids=OBJECTS.keys())
+def test_a_mapping_that_holds_objects_is_refused_in_a_line(changes: dict[Any, Any], reason: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(f"scene mapping: {reason}")) as caught:
+        load_scene(scene() | changes)
+    one_line(caught.value)
 
 
 def test_aliases_of_moderate_size_are_values() -> None:
@@ -115,16 +174,10 @@ def test_an_interpolation_is_a_whole_key_without_resolver(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, text: str
 ) -> None:
     monkeypatch.setenv("SECRET", "hunter2")
-    given = {**OmegaConf.to_container(OmegaConf.create(SCENE)), "name": text, "array": {"path": "x"}}
-    source: object = given
-    if kind == "file":
-        source = tmp_path / "sent.yaml"
-        OmegaConf.save(given, source)
-    elif kind == "node":
-        source = OmegaConf.create(given)
+    source, _ = given(kind, scene() | {"name": text, "array": {"path": "x"}}, tmp_path)
     with pytest.raises(ValueError, match=": name: ") as caught:
         load_scene(source)
-    assert "hunter2" not in str(caught.value)
+    assert "hunter2" not in one_line(caught.value)
 
 
 @pytest.mark.parametrize("tag", ["!!python/object/apply:pathlib.Path", "!!python/name:os.system", "!mine"])
@@ -172,6 +225,9 @@ ARRAYS = {
     "a header that is code": npy("__import__('pathlib').Path('canary').touch()"),
     "a header that does not end": npy("(" * 900),
     "negative": npy(declared("-1,"), b"\x01"),
+    "a type of nothing": npy("{'descr': (), 'fortran_order': False, 'shape': (1,), }\n", b"\x01"),
+    "keys of two kinds": npy("{'descr': '|b1', 1: False, 'shape': (1,), }\n", b"\x01"),
+    "a boolean as a length": npy(declared("True,"), b"\x01"),
 }
 
 
@@ -185,11 +241,13 @@ def test_arrays_in_files_are_checked_before_they_are_allocated(
     tracemalloc.start()
     try:
         for load, name in ((load_array, "array.npz"), (load_drive, "array.npz")):
-            with pytest.raises(ValueError, match=name):
+            with pytest.raises(ValueError, match=name) as caught:
                 load(name)
+            one_line(caught.value)
         for name in ("mask.npy", "array.npz"):
-            with pytest.raises(ValueError, match=name):
+            with pytest.raises(ValueError, match=rf"VoxelMask\.path: .*{name}") as caught:
                 VoxelMask.load(name, 1e-3, rigid=True)
+            one_line(caught.value)
         assert tracemalloc.get_traced_memory()[1] < 5e6
     finally:
         tracemalloc.stop()
@@ -221,6 +279,11 @@ MESHES = {
     "ply of quads": HEAD.format(kind="ascii", vertices=4, faces=4)
     + f"{CORNERS}3 0 2 1\n3 0 1 3\n3 0 3 2\n4 1 2 3 0\n",
     "ply of nothing": "ply\nformat ascii 1.0\nend_header\n",
+    "ply of less than nothing": HEAD.format(kind="binary_little_endian", vertices=-1, faces=0),
+    "ply of halves": HEAD.format(kind="ascii", vertices=4, faces=4)
+    + f"{CORNERS}3 0 2.5 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n",
+    "ply of no numbers": HEAD.format(kind="ascii", vertices=4, faces=4)
+    + f"{CORNERS}3 0 nan 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n",
     "obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1\n",
     "obj beyond integers": f"v 0 0 0\nf 1 1 {10**30}\n",
     "stl": "\0" * 80 + "\x7f" * 4 + "\0" * 50,
@@ -232,5 +295,6 @@ def test_a_mesh_that_declares_what_it_does_not_hold_is_refused(tmp_path: Path, n
     """libigl's readers end the process, or take all memory, on some of these."""
     path = tmp_path / f"sent.{name.partition(' ')[0]}"
     path.write_bytes(MESHES[name].encode("ascii"))
-    with pytest.raises(ValueError, match=r"Mesh\.path: .*sent"):
+    with pytest.raises(ValueError, match=r"Mesh\.path: .*sent") as caught:
         Mesh(path, rigid=True)
+    one_line(caught.value)

@@ -1,0 +1,99 @@
+"""What the watcher of a sweep's jobs makes of `squeue`: its answers, and that there are none."""
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("submitit")
+
+from autdtorch import slurm
+from autdtorch.slurm import QueueWatcher
+
+Squeue = Callable[[str], None]
+
+
+@pytest.fixture
+def squeue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Squeue:
+    """Puts a shell script in the place of `squeue`; there is none before."""
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(slurm, "_PAUSE", 0.0)
+
+    def install(script: str) -> None:
+        (tmp_path / "squeue").write_text(f"#!/bin/sh\n{script}\n", encoding="utf-8")
+        (tmp_path / "squeue").chmod(0o755)
+
+    return install
+
+
+@pytest.fixture
+def watcher() -> QueueWatcher:
+    watcher = QueueWatcher("logs/%j")
+    watcher.register_job("7_0")
+    return watcher
+
+
+def answering(*rows: tuple[str, str, str]) -> str:
+    """A script that fills each row into the format that it is given, as `squeue` does."""
+    lines = ['for format; do case "$format" in --format=*) format=${format#--format=};; esac; done']
+    for row in rows:
+        lines.append("line=$format")
+        for field, value in zip(("%F", "%T", "%r"), row, strict=True):
+            lines.append(f'line="${{line%%{field}*}}{value}${{line#*{field}}}"')
+        lines.append('echo "$line"')
+    return "\n".join(lines)
+
+
+def test_a_job_without_a_reason_is_in_the_queue(squeue: Squeue, watcher: QueueWatcher) -> None:
+    squeue(answering(("7", "RUNNING", ""), ("8", "PENDING", "Priority")))
+    assert not watcher.is_done("7_0")
+    squeue(answering(("8", "PENDING", "")))
+    assert watcher.is_done("7_0")
+
+
+def test_why_jobs_wait_is_told_with_all_words_of_the_reason(
+    squeue: Squeue, watcher: QueueWatcher, caplog: pytest.LogCaptureFixture
+) -> None:
+    squeue(answering(("7", "PENDING", "ReqNodeNotAvail, Reserved | for maintenance")))
+    with caplog.at_level(logging.INFO):
+        assert not watcher.is_done("7_0")
+    assert caplog.messages == ["jobs wait in the queue: ReqNodeNotAvail, Reserved | for maintenance"]
+
+
+FAILURES = {
+    "missing": (None, "No such file or directory: 'squeue'"),
+    "refused": (
+        "echo 'slurm_load_jobs error:' >&2\necho 'no controller' >&2\nexit 1",
+        "error: no controller",
+    ),
+}
+
+
+@pytest.mark.parametrize(("script", "reason"), FAILURES.values(), ids=FAILURES.keys())
+def test_a_squeue_that_fails_for_good_ends_the_wait_in_a_line_that_says_what_to_do(
+    squeue: Squeue,
+    watcher: QueueWatcher,
+    caplog: pytest.LogCaptureFixture,
+    script: str | None,
+    reason: str,
+) -> None:
+    if script is not None:
+        squeue(script)
+    with caplog.at_level(logging.INFO):
+        for _ in range(slurm._MOST_FAILURES - 1):
+            assert not watcher.is_done("7_0")
+    (told,) = caplog.messages
+    assert reason in told
+    with pytest.raises(OSError, match=rf"{reason}.* jobs 7 may still run; .* the same command") as caught:
+        watcher.is_done("7_0")
+    assert "\n" not in str(caught.value) + told
+
+
+def test_failures_are_counted_anew_after_an_answer(squeue: Squeue, watcher: QueueWatcher) -> None:
+    for _ in range(2):
+        squeue("exit 1")
+        for _ in range(slurm._MOST_FAILURES - 1):
+            assert not watcher.is_done("7_0")
+        squeue(answering(("7", "RUNNING", "None")))
+        assert not watcher.is_done("7_0")
