@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numbers
-from collections.abc import Sequence, Sized
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -238,7 +238,7 @@ def trial_seeds(seed: int, trials: Trials) -> list[int]:
         chosen = list(range(count))
     else:
         accepted = "must be an integer >= 1, or trial numbers, each once"
-        if isinstance(trials, Sized):
+        if isinstance(trials, Sequence):
             require_memory("trials", f"{len(trials)} numbers", TRIAL_BYTES * len(trials))
         chosen = integers("trials", trials, 0, accepted)
         if not chosen or len(set(chosen)) < len(chosen):
