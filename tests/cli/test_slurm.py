@@ -16,7 +16,6 @@ from one_node_slurm import missing_programs, one_node_slurm
 
 from autdtorch.cli import CONFIGS
 from autdtorch.results import load_results
-from autdtorch.slurm import QueueWatcher
 
 Run = Callable[..., int]
 
@@ -108,20 +107,3 @@ def test_a_job_may_use_the_cores_that_it_asks_for(slurm: dict[str, str], tmp_pat
     submit = ["sbatch", "--wait", f"--output={output}", *asked]
     subprocess.run(submit, input=script, env=slurm, text=True, check=True)
     assert output.read_text(encoding="utf-8").split() == [str(cores), str(cores)]
-
-
-def test_jobs_have_ended_when_slurm_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    squeue = tmp_path / "squeue"
-    squeue.touch(mode=0o755)
-    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
-    monkeypatch.setattr("autdtorch.slurm._PAUSE", 0.0)
-    watcher = QueueWatcher("multirun/.submitit/%j")
-    watcher.register_job("7_0")
-    watcher.register_job("7_1")
-    for answer, ended in (
-        ("echo '7 PENDING Resources\n8 RUNNING None'", False),
-        ("exit 1", False),  # its controller does not answer
-        ("echo '8 RUNNING None'", True),
-    ):
-        squeue.write_text(f"#!/bin/sh\n{answer}\n", encoding="utf-8")
-        assert watcher.is_done("7_0") is ended

@@ -76,7 +76,9 @@ def test_every_trial_of_every_method_has_its_figures(scenes: dict[str, Scene], t
             shown = field[method.shown_trial].reshape(10, 8)
             torch.testing.assert_close(method.plane_pressure, shown, rtol=1e-13, atol=0)
             loud = field.abs() >= method.metrics.mean[:, None] / 2**0.5
-            torch.testing.assert_close(method.metrics.area, loud.sum(dim=1) * 4e-6 / 3, rtol=1e-13, atol=0)
+            torch.testing.assert_close(
+                method.metrics.area, loud.sum(dim=1).double() * 4e-6 / 3, rtol=1e-13, atol=0
+            )
     assert len((tmp_path / TRIALS_FILE).read_text(encoding="utf-8").splitlines()) == 2 * 4
 
 
