@@ -30,6 +30,9 @@ _VARYING_BYTES, _ELEMENT_BYTES, _MOST_ELEMENTS = 2_000.0, 20_500.0, 4096
 """Memory [bytes] of a cell that is not of uniform air, and of an element of the grid while its surface is
 measured; so many are at a time."""
 
+_COLUMN_BYTES = 8_000.0
+"""Memory [bytes] of an element that a surface goes through in a boundary layer."""
+
 _ELEMENTS = 1.4
 """Elements that are measured for each that a surface goes through: some are only near it."""
 
@@ -37,7 +40,7 @@ _BESIDE_RIGID, _BESIDE_FLUID, _SHARE_INSIDE = 1.5, 2.0, 0.5
 """Cells that are not of uniform air for each area of a cell of a surface, and share of such cells in the
 cuboid around an obstacle of another sound speed."""
 
-_VARYING_STEPS, _COLUMN_STEPS = 35.0, 280.0
+_VARYING_STEPS, _COLUMN_STEPS = 35.0, 250.0
 """Time of a step of a varying cell, and of one where a surface goes through a boundary layer, in steps of a
 cell."""
 
@@ -150,6 +153,7 @@ class Workload:
         run += self.kept * (16 * phasors_kept(self.kept) + 48 * block)
         judged = 24 * self.judged * self.kept
         lasting = _CELL_BYTES * self.cells + _VARYING_BYTES * self.matter.varying
+        lasting += _COLUMN_BYTES * self.matter.columns
         measured = min(_ELEMENTS * self.matter.cut / len(self.grids), _MOST_ELEMENTS)
         return lasting + max(_ELEMENT_BYTES * measured, judged + min(runs, self._at_once(kernel)) * run)
 
