@@ -28,7 +28,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 import autdtorch
 from autdtorch.config_files import CONFIGS, register
-from autdtorch.method_section import TARGET, Method, load_method, parameters, require_known
+from autdtorch.method_section import TARGET, Method, load_method, parameters
+from autdtorch.validation import require_known
 from autdtorch.yaml_file import plain
 
 if TYPE_CHECKING:

@@ -43,8 +43,7 @@ def row_of(line: bytes, key: str = "") -> dict[str, Any]:
     """
     if not _is_whole(line, key):
         raise ValueError(_WRONG_CHECKSUM)
-    row: dict[str, Any] = json.loads(_body(line) + b"}")
-    return row
+    return _row(line)
 
 
 class JsonLines:
@@ -79,7 +78,7 @@ class JsonLines:
         for number, line in enumerate(lines, first):
             reason = _WRONG_CHECKSUM if number < first + len(lines) - 1 else _BROKE_OFF
             for whole, part in _parts(line, key):
-                refusal = _refusal(use, part, key) if whole else reason
+                refusal = _refusal(use, part) if whole else reason
                 if refusal is None:
                     good.append(part)
                 else:
@@ -154,15 +153,20 @@ def _parts(line: bytes, key: str) -> Iterator[tuple[bool, bytes]]:
             yield are_whole, part
 
 
-def _refusal(use: Callable[[dict[str, Any]], None], line: bytes, key: str) -> str | None:
+def _refusal(use: Callable[[dict[str, Any]], None], whole: bytes) -> str | None:
     """Give a row to its reader; returns why that refused it, or None."""
     try:
-        use(row_of(line, key))
+        use(_row(whole))
     except KeyError as error:
         return f"it has no {error}"
     except _DAMAGE as error:
         return str(error)
     return None
+
+
+def _row(whole: bytes) -> dict[str, Any]:
+    row: dict[str, Any] = json.loads(_body(whole) + b"}")
+    return row
 
 
 def _body(line: bytes) -> bytes:

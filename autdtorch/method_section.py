@@ -13,6 +13,7 @@ from typing import Any, TypeAlias, cast
 
 import autdtorch
 from autdtorch.optim import METHOD_LABELS
+from autdtorch.validation import require_known
 
 Method: TypeAlias = "functools.partial[Any]"
 
@@ -83,14 +84,3 @@ def _imported(where: str, target: object, module: str) -> ModuleType:
 def parameters(function: Callable[..., Any], but: tuple[str, ...]) -> tuple[str, ...]:
     """Names of the function's parameters, without those in `but`."""
     return tuple(name for name in inspect.signature(function).parameters if name not in but)
-
-
-def require_known(where: str, given: Mapping[str, Any], allowed: tuple[str, ...]) -> None:
-    """Refuse keys that are not allowed.
-
-    Raises:
-        ValueError: names the first such key.
-    """
-    for key in given:
-        if key not in allowed:
-            raise ValueError(f"{where}: unknown key {key!r}; allowed keys: {', '.join(allowed)}")

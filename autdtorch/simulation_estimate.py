@@ -19,7 +19,7 @@ from autdtorch.medium import Medium
 from autdtorch.memory import available_memory
 from autdtorch.propagator import SIMULATED
 from autdtorch.propagator.auto import method_for
-from autdtorch.propagator.cost import grid_cost
+from autdtorch.propagator.cost import grid_cost, most_runs
 from autdtorch.propagator.stepper import KERNELS, make_kernel, precision_of, relative_tolerance
 from autdtorch.propagator.workload import Workload, memory_for
 from autdtorch.scene import Scene
@@ -106,7 +106,7 @@ def estimate(
     stepper = make_kernel(kernel)
     # a multiple: what is symmetric on the one grid is mostly so on the other
     pilot = spacing * max(1, math.floor(pilot_spacing(scene) / spacing))
-    runs = min(len(scene.control_points), len(scene.array))
+    runs = most_runs(scene)
     if memory_for(scene, method, pilot, tolerance, precision, stepper) < available_memory():
         runs = SIMULATED[method](scene, pilot, tolerance, stepper, precision, 1, None, None).planned_runs
     workload = Workload.of(scene, method, spacing, tolerance)

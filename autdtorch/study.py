@@ -31,6 +31,7 @@ from autdtorch.validation import (
     path_of,
     positive,
     require_kind,
+    require_known,
     require_name,
 )
 
@@ -126,9 +127,7 @@ def _check_kinds(scenes: object, methods: object, solver: object, config: object
         if not isinstance(solver, Mapping):
             raise invalid("solver", solver, "must be a mapping of arguments of make_propagator")
         _, *allowed = inspect.signature(make_propagator).parameters  # all but the scene
-        for key in solver:
-            if key not in allowed:
-                raise ValueError(f"solver: unknown key {key!r}; allowed keys: {', '.join(allowed)}")
+        require_known("solver", solver, allowed)
     if not isinstance(config, str):
         raise invalid("config", config, "must be text")
 

@@ -12,7 +12,7 @@ import numbers
 import os
 import re
 import reprlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias, TypeGuard
 
@@ -173,6 +173,17 @@ def require_one_of(name: str, value: object, accepted: Iterable[str]) -> None:
     accepted = tuple(accepted)
     if not isinstance(value, str) or value not in accepted:
         raise invalid(name, value, f"must be one of {', '.join(accepted)}")
+
+
+def require_known(where: str, given: Iterable[Any], allowed: Collection[str]) -> None:
+    """Refuse keys that are not allowed.
+
+    Raises:
+        ValueError: names the first such key.
+    """
+    for key in given:
+        if key not in allowed:
+            raise ValueError(f"{where}: unknown key {key!r}; allowed keys: {', '.join(allowed)}")
 
 
 def require_kind(name: str, value: object, kind: type) -> None:

@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from autdtorch.fdtd.grid import FAIR_CELLS_PER_WAVELENGTH
+from autdtorch.fdtd.grid import FAIR_CELLS_PER_WAVELENGTH, speeds_of
 from autdtorch.scene import Scene
 
 RATIO = 1.5
@@ -22,9 +22,7 @@ _PILOT_CELLS = 6.0
 
 def coarsest_spacing(scene: Scene) -> float:
     """Largest spacing [m] with a fair number of cells per wavelength, in the air and in every obstacle."""
-    speeds = [scene.medium.sound_speed]
-    speeds += [obstacle.sound_speed for obstacle in scene.obstacles if obstacle.sound_speed is not None]
-    return min(speeds) / scene.frequency / FAIR_CELLS_PER_WAVELENGTH
+    return min(speeds_of(scene).values()) / scene.frequency / FAIR_CELLS_PER_WAVELENGTH
 
 
 def pilot_spacing(scene: Scene) -> float:

@@ -182,9 +182,8 @@ def windows_of_run(
         both[:steps] = both[steps:]
         both[steps:] = recorded
         starts = range(-(-(first + 1) // shift) * shift - steps, first + 1, shift)
-        windows = [(start, both[start - first + steps :][:steps]) for start in starts]
-        phasors = [(start, _turned(window, start, periods)) for start, window in windows]
-        yield (block + 1) * periods, phasors
+        windows = ((start, both[start - first + steps :][:steps]) for start in starts)
+        yield (block + 1) * periods, [(start, _turned(window, start, periods)) for start, window in windows]
 
 
 def _turned(window: torch.Tensor, start: int, periods: int) -> Phasors:

@@ -147,22 +147,21 @@ class Ledger:
         self._evaluations = torch.zeros(trials, dtype=torch.int64, device="cpu")
         self._scores: list[torch.Tensor] = []
 
-    def require_memory(self, field: str, value: object, evaluations: float, at_once: float = 1.0) -> None:
-        """Refuse an argument that leads to more evaluations than there is memory for.
+    def require_memory(self, evaluations: float, at_once: float = 1.0, /, **counts: int) -> None:
+        """Refuse counts that lead to more evaluations than there is memory for.
 
         Args:
-            field: name of the argument.
-            value: its value.
             evaluations: of each trial.
             at_once: of these in one call of the objective.
+            **counts: arguments that decide, by name; of equal ones the first is blamed.
 
         Raises:
-            ValueError: names the field.
+            ValueError: names the largest of the counts.
         """
-        numbers = _SCORE_NUMBERS * evaluations + at_once * (
-            4 * self.transducers + 2 * self._pressure.shape[1]
-        )
-        require_memory(field, value, 8 * len(self._best) * numbers)
+        field = max(counts, key=counts.__getitem__)
+        called = at_once * (4 * self.transducers + 2 * self._pressure.shape[1])
+        needed = 8 * len(self._best) * (_SCORE_NUMBERS * evaluations + called)
+        require_memory(field, counts[field], needed)
 
     def evaluate(self, drive: torch.Tensor, trials: torch.Tensor | None = None) -> torch.Tensor:
         """Scores (T, B), float64, of drives (T, B, M): `observe`, where only the score counts."""

@@ -78,7 +78,7 @@ def bayes_opt(
     if integer_at_least("fixed_transducer", fixed_transducer, 0) >= transducers:
         raise invalid("fixed_transducer", fixed_transducer, f"must be an integer from 0 to {transducers - 1}")
     # each trial's process holds a matrix of all pairs of evaluations
-    ledger.require_memory("evaluations", evaluations, float(evaluations) ** 2 / 2)
+    ledger.require_memory(float(evaluations) ** 2 / 2, evaluations=evaluations)
 
     from autdtorch.optim.bayes_trial import BayesTrial, Settings  # loads Numba
 

@@ -59,8 +59,7 @@ def gabs(
     ledger = Ledger(objective, len(seeds), score)
     transducers = ledger.transducers
     evaluations, at_once = transducers * (1.0 + passes * levels), max(levels, transducers)
-    field, value = ("passes", passes) if passes > levels else ("levels", levels)
-    ledger.require_memory(field, value, evaluations, at_once)
+    ledger.require_memory(evaluations, at_once, levels=levels, passes=passes)
     orders = _known_orders(order, transducers, seeds)
     if first is not None and integer_at_least("first", first, 0) >= transducers:
         raise invalid("first", first, f"must be an integer from 0 to {transducers - 1}")

@@ -47,7 +47,7 @@ def gradient_ascent(
     steps = integer_at_least("steps", steps, 2)
     seeds = trial_seeds(seed, trials)
     ledger = Ledger(objective, len(seeds), weakest_focus)
-    ledger.require_memory("starts" if starts > steps else "steps", max(starts, steps), steps, 2.0 * starts)
+    ledger.require_memory(steps, 2.0 * starts, steps=steps, starts=starts)
     matrix = getattr(objective, "transfer_matrix", None)
     if matrix is None:
         raise invalid(

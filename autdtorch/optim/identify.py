@@ -55,7 +55,7 @@ def identify(objective: Objective, evaluations: int = 64, trials: Trials = 1, se
             evaluations,
             f"must be an integer >= {3 * transducers - 1}, to identify {transducers} transducers",
         )
-    ledger.require_memory("evaluations", evaluations, evaluations, 2.0 * evaluations)
+    ledger.require_memory(evaluations, 2.0 * evaluations, evaluations=evaluations)
     first = max(3 * transducers - 2, evaluations // 2)
     drives = playable(objective, torch.stack([random_drives(first, transducers, own) for own in generators]))
     observed = ledger.observe(drives)

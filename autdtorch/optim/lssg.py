@@ -74,7 +74,7 @@ def lssg(
     ledger = Ledger(objective, trials=1, score=score)
     foci = _focus_drives(objective.scene)
     evaluations = float(len(foci)) * passes * levels
-    ledger.require_memory("passes" if passes > levels else "levels", max(passes, levels), evaluations, levels)
+    ledger.require_memory(evaluations, levels, levels=levels, passes=passes)
     places = indices_of(order, len(foci))
     start = torch.ones(1, len(foci), dtype=torch.complex128, device="cpu")
     repeat_passes(ledger, start, places[None], levels, passes, lambda weights: normalise(weights @ foci))

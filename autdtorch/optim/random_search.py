@@ -42,7 +42,7 @@ def random_search(
     levels = None if levels is None else integer_at_least("levels", levels, 2)
     generators = [torch.Generator("cpu").manual_seed(own) for own in trial_seeds(seed, trials)]
     ledger = Ledger(objective, len(generators), score)
-    ledger.require_memory("evaluations", evaluations, evaluations, min(evaluations, _AT_ONCE))
+    ledger.require_memory(evaluations, min(evaluations, _AT_ONCE), evaluations=evaluations)
     for begin in range(0, evaluations, _AT_ONCE):
         count = min(_AT_ONCE, evaluations - begin)
         turns = torch.stack(

@@ -6,7 +6,7 @@ import logging
 
 from autdtorch.fdtd.grid import Extent, domain_extent, obstacles_extent, require_spacing
 from autdtorch.fdtd.medium import is_wall
-from autdtorch.propagator.cost import full_cost, grid_cost
+from autdtorch.propagator.cost import full_cost, grid_cost, most_runs
 from autdtorch.propagator.groups import cheapest_grouping
 from autdtorch.scene import Scene
 from autdtorch.validation import invalid, require_one_of
@@ -41,7 +41,7 @@ def _chosen_method(scene: Scene, spacing: float, tolerance: float) -> str:
         logger.info("method auto: free_space (no obstacles: nothing to simulate)")
         return "free_space"
     require_spacing(scene, spacing)
-    runs = min(len(scene.control_points), len(scene.array))
+    runs = most_runs(scene)
     domain = grid_cost(scene, domain_extent(scene, spacing), spacing)
     boxes = cheapest_grouping(scene, spacing, tolerance, runs)
     gain = full_cost(domain, runs) / boxes.cost(runs)

@@ -17,6 +17,7 @@ from autdtorch.fdtd.steady_state import SteadyState, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble_on
 from autdtorch.neighbours import nearest
 from autdtorch.propagator.base import SimulatedPropagator
+from autdtorch.propagator.cost import most_runs
 from autdtorch.propagator.coupling import coupled_runs
 from autdtorch.propagator.groups import MOST_PASSES, cheapest_grouping, one_box
 from autdtorch.propagator.workload import MOST_JUDGED
@@ -43,7 +44,7 @@ class BoxPropagator(SimulatedPropagator):
 
     def _assembled(self, dtype: torch.dtype, time_step: float | None) -> Sequence[Assembly]:
         self._wanted = dtype, time_step
-        runs = min(len(self.scene.control_points), len(self.scene.array))
+        runs = most_runs(self.scene)
         grouping = cheapest_grouping(self.scene, self.spacing, self.tolerance, runs)
         if len(grouping.groups) > 1:
             alone = one_box(self.scene, self.spacing)

@@ -6,7 +6,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from autdtorch.fdtd.grid import MAX_CELLS_PER_WAVELENGTH, MIN_CELLS_PER_WAVELENGTH, Extent, layer_cells
+from autdtorch.fdtd.grid import (
+    MAX_CELLS_PER_WAVELENGTH,
+    MIN_CELLS_PER_WAVELENGTH,
+    Extent,
+    layer_cells,
+    speeds_of,
+)
 from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.steady_state import fewest_periods
 from autdtorch.fdtd.stencil import tuned_stencil
@@ -69,11 +75,15 @@ def grid_cost(scene: Scene, extent: Extent, spacing: float) -> GridCost:
     rim = layer_cells(kappa) + 1
     stencil = tuned_stencil(kappa, scene.attenuation * spacing)
     periods = fewest_periods(spacing * math.hypot(*interior) / scene.wavelength)
-    speeds = [obstacle.sound_speed or 0.0 for obstacle in scene.obstacles]
-    fastest = max(1.0, *(speed / scene.medium.sound_speed for speed in speeds), 0.0)
+    fastest = max(speeds_of(scene).values()) / scene.medium.sound_speed
     steps_per_period = fewest_steps(stencil, stencil.largest_symbol * fastest**2)
     shape = x + 2 * rim, y + 2 * rim, z + 2 * rim
     return GridCost(interior, shape, math.ceil(periods * steps_per_period), steps_per_period)
+
+
+def most_runs(scene: Scene) -> int:
+    """Return the simulations of the control points' transfer matrix, symmetries left out."""
+    return min(len(scene.control_points), len(scene.array))
 
 
 def full_cost(grid: GridCost, runs: int) -> float:

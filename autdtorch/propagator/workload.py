@@ -14,7 +14,7 @@ from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.points import footprint
 from autdtorch.fdtd.steady_state import phasors_kept
 from autdtorch.obstacles import Mesh
-from autdtorch.propagator.cost import USUAL_PERIODS, GridCost, grid_cost
+from autdtorch.propagator.cost import USUAL_PERIODS, GridCost, grid_cost, most_runs
 from autdtorch.propagator.groups import cheapest_grouping
 from autdtorch.scene import Scene
 
@@ -134,8 +134,7 @@ class Workload:
             grid = grid_cost(scene, domain_extent(scene, spacing), spacing)
             kept = min(grid.cells, heard * footprint(scene.wavenumber * spacing) ** 3)
             return cls((grid,), 1, Matter.in_domain(scene, spacing), kept, 0, 0)
-        runs = min(len(scene.control_points), len(scene.array))
-        grouping = cheapest_grouping(scene, spacing, tolerance, runs)
+        grouping = cheapest_grouping(scene, spacing, tolerance, most_runs(scene))
         radiating = [grid.radiating for grid in grouping.grids]
         matter = Matter.in_boxes(scene, spacing)
         judged = min(MOST_JUDGED, max(len(scene.control_points), len(scene.array)))
@@ -176,8 +175,8 @@ def memory_for(
     scene: Scene, method: str, spacing: float, tolerance: float, dtype: torch.dtype, kernel: Kernel
 ) -> float:
     """Return the memory [bytes] that "box" or "full" takes at most, whatever is symmetric."""
-    runs = min(len(scene.control_points), len(scene.array))
-    return Workload.of(scene, method, spacing, tolerance).memory(dtype.itemsize, kernel, runs)
+    workload = Workload.of(scene, method, spacing, tolerance)
+    return workload.memory(dtype.itemsize, kernel, most_runs(scene))
 
 
 def _doubled_areas(triangles: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -19,45 +19,32 @@ PACKAGE = Path(at.__file__).parent
 
 
 @contextlib.contextmanager
-def default_dtype(dtype: torch.dtype) -> Iterator[None]:
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(dtype)
+def setting(name: str, value: object) -> Iterator[None]:
+    """One of PyTorch's settings that has a function to get it and one to set it."""
+    before = getattr(torch, f"get_{name}")()
+    getattr(torch, f"set_{name}")(value)
     try:
         yield
     finally:
-        torch.set_default_dtype(before)
+        getattr(torch, f"set_{name}")(before)
 
 
 @contextlib.contextmanager
 def threads(count: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        with mock.patch("autdtorch.threads._processors", return_value=count):  # whatever the machine has
-            yield
-    finally:
-        torch.set_num_threads(before)
-
-
-@contextlib.contextmanager
-def matmul_precision(name: str) -> Iterator[None]:
-    before = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision(name)
-    try:
+    processors = mock.patch("autdtorch.threads._processors", return_value=count)  # whatever the machine has
+    with setting("num_threads", count), processors:
         yield
-    finally:
-        torch.set_float32_matmul_precision(before)
 
 
 STATES = {
-    "float16": lambda: default_dtype(torch.float16),
-    "float64": lambda: default_dtype(torch.float64),
+    "float16": lambda: setting("default_dtype", torch.float16),
+    "float64": lambda: setting("default_dtype", torch.float64),
     "meta device": lambda: torch.device("meta"),
     "inference mode": torch.inference_mode,
     "no gradients": torch.no_grad,
     "one thread": lambda: threads(1),
     "three threads": lambda: threads(3),
-    "coarse products": lambda: matmul_precision("medium"),
+    "coarse products": lambda: setting("float32_matmul_precision", "medium"),
 }
 
 
