@@ -4,8 +4,21 @@ Every public name is listed in ``__init__.pyi`` and imported when it is first us
 ``import autdtorch`` is quick and loads no simulation, plotting or optimisation package.
 """
 
+import warnings
+
 import lazy_loader
 
 __version__ = "0.1.0"
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+#: Names of version 0.1 that were renamed since, and their names now.
+_RENAMED = {"reference": "analytic"}
+
+
+def __getattr__(name: str) -> object:
+    """Import a public name when it is first used."""
+    if name not in _RENAMED:
+        return _load(name)
+    warnings.warn(f"autdtorch.{name} is now autdtorch.{_RENAMED[name]}", DeprecationWarning, stacklevel=2)
+    return _load(_RENAMED[name])

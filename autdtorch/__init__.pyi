@@ -1,26 +1,21 @@
-from . import hardware, reference
-from .array import PAPER_SOURCE_STRENGTH, TransducerArray
-from .array_file import load_array
-from .collect import Sweep, collect_results
-from .conditions import Dead, Drift, Noise, Quantised, true_pressure
-from .drive import amplitudes_of, drive_from_phases, focus_phases, phases_of
-from .drive_file import load_drive, save_drive
-from .field_file import save_field
-from .freespace import green
-from .geometry import Plane, circle_points
-from .medium import Medium
-from .metrics import FocusMetrics, focus_metrics
-from .objective import Objective, SimulatedObjective, weakest_focus
-from .obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
-from .openmpd_board import OpenMPDBoard
-from .optim.base import Solution
-from .optim.bayes import bayes_opt
-from .optim.bound import focus_bound
-from .optim.gabs import gabs
-from .optim.gradient import gradient_ascent
-from .optim.identify import identify
-from .optim.lssg import lss, lssg
-from .optim.random_search import random_search
+from . import analytic, hardware
+from .analytic.green import green
+from .hardware.openmpd_board import OpenMPDBoard
+from .io.array_file import load_array
+from .io.drive_file import load_drive, save_drive
+from .io.field_file import save_field
+from .io.scene_file import load_scene
+from .methods.base import Solution
+from .methods.bayes.bayes import bayes_opt
+from .methods.bound import focus_bound
+from .methods.gabs import gabs
+from .methods.gradient import gradient_ascent
+from .methods.identify import identify
+from .methods.lssg import lss, lssg
+from .methods.random_search import random_search
+from .objectives.metrics import FocusMetrics, focus_metrics
+from .objectives.perturbations import Dead, Drift, Noise, Quantised, true_pressure
+from .objectives.simulated import Objective, SimulatedObjective, weakest_focus
 from .plot import (
     plot_convergence,
     plot_pareto,
@@ -30,18 +25,23 @@ from .plot import (
     plot_scene,
     plot_trials,
 )
-from .propagator import (
+from .plot.view3d import animate3d, view3d
+from .propagators import (
     SteadyStateWarning,
     cell_centers,
     differentiable_field,
     make_propagator,
     volume_field,
 )
-from .rendering import animate3d, view3d
-from .results import load_results
-from .scene import OverlapWarning, ScaleWarning, Scene
-from .scene_file import load_scene
-from .simulation_estimate import Estimate, estimate
+from .propagators.estimate import Estimate, estimate
+from .scene.arrays import PAPER_SOURCE_STRENGTH, TransducerArray
+from .scene.drive import amplitudes_of, drive_from_phases, focus_phases, phases_of
+from .scene.geometry import Plane, circle_points
+from .scene.medium import Medium
+from .scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
+from .scene.scene import OverlapWarning, ScaleWarning, Scene
+from .study.results import load_results
+from .study.sweeps import Sweep, collect_results
 
 __all__ = [
     "PAPER_SOURCE_STRENGTH",
@@ -70,6 +70,7 @@ __all__ = [
     "TransducerArray",
     "VoxelMask",
     "amplitudes_of",
+    "analytic",
     "animate3d",
     "bayes_opt",
     "cell_centers",
@@ -102,7 +103,6 @@ __all__ = [
     "plot_scene",
     "plot_trials",
     "random_search",
-    "reference",
     "save_drive",
     "save_field",
     "true_pressure",

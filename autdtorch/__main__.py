@@ -1,6 +1,6 @@
 """``python -m autdtorch`` is the command line."""
 
-from autdtorch.cli import main
+from autdtorch.cli.main import main
 
 if __name__ == "__main__":
     main()

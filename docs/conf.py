@@ -38,10 +38,10 @@ autodoc_member_order = "bysource"
 autodoc_default_options = {"members": True, "special-members": "__call__"}
 autodoc_preserve_defaults = True
 autodoc_type_aliases = {
-    "ArrayLike": "autdtorch.validation.ArrayLike",
-    "Score": "autdtorch.objective.Score",
-    "Trials": "autdtorch.optim.base.Trials",
-    "Vector": "autdtorch.validation.Vector",
+    "ArrayLike": "autdtorch.utils.validation.ArrayLike",
+    "Score": "autdtorch.objectives.simulated.Score",
+    "Trials": "autdtorch.methods.base.Trials",
+    "Vector": "autdtorch.utils.validation.Vector",
 }
 add_module_names = False
 maximum_signature_line_length = 88

@@ -32,10 +32,10 @@ from accuracy_report import Row, write_report
 from surface_variants import TREATMENTS, treatment
 
 import autdtorch as at
-from autdtorch import reference
-from autdtorch.freespace import free_space_matrix
-from autdtorch.geometry import plane_basis
-from autdtorch.propagator import SimulatedPropagator
+from autdtorch import analytic
+from autdtorch.analytic.green import free_space_matrix
+from autdtorch.propagators import SimulatedPropagator
+from autdtorch.scene.geometry import plane_basis
 
 ROOT = Path(__file__).parents[1]
 SCENES = ROOT / "configs" / "scene"
@@ -143,12 +143,12 @@ def sphere_case(name: str, shift: Sequence[float] = (0.0, 0.0, 0.0)) -> Case:
     where = (empty.control_points, empty.array.positions, empty.wavenumber, center, SPHERE_RADIUS)
     if speed_ratio is None:
         sphere = at.Sphere(center, SPHERE_RADIUS, rigid=True)
-        both = [reference.rigid_sphere(*where, scattered=scattered) for scattered in (False, True)]
+        both = [analytic.rigid_sphere(*where, scattered=scattered) for scattered in (False, True)]
     else:
         density, speed = SPHERE_DENSITY_RATIO * air.density, speed_ratio * air.sound_speed
         sphere = at.Sphere(center, SPHERE_RADIUS, density=density, sound_speed=speed)
         ratios = SPHERE_DENSITY_RATIO, speed_ratio
-        both = [reference.fluid_sphere(*where, *ratios, scattered=scattered) for scattered in (False, True)]
+        both = [analytic.fluid_sphere(*where, *ratios, scattered=scattered) for scattered in (False, True)]
     exact, scattered = (4 * math.pi * empty.array.source_strength * part for part in both)
     scene = load("homogeneous", [sphere])
     return Case(name, scene, scene.control_points, exact, float(scattered.norm()), SPHERE_ORDER)
@@ -244,7 +244,7 @@ def slab_case() -> Case:
         sound_speed=speed_ratio * AIR.sound_speed,
     )
     exact = partial(
-        reference.fluid_slab, thickness=thickness, density_ratio=density_ratio, speed_ratio=speed_ratio
+        analytic.fluid_slab, thickness=thickness, density_ratio=density_ratio, speed_ratio=speed_ratio
     )
     return layered_case("slab", slab, (14.1e-3, 34.6e-3), exact)
 
@@ -252,7 +252,7 @@ def slab_case() -> Case:
 def wall_case() -> Case:
     """A point source and points before a rigid wall."""
     wall = at.Box((FACE + 0.5, 20e-3, 20e-3), (1.0, 1.0, 1.0), rigid=True)
-    return layered_case("rigid wall", wall, (14.1e-3,), reference.rigid_plane)
+    return layered_case("rigid wall", wall, (14.1e-3,), analytic.rigid_plane)
 
 
 def layered_case(name: str, box: at.Box, planes: Sequence[float], exact: Callable[..., torch.Tensor]) -> Case:
@@ -276,7 +276,7 @@ def piston_case() -> Case:
     points = center + 20e-3 * (angles.cos() * normal + angles.sin() * across)
     domain = torch.stack((points.amin(0).minimum(center - 6e-3), points.amax(0).maximum(center + 6e-3)))
     scene = at.Scene(array, AIR, 40e3, points, domain=domain)
-    field = reference.piston_field(points, array.positions, scene.wavenumber, 5e-3, tilt)
+    field = analytic.piston_field(points, array.positions, scene.wavenumber, 5e-3, tilt)
     return Case(
         "piston", scene, points, 4 * math.pi * array.source_strength * field, None, SPHERE_ORDER, "full"
     )

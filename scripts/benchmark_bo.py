@@ -22,9 +22,9 @@ from generated_block import table
 from large_arrays import autd3_array, with_array
 
 import autdtorch as at
-from autdtorch.objective import weakest_focus
-from autdtorch.optim.base import Ledger, trial_seeds
-from autdtorch.optim.bayes import NOISE, _drive
+from autdtorch.methods.base import Ledger, trial_seeds
+from autdtorch.methods.bayes.bayes import NOISE, _drive
+from autdtorch.objectives.simulated import weakest_focus
 
 SCENES = Path(__file__).parents[1] / "configs" / "scene"
 EVALUATIONS, INITIAL, FIXED = 256, 16, 6

@@ -19,7 +19,7 @@ import torch
 from generated_block import fill_in, measured, table
 
 import autdtorch as at
-from autdtorch.threads import thread_count
+from autdtorch.utils.threads import thread_count
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -19,8 +19,8 @@ from paper_objectives import DOCS, paper_objectives
 
 import autdtorch as at
 from autdtorch import hardware
-from autdtorch.conditions import random_rms
-from autdtorch.intervals import bootstrap
+from autdtorch.objectives.perturbations import random_rms
+from autdtorch.study.intervals import bootstrap
 
 COMMAND = "python scripts/benchmark_hardware.py"
 

@@ -23,7 +23,7 @@ from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Kernel, Recei
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import Assembly, assemble, assemble_on
-from autdtorch.threads import thread_count
+from autdtorch.utils.threads import thread_count
 
 ROOT = Path(__file__).parents[1]
 SCENES, DOCS = ROOT / "configs" / "scene", ROOT / "docs"

@@ -20,7 +20,7 @@ from benchmark_accuracy import CUBES, ROOT, compare, cube_case, relative_error, 
 import autdtorch as at
 from autdtorch.fdtd import placement
 from autdtorch.fdtd.grid import make_box
-from autdtorch.propagator import SimulatedPropagator
+from autdtorch.propagators import SimulatedPropagator
 
 SPACING = 1e-3
 SPACINGS = (2.0, 1.7, 1.4, 1.3, 0.85, 0.75, 0.7, 0.65, 0.6, 0.45, 0.4)

@@ -26,8 +26,8 @@ from large_arrays import MIDDLE, autd3_array, with_array
 from scaling_report import Point, exponents, figure, measurements
 
 import autdtorch as at
-from autdtorch.propagator import SimulatedPropagator
-from autdtorch.threads import thread_count
+from autdtorch.propagators import SimulatedPropagator
+from autdtorch.utils.threads import thread_count
 
 DOCS = ROOT / "docs"
 

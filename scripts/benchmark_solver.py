@@ -16,11 +16,11 @@ import numpy as np
 import torch
 
 import autdtorch as at
+from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources, uniform_state
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import assemble, drive_signal
-from autdtorch.freespace import free_space_matrix
 
 SCENES = Path(__file__).parents[1] / "configs" / "scene"
 OBSTACLE_SCENES = ("three_cubes", "two_cubes")

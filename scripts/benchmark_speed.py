@@ -25,9 +25,9 @@ import autdtorch as at
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.steady_state import Extrapolation, windows_of_run
 from autdtorch.fdtd.stepping import RAMP_PERIODS
-from autdtorch.propagator import BoxPropagator, SimulatedPropagator
-from autdtorch.propagator.base import single_nodes
-from autdtorch.threads import thread_count
+from autdtorch.propagators import BoxPropagator, SimulatedPropagator
+from autdtorch.propagators.base import single_nodes
+from autdtorch.utils.threads import thread_count
 
 SPACINGS = (1.0, 0.8, 2 / 3, 0.5)  # [mm]
 REPEATS = 3

@@ -17,7 +17,7 @@ import torch
 from paper_objectives import paper_objectives
 
 import autdtorch as at
-from autdtorch.freespace import free_space_matrix
+from autdtorch.analytic.green import free_space_matrix
 
 FREQUENCY = 40e3
 AIR = at.Medium(density=1.2, sound_speed=340.0)

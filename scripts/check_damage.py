@@ -27,12 +27,12 @@ import torch
 
 import autdtorch as at
 from autdtorch import hardware
-from autdtorch.json_lines import SET_ASIDE
-from autdtorch.optim.base import Solution
-from autdtorch.results import PROVENANCE_FILE, RESULTS_FILE
-from autdtorch.study import run_study
-from autdtorch.study_folder import PREVIOUS
-from autdtorch.trial_file import TRIALS_FILE
+from autdtorch.methods.base import Solution
+from autdtorch.study.folder import PREVIOUS
+from autdtorch.study.results import PROVENANCE_FILE, RESULTS_FILE
+from autdtorch.study.run import run_study
+from autdtorch.study.trial_file import TRIALS_FILE
+from autdtorch.utils.json_lines import SET_ASIDE
 
 LOG_FILE = "trial.jsonl"
 
@@ -173,7 +173,7 @@ def study_subject(folder: Path) -> Subject:
     finished, half, another = (folder / name for name in ("study", "half-study", "another-study"))
     numbers = study(finished)
     study(another, seed=1)
-    with mock.patch("autdtorch.study.focus_bound", side_effect=[0.0, KeyboardInterrupt]):
+    with mock.patch("autdtorch.study.run.focus_bound", side_effect=[0.0, KeyboardInterrupt]):
         try:
             study(half)
         except KeyboardInterrupt:

@@ -24,12 +24,12 @@ from triton.backends.compiler import GPUTarget
 from triton.runtime import driver
 from triton.runtime.jit import JITFunction
 
-from autdtorch.array import TransducerArray
 from autdtorch.fdtd.kernels.cuda import BLOCKS, DeviceMedium, DeviceRun
 from autdtorch.fdtd.kernels.cuda_tables import Shape
 from autdtorch.fdtd.stepping import assemble, drive_signal
-from autdtorch.obstacles import Box
-from autdtorch.scene import Medium, Scene
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.obstacles import Box
+from autdtorch.scene.scene import Medium, Scene
 
 CUOBJDUMP = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
 

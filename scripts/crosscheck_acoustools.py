@@ -39,8 +39,8 @@ from benchmark_accuracy import (
 from generated_block import fill_in, measured, table
 
 import autdtorch as at
-from autdtorch.device_layouts import TRANSDUCER_RADIUS
-from autdtorch.freespace import free_space_matrix
+from autdtorch.analytic.green import free_space_matrix
+from autdtorch.scene.device_layouts import TRANSDUCER_RADIUS
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "crosschecks.md"
 COMMAND = "python scripts/crosscheck_acoustools.py"

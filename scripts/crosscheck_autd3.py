@@ -28,9 +28,9 @@ from generated_block import fill_in, measured, table
 from numpy.typing import NDArray
 
 import autdtorch as at
-from autdtorch.device_layouts import TRANSDUCER_RADIUS
-from autdtorch.freespace import free_space_matrix
+from autdtorch.analytic.green import free_space_matrix
 from autdtorch.hardware.levels import AUTD3_FULL, Levels, autd3_drive, autd3_levels
+from autdtorch.scene.device_layouts import TRANSDUCER_RADIUS
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "crosschecks.md"
 COMMAND = "python scripts/crosscheck_autd3.py"

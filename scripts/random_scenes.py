@@ -17,10 +17,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from autdtorch.array import TransducerArray
 from autdtorch.fdtd.grid import MIN_CELLS_PER_WAVELENGTH, make_grid
-from autdtorch.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
-from autdtorch.scene import Medium, OverlapWarning, Scene
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
+from autdtorch.scene.scene import Medium, OverlapWarning, Scene
 
 Array = NDArray[np.float64]
 

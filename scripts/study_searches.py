@@ -14,7 +14,7 @@ from generated_block import fill_in, measured, table
 from paper_objectives import DOCS, SCENES, paper_objectives
 
 import autdtorch as at
-from autdtorch.drive import normalise
+from autdtorch.scene.drive import normalise
 
 COMMAND = "python scripts/study_searches.py"
 

@@ -12,11 +12,11 @@ import torch
 
 import autdtorch as at
 from autdtorch import hardware
-from autdtorch.cache import digest_of
-from autdtorch.conditions import random_rms
 from autdtorch.hardware.autd3 import autd3_device, autd3_kit
 from autdtorch.hardware.sensor import typed
 from autdtorch.hardware.wiring import Wiring
+from autdtorch.objectives.perturbations import random_rms
+from autdtorch.utils.digest import digest_of
 
 DEVICES = ("sonicsurface", "openmpd", "ultraino", "autd3")
 _USUAL = "emulated"

@@ -21,9 +21,9 @@ from yaml import YAMLError
 import autdtorch as at
 from autdtorch import hardware
 from autdtorch.hardware.sensor import checked_reading
-from autdtorch.hardware_report import write_hardware_report
-from autdtorch.optim.base import Solution
-from autdtorch.progress import Progress, show_progress
+from autdtorch.methods.base import Solution
+from autdtorch.study.report.trial_report import write_hardware_report
+from autdtorch.utils.progress import Progress, show_progress
 
 SCENES = Path(__file__).parents[1] / "configs" / "scene"
 

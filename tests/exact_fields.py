@@ -7,7 +7,7 @@ truncation error is (k STEP)^2 / 3 = 3e-7 of k |p| in a plane wave, and more whe
 
 import math
 
-from autdtorch.freespace import green
+from autdtorch.analytic.green import green
 
 WAVELENGTH = 8.5e-3
 K = 2 * math.pi / WAVELENGTH

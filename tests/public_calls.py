@@ -18,7 +18,7 @@ import torch
 from small_scenes import AIR, CUBE, small_scene
 
 import autdtorch as at
-from autdtorch import hardware, propagator
+from autdtorch import hardware, propagators
 from autdtorch.hardware.emulated_bus import EmulatedBus
 from autdtorch.hardware.emulated_usbtmc import EmulatedInstrument
 
@@ -332,7 +332,7 @@ def public_calls() -> dict[str, Call]:
     """All that have parameters, by name."""
     found = [
         call
-        for module in (at, at.reference, hardware, propagator)
+        for module in (at, at.analytic, hardware, propagators)
         for name in module.__all__
         if callable(thing := getattr(module, name))
         for call in (_calls_of(thing) if inspect.isclass(thing) else [Call(name, thing)])

@@ -8,11 +8,11 @@ import time
 
 from small_scenes import CUBE, small_scene
 
-import autdtorch.study
-from autdtorch.geometry import Plane
-from autdtorch.objective import Objective
-from autdtorch.optim.base import Solution, Trials
-from autdtorch.optim.gabs import gabs
+import autdtorch.study.run
+from autdtorch.methods.base import Solution, Trials
+from autdtorch.methods.gabs import gabs
+from autdtorch.objectives.simulated import Objective
+from autdtorch.scene.geometry import Plane
 
 PLANE = Plane(center=(20e-3, 12e-3, 12e-3), normal=(1, 0, 0), size=(20e-3, 16e-3))
 SOLVER = {"method": "auto", "spacing": 2e-3, "tolerance": 0.1, "kernel": "reference"}
@@ -27,13 +27,13 @@ def slow_gabs(objective: Objective, trials: Trials = 1, seed: int = 0) -> Soluti
 def main() -> None:
     """Run the study into the folder that the command line names."""
     slow_gabs.__module__ = gabs.__module__  # results of others' methods are not used again
-    autdtorch.study._FIRST_BLOCK = autdtorch.study._LARGEST_GROWTH = 1  # a trial a block
+    autdtorch.study.run._FIRST_BLOCK = autdtorch.study.run._LARGEST_GROWTH = 1  # a trial a block
     scenes = {
         "empty": dataclasses.replace(small_scene(), observation_plane=PLANE),
         "cube": dataclasses.replace(small_scene((CUBE,)), observation_plane=PLANE),
     }
     print("ready", flush=True)
-    autdtorch.study.run_study(
+    autdtorch.study.run.run_study(
         scenes,
         {"gabs": slow_gabs},
         solver=SOLVER,

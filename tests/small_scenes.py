@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from autdtorch.array import TransducerArray
-from autdtorch.geometry import Plane
-from autdtorch.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
-from autdtorch.scene import Medium, Scene
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.geometry import Plane
+from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
+from autdtorch.scene.scene import Medium, Scene
 
 AIR = Medium(density=1.293, sound_speed=340.0)
 CUBE = Box(center=(12e-3, 12e-3, 12e-3), size=(6e-3, 8e-3, 4e-3), density=100.0, sound_speed=340.0)

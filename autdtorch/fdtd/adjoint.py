@@ -27,7 +27,7 @@ from autdtorch.fdtd.kernels.contract import Kernel, Layer, Receivers, Sources, S
 from autdtorch.fdtd.points import PointWeights
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
-from autdtorch.threads import spread
+from autdtorch.utils.threads import spread
 
 _SEGMENT_BYTES = 128 * 2**20
 """Of what is recorded in a segment at once; longer ones only where the states kept would take more."""

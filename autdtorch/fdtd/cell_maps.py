@@ -17,7 +17,7 @@ from autdtorch.fdtd.grid import Grid, domain_extent
 from autdtorch.fdtd.stencil import OFFSETS, Stencil
 from autdtorch.fdtd.stepping import air_stencil
 from autdtorch.fdtd.variable_cells import VariableCells
-from autdtorch.scene import Scene
+from autdtorch.scene.scene import Scene
 
 _RIM = 2
 """Cells of air around the maps: the first varies with them, the second is its neighbour."""

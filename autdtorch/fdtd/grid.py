@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from autdtorch.fdtd.placement import grid_offset
 from autdtorch.fdtd.points import footprint
-from autdtorch.obstacles import Obstacle
-from autdtorch.scene import Scene
-from autdtorch.validation import invalid, positive
+from autdtorch.scene.obstacles import Obstacle
+from autdtorch.scene.scene import Scene
+from autdtorch.utils.validation import invalid, positive
 
 logger = logging.getLogger(__name__)
 

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.fdtd.surface import FAR, LATTICE, CutElements, Materials, cut_elements
-from autdtorch.obstacles import Box, Obstacle
-from autdtorch.progress import show_progress
-from autdtorch.scene import Medium, Scene
+from autdtorch.scene.obstacles import Box, Obstacle
+from autdtorch.scene.scene import Medium, Scene
+from autdtorch.utils.progress import show_progress
 
 logger = logging.getLogger(__name__)
 

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from autdtorch.obstacles import Obstacle
-from autdtorch.scene import Scene
-from autdtorch.validation import LENGTH_TOLERANCE
+from autdtorch.scene.obstacles import Obstacle
+from autdtorch.scene.scene import Scene
+from autdtorch.utils.validation import LENGTH_TOLERANCE
 
 Array = NDArray[np.float64]
 

@@ -17,12 +17,12 @@ import torch
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from autdtorch.array import Nodes
 from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.points import PointWeights
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.superposition import superposition
+from autdtorch.scene.arrays import Nodes
 
 _BESIDE = 1.25
 """Cells from the rim of the interior up to which points are not read. The outermost are not interpolated

@@ -7,7 +7,7 @@ import math
 import torch
 
 from autdtorch.fdtd.grid import FAIR_CELLS_PER_WAVELENGTH, speeds_of
-from autdtorch.scene import Scene
+from autdtorch.scene.scene import Scene
 
 RATIO = 1.5
 """Between the spacings of the two grids: the coarser costs a fifth of the finer."""

@@ -19,8 +19,8 @@ from autdtorch.fdtd.medium import fill_elements
 from autdtorch.fdtd.points import PointWeights, merged, point_weights, without
 from autdtorch.fdtd.stability import fewest_steps, largest_eigenvalue, whole_steps
 from autdtorch.fdtd.stencil import Stencil, tuned_stencil
-from autdtorch.scene import Scene
-from autdtorch.validation import invalid
+from autdtorch.scene.scene import Scene
+from autdtorch.utils.validation import invalid
 
 logger = logging.getLogger(__name__)
 

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from autdtorch.threads import spread
-from autdtorch.validation import LENGTH_TOLERANCE
+from autdtorch.utils.threads import spread
+from autdtorch.utils.validation import LENGTH_TOLERANCE
 
 Array = NDArray[np.floating]
 

@@ -15,8 +15,8 @@ from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.medium import fill_elements
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.fdtd.stepping import Assembly, air_stencil, assembly_of
-from autdtorch.obstacles import Obstacle
-from autdtorch.scene import Scene, with_obstacles
+from autdtorch.scene.obstacles import Obstacle
+from autdtorch.scene.scene import Scene, with_obstacles
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

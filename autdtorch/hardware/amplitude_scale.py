@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 
-from autdtorch.drive import AMPLITUDE_TOLERANCE, validate_drive, validate_single_drive
 from autdtorch.hardware.wiring import Wiring
-from autdtorch.validation import invalid, number_between, positive
+from autdtorch.scene.drive import AMPLITUDE_TOLERANCE, validate_drive, validate_single_drive
+from autdtorch.utils.validation import invalid, number_between, positive
 
 _FINEST = 2.0**-14  # of the amplitudes to choose from; two levels of a device here are further apart
 

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from autdtorch.device_layouts import AUTD3_TRANSDUCERS
 from autdtorch.hardware.devices import Device
 from autdtorch.hardware.levels import Levels, autd3_drive, autd3_levels
 from autdtorch.hardware.link import SETTLE, Link
 from autdtorch.hardware.usb import LinkError, closed_on_error
-from autdtorch.validation import integer_at_least
+from autdtorch.scene.device_layouts import AUTD3_TRANSDUCERS
+from autdtorch.utils.validation import integer_at_least
 
 #: How long the kit waits for an answer [ms]; its own 10 ms run out on a computer that is busy.
 _ANSWER_MS = 100

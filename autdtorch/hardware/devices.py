@@ -26,8 +26,8 @@ from autdtorch.hardware.levels import (
     ultraino_drive,
     ultraino_levels,
 )
-from autdtorch.openmpd_board import OpenMPDBoard
-from autdtorch.validation import integer_at_least, invalid, members
+from autdtorch.hardware.openmpd_board import OpenMPDBoard
+from autdtorch.utils.validation import integer_at_least, invalid, members
 
 SONICSURFACE_BAUD = 230_400
 ULTRAINO_BAUD = 115_200

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from autdtorch.drive import amplitudes_of, phases_of
 from autdtorch.hardware.devices import Device
 from autdtorch.hardware.emulator import EmulatedBench
+from autdtorch.scene.drive import amplitudes_of, phases_of
 
 
 class DryPort:

@@ -14,7 +14,7 @@ import torch
 
 from autdtorch.hardware.emulated_usbtmc import EmulatedInstrument
 from autdtorch.hardware.emulator import EmulatedBench
-from autdtorch.validation import (
+from autdtorch.utils.validation import (
     finite_number,
     integer_at_least,
     integers,

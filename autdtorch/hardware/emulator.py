@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
-from autdtorch.conditions import SNRS, random_rms
 from autdtorch.hardware.adapters import Adapter
 from autdtorch.hardware.autd3 import autd3_device
 from autdtorch.hardware.devices import OPENMPD, SONICSURFACE, ULTRAINO, Device
@@ -21,7 +20,8 @@ from autdtorch.hardware.firmware import (
     UltrainoFirmware,
 )
 from autdtorch.hardware.wiring import Wiring
-from autdtorch.validation import (
+from autdtorch.objectives.perturbations import SNRS, random_rms
+from autdtorch.utils.validation import (
     complex_tensor,
     indices,
     integer_at_least,

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Literal, TypeAlias
 
 from autdtorch.hardware.emulated_bus import EmulatedBus, EmulatedDevice, stall, time_out, unplugged
-from autdtorch.validation import integer_at_least, require_one_of
+from autdtorch.utils.validation import integer_at_least, require_one_of
 
 #: "time-out" and "short write": a transfer ends in mid-frame, with an error or without, and the chip takes
 #: nothing until it is reset; "stall": the endpoint refuses until its halt is cleared; "unplug": the chip is

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import torch
 
-from autdtorch.drive import validate_drive
-from autdtorch.validation import ArrayLike, complex_tensor, invalid
+from autdtorch.scene.drive import validate_drive
+from autdtorch.utils.validation import ArrayLike, complex_tensor, invalid
 
 #: Phase levels of a device in one period, and the largest amplitude levels.
 AUTD3_PHASES, AUTD3_FULL = 256, 255

@@ -15,7 +15,7 @@ import torch
 from autdtorch.hardware.devices import Device
 from autdtorch.hardware.usb import LinkError, Port, closed_on_error, find_device
 from autdtorch.hardware.wiring import Wiring
-from autdtorch.validation import invalid, not_negative, require_callable, require_kind
+from autdtorch.utils.validation import invalid, not_negative, require_callable, require_kind
 
 #: Default settle time [s]. Sound goes 1.7 m in it; a T4010A1 rings up in some 30 periods, 0.75 ms, as the
 #: emulator of AUTD3's kit models it.

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import torch
 
-from autdtorch.validation import integer_at_least, invalid, positive
+from autdtorch.utils.validation import integer_at_least, invalid, positive
 
 
 class Heard(NamedTuple):

@@ -15,12 +15,12 @@ from typing import Any
 import torch
 from filelock import FileLock
 
-from autdtorch.cache import digest_of
-from autdtorch.drive import validate_single_drive
-from autdtorch.json_lines import JsonLines, line_of, row_of
-from autdtorch.locking import held
-from autdtorch.objective import validate_magnitudes
-from autdtorch.validation import integer_at_least, not_negative, real_tensor, require_kind
+from autdtorch.objectives.simulated import validate_magnitudes
+from autdtorch.scene.drive import validate_single_drive
+from autdtorch.utils.digest import digest_of
+from autdtorch.utils.json_lines import JsonLines, line_of, row_of
+from autdtorch.utils.locking import held
+from autdtorch.utils.validation import integer_at_least, not_negative, real_tensor, require_kind
 
 _ORIGIN, _NUMBER = "origin", "evaluation"
 

@@ -9,13 +9,13 @@ from typing import Any
 
 import torch
 
-from autdtorch.cache import digest_of
 from autdtorch.hardware.log import Evaluation, EvaluationLog
 from autdtorch.hardware.safety import LimitedLink, LimitError
 from autdtorch.hardware.sensor import Sensor, checked_reading
-from autdtorch.objective import validate_drives
-from autdtorch.scene import Scene
-from autdtorch.validation import invalid, path_of, require_callable, require_kind
+from autdtorch.objectives.simulated import validate_drives
+from autdtorch.scene.scene import Scene
+from autdtorch.utils.digest import digest_of
+from autdtorch.utils.validation import invalid, path_of, require_callable, require_kind
 
 
 class HardwareObjective:

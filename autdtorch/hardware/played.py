@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import torch
 
-from autdtorch.conditions import Condition
 from autdtorch.hardware.amplitude_scale import AmplitudeScale
 from autdtorch.hardware.devices import Device
 from autdtorch.hardware.wiring import Wiring
-from autdtorch.objective import Objective
-from autdtorch.validation import invalid
+from autdtorch.objectives.perturbations import Condition
+from autdtorch.objectives.simulated import Objective
+from autdtorch.utils.validation import invalid
 
 
 class Played(Condition):

@@ -18,7 +18,7 @@ import torch
 
 from autdtorch.hardware.amplitude_scale import AmplitudeScale
 from autdtorch.hardware.link import Link
-from autdtorch.validation import integer_at_least, not_negative, number_between, positive, require_kind
+from autdtorch.utils.validation import integer_at_least, not_negative, number_between, positive, require_kind
 
 logger = logging.getLogger(__name__)
 

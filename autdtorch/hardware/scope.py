@@ -17,7 +17,14 @@ from autdtorch.hardware.sensor import SensorError
 from autdtorch.hardware.usb import LinkError, closed_on_error, find_device
 from autdtorch.hardware.usbtmc import UsbtmcPort
 from autdtorch.hardware.vertical_scale import VerticalScale
-from autdtorch.validation import integer_at_least, invalid, members, positive, positive_integers, require_kind
+from autdtorch.utils.validation import (
+    integer_at_least,
+    invalid,
+    members,
+    positive,
+    positive_integers,
+    require_kind,
+)
 
 logger = logging.getLogger(__name__)
 

@@ -12,8 +12,8 @@ from typing import Protocol, runtime_checkable
 
 import torch
 
-from autdtorch.objective import validate_magnitudes
-from autdtorch.validation import (
+from autdtorch.objectives.simulated import validate_magnitudes
+from autdtorch.utils.validation import (
     ArrayLike,
     integer_at_least,
     invalid,

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from autdtorch.validation import require_kind
+from autdtorch.utils.validation import require_kind
 
 #: Lets users write to the devices on Linux; to be copied to /etc/udev/rules.d.
 UDEV_RULES = Path(__file__).with_name("70-autdtorch.rules")

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import torch
 
-from autdtorch.drive import validate_single_drive
 from autdtorch.hardware.devices import Device
-from autdtorch.validation import indices, require_kind
+from autdtorch.scene.drive import validate_single_drive
+from autdtorch.utils.validation import indices, require_kind
 
 
 class Wiring:

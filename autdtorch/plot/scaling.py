@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator
 
-from autdtorch.drawing import Array
+from autdtorch.plot.drawing import Array
 from autdtorch.plot.style import (
     TICK_SIZE,
     ByMethod,
@@ -24,7 +24,7 @@ from autdtorch.plot.style import (
     require_scenes,
     styled,
 )
-from autdtorch.validation import ArrayLike, require_kind
+from autdtorch.utils.validation import ArrayLike, require_kind
 
 OVERHEAD = 2.0
 """Costs from this many times the least one on are fitted: at most half of them is what costs always."""

@@ -13,7 +13,7 @@ from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import NDArray
 
-from autdtorch.drawing import (
+from autdtorch.plot.drawing import (
     EDGE_COLOUR,
     FOCUS_COLOUR,
     MM,
@@ -27,10 +27,10 @@ from autdtorch.drawing import (
     clipped,
     single_drive_phases,
 )
-from autdtorch.obstacles import Obstacle
 from autdtorch.plot.style import TICK_SIZE, new_figure, styled
-from autdtorch.scene import Scene
-from autdtorch.validation import ArrayLike, Vector, require_kind
+from autdtorch.scene.obstacles import Obstacle
+from autdtorch.scene.scene import Scene
+from autdtorch.utils.validation import ArrayLike, Vector, require_kind
 
 _TICKS = 5  # along the longest side; on a short one more would run into each other
 _ELEVATION, _AZIMUTH = 22.0, -118.0  # of the viewer [degrees]

@@ -15,9 +15,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from autdtorch.drawing import Array
-from autdtorch.optim import label_of as label_of
-from autdtorch.validation import ArrayLike, invalid, real_tensor, require_kind
+from autdtorch.methods import label_of as label_of
+from autdtorch.plot.drawing import Array
+from autdtorch.utils.validation import ArrayLike, invalid, real_tensor, require_kind
 
 ByMethod: TypeAlias = Mapping[str, ArrayLike]
 Dashes: TypeAlias = tuple[float, tuple[float, ...]]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from autdtorch.cli import main
+from autdtorch.cli.main import main
 
 Run = Callable[..., int]
 

@@ -14,12 +14,12 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-import autdtorch.study
-from autdtorch.config_files import CONFIGS
-from autdtorch.method_section import load_method
-from autdtorch.propagator import FreeSpacePropagator, make_propagator
-from autdtorch.results import load_results
-from autdtorch.scene_file import load_scene
+import autdtorch.study.run
+from autdtorch.cli.config_files import CONFIGS
+from autdtorch.cli.method_section import load_method
+from autdtorch.io.scene_file import load_scene
+from autdtorch.propagators import FreeSpacePropagator, make_propagator
+from autdtorch.study.results import load_results
 
 Run = Callable[..., int]
 
@@ -160,7 +160,7 @@ def test_a_wrong_command_gets_one_line(
     def refuse(*_: object) -> None:
         raise AssertionError("simulated before all settings were checked")
 
-    monkeypatch.setattr(autdtorch.study, "_run_scene", refuse)
+    monkeypatch.setattr(autdtorch.study.run, "_run_scene", refuse)
     (tmp_path / "file").touch()
     assert run(*arguments) == 2
     captured = capsys.readouterr()
@@ -270,7 +270,7 @@ def test_what_is_finished_is_not_computed_again(
     command = ("scene=homogeneous", "method=lssg", "output=here")
     assert run(*command) == 0
     table = capsys.readouterr().out
-    monkeypatch.setattr(autdtorch.study, "_run_scene", lambda *_: pytest.fail("computed again"))
+    monkeypatch.setattr(autdtorch.study.run, "_run_scene", lambda *_: pytest.fail("computed again"))
     assert run(*command) == 0
     captured = capsys.readouterr()
     assert captured.out == table
@@ -327,7 +327,7 @@ def test_ones_own_scene_file(run: Run, tmp_path: Path, capsys: pytest.CaptureFix
 def test_an_experiment_ends_with_its_report(
     run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("autdtorch.report.rendering_problem", lambda: "not tried")
+    monkeypatch.setattr("autdtorch.study.report.pages.rendering_problem", lambda: "not tried")
     command = (
         "experiment=paper",
         "~methods.bayes_opt",
@@ -351,7 +351,7 @@ def test_ctrl_c_ends_with_one_line_and_its_status(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(autdtorch.study, "_run_scene", interrupted)
+    monkeypatch.setattr(autdtorch.study.run, "_run_scene", interrupted)
     assert run("solver.method=free_space") == 130
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("autdtorch: interrupted; ")

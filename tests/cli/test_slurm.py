@@ -14,8 +14,8 @@ import pytest
 from hydra import compose, initialize_config_dir
 from one_node_slurm import missing_programs, one_node_slurm
 
-from autdtorch.cli import CONFIGS
-from autdtorch.results import load_results
+from autdtorch.cli.main import CONFIGS
+from autdtorch.study.results import load_results
 
 Run = Callable[..., int]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from autdtorch.config_files import CONFIGS
+from autdtorch.cli.config_files import CONFIGS
 
 Run = Callable[..., int]
 Send = Callable[[dict[str, str]], None]

@@ -15,7 +15,7 @@ from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources, State
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import Assembly, assemble
-from autdtorch.obstacles import Box, Obstacle, Sphere
+from autdtorch.scene.obstacles import Box, Obstacle, Sphere
 
 HEAVY = Sphere((4.7e-3, 4.2e-3, 4.6e-3), 1.7e-3, density=20.0, sound_speed=300.0)
 RIGID = Box((3.2e-3, 7e-3, 7e-3), (3e-3, 2.3e-3, 2.3e-3), rigid=True)

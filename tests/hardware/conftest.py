@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from autdtorch.array import TransducerArray
 from autdtorch.hardware import (
     SONICSURFACE,
     Device,
@@ -21,9 +20,10 @@ from autdtorch.hardware import (
     Sensor,
     open_link,
 )
-from autdtorch.objective import SimulatedObjective
-from autdtorch.propagator import make_propagator
-from autdtorch.scene import Medium, Scene
+from autdtorch.objectives.simulated import SimulatedObjective
+from autdtorch.propagators import make_propagator
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.scene import Medium, Scene
 
 #: The scene's transducers among the device's: four columns of four rows, not in the order of its channels.
 TRANSDUCERS = [16 * row + column for column in range(6, 10) for row in range(5, 9)]

@@ -10,7 +10,6 @@ import threading
 import pytest
 import torch
 
-from autdtorch.drive import drive_from_phases
 from autdtorch.hardware import (
     LimitedLink,
     LimitError,
@@ -23,6 +22,7 @@ from autdtorch.hardware import (
 from autdtorch.hardware import autd3 as module
 from autdtorch.hardware.autd3 import Autd3Port, autd3_device
 from autdtorch.hardware.levels import Levels, autd3_levels
+from autdtorch.scene.drive import drive_from_phases
 
 
 def random_drive(count: int) -> torch.Tensor:

@@ -6,15 +6,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from autdtorch.drive import drive_from_phases
 from autdtorch.hardware import (
     EmulatedBench,
     LinkError,
     open_link,
     openmpd_boards,
 )
+from autdtorch.hardware.openmpd_board import OpenMPDBoard
 from autdtorch.hardware.wiring import Wiring
-from autdtorch.openmpd_board import OpenMPDBoard
+from autdtorch.scene.drive import drive_from_phases
 
 
 def board(name: str, seed: int, gain: float = 1.0) -> OpenMPDBoard:

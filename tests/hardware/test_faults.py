@@ -26,8 +26,8 @@ from autdtorch.hardware import (
 )
 from autdtorch.hardware.emulated_bus import EmulatedBus
 from autdtorch.hardware.faults import FAULTS, FaultyBus
-from autdtorch.optim.base import Solution
-from autdtorch.optim.gabs import gabs
+from autdtorch.methods.base import Solution
+from autdtorch.methods.gabs import gabs
 
 METHOD = partial(gabs, levels=2, order="given")
 EVALUATIONS = 1 + 15 * 2

@@ -7,7 +7,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autdtorch.drive import drive_from_phases
 from autdtorch.hardware.devices import OPENMPD, SONICSURFACE, Device, ultraino_boards
 from autdtorch.hardware.emulator import EmulatedBench
 from autdtorch.hardware.firmware import OpenMPDFirmware, SonicSurfaceFirmware, UltrainoFirmware
@@ -22,6 +21,7 @@ from autdtorch.hardware.frames import (
 from autdtorch.hardware.levels import Levels, openmpd_drive, sonicsurface_drive, ultraino_drive
 from autdtorch.hardware.link import open_link
 from autdtorch.hardware.order import sonicsurface_channels, ultraino_pins
+from autdtorch.scene.drive import drive_from_phases
 
 seeds = st.integers(0, 2**32 - 1)
 

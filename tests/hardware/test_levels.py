@@ -6,9 +6,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autdtorch.drive import drive_from_phases, focus_phases
 from autdtorch.hardware import levels as device
 from autdtorch.hardware.levels import Levels
+from autdtorch.scene.drive import drive_from_phases, focus_phases
 
 DEVICES = {
     "autd3": (device.autd3_levels, device.autd3_drive, 256, 255),

@@ -10,9 +10,9 @@ import pytest
 import torch
 from filelock import FileLock, Timeout
 
-from autdtorch.cache import digest_of
 from autdtorch.hardware import EmulatedSensor, LogError
-from autdtorch.json_lines import SET_ASIDE, line_of, row_of
+from autdtorch.utils.digest import digest_of
+from autdtorch.utils.json_lines import SET_ASIDE, line_of, row_of
 
 
 def full_on(rows: int = 1) -> torch.Tensor:

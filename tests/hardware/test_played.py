@@ -7,7 +7,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autdtorch.array import TransducerArray
 from autdtorch.hardware import (
     OPENMPD,
     SONICSURFACE,
@@ -21,8 +20,9 @@ from autdtorch.hardware import (
     ultraino_boards,
 )
 from autdtorch.hardware.autd3 import autd3_device
-from autdtorch.openmpd_board import OpenMPDBoard
-from autdtorch.scene import Medium, Scene
+from autdtorch.hardware.openmpd_board import OpenMPDBoard
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.scene import Medium, Scene
 
 #: On two boards, where there are two, and in no order.
 TRANSDUCERS = [70, 3, *range(200, 186, -1)]

@@ -8,8 +8,6 @@ import re
 import pytest
 import torch
 
-from autdtorch.conditions import random_rms
-from autdtorch.drive import drive_from_phases
 from autdtorch.hardware import (
     KEYSIGHT,
     RIGOL,
@@ -24,7 +22,9 @@ from autdtorch.hardware import (
 from autdtorch.hardware.emulated_bus import EmulatedBus
 from autdtorch.hardware.emulated_usbtmc import EmulatedInstrument, Fault
 from autdtorch.hardware.scpi import Dialect
-from autdtorch.optim.gabs import gabs
+from autdtorch.methods.gabs import gabs
+from autdtorch.objectives.perturbations import random_rms
+from autdtorch.scene.drive import drive_from_phases
 
 CHIP = (0x2A8D, 0x1770)
 FREQUENCY = 40e3

@@ -6,8 +6,6 @@ from functools import partial
 import pytest
 import torch
 
-from autdtorch.conditions import Quantised, random_rms
-from autdtorch.drive import drive_from_phases
 from autdtorch.hardware import (
     OPENMPD,
     SONICSURFACE,
@@ -20,9 +18,11 @@ from autdtorch.hardware import (
     open_link,
     ultraino_boards,
 )
-from autdtorch.optim.gabs import gabs
-from autdtorch.optim.identify import identify
-from autdtorch.optim.lssg import lssg
+from autdtorch.methods.gabs import gabs
+from autdtorch.methods.identify import identify
+from autdtorch.methods.lssg import lssg
+from autdtorch.objectives.perturbations import Quantised, random_rms
+from autdtorch.scene.drive import drive_from_phases
 
 
 def full_on() -> torch.Tensor:

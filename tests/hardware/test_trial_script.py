@@ -18,12 +18,12 @@ import trial_run
 import trial_values
 from filelock import FileLock
 
-from autdtorch.array import TransducerArray
-from autdtorch.drive_file import load_drive
 from autdtorch.hardware import LinkError, OffError
-from autdtorch.hardware_report import compare
-from autdtorch.optim.gabs import gabs
-from autdtorch.scene_file import load_scene
+from autdtorch.io.drive_file import load_drive
+from autdtorch.io.scene_file import load_scene
+from autdtorch.methods.gabs import gabs
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.study.report.trial_report import compare
 
 SCENE = """
 name: two

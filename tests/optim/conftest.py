@@ -3,9 +3,9 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from autdtorch.array import TransducerArray
-from autdtorch.objective import SimulatedObjective
-from autdtorch.scene import Medium, Scene
+from autdtorch.objectives.simulated import SimulatedObjective
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.scene import Medium, Scene
 
 MakeObjective = Callable[[torch.Tensor], SimulatedObjective]
 
@@ -55,8 +55,8 @@ def random_matrix() -> Callable[[int, int, int], torch.Tensor]:
 @pytest.fixture(scope="session")
 def paper_objective() -> SimulatedObjective:
     """The paper's array and four foci in empty air."""
-    from autdtorch.freespace import free_space_matrix
-    from autdtorch.geometry import circle_points
+    from autdtorch.analytic.green import free_space_matrix
+    from autdtorch.scene.geometry import circle_points
 
     array = TransducerArray.grid((4, 4), pitch=10e-3, center=(1e-3, 50e-3, 50e-3))
     foci = circle_points(center=(80e-3, 50e-3, 50e-3), radius=30e-3, count=4, normal=(1, 0, 0))

@@ -4,9 +4,9 @@ import sys
 import pytest
 import torch
 
-from autdtorch.drive import drive_from_phases
-from autdtorch.objective import weakest_focus
-from autdtorch.optim.base import Ledger, trial_seed
+from autdtorch.methods.base import Ledger, trial_seed
+from autdtorch.objectives.simulated import weakest_focus
+from autdtorch.scene.drive import drive_from_phases
 
 
 class Broken:
@@ -78,7 +78,7 @@ def test_seeds_of_trials_are_all_different():
 
 def test_importing_the_methods_loads_no_numba():
     code = (
-        "import sys, autdtorch.optim.bayes, autdtorch.optim.gabs, autdtorch.optim.lssg, autdtorch.metrics;"
+        "import sys, autdtorch.methods.bayes.bayes, autdtorch.methods.gabs, autdtorch.methods.lssg;"
         "sys.exit(any(name.split('.')[0] == 'numba' for name in sys.modules))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -3,9 +3,9 @@ import math
 import pytest
 import torch
 
-from autdtorch.drive import drive_from_phases
-from autdtorch.objective import weakest_focus
-from autdtorch.optim.bayes import bayes_opt
+from autdtorch.methods.bayes.bayes import bayes_opt
+from autdtorch.objectives.simulated import weakest_focus
+from autdtorch.scene.drive import drive_from_phases
 
 SMALL = {"evaluations": 30, "initial": 6, "fixed_transducer": 2}
 

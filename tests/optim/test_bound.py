@@ -6,9 +6,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autdtorch.optim.bound import focus_bound
-from autdtorch.optim.gabs import gabs
-from autdtorch.optim.gradient import gradient_ascent, random_drives
+from autdtorch.methods.bound import focus_bound
+from autdtorch.methods.gabs import gabs
+from autdtorch.methods.gradient import gradient_ascent, random_drives
 
 
 @settings(max_examples=40)

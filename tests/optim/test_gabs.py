@@ -4,9 +4,9 @@ import math
 import pytest
 import torch
 
-from autdtorch.optim.base import trial_seed
-from autdtorch.optim.gabs import gabs
-from autdtorch.optim.lssg import lssg
+from autdtorch.methods.base import trial_seed
+from autdtorch.methods.gabs import gabs
+from autdtorch.methods.lssg import lssg
 
 
 def weakest(matrix, drive):

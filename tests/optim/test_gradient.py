@@ -3,8 +3,8 @@ import pytest
 import scipy.optimize
 import torch
 
-from autdtorch.objective import SimulatedObjective
-from autdtorch.optim.gradient import gradient_ascent
+from autdtorch.methods.gradient import gradient_ascent
+from autdtorch.objectives.simulated import SimulatedObjective
 
 
 def polished(matrix: torch.Tensor, starts: int) -> float:

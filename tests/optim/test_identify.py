@@ -5,10 +5,10 @@ import pytest
 import scipy.optimize
 import torch
 
-from autdtorch.conditions import Noise, Quantised
-from autdtorch.optim.bound import focus_bound
-from autdtorch.optim.gradient import gradient_ascent, random_drives
-from autdtorch.optim.identify import _fit, identify
+from autdtorch.methods.bound import focus_bound
+from autdtorch.methods.gradient import gradient_ascent, random_drives
+from autdtorch.methods.identify import _fit, identify
+from autdtorch.objectives.perturbations import Noise, Quantised
 
 
 @pytest.mark.parametrize("evaluations", [47, 64])

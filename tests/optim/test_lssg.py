@@ -3,9 +3,9 @@ import math
 import pytest
 import torch
 
-from autdtorch.drive import drive_from_phases, focus_phases, normalise
-from autdtorch.objective import weakest_focus
-from autdtorch.optim.lssg import lss, lssg
+from autdtorch.methods.lssg import lss, lssg
+from autdtorch.objectives.simulated import weakest_focus
+from autdtorch.scene.drive import drive_from_phases, focus_phases, normalise
 
 
 def focus_drives(scene):

@@ -8,14 +8,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autdtorch.conditions import Quantised
-from autdtorch.optim.base import NEAR_TIE
-from autdtorch.optim.bayes import bayes_opt
-from autdtorch.optim.gabs import gabs
-from autdtorch.optim.gradient import gradient_ascent
-from autdtorch.optim.identify import identify
-from autdtorch.optim.lssg import lss, lssg
-from autdtorch.optim.random_search import random_search
+from autdtorch.methods.base import NEAR_TIE
+from autdtorch.methods.bayes.bayes import bayes_opt
+from autdtorch.methods.gabs import gabs
+from autdtorch.methods.gradient import gradient_ascent
+from autdtorch.methods.identify import identify
+from autdtorch.methods.lssg import lss, lssg
+from autdtorch.methods.random_search import random_search
+from autdtorch.objectives.perturbations import Quantised
 
 
 def small_bayes_opt(objective, **options):
@@ -140,7 +140,7 @@ def test_a_method_of_small_steps_takes_one_thread_and_gives_the_others_back(
 ):
     used = set()
     monkeypatch.setattr(
-        "autdtorch.optim.gradient._pressure",
+        "autdtorch.methods.gradient._pressure",
         lambda matrix, drive: used.add(torch.get_num_threads()) or (drive[:, None] * matrix).sum(dim=-1),
     )
     threads = torch.get_num_threads()

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from autdtorch.optim.acquisition import _climb, _value, expected_improvement, largest, posterior
-from autdtorch.optim.acquisition import log_expected_improvement as log_ei
-from autdtorch.optim.process import Process, features_of
+from autdtorch.methods.bayes.acquisition import _climb, _value, expected_improvement, largest, posterior
+from autdtorch.methods.bayes.acquisition import log_expected_improvement as log_ei
+from autdtorch.methods.bayes.process import Process, features_of
 
 CIRCLE = pytest.mark.parametrize("circle", [False, True], ids=["phases", "circle"])
 DIMENSIONS = 4

@@ -3,9 +3,9 @@ import math
 import pytest
 import torch
 
-from autdtorch.drive import drive_from_phases
-from autdtorch.objective import weakest_focus
-from autdtorch.optim.random_search import random_search
+from autdtorch.methods.random_search import random_search
+from autdtorch.objectives.simulated import weakest_focus
+from autdtorch.scene.drive import drive_from_phases
 
 
 def test_longer_search_begins_with_the_shorter(make_objective, random_matrix):

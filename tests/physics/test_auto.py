@@ -11,9 +11,9 @@ import pytest
 from small_scenes import CUBE, relative_error, small_scene
 
 from autdtorch.fdtd.grid import make_box, make_grid
-from autdtorch.obstacles import Box, Obstacle, Sphere
-from autdtorch.propagator import FreeSpacePropagator, SimulatedPropagator, make_propagator
-from autdtorch.propagator.auto import method_for
+from autdtorch.propagators import FreeSpacePropagator, SimulatedPropagator, make_propagator
+from autdtorch.propagators.auto import method_for
+from autdtorch.scene.obstacles import Box, Obstacle, Sphere
 
 
 def test_nothing_is_simulated_where_nothing_scatters(caplog: pytest.LogCaptureFixture) -> None:

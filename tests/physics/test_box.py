@@ -9,12 +9,12 @@ import pytest
 import torch
 from small_scenes import AIR, CUBE, relative_error, small_scene
 
-from autdtorch.array import TransducerArray
+from autdtorch.analytic import rigid_sphere
 from autdtorch.fdtd.grid import make_box
-from autdtorch.obstacles import Box, Sphere
-from autdtorch.propagator import make_propagator
-from autdtorch.reference import rigid_sphere
-from autdtorch.scene import OverlapWarning
+from autdtorch.propagators import make_propagator
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.obstacles import Box, Sphere
+from autdtorch.scene.scene import OverlapWarning
 
 SPHERE = Sphere((12.2e-3, 11.9e-3, 12.1e-3), 3.3e-3, rigid=True)
 

@@ -12,14 +12,14 @@ import pytest
 import torch
 from small_scenes import AIR, relative_error
 
-from autdtorch.array import TransducerArray
+from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd.grid import obstacles_extent
-from autdtorch.freespace import free_space_matrix
-from autdtorch.obstacles import Box, Obstacle, Sphere
-from autdtorch.propagator import BoxPropagator, make_propagator
-from autdtorch.propagator.cost import _PAIR, box_cost, grid_cost
-from autdtorch.propagator.groups import Grouping, cheapest_grouping, one_box
-from autdtorch.scene import Scene
+from autdtorch.propagators import BoxPropagator, make_propagator
+from autdtorch.propagators.cost import _PAIR, box_cost, grid_cost
+from autdtorch.propagators.groups import Grouping, cheapest_grouping, one_box
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.obstacles import Box, Obstacle, Sphere
+from autdtorch.scene.scene import Scene
 
 EXTENT, SPACING, TOLERANCE = 64e-3, 1.4e-3, 1e-3
 NEAR = (13.8e-3, 15.2e-3, 15.2e-3)
@@ -37,7 +37,7 @@ def take_one_box(monkeypatch: pytest.MonkeyPatch) -> OneBox:
     def alone(scene: Scene, spacing: float, *_: float) -> Grouping:
         return one_box(scene, spacing)
 
-    return functools.partial(monkeypatch.setattr, "autdtorch.propagator.box.cheapest_grouping", alone)
+    return functools.partial(monkeypatch.setattr, "autdtorch.propagators.box.cheapest_grouping", alone)
 
 
 def far_apart(*obstacles: Obstacle) -> Scene:
@@ -103,7 +103,7 @@ def test_points_in_a_box_read_its_grid_and_hear_the_other(take_one_box: OneBox) 
 def test_boxes_that_hear_too_much_of_each_other_are_joined(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("autdtorch.propagator.coupling.MOST_PASSES", 1)
+    monkeypatch.setattr("autdtorch.propagators.coupling.MOST_PASSES", 1)
     propagator = make_propagator(spheres(), "box", SPACING, tolerance=TOLERANCE)
     with caplog.at_level(logging.INFO):
         propagator.transfer_matrix()
@@ -147,7 +147,7 @@ def test_boxes_that_need_many_passes_are_joined(monkeypatch: pytest.MonkeyPatch)
     assert cheapest_grouping(scene, spacing, TOLERANCE, runs=1) == one_box(scene, spacing)
     together = make_propagator(scene, "box", spacing, tolerance=TOLERANCE)
     apart = box_each(scene, spacing)
-    monkeypatch.setattr("autdtorch.propagator.box.cheapest_grouping", lambda *_: apart)
+    monkeypatch.setattr("autdtorch.propagators.box.cheapest_grouping", lambda *_: apart)
     two = make_propagator(scene, "box", spacing, tolerance=TOLERANCE)
     assert isinstance(together, BoxPropagator)
     assert isinstance(two, BoxPropagator)
@@ -171,7 +171,7 @@ def test_what_boxes_hear_of_each_other_is_counted_from_their_geometry(
 ) -> None:
     scene, spacing = cubes(edge, 60e-3), 2e-3
     apart = box_each(scene, spacing)
-    monkeypatch.setattr("autdtorch.propagator.box.cheapest_grouping", lambda *_: apart)
+    monkeypatch.setattr("autdtorch.propagators.box.cheapest_grouping", lambda *_: apart)
     propagator = make_propagator(scene, "box", spacing, tolerance=TOLERANCE)
     assert isinstance(propagator, BoxPropagator)
     one, other = propagator._boxes

@@ -20,8 +20,8 @@ from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.kernels.cuda import Blocks, CudaKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import assemble
-from autdtorch.obstacles import Box, Obstacle
-from autdtorch.propagator import make_propagator
+from autdtorch.propagators import make_propagator
+from autdtorch.scene.obstacles import Box, Obstacle
 
 needs_gpu = pytest.mark.skipif(
     not torch.cuda.is_available(), reason="needs an NVIDIA GPU: torch.cuda.is_available() is false"

@@ -8,11 +8,11 @@ import pytest
 import torch
 from small_scenes import AIR, relative_error, small_scene
 
-from autdtorch import reference
+from autdtorch import analytic
+from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd.spacing import RATIO, coarsest_spacing, grid_error, second_spacing, spacing_for
-from autdtorch.freespace import free_space_matrix
-from autdtorch.obstacles import Sphere
-from autdtorch.propagator import FreeSpacePropagator, FullPropagator, make_propagator
+from autdtorch.propagators import FreeSpacePropagator, FullPropagator, make_propagator
+from autdtorch.scene.obstacles import Sphere
 
 CENTER, RADIUS = (12.2e-3, 11.9e-3, 12.1e-3), 3.3e-3
 
@@ -22,9 +22,9 @@ def exact_sphere(rigid: bool) -> tuple[Sphere, torch.Tensor]:
     where = (scene.control_points, scene.array.positions, scene.wavenumber, CENTER, RADIUS)
     strength = 4 * math.pi * scene.array.source_strength
     if rigid:
-        return Sphere(CENTER, RADIUS, rigid=True), strength * reference.rigid_sphere(*where)
+        return Sphere(CENTER, RADIUS, rigid=True), strength * analytic.rigid_sphere(*where)
     heavy = Sphere(CENTER, RADIUS, density=10 * AIR.density, sound_speed=1.5 * AIR.sound_speed)
-    return heavy, strength * reference.fluid_sphere(*where, 10.0, 1.5)
+    return heavy, strength * analytic.fluid_sphere(*where, 10.0, 1.5)
 
 
 @pytest.mark.parametrize("rigid", [True, False], ids=["rigid", "heavy"])

@@ -8,7 +8,7 @@ import pytest
 from small_scenes import CUBE, small_scene
 
 import autdtorch as at
-from autdtorch import simulation_estimate
+from autdtorch.propagators import estimate as simulation_estimate
 
 BALL = at.Sphere((12e-3, 20e-3, 5e-3), 3e-3, density=0.2, sound_speed=900.0)
 

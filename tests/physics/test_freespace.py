@@ -10,10 +10,10 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from autdtorch.array import TransducerArray
-from autdtorch.drive import drive_from_phases, focus_phases
-from autdtorch.freespace import free_space_matrix, green
-from autdtorch.neighbours import distances
+from autdtorch.analytic.green import free_space_matrix, green
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.drive import drive_from_phases, focus_phases
+from autdtorch.utils.neighbours import distances
 
 WAVELENGTH = 8.5e-3
 WAVENUMBER = 2 * math.pi / WAVELENGTH

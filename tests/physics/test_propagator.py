@@ -9,17 +9,17 @@ import pytest
 import torch
 from small_scenes import AIR, CUBE, relative_error, small_scene
 
-from autdtorch.array import TransducerArray
-from autdtorch.drive import drive_from_phases
-from autdtorch.freespace import free_space_matrix
-from autdtorch.geometry import plane_basis
-from autdtorch.objective import SimulatedObjective
-from autdtorch.propagator import (
+from autdtorch.analytic.green import free_space_matrix
+from autdtorch.objectives.simulated import SimulatedObjective
+from autdtorch.propagators import (
     FreeSpacePropagator,
     SteadyStateWarning,
     make_propagator,
 )
-from autdtorch.scene import Box, Scene
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.drive import drive_from_phases
+from autdtorch.scene.geometry import plane_basis
+from autdtorch.scene.scene import Box, Scene
 
 
 def random_drive(rows: int, transducers: int, seed: int = 0) -> torch.Tensor:

@@ -9,8 +9,8 @@ from exact_fields import WAVELENGTH, K
 from scipy.special import j0, struve
 
 import autdtorch as at
-from autdtorch import reference
-from autdtorch.freespace import green
+from autdtorch import analytic
+from autdtorch.analytic.green import green
 
 PISTON = 5e-3
 POINTS, SOURCES = [[0.02, 0.0, 0.0], [0.0, 0.01, 0.05]], [[0.0, 0.0, 0.03]]
@@ -19,15 +19,15 @@ UP = (0.0, 0.0, 1.0)
 
 
 def test_reference_is_reached_from_the_package():
-    assert at.reference.rigid_sphere is reference.rigid_sphere
-    assert at.reference.green is green
+    assert at.analytic.rigid_sphere is analytic.rigid_sphere
+    assert at.analytic.green is green
 
 
 def test_piston_on_its_axis_is_the_closed_form_near_and_far():
     z = torch.tensor([0.0, 1e-4, 5e-3, 0.1, 3.0, 1e3], dtype=torch.float64)
     points = torch.stack([z, 0 * z, 0 * z], dim=1)
-    field = reference.piston_field(points, [[0.0, 0.0, 0.0]], K, PISTON, (2.0, 0.0, 0.0))[:, 0]
-    exact = reference.piston_on_axis(z, K, PISTON)
+    field = analytic.piston_field(points, [[0.0, 0.0, 0.0]], K, PISTON, (2.0, 0.0, 0.0))[:, 0]
+    exact = analytic.piston_on_axis(z, K, PISTON)
     # Rounding of k z = 7e5 at the farthest.
     assert torch.allclose(field, exact, rtol=1e-9, atol=0)
     # Fresnel's phase k a^2 / 4z = 5e-6 is left at 1 km.
@@ -46,9 +46,9 @@ def test_piston_far_away_is_its_directivity(reach):
     distance = 1e4 * WAVELENGTH * max(1, reach**2)
     angle = torch.linspace(0, math.pi / 2, 9, dtype=torch.float64)
     points = distance * torch.stack([torch.sin(angle), 0 * angle, torch.cos(angle)], dim=1)
-    field = reference.piston_field(points, [[0.0, 0.0, 0.0]], K, radius, (0.0, 0.0, 1.0))
+    field = analytic.piston_field(points, [[0.0, 0.0, 0.0]], K, radius, (0.0, 0.0, 1.0))
     ratio = (field / green(points, [[0.0, 0.0, 0.0]], K))[:, 0]
-    assert (ratio - reference.piston_directivity(angle, K, radius)).abs().max() < 1e-4
+    assert (ratio - analytic.piston_directivity(angle, K, radius)).abs().max() < 1e-4
 
 
 def test_piston_near_is_the_sum_over_its_disc():
@@ -67,7 +67,7 @@ def test_piston_near_is_the_sum_over_its_disc():
     area = torch.tensor(np.repeat(rho * rho_weights, phi.size) * 2 * math.pi / phi.size)
     points = [[0.3 * PISTON, 0.0, PISTON], [0.0, PISTON, -PISTON], [2.5 * PISTON, 0.0, 0.0]]
     expected = green(points, grid, K) @ area.to(torch.complex128) / (math.pi * PISTON**2)
-    field = reference.piston_field(points, [[0.0, 0.0, 0.0]], K, PISTON, (0.0, 0.0, 1.0))
+    field = analytic.piston_field(points, [[0.0, 0.0, 0.0]], K, PISTON, (0.0, 0.0, 1.0))
     assert torch.allclose(field[:, 0], expected, rtol=1e-10, atol=0)
 
 
@@ -77,7 +77,7 @@ def test_piston_on_its_rim_is_the_closed_form():
     chords = j0(reach) + 1j * struve(0, reach) - 1
     expected = chords / (4j * math.pi * K * PISTON**2)
     point = torch.tensor([[PISTON, 0.0, 0.0]], dtype=torch.float64)
-    field = reference.piston_field(point, [[0.0, 0.0, 0.0]], K, PISTON, (0.0, 0.0, 1.0))
+    field = analytic.piston_field(point, [[0.0, 0.0, 0.0]], K, PISTON, (0.0, 0.0, 1.0))
     # Rounding.
     assert abs(field[0, 0] / expected - 1) < 1e-10
 
@@ -85,40 +85,40 @@ def test_piston_on_its_rim_is_the_closed_form():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: reference.rigid_sphere([ORIGIN], SOURCES, K, ORIGIN, 0.01), r"points\[0\].*at least 0.01 m"),
+        (lambda: analytic.rigid_sphere([ORIGIN], SOURCES, K, ORIGIN, 0.01), r"points\[0\].*at least 0.01 m"),
         (
-            lambda: reference.rigid_sphere(POINTS, [ORIGIN], K, ORIGIN, 0.01),
+            lambda: analytic.rigid_sphere(POINTS, [ORIGIN], K, ORIGIN, 0.01),
             r"sources\[0\].*must be at least",
         ),
-        (lambda: reference.rigid_sphere(SOURCES, SOURCES, K, ORIGIN, 0.01), r"points\[0\].*lies on source 0"),
-        (lambda: reference.soft_sphere(POINTS, SOURCES, K, ORIGIN, -1.0), "radius: -1.0 m; must be"),
+        (lambda: analytic.rigid_sphere(SOURCES, SOURCES, K, ORIGIN, 0.01), r"points\[0\].*lies on source 0"),
+        (lambda: analytic.soft_sphere(POINTS, SOURCES, K, ORIGIN, -1.0), "radius: -1.0 m; must be"),
         (
-            lambda: reference.fluid_sphere(POINTS, SOURCES, K, ORIGIN, 0.01, 0.0, 1.0),
+            lambda: analytic.fluid_sphere(POINTS, SOURCES, K, ORIGIN, 0.01, 0.0, 1.0),
             "density_ratio: 0.0; must be",
         ),
         (
-            lambda: reference.fluid_sphere(POINTS, SOURCES, K, ORIGIN, 0.01, 1.0, math.inf),
+            lambda: analytic.fluid_sphere(POINTS, SOURCES, K, ORIGIN, 0.01, 1.0, math.inf),
             "speed_ratio: inf; must",
         ),
         (
-            lambda: reference.rigid_plane([[0, 0, -1e-3]], SOURCES, K, ORIGIN, UP),
+            lambda: analytic.rigid_plane([[0, 0, -1e-3]], SOURCES, K, ORIGIN, UP),
             r"points\[0\].*-0.001 m in front",
         ),
-        (lambda: reference.soft_plane(POINTS, [[0, 0, -1.0]], K, ORIGIN, UP), r"sources\[0\].*-1 m in front"),
+        (lambda: analytic.soft_plane(POINTS, [[0, 0, -1.0]], K, ORIGIN, UP), r"sources\[0\].*-1 m in front"),
         (
-            lambda: reference.fluid_half_space(POINTS, [ORIGIN], K, ORIGIN, UP, 2.0, 1.0),
+            lambda: analytic.fluid_half_space(POINTS, [ORIGIN], K, ORIGIN, UP, 2.0, 1.0),
             r"sources\[0\].*0 m in front",
         ),
         (
-            lambda: reference.fluid_slab(POINTS, SOURCES, K, ORIGIN, UP, 0.0, 2.0, 1.0),
+            lambda: analytic.fluid_slab(POINTS, SOURCES, K, ORIGIN, UP, 0.0, 2.0, 1.0),
             "thickness: 0.0 m; must be",
         ),
         (
-            lambda: reference.step_coefficients([0.1, 1.6], 2.0, 1.0),
+            lambda: analytic.step_coefficients([0.1, 1.6], 2.0, 1.0),
             r"angle: \(0.1, 1.6\) rad; .*\[0, pi/2\)",
         ),
-        (lambda: reference.piston_on_axis([-0.1], K, PISTON), "distance: .*must be >= 0"),
-        (lambda: reference.piston_field(POINTS, SOURCES, K, PISTON, ORIGIN), "normal: .*length"),
+        (lambda: analytic.piston_on_axis([-0.1], K, PISTON), "distance: .*must be >= 0"),
+        (lambda: analytic.piston_field(POINTS, SOURCES, K, PISTON, ORIGIN), "normal: .*length"),
     ],
 )
 def test_bad_input_is_named(call, message):

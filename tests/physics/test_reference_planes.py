@@ -6,8 +6,8 @@ import pytest
 import torch
 from exact_fields import FLUIDS, SLOPE_TOLERANCE, STEP, WAVELENGTH, K, relative, sampled, slope
 
-from autdtorch import reference
-from autdtorch.freespace import green
+from autdtorch import analytic
+from autdtorch.analytic.green import green
 
 ORIGIN = (0.002, 0.001, -0.003)
 NORMAL = (0.3, -0.5, 0.9)
@@ -28,7 +28,7 @@ def above_plane(heights, lateral=((0.0, 0.0), (0.01, -0.004), (0.1, 0.03))):
 
 def fluid_half_space(density_ratio, speed_ratio):
     def field(points, sources, **options):
-        return reference.fluid_half_space(
+        return analytic.fluid_half_space(
             points, sources, K, ORIGIN, NORMAL, density_ratio, speed_ratio, **options
         )
 
@@ -37,7 +37,7 @@ def fluid_half_space(density_ratio, speed_ratio):
 
 def fluid_slab(density_ratio, speed_ratio, thickness=THICKNESS):
     def field(points, sources, **options):
-        return reference.fluid_slab(
+        return analytic.fluid_slab(
             points, sources, K, ORIGIN, NORMAL, thickness, density_ratio, speed_ratio, **options
         )
 
@@ -49,7 +49,7 @@ ANGLES = torch.linspace(0, 1.55, 32, dtype=torch.float64)
 
 @pytest.mark.parametrize(("density_ratio", "speed_ratio"), [*FLUIDS, (3.0, 4.3)])
 def test_step_conserves_energy_and_reflects_all_beyond_the_critical_angle(density_ratio, speed_ratio):
-    reflected, transmitted = reference.step_coefficients(ANGLES, density_ratio, speed_ratio)
+    reflected, transmitted = analytic.step_coefficients(ANGLES, density_ratio, speed_ratio)
     sine = speed_ratio * torch.sin(ANGLES)
     cosine = torch.sqrt((1 - sine**2).clamp(min=0))
     flux = transmitted.abs() ** 2 * cosine / (density_ratio * speed_ratio * torch.cos(ANGLES))
@@ -63,11 +63,11 @@ def test_step_conserves_energy_and_reflects_all_beyond_the_critical_angle(densit
 
 @pytest.mark.parametrize(("density_ratio", "speed_ratio"), [*FLUIDS, (3.0, 4.3)])
 def test_slab_conserves_energy_and_sums_its_echoes(density_ratio, speed_ratio):
-    reflected, transmitted = reference.slab_coefficients(ANGLES, K, THICKNESS, density_ratio, speed_ratio)
+    reflected, transmitted = analytic.slab_coefficients(ANGLES, K, THICKNESS, density_ratio, speed_ratio)
     power = reflected.abs() ** 2 + transmitted.abs() ** 2
     # Rounding, magnified at resonances and where cos is small.
     assert torch.allclose(power, torch.ones_like(power), rtol=0, atol=1e-10)
-    step, _ = reference.step_coefficients(ANGLES, density_ratio, speed_ratio)
+    step, _ = analytic.step_coefficients(ANGLES, density_ratio, speed_ratio)
     inner = K * torch.sqrt(1 / speed_ratio**2 - torch.sin(ANGLES).to(torch.complex128) ** 2)
     pass_once = torch.exp(1j * inner * THICKNESS)
     echoes = 1 - step**2 * pass_once**2
@@ -76,15 +76,15 @@ def test_slab_conserves_energy_and_sums_its_echoes(density_ratio, speed_ratio):
 
 
 def test_slabs_that_let_all_pass():
-    reflected, transmitted = reference.slab_coefficients(ANGLES, K, 1e-12, 3.0, 2.0)
+    reflected, transmitted = analytic.slab_coefficients(ANGLES, K, 1e-12, 3.0, 2.0)
     # First order in k d = 7e-10, over cos of the last angle, 0.02.
     assert (reflected.abs() + (transmitted - 1).abs() < 1e-6).all()
-    half_wave, through = reference.slab_coefficients(0.0, K, WAVELENGTH, 3.0, 2.0)
+    half_wave, through = analytic.slab_coefficients(0.0, K, WAVELENGTH, 3.0, 2.0)
     assert abs(half_wave) < 1e-12  # rounding of sin(pi)
     assert abs(through + 1) < 1e-12
     critical = math.asin(0.5)
-    at_critical, _ = reference.slab_coefficients(critical, K, THICKNESS, 3.0, 2.0)
-    beside, _ = reference.slab_coefficients(critical + 1e-9, K, THICKNESS, 3.0, 2.0)
+    at_critical, _ = analytic.slab_coefficients(critical, K, THICKNESS, 3.0, 2.0)
+    beside, _ = analytic.slab_coefficients(critical + 1e-9, K, THICKNESS, 3.0, 2.0)
     # Smooth there: R depends on the square of the inner wavenumber, and k d = 4.
     assert abs(at_critical - beside) < 1e-7
 
@@ -94,8 +94,8 @@ def test_image_sources_meet_the_conditions_on_their_planes():
     rigid, soft = (
         sampled(lambda points, plane=plane: plane(points, sources, K, ORIGIN, NORMAL), above_plane(heights))
         for plane, heights in (
-            (reference.rigid_plane, [0, STEP, 2 * STEP]),
-            (reference.soft_plane, [0]),
+            (analytic.rigid_plane, [0, STEP, 2 * STEP]),
+            (analytic.soft_plane, [0]),
         )
     )
     incident = sampled(lambda points: green(points, sources, K), above_plane([0]))[:, 0]
@@ -142,7 +142,7 @@ def test_layers_of_the_medium_are_not_there(layer):
 def test_layers_become_rigid_or_soft_with_their_density(layer):
     sources = above_plane([1e-3, 0.02])[0]
     points = above_plane([0.0, 0.03]).reshape(-1, 3)
-    image = reference.rigid_plane(points, sources, K, ORIGIN, NORMAL, scattered=True)
+    image = analytic.rigid_plane(points, sources, K, ORIGIN, NORMAL, scattered=True)
     # First order in the ratio, times some 100 for the slab's resonances.
     assert relative(layer(1e9, 1.3)(points, sources, scattered=True) - image, points, sources) < 1e-6
     assert relative(layer(1e-9, 1.3)(points, sources, scattered=True) + image, points, sources) < 1e-6
@@ -186,7 +186,7 @@ def test_slab_is_reciprocal_from_front_to_back():
     behind = above_plane([-THICKNESS])[0, 0].tolist()
     turned = tuple(-entry for entry in NORMAL)
     there = fluid_slab(77, 1)(back, front)
-    here = reference.fluid_slab(front, back, K, behind, turned, THICKNESS, 77, 1)
+    here = analytic.fluid_slab(front, back, K, behind, turned, THICKNESS, 77, 1)
     assert relative(there - here.T, back, front) < 1e-10
 
 
@@ -197,11 +197,11 @@ def test_far_away_the_reflected_wave_is_the_image_times_the_plane_wave_coefficie
     source = above_plane([length / 2 * math.cos(angle)])[0]
     point = above_plane([length / 2 * math.cos(angle)], [(length * math.sin(angle), 0.0)])[0]
     wave = layer(2.5, 0.6)(point, source, scattered=True)
-    image = reference.rigid_plane(point, source, K, ORIGIN, NORMAL, scattered=True)
+    image = analytic.rigid_plane(point, source, K, ORIGIN, NORMAL, scattered=True)
     if layer is fluid_slab:
-        expected, _ = reference.slab_coefficients(angle, K, THICKNESS, 2.5, 0.6)
+        expected, _ = analytic.slab_coefficients(angle, K, THICKNESS, 2.5, 0.6)
     else:
-        expected, _ = reference.step_coefficients(angle, 2.5, 0.6)
+        expected, _ = analytic.step_coefficients(angle, 2.5, 0.6)
     assert abs(wave / image - expected) < 10 / (K * length)
 
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 from exact_fields import FLUIDS, SLOPE_TOLERANCE, STEP, K, relative, sampled, slope
 
-from autdtorch import reference
-from autdtorch.freespace import green
+from autdtorch import analytic
+from autdtorch.analytic.green import green
 
 CENTER = (0.01, -0.02, 0.005)
 RADIUS = 0.01
@@ -24,16 +24,16 @@ def on_sphere(distances, radius=RADIUS):
 
 
 def rigid_sphere(points, sources, **options):
-    return reference.rigid_sphere(points, sources, K, CENTER, RADIUS, **options)
+    return analytic.rigid_sphere(points, sources, K, CENTER, RADIUS, **options)
 
 
 def soft_sphere(points, sources, **options):
-    return reference.soft_sphere(points, sources, K, CENTER, RADIUS, **options)
+    return analytic.soft_sphere(points, sources, K, CENTER, RADIUS, **options)
 
 
 def fluid_sphere(density_ratio, speed_ratio):
     def field(points, sources, **options):
-        return reference.fluid_sphere(
+        return analytic.fluid_sphere(
             points, sources, K, CENTER, RADIUS, density_ratio, speed_ratio, **options
         )
 
@@ -66,7 +66,7 @@ def test_rigid_sphere_of_ka_60_holds_a_hundredth_of_its_radius_off():
     points = heights.new_tensor(CENTER) + heights[:, None] * torch.tensor(
         [0.0, 0.0, 1.0], dtype=torch.float64
     )
-    field = reference.rigid_sphere(points, source, K, CENTER, radius)
+    field = analytic.rigid_sphere(points, source, K, CENTER, radius)
     assert abs(slope(field[None])) / (K * abs(field[0])) < 1e-4
     # And it nearly doubles what arrives, as a plane would but for a curvature of 0.01 radii.
     assert abs(field[0] / green(points[:1], source, K) - 2) < 0.02
@@ -127,19 +127,19 @@ def test_small_sphere_scatters_by_compressibility_and_density(density_ratio, spe
     points = distance * torch.stack([torch.sin(angle), 0 * angle, -torch.cos(angle)], dim=1)
     points[-1, 2] -= 1 / K  # not on the source
     arguments = points, source, K, (0.0, 0.0, 0.0), radius
-    wave = reference.fluid_sphere(*arguments, density_ratio, speed_ratio, scattered=True)[:, 0]
+    wave = analytic.fluid_sphere(*arguments, density_ratio, speed_ratio, scattered=True)[:, 0]
     scale = 4 * math.pi * green([[0.0, 0.0, 0.0]], source, K) * green(points, [[0.0, 0.0, 0.0]], K)
     amplitude = wave / (K**2 * radius**3 * scale[:, 0])
     monopole = (1 / (density_ratio * speed_ratio**2) - 1) / 3
     dipole = (density_ratio - 1) / (2 * density_ratio + 1)
     assert (amplitude - (monopole + dipole * torch.cos(angle))).abs().max() < 1e-3
-    rigid = reference.rigid_sphere(*arguments, scattered=True)[:, 0] / (K**2 * radius**3 * scale[:, 0])
+    rigid = analytic.rigid_sphere(*arguments, scattered=True)[:, 0] / (K**2 * radius**3 * scale[:, 0])
     assert (rigid - (torch.cos(angle) / 2 - 1 / 3)).abs().max() < 1e-3
 
 
 @pytest.mark.parametrize(
     ("sphere", "plane"),
-    [(reference.rigid_sphere, reference.rigid_plane), (reference.soft_sphere, reference.soft_plane)],
+    [(analytic.rigid_sphere, analytic.rigid_plane), (analytic.soft_sphere, analytic.soft_plane)],
 )
 def test_large_sphere_is_a_plane_but_for_its_curvature(sphere, plane):
     source, points = [[0.0, 0.0, 8e-3]], [[4e-3, 0.0, 6e-3], [0.0, 0.0, 1e-3]]
@@ -155,4 +155,4 @@ def test_large_sphere_is_a_plane_but_for_its_curvature(sphere, plane):
 
 def test_points_and_sources_that_no_series_reaches_are_refused():
     with pytest.raises(ValueError, match=r"1e-05 m off the sphere.*0.001 m or more"):
-        reference.soft_sphere([[0, 0, 1 + 1e-5]], [[0, 0, 1 + 1e-5]], 1.0, (0, 0, 0), 1.0, scattered=True)
+        analytic.soft_sphere([[0, 0, 1 + 1e-5]], [[0, 0, 1 + 1e-5]], 1.0, (0, 0, 0), 1.0, scattered=True)

@@ -8,10 +8,10 @@ import pytest
 import torch
 from small_scenes import AIR, relative_error, small_scene
 
-from autdtorch.obstacles import Sphere
-from autdtorch.propagator import make_propagator
-from autdtorch.reference import fluid_sphere, rigid_sphere
-from autdtorch.scene import Scene
+from autdtorch.analytic import fluid_sphere, rigid_sphere
+from autdtorch.propagators import make_propagator
+from autdtorch.scene.obstacles import Sphere
+from autdtorch.scene.scene import Scene
 
 CENTER, RADIUS, RATIO = (12.2e-3, 11.9e-3, 12.1e-3), 3.3e-3, 77.0
 

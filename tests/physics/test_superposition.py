@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 
+from autdtorch.analytic.green import green
 from autdtorch.fdtd.superposition import superposition
-from autdtorch.freespace import green
 
 
 def places(points: int, sources: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -52,7 +52,7 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -
     targets, origins, amplitude = places(3000, 200)
     sums = []
     for threads in (1, 2, 5):
-        monkeypatch.setattr("autdtorch.threads.thread_count", lambda count=threads: count)
+        monkeypatch.setattr("autdtorch.utils.threads.thread_count", lambda count=threads: count)
         sums += [superposition(targets, origins, amplitude, 740.0, dtype=torch.float32)]
         sums += [superposition(origins, targets, amplitude[:1].repeat(3000, 1), 740.0)]
     for one, other in (sums[2:4], sums[4:]):

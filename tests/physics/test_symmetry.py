@@ -15,13 +15,13 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from small_scenes import AIR, relative_error
 
-from autdtorch.array import TransducerArray
 from autdtorch.fdtd.grid import make_box
-from autdtorch.geometry import circle_points
-from autdtorch.obstacles import Box, Cylinder, Obstacle, Sphere, VoxelMask
-from autdtorch.propagator import SimulatedPropagator, make_propagator
-from autdtorch.scene import OverlapWarning, Scene
-from autdtorch.scene_file import load_scene
+from autdtorch.io.scene_file import load_scene
+from autdtorch.propagators import SimulatedPropagator, make_propagator
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.geometry import circle_points
+from autdtorch.scene.obstacles import Box, Cylinder, Obstacle, Sphere, VoxelMask
+from autdtorch.scene.scene import OverlapWarning, Scene
 
 SCENES = Path(__file__).parents[2] / "configs" / "scene"
 MIDDLE = 12e-3, 12e-3, 12e-3

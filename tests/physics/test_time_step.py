@@ -16,8 +16,8 @@ from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, St
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.stepping import Assembly, assemble, drive_signal, lock_in
-from autdtorch.propagator import make_propagator
-from autdtorch.scene import Box
+from autdtorch.propagators import make_propagator
+from autdtorch.scene.scene import Box
 
 NOBODY = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros((0, 2), dtype=torch.float64))
 DEAF = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1), dtype=torch.float64))

@@ -10,14 +10,14 @@ import pytest
 import torch
 from small_scenes import AIR, relative_error
 
-from autdtorch import reference
-from autdtorch.array import TransducerArray
+from autdtorch import analytic
 from autdtorch.fdtd.kernels.contract import Receivers, Sources
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.stepping import assemble
-from autdtorch.obstacles import Box, Obstacle, Sphere
-from autdtorch.propagator import make_propagator
-from autdtorch.scene import Scene
+from autdtorch.propagators import make_propagator
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.obstacles import Box, Obstacle, Sphere
+from autdtorch.scene.scene import Scene
 
 FACE = 18e-3
 FRONT = [(8e-3, 15e-3, 13e-3), (12e-3, 8e-3, 16e-3), (10e-3, 16e-3, 9e-3)]
@@ -40,7 +40,7 @@ def error(
 def test_rigid_wall_mirrors_the_source() -> None:
     wall = Box((FACE + 0.5, 0, 0), (1.0, 1.0, 1.0), rigid=True)
     # the grid's own error in air is 3e-4, and the run ends 1e-3 from steady
-    assert error(layered_scene((wall,), FRONT), reference.rigid_plane) < 1.5e-3
+    assert error(layered_scene((wall,), FRONT), analytic.rigid_plane) < 1.5e-3
 
 
 def test_fluid_half_space_reflects() -> None:
@@ -48,7 +48,7 @@ def test_fluid_half_space_reflects() -> None:
         (FACE + 0.5, 0, 0), (1.0, 1.0, 1.0), density=3 * AIR.density, sound_speed=1.5 * AIR.sound_speed
     )
     ratios = {"density_ratio": 3.0, "speed_ratio": 1.5}
-    assert error(layered_scene((wall,), FRONT), reference.fluid_half_space, **ratios) < 2e-3
+    assert error(layered_scene((wall,), FRONT), analytic.fluid_half_space, **ratios) < 2e-3
 
 
 def slab(normal: int = 0, begin: float = FACE, thickness: float = 5e-3, density: float = 3.0) -> Box:
@@ -63,7 +63,7 @@ def test_slab_transmits(shift: float) -> None:
     """Required: 1 %. The faces lie half-way between cell centres, where the scheme is exact head on."""
     what = {"thickness": 5e-3, "density_ratio": 3.0, "speed_ratio": 1.5}
     scene = layered_scene((slab(begin=FACE + shift),), BEHIND)
-    assert error(scene, reference.fluid_slab, FACE + shift, **what) < 2e-3
+    assert error(scene, analytic.fluid_slab, FACE + shift, **what) < 2e-3
 
 
 @pytest.mark.parametrize("density", [77.0, 3.0, 0.01])

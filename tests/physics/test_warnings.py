@@ -9,15 +9,15 @@ import pytest
 import torch
 from small_scenes import AIR, CUBE, small_scene
 
-from autdtorch.obstacles import Box, Sphere
-from autdtorch.propagator import (
+from autdtorch.propagators import (
     BoxPropagator,
     SimulatedPropagator,
     SteadyStateWarning,
     differentiable_field,
     make_propagator,
 )
-from autdtorch.scene import OverlapWarning, Scene
+from autdtorch.scene.obstacles import Box, Sphere
+from autdtorch.scene.scene import OverlapWarning, Scene
 
 DRIVE = torch.ones(4, dtype=torch.complex128)
 

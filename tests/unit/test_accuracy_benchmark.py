@@ -28,10 +28,10 @@ from generated_block import with_block
 from surface_variants import TREATMENTS, treatment
 
 import autdtorch as at
+from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd import medium
 from autdtorch.fdtd.stencil import tuned_stencil
 from autdtorch.fdtd.surface import LATTICE, PAIRS, VERTICES, Materials, cut_elements, uniform_bonds
-from autdtorch.freespace import free_space_matrix
 
 STENCIL = tuned_stencil(2 * math.pi / 8.5)
 MATERIALS = Materials(np.array([1.0, 77.3]), np.array([1.0, 1 / 77.3]))

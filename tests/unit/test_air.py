@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from autdtorch.air import absorption, density_and_sound_speed, vapour_fraction
-from autdtorch.scene import Medium
+from autdtorch.scene.air import absorption, density_and_sound_speed, vapour_fraction
+from autdtorch.scene.scene import Medium
 
 ATMOSPHERE = 101325.0
 

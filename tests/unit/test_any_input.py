@@ -12,7 +12,7 @@ from public_calls import Call, public_calls
 from wrong_values import WRONG, Wrong, spoiled
 
 import autdtorch as at
-from autdtorch.rendering import animation, view
+from autdtorch.plot.view3d import animation, view
 
 CALLS = public_calls()
 

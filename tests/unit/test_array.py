@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from autdtorch.array import PAPER_SOURCE_STRENGTH, TransducerArray
-from autdtorch.geometry import circle_points
+from autdtorch.scene.arrays import PAPER_SOURCE_STRENGTH, TransducerArray
+from autdtorch.scene.geometry import circle_points
 
 
 def test_grid_is_row_major_along_the_axes_of_its_plane():

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from autdtorch.array import PAPER_SOURCE_STRENGTH, TransducerArray
-from autdtorch.array_file import load_array
-from autdtorch.device_layouts import OPENMPD_SOURCE_STRENGTH
-from autdtorch.openmpd_board import OpenMPDBoard
-from autdtorch.scene_file import load_scene
+from autdtorch.hardware.openmpd_board import OpenMPDBoard
+from autdtorch.io.array_file import load_array
+from autdtorch.io.scene_file import load_scene
+from autdtorch.scene.arrays import PAPER_SOURCE_STRENGTH, TransducerArray
+from autdtorch.scene.device_layouts import OPENMPD_SOURCE_STRENGTH
 
 BOARD = """FT123456
 4

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from autdtorch.array import TransducerArray
-from autdtorch.drive import drive_from_phases, focus_phases, normalise, validate_drive
-from autdtorch.freespace import green
-from autdtorch.geometry import Plane, circle_points, plane_basis
-from autdtorch.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
-from autdtorch.propagator import make_propagator
-from autdtorch.scene import Medium, Scene
+from autdtorch.analytic.green import green
+from autdtorch.propagators import make_propagator
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.drive import drive_from_phases, focus_phases, normalise, validate_drive
+from autdtorch.scene.geometry import Plane, circle_points, plane_basis
+from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
+from autdtorch.scene.scene import Medium, Scene
 
 NAN, INF = math.nan, math.inf
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from autdtorch.scene_file import load_scene
+from autdtorch.io.scene_file import load_scene
 
 SCENES = Path(__file__).parents[2] / "configs" / "scene"
 

@@ -7,14 +7,14 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from autdtorch.array import TransducerArray
 from autdtorch.fdtd.bonds import VaryingCells, _condensed, varying_cells
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.medium import ElementMedium, fill_elements
 from autdtorch.fdtd.stencil import OFFSETS, tuned_stencil
 from autdtorch.fdtd.surface import VERTICES, CutElements, Materials, energy_matrix
-from autdtorch.obstacles import Box, Obstacle, Sphere
-from autdtorch.scene import Medium, Scene
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.obstacles import Box, Obstacle, Sphere
+from autdtorch.scene.scene import Medium, Scene
 
 AIR = Medium(density=1.293, sound_speed=340.0)
 STENCIL = tuned_stencil(2 * math.pi / 8.5)

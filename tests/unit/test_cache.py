@@ -16,11 +16,12 @@ import pytest
 import torch
 from small_scenes import AIR, CUBE, small_scene
 
-from autdtorch.array import TransducerArray
-from autdtorch.cache import ABANDONED, PARTIAL, SUFFIX, DiskCache, _with_checksum, digest_of
-from autdtorch.obstacles import Mesh, Obstacle, Sphere, VoxelMask
-from autdtorch.propagator import SimulatedPropagator, SteadyStateWarning, make_propagator
-from autdtorch.scene import Medium, Scene
+from autdtorch.propagators import SimulatedPropagator, SteadyStateWarning, make_propagator
+from autdtorch.propagators.cache import ABANDONED, PARTIAL, SUFFIX, DiskCache, _with_checksum
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.obstacles import Mesh, Obstacle, Sphere, VoxelMask
+from autdtorch.scene.scene import Medium, Scene
+from autdtorch.utils.digest import digest_of
 
 SPACING = 2.5e-3
 CORNER = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
@@ -28,7 +29,7 @@ CORNER = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4
 WRITER = """
 import sys, time, numpy as np
 from pathlib import Path
-from autdtorch.cache import DiskCache
+from autdtorch.propagators.cache import DiskCache
 cache, value = DiskCache(sys.argv[1]), float(sys.argv[2])
 Path(sys.argv[3]).touch()
 while True:
@@ -158,9 +159,9 @@ def test_another_source_or_another_package_simulates_again(
     propagator = prepared(small_scene((CUBE,)), tmp_path)
     points = propagator.scene.control_points
     digests = {propagator._digest(points)}
-    monkeypatch.setattr("autdtorch.propagator.base.source_digest", lambda: "changed")
+    monkeypatch.setattr("autdtorch.propagators.base.source_digest", lambda: "changed")
     digests.add(propagator._digest(points))
-    monkeypatch.setattr("autdtorch.propagator.base.package_versions", lambda: {"torch": "0"})
+    monkeypatch.setattr("autdtorch.propagators.base.package_versions", lambda: {"torch": "0"})
     digests.add(propagator._digest(points))
     assert len(digests) == 3
 

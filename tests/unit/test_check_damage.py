@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from check_damage import check, journal_problems
 
-from autdtorch.json_lines import SET_ASIDE, JsonLines, line_of
+from autdtorch.utils.json_lines import SET_ASIDE, JsonLines, line_of
 
 
 def test_damaged_files_change_no_number_and_cost_no_undamaged_line(tmp_path: Path) -> None:

@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from autdtorch.claims import CLAIMS, judge_claims
-from autdtorch.intervals import FEWEST_TRIALS
-from autdtorch.metrics import FocusMetrics
-from autdtorch.optim.base import Solution
-from autdtorch.results import MethodResult, Provenance, SceneResult, Simulation, StudyResult
+from autdtorch.methods.base import Solution
+from autdtorch.objectives.metrics import FocusMetrics
+from autdtorch.study.claims import CLAIMS, judge_claims
+from autdtorch.study.intervals import FEWEST_TRIALS
+from autdtorch.study.results import MethodResult, Provenance, SceneResult, Simulation, StudyResult
 
 SIMULATION = Simulation("free_space", 8.5e-3, None, None, (), 0.0, 0.0)
 

@@ -8,14 +8,14 @@ import pytest
 import torch
 import yaml
 
-from autdtorch.collect import Sweep, collect_results
-from autdtorch.optim.base import Solution, joined
-from autdtorch.optim.gabs import gabs
-from autdtorch.optim.lssg import lssg
-from autdtorch.results import RESULTS_FILE
-from autdtorch.scene_file import load_scene
-from autdtorch.study import run_study
-from autdtorch.summary import save_summary
+from autdtorch.io.scene_file import load_scene
+from autdtorch.methods.base import Solution, joined
+from autdtorch.methods.gabs import gabs
+from autdtorch.methods.lssg import lssg
+from autdtorch.study.report.summary import save_summary
+from autdtorch.study.results import RESULTS_FILE
+from autdtorch.study.run import run_study
+from autdtorch.study.sweeps import Sweep, collect_results
 
 Study = Callable[..., None]
 

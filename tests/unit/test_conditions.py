@@ -11,11 +11,19 @@ from hypothesis import strategies as st
 from scipy.stats import kstest, rice
 from small_scenes import small_scene
 
-from autdtorch.conditions import Condition, Dead, Drift, Noise, Quantised, playable, true_pressure
-from autdtorch.drive import drive_from_phases, phases_of
-from autdtorch.objective import Objective, SimulatedObjective
-from autdtorch.optim.gabs import gabs
-from autdtorch.propagator import FreeSpacePropagator
+from autdtorch.methods.gabs import gabs
+from autdtorch.objectives.perturbations import (
+    Condition,
+    Dead,
+    Drift,
+    Noise,
+    Quantised,
+    playable,
+    true_pressure,
+)
+from autdtorch.objectives.simulated import Objective, SimulatedObjective
+from autdtorch.propagators import FreeSpacePropagator
+from autdtorch.scene.drive import drive_from_phases, phases_of
 
 SCENE = small_scene()  # 4 transducers, 3 control points
 

@@ -9,8 +9,8 @@ from small_scenes import small_scene
 from study_conditions import CONDITIONS, METHODS, Method, outcome
 from study_searches import best_of
 
-from autdtorch.objective import SimulatedObjective
-from autdtorch.propagator import FreeSpacePropagator
+from autdtorch.objectives.simulated import SimulatedObjective
+from autdtorch.propagators import FreeSpacePropagator
 
 
 def outcomes() -> dict[tuple[str, str, str], Outcome]:

@@ -3,9 +3,9 @@ import math
 import pytest
 import torch
 
-from autdtorch.array import TransducerArray
-from autdtorch.device_layouts import AUTD3_UNIT
-from autdtorch.neighbours import distances
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.device_layouts import AUTD3_UNIT
+from autdtorch.utils.neighbours import distances
 
 PITCH = 10.16e-3
 ROUNDING = 1e-12  # of lengths below 1 m in float64, with margin

@@ -9,7 +9,7 @@ import re
 import pytest
 
 import autdtorch
-from autdtorch import validation
+from autdtorch.utils import validation
 
 UNITS = {
     "deg C": {"temperature"},

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from autdtorch.drive import (
+from autdtorch.scene.drive import (
     amplitudes_of,
     drive_from_phases,
     focus_phases,

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from autdtorch.array import TransducerArray
-from autdtorch.array_file import load_array
-from autdtorch.drive import amplitudes_of, drive_from_phases
-from autdtorch.drive_file import load_drive, save_drive
-from autdtorch.freespace import free_space_matrix
+from autdtorch.analytic.green import free_space_matrix
 from autdtorch.hardware.levels import autd3_levels
+from autdtorch.io.array_file import load_array
+from autdtorch.io.drive_file import load_drive, save_drive
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.drive import amplitudes_of, drive_from_phases
 
 ARRAYS = {
     "autd3": TransducerArray.autd3((0, 0, 0), units=(2, 1)),

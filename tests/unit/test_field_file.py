@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from autdtorch.field_file import save_field
-from autdtorch.geometry import Plane
+from autdtorch.io.field_file import save_field
+from autdtorch.scene.geometry import Plane
 
 LENGTH = 1e-12  # rounding of lengths below 1 m in float64, with margin
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from autdtorch.findings import evaluations_to, find
-from autdtorch.metrics import FocusMetrics
-from autdtorch.optim.base import Solution
-from autdtorch.results import MethodResult
+from autdtorch.methods.base import Solution
+from autdtorch.objectives.metrics import FocusMetrics
+from autdtorch.study.findings import evaluations_to, find
+from autdtorch.study.results import MethodResult
 
 HISTORY = [
     [1.0, 2.0, 9.0, 9.5],

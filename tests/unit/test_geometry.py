@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from small_scenes import small_scene
 
-from autdtorch.geometry import Plane, circle_points, plane_basis
+from autdtorch.scene.geometry import Plane, circle_points, plane_basis
 
 # Unit vectors are products of a few roundings of numbers up to 1.
 ROUNDING = 1e-14

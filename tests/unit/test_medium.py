@@ -3,12 +3,12 @@ import math
 import numpy as np
 import pytest
 
-from autdtorch.array import TransducerArray
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.medium import RIGID, ElementMedium, fill_elements, speed_factor
 from autdtorch.fdtd.stencil import tuned_stencil
-from autdtorch.obstacles import Box, Obstacle, Sphere
-from autdtorch.scene import Medium, OverlapWarning, Scene
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.obstacles import Box, Obstacle, Sphere
+from autdtorch.scene.scene import Medium, OverlapWarning, Scene
 
 AIR = Medium(density=1.293, sound_speed=340.0)
 STENCIL = tuned_stencil(2 * math.pi / 8.5)

@@ -11,9 +11,9 @@ import torch
 from small_scenes import CUBE, small_scene
 
 import autdtorch as at
-from autdtorch import memory
-from autdtorch.propagator import Propagator
-from autdtorch.study import run_study
+from autdtorch.propagators import Propagator
+from autdtorch.study.run import run_study
+from autdtorch.utils import memory
 
 AIR = small_scene()
 OBJECTIVE = at.SimulatedObjective(AIR, at.make_propagator(AIR))

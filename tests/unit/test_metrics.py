@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autdtorch.metrics import focus_metrics
+from autdtorch.objectives.metrics import focus_metrics
 
 pressures = st.lists(st.floats(1e-3, 1e3), min_size=1, max_size=6)
 

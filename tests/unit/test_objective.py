@@ -1,11 +1,11 @@
 import pytest
 import torch
 
-from autdtorch.array import TransducerArray
-from autdtorch.drive import drive_from_phases
-from autdtorch.objective import SimulatedObjective, weakest_focus
-from autdtorch.propagator import FreeSpacePropagator, make_propagator
-from autdtorch.scene import Medium, Scene
+from autdtorch.objectives.simulated import SimulatedObjective, weakest_focus
+from autdtorch.propagators import FreeSpacePropagator, make_propagator
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.drive import drive_from_phases
+from autdtorch.scene.scene import Medium, Scene
 
 POINTS = ((80e-3, 10e-3, 0.0), (80e-3, -20e-3, 5e-3))
 

@@ -10,8 +10,8 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from autdtorch.geometry import rotation_matrix
-from autdtorch.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
+from autdtorch.scene.geometry import rotation_matrix
+from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
 
 CENTER, TURN = (0.4, -0.2, 0.1), (0.5, -0.3, 2.0)
 BOX = Box(CENTER, (1.0, 0.6, 0.4), rotation=TURN, rigid=True)

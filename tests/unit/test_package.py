@@ -104,4 +104,4 @@ def test_wheel_holds_configs_stub_and_type_marker(tmp_path: Path, monkeypatch: p
     assert wanted
     assert wanted | {"autdtorch/__init__.pyi", "autdtorch/py.typed"} <= names
     assert not any(name.startswith(("configs/", "tests/")) for name in names)
-    assert "autdtorch = autdtorch.cli:main" in entry_points
+    assert "autdtorch = autdtorch.cli.main:main" in entry_points

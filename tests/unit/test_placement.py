@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_scenes import AIR
 
-from autdtorch.array import TransducerArray
 from autdtorch.fdtd.grid import make_grid
 from autdtorch.fdtd.placement import grid_offset
 from autdtorch.fdtd.points import footprint
-from autdtorch.obstacles import Box, Obstacle, Sphere, VoxelMask
-from autdtorch.scene import Scene
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.obstacles import Box, Obstacle, Sphere, VoxelMask
+from autdtorch.scene.scene import Scene
 
 SPACING = 1e-3
 CORNERS = (0, 0, 0), (30e-3, 30e-3, 30e-3)

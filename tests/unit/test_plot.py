@@ -18,7 +18,6 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from small_scenes import scene_of_all_kinds, small_scene
 
 import autdtorch as at
-from autdtorch.drawing import clipped
 from autdtorch.plot import (
     plot_convergence,
     plot_pareto,
@@ -28,6 +27,7 @@ from autdtorch.plot import (
     plot_scene,
     plot_trials,
 )
+from autdtorch.plot.drawing import clipped
 from autdtorch.plot.pareto import pareto_front
 from autdtorch.plot.style import looks_of
 

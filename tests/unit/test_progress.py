@@ -8,7 +8,7 @@ import pytest
 from small_scenes import small_scene
 
 import autdtorch as at
-from autdtorch import progress
+from autdtorch.utils import progress
 
 
 class Clock:

@@ -11,17 +11,17 @@ import pytest
 import torch
 from small_scenes import AIR, CUBE, small_scene
 
-import autdtorch.report
-from autdtorch.geometry import Plane
-from autdtorch.optim.bound import focus_bound
-from autdtorch.optim.gabs import gabs
-from autdtorch.optim.lssg import lssg
+import autdtorch.study.report.pages
+from autdtorch.methods.bound import focus_bound
+from autdtorch.methods.gabs import gabs
+from autdtorch.methods.lssg import lssg
 from autdtorch.plot import plot_convergence
-from autdtorch.report import HTML_FILE, write_report
-from autdtorch.report_tables import claims, finding_rows, findings
-from autdtorch.results import StudyResult, summary_rows
-from autdtorch.scene import Box, Scene
-from autdtorch.study import run_study
+from autdtorch.scene.geometry import Plane
+from autdtorch.scene.scene import Box, Scene
+from autdtorch.study.report.pages import HTML_FILE, write_report
+from autdtorch.study.report.tables import claims, finding_rows, findings
+from autdtorch.study.results import StudyResult, summary_rows
+from autdtorch.study.run import run_study
 
 PLANE = Plane(center=(20e-3, 12e-3, 12e-3), normal=(1, 0, 0), size=(20e-3, 20e-3))
 # Stands for BO, which takes seconds: the report knows methods by their names.
@@ -41,7 +41,7 @@ def scene(plane: Plane | None = PLANE, obstacles: tuple[Box, ...] = ()) -> Scene
 def without_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
     """3D pictures take seconds, and are tested where they are made."""
     monkeypatch.setattr(
-        autdtorch.report, "rendering_problem", lambda: "3D rendering is not available: no driver"
+        autdtorch.study.report.pages, "rendering_problem", lambda: "3D rendering is not available: no driver"
     )
 
 
@@ -170,7 +170,7 @@ def test_the_gradient_is_a_line_to_compare_with(tmp_path: Path, monkeypatch: pyt
         drawn.extend(arguments)
         return plot_convergence(*arguments)
 
-    monkeypatch.setattr(autdtorch.report, "plot_convergence", record)
+    monkeypatch.setattr(autdtorch.study.report.pages, "plot_convergence", record)
     write_report(with_bound(results, 2 * score), {"a": scene()}, tmp_path, "autdtorch")
     row = finding_rows(with_bound(results, 2 * score))[-1]
     assert (row[1], row[3], row[4], row[5]) == ("gradient ascent", "50.0", "-", "-")

@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 import torch
 
-from autdtorch.json_lines import line_of
-from autdtorch.metrics import focus_metrics
-from autdtorch.optim.base import Solution
-from autdtorch.propagator import Run
-from autdtorch.results import (
+from autdtorch.methods.base import Solution
+from autdtorch.objectives.metrics import focus_metrics
+from autdtorch.propagators import Run
+from autdtorch.study.results import (
     PROVENANCE_FILE,
     RESULTS_FILE,
     MethodResult,
@@ -30,6 +29,7 @@ from autdtorch.results import (
     save_provenance,
     save_results,
 )
+from autdtorch.utils.json_lines import line_of
 
 FREE_SPACE = Simulation("free_space", 8.5e-3, None, None, (), 0.25, 0.5)
 FULL = Simulation(

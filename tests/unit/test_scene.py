@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from autdtorch.array import TransducerArray
-from autdtorch.geometry import Plane, circle_points
-from autdtorch.obstacles import Box, Sphere
-from autdtorch.scene import Medium, OverlapWarning, ScaleWarning, Scene
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.geometry import Plane, circle_points
+from autdtorch.scene.obstacles import Box, Sphere
+from autdtorch.scene.scene import Medium, OverlapWarning, ScaleWarning, Scene
 
 AIR = Medium(density=1.293, sound_speed=340.0)
 

@@ -5,9 +5,9 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from autdtorch.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
-from autdtorch.scene import Medium
-from autdtorch.scene_file import load_scene
+from autdtorch.io.scene_file import load_scene
+from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
+from autdtorch.scene.scene import Medium
 
 SCENES = Path(__file__).parents[2] / "configs" / "scene"
 

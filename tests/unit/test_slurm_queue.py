@@ -8,8 +8,8 @@ import pytest
 
 pytest.importorskip("submitit")
 
-from autdtorch import slurm
-from autdtorch.slurm import QueueWatcher
+from autdtorch.cli import slurm
+from autdtorch.cli.slurm import QueueWatcher
 
 Squeue = Callable[[str], None]
 

@@ -12,19 +12,19 @@ import pytest
 import torch
 from small_scenes import AIR, CUBE, small_scene
 
-import autdtorch.study
-from autdtorch.array import Nodes
-from autdtorch.freespace import green
-from autdtorch.geometry import Plane
-from autdtorch.objective import Objective
-from autdtorch.optim.base import Solution
-from autdtorch.optim.gabs import gabs
-from autdtorch.optim.lssg import lssg
-from autdtorch.propagator import FreeSpacePropagator, FullPropagator, Run, SteadyStateWarning
-from autdtorch.results import RESULTS_FILE, load_results
-from autdtorch.scene import Box, Scene
-from autdtorch.study import run_study
-from autdtorch.trial_file import TRIALS_FILE
+import autdtorch.study.run
+from autdtorch.analytic.green import green
+from autdtorch.methods.base import Solution
+from autdtorch.methods.gabs import gabs
+from autdtorch.methods.lssg import lssg
+from autdtorch.objectives.simulated import Objective
+from autdtorch.propagators import FreeSpacePropagator, FullPropagator, Run, SteadyStateWarning
+from autdtorch.scene.arrays import Nodes
+from autdtorch.scene.geometry import Plane
+from autdtorch.scene.scene import Box, Scene
+from autdtorch.study.results import RESULTS_FILE, load_results
+from autdtorch.study.run import run_study
+from autdtorch.study.trial_file import TRIALS_FILE
 
 PLANE = Plane(center=(20e-3, 12e-3, 12e-3), normal=(1, 0, 0), size=(20e-3, 16e-3))
 METHODS = {"lssg": functools.partial(lssg, levels=4), "gabs": functools.partial(gabs, levels=4)}
@@ -45,13 +45,13 @@ def scenes() -> dict[str, Scene]:
 def count_runs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the scenes that are computed, in order."""
     computed: list[str] = []
-    run_scene = autdtorch.study._run_scene
+    run_scene = autdtorch.study.run._run_scene
 
     def counted(name: str, *rest: object) -> object:
         computed.append(name)
         return run_scene(name, *rest)
 
-    monkeypatch.setattr(autdtorch.study, "_run_scene", counted)
+    monkeypatch.setattr(autdtorch.study.run, "_run_scene", counted)
     return computed
 
 
@@ -132,7 +132,7 @@ def test_finished_scenes_of_the_same_settings_are_used_again(
 ) -> None:
     study = functools.partial(run_study, scenes, METHODS, solver=FREE_SPACE, folder=tmp_path)
     first = study(config="a: 1")
-    with caplog.at_level(logging.INFO, logger="autdtorch.study_folder"):
+    with caplog.at_level(logging.INFO, logger="autdtorch.study.folder"):
         again = study(config="a: 1")
     assert count_runs == ["second", "first"]
     assert "re-using second, first" in caplog.text
@@ -150,7 +150,7 @@ def test_changed_source_is_computed_again(
 ) -> None:
     study = functools.partial(run_study, scenes, METHODS, solver=FREE_SPACE, folder=tmp_path, config="a: 1")
     study()
-    monkeypatch.setattr("autdtorch.results.source_digest", lambda: "changed")
+    monkeypatch.setattr("autdtorch.study.results.source_digest", lambda: "changed")
     study()
     assert count_runs == ["second", "first"] * 2
 
@@ -182,7 +182,7 @@ def test_killed_while_writing_the_last_complete_file_stays(
     scenes: dict[str, Scene], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     study = functools.partial(run_study, scenes, METHODS, solver=FREE_SPACE, folder=tmp_path, config="a: 1")
-    write_scene = autdtorch.results._write_scene
+    write_scene = autdtorch.study.results._write_scene
     complete: list[bytes] = []
     calls = itertools.count(1)
 
@@ -192,7 +192,7 @@ def test_killed_while_writing_the_last_complete_file_stays(
             raise KeyboardInterrupt
         write_scene(group, scene)
 
-    monkeypatch.setattr("autdtorch.results._write_scene", killed)
+    monkeypatch.setattr("autdtorch.study.results._write_scene", killed)
     with pytest.raises(KeyboardInterrupt):
         study()
     assert [(tmp_path / RESULTS_FILE).read_bytes()] == complete
@@ -252,7 +252,7 @@ def test_settings_are_checked_before_anything_is_simulated(
     def refuse(*_: object) -> None:
         raise AssertionError("simulated before all settings were checked")
 
-    monkeypatch.setattr(autdtorch.study, "_run_scene", refuse)
+    monkeypatch.setattr(autdtorch.study.run, "_run_scene", refuse)
     arguments = {"scenes": {"a": scene()}, "methods": METHODS} | changes
     with pytest.raises(ValueError, match=message) as caught:
         run_study(**arguments)

@@ -9,16 +9,16 @@ import pytest
 import torch
 from small_scenes import CUBE, small_scene
 
-from autdtorch.array import TransducerArray
-from autdtorch.json_lines import SET_ASIDE
-from autdtorch.objective import Objective
-from autdtorch.optim.base import Solution, Trials
-from autdtorch.optim.gabs import gabs
-from autdtorch.results import PROVENANCE_FILE, RESULTS_FILE, StudyResult, load_provenance, load_results
-from autdtorch.scene import Scene
-from autdtorch.study import run_study
-from autdtorch.study_folder import MATRICES_FOLDER, PREVIOUS
-from autdtorch.trial_file import TRIALS_FILE
+from autdtorch.methods.base import Solution, Trials
+from autdtorch.methods.gabs import gabs
+from autdtorch.objectives.simulated import Objective
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.scene import Scene
+from autdtorch.study.folder import MATRICES_FOLDER, PREVIOUS
+from autdtorch.study.results import PROVENANCE_FILE, RESULTS_FILE, StudyResult, load_provenance, load_results
+from autdtorch.study.run import run_study
+from autdtorch.study.trial_file import TRIALS_FILE
+from autdtorch.utils.json_lines import SET_ASIDE
 
 FILES = (RESULTS_FILE, TRIALS_FILE, PROVENANCE_FILE)
 SIMULATED = {"method": "auto", "spacing": 2e-3, "tolerance": 0.2, "kernel": "reference"}

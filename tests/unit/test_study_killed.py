@@ -10,8 +10,8 @@ from check_kills import SUBJECTS, calm_run, finish, wait
 from filelock import FileLock
 from small_scenes import small_scene
 
-from autdtorch.optim.gabs import gabs
-from autdtorch.study import run_study
+from autdtorch.methods.gabs import gabs
+from autdtorch.study.run import run_study
 
 STUDY = SUBJECTS["study"]
 

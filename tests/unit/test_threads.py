@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from autdtorch import threads
+from autdtorch.utils import threads
 
 
 @pytest.fixture(autouse=True)

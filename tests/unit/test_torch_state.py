@@ -31,7 +31,7 @@ def setting(name: str, value: object) -> Iterator[None]:
 
 @contextlib.contextmanager
 def threads(count: int) -> Iterator[None]:
-    processors = mock.patch("autdtorch.threads._processors", return_value=count)  # whatever the machine has
+    processors = mock.patch("autdtorch.utils.threads._processors", return_value=count)
     with setting("num_threads", count), processors:
         yield
 

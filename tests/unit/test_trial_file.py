@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from autdtorch.json_lines import SET_ASIDE, line_of, row_of
-from autdtorch.optim.base import NEAR_TIE, Solution
-from autdtorch.trial_file import TRIALS_FILE, TrialFile
+from autdtorch.methods.base import NEAR_TIE, Solution
+from autdtorch.study.trial_file import TRIALS_FILE, TrialFile
+from autdtorch.utils.json_lines import SET_ASIDE, line_of, row_of
 
 ORIGIN = "the study's"
 SHAPES = {"a": (3, 2)}

@@ -11,15 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 
-from autdtorch.collect import collect_results
-from autdtorch.optim.gabs import gabs
-from autdtorch.report import write_report
-from autdtorch.report_html import as_page
-from autdtorch.report_tables import code, fenced, table
-from autdtorch.results import StudyResult, load_results, save_results
-from autdtorch.scene_file import load_scene
-from autdtorch.study import run_study
-from autdtorch.summary import SUMMARY_FILE, save_summary
+from autdtorch.io.scene_file import load_scene
+from autdtorch.methods.gabs import gabs
+from autdtorch.study.report.html import as_page
+from autdtorch.study.report.pages import write_report
+from autdtorch.study.report.summary import SUMMARY_FILE, save_summary
+from autdtorch.study.report.tables import code, fenced, table
+from autdtorch.study.results import StudyResult, load_results, save_results
+from autdtorch.study.run import run_study
+from autdtorch.study.sweeps import collect_results
 
 SCENE = {
     "frequency": 40e3,
@@ -34,7 +34,7 @@ HOSTILE = f"{HTML}\n{MARKDOWN}\n\n</details>\n```\n{HTML}\n[x]: https://evil.exa
 
 @pytest.fixture(autouse=True)
 def without_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("autdtorch.report.rendering_problem", lambda: "not tried")
+    monkeypatch.setattr("autdtorch.study.report.pages.rendering_problem", lambda: "not tried")
 
 
 def study(solver: dict[str, object] | None = None, seed: int = 0) -> StudyResult:

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from autdtorch.array_file import load_array
-from autdtorch.drive_file import load_drive
-from autdtorch.obstacles import Mesh, VoxelMask
-from autdtorch.scene_file import load_scene
-from autdtorch.yaml_file import parse_yaml
+from autdtorch.io.array_file import load_array
+from autdtorch.io.drive_file import load_drive
+from autdtorch.io.scene_file import load_scene
+from autdtorch.io.yaml_file import parse_yaml
+from autdtorch.scene.obstacles import Mesh, VoxelMask
 
 SCENE = """
 frequency: 40e3
@@ -255,7 +255,7 @@ def test_arrays_in_files_are_checked_before_they_are_allocated(
 
 
 def test_a_small_file_of_many_zeros_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("autdtorch.numpy_file._LARGEST", 10**6)
+    monkeypatch.setattr("autdtorch.utils.numpy_file._LARGEST", 10**6)
     np.savez_compressed(tmp_path / "zeros.npz", mask=np.ones((100, 100, 101), bool))
     with pytest.raises(ValueError, match=r"zeros\.npz.*1010128 bytes"):
         VoxelMask.load(tmp_path / "zeros.npz", 1e-3, rigid=True)

@@ -13,7 +13,7 @@ import torch
 from small_scenes import scene_of_all_kinds, small_scene
 
 import autdtorch as at
-from autdtorch.rendering import animate3d, rendering_problem, view3d
+from autdtorch.plot.view3d import animate3d, rendering_problem, view3d
 
 SPACING = 5e-3  # m, cells of the plane in the pictures
 
@@ -71,7 +71,7 @@ def test_a_probe_that_hangs_is_a_reason(
     broken_pyvista: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     broken_pyvista("import time\ntime.sleep(60)")
-    monkeypatch.setattr(sys.modules["autdtorch.rendering.probe"], "_PROBE_TIMEOUT", 0.5)
+    monkeypatch.setattr(sys.modules["autdtorch.plot.view3d.probe"], "_PROBE_TIMEOUT", 0.5)
     assert "did not end within 0.5 s" in str(rendering_problem())
 
 

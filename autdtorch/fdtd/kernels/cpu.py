@@ -29,7 +29,7 @@ from autdtorch.fdtd.kernels.cpu_workers import (
     wait_for,
     yield_address,
 )
-from autdtorch.threads import thread_count
+from autdtorch.utils.threads import thread_count
 
 Array = NDArray[np.generic]
 

@@ -21,7 +21,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from autdtorch.fdtd.kernels.compiled import INNER
-from autdtorch.threads import spread
+from autdtorch.utils.threads import spread
 
 _CLAIMED, _FINISHED = 0, 16
 """Places of the two counters, on cache lines of their own."""

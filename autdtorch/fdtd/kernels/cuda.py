@@ -27,7 +27,7 @@ from autdtorch.fdtd.kernels.cuda_tables import (
     settled_table,
     varying_table,
 )
-from autdtorch.validation import invalid
+from autdtorch.utils.validation import invalid
 
 _GRAPH_STEPS = 16
 """Steps of a captured graph; even, so that both fields are again where they were."""

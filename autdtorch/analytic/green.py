@@ -1,0 +1,74 @@
+"""The field of point sources and discs in free space, exact."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.utils.memory import require_memory
+from autdtorch.utils.neighbours import distances
+from autdtorch.utils.validation import LENGTH_TOLERANCE, ArrayLike, not_negative, points_tensor, positive
+
+PAIR_BYTES = 80.0
+"""Memory [bytes] that a point and a transducer take while their entry of a matrix is worked out."""
+
+
+def green(points: ArrayLike, sources: ArrayLike, wavenumber: complex) -> torch.Tensor:
+    """Green's function of the Helmholtz equation, outgoing with e^{-i w t}: e^{i k r} / (4 pi r).
+
+    Args:
+        points: (P, 3) [m].
+        sources: (M, 3) [m].
+        wavenumber: k [rad/m], > 0, or k + i alpha with an attenuation alpha >= 0 [Np/m].
+
+    Returns:
+        complex128 (P, M) [1/m], on the device of `points`; not differentiable in the positions.
+
+    Raises:
+        ValueError: not finite, wrong shape, k <= 0, alpha < 0, or a point on a source.
+    """
+    targets = points_tensor("points", points)
+    origins = points_tensor("sources", sources).to(targets.device)
+    k, alpha = _wavenumber(wavenumber)
+    r = distances(targets, origins)
+    if r.min() < LENGTH_TOLERANCE:
+        point, source = divmod(int(r.argmin()), len(origins))
+        raise ValueError(
+            f"points[{point}]: {tuple(targets[point].tolist())} m; lies on source {source}, "
+            f"must be at least {LENGTH_TOLERANCE:g} m away"
+        )
+    return torch.polar(torch.exp(-alpha * r) / (4 * math.pi * r), k * r)
+
+
+def free_space_matrix(points: ArrayLike, array: TransducerArray, wavenumber: complex) -> torch.Tensor:
+    """Transfer matrix of an array in free space: S e^{i k r} / r (Eq. 2), the mean of it over discs.
+
+    Args:
+        points: (P, 3) [m].
+        array: the M transducers, of source strength S; the mean is taken over `array.nodes`.
+        wavenumber: k [rad/m], > 0, or k + i alpha with an attenuation alpha >= 0 [Np/m].
+
+    Returns:
+        complex128 (P, M), pressure [Pa] per unit drive.
+
+    Raises:
+        ValueError: not finite, wrong shape, k <= 0, alpha < 0, or a point on a node of a transducer.
+    """
+    positions, weights = array.nodes
+    points = points_tensor("points", points)
+    require_memory("points", tuple(points.shape), PAIR_BYTES * len(points) * len(array))
+    # Node by node: memory for one matrix only.
+    terms = (w * green(points, at, wavenumber) for at, w in zip(positions.unbind(1), weights, strict=True))
+    none = torch.zeros((), dtype=torch.complex128, device="cpu")
+    return 4 * math.pi * array.source_strength * sum(terms, start=none)
+
+
+def _wavenumber(value: complex) -> tuple[float, float]:
+    """Wavenumber k and attenuation alpha of a complex wavenumber."""
+    if not isinstance(value, complex):
+        return positive("wavenumber", value, "rad/m"), 0.0
+    return positive("wavenumber.real", value.real, "rad/m"), not_negative(
+        "wavenumber.imag", value.imag, "Np/m"
+    )

@@ -1,0 +1,327 @@
+"""Point sources outside a sphere: rigid, pressure-release, fluid.
+
+The series in partial waves of Anderson (1950, JASA 22, 426; also Morse & Ingard, Theoretical Acoustics
+(1968), chapter 8), written in ratios of Hankel functions and in logarithmic derivatives, none of which
+overflows at any order. With x = ka, k_1 = k / speed_ratio, source and point at distances s and r from the
+centre and gamma between them,
+
+    scattered outside: (ik/4pi) sum (2n+1) [A_n h_n(x)^2] [h_n(ks) / h_n(x)] [h_n(kr) / h_n(x)] P_n(cos gamma)
+    total inside:      (ik/4pi) sum (2n+1) [B_n h_n(x)] [h_n(ks) / h_n(x)] j_n(k_1 r) P_n(cos gamma).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import torch
+
+from autdtorch.analytic.green import green
+from autdtorch.utils.validation import (
+    LENGTH_TOLERANCE,
+    ArrayLike,
+    Vector,
+    boolean,
+    finite_vector,
+    points_tensor,
+    positive,
+)
+
+#: Of N, for orders 0 to N: (slope, pressure) such that slope * dp/d(kr) + pressure * p = 0 on the surface.
+Boundary: TypeAlias = Callable[[int], tuple[torch.Tensor | float, torch.Tensor | float]]
+#: Of k r (P,) and of N, for orders 0 to N: how the field varies with r, complex (N + 1, P).
+Radial: TypeAlias = Callable[[torch.Tensor, int], torch.Tensor]
+
+#: Points summed at a time, which bounds the memory that their radial functions take.
+_BLOCK = 256
+#: A series ends where its terms have fallen to this fraction of the largest.
+_NEGLIGIBLE = 1e-17
+#: About what a point on the surface takes with a source 6e-4 radii off it.
+_MOST_ORDERS = 2**16
+#: Stands for k r = 0, where the field has a limit but its factors have none.
+_CENTER = 1e-100
+
+
+def rigid_sphere(
+    points: ArrayLike,
+    sources: ArrayLike,
+    wavenumber: float,
+    center: Vector,
+    radius: float,
+    *,
+    scattered: bool = False,
+) -> torch.Tensor:
+    """Field of point sources outside a rigid sphere.
+
+    Args:
+        points: (P, 3) [m], outside the sphere or on it.
+        sources: (M, 3) [m], outside the sphere.
+        wavenumber: k [rad/m], > 0.
+        center: of the sphere (3,) [m].
+        radius: of the sphere [m], > 0.
+        scattered: the scattered wave alone, which also exists at the sources.
+
+    Returns:
+        complex128 (P, M) [1/m], in units of `freespace.green`.
+
+    Raises:
+        ValueError: not finite, wrong shape, out of the ranges above, a point on a source, or points and
+            sources both so near the surface that the series would not end.
+
+    Source: Morse & Ingard, Theoretical Acoustics (1968), chapter 8; Anderson (1950), JASA 22, 426, for
+        rho_1 -> infinity.
+    """
+    setup = _setup(points, sources, wavenumber, center, radius)
+    return _field_outside(setup, lambda _: (1.0, 0.0), boolean("scattered", scattered))
+
+
+def soft_sphere(
+    points: ArrayLike,
+    sources: ArrayLike,
+    wavenumber: float,
+    center: Vector,
+    radius: float,
+    *,
+    scattered: bool = False,
+) -> torch.Tensor:
+    """Field of point sources outside a pressure-release sphere.
+
+    Arguments, returns and errors as for `rigid_sphere`.
+
+    Source: Anderson (1950), JASA 22, 426, for rho_1 -> 0.
+    """
+    setup = _setup(points, sources, wavenumber, center, radius)
+    return _field_outside(setup, lambda _: (0.0, 1.0), boolean("scattered", scattered))
+
+
+def fluid_sphere(
+    points: ArrayLike,
+    sources: ArrayLike,
+    wavenumber: float,
+    center: Vector,
+    radius: float,
+    density_ratio: float,
+    speed_ratio: float,
+    *,
+    scattered: bool = False,
+) -> torch.Tensor:
+    """Field of point sources outside a fluid sphere, outside and inside it.
+
+    Args:
+        points: (P, 3) [m], anywhere.
+        sources: (M, 3) [m], outside the sphere.
+        wavenumber: k of the medium outside [rad/m], > 0.
+        center: of the sphere (3,) [m].
+        radius: of the sphere [m], > 0.
+        density_ratio: rho_1 / rho > 0.
+        speed_ratio: c_1 / c > 0.
+        scattered: the field less that of the sources in the medium without a sphere.
+
+    Returns:
+        complex128 (P, M) [1/m], in units of `freespace.green`.
+
+    Raises:
+        ValueError: as for `rigid_sphere`, and ratios <= 0.
+
+    Source: Anderson (1950), JASA 22, 426, with the plane wave's partial waves replaced by a point source's.
+    """
+    density_ratio = positive("density_ratio", density_ratio)
+    speed_ratio = positive("speed_ratio", speed_ratio)
+    scattered = boolean("scattered", scattered)
+    setup = _setup(points, sources, wavenumber, center, radius)
+    inside = setup.point_distances < setup.radius
+    field = torch.empty(setup.cosines.shape, dtype=torch.complex128, device=setup.points.device)
+    if inside.any():
+        field[inside] = _field_inside(setup.at(inside), density_ratio, speed_ratio, scattered)
+    if not inside.all():
+        boundary = _fluid_boundary(setup.size, density_ratio, speed_ratio)
+        inner_size = float(setup.size) / speed_ratio
+        field[~inside] = _field_outside(setup.at(~inside), boundary, scattered, inner_size)
+    return field
+
+
+@dataclass(frozen=True)
+class _Setup:
+    """Checked points and sources, and where they are as seen from the centre of the sphere."""
+
+    points: torch.Tensor
+    sources: torch.Tensor
+    wavenumber: float
+    radius: float
+    point_distances: torch.Tensor
+    source_distances: torch.Tensor
+    cosines: torch.Tensor
+
+    @property
+    def size(self) -> torch.Tensor:
+        """The argument ka on the surface, as a tensor without axes."""
+        return self.point_distances.new_tensor(self.wavenumber * self.radius)
+
+    def at(self, rows: torch.Tensor) -> _Setup:
+        """Some of the points, all of the sources."""
+        return _Setup(
+            self.points[rows],
+            self.sources,
+            self.wavenumber,
+            self.radius,
+            self.point_distances[rows],
+            self.source_distances,
+            self.cosines[rows],
+        )
+
+
+def _setup(points: ArrayLike, sources: ArrayLike, wavenumber: float, center: Vector, radius: float) -> _Setup:
+    targets = points_tensor("points", points)
+    origins = points_tensor("sources", sources).to(targets.device)
+    wavenumber, radius = positive("wavenumber", wavenumber, "rad/m"), positive("radius", radius, "m")
+    middle = targets.new_tensor(finite_vector("center", center))
+    from_center = targets - middle
+    sources_from_center = origins - middle
+    source_distances = sources_from_center.norm(dim=1)
+    _require_outside("sources", origins, source_distances, radius + LENGTH_TOLERANCE)
+    directions = torch.nn.functional.normalize(from_center, dim=1)
+    cosines = directions @ torch.nn.functional.normalize(sources_from_center, dim=1).T
+    distances = from_center.norm(dim=1)
+    # A point that rounding puts off the surface is on it.
+    distances = torch.where((distances - radius).abs() < LENGTH_TOLERANCE, radius, distances)
+    return _Setup(targets, origins, wavenumber, radius, distances, source_distances, cosines.clamp(-1, 1))
+
+
+def _field_outside(
+    setup: _Setup, boundary: Boundary, scattered: bool, inner_size: float = 0.0
+) -> torch.Tensor:
+    _require_outside("points", setup.points, setup.point_distances, setup.radius)
+    x = setup.size
+
+    def radial(kr: torch.Tensor, orders: int) -> torch.Tensor:
+        slope, pressure = boundary(orders)
+        bessel, hankel = _bessel_slopes(x, orders), _hankel_slopes(x, orders)
+        # A_n h_n(x)^2, with j_n h_n (h_n'/h_n - j_n'/j_n) = i / x^2 for the product of j_n and h_n.
+        modes = (pressure + slope * bessel) / ((bessel - hankel) * (pressure + slope * hankel))
+        return (1j / x**2 * modes)[:, None] * _hankel_fall(x, kr, orders)
+
+    field = _series(setup, setup.wavenumber * setup.point_distances, radial, inner_size)
+    return field if scattered else field + green(setup.points, setup.sources, setup.wavenumber)
+
+
+def _field_inside(setup: _Setup, density_ratio: float, speed_ratio: float, scattered: bool) -> torch.Tensor:
+    x, inner_size = setup.size, setup.size / speed_ratio
+    boundary = _fluid_boundary(x, density_ratio, speed_ratio)
+
+    def radial(kr: torch.Tensor, orders: int) -> torch.Tensor:
+        slope, pressure = boundary(orders)
+        # B_n h_n(x) j_n(x_1), times j_n(k_1 r) / j_n(x_1) with j_n = (j_n h_n) / h_n, as j_n may be zero.
+        modes = 1j / x**2 / (pressure + slope * _hankel_slopes(x, orders)) / _product(inner_size, orders)
+        return modes[:, None] * _product(kr, orders) * _hankel_fall(kr, inner_size, orders)
+
+    inner_wavenumber = setup.wavenumber / speed_ratio
+    kr = (inner_wavenumber * setup.point_distances).clamp(min=_CENTER)
+    field = _series(setup, kr, radial, float(inner_size))
+    return field - green(setup.points, setup.sources, setup.wavenumber) if scattered else field
+
+
+def _fluid_boundary(x: torch.Tensor, density_ratio: float, speed_ratio: float) -> Boundary:
+    """Continuity of p and of (1/rho) dp/dr: dp/d(kr) over p is that inside, over both ratios."""
+    return lambda orders: (1.0, -_bessel_slopes(x / speed_ratio, orders) / (density_ratio * speed_ratio))
+
+
+def _series(setup: _Setup, kr: torch.Tensor, radial: Radial, inner_size: float) -> torch.Tensor:
+    """(ik / 4 pi) times the sum over orders of (2n + 1) radial_n(kr) [h_n(ks) / h_n(x)] P_n."""
+    blocks = [
+        _block(setup.at(rows), kr[rows], radial, inner_size)
+        for rows in torch.split(torch.arange(len(kr), device=kr.device), _BLOCK)
+    ]
+    return 1j * setup.wavenumber / (4 * math.pi) * torch.cat(blocks)
+
+
+def _block(setup: _Setup, kr: torch.Tensor, radial: Radial, inner_size: float) -> torch.Tensor:
+    orders = _enough_orders(setup, inner_size)
+    weights = 2 * _counted(setup.size, orders) + 1
+    at_points = weights[:, None] * radial(kr, orders)
+    at_sources = _hankel_fall(setup.size, setup.wavenumber * setup.source_distances, orders)
+    bound = at_points.abs().amax(dim=1) * at_sources.abs().amax(dim=1)
+    total = torch.zeros_like(setup.cosines, dtype=torch.complex128)
+    before, legendre = torch.zeros_like(setup.cosines), torch.ones_like(setup.cosines)
+    for n, counts in enumerate((bound > _NEGLIGIBLE * bound.max()).tolist()):
+        if counts:
+            total += at_points[n, :, None] * at_sources[n] * legendre
+        before, legendre = legendre, ((2 * n + 1) * setup.cosines * legendre - n * before) / (n + 1)
+    return total
+
+
+def _enough_orders(setup: _Setup, inner_size: float) -> int:
+    """The order past which terms stay below `_NEGLIGIBLE`.
+
+    From some cube roots past ka (and k_1 a) on, what each point and source adds to a term falls from order to
+    order by the ratio of its distance to the radius, or faster.
+    """
+    largest = max(float(setup.size), inner_size)
+    past = largest + 4 * math.cbrt(largest) + 16
+    fall = (setup.point_distances / setup.radius).clamp(min=_CENTER).log().abs().min()
+    fall += (setup.source_distances.min() / setup.radius).log()
+    orders = past - math.log(_NEGLIGIBLE) / float(fall)
+    if orders > _MOST_ORDERS:
+        nearest = float(setup.source_distances.min()) - setup.radius
+        raise ValueError(
+            f"sources: {nearest:g} m off the sphere, points about as near; both distances must add up to "
+            f"about {1e-3 * setup.radius:g} m or more"
+        )
+    return math.ceil(orders)
+
+
+def _bessel_slopes(x: torch.Tensor, orders: int) -> torch.Tensor:
+    """j_n'(x) / j_n(x), n = 0 to orders: (orders + 1, *x.shape), by downward recurrence of j_{n-1} / j_n."""
+    largest = float(x.max())
+    start = math.ceil(max(orders, largest) + 8 * math.cbrt(largest)) + 32
+    ratio = (2 * start + 1) / x
+    ratios = []
+    for n in range(start - 1, -1, -1):
+        ratio = (2 * n + 1) / x - 1 / ratio
+        if n <= orders:
+            ratios.append(ratio)
+    return torch.stack(ratios[::-1]) - (_counted(x, orders) + 1) / x
+
+
+def _hankel_slopes(x: torch.Tensor, orders: int) -> torch.Tensor:
+    """h_n'(x) / h_n(x), n = 0 to orders: (orders + 1, *x.shape)."""
+    return _hankel_ratios(x, orders) - (_counted(x, orders) + 1) / x
+
+
+def _hankel_ratios(x: torch.Tensor, orders: int) -> torch.Tensor:
+    """h_{n-1}(x) / h_n(x), n = 0 to orders, by upward recurrence: (orders + 1, *x.shape)."""
+    ratio = torch.full_like(x, 1j, dtype=torch.complex128)
+    ratios = [ratio]
+    for n in range(orders):
+        ratio = 1 / ((2 * n + 1) / x - ratio)
+        ratios.append(ratio)
+    return torch.stack(ratios)
+
+
+def _hankel_fall(near: torch.Tensor, far: torch.Tensor, orders: int) -> torch.Tensor:
+    """h_n(far) / h_n(near), n = 0 to orders, near <= far, one of them without axes: (orders + 1, P)."""
+    steps_near, steps_far = _hankel_ratios(near, orders), _hankel_ratios(far, orders)
+    size = max(near.numel(), far.numel())
+    steps = (steps_near.reshape(orders + 1, -1) / steps_far.reshape(orders + 1, -1)).expand(-1, size).clone()
+    steps[0] = torch.polar(near / far, far - near)
+    return steps.cumprod(dim=0)
+
+
+def _product(x: torch.Tensor, orders: int) -> torch.Tensor:
+    """j_n(x) h_n(x), n = 0 to orders, from their Wronskian: (orders + 1, *x.shape)."""
+    return 1j / x**2 / (_hankel_slopes(x, orders) - _bessel_slopes(x, orders))
+
+
+def _counted(x: torch.Tensor, orders: int) -> torch.Tensor:
+    """The orders 0 to `orders`, to be broadcast against x: (orders + 1, 1, ...)."""
+    return torch.arange(orders + 1, dtype=torch.float64, device=x.device).reshape(-1, *[1] * x.ndim)
+
+
+def _require_outside(name: str, positions: torch.Tensor, distances: torch.Tensor, least: float) -> None:
+    nearest = int(distances.argmin())
+    if distances[nearest] < least:
+        raise ValueError(
+            f"{name}[{nearest}]: {tuple(positions[nearest].tolist())} m, {float(distances[nearest]):g} m "
+            f"from the centre of the sphere; must be at least {least:g} m from it"
+        )

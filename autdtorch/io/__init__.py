@@ -1,0 +1,1 @@
+"""Files: scenes in YAML, arrays, drives and fields."""

@@ -1,0 +1,107 @@
+"""Transducer arrays from files: CSV, .npz and the board files of OpenMPD."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+
+from autdtorch.hardware.openmpd_board import OpenMPDBoard
+from autdtorch.io.csv_table import read_table
+from autdtorch.scene.arrays import PAPER_SOURCE_STRENGTH, TransducerArray
+from autdtorch.scene.geometry import device_axes, in_plane
+from autdtorch.utils.numpy_file import read_arrays
+from autdtorch.utils.validation import ArrayLike, invalid, path_of, points_tensor, real_tensor
+
+#: Columns of a CSV file that say where a transducer is and where it points, and their units.
+PLACE_COLUMNS = {"x": "m", "y": "m", "z": "m"}
+NORMAL_COLUMNS = {"nx": "", "ny": "", "nz": ""}
+#: Other columns that drive files have.
+_PASSED_OVER = {"transducer": "", "phase": "rad", "amplitude": ""}
+
+
+def load_array(
+    path: str | os.PathLike[str],
+    center: ArrayLike = (0.0, 0.0, 0.0),
+    normal: ArrayLike = (0.0, 0.0, 1.0),
+    angle: float = 0.0,
+    source_strength: float | None = None,
+    radius: float | None = None,
+) -> TransducerArray:
+    """Read an array from a file, and move it as a whole; by default it stays where the file has it.
+
+    - `.csv`: columns `x [m]`, `y [m]`, `z [m]` (or `[mm]`), and `nx`, `ny`, `nz` for the directions of
+      emission; without these it is +z.
+    - `.npz`: arrays `positions` (M, 3) [m] and `normals` (M, 3) or (3,), and numbers `source_strength` [Pa m]
+      and `radius` [m] if they are not the defaults of `TransducerArray`.
+    - `.pat`: a board of OpenMPD, emitting along +z; `OpenMPDBoard.load` gives its calibration too.
+
+    The drives that `save_drive` writes as .csv and .npz hold the array and can be read here.
+
+    Args:
+        path: of the file; its suffix says what it is.
+        center: where the origin of the file goes (3,) [m].
+        normal: where its z axis points (3,).
+        angle: of its x axis from u towards v [rad], (u, v) being `plane_basis(normal)`.
+        source_strength: [Pa m], > 0; None for what the file says, or else the default of its kind.
+        radius: of the discs [m], 0 for points; None for what the file says, or else the default of its kind.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: another suffix, a file that is not of its kind, or an argument that is not accepted. The
+            message names the file, and the line where it has lines.
+    """
+    kind = path_of("path", path).suffix.lower()
+    if kind == ".pat":
+        file = OpenMPDBoard.load(path).array()
+    elif kind == ".csv":
+        file = _from_csv(path)
+    elif kind == ".npz":
+        file = _from_npz(path)
+    else:
+        raise invalid("path", str(path), "must end in .csv, .npz or .pat")
+    return TransducerArray(
+        in_plane(file.positions, center, normal, angle),
+        file.normals @ device_axes(normal, angle),
+        file.source_strength if source_strength is None else source_strength,
+        file.radius if radius is None else radius,
+    )
+
+
+def _from_csv(path: str | os.PathLike[str]) -> TransducerArray:
+    table = read_table(path, PLACE_COLUMNS | NORMAL_COLUMNS | _PASSED_OVER)
+    for wanted in (PLACE_COLUMNS, NORMAL_COLUMNS):
+        missing = [name for name in wanted if name not in table]
+        if missing and (wanted is PLACE_COLUMNS or len(missing) < 3):
+            raise ValueError(f"{path}: no column {', '.join(missing)}; must have {', '.join(wanted)}")
+    positions = np.stack([table[name] for name in PLACE_COLUMNS], axis=1)
+    normals: Any = (0.0, 0.0, 1.0)
+    if "nx" in table:
+        normals = np.stack([table[name] for name in NORMAL_COLUMNS], axis=1)
+    return _built(path, positions, normals)
+
+
+def _from_npz(path: str | os.PathLike[str]) -> TransducerArray:
+    arrays = read_arrays(path)
+    for name in ("positions", "normals"):
+        if name not in arrays:
+            raise ValueError(f"{path}: no array {name!r}; must have positions and normals")
+    strength = arrays.get("source_strength", np.array(PAPER_SOURCE_STRENGTH))
+    radius = arrays.get("radius", np.array(0.0))
+    return _built(path, arrays["positions"], arrays["normals"], strength, radius)
+
+
+def _built(
+    path: str | os.PathLike[str],
+    positions: ArrayLike,
+    normals: ArrayLike,
+    source_strength: Any = PAPER_SOURCE_STRENGTH,
+    radius: Any = None,
+) -> TransducerArray:
+    try:
+        return TransducerArray(
+            points_tensor("positions", positions), real_tensor("normals", normals), source_strength, radius
+        )
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error

@@ -1,0 +1,107 @@
+"""Tables of numbers in CSV files whose header names the columns and their units, such as `x [mm]`."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from autdtorch.utils.files import replacing
+
+Column: TypeAlias = npt.NDArray[np.float64]
+
+#: What a column may be given in, by its SI unit, and what that is in SI.
+_UNITS: dict[str, dict[str, float]] = {
+    "": {"": 1.0},
+    "m": {"m": 1.0, "mm": 1e-3},
+    "rad": {"rad": 1.0, "deg": math.pi / 180},
+}
+
+
+def read_table(path: str | os.PathLike[str], columns: Mapping[str, str]) -> dict[str, Column]:
+    """Read a table; empty lines and lines that begin with # are skipped.
+
+    Args:
+        path: of the file, in UTF-8, with commas.
+        columns: names that may occur, and their SI units: "m" (the file may say mm), "rad" (or deg) or "".
+
+    Returns:
+        The columns that the file has (R,) in SI units, by name.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: an unknown or double column, a unit missing or unknown, a row of another length, something
+            that is no finite number, or no row. The message names file, line and column.
+    """
+    rows = _rows(path)
+    try:
+        line, header = next(rows)
+    except StopIteration:
+        raise ValueError(f"{path}: empty; must begin with the names of the columns") from None
+    known = [_column(f"{path}, line {line}", cell, columns) for cell in header]
+    names = [name for name, _ in known]
+    if len(set(names)) < len(names):
+        raise ValueError(f"{path}, line {line}: columns {', '.join(names)}; every name must occur once")
+    table = [_values(f"{path}, line {line}", cells, known) for line, cells in rows]
+    if not table:
+        raise ValueError(f"{path}: no row under the header; must have at least one")
+    return dict(zip(names, np.array(table).T, strict=True))
+
+
+def write_table(path: str | os.PathLike[str], columns: Mapping[str, npt.NDArray[np.generic]]) -> None:
+    """Write columns (R,) by header; floats with all digits that they need."""
+    with replacing(Path(path)) as partial, partial.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(zip(*(values.tolist() for values in columns.values()), strict=True))
+
+
+def _rows(path: str | os.PathLike[str]) -> Iterator[tuple[int, list[str]]]:
+    """Number and cells of every line that holds something."""
+    with Path(path).open(encoding="utf-8-sig", newline="") as file:
+        reader = csv.reader(file)
+        try:
+            for cells in reader:
+                row = [cell.strip() for cell in cells]
+                if any(row) and not row[0].startswith("#"):
+                    yield reader.line_num, row
+        except (csv.Error, UnicodeDecodeError) as error:
+            raise ValueError(f"{path}, line {reader.line_num + 1}: {error}; must be CSV in UTF-8") from error
+
+
+def _column(where: str, cell: str, columns: Mapping[str, str]) -> tuple[str, float]:
+    """Name of a column, and what its unit is in SI."""
+    match = re.fullmatch(r"([^\[\]]*?)\s*(?:\[(.*)\])?", cell)
+    name, unit = (match[1], match[2] or "") if match else (cell, "")
+    if name not in columns:
+        raise ValueError(f"{where}: unknown column {cell!r}; known columns: {', '.join(columns)}")
+    units = _UNITS[columns[name]]
+    if unit not in units:
+        accepted = " or ".join(f"{name} [{unit}]" if unit else name for unit in units)
+        raise ValueError(f"{where}: column {cell!r}; must be {accepted}")
+    return name, units[unit]
+
+
+def _values(where: str, cells: list[str], known: list[tuple[str, float]]) -> list[float]:
+    if len(cells) != len(known):
+        raise ValueError(f"{where}: {len(cells)} cells; must be {len(known)} as in the header")
+    return [
+        factor * _number(f"{where}, {name}", cell) for (name, factor), cell in zip(known, cells, strict=True)
+    ]
+
+
+def _number(where: str, cell: str) -> float:
+    try:
+        number = float(cell)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"{where}: {cell!r}; must be a finite number")
+    return number

@@ -1,0 +1,206 @@
+"""Drives in files: as they are, with their array, or as the integer levels that a device is sent."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from autdtorch.hardware.levels import (
+    Levels,
+    autd3_drive,
+    autd3_levels,
+    openmpd_drive,
+    openmpd_levels,
+    sonicsurface_drive,
+    sonicsurface_levels,
+)
+from autdtorch.io.array_file import NORMAL_COLUMNS, PLACE_COLUMNS
+from autdtorch.io.csv_table import read_table, write_table
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.device_layouts import AUTD3_TRANSDUCERS
+from autdtorch.scene.drive import (
+    amplitudes_of,
+    drive_from_phases,
+    phases_of,
+    validate_drive,
+    validate_single_drive,
+)
+from autdtorch.utils.files import replacing
+from autdtorch.utils.numpy_file import read_arrays
+from autdtorch.utils.validation import ArrayLike, invalid, path_of, real_tensor, require_kind, require_one_of
+
+
+class _Device(NamedTuple):
+    """How the levels of a device are stored."""
+
+    transducers: int  # of one unit
+    names: tuple[str, ...]
+    levels: Callable[[torch.Tensor], tuple[torch.Tensor, ...]]
+    drive: Callable[..., torch.Tensor]
+
+
+_DEVICES: dict[str, _Device] = {
+    "autd3": _Device(
+        AUTD3_TRANSDUCERS,
+        ("phase", "intensity"),
+        autd3_levels,
+        lambda phase, intensity: autd3_drive(Levels(phase, intensity)),
+    ),
+    "openmpd": _Device(
+        256, ("phase", "duty"), openmpd_levels, lambda phase, duty: openmpd_drive(Levels(phase, duty))
+    ),
+    "sonicsurface": _Device(256, ("phase",), lambda drive: (sonicsurface_levels(drive),), sonicsurface_drive),
+}
+_LEVEL_COLUMNS = {f"{name} {column}": "" for name, device in _DEVICES.items() for column in device.names}
+_PLAIN_COLUMNS = {"phase": "rad", "amplitude": ""}
+
+
+def save_drive(
+    path: str | os.PathLike[str], drive: ArrayLike, array: TransducerArray, device: str | None = None
+) -> None:
+    """Write a drive as `.csv` or `.npz`, whole or as what a device is sent.
+
+    Without `device`, with all digits: `.csv` has the columns transducer, x, y, z [m], nx, ny, nz, phase [rad]
+    and amplitude; `.npz` the arrays drive (M,), positions, normals, source_strength and radius. `load_array`
+    reads the array from both; .csv says neither strength nor radius.
+
+    With `device`, rounded to its levels (`autdtorch.hardware.levels`), in the order of the array, which must
+    be the device's: that of `TransducerArray.autd3`, `.sonicsurface` and `.openmpd`. `.csv` has the columns
+    unit, transducer and, say, autd3 phase and autd3 intensity; `.npz` the name `device` and uint8 arrays
+    (units, transducers of a unit): phase and intensity (AUTD3), phase and duty (OpenMPD), or phase alone.
+
+    Args:
+        path: of the file, which is replaced; its suffix says the format.
+        drive: complex (M,), |q| <= 1.
+        array: the M transducers.
+        device: "autd3", "openmpd", "sonicsurface", or None.
+
+    Raises:
+        ValueError: another suffix or device, not a drive of the array, or an M that is no multiple of what a
+            unit of the device has.
+    """
+    kind = _kind(path)
+    require_kind("array", array, TransducerArray)
+    checked = validate_single_drive(drive, len(array)).detach().cpu()
+    if device is None:
+        columns, arrays = _plain(checked, array)
+    else:
+        require_one_of("device", device, tuple(_DEVICES))
+        columns, arrays = _levelled(checked, device)
+    if kind == ".csv":
+        write_table(path, columns)
+    else:
+        with replacing(Path(path)) as partial, partial.open("wb") as file:  # to a path, NumPy would add .npz
+            np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
+    """The drive (M,), complex128, from a file as `save_drive` writes it; levels as the device plays them.
+
+    Args:
+        path: of the file; its suffix says the format.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: another suffix, or a file that holds no drive. The message names the file, and the line
+            where it has lines.
+    """
+    if _kind(path) == ".csv":
+        return _from_columns(path, read_table(path, _all_columns()))
+    arrays = read_arrays(path)
+    if "device" in arrays:
+        name = str(arrays["device"])
+        require_one_of(f"{path}: device", name, tuple(_DEVICES))
+        return _played(path, name, {f"{name} {key}": value.reshape(-1) for key, value in arrays.items()})
+    if "drive" not in arrays:
+        raise ValueError(f"{path}: no array 'drive'; must be written by save_drive")
+    drive = arrays["drive"]
+    return _valid(path, lambda: validate_drive(drive.reshape(-1), drive.size))
+
+
+def _kind(path: str | os.PathLike[str]) -> str:
+    kind = path_of("path", path).suffix.lower()
+    if kind not in (".csv", ".npz"):
+        raise invalid("path", str(path), "must end in .csv or .npz")
+    return kind
+
+
+def _all_columns() -> dict[str, str]:
+    numbering = {"unit": "", "transducer": ""}
+    return numbering | PLACE_COLUMNS | NORMAL_COLUMNS | _PLAIN_COLUMNS | _LEVEL_COLUMNS
+
+
+def _plain(drive: torch.Tensor, array: TransducerArray) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Columns by header and arrays by name of a drive that is not rounded."""
+    positions, normals = array.positions.numpy(), array.normals.numpy()
+    columns = {"transducer": np.arange(len(array))}
+    columns |= {f"{name} [m]": positions[:, axis] for axis, name in enumerate(PLACE_COLUMNS)}
+    columns |= {name: normals[:, axis] for axis, name in enumerate(NORMAL_COLUMNS)}
+    columns |= {"phase [rad]": phases_of(drive).numpy(), "amplitude": amplitudes_of(drive).numpy()}
+    arrays = {
+        "drive": drive.numpy(),
+        "positions": positions,
+        "normals": normals,
+        "source_strength": array.source_strength,
+        "radius": array.radius,
+    }
+    return columns, arrays
+
+
+def _levelled(drive: torch.Tensor, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Columns by header and arrays by name of the levels that a device is sent."""
+    device = _DEVICES[name]
+    units, rest = divmod(len(drive), device.transducers)
+    if rest:
+        raise ValueError(
+            f"drive: {len(drive)} transducers; must be a multiple of {device.transducers} for {name}"
+        )
+    levels = [level.numpy().astype(np.uint8) for level in device.levels(drive)]
+    unit, transducer = np.divmod(np.arange(len(drive)), device.transducers)
+    columns = {"unit": unit, "transducer": transducer}
+    columns |= {f"{name} {key}": level for key, level in zip(device.names, levels, strict=True)}
+    arrays = {key: level.reshape(units, -1) for key, level in zip(device.names, levels, strict=True)}
+    return columns, arrays | {"device": name}
+
+
+def _from_columns(path: str | os.PathLike[str], table: Mapping[str, npt.NDArray[np.float64]]) -> torch.Tensor:
+    for name, device in _DEVICES.items():
+        if any(f"{name} {column}" in table for column in device.names):
+            return _played(path, name, table)
+    missing = [column for column in _PLAIN_COLUMNS if column not in table]
+    if missing:
+        raise ValueError(
+            f"{path}: no column {', '.join(missing)}; must have phase and amplitude, or a device's"
+        )
+    return _valid(path, lambda: drive_from_phases(table["phase"], table["amplitude"]))
+
+
+def _played(path: str | os.PathLike[str], name: str, stored: Mapping[str, npt.NDArray[Any]]) -> torch.Tensor:
+    """What a device plays for levels that are stored by names such as "autd3 phase"."""
+    device = _DEVICES[name]
+    wanted = [f"{name} {column}" for column in device.names]
+    missing = [column for column in wanted if column not in stored]
+    if missing:
+        raise ValueError(f"{path}: no {', '.join(missing)}; must have {', '.join(wanted)}")
+
+    def drive() -> torch.Tensor:
+        levels = [real_tensor(column, stored[column]) for column in wanted]
+        # Whole numbers become the integers they stand for; the device refuses others.
+        return device.drive(
+            *(level.long() if bool((level == level.long()).all()) else level for level in levels)
+        )
+
+    return _valid(path, drive)
+
+
+def _valid(path: str | os.PathLike[str], make: Callable[[], torch.Tensor]) -> torch.Tensor:
+    try:
+        return make()
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error

@@ -1,0 +1,185 @@
+"""Fields on regular grids in files: VTK image data (.vti) for ParaView, and HDF5.
+
+VTK's XML format is written here: its own library is a large dependency, and the small writers have no
+directions, which a plane in space needs.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import BinaryIO, NamedTuple, TypeAlias
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from autdtorch.utils.files import replacing
+from autdtorch.utils.validation import (
+    LENGTH_TOLERANCE,
+    ArrayLike,
+    complex_tensor,
+    invalid,
+    path_of,
+    positive,
+    real_tensor,
+)
+
+Array: TypeAlias = npt.NDArray[np.float64]
+
+_HDF5 = (".h5", ".hdf5")
+
+
+class _Grid(NamedTuple):
+    """Points origin + i spacing[0] axes[0] + j spacing[1] axes[1] + k spacing[2] axes[2] [m]."""
+
+    origin: Array  # (3,) of the first point
+    spacing: Array  # (3,)
+    axes: Array  # (3, 3), one a row, orthonormal
+
+
+def save_field(
+    path: str | os.PathLike[str], pressure: ArrayLike, points: ArrayLike, frequency: float
+) -> None:
+    """Write the complex pressure on a regular grid or plane of points.
+
+    - `.vti`: VTK image data, for ParaView and PyVista. Point data pressure_real, pressure_imag and
+      pressure_magnitude [Pa], field data frequency [Hz]; lengths in m. A grid that lies along x, y and z gets
+      VTK's own axes, any other a direction matrix (VTK 9 and later).
+    - `.h5`, `.hdf5`: the dataset `pressure`, complex128, of the shape given; its attributes: units "Pa",
+      origin (3,), the first point; spacing (n,) and axes (n, 3), unit vectors, of its n axes; length_units
+      "m"; frequency; frequency_units "Hz"; time_convention "exp(-i omega t)".
+
+    Args:
+        path: of the file, which is replaced; its suffix says the format.
+        pressure: complex (Nx, Ny, Nz) or (Nu, Nv) [Pa], amplitudes for e^{-i w t}.
+        points: (Nx, Ny, Nz, 3) as from `cell_centers`, or (Nu, Nv, 3) as from `Plane.points` [m].
+        frequency: of the drive [Hz], > 0.
+
+    Raises:
+        ValueError: another suffix, shapes that do not agree, or points that are no regular right-angled grid
+            of at least two points along two axes.
+    """
+    kind = path_of("path", path).suffix.lower()
+    if kind not in (".vti", *_HDF5):
+        raise invalid("path", str(path), "must end in .vti, .h5 or .hdf5")
+    places = real_tensor("points", points, "m").detach().cpu().numpy()
+    if places.ndim not in (3, 4) or places.shape[-1] != 3:
+        raise ValueError(f"points: shape {places.shape}; must be (Nx, Ny, Nz, 3) or (Nu, Nv, 3)")
+    values = complex_tensor("pressure", pressure).detach().cpu()
+    if values.shape != places.shape[:-1]:
+        raise ValueError(f"pressure: shape {tuple(values.shape)}; must be {places.shape[:-1]} as the points")
+    frequency = positive("frequency", frequency, "Hz")
+    grid = _grid(places)
+    write = _write_vti if kind == ".vti" else _write_hdf5
+    with replacing(Path(path)) as partial:
+        write(partial, values, grid, frequency)
+
+
+def _grid(points: Array) -> _Grid:
+    """The regular grid that `points` (Nx, Ny, Nz, 3) or (Nu, Nv, 3) are."""
+    shape = points.shape[:-1] + (1,) * (4 - points.ndim)
+    points = points.reshape(*shape, 3)
+    long = [axis for axis in range(3) if shape[axis] > 1]
+    if len(long) < 2:
+        raise ValueError(f"points: shape {points.shape}; must have two axes of at least 2 points")
+    origin = points[0, 0, 0]
+    steps = np.zeros((3, 3))
+    for axis in long:
+        steps[axis] = np.take(points, -1, axis)[0, 0] - origin
+        steps[axis] /= shape[axis] - 1
+    spacing = np.linalg.norm(steps, axis=1)
+    if spacing[long].min() < LENGTH_TOLERANCE:
+        raise ValueError("points: two coincide; must be a grid")
+    if len(long) == 2:
+        # The axis of one point: the normal, with a step that no reader needs but that is none of zero.
+        (flat,) = {0, 1, 2} - set(long)
+        spacing[flat] = spacing[long].min()
+        steps[flat] = np.cross(steps[flat - 2], steps[flat - 1]) / spacing[long].max()
+    axes = steps / spacing[:, None]
+    index = np.moveaxis(np.indices(shape), 0, -1)
+    off = np.abs(points - (origin + index @ steps)).max()
+    if off > LENGTH_TOLERANCE or np.abs(axes @ axes.T - np.eye(3)).max() > 1e-6:
+        raise ValueError("points: must be a regular grid with right angles, such as Plane.points")
+    return _Grid(origin, spacing, axes)
+
+
+def _write_hdf5(path: Path, pressure: torch.Tensor, grid: _Grid, frequency: float) -> None:
+    with h5py.File(path, "w") as file:
+        data = file.create_dataset("pressure", data=pressure.numpy(), compression="gzip", shuffle=True)
+        data.attrs["units"] = "Pa"
+        data.attrs["origin"] = grid.origin
+        data.attrs["spacing"] = grid.spacing[: pressure.ndim]
+        data.attrs["axes"] = grid.axes[: pressure.ndim]
+        data.attrs["length_units"] = "m"
+        data.attrs["frequency"] = frequency
+        data.attrs["frequency_units"] = "Hz"
+        data.attrs["time_convention"] = "exp(-i omega t)"
+
+
+def _along_coordinates(pressure: Array, grid: _Grid) -> tuple[Array, _Grid]:
+    """The same field with its axes along +x, +y and +z, where they lie along coordinate axes at all."""
+    nearest = np.abs(grid.axes).argmax(axis=1)
+    if np.abs(grid.axes[range(3), nearest]).min() < 1 - 1e-12:
+        return pressure, grid
+    order = np.argsort(nearest)
+    pressure, spacing = pressure.transpose(order), grid.spacing[order]
+    origin = grid.origin.copy()
+    for axis, sign in enumerate(np.sign(grid.axes[order, range(3)])):
+        if sign < 0:
+            pressure = np.flip(pressure, axis)
+            origin[axis] -= spacing[axis] * (pressure.shape[axis] - 1)
+    return pressure, _Grid(origin, spacing, np.eye(3))
+
+
+def _write_vti(path: Path, pressure: torch.Tensor, grid: _Grid, frequency: float) -> None:
+    values = pressure.numpy().reshape(*pressure.shape, *(1,) * (3 - pressure.ndim))
+    values, grid = _along_coordinates(values, grid)
+    arrays = {
+        "pressure_real": values.real,
+        "pressure_imag": values.imag,
+        "pressure_magnitude": np.abs(values),
+    }
+    extent = " ".join(f"0 {count - 1}" for count in values.shape)
+    size = values.size * 8
+    # The appended blocks stand one after the other, each behind its length.
+    entries = "".join(
+        f'<DataArray type="Float64" Name="{name}" format="appended" offset="{place * (size + 8)}"/>\n'
+        for place, name in enumerate(arrays)
+    )
+    # VTK wants the axes as columns.
+    header = f"""<?xml version="1.0"?>
+<VTKFile type="ImageData" version="1.0" byte_order="{_byte_order()}" header_type="UInt64">
+<ImageData WholeExtent="{extent}" Origin="{_text(grid.origin)}" Spacing="{_text(grid.spacing)}"
+ Direction="{_text(grid.axes.T)}">
+<FieldData>
+<DataArray type="Float64" Name="frequency" NumberOfTuples="1" format="ascii">{frequency!r}</DataArray>
+</FieldData>
+<Piece Extent="{extent}">
+<PointData Scalars="pressure_magnitude">
+{entries}</PointData>
+</Piece>
+</ImageData>
+<AppendedData encoding="raw">
+_"""
+    with path.open("wb") as file:
+        file.write(header.encode("ascii"))
+        for block in arrays.values():
+            _append(file, block)
+        file.write(b"\n</AppendedData>\n</VTKFile>\n")
+
+
+def _append(file: BinaryIO, block: Array) -> None:
+    """A block of appended data: its length, then the values with x the fastest."""
+    file.write(np.uint64(block.size * 8).tobytes())
+    file.write(np.asarray(block, dtype=np.float64).tobytes(order="F"))
+
+
+def _byte_order() -> str:
+    return "LittleEndian" if sys.byteorder == "little" else "BigEndian"
+
+
+def _text(numbers: Array) -> str:
+    return " ".join(repr(float(number)) for number in numbers.ravel())

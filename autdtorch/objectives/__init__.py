@@ -1,0 +1,1 @@
+"""Objectives: drives in, pressure magnitudes at the control points out."""

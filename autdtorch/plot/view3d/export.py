@@ -1,0 +1,94 @@
+"""Files of a 3D view."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from autdtorch.plot.drawing import MM
+from autdtorch.utils.validation import path_of
+
+if TYPE_CHECKING:
+    import pyvista
+
+_SUFFIXES = (".png", ".html", ".gltf")
+
+_LEGEND = (
+    "position: fixed; z-index: 1; left: 16px; top: 16px; display: flex; gap: 32px; font: 14px sans-serif"
+)
+_BAR = "width: 200px; height: 14px"
+_ENDS = "display: flex; justify-content: space-between"
+_EVERY = 8  # colours of a table
+
+
+def require_suffix(name: str, path: str | Path, suffixes: tuple[str, ...] = _SUFFIXES) -> Path:
+    """The path after checking that its suffix says what can be written.
+
+    Raises:
+        ValueError: another suffix.
+        RuntimeError: what writes that file is not installed.
+    """
+    path = path_of(name, path)
+    if path.suffix not in suffixes:
+        raise ValueError(f"{name}: {str(path)!r}; its suffix must be one of {', '.join(suffixes)}")
+    if path.suffix == ".html" and importlib.util.find_spec("trame_pyvista") is None:
+        raise RuntimeError(f"{name}: {str(path)!r} needs trame-pyvista: pip install 'autdtorch[notebook]'")
+    return path
+
+
+def write(plotter: pyvista.Plotter, path: Path, caption: Sequence[str]) -> None:
+    """Write what the plotter shows, in the format of the path's suffix."""
+    if path.suffix == ".png":
+        plotter.screenshot(str(path))
+    elif path.suffix == ".gltf":
+        _write_gltf(plotter, path)
+    else:
+        _write_html(plotter, path, caption)
+
+
+def _write_gltf(plotter: pyvista.Plotter, path: Path) -> None:
+    """In metres and without camera, which PyVista does not turn with the scene; with colours as drawn.
+
+    VTK leaves a tint on what a texture colours, and what is translucent solid.
+    """
+    plotter.export_gltf(str(path))
+    content = json.loads(path.read_text(encoding="utf-8"))
+    del content["cameras"]
+    for node in content["nodes"]:
+        node.pop("camera", None)
+        if "children" in node:
+            node["scale"] = [1 / MM] * 3
+    for material in content["materials"]:
+        surface = material["pbrMetallicRoughness"]
+        if "baseColorTexture" in surface:
+            surface["baseColorFactor"][:3] = 1.0, 1.0, 1.0
+        if surface["baseColorFactor"][3] < 1:
+            material["alphaMode"] = "BLEND"
+        material["doubleSided"] = True
+    path.write_text(json.dumps(content), encoding="utf-8")
+
+
+def _write_html(plotter: pyvista.Plotter, path: Path, caption: Sequence[str]) -> None:
+    """With colour bars of our own: the viewer in the page would draw all of them in one place."""
+    bars = plotter.scalar_bars
+    legend = "".join(_html_bar(title.strip(), bar.lookup_table) for title, bar in bars.items())
+    for bar in bars.values():
+        bar.SetVisibility(False)
+    page: str = plotter.trame.export_html(None).getvalue()
+    for bar in bars.values():
+        bar.SetVisibility(True)
+    lines = "<br>".join(caption)
+    # The viewer takes the element of class "content" for itself, or else empties the whole page.
+    legend = f'<div class="content"></div><div style="{_LEGEND}">{legend}<div>{lines}</div></div>'
+    path.write_text(page.replace("</body>", f"{legend}\n</body>"), encoding="utf-8")
+
+
+def _html_bar(title: str, table: pyvista.LookupTable) -> str:
+    low, high = table.scalar_range
+    colours = ", ".join("rgb({}, {}, {})".format(*rgba[:3]) for rgba in table.values[::_EVERY])
+    bar = f'<div style="{_BAR}; background: linear-gradient(to right, {colours})"></div>'
+    ends = f'<div style="{_ENDS}"><span>{low:g}</span><span>{high:g}</span></div>'
+    return f"<div>{title}{bar}{ends}</div>"

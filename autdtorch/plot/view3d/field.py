@@ -1,0 +1,84 @@
+"""Fields as meshes: the pressure on the observation plane, and where in space it reaches a level."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from autdtorch.plot.drawing import EDGE_COLOUR, FLOOR, MM, PLANE_COLOUR, PRESSURE_MAP, Array
+from autdtorch.plot.view3d.scene import FIELD_BAR, add_bar
+from autdtorch.scene.geometry import Plane
+from autdtorch.scene.scene import Scene
+from autdtorch.utils.neighbours import distances
+
+if TYPE_CHECKING:
+    import pyvista
+
+logger = logging.getLogger(__name__)
+
+_REACH = 3.0  # wavelengths around a control point
+_SURFACE_COLOUR = "#8CD0FF"  # blue: a hue that the map of the pressure does not have
+
+
+def add_plane(plotter: pyvista.Plotter, plane: Plane, level: Array | None) -> None:
+    """Draw the plane, coloured by its level (Nu, Nv) [dB]; without, a translucent sheet."""
+    if level is None:
+        plotter.add_mesh(
+            plane_mesh(plane, np.zeros((1, 1))), color=PLANE_COLOUR, opacity=0.35, lighting=False
+        )
+        return
+    actor = add_sheet(plotter, plane_mesh(plane, np.maximum(level, FLOOR)), PRESSURE_MAP, (FLOOR, 0.0))
+    add_bar(plotter, actor, "pressure [dB]", position=FIELD_BAR, labels=7, fmt="%.0f")
+
+
+def add_sheet(
+    plotter: pyvista.Plotter, sheet: pyvista.PolyData, colours: str, limits: tuple[float, float]
+) -> pyvista.Actor:
+    """Draw a mesh of `plane_mesh`, coloured by its values between the limits, and its frame."""
+    actor = plotter.add_mesh(sheet, cmap=colours, clim=limits, lighting=False, show_scalar_bar=False)
+    frame = sheet.extract_feature_edges()
+    frame.clear_data()
+    plotter.add_mesh(frame, color=EDGE_COLOUR, line_width=1, lighting=False)
+    return actor
+
+
+def plane_mesh(plane: Plane, values: Array) -> pyvista.PolyData:
+    """The plane with `values` (Nu, Nv) at the centres of its cells, and those next to its edge also there."""
+    import pyvista
+
+    u, v = (axis.numpy() for axis in plane.basis)
+    along_u, along_v = (
+        length * (np.concatenate([[0.0], np.arange(cells) + 0.5, [cells]]) / cells - 0.5)
+        for length, cells in zip(plane.size, values.shape, strict=True)
+    )
+    nodes = MM * (np.asarray(plane.center) + along_u[:, None, None] * u + along_v[None, :, None] * v)
+    mesh = pyvista.StructuredGrid(*(nodes[:, :, None, axis] for axis in range(3)))
+    mesh["field"] = np.pad(values, 1, mode="edge").ravel(order="F")  # VTK counts the first axis fastest
+    return mesh.extract_surface(algorithm=None)
+
+
+def add_isosurface(plotter: pyvista.Plotter, scene: Scene, level: Array, height: float) -> None:
+    """Draw where the level (Nx, Ny, Nz) [dB], at the centres of the domain's cells, is `height`.
+
+    That is done around the control points alone: near the array the surface would hide all.
+    """
+    import pyvista
+
+    lower, upper = (MM * np.asarray(corner) for corner in scene.domain)
+    step = (upper - lower) / level.shape
+    grid = pyvista.ImageData(dimensions=level.shape, spacing=step, origin=lower + step / 2)
+    grid["level"] = np.maximum(np.nan_to_num(level, nan=FLOOR), 2 * FLOOR).ravel(order="F")
+    grid["known"] = (~np.isnan(level)).ravel(order="F").astype(float)
+    known = grid.threshold(0.5, scalars="known", all_scalars=True)
+    surface = known.contour([height], scalars="level")
+    points = torch.from_numpy(np.asarray(surface.points, np.float64))
+    surface["away"] = distances(points, MM * scene.control_points).amin(dim=1).numpy()
+    surface = surface.clip_scalar(scalars="away", value=MM * _REACH * scene.wavelength)
+    if surface.n_cells == 0:
+        logger.warning("no isosurface: %g dB is not reached around the control points", height)
+        return
+    surface.clear_data()
+    plotter.add_mesh(surface.compute_normals(), color=_SURFACE_COLOUR, opacity=0.45, smooth_shading=True)

@@ -1,0 +1,203 @@
+"""What a scene holds, as meshes: transducers, obstacles, control points; axes and camera."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from autdtorch.plot.drawing import (
+    EDGE_COLOUR,
+    MM,
+    MOST_EDGES,
+    OBSTACLE_COLOUR,
+    PHASE_MAP,
+    SHARP_ANGLE,
+    TRANSDUCER_COLOUR,
+    Array,
+    single_drive_phases,
+)
+from autdtorch.scene.drive import amplitudes_of
+from autdtorch.scene.obstacles import Obstacle
+from autdtorch.scene.scene import Scene
+from autdtorch.utils.neighbours import nearest_other
+from autdtorch.utils.validation import ArrayLike, Vector
+
+if TYPE_CHECKING:
+    import pyvista
+
+_WINDOW = (1200, 860)  # pixels
+
+POINT_COLOUR = "#00C8A0"  # green: a hue that the map of the pressure does not have
+_SILENT_COLOUR = "#C8C8C8"
+_PHASE_BAR = 0.03  # left edges of the colour bars in the window
+FIELD_BAR = 0.9
+_CAPTION = (0.85, 0.15)  # its lower left corner in the window
+_CAMERA = (-0.75, -1.0, 0.5)  # from the centre towards the camera
+
+
+def new_plotter(scene: Scene, off_screen: bool) -> pyvista.Plotter:
+    """A plotter with obstacles, control points, axes and camera."""
+    import pyvista
+
+    with pyvista.vtk_verbosity("error"):  # VTK warns of a missing X server, and then goes on without one
+        plotter = pyvista.Plotter(off_screen=off_screen, window_size=list(_WINDOW))
+    plotter.set_background("white")
+    for obstacle in scene.obstacles:
+        _add_obstacle(plotter, obstacle, scene.domain)
+    _add_control_points(plotter, scene)
+    _add_axes(plotter, scene)
+    return plotter
+
+
+def emitted_phases(drive: ArrayLike, transducers: int) -> Array:
+    """Phases (M,) in [0, 2 pi) [rad] of one drive of an array of `transducers`; NaN where it is silent.
+
+    Raises:
+        ValueError: not one drive that the array can play.
+    """
+    phases = single_drive_phases(drive, transducers)
+    return np.where(amplitudes_of(drive).detach().cpu().numpy() > 0, phases, np.nan)
+
+
+def add_transducers(plotter: pyvista.Plotter, scene: Scene, phases: Array | None) -> pyvista.PolyData:
+    """Draw the transducers as discs.
+
+    Args:
+        plotter: where to.
+        scene: the transducers' scene.
+        phases: (M,) [rad], NaN for silent ones; colour the discs.
+
+    Returns:
+        The discs, a cell or more each, with the transducers' phases over pi as "phase" if there are phases.
+    """
+    import pyvista
+
+    positions = scene.array.positions
+    apart = nearest_other(positions)[0].min().item() if len(positions) > 1 else math.inf
+    # Those that are points are drawn as discs that do not touch, of one wavelength at most.
+    radius = MM * (scene.array.radius or 0.42 * min(apart, scene.wavelength))
+    points = pyvista.PolyData(MM * positions.numpy())
+    points["normals"] = scene.array.normals.numpy()
+    if phases is not None:
+        points["phase"] = phases / math.pi
+    along = {"orient": "normals", "scale": False}
+    face, rim = (
+        points.glyph(geom=pyvista.Disc(inner=inner, outer=outer, normal=(1.0, 0.0, 0.0), c_res=48), **along)
+        for inner, outer in ((0.0, radius), (radius, 1.1 * radius))
+    )
+    arrow = pyvista.Arrow(
+        start=(0.1 * radius, 0.0, 0.0),
+        scale=2.0 * radius,
+        tip_length=0.35,
+        tip_radius=0.1,
+        shaft_radius=0.03,
+    )
+    if phases is None:
+        plotter.add_mesh(face, color=TRANSDUCER_COLOUR, lighting=False)
+    else:
+        actor = plotter.add_mesh(
+            face,
+            scalars="phase",
+            cmap=PHASE_MAP,
+            clim=(0.0, 2.0),
+            nan_color=_SILENT_COLOUR,
+            lighting=False,
+            show_scalar_bar=False,
+        )
+        add_bar(plotter, actor, "phase / π", position=_PHASE_BAR, labels=5, fmt="%.1f")
+    plotter.add_mesh(rim, color=EDGE_COLOUR, lighting=False)
+    plotter.add_mesh(points.glyph(geom=arrow, **along), color="#555555")
+    return face
+
+
+def add_bar(
+    plotter: pyvista.Plotter, mesh: pyvista.Actor, title: str, *, position: float, labels: int, fmt: str
+) -> None:
+    """Draw the colour bar of a mesh; `position` is its left edge in the window."""
+    bar = plotter.add_scalar_bar(
+        title + "\n",  # VTK sets the title tight against the bar
+        mapper=mesh.mapper,
+        vertical=True,
+        position_x=position,
+        position_y=0.25,
+        width=0.05,
+        height=0.5,
+        n_labels=labels,
+        fmt=fmt,
+        color="black",
+        title_font_size=20,
+        label_font_size=18,
+        unconstrained_font_size=True,
+    )
+    _use_font(bar.GetTitleTextProperty(), bar.GetLabelTextProperty())
+
+
+def add_caption(plotter: pyvista.Plotter, *lines: str) -> None:
+    """Write lines below the bar of the field."""
+    text = plotter.add_text("\n".join(lines), position=_CAPTION, viewport=True, font_size=10, color="black")
+    _use_font(text.prop)
+
+
+def _use_font(*properties: pyvista.TextProperty) -> None:
+    """Give texts the font that Matplotlib takes for its figures; VTK's own have no π."""
+    package = importlib.util.find_spec("matplotlib")  # PyVista needs it
+    if package is None or package.origin is None:
+        raise ModuleNotFoundError("matplotlib")
+    for text in properties:
+        text.SetFontFamily(4)  # VTK_FONT_FILE
+        text.SetFontFile(str(Path(package.origin).parent / "mpl-data/fonts/ttf/DejaVuSans.ttf"))
+
+
+def _add_obstacle(plotter: pyvista.Plotter, obstacle: Obstacle, domain: tuple[Vector, Vector]) -> None:
+    """The obstacle's surface and its sharp edges, cut off and left open where the domain ends."""
+    import pyvista
+
+    vertices, faces = obstacle.surface()
+    surface = pyvista.PolyData.from_regular_faces(MM * vertices.numpy(), faces.numpy())
+    for outwards, corner in zip((-1.0, 1.0), domain, strict=True):
+        for normal in outwards * np.eye(3):
+            if (((surface.points - MM * np.array(corner)) @ normal) > 0).any():
+                surface = surface.clip(normal=normal, origin=MM * np.array(corner))
+    if surface.n_cells == 0:  # only its bounding box reaches into the domain
+        return
+    normals = surface.compute_normals(
+        split_vertices=True, feature_angle=math.degrees(SHARP_ANGLE), auto_orient_normals=False
+    )
+    plotter.add_mesh(normals, color=OBSTACLE_COLOUR, ambient=0.35, smooth_shading=True)
+    edges = surface.extract_feature_edges(math.degrees(SHARP_ANGLE))
+    if 0 < edges.n_cells <= MOST_EDGES:
+        plotter.add_mesh(edges, color=EDGE_COLOUR, line_width=2, lighting=False)
+
+
+def _add_control_points(plotter: pyvista.Plotter, scene: Scene) -> None:
+    import pyvista
+
+    sphere = pyvista.Sphere(radius=MM * scene.wavelength / 5)
+    points = pyvista.PolyData(MM * scene.control_points.numpy())
+    plotter.add_mesh(points.glyph(orient=False, scale=False, geom=sphere), color=POINT_COLOUR, ambient=0.3)
+
+
+def _add_axes(plotter: pyvista.Plotter, scene: Scene) -> None:
+    lower, upper = scene.domain
+    axes = plotter.show_bounds(
+        bounds=[MM * corner[axis] for axis in range(3) for corner in (lower, upper)],
+        xtitle="x [mm]",
+        ytitle="y [mm]",
+        ztitle="z [mm]",
+        grid="back",
+        location="outer",
+        fmt="%.0f",
+        color="black",
+        font_size=15,
+    )
+    for axis in range(3):
+        axes.SetAxisLabels(axis, None)  # PyVista's: VTK's own are at round numbers
+    plotter.view_vector(_CAMERA, viewup=(0.0, 0.0, 1.0))
+    plotter.enable_parallel_projection()
+    plotter.reset_camera()
+    plotter.camera.zoom(1.05)
+    plotter.enable_anti_aliasing("ssaa")

@@ -1,0 +1,79 @@
+"""A scene and its field in 3D."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from autdtorch.plot.drawing import FLOOR, in_decibels
+from autdtorch.plot.view3d.export import require_suffix, write
+from autdtorch.plot.view3d.field import add_isosurface, add_plane
+from autdtorch.plot.view3d.level import plane_pressure, volume_magnitude, zero_level
+from autdtorch.plot.view3d.probe import require_rendering
+from autdtorch.plot.view3d.scene import add_caption, add_transducers, emitted_phases, new_plotter
+from autdtorch.scene.scene import Scene
+from autdtorch.utils.validation import ArrayLike, boolean, number_between, require_kind
+
+if TYPE_CHECKING:
+    import pyvista
+
+
+def view3d(
+    scene: Scene,
+    drive: ArrayLike | None = None,
+    field: ArrayLike | None = None,
+    volume: ArrayLike | None = None,
+    *,
+    isosurface: float = -3.0,
+    reference: float | None = None,
+    save: str | Path | None = None,
+    off_screen: bool = True,
+) -> pyvista.Plotter:
+    """Draw transducers, obstacles, control points, observation plane and field, in millimetres.
+
+    Pressures are drawn as levels 20 lg(|p| / reference), from -30 to 0 dB; the colour bar says what 0 dB is.
+
+    Args:
+        scene: what to draw.
+        drive: complex (M,); colours the transducers by phase. Silent ones are grey.
+        field: pressure on the observation plane (Nu, Nv) [Pa], complex or its magnitude, at the points of
+            `Plane.points`; colours the plane. Without it, the plane is a translucent sheet.
+        volume: pressure in the domain (Nx, Ny, Nz) [Pa], complex or its magnitude, from `volume_field`; NaN
+            where it is not known. Drawn as the surface where it has the level `isosurface`.
+        isosurface: that level [dB], in -30 to 0.
+        reference: the pressure of 0 dB [Pa], > 0. By default the largest on the plane or, without `field`, in
+            the volume. Give one to compare pictures.
+        save: file to write, by its suffix: ``.png``; ``.html`` to turn in a browser (extra ``notebook``);
+            ``.gltf`` for other 3D programs, in m and without axes and bars.
+        off_screen: False for a plotter whose ``show()`` opens a window.
+
+    Returns:
+        The plotter, for changes or ``show()``; close it when done.
+
+    Raises:
+        RuntimeError: this machine cannot render, or cannot write HTML; the message says what is missing.
+        ValueError: `drive`, `field` or `volume` does not fit the scene, another argument is out of range, or
+            the suffix of `save` is another.
+    """
+    require_kind("scene", scene, Scene)
+    off_screen = boolean("off_screen", off_screen)
+    phases = None if drive is None else emitted_phases(drive, len(scene.array))
+    on_plane = None if field is None else plane_pressure(scene, field)[1]
+    in_domain = None if volume is None else volume_magnitude(volume)
+    height = number_between("isosurface", isosurface, FLOOR, 0.0, "dB")
+    zero = zero_level(reference, on_plane, in_domain)
+    path = None if save is None else require_suffix("save", save)
+    require_rendering()
+    plotter = new_plotter(scene, off_screen)
+    add_transducers(plotter, scene, phases)
+    if scene.observation_plane is not None:
+        level = None if on_plane is None else in_decibels(on_plane, zero)
+        add_plane(plotter, scene.observation_plane, level)
+    caption = [] if on_plane is None and in_domain is None else [f"0 dB = {zero:.3g} Pa"]
+    if in_domain is not None:
+        add_isosurface(plotter, scene, in_decibels(in_domain, zero), height)
+        caption.append(f"surface: {height:g} dB")
+    add_caption(plotter, *caption)
+    if path is not None:
+        write(plotter, path, caption)
+    return plotter

@@ -1,0 +1,167 @@
+"""The field of a scene as a function that autograd can go back through: to the drive and to the medium."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from autdtorch.fdtd.adjoint import recorded
+from autdtorch.fdtd.cell_maps import cells_of_maps, domain_cells
+from autdtorch.fdtd.grid import Grid, make_grid, require_fine, speeds_of, warn_if_coarse
+from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources
+from autdtorch.fdtd.medium import warn_of_ending_walls
+from autdtorch.fdtd.steady_state import block_of, fewest_periods
+from autdtorch.fdtd.stepping import Assembly, drive_signal, lock_in
+from autdtorch.fdtd.variable_cells import VariableCells, cells_of_obstacles
+from autdtorch.propagators.stepper import KERNELS, make_kernel, precision_of
+from autdtorch.scene.drive import validate_drive
+from autdtorch.scene.scene import Scene, require_inside
+from autdtorch.utils.validation import (
+    ArrayLike,
+    integer_at_least,
+    invalid,
+    points_tensor,
+    positive,
+    real_tensor,
+    require_kind,
+    require_one_of,
+)
+
+
+def differentiable_field(
+    scene: Scene,
+    drive: torch.Tensor,
+    points: ArrayLike | None = None,
+    *,
+    density: ArrayLike | None = None,
+    sound_speed: ArrayLike | None = None,
+    spacing: float = 1e-3,
+    periods: int | None = None,
+    kernel: str = "auto",
+    dtype: str | torch.dtype = "float32",
+    time_step: float | None = None,
+) -> torch.Tensor:
+    """Pressure of drives at points, differentiable by every tensor given, on the whole domain.
+
+    A loss is differentiated by an adjoint run of the same kernel, in bounded memory. Density and sound speed
+    are those of the scene's K obstacles or, in a scene without obstacles, maps of the domain's cells, whose
+    places `cell_centers` tells. Maps know no surfaces between the cells and are less accurate, but the field
+    of a map that changes smoothly with a place or a shape does so too; that of an obstacle does not, as the
+    grid shows through (docs/decisions/gradients.md).
+
+    Args:
+        scene: all that is not given here.
+        drive: (..., M) complex, |q| <= 1; each takes a run, and its gradient one or two more.
+        points: (P, 3) [m] inside the domain; by default the scene's control points.
+        density: (K,) or (nx, ny, nz) [kg/m^3], > 0. What is given for rigid obstacles does not count.
+        sound_speed: (K,) or (nx, ny, nz) [m/s], > 0, likewise.
+        spacing: edge of a cell [m], at most a third of the wavelength.
+        periods: of the drive that are stepped, in whole blocks of a few; the last block is locked in. By
+            default sound crosses the domain twice. What resonates needs more.
+        kernel: as in `make_propagator`.
+        dtype: precision of the fields, float32 or float64.
+        time_step: [s], as in `make_propagator`. By default the largest stable one, which may change with the
+            medium from call to call, and the field with it by a little.
+
+    Returns:
+        complex128 (..., P) [Pa].
+
+    Raises:
+        ValueError: an argument of another shape or out of range, maps in a scene with obstacles, or an
+            obstacle that is differentiated and not clear of the boundary layers.
+    """
+    require_kind("scene", scene, Scene)
+    require_one_of("kernel", kernel, KERNELS)
+    precision = precision_of(dtype)
+    drive = validate_drive(drive, len(scene.array))
+    targets = scene.control_points if points is None else points_tensor("points", points).cpu()
+    require_inside(scene.domain, "points", targets)
+    given = _material("density", density, scene), _material("sound_speed", sound_speed, scene)
+    grid = make_grid(scene, positive("spacing", spacing, "m"))
+    speeds = speeds_of(scene) | _slowest(scene, given[1])
+    require_fine(speeds, scene.frequency, spacing)
+    warn_if_coarse(speeds, scene.frequency, spacing)
+    warn_of_ending_walls(scene)
+    if periods is None:
+        periods = fewest_periods(grid.diagonal / grid.wavelength)
+    periods = integer_at_least("periods", periods, 1)
+    if time_step is not None:
+        time_step = positive("time_step", time_step, "s")
+    cells = _cells(scene, grid, *given)
+    assembly = cells.assembly(grid, scene, precision, time_step)
+    receivers, stepper = assembly.receivers(targets), make_kernel(kernel)
+    fields = [
+        _phasors(stepper, assembly, cells.driven(_sources(assembly, scene, row)), receivers, periods)
+        for row in drive.reshape(-1, drive.shape[-1])
+    ]
+    found = (
+        torch.stack(fields)
+        if fields
+        else torch.zeros((0, len(targets)), dtype=torch.complex128, device="cpu")
+    )
+    return found.reshape(*drive.shape[:-1], len(targets))
+
+
+def cell_centers(scene: Scene, spacing: float = 1e-3) -> torch.Tensor:
+    """Centres (nx, ny, nz, 3) [m] of the domain's cells, which maps of the medium are given for.
+
+    Args:
+        scene: without obstacles.
+        spacing: edge of a cell [m].
+
+    Raises:
+        ValueError: the spacing is too coarse for the frequency.
+    """
+    require_kind("scene", scene, Scene)
+    grid = make_grid(scene, positive("spacing", spacing, "m"))
+    axes = [
+        torch.from_numpy(axis[part])
+        for axis, part in zip(grid.centers, domain_cells(scene, grid), strict=True)
+    ]
+    return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
+
+
+def _material(name: str, given: ArrayLike | None, scene: Scene) -> torch.Tensor | None:
+    """Values (K,) of the obstacles or (nx, ny, nz) of the cells."""
+    if given is None:
+        return None
+    values, count = real_tensor(name, given).cpu(), len(scene.obstacles)
+    if values.shape != (count,) and (values.ndim != 3 or count > 0):
+        accepted = f"must be ({count},)" if count else "must be (nx, ny, nz), in a scene without obstacles"
+        raise ValueError(f"{name}: shape {tuple(values.shape)}; {accepted}")
+    if values.numel() and values.detach().min() <= 0:
+        raise invalid(name, float(values.detach().min()), "every entry must be > 0")
+    return values
+
+
+def _slowest(scene: Scene, sound_speed: torch.Tensor | None) -> dict[str, float]:
+    """Return the least of the sound speeds [m/s] that are given and count, if there is one."""
+    if sound_speed is None:
+        return {}
+    rigid = torch.tensor([obstacle.rigid for obstacle in scene.obstacles], dtype=torch.bool, device="cpu")
+    speeds = sound_speed.detach() if sound_speed.ndim == 3 else sound_speed.detach()[~rigid]
+    return {"the medium given": float(speeds.min())} if speeds.numel() else {}
+
+
+def _cells(
+    scene: Scene, grid: Grid, density: torch.Tensor | None, sound_speed: torch.Tensor | None
+) -> VariableCells:
+    if any(given is not None and given.ndim == 3 for given in (density, sound_speed)):
+        return cells_of_maps(scene, grid, density, sound_speed)
+    return cells_of_obstacles(scene, grid, density, sound_speed)
+
+
+def _sources(assembly: Assembly, scene: Scene, drive: torch.Tensor) -> Sources:
+    nodes = scene.array.nodes
+    return assembly.sources(nodes.positions, scene.array.source_strength * drive.cpu(), nodes.weights)
+
+
+def _phasors(
+    kernel: Kernel, assembly: Assembly, sources: Sources, receivers: Receivers, periods: int
+) -> torch.Tensor:
+    """Phasors (P,) of the last block of a run of `periods` at least."""
+    steps, block = block_of(assembly.steps_per_period)
+    count = steps * math.ceil(periods / block)
+    signal = drive_signal(assembly.steps_per_period, 0, count).to(assembly.dtype)
+    return lock_in(recorded(kernel, assembly, sources, receivers, signal)[-steps:], block)

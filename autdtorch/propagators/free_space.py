@@ -1,0 +1,85 @@
+"""The exact field of the array in free space."""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import Literal, overload
+
+import torch
+
+from autdtorch.analytic.green import free_space_matrix
+from autdtorch.scene.drive import validate_drive
+from autdtorch.scene.scene import Scene
+from autdtorch.utils.validation import ArrayLike, boolean, points_grid, require_kind
+
+logger = logging.getLogger(__name__)
+
+
+class FreeSpacePropagator:
+    """The exact field of the array in free space; obstacles are left out.
+
+    Attributes:
+        scene: the scene it was made for.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        """Remember the scene; a scene with obstacles is logged as such."""
+        require_kind("scene", scene, Scene)
+        self.scene = scene
+        if scene.obstacles:
+            logger.warning(
+                "free_space leaves out the %d obstacles of scene %r", len(scene.obstacles), scene.name
+            )
+
+    def __repr__(self) -> str:
+        """The scene."""
+        return f"FreeSpacePropagator(scene {self.scene.name!r})"
+
+    @overload
+    def transfer_matrix(
+        self, points: ArrayLike | None = None, return_error: Literal[False] = False
+    ) -> torch.Tensor: ...
+
+    @overload
+    def transfer_matrix(
+        self, points: ArrayLike | None = None, *, return_error: Literal[True]
+    ) -> tuple[torch.Tensor, float]: ...
+
+    def transfer_matrix(
+        self, points: ArrayLike | None = None, return_error: bool = False
+    ) -> torch.Tensor | tuple[torch.Tensor, float]:
+        """Transfer matrix G (Eq. 2).
+
+        Args:
+            points: (P, 3) [m]; by default the scene's control points.
+            return_error: also return the estimated relative error: 0, or infinite where obstacles are left
+                out.
+
+        Returns:
+            complex128 (P, M) [Pa], and the error if asked for.
+
+        Raises:
+            ValueError: `points` are not finite, have another shape, or lie on a transducer.
+        """
+        points = self.scene.control_points if points is None else points
+        matrix = free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber)
+        error = math.inf if self.scene.obstacles else 0.0
+        return (matrix, error) if boolean("return_error", return_error) else matrix
+
+    def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
+        """Pressure of drives at points.
+
+        Args:
+            drive: (..., M) complex, |q| <= 1.
+            points: (P, 3) or a grid such as (Nu, Nv, 3) [m].
+
+        Returns:
+            complex128 (..., P) or (..., Nu, Nv) [Pa]; differentiable by the drive.
+
+        Raises:
+            ValueError: drive or points of another shape or out of range.
+        """
+        drive = validate_drive(drive, len(self.scene.array))
+        points, grid = points_grid("points", points)
+        return (drive @ self.transfer_matrix(points).mT).reshape(*drive.shape[:-1], *grid)

@@ -1,0 +1,58 @@
+"""The field of a drive in all of a scene's domain."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+
+from autdtorch.propagators.base import Propagator
+from autdtorch.scene.drive import validate_single_drive
+from autdtorch.utils.validation import ArrayLike, invalid, positive, require_kind
+
+_CLEARANCE = 0.5  # wavelengths around a transducer, where its own 1/r would hide the field of the others
+
+_MOST_CELLS = 10_000_000
+
+
+def volume_field(propagator: Propagator, drive: ArrayLike, spacing: float | None = None) -> torch.Tensor:
+    """Pressure of a drive at the centres of the equal cells that fill the scene's domain.
+
+    Left out are obstacles, and half a wavelength around every transducer.
+
+    Args:
+        propagator: of the scene.
+        drive: complex (M,), |q| <= 1.
+        spacing: wanted edge of a cell [m], > 0; by default a quarter of the wavelength. The cells fill the
+            domain, with edges Lx / Nx, Ly / Ny and Lz / Nz.
+
+    Returns:
+        complex128 (Nx, Ny, Nz) [Pa], NaN where it was left out; Nx = Lx / spacing rounded, at least 2, and Ny
+        and Nz alike.
+
+    Raises:
+        ValueError: `drive` is not one that the array can play, `spacing` is not > 0, or gives more than 10
+            million cells.
+    """
+    require_kind("propagator", propagator, Propagator)
+    scene = propagator.scene
+    drive = validate_single_drive(drive, len(scene.array))
+    spacing = scene.wavelength / 4 if spacing is None else positive("spacing", spacing, "m")
+    lower, upper = torch.tensor(scene.domain, dtype=torch.float64, device="cpu")
+    counts = [max(2, round(float(length) / spacing)) for length in upper - lower]
+    if math.prod(counts) > _MOST_CELLS:
+        raise invalid("spacing", spacing, f"gives {counts} cells, must give at most {_MOST_CELLS}", "m")
+    axes = [
+        low + (high - low) * (torch.arange(count, dtype=torch.float64, device="cpu") + 0.5) / count
+        for low, high, count in zip(lower, upper, counts, strict=True)
+    ]
+    points = torch.cartesian_prod(*axes)
+    nodes = scene.array.nodes.positions.reshape(-1, 3)
+    heard = torch.ones(len(points), dtype=torch.bool, device="cpu")
+    for node in nodes:
+        heard &= torch.linalg.vector_norm(points - node, dim=1) > _CLEARANCE * scene.wavelength
+    for obstacle in scene.obstacles:
+        heard &= ~obstacle.contains(points)
+    field = torch.full((len(points),), complex(math.nan, math.nan), dtype=torch.complex128, device="cpu")
+    field[heard] = propagator.field(drive, points[heard])
+    return field.reshape(counts)

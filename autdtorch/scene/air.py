@@ -1,0 +1,96 @@
+"""Humid air: density, sound speed and absorption, from temperature, humidity and pressure.
+
+Density and sound speed are those of an ideal gas of dry air and water vapour. Absorption is that of
+ISO 9613-1:1993, whose vapour pressure is used throughout; ANSI S1.26 and Bass et al., J. Acoust. Soc. Am. 97
+(1995) 680-683, have the same equations.
+"""
+
+from __future__ import annotations
+
+import math
+
+from autdtorch.utils.validation import number_between
+
+TEMPERATURES = (-20.0, 50.0)
+"""Range of ISO 9613-1 [deg C]."""
+PRESSURES = (50e3, 200e3)
+"""Ambient, from half an atmosphere to the limit of ISO 9613-1 [Pa]."""
+FREQUENCIES_BY_PRESSURE = (4e-4, 10.0)
+"""Range of ISO 9613-1 [Hz/Pa]."""
+
+_ZERO_CELSIUS = 273.15  # K
+_REFERENCE_TEMPERATURE = 293.15  # K
+_REFERENCE_PRESSURE = 101325.0  # Pa
+_TRIPLE_POINT = 273.16  # K
+_GAS_CONSTANT = 8.314462618  # J/(mol K)
+_DRY_AIR, _WATER = 28.9647e-3, 18.01528e-3  # kg/mol
+
+
+def vapour_fraction(temperature: float, relative_humidity: float, pressure: float) -> float:
+    """Share of water vapour among the molecules of air (ISO 9613-1, Eqs. B.1 to B.3).
+
+    Args:
+        temperature: [deg C], -20 to 50.
+        relative_humidity: [%], 0 to 100.
+        pressure: ambient [Pa], 50e3 to 200e3.
+
+    Raises:
+        ValueError: an argument is not a number in its range.
+    """
+    celsius = number_between("temperature", temperature, *TEMPERATURES, "deg C")
+    humidity = number_between("relative_humidity", relative_humidity, 0.0, 100.0, "%")
+    pressure = number_between("pressure", pressure, *PRESSURES, "Pa")
+    exponent = 4.6151 - 6.8346 * (_TRIPLE_POINT / (celsius + _ZERO_CELSIUS)) ** 1.261
+    return humidity / 100 * math.pow(10, exponent) * _REFERENCE_PRESSURE / pressure
+
+
+def density_and_sound_speed(
+    temperature: float, relative_humidity: float, pressure: float
+) -> tuple[float, float]:
+    """Density [kg/m^3] and sound speed [m/s] of humid air as an ideal gas.
+
+    With x the vapour fraction, molecules of air have 5/2 and those of water 6/2 degrees of freedom, so that
+    c^2 = (7 + x)/(5 + x) R T / M (Bohn, J. Audio Eng. Soc. 36 (1988) 223-231). Between 0 and 30 deg C it is
+    within 0.05 % of the real-gas formula of Cramer (J. Acoust. Soc. Am. 93 (1993) 2510-2516), itself good to
+    0.03 %.
+
+    Args:
+        temperature: [deg C], -20 to 50.
+        relative_humidity: [%], 0 to 100.
+        pressure: ambient [Pa], 50e3 to 200e3.
+
+    Raises:
+        ValueError: an argument is not a number in its range.
+    """
+    x = vapour_fraction(temperature, relative_humidity, pressure)
+    thermal = _GAS_CONSTANT * (temperature + _ZERO_CELSIUS) / ((1 - x) * _DRY_AIR + x * _WATER)
+    return pressure / thermal, math.sqrt((7 + x) / (5 + x) * thermal)
+
+
+def absorption(temperature: float, relative_humidity: float, pressure: float, frequency: float) -> float:
+    """Absorption of a pure tone [dB/m] by ISO 9613-1:1993, Eqs. 3 to 5.
+
+    The standard gives it to 10 % for a vapour fraction of 0.05 to 5 %, to 20 % down to 0.005 % and to 50 % in
+    drier air.
+
+    Args:
+        temperature: [deg C], -20 to 50.
+        relative_humidity: [%], 0 to 100.
+        pressure: ambient [Pa], 50e3 to 200e3.
+        frequency: [Hz], 4e-4 to 10 times the pressure in Pa.
+
+    Raises:
+        ValueError: an argument is not a number in its range.
+    """
+    percent = 100 * vapour_fraction(temperature, relative_humidity, pressure)
+    least, most = (limit * pressure for limit in FREQUENCIES_BY_PRESSURE)
+    frequency = number_between("frequency", frequency, least, most, "Hz")
+    kelvin = temperature + _ZERO_CELSIUS
+    warmth, atmospheres = kelvin / _REFERENCE_TEMPERATURE, pressure / _REFERENCE_PRESSURE
+    oxygen = atmospheres * (24 + 4.04e4 * percent * (0.02 + percent) / (0.391 + percent))
+    slowing = math.exp(-4.170 * (math.pow(warmth, -1 / 3) - 1))
+    nitrogen = atmospheres / math.sqrt(warmth) * (9 + 280 * percent * slowing)
+    classical = 1.84e-11 / atmospheres * math.sqrt(warmth)
+    relaxing = 0.01275 * math.exp(-2239.1 / kelvin) / (oxygen + frequency**2 / oxygen)
+    relaxing += 0.1068 * math.exp(-3352.0 / kelvin) / (nitrogen + frequency**2 / nitrogen)
+    return 8.686 * frequency**2 * (classical + math.pow(warmth, -2.5) * relaxing)

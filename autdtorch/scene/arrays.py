@@ -1,0 +1,281 @@
+"""The transducer array: where the transducers are, where they point, how strong they are."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from autdtorch.scene.device_layouts import (
+    AUTD3_SOURCE_STRENGTH,
+    AUTD3_TRANSDUCERS,
+    OPENMPD_SOURCE_STRENGTH,
+    SONICSURFACE_SOURCE_STRENGTH,
+    TRANSDUCER_RADIUS,
+    autd3_places,
+    openmpd_places,
+    sonicsurface_places,
+)
+from autdtorch.scene.geometry import Coordinates, in_plane, plane_basis
+from autdtorch.utils.memory import require_memory
+from autdtorch.utils.neighbours import nearest_other, require_distinct
+from autdtorch.utils.validation import (
+    LENGTH_TOLERANCE,
+    ArrayLike,
+    finite_vector,
+    invalid,
+    not_negative,
+    points_tensor,
+    positive,
+    positive_integers,
+    real_tensor,
+    unit_vector,
+)
+
+#: On-axis pressure of a transducer at full drive, times distance [Pa m], in the paper's Eq. 2.
+PAPER_SOURCE_STRENGTH = 1 / (4 * math.pi)
+
+_TRANSDUCER_BYTES = 500.0
+"""Memory [bytes] of a transducer: its place and direction, and the search for its neighbours."""
+
+_RINGS, _RING_NODES = 5, 16
+
+
+class Nodes(NamedTuple):
+    """Monopoles that sources or receivers of one shape consist of.
+
+    Attributes:
+        positions: of the n nodes of each of N sources (N, n, 3) [m], float64.
+        weights: share of each node (n,), float64; they sum to 1.
+    """
+
+    positions: torch.Tensor
+    weights: torch.Tensor
+
+
+@dataclass(frozen=True, eq=False, init=False, repr=False)
+class TransducerArray:
+    """M transducers of equal strength and size. The tensors are the array's own copies, on the CPU.
+
+    A transducer is a point or a disc of monopoles, which is Rayleigh's integral for a flat circular piston of
+    uniform velocity. Its far field has the directivity 2 J1(k a sin t) / (k a sin t) at the angle t from the
+    normal, and is the same behind it as before it: there is no baffle.
+
+    Attributes:
+        positions: (M, 3) [m], float64, all different.
+        normals: directions of emission (M, 3), float64, of length 1.
+        source_strength: on-axis pressure at full drive times distance, far away [Pa m], > 0.
+        radius: of the discs [m]; 0 for point sources.
+    """
+
+    positions: torch.Tensor
+    normals: torch.Tensor
+    source_strength: float
+    radius: float
+
+    def __init__(
+        self,
+        positions: ArrayLike,
+        normals: ArrayLike,
+        source_strength: float = PAPER_SOURCE_STRENGTH,
+        radius: float | None = None,
+    ) -> None:
+        """Check and copy the input.
+
+        Args:
+            positions: (M, 3) [m], M >= 1.
+            normals: (M, 3), or (3,) for all; of any length > 0.
+            source_strength: [Pa m], > 0.
+            radius: of the discs [m], at most half the distance of the nearest two; None or 0 for points.
+
+        Raises:
+            ValueError: not finite, wrong shape, zero normal, strength <= 0, two transducers in one place, or
+                discs that could overlap.
+        """
+        places = points_tensor("TransducerArray.positions", positions).cpu()
+        require_distinct("TransducerArray.positions", places)
+        object.__setattr__(self, "positions", places.as_subclass(Coordinates))
+        directions = _unit_normals(normals, len(places))
+        object.__setattr__(self, "normals", directions.as_subclass(Coordinates))
+        strength = positive("TransducerArray.source_strength", source_strength, "Pa m")
+        object.__setattr__(self, "source_strength", strength)
+        object.__setattr__(self, "radius", _disc_radius(radius, places))
+
+    @classmethod
+    def grid(
+        cls,
+        shape: tuple[int, int],
+        pitch: float,
+        center: ArrayLike,
+        normal: ArrayLike = (1.0, 0.0, 0.0),
+        source_strength: float = PAPER_SOURCE_STRENGTH,
+        radius: float | None = None,
+    ) -> TransducerArray:
+        """A flat rectangular array; transducer i * shape[1] + j is i pitches along u and j along v.
+
+        Args:
+            shape: numbers of transducers along u and v, the axes of `plane_basis(normal)`.
+            pitch: distance of neighbours [m], > 0.
+            center: centre of the array (3,) [m].
+            normal: direction of emission (3,).
+            source_strength: [Pa m], > 0.
+            radius: of the discs [m], at most half the pitch; None or 0 for point sources.
+
+        Raises:
+            ValueError: an argument is not finite, has the wrong shape or is out of range.
+        """
+        count_u, count_v = positive_integers("shape", shape, 2)
+        require_memory("shape", shape, _TRANSDUCER_BYTES * count_u * count_v)
+        pitch = positive("pitch", pitch, "m")
+        middle = torch.tensor(finite_vector("center", center), dtype=torch.float64, device="cpu")
+        u, v = plane_basis(normal)
+        along_u = pitch * (torch.arange(count_u, dtype=torch.float64, device="cpu") - (count_u - 1) / 2)
+        along_v = pitch * (torch.arange(count_v, dtype=torch.float64, device="cpu") - (count_v - 1) / 2)
+        positions = middle + along_u[:, None, None] * u + along_v[None, :, None] * v
+        return cls(positions.reshape(-1, 3), normal, source_strength, radius)
+
+    @classmethod
+    def autd3(
+        cls,
+        center: ArrayLike,
+        normal: ArrayLike = (1.0, 0.0, 0.0),
+        angle: float = 0.0,
+        units: tuple[int, int] = (1, 1),
+        source_strength: float = AUTD3_SOURCE_STRENGTH,
+        radius: float | None = TRANSDUCER_RADIUS,
+    ) -> TransducerArray:
+        """AUTD3: 249 transducers a unit, in the order of the device, unit by unit.
+
+        Args:
+            center: middle of the 18 x 14 places of a unit, of several units the middle of all (3,) [m].
+            normal: direction of emission (3,), the device's z.
+            angle: of the device's x from u towards v [rad], (u, v) being `plane_basis(normal)`.
+            units: numbers of units side by side along the device's x and y; unit i * units[1] + j is the
+                i-th along x and the j-th along y.
+            source_strength: [Pa m], > 0; by default as the AUTD3 SDK assumes.
+            radius: of the discs [m]; None or 0 for point sources.
+
+        Raises:
+            ValueError: an argument is not finite, has the wrong shape or is out of range.
+        """
+        count_x, count_y = positive_integers("units", units, 2)
+        require_memory("units", units, _TRANSDUCER_BYTES * AUTD3_TRANSDUCERS * count_x * count_y)
+        positions = in_plane(autd3_places((count_x, count_y)), center, normal, angle)
+        return cls(positions, normal, source_strength, radius)
+
+    @classmethod
+    def sonicsurface(
+        cls,
+        center: ArrayLike,
+        normal: ArrayLike = (1.0, 0.0, 0.0),
+        angle: float = 0.0,
+        source_strength: float = SONICSURFACE_SOURCE_STRENGTH,
+        radius: float | None = TRANSDUCER_RADIUS,
+    ) -> TransducerArray:
+        """SonicSurface: 16 x 16 transducers row by row, from the largest y down, x the fastest.
+
+        Its firmware wants them by channel: that is done where the bytes are made.
+
+        Args:
+            center: middle of the transducers (3,) [m].
+            normal: direction of emission (3,).
+            angle: of the device's x from u towards v [rad], (u, v) being `plane_basis(normal)`.
+            source_strength: [Pa m], > 0; by default as Ultraino assumes.
+            radius: of the discs [m]; None or 0 for point sources.
+
+        Raises:
+            ValueError: an argument is not finite, has the wrong shape or is out of range.
+        """
+        return cls(in_plane(sonicsurface_places(), center, normal, angle), normal, source_strength, radius)
+
+    @classmethod
+    def openmpd(
+        cls,
+        center: ArrayLike,
+        normal: ArrayLike = (1.0, 0.0, 0.0),
+        angle: float = 0.0,
+        source_strength: float = OPENMPD_SOURCE_STRENGTH,
+        radius: float | None = TRANSDUCER_RADIUS,
+    ) -> TransducerArray:
+        """A board of OpenMPD: 16 x 16 transducers column by column, each from the largest y down.
+
+        These are the nominal positions; `OpenMPDBoard.load` reads those of one board, with its calibration.
+
+        Args:
+            center: middle of the transducers (3,) [m].
+            normal: direction of emission (3,), the device's z.
+            angle: of the device's x from u towards v [rad], (u, v) being `plane_basis(normal)`.
+            source_strength: [Pa m], > 0; by default as AcousTools assumes.
+            radius: of the discs [m]; None or 0 for point sources.
+
+        Raises:
+            ValueError: an argument is not finite, has the wrong shape or is out of range.
+        """
+        return cls(in_plane(openmpd_places(), center, normal, angle), normal, source_strength, radius)
+
+    @property
+    def nodes(self) -> Nodes:
+        """The monopoles of each transducer, the point itself or 80 of its disc.
+
+        On a disc of radius a they are 5 rings, Gauss points in r^2, of 16 equal angles, each turned by half a
+        step against the next (Peirce, J. SIAM 5 (1957) 66-73). For k a <= 6 the field is right to 1e-6 far
+        away, at all angles, and to 1e-4 of the largest pressure at a distance of a/2 from the disc.
+        """
+        if self.radius == 0:
+            return Nodes(self.positions[:, None], torch.ones(1, dtype=torch.float64, device="cpu"))
+        disc, weights = _disc_rule()
+        axes = torch.stack([torch.stack(plane_basis(normal)) for normal in self.normals])
+        return Nodes(self.positions[:, None] + self.radius * disc @ axes, weights)
+
+    @property
+    def half_extents(self) -> torch.Tensor:
+        """How far each transducer reaches from its position along x, y and z (M, 3) [m]."""
+        return self.radius * (1 - self.normals**2).clamp(min=0).sqrt()
+
+    def __len__(self) -> int:
+        """Number of transducers M."""
+        return len(self.positions)
+
+    def __repr__(self) -> str:
+        """Count, centre and strength, with units."""
+        x, y, z = (1e3 * self.positions.mean(dim=0)).tolist()
+        size = f"radius {1e3 * self.radius:.4g} mm, " if self.radius else ""
+        return (
+            f"TransducerArray({len(self)} transducers around ({x:.4g}, {y:.4g}, {z:.4g}) mm, "
+            f"{size}source strength {self.source_strength:.4g} Pa m)"
+        )
+
+
+def _disc_rule() -> tuple[torch.Tensor, torch.Tensor]:
+    """Nodes (n, 2) and weights (n,) of a rule for the mean over the unit disc."""
+    abscissa, weights = np.polynomial.legendre.leggauss(_RINGS)
+    radius = np.sqrt((abscissa + 1) / 2)[:, None]
+    ring, step = np.indices((_RINGS, _RING_NODES))
+    angle = 2 * np.pi / _RING_NODES * (step + ring % 2 / 2)
+    disc = np.stack((radius * np.cos(angle), radius * np.sin(angle)), axis=-1).reshape(-1, 2)
+    return torch.from_numpy(disc), torch.from_numpy(np.repeat(weights / (2 * _RING_NODES), _RING_NODES))
+
+
+def _disc_radius(given: float | None, positions: torch.Tensor) -> float:
+    name = "TransducerArray.radius"
+    radius = 0.0 if given is None else not_negative(name, given, "m")
+    if radius > 0 and len(positions) > 1:
+        most = float(nearest_other(positions)[0].min()) / 2
+        if radius > most + LENGTH_TOLERANCE:
+            raise invalid(name, radius, f"must be at most {most:.6g} m, half the distance of neighbours", "m")
+    return radius
+
+
+def _unit_normals(normals: ArrayLike, count: int) -> torch.Tensor:
+    name = "TransducerArray.normals"
+    rows = real_tensor(name, normals).detach().cpu()
+    if rows.shape == (3,):
+        return torch.tensor(unit_vector(name, rows), dtype=torch.float64, device="cpu").repeat(count, 1)
+    if rows.shape != (count, 3):
+        raise ValueError(f"{name}: shape {tuple(rows.shape)}; must be (3,) or ({count}, 3) as positions")
+    return torch.tensor(
+        [unit_vector(f"{name}[{m}]", row) for m, row in enumerate(rows)], dtype=torch.float64, device="cpu"
+    )

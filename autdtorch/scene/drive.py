@@ -1,0 +1,142 @@
+"""Drives of the array: q = a e^{-i phi}, amplitudes a in [0, 1] and phases phi [rad] (Eq. 1)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from autdtorch.utils.neighbours import distances
+from autdtorch.utils.validation import (
+    ArrayLike,
+    complex_tensor,
+    finite_vector,
+    points_tensor,
+    positive,
+    real_tensor,
+)
+
+#: How far |q| may exceed 1: the rounding of a drive computed in float32.
+AMPLITUDE_TOLERANCE = 1e-6
+
+
+def drive_from_phases(phases: ArrayLike, amplitudes: ArrayLike | None = None) -> torch.Tensor:
+    """Drive q = a e^{-i phi} (Eq. 1); differentiable in both arguments.
+
+    Args:
+        phases: (..., M) [rad].
+        amplitudes: in [0, 1], of a shape that broadcasts with `phases`; 1 by default.
+
+    Returns:
+        Drive (..., M), complex128, on the device of `phases`.
+
+    Raises:
+        ValueError: not finite real numbers, an amplitude outside [0, 1], or shapes that do not broadcast.
+    """
+    phi = real_tensor("phases", phases, "rad")
+    if phi.ndim == 0:
+        raise ValueError("phases: shape (); must be (..., M)")
+    if amplitudes is None:
+        return torch.polar(torch.ones_like(phi), -phi)
+    a = real_tensor("amplitudes", amplitudes).to(phi.device)
+    if a.numel() and (a.min() < 0 or a.max() > 1):
+        raise ValueError(f"amplitudes: from {a.min():g} to {a.max():g}; every entry must be in [0, 1]")
+    try:
+        shape = np.broadcast_shapes(a.shape, phi.shape)
+    except ValueError as error:
+        raise ValueError(
+            f"amplitudes: shape {tuple(a.shape)}; must broadcast with phases, {tuple(phi.shape)}"
+        ) from error
+    return torch.polar(a.expand(shape), -phi.expand(shape))
+
+
+def phases_of(drive: ArrayLike) -> torch.Tensor:
+    """Phases in [0, 2 pi) [rad] of a `drive` (..., M); 0 where the drive is 0.
+
+    Raises:
+        ValueError: not finite complex numbers.
+    """
+    drive = complex_tensor("drive", drive)
+    phases = torch.remainder(-torch.angle(drive), 2 * math.pi)
+    # remainder rounds a phase just below 0 up to 2 pi itself and keeps -0; the angle of -0 is pi.
+    return torch.where((phases >= 2 * math.pi) | (phases == 0) | (drive == 0), 0.0, phases)
+
+
+def amplitudes_of(drive: ArrayLike) -> torch.Tensor:
+    """Amplitudes |q| of a `drive` (..., M).
+
+    Raises:
+        ValueError: not finite complex numbers.
+    """
+    return complex_tensor("drive", drive).abs()
+
+
+def focus_phases(positions: ArrayLike, focus: ArrayLike, wavenumber: float) -> torch.Tensor:
+    """Phases that focus on a point in free space: phi_i = k |r_f - r_i| (Eq. 3), not wrapped.
+
+    Args:
+        positions: transducers (M, 3) [m].
+        focus: (3,), or several foci (P, 3), each for itself [m].
+        wavenumber: k [rad/m], > 0.
+
+    Returns:
+        Phases (M,), or (P, M) for several foci [rad].
+
+    Raises:
+        ValueError: not finite, wrong shape, or a wavenumber <= 0.
+    """
+    sources = points_tensor("positions", positions)
+    wavenumber = positive("wavenumber", wavenumber, "rad/m")
+    foci = real_tensor("focus", focus, "m")
+    if foci.ndim == 1:
+        single = torch.tensor([finite_vector("focus", focus)], dtype=torch.float64, device=sources.device)
+        return wavenumber * distances(single, sources)[0]
+    return wavenumber * distances(points_tensor("focus", foci).to(sources.device), sources)
+
+
+def normalise(drive: ArrayLike) -> torch.Tensor:
+    """`drive` (..., M) scaled so that the largest amplitude over the last axis is 1 (Eq. 6).
+
+    Raises:
+        ValueError: not finite complex numbers, or a drive that is zero everywhere.
+    """
+    drive = complex_tensor("drive", drive)
+    if drive.ndim == 0 or drive.shape[-1] == 0:
+        raise ValueError(f"drive: shape {tuple(drive.shape)}; must be (..., M) with M >= 1")
+    largest = drive.abs().amax(dim=-1, keepdim=True)
+    if not (largest > 0).all():
+        raise ValueError("drive: 0 for every transducer; at least one amplitude must be > 0")
+    return drive / largest
+
+
+def validate_drive(drive: ArrayLike, transducers: int) -> torch.Tensor:
+    """`drive` as complex128 after checking that an array of `transducers` can play it.
+
+    Args:
+        drive: complex (..., M), |q| <= 1 up to rounding.
+        transducers: M.
+
+    Raises:
+        ValueError: not finite complex numbers, a last axis other than M, or an amplitude above 1.
+    """
+    drive = complex_tensor("drive", drive)
+    if drive.ndim == 0 or drive.shape[-1] != transducers:
+        raise ValueError(f"drive: shape {tuple(drive.shape)}; must be (..., {transducers})")
+    if drive.numel():
+        largest = float(drive.detach().abs().max())
+        if largest > 1 + AMPLITUDE_TOLERANCE:
+            raise ValueError(f"drive: amplitude {largest:.9g}; every |q| must be in [0, 1]")
+    return drive
+
+
+def validate_single_drive(drive: ArrayLike, transducers: int) -> torch.Tensor:
+    """One `drive` (M,) as `validate_drive` gives it.
+
+    Raises:
+        ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+    """
+    drive = validate_drive(drive, transducers)
+    if drive.ndim != 1:
+        raise ValueError(f"drive: shape {tuple(drive.shape)}; must be ({transducers},), a single drive")
+    return drive

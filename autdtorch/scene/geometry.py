@@ -1,0 +1,219 @@
+"""Points and planes in space: bases of planes, rotations, points on circles, the observation plane."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from autdtorch.utils.memory import require_memory
+from autdtorch.utils.validation import (
+    ArrayLike,
+    Vector,
+    finite_number,
+    finite_vector,
+    integer_at_least,
+    positive,
+    positive_entries,
+    real_tensor,
+    unit_vector,
+)
+
+_POINT_BYTES = 100.0
+"""Memory [bytes] of a point while it is placed."""
+
+
+class Coordinates(torch.Tensor):
+    """A tensor on the CPU that `numpy.array` takes without a warning; what is computed with it is plain.
+
+    NumPy 2 passes `copy` to `__array__`; PyTorch's own does not know it, of which NumPy warns.
+    """
+
+    __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
+
+    def __array__(self, dtype: npt.DTypeLike | None = None, copy: bool | None = None) -> npt.NDArray[Any]:
+        """Return the values, copied as `numpy.array` says."""
+        return np.array(self.numpy(), dtype=dtype, copy=copy)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Coordinates:
+        """Return a tensor with values of its own."""
+        return self.clone().as_subclass(Coordinates)
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Return what stores a plain tensor, the kind that `torch.load` takes."""
+        return self.as_subclass(torch.Tensor).__reduce_ex__(protocol)  # type: ignore[no-untyped-call]
+
+
+def plane_basis(normal: ArrayLike) -> tuple[torch.Tensor, torch.Tensor]:
+    """Orthonormal axes (u, v) of the plane with `normal`, right-handed: u x v = normal / |normal|.
+
+    u is the projection into the plane of the coordinate axis that cyclically follows the axis `normal` is
+    closest to, so that normal +x gives (y, z), +y (z, x), +z (x, y), and -x gives (y, -z).
+
+    Args:
+        normal: (3,), of any length > 0.
+
+    Returns:
+        Two unit tensors (3,), float64.
+
+    Raises:
+        ValueError: `normal` is not three finite numbers, or is zero.
+    """
+    n = torch.tensor(unit_vector("normal", normal), dtype=torch.float64, device="cpu")
+    axis = (int(n.abs().argmax()) + 1) % 3
+    u = -n[axis] * n
+    u[axis] += 1.0
+    u = u / torch.linalg.vector_norm(u)
+    v = torch.linalg.cross(n, u)
+    # Adding 0 turns -0 into 0, which would otherwise show in every printed point.
+    return u + 0.0, v + 0.0
+
+
+def in_plane(places: ArrayLike, center: ArrayLike, normal: ArrayLike, angle: float = 0.0) -> torch.Tensor:
+    """Places of a flat device, given along its own x and y, in the plane through `center`.
+
+    Args:
+        places: (M, 2) [m], or (M, 3) with heights along `normal`.
+        center: where the device's origin goes (3,) [m].
+        normal: where its z axis points (3,).
+        angle: of its x axis from u towards v [rad], (u, v) being `plane_basis(normal)`.
+
+    Returns:
+        Points (M, 3) [m], float64.
+
+    Raises:
+        ValueError: an argument is not finite or has the wrong shape.
+    """
+    local = real_tensor("places", places, "m").detach().cpu()
+    if local.ndim != 2 or local.shape[1] not in (2, 3):
+        raise ValueError(f"places: shape {tuple(local.shape)}; must be (M, 2) or (M, 3)")
+    origin = torch.tensor(finite_vector("center", center), dtype=torch.float64, device="cpu")
+    return origin + local @ device_axes(normal, angle)[: local.shape[1]]
+
+
+def device_axes(normal: ArrayLike, angle: float = 0.0) -> torch.Tensor:
+    """Axes x, y and z (3, 3), one a row, of a device that faces `normal` and is turned by `angle` [rad].
+
+    Raises:
+        ValueError: `normal` is not three finite numbers, or is zero; `angle` is not finite.
+    """
+    turn = finite_number("angle", angle, "rad")
+    u, v = plane_basis(normal)
+    x = math.cos(turn) * u + math.sin(turn) * v
+    y = math.cos(turn) * v - math.sin(turn) * u
+    return torch.stack((x, y, torch.tensor(unit_vector("normal", normal), dtype=torch.float64, device="cpu")))
+
+
+def rotation_matrix(rotation: Vector) -> torch.Tensor:
+    """Matrix R of the rotation by angles (a, b, c) about x, then y, then z, the axes staying where they are.
+
+    R = Rz(c) Ry(b) Rx(a) (extrinsic Euler angles); each is right-handed: (0, 0, pi/2) turns x into y.
+
+    Args:
+        rotation: (a, b, c) [rad].
+
+    Returns:
+        (3, 3), float64; a column vector r is turned into R r.
+    """
+    matrix = torch.eye(3, dtype=torch.float64, device="cpu")
+    for axis, angle in enumerate(rotation):
+        first, second = (axis + 1) % 3, (axis + 2) % 3
+        turn = torch.eye(3, dtype=torch.float64, device="cpu")
+        turn[first, first] = turn[second, second] = math.cos(angle)
+        turn[second, first] = math.sin(angle)
+        turn[first, second] = -math.sin(angle)
+        matrix = turn @ matrix
+    return matrix
+
+
+def circle_points(
+    center: ArrayLike, radius: float, count: int, normal: ArrayLike, angle: float = 0.0
+) -> torch.Tensor:
+    """Points spread evenly over a circle: center + radius (cos(angle + 2 pi n / count) u + sin(...) v).
+
+    Args:
+        center: centre of the circle (3,) [m].
+        radius: its radius [m], > 0.
+        count: number of points, >= 1.
+        normal: normal of its plane (3,); (u, v) is `plane_basis(normal)`.
+        angle: where point 0 lies, from u towards v [rad].
+
+    Returns:
+        Points (count, 3) [m], float64.
+
+    Raises:
+        ValueError: an argument is not finite, has the wrong shape or is out of range.
+    """
+    origin = torch.tensor(finite_vector("center", center), dtype=torch.float64, device="cpu")
+    radius = positive("radius", radius, "m")
+    count = integer_at_least("count", count, 1)
+    require_memory("count", count, _POINT_BYTES * count)
+    u, v = plane_basis(normal)
+    start = finite_number("angle", angle, "rad")
+    angles = start + 2 * math.pi * torch.arange(count, dtype=torch.float64, device="cpu") / count
+    return origin + radius * (angles.cos()[:, None] * u + angles.sin()[:, None] * v)
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A rectangle in space on which a field is sampled.
+
+    Attributes:
+        center: centre (3,) [m].
+        normal: normal (3,), stored with length 1.
+        size: edge lengths (Lu, Lv) [m] along the axes (u, v) of `basis`, > 0.
+
+    Raises:
+        ValueError: an attribute is not finite, has the wrong shape or is out of range.
+    """
+
+    center: Vector
+    normal: Vector
+    size: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        """Check the attributes and bring them into canonical form."""
+        object.__setattr__(self, "center", finite_vector("Plane.center", self.center))
+        object.__setattr__(self, "normal", unit_vector("Plane.normal", self.normal))
+        object.__setattr__(self, "size", positive_entries("Plane.size", self.size, 2))
+
+    @property
+    def basis(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Unit tensors (u, v), (3,) each, along the edges; see `plane_basis`."""
+        return plane_basis(self.normal)
+
+    @property
+    def corners(self) -> torch.Tensor:
+        """The four corners (4, 3) [m]."""
+        signs = torch.tensor([-1.0, 1.0], dtype=torch.float64, device="cpu")
+        return self._at(signs * self.size[0] / 2, signs * self.size[1] / 2).reshape(4, 3)
+
+    def points(self, spacing: float) -> torch.Tensor:
+        """Centres of the equal cells that cover the plane.
+
+        Args:
+            spacing: wanted edge of a cell [m], > 0. The cells fill the plane, with edges Lu / Nu and Lv / Nv.
+
+        Returns:
+            Points (Nu, Nv, 3) [m], float64; Nu = Lu / spacing rounded, at least 1, and Nv alike.
+
+        Raises:
+            ValueError: `spacing` is not a finite number > 0.
+        """
+        spacing = positive("spacing", spacing, "m")
+        counts = [max(1.0, round(length / spacing, 0)) for length in self.size]
+        require_memory("spacing", spacing, _POINT_BYTES * math.prod(counts), "m")
+        along = [
+            length * ((torch.arange(int(count), dtype=torch.float64, device="cpu") + 0.5) / count - 0.5)
+            for length, count in zip(self.size, counts, strict=True)
+        ]
+        return self._at(along[0], along[1])
+
+    def _at(self, along_u: torch.Tensor, along_v: torch.Tensor) -> torch.Tensor:
+        u, v = self.basis
+        center = torch.tensor(self.center, dtype=torch.float64, device="cpu")
+        return center + along_u[:, None, None] * u + along_v[None, :, None] * v

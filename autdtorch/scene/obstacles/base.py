@@ -1,0 +1,127 @@
+"""What every obstacle is: a material, an extent, an inside and a distance to its surface."""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from numpy.typing import NDArray
+
+from autdtorch.utils.validation import ArrayLike, Vector, boolean, fluid, invalid, not_negative, real_tensor
+
+
+@dataclass(frozen=True, kw_only=True)
+class Obstacle(ABC):
+    """A body in the way of sound: of a fluid material, or rigid. Unions are made by listing several.
+
+    Attributes:
+        density: of the material [kg/m^3], 1e-9 to 1e9; None if rigid.
+        sound_speed: of the material [m/s], 1e-3 to 1e6; None if rigid.
+        rigid: True for walls that do not move.
+
+    Raises:
+        ValueError: density or sound speed is not a number in its range; a material and rigid, or neither.
+    """
+
+    density: float | None = None
+    sound_speed: float | None = None
+    rigid: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the material."""
+        kind = type(self).__name__
+        object.__setattr__(self, "rigid", boolean(f"{kind}.rigid", self.rigid))
+        if self.rigid:
+            if self.density is not None or self.sound_speed is not None:
+                material = (self.density, self.sound_speed)
+                raise invalid(
+                    f"{kind}.rigid", material, "must have either a material or rigid=True, not both"
+                )
+            return
+        if self.density is None or self.sound_speed is None:
+            missing = "density" if self.density is None else "sound_speed"
+            raise invalid(f"{kind}.{missing}", None, "must have both density and sound_speed, or rigid=True")
+        density, sound_speed = fluid(kind, self.density, self.sound_speed)
+        object.__setattr__(self, "density", density)
+        object.__setattr__(self, "sound_speed", sound_speed)
+
+    @property
+    @abstractmethod
+    def lower(self) -> Vector:
+        """Corner of the bounding box with the smallest coordinates (3,) [m]."""
+
+    @property
+    @abstractmethod
+    def upper(self) -> Vector:
+        """Corner of the bounding box with the largest coordinates (3,) [m]."""
+
+    def contains(self, points: ArrayLike, margin: float = 0.0) -> torch.Tensor:
+        """Which points lie inside.
+
+        Args:
+            points: (..., 3) [m].
+            margin: by how much the obstacle is grown on every side [m], >= 0.
+
+        Returns:
+            bool (...).
+
+        Raises:
+            ValueError: `points` are not finite real numbers or have another last axis, or `margin` is < 0.
+        """
+        points = _points(points)
+        margin = not_negative("margin", margin, "m")
+        return self._inside(points.reshape(-1, 3), margin).reshape(points.shape[:-1])
+
+    def signed_distance(self, points: ArrayLike) -> torch.Tensor:
+        """Distance to the surface, negative inside.
+
+        Args:
+            points: (..., 3) [m].
+
+        Returns:
+            float64 (...) [m].
+
+        Raises:
+            ValueError: `points` are not finite real numbers or have another last axis.
+        """
+        points = _points(points)
+        return self._distance(points.reshape(-1, 3)).reshape(points.shape[:-1])
+
+    @abstractmethod
+    def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Triangles for drawing, counter-clockwise as seen from outside.
+
+        Returns:
+            Vertices (V, 3) [m], float64, and the vertices of each triangle (F, 3), int64.
+        """
+
+    def _inside(self, points: torch.Tensor, margin: float) -> torch.Tensor:
+        return self._distance(points) < margin
+
+    @abstractmethod
+    def _distance(self, points: torch.Tensor) -> torch.Tensor:
+        """Signed distance (N,) [m] of checked `points` (N, 3) [m]."""
+
+
+def distance_from_excess(excess: torch.Tensor) -> torch.Tensor:
+    """Signed distance (N,) from how far points lie beyond each of K faces at right angles (N, K)."""
+    outside: torch.Tensor = torch.linalg.vector_norm(excess.clamp(min=0), dim=-1)
+    return outside + excess.amax(dim=-1).clamp(max=0)
+
+
+def content_digest(*arrays: NDArray[Any]) -> str:
+    """What tells contents apart that are too large to compare or to print: 16 hexadecimal digits."""
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _points(given: ArrayLike) -> torch.Tensor:
+    points = real_tensor("points", given, "m")
+    if points.ndim == 0 or points.shape[-1] != 3:
+        raise ValueError(f"points: shape {tuple(points.shape)}; must be (..., 3)")
+    return points

@@ -1,0 +1,138 @@
+"""The body that a triangle mesh encloses. libigl reads STL files and measures distances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from autdtorch.scene.geometry import rotation_matrix
+from autdtorch.scene.obstacles.base import Obstacle, content_digest
+from autdtorch.scene.obstacles.mesh_file import read_obj, read_ply
+from autdtorch.utils.validation import Vector, finite_vector, invalid, path_of, positive
+
+_FORMATS = (".stl", ".obj", ".ply")
+
+_FARTHEST = 1e100  # of a vertex, in units of the file: volumes do not overflow
+
+
+@dataclass(frozen=True)
+class Mesh(Obstacle):
+    """The inside of a watertight triangle mesh from an STL, OBJ or PLY file.
+
+    A point r of the file comes to lie at R(rotation) scale r + offset. The file is read once. Triangles may
+    enclose cavities and several bodies, but must not cut through each other.
+
+    Attributes:
+        path: of the file.
+        scale: metres per unit of the file, > 0; 1e-3 for a file in millimetres.
+        offset: where the file's origin comes to lie (3,) [m].
+        rotation: angles (3,) [rad] about the file's origin; see `autdtorch.scene.geometry.rotation_matrix`.
+        vertices: (V, 3) [m], float64, as they lie in the scene.
+        faces: vertices of each triangle (F, 3), int64, counter-clockwise as seen from outside.
+        digest: of vertices and faces. Meshes are equal if this and the material are, wherever they come from.
+
+    Raises:
+        ValueError: no such file, not a watertight mesh, or an attribute that is not finite, has the wrong
+            shape or is out of range; see also `Obstacle`.
+    """
+
+    path: str = field(compare=False)
+    scale: float = field(default=1.0, compare=False)
+    offset: Vector = field(default=(0.0, 0.0, 0.0), compare=False)
+    rotation: Vector = field(default=(0.0, 0.0, 0.0), compare=False)
+    vertices: torch.Tensor = field(init=False, repr=False, compare=False)
+    faces: torch.Tensor = field(init=False, repr=False, compare=False)
+    digest: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Check the attributes and read the file."""
+        super().__post_init__()
+        object.__setattr__(self, "scale", positive("Mesh.scale", self.scale))
+        object.__setattr__(self, "offset", finite_vector("Mesh.offset", self.offset))
+        object.__setattr__(self, "rotation", finite_vector("Mesh.rotation", self.rotation, "rad"))
+        object.__setattr__(self, "path", _checked_path(self.path))
+        points, faces = _read(self.path)
+        vertices = self.scale * torch.from_numpy(points) @ rotation_matrix(self.rotation).T
+        vertices = vertices + torch.tensor(self.offset, dtype=torch.float64, device="cpu")
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", torch.from_numpy(faces))
+        object.__setattr__(self, "digest", content_digest(vertices.numpy(), faces))
+
+    @property
+    def lower(self) -> Vector:
+        """Corner of the bounding box with the smallest coordinates (3,) [m]."""
+        x, y, z = self.vertices.amin(dim=0).tolist()
+        return x, y, z
+
+    @property
+    def upper(self) -> Vector:
+        """Corner of the bounding box with the largest coordinates (3,) [m]."""
+        x, y, z = self.vertices.amax(dim=0).tolist()
+        return x, y, z
+
+    def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Copies of `vertices` and `faces`; see `Obstacle.surface`."""
+        return self.vertices.clone(), self.faces.clone()
+
+    def _distance(self, points: torch.Tensor) -> torch.Tensor:
+        """To the nearest triangle; the pseudonormal there gives the sign (Baerentzen & Aanaes 2005)."""
+        if len(points) == 0:
+            return points.new_zeros(0)
+        import igl
+
+        queries = np.ascontiguousarray(points.detach().cpu().numpy())
+        kind = igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
+        distance = igl.signed_distance(queries, self.vertices.numpy(), self.faces.numpy(), sign_type=kind)[0]
+        return torch.from_numpy(distance).to(points)
+
+
+def _checked_path(given: object) -> str:
+    path = path_of("Mesh.path", given)
+    if path.suffix.lower() not in _FORMATS:
+        raise invalid("Mesh.path", str(path), f"must end in one of {', '.join(_FORMATS)}")
+    if not path.is_file():
+        raise invalid("Mesh.path", str(path), "must be an existing file")
+    return str(path)
+
+
+def _read(path: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices (V, 3), each once, and faces (F, 3) of a watertight mesh, outward.
+
+    Raises:
+        ValueError: not such a mesh.
+    """
+    import igl
+
+    readers = {".obj": read_obj, ".ply": read_ply}
+    try:
+        corners, triangles = readers.get(Path(path).suffix.lower(), igl.read_triangle_mesh)(path)
+    except (RuntimeError, ValueError, LookupError, OverflowError) as error:
+        raise invalid("Mesh.path", path, f"must be a mesh file ({error})") from error
+    whole = triangles.size > 0 and 0 <= triangles.min() <= triangles.max() < len(corners)
+    if not whole or triangles.shape[1] != 3 or not (np.abs(corners) <= _FARTHEST).all():
+        accepted = f"triangles with finite vertices, none beyond {_FARTHEST:g}"
+        raise invalid("Mesh.path", path, f"must be a mesh file that holds {accepted}")
+    # STL repeats a vertex for every triangle at it.
+    vertices, index = np.unique(corners + 0.0, axis=0, return_inverse=True)
+    faces = index.reshape(-1)[triangles].astype(np.int64)
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    _require_watertight(path, faces)
+    volume = np.linalg.det(vertices[faces] - vertices.mean(axis=0)).sum() / 6
+    if volume == 0:
+        raise invalid("Mesh.path", path, "must enclose a volume")
+    return vertices, faces if volume > 0 else np.ascontiguousarray(faces[:, ::-1])
+
+
+def _require_watertight(path: str, faces: NDArray[np.int64]) -> None:
+    """Every edge must be run through once in each direction, by the two triangles that it joins."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    _, edge, count = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    balance = np.bincount(edge.reshape(-1), weights=np.where(edges[:, 0] < edges[:, 1], 1, -1))
+    wrong = int(((count != 2) | (balance != 0)).sum())
+    if wrong or len(edges) == 0:
+        found = f"{wrong} of its {len(count)} edges do not join two triangles of one orientation"
+        raise invalid("Mesh.path", path, f"{found}, must be watertight")

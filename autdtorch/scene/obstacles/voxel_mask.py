@@ -1,0 +1,200 @@
+"""The union of the voxels of a boolean array."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from autdtorch.scene.obstacles.base import Obstacle, content_digest
+from autdtorch.scene.obstacles.triangles import BOX_TRIANGLES
+from autdtorch.utils.numpy_file import read_arrays
+from autdtorch.utils.validation import Vector, finite_vector, invalid, is_dense, path_of, positive
+
+_AIR = 2
+"""Voxels of air around the body in the distance transform; farther away, distances are searched for."""
+
+
+@dataclass(frozen=True)
+class VoxelMask(Obstacle):
+    """A body made of cubic voxels, such as a segmented scan.
+
+    The signed distance at a voxel centre is that to the cube of the nearest voxel of the other kind. Between
+    centres it is linear: right at flat faces, up to half a voxel off at edges, corners and half way through.
+
+    Attributes:
+        mask: (nx, ny, nz), bool, True in the body; kept as a copy that cannot be written to.
+        spacing: edge of a voxel [m], > 0.
+        origin: corner of voxel (0, 0, 0) with the smallest coordinates (3,) [m]; voxel (i, j, k) has its
+            centre at origin + spacing (i + 1/2, j + 1/2, k + 1/2).
+        digest: of the mask. Masks of the same digest are the same.
+
+    Raises:
+        ValueError: the mask is not boolean, not (nx, ny, nz) or nowhere True; or an attribute that is not
+            finite, has the wrong shape or is out of range; see also `Obstacle`.
+    """
+
+    mask: NDArray[np.bool_] = field(repr=False, compare=False)
+    spacing: float
+    origin: Vector = (0.0, 0.0, 0.0)
+    digest: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Check the attributes and copy the mask."""
+        super().__post_init__()
+        object.__setattr__(self, "mask", _checked_mask(self.mask))
+        object.__setattr__(self, "spacing", positive("VoxelMask.spacing", self.spacing, "m"))
+        object.__setattr__(self, "origin", finite_vector("VoxelMask.origin", self.origin))
+        object.__setattr__(self, "digest", content_digest(self.mask))
+
+    @classmethod
+    def load(
+        cls,
+        path: str | os.PathLike[str],
+        spacing: float,
+        origin: Vector = (0.0, 0.0, 0.0),
+        *,
+        density: float | None = None,
+        sound_speed: float | None = None,
+        rigid: bool = False,
+    ) -> VoxelMask:
+        """Read the mask from a NumPy file.
+
+        Args:
+            path: .npy, or .npz that holds a single array.
+            spacing: edge of a voxel [m], > 0.
+            origin: corner of voxel (0, 0, 0) with the smallest coordinates (3,) [m].
+            density: of the material [kg/m^3], 1e-9 to 1e9; None if rigid.
+            sound_speed: of the material [m/s], 1e-3 to 1e6; None if rigid.
+            rigid: True for walls that do not move.
+
+        Returns:
+            The obstacle.
+
+        Raises:
+            ValueError: no such file, or another content; see also `VoxelMask`.
+        """
+        mask = _read(path_of("VoxelMask.path", path))
+        return cls(mask, spacing, origin, density=density, sound_speed=sound_speed, rigid=rigid)
+
+    @property
+    def lower(self) -> Vector:
+        """Corner of the body's bounding box with the smallest coordinates (3,) [m]."""
+        return self._corner(self._extent[0])
+
+    @property
+    def upper(self) -> Vector:
+        """Corner of the body's bounding box with the largest coordinates (3,) [m]."""
+        return self._corner(self._extent[1])
+
+    def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """The faces between voxels in and out of the body; see `Obstacle.surface`."""
+        mask = np.pad(self.mask, 1)
+        signs = np.array([0, 1])
+        corners = np.stack(np.meshgrid(signs, signs, signs, indexing="ij"), axis=-1).reshape(8, 3)
+        quads = []
+        for side, triangles in enumerate(BOX_TRIANGLES.reshape(6, 2, 3).numpy()):
+            axis, step = side // 2, 2 * (side % 2) - 1
+            bare = np.argwhere(mask & ~np.roll(mask, -step, axis=axis)) - 1
+            quads.append((bare[:, None, None, :] + corners[triangles]).reshape(-1, 3))
+        nodes, index = np.unique(np.concatenate(quads), axis=0, return_inverse=True)
+        vertices = np.array(self.origin) + self.spacing * nodes
+        return torch.from_numpy(vertices), torch.from_numpy(index.reshape(-1, 3))
+
+    @cached_property
+    def _extent(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """First voxel of the body and one past the last, along each axis."""
+        filled = np.argwhere(self.mask)
+        return filled.min(axis=0), filled.max(axis=0) + 1
+
+    @cached_property
+    def _field(self) -> NDArray[np.float64]:
+        """Signed distance in voxels, at the voxel centres of the body's extent and `_AIR` around it."""
+        from scipy.ndimage import distance_transform_edt
+
+        first, last = self._extent
+        window = tuple(slice(low, high) for low, high in zip(first, last, strict=True))
+        body = np.pad(self.mask[window], _AIR)
+        here = np.indices(body.shape)
+        outside, inside = (
+            _to_cube(distance_transform_edt(kind, return_distances=False, return_indices=True) - here, axis=0)
+            for kind in (~body, body)
+        )
+        return np.where(body, -inside, outside)
+
+    @cached_property
+    def _shell(self) -> Any:
+        """Search tree of the body's outer voxels, in voxels of the mask."""
+        from scipy.ndimage import binary_erosion
+        from scipy.spatial import KDTree
+
+        mask = self.mask
+        return KDTree(np.argwhere(mask & ~binary_erosion(mask)))
+
+    def _corner(self, voxel: NDArray[np.int64]) -> Vector:
+        x, y, z = (low + self.spacing * int(count) for low, count in zip(self.origin, voxel, strict=True))
+        return x, y, z
+
+    def _voxels(self, points: torch.Tensor) -> NDArray[np.float64]:
+        """Positions (N, 3) in voxels, those of voxel centres being whole numbers."""
+        return np.asarray(points.detach().cpu().numpy() - self.origin, np.float64) / self.spacing - 0.5
+
+    def _inside(self, points: torch.Tensor, margin: float) -> torch.Tensor:
+        """A voxel holds its lower faces and not its upper ones."""
+        mask = self.mask
+        voxel = np.floor(self._voxels(points) + 0.5)
+        within = ((voxel >= 0) & (voxel < mask.shape)).all(axis=1)
+        filled = np.zeros(len(points), bool)
+        filled[within] = mask[tuple(voxel[within].astype(np.int64).T)]
+        inside = torch.from_numpy(filled).to(points.device)
+        return inside | (self._distance(points) < margin) if margin > 0 else inside
+
+    def _distance(self, points: torch.Tensor) -> torch.Tensor:
+        from scipy.ndimage import map_coordinates
+
+        voxels = self._voxels(points)
+        local = voxels - self._extent[0] + _AIR
+        near = ((local >= 0) & (local <= np.array(self._field.shape) - 1)).all(axis=1)
+        distance = np.empty(len(voxels))
+        distance[near] = map_coordinates(self._field, local[near].T, order=1)
+        if not near.all():
+            nearest = self._shell.query(voxels[~near])[1]
+            distance[~near] = _to_cube(self._shell.data[nearest] - voxels[~near], axis=1)
+        return torch.from_numpy(self.spacing * distance).to(points)
+
+
+def _to_cube(offset: NDArray[Any], axis: int) -> NDArray[np.float64]:
+    """Distance to a cube of edge 1 whose centre lies at `offset`, with the coordinates along `axis`."""
+    return np.asarray(np.linalg.norm(np.maximum(np.abs(offset) - 0.5, 0), axis=axis), np.float64)
+
+
+def _checked_mask(given: object) -> NDArray[np.bool_]:
+    if (
+        not isinstance(given, torch.Tensor | np.ndarray)
+        or given.dtype not in (torch.bool, np.bool_)
+        or not is_dense(given)
+        or given.ndim != 3
+    ):
+        raise invalid("VoxelMask.mask", given, "must be an array (nx, ny, nz) of booleans")
+    mask = given.cpu().numpy() if isinstance(given, torch.Tensor) else given
+    if not mask.any():
+        raise ValueError(f"VoxelMask.mask: array of shape {mask.shape}; must be True somewhere")
+    mask = np.array(mask)
+    mask.flags.writeable = False
+    return mask
+
+
+def _read(path: Path) -> NDArray[Any]:
+    try:
+        arrays = list(read_arrays(path).values())
+    except (OSError, ValueError) as error:
+        raise invalid("VoxelMask.path", str(path), f"must be a .npy or .npz file ({error})") from error
+    if len(arrays) != 1:
+        raise invalid("VoxelMask.path", str(path), f"holds {len(arrays)} arrays, must hold a single one")
+    return arrays[0]

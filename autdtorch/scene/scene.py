@@ -1,0 +1,377 @@
+"""The scene: medium, obstacles, control points and the array, checked once and then constant."""
+
+from __future__ import annotations
+
+import copy
+import math
+import warnings
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import torch
+
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.geometry import Coordinates, Plane
+from autdtorch.scene.medium import Medium as Medium
+from autdtorch.scene.obstacles import Box as Box
+from autdtorch.scene.obstacles import Obstacle
+from autdtorch.utils.html import html_facts
+from autdtorch.utils.neighbours import nearest, require_distinct
+from autdtorch.utils.validation import (
+    LENGTH_TOLERANCE,
+    ArrayLike,
+    Vector,
+    finite_vector,
+    invalid,
+    members,
+    number_between,
+    points_tensor,
+    positive,
+    real_tensor,
+    require_kind,
+)
+
+_OVERLAP_SAMPLES = 16  # along each axis of the space that two bounding boxes share
+_DEFAULT_MARGIN = 2.0  # wavelengths of air on each side of everything, where no domain is given
+
+_FARTHEST = 1e6  # m from the origin along an axis; far beyond any simulation, and near enough for cubes
+_FREQUENCIES = 1e-3, 1e12  # Hz
+
+_DECIBELS = 20 / math.log(10)  # of a neper
+
+_USUAL_EXTENT = 0.1, 2000.0  # wavelengths from end to end of array and control points
+
+_MOST_ABSORPTION = 3.0  # dB per wavelength: absorption is to be a small part of the wavenumber
+
+
+class ScaleWarning(UserWarning):
+    """Lengths and frequency of a scene do not seem to be in metres and hertz."""
+
+
+class OverlapWarning(UserWarning):
+    """Two obstacles of different materials overlap."""
+
+
+@dataclass(frozen=True, eq=False, init=False, repr=False)
+class Scene:
+    """All that determines a field. The tensors are the scene's own copies, on the CPU.
+
+    No coordinate of anything may be beyond 1e6 m.
+
+    Attributes:
+        array: the transducers.
+        medium: what surrounds the obstacles.
+        frequency: [Hz], 1e-3 to 1e12.
+        control_points: (P, 3) [m], float64, where pressure is observed; all different.
+        obstacles: may touch and overlap; where they do, the later one counts.
+        observation_plane: where pictures and areas are taken, or None.
+        domain: corners (lower, upper) [m] of the space that holds everything but what obstacles have outside.
+        name: for titles and file names.
+    """
+
+    array: TransducerArray
+    medium: Medium
+    frequency: float
+    control_points: torch.Tensor
+    obstacles: tuple[Obstacle, ...]
+    observation_plane: Plane | None
+    domain: tuple[Vector, Vector]
+    name: str
+
+    def __init__(
+        self,
+        array: TransducerArray,
+        medium: Medium,
+        frequency: float,
+        control_points: ArrayLike,
+        obstacles: Iterable[Obstacle] = (),
+        observation_plane: Plane | None = None,
+        domain: ArrayLike | None = None,
+        name: str = "scene",
+    ) -> None:
+        """Check and copy the input.
+
+        Args:
+            array: the transducers, outside the obstacles.
+            medium: what surrounds the obstacles.
+            frequency: [Hz], 1e-3 to 1e12.
+            control_points: (P, 3) [m], P >= 1, outside the obstacles.
+            obstacles: may touch and overlap; where they do, the later one counts.
+            observation_plane: where pictures and areas are taken.
+            domain: corners (lower, upper) [m] around array, control points and observation plane. Obstacles
+                may reach beyond it: parallel walls and slabs across it then go on without end, others are
+                whole or end before it, as `make_propagator` says of its methods. By default the bounding box
+                of everything, obstacles included, and two wavelengths more on each side.
+            name: for titles and file names.
+
+        Raises:
+            ValueError: a field of the wrong type or out of range, a coordinate beyond 1e6 m, a transducer or
+                control point in or on an obstacle, two points in one place, something outside the domain, or
+                a medium that absorbs more than 3 dB per wavelength.
+
+        Warns:
+            OverlapWarning: two obstacles of different materials overlap.
+            ScaleWarning: lengths beside the wavelength look as if in mm, or the frequency in kHz.
+        """
+        require_kind("Scene.array", array, TransducerArray)
+        require_kind("Scene.medium", medium, Medium)
+        if observation_plane is not None:
+            require_kind("Scene.observation_plane", observation_plane, Plane)
+        if not isinstance(name, str) or not name:
+            raise invalid("Scene.name", name, "must be text of at least one character")
+        object.__setattr__(self, "array", array)
+        object.__setattr__(self, "medium", medium)
+        frequency = number_between(
+            "Scene.frequency", positive("Scene.frequency", frequency, "Hz"), *_FREQUENCIES, "Hz"
+        )
+        object.__setattr__(self, "frequency", frequency)
+        points = points_tensor("Scene.control_points", control_points).cpu()
+        object.__setattr__(self, "control_points", points.as_subclass(Coordinates))
+        object.__setattr__(self, "obstacles", members("Scene.obstacles", obstacles, Obstacle))
+        object.__setattr__(self, "observation_plane", observation_plane)
+        object.__setattr__(self, "name", name)
+        _require_near(self)
+        object.__setattr__(self, "domain", self._bounds() if domain is None else _corners(domain))
+        _require_propagating(self)
+        _require_separate_points(self)
+        _require_in_domain(self)
+        _warn_of_overlaps(self.obstacles)
+        _warn_of_units(self)
+
+    @property
+    def angular_frequency(self) -> float:
+        """Of the drive, 2 pi f [rad/s]."""
+        return 2 * math.pi * self.frequency
+
+    @property
+    def wavenumber(self) -> float:
+        """In the medium, k = 2 pi f / c [rad/m]."""
+        return self.angular_frequency / self.medium.sound_speed
+
+    @property
+    def attenuation(self) -> float:
+        """In the medium, alpha [Np/m]; a plane wave falls as e^{-alpha x}."""
+        return self.medium.absorption / _DECIBELS
+
+    @property
+    def complex_wavenumber(self) -> complex:
+        """In the medium, k + i alpha [rad/m]; a plane wave is e^{i (k + i alpha) x}."""
+        return complex(self.wavenumber, self.attenuation)
+
+    @property
+    def wavelength(self) -> float:
+        """In the medium, c / f [m]."""
+        return self.medium.sound_speed / self.frequency
+
+    def __repr__(self) -> str:
+        """Name, frequency, counts and extent, with units."""
+        return (
+            f"Scene({self.name!r}, {self.frequency / 1e3:.4g} kHz, "
+            f"wavelength {1e3 * self.wavelength:.4g} mm, {len(self.array)} transducers, "
+            f"{len(self.control_points)} control points, {len(self.obstacles)} obstacles, "
+            f"domain {self._size()} mm)"
+        )
+
+    def _repr_html_(self) -> str:
+        """Return a table of the scene's contents, for Jupyter."""
+        medium = self.medium
+        facts = [
+            ("frequency", f"{self.frequency / 1e3:.4g} kHz, wavelength {1e3 * self.wavelength:.4g} mm"),
+            (
+                "medium",
+                f"{medium.density:.4g} kg/m³, {medium.sound_speed:.4g} m/s, {medium.absorption:.3g} dB/m",
+            ),
+            ("transducers", f"{len(self.array)}, of source strength {self.array.source_strength:.4g} Pa m"),
+            ("control points", str(len(self.control_points))),
+            ("obstacles", ", ".join(_kinds(self.obstacles)) or "none"),
+            ("domain", f"{self._size()} mm, {self._size(self.wavelength, 3)} wavelengths"),
+        ]
+        return html_facts(f"Scene {self.name!r}", facts)
+
+    def _size(self, unit: float = 1e-3, digits: int = 4) -> str:
+        """Edges of the domain, in units of so many m."""
+        lower, upper = self.domain
+        return " x ".join(f"{(high - low) / unit:.{digits}g}" for low, high in zip(lower, upper, strict=True))
+
+    def _bounds(self) -> tuple[Vector, Vector]:
+        corners = [
+            torch.tensor([o.lower, o.upper], dtype=torch.float64, device="cpu") for o in self.obstacles
+        ]
+        points = torch.cat([points for _, points in _contents(self)] + corners)
+        margin = _DEFAULT_MARGIN * self.wavelength
+        return _corners(torch.stack([points.amin(dim=0) - margin, points.amax(dim=0) + margin]))
+
+
+def _kinds(obstacles: tuple[Obstacle, ...]) -> list[str]:
+    """How many there are of each kind and material."""
+    counts = Counter(
+        f"{type(obstacle).__name__} "
+        + ("(rigid)" if obstacle.rigid else f"({obstacle.density:.4g} kg/m³, {obstacle.sound_speed:.4g} m/s)")
+        for obstacle in obstacles
+    )
+    return [f"{count} x {kind}" for kind, count in counts.items()]
+
+
+def _corners(domain: ArrayLike) -> tuple[Vector, Vector]:
+    corners = real_tensor("Scene.domain", domain, "m")
+    if corners.shape != (2, 3):
+        raise invalid("Scene.domain", domain, "must be two corners (lower, upper) of three numbers each [m]")
+    lower, upper = (finite_vector("Scene.domain", corner) for corner in corners)
+    if not all(low < high for low, high in zip(lower, upper, strict=True)):
+        raise invalid("Scene.domain", (lower, upper), "lower must be below upper on every axis", "m")
+    _require_within("Scene.domain", corners)
+    return lower, upper
+
+
+def _points(scene: Scene) -> dict[str, torch.Tensor]:
+    return {"Scene.array.positions": scene.array.positions, "Scene.control_points": scene.control_points}
+
+
+def _require_propagating(scene: Scene) -> None:
+    most = _MOST_ABSORPTION / scene.wavelength
+    if scene.medium.absorption > most:
+        accepted = f"must be at most {most:.4g} dB/m, {_MOST_ABSORPTION:g} dB per wavelength"
+        raise invalid("Scene.medium.absorption", scene.medium.absorption, accepted, "dB/m")
+
+
+def _contents(scene: Scene) -> list[tuple[str, torch.Tensor]]:
+    """All that must be inside the domain: names, and points (N, 3) [m] that span it."""
+    contents = list(_points(scene).items())
+    positions, reach = scene.array.positions, scene.array.half_extents
+    contents += [("Scene.array disc's lower edge", positions - reach)]
+    contents += [("Scene.array disc's upper edge", positions + reach)]
+    if scene.observation_plane is not None:
+        contents.append(("Scene.observation_plane corner", scene.observation_plane.corners))
+    return contents
+
+
+def _require_near(scene: Scene) -> None:
+    """Nothing so far away that its cells could not be counted."""
+    for name, points in _contents(scene):
+        _require_within(name, points)
+    for index, obstacle in enumerate(scene.obstacles):
+        corners = torch.tensor([obstacle.lower, obstacle.upper], dtype=torch.float64, device="cpu")
+        _require_within(f"Scene.obstacles[{index}] corner", corners)
+
+
+def _require_within(name: str, points: torch.Tensor) -> None:
+    far = ~(points.abs() <= _FARTHEST).all(dim=-1)
+    if far.any():
+        first = points[far][0].detach()
+        raise invalid(name, first, f"every coordinate must be in {-_FARTHEST:g} to {_FARTHEST:g}", "m")
+
+
+def _require_separate_points(scene: Scene) -> None:
+    """No two points in one place, none in an obstacle or on it, where rounding would choose the side."""
+    require_distinct("Scene.control_points", scene.control_points)
+    nodes = scene.array.nodes.positions
+    gap, node = nearest(scene.control_points, nodes.reshape(-1, 3))
+    if gap.min() < LENGTH_TOLERANCE:
+        point = int(gap.argmin())
+        transducer = int(node[point]) // nodes.shape[1]
+        accepted = f"lies on transducer {transducer}, must be at least {LENGTH_TOLERANCE:g} m away"
+        raise invalid(f"Scene.control_points[{point}]", scene.control_points[point], accepted, "m")
+    for name, group in (_points(scene) | {"Scene.array.nodes": nodes}).items():
+        for index, obstacle in enumerate(scene.obstacles):
+            inside = obstacle.contains(group, margin=LENGTH_TOLERANCE)
+            if inside.any():
+                first = tuple(inside.nonzero()[0].tolist())
+                extent = _extent(obstacle.lower, obstacle.upper)
+                accepted = f"lies in or on obstacle {index}, {extent}, must be outside it"
+                raise invalid(f"{name}{list(first)}", group[first], accepted, "m")
+
+
+def _warn_of_units(scene: Scene) -> None:
+    points = torch.cat(list(_points(scene).values()))
+    extent = float((points.amax(dim=0) - points.amin(dim=0)).norm())
+    least, most = (bound * scene.wavelength for bound in _USUAL_EXTENT)
+    if not least <= extent <= most:
+        warnings.warn(
+            f"Scene: {extent:.4g} m from end to end of array and control points, but a wavelength of "
+            f"{scene.wavelength:.4g} m; are lengths in m and the frequency in Hz?",
+            ScaleWarning,
+            stacklevel=3,
+        )
+
+
+def _warn_of_overlaps(obstacles: tuple[Obstacle, ...]) -> None:
+    """Name the pairs that overlap and differ in material, for the order of the list then matters.
+
+    They are looked for at the centres of `_OVERLAP_SAMPLES`^3 cells of what two bounding boxes share.
+    """
+    pairs = [
+        f"{index} overlaps {earlier}"
+        for index, obstacle in enumerate(obstacles)
+        for earlier, other in enumerate(obstacles[:index])
+        if _material(obstacle) != _material(other) and _overlap(obstacle, other)
+    ]
+    if pairs:
+        warnings.warn(
+            f"Scene.obstacles: {', '.join(pairs)}, of another material; where both are, the later counts",
+            OverlapWarning,
+            stacklevel=3,
+        )
+
+
+def with_obstacles(scene: Scene, obstacles: Iterable[Obstacle]) -> Scene:
+    """Return a scene with some of its obstacles, or with all of them of other materials.
+
+    Their geometry is not checked, nor warned of, once more.
+    """
+    changed = copy.copy(scene)
+    object.__setattr__(changed, "obstacles", tuple(obstacles))
+    return changed
+
+
+def _material(obstacle: Obstacle) -> tuple[float | None, float | None, bool]:
+    return obstacle.density, obstacle.sound_speed, obstacle.rigid
+
+
+def _overlap(obstacle: Obstacle, other: Obstacle) -> bool:
+    shared = _shared((obstacle.lower, obstacle.upper), (other.lower, other.upper))
+    if shared is None:
+        return False
+    lower, upper = shared
+    share = (torch.arange(_OVERLAP_SAMPLES, dtype=torch.float64, device="cpu") + 0.5) / _OVERLAP_SAMPLES
+    points = lower + (upper - lower) * torch.cartesian_prod(share, share, share)
+    return bool((obstacle.contains(points) & other.contains(points)).any())
+
+
+def _shared(
+    box: tuple[Vector, Vector], other: tuple[Vector, Vector]
+) -> tuple[torch.Tensor, torch.Tensor] | None:
+    """Corners of the space that two boxes (lower, upper) share; None if there is none, or they only touch."""
+    corners = torch.tensor([box, other], dtype=torch.float64, device="cpu")
+    lower, upper = corners[:, 0].amax(dim=0), corners[:, 1].amin(dim=0)
+    return (lower, upper) if (upper - lower).min() > LENGTH_TOLERANCE else None
+
+
+def _extent(lower: Vector, upper: Vector) -> str:
+    """As text; rounded, for the corners of a bounding box are computed."""
+    low, high = (tuple(float(f"{entry:.9g}") for entry in corner) for corner in (lower, upper))
+    return f"{low} to {high} m"
+
+
+def require_inside(domain: tuple[Vector, Vector], name: str, points: torch.Tensor) -> None:
+    """Refuse points (N, 3) [m] outside the corners (lower, upper) of a domain.
+
+    Raises:
+        ValueError: names the first point outside, as an entry of `name`.
+    """
+    lower, upper = (torch.tensor(corner, dtype=torch.float64, device="cpu") for corner in domain)
+    outside = ((points < lower - LENGTH_TOLERANCE) | (points > upper + LENGTH_TOLERANCE)).any(dim=-1)
+    if outside.any():
+        first = int(outside.nonzero()[0, 0])
+        accepted = f"must be inside the domain, {domain[0]} to {domain[1]} m"
+        raise invalid(f"{name}[{first}]", points[first], accepted, "m")
+
+
+def _require_in_domain(scene: Scene) -> None:
+    for name, points in _contents(scene):
+        require_inside(scene.domain, name, points)
+    for index, obstacle in enumerate(scene.obstacles):
+        bounds = (obstacle.lower, obstacle.upper)
+        if _shared(bounds, scene.domain) is None:
+            accepted = f"must be at least partly inside the domain, {scene.domain[0]} to {scene.domain[1]} m"
+            raise ValueError(f"Scene.obstacles[{index}]: {_extent(*bounds)}; {accepted}")

@@ -1,0 +1,1 @@
+"""Trials of methods in scenes: run, kept on disk, compared, reported."""

@@ -1,0 +1,170 @@
+"""The folder of a study: what it holds of the same study is used again, all else is kept aside."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import logging
+import os
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TypeVar
+
+from filelock import FileLock
+
+from autdtorch.scene.scene import Scene
+from autdtorch.study.results import (
+    PROVENANCE_FILE,
+    RESULTS_FILE,
+    Provenance,
+    SceneResult,
+    StudyResult,
+    load_provenance,
+    load_results,
+    save_provenance,
+    save_results,
+)
+from autdtorch.study.trial_file import TRIALS_FILE, TrialFile
+from autdtorch.utils.locking import held
+
+logger = logging.getLogger(__name__)
+
+MATRICES_FOLDER = "matrices"
+PREVIOUS = "previous-"
+"""Start of the names of the folders where files of earlier studies, and damaged ones, are kept."""
+
+_LOCK_FILE = ".lock"
+_ANOTHER = "of another study (other settings, source or packages)"
+
+_Stored = TypeVar("_Stored", Provenance, StudyResult)
+
+
+class StudyFolder:
+    """What a study finds on disk and leaves there; see `open_folder`.
+
+    Attributes:
+        path: of the folder; None where the study is kept in memory alone.
+        provenance: of the study, with the date when it was first begun.
+        scenes: results of the scenes that are finished, by name.
+        trials: finished trials of all scenes.
+    """
+
+    def __init__(
+        self, path: Path | None, provenance: Provenance, scenes: Mapping[str, Scene], reuse: bool
+    ) -> None:
+        """Read what the folder, which must be locked, holds of the study of this provenance.
+
+        Each file tells by itself whether it is of the study, so that one that is damaged costs no other.
+        """
+        self.path = path
+        self.provenance = provenance
+        self.scenes: dict[str, SceneResult] = {}
+        self._shapes = {name: (len(scene.array), len(scene.control_points)) for name, scene in scenes.items()}
+        self._not_used = dict.fromkeys((RESULTS_FILE, TRIALS_FILE, PROVENANCE_FILE), _ANOTHER)
+        self.trials = self._trial_file(None)
+        if path is not None and reuse:
+            self._take_up(path)
+
+    def begin(self) -> None:
+        """Set aside what the folder holds of another study or damaged, and open the file of trials.
+
+        Until then nothing is written: a study that is refused leaves the folder as it was.
+
+        Raises:
+            OSError: the folder cannot be read or written.
+        """
+        if self.path is None:
+            return
+        _set_aside(self.path, self._not_used)
+        save_provenance(self.provenance, self.path)
+        if TRIALS_FILE in self._not_used:
+            self.trials = self._trial_file(self.path)
+        self.trials.mend()
+        if len(self.trials):
+            logger.info("re-using %d trials from %s", len(self.trials), self.path)
+
+    def _take_up(self, path: Path) -> None:
+        stored = self._stored(PROVENANCE_FILE, load_provenance, path)
+        results = self._stored(RESULTS_FILE, load_results, path)
+        if results is not None:
+            self.provenance, self.scenes = results.provenance, dict(results.scenes)
+            logger.info("re-using %s from %s, same settings and same source", ", ".join(self.scenes), path)
+        if stored is not None:
+            self.provenance = stored
+        self.trials = self._trial_file(path)
+        if stored is not None or results is not None or len(self.trials):
+            del self._not_used[TRIALS_FILE]  # of which single lines are set aside
+
+    def _stored(self, name: str, load: Callable[[Path], _Stored], path: Path) -> _Stored | None:
+        """Return what a file holds if it is of this study; otherwise note why it is not used."""
+        try:
+            stored = load(path)
+        except FileNotFoundError:
+            return None
+        except ValueError as error:
+            self._not_used[name] = str(error)
+            return None
+        origin = stored if isinstance(stored, Provenance) else stored.provenance
+        if not origin.same_origin(self.provenance):
+            return None
+        del self._not_used[name]
+        return stored
+
+    def _trial_file(self, path: Path | None) -> TrialFile:
+        file = None if path is None else path / TRIALS_FILE
+        return TrialFile(file, self.provenance.origin, self.provenance.seed, self._shapes)
+
+    @property
+    def matrices(self) -> Path | None:
+        """Where transfer matrices are kept."""
+        return None if self.path is None else self.path / MATRICES_FOLDER
+
+    def save(self, name: str, scene: SceneResult, order: Mapping[str, object]) -> None:
+        """Keep a finished scene; `order` has the names of all scenes in their order.
+
+        Raises:
+            OSError: the folder cannot be written.
+        """
+        self.scenes[name] = scene
+        self.scenes = {other: self.scenes[other] for other in order if other in self.scenes}
+        if self.path is not None:
+            save_results(StudyResult(self.provenance, self.scenes), self.path)
+
+
+@contextlib.contextmanager
+def open_folder(
+    folder: str | os.PathLike[str] | None, provenance: Provenance, scenes: Mapping[str, Scene], reuse: bool
+) -> Iterator[StudyFolder]:
+    """Have a folder to oneself for the time of a study; it is made if need be.
+
+    Args:
+        folder: None to keep the study in memory alone.
+        provenance: of the study.
+        scenes: of the study, by name.
+        reuse: whether what the folder holds of the same origin is used again.
+
+    Raises:
+        ValueError: another process writes into the folder.
+        OSError: the folder cannot be made, read or written.
+    """
+    if folder is None:
+        yield StudyFolder(None, provenance, scenes, reuse)
+        return
+    path = Path(folder)
+    path.mkdir(parents=True, exist_ok=True)
+    accepted = "another process writes there; wait until it ends, or give another folder"
+    with held(FileLock(path / _LOCK_FILE), ValueError(f"output: {path}; {accepted}")):
+        yield StudyFolder(path, provenance, scenes, reuse)
+
+
+def _set_aside(path: Path, not_used: Mapping[str, str]) -> None:
+    """Move files, by name with the reason, so that the study does not overwrite them."""
+    reasons = {name: reason for name, reason in not_used.items() if (path / name).exists()}
+    if not reasons:
+        return
+    kept = next(place for n in itertools.count(1) if not (place := path / f"{PREVIOUS}{n}").exists())
+    kept.mkdir()
+    for name in reasons:
+        (path / name).replace(kept / name)
+    why = "; ".join(dict.fromkeys(reasons.values()))
+    logger.warning("%s of %s kept in %s: %s", ", ".join(reasons), path, kept, why)

@@ -1,0 +1,341 @@
+"""Trials x scenes x methods; what is finished is kept on disk, trial by trial, and not computed again."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import math
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeAlias
+
+import torch
+
+from autdtorch.methods.base import TRIAL_BYTES, Solution, Trials
+from autdtorch.methods.bound import focus_bound
+from autdtorch.objectives.metrics import focus_metrics
+from autdtorch.objectives.simulated import Objective, SimulatedObjective
+from autdtorch.propagators import CACHE_VARIABLE, Propagator, SimulatedPropagator, make_propagator
+from autdtorch.scene.scene import Scene
+from autdtorch.study.folder import StudyFolder, open_folder
+from autdtorch.study.results import (
+    MethodResult,
+    SceneResult,
+    Simulation,
+    StudyResult,
+    median_trial,
+    provenance_now,
+)
+from autdtorch.study.trial_file import TrialFile
+from autdtorch.utils.memory import require_memory
+from autdtorch.utils.neighbours import nearest
+from autdtorch.utils.progress import Progress, show_progress
+from autdtorch.utils.validation import (
+    LENGTH_TOLERANCE,
+    integer_at_least,
+    invalid,
+    path_of,
+    positive,
+    require_kind,
+    require_known,
+    require_name,
+)
+
+#: An optimiser with its settings bound. Where it has parameters `trials` and `seed` it gets a sequence of the
+#: numbers of the trials to run, of which it is to return as many, and the study's seed.
+Method: TypeAlias = Callable[..., Solution]
+
+_GIVEN = ("trials", "seed")  # parameters of a method that the study gives, if it has them
+
+_FIRST_BLOCK = 2  # Trials are run so many at a time at first,
+_LARGEST_GROWTH = 4  # then up to so many times more,
+_BLOCK_SECONDS = 10.0  # so that about as much is lost when the process is killed.
+_LARGEST_BLOCK = 64  # More at once take more memory, and hardly less time each.
+
+_LARGEST_SEED = 2**63 - 1  # the largest integer that a results file holds
+_MOST_SAMPLES = 10**6  # of an observation plane: 16 complex columns of them are 256 MB
+
+
+def run_study(
+    scenes: Mapping[str, Scene],
+    methods: Mapping[str, Method],
+    *,
+    solver: Mapping[str, Any] | None = None,
+    trials: int | Mapping[str, int] = 1,
+    seed: int = 0,
+    plane_spacing: float = 1e-3,
+    folder: str | os.PathLike[str] | None = None,
+    config: str = "",
+) -> StudyResult:
+    """Run every method in every scene.
+
+    A scene is simulated twice, whatever the number of methods and trials: its transfer matrix, on which the
+    methods work, and then the observation plane under the drives they found. All settings are checked before.
+
+    Args:
+        scenes: by name.
+        methods: by name, such as ``functools.partial(gabs, levels=16)``.
+        solver: arguments of `make_propagator`.
+        trials: of every method that has random choices, or by method name.
+        seed: of the random choices, >= 0; the same in every scene.
+        plane_spacing: edge of a cell of the observation plane [m].
+        folder: where trials are saved as they end, scenes when they are finished; None to save nothing.
+        config: all of the above as text. What the folder holds for the same text, made with the same source
+            and packages, is taken from there. Without text, or with methods that are not autdtorch's own,
+            everything is computed.
+
+    Returns:
+        The results of all scenes.
+
+    Raises:
+        ValueError: an argument of another kind or out of range, a solver's and a method's included, or
+            another process writes into the folder.
+        OSError: the folder cannot be written.
+    """
+    _check_kinds(scenes, methods, solver, config)
+    folder = None if folder is None else path_of("folder", folder, "a folder")
+    counts = _check(methods, trials, seed)
+    plane_spacing = positive("plane_spacing", plane_spacing, "m")
+    for name, method in methods.items():
+        for scene in scenes.values():
+            _check_method(name, method, scene, counts[name], seed)
+    planes = {name: _plane_points(scene, plane_spacing) for name, scene in scenes.items()}
+    # The digest of our source says nothing of others' methods.
+    ours = all(_package(method) == "autdtorch" for method in methods.values())
+    provenance = provenance_now(config, seed)
+    with open_folder(folder, provenance, scenes, reuse=bool(config) and ours) as kept:
+        missing = {name: scene for name, scene in scenes.items() if name not in kept.scenes}
+        propagators = {name: _propagator(scene, solver or {}, kept) for name, scene in missing.items()}
+        kept.begin()
+        with show_progress(len(missing) * (sum(counts.values()) + 2)) as progress:
+            for name in missing:
+                finished = _run_scene(
+                    name, propagators.pop(name), methods, counts, seed, planes[name], kept.trials, progress
+                )
+                kept.save(name, finished, scenes)
+        return StudyResult(kept.provenance, {name: kept.scenes[name] for name in scenes})
+
+
+def _check_kinds(scenes: object, methods: object, solver: object, config: object) -> None:
+    """Check that names are names, and what they name, scenes and methods; and the settings' kinds."""
+    for field, named in (("scenes", scenes), ("methods", methods)):
+        if not isinstance(named, Mapping):
+            raise invalid(field, named, f"must be a mapping of names to {field}")
+        if not named:
+            raise ValueError(f"{field}: empty; must have at least one")
+        for name, entry in named.items():
+            require_name(field, name)
+            if field == "scenes":
+                require_kind(f"scenes.{name}", entry, Scene)
+            else:
+                _require_method(f"methods.{name}", entry)
+    if solver is not None:
+        if not isinstance(solver, Mapping):
+            raise invalid("solver", solver, "must be a mapping of arguments of make_propagator")
+        _, *allowed = inspect.signature(make_propagator).parameters  # all but the scene
+        require_known("solver", solver, allowed)
+    if not isinstance(config, str):
+        raise invalid("config", config, "must be text")
+
+
+def _require_method(where: str, method: object) -> None:
+    accepted = "must be a function of an objective, and of trials and seed if it has random choices"
+    if not callable(method):
+        raise invalid(where, method, accepted)
+    try:
+        signature = inspect.signature(method)
+        signature.bind("objective", **{key: None for key in _GIVEN if key in signature.parameters})
+    except (TypeError, ValueError) as error:
+        raise invalid(where, method, f"{accepted} ({error})") from error
+
+
+def _check(methods: Mapping[str, Method], trials: int | Mapping[str, int], seed: int) -> dict[str, int]:
+    """Check seed and counts; returns the number of trials of each method."""
+    if integer_at_least("seed", seed, 0) > _LARGEST_SEED:
+        raise invalid("seed", seed, f"must be an integer from 0 to {_LARGEST_SEED}")
+    random = [name for name, method in methods.items() if "trials" in inspect.signature(method).parameters]
+    if not isinstance(trials, Mapping):
+        count = integer_at_least("trials", trials, 1)
+        trials = dict.fromkeys(random, count)
+    for name in trials:
+        if name not in random:
+            accepted = f"must be a method with random choices: {', '.join(random) or 'none'}"
+            raise invalid("trials", name, accepted)
+    if absent := [name for name in random if name not in trials]:
+        raise invalid("trials", dict(trials), f"must also give the number for {', '.join(absent)}")
+    counts = {name: integer_at_least(f"trials.{name}", trials.get(name, 1), 1) for name in methods}
+    for name, count in counts.items():
+        require_memory(f"trials.{name}", count, TRIAL_BYTES * count)
+    return counts
+
+
+def _propagator(scene: Scene, solver: Mapping[str, Any], kept: StudyFolder) -> Propagator:
+    cache = solver.get("cache")
+    if cache is None and CACHE_VARIABLE not in os.environ and kept.matrices is not None:
+        cache = kept.matrices  # a study that goes on needs its matrices again
+    try:
+        return make_propagator(scene, **{**solver, "cache": cache})
+    except ValueError as error:
+        raise ValueError(f"solver: {error}") from error
+
+
+class _FirstEvaluationError(Exception):
+    """Ends a method that has come as far as its first evaluation."""
+
+
+class _Probe:
+    """An objective that ends the method instead of observing anything."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.evaluations = 0
+
+    def __call__(self, drive: torch.Tensor) -> torch.Tensor:
+        raise _FirstEvaluationError
+
+    @property
+    def transfer_matrix(self) -> torch.Tensor:
+        """What gradient ascent asks for, once its settings are checked."""
+        raise _FirstEvaluationError
+
+
+def _check_method(name: str, method: Method, scene: Scene, trials: int, seed: int) -> None:
+    """Have the method check its settings now, not after minutes of simulation."""
+    try:
+        _solve(method, _Probe(scene), range(min(trials, _FIRST_BLOCK)), seed)
+    except _FirstEvaluationError:
+        pass
+    except ValueError as error:
+        raise ValueError(f"method {name}: {error}") from error
+
+
+def _package(method: Method) -> str:
+    function = method.func if isinstance(method, functools.partial) else method
+    return str(getattr(function, "__module__", "")).partition(".")[0]
+
+
+def _solve(method: Method, objective: Objective, trials: Trials, seed: int) -> Solution:
+    taken = inspect.signature(method).parameters
+    given = zip(_GIVEN, (trials, seed), strict=True)
+    return method(objective, **{key: value for key, value in given if key in taken})
+
+
+def _run_scene(
+    name: str,
+    propagator: Propagator,
+    methods: Mapping[str, Method],
+    counts: Mapping[str, int],
+    seed: int,
+    plane: torch.Tensor | None,
+    trials: TrialFile,
+    progress: Progress,
+) -> SceneResult:
+    scene = propagator.scene
+    progress.begin(f"{name}: transfer matrix")
+    begin = time.perf_counter()
+    transfer_matrix = propagator.transfer_matrix().cpu()
+    matrix_seconds = time.perf_counter() - begin
+    objective = SimulatedObjective(scene, propagator)
+    progress.advance(1)
+    for method_name, method in methods.items():
+        where = name, method_name, counts[method_name]
+        progress.advance(where[2] - len(trials.missing(*where)))
+        _run_trials(where, functools.partial(_solve, method, objective, seed=seed), trials, progress)
+    found = {method_name: trials.found(name, method_name, count) for method_name, count in counts.items()}
+    progress.begin(f"{name}: observation plane")
+    begin = time.perf_counter()
+    solutions = {method_name: solution for method_name, (solution, _) in found.items()}
+    planes, cell_area = _plane_pressures(propagator, solutions, plane)
+    plane_seconds = time.perf_counter() - begin
+    progress.advance(1)
+    results = {
+        method_name: _method_result(solution, planes.get(method_name), cell_area, seconds)
+        for method_name, (solution, seconds) in found.items()
+    }
+    simulation = _simulation(propagator, matrix_seconds, plane_seconds)
+    return SceneResult(
+        len(scene.obstacles), transfer_matrix, focus_bound(transfer_matrix), simulation, results
+    )
+
+
+def _run_trials(
+    where: tuple[str, str, int], solve: Callable[..., Solution], trials: TrialFile, progress: Progress
+) -> None:
+    """Run the trials that are missing, in blocks; `where` is scene, method and number of trials."""
+    scene, method, count = where
+    missing, size = trials.missing(*where), _FIRST_BLOCK
+    while missing:
+        block, missing = missing[:size], missing[size:]
+        progress.begin(f"{scene}: {method}, {_numbered(block)} of {count}")
+        begin = time.perf_counter()
+        solution = solve(trials=block)
+        seconds = time.perf_counter() - begin
+        if not isinstance(solution, Solution):
+            raise invalid(f"method {method}", solution, "must return a Solution")
+        if len(solution.score) != len(block):
+            accepted = f"must be the trials {list(block)}, or one where it has no random choices"
+            raise invalid(f"method {method}", len(solution.score), accepted, "trials")
+        trials.append(scene, method, block, solution, seconds)
+        progress.advance(len(block))
+        size = max(1, int(size * min(_LARGEST_GROWTH, _BLOCK_SECONDS / seconds, _LARGEST_BLOCK / size)))
+
+
+def _numbered(trials: Sequence[int]) -> str:
+    """Trials as people count them, from 1 on."""
+    first, last = trials[0] + 1, trials[-1] + 1
+    return f"trial {first}" if first == last else f"trials {first} to {last}"
+
+
+def _plane_points(scene: Scene, spacing: float) -> torch.Tensor | None:
+    """Samples (Nu, Nv, 3) [m] of the observation plane, fit to be simulated."""
+    plane = scene.observation_plane
+    if plane is None:
+        return None
+    if spacing > min(plane.size):
+        raise invalid(
+            "plane_spacing", spacing, f"must be at most {min(plane.size):g} m, the plane's edge", "m"
+        )
+    count = math.prod(max(1, round(length / spacing)) for length in plane.size)
+    if count > _MOST_SAMPLES:
+        accepted = f"gives {count} samples of the observation plane, must be at most {_MOST_SAMPLES}"
+        raise invalid("plane_spacing", spacing, accepted, "m")
+    points = plane.points(spacing)
+    gap, transducers = nearest(points.reshape(-1, 3), scene.array.positions)
+    if gap.min() < LENGTH_TOLERANCE:
+        transducer = int(transducers[gap.argmin()])
+        accepted = f"puts a sample of the observation plane on transducer {transducer}; shift the plane"
+        raise invalid("plane_spacing", spacing, accepted, "m")
+    return points
+
+
+def _plane_pressures(
+    propagator: Propagator, solutions: Mapping[str, Solution], points: torch.Tensor | None
+) -> tuple[dict[str, torch.Tensor], float | None]:
+    """Pressure (T, Nu, Nv) [Pa] on the observation plane by method, and the area of a cell [m^2]."""
+    plane = propagator.scene.observation_plane
+    if plane is None or points is None:
+        return {}, None
+    # All drives in one call: the propagator then needs no more than one simulation a transducer.
+    drives = torch.cat([solution.drive for solution in solutions.values()])
+    pressure = propagator.field(drives, points).cpu()
+    parts = torch.split(pressure, [len(solution.drive) for solution in solutions.values()])
+    return dict(zip(solutions, parts, strict=True)), plane.size[0] * plane.size[1] / points[..., 0].numel()
+
+
+def _method_result(
+    solution: Solution, plane: torch.Tensor | None, cell_area: float | None, seconds: torch.Tensor
+) -> MethodResult:
+    metrics = focus_metrics(solution.pressure, None if plane is None else plane.abs(), cell_area)
+    shown = median_trial(solution.score)
+    return MethodResult(solution, metrics, seconds, shown, None if plane is None else plane[shown].clone())
+
+
+def _simulation(propagator: Propagator, matrix_seconds: float, plane_seconds: float) -> Simulation:
+    wavelength = propagator.scene.wavelength
+    if isinstance(propagator, SimulatedPropagator):
+        spacing, tolerance, runs = propagator.spacing, propagator.tolerance, tuple(propagator.runs)
+        return Simulation(
+            propagator.method, wavelength, spacing, tolerance, runs, matrix_seconds, plane_seconds
+        )
+    return Simulation("free_space", wavelength, None, None, (), matrix_seconds, plane_seconds)

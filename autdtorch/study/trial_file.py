@@ -1,0 +1,154 @@
+"""The finished trials of a study, appended to a file as they end.
+
+A line a trial, as JSON, with all that the trial found: what is there survives the end of the process, at
+whatever moment it comes, and a study that is begun again goes on after it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import torch
+
+from autdtorch.methods.base import NEAR_TIE, Solution, joined
+from autdtorch.objectives.metrics import focus_metrics
+from autdtorch.objectives.simulated import validate_magnitudes
+from autdtorch.scene.drive import validate_single_drive
+from autdtorch.utils.json_lines import JsonLines
+from autdtorch.utils.validation import (
+    finite_number,
+    integer_at_least,
+    invalid,
+    not_negative,
+    real_tensor,
+    require_kind,
+)
+
+TRIALS_FILE = "trials.jsonl"
+
+Trial: TypeAlias = tuple[Solution, float]
+"""What one trial found, and the seconds it took."""
+
+Shapes: TypeAlias = Mapping[str, tuple[int, int]]
+"""Numbers of transducers M and of control points P, by name of the scene."""
+
+_METRICS = ("mean", "min", "std", "uniformity")
+
+
+class TrialFile:
+    """Trials by scene, method and number: those that the file holds, and those that are added."""
+
+    def __init__(self, path: Path | None, origin: str, seed: int, shapes: Shapes) -> None:
+        """Read what the file holds of the study; it is left as it is until `mend`.
+
+        Args:
+            path: of the file; None to keep the trials in memory alone.
+            origin: of the study, which its lines are told by.
+            seed: of the study, for the rows.
+            shapes: of its scenes.
+
+        Raises:
+            OSError: the file cannot be read.
+        """
+        self._seed = seed
+        self._shapes = shapes
+        self._trials: dict[tuple[str, str, int], Trial] = {}
+        self._lines = None if path is None else JsonLines(path, origin, self._use)
+
+    def __len__(self) -> int:
+        """Number of trials."""
+        return len(self._trials)
+
+    def mend(self) -> None:
+        """Set aside the lines that are damaged or not of this study, which comes before the first `append`.
+
+        Raises:
+            OSError: a file cannot be written.
+        """
+        if self._lines is not None:
+            self._lines.mend()
+
+    def missing(self, scene: str, method: str, trials: int) -> list[int]:
+        """Which of the first `trials` trials are not there."""
+        return [trial for trial in range(trials) if (scene, method, trial) not in self._trials]
+
+    def append(self, scene: str, method: str, trials: Sequence[int], found: Solution, seconds: float) -> None:
+        """Add trials that ended together.
+
+        Args:
+            scene: name.
+            method: name.
+            trials: their numbers (T,).
+            found: what they found.
+            seconds: what they took together; each is given an equal share.
+
+        Raises:
+            ValueError: the file has changed meanwhile.
+            OSError: the file cannot be written.
+        """
+        share = seconds / len(trials)
+        for place, trial in enumerate(trials):
+            self._trials[scene, method, trial] = _alone(found, place), share
+        if self._lines is not None:
+            self._lines.append(*(self._row(scene, method, trial) for trial in trials))
+
+    def found(self, scene: str, method: str, trials: int) -> tuple[Solution, torch.Tensor]:
+        """What the first `trials` trials found, all of which must be there, and seconds (T,) of each."""
+        each = [self._trials[scene, method, trial] for trial in range(trials)]
+        seconds = torch.tensor([share for _, share in each], dtype=torch.float64, device="cpu")
+        return joined([solution for solution, _ in each]), seconds
+
+    def _row(self, scene: str, method: str, trial: int) -> dict[str, Any]:
+        solution, seconds = self._trials[scene, method, trial]
+        metrics = focus_metrics(solution.pressure)
+        return {
+            "scene": scene,
+            "method": method,
+            "trial": trial,
+            "seed": self._seed,
+            "score": float(solution.score),
+            **{name: float(getattr(metrics, name)) for name in _METRICS},
+            "evaluations": int(solution.evaluations),
+            "seconds": seconds,
+            "pressure": solution.pressure[0].tolist(),
+            "drive": torch.view_as_real(solution.drive[0]).tolist(),
+            "history": solution.history[0].tolist(),
+        }
+
+    def _use(self, row: dict[str, Any]) -> None:
+        """Add the trial of a row, after checking it as what a method found in a scene of the study."""
+        for name in ("scene", "method"):
+            require_kind(name, row[name], str)
+        if row["scene"] not in self._shapes:
+            raise invalid("scene", row["scene"], f"must be one of this study: {', '.join(self._shapes)}")
+        where = row["scene"], row["method"], integer_at_least("trial", row["trial"], 0)
+        if where in self._trials:
+            raise invalid("trial", where, "must be there once")
+        transducers, foci = self._shapes[row["scene"]]
+        drive = torch.view_as_complex(real_tensor("drive", row["drive"]))
+        evaluations = integer_at_least("evaluations", row["evaluations"], 1)
+        history = real_tensor("history", row["history"])
+        if history.shape != (evaluations,) or (history.diff() < 0).any():
+            raise invalid("history", history, f"must be {evaluations} numbers, none below the one before")
+        score = finite_number("score", row["score"])
+        best = float(history[-1])
+        if score > best + NEAR_TIE * abs(best):  # the last drive, of `identify`
+            raise invalid("score", score, f"must be at most {best:g}, the best of the history")
+        solution = Solution(
+            validate_single_drive(drive, transducers)[None],
+            validate_magnitudes("pressure", row["pressure"], foci)[None],
+            torch.tensor([score], dtype=torch.float64, device="cpu"),
+            torch.tensor([evaluations], dtype=torch.int64, device="cpu"),
+            history[None],
+        )
+        self._trials[where] = solution, not_negative("seconds", row["seconds"], "s")
+
+
+def _alone(found: Solution, place: int) -> Solution:
+    """One of the trials (T,), its history as long as its evaluations."""
+    row = slice(place, place + 1)
+    evaluations = found.evaluations[row]
+    history = found.history[row, : int(evaluations)]
+    return Solution(found.drive[row], found.pressure[row], found.score[row], evaluations, history)

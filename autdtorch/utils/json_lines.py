@@ -1,0 +1,182 @@
+"""Files of JSON lines that are only appended to, every line with a checksum."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import logging
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from autdtorch.utils.files import naming, replace_file
+
+logger = logging.getLogger(__name__)
+
+SET_ASIDE = ".damaged"
+"""End of the name of the file, beside the first, that keeps the lines which cannot be used."""
+
+_SEAM = re.compile(rb'(?=\{")|(?<="\})')  # where a row can begin or end, if no object is in it
+_WRONG_CHECKSUM = "its checksum is wrong"
+_BROKE_OFF = "the last line broke off"
+_DAMAGE = (ValueError, KeyError, TypeError, OverflowError, RuntimeError)  # by which a reader refuses a row
+
+
+def line_of(row: Mapping[str, Any], key: str = "") -> bytes:
+    """Return a row as a line, its last field the checksum of all before it; the line's end is left out.
+
+    Args:
+        row: what JSON can hold, by name; at least one field.
+        key: what the line belongs to. It is part of the checksum, so that a line of elsewhere is told apart.
+    """
+    return _with_checksum(json.dumps(row)[:-1].encode(), key)
+
+
+def row_of(line: bytes, key: str = "") -> dict[str, Any]:
+    """Return the row of a line of `line_of`. Nothing is parsed before the checksum is found right.
+
+    Raises:
+        ValueError: the line is damaged, or of another key.
+    """
+    if not _is_whole(line, key):
+        raise ValueError(_WRONG_CHECKSUM)
+    return _row(line)
+
+
+class JsonLines:
+    """An append-only file of JSON objects, one a line; `mend` comes before the first `append`.
+
+    A row whose checksum is right counts, also where the end of its line is damaged or missing.
+
+    Attributes:
+        used: number of the rows that were read and used.
+    """
+
+    def __init__(
+        self, path: Path, key: str, use: Callable[[dict[str, Any]], None], head: bytes = b""
+    ) -> None:
+        """Read the file, if it is there; it is left as it is.
+
+        Args:
+            path: of the file.
+            key: what the lines belong to.
+            use: is given each row in turn. It refuses a row by a `ValueError`, or by the error of a missing
+                field or of a wrong type.
+            head: a first line, its end included, that the file begins with.
+
+        Raises:
+            OSError: the file cannot be read.
+        """
+        content = path.read_bytes() if path.exists() else b""
+        lines = content.removeprefix(head).split(b"\n")
+        first = 2 if head and content.startswith(head) else 1
+        good: list[bytes] = []
+        self._refused: list[tuple[int, bytes, str]] = []
+        for number, line in enumerate(lines, first):
+            reason = _WRONG_CHECKSUM if number < first + len(lines) - 1 else _BROKE_OFF
+            for whole, part in _parts(line, key):
+                refusal = _refusal(use, part) if whole else reason
+                if refusal is None:
+                    good.append(part)
+                else:
+                    self._refused.append((number, part, refusal))
+        self.used = len(good)
+        self._path, self._key = path, key
+        mended = head + b"".join(line + b"\n" for line in good)
+        self._mended = None if content == mended else mended
+        self._was_there = bool(content)
+        self._size = len(mended)
+
+    def mend(self) -> None:
+        """Set aside what is no row or was refused, restore ends of lines, write a missing head.
+
+        Raises:
+            OSError: a file cannot be written; the one that was read is then as it was.
+        """
+        if self._mended is None:
+            return
+        if self._refused:
+            self._set_aside()
+        elif self._was_there:
+            logger.warning("%s: the first line or an end of line was damaged: restored", self._path)
+        replace_file(self._path, self._mended)
+        self._mended = None
+
+    def append(self, *rows: Mapping[str, Any]) -> None:
+        """Add lines, which are on disk on return, or leave the file as it is: nothing may follow half a line.
+
+        Raises:
+            ValueError: the file has changed since it was read or last appended to.
+            OSError: the file cannot be written, or was removed.
+        """
+        rest = memoryview(b"".join(line_of(row, self._key) + b"\n" for row in rows))
+        mode = "r+b" if self._size else "ab"  # the second would make a file anew that was removed
+        with naming(self._path), self._path.open(mode, buffering=0) as file:
+            if file.seek(0, os.SEEK_END) != self._size:
+                raise ValueError(f"{self._path}: has changed meanwhile; open it anew, or give another file")
+            try:
+                while rest:
+                    rest = rest[file.write(rest) :]
+                os.fsync(file.fileno())
+                self._size = file.tell()
+            except BaseException:
+                file.truncate(self._size)
+                raise
+
+    def _set_aside(self) -> None:
+        path = self._path.with_name(self._path.name + SET_ASIDE)
+        with naming(path), path.open("ab") as file:
+            file.writelines(line + b"\n" for _, line, _ in self._refused)
+            file.flush()
+            os.fsync(file.fileno())
+        numbers = list(dict.fromkeys(number for number, _, _ in self._refused))
+        more = f" and {len(numbers) - 1} more" if len(numbers) > 1 else ""
+        reasons = "; ".join(dict.fromkeys((self._refused[0][2], self._refused[-1][2])))
+        logger.warning("%s, line %d%s: set aside in %s: %s", self._path, numbers[0], more, path, reasons)
+
+
+def _parts(line: bytes, key: str) -> Iterator[tuple[bool, bytes]]:
+    """Take a line apart where the end of another was lost in it.
+
+    Yields:
+        Whole rows (True) and what is between them (False), in their order.
+    """
+    if _is_whole(line, key):
+        yield True, line
+        return
+    pieces = filter(None, _SEAM.split(line))
+    for are_whole, alike in itertools.groupby(pieces, lambda piece: _is_whole(piece, key)):
+        for part in alike if are_whole else (b"".join(alike),):
+            yield are_whole, part
+
+
+def _refusal(use: Callable[[dict[str, Any]], None], whole: bytes) -> str | None:
+    """Give a row to its reader; returns why that refused it, or None."""
+    try:
+        use(_row(whole))
+    except KeyError as error:
+        return f"it has no {error}"
+    except _DAMAGE as error:
+        return str(error)
+    return None
+
+
+def _row(whole: bytes) -> dict[str, Any]:
+    row: dict[str, Any] = json.loads(_body(whole) + b"}")
+    return row
+
+
+def _body(line: bytes) -> bytes:
+    return line[: -len(_with_checksum(b"", ""))]
+
+
+def _is_whole(line: bytes, key: str) -> bool:
+    return line == _with_checksum(_body(line), key)
+
+
+def _with_checksum(body: bytes, key: str) -> bytes:
+    checksum = hashlib.sha256(key.encode() + b"\n" + body).hexdigest()
+    return body + f', "sha256": "{checksum}"}}'.encode()

@@ -1,0 +1,77 @@
+"""The memory that this process may still use."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+
+from autdtorch.utils.validation import invalid
+
+_CGROUP = Path("/proc/self/cgroup")
+_MOUNT = Path("/sys/fs/cgroup")
+_FILES = {
+    2: ("memory.max", "memory.current", "inactive_file"),
+    1: ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+}
+"""Files of a control group by version: the limit, what is in use, and the part of it that can be dropped."""
+
+
+def available_memory() -> int:
+    """Return the memory [bytes] that the machine, control groups and limits leave to this process."""
+    left = [psutil.virtual_memory().available, *_left_in_groups(), *_left_to_process()]
+    return int(max(0, min(left)))
+
+
+def require_memory(field: str, value: object, needed: float, unit: str = "") -> None:
+    """Refuse what would need more memory than there is.
+
+    Args:
+        field: name of the argument that decides.
+        value: its value.
+        needed: [bytes].
+        unit: of the value.
+
+    Raises:
+        ValueError: names the field, and both figures.
+    """
+    if needed > (available := available_memory()):
+        left = f"this process may use {available / 1e9:.3g} GB"
+        raise invalid(field, value, f"needs about {needed / 1e9:.3g} GB of memory, {left}", unit)
+
+
+def _left_in_groups() -> Iterator[int]:
+    """Yield what is left in each control group that this process is in."""
+    with contextlib.suppress(OSError):  # not Linux
+        for line in _CGROUP.read_text("utf-8").splitlines():
+            _, controllers, path = line.split(":", 2)
+            if not controllers:
+                root, version = _MOUNT, 2
+            elif "memory" in controllers.split(","):
+                root, version = _MOUNT / "memory", 1
+            else:
+                continue
+            here = root / path.lstrip("/")
+            for folder in (here, *here.parents):
+                if folder.is_relative_to(root):
+                    yield from _left_in_group(folder, *_FILES[version])
+
+
+def _left_in_group(folder: Path, limit: str, usage: str, inactive: str) -> Iterator[int]:
+    # no such file: a group without a limit; "max": none is set
+    with contextlib.suppress(OSError, ValueError):
+        most, used = (int((folder / name).read_text("ascii")) for name in (limit, usage))
+        statistics = dict(line.split() for line in (folder / "memory.stat").read_text("ascii").splitlines())
+        yield most - used + int(statistics.get(inactive, 0))
+
+
+def _left_to_process() -> Iterator[int]:
+    """Yield what `ulimit -v` leaves."""
+    with contextlib.suppress(ImportError):  # Windows
+        import resource
+
+        most = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if most != resource.RLIM_INFINITY:
+            yield most - psutil.Process().memory_info().vms
