@@ -16,15 +16,11 @@ from .methods.random_search import random_search
 from .objectives.metrics import FocusMetrics, focus_metrics
 from .objectives.perturbations import Dead, Drift, Noise, Quantised, true_pressure
 from .objectives.simulated import Objective, SimulatedObjective, weakest_focus
-from .plot import (
-    plot_convergence,
-    plot_pareto,
-    plot_plane,
-    plot_planes,
-    plot_scaling,
-    plot_scene,
-    plot_trials,
-)
+from .plot.fields import plot_plane, plot_planes
+from .plot.pareto import plot_pareto
+from .plot.scaling import plot_scaling
+from .plot.scene import plot_scene
+from .plot.trials import plot_convergence, plot_trials
 from .plot.view3d import animate3d, view3d
 from .propagators import (
     SteadyStateWarning,

@@ -13,7 +13,7 @@ from accuracy_report import percent
 from generated_block import fill_in, measured, table
 from matplotlib.figure import Figure
 
-from autdtorch.plot import plot_pareto
+from autdtorch.plot.pareto import plot_pareto
 from autdtorch.plot.style import TICK_SIZE
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "peers.md"

@@ -49,7 +49,7 @@ def test_a_cold_process_and_a_warm_one_find_the_same(tmp_path: Path) -> None:
     assert compiled_again == 0
     assert warm == cold
     kept = [path.name for path in tmp_path.rglob("*.nbi")]
-    folders = Path(at.__file__).parent / "fdtd" / "kernels", Path(at.__file__).parent / "optim"
+    folders = Path(at.__file__).parent / "fdtd" / "kernels", Path(at.__file__).parent / "methods" / "bayes"
     assert all(any(compiled._digest(folder) in name for folder in folders) for name in kept)
     assert kept
 

@@ -18,18 +18,13 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from small_scenes import scene_of_all_kinds, small_scene
 
 import autdtorch as at
-from autdtorch.plot import (
-    plot_convergence,
-    plot_pareto,
-    plot_plane,
-    plot_planes,
-    plot_scaling,
-    plot_scene,
-    plot_trials,
-)
 from autdtorch.plot.drawing import clipped
-from autdtorch.plot.pareto import pareto_front
+from autdtorch.plot.fields import plot_plane, plot_planes
+from autdtorch.plot.pareto import pareto_front, plot_pareto
+from autdtorch.plot.scaling import plot_scaling
+from autdtorch.plot.scene import plot_scene
 from autdtorch.plot.style import looks_of
+from autdtorch.plot.trials import plot_convergence, plot_trials
 
 PLANE = at.Plane(center=(80e-3, 50e-3, 40e-3), normal=(1, 0, 0), size=(60e-3, 40e-3))
 RANDOM = np.random.default_rng(7)

@@ -15,7 +15,7 @@ import autdtorch.study.report.pages
 from autdtorch.methods.bound import focus_bound
 from autdtorch.methods.gabs import gabs
 from autdtorch.methods.lssg import lssg
-from autdtorch.plot import plot_convergence
+from autdtorch.plot.trials import plot_convergence
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.scene import Box, Scene
 from autdtorch.study.report.pages import HTML_FILE, write_report

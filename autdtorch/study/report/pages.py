@@ -9,8 +9,11 @@ from pathlib import Path
 
 import torch
 
-from autdtorch.plot import plot_convergence, plot_pareto, plot_planes, plot_scene, plot_trials
+from autdtorch.plot.fields import plot_planes
+from autdtorch.plot.pareto import plot_pareto
+from autdtorch.plot.scene import plot_scene
 from autdtorch.plot.style import label_of
+from autdtorch.plot.trials import plot_convergence, plot_trials
 from autdtorch.plot.view3d import rendering_problem, view3d
 from autdtorch.scene.scene import Scene
 from autdtorch.study.claims import BO, GABS

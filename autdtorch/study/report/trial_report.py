@@ -16,7 +16,7 @@ from autdtorch.hardware.log import Evaluation, EvaluationLog
 from autdtorch.hardware.preflight import Preflight
 from autdtorch.methods.base import Solution
 from autdtorch.objectives.simulated import Objective
-from autdtorch.plot import plot_convergence
+from autdtorch.plot.trials import plot_convergence
 from autdtorch.study.report.tables import code, fenced, table
 from autdtorch.utils.files import naming, replace_file
 
