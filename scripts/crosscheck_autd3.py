@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 import autdtorch as at
 from autdtorch.analytic.green import free_space_matrix
-from autdtorch.hardware.levels import AUTD3_FULL, Levels, autd3_drive, autd3_levels
+from autdtorch.hardware.devices.levels import AUTD3_FULL, Levels, autd3_drive, autd3_levels
 from autdtorch.scene.device_layouts import TRANSDUCER_RADIUS
 
 DOCUMENT = Path(__file__).parents[1] / "docs" / "crosschecks.md"

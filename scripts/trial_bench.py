@@ -12,8 +12,8 @@ import torch
 
 import autdtorch as at
 from autdtorch import hardware
-from autdtorch.hardware.autd3 import autd3_device, autd3_kit
-from autdtorch.hardware.sensor import typed
+from autdtorch.hardware.sensors.sensor import typed
+from autdtorch.hardware.transport.autd3_network import autd3_device, autd3_kit
 from autdtorch.hardware.wiring import Wiring
 from autdtorch.objectives.perturbations import random_rms
 from autdtorch.utils.digest import digest_of
@@ -150,11 +150,11 @@ def _link(
         return hardware.open_link(device, transducers, options.serial, settle=settle)
     # Imported here, as both need pyusb: without it, no more than its hint is to be shown.
     if options.dry_run:
-        from autdtorch.hardware.dry_run import DryPort
+        from autdtorch.hardware.emulator.dry_run import DryPort
 
         port: hardware.Port = DryPort(bench, device, print)
     elif on_network:
-        from autdtorch.hardware.emulated_autd3 import EmulatedAutd3Port
+        from autdtorch.hardware.emulator.emulated_autd3 import EmulatedAutd3Port
 
         port = EmulatedAutd3Port(_board_count(options), bench)
     else:

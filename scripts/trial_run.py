@@ -20,7 +20,7 @@ from yaml import YAMLError
 
 import autdtorch as at
 from autdtorch import hardware
-from autdtorch.hardware.sensor import checked_reading
+from autdtorch.hardware.sensors.sensor import checked_reading
 from autdtorch.methods.base import Solution
 from autdtorch.study.report.trial_report import write_hardware_report
 from autdtorch.utils.progress import Progress, show_progress
@@ -182,7 +182,7 @@ def method_of(name: str, settings: dict[str, Any], seed: int) -> Method:
 @contextlib.contextmanager
 def silence_expected() -> Iterator[None]:
     """Have an oscilloscope not warn that it hears nothing."""
-    scope = logging.getLogger("autdtorch.hardware.scope")
+    scope = logging.getLogger("autdtorch.hardware.sensors.oscilloscope")
     scope.setLevel(logging.ERROR)
     try:
         yield

@@ -1,19 +1,19 @@
-from .adapters import Adapter
-from .autd3 import open_autd3
 from .devices import OPENMPD, SONICSURFACE, ULTRAINO, Device, openmpd_boards, ultraino_boards
-from .emulated_scope import EmulatedScope
-from .emulator import EmulatedBench, EmulatedSensor
+from .emulator.bench import EmulatedBench, EmulatedSensor
+from .emulator.emulated_scope import EmulatedScope
 from .link import Link, OffError, open_link
 from .log import Evaluation, EvaluationLog, LogError, lock_log
 from .objective import HardwareObjective
 from .played import Played
 from .preflight import Preflight, check_transducers, hears_silence
 from .safety import LimitedLink, LimitError, Limits, Signalled, ended_by_signals
-from .scope import Microphone, Oscilloscope, ScopeSensor, open_scope
-from .scpi import KEYSIGHT, RIGOL, Dialect, Waveform
-from .sensor import FileSensor, ManualSensor, MovedMicrophone, Sensor, SensorError
-from .usb import LinkError, Port
-from .usbtmc import UsbtmcPort
+from .sensors.oscilloscope import Microphone, Oscilloscope, ScopeSensor, open_scope
+from .sensors.scpi import KEYSIGHT, RIGOL, Dialect, Waveform
+from .sensors.sensor import FileSensor, ManualSensor, MovedMicrophone, Sensor, SensorError
+from .transport.autd3_network import open_autd3
+from .transport.serial_chips import Adapter
+from .transport.usb import LinkError, Port
+from .transport.usbtmc import UsbtmcPort
 
 __all__ = [
     "KEYSIGHT",

@@ -13,7 +13,7 @@ from typing import Any, Self
 import torch
 
 from autdtorch.hardware.devices import Device
-from autdtorch.hardware.usb import LinkError, Port, closed_on_error, find_device
+from autdtorch.hardware.transport.usb import LinkError, Port, closed_on_error, find_device
 from autdtorch.hardware.wiring import Wiring
 from autdtorch.utils.validation import invalid, not_negative, require_callable, require_kind
 

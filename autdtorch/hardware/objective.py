@@ -11,7 +11,7 @@ import torch
 
 from autdtorch.hardware.log import Evaluation, EvaluationLog
 from autdtorch.hardware.safety import LimitedLink, LimitError
-from autdtorch.hardware.sensor import Sensor, checked_reading
+from autdtorch.hardware.sensors.sensor import Sensor, checked_reading
 from autdtorch.objectives.simulated import validate_drives
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.digest import digest_of

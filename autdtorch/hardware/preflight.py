@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from autdtorch.hardware.safety import LimitedLink
-from autdtorch.hardware.sensor import Sensor, checked_reading
+from autdtorch.hardware.sensors.sensor import Sensor, checked_reading
 from autdtorch.utils.validation import integer_at_least, require_callable, require_kind
 
 #: How far above the noise a transducer is heard, in standard deviations of the noise's mean power.

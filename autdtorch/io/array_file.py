@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from autdtorch.hardware.openmpd_board import OpenMPDBoard
+from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
 from autdtorch.io.csv_table import read_table
 from autdtorch.scene.arrays import PAPER_SOURCE_STRENGTH, TransducerArray
 from autdtorch.scene.geometry import device_axes, in_plane

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from autdtorch.hardware.levels import (
+from autdtorch.hardware.devices.levels import (
     Levels,
     autd3_drive,
     autd3_levels,
@@ -70,7 +70,7 @@ def save_drive(
     and amplitude; `.npz` the arrays drive (M,), positions, normals, source_strength and radius. `load_array`
     reads the array from both; .csv says neither strength nor radius.
 
-    With `device`, rounded to its levels (`autdtorch.hardware.levels`), in the order of the array, which must
+    With `device`, rounded to its levels (`hardware.devices.levels`), in the order of the array, which must
     be the device's: that of `TransducerArray.autd3`, `.sonicsurface` and `.openmpd`. `.csv` has the columns
     unit, transducer and, say, autd3 phase and autd3 intensity; `.npz` the name `device` and uint8 arrays
     (units, transducers of a unit): phase and intensity (AUTD3), phase and duty (OpenMPD), or phase alone.

@@ -31,7 +31,7 @@ from crosscheck_autd3 import (
 )
 
 import autdtorch as at
-from autdtorch.hardware.levels import autd3_drive, autd3_levels
+from autdtorch.hardware.devices.levels import autd3_drive, autd3_levels
 
 FLOAT32 = 1e-5
 

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from autdtorch.hardware import SONICSURFACE, ULTRAINO, Device, EmulatedBench, open_link, ultraino_boards
-from autdtorch.hardware.adapters import Adapter, ch340_divisor
-from autdtorch.hardware.emulated_bus import EmulatedBus, time_out
-from autdtorch.hardware.emulated_chips import CHIPS, EmulatedCdc, EmulatedCp2102
-from autdtorch.hardware.firmware import SonicSurfaceFirmware, UltrainoFirmware
-from autdtorch.hardware.usb import UDEV_RULES, find_device
+from autdtorch.hardware.emulator.bus import EmulatedBus, time_out
+from autdtorch.hardware.emulator.chips import CHIPS, EmulatedCdc, EmulatedCp2102
+from autdtorch.hardware.emulator.firmware import SonicSurfaceFirmware, UltrainoFirmware
+from autdtorch.hardware.transport.serial_chips import Adapter, ch340_divisor
+from autdtorch.hardware.transport.usb import UDEV_RULES, find_device
 
 WIRED = [(device, adapter) for device in (SONICSURFACE, ULTRAINO) for adapter in device.adapters]
 

@@ -19,9 +19,9 @@ from autdtorch.hardware import (
     ended_by_signals,
     open_autd3,
 )
-from autdtorch.hardware import autd3 as module
-from autdtorch.hardware.autd3 import Autd3Port, autd3_device
-from autdtorch.hardware.levels import Levels, autd3_levels
+from autdtorch.hardware.devices.levels import Levels, autd3_levels
+from autdtorch.hardware.transport import autd3_network as module
+from autdtorch.hardware.transport.autd3_network import Autd3Port, autd3_device
 from autdtorch.scene.drive import drive_from_phases
 
 
@@ -218,7 +218,7 @@ class TestWithTheKit:
         from autd3.commands import SetSilencer
         from autd3_core import Autd3, Duration, Geometry
 
-        from autdtorch.hardware.autd3 import autd3_pattern
+        from autdtorch.hardware.transport.autd3_network import autd3_pattern
 
         drive = random_drive(249)
 

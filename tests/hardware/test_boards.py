@@ -12,7 +12,7 @@ from autdtorch.hardware import (
     open_link,
     openmpd_boards,
 )
-from autdtorch.hardware.openmpd_board import OpenMPDBoard
+from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
 from autdtorch.hardware.wiring import Wiring
 from autdtorch.scene.drive import drive_from_phases
 

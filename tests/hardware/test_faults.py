@@ -24,8 +24,8 @@ from autdtorch.hardware import (
     Signalled,
     ended_by_signals,
 )
-from autdtorch.hardware.emulated_bus import EmulatedBus
-from autdtorch.hardware.faults import FAULTS, FaultyBus
+from autdtorch.hardware.emulator.bus import EmulatedBus
+from autdtorch.hardware.emulator.faults import FAULTS, FaultyBus
 from autdtorch.methods.base import Solution
 from autdtorch.methods.gabs import gabs
 

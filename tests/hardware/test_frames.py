@@ -8,9 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autdtorch.hardware.devices import OPENMPD, SONICSURFACE, Device, ultraino_boards
-from autdtorch.hardware.emulator import EmulatedBench
-from autdtorch.hardware.firmware import OpenMPDFirmware, SonicSurfaceFirmware, UltrainoFirmware
-from autdtorch.hardware.frames import (
+from autdtorch.hardware.devices.frames import (
     levels_of_openmpd_frame,
     levels_of_sonicsurface_frame,
     levels_of_ultraino_frame,
@@ -18,9 +16,11 @@ from autdtorch.hardware.frames import (
     sonicsurface_frame,
     ultraino_frame,
 )
-from autdtorch.hardware.levels import Levels, openmpd_drive, sonicsurface_drive, ultraino_drive
+from autdtorch.hardware.devices.levels import Levels, openmpd_drive, sonicsurface_drive, ultraino_drive
+from autdtorch.hardware.devices.order import sonicsurface_channels, ultraino_pins
+from autdtorch.hardware.emulator.bench import EmulatedBench
+from autdtorch.hardware.emulator.firmware import OpenMPDFirmware, SonicSurfaceFirmware, UltrainoFirmware
 from autdtorch.hardware.link import open_link
-from autdtorch.hardware.order import sonicsurface_channels, ultraino_pins
 from autdtorch.scene.drive import drive_from_phases
 
 seeds = st.integers(0, 2**32 - 1)

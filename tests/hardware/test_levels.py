@@ -6,8 +6,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autdtorch.hardware import levels as device
-from autdtorch.hardware.levels import Levels
+from autdtorch.hardware.devices import levels as device
+from autdtorch.hardware.devices.levels import Levels
 from autdtorch.scene.drive import drive_from_phases, focus_phases
 
 DEVICES = {

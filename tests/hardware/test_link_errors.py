@@ -9,9 +9,9 @@ import torch
 from usb.core import USBError, USBTimeoutError
 
 from autdtorch.hardware import OPENMPD, SONICSURFACE, ULTRAINO, Device, EmulatedBench, LinkError, open_link
-from autdtorch.hardware.emulated_bus import EmulatedBus
-from autdtorch.hardware.emulated_chips import EmulatedFtdi
-from autdtorch.hardware.firmware import SonicSurfaceFirmware
+from autdtorch.hardware.emulator.bus import EmulatedBus
+from autdtorch.hardware.emulator.chips import EmulatedFtdi
+from autdtorch.hardware.emulator.firmware import SonicSurfaceFirmware
 
 # Method of the backend that fails, the error of libusb, and what the message says.
 ACCESS = USBError("Access denied (insufficient permissions)", -3, errno.EACCES)
@@ -86,9 +86,9 @@ def test_without_the_packages_there_is_a_hint(monkeypatch, package: str):
     with pytest.raises(ImportError, match=r"pip install 'autdtorch\[hardware\]'"):
         open_link(SONICSURFACE)
     if package == "usb":
-        monkeypatch.delitem(sys.modules, "autdtorch.hardware.emulated_bus")
+        monkeypatch.delitem(sys.modules, "autdtorch.hardware.emulator.bus")
         with pytest.raises(ImportError, match=r"pip install 'autdtorch\[hardware\]'"):
-            import autdtorch.hardware.emulated_bus  # noqa: F401
+            import autdtorch.hardware.emulator.bus  # noqa: F401
 
 
 def test_that_the_outputs_may_be_on_is_not_hidden_by_a_driver_that_does_not_come_back():

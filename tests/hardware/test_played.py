@@ -19,8 +19,8 @@ from autdtorch.hardware import (
     openmpd_boards,
     ultraino_boards,
 )
-from autdtorch.hardware.autd3 import autd3_device
-from autdtorch.hardware.openmpd_board import OpenMPDBoard
+from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
+from autdtorch.hardware.transport.autd3_network import autd3_device
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.scene import Medium, Scene
 

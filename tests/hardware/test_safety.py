@@ -246,7 +246,7 @@ def test_what_an_earlier_process_played_besides_counts_and_is_rested_from(trial)
 
 
 def test_a_chip_that_keeps_the_off_frame_is_told_of(trial, monkeypatch):
-    monkeypatch.setattr("autdtorch.hardware.adapters._FLUSH_SECONDS", 0.0)
+    monkeypatch.setattr("autdtorch.hardware.transport.serial_chips._FLUSH_SECONDS", 0.0)
     bench = trial.bench()
     link = trial.link(bench)
     bench.chip.answer = lambda kind, request: b"\x01\x20"  # room for more, but not all is sent

@@ -19,9 +19,9 @@ from autdtorch.hardware import (
     SensorError,
     open_scope,
 )
-from autdtorch.hardware.emulated_bus import EmulatedBus
-from autdtorch.hardware.emulated_usbtmc import EmulatedInstrument, Fault
-from autdtorch.hardware.scpi import Dialect
+from autdtorch.hardware.emulator.bus import EmulatedBus
+from autdtorch.hardware.emulator.instrument import EmulatedInstrument, Fault
+from autdtorch.hardware.sensors.scpi import Dialect
 from autdtorch.methods.gabs import gabs
 from autdtorch.objectives.perturbations import random_rms
 from autdtorch.scene.drive import drive_from_phases

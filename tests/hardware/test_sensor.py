@@ -12,10 +12,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autdtorch.hardware import FileSensor, ManualSensor, MovedMicrophone, SensorError, sensor
-from autdtorch.hardware.lock_in import LockIn
+from autdtorch.hardware import FileSensor, ManualSensor, MovedMicrophone, SensorError
 from autdtorch.hardware.safety import Signalled, ended_by_signals
-from autdtorch.hardware.sensor import typed
+from autdtorch.hardware.sensors import sensor
+from autdtorch.hardware.sensors.lock_in import LockIn
+from autdtorch.hardware.sensors.sensor import typed
 
 POINTS = [(0.08, 0.01, 0.0), (0.08, -0.02, 5e-3)]
 

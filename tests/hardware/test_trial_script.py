@@ -262,7 +262,7 @@ def test_a_signal_speaks_of_the_device_only_once_it_was_opened(run, monkeypatch,
 
 @pytest.mark.parametrize("words", [(), ("--dry-run",)])
 def test_without_pyusb_an_emulated_trial_ends_with_the_hint(run, monkeypatch, caplog, words):
-    emulated = "autdtorch.hardware.emulat", "autdtorch.hardware.dry_run", "trial_"
+    emulated = "autdtorch.hardware.emulat", "autdtorch.hardware.emulator.dry_run", "trial_"
     for name in [name for name in sys.modules if name.startswith(emulated)]:
         monkeypatch.delitem(sys.modules, name)
     for name in ("usb", "usb.core", "usb.backend"):

@@ -6,11 +6,11 @@ import pytest
 from usb.core import USBError
 
 from autdtorch.hardware import LinkError
-from autdtorch.hardware.adapters import BAUD_RATE, FtdiPort, FtdiUart, baud_divisor
-from autdtorch.hardware.emulated_bus import EmulatedBus
-from autdtorch.hardware.emulated_chips import EmulatedChip, EmulatedFtdi
-from autdtorch.hardware.firmware import OpenMPDFirmware, SonicSurfaceFirmware
-from autdtorch.hardware.usb import VENDOR_REQUEST, find_device
+from autdtorch.hardware.emulator.bus import EmulatedBus
+from autdtorch.hardware.emulator.chips import EmulatedChip, EmulatedFtdi
+from autdtorch.hardware.emulator.firmware import OpenMPDFirmware, SonicSurfaceFirmware
+from autdtorch.hardware.transport.serial_chips import BAUD_RATE, FtdiPort, FtdiUart, baud_divisor
+from autdtorch.hardware.transport.usb import VENDOR_REQUEST, find_device
 
 UART, FIFO = (0x0403, 0x6001), (0x0403, 0x6014)
 

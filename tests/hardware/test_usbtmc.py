@@ -6,11 +6,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from autdtorch.hardware import LinkError
-from autdtorch.hardware.emulated_bus import EmulatedBus
-from autdtorch.hardware.emulated_usbtmc import EmulatedInstrument
-from autdtorch.hardware.scpi import KEYSIGHT, RIGOL
-from autdtorch.hardware.usb import find_device
-from autdtorch.hardware.usbtmc import END, TELL, UsbtmcPort, announced, block, message
+from autdtorch.hardware.emulator.bus import EmulatedBus
+from autdtorch.hardware.emulator.instrument import EmulatedInstrument
+from autdtorch.hardware.sensors.scpi import KEYSIGHT, RIGOL
+from autdtorch.hardware.transport.usb import find_device
+from autdtorch.hardware.transport.usbtmc import END, TELL, UsbtmcPort, announced, block, message
 
 CHIP = (0x1AB1, 0x04CE)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from autdtorch.hardware.openmpd_board import OpenMPDBoard
+from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
 from autdtorch.io.array_file import load_array
 from autdtorch.io.scene_file import load_scene
 from autdtorch.scene.arrays import PAPER_SOURCE_STRENGTH, TransducerArray

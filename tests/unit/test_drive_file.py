@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from autdtorch.analytic.green import free_space_matrix
-from autdtorch.hardware.levels import autd3_levels
+from autdtorch.hardware.devices.levels import autd3_levels
 from autdtorch.io.array_file import load_array
 from autdtorch.io.drive_file import load_drive, save_drive
 from autdtorch.scene.arrays import TransducerArray

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from autdtorch.hardware.autd3 import Autd3Port, autd3_kit
-from autdtorch.hardware.emulator import EmulatedBench
+from autdtorch.hardware.emulator.bench import EmulatedBench
+from autdtorch.hardware.transport.autd3_network import Autd3Port, autd3_kit
 
 
 class EmulatedAutd3Port(Autd3Port):

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from autdtorch.hardware.emulated_usbtmc import EmulatedInstrument
-from autdtorch.hardware.emulator import EmulatedBench
+from autdtorch.hardware.emulator.bench import EmulatedBench
+from autdtorch.hardware.emulator.instrument import EmulatedInstrument
 from autdtorch.utils.validation import (
     finite_number,
     integer_at_least,

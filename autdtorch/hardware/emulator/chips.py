@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from typing import ClassVar, TypeAlias
 
-from autdtorch.hardware.firmware import Firmware
+from autdtorch.hardware.emulator.firmware import Firmware
 
 #: Class, subclass and protocol of each interface, and its bulk endpoints.
 Interfaces: TypeAlias = tuple[tuple[tuple[int, int, int], tuple[int, ...]], ...]

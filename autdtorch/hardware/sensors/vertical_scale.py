@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from autdtorch.hardware.scpi import Waveform
+from autdtorch.hardware.sensors.scpi import Waveform
 
 _DIVISIONS = 3.5  # of a full screen, above and below the middle; there are 4 or more
 _QUIET = 0.25  # of a full screen: what fills less is put on a finer scale,

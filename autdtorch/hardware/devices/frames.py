@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from autdtorch.hardware.levels import ULTRAINO_PHASES, Levels
-from autdtorch.hardware.order import sonicsurface_channels, ultraino_pins
+from autdtorch.hardware.devices.levels import ULTRAINO_PHASES, Levels
+from autdtorch.hardware.devices.order import sonicsurface_channels, ultraino_pins
 
 #: Transducers of a board of SonicSurface or OpenMPD, and of Ultraino.
 BOARD, ULTRAINO_BOARD = 256, 64

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import ClassVar, Protocol
 
-from autdtorch.hardware.emulated_chips import Interfaces
-from autdtorch.hardware.usb import INSTALL_HINT
+from autdtorch.hardware.emulator.chips import Interfaces
+from autdtorch.hardware.transport.usb import INSTALL_HINT
 
 try:
     from usb.backend import IBackend

@@ -11,12 +11,12 @@ from typing import Any, Self
 
 import torch
 
-from autdtorch.hardware.lock_in import LockIn
-from autdtorch.hardware.scpi import KEYSIGHT, Dialect, Waveform
-from autdtorch.hardware.sensor import SensorError
-from autdtorch.hardware.usb import LinkError, closed_on_error, find_device
-from autdtorch.hardware.usbtmc import UsbtmcPort
-from autdtorch.hardware.vertical_scale import VerticalScale
+from autdtorch.hardware.sensors.lock_in import LockIn
+from autdtorch.hardware.sensors.scpi import KEYSIGHT, Dialect, Waveform
+from autdtorch.hardware.sensors.sensor import SensorError
+from autdtorch.hardware.sensors.vertical_scale import VerticalScale
+from autdtorch.hardware.transport.usb import LinkError, closed_on_error, find_device
+from autdtorch.hardware.transport.usbtmc import UsbtmcPort
 from autdtorch.utils.validation import (
     integer_at_least,
     invalid,

@@ -9,7 +9,7 @@ import struct
 import time
 from typing import Any
 
-from autdtorch.hardware.usb import LinkError, UsbPort, closed_on_error
+from autdtorch.hardware.transport.usb import LinkError, UsbPort, closed_on_error
 
 #: MsgID: a message to the instrument; asking for one, and the answer.
 TELL, ASK = 1, 2

@@ -7,18 +7,18 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
-from autdtorch.hardware.adapters import Adapter
-from autdtorch.hardware.autd3 import autd3_device
 from autdtorch.hardware.devices import OPENMPD, SONICSURFACE, ULTRAINO, Device
-from autdtorch.hardware.emulated_bus import EmulatedBus, EmulatedDevice
-from autdtorch.hardware.emulated_chips import CHIPS
-from autdtorch.hardware.firmware import (
+from autdtorch.hardware.emulator.bus import EmulatedBus, EmulatedDevice
+from autdtorch.hardware.emulator.chips import CHIPS
+from autdtorch.hardware.emulator.firmware import (
     Autd3Firmware,
     Firmware,
     OpenMPDFirmware,
     SonicSurfaceFirmware,
     UltrainoFirmware,
 )
+from autdtorch.hardware.transport.autd3_network import autd3_device
+from autdtorch.hardware.transport.serial_chips import Adapter
 from autdtorch.hardware.wiring import Wiring
 from autdtorch.objectives.perturbations import SNRS, random_rms
 from autdtorch.utils.validation import (

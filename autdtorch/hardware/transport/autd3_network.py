@@ -12,9 +12,9 @@ import numpy as np
 import torch
 
 from autdtorch.hardware.devices import Device
-from autdtorch.hardware.levels import Levels, autd3_drive, autd3_levels
+from autdtorch.hardware.devices.levels import Levels, autd3_drive, autd3_levels
 from autdtorch.hardware.link import SETTLE, Link
-from autdtorch.hardware.usb import LinkError, closed_on_error
+from autdtorch.hardware.transport.usb import LinkError, closed_on_error
 from autdtorch.scene.device_layouts import AUTD3_TRANSDUCERS
 from autdtorch.utils.validation import integer_at_least
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from autdtorch.hardware.adapters import FT232H, Adapter, arduino_mega, ch340, cp2102, ft232r
-from autdtorch.hardware.frames import (
+from autdtorch.hardware.devices.frames import (
     BOARD,
     ULTRAINO_BOARD,
     levels_of_openmpd_frame,
@@ -18,7 +17,7 @@ from autdtorch.hardware.frames import (
     sonicsurface_frame,
     ultraino_frame,
 )
-from autdtorch.hardware.levels import (
+from autdtorch.hardware.devices.levels import (
     openmpd_drive,
     openmpd_levels,
     sonicsurface_drive,
@@ -26,7 +25,8 @@ from autdtorch.hardware.levels import (
     ultraino_drive,
     ultraino_levels,
 )
-from autdtorch.hardware.openmpd_board import OpenMPDBoard
+from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
+from autdtorch.hardware.transport.serial_chips import FT232H, Adapter, arduino_mega, ch340, cp2102, ft232r
 from autdtorch.utils.validation import integer_at_least, invalid, members
 
 SONICSURFACE_BAUD = 230_400

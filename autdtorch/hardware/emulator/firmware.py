@@ -12,7 +12,7 @@ from typing import ClassVar, Protocol
 
 import torch
 
-from autdtorch.hardware.order import sonicsurface_channels, ultraino_pins
+from autdtorch.hardware.devices.order import sonicsurface_channels, ultraino_pins
 
 
 class Firmware(Protocol):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from autdtorch.hardware.devices import Device
-from autdtorch.hardware.emulator import EmulatedBench
+from autdtorch.hardware.emulator.bench import EmulatedBench
 from autdtorch.scene.drive import amplitudes_of, phases_of
 
 

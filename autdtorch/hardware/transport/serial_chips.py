@@ -13,7 +13,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-from autdtorch.hardware.usb import LinkError, Port, UsbPort
+from autdtorch.hardware.transport.usb import LinkError, Port, UsbPort
 
 #: FTDI's requests.
 RESET, FLOW_CONTROL, BAUD_RATE, DATA_FORMAT, STATUS, LATENCY = 0x00, 0x02, 0x03, 0x04, 0x05, 0x09

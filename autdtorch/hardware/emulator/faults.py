@@ -6,7 +6,7 @@ from array import array
 from collections.abc import Sequence
 from typing import Literal, TypeAlias
 
-from autdtorch.hardware.emulated_bus import EmulatedBus, EmulatedDevice, stall, time_out, unplugged
+from autdtorch.hardware.emulator.bus import EmulatedBus, EmulatedDevice, stall, time_out, unplugged
 from autdtorch.utils.validation import integer_at_least, require_one_of
 
 #: "time-out" and "short write": a transfer ends in mid-frame, with an error or without, and the chip takes

@@ -8,8 +8,8 @@ from __future__ import annotations
 import random
 from typing import ClassVar, Literal, Protocol
 
-from autdtorch.hardware.emulated_bus import stall, time_out
-from autdtorch.hardware.emulated_chips import Interfaces
+from autdtorch.hardware.emulator.bus import stall, time_out
+from autdtorch.hardware.emulator.chips import Interfaces
 
 #: What can go wrong with a transfer from the instrument.
 Fault = Literal["time-out", "stall", "short", "garbage"]
