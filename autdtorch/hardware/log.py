@@ -18,8 +18,8 @@ from filelock import FileLock
 from autdtorch.objectives.simulated import validate_magnitudes
 from autdtorch.scene.drive import validate_single_drive
 from autdtorch.utils.digest import digest_of
+from autdtorch.utils.files import held
 from autdtorch.utils.json_lines import JsonLines, line_of, row_of
-from autdtorch.utils.locking import held
 from autdtorch.utils.validation import integer_at_least, not_negative, real_tensor, require_kind
 
 _ORIGIN, _NUMBER = "origin", "evaluation"

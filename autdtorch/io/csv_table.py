@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from autdtorch.utils.files import replacing
+from autdtorch.utils.validation import require_known
 
 Column: TypeAlias = npt.NDArray[np.float64]
 
@@ -80,8 +81,7 @@ def _column(where: str, cell: str, columns: Mapping[str, str]) -> tuple[str, flo
     """Name of a column, and what its unit is in SI."""
     match = re.fullmatch(r"([^\[\]]*?)\s*(?:\[(.*)\])?", cell)
     name, unit = (match[1], match[2] or "") if match else (cell, "")
-    if name not in columns:
-        raise ValueError(f"{where}: unknown column {cell!r}; known columns: {', '.join(columns)}")
+    require_known(where, [name], columns, "column")
     units = _UNITS[columns[name]]
     if unit not in units:
         accepted = " or ".join(f"{name} [{unit}]" if unit else name for unit in units)

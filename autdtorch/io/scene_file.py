@@ -5,10 +5,9 @@ The keys of a section are the arguments of what it builds, so that the two canno
 
 from __future__ import annotations
 
-import difflib
 import inspect
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,16 @@ from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import Plane, circle_points
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
 from autdtorch.scene.scene import Medium, Scene
-from autdtorch.utils.validation import ArrayLike, Vector, finite_vector, invalid, path_of, points_tensor
+from autdtorch.utils.validation import (
+    ArrayLike,
+    Vector,
+    finite_vector,
+    hint,
+    invalid,
+    path_of,
+    points_tensor,
+    require_known,
+)
 
 Builder = Callable[..., Any]
 
@@ -135,7 +143,7 @@ def _build_kind(where: str, value: object, builders: Mapping[str, Builder]) -> A
     section = _mapping(where, value)
     kind = section.pop("type", None)
     if not isinstance(kind, str) or kind not in builders:
-        raise invalid(f"{where}: type", kind, f"must be one of {', '.join(builders)}{_hint(kind, builders)}")
+        raise invalid(f"{where}: type", kind, f"must be one of {', '.join(builders)}{hint(kind, builders)}")
     return _build(where, section, builders[kind])
 
 
@@ -155,21 +163,13 @@ def _mapping(where: str, value: object) -> dict[str, Any]:
 
 def _check_keys(where: str, section: Mapping[str, object], builder: Builder) -> None:
     parameters = _parameters(builder)
-    allowed = f"allowed keys: {', '.join(parameters)}"
-    for key in section:
-        if key not in parameters:
-            raise ValueError(f"{where}: unknown key {key!r}{_hint(key, parameters)}; {allowed}")
+    require_known(where, section, parameters)
     for key, parameter in parameters.items():
         if parameter.default is inspect.Parameter.empty and key not in section:
-            raise ValueError(f"{where}: missing key {key!r}; {allowed}")
+            raise ValueError(f"{where}: missing key {key!r}; allowed keys: {', '.join(parameters)}")
 
 
 def _parameters(builder: Builder) -> dict[str, inspect.Parameter]:
     """Arguments that a section gives: all but those that a `partial` has already."""
     given = builder.keywords if isinstance(builder, partial) else {}
     return {key: entry for key, entry in inspect.signature(builder).parameters.items() if key not in given}
-
-
-def _hint(key: object, known: Iterable[str]) -> str:
-    nearest = difflib.get_close_matches(str(key), list(known), n=1)
-    return f" (did you mean {nearest[0]!r}?)" if nearest else ""

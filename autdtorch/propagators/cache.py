@@ -1,32 +1,25 @@
 """Matrices that took long to compute, kept on disk under a digest of all that decides them.
 
-A file is written beside its place and then renamed: whoever reads finds nothing or all of it, whatever other
-processes do and whenever one is killed. Its first line is a checksum of its name, its shape and the rest.
+The first line of a file is a checksum of its name, its shape and the rest.
 """
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import logging
 import math
 import os
-import time
-import uuid
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from autdtorch.utils.files import replace_file
+
 logger = logging.getLogger(__name__)
 
 SUFFIX = ".matrix"
-PARTIAL = ".partial"
-
-ABANDONED = 3600.0
-"""Age [s] from which on the partial file of a writer that was killed is removed; writing takes seconds."""
 
 
 class DiskCache:
@@ -70,20 +63,12 @@ class DiskCache:
         body = np.append(matrix, number).astype(np.complex128).tobytes()
         path = self._path(digest)
         try:
-            self._remove_abandoned()
-            with _partial_file(path) as file:
-                file.write(_with_checksum(digest, matrix.shape, body))
+            replace_file(path, _with_checksum(digest, matrix.shape, body))
         except OSError as error:
             logger.warning("%s cannot be written (%s): not kept", path, error.strerror)
 
     def _path(self, digest: str) -> Path:
         return self.folder / f"{digest}{SUFFIX}"
-
-    def _remove_abandoned(self) -> None:
-        for path in self.folder.glob(f"*{PARTIAL}"):
-            with contextlib.suppress(OSError):  # another process removes it as well, or it is another user's
-                if time.time() - path.stat().st_mtime > ABANDONED:
-                    path.unlink()
 
 
 def _bytes_of(shape: tuple[int, ...]) -> int:
@@ -94,16 +79,3 @@ def _bytes_of(shape: tuple[int, ...]) -> int:
 def _with_checksum(digest: str, shape: tuple[int, ...], body: bytes) -> bytes:
     named = f"{digest} {shape}\n".encode()
     return hashlib.sha256(named + body).hexdigest().encode() + b"\n" + body
-
-
-@contextlib.contextmanager
-def _partial_file(path: Path) -> Iterator[BinaryIO]:
-    """A file of this process alone, which takes its place when it is complete and is removed otherwise."""
-    partial = path.with_name(f"{path.stem}-{uuid.uuid4().hex}{PARTIAL}")
-    try:
-        with partial.open("xb") as file:
-            yield file
-        partial.replace(path)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise

@@ -25,7 +25,7 @@ from autdtorch.study.results import (
     save_results,
 )
 from autdtorch.study.trial_file import TRIALS_FILE, TrialFile
-from autdtorch.utils.locking import held
+from autdtorch.utils.files import held
 
 logger = logging.getLogger(__name__)
 

@@ -1,16 +1,29 @@
-"""Files that are written whole or not at all, and errors that name them."""
+"""Files that are written as a whole or not at all, errors that name them, and locks."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import re
+import time
+import uuid
 from collections.abc import Iterator
 from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+PARTIAL = ".partial"
+"""Suffix of a file that is being written."""
+
+ABANDONED = 3600.0
+"""Age [s] after which the partial file of a killed writer is removed; writing takes seconds."""
+
+_PARTIAL_NAME = re.compile(rf".+\.[0-9a-f]{{32}}{re.escape(PARTIAL)}")
 
 
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Have an `OSError` name the file: one of a full disk does not."""
+    """Add the path to an `OSError` that has none, such as the error of a full disk."""
     try:
         yield
     except OSError as error:
@@ -21,14 +34,17 @@ def naming(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give another name to write a file under, which then takes its place, so that nobody finds half of it.
+    """Give a temporary name to write a file under, and rename it to `path` when it is complete.
+
+    Readers find the old file or the new one, never a part of it, also if several processes write it at once.
+    The partial files that killed writers left in the folder are removed.
 
     Raises:
         OSError: the file cannot be written.
     """
-    partial = path.with_name(f"{path.name}.partial")
+    partial = path.with_name(f"{path.name}.{uuid.uuid4().hex}{PARTIAL}")
     with naming(path):
-        partial.unlink(missing_ok=True)  # it may be a link to another file
+        _remove_abandoned(path.parent)
         try:
             yield partial
             with partial.open("rb+") as file:
@@ -47,3 +63,32 @@ def replace_file(path: Path, content: bytes) -> None:
     """
     with replacing(path) as partial:
         partial.write_bytes(content)
+
+
+def _remove_abandoned(folder: Path) -> None:
+    for path in folder.glob(f"*{PARTIAL}"):
+        if _PARTIAL_NAME.fullmatch(path.name):
+            with contextlib.suppress(OSError):  # another process removes it too, or another user owns it
+                if time.time() - path.lstat().st_mtime > ABANDONED:
+                    path.unlink()
+
+
+@contextlib.contextmanager
+def held(lock: FileLock, refusal: Exception) -> Iterator[None]:
+    """Hold a lock; the system frees it when the process ends, however it ends.
+
+    Args:
+        lock: acquired at once or not at all.
+        refusal: raised if another process holds the lock.
+
+    Raises:
+        OSError: the lock file cannot be written.
+    """
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise refusal from error
+    try:
+        yield
+    finally:
+        lock.release()

@@ -17,11 +17,12 @@ import torch
 from small_scenes import AIR, CUBE, small_scene
 
 from autdtorch.propagators import SimulatedPropagator, SteadyStateWarning, make_propagator
-from autdtorch.propagators.cache import ABANDONED, PARTIAL, SUFFIX, DiskCache, _with_checksum
+from autdtorch.propagators.cache import SUFFIX, DiskCache, _with_checksum
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Mesh, Obstacle, Sphere, VoxelMask
 from autdtorch.scene.scene import Medium, Scene
 from autdtorch.utils.digest import digest_of
+from autdtorch.utils.files import ABANDONED, PARTIAL
 
 SPACING = 2.5e-3
 CORNER = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
