@@ -15,14 +15,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from autdtorch.fdtd.grid import MIN_CELLS_PER_WAVELENGTH, make_grid
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
 from autdtorch.scene.scene import Medium, OverlapWarning, Scene
-
-Array = NDArray[np.float64]
+from autdtorch.utils.arrays import Array
 
 AIR = Medium(density=1.2, sound_speed=340.0)
 FREQUENCY = 40e3

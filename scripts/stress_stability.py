@@ -27,8 +27,7 @@ from tqdm import tqdm
 from autdtorch.fdtd.kernels.contract import Receivers, Sources, State
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, assemble, drive_signal, lock_in
-
-Array = NDArray[np.float64]
+from autdtorch.utils.arrays import Array
 
 FEWEST_PERIODS = 3 * RAMP_PERIODS
 """Of a driven run: in a fast obstacle a period has hundreds of steps."""

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias
+from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
+from autdtorch.utils.arrays import ComplexArray
 from autdtorch.utils.validation import ArrayLike, invalid, positive, real_tensor
-
-ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 
 
 class Layering(Protocol):

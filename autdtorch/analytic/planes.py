@@ -6,8 +6,9 @@ import numpy as np
 import torch
 
 from autdtorch.analytic.green import green
-from autdtorch.analytic.layers import ComplexArray, Layering, half_space, slab, vertical_wavenumber
+from autdtorch.analytic.layers import Layering, half_space, slab, vertical_wavenumber
 from autdtorch.analytic.sommerfeld import sommerfeld_integral
+from autdtorch.utils.arrays import ComplexArray
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,

@@ -10,7 +10,8 @@ import numpy.typing as npt
 from scipy.integrate import cumulative_trapezoid
 from scipy.special import hankel1, jv
 
-from autdtorch.analytic.layers import ComplexArray, vertical_wavenumber
+from autdtorch.analytic.layers import vertical_wavenumber
+from autdtorch.utils.arrays import ComplexArray
 
 Spectrum = Callable[[ComplexArray], ComplexArray]
 

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from autdtorch.fdtd.medium import ElementMedium
 from autdtorch.fdtd.stencil import Stencil, flat_offsets
 from autdtorch.fdtd.surface import PAIRS, VERTICES, CutElements, energy_matrix, uniform_bonds
+from autdtorch.utils.arrays import Array, Index
 
 logger = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 Shape = tuple[int, int, int]
 
 _SEALED = 0.1

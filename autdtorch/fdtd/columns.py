@@ -19,8 +19,7 @@ from autdtorch.fdtd.bonds import VaryingCells
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.kernels.contract import Columns
 from autdtorch.fdtd.stencil import OFFSETS, Stencil, flat_strides
-
-Index = NDArray[np.int64]
+from autdtorch.utils.arrays import Index
 
 _ALIKE = 1e-6
 """Differences from scaled air below this, relative to a face's weight, are rounding."""

@@ -16,11 +16,11 @@ from autdtorch.fdtd.placement import grid_offset
 from autdtorch.fdtd.points import footprint
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.arrays import Array
 from autdtorch.utils.validation import invalid, positive
 
 logger = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 MIN_CELLS_PER_WAVELENGTH = 3.0
 """Coarser grids are refused."""

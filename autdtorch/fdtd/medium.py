@@ -16,11 +16,11 @@ from autdtorch.fdtd.stencil import Stencil
 from autdtorch.fdtd.surface import FAR, LATTICE, CutElements, Materials, cut_elements
 from autdtorch.scene.obstacles import Box, Obstacle
 from autdtorch.scene.scene import Medium, Scene
+from autdtorch.utils.arrays import Array
 from autdtorch.utils.progress import show_progress
 
 logger = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 RIGID = 1e5
 """Density, relative to air, that rigid obstacles are assembled with; what it leaves open is then sealed."""

@@ -17,13 +17,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.arrays import Array
 from autdtorch.utils.validation import LENGTH_TOLERANCE
-
-Array = NDArray[np.float64]
 
 _ALONG = 1 - 1e-9
 """Cosine of the angle between a face's normal and an axis from which on the face lies along the grid."""

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy.linalg import solve
 from scipy.sparse import csr_array
 
-Array = NDArray[np.float64]
+from autdtorch.utils.arrays import Array
+
 Shape = tuple[int, int, int]
 
 FOOTPRINTS = (4, 6, 8, 10)

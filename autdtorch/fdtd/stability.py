@@ -19,10 +19,10 @@ from scipy.linalg import eigvalsh_tridiagonal
 from scipy.sparse import csr_array
 
 from autdtorch.fdtd.stencil import Stencil, flat_offsets
+from autdtorch.utils.arrays import Array
 
 logger = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 CLOSE = 1.03
 """A bound within this factor of a value that is reached is taken as it is: 1.5 % of the time step."""

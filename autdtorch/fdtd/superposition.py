@@ -7,12 +7,10 @@ from typing import Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from autdtorch.utils.arrays import AnyArray
 from autdtorch.utils.threads import spread
 from autdtorch.utils.validation import LENGTH_TOLERANCE
-
-Array = NDArray[np.floating]
 
 _PAIRS = 100_000
 """Pairs of a point and a source in a piece of work: less than a millisecond."""
@@ -71,10 +69,10 @@ def superposition(
     return torch.from_numpy((real + 1j * imaginary).T)
 
 
-def _rows(columns: Array) -> Array:
+def _rows(columns: AnyArray) -> AnyArray:
     return np.ascontiguousarray(columns.T)
 
 
-def _filled(rows: Array, size: int, mode: Literal["edge", "constant"]) -> Array:
+def _filled(rows: AnyArray, size: int, mode: Literal["edge", "constant"]) -> AnyArray:
     """Fill rows (..., N) up to a multiple of `size`, by their last entry or by zeros."""
     return np.pad(rows, (*((0, 0),) * (rows.ndim - 1), (0, -rows.shape[-1] % size)), mode)

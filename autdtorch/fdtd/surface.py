@@ -31,8 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from autdtorch.fdtd.stencil import Stencil
-
-Array = NDArray[np.float64]
+from autdtorch.utils.arrays import Array
 
 SUBCELLS = 4
 """Sub-cells an edge of a cut element, on which volumes are summed."""

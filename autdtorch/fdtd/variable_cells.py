@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from autdtorch.fdtd.bonds import VaryingCells, varying_cells
 from autdtorch.fdtd.grid import Grid
@@ -17,9 +16,7 @@ from autdtorch.fdtd.stencil import Stencil
 from autdtorch.fdtd.stepping import Assembly, air_stencil, assembly_of
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.scene import Scene, with_obstacles
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from autdtorch.utils.arrays import Array, Index
 
 _SMALL = 1e-4
 """Relative step of the central differences: what they miss and the rounding in them are about 1e-8."""

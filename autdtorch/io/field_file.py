@@ -9,13 +9,13 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, TypeAlias
+from typing import BinaryIO, NamedTuple
 
 import h5py
 import numpy as np
-import numpy.typing as npt
 import torch
 
+from autdtorch.utils.arrays import Array
 from autdtorch.utils.files import replacing
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
@@ -26,8 +26,6 @@ from autdtorch.utils.validation import (
     positive,
     real_tensor,
 )
-
-Array: TypeAlias = npt.NDArray[np.float64]
 
 _HDF5 = (".h5", ".hdf5")
 

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
-
 import numpy as np
-import numpy.typing as npt
 
 from autdtorch.scene.drive import phases_of, validate_single_drive
+from autdtorch.utils.arrays import Array
 from autdtorch.utils.validation import ArrayLike, Vector, magnitude_tensor, real_tensor
-
-Array: TypeAlias = npt.NDArray[np.float64]
 
 MM = 1e3  # lengths are drawn in millimetres
 

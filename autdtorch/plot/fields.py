@@ -12,7 +12,7 @@ from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
-from autdtorch.plot.drawing import FLOOR, MM, PRESSURE_MAP, Array, in_decibels, plane_magnitude
+from autdtorch.plot.drawing import FLOOR, MM, PRESSURE_MAP, in_decibels, plane_magnitude
 from autdtorch.plot.style import (
     TICK_SIZE,
     ByMethod,
@@ -27,6 +27,7 @@ from autdtorch.plot.style import (
 )
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Obstacle
+from autdtorch.utils.arrays import Array
 from autdtorch.utils.validation import ArrayLike, boolean, members, points_tensor, require_kind
 
 _AXIS_TOLERANCE = 1e-12  # by which a unit vector along x, y or z may miss length 1 in that coordinate

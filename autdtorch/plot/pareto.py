@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from autdtorch.plot.drawing import Array
 from autdtorch.plot.style import (
     TICK_SIZE,
     ByMethod,
@@ -26,6 +25,7 @@ from autdtorch.plot.style import (
     require_scenes,
     styled,
 )
+from autdtorch.utils.arrays import Array
 from autdtorch.utils.validation import ArrayLike, boolean, invalid, members, require_kind
 
 _FRONT: dict[str, Any] = {"color": "0.8", "linewidth": 4.0, "solid_joinstyle": "miter", "zorder": 1.0}

@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator
 
-from autdtorch.plot.drawing import Array
 from autdtorch.plot.style import (
     TICK_SIZE,
     ByMethod,
@@ -24,6 +23,7 @@ from autdtorch.plot.style import (
     require_scenes,
     styled,
 )
+from autdtorch.utils.arrays import Array
 from autdtorch.utils.validation import ArrayLike, require_kind
 
 OVERHEAD = 2.0

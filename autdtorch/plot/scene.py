@@ -23,13 +23,13 @@ from autdtorch.plot.drawing import (
     PLANE_COLOUR,
     SHARP_ANGLE,
     TRANSDUCER_COLOUR,
-    Array,
     clipped,
     single_drive_phases,
 )
 from autdtorch.plot.style import TICK_SIZE, new_figure, styled
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.arrays import Array
 from autdtorch.utils.validation import ArrayLike, Vector, require_kind
 
 _TICKS = 5  # along the longest side; on a short one more would run into each other

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from autdtorch.methods import label_of as label_of
-from autdtorch.plot.drawing import Array
+from autdtorch.utils.arrays import Array
 from autdtorch.utils.validation import ArrayLike, invalid, real_tensor, require_kind
 
 ByMethod: TypeAlias = Mapping[str, ArrayLike]

@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from autdtorch.plot.drawing import Array
 from autdtorch.plot.style import (
     TICK_SIZE,
     ByMethod,
@@ -29,6 +28,7 @@ from autdtorch.plot.style import (
     styled,
     wrapped,
 )
+from autdtorch.utils.arrays import Array
 from autdtorch.utils.validation import finite_number, require_kind
 
 # The first is broad and pale, so that what lies on it is seen.

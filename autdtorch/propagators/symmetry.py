@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from autdtorch.fdtd.bonds import VaryingCells
@@ -22,10 +21,8 @@ from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.stencil import OFFSETS
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.scene.arrays import Nodes
+from autdtorch.utils.arrays import Array, Index
 from autdtorch.utils.validation import LENGTH_TOLERANCE
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _ALIKE = 1e-6
 """Rows that differ by less, relative to a face's weight, differ by rounding: as for places `LENGTH_TOLERANCE`

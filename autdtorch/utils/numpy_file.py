@@ -8,13 +8,12 @@ import tokenize
 import zipfile
 import zlib
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.lib import format as npy
-from numpy.typing import NDArray
 
-Array: TypeAlias = NDArray[Any]
+from autdtorch.utils.arrays import AnyArray
 
 _LARGEST = 2**30  # bytes in a .npz file: a small one can hold many zeros
 _LONGEST_HEADER = 1000  # bytes; what NumPy writes for plain arrays has 128
@@ -38,7 +37,7 @@ _DAMAGE = (
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
 
-def read_arrays(path: str | os.PathLike[str]) -> dict[str, Array]:
+def read_arrays(path: str | os.PathLike[str]) -> dict[str, AnyArray]:
     """Read the arrays of a .npz file by name; a .npy file holds one without a name.
 
     Raises:
@@ -61,12 +60,12 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, Array]:
         raise ValueError(f"{os.fspath(path)}: {error}; must hold plain NumPy arrays") from error
 
 
-def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Array:
+def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> AnyArray:
     with archive.open(member) as file:
         return _read(file, member.file_size)
 
 
-def _read(file: Any, size: int) -> Array:
+def _read(file: Any, size: int) -> AnyArray:
     """Read the array of a file of `size` bytes."""
     version = npy.read_magic(file)
     if version not in _HEADERS:

@@ -29,9 +29,8 @@ from autdtorch.fdtd.kernels.cpu_workers import (
     wait_for,
     yield_address,
 )
+from autdtorch.utils.arrays import AnyArray
 from autdtorch.utils.threads import thread_count
-
-Array = NDArray[np.generic]
 
 _CHUNK_CELLS, _CHUNK_PLANES = 200_000, 32
 """Fewest cells and planes of a chunk: what a second thread is worth, and the sums at its ends."""
@@ -180,7 +179,7 @@ def _cuts(shape: tuple[int, ...]) -> NDArray[np.int64]:
     return np.linspace(1, 1 + planes, chunks + 1).astype(np.int64)
 
 
-def _room(chunks: int, shape: torch.Size, layer_cells: int, dtype: type) -> tuple[Array, ...]:
+def _room(chunks: int, shape: torch.Size, layer_cells: int, dtype: type) -> tuple[AnyArray, ...]:
     """What a chunk keeps during a step, see `sweep_planes`."""
     _, ny, nz = shape
     lanes = 2 * (layer_cells + 2)
@@ -189,12 +188,12 @@ def _room(chunks: int, shape: torch.Size, layer_cells: int, dtype: type) -> tupl
     return tuple(np.zeros((chunks, size), dtype) for size in sizes)
 
 
-def _columns(c: Coefficients, columns: Columns) -> tuple[Array, ...]:
+def _columns(c: Coefficients, columns: Columns) -> tuple[AnyArray, ...]:
     count = len(columns.index)
     return columns.index.numpy(), columns.offset.numpy(), columns.weight.numpy(), *rows_profile(c, count)
 
 
-def _varying_cells(c: Coefficients, strides: NDArray[np.int64]) -> tuple[Array, ...]:
+def _varying_cells(c: Coefficients, strides: NDArray[np.int64]) -> tuple[AnyArray, ...]:
     """Their indices, weights, the offsets of these, and what the layers need to know about them."""
     offsets = np.indices((3, 3, 3)).reshape(3, -1).T - 1
     air = np.array((c.center, c.face, c.edge, c.corner))[np.abs(offsets).sum(axis=1)]

@@ -10,13 +10,11 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from autdtorch.fdtd.kernels.contract import Coefficients, Layer
+from autdtorch.utils.arrays import AnyArray
 
-Array = NDArray[np.floating]
-
-Profile = tuple[Array, Array, Array, Array]
+Profile = tuple[AnyArray, AnyArray, AnyArray, AnyArray]
 """b and a of the half cells, then b and a of the cells, each as often as `stretch` meets it."""
 
 
@@ -29,7 +27,7 @@ def rows_profile(c: Coefficients, row: int) -> Profile:
     return b_half, a_half, b_cell, a_cell
 
 
-def plane_profiles(c: Coefficients, shape: torch.Size) -> tuple[Array, ...]:
+def plane_profiles(c: Coefficients, shape: torch.Size) -> tuple[AnyArray, ...]:
     """Profiles across y, z, and y for the lanes, of both layers each."""
     _, ny, nz = shape
     decay, gain = c.layer_decay.numpy(), c.layer_gain.numpy()
@@ -84,7 +82,7 @@ class Memory:
         for here, there, sign in self._pairs():
             there[...] = sign * here
 
-    def _pairs(self) -> Iterator[tuple[Array, Array, int]]:
+    def _pairs(self) -> Iterator[tuple[AnyArray, AnyArray, int]]:
         """Views of parts of the arrays and of the state; psi of upper layers changes its sign."""
         for half, number in ((True, 2), (False, 3)):
             y, z, yz = self.arrays[number], self.arrays[number + 2], self.arrays[number + 4]

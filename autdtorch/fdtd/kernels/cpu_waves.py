@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from autdtorch.fdtd.kernels.compiled import INNER, entry
 
-Array = NDArray[np.floating]
-
 LANES = 64
 """Places in a block; their waves stay in the first-level cache."""
 

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from autdtorch.plot.drawing import EDGE_COLOUR, FLOOR, MM, PLANE_COLOUR, PRESSURE_MAP, Array
+from autdtorch.plot.drawing import EDGE_COLOUR, FLOOR, MM, PLANE_COLOUR, PRESSURE_MAP
 from autdtorch.plot.view3d.scene import FIELD_BAR, add_bar
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.arrays import Array
 from autdtorch.utils.neighbours import distances
 
 if TYPE_CHECKING:

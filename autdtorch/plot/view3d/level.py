@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from autdtorch.plot.drawing import Array, plane_magnitude
+from autdtorch.plot.drawing import plane_magnitude
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.arrays import Array
 from autdtorch.utils.validation import ArrayLike, magnitude_tensor, positive
 
 

@@ -17,12 +17,12 @@ from autdtorch.plot.drawing import (
     PHASE_MAP,
     SHARP_ANGLE,
     TRANSDUCER_COLOUR,
-    Array,
     single_drive_phases,
 )
 from autdtorch.scene.drive import amplitudes_of
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.arrays import Array
 from autdtorch.utils.neighbours import nearest_other
 from autdtorch.utils.validation import ArrayLike, Vector
 
