@@ -36,7 +36,7 @@ from .scene.geometry import Plane, circle_points
 from .scene.medium import Medium
 from .scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
 from .scene.scene import OverlapWarning, ScaleWarning, Scene
-from .study.results import load_results
+from .study.results_file import load_results
 from .study.sweeps import Sweep, collect_results
 
 __all__ = [

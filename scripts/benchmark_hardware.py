@@ -20,7 +20,7 @@ from paper_objectives import DOCS, paper_objectives
 import autdtorch as at
 from autdtorch import hardware
 from autdtorch.objectives.perturbations import random_rms
-from autdtorch.study.intervals import bootstrap
+from autdtorch.study.statistics import bootstrap
 
 COMMAND = "python scripts/benchmark_hardware.py"
 

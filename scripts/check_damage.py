@@ -29,7 +29,8 @@ import autdtorch as at
 from autdtorch import hardware
 from autdtorch.methods.base import Solution
 from autdtorch.study.folder import PREVIOUS
-from autdtorch.study.results import PROVENANCE_FILE, RESULTS_FILE
+from autdtorch.study.provenance import PROVENANCE_FILE
+from autdtorch.study.results_file import RESULTS_FILE
 from autdtorch.study.run import run_study
 from autdtorch.study.trial_file import TRIALS_FILE
 from autdtorch.utils.json_lines import SET_ASIDE

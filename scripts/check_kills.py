@@ -22,7 +22,7 @@ from pathlib import Path
 import torch
 
 import autdtorch as at
-from autdtorch.study.results import load_results
+from autdtorch.study.results_file import load_results
 
 SCRIPTS = Path(__file__).parent
 STUDY = SCRIPTS.parent / "tests" / "slow_study.py"  # with trials that take a while

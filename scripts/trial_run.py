@@ -22,7 +22,7 @@ import autdtorch as at
 from autdtorch import hardware
 from autdtorch.hardware.sensors.sensor import checked_reading
 from autdtorch.methods.base import Solution
-from autdtorch.study.report.trial_report import write_hardware_report
+from autdtorch.study.report.hardware_report import write_hardware_report
 from autdtorch.utils.progress import Progress, show_progress
 
 SCENES = Path(__file__).parents[1] / "configs" / "scene"

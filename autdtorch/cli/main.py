@@ -231,8 +231,8 @@ def _study(config: DictConfig, sweep: Path | None) -> None:
 
 
 def _collect(arguments: list[str]) -> None:
-    from autdtorch.study.report.pages import write_report
-    from autdtorch.study.report.summary import SUMMARY_FILE, save_summary
+    from autdtorch.study.report.study_report import write_report
+    from autdtorch.study.report.summary_table import SUMMARY_FILE, save_summary
     from autdtorch.study.sweeps import collect_results
 
     if {"-h", "--help"} & set(arguments):
@@ -342,7 +342,7 @@ def _section(settings: Mapping[str, Any], key: str) -> dict[str, Any]:
 def _show(results: StudyResult, scenes: Mapping[str, Scene], folder: Path, single: bool) -> None:
     """Print the results' table; draw the plane of a single run, write the report of an experiment."""
     from autdtorch.plot.fields import plot_plane
-    from autdtorch.study.report.pages import write_report
+    from autdtorch.study.report.study_report import write_report
 
     lines = _table_lines(results)
     # A relative path is shorter, and the same on every machine.

@@ -13,17 +13,9 @@ from typing import TypeVar
 from filelock import FileLock
 
 from autdtorch.scene.scene import Scene
-from autdtorch.study.results import (
-    PROVENANCE_FILE,
-    RESULTS_FILE,
-    Provenance,
-    SceneResult,
-    StudyResult,
-    load_provenance,
-    load_results,
-    save_provenance,
-    save_results,
-)
+from autdtorch.study.provenance import PROVENANCE_FILE, Provenance, load_provenance, save_provenance
+from autdtorch.study.results import SceneResult, StudyResult
+from autdtorch.study.results_file import RESULTS_FILE, load_results, save_results
 from autdtorch.study.trial_file import TRIALS_FILE, TrialFile
 from autdtorch.utils.files import held
 

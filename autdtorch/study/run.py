@@ -19,14 +19,8 @@ from autdtorch.objectives.simulated import Objective, SimulatedObjective
 from autdtorch.propagators import CACHE_VARIABLE, Propagator, SimulatedPropagator, make_propagator
 from autdtorch.scene.scene import Scene
 from autdtorch.study.folder import StudyFolder, open_folder
-from autdtorch.study.results import (
-    MethodResult,
-    SceneResult,
-    Simulation,
-    StudyResult,
-    median_trial,
-    provenance_now,
-)
+from autdtorch.study.provenance import provenance_now
+from autdtorch.study.results import MethodResult, SceneResult, Simulation, StudyResult, median_trial
 from autdtorch.study.trial_file import TrialFile
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.neighbours import nearest

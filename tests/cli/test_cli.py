@@ -19,7 +19,7 @@ from autdtorch.cli.config_files import CONFIGS
 from autdtorch.cli.method_section import load_method
 from autdtorch.io.scene_file import load_scene
 from autdtorch.propagators import FreeSpacePropagator, make_propagator
-from autdtorch.study.results import load_results
+from autdtorch.study.results_file import load_results
 
 Run = Callable[..., int]
 
@@ -327,7 +327,7 @@ def test_ones_own_scene_file(run: Run, tmp_path: Path, capsys: pytest.CaptureFix
 def test_an_experiment_ends_with_its_report(
     run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("autdtorch.study.report.pages.rendering_problem", lambda: "not tried")
+    monkeypatch.setattr("autdtorch.study.report.study_report.rendering_problem", lambda: "not tried")
     command = (
         "experiment=paper",
         "~methods.bayes_opt",

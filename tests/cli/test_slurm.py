@@ -15,7 +15,7 @@ from hydra import compose, initialize_config_dir
 from one_node_slurm import missing_programs, one_node_slurm
 
 from autdtorch.cli.main import CONFIGS
-from autdtorch.study.results import load_results
+from autdtorch.study.results_file import load_results
 
 Run = Callable[..., int]
 

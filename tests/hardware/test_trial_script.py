@@ -23,7 +23,7 @@ from autdtorch.io.drive_file import load_drive
 from autdtorch.io.scene_file import load_scene
 from autdtorch.methods.gabs import gabs
 from autdtorch.scene.arrays import TransducerArray
-from autdtorch.study.report.trial_report import compare
+from autdtorch.study.report.hardware_report import compare
 
 SCENE = """
 name: two

@@ -12,8 +12,8 @@ from autdtorch.io.scene_file import load_scene
 from autdtorch.methods.base import Solution, joined
 from autdtorch.methods.gabs import gabs
 from autdtorch.methods.lssg import lssg
-from autdtorch.study.report.summary import save_summary
-from autdtorch.study.results import RESULTS_FILE
+from autdtorch.study.report.summary_table import save_summary
+from autdtorch.study.results_file import RESULTS_FILE
 from autdtorch.study.run import run_study
 from autdtorch.study.sweeps import Sweep, collect_results
 

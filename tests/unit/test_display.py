@@ -13,7 +13,8 @@ from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.plot.style import ShownFigure
 from autdtorch.propagators import make_propagator
 from autdtorch.scene.scene import Scene
-from autdtorch.study.results import MethodResult, Provenance, SceneResult, Simulation, StudyResult
+from autdtorch.study.provenance import Provenance
+from autdtorch.study.results import MethodResult, SceneResult, Simulation, StudyResult
 
 
 @pytest.fixture

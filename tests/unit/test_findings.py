@@ -8,8 +8,8 @@ import torch
 
 from autdtorch.methods.base import Solution
 from autdtorch.objectives.metrics import FocusMetrics
-from autdtorch.study.findings import evaluations_to, find
 from autdtorch.study.results import MethodResult
+from autdtorch.study.statistics import bound_gap, evaluations_to
 
 HISTORY = [
     [1.0, 2.0, 9.0, 9.5],
@@ -46,20 +46,20 @@ def test_what_pads_the_history_of_a_trial_that_ended_is_no_evaluation() -> None:
 
 def test_the_gap_is_what_the_median_score_lacks_to_the_bound() -> None:
     # Scores 1 to 9, of median 5: the gap to 10 is a half, its ends are those of the score turned around.
-    finding = find(method_result([[float(score)] for score in range(1, 10)]), 10.0)
+    finding = bound_gap(method_result([[float(score)] for score in range(1, 10)]), 10.0)
     assert finding.score.value == 5.0
     assert finding.gap.value == 0.5
     assert finding.gap.low == pytest.approx(1 - finding.score.high / 10)
     assert finding.gap.high == pytest.approx(1 - finding.score.low / 10)
     assert 0 < finding.gap.low < 0.5 < finding.gap.high < 1
-    assert finding.evaluations_near.tolist() == [math.inf] * 8 + [1]
+    assert finding.evaluations.tolist() == [math.inf] * 8 + [1]
 
 
 def test_a_single_trial_has_a_gap_without_interval() -> None:
-    finding = find(method_result([[4.0, 8.0]]), 10.0)
+    finding = bound_gap(method_result([[4.0, 8.0]]), 10.0)
     assert finding.gap.value == pytest.approx(0.2)
     assert math.isinf(finding.gap.low)
 
 
 def test_where_nothing_can_be_heard_there_is_no_gap() -> None:
-    assert find(method_result([[0.0, 0.0]]), 0.0).gap.value == 0.0
+    assert bound_gap(method_result([[0.0, 0.0]]), 0.0).gap.value == 0.0

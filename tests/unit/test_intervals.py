@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy import stats
 
-from autdtorch.study.intervals import CONFIDENCE, FEWEST_TRIALS, Interval, bootstrap, share_interval
+from autdtorch.study.statistics import CONFIDENCE, FEWEST_TRIALS, Interval, bootstrap, share_interval
 
 DRAWS = 200
 # Of 200 draws, each of which covers the truth with 95 %, fewer or more than these do in 1 of 1000 cases.
@@ -17,7 +17,7 @@ LEAST, MOST = (int(stats.binom.ppf(tail, DRAWS, CONFIDENCE)) for tail in (1e-3, 
 
 @pytest.mark.parametrize("trials", [FEWEST_TRIALS, 30])
 def test_intervals_cover_the_truth_as_often_as_they_say(trials: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("autdtorch.study.intervals._RESAMPLES", 999)  # enough, and quick
+    monkeypatch.setattr("autdtorch.study.statistics._RESAMPLES", 999)  # enough, and quick
     generator = torch.Generator().manual_seed(3)
     covered = dict.fromkeys(("mean", "median", "difference", "ratio"), 0)
     for _ in range(DRAWS):

@@ -11,14 +11,14 @@ import pytest
 import torch
 from small_scenes import AIR, CUBE, small_scene
 
-import autdtorch.study.report.pages
+import autdtorch.study.report.study_report
 from autdtorch.methods.bound import focus_bound
 from autdtorch.methods.gabs import gabs
 from autdtorch.methods.lssg import lssg
 from autdtorch.plot.trials import plot_convergence
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.scene import Box, Scene
-from autdtorch.study.report.pages import HTML_FILE, write_report
+from autdtorch.study.report.study_report import HTML_FILE, write_report
 from autdtorch.study.report.tables import claims, finding_rows, findings
 from autdtorch.study.results import StudyResult, summary_rows
 from autdtorch.study.run import run_study
@@ -41,7 +41,9 @@ def scene(plane: Plane | None = PLANE, obstacles: tuple[Box, ...] = ()) -> Scene
 def without_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
     """3D pictures take seconds, and are tested where they are made."""
     monkeypatch.setattr(
-        autdtorch.study.report.pages, "rendering_problem", lambda: "3D rendering is not available: no driver"
+        autdtorch.study.report.study_report,
+        "rendering_problem",
+        lambda: "3D rendering is not available: no driver",
     )
 
 
@@ -170,7 +172,7 @@ def test_the_gradient_is_a_line_to_compare_with(tmp_path: Path, monkeypatch: pyt
         drawn.extend(arguments)
         return plot_convergence(*arguments)
 
-    monkeypatch.setattr(autdtorch.study.report.pages, "plot_convergence", record)
+    monkeypatch.setattr(autdtorch.study.report.study_report, "plot_convergence", record)
     write_report(with_bound(results, 2 * score), {"a": scene()}, tmp_path, "autdtorch")
     row = finding_rows(with_bound(results, 2 * score))[-1]
     assert (row[1], row[3], row[4], row[5]) == ("gradient ascent", "50.0", "-", "-")

@@ -22,7 +22,7 @@ from autdtorch.propagators import FreeSpacePropagator, FullPropagator, Run, Stea
 from autdtorch.scene.arrays import Nodes
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.scene import Box, Scene
-from autdtorch.study.results import RESULTS_FILE, load_results
+from autdtorch.study.results_file import RESULTS_FILE, load_results
 from autdtorch.study.run import run_study
 from autdtorch.study.trial_file import TRIALS_FILE
 
@@ -150,7 +150,7 @@ def test_changed_source_is_computed_again(
 ) -> None:
     study = functools.partial(run_study, scenes, METHODS, solver=FREE_SPACE, folder=tmp_path, config="a: 1")
     study()
-    monkeypatch.setattr("autdtorch.study.results.source_digest", lambda: "changed")
+    monkeypatch.setattr("autdtorch.study.provenance.source_digest", lambda: "changed")
     study()
     assert count_runs == ["second", "first"] * 2
 
@@ -182,7 +182,7 @@ def test_killed_while_writing_the_last_complete_file_stays(
     scenes: dict[str, Scene], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     study = functools.partial(run_study, scenes, METHODS, solver=FREE_SPACE, folder=tmp_path, config="a: 1")
-    write_scene = autdtorch.study.results._write_scene
+    write_scene = autdtorch.study.results_file._write_scene
     complete: list[bytes] = []
     calls = itertools.count(1)
 
@@ -192,7 +192,7 @@ def test_killed_while_writing_the_last_complete_file_stays(
             raise KeyboardInterrupt
         write_scene(group, scene)
 
-    monkeypatch.setattr("autdtorch.study.results._write_scene", killed)
+    monkeypatch.setattr("autdtorch.study.results_file._write_scene", killed)
     with pytest.raises(KeyboardInterrupt):
         study()
     assert [(tmp_path / RESULTS_FILE).read_bytes()] == complete

@@ -15,7 +15,9 @@ from autdtorch.objectives.simulated import Objective
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.scene import Scene
 from autdtorch.study.folder import MATRICES_FOLDER, PREVIOUS
-from autdtorch.study.results import PROVENANCE_FILE, RESULTS_FILE, StudyResult, load_provenance, load_results
+from autdtorch.study.provenance import PROVENANCE_FILE, load_provenance
+from autdtorch.study.results import StudyResult
+from autdtorch.study.results_file import RESULTS_FILE, load_results
 from autdtorch.study.run import run_study
 from autdtorch.study.trial_file import TRIALS_FILE
 from autdtorch.utils.json_lines import SET_ASIDE

@@ -10,10 +10,9 @@ import numpy as np
 import torch
 
 from autdtorch.plot.style import label_of
-from autdtorch.study.claims import CLAIMS, judge_claims
-from autdtorch.study.findings import NEAR_BOUND, find
-from autdtorch.study.intervals import FEWEST_TRIALS
+from autdtorch.study.report.claims import CLAIMS, judge_claims
 from autdtorch.study.results import MethodResult, SceneResult, StudyResult, summary_rows
+from autdtorch.study.statistics import FEWEST_TRIALS, NEAR_BOUND, bound_gap
 
 BASELINE = "gradient_ascent"
 """The method that is no competitor but a line to compare with: it knows the transfer matrix."""
@@ -70,10 +69,10 @@ def finding_rows(results: StudyResult) -> list[list[str]]:
 
 
 def _finding_cells(name: str, method: MethodResult, bound: float) -> list[str]:
-    finding = find(method, bound)
+    finding = bound_gap(method, bound)
     gap = f"{finding.gap.mapped(lambda share: 100 * share):.1f}"
     evaluations = f"{method.solution.evaluations.double().mean():.0f}"
-    near = _median_of_reached(finding.evaluations_near)
+    near = _median_of_reached(finding.evaluations)
     if is_baseline(name):
         evaluations = near = _NO_NUMBER
     return [str(finding.score), gap, evaluations, near, f"{method.seconds.median():.2g}"]

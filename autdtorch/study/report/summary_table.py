@@ -7,8 +7,8 @@ import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from autdtorch.study.findings import find
 from autdtorch.study.results import MethodResult, StudyResult
+from autdtorch.study.statistics import bound_gap
 from autdtorch.study.sweeps import Settings
 from autdtorch.utils.files import replacing
 
@@ -16,10 +16,10 @@ SUMMARY_FILE = "summary.csv"
 
 _COLUMNS: dict[str, Callable[[MethodResult, float], float | None]] = {
     "trials": lambda method, _: method.trials,
-    "median score [Pa]": lambda method, bound: find(method, bound).score.value,
+    "median score [Pa]": lambda method, bound: bound_gap(method, bound).score.value,
     "best score [Pa]": lambda method, _: float(method.solution.score.max()),
     "bound [Pa]": lambda _, bound: bound,
-    "gap to the bound": lambda method, bound: find(method, bound).gap.value,
+    "gap to the bound": lambda method, bound: bound_gap(method, bound).gap.value,
     "mean of the foci [Pa]": lambda method, _: float(method.metrics.mean.mean()),
     "std among the foci [Pa]": lambda method, _: float(method.metrics.std.mean()),
     "area a focus [m^2]": lambda method, _: (

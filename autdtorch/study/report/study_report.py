@@ -16,9 +16,8 @@ from autdtorch.plot.style import label_of
 from autdtorch.plot.trials import plot_convergence, plot_trials
 from autdtorch.plot.view3d import rendering_problem, view3d
 from autdtorch.scene.scene import Scene
-from autdtorch.study.claims import BO, GABS
-from autdtorch.study.findings import NEAR_BOUND, find
-from autdtorch.study.report.html import as_page
+from autdtorch.study.report.claims import BO, GABS
+from autdtorch.study.report.document import as_page
 from autdtorch.study.report.tables import (
     NEAR,
     claims,
@@ -31,7 +30,9 @@ from autdtorch.study.report.tables import (
     summary,
     table,
 )
-from autdtorch.study.results import RESULTS_FILE, MethodResult, SceneResult, StudyResult
+from autdtorch.study.results import MethodResult, SceneResult, StudyResult
+from autdtorch.study.results_file import RESULTS_FILE
+from autdtorch.study.statistics import NEAR_BOUND, bound_gap
 from autdtorch.study.trial_file import TRIALS_FILE
 
 REPORT_FILE = "report.md"
@@ -265,7 +266,7 @@ def _metric(
 def _cost_figure(results: StudyResult, folder: Path) -> str:
     points = {
         scene: {
-            name: [(float(method.seconds.median()), 100 * (1 - find(method, found.bound).gap.value))]
+            name: [(float(method.seconds.median()), 100 * (1 - bound_gap(method, found.bound).gap.value))]
             for name, method in _competitors(found.methods).items()
         }
         for scene, found in results.scenes.items()

@@ -1,0 +1,154 @@
+"""Statistics over trials: confidence intervals, and the gap of a method to the certified bound."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from scipy import stats
+
+from autdtorch.methods.base import Solution
+from autdtorch.study.results import MethodResult
+
+CONFIDENCE = 0.95
+
+FEWEST_TRIALS = 6
+"""Fewest trials for an interval: of 5, even the full range covers the median with only 1 - 2 / 2^5 < 95 %."""
+
+NEAR_BOUND = 0.9
+"""A score of at least this share of the bound is near the bound."""
+
+_RESAMPLES = 4999
+_SEED = 0
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A number with its confidence interval; the ends are infinite if the interval is unknown."""
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        """Return "1.23 [1.10, 1.35]", or the number alone if it is exact or its interval unknown."""
+        if self.low == self.high and self.value.is_integer():
+            return f"{self:.0f}"
+        shown = (self.value, self.low, self.high) if self._has_ends else (self.value,)
+        largest = max(abs(number) for number in shown)
+        digits = max(0, 2 - math.floor(math.log10(largest))) if largest else 0
+        return f"{self:.{digits}f}"
+
+    def __format__(self, form: str) -> str:
+        """Return the text of `str`, with each number in the given form."""
+        if not form:
+            return str(self)
+        value, low, high = (format(number, form) for number in (self.value, self.low, self.high))
+        return f"{value} [{low}, {high}]" if self._has_ends else value
+
+    @property
+    def _has_ends(self) -> bool:
+        return self.low < self.high < math.inf
+
+    @classmethod
+    def exact(cls, value: float) -> Interval:
+        """Return a number without uncertainty."""
+        return cls(value, value, value)
+
+    @classmethod
+    def unknown(cls, value: float) -> Interval:
+        """Return a number of unknown uncertainty."""
+        return cls(value, -math.inf, math.inf)
+
+    def mapped(self, function: Callable[[float], float]) -> Interval:
+        """Return the interval of a monotone function of the number."""
+        low, high = sorted((function(self.low), function(self.high)))
+        return Interval(function(self.value), low, high)
+
+
+def bootstrap(
+    *samples: torch.Tensor | float,
+    average: Callable[..., Any] = np.mean,
+    combine: Callable[..., Any] = lambda average: average,
+) -> Interval:
+    """Return an average over trials, or a combination of averages, with its bootstrap interval.
+
+    The interval is the expanded percentile interval of Hesterberg, "What teachers should know about the
+    bootstrap", The American Statistician 69 (2015) 371, which is not too narrow for few trials. Equal data
+    give equal intervals.
+
+    Args:
+        samples: values of independent trials (T,), resampled independently; a plain number is exact. If a
+            sample has fewer than `FEWEST_TRIALS`, the interval is unknown.
+        average: NumPy's mean or median.
+        combine: elementwise function of the averages, one argument for each sample.
+    """
+    drawn = [sample.numpy() for sample in samples if isinstance(sample, torch.Tensor)]
+
+    def statistic(*resampled: Any, axis: int = -1) -> Any:
+        averages = iter([average(values, axis=axis) for values in resampled])
+        return combine(*(next(averages) if isinstance(part, torch.Tensor) else part for part in samples))
+
+    value = float(statistic(*drawn))
+    if not drawn:
+        return Interval.exact(value)
+    trials = min(len(values) for values in drawn)
+    if trials < FEWEST_TRIALS:
+        return Interval.unknown(value)
+    student = stats.t.ppf((1 + CONFIDENCE) / 2, trials - 1)
+    found = stats.bootstrap(
+        drawn,
+        statistic,
+        n_resamples=_RESAMPLES,
+        vectorized=True,
+        confidence_level=1 - 2 * stats.norm.sf(math.sqrt(trials / (trials - 1)) * student),
+        method="percentile",
+        rng=np.random.default_rng(_SEED),
+    ).confidence_interval
+    return Interval(value, float(found.low), float(found.high))
+
+
+def share_interval(successes: torch.Tensor) -> Interval:
+    """Return the share of successful trials (T,) with Wilson's interval.
+
+    The bootstrap would take a share of 0 or 1 as certain.
+    """
+    found = stats.binomtest(int(successes.sum()), len(successes)).proportion_ci(CONFIDENCE, method="wilson")
+    return Interval(float(successes.double().mean()), float(found.low), float(found.high))
+
+
+@dataclass(frozen=True, eq=False)
+class BoundGap:
+    """The distance of a method's score from the certified bound.
+
+    Attributes:
+        score: median over the trials [Pa].
+        gap: 1 - score / bound.
+        evaluations: evaluations of each trial until it was near the bound (T,), float64; inf if it never was.
+    """
+
+    score: Interval
+    gap: Interval
+    evaluations: torch.Tensor
+
+
+def bound_gap(method: MethodResult, bound: float) -> BoundGap:
+    """Return the gap of a method to the upper bound on the score [Pa], >= 0."""
+    score = bootstrap(method.solution.score, average=np.median)
+    gap = score.mapped(lambda value: 1 - value / bound if bound > 0 else 0.0)
+    return BoundGap(score, gap, evaluations_to(method.solution, NEAR_BOUND * bound))
+
+
+def evaluations_to(solution: Solution, score: float) -> torch.Tensor:
+    """Return the evaluations until each trial's best score reached `score` (T,), float64.
+
+    A trial that ended below counts as inf. The median over the trials is then right if more than half of
+    them reached the score.
+    """
+    reached = solution.history >= score
+    first = reached.int().argmax(dim=1).double() + 1
+    return torch.where(reached.any(dim=1), first, torch.inf)
