@@ -23,6 +23,7 @@ from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Kernel, Recei
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import Assembly, assemble, assemble_on
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.utils.threads import thread_count
 
 ROOT = Path(__file__).parents[1]
@@ -106,12 +107,12 @@ def kernels() -> dict[str, Kernel]:
 
 def scenes() -> dict[str, Assembly]:
     """Assembled at 1 mm: the whole domain and the box."""
-    found = {"free space": assemble(at.load_scene(SCENES / "homogeneous.yaml"), 1e-3)}
+    found = {"free space": assemble(region_of(at.load_scene(SCENES / "homogeneous.yaml")), 1e-3)}
     for name in ("three_cubes", "two_cubes"):
         scene = at.load_scene(SCENES / f"{name}.yaml")
-        found[f"{name.replace('_', ' ')}, full"] = assemble(scene, 1e-3)
+        found[f"{name.replace('_', ' ')}, full"] = assemble(region_of(scene), 1e-3)
         found[f"{name.replace('_', ' ')}, box"] = assemble_on(
-            make_box(scene, 1e-3), scene, torch.float32, None
+            make_box(region_of(scene), 1e-3), region_of(scene), torch.float32, None
         )
     return found
 

@@ -21,6 +21,7 @@ import autdtorch as at
 from autdtorch.fdtd import placement
 from autdtorch.fdtd.grid import make_box
 from autdtorch.propagators import SimulatedPropagator
+from autdtorch.propagators.scene_region import region_of
 
 SPACING = 1e-3
 SPACINGS = (2.0, 1.7, 1.4, 1.3, 0.85, 0.75, 0.7, 0.65, 0.6, 0.45, 0.4)
@@ -74,7 +75,7 @@ def measure_places(name: str) -> None:
         grids, errors = [], []
         for place, missed in (("best place", 0.0), ("symmetric", math.inf)):
             with forgiven(missed):
-                grids.append(make_box(case.scene, spacing * 1e-3))
+                grids.append(make_box(region_of(case.scene), spacing * 1e-3))
                 if len(grids) == 1 or grids[0] != grids[1]:
                     errors.append(compare(case, place, spacing, simulate(case, spacing)).total)
         if len(errors) == 2:

@@ -21,6 +21,7 @@ from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources, uniform_
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import assemble, drive_signal
+from autdtorch.propagators.scene_region import region_of
 
 SCENES = Path(__file__).parents[1] / "configs" / "scene"
 OBSTACLE_SCENES = ("three_cubes", "two_cubes")
@@ -85,7 +86,7 @@ def long_run(steps: int = 20_000, block: int = 2_000) -> None:
     """Whether anything grows under a drive that stays on."""
     for name in OBSTACLE_SCENES:
         scene = load(name)
-        assembly = assemble(scene, 1e-3)
+        assembly = assemble(region_of(scene), 1e-3)
         sources = assembly.sources(scene.array.positions, torch.ones(16, dtype=torch.complex128))
         receivers, state, peaks = assembly.receivers(scene.control_points), assembly.silence(sources), []
         for first in range(0, steps, block):
@@ -102,7 +103,7 @@ def long_run(steps: int = 20_000, block: int = 2_000) -> None:
 def kernel_rate(cells: int = 112) -> None:
     """Cell updates per second of both kernels."""
     scene = load("homogeneous")
-    coefficients = assemble(scene, 1e-3).coefficients
+    coefficients = assemble(region_of(scene), 1e-3).coefficients
     shape = (cells, cells, cells)
     nobody = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros((0, 2)))
     deaf = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1)))

@@ -27,6 +27,7 @@ from triton.runtime.jit import JITFunction
 from autdtorch.fdtd.kernels.cuda import BLOCKS, DeviceMedium, DeviceRun
 from autdtorch.fdtd.kernels.cuda_tables import Shape
 from autdtorch.fdtd.stepping import assemble, drive_signal
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box
 from autdtorch.scene.scene import Medium, Scene
@@ -67,7 +68,7 @@ def compiled(capability: int, dtype: torch.dtype) -> dict[str, Any]:
         (wall, solid),
         domain=((0,) * 3, (24e-3,) * 3),
     )
-    assembly = assemble(scene, 1e-3, dtype)
+    assembly = assemble(region_of(scene), 1e-3, dtype)
     sources = assembly.sources(array.positions, torch.ones(4, dtype=torch.complex128))
     receivers = assembly.receivers(scene.control_points)
     signal = drive_signal(assembly.steps_per_period, 0, 2).to(dtype)

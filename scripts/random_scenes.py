@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from autdtorch.fdtd.grid import MIN_CELLS_PER_WAVELENGTH, make_grid
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
 from autdtorch.scene.scene import Medium, OverlapWarning, Scene
@@ -125,7 +126,7 @@ def draw_trial(seed: int, number: int, long_share: float = LONG_SHARE) -> Trial:
 def _refused(scene: Scene, spacing: float) -> bool:
     """Whether an obstacle is too slow for the spacing, the one thing that the grid may refuse here."""
     try:
-        make_grid(scene, spacing)
+        make_grid(region_of(scene), spacing)
     except ValueError as error:
         if "cells per wavelength in obstacle" not in str(error):
             raise

@@ -27,6 +27,7 @@ from tqdm import tqdm
 from autdtorch.fdtd.kernels.contract import Receivers, Sources, State
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, assemble, drive_signal, lock_in
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.utils.arrays import Array
 
 FEWEST_PERIODS = 3 * RAMP_PERIODS
@@ -90,7 +91,7 @@ def _power(logarithm: float) -> str:
 def run_trial(trial: Trial) -> Outcome:
     """Step a trial's scene, driven and free."""
     try:
-        assembly = assemble(trial.scene, trial.spacing, trial.dtype)
+        assembly = assemble(region_of(trial.scene), trial.spacing, trial.dtype)
     except Exception as error:  # a finding like any other: the scenes are all in order
         infinite = dict.fromkeys(LARGEST_RISE, math.inf)
         return Outcome(trial, infinite, infinite, False, math.inf, f"assembling: {error!r}")

@@ -14,38 +14,38 @@ import torch
 
 from autdtorch.fdtd.bonds import VaryingCells
 from autdtorch.fdtd.grid import Grid, domain_extent
+from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.stencil import OFFSETS, Stencil
 from autdtorch.fdtd.stepping import air_stencil
 from autdtorch.fdtd.variable_cells import VariableCells
-from autdtorch.scene.scene import Scene
 
 _RIM = 2
 """Cells of air around the maps: the first varies with them, the second is its neighbour."""
 
 
-def domain_cells(scene: Scene, grid: Grid) -> tuple[slice, ...]:
-    """Which cells of a grid of the scene's domain are in the domain, per axis: those that maps are of."""
-    margin = domain_extent(scene, grid.spacing).margin
+def domain_cells(region: Region, grid: Grid) -> tuple[slice, ...]:
+    """Which cells of a grid of the region's domain are in the domain, per axis: those that maps are of."""
+    margin = domain_extent(region, grid.spacing).margin
     return tuple(slice(a + margin, b - margin) for a, b in zip(grid.first, grid.last, strict=True))
 
 
 def cells_of_maps(
-    scene: Scene, grid: Grid, density: torch.Tensor | None = None, sound_speed: torch.Tensor | None = None
+    region: Region, grid: Grid, density: torch.Tensor | None = None, sound_speed: torch.Tensor | None = None
 ) -> VariableCells:
     """Varying cells of maps (nx, ny, nz) of density [kg/m^3] and sound speed [m/s], differentiable by them.
 
     Raises:
         ValueError: a map has another shape than the domain has cells.
     """
-    cells = domain_cells(scene, grid)
+    cells = domain_cells(region, grid)
     shape = tuple(part.stop - part.start for part in cells)
     for name, given in (("density", density), ("sound_speed", sound_speed)):
         if given is not None and given.shape != shape:
             raise ValueError(f"{name}: shape {tuple(given.shape)}; must be {shape}, the cells of the domain")
-    stencil = air_stencil(grid, scene)
+    stencil = air_stencil(grid, region)
     air = torch.ones(shape, dtype=torch.float64, device="cpu")
-    relative = air if density is None else density / scene.medium.density
-    speed = air if sound_speed is None else sound_speed / scene.medium.sound_speed
+    relative = air if density is None else density / region.fluid.density
+    speed = air if sound_speed is None else sound_speed / region.fluid.sound_speed
     relative = relative / _flow_factor(stencil, speed)
     fluidity = relative * _speed_factor(stencil, speed)
     return VariableCells(*_rows(cells, grid, stencil, relative, fluidity))

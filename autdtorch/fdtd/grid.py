@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from autdtorch.fdtd.placement import grid_offset
 from autdtorch.fdtd.points import footprint
-from autdtorch.scene.obstacles import Obstacle
-from autdtorch.scene.scene import Scene
+from autdtorch.fdtd.region import Region, Shape
 from autdtorch.utils.arrays import Array
 from autdtorch.utils.validation import invalid, positive
 
@@ -150,52 +149,52 @@ class Extent:
         return x, y, z
 
 
-def domain_extent(scene: Scene, spacing: float) -> Extent:
-    """The scene's domain, and as much air around it as points in the outermost cells need."""
-    return Extent(*scene.domain, footprint(scene.wavenumber * spacing) // 2 - 1)
+def domain_extent(region: Region, spacing: float) -> Extent:
+    """The region's domain, and as much air around it as points in the outermost cells need."""
+    return Extent(*region.domain, footprint(region.wavenumber * spacing) // 2 - 1)
 
 
-def obstacles_extent(obstacles: Sequence[Obstacle]) -> Extent:
-    """Obstacles, of which there must be some, and the air around them."""
-    lower = np.array([obstacle.lower for obstacle in obstacles]).min(axis=0)
-    upper = np.array([obstacle.upper for obstacle in obstacles]).max(axis=0)
+def bodies_extent(shapes: Sequence[Shape]) -> Extent:
+    """Shapes, of which there must be some, and the air around them."""
+    lower = np.array([shape.lower for shape in shapes]).min(axis=0)
+    upper = np.array([shape.upper for shape in shapes]).max(axis=0)
     return Extent(lower.tolist(), upper.tolist(), AROUND)
 
 
-def make_grid(scene: Scene, spacing: float) -> Grid:
-    """Cover the scene's domain with cells of `spacing`, placed as flat faces need it (`placement.py`).
+def make_grid(region: Region, spacing: float) -> Grid:
+    """Cover the region's domain with cells of `spacing`, placed as flat faces need it (`placement.py`).
 
     Raises:
         ValueError: fewer than `MIN_CELLS_PER_WAVELENGTH` cells a wavelength, more than
             `MAX_CELLS_PER_WAVELENGTH`, or more than `MAX_CELLS` in all.
     """
-    return _covering(scene, spacing, domain_extent(scene, spacing))
+    return _covering(region, spacing, domain_extent(region, spacing))
 
 
-def make_box(scene: Scene, spacing: float) -> Grid:
-    """Cover the scene's obstacles, of which there must be some, with `AROUND` cells of air around them."""
-    return _covering(scene, spacing, obstacles_extent(scene.obstacles))
+def make_box(region: Region, spacing: float) -> Grid:
+    """Cover the region's bodies, of which there must be some, with `AROUND` cells of air around them."""
+    return _covering(region, spacing, bodies_extent(region.shapes))
 
 
-def require_spacing(scene: Scene, spacing: float) -> None:
-    """Refuse a spacing [m] of cells that are too large or too small for a scene.
+def require_spacing(region: Region, spacing: float) -> None:
+    """Refuse a spacing [m] of cells that are too large or too small for a region.
 
     Raises:
         ValueError: fewer than `MIN_CELLS_PER_WAVELENGTH` cells a wavelength, or more than
             `MAX_CELLS_PER_WAVELENGTH`.
     """
     positive("spacing", spacing, "m")
-    require_fine(speeds_of(scene), scene.frequency, spacing)
-    finest = scene.wavelength / MAX_CELLS_PER_WAVELENGTH
+    require_fine(region.sound_speeds, region.frequency, spacing)
+    finest = region.wavelength / MAX_CELLS_PER_WAVELENGTH
     if spacing < finest:
         accepted = f"must be at least {finest:.3g} m, {MAX_CELLS_PER_WAVELENGTH} cells per wavelength"
-        raise invalid("spacing", spacing, f"{accepted} in the medium at {scene.frequency:g} Hz", "m")
+        raise invalid("spacing", spacing, f"{accepted} in the medium at {region.frequency:g} Hz", "m")
 
 
-def _covering(scene: Scene, spacing: float, extent: Extent) -> Grid:
-    require_spacing(scene, spacing)
-    kappa = scene.wavenumber * spacing
-    offset = grid_offset(scene, spacing, extent.lower, extent.upper)
+def _covering(region: Region, spacing: float, extent: Extent) -> Grid:
+    require_spacing(region, spacing)
+    kappa = region.wavenumber * spacing
+    offset = grid_offset(region, spacing, extent.lower, extent.upper)
     rim = layer_cells(kappa) + 1 + extent.margin - 0.5
     x, y, z = (low - (rim + first) * spacing for low, first in zip(extent.lower, offset, strict=True))
     grid = Grid(spacing, extent.interior(spacing, offset), (x, y, z), kappa)
@@ -203,16 +202,6 @@ def _covering(scene: Scene, spacing: float, extent: Extent) -> Grid:
         cells = " x ".join(map(str, grid.shape))
         raise invalid("spacing", spacing, f"gives {cells} cells, must be at most {MAX_CELLS:.0e} in all", "m")
     return grid
-
-
-def speeds_of(scene: Scene) -> dict[str, float]:
-    """Return the sound speeds [m/s] in a scene, by where."""
-    fluid = {
-        f"obstacle {index}": obstacle.sound_speed
-        for index, obstacle in enumerate(scene.obstacles)
-        if obstacle.sound_speed is not None
-    }
-    return {"the medium": scene.medium.sound_speed} | fluid
 
 
 def require_fine(speeds: Mapping[str, float], frequency: float, spacing: float) -> None:

@@ -12,10 +12,9 @@ import torch
 from numpy.typing import NDArray
 
 from autdtorch.fdtd.grid import Grid
+from autdtorch.fdtd.region import Fluid, Region, Shape
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.fdtd.surface import FAR, LATTICE, CutElements, Materials, cut_elements
-from autdtorch.scene.obstacles import Box, Obstacle
-from autdtorch.scene.scene import Medium, Scene
 from autdtorch.utils.arrays import Array
 from autdtorch.utils.progress import show_progress
 
@@ -35,35 +34,35 @@ _ELEMENTS_AT_ONCE = 4096
 
 
 @dataclass(frozen=True)
-class Body:
-    """Consecutive obstacles of one material, which need not be told apart.
+class Joined:
+    """Consecutive bodies of one material, which need not be told apart.
 
     Attributes:
-        obstacles: of which it consists.
+        shapes: the shapes it consists of.
         number: of its material.
-        goes_on: whether it goes on through the boundary layers, where it leaves the interior; else it ends.
+        continued: whether it continues through the boundary layers, where it leaves the interior.
     """
 
-    obstacles: tuple[Obstacle, ...]
+    shapes: tuple[Shape, ...]
     number: int
-    goes_on: bool
+    continued: bool
 
     @property
     def lower(self) -> Array:
         """Corner of the bounding box with the smallest coordinates (3,) [m]."""
-        return np.asarray(np.array([obstacle.lower for obstacle in self.obstacles]).min(axis=0))
+        return np.asarray(np.array([shape.lower for shape in self.shapes]).min(axis=0))
 
     @property
     def upper(self) -> Array:
         """Corner of the bounding box with the largest coordinates (3,) [m]."""
-        return np.asarray(np.array([obstacle.upper for obstacle in self.obstacles]).max(axis=0))
+        return np.asarray(np.array([shape.upper for shape in self.shapes]).max(axis=0))
 
     def distance(self, cell: Array, grid: Grid) -> Array:
         """Signed distance [cells] of places (..., 3) in cells."""
-        places = np.array(grid.origin) + grid.spacing * (grid.clip(cell) if self.goes_on else cell)
-        each = [obstacle.signed_distance(torch.from_numpy(places)) for obstacle in self.obstacles]
+        places = np.array(grid.origin) + grid.spacing * (grid.clip(cell) if self.continued else cell)
+        each = [shape.signed_distance(torch.from_numpy(places)) for shape in self.shapes]
         distance = torch.stack(each).amin(dim=0).numpy() / grid.spacing - _TOUCHING
-        if self.goes_on:
+        if self.continued:
             return np.asarray(distance)
         beyond = np.maximum(np.array(grid.first) - cell, cell - np.array(grid.last) + 1).max(axis=-1) + 0.5
         return np.asarray(np.maximum(distance, beyond))
@@ -107,13 +106,13 @@ def flow_factor(kappa: float, speed_ratio: float) -> float:
     return (math.tan(air) / air) / (math.tan(own) / own)
 
 
-def fill_elements(scene: Scene, grid: Grid, stencil: Stencil) -> ElementMedium:
+def fill_elements(region: Region, grid: Grid, stencil: Stencil) -> ElementMedium:
     """Find the material of every element, and the bonds and masses of those that surfaces cut.
 
-    Where obstacles overlap the later wins. Of those that reach beyond the interior, parallel walls and slabs
-    across the domain go on through the boundary layer, as they leave the interior; others end before it.
+    Where bodies overlap the later wins. Those that are `continued` go on through the boundary layer, as they
+    leave the interior; others end before it.
     """
-    bodies, materials, rigid = _bodies(scene, stencil)
+    bodies, materials, rigid = _bodies(region, stencil)
     number = np.zeros([cells - 1 for cells in grid.shape], np.int16)
     cut = np.zeros(number.shape, bool)
     for body in bodies:
@@ -124,21 +123,19 @@ def fill_elements(scene: Scene, grid: Grid, stencil: Stencil) -> ElementMedium:
     return ElementMedium(materials, rigid, number, index, _cut(bodies, index, grid, materials, stencil))
 
 
-def _bodies(scene: Scene, stencil: Stencil) -> tuple[list[Body], Materials, NDArray[np.bool_]]:
-    """Obstacles joined where consecutive ones share a material, and the materials that there are."""
-    air = Medium(scene.medium.density, scene.medium.sound_speed)  # what absorbs, absorbs everywhere
-    known: list[Medium | None] = [air]
-    bodies: list[Body] = []
-    for obstacle, goes_on in zip(scene.obstacles, _going_on(scene), strict=True):
-        material = None if obstacle.rigid else Medium(obstacle.density, obstacle.sound_speed)  # type: ignore[arg-type]
-        if material not in known:
-            known.append(material)
-        own = known.index(material)
-        kind = own, goes_on
-        if bodies and kind == (bodies[-1].number, bodies[-1].goes_on):
-            bodies[-1] = Body((*bodies[-1].obstacles, obstacle), *kind)
+def _bodies(region: Region, stencil: Stencil) -> tuple[list[Joined], Materials, NDArray[np.bool_]]:
+    """Bodies joined where consecutive ones share a material, and the materials that there are."""
+    air = region.fluid
+    known: list[Fluid | None] = [air]
+    bodies: list[Joined] = []
+    for body in region.bodies:
+        if body.fluid not in known:
+            known.append(body.fluid)
+        kind = known.index(body.fluid), body.continued
+        if bodies and kind == (bodies[-1].number, bodies[-1].continued):
+            bodies[-1] = Joined((*bodies[-1].shapes, body.shape), *kind)
         else:
-            bodies.append(Body((obstacle,), *kind))
+            bodies.append(Joined((body.shape,), *kind))
     density = [
         RIGID
         if m is None
@@ -150,45 +147,7 @@ def _bodies(scene: Scene, stencil: Stencil) -> tuple[list[Body], Materials, NDAr
     return bodies, materials, np.array([m is None for m in known])
 
 
-def is_wall(scene: Scene, obstacle: Obstacle) -> bool:
-    """Whether an obstacle is a wall or slab along the grid, across the whole domain on two axes at least."""
-    along = isinstance(obstacle, Box) and obstacle.rotation == (0.0, 0.0, 0.0)
-    return along and len(_ends(scene, obstacle)) <= 1
-
-
-def _ends(scene: Scene, obstacle: Obstacle) -> list[int]:
-    """Axes on which an obstacle does not cross the whole domain."""
-    corners = zip(obstacle.lower, obstacle.upper, *scene.domain, strict=True)
-    return [axis for axis, (low, high, first, last) in enumerate(corners) if low > first or high < last]
-
-
-def _going_on(scene: Scene) -> list[bool]:
-    """Which obstacles go on through the boundary layers: parallel walls.
-
-    In the layers other shapes were found to grow, and so are the edges where walls of two directions meet:
-    the first to come decides the direction.
-    """
-    going, normal = [], None
-    for obstacle in scene.obstacles:
-        wall, ends = is_wall(scene, obstacle), _ends(scene, obstacle)
-        going.append(wall and (not ends or normal in (None, ends[0])))
-        if going[-1] and ends:
-            normal = ends[0]
-    return going
-
-
-def warn_of_ending_walls(scene: Scene) -> None:
-    """Log which walls end before the boundary layers, as another wall decides the direction."""
-    goes_on = zip(scene.obstacles, _going_on(scene), strict=True)
-    ending = [index for index, (one, going) in enumerate(goes_on) if is_wall(scene, one) and not going]
-    if ending:
-        logger.warning(
-            "obstacle %s crosses the domain in another direction than a wall before: it ends where the"
-            " boundary layer begins, and its end reflects", ", ".join(map(str, ending)),
-        )  # fmt: skip
-
-
-def _windows(body: Body, grid: Grid) -> Iterator[tuple[tuple[slice, ...], Array]]:
+def _windows(body: Joined, grid: Grid) -> Iterator[tuple[tuple[slice, ...], Array]]:
     """Slabs of elements around a body, with the signed distance [cells] of their centres."""
     middle = [np.arange(cells - 1) + 0.5 for cells in grid.shape]
     ranges = []
@@ -201,7 +160,7 @@ def _windows(body: Body, grid: Grid) -> Iterator[tuple[tuple[slice, ...], Array]
         yield window, body.distance(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1), grid)
 
 
-def _distances(bodies: list[Body], first: NDArray[np.int64], grid: Grid) -> NDArray[np.float64]:
+def _distances(bodies: list[Joined], first: NDArray[np.int64], grid: Grid) -> NDArray[np.float64]:
     """Distances (B, n, L) of bodies from the lattices of elements, by their first cells (n, 3)."""
     cell = first[:, None] + LATTICE
     center = np.array(grid.origin) + grid.spacing * grid.clip(np.asarray(first + 0.5))
@@ -215,7 +174,7 @@ def _distances(bodies: list[Body], first: NDArray[np.int64], grid: Grid) -> NDAr
 
 
 def _cut(
-    bodies: list[Body],
+    bodies: list[Joined],
     index: NDArray[np.int64],
     grid: Grid,
     materials: Materials,

@@ -18,8 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autdtorch.scene.obstacles import Obstacle
-from autdtorch.scene.scene import Scene
+from autdtorch.fdtd.region import Region, Shape
 from autdtorch.utils.arrays import Array
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
@@ -60,8 +59,8 @@ class _Triangles:
     normal: Array
 
     @classmethod
-    def of(cls, obstacle: Obstacle) -> _Triangles:
-        vertices, triangles = (part.numpy() for part in obstacle.surface())
+    def of(cls, shape: Shape) -> _Triangles:
+        vertices, triangles = (part.numpy() for part in shape.surface())
         first, second, third = np.moveaxis(vertices[triangles], 1, 0)
         return cls(first, np.cross(second - first, third - first))
 
@@ -73,12 +72,12 @@ class _Triangles:
 
 
 def grid_offset(
-    scene: Scene, spacing: float, lower: Sequence[float], upper: Sequence[float]
+    region: Region, spacing: float, lower: Sequence[float], upper: Sequence[float]
 ) -> tuple[float, float, float]:
     """How far below a lower corner (3,) [m] a grid's first cell should begin, per axis [cells], in [0, 1).
 
     Args:
-        scene: its obstacles decide.
+        region: its bodies decide.
         spacing: edge of a cell [m].
         lower: corner of what the grid is to cover.
         upper: the other corner.
@@ -87,11 +86,11 @@ def grid_offset(
         Offsets with which the grid extends as far beyond the one corner as beyond the other, unless flat
         faces lie clearly better in another place.
     """
-    surfaces = [_Triangles.of(obstacle) for obstacle in scene.obstacles]
+    surfaces = [_Triangles.of(shape) for shape in region.shapes]
     x, y, z = (
         _axis_offset(
-            _faces(scene, surfaces, axis, low),
-            scene.array.positions.numpy()[:, axis] - low,
+            _faces(region, surfaces, axis, low),
+            region.sources[:, axis] - low,
             high - low,
             spacing,
         )
@@ -100,17 +99,19 @@ def grid_offset(
     return x, y, z
 
 
-def _faces(scene: Scene, surfaces: list[_Triangles], axis: int, origin: float) -> tuple[Array, Array, Array]:
+def _faces(
+    region: Region, surfaces: list[_Triangles], axis: int, origin: float
+) -> tuple[Array, Array, Array]:
     """Faces across an axis within the domain.
 
     Their distance from an origin [m], 1 where the lighter side comes first and -1 where the heavier
     does, and their area [m^2].
     """
-    low, high = (corner[axis] for corner in scene.domain)
+    low, high = (corner[axis] for corner in region.domain)
     parts = [np.zeros((3, 0))]
-    for obstacle, surface in zip(scene.obstacles, surfaces, strict=True):
+    for body, surface in zip(region.bodies, surfaces, strict=True):
         place, outward, area = surface.across(axis)
-        heavier = obstacle.density is None or obstacle.density >= scene.medium.density
+        heavier = body.fluid is None or body.fluid.density >= region.fluid.density
         inside = (place > low) & (place < high)
         parts.append(np.stack((place - origin, -outward if heavier else outward, area))[:, inside])
     place, first, area = np.concatenate(parts, axis=1)

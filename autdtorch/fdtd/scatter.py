@@ -22,7 +22,6 @@ from autdtorch.fdtd.points import PointWeights
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.superposition import superposition
-from autdtorch.scene.arrays import Nodes
 
 _BESIDE = 1.25
 """Cells from the rim of the interior up to which points are not read. The outermost are not interpolated
@@ -60,29 +59,39 @@ class Scattering:
         both = torch.view_as_real(torch.from_numpy(force)).to(assembly.dtype)
         return Sources(torch.from_numpy(assembly.varying.index), both)
 
-    def incident(self, points: torch.Tensor, origins: Nodes, strength: torch.Tensor) -> torch.Tensor:
-        """Field (P,) in free space at points (P, 3) [m] of N origins with strengths (N,) [Pa m]."""
-        return self._incident(points, origins, strength, 0.0)
+    def incident(
+        self, points: torch.Tensor, nodes: torch.Tensor, weights: torch.Tensor, strength: torch.Tensor
+    ) -> torch.Tensor:
+        """Return the incident field (P,) at points (P, 3) [m].
 
-    def driving(self, origins: Nodes, strength: torch.Tensor) -> torch.Tensor:
-        """The same (n,) where it drives."""
-        return self._incident(self.driven, origins, strength, _NEAREST * self.assembly.grid.spacing)
+        Its N sources have nodes (N, n, 3) [m] with `weights` (n,) and strengths (N,) [Pa m].
+        """
+        return self._incident(points, nodes, weights, strength, 0.0)
+
+    def driving(self, nodes: torch.Tensor, weights: torch.Tensor, strength: torch.Tensor) -> torch.Tensor:
+        """Return the incident field (n,) where it drives; see `incident`."""
+        nearest = _NEAREST * self.assembly.grid.spacing
+        return self._incident(self.driven, nodes, weights, strength, nearest)
 
     def _incident(
-        self, points: torch.Tensor, origins: Nodes, strength: torch.Tensor, nearest: float
+        self,
+        points: torch.Tensor,
+        nodes: torch.Tensor,
+        weights: torch.Tensor,
+        strength: torch.Tensor,
+        nearest: float,
     ) -> torch.Tensor:
-        nodes, shares = origins.positions.reshape(-1, 3), origins.weights.repeat(len(strength))
-        amplitude = strength.repeat_interleave(len(origins.weights)) * shares
-        return self._sum(points, nodes, amplitude[:, None], nearest)[:, 0]
+        amplitude = strength.repeat_interleave(len(weights)) * weights.repeat(len(strength))
+        return self._sum(points, nodes.reshape(-1, 3), amplitude[:, None], nearest)[:, 0]
 
-    def reach(self, targets: Nodes) -> Reach:
-        """How the scattered field gets to P targets, as the mean over the nodes of each."""
+    def reach(self, nodes: torch.Tensor, weights: torch.Tensor) -> Reach:
+        """How the scattered field gets to P targets: means with `weights` (n,) over nodes (P, n, 3) [m]."""
         _, surface, outward = self._surface
-        within = self.inside(targets.positions)
-        spread = self.assembly.spread(targets.positions[within])
+        within = self.inside(nodes)
+        spread = self.assembly.spread(nodes[within])
         cells = np.unique(np.concatenate((surface, spread.index.ravel())))
         picked = PointWeights(surface[:, None], np.ones((len(surface), 1))).reading(cells)
-        return Reach(self, targets, within, cells, outward @ picked, spread.reading(cells))
+        return Reach(self, nodes, weights, within, cells, outward @ picked, spread.reading(cells))
 
     def radiated(self, amplitude: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
         """Fields (P, R) at points (P, 3) [m] of the radiating cells with amplitudes (n, R) [Pa m]."""
@@ -146,7 +155,8 @@ class Reach:
 
     Attributes:
         scattering: of the box.
-        targets: where the field is wanted.
+        nodes: where the field is wanted (P, n, 3) [m].
+        weights: of the nodes of a target (n,).
         within: which nodes (P, n) lie in the box, where its cells are read.
         cells: flat indices (k,) of the cells whose phasors are needed.
         outward: amplitudes of the radiating cells from those phasors.
@@ -154,7 +164,8 @@ class Reach:
     """
 
     scattering: Scattering
-    targets: Nodes
+    nodes: torch.Tensor
+    weights: torch.Tensor
     within: torch.Tensor
     cells: NDArray[np.int64]
     outward: csr_array
@@ -165,8 +176,8 @@ class Reach:
         field = torch.zeros((*self.within.shape, phasors.shape[1]), dtype=torch.complex128, device="cpu")
         field[self.within] = torch.from_numpy(self.inward @ phasors.numpy())
         amplitude = self.amplitudes(phasors)
-        field[~self.within] = self.scattering.radiated(amplitude, self.targets.positions[~self.within])
-        return torch.einsum("pnr,n->pr", field, self.targets.weights.to(field.dtype))
+        field[~self.within] = self.scattering.radiated(amplitude, self.nodes[~self.within])
+        return torch.einsum("pnr,n->pr", field, self.weights.to(field.dtype))
 
     def amplitudes(self, phasors: torch.Tensor) -> torch.Tensor:
         """What the radiating cells send out (n, R) [Pa m], from the cells' phasors (k, R)."""
@@ -174,9 +185,9 @@ class Reach:
 
     def matrix(self, every: int) -> torch.Tensor:
         """Matrix from phasors (k,) to the scattered field at each `every`-th target."""
-        within, share = self.within[::every], self.targets.weights.expand(self.within[::every].shape)
+        within, share = self.within[::every], self.weights.expand(self.within[::every].shape)
         target = torch.arange(len(within), device="cpu")[:, None].expand(within.shape)
-        outside = self.targets.positions[::every][~within]
+        outside = self.nodes[::every][~within]
         amplitude = torch.zeros((len(outside), len(within)), dtype=torch.complex128, device="cpu")
         amplitude[torch.arange(len(outside), device="cpu"), target[~within]] = share[~within].to(
             amplitude.dtype

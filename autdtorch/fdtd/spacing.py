@@ -6,8 +6,8 @@ import math
 
 import torch
 
-from autdtorch.fdtd.grid import FAIR_CELLS_PER_WAVELENGTH, speeds_of
-from autdtorch.scene.scene import Scene
+from autdtorch.fdtd.grid import FAIR_CELLS_PER_WAVELENGTH
+from autdtorch.fdtd.region import Region
 
 RATIO = 1.5
 """Between the spacings of the two grids: the coarser costs a fifth of the finer."""
@@ -20,20 +20,20 @@ _PILOT_CELLS = 6.0
 """Cells per wavelength of the finer of the two grids that a spacing is chosen from."""
 
 
-def coarsest_spacing(scene: Scene) -> float:
+def coarsest_spacing(region: Region) -> float:
     """Largest spacing [m] with a fair number of cells per wavelength, in the air and in every obstacle."""
-    return min(speeds_of(scene).values()) / scene.frequency / FAIR_CELLS_PER_WAVELENGTH
+    return min(region.sound_speeds.values()) / region.frequency / FAIR_CELLS_PER_WAVELENGTH
 
 
-def pilot_spacing(scene: Scene) -> float:
+def pilot_spacing(region: Region) -> float:
     """Spacing [m] of a coarse grid that tells what a scene takes: the finer of two that choose a spacing."""
-    return min(scene.wavelength / _PILOT_CELLS, coarsest_spacing(scene))
+    return min(region.wavelength / _PILOT_CELLS, coarsest_spacing(region))
 
 
-def second_spacing(scene: Scene, spacing: float) -> float:
+def second_spacing(region: Region, spacing: float) -> float:
     """Spacing [m] of the grid that tells the error of another: coarser where that is fair, else finer."""
     coarser = RATIO * spacing
-    return coarser if coarser <= coarsest_spacing(scene) else spacing / RATIO
+    return coarser if coarser <= coarsest_spacing(region) else spacing / RATIO
 
 
 def grid_error(matrix: torch.Tensor, second: torch.Tensor, coarser: bool) -> float:

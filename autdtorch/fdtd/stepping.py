@@ -17,9 +17,9 @@ from autdtorch.fdtd.grid import Grid, make_grid
 from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, State, uniform_state
 from autdtorch.fdtd.medium import fill_elements
 from autdtorch.fdtd.points import PointWeights, merged, point_weights, without
+from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.stability import fewest_steps, largest_eigenvalue, whole_steps
 from autdtorch.fdtd.stencil import Stencil, tuned_stencil
-from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import invalid
 
 logger = logging.getLogger(__name__)
@@ -113,32 +113,32 @@ class Assembly:
 
 
 def assemble(
-    scene: Scene, spacing: float, dtype: torch.dtype = torch.float32, time_step: float | None = None
+    region: Region, spacing: float, dtype: torch.dtype = torch.float32, time_step: float | None = None
 ) -> Assembly:
-    """Put a scene on a grid of its domain, of `spacing` [m]; see `assemble_on`.
+    """Put a region on a grid of its domain, of `spacing` [m]; see `assemble_on`.
 
     Raises:
         ValueError: the spacing is too coarse for the frequency, or the time step is not stable.
     """
-    return assemble_on(make_grid(scene, spacing), scene, dtype, time_step)
+    return assemble_on(make_grid(region, spacing), region, dtype, time_step)
 
 
-def assemble_on(grid: Grid, scene: Scene, dtype: torch.dtype, time_step: float | None) -> Assembly:
-    """Put a scene on a grid, with a time step of `time_step` [s] or just below.
+def assemble_on(grid: Grid, region: Region, dtype: torch.dtype, time_step: float | None) -> Assembly:
+    """Put a region on a grid, with a time step of `time_step` [s] or just below.
 
     By default that is the largest stable one.
 
     Raises:
         ValueError: the time step is not stable.
     """
-    stencil = air_stencil(grid, scene)
-    varying = varying_cells(fill_elements(scene, grid, stencil), stencil)
-    return assembly_of(grid, stencil, varying, scene.frequency, dtype, time_step)
+    stencil = air_stencil(grid, region)
+    varying = varying_cells(fill_elements(region, grid, stencil), stencil)
+    return assembly_of(grid, stencil, varying, region.frequency, dtype, time_step)
 
 
-def air_stencil(grid: Grid, scene: Scene) -> Stencil:
-    """Weights of a scene's air on a grid."""
-    return tuned_stencil(grid.kappa, scene.attenuation * grid.spacing)
+def air_stencil(grid: Grid, region: Region) -> Stencil:
+    """Weights of a region's air on a grid."""
+    return tuned_stencil(grid.kappa, region.attenuation * grid.spacing)
 
 
 def assembly_of(

@@ -12,11 +12,11 @@ from autdtorch.fdtd.bonds import VaryingCells, varying_cells
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.medium import fill_elements
+from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.fdtd.stepping import Assembly, air_stencil, assembly_of
-from autdtorch.scene.obstacles import Obstacle
-from autdtorch.scene.scene import Scene, with_obstacles
 from autdtorch.utils.arrays import Array, Index
+from autdtorch.utils.validation import fluid
 
 _SMALL = 1e-4
 """Relative step of the central differences: what they miss and the rounding in them are about 1e-8."""
@@ -36,10 +36,10 @@ class VariableCells:
     weight: torch.Tensor
     mass: torch.Tensor
 
-    def assembly(self, grid: Grid, scene: Scene, dtype: torch.dtype, time_step: float | None) -> Assembly:
+    def assembly(self, grid: Grid, region: Region, dtype: torch.dtype, time_step: float | None) -> Assembly:
         """Ready to step, differentiable by `coefficients.varying_weight`; see `assemble_on`."""
-        stencil = air_stencil(grid, scene)
-        assembly = assembly_of(grid, stencil, self.varying, scene.frequency, dtype, time_step)
+        stencil = air_stencil(grid, region)
+        assembly = assembly_of(grid, stencil, self.varying, region.frequency, dtype, time_step)
         coefficients = assembly.coefficients
         weight = (coefficients.face / stencil.face * self.weight).to(dtype)
         return replace(assembly, coefficients=replace(coefficients, varying_weight=weight))
@@ -62,30 +62,35 @@ class _Difference:
     behind: VaryingCells
 
 
-def with_materials(
-    scene: Scene, density: torch.Tensor | None, sound_speed: torch.Tensor | None
-) -> tuple[Obstacle, ...]:
-    """A scene's K obstacles with the densities (K,) and sound speeds (K,) given; rigid ones as they are."""
-    obstacles = list(scene.obstacles)
-    for number, obstacle in enumerate(obstacles):
-        if density is not None and not obstacle.rigid:
-            obstacle = replace(obstacle, density=float(density[number]))
-        if sound_speed is not None and not obstacle.rigid:
-            obstacle = replace(obstacle, sound_speed=float(sound_speed[number]))
-        obstacles[number] = obstacle
-    return tuple(obstacles)
+def with_materials(region: Region, density: torch.Tensor | None, sound_speed: torch.Tensor | None) -> Region:
+    """Return a region whose K bodies have the densities (K,) and sound speeds (K,) given.
+
+    Sound-hard bodies stay sound-hard.
+
+    Raises:
+        ValueError: a density or a sound speed is out of range.
+    """
+    bodies = list(region.bodies)
+    for number, body in enumerate(bodies):
+        if body.fluid is not None:
+            rho, speed = (
+                own if given is None else float(given[number])
+                for own, given in zip(body.fluid, (density, sound_speed), strict=True)
+            )
+            bodies[number] = replace(body, fluid=Fluid(*fluid(f"obstacles[{number}]", rho, speed)))
+    return replace(region, bodies=tuple(bodies))
 
 
 def cells_of_obstacles(
-    scene: Scene, grid: Grid, density: torch.Tensor | None = None, sound_speed: torch.Tensor | None = None
+    region: Region, grid: Grid, density: torch.Tensor | None = None, sound_speed: torch.Tensor | None = None
 ) -> VariableCells:
-    """Varying cells of a scene's K obstacles, differentiable by their materials.
+    """Varying cells of a region's K bodies, differentiable by their materials.
 
     The derivatives are central differences of the whole assembly, one for each number of a tensor that asks
     for gradients.
 
     Args:
-        scene: of which all else is taken.
+        region: gives everything else.
         grid: on which.
         density: (K,) [kg/m^3]; what is given for rigid obstacles does not count.
         sound_speed: (K,) [m/s], likewise.
@@ -93,10 +98,10 @@ def cells_of_obstacles(
     Raises:
         ValueError: an obstacle that is differentiated reaches into the boundary layers.
     """
-    stencil = air_stencil(grid, scene)
+    stencil = air_stencil(grid, region)
     fixed = [None if given is None else given.detach() for given in (density, sound_speed)]
-    base = _assembled(scene, grid, stencil, *fixed)
-    differences = list(_differences(scene, grid, stencil, density, sound_speed))
+    base = _assembled(region, grid, stencil, *fixed)
+    differences = list(_differences(region, grid, stencil, density, sound_speed))
     every = [base.index, *(each.index for one in differences for each in (one.ahead, one.behind))]
     index = np.unique(np.concatenate(every))
     weight, mass = (torch.from_numpy(part) for part in _on(index, base, stencil))
@@ -117,7 +122,7 @@ def cells_of_obstacles(
 
 
 def _differences(
-    scene: Scene,
+    region: Region,
     grid: Grid,
     stencil: Stencil,
     density: torch.Tensor | None,
@@ -128,26 +133,26 @@ def _differences(
     for name, values in given.items():
         if values is None or not values.requires_grad:
             continue
-        for number, obstacle in enumerate(scene.obstacles):
-            if obstacle.rigid:
+        for number, body in enumerate(region.bodies):
+            if body.fluid is None:
                 continue
             step = _SMALL * float(values.detach()[number])
             sides = []
             for way in (1, -1):
                 moved = values.detach().clone()
                 moved[number] += way * step
-                sides.append(_assembled(scene, grid, stencil, **(fixed | {name: moved})))
+                sides.append(_assembled(region, grid, stencil, **(fixed | {name: moved})))
             yield _Difference(values[number], step, *sides)
 
 
 def _assembled(
-    scene: Scene,
+    region: Region,
     grid: Grid,
     stencil: Stencil,
     density: torch.Tensor | None,
     sound_speed: torch.Tensor | None,
 ) -> VaryingCells:
-    changed = with_obstacles(scene, with_materials(scene, density, sound_speed))
+    changed = with_materials(region, density, sound_speed)
     return varying_cells(fill_elements(changed, grid, stencil), stencil)
 
 

@@ -9,9 +9,8 @@ from typing import Literal
 
 import torch
 
-from autdtorch.fdtd.grid import speeds_of, warn_if_coarse
+from autdtorch.fdtd.grid import warn_if_coarse
 from autdtorch.fdtd.kernels.contract import Kernel
-from autdtorch.fdtd.medium import warn_of_ending_walls
 from autdtorch.fdtd.spacing import coarsest_spacing, pilot_spacing, spacing_for
 from autdtorch.propagators.auto import method_for
 from autdtorch.propagators.base import Propagator, Run, SimulatedPropagator, SteadyStateWarning
@@ -20,6 +19,7 @@ from autdtorch.propagators.cache import DiskCache
 from autdtorch.propagators.differentiable import cell_centers, differentiable_field
 from autdtorch.propagators.free_space import FreeSpacePropagator
 from autdtorch.propagators.full import FullPropagator
+from autdtorch.propagators.scene_region import region_of, warn_of_ending_walls
 from autdtorch.propagators.stepper import KERNELS, make_kernel, precision_of, relative_tolerance
 from autdtorch.propagators.volume import volume_field
 from autdtorch.propagators.workload import memory_for
@@ -110,7 +110,9 @@ def make_propagator(
     if time_step is not None:
         time_step = positive("time_step", time_step, "s")
     disk_cache = _disk_cache(cache)
-    method = method_for(scene, method, pilot_spacing(scene) if spacing is None else spacing, tolerance)
+    method = method_for(
+        scene, method, pilot_spacing(region_of(scene)) if spacing is None else spacing, tolerance
+    )
     if method == "free_space":
         return FreeSpacePropagator(scene)
     kind = SIMULATED[method]
@@ -119,7 +121,7 @@ def make_propagator(
         tolerance /= 2
         spacing = _chosen_spacing(kind, scene, tolerance, *settings)
     propagator = kind(scene, spacing, tolerance, *settings, time_step)
-    warn_if_coarse(speeds_of(scene), scene.frequency, spacing)
+    warn_if_coarse(region_of(scene).sound_speeds, scene.frequency, spacing)
     warn_of_ending_walls(scene)
     return propagator
 
@@ -134,14 +136,14 @@ def _chosen_spacing(
     cache: DiskCache | None,
 ) -> float:
     """Spacing [m] at which the grid's error should be `tolerance`, told from two coarse grids."""
-    pilot = pilot_spacing(scene)
+    pilot = pilot_spacing(region_of(scene))
     near_steady = max(tolerance, 1e-3)
     propagator = kind(scene, pilot, near_steady, kernel, dtype, max_periods, cache, None)
     _, error, _ = propagator._estimated()
     if not math.isfinite(error):
         accepted = f"too few to choose a spacing: at {pilot:.3g} m no run came near its steady state"
         raise invalid("max_periods", max_periods, accepted)
-    spacing = min(spacing_for(tolerance, error, pilot), coarsest_spacing(scene))
+    spacing = min(spacing_for(tolerance, error, pilot), coarsest_spacing(region_of(scene)))
     needed = memory_for(scene, kind.method, spacing, tolerance, dtype, kernel)
     require_memory("tolerance", 2 * tolerance, needed)
     logger.info("spacing %.3g mm: the error at %.3g mm is about %.2g", 1e3 * spacing, 1e3 * pilot, error)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import logging
 
-from autdtorch.fdtd.grid import Extent, domain_extent, obstacles_extent, require_spacing
-from autdtorch.fdtd.medium import is_wall
+from autdtorch.fdtd.grid import Extent, bodies_extent, domain_extent, require_spacing
 from autdtorch.propagators.cost import full_cost, grid_cost, most_runs
 from autdtorch.propagators.groups import cheapest_grouping
+from autdtorch.propagators.scene_region import is_wall, region_of
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import invalid, require_one_of
 
@@ -40,14 +40,14 @@ def _chosen_method(scene: Scene, spacing: float, tolerance: float) -> str:
     if not scene.obstacles:
         logger.info("method auto: free_space (no obstacles: nothing to simulate)")
         return "free_space"
-    require_spacing(scene, spacing)
+    require_spacing(region_of(scene), spacing)
     runs = most_runs(scene)
-    domain = grid_cost(scene, domain_extent(scene, spacing), spacing)
+    domain = grid_cost(scene, domain_extent(region_of(scene), spacing), spacing)
     boxes = cheapest_grouping(scene, spacing, tolerance, runs)
     gain = full_cost(domain, runs) / boxes.cost(runs)
     if any(is_wall(scene, obstacle) for obstacle in scene.obstacles):
         method, reason = "full", "a wall goes on without end"
-    elif any(_reaches_out(scene, obstacles_extent([obstacle])) for obstacle in scene.obstacles):
+    elif any(_reaches_out(scene, bodies_extent([obstacle])) for obstacle in scene.obstacles):
         method, reason = "box", "obstacles reach out of the domain, where full would cut them off"
     elif gain > 1:
         method, reason = "box", f"{gain:.2g} times cheaper than full"

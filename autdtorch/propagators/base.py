@@ -23,6 +23,7 @@ from autdtorch.fdtd.steady_state import SteadyState, fewest_periods
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.propagators.cache import DiskCache
 from autdtorch.propagators.cost import USUAL_PERIODS
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.propagators.symmetry import Plan, Symmetry, backward_plan, forward_plan, symmetries
 from autdtorch.propagators.workload import memory_for
 from autdtorch.scene.arrays import Nodes
@@ -127,7 +128,7 @@ class SimulatedPropagator(ABC):
         self._near_told = False
         self._kernel = kernel
         self._cache = cache
-        require_spacing(scene, spacing)
+        require_spacing(region_of(scene), spacing)
         needed = memory_for(scene, self.method, spacing, tolerance, dtype, kernel)
         require_memory("spacing", spacing, needed, "m")
         self._assemblies = self._assembled(dtype, time_step)
@@ -228,7 +229,7 @@ class SimulatedPropagator(ABC):
     @cached_property
     def _second(self) -> Self:
         """The same on another grid, which tells the error of this one."""
-        spacing = second_spacing(self.scene, self.spacing)
+        spacing = second_spacing(region_of(self.scene), self.spacing)
         return type(self)(
             self.scene, spacing, self.tolerance, self._kernel, self._assemblies[0].dtype, self.max_periods,
             self._cache, None,

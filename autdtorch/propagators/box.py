@@ -18,6 +18,7 @@ from autdtorch.propagators.base import SimulatedPropagator
 from autdtorch.propagators.cost import most_runs
 from autdtorch.propagators.coupling import coupled_runs
 from autdtorch.propagators.groups import MOST_PASSES, cheapest_grouping, one_box
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.propagators.workload import MOST_JUDGED
 from autdtorch.scene.arrays import Nodes
 from autdtorch.scene.scene import with_obstacles
@@ -61,7 +62,10 @@ class BoxPropagator(SimulatedPropagator):
         if len(groups) > 1:
             obstacles = self.scene.obstacles
             scenes = [with_obstacles(self.scene, [obstacles[one] for one in group]) for group in groups]
-        assemblies = [assemble_on(make_box(scene, self.spacing), scene, *self._wanted) for scene in scenes]
+        regions = [region_of(scene) for scene in scenes]
+        assemblies = [
+            assemble_on(make_box(region, self.spacing), region, *self._wanted) for region in regions
+        ]
         self._boxes = [Scattering(assembly, self.scene.complex_wavenumber) for assembly in assemblies]
         return assemblies
 
@@ -89,12 +93,13 @@ class BoxPropagator(SimulatedPropagator):
         drives = list(zip(origins, strength, strict=True))
         incident = torch.stack(
             [
-                self._boxes[0].incident(points.reshape(-1, 3), *drive).reshape(points.shape[:-1]) @ weights
-                for drive in drives
+                self._boxes[0].incident(points.reshape(-1, 3), *nodes, own).reshape(points.shape[:-1])
+                @ weights
+                for nodes, own in drives
             ],
             dim=1,
         )
-        reaches = [box.reach(targets) for box in self._boxes]
+        reaches = [box.reach(*targets) for box in self._boxes]
         if len(self._boxes) == 1:
             phasors = self._in_one_box(drives, incident, reaches[0], stepped)
         else:
@@ -126,7 +131,7 @@ class BoxPropagator(SimulatedPropagator):
         def run(given: tuple[Drive, torch.Tensor]) -> tuple[SteadyState, float]:
             begin, (drive, direct) = time.perf_counter(), given
             judged = _heard(matrix, direct)
-            steady = self._run(box, box.driving(*drive), reach, self.tolerance, judged, stepped)
+            steady = self._run(box, box.driving(*drive[0], drive[1]), reach, self.tolerance, judged, stepped)
             return steady, time.perf_counter() - begin
 
         given = zip(drives, incident[::every].mT, strict=True)
@@ -150,7 +155,9 @@ class BoxPropagator(SimulatedPropagator):
             reach = reaches[index]  # judged by all that leaves the box
             return self._run(self._boxes[index], field, reach, tolerance, reach.amplitudes, stepped)
 
-        driving = [torch.stack([box.driving(*drive) for drive in drives], dim=1) for box in self._boxes]
+        driving = [
+            torch.stack([box.driving(*drive[0], drive[1]) for drive in drives], dim=1) for box in self._boxes
+        ]
         heard = _heard(matrix, incident[::every])
         coupled = coupled_runs(self._boxes, reaches, driving, heard, simulate, self.tolerance)
         if coupled is None:

@@ -11,11 +11,11 @@ from autdtorch.fdtd.grid import (
     MIN_CELLS_PER_WAVELENGTH,
     Extent,
     layer_cells,
-    speeds_of,
 )
 from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.steady_state import fewest_periods
 from autdtorch.fdtd.stencil import tuned_stencil
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.scene import Scene
 
 _LAYER = 4.0
@@ -75,7 +75,7 @@ def grid_cost(scene: Scene, extent: Extent, spacing: float) -> GridCost:
     rim = layer_cells(kappa) + 1
     stencil = tuned_stencil(kappa, scene.attenuation * spacing)
     periods = fewest_periods(spacing * math.hypot(*interior) / scene.wavelength)
-    fastest = max(speeds_of(scene).values()) / scene.medium.sound_speed
+    fastest = max(region_of(scene).sound_speeds.values()) / scene.medium.sound_speed
     steps_per_period = fewest_steps(stencil, stencil.largest_symbol * fastest**2)
     shape = x + 2 * rim, y + 2 * rim, z + 2 * rim
     return GridCost(interior, shape, math.ceil(periods * steps_per_period), steps_per_period)

@@ -8,12 +8,13 @@ import torch
 
 from autdtorch.fdtd.adjoint import recorded
 from autdtorch.fdtd.cell_maps import cells_of_maps, domain_cells
-from autdtorch.fdtd.grid import Grid, make_grid, require_fine, speeds_of, warn_if_coarse
+from autdtorch.fdtd.grid import Grid, make_grid, require_fine, warn_if_coarse
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources
-from autdtorch.fdtd.medium import warn_of_ending_walls
+from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import block_of, fewest_periods
 from autdtorch.fdtd.stepping import Assembly, drive_signal, lock_in
 from autdtorch.fdtd.variable_cells import VariableCells, cells_of_obstacles
+from autdtorch.propagators.scene_region import region_of, warn_of_ending_walls
 from autdtorch.propagators.stepper import KERNELS, make_kernel, precision_of
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene, require_inside
@@ -78,8 +79,9 @@ def differentiable_field(
     targets = scene.control_points if points is None else points_tensor("points", points).cpu()
     require_inside(scene.domain, "points", targets)
     given = _material("density", density, scene), _material("sound_speed", sound_speed, scene)
-    grid = make_grid(scene, positive("spacing", spacing, "m"))
-    speeds = speeds_of(scene) | _slowest(scene, given[1])
+    region = region_of(scene)
+    grid = make_grid(region, positive("spacing", spacing, "m"))
+    speeds = region.sound_speeds | _slowest(scene, given[1])
     require_fine(speeds, scene.frequency, spacing)
     warn_if_coarse(speeds, scene.frequency, spacing)
     warn_of_ending_walls(scene)
@@ -88,8 +90,8 @@ def differentiable_field(
     periods = integer_at_least("periods", periods, 1)
     if time_step is not None:
         time_step = positive("time_step", time_step, "s")
-    cells = _cells(scene, grid, *given)
-    assembly = cells.assembly(grid, scene, precision, time_step)
+    cells = _cells(region, grid, *given)
+    assembly = cells.assembly(grid, region, precision, time_step)
     receivers, stepper = assembly.receivers(targets), make_kernel(kernel)
     fields = [
         _phasors(stepper, assembly, cells.driven(_sources(assembly, scene, row)), receivers, periods)
@@ -114,10 +116,11 @@ def cell_centers(scene: Scene, spacing: float = 1e-3) -> torch.Tensor:
         ValueError: the spacing is too coarse for the frequency.
     """
     require_kind("scene", scene, Scene)
-    grid = make_grid(scene, positive("spacing", spacing, "m"))
+    region = region_of(scene)
+    grid = make_grid(region, positive("spacing", spacing, "m"))
     axes = [
         torch.from_numpy(axis[part])
-        for axis, part in zip(grid.centers, domain_cells(scene, grid), strict=True)
+        for axis, part in zip(grid.centers, domain_cells(region, grid), strict=True)
     ]
     return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
 
@@ -145,11 +148,11 @@ def _slowest(scene: Scene, sound_speed: torch.Tensor | None) -> dict[str, float]
 
 
 def _cells(
-    scene: Scene, grid: Grid, density: torch.Tensor | None, sound_speed: torch.Tensor | None
+    region: Region, grid: Grid, density: torch.Tensor | None, sound_speed: torch.Tensor | None
 ) -> VariableCells:
     if any(given is not None and given.ndim == 3 for given in (density, sound_speed)):
-        return cells_of_maps(scene, grid, density, sound_speed)
-    return cells_of_obstacles(scene, grid, density, sound_speed)
+        return cells_of_maps(region, grid, density, sound_speed)
+    return cells_of_obstacles(region, grid, density, sound_speed)
 
 
 def _sources(assembly: Assembly, scene: Scene, drive: torch.Tensor) -> Sources:

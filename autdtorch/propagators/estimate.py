@@ -17,6 +17,7 @@ from autdtorch.fdtd.stepping import assemble, drive_signal
 from autdtorch.propagators import SIMULATED
 from autdtorch.propagators.auto import method_for
 from autdtorch.propagators.cost import grid_cost, most_runs
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.propagators.stepper import KERNELS, make_kernel, precision_of, relative_tolerance
 from autdtorch.propagators.workload import Workload, memory_for
 from autdtorch.scene.arrays import TransducerArray
@@ -102,10 +103,10 @@ def estimate(
     if method == "free_space":
         pairs, nodes = len(scene.array) * len(scene.control_points), len(scene.array.nodes.weights)
         return Estimate(method, None, 0, 0, PAIR_BYTES * pairs, _NODE_SECONDS * nodes * pairs)
-    require_spacing(scene, spacing)
+    require_spacing(region_of(scene), spacing)
     stepper = make_kernel(kernel)
     # a multiple: what is symmetric on the one grid is mostly so on the other
-    pilot = spacing * max(1, math.floor(pilot_spacing(scene) / spacing))
+    pilot = spacing * max(1, math.floor(pilot_spacing(region_of(scene)) / spacing))
     runs = most_runs(scene)
     if memory_for(scene, method, pilot, tolerance, precision, stepper) < available_memory():
         runs = SIMULATED[method](scene, pilot, tolerance, stepper, precision, 1, None, None).planned_runs
@@ -124,7 +125,7 @@ def _rate(kernel: type[Kernel], dtype: torch.dtype, cells: int) -> float:
     array = TransducerArray([[0.0, 0.0, 0.0]], (1.0, 0.0, 0.0))
     domain = (-half,) * 3, (half,) * 3
     scene = Scene(array, Medium(1.2, 340.0), 40e3, [[half / 2, 0.0, 0.0]], domain=domain)
-    assembly, stepper = assemble(scene, _AIR_SPACING, dtype), kernel()
+    assembly, stepper = assemble(region_of(scene), _AIR_SPACING, dtype), kernel()
     sources = assembly.sources(array.positions, torch.ones(1, dtype=torch.complex128, device="cpu"))
     receivers, state = assembly.receivers(scene.control_points), assembly.silence(sources)
     signal = drive_signal(assembly.steps_per_period, 0, _MEASURED_STEPS).to(dtype)
@@ -134,5 +135,5 @@ def _rate(kernel: type[Kernel], dtype: torch.dtype, cells: int) -> float:
         state, recorded = stepper.advance(state, assembly.coefficients, sources, receivers, signal)
         recorded.cpu()  # waits for a GPU
         spent = min(spent, time.perf_counter() - begin)
-    grid = grid_cost(scene, domain_extent(scene, _AIR_SPACING), _AIR_SPACING)
+    grid = grid_cost(scene, domain_extent(region_of(scene), _AIR_SPACING), _AIR_SPACING)
     return grid.work / grid.steps * _MEASURED_STEPS / spent

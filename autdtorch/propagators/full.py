@@ -12,6 +12,7 @@ import torch
 from autdtorch.fdtd.steady_state import run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble
 from autdtorch.propagators.base import SimulatedPropagator
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.propagators.workload import MOST_JUDGED
 from autdtorch.scene.arrays import Nodes
 from autdtorch.scene.scene import require_inside
@@ -24,7 +25,7 @@ class FullPropagator(SimulatedPropagator):
     method = "full"
 
     def _assembled(self, dtype: torch.dtype, time_step: float | None) -> Sequence[Assembly]:
-        return (assemble(self.scene, self.spacing, dtype, time_step),)
+        return (assemble(region_of(self.scene), self.spacing, dtype, time_step),)
 
     def _checked(self, points: ArrayLike) -> torch.Tensor:
         points = points_tensor("points", points).cpu()

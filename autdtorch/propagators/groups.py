@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.grid import Extent, obstacles_extent
+from autdtorch.fdtd.grid import Extent, bodies_extent
 from autdtorch.propagators.cost import GridCost, box_cost, grid_cost
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.scene import Scene
@@ -43,7 +43,7 @@ class Grouping:
 def one_box(scene: Scene, spacing: float) -> Grouping:
     """All obstacles in one box on cells of `spacing` [m]."""
     everything = tuple(range(len(scene.obstacles)))
-    return Grouping((everything,), (grid_cost(scene, obstacles_extent(scene.obstacles), spacing),), 1)
+    return Grouping((everything,), (grid_cost(scene, bodies_extent(scene.obstacles), spacing),), 1)
 
 
 def cheapest_grouping(scene: Scene, spacing: float, tolerance: float, runs: int) -> Grouping:
@@ -56,7 +56,7 @@ def cheapest_grouping(scene: Scene, spacing: float, tolerance: float, runs: int)
         return best
     groups: list[tuple[int, ...]] = [(index,) for index in range(len(scene.obstacles))]
     while len(groups) > 1:
-        extents = [obstacles_extent(_members(scene, group)) for group in groups]
+        extents = [bodies_extent(_members(scene, group)) for group in groups]
         gaps = _gaps(extents, spacing)
         if gaps.min() > 0:
             grids = tuple(grid_cost(scene, extent, spacing) for extent in extents)

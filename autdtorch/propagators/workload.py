@@ -15,6 +15,7 @@ from autdtorch.fdtd.points import footprint
 from autdtorch.fdtd.steady_state import phasors_kept
 from autdtorch.propagators.cost import USUAL_PERIODS, GridCost, grid_cost, most_runs
 from autdtorch.propagators.groups import cheapest_grouping
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.obstacles import Mesh
 from autdtorch.scene.scene import Scene
 
@@ -131,7 +132,7 @@ class Workload:
         """Count it for "box" or "full" on cells of `spacing` [m], boxes being coupled to a `tolerance`."""
         heard = max(len(scene.control_points), scene.array.nodes.positions[..., 0].numel())
         if method == "full":
-            grid = grid_cost(scene, domain_extent(scene, spacing), spacing)
+            grid = grid_cost(scene, domain_extent(region_of(scene), spacing), spacing)
             kept = min(grid.cells, heard * footprint(scene.wavenumber * spacing) ** 3)
             return cls((grid,), 1, Matter.in_domain(scene, spacing), kept, 0, 0)
         grouping = cheapest_grouping(scene, spacing, tolerance, most_runs(scene))

@@ -15,6 +15,7 @@ from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources, State
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import Assembly, assemble
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.obstacles import Box, Obstacle, Sphere
 
 HEAVY = Sphere((4.7e-3, 4.2e-3, 4.6e-3), 1.7e-3, density=20.0, sound_speed=300.0)
@@ -30,7 +31,7 @@ Gradients = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 def parts(dtype: torch.dtype, *obstacles: Obstacle) -> Parts:
     """A 2 x 2 array in absorbing air, what drives it, and three receivers."""
     scene = small_scene(obstacles, extent=9e-3, absorption=40.0)
-    assembly = assemble(scene, 1.4e-3, dtype)
+    assembly = assemble(region_of(scene), 1.4e-3, dtype)
     strength = torch.tensor([1.0, 1j, -0.4, 0.3 - 0.7j], dtype=torch.complex128)
     return (
         assembly,

@@ -15,6 +15,7 @@ from autdtorch.fdtd.cell_maps import cells_of_maps
 from autdtorch.fdtd.grid import make_grid
 from autdtorch.fdtd.medium import fill_elements
 from autdtorch.fdtd.stepping import air_stencil
+from autdtorch.propagators.scene_region import region_of
 
 SPHERE = at.Sphere((6.2e-3, 5.7e-3, 6.1e-3), 2e-3, density=20.0, sound_speed=300.0)
 RIGID = at.Box((3e-3, 9.5e-3, 9.5e-3), (3e-3, 3e-3, 3e-3), rigid=True)
@@ -127,12 +128,12 @@ def test_uniform_maps_are_a_material() -> None:
     air = small_scene(extent=24e-3)
     box = at.Box((12e-3, 12e-3, 12e-3), (12e-3, 12e-3, 12e-3), density=3.0, sound_speed=450.0)
     scene = small_scene((box,), extent=24e-3, absorption=40.0)
-    grid = make_grid(scene, 2e-3)
-    stencil = air_stencil(grid, scene)
-    cells = varying_cells(fill_elements(scene, grid, stencil), stencil)
+    grid = make_grid(region_of(scene), 2e-3)
+    stencil = air_stencil(grid, region_of(scene))
+    cells = varying_cells(fill_elements(region_of(scene), grid, stencil), stencil)
     shape = at.cell_centers(air, 2e-3).shape[:3]
     full = torch.ones(shape, dtype=torch.float64)
-    same = cells_of_maps(scene, grid, 3.0 * full, 450.0 * full).varying
+    same = cells_of_maps(region_of(scene), grid, 3.0 * full, 450.0 * full).varying
     places = np.stack(np.unravel_index(cells.index, grid.shape), axis=-1)
     far = box.signed_distance(np.array(grid.origin) + grid.spacing * places).numpy()
     deep = far < -1.8 * grid.spacing
@@ -141,7 +142,7 @@ def test_uniform_maps_are_a_material() -> None:
     # the mean over directions is a quadrature in the one and a closed form in the other
     np.testing.assert_allclose(same.weight[place], cells.weight[deep], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(same.mass[place], cells.mass[deep], rtol=1e-9)
-    silent = cells_of_maps(scene, grid, AIR.density * full, AIR.sound_speed * full).varying
+    silent = cells_of_maps(region_of(scene), grid, AIR.density * full, AIR.sound_speed * full).varying
     np.testing.assert_allclose(silent.weight, np.tile(stencil.weights, (len(silent.index), 1)), atol=1e-9)
 
 

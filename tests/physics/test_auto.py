@@ -13,6 +13,7 @@ from small_scenes import CUBE, relative_error, small_scene
 from autdtorch.fdtd.grid import make_box, make_grid
 from autdtorch.propagators import FreeSpacePropagator, SimulatedPropagator, make_propagator
 from autdtorch.propagators.auto import method_for
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.obstacles import Box, Obstacle, Sphere
 
 
@@ -53,8 +54,8 @@ def test_the_log_counts_what_is_simulated(caplog: pytest.LogCaptureFixture) -> N
         for counts in re.findall(r"([\d,]+) cells x ([\d,]+) steps x (\d+) runs", caplog.text)
     )
     # the place of the grid within a cell is not known before the obstacles' surfaces are
-    assert chosen[0] == pytest.approx(math.prod(make_box(scene, 1e-3).shape), rel=0.1)
-    assert naive[0] == pytest.approx(math.prod(make_grid(scene, 1e-3).shape), rel=0.1)
+    assert chosen[0] == pytest.approx(math.prod(make_box(region_of(scene), 1e-3).shape), rel=0.1)
+    assert naive[0] == pytest.approx(math.prod(make_grid(region_of(scene), 1e-3).shape), rel=0.1)
     assert chosen[2] == len(propagator.runs)
     assert naive[2] == len(scene.array)
     steps_per_period = 1 / (scene.frequency * propagator.time_step)

@@ -12,6 +12,7 @@ from small_scenes import AIR, CUBE, relative_error, small_scene
 from autdtorch.analytic import rigid_sphere
 from autdtorch.fdtd.grid import make_box
 from autdtorch.propagators import make_propagator
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Sphere
 from autdtorch.scene.scene import OverlapWarning
@@ -71,7 +72,7 @@ def test_the_field_passes_the_rim_of_the_box_smoothly() -> None:
     """From the grid's field inside to what the surface radiates, also on the centre of a cell."""
     scene = small_scene((SPHERE,))
     propagator = make_propagator(scene, "box", 1e-3, tolerance=1e-4)
-    grid = make_box(scene, 1e-3)
+    grid = make_box(region_of(scene), 1e-3)
     rim = grid.origin[0] + 1e-3 * (grid.last[0] - 1)
     across = [grid.origin[axis] + 1e-3 * (grid.first[axis] + 6) for axis in (1, 2)]
     points = torch.tensor([(rim + 1e-3 * step, *across) for step in (-3, -2.5, -2, -1.5, -1, -0.5, 0)])

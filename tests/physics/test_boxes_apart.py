@@ -13,7 +13,7 @@ import torch
 from small_scenes import AIR, relative_error
 
 from autdtorch.analytic.green import free_space_matrix
-from autdtorch.fdtd.grid import obstacles_extent
+from autdtorch.fdtd.grid import bodies_extent
 from autdtorch.propagators import BoxPropagator, make_propagator
 from autdtorch.propagators.cost import _PAIR, box_cost, grid_cost
 from autdtorch.propagators.groups import Grouping, cheapest_grouping, one_box
@@ -138,7 +138,7 @@ def cubes(edge: float, gap: float) -> Scene:
 
 def box_each(scene: Scene, spacing: float) -> Grouping:
     """Its two obstacles, a box each."""
-    grids = tuple(grid_cost(scene, obstacles_extent([one]), spacing) for one in scene.obstacles)
+    grids = tuple(grid_cost(scene, bodies_extent([one]), spacing) for one in scene.obstacles)
     return Grouping(((0,), (1,)), grids, passes=3)
 
 

@@ -21,6 +21,7 @@ from autdtorch.fdtd.kernels.cuda import Blocks, CudaKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import assemble
 from autdtorch.propagators import make_propagator
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.obstacles import Box, Obstacle
 
 needs_gpu = pytest.mark.skipif(
@@ -45,7 +46,7 @@ Parts = tuple[tuple[int, int, int], Coefficients, Sources, Receivers]
 
 def parts(obstacles: tuple[Obstacle, ...], dtype: torch.dtype, absorption: float = 0.0) -> Parts:
     """Coefficients of a scene; sources and receivers all over the grid, in special cells too."""
-    assembly = assemble(small_scene(obstacles, SIZE, absorption), 1e-3, dtype)
+    assembly = assemble(region_of(small_scene(obstacles, SIZE, absorption)), 1e-3, dtype)
     c, shape = assembly.coefficients, assembly.grid.shape
     generator = torch.Generator().manual_seed(1)
     inner = torch.zeros(shape, dtype=torch.bool)

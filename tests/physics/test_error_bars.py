@@ -12,6 +12,7 @@ from autdtorch import analytic
 from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd.spacing import RATIO, coarsest_spacing, grid_error, second_spacing, spacing_for
 from autdtorch.propagators import FreeSpacePropagator, FullPropagator, make_propagator
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.obstacles import Sphere
 
 CENTER, RADIUS = (12.2e-3, 11.9e-3, 12.1e-3), 3.3e-3
@@ -60,7 +61,7 @@ def test_a_tolerance_chooses_a_spacing_that_meets_it() -> None:
     )
     assert isinstance(loose, FullPropagator)
     assert isinstance(tight, FullPropagator)
-    assert tight.spacing < loose.spacing <= coarsest_spacing(loose.scene)
+    assert tight.spacing < loose.spacing <= coarsest_spacing(region_of(loose.scene))
     assert relative_error(tight.transfer_matrix(), exact) < 0.06
 
 
@@ -68,7 +69,7 @@ def test_a_spacing_is_chosen_also_where_nothing_scatters() -> None:
     like_air = Sphere(CENTER, RADIUS, density=AIR.density, sound_speed=AIR.sound_speed)
     scene = small_scene((like_air,))
     propagator = make_propagator(scene, "box", None, tolerance=0.1)
-    assert propagator.spacing == coarsest_spacing(scene)
+    assert propagator.spacing == coarsest_spacing(region_of(scene))
 
 
 @pytest.mark.filterwarnings("ignore:no steady state")
@@ -85,5 +86,5 @@ def test_spacings_and_errors_scale_with_the_order() -> None:
     assert grid_error(coarse, fine, coarser=False) == pytest.approx(1e-3 * RATIO ** (4 / 3), rel=3e-3)
     assert spacing_for(1e-3, 1e-3 * 2 ** (4 / 3), 2 * h) == pytest.approx(h)
     scene = small_scene()
-    assert second_spacing(scene, h) == RATIO * h
-    assert second_spacing(scene, 2e-3) == 2e-3 / RATIO
+    assert second_spacing(region_of(scene), h) == RATIO * h
+    assert second_spacing(region_of(scene), 2e-3) == 2e-3 / RATIO

@@ -22,6 +22,7 @@ from autdtorch.fdtd.kernels.contract import (
 from autdtorch.fdtd.kernels.cpu import CpuKernel, _cuts
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import Assembly, assemble, drive_signal
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.scene import Box
 
 RIGID = Box(center=(15e-3, 4e-3, 9e-3), size=(4e-3, 6e-3, 7e-3), rigid=True)
@@ -34,7 +35,7 @@ PLATE = Box((12e-3, 12e-3, 21.7e-3), (30e-3, 40e-3, 1.7e-3), density=5.0, sound_
 
 def scene_parts(dtype: torch.dtype, absorption: float = 0.0) -> tuple[Assembly, Sources, Receivers]:
     scene = small_scene((CUBE, RIGID, FAST, PLATE), extent=24e-3, absorption=absorption)
-    assembly = assemble(scene, 1e-3, dtype)
+    assembly = assemble(region_of(scene), 1e-3, dtype)
     strength = torch.tensor([1.0, 1j, -0.4, 0.3 - 0.7j], dtype=torch.complex128)
     return (
         assembly,

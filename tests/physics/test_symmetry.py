@@ -18,6 +18,7 @@ from small_scenes import AIR, relative_error
 from autdtorch.fdtd.grid import make_box
 from autdtorch.io.scene_file import load_scene
 from autdtorch.propagators import SimulatedPropagator, make_propagator
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import circle_points
 from autdtorch.scene.obstacles import Box, Cylinder, Obstacle, Sphere, VoxelMask
@@ -165,7 +166,7 @@ def image(obstacle: Obstacle, exchange: bool, signs: tuple[int, int]) -> Obstacl
 
 
 def lies_symmetrically(scene: Scene, spacing: float) -> bool:
-    grid = make_box(scene, spacing)
+    grid = make_box(region_of(scene), spacing)
     # rounding of coordinates
     return all(abs(grid.centers[axis][[0, -1]].mean() - 12e-3) < 1e-12 for axis in (1, 2))
 

@@ -17,6 +17,7 @@ from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.stepping import Assembly, assemble, drive_signal, lock_in
 from autdtorch.propagators import make_propagator
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.scene import Box
 
 NOBODY = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros((0, 2), dtype=torch.float64))
@@ -79,7 +80,7 @@ def true_eigenvalue(assembly: Assembly) -> float:
 @pytest.mark.parametrize("name", SCENES)
 def test_time_step_is_just_below_the_limit(name: str) -> None:
     obstacles, spacing = SCENES[name]
-    assembly = assemble(small_scene(obstacles), spacing, torch.float64)
+    assembly = assemble(region_of(small_scene(obstacles)), spacing, torch.float64)
     limit = fewest_steps(assembly.stencil, true_eigenvalue(assembly))
     assert 0.95 <= limit / float(assembly.steps_per_period) <= 1
 
@@ -87,7 +88,7 @@ def test_time_step_is_just_below_the_limit(name: str) -> None:
 @pytest.mark.parametrize("name", ["paper", "light"])
 def test_a_run_is_bounded_at_the_chosen_time_step_and_blows_up_above_the_limit(name: str) -> None:
     obstacles, spacing = SCENES[name]
-    assembly = assemble(small_scene(obstacles), spacing, torch.float64)
+    assembly = assemble(region_of(small_scene(obstacles)), spacing, torch.float64)
     stencil, c = assembly.stencil, assembly.coefficients
     limit = fewest_steps(stencil, true_eigenvalue(assembly))
     ratio = stencil.time_factor(limit / 1.05) / stencil.time_factor(float(assembly.steps_per_period))

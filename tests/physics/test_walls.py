@@ -15,6 +15,7 @@ from autdtorch.fdtd.kernels.contract import Receivers, Sources
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.stepping import assemble
 from autdtorch.propagators import make_propagator
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Obstacle, Sphere
 from autdtorch.scene.scene import Scene
@@ -76,7 +77,7 @@ def test_slabs_through_the_layers_do_not_grow(
     array = TransducerArray([(2e-3, 4e-3, 2e-3)], (1, 0, 0))
     plate = slab(2, (4 + offset) * 1e-3, 3.2e-3, density)
     scene = Scene(array, AIR, 40e3, [(6e-3, 5e-3, 2e-3)], (plate,), domain=((0, 0, 0), (9e-3,) * 3))
-    assembly = assemble(scene, 1e-3, torch.float64)
+    assembly = assemble(region_of(scene), 1e-3, torch.float64)
     state = assembly.silence(assembly.sources(scene.array.positions, torch.ones(1, dtype=torch.complex128)))
     inside = tuple(map(slice, assembly.grid.first, assembly.grid.last))
     shape = assembly.grid.interior
@@ -105,7 +106,7 @@ def test_slabs_through_the_layers_do_not_grow(
     ids=["sphere", "post", "wall", "light slab"],
 )
 def test_only_walls_across_the_domain_go_on_through_the_layers(obstacle: Obstacle, goes_on: bool) -> None:
-    assembly = assemble(layered_scene((obstacle,), FRONT), 2e-3)
+    assembly = assemble(region_of(layered_scene((obstacle,), FRONT)), 2e-3)
     index = torch.cat((torch.from_numpy(assembly.varying.index), torch.from_numpy(assembly.varying.rigid)))
     depth = index % assembly.grid.shape[2]
     assert bool((depth < assembly.grid.first[2]).any()) == goes_on
@@ -114,7 +115,7 @@ def test_only_walls_across_the_domain_go_on_through_the_layers(obstacle: Obstacl
 
 
 def test_walls_of_another_direction_end_before_the_layers() -> None:
-    assembly = assemble(layered_scene((slab(0), slab(0, 28e-3), slab(1, 17e-3)), FRONT), 2e-3)
+    assembly = assemble(region_of(layered_scene((slab(0), slab(0, 28e-3), slab(1, 17e-3)), FRONT)), 2e-3)
     x, _, z = np.unravel_index(assembly.varying.index, assembly.grid.shape)
     before = x < assembly.grid.to_cells(torch.tensor([[FACE - 4e-3, 0, 0]]))[0, 0]
     assert before.any()
@@ -124,7 +125,7 @@ def test_walls_of_another_direction_end_before_the_layers() -> None:
 def test_an_obstacle_at_a_wall_leaves_its_rows_in_the_layers() -> None:
     """It ends before them: there all rows along the wall are alike, also those beside its end."""
     post = Box((FACE - 3e-3, 12e-3, 20e-3), (6e-3, 7e-3, 80e-3), density=40.0, sound_speed=1e3)
-    assembly = assemble(layered_scene((slab(), post), FRONT), 1e-3, torch.float64)
+    assembly = assemble(region_of(layered_scene((slab(), post), FRONT)), 1e-3, torch.float64)
     columns = assembly.coefficients.columns
     inwards = columns.index[:, 1] - columns.index[:, 0] == 1  # along z, from its lower end
     weight, x = (

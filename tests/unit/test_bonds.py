@@ -12,6 +12,7 @@ from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.medium import ElementMedium, fill_elements
 from autdtorch.fdtd.stencil import OFFSETS, tuned_stencil
 from autdtorch.fdtd.surface import VERTICES, CutElements, Materials, energy_matrix
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Obstacle, Sphere
 from autdtorch.scene.scene import Medium, Scene
@@ -51,7 +52,7 @@ def box(
 def assembled(*obstacles: Obstacle) -> tuple[ElementMedium, VaryingCells]:
     array = TransducerArray([[2e-3, -0.9, 0.0]], (1, 0, 0))
     scene = Scene(array, AIR, 40e3, [[2e-3, 0.9, 0.0]], obstacles, domain=((-1, -1, -1), (1, 1, 1)))
-    medium = fill_elements(scene, GRID, STENCIL)
+    medium = fill_elements(region_of(scene), GRID, STENCIL)
     return medium, varying_cells(medium, STENCIL)
 
 

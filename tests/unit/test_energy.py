@@ -14,6 +14,7 @@ from autdtorch.fdtd.medium import fill_elements
 from autdtorch.fdtd.stability import largest_eigenvalue
 from autdtorch.fdtd.stencil import OFFSETS, Stencil, tuned_stencil
 from autdtorch.fdtd.surface import energy_matrix
+from autdtorch.propagators.scene_region import region_of
 
 SCENES = range(12)
 
@@ -41,9 +42,9 @@ def assert_not_negative(matrix: np.ndarray, largest: float) -> None:
 @pytest.mark.parametrize("number", SCENES)
 def test_energy_is_symmetric_positive_and_bounded(number: int) -> None:
     trial = draw_trial(0, number, long_share=1.0)
-    grid = make_grid(trial.scene, trial.spacing)
+    grid = make_grid(region_of(trial.scene), trial.spacing)
     stencil = tuned_stencil(grid.kappa)
-    medium = fill_elements(trial.scene, grid, stencil)
+    medium = fill_elements(region_of(trial.scene), grid, stencil)
 
     # of every element by itself, which is more than it takes; what is left is rounding
     own = np.linalg.eigvalsh(energy_matrix(medium.elements.bonds))

@@ -6,6 +6,7 @@ import pytest
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.medium import RIGID, ElementMedium, fill_elements, speed_factor
 from autdtorch.fdtd.stencil import tuned_stencil
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Obstacle, Sphere
 from autdtorch.scene.scene import Medium, OverlapWarning, Scene
@@ -26,7 +27,7 @@ def box(low: tuple[float, ...], high: tuple[float, ...], ratio: float = 77.0, sp
 def filled(*obstacles: Obstacle) -> ElementMedium:
     array = TransducerArray([[-0.9, 0.0, 0.0]], (1, 0, 0))
     scene = Scene(array, AIR, 40e3, [[0.9, 0.0, 0.0]], obstacles, domain=((-1, -1, -1), (1, 1, 1)))
-    return fill_elements(scene, GRID, STENCIL)
+    return fill_elements(region_of(scene), GRID, STENCIL)
 
 
 def element_centers() -> np.ndarray:

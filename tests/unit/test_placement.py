@@ -11,6 +11,7 @@ from small_scenes import AIR
 from autdtorch.fdtd.grid import make_grid
 from autdtorch.fdtd.placement import grid_offset
 from autdtorch.fdtd.points import footprint
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Obstacle, Sphere, VoxelMask
 from autdtorch.scene.scene import Scene
@@ -33,7 +34,7 @@ def box(low: tuple[float, ...], size: tuple[float, ...], density: float | None =
 
 def after_center(scene: Scene, place: float, axis: int = 0) -> float:
     """How far behind the cell centre before it a coordinate [m] lies, in cells."""
-    grid = make_grid(scene, SPACING)
+    grid = make_grid(region_of(scene), SPACING)
     return float((place - grid.origin[axis]) / SPACING % 1)
 
 
@@ -65,12 +66,12 @@ def test_a_face_that_cannot_lie_half_way_lies_closer_to_the_lighter_side(density
 def test_nothing_moves_without_flat_faces_along_the_grid() -> None:
     sphere = Sphere((12.3e-3, 10.2e-3, 9.9e-3), 5e-3, rigid=True)
     tilted = Box((20e-3, 20e-3, 20e-3), (3e-3, 4e-3, 5e-3), (0.3, 0.2, 0.1), rigid=True)
-    assert grid_offset(scene(sphere, tilted), SPACING, *CORNERS) == (0.0, 0.0, 0.0)
-    assert grid_offset(scene(), SPACING, *CORNERS) == (0.0, 0.0, 0.0)
+    assert grid_offset(region_of(scene(sphere, tilted)), SPACING, *CORNERS) == (0.0, 0.0, 0.0)
+    assert grid_offset(region_of(scene()), SPACING, *CORNERS) == (0.0, 0.0, 0.0)
 
 
 def test_nothing_moves_where_faces_lie_well() -> None:
-    assert grid_offset(scene(box((5, 6, 7), (8, 9, 10))), SPACING, *CORNERS) == (0.0, 0.0, 0.0)
+    assert grid_offset(region_of(scene(box((5, 6, 7), (8, 9, 10)))), SPACING, *CORNERS) == (0.0, 0.0, 0.0)
 
 
 def test_voxels_have_faces_too() -> None:
@@ -78,7 +79,8 @@ def test_voxels_have_faces_too() -> None:
     mask[1:3, 1, 1] = True
     voxels = VoxelMask(mask, 2e-3, (10.4e-3, 10.4e-3, 10.4e-3), rigid=True)
     assert all(
-        math.isclose(offset, 0.6, abs_tol=1e-6) for offset in grid_offset(scene(voxels), SPACING, *CORNERS)
+        math.isclose(offset, 0.6, abs_tol=1e-6)
+        for offset in grid_offset(region_of(scene(voxels)), SPACING, *CORNERS)
     )
 
 
@@ -86,11 +88,11 @@ def test_a_grid_far_finer_than_the_wavelength_is_refused() -> None:
     with pytest.raises(
         ValueError, match=r"spacing: 1e-05 m; must be at least 1\.\d+e-05 m, 500 cells per wave"
     ):
-        make_grid(scene(), 1e-5)
+        make_grid(region_of(scene()), 1e-5)
 
 
 def test_the_grid_covers_the_domain_wherever_it_lies() -> None:
-    grid = make_grid(scene(box((5.3, 6.7, 7.9), (8, 9, 10))), SPACING)
+    grid = make_grid(region_of(scene(box((5.3, 6.7, 7.9), (8, 9, 10)))), SPACING)
     margin = footprint(grid.kappa) // 2 - 1  # cells that points beside the rim of the domain need
     for centers, first, last in zip(grid.centers, grid.first, grid.last, strict=True):
         assert centers[first + margin] <= 0.5 * SPACING + 1e-9

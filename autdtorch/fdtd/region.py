@@ -1,0 +1,101 @@
+"""The region that is simulated: a fluid, bodies in it, and the frequency of the drive."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from autdtorch.utils.validation import Vector
+
+
+class Fluid(NamedTuple):
+    """Density [kg/m^3] and sound speed [m/s] of a fluid."""
+
+    density: float
+    sound_speed: float
+
+
+class Shape(Protocol):
+    """A shape that a grid can represent."""
+
+    @property
+    def lower(self) -> Vector:
+        """Corner of the bounding box with the smallest coordinates (3,) [m]."""
+        ...
+
+    @property
+    def upper(self) -> Vector:
+        """Corner of the bounding box with the largest coordinates (3,) [m]."""
+        ...
+
+    def signed_distance(self, points: torch.Tensor, /) -> torch.Tensor:
+        """Return the distance (...) [m] of points (..., 3) to the surface, negative inside."""
+        ...
+
+    def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return vertices (V, 3) [m] and triangles (F, 3), counter-clockwise as seen from outside."""
+        ...
+
+
+@dataclass(frozen=True)
+class Body:
+    """A shape of one material.
+
+    Attributes:
+        shape: its geometry.
+        fluid: its material, None where it is sound-hard.
+        continued: whether it continues through the boundary layers instead of ending before them.
+    """
+
+    shape: Shape
+    fluid: Fluid | None
+    continued: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """A fluid with bodies in it, at one frequency.
+
+    Attributes:
+        fluid: the fluid around the bodies, called air.
+        attenuation: its attenuation [Np/m].
+        frequency: frequency of the drive [Hz].
+        bodies: may overlap; the later one counts.
+        domain: corners (lower, upper) [m] of the space that a grid of the whole domain covers.
+        sources: positions of the transducers (M, 3) [m]; a grid stays symmetric where they are.
+    """
+
+    fluid: Fluid
+    attenuation: float
+    frequency: float
+    bodies: tuple[Body, ...]
+    domain: tuple[Vector, Vector]
+    sources: NDArray[np.float64]
+
+    @property
+    def wavenumber(self) -> float:
+        """Wavenumber in air [rad/m]."""
+        return 2 * math.pi * self.frequency / self.fluid.sound_speed
+
+    @property
+    def wavelength(self) -> float:
+        """Wavelength in air [m]."""
+        return self.fluid.sound_speed / self.frequency
+
+    @property
+    def shapes(self) -> list[Shape]:
+        """Shapes of the bodies."""
+        return [body.shape for body in self.bodies]
+
+    @property
+    def sound_speeds(self) -> dict[str, float]:
+        """Sound speeds [m/s] by where they are, for messages."""
+        fluids = {f"obstacle {index}": body.fluid for index, body in enumerate(self.bodies) if body.fluid}
+        return {"the medium": self.fluid.sound_speed} | {
+            where: fluid.sound_speed for where, fluid in fluids.items()
+        }
