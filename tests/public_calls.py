@@ -180,6 +180,7 @@ ARGUMENTS: dict[str, Any] = {
     "method": "box",
     "microphones": [hardware.Microphone(1, 0.01, 1.0)],
     "mode": "transfer",
+    "modules": (),
     "names": {"scene": {"gabs": ["a", "b"]}},
     "noise": 1e-4,
     "objective": Made(lambda _: objective()),

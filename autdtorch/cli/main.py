@@ -28,8 +28,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 import autdtorch
 from autdtorch.cli.config_files import CONFIGS, register
-from autdtorch.cli.method_section import TARGET, Method, load_method, parameters
+from autdtorch.cli.method_section import Method, load_method, parameters
 from autdtorch.io.yaml_file import plain
+from autdtorch.utils.trusted import TARGET
 from autdtorch.utils.validation import require_known
 
 if TYPE_CHECKING:
@@ -49,6 +50,8 @@ _SETTINGS = ("scene", "method", "scenes", "methods", "solver", "trials", "seed",
 _PLACES = ("modules", "output")  # settings that change no result
 _CALLS = (TARGET, "_args_", "_convert_", "_partial_", "_recursive_")  # keys by which Hydra calls functions
 
+_TARGETS = re.compile(rf"(method|methods\.[^.]+|(scene|scenes\.[^.]+)\.obstacles\.\d+)\.{TARGET}")
+
 _LONGEST_NAME = 150  # of a job's folder; file systems allow 255 bytes
 
 _AGAIN = "the same command repeats what is not finished"
@@ -57,10 +60,11 @@ _NO_SLURM = 'Could not detect "srun"'  # submitit, where it is to hand jobs to a
 _SUBMITIT_ERRORS = ("FailedJobError", "UncompletedJobError")
 _LOST_JOB = re.compile(r" (/.*/(\d[\d_]*))/\2_\d+_(?:result\.pkl|log\.err)$", re.MULTILINE)
 
-_COLLECT_HELP = """autdtorch collect FOLDER
+_COLLECT_HELP = """autdtorch collect FOLDER [modules=NAME]
 
 Merges the finished studies in a folder and below it, such as those of a sweep in multirun, into one table
-(summary.csv) and one report (report.md, report.html), which are written there."""
+(summary.csv) and one report (report.md, report.html), which are written there. modules=NAME allows obstacles
+of one's own, which the module NAME defines."""
 
 
 class _Refusal(BaseException):
@@ -238,11 +242,13 @@ def _collect(arguments: list[str]) -> None:
     if {"-h", "--help"} & set(arguments):
         print(_COLLECT_HELP)
         return
-    if len(arguments) != 1 or arguments[0].startswith("-"):
+    modules = [word.removeprefix("modules=") for word in arguments if word.startswith("modules=")]
+    folders = [word for word in arguments if not word.startswith("modules=")]
+    if len(folders) != 1 or folders[0].startswith("-"):
         raise ValueError(f"collect: {shlex.join(arguments)!r}; must be one folder, such as multirun")
     logging.basicConfig(format="%(message)s")
-    folder = Path(arguments[0])
-    sweep = collect_results(folder)
+    folder = Path(folders[0])
+    sweep = collect_results(folder, modules)
     save_summary(sweep.results, sweep.swept, folder / SUMMARY_FILE)
     command = shlex.join(["autdtorch", "collect", *arguments])
     report = write_report(sweep.results, sweep.scenes, folder, command, sweep.seeds)
@@ -253,7 +259,7 @@ def _collect(arguments: list[str]) -> None:
 
 def _single(settings: Mapping[str, Any], modules: list[Any]) -> tuple[dict[str, Scene], dict[str, Method]]:
     """The one scene and the one method, each by its name."""
-    scene = _scene("scene", _section(settings, "scene"))
+    scene = _scene("scene", _section(settings, "scene"), modules)
     method = load_method("method", _section(settings, "method"), modules)
     return {HydraConfig.get().runtime.choices["scene"]: scene}, {method.func.__name__: method}
 
@@ -266,17 +272,18 @@ def _experiment(
         if key in settings:
             names = ", ".join(_section(settings, f"{key}s"))
             raise ValueError(f"{key}: given beside an experiment, which has its own {key}s: {names}")
-    scenes = {name: _scene(f"scenes.{name}", part) for name, part in _section(settings, "scenes").items()}
+    parts = _section(settings, "scenes")
+    scenes = {name: _scene(f"scenes.{name}", part, modules) for name, part in parts.items()}
     sections = _section(settings, "methods")
     methods = {name: load_method(f"methods.{name}", _section(sections, name), modules) for name in sections}
     return scenes, methods
 
 
-def _scene(where: str, section: Mapping[str, Any]) -> Scene:
+def _scene(where: str, section: Mapping[str, Any], modules: list[Any]) -> Scene:
     from autdtorch.io.scene_file import load_scene
 
     try:
-        return load_scene(section)
+        return load_scene(section, modules)
     except ValueError as error:
         raise ValueError(f"{where}: {str(error).removeprefix('scene mapping: ')}") from error
 
@@ -306,14 +313,13 @@ def _solver(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _require_no_calls(value: object, *path: str) -> None:
-    """Refuse the keys by which Hydra calls functions, but for the target of a method."""
+    """Refuse the keys by which Hydra calls functions, except the target of a method or obstacle."""
     if isinstance(value, list):
         value = dict(enumerate(value))
     for key, entry in value.items() if isinstance(value, dict) else ():
         place = (*path, str(key))
-        is_method = place[:-1] == ("method",) or (place[:1] == ("methods",) and len(place) == 3)
-        if key in _CALLS and not (is_method and key == TARGET):
-            accepted = "must not be given; a method alone has a _target_"
+        if key in _CALLS and not _TARGETS.fullmatch(".".join(place)):
+            accepted = "must not be given; only a method or an obstacle has a _target_"
             raise ValueError(f"{'.'.join(place)}: {entry!r}; {accepted}")
         _require_no_calls(entry, *place)
 

@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 import functools
-import importlib
 import inspect
-import os
-import sys
 from collections.abc import Callable, Collection, Mapping
-from types import ModuleType
 from typing import Any, TypeAlias, cast
 
 import autdtorch
 from autdtorch.methods import METHOD_LABELS
+from autdtorch.utils.trusted import TARGET, load_trusted
 from autdtorch.utils.validation import require_known
 
 Method: TypeAlias = "functools.partial[Any]"
-
-TARGET = "_target_"
-"""The key that names the function."""
 
 _NO_SETTINGS = ("objective", "trials", "seed", "score")  # the first three are the study's to give
 
@@ -56,29 +50,8 @@ def _function(where: str, target: object, modules: Collection[Any]) -> Callable[
     module, _, name = str(target).rpartition(".")
     if module == "autdtorch" and name in METHOD_LABELS:
         return cast(Callable[..., Any], getattr(autdtorch, name))
-    if module not in modules:
-        ours = ", ".join(f"autdtorch.{method}" for method in METHOD_LABELS)
-        accepted = "or a function of a module that the command line names, as modules=MODULE"
-        raise ValueError(f"{where}: {target!r}; must be one of {ours}, {accepted}")
-    if not all(map(str.isidentifier, [*module.split("."), name])):
-        raise ValueError(
-            f"{where}: {target!r}; must be a module and a function, as in package.module.function"
-        )
-    function = getattr(_imported(where, target, module), name, None)
-    # A function that the module imports is not one that the user trusts.
-    if not inspect.isfunction(function) or not f"{function.__module__}.".startswith(f"{module}."):
-        raise ValueError(f"{where}: {target!r}; must be a function that {module} defines")
-    return function
-
-
-def _imported(where: str, target: object, module: str) -> ModuleType:
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # where a module of one's own is looked for, behind what is installed
-    try:
-        return importlib.import_module(module)
-    except (Exception, SystemExit) as error:  # whatever a module of one's own raises
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        raise ValueError(f"{where}: {target!r}; {module} cannot be imported ({reason})") from error
+    ours = ", ".join(f"autdtorch.{method}" for method in METHOD_LABELS)
+    return load_trusted(where, target, modules, ours)
 
 
 def parameters(function: Callable[..., Any], but: tuple[str, ...]) -> tuple[str, ...]:

@@ -1,13 +1,13 @@
 """Scenes from YAML files.
 
-The keys of a section are the arguments of what it builds, so that the two cannot drift apart.
+The keys of a section are the arguments of the function or class that builds its part of the scene.
 """
 
 from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,12 +20,14 @@ from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import Plane, circle_points
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
 from autdtorch.scene.scene import Medium, Scene
+from autdtorch.utils.trusted import TARGET, load_trusted
 from autdtorch.utils.validation import (
     ArrayLike,
     Vector,
     finite_vector,
     hint,
     invalid,
+    members,
     path_of,
     points_tensor,
     require_known,
@@ -50,39 +52,45 @@ _OBSTACLES: dict[str, Builder] = {
 }
 
 
-def load_scene(source: str | os.PathLike[str] | Mapping[str, Any]) -> Scene:
+def load_scene(source: str | os.PathLike[str] | Mapping[str, Any], modules: Collection[str] = ()) -> Scene:
     """Read a scene from a YAML file, or from a mapping of the same layout such as Hydra's `cfg.scene`.
+
+    An obstacle has a `type`, or the `_target_` of a class of the user's own, such as `mymodule.MyObstacle`.
 
     Args:
         source: path of the file, or the mapping. A value may be an interpolation of another key, `${key}`;
             resolvers such as `${oc.env:HOME}` are refused. A key without a value counts as left out. Paths
-            in it start from the folder of the file; in a mapping, from the working directory.
+            in a file start from its folder; paths in a mapping, from the working directory.
+        modules: names of the trusted modules, whose obstacles the scene may name by `_target_`.
 
     Returns:
         The scene.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: not YAML, larger or deeper than a scene is, an unknown or missing key, or a value that is
-            not accepted. The message names the file and the section.
+        ValueError: not YAML, larger or deeper than a scene is, an unknown or missing key, or a bad value. The
+            message names the file and the section.
     """
     where = "scene mapping" if isinstance(source, Mapping) else str(path_of("source", source))
+    trusted = members("modules", modules, str)
     section = _mapping(where, _read(where, source))
     _check_keys(where, section, Scene)
     air = partial(Medium.air, frequency=section["frequency"])
     folder = Path() if isinstance(source, Mapping) else Path(source).parent
-    parts = {key: _part(f"{where}: {key}", key, value, air, folder) for key, value in section.items()}
+    parts = {
+        key: _part(f"{where}: {key}", key, value, air, folder, trusted) for key, value in section.items()
+    }
     scene: Scene = _build(where, parts, Scene)
     return scene
 
 
 def _read(where: str, source: str | os.PathLike[str] | Mapping[str, Any]) -> object:
-    """What the file or mapping holds, as plain Python containers."""
+    """Return the content of a file or mapping as plain Python containers."""
     from omegaconf import DictConfig, OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
     try:
-        config: Any = source  # a node of a larger configuration stays there, where its interpolations resolve
+        config: Any = source  # the node of a larger configuration is not copied: its interpolations need it
         if not isinstance(source, Mapping):
             config = load_yaml(source)
         elif not isinstance(source, DictConfig):
@@ -97,8 +105,19 @@ def _read(where: str, source: str | os.PathLike[str] | Mapping[str, Any]) -> obj
         raise ValueError(" ".join(f"{place}: {reason}; {accepted}".split())) from error
 
 
-def _part(where: str, key: str, value: object, air: Builder, folder: Path) -> object:
-    """The argument `key` of `Scene` from its `value`; `air` builds its air, and paths start from `folder`."""
+def _part(
+    where: str, key: str, value: object, air: Builder, folder: Path, modules: tuple[str, ...]
+) -> object:
+    """Build one argument of `Scene`.
+
+    Args:
+        where: name of the section, for messages.
+        key: name of the argument.
+        value: content of the section.
+        air: builder of a medium of air.
+        folder: where paths start.
+        modules: trusted modules.
+    """
     match key:
         case "medium":
             section = _mapping(where, value)
@@ -108,10 +127,8 @@ def _part(where: str, key: str, value: object, air: Builder, folder: Path) -> ob
         case "obstacles":
             if not isinstance(value, list):
                 raise invalid(where, value, "must be a list of obstacles")
-            return [
-                _build_kind(f"{where}[{index}]", _with_path(f"{where}[{index}]", entry, folder), _OBSTACLES)
-                for index, entry in enumerate(value)
-            ]
+            places = [(f"{where}[{index}]", entry) for index, entry in enumerate(value)]
+            return [_obstacle(place, _with_path(place, entry, folder), modules) for place, entry in places]
         case "control_points":
             return _build_kind(where, value, {"circle": circle_points, "points": _points})
         case "observation_plane":
@@ -122,8 +139,15 @@ def _part(where: str, key: str, value: object, air: Builder, folder: Path) -> ob
             return value
 
 
+def _obstacle(where: str, section: dict[str, Any], modules: tuple[str, ...]) -> Any:
+    if TARGET not in section:
+        return _build_kind(where, section, _OBSTACLES)
+    builder = load_trusted(f"{where}.{TARGET}", section.pop(TARGET), modules)
+    return _build(where, section, builder)
+
+
 def _with_path(where: str, value: object, folder: Path) -> dict[str, Any]:
-    """The section, its `path` starting from `folder`."""
+    """Return the section, with a `path` that starts from `folder`."""
     section = _mapping(where, value)
     if isinstance(path := section.get("path"), str):
         section["path"] = str(folder / path)
@@ -139,7 +163,7 @@ def _domain(lower: ArrayLike, upper: ArrayLike) -> tuple[Vector, Vector]:
 
 
 def _build_kind(where: str, value: object, builders: Mapping[str, Builder]) -> Any:
-    """Build with the one of `builders` that the key `type` names."""
+    """Build a part with the builder that the key `type` names."""
     section = _mapping(where, value)
     kind = section.pop("type", None)
     if not isinstance(kind, str) or kind not in builders:
@@ -170,6 +194,6 @@ def _check_keys(where: str, section: Mapping[str, object], builder: Builder) -> 
 
 
 def _parameters(builder: Builder) -> dict[str, inspect.Parameter]:
-    """Arguments that a section gives: all but those that a `partial` has already."""
-    given = builder.keywords if isinstance(builder, partial) else {}
-    return {key: entry for key, entry in inspect.signature(builder).parameters.items() if key not in given}
+    """Return the parameters that a section may give, without those that a `partial` binds."""
+    bound = builder.keywords if isinstance(builder, partial) else {}
+    return {key: entry for key, entry in inspect.signature(builder).parameters.items() if key not in bound}

@@ -76,8 +76,8 @@ def run_study(
         plane_spacing: edge of a cell of the observation plane [m].
         folder: where trials are saved as they end, scenes when they are finished; None to save nothing.
         config: all of the above as text. What the folder holds for the same text, made with the same source
-            and packages, is taken from there. Without text, or with methods that are not autdtorch's own,
-            everything is computed.
+            and packages, is taken from there. Without text, or with methods or obstacles that are not
+            autdtorch's own, everything is computed.
 
     Returns:
         The results of all scenes.
@@ -95,8 +95,10 @@ def run_study(
         for scene in scenes.values():
             _check_method(name, method, scene, counts[name], seed)
     planes = {name: _plane_points(scene, plane_spacing) for name, scene in scenes.items()}
-    # The digest of our source says nothing of others' methods.
-    ours = all(_package(method) == "autdtorch" for method in methods.values())
+    # The digest of our source does not cover methods and obstacles of the user's own.
+    obstacles = [type(obstacle) for scene in scenes.values() for obstacle in scene.obstacles]
+    code: list[Any] = [*methods.values(), *obstacles]
+    ours = all(_package(one) == "autdtorch" for one in code)
     provenance = provenance_now(config, seed)
     with open_folder(folder, provenance, scenes, reuse=bool(config) and ours) as kept:
         missing = {name: scene for name, scene in scenes.items() if name not in kept.scenes}
@@ -204,8 +206,8 @@ def _check_method(name: str, method: Method, scene: Scene, trials: int, seed: in
         raise ValueError(f"method {name}: {error}") from error
 
 
-def _package(method: Method) -> str:
-    function = method.func if isinstance(method, functools.partial) else method
+def _package(code: Callable[..., Any]) -> str:
+    function = code.func if isinstance(code, functools.partial) else code
     return str(getattr(function, "__module__", "")).partition(".")[0]
 
 

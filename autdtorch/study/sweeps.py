@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -23,7 +23,7 @@ from autdtorch.study.provenance import PROVENANCE_FILE
 from autdtorch.study.results import MethodResult, SceneResult, StudyResult, median_trial
 from autdtorch.study.results_file import RESULTS_FILE, load_results
 from autdtorch.utils.digest import digest_of
-from autdtorch.utils.validation import path_of
+from autdtorch.utils.validation import members, path_of
 
 logger = logging.getLogger(__name__)
 
@@ -74,7 +74,7 @@ class _Part:
         return self.found.methods[self.method]
 
 
-def collect_results(folder: str | os.PathLike[str]) -> Sweep:
+def collect_results(folder: str | os.PathLike[str], modules: Collection[str] = ()) -> Sweep:
     """Merge the studies in a folder and in the folders below it, such as those that a sweep left.
 
     Studies that differ in nothing but seed and number of trials are taken as one, with the trials of all
@@ -83,6 +83,7 @@ def collect_results(folder: str | os.PathLike[str]) -> Sweep:
 
     Args:
         folder: where to look.
+        modules: names of trusted modules, whose obstacles scenes may name by `_target_`; see `load_scene`.
 
     Returns:
         The merged studies.
@@ -92,7 +93,7 @@ def collect_results(folder: str | os.PathLike[str]) -> Sweep:
             is not there (paths start from the working directory, as they did for the sweep).
         ValueError: results of another version, or of a study that did not come from the command line.
     """
-    folder = path_of("folder", folder, "a folder")
+    folder, modules = path_of("folder", folder, "a folder"), members("modules", modules, str)
     _log_unfinished(folder)
     studies = {file.parent: load_results(file) for file in _files(folder, RESULTS_FILE)}
     if not studies:
@@ -106,7 +107,8 @@ def collect_results(folder: str | os.PathLike[str]) -> Sweep:
     parts = [part for path, study in studies.items() for part in _parts(path, study)]
     groups, swept = _groups(parts)
     results = {scene: _merged_scene(methods) for scene, methods in groups.items()}
-    scenes = {scene: load_scene(next(iter(methods.values()))[0].section) for scene, methods in groups.items()}
+    sections = {scene: next(iter(methods.values()))[0].section for scene, methods in groups.items()}
+    scenes = {scene: load_scene(section, modules) for scene, section in sections.items()}
     origin = next(iter(studies.values())).provenance
     texts = (f"# {path}\n{study.provenance.config.strip()}" for path, study in studies.items())
     merged = StudyResult(replace(origin, config="\n\n".join(texts)), results)

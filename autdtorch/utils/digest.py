@@ -1,9 +1,13 @@
-"""Digests of values, to name what was computed from them."""
+"""Digests of values, to name the results computed from them."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
+import inspect
+import sys
+import uuid
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,9 +15,10 @@ import numpy as np
 
 
 def digest_of(*parts: object) -> str:
-    """SHA-256 of values, to their last bit: numbers, text, arrays, tensors, and what is made up of these.
+    """Return the SHA-256 of values: numbers, text, arrays, tensors, and containers and dataclasses of these.
 
-    Of a dataclass the fields that are compared count, and all arrays.
+    Two values have the same digest only if they agree to the last bit. Of a dataclass, compared fields and
+    arrays count, and the source code where the class is not autdtorch's own.
 
     Raises:
         TypeError: a value of another kind.
@@ -25,7 +30,7 @@ def digest_of(*parts: object) -> str:
 
 
 def _add(digest: Any, part: Any) -> None:
-    """Add a value, its kind and its length, so that no two different ones look the same."""
+    """Add a value with its kind and length, so that different values give different input."""
     if part is None or isinstance(part, str | bool | int | float):
         text = part.hex() if isinstance(part, float) else repr(part)
         digest.update(f"{type(part).__name__} {len(text)} {text}\n".encode())
@@ -35,7 +40,7 @@ def _add(digest: Any, part: Any) -> None:
     elif dataclasses.is_dataclass(part):
         named = [(field, getattr(part, field.name)) for field in dataclasses.fields(part)]
         kept = {field.name: own for field, own in named if field.compare or hasattr(own, "__array__")}
-        _add(digest, (type(part).__name__, kept))
+        _add(digest, (type(part).__name__, _source_of(type(part)), kept))
     elif isinstance(part, Mapping):
         _add(digest, tuple(part.items()))
     elif isinstance(part, tuple | list):
@@ -43,4 +48,14 @@ def _add(digest: Any, part: Any) -> None:
         for entry in part:
             _add(digest, entry)
     else:
-        raise TypeError(f"{type(part).__name__}: cannot be told by its content")
+        raise TypeError(f"{type(part).__name__}: has no digest")
+
+
+def _source_of(kind: type) -> str:
+    """Return the source of a user's class or of its module, or a new text where the source is unknown."""
+    if kind.__module__.partition(".")[0] == __package__.partition(".")[0]:
+        return ""  # the digest of the package's source covers it
+    for thing in (sys.modules.get(kind.__module__), kind):
+        with contextlib.suppress(OSError, TypeError):
+            return inspect.getsource(thing)  # type: ignore[arg-type]
+    return uuid.uuid4().hex

@@ -97,6 +97,7 @@ ATTACKS: dict[str, list[tuple[str, str]]] = {
     ],
     "scene": [
         (f"{SCENE}extra: {CALL}\n", "scene.extra._target_"),
+        (SCENE.replace("obstacles: []", f"obstacles: [{CALL}]"), "obstacles[0]._target_"),
         *((f"{GLOBAL}hydra: {{{key}: {value}}}\n", "hydra") for key, value in HYDRA.items()),
         *((f"{GLOBAL}defaults:\n  - {entry}\n", "defaults") for entry in DEFAULTS),
         (f"# @package hydra.callbacks\nx: {CALL}\n", "@package hydra.callbacks"),

@@ -63,8 +63,8 @@ def complaint(call: Call, parameter: str, wrong: Wrong, error: Exception | None)
     barred = type(wrong.value) in LET_IN and not any(kind in annotation for kind in LET_IN[type(wrong.value)])
     if error is None:
         return "taken" if wrong.never or barred else None
-    if isinstance(error, OSError) and isinstance(wrong.value, str):
-        return None  # no such file or device, or a folder
+    if isinstance(error, OSError) and not wrong.never:
+        return None  # accepted, but there is no such file or device
     text = str(error)
     if not isinstance(error, ValueError | TypeError):
         return f"{type(error).__name__}: {text[:200]}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import os
 import re
@@ -186,7 +187,7 @@ def test_values_are_not_confused() -> None:
     values += [np.ones((1, 2)), np.ones(2, np.float32), torch.ones(2, dtype=torch.complex64), {"1": 1}]
     assert len({digest_of(value) for value in values}) == len(values)
     assert digest_of(1, 2) != digest_of((1, 2), ())
-    with pytest.raises(TypeError, match="object: cannot be told by its content"):
+    with pytest.raises(TypeError, match="object: has no digest"):
         digest_of(object())
 
 
@@ -319,3 +320,20 @@ def test_a_writer_killed_before_it_is_done_leaves_nothing_that_is_read(tmp_path:
     cache.save("shared", np.ones(200_000), 0.0)
     assert not left.exists()
     assert cache.load("shared", (200_000,)) is not None
+
+
+def test_an_obstacle_of_ones_own_has_the_digest_of_its_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    code = "from dataclasses import dataclass\n@dataclass(frozen=True)\nclass Own:\n    size: float\n"
+    for name, more in (
+        ("own_a", ""),
+        ("own_b", ""),
+        ("own_c", "    def twice(self): return 2 * self.size\n"),
+    ):
+        (tmp_path / f"{name}.py").write_text(code + more, encoding="utf-8")
+    first, same, other = (
+        digest_of(importlib.import_module(name).Own(1.0)) for name in ("own_a", "own_b", "own_c")
+    )
+    assert first == same != other

@@ -144,3 +144,70 @@ def test_path_in_a_mapping_starts_from_the_working_directory(tmp_path, monkeypat
     }
     (found,) = load_scene({**OmegaConf.create(SMALL), "obstacles": [obstacle]}).obstacles
     assert found.upper == pytest.approx((62e-3, 3e-3, 4e-3))
+
+
+OWN = """
+from dataclasses import dataclass
+from pathlib import Path
+from autdtorch import Obstacle, Sphere
+
+@dataclass(frozen=True)
+class Ball(Sphere):
+    path: str = ""
+
+def ball(radius):
+    return Ball((40e-3, 0.0, 0.0), radius, rigid=True)
+
+class Other:
+    def __init__(self): pass
+"""
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """Load the small scene with one obstacle from a module of the user's own."""
+    (tmp_path / "own_obstacles.py").write_text(OWN)
+    monkeypatch.syspath_prepend(tmp_path)
+    path = tmp_path / "scene.yaml"
+
+    def load(obstacle, modules=("own_obstacles",)):
+        path.write_text(f"{SMALL}obstacles: [{{_target_: {obstacle}}}]\n")
+        return load_scene(path, modules).obstacles
+
+    return load
+
+
+def test_an_obstacle_of_ones_own_is_named_by_target(own, tmp_path):
+    (found,) = own("own_obstacles.Ball, center: [40e-3, 0, 0], radius: 3e-3, rigid: true, path: a.csv")
+    assert (type(found).__name__, found.center, found.path) == (
+        "Ball",
+        (40e-3, 0, 0),
+        str(tmp_path / "a.csv"),
+    )
+    assert own("own_obstacles.ball, radius: 3e-3")[0].radius == 3e-3
+
+
+@pytest.mark.parametrize(
+    ("target", "modules", "message"),
+    [
+        (
+            "own_obstacles.ball, radius: 1e-3",
+            (),
+            "must be in a module that the user names, as modules=MODULE",
+        ),
+        (
+            "own_obstacles.ball, radius: 1e-3",
+            "own_obstacles",
+            r"modules: 'own_obstacles'; must be a sequence",
+        ),
+        ("pathlib.Path", ("own_obstacles",), r"obstacles\[0\]._target_: 'pathlib.Path'; must be in a module"),
+        ("own_obstacles.Path", ("own_obstacles",), "must be a function or class that own_obstacles defines"),
+        ("own_obstacles.Other", ("own_obstacles",), r"Scene.obstacles\[0\]: .* must be an Obstacle"),
+        ("own_obstacles.ball", ("own_obstacles",), r"obstacles\[0\]: missing key 'radius'"),
+        ("own_obstacles.ball, radius: -1", ("own_obstacles",), "Sphere.radius: -1 m; must be finite and > 0"),
+        ("nowhere.Ball", ("nowhere",), "nowhere cannot be imported .*No module named 'nowhere'"),
+    ],
+)
+def test_what_is_not_an_obstacle_of_a_trusted_module_is_refused(own, target, modules, message):
+    with pytest.raises(ValueError, match=message):
+        own(target, modules)

@@ -1,0 +1,52 @@
+"""Functions and classes that config files name by `_target_`, from modules that the user trusts.
+
+A config file may come from others, so it never decides what runs: the user names the modules, on the command
+line or as an argument.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Callable, Collection
+from types import FunctionType, ModuleType
+from typing import Any
+
+TARGET = "_target_"
+"""Key that names the function or class."""
+
+
+def load_trusted(where: str, target: object, modules: Collection[Any], ours: str = "") -> Callable[..., Any]:
+    """Import a function or class that one of the trusted modules defines.
+
+    Args:
+        where: name of the key, for messages.
+        target: its value, such as "package.module.name".
+        modules: names of the trusted modules.
+        ours: names that autdtorch itself offers in this place, for messages.
+
+    Raises:
+        ValueError: another module, a module that cannot be imported, or neither function nor class of it.
+    """
+    module, _, name = str(target).rpartition(".")
+    if module not in modules:
+        accepted = "in a module that the user names, as modules=MODULE"
+        raise ValueError(f"{where}: {target!r}; must be {f'one of {ours}, or ' if ours else ''}{accepted}")
+    if not all(map(str.isidentifier, [*module.split("."), name])):
+        raise ValueError(f"{where}: {target!r}; must be a module and a name in it, as in package.module.name")
+    found = getattr(_imported(where, target, module), name, None)
+    # What the module merely imports is not trusted.
+    if not isinstance(found, FunctionType | type) or not f"{found.__module__}.".startswith(f"{module}."):
+        raise ValueError(f"{where}: {target!r}; must be a function or class that {module} defines")
+    return found
+
+
+def _imported(where: str, target: object, module: str) -> ModuleType:
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # searched for the user's modules, after the installed packages
+    try:
+        return importlib.import_module(module)
+    except (Exception, SystemExit) as error:  # the user's module may raise anything
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise ValueError(f"{where}: {target!r}; {module} cannot be imported ({reason})") from error
