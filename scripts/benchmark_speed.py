@@ -110,7 +110,7 @@ def periods_to_limit(name: str) -> list[str]:
     (box,) = propagator._boxes
     origin, heard = single_nodes(scene.control_points[:1]), scene.array.nodes
     strength = torch.full((1,), scene.array.source_strength, dtype=torch.complex128)
-    reach, direct = box.reach(*heard), box.incident(heard.positions.reshape(-1, 3), *origin, strength)
+    reach, direct = box.near_to_far(*heard), box.incident(heard.positions.reshape(-1, 3), *origin, strength)
     matrix, sources = reach.matrix(1), box.sources(box.driving(*origin, strength))
     foretold = Extrapolation(64)
     counts, fields = [], []

@@ -23,7 +23,7 @@ from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Receivers, So
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.stability import fewest_steps, whole_steps
 from autdtorch.fdtd.stencil import tuned_stencil
-from autdtorch.fdtd.stepping import RAMP_PERIODS, drive_signal, lock_in
+from autdtorch.fdtd.stepping import RAMP_PERIODS, drive_dft, drive_signal
 from autdtorch.utils.arrays import Array
 
 DEGREES = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0)
@@ -78,9 +78,9 @@ def _air(cells_per_wavelength: float, layer_cells: int) -> Air:
         edge=factor * stencil.edge,
         corner=factor * stencil.corner,
         keep=1.0,
-        varying_index=torch.zeros(0, dtype=torch.int64),
-        varying_weight=torch.zeros((0, 27), dtype=torch.float64),
-        closed_index=torch.zeros(0, dtype=torch.int64),
+        heterogeneous_index=torch.zeros(0, dtype=torch.int64),
+        heterogeneous_weight=torch.zeros((0, 27), dtype=torch.float64),
+        sound_hard_index=torch.zeros(0, dtype=torch.int64),
         layer_decay=torch.from_numpy(profile.decay),
         layer_gain=torch.from_numpy(profile.gain),
         layer_index=torch.zeros(0, dtype=torch.int64),
@@ -109,7 +109,7 @@ def _pressure(
         Receivers(index, torch.ones(index.shape, dtype=torch.float64)),
         drive_signal(steps, 0, blocks * steps.numerator),
     )
-    return lock_in(recorded[-steps.numerator :], steps.denominator).numpy()
+    return drive_dft(recorded[-steps.numerator :], steps.denominator).numpy()
 
 
 def main() -> None:

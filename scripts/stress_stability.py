@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from autdtorch.fdtd.kernels.contract import Receivers, Sources, State
 from autdtorch.fdtd.kernels.cpu import CpuKernel
-from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, assemble, drive_signal, lock_in
+from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, assemble, drive_dft, drive_signal
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.utils.arrays import Array
 
@@ -98,7 +98,7 @@ def run_trial(trial: Trial) -> Outcome:
     period = float(assembly.steps_per_period)
     steps = {"driven": max(trial.steps, math.ceil(FEWEST_PERIODS * period)), "free": trial.steps}
     mass = np.ones(math.prod(assembly.grid.shape))
-    mass[assembly.varying.index] = assembly.varying.mass
+    mass[assembly.heterogeneous.index] = assembly.heterogeneous.mass
     strength = torch.full(
         (len(trial.scene.array),), trial.scene.array.source_strength, dtype=torch.complex128
     )
@@ -137,7 +137,7 @@ def _random_state(assembly: Assembly, sources: Sources, seed: int) -> State:
     state.now[inside] = torch.from_numpy(np.random.default_rng(seed).standard_normal(grid.interior)).to(
         assembly.dtype
     )
-    state.now.reshape(-1)[torch.from_numpy(assembly.varying.rigid)] = 0
+    state.now.reshape(-1)[torch.from_numpy(assembly.heterogeneous.rigid)] = 0
     state.before.copy_(state.now)
     return state
 
@@ -158,7 +158,7 @@ def _course(
     block = assembly.steps_per_period.numerator
     whole = torch.cat(recorded)
     phasor = [
-        lock_in(whole[first : first + block], assembly.steps_per_period.denominator)
+        drive_dft(whole[first : first + block], assembly.steps_per_period.denominator)
         for first in range(0, len(whole) - block + 1, block)
     ]
     peak = np.unravel_index(np.abs(state.now.numpy()).argmax(), assembly.grid.shape)

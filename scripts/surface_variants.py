@@ -1,6 +1,6 @@
 """Other treatments of the elements that surfaces cut, to compare the solver's own with.
 
-Each has the signature of `autdtorch.fdtd.surface.cut_elements`; `treatment` puts one in its place.
+Each has the signature of `interface_elements` in `autdtorch.fdtd.assembly`; `treatment` substitutes one.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from autdtorch.fdtd import medium, surface
-from autdtorch.fdtd.stencil import Stencil
-from autdtorch.fdtd.surface import (
+from autdtorch.fdtd.assembly import elements, interface
+from autdtorch.fdtd.assembly.interface import (
     LATTICE,
     PAIRS,
     SUBCELLS,
     Array,
-    CutElements,
+    InterfaceElements,
     Materials,
-    cut_elements,
-    uniform_bonds,
+    interface_elements,
+    uniform_coupling,
 )
+from autdtorch.fdtd.stencil import Stencil
 
 Numbers = NDArray[np.int64]
 
@@ -32,42 +32,46 @@ _CORNERS = np.flatnonzero(np.isin(LATTICE, (0, 1)).all(axis=1))
 
 
 class Treatment(Protocol):
-    """Bonds and masses of elements that surfaces cut, as `cut_elements`."""
+    """Bonds and masses of elements that surfaces cut, as `interface_elements`."""
 
     def __call__(
         self, distance: Array, material: Numbers, materials: Materials, stencil: Stencil
-    ) -> CutElements:
-        """See `cut_elements`."""
+    ) -> InterfaceElements:
+        """See `interface_elements`."""
 
 
-def staircase(distance: Array, material: Numbers, materials: Materials, stencil: Stencil) -> CutElements:
+def staircase(
+    distance: Array, material: Numbers, materials: Materials, stencil: Stencil
+) -> InterfaceElements:
     """A cell is of the material of its centre, bonds are 2 / (rho_i + rho_j)."""
     number = _vertex_numbers(distance, material)
     density = materials.density[number][:, PAIRS].mean(axis=2)
-    return CutElements(uniform_bonds(stencil) / density, materials.mass[number] / 8, number)
+    return InterfaceElements(uniform_coupling(stencil) / density, materials.mass[number] / 8, number)
 
 
-def series_bonds(distance: Array, material: Numbers, materials: Materials, stencil: Stencil) -> CutElements:
+def series_bonds(
+    distance: Array, material: Numbers, materials: Materials, stencil: Stencil
+) -> InterfaceElements:
     """Density is averaged along each bond and mass over the volume, by the default's own sums."""
     count = len(materials.density)
-    lines = surface._shares(surface._line_coverage, distance, material, count)
-    volumes = surface._shares(surface._volume_coverage, distance, material, count)
+    lines = interface._shares(interface._line_coverage, distance, material, count)
+    volumes = interface._shares(interface._volume_coverage, distance, material, count)
     density = (lines @ materials.density).reshape(-1, len(PAIRS), SUBCELLS).mean(axis=2)
-    mass = (volumes @ materials.mass) @ surface._HATS / SUBCELLS**3
-    return CutElements(uniform_bonds(stencil) / density, mass, _vertex_numbers(distance, material))
+    mass = (volumes @ materials.mass) @ interface._HATS / SUBCELLS**3
+    return InterfaceElements(uniform_coupling(stencil) / density, mass, _vertex_numbers(distance, material))
 
 
 TREATMENTS: dict[str, Treatment] = {
     "staircase": staircase,
     "series bonds": series_bonds,
-    "default": cut_elements,
+    "default": interface_elements,
 }
 
 
 @contextmanager
 def treatment(name: str) -> Iterator[None]:
     """A context in which scenes are assembled with that treatment."""
-    with patch.object(medium, "cut_elements", TREATMENTS[name]):
+    with patch.object(elements, "interface_elements", TREATMENTS[name]):
         yield
 
 

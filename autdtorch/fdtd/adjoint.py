@@ -9,7 +9,7 @@ loss's derivatives by what they recorded, last step first, over the masses, and 
     dL / d weight_ij = sum_t lambda_i(t) (p_j(t) - p_i(t)).
 
 For the second the run itself is needed in reverse. Its state is kept at the beginning of segments, and each
-segment is stepped again, with the varying cells and their neighbours as receivers. What it costs is in
+segment is stepped again, with the heterogeneous cells and their neighbours as receivers. What it costs is in
 `docs/decisions/gradients.md`.
 """
 
@@ -23,8 +23,8 @@ from typing import Any
 import torch
 from torch.autograd.function import once_differentiable
 
+from autdtorch.fdtd.interpolation import Interpolation
 from autdtorch.fdtd.kernels.contract import Kernel, Layer, Receivers, Sources, State
-from autdtorch.fdtd.points import PointWeights
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.utils.threads import spread
@@ -44,8 +44,8 @@ def recorded(
 ) -> torch.Tensor:
     """Step from silence, once per row of `signal` (steps, S), and record (steps, R); see `Kernel.advance`.
 
-    Differentiable, once, by `sources.force` and by `assembly.coefficients.varying_weight`. Rows of cells in
-    the boundary layers count as constant: their derivatives are zero.
+    Differentiable, once, by `sources.force` and by `assembly.coefficients.heterogeneous_weight`. Stencil rows
+    in the boundary layers count as constant: their derivatives are zero.
 
     Raises:
         ValueError: a source or a receiver is in the boundary layers, where reciprocity does not hold.
@@ -53,8 +53,8 @@ def recorded(
     for name, index in (("sources", sources.index), ("receivers", receivers.index)):
         if not assembly.grid.inside(index.numpy()).all():
             raise ValueError(f"{name}: cells in the boundary layers; must be inside of them")
-    weight = assembly.coefficients.varying_weight
-    coefficients = replace(assembly.coefficients, varying_weight=weight.detach())
+    weight = assembly.coefficients.heterogeneous_weight
+    coefficients = replace(assembly.coefficients, heterogeneous_weight=weight.detach())
     run = _Run(kernel, replace(assembly, coefficients=coefficients), sources.index, receivers, signal)
     result: torch.Tensor = _Recorded.apply(sources.force, weight, run)  # type: ignore[no-untyped-call]
     return result
@@ -92,7 +92,7 @@ class _Run:
 
     def mass(self, cells: torch.Tensor) -> torch.Tensor:
         """Of cells (k,), no two alike."""
-        return torch.from_numpy(self.assembly.varying.mass_of(cells.numpy())).to(self.assembly.dtype)
+        return torch.from_numpy(self.assembly.heterogeneous.mass_of(cells.numpy())).to(self.assembly.dtype)
 
     def adjoint_sources(self, slope: torch.Tensor) -> tuple[Sources, torch.Tensor]:
         """What drives the adjoint run, and by which signals (steps, S), last step first.
@@ -115,10 +115,10 @@ class _Run:
 
 @dataclass(frozen=True)
 class _Neighbourhood:
-    """The varying cells outside the layers, and where the field is needed for the derivatives by their rows.
+    """The heterogeneous cells outside the layers, and the cells whose field their derivatives need.
 
     Attributes:
-        own: which of the varying cells they are (n,).
+        own: which of the heterogeneous cells they are (n,).
         index: their flat indices.
         cells: these, their neighbours' and those of the receivers (k,), ascending.
         offsets: to the neighbours (27,).
@@ -129,23 +129,23 @@ class _Neighbourhood:
     index: torch.Tensor
     cells: torch.Tensor
     offsets: torch.Tensor
-    points: PointWeights
+    points: Interpolation
 
     @classmethod
     def of(cls, run: _Run) -> _Neighbourhood:
-        grid, varying = run.assembly.grid, run.assembly.coefficients.varying_index
-        own = torch.from_numpy(grid.inside(varying.numpy()))
-        index, offsets = varying[own], torch.from_numpy(flat_offsets(grid.shape))
+        grid, heterogeneous = run.assembly.grid, run.assembly.coefficients.heterogeneous_index
+        own = torch.from_numpy(grid.inside(heterogeneous.numpy()))
+        index, offsets = heterogeneous[own], torch.from_numpy(flat_offsets(grid.shape))
         used = torch.zeros(math.prod(grid.shape), dtype=torch.bool, device="cpu")
         used[run.receivers.index] = True
         for offset in offsets:
             used[index + offset] = True
-        points = PointWeights(run.receivers.index.numpy(), run.receivers.weight.numpy())
+        points = Interpolation(run.receivers.index.numpy(), run.receivers.weight.numpy())
         return cls(own, index, used.nonzero().reshape(-1), offsets, points)
 
     def heard(self, field: torch.Tensor) -> torch.Tensor:
         """What the receivers hear (steps, R) of the field in the cells (steps, k)."""
-        return torch.from_numpy((self.points.reading(self.cells.numpy()) @ field.numpy().T).T)
+        return torch.from_numpy((self.points.matrix(self.cells.numpy()) @ field.numpy().T).T)
 
     def correlate(
         self, adjoint: torch.Tensor, first: torch.Tensor, after: torch.Tensor, total: torch.Tensor
@@ -207,7 +207,7 @@ class _Recorded(torch.autograd.Function):
                 part = run.signal[start:end]
                 state, heard = run.advance(state, sources, read, signal[steps - end : steps - start])
                 adjoint = mass * heard.flip(0)
-                by_force += adjoint[:, :driven].double().T @ part.double()  # as in `lock_in`
+                by_force += adjoint[:, :driven].double().T @ part.double()  # as in `drive_dft`
                 if around is not None:
                     fields = ctx.last
                     if end < steps:
@@ -215,7 +215,7 @@ class _Recorded(torch.autograd.Function):
                     around.correlate(adjoint[:, driven:], *fields, by_row)
         if around is None:
             return by_force, None, None
-        by_weight = torch.zeros_like(run.assembly.coefficients.varying_weight)
+        by_weight = torch.zeros_like(run.assembly.coefficients.heterogeneous_weight)
         by_weight[around.own] = by_row
         return by_force, by_weight, None
 

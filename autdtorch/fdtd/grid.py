@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.placement import grid_offset
-from autdtorch.fdtd.points import footprint
 from autdtorch.fdtd.region import Region, Shape
 from autdtorch.utils.arrays import Array
 from autdtorch.utils.validation import invalid, positive
@@ -151,7 +151,7 @@ class Extent:
 
 def domain_extent(region: Region, spacing: float) -> Extent:
     """The region's domain, and as much air around it as points in the outermost cells need."""
-    return Extent(*region.domain, footprint(region.wavenumber * spacing) // 2 - 1)
+    return Extent(*region.domain, interpolation_width(region.wavenumber * spacing) // 2 - 1)
 
 
 def bodies_extent(shapes: Sequence[Shape]) -> Extent:

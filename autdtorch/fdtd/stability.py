@@ -32,7 +32,7 @@ MARGIN = 1.01
 up to 2e-4, the rim of one cell 3e-4 (cubes of density ratio 1e-3 to 1e4, speed ratio 0.3 to 4)."""
 
 MOST_CELLS = 1_000_000
-"""Varying cells that are iterated on, in about five seconds; of more, the bound decides alone."""
+"""Heterogeneous cells that are iterated on, in about five seconds; of more, the bound decides alone."""
 
 LONG_ENOUGH = 0.97
 """Share of the longest time step that is worth having. The rest asks for blocks of more periods, and a run
@@ -49,8 +49,8 @@ def largest_eigenvalue(
 ) -> float:
     """Largest eigenvalue of a scene's operator, from above.
 
-    The larger of two: what uniform air reaches, and what the varying cells reach with a rim of one cell. A
-    mode that beats the air's is bound to those cells and fades within a cell.
+    The larger of two: that of uniform air, and that of the heterogeneous cells with a rim of one cell. A mode
+    above those of air is bound to the heterogeneous cells and fades within a cell.
 
     Args:
         index: flat indices (n,) of the cells whose weights differ from the stencil's, ascending; none of them
@@ -78,7 +78,7 @@ def largest_eigenvalue(
     if len(index) > MOST_CELLS:
         logger.info(
             "the time step comes from a bound, up to a quarter short of the limit: the largest eigenvalue of"
-            " %d varying cells is not worked out, only of up to %d", len(index), MOST_CELLS,
+            " %d heterogeneous cells is not worked out, only of up to %d", len(index), MOST_CELLS,
         )  # fmt: skip
         return bound
     product = np.where(inside, forth * back, 0).clip(min=0)  # zeros by rounding may differ in sign

@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources
-from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, drive_signal, lock_in
+from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, drive_dft, drive_signal
 
 Phasors = NDArray[np.complex128]
 
@@ -54,14 +54,14 @@ class SteadyState:
     Attributes:
         pressure: (k,) complex, amplitude of the pressure in each cell.
         periods: periods stepped.
-        remaining: estimated relative distance to the steady state, infinite while it cannot be told.
-        reached: whether that is within the tolerance.
+        residual: estimated relative distance to the steady state, infinite while it cannot be told.
+        converged: whether that is within the tolerance.
     """
 
     pressure: torch.Tensor
     periods: int
-    remaining: float
-    reached: bool
+    residual: float
+    converged: bool
 
 
 def run_to_steady_state(
@@ -71,7 +71,7 @@ def run_to_steady_state(
     cells: NDArray[np.int64],
     tolerance: float,
     max_periods: int,
-    judged: Callable[[torch.Tensor], torch.Tensor],
+    observe: Callable[[torch.Tensor], torch.Tensor],
     stepped: Callable[[int], None],
 ) -> SteadyState:
     """Step until the limit of what is wanted stands, or `max_periods` have passed.
@@ -83,7 +83,7 @@ def run_to_steady_state(
         cells: flat indices (k,) of the cells whose phasors are wanted.
         tolerance: relative distance to the steady state at which to stop.
         max_periods: after which to stop in any case.
-        judged: what of the phasors (k,) must stand. A run is not judged before sound has crossed the grid
+        observe: what of the phasors (k,) must stand. A run is not observe before sound has crossed the grid
             twice.
         stepped: is called with the number of periods after each block.
     """
@@ -97,12 +97,12 @@ def run_to_steady_state(
             if start >= ramp:
                 sequence.append(phasor)
         limit = torch.from_numpy(sequence.limit() if len(sequence) else windows[-1][1])
-        values.append(judged(limit))
-        remaining = _distance(values)
-        reached = count >= earliest and remaining <= tolerance
-        if reached or count >= max_periods:
+        values.append(observe(limit))
+        residual = _distance(values)
+        converged = count >= earliest and residual <= tolerance
+        if converged or count >= max_periods:
             break
-    return SteadyState(limit, count, remaining, reached)
+    return SteadyState(limit, count, residual, converged)
 
 
 def block_of(steps_per_period: Fraction) -> tuple[int, int]:
@@ -189,7 +189,7 @@ def windows_of_run(
 def _turned(window: torch.Tensor, start: int, periods: int) -> Phasors:
     """Phasors (k,) of a window of `periods`, recorded (steps, k) after each step that follows `start`."""
     turn = 2 * math.pi * (start * periods % len(window)) / len(window)
-    return np.asarray(lock_in(window, periods).cpu().numpy() * complex(math.cos(turn), math.sin(turn)))
+    return np.asarray(drive_dft(window, periods).cpu().numpy() * complex(math.cos(turn), math.sin(turn)))
 
 
 def _distance(values: deque[torch.Tensor]) -> float:

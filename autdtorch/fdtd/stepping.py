@@ -10,13 +10,13 @@ from fractions import Fraction
 import numpy as np
 import torch
 
-from autdtorch.fdtd.bonds import VaryingCells, varying_cells
+from autdtorch.fdtd.assembly.elements import elements_of
+from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells
+from autdtorch.fdtd.assembly.layer_columns import layer_columns, scaled_cells
 from autdtorch.fdtd.boundary import tuned_profile
-from autdtorch.fdtd.columns import layer_columns, scaled_cells
 from autdtorch.fdtd.grid import Grid, make_grid
+from autdtorch.fdtd.interpolation import Interpolation, average_nodes, exclude_cells, interpolate_points
 from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, State, uniform_state
-from autdtorch.fdtd.medium import fill_elements
-from autdtorch.fdtd.points import PointWeights, merged, point_weights, without
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.stability import fewest_steps, largest_eigenvalue, whole_steps
 from autdtorch.fdtd.stencil import Stencil, tuned_stencil
@@ -46,19 +46,19 @@ class Assembly:
         steps_per_period: time steps a period of the drive: steps a block (numerator) over periods a block
             (denominator).
         coefficients: what the kernel sees.
-        varying: the cells that are not of uniform air.
+        heterogeneous: the cells that are not of uniform air.
     """
 
     grid: Grid
     stencil: Stencil
     steps_per_period: Fraction
     coefficients: Coefficients
-    varying: VaryingCells
+    heterogeneous: HeterogeneousCells
 
     @property
     def dtype(self) -> torch.dtype:
         """Precision of the fields."""
-        return self.coefficients.varying_weight.dtype
+        return self.coefficients.heterogeneous_weight.dtype
 
     def silence(self, sources: Sources) -> State:
         """The state before anything is switched on: a uniform pressure, too faint to matter.
@@ -69,30 +69,29 @@ class Assembly:
         faint = _FAINT * float(sources.force.detach().abs().max())
         return uniform_state(self.grid.shape, self.coefficients, faint)
 
-    def spread(self, points: torch.Tensor, weights: torch.Tensor = _ONE_NODE) -> PointWeights:
+    def interpolation(self, points: torch.Tensor, weights: torch.Tensor = _ONE_NODE) -> Interpolation:
         """Cells and weights of points (P, 3) [m], or nodes (P, n, 3) with `weights` (n,), in the domain."""
-        return merged(self._spread_nodes(points.reshape(-1, 3)), weights.numpy())
+        return average_nodes(self._interpolation_of_nodes(points.reshape(-1, 3)), weights.numpy())
 
-    def _spread_nodes(self, points: torch.Tensor) -> PointWeights:
+    def _interpolation_of_nodes(self, points: torch.Tensor) -> Interpolation:
         grid = self.grid
-        spread = self._footprints(points)
-        cells = grid.to_cells(points)
-        # the pressure of a rigid obstacle's closed cells means nothing
-        return without(spread, cells, np.isin(spread.index, self.varying.rigid), grid.shape, grid.kappa)
+        found = self._in_air(points)
+        sound_hard = np.isin(found.index, self.heterogeneous.sound_hard)  # their pressure is not defined
+        return exclude_cells(found, grid.to_cells(points), sound_hard, grid.shape, grid.kappa)
 
-    def _footprints(self, points: torch.Tensor) -> PointWeights:
-        """As if all cells were of air."""
+    def _in_air(self, points: torch.Tensor) -> Interpolation:
+        """Interpolation as if all cells were of air."""
         grid = self.grid
-        return point_weights(grid.to_cells(points), grid.shape, grid.first, grid.last, grid.kappa)
+        return interpolate_points(grid.to_cells(points), grid.shape, grid.first, grid.last, grid.kappa)
 
-    def touches_varying(self, points: torch.Tensor) -> bool:
-        """Whether any of the points (N, 3) [m], in the domain, is spread over cells that are not of air."""
-        return len(points) > 0 and bool(np.isin(self._footprints(points).index, self.varying.index).any())
+    def touches_heterogeneous(self, points: torch.Tensor) -> bool:
+        """Return whether any of the points (N, 3) [m], in the domain, uses cells that are not of air."""
+        return len(points) > 0 and bool(np.isin(self._in_air(points).index, self.heterogeneous.index).any())
 
     def receivers(self, points: torch.Tensor, weights: torch.Tensor = _ONE_NODE) -> Receivers:
         """Receivers at points (P, 3) [m], or means over nodes (P, n, 3) with `weights` (n,)."""
-        spread = self.spread(points, weights)
-        return Receivers(torch.from_numpy(spread.index), torch.from_numpy(spread.weight).to(self.dtype))
+        found = self.interpolation(points, weights)
+        return Receivers(torch.from_numpy(found.index), torch.from_numpy(found.weight).to(self.dtype))
 
     def sources(
         self, points: torch.Tensor, strength: torch.Tensor, weights: torch.Tensor = _ONE_NODE
@@ -101,14 +100,14 @@ class Assembly:
 
         Nodes (P, n, 3) with `weights` (n,) share the strength of a source. Differentiable by strength.
         """
-        spread = self.spread(points, weights)
+        found = self.interpolation(points, weights)
         factor = self.stencil.source_factor(float(self.steps_per_period)) / self.grid.spacing
-        index, inverse = np.unique(spread.index, return_inverse=True)
-        force = (strength[:, None] * torch.from_numpy(factor * spread.weight)).reshape(-1)
+        index, inverse = np.unique(found.index, return_inverse=True)
+        force = (strength[:, None] * torch.from_numpy(factor * found.weight)).reshape(-1)
         total = torch.zeros(len(index), dtype=force.dtype, device="cpu").index_add(
             0, torch.from_numpy(inverse.reshape(-1)), force
         )
-        total = total / torch.from_numpy(self.varying.mass_of(index))
+        total = total / torch.from_numpy(self.heterogeneous.mass_of(index))
         return Sources(torch.from_numpy(index), torch.view_as_real(total).to(self.dtype))
 
 
@@ -132,8 +131,8 @@ def assemble_on(grid: Grid, region: Region, dtype: torch.dtype, time_step: float
         ValueError: the time step is not stable.
     """
     stencil = air_stencil(grid, region)
-    varying = varying_cells(fill_elements(region, grid, stencil), stencil)
-    return assembly_of(grid, stencil, varying, region.frequency, dtype, time_step)
+    heterogeneous = heterogeneous_cells(elements_of(region, grid, stencil), stencil)
+    return assembly_of(grid, stencil, heterogeneous, region.frequency, dtype, time_step)
 
 
 def air_stencil(grid: Grid, region: Region) -> Stencil:
@@ -144,13 +143,13 @@ def air_stencil(grid: Grid, region: Region) -> Stencil:
 def assembly_of(
     grid: Grid,
     stencil: Stencil,
-    varying: VaryingCells,
+    heterogeneous: HeterogeneousCells,
     frequency: float,
     dtype: torch.dtype,
     time_step: float | None,
 ) -> Assembly:
-    """Make a grid ready to step whose varying cells are known; see `assemble_on`."""
-    largest = largest_eigenvalue(varying.index, varying.weight, stencil, grid.shape)
+    """Make a grid ready to step whose heterogeneous cells are known; see `assemble_on`."""
+    largest = largest_eigenvalue(heterogeneous.index, heterogeneous.weight, stencil, grid.shape)
     fewest = fewest_steps(stencil, largest)
     steps_per_period = whole_steps(_wanted_steps(fewest, time_step, frequency))
     steps = float(steps_per_period)
@@ -159,17 +158,17 @@ def assembly_of(
     keep = (1 - damping) / (1 + damping)
     profile = tuned_profile(grid.kappa, steps, grid.layer_cells)
     face, edge, corner = factor * stencil.face, factor * stencil.edge, factor * stencil.corner
-    layer_index, layer_scale = scaled_cells(varying, stencil, grid, dtype)
-    columns, crossed, crossing = layer_columns(varying, stencil, grid, factor, dtype)
+    layer_index, layer_scale = scaled_cells(heterogeneous, stencil, grid, dtype)
+    columns, crossed, crossing = layer_columns(heterogeneous, stencil, grid, factor, dtype)
     coefficients = Coefficients(
         center=1 + keep - factor * stencil.total,
         face=face,
         edge=edge,
         corner=corner,
         keep=keep,
-        varying_index=torch.from_numpy(varying.index),
-        varying_weight=torch.from_numpy(factor * varying.weight).to(dtype),
-        closed_index=torch.from_numpy(varying.shell),
+        heterogeneous_index=torch.from_numpy(heterogeneous.index),
+        heterogeneous_weight=torch.from_numpy(factor * heterogeneous.weight).to(dtype),
+        sound_hard_index=torch.from_numpy(heterogeneous.shell),
         layer_decay=torch.from_numpy(profile.decay).to(dtype),
         layer_gain=torch.from_numpy(profile.gain).to(dtype),
         layer_index=layer_index,
@@ -179,11 +178,11 @@ def assembly_of(
         crossing=crossing,
     )
     logger.info(
-        "grid %s at %.3g mm, %d varying cells; %d steps in %d periods: %.4g us, %.1f %% of the limit",
-        grid.shape, grid.spacing * 1e3, len(varying.index), steps_per_period.numerator,
+        "grid %s at %.3g mm, %d heterogeneous cells; %d steps in %d periods: %.4g us, %.1f %% of the limit",
+        grid.shape, grid.spacing * 1e3, len(heterogeneous.index), steps_per_period.numerator,
         steps_per_period.denominator, 1e6 / (steps * frequency), 100 * fewest / steps,
     )  # fmt: skip
-    return Assembly(grid, stencil, steps_per_period, coefficients, varying)
+    return Assembly(grid, stencil, steps_per_period, coefficients, heterogeneous)
 
 
 def _wanted_steps(fewest: float, time_step: float | None, frequency: float) -> float:
@@ -208,7 +207,7 @@ def drive_signal(steps_per_period: Fraction, first: int, count: int) -> torch.Te
     return torch.stack((envelope * torch.cos(phase), envelope * torch.sin(phase)), dim=1)
 
 
-def lock_in(recorded: torch.Tensor, periods: int) -> torch.Tensor:
+def drive_dft(recorded: torch.Tensor, periods: int) -> torch.Tensor:
     """Phasors (R,) of one block of `periods`, recorded after each of its steps (steps, R)."""
     steps = len(recorded)
     turn = 2 * math.pi * periods / steps * torch.arange(1, steps + 1, dtype=torch.float64, device="cpu")

@@ -16,8 +16,8 @@ import torch
 
 from autdtorch.analytic.green import PAIR_BYTES
 from autdtorch.fdtd.grid import require_spacing
+from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.kernels.contract import Kernel
-from autdtorch.fdtd.points import footprint
 from autdtorch.fdtd.spacing import grid_error, second_spacing
 from autdtorch.fdtd.steady_state import SteadyState, fewest_periods
 from autdtorch.fdtd.stepping import Assembly
@@ -204,7 +204,7 @@ class SimulatedPropagator(ABC):
             grid = self._assemblies[0].grid
             logger.warning(
                 "a source is within %.2g mm of an obstacle: less accurate; use a finer spacing than %.2g mm",
-                1e3 * grid.spacing * footprint(grid.kappa) / 2, 1e3 * grid.spacing,
+                1e3 * grid.spacing * interpolation_width(grid.kappa) / 2, 1e3 * grid.spacing,
             )  # fmt: skip
 
     def _warn_unsettled(self, runs: Sequence[Run]) -> None:
@@ -393,8 +393,8 @@ class SimulatedPropagator(ABC):
         return rows if plan.backward else rows.mT.contiguous()
 
     def _note(self, steady: SteadyState, seconds: float) -> None:
-        self.runs.append(Run(steady.periods, steady.remaining, steady.reached, seconds))
-        logger.info("run of %d periods, %.1e from steady, %.1f s", steady.periods, steady.remaining, seconds)
+        self.runs.append(Run(steady.periods, steady.residual, steady.converged, seconds))
+        logger.info("run of %d periods, %.1e from steady, %.1f s", steady.periods, steady.residual, seconds)
 
 
 def single_nodes(points: torch.Tensor) -> Nodes:

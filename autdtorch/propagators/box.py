@@ -11,7 +11,7 @@ from typing import TypeAlias
 import torch
 
 from autdtorch.fdtd.grid import make_box
-from autdtorch.fdtd.scatter import Reach, Scattering
+from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
 from autdtorch.fdtd.steady_state import SteadyState, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble_on
 from autdtorch.propagators.base import SimulatedPropagator
@@ -66,7 +66,7 @@ class BoxPropagator(SimulatedPropagator):
         assemblies = [
             assemble_on(make_box(region, self.spacing), region, *self._wanted) for region in regions
         ]
-        self._boxes = [Scattering(assembly, self.scene.complex_wavenumber) for assembly in assemblies]
+        self._boxes = [ScatteredField(assembly, self.scene.complex_wavenumber) for assembly in assemblies]
         return assemblies
 
     def _checked(self, points: ArrayLike) -> torch.Tensor:
@@ -79,7 +79,7 @@ class BoxPropagator(SimulatedPropagator):
         return points
 
     def _near_obstacle(self, points: torch.Tensor) -> bool:
-        return any(box.assembly.touches_varying(points[box.inside(points)]) for box in self._boxes)
+        return any(box.assembly.touches_heterogeneous(points[box.inside(points)]) for box in self._boxes)
 
     @torch.no_grad()
     def _simulate(
@@ -99,7 +99,7 @@ class BoxPropagator(SimulatedPropagator):
             ],
             dim=1,
         )
-        reaches = [box.reach(*targets) for box in self._boxes]
+        reaches = [box.near_to_far(*targets) for box in self._boxes]
         if len(self._boxes) == 1:
             phasors = self._in_one_box(drives, incident, reaches[0], stepped)
         else:
@@ -120,7 +120,11 @@ class BoxPropagator(SimulatedPropagator):
         return total.mT.masked_fill(silent, 0)
 
     def _in_one_box(
-        self, drives: Sequence[Drive], incident: torch.Tensor, reach: Reach, stepped: Callable[[int], None]
+        self,
+        drives: Sequence[Drive],
+        incident: torch.Tensor,
+        reach: NearToFar,
+        stepped: Callable[[int], None],
     ) -> torch.Tensor:
         """Phasors (k, R) of the cells that `reach` reads, incident (P, R) being the field at its targets."""
         (box,) = self._boxes
@@ -144,7 +148,7 @@ class BoxPropagator(SimulatedPropagator):
         self,
         drives: Sequence[Drive],
         incident: torch.Tensor,
-        reaches: Sequence[Reach],
+        reaches: Sequence[NearToFar],
         stepped: Callable[[int], None],
     ) -> torch.Tensor | None:
         """The same for the cells of all boxes, one after the other; None if they do not settle."""
@@ -168,9 +172,9 @@ class BoxPropagator(SimulatedPropagator):
 
     def _run(
         self,
-        box: Scattering,
+        box: ScatteredField,
         field: torch.Tensor,
-        reach: Reach,
+        reach: NearToFar,
         tolerance: float,
         judged: Judged,
         stepped: Callable[[int], None],

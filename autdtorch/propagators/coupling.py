@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from autdtorch.fdtd.scatter import Reach, Scattering
+from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
 from autdtorch.fdtd.steady_state import Extrapolation, SteadyState
 from autdtorch.propagators.groups import MOST_PASSES
 
@@ -45,8 +45,8 @@ class Coupled:
 
 
 def coupled_runs(
-    boxes: Sequence[Scattering],
-    reaches: Sequence[Reach],
+    boxes: Sequence[ScatteredField],
+    reaches: Sequence[NearToFar],
     driving: Sequence[torch.Tensor],
     heard: Callable[[torch.Tensor], torch.Tensor],
     simulate: Simulate,
@@ -84,8 +84,8 @@ def coupled_runs(
             steady = [simulate(index, column, each) for column, each in zip(field.mT, loose, strict=True)]
             parts.append(torch.stack([each.pressure for each in steady], dim=1))
             periods += [each.periods for each in steady]
-            reached &= [each.reached for each in steady]
-            remaining = [each.remaining for each in steady]
+            reached &= [each.converged for each in steady]
+            remaining = [each.residual for each in steady]
             unsettled[index] = share * torch.tensor(remaining, dtype=torch.float64, device="cpu")
         left += unsettled.amax(dim=0)
         sums = sums + torch.cat(parts)
@@ -111,7 +111,9 @@ def coupled_runs(
     return None
 
 
-def _from_others(boxes: Sequence[Scattering], index: int, amplitudes: Sequence[torch.Tensor]) -> torch.Tensor:
+def _from_others(
+    boxes: Sequence[ScatteredField], index: int, amplitudes: Sequence[torch.Tensor]
+) -> torch.Tensor:
     """What the other boxes radiate (n, R), where it drives a box."""
     others = [number for number in range(len(boxes)) if number != index]
     places = boxes[index].driven

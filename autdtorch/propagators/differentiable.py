@@ -7,13 +7,13 @@ import math
 import torch
 
 from autdtorch.fdtd.adjoint import recorded
-from autdtorch.fdtd.cell_maps import cells_of_maps, domain_cells
+from autdtorch.fdtd.assembly.cell_maps import cells_of_maps, domain_cells
+from autdtorch.fdtd.assembly.differentiable import DifferentiableCells, cells_of_obstacles
 from autdtorch.fdtd.grid import Grid, make_grid, require_fine, warn_if_coarse
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import block_of, fewest_periods
-from autdtorch.fdtd.stepping import Assembly, drive_signal, lock_in
-from autdtorch.fdtd.variable_cells import VariableCells, cells_of_obstacles
+from autdtorch.fdtd.stepping import Assembly, drive_dft, drive_signal
 from autdtorch.propagators.scene_region import region_of, warn_of_ending_walls
 from autdtorch.propagators.stepper import KERNELS, make_kernel, precision_of
 from autdtorch.scene.drive import validate_drive
@@ -149,7 +149,7 @@ def _slowest(scene: Scene, sound_speed: torch.Tensor | None) -> dict[str, float]
 
 def _cells(
     region: Region, grid: Grid, density: torch.Tensor | None, sound_speed: torch.Tensor | None
-) -> VariableCells:
+) -> DifferentiableCells:
     if any(given is not None and given.ndim == 3 for given in (density, sound_speed)):
         return cells_of_maps(region, grid, density, sound_speed)
     return cells_of_obstacles(region, grid, density, sound_speed)
@@ -167,4 +167,4 @@ def _phasors(
     steps, block = block_of(assembly.steps_per_period)
     count = steps * math.ceil(periods / block)
     signal = drive_signal(assembly.steps_per_period, 0, count).to(assembly.dtype)
-    return lock_in(recorded(kernel, assembly, sources, receivers, signal)[-steps:], block)
+    return drive_dft(recorded(kernel, assembly, sources, receivers, signal)[-steps:], block)

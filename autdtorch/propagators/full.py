@@ -33,7 +33,7 @@ class FullPropagator(SimulatedPropagator):
         return points
 
     def _near_obstacle(self, points: torch.Tensor) -> bool:
-        return self._assemblies[0].touches_varying(points)
+        return self._assemblies[0].touches_heterogeneous(points)
 
     @torch.no_grad()
     def _simulate(
@@ -44,9 +44,9 @@ class FullPropagator(SimulatedPropagator):
         stepped: Callable[[int], None],
     ) -> torch.Tensor:
         (assembly,) = self._assemblies
-        spread = assembly.spread(targets.positions, targets.weights)
-        cells = np.unique(spread.index)
-        read = spread.reading(cells)
+        points = assembly.interpolation(targets.positions, targets.weights)
+        cells = np.unique(points.index)
+        read = points.matrix(cells)
         some = read[:: math.ceil(len(targets.positions) / MOST_JUDGED)]
         rows = []
         for nodes, own in zip(origins, strength, strict=True):

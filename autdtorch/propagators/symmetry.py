@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 
-from autdtorch.fdtd.bonds import VaryingCells
+from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.stencil import OFFSETS
 from autdtorch.fdtd.stepping import Assembly
@@ -97,7 +97,7 @@ def _standing(images: Index) -> tuple[Index, Index]:
 def symmetries(assemblies: Sequence[Assembly], transducers: Nodes) -> list[Symmetry]:
     """All symmetries of a scene on its grid, the identity first; of several grids that alone."""
     assembly = assemblies[0]
-    grid, varying = assembly.grid, assembly.varying
+    grid, varying = assembly.grid, assembly.heterogeneous
     center = np.array(grid.origin) + grid.spacing * (np.array(grid.shape) - 1) / 2
     alike = _ALIKE * assembly.stencil.face
     positions, weights = transducers.positions.numpy(), transducers.weights.numpy()
@@ -129,7 +129,7 @@ def _matched(groups: Array, weights: Array, matrix: Index, center: Array) -> Ind
     return np.asarray(np.where(whole, group[:, 0], _NONE), np.int64)
 
 
-def _maps_cells(varying: VaryingCells, grid: Grid, matrix: Index, alike: float) -> bool:
+def _maps_cells(varying: HeterogeneousCells, grid: Grid, matrix: Index, alike: float) -> bool:
     """Whether the cells that are not of air come to lie on such with the same rows and mass."""
     shape = np.array(grid.shape)
     if (np.abs(matrix) @ shape != shape).any():
@@ -140,7 +140,7 @@ def _maps_cells(varying: VaryingCells, grid: Grid, matrix: Index, alike: float) 
         places = (double @ matrix.T + (shape - 1)) // 2
         return np.asarray(np.ravel_multi_index(tuple(places.T), grid.shape), np.int64)
 
-    for cells in (varying.rigid, varying.shell):
+    for cells in (varying.sound_hard, varying.shell):
         if not np.array_equal(np.sort(image(cells)), cells):
             return False
     images = image(varying.index)

@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 
 from autdtorch.fdtd.grid import domain_extent, layer_cells
+from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.kernels.contract import Kernel
-from autdtorch.fdtd.points import footprint
 from autdtorch.fdtd.steady_state import phasors_kept
 from autdtorch.propagators.cost import USUAL_PERIODS, GridCost, grid_cost, most_runs
 from autdtorch.propagators.groups import cheapest_grouping
@@ -133,7 +133,7 @@ class Workload:
         heard = max(len(scene.control_points), scene.array.nodes.positions[..., 0].numel())
         if method == "full":
             grid = grid_cost(scene, domain_extent(region_of(scene), spacing), spacing)
-            kept = min(grid.cells, heard * footprint(scene.wavenumber * spacing) ** 3)
+            kept = min(grid.cells, heard * interpolation_width(scene.wavenumber * spacing) ** 3)
             return cls((grid,), 1, Matter.in_domain(scene, spacing), kept, 0, 0)
         grouping = cheapest_grouping(scene, spacing, tolerance, most_runs(scene))
         radiating = [grid.radiating for grid in grouping.grids]

@@ -42,8 +42,8 @@ def parts(dtype: torch.dtype, *obstacles: Obstacle) -> Parts:
 
 
 def differentiable(assembly: Assembly, sources: Sources) -> tuple[Assembly, Sources]:
-    weight = assembly.coefficients.varying_weight.clone().requires_grad_()
-    coefficients = replace(assembly.coefficients, varying_weight=weight)
+    weight = assembly.coefficients.heterogeneous_weight.clone().requires_grad_()
+    coefficients = replace(assembly.coefficients, heterogeneous_weight=weight)
     return replace(assembly, coefficients=coefficients), replace(
         sources, force=sources.force.clone().requires_grad_()
     )
@@ -60,7 +60,7 @@ def gradients(given: Parts, kernel: Kernel | None) -> Gradients:
         heard = recorded(kernel, assembly, sources, receivers, signal)
     slope = torch.randn(heard.shape, generator=torch.Generator().manual_seed(0), dtype=heard.dtype)
     (slope * heard).sum().backward()
-    return heard.detach(), sources.force.grad, assembly.coefficients.varying_weight.grad
+    return heard.detach(), sources.force.grad, assembly.coefficients.heterogeneous_weight.grad
 
 
 # float64: rounding over the steps; float32: the design's parity figure, of which rounding takes a tenth
@@ -74,7 +74,7 @@ def test_fast_gradients_are_those_of_the_readable_kernel(dtype: torch.dtype, tol
 def test_walls_through_the_layers_keep_the_gradients_exact() -> None:
     """Rows in the layers are constants; all others and the drive have the oracle's derivatives."""
     given = parts(torch.float64, HEAVY, WALL)
-    inside = torch.from_numpy(given[0].grid.inside(given[0].varying.index))
+    inside = torch.from_numpy(given[0].grid.inside(given[0].heterogeneous.index))
     assert 0 < inside.sum() < len(inside)
     (_, force, weight), (_, by_force, by_weight) = (gradients(given, each) for each in (CpuKernel(), None))
     assert not weight[~inside].any()
@@ -125,7 +125,7 @@ def test_a_loss_that_hears_nothing_has_no_gradient() -> None:
     heard = recorded(CpuKernel(), assembly, sources, *parts(torch.float64, HEAVY)[2:])
     (0 * heard).sum().backward()
     assert not sources.force.grad.any()
-    assert not assembly.coefficients.varying_weight.grad.any()
+    assert not assembly.coefficients.heterogeneous_weight.grad.any()
 
 
 def test_receivers_in_the_layers_are_refused() -> None:

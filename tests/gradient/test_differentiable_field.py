@@ -10,10 +10,10 @@ import torch
 from small_scenes import AIR, relative_error, small_scene
 
 import autdtorch as at
-from autdtorch.fdtd.bonds import varying_cells
-from autdtorch.fdtd.cell_maps import cells_of_maps
+from autdtorch.fdtd.assembly.cell_maps import cells_of_maps
+from autdtorch.fdtd.assembly.elements import elements_of
+from autdtorch.fdtd.assembly.heterogeneous import heterogeneous_cells
 from autdtorch.fdtd.grid import make_grid
-from autdtorch.fdtd.medium import fill_elements
 from autdtorch.fdtd.stepping import air_stencil
 from autdtorch.propagators.scene_region import region_of
 
@@ -130,10 +130,10 @@ def test_uniform_maps_are_a_material() -> None:
     scene = small_scene((box,), extent=24e-3, absorption=40.0)
     grid = make_grid(region_of(scene), 2e-3)
     stencil = air_stencil(grid, region_of(scene))
-    cells = varying_cells(fill_elements(region_of(scene), grid, stencil), stencil)
+    cells = heterogeneous_cells(elements_of(region_of(scene), grid, stencil), stencil)
     shape = at.cell_centers(air, 2e-3).shape[:3]
     full = torch.ones(shape, dtype=torch.float64)
-    same = cells_of_maps(region_of(scene), grid, 3.0 * full, 450.0 * full).varying
+    same = cells_of_maps(region_of(scene), grid, 3.0 * full, 450.0 * full).heterogeneous
     places = np.stack(np.unravel_index(cells.index, grid.shape), axis=-1)
     far = box.signed_distance(np.array(grid.origin) + grid.spacing * places).numpy()
     deep = far < -1.8 * grid.spacing
@@ -142,7 +142,7 @@ def test_uniform_maps_are_a_material() -> None:
     # the mean over directions is a quadrature in the one and a closed form in the other
     np.testing.assert_allclose(same.weight[place], cells.weight[deep], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(same.mass[place], cells.mass[deep], rtol=1e-9)
-    silent = cells_of_maps(region_of(scene), grid, AIR.density * full, AIR.sound_speed * full).varying
+    silent = cells_of_maps(region_of(scene), grid, AIR.density * full, AIR.sound_speed * full).heterogeneous
     np.testing.assert_allclose(silent.weight, np.tile(stencil.weights, (len(silent.index), 1)), atol=1e-9)
 
 

@@ -52,7 +52,10 @@ def parts(obstacles: tuple[Obstacle, ...], dtype: torch.dtype, absorption: float
     inner = torch.zeros(shape, dtype=torch.bool)
     inner[1:-1, 1:-1, 1:-1] = True
     somewhere = torch.nonzero(inner.reshape(-1)).reshape(-1)[::97]
-    special = [each.reshape(-1)[::5] for each in (c.varying_index, c.closed_index, c.columns.index[:, 1:-1])]
+    special = [
+        each.reshape(-1)[::5]
+        for each in (c.heterogeneous_index, c.sound_hard_index, c.columns.index[:, 1:-1])
+    ]
     index = torch.unique(torch.cat((somewhere, *special)))
     index = index[torch.randperm(len(index), generator=generator)]
     force = torch.randn((len(index), 3), dtype=torch.float64, generator=generator)
@@ -116,8 +119,8 @@ def test_cuda_kernel_is_the_reference_kernel(
 ) -> None:
     given = parts(obstacles, dtype, absorption)
     c = given[1]
-    assert (len(c.varying_index) > 0) == bool(obstacles)
-    assert (len(c.closed_index) > 0) == (RIGID in obstacles)
+    assert (len(c.heterogeneous_index) > 0) == bool(obstacles)
+    assert (len(c.sound_hard_index) > 0) == (RIGID in obstacles)
     assert (len(c.columns.index) > 0 and len(c.crossed.index) > 0) == (WALL in obstacles)
     expected = advance(ReferenceKernel(), given, (2,))
     assert_same(advance(CudaKernel(BLOCKS), given, (1, 1)), expected, tolerance)

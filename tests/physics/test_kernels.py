@@ -168,7 +168,7 @@ def test_nothing_grows_once_the_drive_is_off(dtype: torch.dtype) -> None:
     state = uniform_state(assembly.grid.shape, assembly.coefficients, 0.0)
     inner = state.now[tuple(map(slice, assembly.grid.first, assembly.grid.last))]
     inner.copy_(torch.randn(inner.shape, generator=torch.Generator().manual_seed(0), dtype=dtype))
-    state.now.view(-1)[assembly.coefficients.varying_index] = 0
+    state.now.view(-1)[assembly.coefficients.heterogeneous_index] = 0
     state.before.copy_(state.now)
     sizes = [float(state.now.norm())]
     for _ in range(5):

@@ -15,7 +15,7 @@ from small_scenes import CUBE, relative_error, small_scene
 from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, State, uniform_state
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.stability import fewest_steps
-from autdtorch.fdtd.stepping import Assembly, assemble, drive_signal, lock_in
+from autdtorch.fdtd.stepping import Assembly, assemble, drive_dft, drive_signal
 from autdtorch.propagators import make_propagator
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.scene import Box
@@ -49,7 +49,7 @@ def scaled(c: Coefficients, ratio: float) -> Coefficients:
         face=ratio * c.face,
         edge=ratio * c.edge,
         corner=ratio * c.corner,
-        varying_weight=ratio * c.varying_weight,
+        heterogeneous_weight=ratio * c.heterogeneous_weight,
     )
 
 
@@ -115,7 +115,7 @@ def test_a_block_of_several_periods_locks_in_exactly() -> None:
         assert drive_signal(steps, block, 1).tolist() == [[1, 0]]
         after_each_step = drive_signal(steps, block + 1, steps.numerator)
         recorded = after_each_step @ torch.stack((phasor.real, phasor.imag))
-        assert torch.allclose(lock_in(recorded, steps.denominator), phasor, rtol=1e-12)
+        assert torch.allclose(drive_dft(recorded, steps.denominator), phasor, rtol=1e-12)
 
 
 def test_a_time_step_of_ones_own() -> None:

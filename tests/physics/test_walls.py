@@ -107,7 +107,9 @@ def test_slabs_through_the_layers_do_not_grow(
 )
 def test_only_walls_across_the_domain_go_on_through_the_layers(obstacle: Obstacle, goes_on: bool) -> None:
     assembly = assemble(region_of(layered_scene((obstacle,), FRONT)), 2e-3)
-    index = torch.cat((torch.from_numpy(assembly.varying.index), torch.from_numpy(assembly.varying.rigid)))
+    index = torch.cat(
+        (torch.from_numpy(assembly.heterogeneous.index), torch.from_numpy(assembly.heterogeneous.sound_hard))
+    )
     depth = index % assembly.grid.shape[2]
     assert bool((depth < assembly.grid.first[2]).any()) == goes_on
     assert (len(assembly.coefficients.columns.index) > 0) == goes_on
@@ -116,7 +118,7 @@ def test_only_walls_across_the_domain_go_on_through_the_layers(obstacle: Obstacl
 
 def test_walls_of_another_direction_end_before_the_layers() -> None:
     assembly = assemble(region_of(layered_scene((slab(0), slab(0, 28e-3), slab(1, 17e-3)), FRONT)), 2e-3)
-    x, _, z = np.unravel_index(assembly.varying.index, assembly.grid.shape)
+    x, _, z = np.unravel_index(assembly.heterogeneous.index, assembly.grid.shape)
     before = x < assembly.grid.to_cells(torch.tensor([[FACE - 4e-3, 0, 0]]))[0, 0]
     assert before.any()
     assert (z[before] >= assembly.grid.first[2]).all()

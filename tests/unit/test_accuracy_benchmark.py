@@ -30,8 +30,15 @@ from surface_variants import TREATMENTS, treatment
 import autdtorch as at
 from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd import medium
+from autdtorch.fdtd.assembly.interface import (
+    LATTICE,
+    PAIRS,
+    VERTICES,
+    Materials,
+    interface_elements,
+    uniform_coupling,
+)
 from autdtorch.fdtd.stencil import tuned_stencil
-from autdtorch.fdtd.surface import LATTICE, PAIRS, VERTICES, Materials, cut_elements, uniform_bonds
 
 STENCIL = tuned_stencil(2 * math.pi / 8.5)
 MATERIALS = Materials(np.array([1.0, 77.3]), np.array([1.0, 1 / 77.3]))
@@ -79,7 +86,7 @@ def test_scattered_error_is_that_of_the_scattered_field() -> None:
 def test_treatments_of_air_are_air(name: str) -> None:
     distance, material = half_filled(10.0)
     found = TREATMENTS[name](distance, material, MATERIALS, STENCIL)
-    assert np.allclose(found.bonds, uniform_bonds(STENCIL), rtol=1e-12)
+    assert np.allclose(found.bonds, uniform_coupling(STENCIL), rtol=1e-12)
     assert np.allclose(found.mass, 1 / 8, rtol=1e-12)
 
 
@@ -94,15 +101,15 @@ def test_treatments_of_a_layer(name: str, share: float) -> None:
     # bonds: across the face in series, along it those of a uniform material
     ends = number[PAIRS]
     across, air = ends[:, 0] != ends[:, 1], ~ends.any(axis=1)
-    ratio = uniform_bonds(STENCIL) / found.bonds[0]
+    ratio = uniform_coupling(STENCIL) / found.bonds[0]
     assert np.allclose(ratio[across], 1 - share + share * 77.3, rtol=1e-12)
     assert np.allclose(ratio[air], 1, rtol=1e-12)
 
 
 def test_a_treatment_ends_with_its_context() -> None:
     with treatment("staircase"):
-        assert medium.cut_elements is TREATMENTS["staircase"]
-    assert medium.cut_elements is cut_elements
+        assert medium.interface_elements is TREATMENTS["staircase"]
+    assert medium.interface_elements is interface_elements
 
 
 def test_cases_are_normalised_as_free_space() -> None:

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from small_scenes import AIR
 
 from autdtorch.fdtd.grid import make_grid
+from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.placement import grid_offset
-from autdtorch.fdtd.points import footprint
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Obstacle, Sphere, VoxelMask
@@ -93,7 +93,7 @@ def test_a_grid_far_finer_than_the_wavelength_is_refused() -> None:
 
 def test_the_grid_covers_the_domain_wherever_it_lies() -> None:
     grid = make_grid(region_of(scene(box((5.3, 6.7, 7.9), (8, 9, 10)))), SPACING)
-    margin = footprint(grid.kappa) // 2 - 1  # cells that points beside the rim of the domain need
+    margin = interpolation_width(grid.kappa) // 2 - 1  # cells that points beside the rim of the domain need
     for centers, first, last in zip(grid.centers, grid.first, grid.last, strict=True):
         assert centers[first + margin] <= 0.5 * SPACING + 1e-9
         assert centers[last - 1 - margin] >= 30e-3 - 0.5 * SPACING - 1e-9

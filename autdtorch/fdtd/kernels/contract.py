@@ -4,9 +4,9 @@ One step, from pressures `now` and `before` at two successive times to the next 
 
 1. new = center now + face F + edge E + corner C - keep before, with F, E, C the sums over the 6, 12 and 8
    neighbours;
-2. in the varying cells instead new = (1 + keep) now - keep before + sum_j weight_j (now_j - now);
+2. in the heterogeneous cells instead new = (1 + keep) now - keep before + sum_j weight_j (now_j - now);
 3. the boundary layers add what stretches the sum of the two neighbours along each axis (`boundary.py`), as
-   in air, times `layer_scale` in varying cells, and by column what those differ by (`columns.py`);
+   in air, times `layer_scale` in heterogeneous cells, and by column what those differ by (`columns.py`);
 4. the sources are added: new += sum_s signal_s force_s, of the S signals that they share;
 5. the outermost ring of cells and the closed cells stay zero.
 """
@@ -56,12 +56,12 @@ class Coefficients:
         edge: weight of each of 12.
         corner: weight of each of 8.
         keep: weight of the pressure before, 1 in air that does not absorb and below it otherwise.
-        varying_index: flat indices (n,) int64 of the varying cells, ascending.
-        varying_weight: their weights (n, 27).
-        closed_index: flat indices (k,) int64 of the closed cells.
+        heterogeneous_index: flat indices (n,) int64 of the heterogeneous cells, ascending.
+        heterogeneous_weight: their weights (n, 27).
+        sound_hard_index: flat indices (k,) int64 of the closed cells.
         layer_decay: b of the boundary layer at half cells and cells, interleaved from outside (2 L + 1,).
         layer_gain: a, likewise.
-        layer_index: flat indices (k,) int64 of the varying cells in the layers, ascending.
+        layer_index: flat indices (k,) int64 of the heterogeneous cells in the layers, ascending.
         layer_scale: how many times air's their term is (k,).
         columns: where surfaces run through the boundary layers.
         crossed: where they run through two at once, along one of them.
@@ -74,9 +74,9 @@ class Coefficients:
     edge: float
     corner: float
     keep: float
-    varying_index: torch.Tensor
-    varying_weight: torch.Tensor
-    closed_index: torch.Tensor
+    heterogeneous_index: torch.Tensor
+    heterogeneous_weight: torch.Tensor
+    sound_hard_index: torch.Tensor
     layer_decay: torch.Tensor
     layer_gain: torch.Tensor
     layer_index: torch.Tensor

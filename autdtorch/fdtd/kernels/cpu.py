@@ -193,11 +193,11 @@ def _columns(c: Coefficients, columns: Columns) -> tuple[AnyArray, ...]:
     return columns.index.numpy(), columns.offset.numpy(), columns.weight.numpy(), *rows_profile(c, count)
 
 
-def _varying_cells(c: Coefficients, strides: NDArray[np.int64]) -> tuple[AnyArray, ...]:
+def _heterogeneous_cells(c: Coefficients, strides: NDArray[np.int64]) -> tuple[AnyArray, ...]:
     """Their indices, weights, the offsets of these, and what the layers need to know about them."""
     offsets = np.indices((3, 3, 3)).reshape(3, -1).T - 1
     air = np.array((c.center, c.face, c.edge, c.corner))[np.abs(offsets).sum(axis=1)]
-    index, weight = c.varying_index.numpy(), c.varying_weight.numpy()
+    index, weight = c.heterogeneous_index.numpy(), c.heterogeneous_weight.numpy()
     scale = np.zeros_like(weight, shape=len(index))
     scale[np.searchsorted(index, c.layer_index.numpy())] = c.layer_scale.numpy()
     new, swept = np.empty_like(scale), np.empty_like(scale)
@@ -227,11 +227,11 @@ class CpuKernel:
         c = coefficients
         shape, cuts = state.now.shape, _cuts(state.now.shape)
         plane = shape[1] * shape[2]
-        dtype = c.varying_weight.numpy().dtype.type
+        dtype = c.heterogeneous_weight.numpy().dtype.type
         recorded = torch.empty((len(signal), len(receivers.index)), dtype=signal.dtype, device="cpu")
         medium = (
             cuts,
-            np.searchsorted(c.varying_index.numpy(), plane * np.arange(shape[0] + 1)),
+            np.searchsorted(c.heterogeneous_index.numpy(), plane * np.arange(shape[0] + 1)),
             np.searchsorted(sources.index.numpy(), plane * cuts),
             *(np.uint64(cells) for cells in shape),
             *(dtype(weight) for weight in (c.center, c.face, c.edge, c.corner, c.keep)),
@@ -245,11 +245,11 @@ class CpuKernel:
             state.before.numpy().reshape(-1),
             medium,
             tuple(part.reshape(-1) for part in memory.arrays),
-            _varying_cells(c, np.array(state.now.stride())),
+            _heterogeneous_cells(c, np.array(state.now.stride())),
             _room(len(cuts) - 1, shape, c.layer_cells, dtype),
             (_columns(c, c.columns), _columns(c, c.crossed), c.crossing.numpy()),
             tuple((psi.numpy(), zeta.numpy()) for psi, zeta in (state.columns, state.crossed)),
-            c.closed_index.numpy(),
+            c.sound_hard_index.numpy(),
             # contiguous: for arrays with gaps numba compiles anew, and crashed when it loaded that from disk
             (sources.index.contiguous().numpy(), sources.force.contiguous().numpy()),
             (receivers.index.contiguous().numpy(), receivers.weight.contiguous().numpy()),

@@ -1,4 +1,4 @@
-"""Derivatives by the varying cells' weights, summed over the steps, on one core."""
+"""Derivatives by the heterogeneous cells' weights, summed over the steps, on one core."""
 
 from __future__ import annotations
 

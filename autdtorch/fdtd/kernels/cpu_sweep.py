@@ -43,8 +43,8 @@ def _sweep(p, at, n, row, old, old_at, total, across, weights):  # type: ignore[
 
 
 @njit(**INNER)
-def _varying(p, q, cells, first, last, keep):  # type: ignore[no-untyped-def]
-    """New pressure of some varying cells; in layers also what the sweep alone would make of them."""
+def _heterogeneous(p, q, cells, first, last, keep):  # type: ignore[no-untyped-def]
+    """New pressure of some heterogeneous cells; in layers also what the sweep alone would make of them."""
     index, weight, offset, scale, air, new, swept = cells
     for n in range(first, last):
         cell = index[n]
@@ -237,7 +237,7 @@ def sweep_planes(  # type: ignore[no-untyped-def]
     for i in range(first, last + one):
         done = i - one
         if i < last:
-            _varying(p, q, cells, starts[i], starts[i + one], keep)
+            _heterogeneous(p, q, cells, starts[i], starts[i + one], keep)
             if depth:
                 _stretch_plane(p, i, shape, depth, layers, terms, ends, profiles)
             # what is worked out before the first plane goes where A of that plane will be

@@ -20,12 +20,12 @@ from autdtorch.fdtd.kernels.cuda_tables import (
     Shape,
     column_table,
     driven_table,
-    heard_table,
+    heterogeneous_table,
     memories,
     no_terms,
     profile_table,
+    receiver_table,
     settled_table,
-    varying_table,
 )
 from autdtorch.utils.validation import invalid
 
@@ -63,7 +63,7 @@ class Ends(NamedTuple):
     z: int
     y: int
     yz: int
-    varying: int
+    heterogeneous: int
     crossed: int
 
 
@@ -79,16 +79,16 @@ class DeviceMedium:
             [c.center, c.face, c.edge, c.corner, c.keep], dtype=self.dtype, device=device
         )
         self.profile = profile_table(c, self.depths, device)
-        self.varying = varying_table(c, device)
+        self.heterogeneous = heterogeneous_table(c, device)
         self.columns = column_table(c.columns, c.crossing, device)
         self.crossed = column_table(c.crossed, c.crossing[:0], device)
         self.settled = settled_table(c, device)
         self.terms = no_terms(shape, c, device)
         nx, ny, nz = shape
         z, y, yz = (2 * triton.cdiv(rows, blocks.lanes) for rows in (nx * ny, nx * nz, 2 * self.cells * nx))
-        varying = triton.cdiv(self.varying.size, self.depths * blocks.lanes)
+        heterogeneous = triton.cdiv(self.heterogeneous.size, self.depths * blocks.lanes)
         crossed = triton.cdiv(self.crossed.size, blocks.lanes)
-        self.ends = Ends(*itertools.accumulate((z, y, yz, varying, crossed)))
+        self.ends = Ends(*itertools.accumulate((z, y, yz, heterogeneous, crossed)))
         self.tiles = triton.cdiv(nx - 2, blocks.x) * triton.cdiv(ny, blocks.y) * triton.cdiv(nz, blocks.z)
 
 
@@ -106,7 +106,7 @@ class DeviceRun:
         fresh = Memories(*(Memory(*map(torch.zeros_like, each)) for each in memory))
         self._memories = memory, fresh
         self._driven = driven_table(sources, medium.settled, dtype, device)
-        self._heard = heard_table(receivers, steps, dtype, device)
+        self._heard = receiver_table(receivers, steps, dtype, device)
         self.signal = torch.zeros((steps, sources.force.shape[1]), dtype=dtype, device=device)
         self._first = torch.zeros((), dtype=torch.int64, device=device)
         self._turn = 0
@@ -167,8 +167,8 @@ class DeviceRun:
         lanes = m.depths * blocks.lanes
         sizes = {"CELLS": m.cells, "DEPTHS": m.depths, "LANES": blocks.lanes}
         cuda_steps.prepare[(m.ends.crossed + triton.cdiv(heard.size, lanes),)](
-            now, other, m.shape, m.weights, m.profile, old, new, m.terms, m.varying, m.crossed, heard, m.ends,
-            self._first, offset, CROSSED_WIDTH=len(m.crossed.weight), **sizes,
+            now, other, m.shape, m.weights, m.profile, old, new, m.terms, m.heterogeneous, m.crossed, heard,
+            m.ends, self._first, offset, CROSSED_WIDTH=len(m.crossed.weight), **sizes,
         )  # fmt: skip
         cuda_steps.sweep[(m.tiles + triton.cdiv(m.columns.size, blocks.lanes),)](
             now, other, m.shape, m.weights, m.profile, old, new, m.terms, m.columns, m.tiles,
@@ -176,7 +176,7 @@ class DeviceRun:
             num_warps=blocks.y * blocks.z // 32, **sizes,
         )  # fmt: skip
         cuda_steps.settle[(triton.cdiv(driven.size, lanes),)](
-            other, m.varying, m.settled, driven, m.terms.columns, self.signal, self._first, offset,
+            other, m.heterogeneous, m.settled, driven, m.terms.columns, self.signal, self._first, offset,
             SHARES=len(m.settled.share), SIGNALS=len(driven.force), LANES=lanes,
         )  # fmt: skip
 

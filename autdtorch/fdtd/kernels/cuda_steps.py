@@ -1,9 +1,9 @@
 """One time step on a GPU, in Triton: three launches, each of programs with different tasks.
 
-`prepare` only reads the pressures: it stretches the layers across y and z and the crossed columns, works out
-what varying cells become, and reads the receivers. `sweep` does the 27-point sum with all layers in it, those
-across x on the way, and the columns beside it. `settle` puts right the cells that this leaves wrong: varying
-and closed ones, those of columns and those that are driven.
+`prepare` only reads the pressures. It stretches the layers across y and z and the crossed columns, computes
+the heterogeneous cells, and reads the receivers. `sweep` computes the 27-point sum with all layers, and the
+columns beside it. `settle` corrects the cells that this leaves wrong: heterogeneous, sound-hard and driven
+cells and those of columns.
 
 The memory of layers and columns is read from one place and written to another, so that no program reads what
 another one of the same launch writes: their order does not matter.
@@ -150,10 +150,10 @@ def _stretch_columns(p, columns, old, new, profile, crossed, terms, program, WID
 
 
 @triton.jit
-def _gather_varying(p, before, shape, weights, varying, program, LANES: tl.constexpr):
+def _gather_heterogeneous(p, before, shape, weights, heterogeneous, program, LANES: tl.constexpr):
     n = program * LANES + tl.arange(0, LANES)
-    mask = n < varying.size
-    cell = tl.load(varying.cell + n, mask=mask, other=0)
+    mask = n < heterogeneous.size
+    cell = tl.load(heterogeneous.cell + n, mask=mask, other=0)
     own, old = tl.load(p + cell, mask=mask, other=0), tl.load(before + cell, mask=mask, other=0)
     keep = tl.load(weights + KEEP)
     air, change = -keep * old, tl.zeros([LANES], p.dtype.element_ty)
@@ -163,13 +163,13 @@ def _gather_varying(p, before, shape, weights, varying, program, LANES: tl.const
             for z in tl.static_range(3):
                 beside = p + cell + ((x - 1) * plane + (y - 1) * shape.nz + (z - 1))
                 value = tl.load(beside, mask=mask, other=0)
-                place = n + (9 * x + 3 * y + z) * varying.size
-                change += tl.load(varying.weight + place, mask=mask, other=0) * (value - own)
+                place = n + (9 * x + 3 * y + z) * heterogeneous.size
+                change += tl.load(heterogeneous.weight + place, mask=mask, other=0) * (value - own)
                 kind = (x - 1) * (x - 1) + (y - 1) * (y - 1) + (z - 1) * (z - 1)
                 air += tl.load(weights + kind) * value
-    scale = tl.load(varying.scale + n, mask=mask, other=0)
+    scale = tl.load(heterogeneous.scale + n, mask=mask, other=0)
     # The sweep comes to `air` and the layers' term, of which `settle` adds `scale` times what it finds.
-    tl.store(varying.settled + n, own + keep * (own - old) + change - scale * air, mask=mask)
+    tl.store(heterogeneous.settled + n, own + keep * (own - old) + change - scale * air, mask=mask)
 
 
 @triton.jit
@@ -185,8 +185,8 @@ def _read(p, receivers, row, program, LANES: tl.constexpr):
 
 
 @triton.jit(do_not_specialize=["offset"])
-def prepare(p, before, shape, weights, profile, old, new, terms, varying, crossed, receivers, ends, first,
-            offset, CROSSED_WIDTH: tl.constexpr, CELLS: tl.constexpr, DEPTHS: tl.constexpr,
+def prepare(p, before, shape, weights, profile, old, new, terms, heterogeneous, crossed, receivers, ends,
+            first, offset, CROSSED_WIDTH: tl.constexpr, CELLS: tl.constexpr, DEPTHS: tl.constexpr,
             LANES: tl.constexpr):  # fmt: skip
     """All of a step that only reads the pressures; the receivers are read as the step before left them."""
     program = tl.program_id(0)
@@ -197,11 +197,12 @@ def prepare(p, before, shape, weights, profile, old, new, terms, varying, crosse
     elif program < ends.yz:
         _stretch_yz(p, shape, old.z, old.yz, new.yz, profile, terms.yz, program - ends.y, CELLS, DEPTHS,
                     LANES)  # fmt: skip
-    elif program < ends.varying:
-        _gather_varying(p, before, shape, weights, varying, program - ends.yz, DEPTHS * LANES)
+    elif program < ends.heterogeneous:
+        _gather_heterogeneous(p, before, shape, weights, heterogeneous, program - ends.yz, DEPTHS * LANES)
     elif program < ends.crossed:
         _stretch_columns(p, crossed, old.crossed, new.crossed, profile, terms.crossed, terms.crossed,
-                         program - ends.varying, CROSSED_WIDTH, False, CELLS, DEPTHS, LANES)  # fmt: skip
+                         program - ends.heterogeneous, CROSSED_WIDTH, False, CELLS, DEPTHS,
+                         LANES)  # fmt: skip
     else:
         _read(p, receivers, tl.load(first) + offset - 1, program - ends.crossed, DEPTHS * LANES)
 
@@ -297,17 +298,17 @@ def sweep(p, q, shape, weights, profile, old, new, terms, columns, tiles, COLUMN
 
 
 @triton.jit(do_not_specialize=["offset"])
-def settle(q, varying, settled, driven, shares, signal, first, offset, SHARES: tl.constexpr,
+def settle(q, heterogeneous, settled, driven, shares, signal, first, offset, SHARES: tl.constexpr,
            SIGNALS: tl.constexpr, LANES: tl.constexpr):  # fmt: skip
     """Put right the cells that the sweep leaves wrong."""
     n = tl.program_id(0) * LANES + tl.arange(0, LANES)
     mask, still = n < driven.size, n < driven.settled
     at = q + tl.load(driven.cell + n, mask=mask, other=0)
     value = tl.load(at, mask=mask, other=0)
-    place = tl.load(settled.varying + n, mask=still, other=-1)
+    place = tl.load(settled.heterogeneous + n, mask=still, other=-1)
     varies = place >= 0
-    scale = tl.load(varying.scale + place, mask=varies, other=1)
-    value = scale * value + tl.load(varying.settled + place, mask=varies, other=0)
+    scale = tl.load(heterogeneous.scale + place, mask=varies, other=1)
+    value = scale * value + tl.load(heterogeneous.settled + place, mask=varies, other=0)
     for share in tl.static_range(SHARES):
         source = tl.load(settled.share + share * driven.settled + n, mask=still, other=0)
         value += tl.load(shares + source, mask=still, other=0)

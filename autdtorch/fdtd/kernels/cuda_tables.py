@@ -56,8 +56,8 @@ class Terms(NamedTuple):
     crossed: torch.Tensor
 
 
-class Varying(NamedTuple):
-    """n varying cells.
+class Heterogeneous(NamedTuple):
+    """n heterogeneous cells.
 
     Attributes:
         size: n.
@@ -89,13 +89,13 @@ class Settled(NamedTuple):
 
     Attributes:
         cell: flat index (k,).
-        varying: place among the varying cells, -1 for others (k,).
+        heterogeneous: place among the heterogeneous cells, -1 for others (k,).
         share: places among the columns' terms, the zero at their end included (w, k).
         closed: 1 where closed (k,).
     """
 
     cell: torch.Tensor
-    varying: torch.Tensor
+    heterogeneous: torch.Tensor
     share: torch.Tensor
     closed: torch.Tensor
 
@@ -116,7 +116,7 @@ class Driven(NamedTuple):
     force: torch.Tensor
 
 
-class Heard(NamedTuple):
+class ReceiverTable(NamedTuple):
     """R receivers: width w, flat index and weight (w, R), and room for what they record (steps, R)."""
 
     size: int
@@ -133,15 +133,15 @@ def profile_table(c: Coefficients, depths: int, device: torch.device) -> Profile
     return Profile(decay.to(device), gain.to(device))
 
 
-def varying_table(c: Coefficients, device: torch.device) -> Varying:
-    """The varying cells; the layers' term is scaled in those of them that lie in layers."""
-    index, count = c.varying_index.to(device), len(c.varying_index)
+def heterogeneous_table(c: Coefficients, device: torch.device) -> Heterogeneous:
+    """The heterogeneous cells; the layers' term is scaled in those of them that lie in layers."""
+    index, count = c.heterogeneous_index.to(device), len(c.heterogeneous_index)
     order = torch.argsort(index)
-    scale = torch.zeros(count, dtype=c.varying_weight.dtype, device=device)
+    scale = torch.zeros(count, dtype=c.heterogeneous_weight.dtype, device=device)
     place = order[torch.searchsorted(index[order], c.layer_index.to(device))]
     scale[place] = c.layer_scale.to(device)
-    weight = c.varying_weight.to(device).T.contiguous()
-    return Varying(count, index.contiguous(), weight, scale, torch.zeros_like(scale))
+    weight = c.heterogeneous_weight.to(device).T.contiguous()
+    return Heterogeneous(count, index.contiguous(), weight, scale, torch.zeros_like(scale))
 
 
 def column_table(columns: Columns, crossing: torch.Tensor, device: torch.device) -> ColumnTable:
@@ -153,12 +153,12 @@ def column_table(columns: Columns, crossing: torch.Tensor, device: torch.device)
 
 
 def settled_table(c: Coefficients, device: torch.device) -> Settled:
-    """Varying cells, closed ones and those of columns, each of them once."""
+    """Heterogeneous cells, closed ones and those of columns, each of them once."""
     inside = c.columns.index.to(device).T[1:-1].reshape(-1)
-    varying, closed = c.varying_index.to(device), c.closed_index.to(device)
-    cell = torch.unique(torch.cat((varying, closed, inside)))
+    heterogeneous, closed = c.heterogeneous_index.to(device), c.sound_hard_index.to(device)
+    cell = torch.unique(torch.cat((heterogeneous, closed, inside)))
     place = torch.full_like(cell, -1)
-    place[torch.searchsorted(cell, varying)] = torch.arange(len(varying), device=device)
+    place[torch.searchsorted(cell, heterogeneous)] = torch.arange(len(heterogeneous), device=device)
     shut = torch.zeros(len(cell), dtype=torch.int8, device=device)
     shut[torch.searchsorted(cell, closed)] = 1
     # the n-th of the terms that come to a cell is in row n
@@ -184,11 +184,13 @@ def driven_table(sources: Sources, settled: Settled, dtype: torch.dtype, device:
     return Driven(len(settled.cell), len(cell), cell, force)
 
 
-def heard_table(receivers: Receivers, steps: int, dtype: torch.dtype, device: torch.device) -> Heard:
+def receiver_table(
+    receivers: Receivers, steps: int, dtype: torch.dtype, device: torch.device
+) -> ReceiverTable:
     """The receivers, for runs of `steps`."""
     index, weight = receivers.index.to(device).T.contiguous(), receivers.weight.to(device).T.contiguous()
     recorded = torch.zeros((steps, index.shape[1]), dtype=dtype, device=device)
-    return Heard(index.shape[1], len(index), index, weight.to(dtype), recorded)
+    return ReceiverTable(index.shape[1], len(index), index, weight.to(dtype), recorded)
 
 
 def no_terms(shape: Shape, c: Coefficients, device: torch.device) -> Terms:

@@ -42,12 +42,13 @@ class ReferenceKernel:
     def _step(self, state: State, c: Coefficients, driven: torch.Tensor, force: torch.Tensor) -> State:
         new = torch.nn.functional.pad(_sweep(state.now, c) - c.keep * _core(state.before), (1,) * 6)
         flat_now, flat_before = state.now.reshape(-1), state.before.reshape(-1)
-        own, before = flat_now[c.varying_index], flat_before[c.varying_index]
+        own, before = flat_now[c.heterogeneous_index], flat_before[c.heterogeneous_index]
         change = (
-            c.varying_weight * (flat_now[c.varying_index[:, None] + _offsets(state.now)] - own[:, None])
+            c.heterogeneous_weight
+            * (flat_now[c.heterogeneous_index[:, None] + _offsets(state.now)] - own[:, None])
         ).sum(-1)
         kept = own + c.keep * (own - before)
-        new = new.reshape(-1).index_copy(0, c.varying_index, kept + change)
+        new = new.reshape(-1).index_copy(0, c.heterogeneous_index, kept + change)
         new = new.reshape(state.now.shape)
         layers, term = _absorb(state.now, state.layers, c)
         flat_term = term.reshape(-1)
@@ -60,7 +61,7 @@ class ReferenceKernel:
         columns, shares = _absorb_columns(flat_now, c.columns, beside, state.columns, c)
         inside = c.columns.index.T[1:-1].reshape(-1)
         new = (new + term).reshape(-1).index_add(0, inside, shares.reshape(-1))
-        new = new.index_add(0, driven, force).index_fill(0, c.closed_index, 0)
+        new = new.index_add(0, driven, force).index_fill(0, c.sound_hard_index, 0)
         return State(new.reshape(state.now.shape), state.now, layers, columns, crossed)
 
 

@@ -3,8 +3,8 @@ import math
 import numpy as np
 import pytest
 
+from autdtorch.fdtd.assembly.elements import RIGID, Elements, elements_of, speed_factor
 from autdtorch.fdtd.grid import Grid
-from autdtorch.fdtd.medium import RIGID, ElementMedium, fill_elements, speed_factor
 from autdtorch.fdtd.stencil import tuned_stencil
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
@@ -24,10 +24,10 @@ def box(low: tuple[float, ...], high: tuple[float, ...], ratio: float = 77.0, sp
     return Box(tuple((lower + upper) / 2), tuple(upper - lower), **material)
 
 
-def filled(*obstacles: Obstacle) -> ElementMedium:
+def filled(*obstacles: Obstacle) -> Elements:
     array = TransducerArray([[-0.9, 0.0, 0.0]], (1, 0, 0))
     scene = Scene(array, AIR, 40e3, [[0.9, 0.0, 0.0]], obstacles, domain=((-1, -1, -1), (1, 1, 1)))
-    return fill_elements(region_of(scene), GRID, STENCIL)
+    return elements_of(region_of(scene), GRID, STENCIL)
 
 
 def element_centers() -> np.ndarray:
@@ -133,4 +133,4 @@ def test_boxes_of_two_materials_that_touch_leave_no_air_between_them(joint: floa
 def test_no_obstacles_cut_nothing() -> None:
     medium = filled()
     assert not medium.number.any()
-    assert len(medium.cut) == len(medium.elements.bonds) == 0
+    assert len(medium.cut) == len(medium.elements.coupling) == 0

@@ -10,17 +10,17 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from autdtorch.fdtd.stencil import tuned_stencil
-from autdtorch.fdtd.surface import (
+from autdtorch.fdtd.assembly.interface import (
     FAR,
     LATTICE,
     VERTICES,
-    CutElements,
+    InterfaceElements,
     Materials,
-    cut_elements,
-    energy_matrix,
-    uniform_bonds,
+    interface_elements,
+    stiffness_matrix,
+    uniform_coupling,
 )
+from autdtorch.fdtd.stencil import tuned_stencil
 
 STENCIL = tuned_stencil(2 * math.pi / 8.5)
 ONE = np.array([1])
@@ -42,15 +42,15 @@ def sphere(normal: np.ndarray, offset: float, radius: float) -> np.ndarray:
 
 def element(
     *distance: np.ndarray, density: tuple[float, ...] = (1, 77), mass: tuple[float, ...] | None = None
-) -> CutElements:
+) -> InterfaceElements:
     """One element, obstacle k of which is of material k + 1; masses are 1/density by default."""
     materials = Materials(np.array(density, float), np.array(mass or [1 / d for d in density], float))
-    return cut_elements(np.stack(distance)[:, None], np.arange(len(distance)) + 1, materials, STENCIL)
+    return interface_elements(np.stack(distance)[:, None], np.arange(len(distance)) + 1, materials, STENCIL)
 
 
-def energy(cut: CutElements, field: np.ndarray) -> float:
+def energy(cut: InterfaceElements, field: np.ndarray) -> float:
     """Of a field (8,) at the vertices: the integral of |gradient|^2 / density."""
-    return float(field @ energy_matrix(cut.bonds)[0] @ field)
+    return float(field @ stiffness_matrix(cut.coupling)[0] @ field)
 
 
 @pytest.mark.parametrize("density", [1e-3, 1.0, 1e5])
@@ -58,13 +58,13 @@ def test_an_element_of_one_material_is_the_tuned_stencil_over_its_density(densit
     inside = np.full(len(LATTICE), -FAR)
     cut = element(inside, density=(1, density))
     # rounding
-    assert np.allclose(cut.bonds, uniform_bonds(STENCIL) / density, rtol=1e-14)
+    assert np.allclose(cut.coupling, uniform_coupling(STENCIL) / density, rtol=1e-14)
     assert np.allclose(cut.mass, 1 / (8 * density), rtol=1e-14)
-    assert np.allclose(element(-inside).bonds, uniform_bonds(STENCIL), rtol=1e-14)
+    assert np.allclose(element(-inside).coupling, uniform_coupling(STENCIL), rtol=1e-14)
 
 
 def test_eight_elements_of_air_add_up_to_the_tuned_stencil() -> None:
-    matrix = energy_matrix(uniform_bonds(STENCIL)[None])[0]
+    matrix = stiffness_matrix(uniform_coupling(STENCIL)[None])[0]
     sums = np.zeros((3, 3, 3))
     for own, vertex in enumerate(VERTICES):
         for other, target in enumerate(VERTICES):
@@ -79,7 +79,7 @@ def test_energy_is_never_negative_at_any_contrast(
     normal: np.ndarray, offset: float, density: float, radius: float | None
 ) -> None:
     distance = plane(normal, offset) if radius is None else sphere(normal, offset, radius)
-    matrix = energy_matrix(element(distance, density=(1, density)).bonds)[0]
+    matrix = stiffness_matrix(element(distance, density=(1, density)).coupling)[0]
     size = np.abs(matrix).max()
     # rounding of sums of terms up to the contrast apart
     assert np.linalg.eigvalsh(matrix).min() > -1e-11 * size
@@ -110,7 +110,7 @@ def test_a_flow_through_a_surface_along_the_grid_meets_its_exact_resistance(
     kinked = np.where(depth < 0, density, 1.0) * depth  # of unit flow
     cut = element(plane(normal, offset), density=(1, density))
     resistance = (0.5 + offset) * density + (0.5 - offset)
-    flow = energy_matrix(cut.bonds)[0] @ kinked
+    flow = stiffness_matrix(cut.coupling)[0] @ kinked
     # nothing flows along the surface, all of it across; rounding
     assert flow[depth > 0].sum() == pytest.approx(1, rel=1e-9)
     assert energy(cut, kinked) == pytest.approx(resistance, rel=1e-9)
@@ -189,9 +189,9 @@ def test_a_face_along_the_grid_has_a_positive_energy_in_every_direction(
     """
     normal = (-1.0 if behind else 1.0) * np.eye(3)[axis]
     cut = element(plane(normal, offset), density=(1, contrast))
-    air = uniform_bonds(STENCIL)
+    air = uniform_coupling(STENCIL)
     low, high = (air, air / contrast) if behind else (air / contrast, air)
-    chain = [energy_matrix(one[None])[0] for one in (low, low, cut.bonds[0], high, high)]
+    chain = [stiffness_matrix(one[None])[0] for one in (low, low, cut.coupling[0], high, high)]
     for first in np.linspace(0, np.pi, 5):
         for second in np.linspace(0, np.pi, 5):
             along = _energy_along(chain, axis, np.array((first, second)))

@@ -5,8 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autdtorch.fdtd import points
-from autdtorch.fdtd.points import FOOTPRINT_ERROR, footprint, merged, point_weights, without
+from autdtorch.fdtd import interpolation
+from autdtorch.fdtd.interpolation import (
+    WIDTH_ERROR,
+    average_nodes,
+    exclude_cells,
+    interpolate_points,
+    interpolation_width,
+)
 
 SHAPE = (24, 22, 20)
 FIRST, LAST = (2, 2, 2), (22, 20, 18)
@@ -26,11 +32,11 @@ def test_plane_waves_are_read_exactly_between_the_cells(cells: float, seed: int)
     kappa = 2 * math.pi / cells
     field, vector = wave(kappa, seed)
     positions = np.random.default_rng(seed).uniform(7, 13, (5, 3))
-    weights = point_weights(positions, SHAPE, FIRST, LAST, kappa)
+    weights = interpolate_points(positions, SHAPE, FIRST, LAST, kappa)
     read = (field[weights.index] * weights.weight).sum(1)
-    # FOOTPRINT_ERROR an axis, and three axes, each with an error norm of the other two of about 1.5 (sum of
+    # WIDTH_ERROR an axis, and three axes, each with an error norm of the other two of about 1.5 (sum of
     # |weights|)
-    assert np.abs(read - np.exp(1j * positions @ vector)).max() < 3 * 1.5**2 * FOOTPRINT_ERROR
+    assert np.abs(read - np.exp(1j * positions @ vector)).max() < 3 * 1.5**2 * WIDTH_ERROR
 
 
 @pytest.mark.parametrize("cells", [17.0, 8.5])
@@ -38,7 +44,7 @@ def test_points_within_a_cell_of_the_rim_are_read_from_inside(cells: float) -> N
     kappa = 2 * math.pi / cells
     field, vector = wave(kappa, seed=1)
     positions = np.array([[2.5, 2.5, 2.5], [20.5, 18.5, 16.5], [2.5, 10.2, 16.5]])
-    weights = point_weights(positions, SHAPE, FIRST, LAST, kappa)
+    weights = interpolate_points(positions, SHAPE, FIRST, LAST, kappa)
     touched = np.stack(np.unravel_index(weights.index, SHAPE), axis=-1)
     assert (touched >= FIRST).all()
     assert (touched < LAST).all()
@@ -54,15 +60,15 @@ def test_points_beside_missing_cells_are_read_from_the_others(cells: float) -> N
     kappa = 2 * math.pi / cells
     field, vector = wave(kappa, seed=2)
     positions = np.array([[10.2, 9.6, 8.3], [10.6, 9.1, 8.8], [10.95, 9.0, 8.5], [11.01, 9.0, 8.5]])
-    spread = point_weights(positions, SHAPE, FIRST, LAST, kappa)
+    spread = interpolate_points(positions, SHAPE, FIRST, LAST, kappa)
     missing = np.unravel_index(spread.index, SHAPE)[0] > 10
-    weights = without(spread, positions, missing, SHAPE, kappa)
+    weights = exclude_cells(spread, positions, missing, SHAPE, kappa)
     assert not weights.weight[missing].any()
     assert not weights.weight[3].any()
     read = (field[weights.index] * weights.weight).sum(1)
     # a line through the last two cells would miss up to kappa^2, 0.14 and 0.55; a parabola kappa^3
     assert np.abs(read - np.exp(1j * positions @ vector))[:3].max() < 0.1
-    kept = without(spread, positions, np.zeros_like(missing), SHAPE, kappa)
+    kept = exclude_cells(spread, positions, np.zeros_like(missing), SHAPE, kappa)
     assert np.array_equal(kept.weight, spread.weight)
 
 
@@ -70,9 +76,9 @@ def one_sided(cells: float) -> tuple[float, float]:
     """Rms error of plane waves and largest norm of weights, of points up to a cell beyond the last cell."""
     kappa, random = 2 * math.pi / cells, np.random.default_rng(0)
     positions = np.array((10, 8.5, 8)) + random.uniform(size=(60, 3))
-    spread = point_weights(positions, SHAPE, FIRST, LAST, kappa)
+    spread = interpolate_points(positions, SHAPE, FIRST, LAST, kappa)
     missing = np.unravel_index(spread.index, SHAPE)[0] > 10
-    weights = without(spread, positions, missing, SHAPE, kappa)
+    weights = exclude_cells(spread, positions, missing, SHAPE, kappa)
     errors = []
     for seed in range(20):
         field, vector = wave(kappa, seed)
@@ -86,7 +92,7 @@ def test_small_weights_beside_missing_cells_cost_no_accuracy(
 ) -> None:
     """Half as large as those of a fit that is hardly regularised, as near fields are no plane waves."""
     error, norm = one_sided(cells)
-    monkeypatch.setattr(points, "_ONE_SIDED_REGULARISATION", 1e-6)
+    monkeypatch.setattr(interpolation, "_ONE_SIDED_REGULARISATION", 1e-6)
     least_error, large = one_sided(cells)
     # measured: 1.02 and 0.98, 0.45 and 0.50; a regularisation ten times as strong costs 1.5 and 1.35, one ten
     # times as weak leaves 0.61 and 0.62. Nothing here hangs on rounding.
@@ -95,20 +101,20 @@ def test_small_weights_beside_missing_cells_cost_no_accuracy(
 
 
 def test_a_point_on_a_cell_centre_is_that_cell() -> None:
-    weights = point_weights(np.array([[9.0, 8.0, 7.0]]), SHAPE, FIRST, LAST, 2 * math.pi / 8.5)
+    weights = interpolate_points(np.array([[9.0, 8.0, 7.0]]), SHAPE, FIRST, LAST, 2 * math.pi / 8.5)
     largest = weights.weight[0].argmax()
     assert weights.index[0, largest] == np.ravel_multi_index((9, 8, 7), SHAPE)
-    # not to the last digit: the fit is regularised, which costs up to FOOTPRINT_ERROR an axis
-    assert weights.weight[0, largest] == pytest.approx(1, abs=3 * FOOTPRINT_ERROR)
-    assert np.sort(np.abs(weights.weight[0]))[-2] < FOOTPRINT_ERROR
+    # not to the last digit: the fit is regularised, which costs up to WIDTH_ERROR an axis
+    assert weights.weight[0, largest] == pytest.approx(1, abs=3 * WIDTH_ERROR)
+    assert np.sort(np.abs(weights.weight[0]))[-2] < WIDTH_ERROR
 
 
 def test_merged_groups_read_the_mean_of_their_points() -> None:
     positions = np.random.default_rng(0).uniform(7, 13, (6, 3))
     positions[4:] = positions[3]  # of the second group one point alone: fewer cells than the first
     share = np.array([0.2, 0.3, 0.5])
-    weights = point_weights(positions, SHAPE, FIRST, LAST, 2 * math.pi / 8.5)
-    groups = merged(weights, share)
+    weights = interpolate_points(positions, SHAPE, FIRST, LAST, 2 * math.pi / 8.5)
+    groups = average_nodes(weights, share)
     field = np.random.default_rng(1).normal(size=math.prod(SHAPE))
     each = (field[weights.index] * weights.weight).sum(1).reshape(2, 3)
     assert np.allclose((field[groups.index] * groups.weight).sum(1), each @ share, rtol=1e-12)
@@ -118,6 +124,6 @@ def test_merged_groups_read_the_mean_of_their_points() -> None:
 
 
 def test_coarser_grids_need_wider_footprints() -> None:
-    widths = [footprint(2 * math.pi / cells) for cells in (17.0, 8.5, 6.0, 4.25)]
+    widths = [interpolation_width(2 * math.pi / cells) for cells in (17.0, 8.5, 6.0, 4.25)]
     assert widths == sorted(widths)
     assert widths[0] <= 6

@@ -1,7 +1,7 @@
 """The scattered field alone: driven where the medium is not air, radiated from a surface around it.
 
 With p = p_inc + p_scat and p_inc the exact field in free space, the scheme leaves for p_scat a force
-sum_j (w_ij - w_air) (p_inc,j - p_inc,i) on the varying cells. Around them, where chi steps from 1 to 0
+sum_j (w_ij - w_air) (p_inc,j - p_inc,i) on the heterogeneous cells. Around them, where chi steps from 1 to 0
 between two cells of air, the cells radiate sum_j w_ij (chi_j - chi_i) p_scat,j, by the exact Green's
 function: what a field that is p_scat outside and zero inside needs for its sources (a discrete Huygens
 surface). Between the surface and everything else lies no grid.
@@ -17,8 +17,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from autdtorch.fdtd.interpolation import Interpolation
 from autdtorch.fdtd.kernels.contract import Sources
-from autdtorch.fdtd.points import PointWeights
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.superposition import superposition
@@ -32,7 +32,7 @@ _NEAREST = 0.5
 
 
 @dataclass(frozen=True)
-class Scattering:
+class ScatteredField:
     """An assembled box with what drives it and what it radiates.
 
     Attributes:
@@ -45,19 +45,19 @@ class Scattering:
 
     @property
     def driven(self) -> torch.Tensor:
-        """Places (n, 3) [m] where the incident field must be known: in the varying cells and next to them."""
+        """Places (n, 3) [m] where the incident field is needed: heterogeneous cells and their neighbours."""
         return self.positions(self._driven[0])
 
     def sources(self, field: torch.Tensor) -> Sources:
         """Forces of an incident field, given (n,) where it drives."""
         assembly = self.assembly
         place = self._driven[1]
-        heard = field.numpy()
-        step = heard[place] - heard[place[:, 13]][:, None]
+        received = field.numpy()
+        step = received[place] - received[place[:, 13]][:, None]
         factor = assembly.coefficients.face / assembly.stencil.face
-        force = factor * ((assembly.varying.weight - assembly.stencil.weights) * step).sum(axis=1)
+        force = factor * ((assembly.heterogeneous.weight - assembly.stencil.weights) * step).sum(axis=1)
         both = torch.view_as_real(torch.from_numpy(force)).to(assembly.dtype)
-        return Sources(torch.from_numpy(assembly.varying.index), both)
+        return Sources(torch.from_numpy(assembly.heterogeneous.index), both)
 
     def incident(
         self, points: torch.Tensor, nodes: torch.Tensor, weights: torch.Tensor, strength: torch.Tensor
@@ -84,14 +84,14 @@ class Scattering:
         amplitude = strength.repeat_interleave(len(weights)) * weights.repeat(len(strength))
         return self._sum(points, nodes.reshape(-1, 3), amplitude[:, None], nearest)[:, 0]
 
-    def reach(self, nodes: torch.Tensor, weights: torch.Tensor) -> Reach:
+    def near_to_far(self, nodes: torch.Tensor, weights: torch.Tensor) -> NearToFar:
         """How the scattered field gets to P targets: means with `weights` (n,) over nodes (P, n, 3) [m]."""
         _, surface, outward = self._surface
         within = self.inside(nodes)
-        spread = self.assembly.spread(nodes[within])
-        cells = np.unique(np.concatenate((surface, spread.index.ravel())))
-        picked = PointWeights(surface[:, None], np.ones((len(surface), 1))).reading(cells)
-        return Reach(self, nodes, weights, within, cells, outward @ picked, spread.reading(cells))
+        inner = self.assembly.interpolation(nodes[within])
+        cells = np.unique(np.concatenate((surface, inner.index.ravel())))
+        picked = Interpolation(surface[:, None], np.ones((len(surface), 1))).matrix(cells)
+        return NearToFar(self, nodes, weights, within, cells, outward @ picked, inner.matrix(cells))
 
     def radiated(self, amplitude: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
         """Fields (P, R) at points (P, 3) [m] of the radiating cells with amplitudes (n, R) [Pa m]."""
@@ -111,7 +111,7 @@ class Scattering:
     @cached_property
     def _driven(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Cells where the incident field is needed, and the places among them of the neighbours (n, 27)."""
-        around = self.assembly.varying.index[:, None] + flat_offsets(self.assembly.grid.shape)
+        around = self.assembly.heterogeneous.index[:, None] + flat_offsets(self.assembly.grid.shape)
         cells, place = np.unique(around, return_inverse=True)
         return cells, place.reshape(around.shape)
 
@@ -150,7 +150,7 @@ class Scattering:
 
 
 @dataclass(frozen=True)
-class Reach:
+class NearToFar:
     """From phasors of the box's cells to the scattered field at P targets of n nodes.
 
     Attributes:
@@ -163,7 +163,7 @@ class Reach:
         inward: field at the nodes in the box from them.
     """
 
-    scattering: Scattering
+    scattering: ScatteredField
     nodes: torch.Tensor
     weights: torch.Tensor
     within: torch.Tensor
@@ -192,11 +192,13 @@ class Reach:
         amplitude[torch.arange(len(outside), device="cpu"), target[~within]] = share[~within].to(
             amplitude.dtype
         )
-        heard = self.scattering.at_surface(outside, amplitude)  # as from there: Green's function is symmetric
+        received = self.scattering.at_surface(
+            outside, amplitude
+        )  # as from there: Green's function is symmetric
         number = torch.zeros(self.within.shape, dtype=torch.int64, device="cpu")
         number[self.within] = torch.arange(int(self.within.sum()), device="cpu")
         picked = csr_array(
             (share[within].numpy(), (target[within].numpy(), number[::every][within].numpy())),
             (len(within), self.inward.shape[0]),
         )
-        return torch.from_numpy((self.outward.T @ heard.numpy()).T + (picked @ self.inward).toarray())
+        return torch.from_numpy((self.outward.T @ received.numpy()).T + (picked @ self.inward).toarray())

@@ -1,4 +1,4 @@
-"""Varying cells that autograd can go back through: to the materials of obstacles."""
+"""Heterogeneous cells that autograd can go back through: to the materials of obstacles."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from autdtorch.fdtd.bonds import VaryingCells, varying_cells
+from autdtorch.fdtd.assembly.elements import elements_of
+from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.kernels.contract import Sources
-from autdtorch.fdtd.medium import fill_elements
 from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.fdtd.stepping import Assembly, air_stencil, assembly_of
@@ -23,32 +23,32 @@ _SMALL = 1e-4
 
 
 @dataclass(frozen=True)
-class VariableCells:
-    """Varying cells, and what of them is differentiable.
+class DifferentiableCells:
+    """Heterogeneous cells, and what of them is differentiable.
 
     Attributes:
-        varying: the cells.
+        heterogeneous: the cells.
         weight: their weights (n, 27), differentiable.
         mass: their mass (n,), differentiable.
     """
 
-    varying: VaryingCells
+    heterogeneous: HeterogeneousCells
     weight: torch.Tensor
     mass: torch.Tensor
 
     def assembly(self, grid: Grid, region: Region, dtype: torch.dtype, time_step: float | None) -> Assembly:
-        """Ready to step, differentiable by `coefficients.varying_weight`; see `assemble_on`."""
+        """Ready to step, differentiable by `coefficients.heterogeneous_weight`; see `assemble_on`."""
         stencil = air_stencil(grid, region)
-        assembly = assembly_of(grid, stencil, self.varying, region.frequency, dtype, time_step)
+        assembly = assembly_of(grid, stencil, self.heterogeneous, region.frequency, dtype, time_step)
         coefficients = assembly.coefficients
         weight = (coefficients.face / stencil.face * self.weight).to(dtype)
-        return replace(assembly, coefficients=replace(coefficients, varying_weight=weight))
+        return replace(assembly, coefficients=replace(coefficients, heterogeneous_weight=weight))
 
     def driven(self, sources: Sources) -> Sources:
         """Sources of the assembly, differentiable also by the mass of the cells they are in."""
-        _, place, own = np.intersect1d(self.varying.index, sources.index.numpy(), return_indices=True)
+        _, place, own = np.intersect1d(self.heterogeneous.index, sources.index.numpy(), return_indices=True)
         share = torch.ones(len(sources.index), dtype=self.mass.dtype, device="cpu")
-        share[own] = torch.from_numpy(self.varying.mass[place]) / self.mass[place]
+        share[own] = torch.from_numpy(self.heterogeneous.mass[place]) / self.mass[place]
         return Sources(sources.index, share.to(sources.force)[:, None] * sources.force)
 
 
@@ -58,8 +58,8 @@ class _Difference:
 
     number: torch.Tensor
     step: float
-    ahead: VaryingCells
-    behind: VaryingCells
+    ahead: HeterogeneousCells
+    behind: HeterogeneousCells
 
 
 def with_materials(region: Region, density: torch.Tensor | None, sound_speed: torch.Tensor | None) -> Region:
@@ -83,8 +83,8 @@ def with_materials(region: Region, density: torch.Tensor | None, sound_speed: to
 
 def cells_of_obstacles(
     region: Region, grid: Grid, density: torch.Tensor | None = None, sound_speed: torch.Tensor | None = None
-) -> VariableCells:
-    """Varying cells of a region's K bodies, differentiable by their materials.
+) -> DifferentiableCells:
+    """Heterogeneous cells of a region's K bodies, differentiable by their materials.
 
     The derivatives are central differences of the whole assembly, one for each number of a tensor that asks
     for gradients.
@@ -105,7 +105,7 @@ def cells_of_obstacles(
     every = [base.index, *(each.index for one in differences for each in (one.ahead, one.behind))]
     index = np.unique(np.concatenate(every))
     weight, mass = (torch.from_numpy(part) for part in _on(index, base, stencil))
-    varying = VaryingCells(index, weight.numpy(), mass.numpy(), base.rigid, base.shell)
+    heterogeneous = HeterogeneousCells(index, weight.numpy(), mass.numpy(), base.sound_hard, base.shell)
     for one in differences:
         ahead, behind = _on(index, one.ahead, stencil), _on(index, one.behind, stencil)
         rows, masses = ((more - less) / (2 * one.step) for more, less in zip(ahead, behind, strict=True))
@@ -118,7 +118,7 @@ def cells_of_obstacles(
         places, shift = torch.from_numpy(changed), one.number - one.number.detach()
         weight = weight.index_add(0, places, shift * torch.from_numpy(rows[changed]))
         mass = mass.index_add(0, places, shift * torch.from_numpy(masses[changed]))
-    return VariableCells(varying, weight, mass)
+    return DifferentiableCells(heterogeneous, weight, mass)
 
 
 def _differences(
@@ -151,12 +151,12 @@ def _assembled(
     stencil: Stencil,
     density: torch.Tensor | None,
     sound_speed: torch.Tensor | None,
-) -> VaryingCells:
+) -> HeterogeneousCells:
     changed = with_materials(region, density, sound_speed)
-    return varying_cells(fill_elements(changed, grid, stencil), stencil)
+    return heterogeneous_cells(elements_of(changed, grid, stencil), stencil)
 
 
-def _on(index: Index, cells: VaryingCells, stencil: Stencil) -> tuple[Array, Array]:
+def _on(index: Index, cells: HeterogeneousCells, stencil: Stencil) -> tuple[Array, Array]:
     """Rows (n, 27) and mass (n,) of `index` (n,), which holds all of `cells` and besides them air."""
     weight, mass = np.tile(stencil.weights, (len(index), 1)), np.ones(len(index))
     place = np.searchsorted(index, cells.index)

@@ -1,17 +1,17 @@
 """Surfaces between the cell centres: what an obstacle's surface makes of the elements it cuts.
 
 An element is the cube between eight cell centres, its vertices. The scheme is a sum over elements of an
-energy of bonds between vertices and of a mass at each vertex; in an element of one material both are the
+energy of coupling between vertices and of a mass at each vertex; in an element of one material both are the
 tuned stencil's. A cut element gets
 
-- bonds in series: density averaged along the line between two vertices, which is right for a flow across the
+- coupling in series: density averaged along the line between two vertices, right for a flow across the
   surface;
-- if what is in it is layered along an axis, by faces along the grid, bonds with which the scheme is a product
-  of that direction and the two others;
+- if it is layered along an axis, by faces along the grid, coupling with which the scheme is a product of that
+  direction and the two others;
 - if not, a correction that gives two fields that vary along the surface their exact energy, and leaves that
   of a third, which crosses it continuous in pressure and in flow, with the kink that the densities ask for:
-  for it bonds in series are right. Its matrix is
-  C^T (A - N^T L N) C with L that of the bonds, N the fields at the vertices, A their exact energies, and
+  for it coupling in series are right. Its matrix is
+  C^T (A - N^T L N) C with L that of the coupling, N the fields at the vertices, A their exact energies, and
   C = (N^T L N)^-1 N^T L the projection on them: the consistency of virtual element methods (Beirao da Veiga
   et al. 2013) for the local solutions of immersed finite elements (Li 1998). The two along the surface follow
   its curvature;
@@ -40,7 +40,7 @@ VERTICES = np.array(list(itertools.product((0, 1), repeat=3)))
 """The eight vertices of an element, as offsets in cells."""
 
 PAIRS = np.array(list(itertools.combinations(range(8), 2)))
-"""The 28 pairs of vertices that bonds join."""
+"""The 28 pairs of vertices that coupling join."""
 
 _APART = np.abs(VERTICES[PAIRS[:, 0]] - VERTICES[PAIRS[:, 1]])
 """Of which axes the edges lead from one vertex of a pair to the other (28, 3)."""
@@ -59,7 +59,7 @@ _PLANE = 1e-6
 """Variation of a signed distance [cells] along a face that is rounding."""
 
 _SPARE = 6.0
-"""What an element full of the heavier material lends to diagonal bonds across its face, in units of what it
+"""What an element full of the heavier material lends to diagonals across its face, in units of what it
 needs for its own. A sixth is left over by the element behind, of which half is lent."""
 
 _SHARPEST = 0.5
@@ -112,23 +112,23 @@ class Materials:
 
 
 @dataclass(frozen=True)
-class CutElements:
+class InterfaceElements:
     """What n cut elements add to the scheme.
 
     Attributes:
-        bonds: between the `PAIRS` of vertices (n, 28).
+        coupling: between the `PAIRS` of vertices (n, 28).
         mass: at the vertices (n, 8).
         number: of the material that each vertex lies in (n, 8).
     """
 
-    bonds: Array
+    coupling: Array
     mass: Array
     number: NDArray[np.int64]
 
 
-def cut_elements(
+def interface_elements(
     distance: Array, material: NDArray[np.int64], materials: Materials, stencil: Stencil
-) -> CutElements:
+) -> InterfaceElements:
     """Bonds and masses of elements that surfaces cut.
 
     Args:
@@ -145,14 +145,14 @@ def cut_elements(
     volumes = _shares(_volume_coverage, distance, material, count)
     lines = _shares(_line_coverage, distance, material, count)
     density = (lines @ materials.density).reshape(-1, len(PAIRS), SUBCELLS).mean(axis=2)
-    bonds = uniform_bonds(stencil) / density
+    coupling = uniform_coupling(stencil) / density
     number = np.zeros((distance.shape[1], 8), np.int64)
     for far, own in zip(distance, material, strict=True):
         number[far[:, _CORNERS] < 0] = own
     layered = _layered_axis(distance)
     for axis in range(3):
         own = layered == axis
-        bonds[own] = _layered_bonds(axis, number[own], volumes[own], materials, stencil)
+        coupling[own] = _layered_coupling(axis, number[own], volumes[own], materials, stencil)
     held = (number[:, :, None] == np.arange(count)).any(axis=1)
     present = volumes.mean(axis=1) > _PRESENT
     two = (held.sum(axis=1) == 2) & (present <= held).all(axis=1)
@@ -162,9 +162,9 @@ def cut_elements(
         outer = held[chosen].argmax(axis=1)
         level = _level(distance[:, chosen], material, inner)
         sides = materials.density[np.stack((outer, inner), axis=1)]
-        flat, correction = _correction(level, sides, volumes[chosen], materials, bonds[chosen])
-        bonds[chosen[flat]] += correction
-    return CutElements(bonds, _masses(number, volumes, materials), number)
+        flat, correction = _correction(level, sides, volumes[chosen], materials, coupling[chosen])
+        coupling[chosen[flat]] += correction
+    return InterfaceElements(coupling, _masses(number, volumes, materials), number)
 
 
 def _layered_axis(distance: Array) -> NDArray[np.int64]:
@@ -177,7 +177,7 @@ def _layered_axis(distance: Array) -> NDArray[np.int64]:
     return found
 
 
-def _layered_bonds(
+def _layered_coupling(
     axis: int, number: NDArray[np.int64], volumes: Array, materials: Materials, stencil: Stencil
 ) -> Array:
     """Bonds (n, 28) of elements with faces across an axis, with which the scheme is a product.
@@ -190,7 +190,7 @@ def _layered_bonds(
     """
     across = _APART[:, axis] == 1
     straight = across & (_APART.sum(axis=1) == 1)
-    uniform = uniform_bonds(stencil)
+    uniform = uniform_coupling(stencil)
     beside = np.where(across, 0, _by_steps(stencil)[np.minimum(_APART.sum(axis=1) + 1, 3)])
     share = volumes.mean(axis=1)
     density = share @ materials.density
@@ -209,8 +209,8 @@ def _layered_bonds(
     return np.asarray(np.where(across, 0, along * (uniform + beside)) + link)
 
 
-def uniform_bonds(stencil: Stencil) -> Array:
-    """Bonds (28,) of an element of air; face bonds are shared by four elements, edge bonds by two."""
+def uniform_coupling(stencil: Stencil) -> Array:
+    """Bonds (28,) of an element of air; face coupling are shared by four elements, edge coupling by two."""
     return np.asarray(_by_steps(stencil)[_APART.sum(axis=1)])
 
 
@@ -274,7 +274,7 @@ def _level(distance: Array, material: NDArray[np.int64], inner: NDArray[np.int64
 
 
 def _correction(
-    level: Array, sides: Array, volumes: Array, materials: Materials, bonds: Array
+    level: Array, sides: Array, volumes: Array, materials: Materials, coupling: Array
 ) -> tuple[NDArray[np.bool_], Array]:
     """Bonds that give the local solutions of two-material elements their exact energy.
 
@@ -283,16 +283,16 @@ def _correction(
         sides: density of the outer and the inner material (n, 2).
         volumes: shares of the materials in the sub-cells (n, 64, m).
         materials: the materials.
-        bonds: in series (n, 28).
+        coupling: in series (n, 28).
 
     Returns:
-        Which elements have one normal (n,), and the bonds to add in those.
+        Which elements have one normal (n,), and the coupling to add in those.
     """
     fit = level @ _FIT.T
     steep = np.linalg.norm(fit[:, 1:4], axis=1)
     flat = steep > _FLAT
-    level, sides, volumes, bonds, fit, steep = (
-        part[flat] for part in (level, sides, volumes, bonds, fit, steep)
+    level, sides, volumes, coupling, fit, steep = (
+        part[flat] for part in (level, sides, volumes, coupling, fit, steep)
     )
     normal = fit[:, 1:4] / steep[:, None]
     tangents = _tangents(normal)
@@ -315,7 +315,7 @@ def _correction(
     energy = np.zeros((len(level), 3, 3))
     energy[:, :2, :2] = np.einsum("nq,nqab,nqcb->nac", mobility, stretch, stretch)
 
-    matrix = energy_matrix(bonds)
+    matrix = stiffness_matrix(coupling)
     flow = matrix @ fields
     own = fields.transpose(0, 2, 1) @ flow
     energy[:, 2, 2] = own[:, 2, 2]
@@ -343,10 +343,10 @@ def _curvature(fit: Array, tangents: Array) -> Array:
     return bend
 
 
-def energy_matrix(bonds: Array) -> Array:
-    """Energy matrix (n, 8, 8) of bonds (n, 28)."""
-    matrix = np.zeros((len(bonds), 8, 8))
-    matrix[:, PAIRS[:, 0], PAIRS[:, 1]] = -bonds
+def stiffness_matrix(coupling: Array) -> Array:
+    """Energy matrix (n, 8, 8) of coupling (n, 28)."""
+    matrix = np.zeros((len(coupling), 8, 8))
+    matrix[:, PAIRS[:, 0], PAIRS[:, 1]] = -coupling
     matrix += matrix.transpose(0, 2, 1)
     matrix[:, range(8), range(8)] = -matrix.sum(axis=2)
     return matrix

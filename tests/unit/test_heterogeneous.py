@@ -7,11 +7,11 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from autdtorch.fdtd.bonds import VaryingCells, _condensed, varying_cells
+from autdtorch.fdtd.assembly.elements import Elements, elements_of
+from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, _condensed, heterogeneous_cells
+from autdtorch.fdtd.assembly.interface import VERTICES, InterfaceElements, Materials, stiffness_matrix
 from autdtorch.fdtd.grid import Grid
-from autdtorch.fdtd.medium import ElementMedium, fill_elements
 from autdtorch.fdtd.stencil import OFFSETS, tuned_stencil
-from autdtorch.fdtd.surface import VERTICES, CutElements, Materials, energy_matrix
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Obstacle, Sphere
@@ -49,14 +49,14 @@ def box(
     return Box(tuple((lower + upper) / 2), tuple(upper - lower), rotation=rotation, **material(ratio, speed))
 
 
-def assembled(*obstacles: Obstacle) -> tuple[ElementMedium, VaryingCells]:
+def assembled(*obstacles: Obstacle) -> tuple[Elements, HeterogeneousCells]:
     array = TransducerArray([[2e-3, -0.9, 0.0]], (1, 0, 0))
     scene = Scene(array, AIR, 40e3, [[2e-3, 0.9, 0.0]], obstacles, domain=((-1, -1, -1), (1, 1, 1)))
-    medium = fill_elements(region_of(scene), GRID, STENCIL)
-    return medium, varying_cells(medium, STENCIL)
+    medium = elements_of(region_of(scene), GRID, STENCIL)
+    return medium, heterogeneous_cells(medium, STENCIL)
 
 
-def mass_of_all(medium: ElementMedium, cells: VaryingCells) -> np.ndarray:
+def mass_of_all(medium: Elements, cells: HeterogeneousCells) -> np.ndarray:
     """Mass of every cell: of those not listed, 1 at a surface, else that of the material around."""
     mass = medium.materials.mass[np.pad(medium.number, ((1, 0),) * 3, mode="edge")].ravel()
     first = np.stack(np.unravel_index(medium.cut, medium.number.shape), axis=-1)
@@ -65,12 +65,12 @@ def mass_of_all(medium: ElementMedium, cells: VaryingCells) -> np.ndarray:
     return mass
 
 
-def energy(medium: ElementMedium, cells: VaryingCells) -> np.ndarray:
+def energy(medium: Elements, cells: HeterogeneousCells) -> np.ndarray:
     """Energy matrix of the varying cells and their neighbours, all others held at zero."""
     flat = np.array(OFFSETS) @ STRIDES
     weight, mass = np.tile(STENCIL.weights, (math.prod(GRID.shape), 1)), mass_of_all(medium, cells)
     weight[cells.index] = cells.weight
-    rows = np.setdiff1d(np.unique(cells.index[:, None] + flat), cells.rigid)
+    rows = np.setdiff1d(np.unique(cells.index[:, None] + flat), cells.sound_hard)
     place = np.full(len(mass), -1)
     place[rows] = np.arange(len(rows))
     bonds = mass[rows, None] * weight[rows]
@@ -130,9 +130,9 @@ def test_sharing_moves_mass_and_adds_none(center: tuple[float, ...], radius: flo
 
 
 @pytest.mark.parametrize("obstacles", [(), (box((2.7, 3, 3.4), (7, 7, 7.1), 1.0),)])
-def test_air_has_no_varying_cells_whatever_it_is_called(obstacles: tuple[Obstacle, ...]) -> None:
+def test_air_has_no_heterogeneous_cells_whatever_it_is_called(obstacles: tuple[Obstacle, ...]) -> None:
     _, cells = assembled(*obstacles)
-    assert len(cells.index) == len(cells.rigid) == 0
+    assert len(cells.index) == len(cells.sound_hard) == 0
 
 
 def test_a_heavy_interior_of_one_material_is_swept_as_air_is() -> None:
@@ -159,13 +159,13 @@ def test_rigid_cells_are_closed() -> None:
     _, cells = assembled(sphere((5, 5, 5), 2.6, None))
     centers = np.stack(np.meshgrid(*GRID.centers, indexing="ij"), axis=-1).reshape(-1, 3)
     depth = 2.6 - 1e3 * np.linalg.norm(centers - 5e-3, axis=1)
-    assert (depth[cells.rigid] > 0).all()
+    assert (depth[cells.sound_hard] > 0).all()
     # sound enters a cell whose elements hold some air, whose diagonal is at most sqrt(3) long
-    assert np.isin(np.flatnonzero(depth > math.sqrt(3)), cells.rigid).all()
-    closed = np.isin(cells.index, cells.rigid)
+    assert np.isin(np.flatnonzero(depth > math.sqrt(3)), cells.sound_hard).all()
+    closed = np.isin(cells.index, cells.sound_hard)
     assert not cells.weight[closed].any()
     towards = cells.index[:, None] + np.array(OFFSETS) @ STRIDES
-    assert not cells.weight[np.isin(towards, cells.rigid)].any()
+    assert not cells.weight[np.isin(towards, cells.sound_hard)].any()
 
 
 def test_a_rigid_plate_thinner_than_a_cell_is_tight() -> None:
@@ -230,12 +230,12 @@ def test_condensed_elements_keep_their_energy_positive(exponents: list[float], g
     """Bonds of all sizes, as where three materials meet: no pressure may have an energy below zero."""
     bonds = 10.0 ** np.array(exponents)[None]
     number, cut = np.zeros((3, 3, 3), np.int16), np.array([13])
-    elements = CutElements(bonds, np.full((1, 8), 0.1), np.zeros((1, 8), np.int64))
-    medium = ElementMedium(Materials(np.ones(1), np.ones(1)), np.zeros(1, bool), number, cut, elements)
+    elements = InterfaceElements(bonds, np.full((1, 8), 0.1), np.zeros((1, 8), np.int64))
+    medium = Elements(Materials(np.ones(1), np.ones(1)), np.zeros(1, bool), number, cut, elements)
     closed = np.zeros((4, 4, 4), bool)
     out = np.array([gone >> vertex & 1 for vertex in range(8)], bool)
     closed[tuple((VERTICES[out] + 1).T)] = True
-    matrix = energy_matrix(_condensed(medium, closed.ravel(), (4, 4, 4)).bonds)[0]
+    matrix = stiffness_matrix(_condensed(medium, closed.ravel(), (4, 4, 4)).coupling)[0]
     # rounding of the elimination
     assert np.linalg.eigvalsh(matrix).min() > -1e-9 * bonds.max()
     assert not matrix[out].any()

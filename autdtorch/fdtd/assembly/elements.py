@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from autdtorch.fdtd.assembly.interface import FAR, LATTICE, InterfaceElements, Materials, interface_elements
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Fluid, Region, Shape
 from autdtorch.fdtd.stencil import Stencil
-from autdtorch.fdtd.surface import FAR, LATTICE, CutElements, Materials, cut_elements
 from autdtorch.utils.arrays import Array
 from autdtorch.utils.progress import show_progress
 
@@ -69,7 +69,7 @@ class Joined:
 
 
 @dataclass(frozen=True)
-class ElementMedium:
+class Elements:
     """What fills the elements of a grid of (nx, ny, nz) cells.
 
     Attributes:
@@ -77,14 +77,14 @@ class ElementMedium:
         rigid: which materials are rigid (m,).
         number: material of each element (nx - 1, ny - 1, nz - 1), for a cut one that of its centre.
         cut: flat indices of the cut elements (n,), ascending.
-        elements: their bonds and masses.
+        elements: their coupling and masses.
     """
 
     materials: Materials
     rigid: NDArray[np.bool_]
     number: NDArray[np.int16]
     cut: NDArray[np.int64]
-    elements: CutElements
+    elements: InterfaceElements
 
 
 def speed_factor(stencil: Stencil, speed_ratio: float) -> float:
@@ -96,7 +96,7 @@ def speed_factor(stencil: Stencil, speed_ratio: float) -> float:
 
 
 def flow_factor(kappa: float, speed_ratio: float) -> float:
-    """What a material's bonds and mass are multiplied with for its impedance to be right beside air.
+    """What a material's coupling and mass are multiplied with for its impedance to be right beside air.
 
     Half-way between two cells a wave's slope is their difference over 2 sin(k / 2) / k, and its value their
     mean over cos(k / 2), with the material's own k: the grid's impedance is off by tan(k / 2) / (k / 2). For
@@ -106,8 +106,8 @@ def flow_factor(kappa: float, speed_ratio: float) -> float:
     return (math.tan(air) / air) / (math.tan(own) / own)
 
 
-def fill_elements(region: Region, grid: Grid, stencil: Stencil) -> ElementMedium:
-    """Find the material of every element, and the bonds and masses of those that surfaces cut.
+def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
+    """Find the material of every element, and the coupling and masses of those that surfaces cut.
 
     Where bodies overlap the later wins. Those that are `continued` go on through the boundary layer, as they
     leave the interior; others end before it.
@@ -120,7 +120,7 @@ def fill_elements(region: Region, grid: Grid, stencil: Stencil) -> ElementMedium
             number[window][distance < 0] = body.number
             cut[window] = (cut[window] | (distance < _REACH)) & (distance > -_REACH)
     index = np.flatnonzero(cut)
-    return ElementMedium(materials, rigid, number, index, _cut(bodies, index, grid, materials, stencil))
+    return Elements(materials, rigid, number, index, _cut(bodies, index, grid, materials, stencil))
 
 
 def _bodies(region: Region, stencil: Stencil) -> tuple[list[Joined], Materials, NDArray[np.bool_]]:
@@ -179,17 +179,17 @@ def _cut(
     grid: Grid,
     materials: Materials,
     stencil: Stencil,
-) -> CutElements:
-    parts = [CutElements(np.zeros((0, 28)), np.zeros((0, 8)), np.zeros((0, 8), np.int64))]
+) -> InterfaceElements:
+    parts = [InterfaceElements(np.zeros((0, 28)), np.zeros((0, 8)), np.zeros((0, 8), np.int64))]
     numbers = np.array([body.number for body in bodies], np.int64)
     shape = tuple(cells - 1 for cells in grid.shape)
     with show_progress(len(index), "measuring surfaces") as progress:
         for start in range(0, len(index), _ELEMENTS_AT_ONCE):
             first = np.stack(np.unravel_index(index[start : start + _ELEMENTS_AT_ONCE], shape), axis=-1)
-            parts.append(cut_elements(_distances(bodies, first, grid), numbers, materials, stencil))
+            parts.append(interface_elements(_distances(bodies, first, grid), numbers, materials, stencil))
             progress.advance(len(first))
-    return CutElements(
-        np.concatenate([part.bonds for part in parts]),
+    return InterfaceElements(
+        np.concatenate([part.coupling for part in parts]),
         np.concatenate([part.mass for part in parts]),
         np.concatenate([part.number for part in parts]),
     )

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.bonds import VaryingCells
+from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.kernels.contract import Columns
 from autdtorch.fdtd.stencil import OFFSETS, Stencil, flat_strides
@@ -34,21 +34,21 @@ def row_scale(weight: NDArray[np.float64], stencil: Stencil) -> NDArray[np.float
 
 
 def scaled_cells(
-    varying: VaryingCells, stencil: Stencil, grid: Grid, dtype: torch.dtype
+    heterogeneous: HeterogeneousCells, stencil: Stencil, grid: Grid, dtype: torch.dtype
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Cells of the boundary layers (k,) whose rows are not of air, and their scale (k,)."""
-    here = ~grid.inside(varying.index)
-    scale = row_scale(varying.weight[here], stencil)
-    return torch.from_numpy(varying.index[here]), torch.from_numpy(scale).to(dtype)
+    here = ~grid.inside(heterogeneous.index)
+    scale = row_scale(heterogeneous.weight[here], stencil)
+    return torch.from_numpy(heterogeneous.index[here]), torch.from_numpy(scale).to(dtype)
 
 
 def layer_columns(
-    varying: VaryingCells, stencil: Stencil, grid: Grid, factor: float, dtype: torch.dtype
+    heterogeneous: HeterogeneousCells, stencil: Stencil, grid: Grid, factor: float, dtype: torch.dtype
 ) -> tuple[Columns, Columns, torch.Tensor]:
     """Find the columns whose cells are not of air, by the cell half-way through the layer.
 
     Args:
-        varying: the cells that are not of air.
+        heterogeneous: the cells that are not of air.
         stencil: weights in air.
         grid: where the cells are.
         factor: what the weights are multiplied with for the time step.
@@ -57,8 +57,8 @@ def layer_columns(
     Returns:
         The columns, the crossed ones, and the places of the terms of these: see `Coefficients`.
     """
-    outside = ~grid.inside(varying.index)
-    index, weight = varying.index[outside], varying.weight[outside]
+    outside = ~grid.inside(heterogeneous.index)
+    index, weight = heterogeneous.index[outside], heterogeneous.weight[outside]
     rows = weight - row_scale(weight, stencil)[:, None] * stencil.weights
     places = np.stack(np.unravel_index(index, grid.shape), axis=-1)
     strides = flat_strides(grid.shape)

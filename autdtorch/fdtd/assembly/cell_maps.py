@@ -12,12 +12,12 @@ import math
 import numpy as np
 import torch
 
-from autdtorch.fdtd.bonds import VaryingCells
+from autdtorch.fdtd.assembly.differentiable import DifferentiableCells
+from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells
 from autdtorch.fdtd.grid import Grid, domain_extent
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.stencil import OFFSETS, Stencil
 from autdtorch.fdtd.stepping import air_stencil
-from autdtorch.fdtd.variable_cells import VariableCells
 
 _RIM = 2
 """Cells of air around the maps: the first varies with them, the second is its neighbour."""
@@ -31,8 +31,8 @@ def domain_cells(region: Region, grid: Grid) -> tuple[slice, ...]:
 
 def cells_of_maps(
     region: Region, grid: Grid, density: torch.Tensor | None = None, sound_speed: torch.Tensor | None = None
-) -> VariableCells:
-    """Varying cells of maps (nx, ny, nz) of density [kg/m^3] and sound speed [m/s], differentiable by them.
+) -> DifferentiableCells:
+    """Return heterogeneous cells of maps (nx, ny, nz) of density [kg/m^3] and sound speed [m/s].
 
     Raises:
         ValueError: a map has another shape than the domain has cells.
@@ -48,7 +48,7 @@ def cells_of_maps(
     speed = air if sound_speed is None else sound_speed / region.fluid.sound_speed
     relative = relative / _flow_factor(stencil, speed)
     fluidity = relative * _speed_factor(stencil, speed)
-    return VariableCells(*_rows(cells, grid, stencil, relative, fluidity))
+    return DifferentiableCells(*_rows(cells, grid, stencil, relative, fluidity))
 
 
 def _flow_factor(stencil: Stencil, speed_ratio: torch.Tensor) -> torch.Tensor:
@@ -70,7 +70,7 @@ def _speed_factor(stencil: Stencil, speed_ratio: torch.Tensor) -> torch.Tensor:
 
 def _rows(
     cells: tuple[slice, ...], grid: Grid, stencil: Stencil, density: torch.Tensor, fluidity: torch.Tensor
-) -> tuple[VaryingCells, torch.Tensor, torch.Tensor]:
+) -> tuple[HeterogeneousCells, torch.Tensor, torch.Tensor]:
     """Rows and mass of the mapped cells and of those around them; `fluidity` is one over the mass."""
     density, fluidity = (
         torch.nn.functional.pad(part, (_RIM,) * 6, value=1.0) for part in (density, fluidity)
@@ -88,7 +88,7 @@ def _rows(
     index = np.ravel_multi_index(np.meshgrid(*axes, indexing="ij"), grid.shape).ravel()
     nothing = np.zeros(0, np.int64)
     values = weight.detach().numpy(), mass.detach().numpy()
-    return VaryingCells(index, *values, nothing, nothing), weight, mass
+    return HeterogeneousCells(index, *values, nothing, nothing), weight, mass
 
 
 def _shifted(offset: tuple[int, int, int]) -> tuple[slice, ...]:

@@ -1,0 +1,1 @@
+"""Assembly of heterogeneous cells: geometry, interface elements, coupling coefficients, stencil rows."""
