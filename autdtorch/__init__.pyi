@@ -5,14 +5,17 @@ from .io.array_file import load_array
 from .io.drive_file import load_drive, save_drive
 from .io.field_file import save_field
 from .io.scene_file import load_scene
-from .methods.base import Solution
-from .methods.bayes.bayes import bayes_opt
+from .methods.base import Method, Problem, State
+from .methods.bayes.bayes import BayesOpt, bayes_opt
 from .methods.bound import focus_bound
-from .methods.gabs import gabs
-from .methods.gradient import gradient_ascent
-from .methods.identify import identify
-from .methods.lssg import lss, lssg
-from .methods.random_search import random_search
+from .methods.driver import run
+from .methods.gabs import GABS, gabs
+from .methods.gradient import GradientAscent, gradient_ascent
+from .methods.identify import Identify, identify
+from .methods.lssg import LSS, LSSG, lss, lssg
+from .methods.random_search import RandomSearch, random_search
+from .methods.solution import Solution
+from .methods.state_file import load_state, save_state
 from .objectives.metrics import FocusMetrics, focus_metrics
 from .objectives.perturbations import Dead, Drift, Noise, Quantised, true_pressure
 from .objectives.simulated import Objective, SimulatedObjective, weakest_focus
@@ -40,27 +43,37 @@ from .study.results_file import load_results
 from .study.sweeps import Sweep, collect_results
 
 __all__ = [
+    "GABS",
+    "LSS",
+    "LSSG",
     "PAPER_SOURCE_STRENGTH",
+    "BayesOpt",
     "Box",
     "Cylinder",
     "Dead",
     "Drift",
     "Estimate",
     "FocusMetrics",
+    "GradientAscent",
+    "Identify",
     "Medium",
     "Mesh",
+    "Method",
     "Noise",
     "Objective",
     "Obstacle",
     "OpenMPDBoard",
     "OverlapWarning",
     "Plane",
+    "Problem",
     "Quantised",
+    "RandomSearch",
     "ScaleWarning",
     "Scene",
     "SimulatedObjective",
     "Solution",
     "Sphere",
+    "State",
     "SteadyStateWarning",
     "Sweep",
     "TransducerArray",
@@ -87,6 +100,7 @@ __all__ = [
     "load_drive",
     "load_results",
     "load_scene",
+    "load_state",
     "lss",
     "lssg",
     "make_propagator",
@@ -99,8 +113,10 @@ __all__ = [
     "plot_scene",
     "plot_trials",
     "random_search",
+    "run",
     "save_drive",
     "save_field",
+    "save_state",
     "true_pressure",
     "view3d",
     "volume_field",

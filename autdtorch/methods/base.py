@@ -1,231 +1,292 @@
-"""What the optimisers share: the ledger of evaluations, the solution, and the seeds of the trials."""
+"""Methods as ask and tell: settings, problem and state, and the interface that all methods share."""
 
 from __future__ import annotations
 
 import numbers
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TypeAlias
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
 
+from autdtorch.methods.ranking import NEAR_TIE, first_of_best
+from autdtorch.methods.solution import Solution
 from autdtorch.objectives.perturbations import playable
-from autdtorch.objectives.simulated import Objective, Score, require_objective
-from autdtorch.scene.drive import amplitudes_of, phases_of
-from autdtorch.utils.html import html_facts
+from autdtorch.objectives.simulated import Objective, Score, require_objective, weakest_focus
+from autdtorch.scene.scene import Scene
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.validation import integer_at_least, integers, invalid, real_tensor, require_callable
 
 Trials: TypeAlias = int | Sequence[int]
-"""A number of trials T, or the numbers of the T trials to run, so that a study can be run in parts."""
+"""A number of trials T, or the numbers of the T trials to run, so that a study can run them in blocks."""
+
+TRIAL_BYTES = 6_000.0
+"""Memory of a trial [bytes]; most of it is the state of its random generator."""
+
+_SCORE_NUMBERS = 4.0
+"""Numbers kept for each evaluation: its score, and the history made of the scores."""
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
-    """The drive that each of T trials chose: the best it observed, but where a method says otherwise.
+class Problem:
+    """The problem that a method solves: numbers of transducers and foci, the goal, and what else is known.
+
+    A method that sees magnitudes only needs no more than the two numbers.
 
     Attributes:
-        drive: (T, M), complex128, as it was played: on the device's levels, if the objective knows them.
-        pressure: magnitudes at the P control points (T, P) [Pa], as observed for `drive`.
-        score: (T,), as observed for `drive`; in Pa for the weakest focus.
-        evaluations: number of evaluations (T,), int64.
-        history: best score so far after each evaluation (T, E). E is the most evaluations that the settings
-            allow; a trial that ended before keeps its last score.
-    """
-
-    drive: torch.Tensor
-    pressure: torch.Tensor
-    score: torch.Tensor
-    evaluations: torch.Tensor
-    history: torch.Tensor
-
-    @property
-    def phases(self) -> torch.Tensor:
-        """Phases in [0, 2 pi) of the drive (T, M) [rad]."""
-        return phases_of(self.drive)
-
-    @property
-    def amplitudes(self) -> torch.Tensor:
-        """Amplitudes of the drive (T, M)."""
-        return amplitudes_of(self.drive)
-
-    def __repr__(self) -> str:
-        """Counts and what was reached, with units."""
-        return f"Solution({', '.join(f'{name} {value}' for name, value in self._facts())})"
-
-    def _repr_html_(self) -> str:
-        """For Jupyter: a table of what was reached."""
-        return html_facts("Solution", self._facts())
-
-    def _facts(self) -> list[tuple[str, str]]:
-        weakest = self.pressure.amin(dim=1)
-        reached = f"{weakest.max():.4g} Pa"
-        if len(weakest) > 1:
-            reached = f"best {reached}, median {weakest.quantile(0.5):.4g} Pa, worst {weakest.min():.4g} Pa"
-        low, high = int(self.evaluations.min()), int(self.evaluations.max())
-        return [
-            ("trials", str(len(weakest))),
-            ("transducers", str(self.drive.shape[1])),
-            ("foci", str(self.pressure.shape[1])),
-            ("weakest focus", reached),
-            ("evaluations", str(low) if low == high else f"{low} to {high}"),
-        ]
-
-
-def joined(solutions: Sequence[Solution]) -> Solution:
-    """The trials of several solutions as those of one; shorter histories go on with their last value."""
-    longest = max(solution.history.shape[1] for solution in solutions)
-    histories = [
-        torch.cat([history, history[:, -1:].expand(-1, longest - history.shape[1])], dim=1)
-        for history in (solution.history for solution in solutions)
-    ]
-    columns = {
-        name: torch.cat([getattr(solution, name) for solution in solutions])
-        for name in ("drive", "pressure", "score", "evaluations")
-    }
-    return Solution(history=torch.cat(histories), **columns)
-
-
-NEAR_TIE = 1e-5
-"""Relative difference of scores that count as equal. In symmetric scenes many are, but for the rounding of
-the simulation, which another machine does otherwise."""
-
-
-TRIAL_BYTES = 6_000.0
-"""Memory [bytes] of a trial: its generator of random numbers above all."""
-
-_SCORE_NUMBERS = 4.0
-"""Numbers for each evaluation: its score, and those from which a history is made."""
-
-
-def first_of_best(score: torch.Tensor) -> torch.Tensor:
-    """Return the index (T,) of the first of scores (T, B) within `NEAR_TIE` of the best."""
-    best = score.amax(dim=1, keepdim=True)
-    return (score >= best - NEAR_TIE * best.abs()).byte().argmax(dim=1)
-
-
-def best_first(score: torch.Tensor) -> torch.Tensor:
-    """Return the indices (T, B) of scores (T, B) from the best on, near ties in ascending order."""
-    order = score.argsort(dim=1, descending=True, stable=True)
-    ranked = score.gather(1, order)
-    apart = ranked[:, :-1] - ranked[:, 1:] > NEAR_TIE * ranked[:, :-1].abs()
-    group = torch.nn.functional.pad(apart.cumsum(dim=1), (1, 0))
-    return order.gather(1, (group * score.shape[1] + order).argsort(dim=1))
-
-
-class Ledger:
-    """Evaluates drives for several trials at once, and keeps what was found.
-
-    Optimisers evaluate through a ledger only, so that every evaluation is counted and none is forgotten.
-
-    Attributes:
-        transducers: their number M.
+        transducers: number M of entries of a drive.
+        foci: number P of control points.
+        goal: function of pressures (..., P) [Pa] that gives the scores (...) to maximise.
+        scene: geometry, for methods that start from free-space phases (`LSS`, `LSSG`).
+        transfer_matrix: G (P, M) [Pa], for methods that climb the model (`GradientAscent`).
+        quantise: function of drives (..., M) that gives the drives which the device plays.
     """
 
     transducers: int
+    foci: int
+    goal: Score = weakest_focus
+    scene: Scene | None = None
+    transfer_matrix: torch.Tensor | None = None
+    quantise: Callable[[torch.Tensor], torch.Tensor] = field(default=lambda drive: drive)
 
-    def __init__(self, objective: Objective, trials: int, score: Score) -> None:
-        """Open the ledger.
-
-        Args:
-            objective: what is evaluated.
-            trials: number of trials T.
-            score: what is maximised.
+    def __post_init__(self) -> None:
+        """Check the fields.
 
         Raises:
-            ValueError: no objective, or a score that is no function.
+            ValueError: a number that is no integer >= 1, or a goal that is no function.
+        """
+        for name in ("transducers", "foci"):
+            object.__setattr__(self, name, integer_at_least(name, getattr(self, name), 1))
+        require_callable("score", self.goal)
+
+    @classmethod
+    def of(cls, objective: Objective, goal: Score = weakest_focus) -> Problem:
+        """Return the problem that an objective poses.
+
+        Raises:
+            ValueError: no objective, or a goal that is no function.
         """
         require_objective(objective)
-        require_callable("score", score)
-        self.transducers, foci = len(objective.scene.array), len(objective.scene.control_points)
-        self._objective = objective
-        self._score = score
-        self._drive = torch.zeros(trials, self.transducers, dtype=torch.complex128, device="cpu")
-        self._pressure = torch.zeros(trials, foci, dtype=torch.float64, device="cpu")
-        self._best = torch.full((trials,), -torch.inf, dtype=torch.float64, device="cpu")
-        self._evaluations = torch.zeros(trials, dtype=torch.int64, device="cpu")
-        self._scores: list[torch.Tensor] = []
+        scene = objective.scene
+        matrix = getattr(objective, "transfer_matrix", None)
+        counts = len(scene.array), len(scene.control_points)
+        return cls(*counts, goal, scene, matrix, lambda drive: playable(objective, drive))
 
-    def require_memory(self, evaluations: float, at_once: float = 1.0, /, **counts: int) -> None:
-        """Refuse counts that lead to more evaluations than there is memory for.
 
-        Args:
-            evaluations: of each trial.
-            at_once: of these in one call of the objective.
-            **counts: arguments that decide, by name; of equal ones the first is blamed.
+class Step(NamedTuple):
+    """What a method does next.
 
-        Raises:
-            ValueError: names the largest of the counts.
-        """
-        field = max(counts, key=counts.__getitem__)
-        called = at_once * (4 * self.transducers + 2 * self._pressure.shape[1])
-        needed = 8 * len(self._best) * (_SCORE_NUMBERS * evaluations + called)
-        require_memory(field, counts[field], needed)
+    Attributes:
+        drives: B drives to observe for each of the L trials that go on (L, B, M), complex128; none at the end.
+        search: tensors that the method needs to go on, by name.
+        goes_on: which of the trials that were observed go on (L before,), bool; None for all.
+    """
 
-    def evaluate(self, drive: torch.Tensor, trials: torch.Tensor | None = None) -> torch.Tensor:
-        """Scores (T, B), float64, of drives (T, B, M): `observe`, where only the score counts."""
-        self.observe(drive, trials)
-        scores = self._scores[-1]
-        return scores if trials is None else scores[trials]
+    drives: torch.Tensor
+    search: Mapping[str, torch.Tensor]
+    goes_on: torch.Tensor | None = None
 
-    def observe(self, drive: torch.Tensor, trials: torch.Tensor | None = None) -> torch.Tensor:
-        """Evaluate B drives for each trial, all in one call of the objective.
 
-        Args:
-            drive: (T, B, M), complex128, B >= 1.
-            trials: places of the T trials that go on, all by default. One that is left out has ended.
+@dataclass(frozen=True, eq=False)
+class State:
+    """The state of T trials of a method. `save_state` and `load_state` keep it in a file.
 
-        Returns:
-            Pressure magnitudes (T, B, P) [Pa], float64.
+    Attributes:
+        problem: what is solved.
+        trials: indices of the L trials that go on (L,), of 0 to T - 1.
+        drives: B drives for each of them to observe next (L, B, M), complex128.
+        search: what the method needs to go on: tensors by name.
+        best: the best drive of each trial so far, with its history.
+        scratch: objects that a method can rebuild from `search`; not saved.
+    """
 
-        Raises:
-            ValueError: the objective gave pressures, or the score function gave scores, that are not finite
-                real numbers or have the wrong shape.
-        """
-        batch = drive.shape[:2]
-        pressure = _observed("pressure of the objective", self._objective(drive.flatten(0, 1)), "Pa")
-        _require_shape("pressure of the objective", pressure, (batch.numel(), self._pressure.shape[1]))
-        pressure = pressure.reshape(*batch, -1)
-        score = _observed("score", self._score(pressure))
-        _require_shape("score", score, batch)
+    problem: Problem
+    trials: torch.Tensor
+    drives: torch.Tensor
+    search: Mapping[str, torch.Tensor]
+    best: Solution
+    scratch: Any = None
 
-        trials = torch.arange(len(self._best), device="cpu") if trials is None else trials
-        index = first_of_best(score)
-        best = score.gather(1, index[:, None])[:, 0]
-        row = torch.nonzero(best - NEAR_TIE * best.abs() > self._best[trials])[:, 0]
-        better = trials[row]
-        self._best[better] = best[row]
-        self._drive[better] = drive[row, index[row]]
-        self._pressure[better] = pressure[row, index[row]]
-        self._evaluations[trials] += batch[1]
-        everyone = torch.full((len(self._best), batch[1]), -torch.inf, dtype=torch.float64, device="cpu")
-        everyone[trials] = score
-        self._scores.append(everyone)
-        return pressure
+    @property
+    def done(self) -> bool:
+        """Whether no drive is left to observe."""
+        return self.drives.shape[:2].numel() == 0
 
     @property
     def evaluations(self) -> int:
-        """Evaluations so far of a trial that has not ended."""
-        return int(self._evaluations.max())
+        """Evaluations of all trials so far."""
+        return int(self.best.evaluations.sum())
 
-    def solution(self, most: int | None = None) -> Solution:
-        """The best drive of each trial; at least one evaluation must have been made.
+
+@dataclass(frozen=True)
+class Method(ABC):
+    """Base of all methods: a frozen dataclass of settings that are checked when it is made.
+
+    A method of one's own adds its settings as fields and implements `most_evaluations`, `begin` and
+    `advance`; ``docs/extending.md`` has an example.
+
+    Attributes:
+        name: of the method in results and files.
+        label: name of the method in figures and tables.
+        random: whether trials differ by random choices. A method without has one trial.
+    """
+
+    name: ClassVar[str]
+    label: ClassVar[str]
+    random: ClassVar[bool] = True
+
+    def __init_subclass__(cls) -> None:
+        """Name a method without a name after its class."""
+        cls.name = cls.__dict__.get("name", cls.__name__)
+        cls.label = cls.__dict__.get("label", cls.name)
+
+    @abstractmethod
+    def most_evaluations(self, problem: Problem) -> int:
+        """Return the largest number of evaluations that a trial can take."""
+
+    @abstractmethod
+    def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
+        """Return the first step of the trials, one for each seed."""
+
+    @abstractmethod
+    def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
+        """Return the next step.
 
         Args:
-            most: evaluations that a trial could have made, where trials may end early: with it the history
-                of a trial is as long whatever trials are run beside it.
+            state: with the drives (L, B, M) that were observed.
+            pressure: magnitudes (L, B, P) [Pa], float64.
+            score: scores (L, B), float64.
         """
-        history = torch.cat(self._scores, dim=1).cummax(dim=1).values.minimum(self._best[:, None])
-        if most is not None:
-            ended = history[:, -1:].expand(-1, most - history.shape[1])
-            history = torch.cat([history, ended], dim=1)
-        drive = playable(self._objective, self._drive)
-        return Solution(drive, self._pressure.clone(), self._best.clone(), self._evaluations.clone(), history)
+
+    def check(self, problem: Problem) -> None:  # noqa: B027 - most methods have nothing to check
+        """Check the settings against the problem.
+
+        Raises:
+            ValueError: a setting that does not fit.
+        """
+
+    def most_at_once(self, problem: Problem) -> int:
+        """Return the largest number of drives that a trial has observed in one step."""
+        return self.most_evaluations(problem)
+
+    def numbers_kept(self, problem: Problem) -> float:
+        """Return about how many float64 numbers a trial keeps, to refuse settings that need too many."""
+        drive = 4.0 * problem.transducers + 2.0 * problem.foci
+        return _SCORE_NUMBERS * self.most_evaluations(problem) + drive * self.most_at_once(problem)
+
+    def require_fit(self, problem: Problem, trials: int) -> None:
+        """Check settings and memory, without beginning.
+
+        Raises:
+            ValueError: a setting that does not fit the problem, or needs more memory than there is.
+        """
+        self.check(problem)
+        counts = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        whole = {name: value for name, value in counts.items() if isinstance(value, int)}
+        if whole:
+            largest = max(whole, key=whole.__getitem__)
+            require_memory(largest, whole[largest], 8 * trials * self.numbers_kept(problem))
+
+    def start(self, problem: Problem, seed: int = 0, trials: Trials = 1) -> State:
+        """Begin T trials.
+
+        Args:
+            problem: what is solved.
+            seed: of the random choices, >= 0. Trial t has the same seed for every number of trials.
+            trials: number of trials T, or their numbers.
+
+        Returns:
+            A state whose drives wait to be observed.
+
+        Raises:
+            ValueError: an argument out of range, a setting that does not fit the problem, or more memory
+                would be needed than there is.
+        """
+        seeds = trial_seeds(seed, trials)
+        if not self.random and len(seeds) > 1:
+            raise invalid("trials", trials, f"must be 1: {self.label} has no random choices")
+        self.require_fit(problem, len(seeds))
+        step = self.begin(problem, seeds)
+        count = len(seeds)
+        empty = Solution(
+            torch.zeros(count, problem.transducers, dtype=torch.complex128, device="cpu"),
+            torch.zeros(count, problem.foci, dtype=torch.float64, device="cpu"),
+            torch.full((count,), -torch.inf, dtype=torch.float64, device="cpu"),
+            torch.zeros(count, dtype=torch.int64, device="cpu"),
+            torch.empty(count, 0, dtype=torch.float64, device="cpu"),
+        )
+        return State(problem, torch.arange(count, device="cpu"), step.drives, step.search, empty)
+
+    def ask(self, state: State) -> torch.Tensor:
+        """Return the drives (B, M), complex128, to observe next; none when the method is done."""
+        return state.drives.flatten(0, 1)
+
+    def tell(self, state: State, pressure: torch.Tensor) -> State:
+        """Return the state after the drives of `ask` were observed.
+
+        Args:
+            state: whose drives were observed.
+            pressure: magnitudes at the control points (B, P) [Pa].
+
+        Raises:
+            ValueError: pressures or scores that are not finite real numbers or have the wrong shape.
+        """
+        batch = state.drives.shape[:2]
+        pressure = _real("pressure of the objective", pressure, (batch.numel(), state.problem.foci), "Pa")
+        pressure = pressure.reshape(*batch, -1)
+        score = _real("score", state.problem.goal(pressure), batch)
+        state = replace(state, best=_improved(state, pressure, score))
+        step = self.advance(state, pressure, score)
+        trials = state.trials if step.goes_on is None else state.trials[step.goes_on]
+        return replace(state, trials=trials, drives=step.drives, search=step.search)
+
+    def best(self, state: State) -> Solution:
+        """Return the best drive of each trial so far; at least one evaluation must have been made."""
+        history = state.best.history.cummax(dim=1).values.minimum(state.best.score[:, None])
+        missing = max(0, self.most_evaluations(state.problem) - history.shape[1]) if state.done else 0
+        history = torch.cat([history, history[:, -1:].expand(-1, missing)], dim=1)
+        return replace(state.best, drive=state.problem.quantise(state.best.drive), history=history)
+
+
+def _improved(state: State, pressure: torch.Tensor, score: torch.Tensor) -> Solution:
+    """Return the best drives after another observation, pressures (L, B, P) and scores (L, B)."""
+    best, trials = state.best, state.trials
+    index = first_of_best(score)
+    highest = score.gather(1, index[:, None])[:, 0]
+    row = torch.nonzero(highest - NEAR_TIE * highest.abs() > best.score[trials])[:, 0]
+    better = trials[row]
+    columns = {
+        "score": best.score.index_copy(0, better, highest[row]),
+        "drive": best.drive.index_copy(0, better, state.drives[row, index[row]]),
+        "pressure": best.pressure.index_copy(0, better, pressure[row, index[row]]),
+        "evaluations": best.evaluations.index_add(0, trials, torch.full_like(trials, score.shape[1])),
+    }
+    scores = score.new_full((len(best.score), score.shape[1]), -torch.inf).index_copy(0, trials, score)
+    return Solution(history=torch.cat([best.history, scores], dim=1), **columns)
+
+
+def generators_of(seeds: Sequence[int]) -> list[torch.Generator]:
+    """Return a random generator for each seed."""
+    return [torch.Generator("cpu").manual_seed(seed) for seed in seeds]
+
+
+def states_of(generators: Sequence[torch.Generator]) -> torch.Tensor:
+    """Return the states (T, N), uint8, of generators, as a `State` keeps them."""
+    return torch.stack([generator.get_state() for generator in generators])
+
+
+def restored(states: torch.Tensor) -> list[torch.Generator]:
+    """Return generators in the states (T, N), uint8."""
+    generators = [torch.Generator("cpu") for _ in states]
+    for generator, state in zip(generators, states, strict=True):
+        generator.set_state(state.clone())
+    return generators
 
 
 def trial_seeds(seed: int, trials: Trials) -> list[int]:
-    """Seed of each trial, the same whatever trials are run beside it; different ones are unrelated.
+    """Return the seed of each trial, which does not depend on the other trials.
 
     Raises:
         ValueError: a seed below 0, no trial, a trial twice, or a trial below 0.
@@ -234,27 +295,24 @@ def trial_seeds(seed: int, trials: Trials) -> list[int]:
     if isinstance(trials, numbers.Integral):
         count = integer_at_least("trials", trials, 1)
         require_memory("trials", count, TRIAL_BYTES * count)
-        chosen = list(range(count))
-    else:
-        accepted = "must be an integer >= 1, or trial numbers, each once"
-        if isinstance(trials, Sequence):
-            require_memory("trials", f"{len(trials)} numbers", TRIAL_BYTES * len(trials))
-        chosen = integers("trials", trials, 0, accepted)
-        if not chosen or len(set(chosen)) < len(chosen):
-            raise invalid("trials", chosen, accepted)
+        return [trial_seed(seed, trial) for trial in range(count)]
+    accepted = "must be an integer >= 1, or trial numbers, each once"
+    if isinstance(trials, Sequence):
+        require_memory("trials", f"{len(trials)} numbers", TRIAL_BYTES * len(trials))
+    chosen = integers("trials", trials, 0, accepted)
+    if not chosen or len(set(chosen)) < len(chosen):
+        raise invalid("trials", chosen, accepted)
     return [trial_seed(seed, trial) for trial in chosen]
 
 
 def trial_seed(seed: int, trial: int) -> int:
-    """Seed of one trial."""
+    """Return the seed of one trial."""
     # Half the range of uint64: torch takes seeds as signed.
     return int(np.random.SeedSequence((seed, trial)).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
-def _observed(name: str, value: torch.Tensor, unit: str = "") -> torch.Tensor:
-    return real_tensor(name, value, unit).detach().cpu()
-
-
-def _require_shape(name: str, value: torch.Tensor, shape: tuple[int, ...]) -> None:
-    if value.shape != shape:
-        raise ValueError(f"{name}: shape {tuple(value.shape)}; must be {tuple(shape)}")
+def _real(name: str, value: object, shape: Sequence[int], unit: str = "") -> torch.Tensor:
+    tensor = real_tensor(name, value, unit).detach().cpu()
+    if tensor.shape != tuple(shape):
+        raise ValueError(f"{name}: shape {tuple(tensor.shape)}; must be {tuple(shape)}")
+    return tensor

@@ -1,100 +1,94 @@
-"""Coordinate search: one phase after the other, each the best of several levels, the others held."""
+"""Coordinate ascent: one weight after the other takes the best of several phases, the others held."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 
-from autdtorch.methods.base import Ledger, first_of_best
+from autdtorch.methods.ranking import first_of_best
 from autdtorch.scene.drive import drive_from_phases
 from autdtorch.utils.validation import integers, invalid
 
+Search = Mapping[str, torch.Tensor]
+"""The state of the ascent of L trials over N weights:
 
-def indices_of(order: str | Sequence[int], count: int, names: Sequence[str] = ("given",)) -> torch.Tensor:
-    """Indices (count,) of an `order`, which is "given", from 0 on, or all indices themselves.
+- ``weights`` (L, N), complex128: e^{-i phi}, or 0 for what is off; ``before``: as they were before this pass.
+- ``order`` (L, K): indices of the weights to go through in a pass; ``place``: of the next one in the order.
+- ``passes``: number of passes left, this one included.
+"""
 
-    Args:
-        order: as the user gave it.
-        count: number of what is ordered.
-        names: what the order may be called, for the message.
+
+def order_setting(order: str | Sequence[int], names: Sequence[str]) -> str | tuple[int, ...]:
+    """Return the setting `order`: one of `names`, or indices.
 
     Raises:
         ValueError: anything else.
     """
-    if isinstance(order, str) and order == "given":
-        return torch.arange(count, device="cpu")
-    named = ", ".join(f'"{name}"' for name in names)
-    accepted = f"must be {named} or the indices 0 to {count - 1}, each once"
-    indices = integers("order", order, 0, accepted)
-    if sorted(indices) != list(range(count)):
-        raise invalid("order", indices, accepted)
-    return torch.tensor(indices, dtype=torch.int64, device="cpu")
+    if isinstance(order, str) and order in names:
+        return order
+    quoted = ", ".join(f'"{name}"' for name in names)
+    accepted = f"must be {quoted} or the indices of all, each once"
+    chosen = tuple(integers("order", order, 0, accepted))
+    if sorted(chosen) != list(range(len(chosen))):
+        raise invalid("order", order, accepted)
+    return chosen
 
 
-def take_best_levels(
-    ledger: Ledger,
-    weights: torch.Tensor,
-    order: torch.Tensor,
-    levels: int,
-    drive: Callable[[torch.Tensor], torch.Tensor],
-    trials: torch.Tensor | None = None,
-) -> torch.Tensor:
-    """Go through the weights of every trial in its `order`; each takes the best of `levels` phases.
+def require_all(order: str | Sequence[int], count: int) -> None:
+    """Check that an order given by indices has `count` of them.
 
-    A step takes `levels` evaluations a trial, in one call of the objective for all trials. Of near ties the
-    first level is taken (`first_of_best`).
-
-    Args:
-        ledger: counts the evaluations.
-        weights: e^{-i phi}, or 0 for what is off (T, N), complex128.
-        order: indices of the weights to go through (T, K).
-        levels: number of phases in [0, 2 pi).
-        drive: makes drives (..., M) of weights (..., N).
-        trials: places of the T trials in the ledger; all by default.
-
-    Returns:
-        The weights (T, N) after the last step.
+    Raises:
+        ValueError: it has another number.
     """
+    if not isinstance(order, str) and len(order) != count:
+        raise invalid("order", order, f"must be the indices 0 to {count - 1}, each once")
+
+
+def indices_of(order: str | Sequence[int], count: int) -> torch.Tensor:
+    """Return the indices (count,) of an order; in ascending order unless it is given by indices."""
+    return torch.tensor(range(count) if isinstance(order, str) else order, dtype=torch.int64, device="cpu")
+
+
+def begin_ascent(weights: torch.Tensor, order: torch.Tensor, passes: int, place: int = 0) -> Search:
+    """Return the state of an ascent from weights (L, N), at a place of the first pass."""
+    return {
+        "weights": weights,
+        "before": weights,
+        "order": order,
+        "place": torch.tensor(place, device="cpu"),
+        "passes": torch.tensor(passes, device="cpu"),
+    }
+
+
+def candidates(search: Search, levels: int) -> torch.Tensor:
+    """Return the weights (L, levels, N) to compare: all phases of the next weight.
+
+    The present phase is among them, so that a choice is made among observations of one time: a lucky reading,
+    or the drift since, does not hold a phase for ever.
+    """
+    weights = search["weights"]
     choices = drive_from_phases(
         2 * math.pi * torch.arange(levels, dtype=torch.float64, device="cpu") / levels
     )
+    found = weights[:, None].repeat(1, levels, 1)
     rows = torch.arange(len(weights), device="cpu")
-    for index in order.T:
-        candidates = weights[:, None].repeat(1, levels, 1)
-        candidates[rows, :, index] = choices
-        best = first_of_best(ledger.evaluate(drive(candidates), trials))
-        weights = candidates[rows, best]
-    return weights
+    found[rows, :, search["order"][:, int(search["place"])]] = choices
+    return found
 
 
-def repeat_passes(
-    ledger: Ledger,
-    weights: torch.Tensor,
-    order: torch.Tensor,
-    levels: int,
-    passes: int,
-    drive: Callable[[torch.Tensor], torch.Tensor],
-) -> None:
-    """Coordinate ascent: go through `order` up to `passes` times.
+def ascend(search: Search, levels: int, score: torch.Tensor) -> tuple[Search, torch.Tensor]:
+    """Take the best of the `candidates` by their scores (L, levels); of near ties the first.
 
-    A trial ends with the first pass that changes none of its weights. The present level is evaluated again
-    with the others, so that a choice is among observations made together: one lucky reading, or the drift
-    since, does not hold a level for ever.
-
-    Args:
-        ledger: counts the evaluations.
-        weights: as for `take_best_levels`, of all trials.
-        order: indices of the weights to go through (T, K).
-        levels: number of phases in [0, 2 pi).
-        passes: most passes, >= 0.
-        drive: makes drives (..., M) of weights (..., N).
+    Returns:
+        The state, and which of the L trials go on (L,). A trial ends after its last pass, or after a pass
+        that changed none of its weights.
     """
-    trials = torch.arange(len(weights), device="cpu")
-    for _ in range(passes):
-        passed = take_best_levels(ledger, weights, order[trials], levels, drive, trials)
-        changed = (passed != weights).any(dim=1)
-        trials, weights = trials[changed], passed[changed]
-        if len(trials) == 0:
-            return
+    rows = torch.arange(len(score), device="cpu")
+    weights = candidates(search, levels)[rows, first_of_best(score)]
+    place, passes = int(search["place"]) + 1, int(search["passes"])
+    if place < search["order"].shape[1]:
+        return {**search, "weights": weights, "place": torch.tensor(place, device="cpu")}, rows >= 0
+    goes_on = (weights != search["before"]).any(dim=1) & (passes > 1)
+    return begin_ascent(weights[goes_on], search["order"][goes_on], passes - 1), goes_on

@@ -3,14 +3,117 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import torch
 
-from autdtorch.methods.base import Ledger, Solution, Trials, best_first, trial_seeds
-from autdtorch.methods.coordinates import indices_of, repeat_passes, take_best_levels
+from autdtorch.methods.base import Method, Problem, State, Step, Trials, generators_of
+from autdtorch.methods.coordinates import (
+    ascend,
+    begin_ascent,
+    candidates,
+    indices_of,
+    order_setting,
+    require_all,
+)
+from autdtorch.methods.driver import run
+from autdtorch.methods.ranking import best_first
+from autdtorch.methods.solution import Solution
 from autdtorch.objectives.simulated import Objective, Score, weakest_focus
 from autdtorch.utils.validation import integer_at_least, invalid
+
+
+@dataclass(frozen=True)
+class GABS(Method):
+    """Switch on one transducer after the other, each with the best of several phases (Algorithm 2).
+
+    Further passes go through all M transducers again in the same order, while the others keep their phases
+    (coordinate ascent). A trial ends early with a pass that changes nothing. Where the last transducers only
+    do harm, the best drive observed leaves them off.
+
+    A trial takes 1 + (M - 1) * levels evaluations: the first transducer alone, whose phase changes no
+    magnitude, then `levels` for each of the others. That is 241 for the paper's M = levels = 16; the paper
+    counts M * levels = 256. The order "strength" takes M - 1 more, each further pass at most M * levels.
+
+    Attributes:
+        levels: number of phases in [0, 2 pi), >= 2.
+        order: of the transducers. "random": another one in each trial; "given": that of the array, as in
+            Algorithm 2; "strength": by falling score of each transducer alone; or all their indices.
+        first: index of the transducer to begin with, before the others in their order; None for the first of
+            the order.
+        passes: >= 1.
+
+    Raises:
+        ValueError: a setting out of range.
+    """
+
+    name: ClassVar[str] = "gabs"
+    label: ClassVar[str] = "GABS"
+
+    levels: int = 16
+    order: Literal["random", "given", "strength"] | Sequence[int] = "random"
+    first: int | None = None
+    passes: int = 1
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        object.__setattr__(self, "levels", integer_at_least("levels", self.levels, 2))
+        object.__setattr__(self, "order", order_setting(self.order, ("random", "given", "strength")))
+        object.__setattr__(self, "passes", integer_at_least("passes", self.passes, 1))
+        if self.first is not None:
+            object.__setattr__(self, "first", integer_at_least("first", self.first, 0))
+
+    def check(self, problem: Problem) -> None:
+        """Check order and first transducer against the number of transducers."""
+        require_all(self.order, problem.transducers)
+        if self.first is not None and self.first >= problem.transducers:
+            accepted = f"must be an integer from 0 to {problem.transducers - 1}"
+            raise invalid("first", self.first, accepted)
+
+    def most_evaluations(self, problem: Problem) -> int:
+        """Return the evaluations of all passes."""
+        transducers = problem.transducers
+        alone = transducers if self.order == "strength" else 1
+        return alone + (self.passes * transducers - 1) * self.levels
+
+    def most_at_once(self, problem: Problem) -> int:
+        """Return the number of levels, or of transducers observed alone."""
+        return max(self.levels, problem.transducers if self.order == "strength" else 1)
+
+    def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
+        """Observe the first transducer alone, or each alone where their strengths decide the order."""
+        alone = torch.eye(problem.transducers, dtype=torch.complex128, device="cpu")
+        if self.order == "strength":
+            return Step(alone.expand(len(seeds), -1, -1), {})
+        orders = indices_of(self.order, problem.transducers).expand(len(seeds), -1)
+        if self.order == "random":
+            count = problem.transducers
+            shuffled = [torch.randperm(count, generator=own, device="cpu") for own in generators_of(seeds)]
+            orders = torch.stack(shuffled)
+        orders = self._first_before(orders)
+        return Step(alone[orders[:, :1]], {"orders": orders})
+
+    def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
+        """Compare the phases of the next transducer."""
+        if "weights" in state.search:
+            search, goes_on = ascend(state.search, self.levels, score)
+            return Step(candidates(search, self.levels), search, goes_on)
+        orders = state.search["orders"] if state.search else self._first_before(best_first(score))
+        alone = torch.eye(state.problem.transducers, dtype=torch.complex128, device="cpu")
+        search = begin_ascent(alone[orders[:, 0]], orders, self.passes, place=1)
+        if state.problem.transducers > 1:
+            return Step(candidates(search, self.levels), search)
+        goes_on = torch.full((len(orders),), self.passes > 1, device="cpu")
+        search = begin_ascent(alone[orders[goes_on, 0]], orders[goes_on], self.passes - 1)
+        return Step(candidates(search, self.levels), search, goes_on)
+
+    def _first_before(self, orders: torch.Tensor) -> torch.Tensor:
+        """Return `orders` (T, M) with the transducer `first` moved to the front."""
+        if self.first is None:
+            return orders
+        others = orders[orders != self.first].reshape(len(orders), -1)
+        return torch.cat([orders.new_full((len(orders), 1), self.first), others], dim=1)
 
 
 def gabs(
@@ -23,77 +126,22 @@ def gabs(
     seed: int = 0,
     score: Score = weakest_focus,
 ) -> Solution:
-    """Switch on one transducer after the other, each with the best of `levels` phases (Algorithm 2).
-
-    All trials take a step together, in one call of the objective of trials * levels rows. Further passes go
-    through all M transducers again in the same order (coordinate ascent), while the others stay; a trial ends
-    early with a pass that changes nothing.
-
-    A trial takes 1 + (M - 1) * levels evaluations: the first transducer alone, whose phase changes no
-    magnitude, then `levels` for every further one. That is 241 for the paper's M = levels = 16; the paper
-    says M * levels, 256. The order "strength" takes M - 1 more, a further pass at most M * levels.
+    """Run `GABS` on an objective.
 
     Args:
         objective: what is evaluated.
         levels: number of phases in [0, 2 pi), >= 2.
-        order: of the transducers. "random" is another one in every trial; "given" that of the array, as
-            Algorithm 2 is written; "strength" by falling score of each transducer alone; or all their
-            indices. Trials differ in a random order only.
-        first: index of the transducer that comes first, the others after it in their order; None for the
-            first of the order.
+        order: of the transducers: "random", "given", "strength", or all their indices.
+        first: index of the transducer to begin with, or None.
         passes: >= 1.
         trials: number of trials T, >= 1, or their numbers.
-        seed: >= 0; trial t is the same for every number of trials.
-        score: what is maximised.
+        seed: of the random orders, >= 0.
+        score: function that is maximised.
 
     Returns:
-        The best drive observed in each trial. Where switching on the last transducers only did harm, they are
-        off.
+        The best drive observed in each trial.
 
     Raises:
-        ValueError: an argument out of range, or the objective's pressures or scores are not finite.
+        ValueError: an argument out of range, or pressures or scores that are not finite.
     """
-    levels = integer_at_least("levels", levels, 2)
-    passes = integer_at_least("passes", passes, 1)
-    seeds = trial_seeds(seed, trials)
-    ledger = Ledger(objective, len(seeds), score)
-    transducers = ledger.transducers
-    evaluations, at_once = transducers * (1.0 + passes * levels), max(levels, transducers)
-    ledger.require_memory(evaluations, at_once, levels=levels, passes=passes)
-    orders = _known_orders(order, transducers, seeds)
-    if first is not None and integer_at_least("first", first, 0) >= transducers:
-        raise invalid("first", first, f"must be an integer from 0 to {transducers - 1}")
-
-    alone = torch.eye(transducers, dtype=torch.complex128, device="cpu")
-    if orders is None:
-        scores = ledger.evaluate(alone.expand(len(seeds), -1, -1))
-        orders = _with_first(best_first(scores), first)
-    else:
-        orders = _with_first(orders, first)
-        ledger.evaluate(alone[orders[:, :1]])
-    drive = take_best_levels(ledger, alone[orders[:, 0]], orders[:, 1:], levels, _itself)
-    so_far = ledger.evaluations
-    repeat_passes(ledger, drive, orders, levels, passes - 1, _itself)
-    return ledger.solution(most=so_far + (passes - 1) * transducers * levels)
-
-
-def _known_orders(order: str | Sequence[int], transducers: int, seeds: Sequence[int]) -> torch.Tensor | None:
-    """The order of each trial (T, M), or None for what only evaluations can tell."""
-    if isinstance(order, str) and order == "strength":
-        return None
-    if isinstance(order, str) and order == "random":
-        generators = [torch.Generator("cpu").manual_seed(seed) for seed in seeds]
-        return torch.stack([torch.randperm(transducers, generator=own, device="cpu") for own in generators])
-    return indices_of(order, transducers, ("random", "given", "strength")).expand(len(seeds), -1)
-
-
-def _with_first(orders: torch.Tensor, first: int | None) -> torch.Tensor:
-    """`orders` (T, M) with the transducer `first` moved to the front."""
-    if first is None:
-        return orders
-    others = orders[orders != first].reshape(len(orders), -1)
-    return torch.cat([orders.new_full((len(orders), 1), first), others], dim=1)
-
-
-def _itself(drive: torch.Tensor) -> torch.Tensor:
-    return drive
+    return run(GABS(levels, order, first, passes), objective, trials, seed, score=score)

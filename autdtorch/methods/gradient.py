@@ -1,41 +1,92 @@
-"""Gradient ascent on the weakest focus, through a transfer matrix that is known.
+"""Gradient ascent on the weakest focus, by a known transfer matrix.
 
-No method that sees magnitudes only can do this on a real array: it is a line to compare them with.
+No method that sees magnitudes only can do this on a real array. It is a baseline to compare them with.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 
-from autdtorch.methods.base import Ledger, Solution, Trials, trial_seeds
+from autdtorch.methods.base import Method, Problem, State, Step, Trials, generators_of
+from autdtorch.methods.driver import run
+from autdtorch.methods.solution import Solution
 from autdtorch.objectives.simulated import Objective, weakest_focus
 from autdtorch.utils.threads import one_torch_thread
 from autdtorch.utils.validation import integer_at_least, invalid
 
-# From first to last in equal ratios: temperature of the smooth minimum, in mean pressures of the foci, and
-# step, in largest amplitudes.
+# First and last value, in equal ratios between: temperature of the smooth minimum, in mean pressures of the
+# foci, and step, in largest amplitudes.
 _TEMPERATURE = (0.3, 1e-4)
 _STEP = (0.5, 0.005)
 _MOMENTUM = 0.9
 _TINY = 1e-300
 
 
+@dataclass(frozen=True)
+class GradientAscent(Method):
+    """Climb the weakest focus over all drives of amplitudes <= 1, by the transfer matrix of the problem.
+
+    A trial climbs from `starts` drives of random phases and observes the highest: one evaluation. With 16
+    transducers that is nearly always the global maximum, to 1e-4; a few hundred need more `steps`.
+
+    Attributes:
+        starts: number of drives that a trial starts from, >= 1.
+        steps: of each climb, >= 2.
+
+    Raises:
+        ValueError: a setting out of range.
+    """
+
+    name: ClassVar[str] = "gradient_ascent"
+    label: ClassVar[str] = "gradient ascent"
+
+    starts: int = 32
+    steps: int = 300
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        object.__setattr__(self, "starts", integer_at_least("starts", self.starts, 1))
+        object.__setattr__(self, "steps", integer_at_least("steps", self.steps, 2))
+
+    def most_evaluations(self, problem: Problem) -> int:
+        """Return 1."""
+        return 1
+
+    def numbers_kept(self, problem: Problem) -> float:
+        """Return the numbers of all climbs."""
+        return self.steps + 2.0 * self.starts * (4 * problem.transducers + 2 * problem.foci)
+
+    def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
+        """Climb, and observe the highest drive."""
+        matrix = problem.transfer_matrix
+        if matrix is None:
+            accepted = 'must have a transfer matrix, as SimulatedObjective has in mode "transfer"'
+            raise invalid("objective", None, accepted)
+        starts = [random_drives(self.starts, problem.transducers, own) for own in generators_of(seeds)]
+        highest = [climb(matrix, start, self.steps) for start in starts]
+        return Step(torch.stack(highest)[:, None], {})
+
+    def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
+        """End."""
+        return Step(state.drives[:, :0], {})
+
+
 def gradient_ascent(
     objective: Objective, starts: int = 32, steps: int = 300, trials: Trials = 1, seed: int = 0
 ) -> Solution:
-    """Climb the weakest focus over all drives of amplitudes <= 1, by the objective's transfer matrix.
-
-    A trial climbs from `starts` drives of random phases and evaluates where it came highest: one evaluation.
-    With 16 transducers that is the global maximum nearly always, less 1e-4; a few hundred want more `steps`.
+    """Run `GradientAscent` on an objective.
 
     Args:
         objective: simulated, with a `transfer_matrix`.
-        starts: drives that a trial starts from, >= 1.
+        starts: number of drives that a trial starts from, >= 1.
         steps: of each climb, >= 2.
         trials: number of trials T, >= 1, or their numbers.
-        seed: >= 0; trial t is the same for every number of trials.
+        seed: of the random phases, >= 0.
 
     Returns:
         The drive of each trial.
@@ -43,26 +94,11 @@ def gradient_ascent(
     Raises:
         ValueError: an argument out of range, or an objective without a transfer matrix.
     """
-    starts = integer_at_least("starts", starts, 1)
-    steps = integer_at_least("steps", steps, 2)
-    seeds = trial_seeds(seed, trials)
-    ledger = Ledger(objective, len(seeds), weakest_focus)
-    ledger.require_memory(steps, 2.0 * starts, steps=steps, starts=starts)
-    matrix = getattr(objective, "transfer_matrix", None)
-    if matrix is None:
-        raise invalid(
-            "objective",
-            objective,
-            'must have a transfer matrix, as SimulatedObjective has in mode "transfer"',
-        )
-    generators = [torch.Generator("cpu").manual_seed(own) for own in seeds]
-    highest = [climb(matrix, random_drives(starts, matrix.shape[1], own), steps) for own in generators]
-    ledger.evaluate(torch.stack(highest)[:, None])
-    return ledger.solution()
+    return run(GradientAscent(starts, steps), objective, trials, seed)
 
 
 def random_drives(count: int, transducers: int, generator: torch.Generator) -> torch.Tensor:
-    """Drives (count, M) of amplitudes 1 and random phases."""
+    """Return drives (count, M) of amplitudes 1 and random phases."""
     phases = (
         2 * math.pi * torch.rand(count, transducers, dtype=torch.float64, generator=generator, device="cpu")
     )
@@ -71,18 +107,18 @@ def random_drives(count: int, transducers: int, generator: torch.Generator) -> t
 
 @one_torch_thread()
 def climb(matrix: torch.Tensor, drive: torch.Tensor, steps: int) -> torch.Tensor:
-    """The drive of the strongest weakest focus that projected gradient ascent with momentum finds.
+    """Climb the weakest focus by projected gradient ascent with momentum.
 
-    What is climbed is a smooth minimum, -T log sum_p exp(-|p_p| / T), whose temperature T falls until
-    it is the minimum.
+    The ascent maximises a smooth minimum, -T log sum_p exp(-|p_p| / T), whose temperature T falls until it
+    is the minimum.
 
     Args:
         matrix: transfer matrix (P, M), complex128.
-        drive: where to start (S, M).
+        drive: S drives to start from (S, M).
         steps: >= 2.
 
     Returns:
-        Drive (M,), amplitudes <= 1.
+        The highest drive (M,), amplitudes <= 1.
     """
     velocity = torch.zeros_like(drive)
     for progress in torch.linspace(0, 1, steps, dtype=torch.float64, device="cpu").tolist():

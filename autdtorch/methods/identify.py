@@ -1,19 +1,22 @@
 """Identification: fit the transfer matrix to observed magnitudes, then maximise on the matrix.
 
-The pressure of a control point is linear in the drive, so that enough magnitudes determine its row of the
-transfer matrix, but for a phase that no magnitude shows (docs/decisions/identify.md).
+The pressure of a control point is linear in the drive. Enough magnitudes therefore determine its row of the
+transfer matrix, up to a phase that no magnitude shows (docs/decisions/identify.md).
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 
-from autdtorch.methods.base import Ledger, Solution, Trials, trial_seeds
+from autdtorch.methods.base import Method, Problem, State, Step, Trials, generators_of, restored, states_of
+from autdtorch.methods.driver import run
 from autdtorch.methods.gradient import climb, random_drives
-from autdtorch.objectives.perturbations import playable
-from autdtorch.objectives.simulated import Objective, weakest_focus
+from autdtorch.methods.solution import Solution
+from autdtorch.objectives.simulated import Objective
 from autdtorch.utils.threads import one_torch_thread
 from autdtorch.utils.validation import integer_at_least, invalid
 
@@ -23,68 +26,119 @@ _FIT_STEPS = 100
 _STARTS = 16  # drives from which the fitted matrix is climbed
 _CLIMB_STEPS = 300
 _ROUNDS = 3  # times that the fit is refined by drives near the best one
-_SPREAD = 0.5  # their distance from it, standard deviation of the phases [rad]
+_SPREAD = 0.5  # their distance from it: standard deviation of the phases [rad]
+
+
+@dataclass(frozen=True)
+class Identify(Method):
+    """Fit the transfer matrix to observed magnitudes, and maximise the weakest focus on the matrix.
+
+    The first max(3 M - 2, evaluations / 2) drives have random phases. The others lie around the best drive of
+    the matrix fitted so far, where noise must average out: a few rounds, each after a new fit. The last drive
+    is the best one of the last fit; it is the solution, since the highest of many noisy readings is a lucky
+    one.
+
+    Attributes:
+        evaluations: number of evaluations of a trial, >= 3 M - 1. More of them average noise.
+
+    Raises:
+        ValueError: a setting out of range.
+    """
+
+    name: ClassVar[str] = "identify"
+    label: ClassVar[str] = "identify"
+
+    evaluations: int = 64
+
+    def __post_init__(self) -> None:
+        """Check the setting."""
+        object.__setattr__(self, "evaluations", integer_at_least("evaluations", self.evaluations, 1))
+
+    def check(self, problem: Problem) -> None:
+        """Check that there are enough evaluations for the number of transducers."""
+        least = 3 * problem.transducers - 1
+        if self.evaluations < least:
+            accepted = f"must be an integer >= {least}, to identify {problem.transducers} transducers"
+            raise invalid("evaluations", self.evaluations, accepted)
+
+    def most_evaluations(self, problem: Problem) -> int:
+        """Return `evaluations`."""
+        return self.evaluations
+
+    def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
+        """Observe random phases."""
+        generators = generators_of(seeds)
+        count = self._first(problem)
+        drives = torch.stack([random_drives(count, problem.transducers, own) for own in generators])
+        return Step(problem.quantise(drives), {"generators": states_of(generators)})
+
+    def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
+        """Fit the matrix, and observe drives near the best one; the best one itself at the end."""
+        search = dict(state.search)
+        if "last" in search:
+            return Step(state.drives[:, :0], {**search, "pressure": pressure[:, 0], "score": score[:, 0]})
+        generators = restored(search["generators"])
+        if "rows" in search:
+            drives = torch.cat([search["drives"], state.drives], dim=1)
+            observed = torch.cat([search["observed"], pressure], dim=1)
+            fits = [_fit(*seen) for seen in zip(drives, observed, search["rows"], strict=True)]
+        else:
+            drives, observed = state.drives, pressure
+            fits = [_search(*seen) for seen in zip(drives, observed, generators, strict=True)]
+        best = torch.stack([_strongest(rows, own) for rows, own in zip(fits, generators, strict=True)])
+        search |= {"drives": drives, "observed": observed, "rows": torch.stack(fits)}
+        count = self._near(state.problem, drives.shape[1])
+        if count == 0:
+            return Step(best[:, None], {**search, "last": best})
+        near = torch.stack([_nearby(*of, count) for of in zip(best, generators, strict=True)])
+        return Step(state.problem.quantise(near), {**search, "generators": states_of(generators)})
+
+    def best(self, state: State) -> Solution:
+        """Return the last drive of each trial once it was observed, and the best one before."""
+        found = super().best(state)
+        if not state.done:
+            return found
+        last = state.problem.quantise(state.search["last"])
+        return replace(found, drive=last, pressure=state.search["pressure"], score=state.search["score"])
+
+    def _first(self, problem: Problem) -> int:
+        return max(3 * problem.transducers - 2, self.evaluations // 2)
+
+    def _near(self, problem: Problem, observed: int) -> int:
+        """Return how many drives the next round observes after so many; 0 when all rounds are over."""
+        left, done = self.evaluations - self._first(problem) - 1, self._first(problem)
+        for rounds in range(_ROUNDS, 0, -1):
+            count = left // rounds
+            if count and done == observed:
+                return count
+            left, done = left - count, done + count
+        return 0
 
 
 def identify(objective: Objective, evaluations: int = 64, trials: Trials = 1, seed: int = 0) -> Solution:
-    """Fit the transfer matrix to observed magnitudes, and maximise the weakest focus on the matrix.
-
-    The first max(3 M - 2, evaluations / 2) drives have random phases. The others are spread around the best
-    drive of the matrix fitted so far, in rounds, each after a new fit: there noise must average out. The last
-    one is the best drive of the last fit.
+    """Run `Identify` on an objective.
 
     Args:
         objective: what is evaluated.
-        evaluations: number of evaluations a trial, >= 3 M - 1; more of them average noise.
+        evaluations: number of evaluations of a trial, >= 3 M - 1.
         trials: number of trials T, >= 1, or their numbers.
-        seed: of the random phases, >= 0; trial t is the same for every number of trials.
+        seed: of the random phases, >= 0.
 
     Returns:
         The last drive of each trial; with noise it is better than the one of the highest reading.
 
     Raises:
-        ValueError: an argument out of range, or the objective's pressures are not finite.
+        ValueError: an argument out of range, or pressures that are not finite.
     """
-    generators = [torch.Generator("cpu").manual_seed(own) for own in trial_seeds(seed, trials)]
-    ledger = Ledger(objective, len(generators), weakest_focus)
-    transducers = ledger.transducers
-    evaluations = integer_at_least("evaluations", evaluations, 1)
-    if evaluations < 3 * transducers - 1:
-        raise invalid(
-            "evaluations",
-            evaluations,
-            f"must be an integer >= {3 * transducers - 1}, to identify {transducers} transducers",
-        )
-    ledger.require_memory(evaluations, 2.0 * evaluations, evaluations=evaluations)
-    first = max(3 * transducers - 2, evaluations // 2)
-    drives = playable(objective, torch.stack([random_drives(first, transducers, own) for own in generators]))
-    observed = ledger.observe(drives)
-    rows = [_search(*seen) for seen in zip(drives, observed, generators, strict=True)]
-    best = _strongest(rows, generators)
-    left = evaluations - first - 1
-    for rounds in range(_ROUNDS, 0, -1):
-        count = left // rounds
-        left -= count
-        if count == 0:
-            continue
-        spread = [_nearby(*of, count) for of in zip(best, generators, strict=True)]
-        near = playable(objective, torch.stack(spread))
-        drives = torch.cat([drives, near], dim=1)
-        observed = torch.cat([observed, ledger.observe(near)], dim=1)
-        rows = [_fit(*seen) for seen in zip(drives, observed, rows, strict=True)]
-        best = _strongest(rows, generators)
-    pressure = ledger.observe(best[:, None])[:, 0]
-    # Not the highest reading: among many noisy ones that is a lucky one.
-    chosen = playable(objective, best)
-    return replace(ledger.solution(), drive=chosen, pressure=pressure, score=weakest_focus(pressure))
+    return run(Identify(evaluations), objective, trials, seed)
 
 
 @one_torch_thread()
 def _search(drives: torch.Tensor, observed: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-    """Rows of the transfer matrix (M, P) that explain magnitudes (N, P) observed under `drives` (N, M).
+    """Return rows of the transfer matrix (M, P) that explain magnitudes (N, P) observed for `drives` (N, M).
 
-    Phasors that have the observed magnitudes and that some row produces are sought by Douglas-Rachford
-    splitting, which leaves the local minima that trap a fit; then they are fitted. The best fit is taken.
+    Douglas-Rachford splitting seeks phasors that have the observed magnitudes and that some row produces. It
+    leaves the local minima that trap a fit. The rows are then fitted, and the best fit is taken.
     """
     transducers, foci = drives.shape[1], observed.shape[1]
     guesses = torch.randn(
@@ -105,24 +159,20 @@ def _search(drives: torch.Tensor, observed: torch.Tensor, generator: torch.Gener
 
 @one_torch_thread()
 def _fit(drives: torch.Tensor, observed: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
-    """Least-squares fit of rows (M, K) to magnitudes (N, K), from `rows` on: phases and rows in turn."""
+    """Return the least-squares fit of rows (M, K) to magnitudes (N, K): phases and rows in turn."""
     inverse = torch.linalg.pinv(drives)
     for _ in range(_FIT_STEPS):
         rows = inverse @ (observed * (drives @ rows).sgn())
     return rows
 
 
-def _strongest(rows: list[torch.Tensor], generators: list[torch.Generator]) -> torch.Tensor:
-    """The drive (T, M) of the strongest weakest focus, by each trial's rows (M, P)."""
-    drives = [
-        climb(own.T, random_drives(_STARTS, len(own), generator), _CLIMB_STEPS)
-        for own, generator in zip(rows, generators, strict=True)
-    ]
-    return torch.stack(drives)
+def _strongest(rows: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    """Return the drive (M,) of the strongest weakest focus, by fitted rows (M, P)."""
+    return climb(rows.T, random_drives(_STARTS, len(rows), generator), _CLIMB_STEPS)
 
 
 def _nearby(drive: torch.Tensor, generator: torch.Generator, count: int) -> torch.Tensor:
-    """The `drive` (M,) itself, and count - 1 others around it."""
+    """Return the `drive` (M,) itself, and count - 1 others around it."""
     turns = _SPREAD * torch.randn(count, len(drive), dtype=torch.float64, generator=generator, device="cpu")
     turns[0] = 0
     return drive * torch.polar(torch.ones_like(turns), turns)

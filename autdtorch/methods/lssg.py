@@ -1,38 +1,136 @@
-"""LSS, the linear synthesis scheme, and LSSG, its offsets searched greedily: the paper's baseline."""
+"""LSS, the linear synthesis scheme, and LSSG, which searches its offsets: the paper's baseline."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import torch
 
-from autdtorch.methods.base import Ledger, Solution
-from autdtorch.methods.coordinates import indices_of, repeat_passes
+from autdtorch.methods.base import Method, Problem, State, Step
+from autdtorch.methods.coordinates import (
+    ascend,
+    begin_ascent,
+    candidates,
+    indices_of,
+    order_setting,
+    require_all,
+)
+from autdtorch.methods.driver import run
+from autdtorch.methods.solution import Solution
 from autdtorch.objectives.simulated import Objective, Score, weakest_focus
 from autdtorch.scene.drive import drive_from_phases, focus_phases, normalise
-from autdtorch.scene.scene import Scene
-from autdtorch.utils.validation import integer_at_least
+from autdtorch.utils.validation import integer_at_least, invalid
+
+
+@dataclass(frozen=True)
+class LSS(Method):
+    """Superpose the free-space drives of the single foci, all offsets 0 (Eq. 4, 5 and 6).
+
+    One evaluation, in which nothing is searched. The amplitudes are in [0, 1], not all 1.
+    """
+
+    name: ClassVar[str] = "lss"
+    label: ClassVar[str] = "LSS"
+    random: ClassVar[bool] = False
+
+    def check(self, problem: Problem) -> None:
+        """Check that the problem has a scene."""
+        _require_scene(problem)
+
+    def most_evaluations(self, problem: Problem) -> int:
+        """Return 1."""
+        return 1
+
+    def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
+        """Observe the superposition."""
+        return Step(normalise(_focus_drives(problem).sum(dim=0))[None, None], {})
+
+    def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
+        """End."""
+        return Step(state.drives[:, :0], {})
+
+
+@dataclass(frozen=True)
+class LSSG(Method):
+    """Superpose the free-space drives of the single foci, with the best offset for each (Eq. 4, 5 and 6).
+
+    The search starts from `LSS`, all offsets 0, and goes through the foci in order: each tries `levels`
+    offsets while the others stay, and keeps the best. Since 0 is among them, LSSG is never worse than LSS.
+    The paper gives only the number of evaluations of its search, which is this one's: P * levels, 64 with 4
+    foci. A search that adds one focus after the other, as GABS adds transducers, would take `levels` fewer,
+    but would score foci at which no drive aims yet.
+
+    Further passes go through the foci again, for P * levels evaluations each. The search ends early with a
+    pass that changes nothing. Obstacles enter through the observed scores, not through the phases. The
+    amplitudes are in [0, 1], not all 1.
+
+    Attributes:
+        levels: number of offsets in [0, 2 pi), >= 2.
+        order: of the foci: "given", that of the control points, or all their indices.
+        passes: >= 1.
+
+    Raises:
+        ValueError: a setting out of range.
+    """
+
+    name: ClassVar[str] = "lssg"
+    label: ClassVar[str] = "LSSG"
+    random: ClassVar[bool] = False
+
+    levels: int = 16
+    order: Literal["given"] | Sequence[int] = "given"
+    passes: int = 1
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        object.__setattr__(self, "levels", integer_at_least("levels", self.levels, 2))
+        object.__setattr__(self, "order", order_setting(self.order, ("given",)))
+        object.__setattr__(self, "passes", integer_at_least("passes", self.passes, 1))
+
+    def check(self, problem: Problem) -> None:
+        """Check that the problem has a scene, and the order against the number of foci."""
+        _require_scene(problem)
+        require_all(self.order, problem.foci)
+
+    def most_evaluations(self, problem: Problem) -> int:
+        """Return the evaluations of all passes."""
+        return self.passes * problem.foci * self.levels
+
+    def most_at_once(self, problem: Problem) -> int:
+        """Return the number of levels."""
+        return self.levels
+
+    def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
+        """Compare the offsets of the first focus."""
+        foci = _focus_drives(problem)
+        start = torch.ones(1, problem.foci, dtype=torch.complex128, device="cpu")
+        search = begin_ascent(start, indices_of(self.order, problem.foci)[None], self.passes)
+        return Step(normalise(candidates(search, self.levels) @ foci), {**search, "foci": foci})
+
+    def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
+        """Compare the offsets of the next focus."""
+        foci = state.search["foci"]
+        search, goes_on = ascend(state.search, self.levels, score)
+        drives = normalise(candidates(search, self.levels) @ foci)
+        return Step(drives, {**search, "foci": foci}, goes_on)
 
 
 def lss(objective: Objective, score: Score = weakest_focus) -> Solution:
-    """Superpose the free-space drives of the single foci (Eq. 4, 5 and 6, all offsets 0): one evaluation.
-
-    The amplitudes are in [0, 1], not all 1.
+    """Run `LSS` on an objective.
 
     Args:
         objective: what is evaluated.
-        score: what is reported; nothing is searched.
+        score: function that is reported; nothing is searched.
 
     Returns:
-        One trial, since the method has no randomness.
+        One trial, since the method has no random choices.
 
     Raises:
-        ValueError: the objective's pressure or score is not finite.
+        ValueError: pressures or scores that are not finite.
     """
-    ledger = Ledger(objective, trials=1, score=score)
-    ledger.evaluate(normalise(_focus_drives(objective.scene).sum(dim=0))[None, None])
-    return ledger.solution()
+    return run(LSS(), objective, score=score)
 
 
 def lssg(
@@ -42,45 +140,31 @@ def lssg(
     passes: int = 1,
     score: Score = weakest_focus,
 ) -> Solution:
-    """Superpose the free-space drives of the single foci, with the best offset for each (Eq. 4, 5 and 6).
-
-    The search starts from the linear synthesis scheme, all offsets 0, and goes through the foci once, in
-    their order: each tries `levels` offsets while the others stay, and keeps the best. Since 0 is among them,
-    LSSG is never worse than its start. The paper leaves the search open but for its number of evaluations,
-    which is this one's: P * levels, 64 with 4 foci. Adding one focus after the other, as GABS does with
-    transducers, would take `levels` fewer, but would score foci at which nothing aims yet.
-
-    Further passes go through the foci again, for P * levels evaluations each; the search ends early with a
-    pass that changes nothing.
-
-    Obstacles enter through the observed scores alone, not through the phases of the foci. The amplitudes are
-    in [0, 1], not all 1.
+    """Run `LSSG` on an objective.
 
     Args:
         objective: what is evaluated.
         levels: number of offsets in [0, 2 pi), >= 2.
         order: of the foci: "given", that of the control points, or all their indices.
         passes: >= 1.
-        score: what is maximised.
+        score: function that is maximised.
 
     Returns:
-        One trial, since the method has no randomness.
+        One trial, since the method has no random choices.
 
     Raises:
-        ValueError: an argument out of range, or the objective's pressures or scores are not finite.
+        ValueError: an argument out of range, or pressures or scores that are not finite.
     """
-    levels = integer_at_least("levels", levels, 2)
-    passes = integer_at_least("passes", passes, 1)
-    ledger = Ledger(objective, trials=1, score=score)
-    foci = _focus_drives(objective.scene)
-    evaluations = float(len(foci)) * passes * levels
-    ledger.require_memory(evaluations, levels, levels=levels, passes=passes)
-    places = indices_of(order, len(foci))
-    start = torch.ones(1, len(foci), dtype=torch.complex128, device="cpu")
-    repeat_passes(ledger, start, places[None], levels, passes, lambda weights: normalise(weights @ foci))
-    return ledger.solution(most=passes * len(foci) * levels)
+    return run(LSSG(levels, order, passes), objective, score=score)
 
 
-def _focus_drives(scene: Scene) -> torch.Tensor:
-    """Drives that aim at each focus in free space (P, M)."""
+def _require_scene(problem: Problem) -> None:
+    if problem.scene is None:
+        raise invalid("problem.scene", None, "must be a scene: the phases of the foci need its geometry")
+
+
+def _focus_drives(problem: Problem) -> torch.Tensor:
+    """Return the drives that aim at each focus in free space (P, M)."""
+    scene = problem.scene
+    assert scene is not None
     return drive_from_phases(focus_phases(scene.array.positions, scene.control_points, scene.wavenumber))

@@ -3,15 +3,71 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 
-from autdtorch.methods.base import Ledger, Solution, Trials, trial_seeds
+from autdtorch.methods.base import Method, Problem, State, Step, Trials, generators_of, restored, states_of
+from autdtorch.methods.driver import run
+from autdtorch.methods.solution import Solution
 from autdtorch.objectives.simulated import Objective, Score, weakest_focus
 from autdtorch.scene.drive import drive_from_phases
 from autdtorch.utils.validation import integer_at_least
 
-_AT_ONCE = 64  # evaluations of a trial in one call of the objective, which bounds its memory
+_AT_ONCE = 64  # evaluations of a trial in one step, which bounds the memory of a step
+
+
+@dataclass(frozen=True)
+class RandomSearch(Method):
+    """Try random phases at full amplitude, and keep the best.
+
+    Attributes:
+        evaluations: number of evaluations of a trial, >= 1.
+        levels: number of phases in [0, 2 pi) to draw from, >= 2; None for any phase.
+
+    Raises:
+        ValueError: a setting out of range.
+    """
+
+    name: ClassVar[str] = "random_search"
+    label: ClassVar[str] = "random search"
+
+    evaluations: int = 256
+    levels: int | None = None
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        object.__setattr__(self, "evaluations", integer_at_least("evaluations", self.evaluations, 1))
+        if self.levels is not None:
+            object.__setattr__(self, "levels", integer_at_least("levels", self.levels, 2))
+
+    def most_evaluations(self, problem: Problem) -> int:
+        """Return `evaluations`."""
+        return self.evaluations
+
+    def most_at_once(self, problem: Problem) -> int:
+        """Return the size of a step."""
+        return min(self.evaluations, _AT_ONCE)
+
+    def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
+        """Draw the first phases."""
+        return self._drawn(generators_of(seeds), problem.transducers, 0)
+
+    def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
+        """Draw more phases."""
+        done = state.best.history.shape[1]
+        return self._drawn(restored(state.search["generators"]), state.problem.transducers, done)
+
+    def _drawn(self, generators: Sequence[torch.Generator], transducers: int, done: int) -> Step:
+        size = min(_AT_ONCE, self.evaluations - done), transducers
+        turns = torch.stack(
+            [torch.rand(size, dtype=torch.float64, generator=own, device="cpu") for own in generators]
+        )
+        if self.levels is not None:
+            turns = (self.levels * turns).floor() / self.levels
+        return Step(drive_from_phases(2 * math.pi * turns), {"generators": states_of(generators)})
 
 
 def random_search(
@@ -22,36 +78,20 @@ def random_search(
     seed: int = 0,
     score: Score = weakest_focus,
 ) -> Solution:
-    """Try random phases, all amplitudes being 1, and keep the best.
+    """Run `RandomSearch` on an objective.
 
     Args:
         objective: what is evaluated.
-        evaluations: number of evaluations a trial, >= 1.
+        evaluations: number of evaluations of a trial, >= 1.
         levels: number of phases in [0, 2 pi) to draw from, >= 2; None for any phase.
         trials: number of trials T, >= 1, or their numbers.
-        seed: >= 0; trial t is the same for every number of trials.
-        score: what is maximised.
+        seed: of the phases, >= 0.
+        score: function that is maximised.
 
     Returns:
         The best drive observed in each trial.
 
     Raises:
-        ValueError: an argument out of range, or the objective's pressures or scores are not finite.
+        ValueError: an argument out of range, or pressures or scores that are not finite.
     """
-    evaluations = integer_at_least("evaluations", evaluations, 1)
-    levels = None if levels is None else integer_at_least("levels", levels, 2)
-    generators = [torch.Generator("cpu").manual_seed(own) for own in trial_seeds(seed, trials)]
-    ledger = Ledger(objective, len(generators), score)
-    ledger.require_memory(evaluations, min(evaluations, _AT_ONCE), evaluations=evaluations)
-    for begin in range(0, evaluations, _AT_ONCE):
-        count = min(_AT_ONCE, evaluations - begin)
-        turns = torch.stack(
-            [
-                torch.rand(count, ledger.transducers, dtype=torch.float64, generator=own, device="cpu")
-                for own in generators
-            ]
-        )
-        if levels is not None:
-            turns = (levels * turns).floor() / levels
-        ledger.evaluate(drive_from_phases(2 * math.pi * turns))
-    return ledger.solution()
+    return run(RandomSearch(evaluations, levels), objective, trials, seed, score=score)

@@ -53,6 +53,11 @@ class BayesTrial:
         self._next_fit = settings.initial
         self._best_score = -math.inf
 
+    @property
+    def count(self) -> int:
+        """Number of observations so far."""
+        return self._process.count
+
     def initial_points(self) -> torch.Tensor:
         """Points (initial, D) all over the space."""
         initial, dimensions = self._settings.initial, self._settings.dimensions

@@ -1,0 +1,92 @@
+"""The driver: runs a method on an objective, simulated or on the bench."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import torch
+
+from autdtorch.methods.base import Method, Problem, State, Trials
+from autdtorch.methods.solution import Solution
+from autdtorch.methods.state_file import load_state, save_state
+from autdtorch.objectives.simulated import Objective, Score, weakest_focus
+from autdtorch.utils.progress import show_progress
+from autdtorch.utils.validation import path_of, require_callable, require_kind
+
+
+@runtime_checkable
+class Logged(Protocol):
+    """An objective that keeps a log of its evaluations, as a `HardwareObjective` does."""
+
+    def recorded(self, number: int, drive: torch.Tensor) -> torch.Tensor | None:
+        """Return the pressures (P,) [Pa] of an evaluation of this drive (M,) that the log holds, or None."""
+        ...
+
+
+def run(
+    method: Method,
+    objective: Objective,
+    trials: Trials = 1,
+    seed: int = 0,
+    *,
+    score: Score = weakest_focus,
+    stop: Callable[[State], bool] | None = None,
+    state_file: str | Path | None = None,
+) -> Solution:
+    """Run a method on an objective: ask, observe and tell until the method is done.
+
+    Progress and a forecast are shown when it takes longer than a few seconds. An objective with a log (a
+    `HardwareObjective`) is not asked for evaluations that the log holds, so that an interrupted run goes on
+    where it ended.
+
+    Args:
+        method: such as ``GABS(levels=16)``.
+        objective: simulated or measured.
+        trials: number of trials T, >= 1, or their numbers.
+        seed: of the random choices, >= 0. A trial's random choices do not depend on the other trials.
+        score: function of pressures (..., P) [Pa] that is maximised.
+        stop: function of the state that ends the run when it returns True; called after every step.
+        state_file: file that keeps the state after every step. If it exists, the run goes on from it.
+
+    Returns:
+        The drive that each trial chose.
+
+    Raises:
+        ValueError: an argument out of range, pressures or scores that are not finite, or a state file of
+            another method or problem.
+        OSError: the state file cannot be read or written.
+    """
+    require_kind("method", method, Method)
+    if stop is not None:
+        require_callable("stop", stop)
+    problem = Problem.of(objective, score)
+    path = None if state_file is None else path_of("state_file", state_file)
+    if path is not None and path.exists():
+        state = load_state(path, method, problem)
+    else:
+        state = method.start(problem, seed, trials)
+    most = method.most_evaluations(problem) * len(state.best.score)
+    with show_progress(most, f"{method.label}, evaluations") as progress:
+        progress.advance(state.evaluations)
+        while not state.done and not (stop is not None and state.evaluations and stop(state)):
+            drives = method.ask(state)
+            state = method.tell(state, _observed(objective, drives, state.evaluations))
+            progress.advance(len(drives))
+            if path is not None:
+                save_state(path, method, state)
+    return method.best(state)
+
+
+def _observed(objective: Objective, drives: torch.Tensor, number: int) -> torch.Tensor:
+    """Return pressures (B, P) [Pa] of drives (B, M), the first of which is evaluation `number`."""
+    if not isinstance(objective, Logged):
+        return objective(drives)
+    known = [objective.recorded(number + row, drive) for row, drive in enumerate(drives)]
+    missing = [row for row, pressure in enumerate(known) if pressure is None]
+    if not missing:
+        return torch.stack([pressure for pressure in known if pressure is not None])
+    measured = dict(zip(missing, objective(drives[missing]), strict=True))
+    rows = [measured[row] if pressure is None else pressure for row, pressure in enumerate(known)]
+    return torch.stack(rows)
