@@ -22,8 +22,8 @@ from generated_block import table
 from large_arrays import autd3_array, with_array
 
 import autdtorch as at
-from autdtorch.methods.base import Ledger, trial_seeds
-from autdtorch.methods.bayes.bayes import NOISE, _drive
+from autdtorch.methods.base import trial_seeds
+from autdtorch.methods.bayes.bayes import NOISE
 from autdtorch.objectives.simulated import weakest_focus
 
 SCENES = Path(__file__).parents[1] / "configs" / "scene"
@@ -161,9 +161,8 @@ def botorch_trial(objective: at.SimulatedObjective, trial: int) -> torch.Tensor:
     (seed,) = trial_seeds(0, [trial])
     generator = torch.Generator().manual_seed(seed)
     dimensions = len(objective.scene.array) - 1
-    ledger = Ledger(objective, 1, weakest_focus)
     points = draw_sobol_samples(unit_cube(dimensions), n=INITIAL, q=1, seed=seed)[:, 0]
-    scores = ledger.evaluate(_drive(points[None], FIXED))[0]
+    scores = weakest_focus(objective(drives_at(points, FIXED)))
     length_scale = None
     next_fit = INITIAL
     for count in range(INITIAL, EVALUATIONS):
@@ -171,8 +170,8 @@ def botorch_trial(objective: at.SimulatedObjective, trial: int) -> torch.Tensor:
             length_scale, next_fit = None, math.ceil(REFIT_GROWTH * count)
         point, length_scale = next_point(points, scores, length_scale, generator)
         points = torch.cat([points, point])
-        scores = torch.cat([scores, ledger.evaluate(_drive(point[None], FIXED))[0]])
-    return ledger.solution().score
+        scores = torch.cat([scores, weakest_focus(objective(drives_at(point, FIXED)))])
+    return scores.amax(dim=0, keepdim=True)
 
 
 def unit_cube(dimensions: int) -> torch.Tensor:

@@ -27,7 +27,7 @@ import torch
 
 import autdtorch as at
 from autdtorch import hardware
-from autdtorch.methods.base import Solution
+from autdtorch.methods.solution import Solution
 from autdtorch.study.folder import PREVIOUS
 from autdtorch.study.provenance import PROVENANCE_FILE
 from autdtorch.study.results_file import RESULTS_FILE

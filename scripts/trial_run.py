@@ -21,7 +21,7 @@ from yaml import YAMLError
 import autdtorch as at
 from autdtorch import hardware
 from autdtorch.hardware.sensors.sensor import checked_reading
-from autdtorch.methods.base import Solution
+from autdtorch.methods.solution import Solution
 from autdtorch.study.report.hardware_report import write_hardware_report
 from autdtorch.utils.progress import Progress, show_progress
 

@@ -9,8 +9,9 @@ import time
 from small_scenes import CUBE, small_scene
 
 import autdtorch.study.run
-from autdtorch.methods.base import Solution, Trials
+from autdtorch.methods.base import Trials
 from autdtorch.methods.gabs import gabs
+from autdtorch.methods.solution import Solution
 from autdtorch.objectives.simulated import Objective
 from autdtorch.scene.geometry import Plane
 
@@ -27,7 +28,7 @@ def slow_gabs(objective: Objective, trials: Trials = 1, seed: int = 0) -> Soluti
 def main() -> None:
     """Run the study into the folder that the command line names."""
     slow_gabs.__module__ = gabs.__module__  # results of others' methods are not used again
-    autdtorch.study.run._FIRST_BLOCK = autdtorch.study.run._LARGEST_GROWTH = 1  # a trial a block
+    autdtorch.study.run.BLOCK = 1
     scenes = {
         "empty": dataclasses.replace(small_scene(), observation_plane=PLANE),
         "cube": dataclasses.replace(small_scene((CUBE,)), observation_plane=PLANE),

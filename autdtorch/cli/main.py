@@ -28,7 +28,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 import autdtorch
 from autdtorch.cli.config_files import CONFIGS, register
-from autdtorch.cli.method_section import Method, load_method, parameters
 from autdtorch.io.yaml_file import plain
 from autdtorch.utils.trusted import TARGET
 from autdtorch.utils.validation import require_known
@@ -36,6 +35,7 @@ from autdtorch.utils.validation import require_known
 if TYPE_CHECKING:
     from autdtorch.scene.scene import Scene
     from autdtorch.study.results import StudyResult
+    from autdtorch.study.run import StudyMethod
 
 logger = logging.getLogger(__name__)
 
@@ -257,17 +257,24 @@ def _collect(arguments: list[str]) -> None:
     _print([*_table_lines(sweep.results), end])
 
 
-def _single(settings: Mapping[str, Any], modules: list[Any]) -> tuple[dict[str, Scene], dict[str, Method]]:
-    """The one scene and the one method, each by its name."""
+def _single(
+    settings: Mapping[str, Any], modules: list[Any]
+) -> tuple[dict[str, Scene], dict[str, StudyMethod]]:
+    """Return the one scene and the one method, each by its name."""
+    from autdtorch.cli.method_section import load_method
+    from autdtorch.study.run import name_of
+
     scene = _scene("scene", _section(settings, "scene"), modules)
     method = load_method("method", _section(settings, "method"), modules)
-    return {HydraConfig.get().runtime.choices["scene"]: scene}, {method.func.__name__: method}
+    return {HydraConfig.get().runtime.choices["scene"]: scene}, {name_of(method): method}
 
 
 def _experiment(
     settings: Mapping[str, Any], modules: list[Any]
-) -> tuple[dict[str, Scene], dict[str, Method]]:
-    """The scenes and the methods of an experiment, by name."""
+) -> tuple[dict[str, Scene], dict[str, StudyMethod]]:
+    """Return the scenes and the methods of an experiment, by name."""
+    from autdtorch.cli.method_section import load_method
+
     for key in ("scene", "method"):
         if key in settings:
             names = ", ".join(_section(settings, f"{key}s"))
@@ -303,6 +310,7 @@ def _file_digests(section: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _solver(settings: Mapping[str, Any]) -> dict[str, Any]:
+    from autdtorch.cli.method_section import parameters
     from autdtorch.propagators import make_propagator
 
     solver = _section(settings, "solver")

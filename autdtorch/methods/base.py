@@ -79,7 +79,7 @@ class Step(NamedTuple):
     """What a method does next.
 
     Attributes:
-        drives: B drives to observe for each of the L trials that go on (L, B, M), complex128; none at the end.
+        drives: B drives to observe for each of the L trials that go on (L, B, M); B = 0 at the end.
         search: tensors that the method needs to go on, by name.
         goes_on: which of the trials that were observed go on (L before,), bool; None for all.
     """

@@ -38,8 +38,9 @@ def save_state(path: str | os.PathLike[str], method: Method, state: State) -> No
     tensors |= {f"{_BEST}{field.name}": getattr(state.best, field.name) for field in _columns()}
     tensors |= {f"{_SEARCH}{name}": tensor for name, tensor in state.search.items()}
     arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in tensors.items()}
+    arrays[_ORIGIN] = np.array(_origin(method, state.problem))
     content = io.BytesIO()
-    np.savez(content, **{_ORIGIN: np.array(_origin(method, state.problem))}, **arrays)
+    np.savez(content, **arrays)
     replace_file(path_of("path", path), content.getvalue())
 
 
@@ -104,4 +105,5 @@ def _require_consistent(state: State) -> None:
     }
     for name, (tensor, shape, dtype) in wanted.items():
         if tensor.shape != shape or tensor.dtype != dtype:
-            raise ValueError(f"{name}: {tensor.dtype} of shape {tuple(tensor.shape)}; must be {dtype} of {shape}")
+            found = f"{tensor.dtype} of shape {tuple(tensor.shape)}"
+            raise ValueError(f"{name}: {found}; must be {dtype} of shape {shape}")

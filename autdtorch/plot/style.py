@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from autdtorch.methods import label_of as label_of
+from autdtorch.methods.catalogue import label_of as label_of
 from autdtorch.utils.arrays import Array
 from autdtorch.utils.validation import ArrayLike, invalid, real_tensor, require_kind
 

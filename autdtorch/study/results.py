@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import torch
 
-from autdtorch.methods import label_of
-from autdtorch.methods.base import Solution
+from autdtorch.methods.catalogue import label_of
+from autdtorch.methods.solution import Solution
 from autdtorch.objectives.metrics import FocusMetrics
 from autdtorch.propagators import Run
 from autdtorch.study.provenance import Provenance

@@ -18,7 +18,8 @@ import numpy as np
 import torch
 
 import autdtorch
-from autdtorch.methods.base import NEAR_TIE, Solution
+from autdtorch.methods.ranking import NEAR_TIE
+from autdtorch.methods.solution import Solution
 from autdtorch.objectives.metrics import FocusMetrics
 from autdtorch.objectives.simulated import validate_drives
 from autdtorch.propagators import Run

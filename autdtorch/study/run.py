@@ -12,8 +12,10 @@ from typing import Any, TypeAlias
 
 import torch
 
-from autdtorch.methods.base import TRIAL_BYTES, Solution, Trials
+from autdtorch.methods.base import TRIAL_BYTES, Method, Problem, Trials
 from autdtorch.methods.bound import focus_bound
+from autdtorch.methods.driver import run
+from autdtorch.methods.solution import Solution
 from autdtorch.objectives.metrics import focus_metrics
 from autdtorch.objectives.simulated import Objective, SimulatedObjective
 from autdtorch.propagators import CACHE_VARIABLE, Propagator, SimulatedPropagator, make_propagator
@@ -36,16 +38,14 @@ from autdtorch.utils.validation import (
     require_name,
 )
 
-#: An optimiser with its settings bound. Where it has parameters `trials` and `seed` it gets a sequence of the
-#: numbers of the trials to run, of which it is to return as many, and the study's seed.
-Method: TypeAlias = Callable[..., Solution]
+StudyMethod: TypeAlias = Method | Callable[..., Solution]
+"""A `Method`, or a function of an objective with its settings bound. A function that has parameters `trials`
+and `seed` is given the numbers of the trials to run, as many as it is to return, and the study's seed."""
 
 _GIVEN = ("trials", "seed")  # parameters of a method that the study gives, if it has them
 
-_FIRST_BLOCK = 2  # Trials are run so many at a time at first,
-_LARGEST_GROWTH = 4  # then up to so many times more,
-_BLOCK_SECONDS = 10.0  # so that about as much is lost when the process is killed.
-_LARGEST_BLOCK = 64  # More at once take more memory, and hardly less time each.
+BLOCK = 10
+"""Trials that are run and saved together. The end of the process costs the block in work at most."""
 
 _LARGEST_SEED = 2**63 - 1  # the largest integer that a results file holds
 _MOST_SAMPLES = 10**6  # of an observation plane: 16 complex columns of them are 256 MB
@@ -53,7 +53,7 @@ _MOST_SAMPLES = 10**6  # of an observation plane: 16 complex columns of them are
 
 def run_study(
     scenes: Mapping[str, Scene],
-    methods: Mapping[str, Method],
+    methods: Mapping[str, StudyMethod],
     *,
     solver: Mapping[str, Any] | None = None,
     trials: int | Mapping[str, int] = 1,
@@ -69,7 +69,7 @@ def run_study(
 
     Args:
         scenes: by name.
-        methods: by name, such as ``functools.partial(gabs, levels=16)``.
+        methods: by name, such as ``GABS(levels=16)``.
         solver: arguments of `make_propagator`.
         trials: of every method that has random choices, or by method name.
         seed: of the random choices, >= 0; the same in every scene.
@@ -93,7 +93,7 @@ def run_study(
     plane_spacing = positive("plane_spacing", plane_spacing, "m")
     for name, method in methods.items():
         for scene in scenes.values():
-            _check_method(name, method, scene, counts[name], seed)
+            _check_method(name, method, scene, counts[name])
     planes = {name: _plane_points(scene, plane_spacing) for name, scene in scenes.items()}
     # The digest of our source does not cover methods and obstacles of the user's own.
     obstacles = [type(obstacle) for scene in scenes.values() for obstacle in scene.obstacles]
@@ -136,8 +136,10 @@ def _check_kinds(scenes: object, methods: object, solver: object, config: object
 
 
 def _require_method(where: str, method: object) -> None:
-    accepted = "must be a function of an objective, and of trials and seed if it has random choices"
-    if not callable(method):
+    if isinstance(method, Method):
+        return
+    accepted = "must be a Method or a function of an objective, and of trials and seed if it is random"
+    if not callable(method) or isinstance(method, type):
         raise invalid(where, method, accepted)
     try:
         signature = inspect.signature(method)
@@ -146,11 +148,17 @@ def _require_method(where: str, method: object) -> None:
         raise invalid(where, method, f"{accepted} ({error})") from error
 
 
-def _check(methods: Mapping[str, Method], trials: int | Mapping[str, int], seed: int) -> dict[str, int]:
+def _is_random(method: StudyMethod) -> bool:
+    if isinstance(method, Method):
+        return method.random
+    return "trials" in inspect.signature(method).parameters
+
+
+def _check(methods: Mapping[str, StudyMethod], trials: int | Mapping[str, int], seed: int) -> dict[str, int]:
     """Check seed and counts; returns the number of trials of each method."""
     if integer_at_least("seed", seed, 0) > _LARGEST_SEED:
         raise invalid("seed", seed, f"must be an integer from 0 to {_LARGEST_SEED}")
-    random = [name for name, method in methods.items() if "trials" in inspect.signature(method).parameters]
+    random = [name for name, method in methods.items() if _is_random(method)]
     if not isinstance(trials, Mapping):
         count = integer_at_least("trials", trials, 1)
         trials = dict.fromkeys(random, count)
@@ -176,42 +184,34 @@ def _propagator(scene: Scene, solver: Mapping[str, Any], kept: StudyFolder) -> P
         raise ValueError(f"solver: {error}") from error
 
 
-class _FirstEvaluationError(Exception):
-    """Ends a method that has come as far as its first evaluation."""
-
-
-class _Probe:
-    """An objective that ends the method instead of observing anything."""
-
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
-        self.evaluations = 0
-
-    def __call__(self, drive: torch.Tensor) -> torch.Tensor:
-        raise _FirstEvaluationError
-
-    @property
-    def transfer_matrix(self) -> torch.Tensor:
-        """What gradient ascent asks for, once its settings are checked."""
-        raise _FirstEvaluationError
-
-
-def _check_method(name: str, method: Method, scene: Scene, trials: int, seed: int) -> None:
-    """Have the method check its settings now, not after minutes of simulation."""
+def _check_method(name: str, method: StudyMethod, scene: Scene, trials: int) -> None:
+    """Check a method's settings against a scene now, not after minutes of simulation."""
+    if not isinstance(method, Method):
+        return
+    problem = Problem(len(scene.array), len(scene.control_points), scene=scene)
     try:
-        _solve(method, _Probe(scene), range(min(trials, _FIRST_BLOCK)), seed)
-    except _FirstEvaluationError:
-        pass
+        method.require_fit(problem, min(trials, BLOCK))
     except ValueError as error:
         raise ValueError(f"method {name}: {error}") from error
 
 
-def _package(code: Callable[..., Any]) -> str:
-    function = code.func if isinstance(code, functools.partial) else code
-    return str(getattr(function, "__module__", "")).partition(".")[0]
+def name_of(method: StudyMethod) -> str:
+    """Return the name of a method, or of the function that it is."""
+    while isinstance(method, functools.partial):
+        method = method.func
+    return method.name if isinstance(method, Method) else str(getattr(method, "__name__", "method"))
 
 
-def _solve(method: Method, objective: Objective, trials: Trials, seed: int) -> Solution:
+def _package(code: Method | Callable[..., Any]) -> str:
+    while isinstance(code, functools.partial):
+        code = code.func
+    own = type(code) if isinstance(code, Method) else code
+    return str(getattr(own, "__module__", "")).partition(".")[0]
+
+
+def _solve(method: StudyMethod, objective: Objective, trials: Trials, seed: int) -> Solution:
+    if isinstance(method, Method):
+        return run(method, objective, trials, seed)
     taken = inspect.signature(method).parameters
     given = zip(_GIVEN, (trials, seed), strict=True)
     return method(objective, **{key: value for key, value in given if key in taken})
@@ -220,7 +220,7 @@ def _solve(method: Method, objective: Objective, trials: Trials, seed: int) -> S
 def _run_scene(
     name: str,
     propagator: Propagator,
-    methods: Mapping[str, Method],
+    methods: Mapping[str, StudyMethod],
     counts: Mapping[str, int],
     seed: int,
     plane: torch.Tensor | None,
@@ -258,11 +258,12 @@ def _run_scene(
 def _run_trials(
     where: tuple[str, str, int], solve: Callable[..., Solution], trials: TrialFile, progress: Progress
 ) -> None:
-    """Run the trials that are missing, in blocks; `where` is scene, method and number of trials."""
+    """Run the blocks of trials of which one is missing; `where` is scene, method and number of trials."""
     scene, method, count = where
-    missing, size = trials.missing(*where), _FIRST_BLOCK
-    while missing:
-        block, missing = missing[:size], missing[size:]
+    missing = set(trials.missing(*where))
+    for block in (range(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)):
+        if missing.isdisjoint(block):
+            continue
         progress.begin(f"{scene}: {method}, {_numbered(block)} of {count}")
         begin = time.perf_counter()
         solution = solve(trials=block)
@@ -273,8 +274,7 @@ def _run_trials(
             accepted = f"must be the trials {list(block)}, or one where it has no random choices"
             raise invalid(f"method {method}", len(solution.score), accepted, "trials")
         trials.append(scene, method, block, solution, seconds)
-        progress.advance(len(block))
-        size = max(1, int(size * min(_LARGEST_GROWTH, _BLOCK_SECONDS / seconds, _LARGEST_BLOCK / size)))
+        progress.advance(len(missing.intersection(block)))
 
 
 def _numbered(trials: Sequence[int]) -> str:

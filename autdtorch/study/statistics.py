@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from scipy import stats
 
-from autdtorch.methods.base import Solution
+from autdtorch.methods.solution import Solution
 from autdtorch.study.results import MethodResult
 
 CONFIDENCE = 0.95

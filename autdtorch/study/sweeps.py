@@ -14,8 +14,8 @@ import torch
 
 from autdtorch.io.scene_file import load_scene
 from autdtorch.io.yaml_file import parse_yaml, unresolved
-from autdtorch.methods import METHOD_LABELS
-from autdtorch.methods.base import Solution, joined
+from autdtorch.methods.catalogue import METHODS
+from autdtorch.methods.solution import Solution, joined
 from autdtorch.objectives.metrics import FocusMetrics
 from autdtorch.scene.scene import Scene
 from autdtorch.study.folder import PREVIOUS
@@ -32,7 +32,7 @@ Settings: TypeAlias = Mapping[str, Any]
 
 _Named: TypeAlias = tuple[str, Settings]
 
-_METHODS = list(METHOD_LABELS)
+_METHODS = list(METHODS)
 _FILES = "files"  # digests of what the settings name only by the path of a file
 _LONGEST_NAME = 100  # of a scene or a method; it becomes part of the names of files
 

@@ -12,7 +12,8 @@ from typing import Any, TypeAlias
 
 import torch
 
-from autdtorch.methods.base import NEAR_TIE, Solution, joined
+from autdtorch.methods.ranking import NEAR_TIE
+from autdtorch.methods.solution import Solution, joined
 from autdtorch.objectives.metrics import focus_metrics
 from autdtorch.objectives.simulated import validate_magnitudes
 from autdtorch.scene.drive import validate_single_drive
@@ -75,7 +76,7 @@ class TrialFile:
         return [trial for trial in range(trials) if (scene, method, trial) not in self._trials]
 
     def append(self, scene: str, method: str, trials: Sequence[int], found: Solution, seconds: float) -> None:
-        """Add trials that ended together.
+        """Add the trials of a block; those that the file holds already stay as they are.
 
         Args:
             scene: name.
@@ -89,10 +90,12 @@ class TrialFile:
             OSError: the file cannot be written.
         """
         share = seconds / len(trials)
+        added = [trial for trial in trials if (scene, method, trial) not in self._trials]
         for place, trial in enumerate(trials):
-            self._trials[scene, method, trial] = _alone(found, place), share
+            if trial in added:
+                self._trials[scene, method, trial] = _alone(found, place), share
         if self._lines is not None:
-            self._lines.append(*(self._row(scene, method, trial) for trial in trials))
+            self._lines.append(*(self._row(scene, method, trial) for trial in added))
 
     def found(self, scene: str, method: str, trials: int) -> tuple[Solution, torch.Tensor]:
         """What the first `trials` trials found, all of which must be there, and seconds (T,) of each."""

@@ -1,6 +1,5 @@
 """The command line: one run, an experiment, and what it says of wrong settings."""
 
-import functools
 import inspect
 import json
 import os
@@ -18,6 +17,7 @@ import autdtorch.study.run
 from autdtorch.cli.config_files import CONFIGS
 from autdtorch.cli.method_section import load_method
 from autdtorch.io.scene_file import load_scene
+from autdtorch.methods.base import Method
 from autdtorch.propagators import FreeSpacePropagator, make_propagator
 from autdtorch.study.results_file import load_results
 
@@ -65,7 +65,7 @@ def test_every_scene_builds_and_has_the_name_of_its_file(
 def test_every_method_builds_with_known_settings(
     name: str, composed: Callable[..., dict[str, object]]
 ) -> None:
-    assert isinstance(load_method("method", composed(f"method={name}")["method"], ()), functools.partial)
+    assert isinstance(load_method("method", composed(f"method={name}")["method"], ()), Method)
 
 
 @pytest.mark.parametrize("name", SOLVERS)
@@ -107,7 +107,7 @@ WRONG = [
     (["solver.spacing=abc"], "solver: spacing: 'abc'; must be a real number"),
     (["solver.spacing=nan"], "solver: spacing: nan m; must be finite"),
     (["solver.method=fast"], "solver: method: 'fast'; must be one of auto, free_space, box, full"),
-    (["method.levels=1"], "method gabs: levels: 1; must be an integer >= 2"),
+    (["method.levels=1"], "method: levels: 1; must be an integer >= 2"),
     (["trials=0"], "trials: 0; must be an integer >= 1"),
     (["seed=-1"], "seed: -1; must be an integer >= 0"),
     (["plane_spacing=1"], r"plane_spacing: 1\.0 m; must be at most 0\.1 m, the plane's edge"),
@@ -144,7 +144,7 @@ WRONG = [
         "scene: given beside an experiment, which has its own scenes: homog",
     ),
     (["experiment=paper", "scenes.two_cubes.frequency=0"], r"scenes\.two_cubes: Scene\.frequency: 0 Hz"),
-    (["experiment=paper", "methods.gabs.levels=0"], "method gabs: levels: 0"),
+    (["experiment=paper", "methods.gabs.levels=0"], r"methods\.gabs: levels: 0"),
     (["experiment=paper", "trials.gabs=0"], r"trials\.gabs: 0; must be an integer >= 1"),
     (["three_cubes"], "three_cubes: must be key=value"),
     (["hydra/launcher=nope"], r"hydra/launcher: 'nope'; must be one of basic, joblib.*autdtorch\[cluster\]"),

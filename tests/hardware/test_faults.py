@@ -26,8 +26,8 @@ from autdtorch.hardware import (
 )
 from autdtorch.hardware.emulator.bus import EmulatedBus
 from autdtorch.hardware.emulator.faults import FAULTS, FaultyBus
-from autdtorch.methods.base import Solution
 from autdtorch.methods.gabs import gabs
+from autdtorch.methods.solution import Solution
 
 METHOD = partial(gabs, levels=2, order="given")
 EVALUATIONS = 1 + 15 * 2

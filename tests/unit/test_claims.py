@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from autdtorch.methods.base import Solution
+from autdtorch.methods.solution import Solution
 from autdtorch.objectives.metrics import FocusMetrics
 from autdtorch.study.provenance import Provenance
 from autdtorch.study.report.claims import CLAIMS, judge_claims

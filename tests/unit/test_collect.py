@@ -9,9 +9,9 @@ import torch
 import yaml
 
 from autdtorch.io.scene_file import load_scene
-from autdtorch.methods.base import Solution, joined
 from autdtorch.methods.gabs import gabs
 from autdtorch.methods.lssg import lssg
+from autdtorch.methods.solution import Solution, joined
 from autdtorch.study.report.summary_table import save_summary
 from autdtorch.study.results_file import RESULTS_FILE
 from autdtorch.study.run import run_study

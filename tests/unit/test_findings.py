@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from autdtorch.methods.base import Solution
+from autdtorch.methods.solution import Solution
 from autdtorch.objectives.metrics import FocusMetrics
 from autdtorch.study.results import MethodResult
 from autdtorch.study.statistics import bound_gap, evaluations_to

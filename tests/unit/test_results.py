@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from autdtorch.methods.base import Solution
+from autdtorch.methods.solution import Solution
 from autdtorch.objectives.metrics import focus_metrics
 from autdtorch.propagators import Run
 from autdtorch.study.provenance import (

@@ -14,9 +14,9 @@ from small_scenes import AIR, CUBE, small_scene
 
 import autdtorch.study.run
 from autdtorch.analytic.green import green
-from autdtorch.methods.base import Solution
-from autdtorch.methods.gabs import gabs
-from autdtorch.methods.lssg import lssg
+from autdtorch.methods.gabs import GABS, gabs
+from autdtorch.methods.lssg import LSSG, lssg
+from autdtorch.methods.solution import Solution
 from autdtorch.objectives.simulated import Objective
 from autdtorch.propagators import FreeSpacePropagator, FullPropagator, Run, SteadyStateWarning
 from autdtorch.scene.arrays import Nodes
@@ -27,7 +27,7 @@ from autdtorch.study.run import run_study
 from autdtorch.study.trial_file import TRIALS_FILE
 
 PLANE = Plane(center=(20e-3, 12e-3, 12e-3), normal=(1, 0, 0), size=(20e-3, 16e-3))
-METHODS = {"lssg": functools.partial(lssg, levels=4), "gabs": functools.partial(gabs, levels=4)}
+METHODS = {"lssg": LSSG(levels=4), "gabs": GABS(levels=4)}
 FREE_SPACE = {"method": "free_space"}
 
 
@@ -223,9 +223,12 @@ def test_an_unreadable_file_is_computed_again(
         ({"scenes": {"a": None}}, r"scenes\.a: None; must be a Scene"),
         ({"methods": {3: gabs}}, "methods: 3; a name must be text"),
         ({"methods": gabs}, "methods: .*; must be a mapping of names to methods"),
-        ({"methods": {"m": None}}, r"methods\.m: None; must be a function of an objective"),
-        ({"methods": {"m": lambda: None}}, r"methods\.m: .*; must be a function .*too many positional"),
-        ({"methods": {"m": dict}}, r"methods\.m: .*; must be a function of an objective"),
+        ({"methods": {"m": None}}, r"methods\.m: None; must be a Method or a function of an objective"),
+        (
+            {"methods": {"m": lambda: None}},
+            r"methods\.m: .*; .*function .*too many positional",
+        ),
+        ({"methods": {"m": dict}}, r"methods\.m: .*; must be a Method or a function"),
         ({"solver": [1]}, r"solver: \(1,\); must be a mapping of arguments"),
         ({"solver": {"x": 1}}, "solver: unknown key 'x'; allowed keys: method, spacing"),
         ({"solver": {1: 1}}, "solver: unknown key 1; allowed keys"),
@@ -240,10 +243,7 @@ def test_an_unreadable_file_is_computed_again(
         ({"seed": -1}, "seed: -1"),
         ({"plane_spacing": float("nan")}, "plane_spacing: nan m"),
         ({"solver": {"spacing": -1.0}}, r"solver: spacing: -1\.0 m"),
-        (
-            {"methods": {"gabs": functools.partial(gabs, levels=1)}},
-            "method gabs: levels: 1; must be an integer >= 2",
-        ),
+        ({"methods": {"gabs": GABS(first=16)}}, "method gabs: first: 16; must be an integer from 0 to"),
     ],
 )
 def test_settings_are_checked_before_anything_is_simulated(

@@ -9,8 +9,9 @@ import pytest
 import torch
 from small_scenes import CUBE, small_scene
 
-from autdtorch.methods.base import Solution, Trials
+from autdtorch.methods.base import Trials
 from autdtorch.methods.gabs import gabs
+from autdtorch.methods.solution import Solution
 from autdtorch.objectives.simulated import Objective
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.scene import Scene
@@ -178,13 +179,13 @@ def test_trials_of_other_shapes_do_not_count_though_the_settings_are_called_the_
 def test_with_a_method_of_ones_own_everything_is_computed_again(tmp_path: Path) -> None:
     def own(objective: Objective, trials: Trials, seed: int) -> Solution:
         found = gabs(objective, levels=2, trials=trials, seed=seed)
-        calls.append(trials)  # not where only the settings are checked
+        calls.append(trials)
         return found
 
     calls: list[Trials] = []
     for count in (1, 2):
         study(tmp_path, methods={"gabs": functools.partial(own)})
-        assert len(calls) == count * 2 * 2  # two scenes, two blocks of trials
+        assert len(calls) == count * 2  # two scenes, a block of trials each
     assert sorted(contents(tmp_path / f"{PREVIOUS}1")) == sorted(FILES)
 
 

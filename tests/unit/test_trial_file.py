@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from autdtorch.methods.base import NEAR_TIE, Solution
+from autdtorch.methods.ranking import NEAR_TIE
+from autdtorch.methods.solution import Solution
 from autdtorch.study.trial_file import TRIALS_FILE, TrialFile
 from autdtorch.utils.json_lines import SET_ASIDE, line_of, row_of
 

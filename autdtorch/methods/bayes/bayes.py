@@ -101,7 +101,7 @@ class BayesOpt(Method):
             "scores": points[:, :0, 0],
             "next": points,
         }
-        return Step(self._drive(points), search)
+        return Step(drives_at(points, self.fixed_transducer), search)
 
     def tell(self, state: State, pressure: torch.Tensor) -> State:
         """Return the state after an observation; its processes are kept in `scratch`."""
@@ -122,7 +122,7 @@ class BayesOpt(Method):
             return Step(state.drives[:, :0], search)
         observed = zip(state.scratch, told, score, strict=True)
         points = torch.stack(spread(lambda one: one[0].next_point(*one[1:]), observed))[:, None]
-        return Step(self._drive(points), {**search, "next": points})
+        return Step(drives_at(points, self.fixed_transducer), {**search, "next": points})
 
     def _trials(self, problem: Problem, seeds: Sequence[int]) -> list[BayesTrial]:
         from autdtorch.methods.bayes.trial import BayesTrial, Settings  # loads Numba
@@ -149,12 +149,6 @@ class BayesOpt(Method):
             for trial, own_points, own_scores in zip(trials, points, scores, strict=True):
                 trial.next_point(own_points[begin:end], own_scores[begin:end])
         return trials
-
-    def _drive(self, points: torch.Tensor) -> torch.Tensor:
-        """Return drives (..., M) of points (..., M - 1) in turns."""
-        fixed = self.fixed_transducer
-        parts = [points[..., :fixed], torch.zeros_like(points[..., :1]), points[..., fixed:]]
-        return drive_from_phases(2 * math.pi * torch.cat(parts, dim=-1))
 
 
 def bayes_opt(
@@ -193,7 +187,13 @@ def bayes_opt(
         ValueError: an argument out of range, an array of one transducer, or pressures or scores that are not
             finite.
     """
-    method = BayesOpt(
-        evaluations, initial, fixed_transducer, acquisition, embedding, initial_points, noise
-    )
+    method = BayesOpt(evaluations, initial, fixed_transducer, acquisition, embedding, initial_points, noise)
     return run(method, objective, trials, seed, score=score)
+
+
+def drives_at(points: torch.Tensor, fixed_transducer: int) -> torch.Tensor:
+    """Return drives (..., M) of points (..., M - 1) in turns; the fixed transducer has phase 0."""
+    before, after = points[..., :fixed_transducer], points[..., fixed_transducer:]
+    return drive_from_phases(
+        2 * math.pi * torch.cat([before, torch.zeros_like(points[..., :1]), after], dim=-1)
+    )

@@ -14,7 +14,7 @@ from typing import TypeAlias
 
 import torch
 
-from autdtorch.methods import label_of
+from autdtorch.methods.catalogue import label_of
 from autdtorch.study.results import MethodResult, SceneResult, StudyResult
 from autdtorch.study.statistics import Interval, bootstrap, share_interval
 

@@ -14,7 +14,7 @@ import torch
 import autdtorch
 from autdtorch.hardware.log import Evaluation, EvaluationLog
 from autdtorch.hardware.preflight import Preflight
-from autdtorch.methods.base import Solution
+from autdtorch.methods.solution import Solution
 from autdtorch.objectives.simulated import Objective
 from autdtorch.plot.trials import plot_convergence
 from autdtorch.study.report.tables import code, fenced, table
