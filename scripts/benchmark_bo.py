@@ -23,7 +23,7 @@ from large_arrays import autd3_array, with_array
 
 import autdtorch as at
 from autdtorch.methods.base import trial_seeds
-from autdtorch.methods.bayes.bayes import NOISE
+from autdtorch.methods.bayes.bayes import NOISE, drives_at
 from autdtorch.objectives.simulated import weakest_focus
 
 SCENES = Path(__file__).parents[1] / "configs" / "scene"
