@@ -2,6 +2,7 @@
 
 import math
 import pickle
+from dataclasses import replace
 
 import igl
 import numpy as np
@@ -190,6 +191,18 @@ def test_mesh_and_mask_survive_pickling_without_their_files(folder, box_mesh):
     mesh, voxels = pickle.loads(packed)
     torch.testing.assert_close(mesh.signed_distance(cloud()), box_mesh.signed_distance(cloud()))
     assert voxels.upper == pytest.approx((0.2, 0.3, 0.4))
+
+
+def test_a_mesh_is_moved_rescaled_and_changed_without_its_file(folder, box_mesh):
+    path = saved(folder, "read_once.obj", *box_mesh.surface())
+    mesh = Mesh(path, density=1.0, sound_speed=1.0)
+    path.unlink()
+    moved = replace(mesh, scale=2.0, offset=(1.0, 0.0, 0.0), density=3.0)
+    expected = 2 * mesh.vertices + torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    torch.testing.assert_close(moved.vertices, expected, rtol=1e-14, atol=0)
+    assert (moved.path, moved.density) == (str(path), 3.0)
+    with pytest.raises(ValueError, match=r"Mesh\.path: .*nowhere\.obj"):
+        replace(mesh, path="nowhere.obj")
 
 
 def test_voxels_that_fill_a_box_are_that_box():

@@ -1,4 +1,4 @@
-"""What is in the way: boxes, spheres, cylinders, meshes and voxels, of a material or rigid."""
+"""Obstacles: boxes, spheres, cylinders, meshes and voxel masks, of a fluid material or rigid."""
 
 from autdtorch.scene.obstacles.base import Obstacle
 from autdtorch.scene.obstacles.box import Box

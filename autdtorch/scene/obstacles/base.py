@@ -1,21 +1,20 @@
-"""What every obstacle is: a material, an extent, an inside and a distance to its surface."""
+"""The base class of obstacles: a material, a bounding box and a signed distance."""
 
 from __future__ import annotations
 
-import hashlib
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
 
 import torch
-from numpy.typing import NDArray
 
 from autdtorch.utils.validation import ArrayLike, Vector, boolean, fluid, invalid, not_negative, real_tensor
 
 
 @dataclass(frozen=True, kw_only=True)
 class Obstacle(ABC):
-    """A body in the way of sound: of a fluid material, or rigid. Unions are made by listing several.
+    """A body of a fluid material, or a rigid body. Several obstacles in a list make a union.
+
+    Obstacles are constant. `dataclasses.replace` returns one that is moved, rescaled or of another material.
 
     Attributes:
         density: of the material [kg/m^3], 1e-9 to 1e9; None if rigid.
@@ -23,7 +22,7 @@ class Obstacle(ABC):
         rigid: True for walls that do not move.
 
     Raises:
-        ValueError: density or sound speed is not a number in its range; a material and rigid, or neither.
+        ValueError: a density or sound speed out of range; both a material and rigid, or neither.
     """
 
     density: float | None = None
@@ -59,11 +58,11 @@ class Obstacle(ABC):
         """Corner of the bounding box with the largest coordinates (3,) [m]."""
 
     def contains(self, points: ArrayLike, margin: float = 0.0) -> torch.Tensor:
-        """Which points lie inside.
+        """Return whether each point lies inside.
 
         Args:
             points: (..., 3) [m].
-            margin: by how much the obstacle is grown on every side [m], >= 0.
+            margin: distance by which the obstacle is enlarged on every side [m], >= 0.
 
         Returns:
             bool (...).
@@ -76,7 +75,7 @@ class Obstacle(ABC):
         return self._inside(points.reshape(-1, 3), margin).reshape(points.shape[:-1])
 
     def signed_distance(self, points: ArrayLike) -> torch.Tensor:
-        """Distance to the surface, negative inside.
+        """Return the distance of each point to the surface, negative inside.
 
         Args:
             points: (..., 3) [m].
@@ -92,7 +91,7 @@ class Obstacle(ABC):
 
     @abstractmethod
     def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Triangles for drawing, counter-clockwise as seen from outside.
+        """Return triangles for drawing, counter-clockwise as seen from outside.
 
         Returns:
             Vertices (V, 3) [m], float64, and the vertices of each triangle (F, 3), int64.
@@ -103,21 +102,13 @@ class Obstacle(ABC):
 
     @abstractmethod
     def _distance(self, points: torch.Tensor) -> torch.Tensor:
-        """Signed distance (N,) [m] of checked `points` (N, 3) [m]."""
+        """Return the signed distances (N,) [m] of checked `points` (N, 3) [m]."""
 
 
 def distance_from_excess(excess: torch.Tensor) -> torch.Tensor:
-    """Signed distance (N,) from how far points lie beyond each of K faces at right angles (N, K)."""
+    """Return signed distances (N,) from the distances (N, K) of points beyond K perpendicular faces."""
     outside: torch.Tensor = torch.linalg.vector_norm(excess.clamp(min=0), dim=-1)
     return outside + excess.amax(dim=-1).clamp(max=0)
-
-
-def content_digest(*arrays: NDArray[Any]) -> str:
-    """What tells contents apart that are too large to compare or to print: 16 hexadecimal digits."""
-    digest = hashlib.sha256()
-    for array in arrays:
-        digest.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
-    return digest.hexdigest()[:16]
 
 
 def _points(given: ArrayLike) -> torch.Tensor:

@@ -47,25 +47,21 @@ class Box(Obstacle):
         return self._corner(0.5)
 
     def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Two triangles a face; see `Obstacle.surface`."""
+        """Return two triangles for each face; see `Obstacle.surface`."""
         signs = torch.tensor([-0.5, 0.5], dtype=torch.float64, device="cpu")
-        corners = torch.cartesian_prod(signs, signs, signs) * torch.tensor(
-            self.size, dtype=torch.float64, device="cpu"
-        )
-        center = torch.tensor(self.center, dtype=torch.float64, device="cpu")
-        return center + corners @ rotation_matrix(self.rotation).T, BOX_TRIANGLES.clone()
+        corners = torch.cartesian_prod(signs, signs, signs) * signs.new_tensor(self.size)
+        return signs.new_tensor(self.center) + corners @ rotation_matrix(
+            self.rotation
+        ).T, BOX_TRIANGLES.clone()
 
     def _corner(self, share: float) -> Vector:
-        extent = rotation_matrix(self.rotation).abs() @ torch.tensor(
-            self.size, dtype=torch.float64, device="cpu"
-        )
-        x, y, z = (
-            middle + share * length for middle, length in zip(self.center, extent.tolist(), strict=True)
-        )
+        turn = rotation_matrix(self.rotation).abs()
+        extent = (turn @ turn.new_tensor(self.size)).tolist()
+        x, y, z = (middle + share * length for middle, length in zip(self.center, extent, strict=True))
         return x, y, z
 
     def _inside(self, points: torch.Tensor, margin: float) -> torch.Tensor:
-        """Lower faces belong to the box and upper ones do not: boxes face to face share no point."""
+        """Count lower faces as inside and upper faces as outside: touching boxes share no point."""
         inner, half = self._inner(points), points.new_tensor(self.size) / 2 + margin
         return ((inner >= -half) & (inner < half)).all(dim=-1)
 
@@ -74,5 +70,5 @@ class Box(Obstacle):
         return distance_from_excess(excess)
 
     def _inner(self, points: torch.Tensor) -> torch.Tensor:
-        """Coordinates (N, 3) [m] from the centre along the edges."""
+        """Return coordinates (N, 3) [m] from the centre along the edges."""
         return (points - points.new_tensor(self.center)) @ rotation_matrix(self.rotation).to(points)

@@ -50,7 +50,7 @@ class Cylinder(Obstacle):
         return self._corner(1.0)
 
     def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """A prism with its edges on the cylinder; see `Obstacle.surface`."""
+        """Return a prism with its edges on the cylinder; see `Obstacle.surface`."""
         radius, half = self.radius, self.height / 2
         profile = torch.tensor(
             [(0, -half), (radius, -half), (radius, half), (0, half)], dtype=torch.float64, device="cpu"
@@ -59,7 +59,7 @@ class Cylinder(Obstacle):
 
     def _corner(self, sign: float) -> Vector:
         x, y, z = (
-            # The disc of an end reaches as far along a coordinate as that coordinate's axis is tilted to it.
+            # The extent of an end disc along a coordinate is the radius times the sine to the axis.
             middle + sign * (abs(along) * self.height / 2 + math.sqrt(max(0.0, 1 - along**2)) * self.radius)
             for middle, along in zip(self.center, self.axis, strict=True)
         )

@@ -1,4 +1,4 @@
-"""The body that a triangle mesh encloses. libigl reads STL files and measures distances."""
+"""Bodies enclosed by triangle meshes. libigl reads STL files and computes distances."""
 
 from __future__ import annotations
 
@@ -7,33 +7,52 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from autdtorch.scene.geometry import rotation_matrix
-from autdtorch.scene.obstacles.base import Obstacle, content_digest
+from autdtorch.scene.obstacles.base import Obstacle
 from autdtorch.scene.obstacles.mesh_file import read_obj, read_ply
+from autdtorch.utils.arrays import Array, Index
+from autdtorch.utils.digest import digest_of
 from autdtorch.utils.validation import Vector, finite_vector, invalid, path_of, positive
 
 _FORMATS = (".stl", ".obj", ".ply")
 
-_FARTHEST = 1e100  # of a vertex, in units of the file: volumes do not overflow
+_FARTHEST = 1e100
+"""Largest coordinate of a vertex, in units of the file; volumes do not overflow."""
+
+
+class _MeshPath(str):
+    """The path of a mesh file with the triangles read from it.
+
+    `dataclasses.replace` passes it on to the new mesh, so that the file is read once.
+    """
+
+    vertices: Array
+    faces: Index
+
+    @classmethod
+    def read(cls, given: object) -> _MeshPath:
+        """Check and read a file."""
+        path = cls(_checked_path(given))
+        path.vertices, path.faces = _read(str(path))
+        return path
 
 
 @dataclass(frozen=True)
 class Mesh(Obstacle):
     """The inside of a watertight triangle mesh from an STL, OBJ or PLY file.
 
-    A point r of the file comes to lie at R(rotation) scale r + offset. The file is read once. Triangles may
-    enclose cavities and several bodies, but must not cut through each other.
+    A point r of the file has the position R(rotation) scale r + offset in the scene. Triangles may enclose
+    cavities and several bodies, but must not intersect.
 
     Attributes:
-        path: of the file.
+        path: of the file. It is read once; `dataclasses.replace` keeps the triangles.
         scale: metres per unit of the file, > 0; 1e-3 for a file in millimetres.
-        offset: where the file's origin comes to lie (3,) [m].
+        offset: position of the file's origin (3,) [m].
         rotation: angles (3,) [rad] about the file's origin; see `autdtorch.scene.geometry.rotation_matrix`.
-        vertices: (V, 3) [m], float64, as they lie in the scene.
+        vertices: (V, 3) [m], float64, in the scene.
         faces: vertices of each triangle (F, 3), int64, counter-clockwise as seen from outside.
-        digest: of vertices and faces. Meshes are equal if this and the material are, wherever they come from.
+        digest: of vertices and faces. Meshes of equal digest and material are equal, whatever their files.
 
     Raises:
         ValueError: no such file, not a watertight mesh, or an attribute that is not finite, has the wrong
@@ -54,13 +73,13 @@ class Mesh(Obstacle):
         object.__setattr__(self, "scale", positive("Mesh.scale", self.scale))
         object.__setattr__(self, "offset", finite_vector("Mesh.offset", self.offset))
         object.__setattr__(self, "rotation", finite_vector("Mesh.rotation", self.rotation, "rad"))
-        object.__setattr__(self, "path", _checked_path(self.path))
-        points, faces = _read(self.path)
-        vertices = self.scale * torch.from_numpy(points) @ rotation_matrix(self.rotation).T
-        vertices = vertices + torch.tensor(self.offset, dtype=torch.float64, device="cpu")
+        path = self.path if isinstance(self.path, _MeshPath) else _MeshPath.read(self.path)
+        object.__setattr__(self, "path", path)
+        vertices = self.scale * torch.from_numpy(path.vertices) @ rotation_matrix(self.rotation).T
+        vertices = vertices + vertices.new_tensor(self.offset)
         object.__setattr__(self, "vertices", vertices)
-        object.__setattr__(self, "faces", torch.from_numpy(faces))
-        object.__setattr__(self, "digest", content_digest(vertices.numpy(), faces))
+        object.__setattr__(self, "faces", torch.from_numpy(path.faces))
+        object.__setattr__(self, "digest", digest_of(vertices, self.faces)[:16])
 
     @property
     def lower(self) -> Vector:
@@ -75,11 +94,11 @@ class Mesh(Obstacle):
         return x, y, z
 
     def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Copies of `vertices` and `faces`; see `Obstacle.surface`."""
+        """Return copies of `vertices` and `faces`; see `Obstacle.surface`."""
         return self.vertices.clone(), self.faces.clone()
 
     def _distance(self, points: torch.Tensor) -> torch.Tensor:
-        """To the nearest triangle; the pseudonormal there gives the sign (Baerentzen & Aanaes 2005)."""
+        """Measure to the nearest triangle, with the sign of its pseudonormal (Baerentzen & Aanaes 2005)."""
         if len(points) == 0:
             return points.new_zeros(0)
         import igl
@@ -99,11 +118,11 @@ def _checked_path(given: object) -> str:
     return str(path)
 
 
-def _read(path: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Vertices (V, 3), each once, and faces (F, 3) of a watertight mesh, outward.
+def _read(path: str) -> tuple[Array, Index]:
+    """Return the distinct vertices (V, 3) and the outward faces (F, 3) of a watertight mesh.
 
     Raises:
-        ValueError: not such a mesh.
+        ValueError: not a mesh file, or not watertight.
     """
     import igl
 
@@ -127,8 +146,8 @@ def _read(path: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     return vertices, faces if volume > 0 else np.ascontiguousarray(faces[:, ::-1])
 
 
-def _require_watertight(path: str, faces: NDArray[np.int64]) -> None:
-    """Every edge must be run through once in each direction, by the two triangles that it joins."""
+def _require_watertight(path: str, faces: Index) -> None:
+    """Check that every edge joins two triangles, which run through it in opposite directions."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     _, edge, count = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     balance = np.bincount(edge.reshape(-1), weights=np.where(edges[:, 0] < edges[:, 1], 1, -1))

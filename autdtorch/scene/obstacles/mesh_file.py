@@ -1,4 +1,4 @@
-"""Triangles of OBJ and PLY files, where libigl runs out of memory or crashes if one is damaged or forged."""
+"""Triangles from OBJ and PLY files; libigl's own readers crash on damaged or forged files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.lib.recfunctions import structured_to_unstructured, unstructured_to_s
 from numpy.typing import NDArray
 
 Triangles: TypeAlias = tuple[NDArray[np.float64], NDArray[np.int64]]
-"""Vertices (V, 3) and the indices of each triangle's vertices (F, 3), as the file has them."""
+"""Vertices (V, 3) and the indices of each triangle's vertices (F, 3), as in the file."""
 
 _HEAD = re.compile(rb"ply\r?\n.*?\nend_header\r?\n", re.DOTALL)
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
@@ -21,7 +21,7 @@ _CODES = {
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
 }
-_LENGTH = " length"  # end of the name of the column that holds the length of a list
+_LENGTH = " length"  # suffix of the column with the lengths of a list
 
 
 def read_obj(path: str) -> Triangles:
@@ -29,7 +29,7 @@ def read_obj(path: str) -> Triangles:
 
     Raises:
         OverflowError: an index is too large.
-        ValueError: a vertex or face is none. The message names the line.
+        ValueError: a bad vertex or face. The message names the line.
     """
     vertices: list[list[float]] = []
     faces: list[list[int]] = []
@@ -56,8 +56,8 @@ def read_ply(path: str) -> Triangles:
     Raises:
         LookupError: an unknown type, or no vertices or faces.
         OverflowError: a number is too large.
-        ValueError: no PLY file, faces other than triangles, indices that are no whole numbers, numbers that
-            are not of the type declared, counts below 0, or less data than is declared.
+        ValueError: not a PLY file, faces other than triangles, fractional indices, numbers of another type
+            than declared, negative counts, or less data than declared.
     """
     content = Path(path).read_bytes()
     if (head := _HEAD.match(content)) is None:
@@ -68,16 +68,16 @@ def read_ply(path: str) -> Triangles:
     for table in tables.values():
         lengths = [table[column] for column in table.dtype.names if column.endswith(_LENGTH)]
         if not all((length == 3).all() for length in lengths):
-            raise ValueError("lists of other than three entries")
+            raise ValueError("lists without exactly three entries")
     vertex, face = tables["vertex"], tables["face"]
     corners = face["vertex_indices" if "vertex_indices" in face.dtype.names else "vertex_index"]
     if not (np.isfinite(corners) & (corners == np.trunc(corners))).all():
-        raise ValueError("indices of vertices that are no whole numbers")
+        raise ValueError("indices of vertices that are not whole numbers")
     return np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float64), corners.astype(np.int64)
 
 
 def _index(word: str, count: int) -> int:
-    """An index from 0 on; the file counts from 1 on, or backwards from the last of `count` vertices."""
+    """Return an index from 0; the file counts from 1, or backwards from the last of `count` vertices."""
     index = int(word.partition("/")[0])
     if index == 0:
         raise ValueError("vertex 0; vertices are counted from 1")
@@ -88,7 +88,7 @@ _Element: TypeAlias = tuple[str, int, Any]
 
 
 def _elements(head: str) -> tuple[str, list[_Element]]:
-    """Byte order, empty for text, and name, count and dtype of each element; lists are taken to have 3."""
+    """Return the byte order, empty for text, and name, count and dtype of each element, lists of three."""
     order = ""
     columns: list[tuple[str, int, list[Any]]] = []
     for line in head.splitlines():
@@ -121,7 +121,7 @@ def _text(body: bytes, elements: list[_Element]) -> dict[str, Any]:
         widths = [dtype[column].shape[0] if dtype[column].shape else 1 for column in dtype.names]
         rows, numbers = numbers[: count * sum(widths)], numbers[count * sum(widths) :]
         rows = rows.reshape(count, sum(widths))
-        with np.errstate(invalid="ignore"):  # what is no integer is refused below
+        with np.errstate(invalid="ignore"):  # fractions are refused below
             tables[name] = unstructured_to_structured(rows, dtype)
         integer = np.repeat([dtype[column].base.kind in "iu" for column in dtype.names], widths)
         if (structured_to_unstructured(tables[name], np.float64) != rows)[:, integer].any():

@@ -46,7 +46,7 @@ class Sphere(Obstacle):
         return x + self.radius, y + self.radius, z + self.radius
 
     def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """A polyhedron with its vertices on the sphere; see `Obstacle.surface`."""
+        """Return a polyhedron with its vertices on the sphere; see `Obstacle.surface`."""
         angles = torch.linspace(0, math.pi, SEGMENTS // 2 + 1, dtype=torch.float64, device="cpu")
         profile = self.radius * torch.stack([angles.sin(), -angles.cos()], dim=-1)
         return revolved(profile, self.center, (0.0, 0.0, 1.0))

@@ -9,10 +9,9 @@ import torch
 from autdtorch.scene.geometry import plane_basis
 from autdtorch.utils.validation import Vector
 
-#: Sides of the polygon that stands for a circle: its corners are on the circle, its sides 0.2 % inside.
 SEGMENTS = 48
+"""Sides of the polygon drawn for a circle: corners on the circle, sides up to 0.2 % of the radius inside."""
 
-#: Of a box with its corners in the order of `torch.cartesian_prod`, two for each of -x, +x, -y, +y, -z, +z.
 BOX_TRIANGLES = torch.tensor(
     [
         *((0, 1, 3), (0, 3, 2)),
@@ -25,18 +24,20 @@ BOX_TRIANGLES = torch.tensor(
     dtype=torch.int64,
     device="cpu",
 )
+"""Triangles of a box with corners in the order of `torch.cartesian_prod`, two for each face
+from -x, +x, -y to +z."""
 
 
 def revolved(profile: torch.Tensor, center: Vector, axis: Vector) -> tuple[torch.Tensor, torch.Tensor]:
-    """The body that a profile sweeps out around an axis.
+    """Return the surface of the body of revolution of a profile.
 
     Args:
-        profile: (K, 2) [m], distance from the axis and position along it, upwards; its ends on the axis.
-        center: what the positions are counted from (3,) [m].
+        profile: (K, 2) [m], distance from the axis and position along it, upwards; both ends on the axis.
+        center: origin of the positions along the axis (3,) [m].
         axis: unit vector (3,).
 
     Returns:
-        Vertices (V, 3) [m] and triangles (F, 3): `SEGMENTS` of them between neighbouring rings or poles.
+        Vertices (V, 3) [m] and triangles (F, 3); every ring has `SEGMENTS` vertices.
     """
     rings, count = len(profile) - 2, SEGMENTS
     u, v = plane_basis(axis)

@@ -1,4 +1,4 @@
-"""The union of the voxels of a boolean array."""
+"""Bodies of voxels."""
 
 from __future__ import annotations
 
@@ -12,32 +12,34 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from autdtorch.scene.obstacles.base import Obstacle, content_digest
+from autdtorch.scene.obstacles.base import Obstacle
 from autdtorch.scene.obstacles.triangles import BOX_TRIANGLES
+from autdtorch.utils.digest import digest_of
 from autdtorch.utils.numpy_file import read_arrays
 from autdtorch.utils.validation import Vector, finite_vector, invalid, is_dense, path_of, positive
 
 _AIR = 2
-"""Voxels of air around the body in the distance transform; farther away, distances are searched for."""
+"""Voxels of air around the body in the distance transform; points farther away use a search tree."""
 
 
 @dataclass(frozen=True)
 class VoxelMask(Obstacle):
     """A body made of cubic voxels, such as a segmented scan.
 
-    The signed distance at a voxel centre is that to the cube of the nearest voxel of the other kind. Between
-    centres it is linear: right at flat faces, up to half a voxel off at edges, corners and half way through.
+    The signed distance at a voxel centre is the distance to the cube of the nearest voxel of the other kind.
+    Between centres it is interpolated: exact at flat faces, with an error of up to half a voxel at edges and
+    corners and on the medial axis.
 
     Attributes:
-        mask: (nx, ny, nz), bool, True in the body; kept as a copy that cannot be written to.
+        mask: (nx, ny, nz), bool, True in the body; a read-only copy.
         spacing: edge of a voxel [m], > 0.
         origin: corner of voxel (0, 0, 0) with the smallest coordinates (3,) [m]; voxel (i, j, k) has its
             centre at origin + spacing (i + 1/2, j + 1/2, k + 1/2).
-        digest: of the mask. Masks of the same digest are the same.
+        digest: of the mask; compared in place of it.
 
     Raises:
-        ValueError: the mask is not boolean, not (nx, ny, nz) or nowhere True; or an attribute that is not
-            finite, has the wrong shape or is out of range; see also `Obstacle`.
+        ValueError: a mask that is not boolean, not (nx, ny, nz) or nowhere True; or another attribute that is
+            not finite, has the wrong shape or is out of range; see also `Obstacle`.
     """
 
     mask: NDArray[np.bool_] = field(repr=False, compare=False)
@@ -51,7 +53,7 @@ class VoxelMask(Obstacle):
         object.__setattr__(self, "mask", _checked_mask(self.mask))
         object.__setattr__(self, "spacing", positive("VoxelMask.spacing", self.spacing, "m"))
         object.__setattr__(self, "origin", finite_vector("VoxelMask.origin", self.origin))
-        object.__setattr__(self, "digest", content_digest(self.mask))
+        object.__setattr__(self, "digest", digest_of(self.mask)[:16])
 
     @classmethod
     def load(
@@ -78,7 +80,7 @@ class VoxelMask(Obstacle):
             The obstacle.
 
         Raises:
-            ValueError: no such file, or another content; see also `VoxelMask`.
+            ValueError: no such file, or no single array in it; see also `VoxelMask`.
         """
         mask = _read(path_of("VoxelMask.path", path))
         return cls(mask, spacing, origin, density=density, sound_speed=sound_speed, rigid=rigid)
@@ -94,7 +96,7 @@ class VoxelMask(Obstacle):
         return self._corner(self._extent[1])
 
     def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """The faces between voxels in and out of the body; see `Obstacle.surface`."""
+        """Return the faces between voxels of body and air; see `Obstacle.surface`."""
         mask = np.pad(self.mask, 1)
         signs = np.array([0, 1])
         corners = np.stack(np.meshgrid(signs, signs, signs, indexing="ij"), axis=-1).reshape(8, 3)
@@ -109,13 +111,13 @@ class VoxelMask(Obstacle):
 
     @cached_property
     def _extent(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """First voxel of the body and one past the last, along each axis."""
+        """First voxel of the body and one past the last along each axis, (3,) each."""
         filled = np.argwhere(self.mask)
         return filled.min(axis=0), filled.max(axis=0) + 1
 
     @cached_property
     def _field(self) -> NDArray[np.float64]:
-        """Signed distance in voxels, at the voxel centres of the body's extent and `_AIR` around it."""
+        """Signed distances in voxels at the voxel centres of the body's extent, with `_AIR` around it."""
         from scipy.ndimage import distance_transform_edt
 
         first, last = self._extent
@@ -130,7 +132,7 @@ class VoxelMask(Obstacle):
 
     @cached_property
     def _shell(self) -> Any:
-        """Search tree of the body's outer voxels, in voxels of the mask."""
+        """Search tree of the body's outer voxels."""
         from scipy.ndimage import binary_erosion
         from scipy.spatial import KDTree
 
@@ -142,11 +144,11 @@ class VoxelMask(Obstacle):
         return x, y, z
 
     def _voxels(self, points: torch.Tensor) -> NDArray[np.float64]:
-        """Positions (N, 3) in voxels, those of voxel centres being whole numbers."""
+        """Return positions (N, 3) in voxels; voxel centres have whole numbers."""
         return np.asarray(points.detach().cpu().numpy() - self.origin, np.float64) / self.spacing - 0.5
 
     def _inside(self, points: torch.Tensor, margin: float) -> torch.Tensor:
-        """A voxel holds its lower faces and not its upper ones."""
+        """Count the lower faces of a voxel as inside and the upper faces as outside."""
         mask = self.mask
         voxel = np.floor(self._voxels(points) + 0.5)
         within = ((voxel >= 0) & (voxel < mask.shape)).all(axis=1)
@@ -170,7 +172,7 @@ class VoxelMask(Obstacle):
 
 
 def _to_cube(offset: NDArray[Any], axis: int) -> NDArray[np.float64]:
-    """Distance to a cube of edge 1 whose centre lies at `offset`, with the coordinates along `axis`."""
+    """Return the distance to a unit cube whose centre is at `offset`; coordinates are along `axis`."""
     return np.asarray(np.linalg.norm(np.maximum(np.abs(offset) - 0.5, 0), axis=axis), np.float64)
 
 
