@@ -1,1 +1,1 @@
-"""Files: scenes in YAML, arrays, drives and fields."""
+"""Files of scenes, arrays, drives and fields."""

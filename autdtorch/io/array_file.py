@@ -14,11 +14,11 @@ from autdtorch.scene.geometry import device_axes, in_plane
 from autdtorch.utils.numpy_file import read_arrays
 from autdtorch.utils.validation import ArrayLike, invalid, path_of, points_tensor, real_tensor
 
-#: Columns of a CSV file that say where a transducer is and where it points, and their units.
 PLACE_COLUMNS = {"x": "m", "y": "m", "z": "m"}
+"""Columns of a CSV file with the positions of transducers, and their units."""
 NORMAL_COLUMNS = {"nx": "", "ny": "", "nz": ""}
-#: Other columns that drive files have.
-_PASSED_OVER = {"transducer": "", "phase": "rad", "amplitude": ""}
+"""Columns with the directions of emission."""
+_IGNORED = {"transducer": "", "phase": "rad", "amplitude": ""}
 
 
 def load_array(
@@ -29,28 +29,28 @@ def load_array(
     source_strength: float | None = None,
     radius: float | None = None,
 ) -> TransducerArray:
-    """Read an array from a file, and move it as a whole; by default it stays where the file has it.
+    """Read an array from a file, and place it in the scene; by default, in the coordinates of the file.
 
     - `.csv`: columns `x [m]`, `y [m]`, `z [m]` (or `[mm]`), and `nx`, `ny`, `nz` for the directions of
-      emission; without these it is +z.
-    - `.npz`: arrays `positions` (M, 3) [m] and `normals` (M, 3) or (3,), and numbers `source_strength` [Pa m]
-      and `radius` [m] if they are not the defaults of `TransducerArray`.
-    - `.pat`: a board of OpenMPD, emitting along +z; `OpenMPDBoard.load` gives its calibration too.
+      emission, by default +z.
+    - `.npz`: arrays `positions` (M, 3) [m] and `normals` (M, 3) or (3,), optionally the numbers
+      `source_strength` [Pa m] and `radius` [m].
+    - `.pat`: a board of OpenMPD, emitting along +z; `OpenMPDBoard.load` also reads its calibration.
 
-    The drives that `save_drive` writes as .csv and .npz hold the array and can be read here.
+    Files that `save_drive` writes without a device hold the array, too.
 
     Args:
-        path: of the file; its suffix says what it is.
-        center: where the origin of the file goes (3,) [m].
-        normal: where its z axis points (3,).
-        angle: of its x axis from u towards v [rad], (u, v) being `plane_basis(normal)`.
-        source_strength: [Pa m], > 0; None for what the file says, or else the default of its kind.
-        radius: of the discs [m], 0 for points; None for what the file says, or else the default of its kind.
+        path: of the file; the suffix decides the format.
+        center: position of the file's origin (3,) [m].
+        normal: direction of its z axis (3,).
+        angle: of its x axis from u towards v [rad], with (u, v) = `plane_basis(normal)`.
+        source_strength: [Pa m], > 0; None for the value in the file, or else the default of its format.
+        radius: of the discs [m], 0 for points; None for the value in the file, or the default of its format.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: another suffix, a file that is not of its kind, or an argument that is not accepted. The
-            message names the file, and the line where it has lines.
+        ValueError: another suffix, bad content, or a bad argument. The message names the file, and the line
+            where it has lines.
     """
     kind = path_of("path", path).suffix.lower()
     if kind == ".pat":
@@ -70,7 +70,7 @@ def load_array(
 
 
 def _from_csv(path: str | os.PathLike[str]) -> TransducerArray:
-    table = read_table(path, PLACE_COLUMNS | NORMAL_COLUMNS | _PASSED_OVER)
+    table = read_table(path, PLACE_COLUMNS | NORMAL_COLUMNS | _IGNORED)
     for wanted in (PLACE_COLUMNS, NORMAL_COLUMNS):
         missing = [name for name in wanted if name not in table]
         if missing and (wanted is PLACE_COLUMNS or len(missing) < 3):

@@ -1,4 +1,4 @@
-"""Tables of numbers in CSV files whose header names the columns and their units, such as `x [mm]`."""
+"""Tables of numbers in CSV files with columns and units in the header, such as `x [mm]`."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from autdtorch.utils.validation import require_known
 
 Column: TypeAlias = npt.NDArray[np.float64]
 
-#: What a column may be given in, by its SI unit, and what that is in SI.
 _UNITS: dict[str, dict[str, float]] = {
     "": {"": 1.0},
     "m": {"m": 1.0, "mm": 1e-3},
     "rad": {"rad": 1.0, "deg": math.pi / 180},
 }
+"""Factors to SI of the accepted units, by SI unit."""
 
 
 def read_table(path: str | os.PathLike[str], columns: Mapping[str, str]) -> dict[str, Column]:
-    """Read a table; empty lines and lines that begin with # are skipped.
+    """Read a table; empty lines and lines that start with # are skipped.
 
     Args:
         path: of the file, in UTF-8, with commas.
-        columns: names that may occur, and their SI units: "m" (the file may say mm), "rad" (or deg) or "".
+        columns: SI units by name of the columns that may occur: "m" (or mm in the file), "rad" (or deg), "".
 
     Returns:
-        The columns that the file has (R,) in SI units, by name.
+        The columns (R,) of the file in SI units, by name.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: an unknown or double column, a unit missing or unknown, a row of another length, something
-            that is no finite number, or no row. The message names file, line and column.
+        ValueError: an unknown or repeated column, a missing or unknown unit, a row of another length, a cell
+            that is not a finite number, or no row. The message names file, line and column.
     """
     rows = _rows(path)
     try:
@@ -57,7 +57,7 @@ def read_table(path: str | os.PathLike[str], columns: Mapping[str, str]) -> dict
 
 
 def write_table(path: str | os.PathLike[str], columns: Mapping[str, npt.NDArray[np.generic]]) -> None:
-    """Write columns (R,) by header; floats with all digits that they need."""
+    """Write columns (R,) by header, floats with full precision."""
     with replacing(Path(path)) as partial, partial.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
@@ -65,7 +65,7 @@ def write_table(path: str | os.PathLike[str], columns: Mapping[str, npt.NDArray[
 
 
 def _rows(path: str | os.PathLike[str]) -> Iterator[tuple[int, list[str]]]:
-    """Number and cells of every line that holds something."""
+    """Yield the number and cells of every line that is neither empty nor a comment."""
     with Path(path).open(encoding="utf-8-sig", newline="") as file:
         reader = csv.reader(file)
         try:
@@ -78,7 +78,7 @@ def _rows(path: str | os.PathLike[str]) -> Iterator[tuple[int, list[str]]]:
 
 
 def _column(where: str, cell: str, columns: Mapping[str, str]) -> tuple[str, float]:
-    """Name of a column, and what its unit is in SI."""
+    """Return the name of a column and the factor to SI of its unit."""
     match = re.fullmatch(r"([^\[\]]*?)\s*(?:\[(.*)\])?", cell)
     name, unit = (match[1], match[2] or "") if match else (cell, "")
     require_known(where, [name], columns, "column")

@@ -1,7 +1,7 @@
 """Fields on regular grids in files: VTK image data (.vti) for ParaView, and HDF5.
 
-VTK's XML format is written here: its own library is a large dependency, and the small writers have no
-directions, which a plane in space needs.
+VTK's XML format is written directly: VTK is a large dependency, and small writers lack the direction matrix
+of a tilted plane.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _HDF5 = (".h5", ".hdf5")
 
 
 class _Grid(NamedTuple):
-    """Points origin + i spacing[0] axes[0] + j spacing[1] axes[1] + k spacing[2] axes[2] [m]."""
+    """A grid of points origin + i spacing[0] axes[0] + j spacing[1] axes[1] + k spacing[2] axes[2] [m]."""
 
     origin: Array  # (3,) of the first point
     spacing: Array  # (3,)
@@ -44,21 +44,21 @@ def save_field(
     """Write the complex pressure on a regular grid or plane of points.
 
     - `.vti`: VTK image data, for ParaView and PyVista. Point data pressure_real, pressure_imag and
-      pressure_magnitude [Pa], field data frequency [Hz]; lengths in m. A grid that lies along x, y and z gets
-      VTK's own axes, any other a direction matrix (VTK 9 and later).
+      pressure_magnitude [Pa], field data frequency [Hz]; lengths in m. A grid along x, y and z has VTK's own
+      axes, a tilted grid a direction matrix (VTK 9 and later).
     - `.h5`, `.hdf5`: the dataset `pressure`, complex128, of the shape given; its attributes: units "Pa",
       origin (3,), the first point; spacing (n,) and axes (n, 3), unit vectors, of its n axes; length_units
       "m"; frequency; frequency_units "Hz"; time_convention "exp(-i omega t)".
 
     Args:
-        path: of the file, which is replaced; its suffix says the format.
+        path: of the file, which is replaced; the suffix decides the format.
         pressure: complex (Nx, Ny, Nz) or (Nu, Nv) [Pa], amplitudes for e^{-i w t}.
         points: (Nx, Ny, Nz, 3) as from `cell_centers`, or (Nu, Nv, 3) as from `Plane.points` [m].
         frequency: of the drive [Hz], > 0.
 
     Raises:
-        ValueError: another suffix, shapes that do not agree, or points that are no regular right-angled grid
-            of at least two points along two axes.
+        ValueError: another suffix, shapes that do not agree, or points that are not a regular right-angled
+            grid with at least two points along two axes.
     """
     kind = path_of("path", path).suffix.lower()
     if kind not in (".vti", *_HDF5):
@@ -77,7 +77,7 @@ def save_field(
 
 
 def _grid(points: Array) -> _Grid:
-    """The regular grid that `points` (Nx, Ny, Nz, 3) or (Nu, Nv, 3) are."""
+    """Return the regular grid of `points` (Nx, Ny, Nz, 3) or (Nu, Nv, 3)."""
     shape = points.shape[:-1] + (1,) * (4 - points.ndim)
     points = points.reshape(*shape, 3)
     long = [axis for axis in range(3) if shape[axis] > 1]
@@ -92,7 +92,7 @@ def _grid(points: Array) -> _Grid:
     if spacing[long].min() < LENGTH_TOLERANCE:
         raise ValueError("points: two coincide; must be a grid")
     if len(long) == 2:
-        # The axis of one point: the normal, with a step that no reader needs but that is none of zero.
+        # The axis of one point: the normal, with any step > 0.
         (flat,) = {0, 1, 2} - set(long)
         spacing[flat] = spacing[long].min()
         steps[flat] = np.cross(steps[flat - 2], steps[flat - 1]) / spacing[long].max()
@@ -118,7 +118,7 @@ def _write_hdf5(path: Path, pressure: torch.Tensor, grid: _Grid, frequency: floa
 
 
 def _along_coordinates(pressure: Array, grid: _Grid) -> tuple[Array, _Grid]:
-    """The same field with its axes along +x, +y and +z, where they lie along coordinate axes at all."""
+    """Reorder the field to axes along +x, +y and +z, if its axes are parallel to them."""
     nearest = np.abs(grid.axes).argmax(axis=1)
     if np.abs(grid.axes[range(3), nearest]).min() < 1 - 1e-12:
         return pressure, grid
@@ -142,7 +142,7 @@ def _write_vti(path: Path, pressure: torch.Tensor, grid: _Grid, frequency: float
     }
     extent = " ".join(f"0 {count - 1}" for count in values.shape)
     size = values.size * 8
-    # The appended blocks stand one after the other, each behind its length.
+    # Each appended block follows its length.
     entries = "".join(
         f'<DataArray type="Float64" Name="{name}" format="appended" offset="{place * (size + 8)}"/>\n'
         for place, name in enumerate(arrays)
@@ -170,7 +170,7 @@ _"""
 
 
 def _append(file: BinaryIO, block: Array) -> None:
-    """A block of appended data: its length, then the values with x the fastest."""
+    """Append a block of data: its length, then the values with x fastest."""
     file.write(np.uint64(block.size * 8).tobytes())
     file.write(np.asarray(block, dtype=np.float64).tobytes(order="F"))
 

@@ -1,4 +1,4 @@
-"""YAML that others may have written: values within bounds, which name no function and no variable."""
+"""YAML files from others: bounded in size, without functions and without environment variables."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 
     Config: TypeAlias = DictConfig | ListConfig
 
-_LARGEST = 2_000_000  # characters, aliases expanded: OmegaConf takes 50 MB and 5 s for them
-_LEAST = 32  # characters that every key, value and collection counts for
-_INTERPOLATION = 10_000  # characters that one counts for: OmegaConf takes 0.3 ms to resolve it
+_LARGEST = 2_000_000  # characters with aliases expanded, for which OmegaConf takes 50 MB and 5 s
+_LEAST = 32  # characters counted for a key, value or collection, at least
+_INTERPOLATION = 10_000  # characters counted for an interpolation, which takes OmegaConf 0.3 ms
 _LONGEST = 10_000  # characters of one key or value
-_DEEPEST = 32  # collections in collections, aliases expanded
-_SHOWN = 80  # characters of what is refused, in messages
+_DEEPEST = 32  # levels of nesting with aliases expanded
+_SHOWN = 80  # characters of a refused text in messages
 
 _ACCEPTED = (
     "must be valid YAML: a mapping without tags, "
@@ -32,7 +32,7 @@ _REFERENCE = re.compile(r"\$\{[\w.\[\]]+\}")
 
 @dataclass
 class _Extent:
-    """Size [characters] and depth of a YAML node, aliases expanded."""
+    """Size [characters] and depth of a YAML node with aliases expanded."""
 
     anchor: str | None
     size: int = _LEAST
@@ -44,11 +44,11 @@ class _Extent:
 
 
 def load_yaml(path: str | os.PathLike[str]) -> Config:
-    """Read a YAML file as `parse_yaml` reads a text.
+    """Read a YAML file with the checks of `parse_yaml`.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: its content is not accepted. The message names the file, and the line where there is one.
+        ValueError: bad content. The message names the file, and the line if it is known.
     """
     with Path(path).open(encoding="utf-8") as file:
         try:
@@ -59,14 +59,14 @@ def load_yaml(path: str | os.PathLike[str]) -> Config:
 
 
 def parse_yaml(text: str, where: str) -> Config:
-    """Read YAML as OmegaConf does, after bounding what it expands to.
+    """Read YAML with OmegaConf, after checking the size with aliases expanded.
 
     Args:
         text: a mapping or a list.
         where: name of the text, for messages.
 
     Raises:
-        ValueError: not YAML, a tag, too large or too deep.
+        ValueError: not YAML, with a tag, too large or too deep.
     """
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
@@ -84,14 +84,10 @@ def parse_yaml(text: str, where: str) -> Config:
 
 
 def unresolved(config: Config, where: str) -> Any:
-    """Return what a configuration holds as plain dictionaries and lists, its interpolations as they stand.
-
-    Args:
-        config: it may come from others.
-        where: its name, for messages.
+    """Return a configuration as checked dictionaries and lists, with unresolved interpolations.
 
     Raises:
-        ValueError: as of `plain`.
+        ValueError: as for `plain`.
     """
     from omegaconf import OmegaConf
 
@@ -99,16 +95,16 @@ def unresolved(config: Config, where: str) -> Any:
 
 
 def plain(value: Any, where: str) -> Any:
-    """Return mappings, sequences and scalars as plain dictionaries and lists, after checking them.
+    """Return mappings, sequences and scalars as checked dictionaries and lists.
 
     Args:
-        value: interpolations of an OmegaConf node are resolved; those of others are to be checked before
-            by `unresolved`.
+        value: interpolations of an OmegaConf node are resolved; check a node from others by `unresolved`
+            before.
         where: name of the value, for messages.
 
     Raises:
-        ValueError: too large, too deep, or a text with an interpolation other than one whole `${key}`. Any
-            other could call a resolver, which reads the environment, or grow without limit.
+        ValueError: too large, too deep, or a text with an interpolation other than one whole `${key}`. Others
+            could call a resolver, which reads the environment, or grow without limit.
     """
     from omegaconf import OmegaConf
 
@@ -140,7 +136,7 @@ def plain(value: Any, where: str) -> Any:
 
 
 def _require_bounded(text: str) -> None:
-    """Check the extent of what the text expands to, before anything is built from it."""
+    """Check size and depth with aliases expanded, before anything is built from the text."""
     import yaml
 
     if len(text) > _LARGEST:
@@ -151,7 +147,7 @@ def _require_bounded(text: str) -> None:
         match event:
             case yaml.CollectionStartEvent():
                 unfinished.append(_Extent(event.anchor))
-                named[event.anchor] = _Extent(None, size=_LARGEST + 1)  # in itself, it would have no end
+                named[event.anchor] = _Extent(None, size=_LARGEST + 1)  # an alias in itself
             case yaml.CollectionEndEvent():
                 node = unfinished.pop()
                 named[node.anchor] = node
@@ -166,10 +162,10 @@ def _require_bounded(text: str) -> None:
 
 
 def _problem(event: Any, level: int, collection: _Extent) -> str:
-    """Text on what is wrong with an event in a collection at that level; empty if nothing is."""
+    """Return the problem of an event in a collection at that level, or an empty text."""
     text = getattr(event, "value", "")
-    if text and level == 0:  # OmegaConf would parse it as YAML once more
-        return f"{text[:_SHOWN]!r} is no mapping"
+    if text and level == 0:  # OmegaConf would parse a text as YAML again
+        return f"{text[:_SHOWN]!r} is not a mapping"
     if len(text) > _LONGEST:
         return f"a text of {len(text)} characters, more than {_LONGEST}"
     if (tag := getattr(event, "tag", None)) is not None:

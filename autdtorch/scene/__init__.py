@@ -1,1 +1,1 @@
-"""The scene: transducer array, medium, obstacles, control points, and the geometry they stand on."""
+"""Scenes: transducer array, medium, obstacles and control points."""

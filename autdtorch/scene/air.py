@@ -1,8 +1,7 @@
-"""Humid air: density, sound speed and absorption, from temperature, humidity and pressure.
+"""Density, sound speed and absorption of humid air, from temperature, humidity and pressure.
 
-Density and sound speed are those of an ideal gas of dry air and water vapour. Absorption is that of
-ISO 9613-1:1993, whose vapour pressure is used throughout; ANSI S1.26 and Bass et al., J. Acoust. Soc. Am. 97
-(1995) 680-683, have the same equations.
+Air is an ideal gas of dry air and water vapour. Absorption and vapour pressure follow ISO 9613-1:1993, whose
+equations are also those of ANSI S1.26 and of Bass et al., J. Acoust. Soc. Am. 97 (1995) 680-683.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ _DRY_AIR, _WATER = 28.9647e-3, 18.01528e-3  # kg/mol
 
 
 def vapour_fraction(temperature: float, relative_humidity: float, pressure: float) -> float:
-    """Share of water vapour among the molecules of air (ISO 9613-1, Eqs. B.1 to B.3).
+    """Return the molar fraction of water vapour in air (ISO 9613-1, Eqs. B.1 to B.3).
 
     Args:
         temperature: [deg C], -20 to 50.
@@ -47,12 +46,12 @@ def vapour_fraction(temperature: float, relative_humidity: float, pressure: floa
 def density_and_sound_speed(
     temperature: float, relative_humidity: float, pressure: float
 ) -> tuple[float, float]:
-    """Density [kg/m^3] and sound speed [m/s] of humid air as an ideal gas.
+    """Return the density [kg/m^3] and sound speed [m/s] of humid air as an ideal gas.
 
-    With x the vapour fraction, molecules of air have 5/2 and those of water 6/2 degrees of freedom, so that
-    c^2 = (7 + x)/(5 + x) R T / M (Bohn, J. Audio Eng. Soc. 36 (1988) 223-231). Between 0 and 30 deg C it is
-    within 0.05 % of the real-gas formula of Cramer (J. Acoust. Soc. Am. 93 (1993) 2510-2516), itself good to
-    0.03 %.
+    Air molecules have 5 degrees of freedom and water molecules 6, so that c^2 = (7 + x)/(5 + x) R T / M with
+    the vapour fraction x (Bohn, J. Audio Eng. Soc. 36 (1988) 223-231). Between 0 and 30 deg C the result is
+    within 0.05 % of the real-gas formula of Cramer (J. Acoust. Soc. Am. 93 (1993) 2510-2516), which is
+    accurate to 0.03 %.
 
     Args:
         temperature: [deg C], -20 to 50.
@@ -68,10 +67,10 @@ def density_and_sound_speed(
 
 
 def absorption(temperature: float, relative_humidity: float, pressure: float, frequency: float) -> float:
-    """Absorption of a pure tone [dB/m] by ISO 9613-1:1993, Eqs. 3 to 5.
+    """Return the absorption of a pure tone [dB/m] by ISO 9613-1:1993, Eqs. 3 to 5.
 
-    The standard gives it to 10 % for a vapour fraction of 0.05 to 5 %, to 20 % down to 0.005 % and to 50 % in
-    drier air.
+    The standard states an accuracy of 10 % for vapour fractions of 0.05 to 5 %, of 20 % down to 0.005 %, and
+    of 50 % in drier air.
 
     Args:
         temperature: [deg C], -20 to 50.

@@ -1,4 +1,4 @@
-"""The transducer array: where the transducers are, where they point, how strong they are."""
+"""The transducer array: positions, directions, strength and size of the transducers."""
 
 from __future__ import annotations
 
@@ -35,21 +35,21 @@ from autdtorch.utils.validation import (
     unit_vector,
 )
 
-#: On-axis pressure of a transducer at full drive, times distance [Pa m], in the paper's Eq. 2.
 PAPER_SOURCE_STRENGTH = 1 / (4 * math.pi)
+"""Source strength in the paper's Eq. 2: on-axis pressure at full drive times distance [Pa m]."""
 
 _TRANSDUCER_BYTES = 500.0
-"""Memory [bytes] of a transducer: its place and direction, and the search for its neighbours."""
+"""Memory for each transducer [bytes], with the search for its neighbours."""
 
 _RINGS, _RING_NODES = 5, 16
 
 
 class Nodes(NamedTuple):
-    """Monopoles that sources or receivers of one shape consist of.
+    """The monopoles of N sources or receivers of equal shape.
 
     Attributes:
-        positions: of the n nodes of each of N sources (N, n, 3) [m], float64.
-        weights: share of each node (n,), float64; they sum to 1.
+        positions: of the n nodes of each source (N, n, 3) [m], float64.
+        weights: of the nodes (n,), float64, with the sum 1.
     """
 
     positions: torch.Tensor
@@ -58,16 +58,16 @@ class Nodes(NamedTuple):
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
 class TransducerArray:
-    """M transducers of equal strength and size. The tensors are the array's own copies, on the CPU.
+    """An array of M transducers of equal strength and size. Its tensors are copies on the CPU.
 
-    A transducer is a point or a disc of monopoles, which is Rayleigh's integral for a flat circular piston of
-    uniform velocity. Its far field has the directivity 2 J1(k a sin t) / (k a sin t) at the angle t from the
-    normal, and is the same behind it as before it: there is no baffle.
+    A transducer is a point or a disc of monopoles, Rayleigh's integral for a flat circular piston of uniform
+    velocity. Its far field has the directivity 2 J1(k a sin t) / (k a sin t) at the angle t from the normal.
+    Without a baffle, the field behind the disc mirrors the field in front.
 
     Attributes:
         positions: (M, 3) [m], float64, all different.
         normals: directions of emission (M, 3), float64, of length 1.
-        source_strength: on-axis pressure at full drive times distance, far away [Pa m], > 0.
+        source_strength: on-axis pressure in the far field at full drive, times distance [Pa m], > 0.
         radius: of the discs [m]; 0 for point sources.
     """
 
@@ -92,8 +92,8 @@ class TransducerArray:
             radius: of the discs [m], at most half the distance of the nearest two; None or 0 for points.
 
         Raises:
-            ValueError: not finite, wrong shape, zero normal, strength <= 0, two transducers in one place, or
-                discs that could overlap.
+            ValueError: not finite, wrong shape, zero normal, strength <= 0, two transducers at one position,
+                or discs that could overlap.
         """
         places = points_tensor("TransducerArray.positions", positions).cpu()
         require_distinct("TransducerArray.positions", places)
@@ -114,11 +114,11 @@ class TransducerArray:
         source_strength: float = PAPER_SOURCE_STRENGTH,
         radius: float | None = None,
     ) -> TransducerArray:
-        """A flat rectangular array; transducer i * shape[1] + j is i pitches along u and j along v.
+        """Return a flat rectangular array; transducer i * shape[1] + j is i pitches along u and j along v.
 
         Args:
             shape: numbers of transducers along u and v, the axes of `plane_basis(normal)`.
-            pitch: distance of neighbours [m], > 0.
+            pitch: distance between neighbours [m], > 0.
             center: centre of the array (3,) [m].
             normal: direction of emission (3,).
             source_strength: [Pa m], > 0.
@@ -147,15 +147,15 @@ class TransducerArray:
         source_strength: float = AUTD3_SOURCE_STRENGTH,
         radius: float | None = TRANSDUCER_RADIUS,
     ) -> TransducerArray:
-        """AUTD3: 249 transducers a unit, in the order of the device, unit by unit.
+        """Return an array of AUTD3 units, 249 transducers each, in the order of the device, unit by unit.
 
         Args:
-            center: middle of the 18 x 14 places of a unit, of several units the middle of all (3,) [m].
+            center: centre of all units (3,) [m]; the centre of a unit is that of its 18 x 14 grid.
             normal: direction of emission (3,), the device's z.
-            angle: of the device's x from u towards v [rad], (u, v) being `plane_basis(normal)`.
-            units: numbers of units side by side along the device's x and y; unit i * units[1] + j is the
-                i-th along x and the j-th along y.
-            source_strength: [Pa m], > 0; by default as the AUTD3 SDK assumes.
+            angle: of the device's x from u towards v [rad], with (u, v) = `plane_basis(normal)`.
+            units: numbers of units along the device's x and y; unit i * units[1] + j is the i-th along x and
+                the j-th along y.
+            source_strength: [Pa m], > 0; by default the value of the AUTD3 SDK.
             radius: of the discs [m]; None or 0 for point sources.
 
         Raises:
@@ -175,15 +175,15 @@ class TransducerArray:
         source_strength: float = SONICSURFACE_SOURCE_STRENGTH,
         radius: float | None = TRANSDUCER_RADIUS,
     ) -> TransducerArray:
-        """SonicSurface: 16 x 16 transducers row by row, from the largest y down, x the fastest.
+        """Return the array of a SonicSurface: 16 x 16 transducers row by row from the largest y, x fastest.
 
-        Its firmware wants them by channel: that is done where the bytes are made.
+        The order by channel, which the firmware needs, is applied when frames are encoded.
 
         Args:
-            center: middle of the transducers (3,) [m].
+            center: centre of the array (3,) [m].
             normal: direction of emission (3,).
-            angle: of the device's x from u towards v [rad], (u, v) being `plane_basis(normal)`.
-            source_strength: [Pa m], > 0; by default as Ultraino assumes.
+            angle: of the device's x from u towards v [rad], with (u, v) = `plane_basis(normal)`.
+            source_strength: [Pa m], > 0; by default the value of Ultraino.
             radius: of the discs [m]; None or 0 for point sources.
 
         Raises:
@@ -200,15 +200,15 @@ class TransducerArray:
         source_strength: float = OPENMPD_SOURCE_STRENGTH,
         radius: float | None = TRANSDUCER_RADIUS,
     ) -> TransducerArray:
-        """A board of OpenMPD: 16 x 16 transducers column by column, each from the largest y down.
+        """Return the array of an OpenMPD board: 16 x 16 transducers column by column from the largest y.
 
-        These are the nominal positions; `OpenMPDBoard.load` reads those of one board, with its calibration.
+        Positions are nominal; `OpenMPDBoard.load` reads the positions and calibration of one board.
 
         Args:
-            center: middle of the transducers (3,) [m].
+            center: centre of the array (3,) [m].
             normal: direction of emission (3,), the device's z.
-            angle: of the device's x from u towards v [rad], (u, v) being `plane_basis(normal)`.
-            source_strength: [Pa m], > 0; by default as AcousTools assumes.
+            angle: of the device's x from u towards v [rad], with (u, v) = `plane_basis(normal)`.
+            source_strength: [Pa m], > 0; by default the value of AcousTools.
             radius: of the discs [m]; None or 0 for point sources.
 
         Raises:
@@ -218,11 +218,11 @@ class TransducerArray:
 
     @property
     def nodes(self) -> Nodes:
-        """The monopoles of each transducer, the point itself or 80 of its disc.
+        """The monopoles of each transducer: one for a point, 80 for a disc.
 
-        On a disc of radius a they are 5 rings, Gauss points in r^2, of 16 equal angles, each turned by half a
-        step against the next (Peirce, J. SIAM 5 (1957) 66-73). For k a <= 6 the field is right to 1e-6 far
-        away, at all angles, and to 1e-4 of the largest pressure at a distance of a/2 from the disc.
+        A disc of radius a has 5 rings at Gauss points in r^2, each of 16 equal angles and turned by half a
+        step against the next (Peirce, J. SIAM 5 (1957) 66-73). For k a <= 6 the error of the field is 1e-6 in
+        the far field at all angles, and 1e-4 of the largest pressure at a distance of a/2 from the disc.
         """
         if self.radius == 0:
             return Nodes(self.positions[:, None], torch.ones(1, dtype=torch.float64, device="cpu"))
@@ -232,15 +232,15 @@ class TransducerArray:
 
     @property
     def half_extents(self) -> torch.Tensor:
-        """How far each transducer reaches from its position along x, y and z (M, 3) [m]."""
+        """Half the extents of the transducers along x, y and z (M, 3) [m]."""
         return self.radius * (1 - self.normals**2).clamp(min=0).sqrt()
 
     def __len__(self) -> int:
-        """Number of transducers M."""
+        """Return the number of transducers M."""
         return len(self.positions)
 
     def __repr__(self) -> str:
-        """Count, centre and strength, with units."""
+        """Return count, centre, radius and strength, with units."""
         x, y, z = (1e3 * self.positions.mean(dim=0)).tolist()
         size = f"radius {1e3 * self.radius:.4g} mm, " if self.radius else ""
         return (
@@ -250,7 +250,7 @@ class TransducerArray:
 
 
 def _disc_rule() -> tuple[torch.Tensor, torch.Tensor]:
-    """Nodes (n, 2) and weights (n,) of a rule for the mean over the unit disc."""
+    """Return nodes (n, 2) and weights (n,) of a quadrature rule for the mean over the unit disc."""
     abscissa, weights = np.polynomial.legendre.leggauss(_RINGS)
     radius = np.sqrt((abscissa + 1) / 2)[:, None]
     ring, step = np.indices((_RINGS, _RING_NODES))

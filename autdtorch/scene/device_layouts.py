@@ -1,31 +1,32 @@
-"""Phased arrays one can have: where their transducers are on the board, in the order the device counts them.
+"""Layouts of commercial and open phased arrays, in the order of the device.
 
-Places (M, 2) [m] are along the device's own x and y, seen from the side it radiates to, around the middle.
+Positions (M, 2) [m] are along the device's x and y from its centre, as seen from the side of emission.
 """
 
 from __future__ import annotations
 
 import torch
 
-#: Radius of the radiating disc of a 10 mm transducer for 40 kHz [m] (AcousTools, Ultraino).
 TRANSDUCER_RADIUS = 4.5e-3
-#: On-axis pressure at full drive times distance [Pa m], as programs for the devices assume it. For like
-#: transducers they differ by nearly a factor of 2, and not all say whether peak or RMS: measure your own.
+"""Radius of the radiating disc of a 10 mm transducer for 40 kHz [m] (AcousTools, Ultraino)."""
+
+# Source strengths [Pa m] in programs for the devices. They differ by nearly a factor of 2 for similar
+# transducers, and not all say whether peak or RMS: measure your own.
 AUTD3_SOURCE_STRENGTH = 4.386  # AUTD3 SDK
 OPENMPD_SOURCE_STRENGTH = 3.4  # AcousTools
 SONICSURFACE_SOURCE_STRENGTH = 2.53  # Ultraino
 
 AUTD3_TRANSDUCERS = 249
-#: Width and height of a unit of AUTD3 [m], its rim included.
 AUTD3_UNIT = 192e-3, 151.4e-3
+"""Width and height of an AUTD3 unit with its rim [m]."""
 
 _AUTD3_PLACES, _AUTD3_PITCH = (18, 14), 10.16e-3
-_AUTD3_MISSING = {(1, 1), (2, 1), (16, 1)}  # places (x, y) of screws and connectors
+_AUTD3_MISSING = {(1, 1), (2, 1), (16, 1)}  # grid places (x, y) of screws and connectors
 _SQUARE_PLACES, _SQUARE_PITCH = 16, 10.5e-3
 
 
 def autd3_places(units: tuple[int, int] = (1, 1)) -> torch.Tensor:
-    """AUTD3's, 249 a unit: row by row, x the fastest, without three; units follow each other, y the fastest.
+    """Return the positions of AUTD3 units: row by row with x fastest; of several units, y fastest.
 
     Source: autd3-core 0.12.
     """
@@ -43,16 +44,16 @@ def autd3_places(units: tuple[int, int] = (1, 1)) -> torch.Tensor:
 
 
 def sonicsurface_places() -> torch.Tensor:
-    """SonicSurface's 256: row by row from the largest y down, x the fastest.
+    """Return the 256 positions of a SonicSurface: row by row from the largest y down, x fastest.
 
-    Source: the table of emitters in its Python program, in the order that it permutes to channels.
+    Source: the table of emitters in its Python program, before the permutation to channels.
     """
     across = _SQUARE_PITCH * _centred(_SQUARE_PLACES)
     return torch.cartesian_prod(-across, across).flip(1)
 
 
 def openmpd_places() -> torch.Tensor:
-    """OpenMPD's 256: column by column from the smallest x up, each from the largest y down.
+    """Return the 256 positions of an OpenMPD board: columns from the smallest x, each from the largest y.
 
     Source: the positions in the board files of OpenMPD and AcousTools.
     """

@@ -17,12 +17,12 @@ from autdtorch.utils.validation import (
     real_tensor,
 )
 
-#: How far |q| may exceed 1: the rounding of a drive computed in float32.
 AMPLITUDE_TOLERANCE = 1e-6
+"""Excess of |q| over 1 that is accepted: the rounding error of a drive computed in float32."""
 
 
 def drive_from_phases(phases: ArrayLike, amplitudes: ArrayLike | None = None) -> torch.Tensor:
-    """Drive q = a e^{-i phi} (Eq. 1); differentiable in both arguments.
+    """Return the drive q = a e^{-i phi} (Eq. 1); differentiable in both arguments.
 
     Args:
         phases: (..., M) [rad].
@@ -52,19 +52,19 @@ def drive_from_phases(phases: ArrayLike, amplitudes: ArrayLike | None = None) ->
 
 
 def phases_of(drive: ArrayLike) -> torch.Tensor:
-    """Phases in [0, 2 pi) [rad] of a `drive` (..., M); 0 where the drive is 0.
+    """Return the phases of a `drive` (..., M) in [0, 2 pi) [rad]; 0 where the drive is 0.
 
     Raises:
         ValueError: not finite complex numbers.
     """
     drive = complex_tensor("drive", drive)
     phases = torch.remainder(-torch.angle(drive), 2 * math.pi)
-    # remainder rounds a phase just below 0 up to 2 pi itself and keeps -0; the angle of -0 is pi.
+    # remainder rounds a phase just below 0 to 2 pi and keeps -0, and the angle of -0 is pi.
     return torch.where((phases >= 2 * math.pi) | (phases == 0) | (drive == 0), 0.0, phases)
 
 
 def amplitudes_of(drive: ArrayLike) -> torch.Tensor:
-    """Amplitudes |q| of a `drive` (..., M).
+    """Return the amplitudes |q| of a `drive` (..., M).
 
     Raises:
         ValueError: not finite complex numbers.
@@ -73,11 +73,11 @@ def amplitudes_of(drive: ArrayLike) -> torch.Tensor:
 
 
 def focus_phases(positions: ArrayLike, focus: ArrayLike, wavenumber: float) -> torch.Tensor:
-    """Phases that focus on a point in free space: phi_i = k |r_f - r_i| (Eq. 3), not wrapped.
+    """Return phases that focus on a point in free space: phi_i = k |r_f - r_i| (Eq. 3), not wrapped.
 
     Args:
         positions: transducers (M, 3) [m].
-        focus: (3,), or several foci (P, 3), each for itself [m].
+        focus: (3,), or P foci (P, 3), each with its own phases [m].
         wavenumber: k [rad/m], > 0.
 
     Returns:
@@ -96,7 +96,7 @@ def focus_phases(positions: ArrayLike, focus: ArrayLike, wavenumber: float) -> t
 
 
 def normalise(drive: ArrayLike) -> torch.Tensor:
-    """`drive` (..., M) scaled so that the largest amplitude over the last axis is 1 (Eq. 6).
+    """Scale a `drive` (..., M) to a largest amplitude of 1 over the last axis (Eq. 6).
 
     Raises:
         ValueError: not finite complex numbers, or a drive that is zero everywhere.
@@ -111,7 +111,7 @@ def normalise(drive: ArrayLike) -> torch.Tensor:
 
 
 def validate_drive(drive: ArrayLike, transducers: int) -> torch.Tensor:
-    """`drive` as complex128 after checking that an array of `transducers` can play it.
+    """Return `drive` as complex128 after checking that it suits an array of `transducers`.
 
     Args:
         drive: complex (..., M), |q| <= 1 up to rounding.
@@ -131,7 +131,7 @@ def validate_drive(drive: ArrayLike, transducers: int) -> torch.Tensor:
 
 
 def validate_single_drive(drive: ArrayLike, transducers: int) -> torch.Tensor:
-    """One `drive` (M,) as `validate_drive` gives it.
+    """Return a single `drive` (M,), checked as by `validate_drive`.
 
     Raises:
         ValueError: another shape, not finite complex numbers, or an amplitude above 1.

@@ -1,4 +1,4 @@
-"""Points and planes in space: bases of planes, rotations, points on circles, the observation plane."""
+"""Bases of planes, rotations, points on circles, and the observation plane."""
 
 from __future__ import annotations
 
@@ -24,35 +24,35 @@ from autdtorch.utils.validation import (
 )
 
 _POINT_BYTES = 100.0
-"""Memory [bytes] of a point while it is placed."""
+"""Memory for each generated point [bytes]."""
 
 
 class Coordinates(torch.Tensor):
-    """A tensor on the CPU that `numpy.array` takes without a warning; what is computed with it is plain.
+    """A tensor on the CPU that `numpy.array` takes without a warning. Operations return plain tensors.
 
-    NumPy 2 passes `copy` to `__array__`; PyTorch's own does not know it, of which NumPy warns.
+    NumPy 2 passes `copy` to `__array__` and warns that PyTorch's own method does not accept it.
     """
 
     __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
 
     def __array__(self, dtype: npt.DTypeLike | None = None, copy: bool | None = None) -> npt.NDArray[Any]:
-        """Return the values, copied as `numpy.array` says."""
+        """Return the values, copied as `copy` says."""
         return np.array(self.numpy(), dtype=dtype, copy=copy)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Coordinates:
-        """Return a tensor with values of its own."""
+        """Return a copy of the same class."""
         return self.clone().as_subclass(Coordinates)
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Return what stores a plain tensor, the kind that `torch.load` takes."""
+        """Pickle as a plain tensor, which `torch.load` accepts."""
         return self.as_subclass(torch.Tensor).__reduce_ex__(protocol)  # type: ignore[no-untyped-call]
 
 
 def plane_basis(normal: ArrayLike) -> tuple[torch.Tensor, torch.Tensor]:
-    """Orthonormal axes (u, v) of the plane with `normal`, right-handed: u x v = normal / |normal|.
+    """Return orthonormal axes (u, v) of the plane with `normal`, right-handed: u x v = normal / |normal|.
 
-    u is the projection into the plane of the coordinate axis that cyclically follows the axis `normal` is
-    closest to, so that normal +x gives (y, z), +y (z, x), +z (x, y), and -x gives (y, -z).
+    u is the projection into the plane of the coordinate axis that cyclically follows the axis nearest to
+    `normal`. So normal +x gives (y, z), +y (z, x), +z (x, y), and -x gives (y, -z).
 
     Args:
         normal: (3,), of any length > 0.
@@ -69,18 +69,18 @@ def plane_basis(normal: ArrayLike) -> tuple[torch.Tensor, torch.Tensor]:
     u[axis] += 1.0
     u = u / torch.linalg.vector_norm(u)
     v = torch.linalg.cross(n, u)
-    # Adding 0 turns -0 into 0, which would otherwise show in every printed point.
+    # Adding 0 turns -0 into 0 for printing.
     return u + 0.0, v + 0.0
 
 
 def in_plane(places: ArrayLike, center: ArrayLike, normal: ArrayLike, angle: float = 0.0) -> torch.Tensor:
-    """Places of a flat device, given along its own x and y, in the plane through `center`.
+    """Transform positions from the coordinates of a flat device to those of the scene.
 
     Args:
         places: (M, 2) [m], or (M, 3) with heights along `normal`.
-        center: where the device's origin goes (3,) [m].
-        normal: where its z axis points (3,).
-        angle: of its x axis from u towards v [rad], (u, v) being `plane_basis(normal)`.
+        center: position of the device's origin (3,) [m].
+        normal: direction of its z axis (3,).
+        angle: of its x axis from u towards v [rad], with (u, v) = `plane_basis(normal)`.
 
     Returns:
         Points (M, 3) [m], float64.
@@ -96,7 +96,7 @@ def in_plane(places: ArrayLike, center: ArrayLike, normal: ArrayLike, angle: flo
 
 
 def device_axes(normal: ArrayLike, angle: float = 0.0) -> torch.Tensor:
-    """Axes x, y and z (3, 3), one a row, of a device that faces `normal` and is turned by `angle` [rad].
+    """Return the axes x, y and z of a device, the rows of (3, 3), for its `normal` and `angle` [rad].
 
     Raises:
         ValueError: `normal` is not three finite numbers, or is zero; `angle` is not finite.
@@ -109,15 +109,15 @@ def device_axes(normal: ArrayLike, angle: float = 0.0) -> torch.Tensor:
 
 
 def rotation_matrix(rotation: Vector) -> torch.Tensor:
-    """Matrix R of the rotation by angles (a, b, c) about x, then y, then z, the axes staying where they are.
+    """Return the matrix of the rotation about the fixed axes x, then y, then z.
 
-    R = Rz(c) Ry(b) Rx(a) (extrinsic Euler angles); each is right-handed: (0, 0, pi/2) turns x into y.
+    R = Rz(c) Ry(b) Rx(a) (extrinsic Euler angles); rotations are right-handed: (0, 0, pi/2) turns x into y.
 
     Args:
         rotation: (a, b, c) [rad].
 
     Returns:
-        (3, 3), float64; a column vector r is turned into R r.
+        (3, 3), float64, for column vectors: R r.
     """
     matrix = torch.eye(3, dtype=torch.float64, device="cpu")
     for axis, angle in enumerate(rotation):
@@ -133,14 +133,14 @@ def rotation_matrix(rotation: Vector) -> torch.Tensor:
 def circle_points(
     center: ArrayLike, radius: float, count: int, normal: ArrayLike, angle: float = 0.0
 ) -> torch.Tensor:
-    """Points spread evenly over a circle: center + radius (cos(angle + 2 pi n / count) u + sin(...) v).
+    """Return equidistant points on a circle: center + radius (cos(angle + 2 pi n / count) u + sin(...) v).
 
     Args:
         center: centre of the circle (3,) [m].
         radius: its radius [m], > 0.
         count: number of points, >= 1.
-        normal: normal of its plane (3,); (u, v) is `plane_basis(normal)`.
-        angle: where point 0 lies, from u towards v [rad].
+        normal: normal of its plane (3,); (u, v) = `plane_basis(normal)`.
+        angle: of point 0 from u towards v [rad].
 
     Returns:
         Points (count, 3) [m], float64.
@@ -160,7 +160,7 @@ def circle_points(
 
 @dataclass(frozen=True)
 class Plane:
-    """A rectangle in space on which a field is sampled.
+    """A rectangle on which a field is sampled.
 
     Attributes:
         center: centre (3,) [m].
@@ -193,13 +193,13 @@ class Plane:
         return self._at(signs * self.size[0] / 2, signs * self.size[1] / 2).reshape(4, 3)
 
     def points(self, spacing: float) -> torch.Tensor:
-        """Centres of the equal cells that cover the plane.
+        """Return the centres of equal cells that fill the plane.
 
         Args:
-            spacing: wanted edge of a cell [m], > 0. The cells fill the plane, with edges Lu / Nu and Lv / Nv.
+            spacing: target edge of a cell [m], > 0; the edges are Lu / Nu and Lv / Nv.
 
         Returns:
-            Points (Nu, Nv, 3) [m], float64; Nu = Lu / spacing rounded, at least 1, and Nv alike.
+            Points (Nu, Nv, 3) [m], float64; Nu = Lu / spacing, rounded to at least 1, and Nv likewise.
 
         Raises:
             ValueError: `spacing` is not a finite number > 0.

@@ -1,4 +1,4 @@
-"""What surrounds the obstacles: a uniform fluid, such as humid air."""
+"""The medium around the obstacles: a uniform fluid, such as humid air."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Medium:
     Attributes:
         density: [kg/m^3], 1e-9 to 1e9.
         sound_speed: [m/s], 1e-3 to 1e6.
-        absorption: of a plane wave at the frequency of the drive [dB/m], >= 0.
+        absorption: of a plane wave at the drive frequency [dB/m], >= 0.
 
     Raises:
         ValueError: an attribute is not finite or out of range.
@@ -40,13 +40,13 @@ class Medium:
         pressure: float = 101325.0,
         frequency: float = 40e3,
     ) -> Medium:
-        """Humid air: an ideal gas that absorbs by ISO 9613-1:1993; `autdtorch.scene.air` has its accuracy.
+        """Return humid air: an ideal gas with absorption by ISO 9613-1:1993; see `autdtorch.scene.air`.
 
         Args:
             temperature: [deg C], -20 to 50.
             relative_humidity: [%], 0 to 100.
             pressure: ambient [Pa], 50e3 to 200e3.
-            frequency: of the drive, for the absorption [Hz]; 4e-4 to 10 times the pressure in Pa.
+            frequency: drive frequency, for the absorption [Hz]; 4e-4 to 10 times the pressure in Pa.
 
         Raises:
             ValueError: an argument is not a number in its range.

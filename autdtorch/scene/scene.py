@@ -1,4 +1,4 @@
-"""The scene: medium, obstacles, control points and the array, checked once and then constant."""
+"""The scene: array, medium, obstacles and control points, checked once and then constant."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ from autdtorch.utils.validation import (
     require_kind,
 )
 
-_OVERLAP_SAMPLES = 16  # along each axis of the space that two bounding boxes share
-_DEFAULT_MARGIN = 2.0  # wavelengths of air on each side of everything, where no domain is given
+_OVERLAP_SAMPLES = 16  # along each axis of the intersection of two bounding boxes
+_DEFAULT_MARGIN = 2.0  # [wavelengths] of air on each side, where no domain is given
 
-_FARTHEST = 1e6  # m from the origin along an axis; far beyond any simulation, and near enough for cubes
-_FREQUENCIES = 1e-3, 1e12  # Hz
+_FARTHEST = 1e6  # [m] along an axis; far beyond any simulation, and volumes do not overflow
+_FREQUENCIES = 1e-3, 1e12  # [Hz]
 
-_DECIBELS = 20 / math.log(10)  # of a neper
+_DECIBELS = 20 / math.log(10)  # in a neper
 
-_USUAL_EXTENT = 0.1, 2000.0  # wavelengths from end to end of array and control points
+_USUAL_EXTENT = 0.1, 2000.0  # [wavelengths] across array and control points
 
-_MOST_ABSORPTION = 3.0  # dB per wavelength: absorption is to be a small part of the wavenumber
+_MOST_ABSORPTION = 3.0  # [dB per wavelength]: the model assumes a small imaginary part of the wavenumber
 
 
 class ScaleWarning(UserWarning):
-    """Lengths and frequency of a scene do not seem to be in metres and hertz."""
+    """The lengths or the frequency of a scene seem to be in other units than metres and hertz."""
 
 
 class OverlapWarning(UserWarning):
@@ -55,18 +55,18 @@ class OverlapWarning(UserWarning):
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
 class Scene:
-    """All that determines a field. The tensors are the scene's own copies, on the CPU.
+    """The description of a field: array, medium, frequency, obstacles and points of observation.
 
-    No coordinate of anything may be beyond 1e6 m.
+    The tensors are copies on the CPU. No coordinate may exceed 1e6 m.
 
     Attributes:
         array: the transducers.
-        medium: what surrounds the obstacles.
+        medium: the fluid around the obstacles.
         frequency: [Hz], 1e-3 to 1e12.
-        control_points: (P, 3) [m], float64, where pressure is observed; all different.
-        obstacles: may touch and overlap; where they do, the later one counts.
-        observation_plane: where pictures and areas are taken, or None.
-        domain: corners (lower, upper) [m] of the space that holds everything but what obstacles have outside.
+        control_points: (P, 3) [m], float64, where the pressure is observed; all different.
+        obstacles: may touch and overlap; in an overlap the later one counts.
+        observation_plane: plane of pictures and focal areas, or None.
+        domain: corners (lower, upper) [m] of the simulated space; obstacles may extend beyond it.
         name: for titles and file names.
     """
 
@@ -94,25 +94,25 @@ class Scene:
 
         Args:
             array: the transducers, outside the obstacles.
-            medium: what surrounds the obstacles.
+            medium: the fluid around the obstacles.
             frequency: [Hz], 1e-3 to 1e12.
             control_points: (P, 3) [m], P >= 1, outside the obstacles.
-            obstacles: may touch and overlap; where they do, the later one counts.
-            observation_plane: where pictures and areas are taken.
-            domain: corners (lower, upper) [m] around array, control points and observation plane. Obstacles
-                may reach beyond it: parallel walls and slabs across it then go on without end, others are
-                whole or end before it, as `make_propagator` says of its methods. By default the bounding box
-                of everything, obstacles included, and two wavelengths more on each side.
+            obstacles: may touch and overlap; in an overlap the later one counts.
+            observation_plane: plane of pictures and focal areas.
+            domain: corners (lower, upper) [m] around array, control points and observation plane. Walls and
+                slabs across the domain extend to infinity; for other obstacles that leave it, see the methods
+                of `make_propagator`. By default the bounding box of everything, with obstacles, and a margin
+                of two wavelengths on each side.
             name: for titles and file names.
 
         Raises:
             ValueError: a field of the wrong type or out of range, a coordinate beyond 1e6 m, a transducer or
-                control point in or on an obstacle, two points in one place, something outside the domain, or
-                a medium that absorbs more than 3 dB per wavelength.
+                control point in or on an obstacle, coincident points, a point outside the domain, or a medium
+                that absorbs more than 3 dB per wavelength.
 
         Warns:
             OverlapWarning: two obstacles of different materials overlap.
-            ScaleWarning: lengths beside the wavelength look as if in mm, or the frequency in kHz.
+            ScaleWarning: lengths seem to be in mm, or the frequency in kHz.
         """
         require_kind("Scene.array", array, TransducerArray)
         require_kind("Scene.medium", medium, Medium)
@@ -141,31 +141,31 @@ class Scene:
 
     @property
     def angular_frequency(self) -> float:
-        """Of the drive, 2 pi f [rad/s]."""
+        """Angular frequency of the drive, 2 pi f [rad/s]."""
         return 2 * math.pi * self.frequency
 
     @property
     def wavenumber(self) -> float:
-        """In the medium, k = 2 pi f / c [rad/m]."""
+        """Wavenumber in the medium, k = 2 pi f / c [rad/m]."""
         return self.angular_frequency / self.medium.sound_speed
 
     @property
     def attenuation(self) -> float:
-        """In the medium, alpha [Np/m]; a plane wave falls as e^{-alpha x}."""
+        """Attenuation in the medium, alpha [Np/m]: a plane wave decays as e^{-alpha x}."""
         return self.medium.absorption / _DECIBELS
 
     @property
     def complex_wavenumber(self) -> complex:
-        """In the medium, k + i alpha [rad/m]; a plane wave is e^{i (k + i alpha) x}."""
+        """Complex wavenumber in the medium, k + i alpha [rad/m]: a plane wave is e^{i (k + i alpha) x}."""
         return complex(self.wavenumber, self.attenuation)
 
     @property
     def wavelength(self) -> float:
-        """In the medium, c / f [m]."""
+        """Wavelength in the medium, c / f [m]."""
         return self.medium.sound_speed / self.frequency
 
     def __repr__(self) -> str:
-        """Name, frequency, counts and extent, with units."""
+        """Return name, frequency, counts and extent, with units."""
         return (
             f"Scene({self.name!r}, {self.frequency / 1e3:.4g} kHz, "
             f"wavelength {1e3 * self.wavelength:.4g} mm, {len(self.array)} transducers, "
@@ -190,7 +190,7 @@ class Scene:
         return html_facts(f"Scene {self.name!r}", facts)
 
     def _size(self, unit: float = 1e-3, digits: int = 4) -> str:
-        """Edges of the domain, in units of so many m."""
+        """Return the edges of the domain as text, in multiples of `unit` [m]."""
         lower, upper = self.domain
         return " x ".join(f"{(high - low) / unit:.{digits}g}" for low, high in zip(lower, upper, strict=True))
 
@@ -204,7 +204,7 @@ class Scene:
 
 
 def _kinds(obstacles: tuple[Obstacle, ...]) -> list[str]:
-    """How many there are of each kind and material."""
+    """Return the number of obstacles of each kind and material as texts."""
     counts = Counter(
         f"{type(obstacle).__name__} "
         + ("(rigid)" if obstacle.rigid else f"({obstacle.density:.4g} kg/m³, {obstacle.sound_speed:.4g} m/s)")
@@ -236,7 +236,7 @@ def _require_propagating(scene: Scene) -> None:
 
 
 def _contents(scene: Scene) -> list[tuple[str, torch.Tensor]]:
-    """All that must be inside the domain: names, and points (N, 3) [m] that span it."""
+    """Return names and points (N, 3) [m] of everything that must be inside the domain."""
     contents = list(_points(scene).items())
     positions, reach = scene.array.positions, scene.array.half_extents
     contents += [("Scene.array disc's lower edge", positions - reach)]
@@ -247,7 +247,7 @@ def _contents(scene: Scene) -> list[tuple[str, torch.Tensor]]:
 
 
 def _require_near(scene: Scene) -> None:
-    """Nothing so far away that its cells could not be counted."""
+    """Refuse coordinates so large that cells could not be counted."""
     for name, points in _contents(scene):
         _require_within(name, points)
     for index, obstacle in enumerate(scene.obstacles):
@@ -263,7 +263,7 @@ def _require_within(name: str, points: torch.Tensor) -> None:
 
 
 def _require_separate_points(scene: Scene) -> None:
-    """No two points in one place, none in an obstacle or on it, where rounding would choose the side."""
+    """Refuse coincident points and points in or on an obstacle; on it, rounding would choose the side."""
     require_distinct("Scene.control_points", scene.control_points)
     nodes = scene.array.nodes.positions
     gap, node = nearest(scene.control_points, nodes.reshape(-1, 3))
@@ -296,9 +296,9 @@ def _warn_of_units(scene: Scene) -> None:
 
 
 def _warn_of_overlaps(obstacles: tuple[Obstacle, ...]) -> None:
-    """Name the pairs that overlap and differ in material, for the order of the list then matters.
+    """Warn of overlapping pairs of different material, where the order of the list matters.
 
-    They are looked for at the centres of `_OVERLAP_SAMPLES`^3 cells of what two bounding boxes share.
+    The intersection of two bounding boxes is sampled at the centres of `_OVERLAP_SAMPLES`^3 cells.
     """
     pairs = [
         f"{index} overlaps {earlier}"
@@ -315,9 +315,9 @@ def _warn_of_overlaps(obstacles: tuple[Obstacle, ...]) -> None:
 
 
 def with_obstacles(scene: Scene, obstacles: Iterable[Obstacle]) -> Scene:
-    """Return a scene with some of its obstacles, or with all of them of other materials.
+    """Return the scene with other obstacles: some of its own, or all with other materials.
 
-    Their geometry is not checked, nor warned of, once more.
+    The geometry is not checked again.
     """
     changed = copy.copy(scene)
     object.__setattr__(changed, "obstacles", tuple(obstacles))
@@ -341,14 +341,14 @@ def _overlap(obstacle: Obstacle, other: Obstacle) -> bool:
 def _shared(
     box: tuple[Vector, Vector], other: tuple[Vector, Vector]
 ) -> tuple[torch.Tensor, torch.Tensor] | None:
-    """Corners of the space that two boxes (lower, upper) share; None if there is none, or they only touch."""
+    """Return the corners of the intersection of two boxes (lower, upper); None if they at most touch."""
     corners = torch.tensor([box, other], dtype=torch.float64, device="cpu")
     lower, upper = corners[:, 0].amax(dim=0), corners[:, 1].amin(dim=0)
     return (lower, upper) if (upper - lower).min() > LENGTH_TOLERANCE else None
 
 
 def _extent(lower: Vector, upper: Vector) -> str:
-    """As text; rounded, for the corners of a bounding box are computed."""
+    """Return the corners of a bounding box as text, without rounding errors."""
     low, high = (tuple(float(f"{entry:.9g}") for entry in corner) for corner in (lower, upper))
     return f"{low} to {high} m"
 

@@ -1,1 +1,1 @@
-"""Helpers that know nothing of acoustics: validation, files, memory, threads, progress."""
+"""Helpers without acoustics: validation, files, memory, threads, progress."""

@@ -1,4 +1,4 @@
-"""Tables for Jupyter, as HTML text."""
+"""HTML tables for Jupyter."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from html import escape
 
 
 def html_facts(title: str, facts: Sequence[tuple[str, str]]) -> str:
-    """A table of names and values below a title."""
+    """Return a table of names and values with a title."""
     rows = "".join(
         f'<tr><th style="text-align: left">{escape(name)}</th>'
         f'<td style="text-align: left">{escape(value)}</td></tr>'
@@ -17,7 +17,7 @@ def html_facts(title: str, facts: Sequence[tuple[str, str]]) -> str:
 
 
 def html_table(title: str, rows: Sequence[Sequence[str]]) -> str:
-    """A table below a title; the first row is its head."""
+    """Return a table with a title; the first row is the header."""
     head, *body = rows
     lines = [_row("th", head), *(_row("td", row) for row in body)]
     return f"<table>{_caption(title)}{''.join(lines)}</table>"

@@ -1,4 +1,4 @@
-"""Files of JSON lines that are only appended to, every line with a checksum."""
+"""Append-only files of JSON lines, each with a checksum."""
 
 from __future__ import annotations
 
@@ -17,29 +17,35 @@ from autdtorch.utils.files import naming, replace_file
 logger = logging.getLogger(__name__)
 
 SET_ASIDE = ".damaged"
-"""End of the name of the file, beside the first, that keeps the lines which cannot be used."""
+"""Suffix of the file, next to the first, that keeps the lines that cannot be used."""
 
-_SEAM = re.compile(rb'(?=\{")|(?<="\})')  # where a row can begin or end, if no object is in it
+_SEAM = re.compile(rb'(?=\{")|(?<="\})')  # possible start or end of a row without nested objects
 _WRONG_CHECKSUM = "its checksum is wrong"
 _BROKE_OFF = "the last line broke off"
-_DAMAGE = (ValueError, KeyError, TypeError, OverflowError, RuntimeError)  # by which a reader refuses a row
+_DAMAGE = (
+    ValueError,
+    KeyError,
+    TypeError,
+    OverflowError,
+    RuntimeError,
+)  # errors of a refused row
 
 
 def line_of(row: Mapping[str, Any], key: str = "") -> bytes:
-    """Return a row as a line, its last field the checksum of all before it; the line's end is left out.
+    """Return a row as a line without its newline; the last field is the checksum of the rest.
 
     Args:
-        row: what JSON can hold, by name; at least one field.
-        key: what the line belongs to. It is part of the checksum, so that a line of elsewhere is told apart.
+        row: JSON values by name; at least one.
+        key: the owner of the line. It is part of the checksum, so that lines of other owners are refused.
     """
     return _with_checksum(json.dumps(row)[:-1].encode(), key)
 
 
 def row_of(line: bytes, key: str = "") -> dict[str, Any]:
-    """Return the row of a line of `line_of`. Nothing is parsed before the checksum is found right.
+    """Return the row of a line made by `line_of`; nothing is parsed before the checksum is verified.
 
     Raises:
-        ValueError: the line is damaged, or of another key.
+        ValueError: the line is damaged, or has another key.
     """
     if not _is_whole(line, key):
         raise ValueError(_WRONG_CHECKSUM)
@@ -47,25 +53,24 @@ def row_of(line: bytes, key: str = "") -> dict[str, Any]:
 
 
 class JsonLines:
-    """An append-only file of JSON objects, one a line; `mend` comes before the first `append`.
+    """An append-only file of JSON objects, one per line; call `mend` before the first `append`.
 
-    A row whose checksum is right counts, also where the end of its line is damaged or missing.
+    A row with a correct checksum is used even if the end of its line is damaged or missing.
 
     Attributes:
-        used: number of the rows that were read and used.
+        used: number of rows that were read and accepted.
     """
 
     def __init__(
         self, path: Path, key: str, use: Callable[[dict[str, Any]], None], head: bytes = b""
     ) -> None:
-        """Read the file, if it is there; it is left as it is.
+        """Read the file if it exists, without changing it.
 
         Args:
             path: of the file.
-            key: what the lines belong to.
-            use: is given each row in turn. It refuses a row by a `ValueError`, or by the error of a missing
-                field or of a wrong type.
-            head: a first line, its end included, that the file begins with.
+            key: the owner of the lines.
+            use: called with each row. It refuses a row by a `ValueError`, `KeyError` or `TypeError`.
+            head: first line of the file, with its newline.
 
         Raises:
             OSError: the file cannot be read.
@@ -91,10 +96,10 @@ class JsonLines:
         self._size = len(mended)
 
     def mend(self) -> None:
-        """Set aside what is no row or was refused, restore ends of lines, write a missing head.
+        """Move damaged and refused lines to another file, and restore newlines and a missing head.
 
         Raises:
-            OSError: a file cannot be written; the one that was read is then as it was.
+            OSError: a file cannot be written; the file that was read is then unchanged.
         """
         if self._mended is None:
             return
@@ -106,17 +111,17 @@ class JsonLines:
         self._mended = None
 
     def append(self, *rows: Mapping[str, Any]) -> None:
-        """Add lines, which are on disk on return, or leave the file as it is: nothing may follow half a line.
+        """Append rows, which are on disk on return; after an error the file is unchanged.
 
         Raises:
             ValueError: the file has changed since it was read or last appended to.
             OSError: the file cannot be written, or was removed.
         """
         rest = memoryview(b"".join(line_of(row, self._key) + b"\n" for row in rows))
-        mode = "r+b" if self._size else "ab"  # the second would make a file anew that was removed
+        mode = "r+b" if self._size else "ab"  # "ab" would create a removed file again
         with naming(self._path), self._path.open(mode, buffering=0) as file:
             if file.seek(0, os.SEEK_END) != self._size:
-                raise ValueError(f"{self._path}: has changed meanwhile; open it anew, or give another file")
+                raise ValueError(f"{self._path}: has changed meanwhile; open it again, or give another file")
             try:
                 while rest:
                     rest = rest[file.write(rest) :]
@@ -139,10 +144,10 @@ class JsonLines:
 
 
 def _parts(line: bytes, key: str) -> Iterator[tuple[bool, bytes]]:
-    """Take a line apart where the end of another was lost in it.
+    """Split a line in which the newlines of other lines were lost.
 
     Yields:
-        Whole rows (True) and what is between them (False), in their order.
+        Whole rows (True) and the text between them (False), in order.
     """
     if _is_whole(line, key):
         yield True, line
@@ -154,7 +159,7 @@ def _parts(line: bytes, key: str) -> Iterator[tuple[bool, bytes]]:
 
 
 def _refusal(use: Callable[[dict[str, Any]], None], whole: bytes) -> str | None:
-    """Give a row to its reader; returns why that refused it, or None."""
+    """Pass a row to its reader; return the reason of a refusal, or None."""
     try:
         use(_row(whole))
     except KeyError as error:

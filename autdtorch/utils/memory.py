@@ -1,4 +1,4 @@
-"""The memory that this process may still use."""
+"""The memory that is available to this process."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _FILES = {
     2: ("memory.max", "memory.current", "inactive_file"),
     1: ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
 }
-"""Files of a control group by version: the limit, what is in use, and the part of it that can be dropped."""
+"""Files of a control group by version: the limit, the memory in use, and the reclaimable part of it."""
 
 
 def available_memory() -> int:
@@ -26,16 +26,16 @@ def available_memory() -> int:
 
 
 def require_memory(field: str, value: object, needed: float, unit: str = "") -> None:
-    """Refuse what would need more memory than there is.
+    """Refuse an argument that needs more memory than is available.
 
     Args:
-        field: name of the argument that decides.
+        field: name of the argument.
         value: its value.
-        needed: [bytes].
+        needed: memory [bytes].
         unit: of the value.
 
     Raises:
-        ValueError: names the field, and both figures.
+        ValueError: `needed` exceeds the available memory; the message has both figures.
     """
     if needed > (available := available_memory()):
         left = f"this process may use {available / 1e9:.3g} GB"
@@ -43,7 +43,7 @@ def require_memory(field: str, value: object, needed: float, unit: str = "") -> 
 
 
 def _left_in_groups() -> Iterator[int]:
-    """Yield what is left in each control group that this process is in."""
+    """Yield the memory left in each control group of this process."""
     with contextlib.suppress(OSError):  # not Linux
         for line in _CGROUP.read_text("utf-8").splitlines():
             _, controllers, path = line.split(":", 2)
@@ -60,7 +60,7 @@ def _left_in_groups() -> Iterator[int]:
 
 
 def _left_in_group(folder: Path, limit: str, usage: str, inactive: str) -> Iterator[int]:
-    # no such file: a group without a limit; "max": none is set
+    # a group without a limit has no such file, or "max" in it
     with contextlib.suppress(OSError, ValueError):
         most, used = (int((folder / name).read_text("ascii")) for name in (limit, usage))
         statistics = dict(line.split() for line in (folder / "memory.stat").read_text("ascii").splitlines())
@@ -68,7 +68,7 @@ def _left_in_group(folder: Path, limit: str, usage: str, inactive: str) -> Itera
 
 
 def _left_to_process() -> Iterator[int]:
-    """Yield what `ulimit -v` leaves."""
+    """Yield the memory left below the limit of `ulimit -v`."""
     with contextlib.suppress(ImportError):  # Windows
         import resource
 

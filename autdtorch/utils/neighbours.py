@@ -1,4 +1,4 @@
-"""Distances of points, and which is nearest."""
+"""Distances between points, and nearest neighbours."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from autdtorch.utils.validation import LENGTH_TOLERANCE
 
 def distances(points: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
     """Return the distances (P, M) [m] between `points` (P, 3) and `others` (M, 3)."""
-    # The default of cdist expands the square, which loses half the digits of short distances.
+    # By default cdist expands the square, which loses half the digits of short distances.
     return torch.cdist(points, others, compute_mode="donot_use_mm_for_euclid_dist")
 
 
@@ -22,12 +22,12 @@ def nearest(points: torch.Tensor, others: torch.Tensor) -> tuple[torch.Tensor, t
 
 
 def nearest_other(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the distance (P,) [m] of P >= 2 points (P, 3) to the nearest other each, and its index (P,)."""
+    """Return the distance (P,) [m] of P >= 2 points (P, 3) to their nearest others, and the indices (P,)."""
     from scipy.spatial import KDTree
 
     places = points.numpy(force=True)
     apart, index = (torch.from_numpy(found) for found in KDTree(places).query(places, k=2))
-    itself = index[:, 0] == torch.arange(len(points), device="cpu")  # one in the same place may come first
+    itself = index[:, 0] == torch.arange(len(points), device="cpu")  # a coincident point may come first
     return apart[:, 1], torch.where(itself, index[:, 1], index[:, 0])
 
 

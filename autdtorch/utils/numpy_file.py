@@ -1,4 +1,4 @@
-"""Arrays from NumPy's files, checked before they are allocated."""
+"""Arrays from NumPy files, checked before they are allocated."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from numpy.lib import format as npy
 
 from autdtorch.utils.arrays import AnyArray
 
-_LARGEST = 2**30  # bytes in a .npz file: a small one can hold many zeros
-_LONGEST_HEADER = 1000  # bytes; what NumPy writes for plain arrays has 128
-_PLAIN = "biufcU"  # kinds of values: numbers and text
+_LARGEST = 2**30  # [bytes] of unpacked arrays; a small file can hold many zeros
+_LONGEST_HEADER = 1000  # [bytes]; NumPy writes 128 for plain arrays
+_PLAIN = "biufcU"  # kinds of dtype: numbers and text
 
-#: What NumPy and zipfile raise of a damaged file.
+#: Errors of NumPy and zipfile for damaged files.
 _DAMAGE = (
     OSError,
     ValueError,
@@ -38,11 +38,11 @@ _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0
 
 
 def read_arrays(path: str | os.PathLike[str]) -> dict[str, AnyArray]:
-    """Read the arrays of a .npz file by name; a .npy file holds one without a name.
+    """Read the arrays of a .npz file by name; the array of a .npy file has the name "".
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is neither, is damaged, holds Python objects, or unpacks to more than 1 GiB. The
+        ValueError: another or a damaged file, Python objects in it, or more than 1 GiB when unpacked. The
             message names the file.
     """
     if not Path(path).is_file():

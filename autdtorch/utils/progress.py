@@ -1,4 +1,4 @@
-"""Progress of long work, with a forecast: a bar on a terminal; elsewhere and in workers lines of the log."""
+"""Progress of long work with a forecast: a bar on a terminal, log lines elsewhere and in workers."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 logger = logging.getLogger(__name__)
 
 _PATIENCE = 3.0
-"""Time [s] that work may take before its bar appears or the log has a forecast."""
+"""Time after which the bar or the first forecast in the log appears [s]."""
 
 
 class Progress:
-    """Counts steps, and says what is being done and how long it will take."""
+    """A counter of steps that shows the current task and the time left."""
 
     def __init__(self, steps: int, what: str, bar: tqdm[None] | None) -> None:
-        """Show the progress of so many steps, more or less, on a bar or in the log."""
+        """Show the progress on `bar`, or in the log if it is None; `steps` may be an estimate."""
         self._bar = bar
         self._steps = steps
         self._what = what
         self._done = 0
         self._begun = time.monotonic()
-        self._first: tuple[float, int] | None = None  # when steps were first done, and how many
+        self._first: tuple[float, int] | None = None  # time and number of the first steps
         self._next = _PATIENCE
-        self._lock = threading.Lock()  # runs go side by side
+        self._lock = threading.Lock()  # several threads run simulations
 
     def begin(self, what: str) -> None:
-        """Say what is being done from now on."""
+        """Name the current task."""
         self._what = what
         if self._bar is None:
             logger.info(what)
@@ -42,7 +42,7 @@ class Progress:
             self._bar.set_description(what)
 
     def advance(self, steps: int) -> None:
-        """Count steps that are done, by any thread."""
+        """Count finished steps; any thread may call it."""
         with self._lock:
             self._advance(steps)
 
@@ -53,7 +53,7 @@ class Progress:
             self._bar.update(steps)
             return
         now = time.monotonic()
-        if self._first is None:  # kernels may have been compiled before it, and will not be again
+        if self._first is None:  # the time before may include compiling kernels
             self._first = now, self._done
         begun, done = self._first
         spent = now - self._begun
@@ -65,11 +65,11 @@ class Progress:
 
 @contextlib.contextmanager
 def show_progress(steps: int, what: str = "") -> Iterator[Progress]:
-    """Show the progress of so many steps of `what`.
+    """Show the progress of a task.
 
     Args:
-        steps: an estimate will do.
-        what: is being done first.
+        steps: their number, or an estimate of it.
+        what: name of the first task.
     """
     if not sys.stderr.isatty() or multiprocessing.parent_process() is not None:
         yield Progress(steps, what, None)

@@ -1,4 +1,4 @@
-"""What results come from: this package's source and the packages that compute for it."""
+"""The versions behind a result: this package's source and the numerical packages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _OPTIONAL_PACKAGES = ("triton",)
 
 @lru_cache(maxsize=1)
 def source_digest() -> str:
-    """SHA-256 of the package's source: changes with any of it, so that no version can be forgotten."""
+    """Return the SHA-256 of the package's source, which changes with any edit."""
     package = Path(__file__).parents[1]
     digest = hashlib.sha256()
     for source in sorted(package.rglob("*.py")):
@@ -24,7 +24,7 @@ def source_digest() -> str:
 
 
 def package_versions() -> dict[str, str]:
-    """Versions of the packages that compute, of those of extras as far as they are installed."""
+    """Return the versions of the numerical packages; optional packages count if they are installed."""
     versions = {package: importlib.metadata.version(package) for package in _PACKAGES}
     for package in _OPTIONAL_PACKAGES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):

@@ -1,6 +1,6 @@
 """The number of threads, and work spread over them.
 
-Threads live for one call. None is left behind that would spin while it waits, or be missing after a fork.
+Threads live for one call, so that none spins while it waits and none is missing after a fork.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ _given: ContextVar[int | None] = ContextVar("threads", default=None)
 
 
 class _Outside:
-    """PyTorch's number of threads outside `one_torch_thread`, where several threads may be at once."""
+    """PyTorch's number of threads outside `one_torch_thread`, which several threads may enter at once."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._threads = self._inside = 0
 
     def threads(self) -> int:
-        """Return PyTorch's threads, or what they were before anyone entered."""
+        """Return PyTorch's number of threads before the first thread entered."""
         with self._lock:
             return self._threads if self._inside else torch.get_num_threads()
 
     def enter(self) -> int:
-        """Have one thread from now on; returns how many this thread had."""
+        """Set one thread, and return the number that this thread had before."""
         with self._lock:
             before = torch.get_num_threads()
             if not self._inside:
@@ -44,14 +44,14 @@ class _Outside:
             return before
 
     def leave(self, before: int) -> None:
-        """Have as many as before; the last to leave also restores what new threads will have."""
+        """Restore the number of threads; the last thread to leave restores the default of new threads."""
         with self._lock:
             self._inside -= 1
             torch.set_num_threads(before if self._inside else self._threads)
 
     def begin_forked(self) -> None:
-        """Have one thread in a child process, also after leaving what its parent had entered."""
-        # PyTorch's threads do not survive a fork: a forked process would wait for them without end.
+        """Set one thread in a forked process, also for the time after `leave`."""
+        # PyTorch's threads do not survive a fork, and a forked process would wait for them forever.
         self._lock, self._threads = threading.Lock(), 1
         torch.set_num_threads(1)
 
@@ -65,8 +65,8 @@ if hasattr(os, "register_at_fork"):
 def thread_count() -> int:
     """Return the number of threads that work may be spread over.
 
-    It is PyTorch's, which follows `torch.set_num_threads` and OMP_NUM_THREADS, but at most one for each
-    processor that this process may use.
+    It is PyTorch's number, set by `torch.set_num_threads` or OMP_NUM_THREADS, and at most the number of
+    processors that this process may use.
     """
     given = _given.get()
     return min(_outside.threads(), _processors()) if given is None else given
@@ -74,10 +74,10 @@ def thread_count() -> int:
 
 @contextlib.contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """Have PyTorch work on one thread for a while; also a decorator. `thread_count` stays what it was.
+    """Restrict PyTorch to one thread, without a change to `thread_count`; also a decorator.
 
-    PyTorch's threads spin while they wait for each other. Where a busy machine keeps one of them from its
-    processor, thousands of small operations take many times longer (docs/decisions/threads.md).
+    PyTorch's threads spin while they wait for each other. On a busy machine this slows thousands of small
+    operations down many times (docs/decisions/threads.md).
     """
     token = _given.set(thread_count())
     before = _outside.enter()
@@ -89,16 +89,13 @@ def one_torch_thread() -> Iterator[None]:
 
 
 def spread(function: Callable[[T], R], items: Iterable[T], most: int | None = None) -> list[R]:
-    """Return the function's values for all items, worked out on several threads.
-
-    The function spends its time in code that does not hold the interpreter's lock. What it spreads itself
-    stays on its own thread.
+    """Return the values of a function for all items, computed on several threads.
 
     Args:
-        function: of one item.
-        items: each is taken up by the next free thread, so that a thread that is kept from its processor
-            delays the others by one item.
-        most: threads; by default `thread_count()`.
+        function: of one item; it releases the interpreter lock most of the time. Nested calls of `spread` in
+            it use one thread.
+        items: each goes to the next free thread, so that a delayed thread costs at most one item.
+        most: largest number of threads; by default `thread_count()`.
     """
     items = list(items)
     threads = min(thread_count() if most is None else most, len(items))

@@ -81,7 +81,7 @@ FILES = {
     "syntax": ("name: x\nfrequency: [40e3,\nmedium: }\n", ", line 3: "),
     "key twice": ("name: x\nname: y\n", ", line 2: found duplicate key name"),
     "a list": ("- 1\n- 2\n", ": (1, 2); must be a mapping of keys to values"),
-    "a number": ("40e3\n", ", line 1: '40e3' is no mapping"),
+    "a number": ("40e3\n", ", line 1: '40e3' is not a mapping"),
     "empty": ("", ": missing key 'array'; allowed keys"),
     "not text": (b"\xff\xfe\xff", "must be valid YAML in UTF-8"),
 }
