@@ -22,7 +22,7 @@ from autdtorch.scene.scene import Scene
 MOST_JUDGED = 64
 """Targets whose pressure decides when a run has settled."""
 
-# Fitted to transfer matrices of boxes and domains at 0.6 to 2 mm: scripts/check_estimate.py says how well.
+# Fitted to transfer matrices of boxes and domains at 0.6 to 2 mm; `scripts/check.py estimate` reports errors.
 
 _CELL_BYTES, _FIELD_NUMBERS = 3.0, 2.5
 """Memory of a cell: of the assembly [bytes], and numbers of each run."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from check_kills import Subject, of_studies, wait
+from checks.kills import Subject, of_studies, wait
 from hydra import compose, initialize_config_dir
 
 from autdtorch.cli.config_files import CONFIGS

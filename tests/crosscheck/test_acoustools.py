@@ -8,8 +8,9 @@ import torch
 pytest.importorskip("acoustools", reason="needs AcousTools: install autdtorch[crosscheck]")
 pytest.importorskip("vedo", reason="AcousTools needs it: install autdtorch[crosscheck]")
 
-from benchmark_accuracy import relative_error, simulate, sphere_case
-from crosscheck_acoustools import ANGLES, boundary_elements, cube_case, cube_mesh, directivities, sphere_mesh
+from checks.acoustools import ANGLES, boundary_elements, cube_mesh, directivities, rigid_cubes, sphere_mesh
+from shared.cases import simulate, sphere_case
+from shared.scenes import relative_error
 
 
 def test_both_come_to_the_series_of_a_rigid_sphere() -> None:
@@ -23,7 +24,7 @@ def test_both_come_to_the_series_of_a_rigid_sphere() -> None:
 
 
 def test_both_agree_on_a_rigid_cube() -> None:
-    case = cube_case(1, (1.0, 0.5))
+    case = rigid_cubes(1, (1.0, 0.5))
     # 0.55 % with 768 panels of 1.2 mm, most of it AcousTools': four times as many leave half of it.
     theirs = boundary_elements(case, cube_mesh(case.scene, 3))
     assert relative_error(theirs, case.exact) < 0.01

@@ -13,7 +13,7 @@ import torch
 pytest.importorskip("autd3_emulator", reason="the AUTD3 SDK's emulator: install autdtorch[crosscheck]")
 pytest.importorskip("autd3_pattern", reason="the emulator needs it: install autdtorch[crosscheck]")
 
-from crosscheck_autd3 import (
+from checks.autd3 import (
     FOCUS,
     FULL_PULSE,
     WAVENUMBER,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from measure_boundary import measured_reflection
+from checks.boundary import measured_reflection
 
 from autdtorch.fdtd.grid import FINE_LAYER_CELLS
 

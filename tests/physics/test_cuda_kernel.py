@@ -161,7 +161,7 @@ def test_every_launch_compiles_for_a_gpu(tmp_path: Path) -> None:
     """The interpreter takes more than the compiler does."""
     environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
     run = subprocess.run(
-        [sys.executable, Path(__file__).parents[2] / "scripts" / "compile_cuda_kernel.py"],
+        [sys.executable, Path(__file__).parents[2] / "scripts" / "check.py", "cuda"],
         env=environment | {"TRITON_CACHE_DIR": str(tmp_path)}, check=True, capture_output=True, text=True,
     )  # fmt: skip
     rows = [line.split("|")[1:-1] for line in run.stdout.splitlines()[2:]]

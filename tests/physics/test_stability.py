@@ -1,4 +1,4 @@
-"""Nothing grows: the first scenes of `scripts/stress_stability.py`, in short runs on its smallest grids."""
+"""Nothing grows: the first scenes of `scripts/check.py stability`, in short runs on its smallest grids."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import logging
 from dataclasses import replace
 
 import pytest
-from random_scenes import Trial, draw_trial
-from stress_stability import run_trial
+from checks.stability import run_trial
+from shared.random_scenes import Trial, draw_trial
 
 TRIALS = [replace(draw_trial(0, number, long_share=1.0), steps=1_000) for number in range(14)]
 

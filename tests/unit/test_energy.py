@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from random_scenes import draw_trial
+from shared.random_scenes import draw_trial
 
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from check_kills import SUBJECTS, calm_run, finish, wait
+from checks.kills import SUBJECTS, calm_run, finish, wait
 from filelock import FileLock
 from small_scenes import small_scene
 

@@ -1,0 +1,282 @@
+"""Run time against error of transfer matrices: exact solutions, and the paper's cubes.
+
+    python scripts/benchmark.py accuracy                     2 to 1 mm
+    python scripts/benchmark.py accuracy --fine              with 0.5 mm
+    python scripts/benchmark.py accuracy --make-reference    the fine grids of the cubes, once
+
+Writes accuracy.json, accuracy.png and a block of benchmarks.md. Errors are complex relative L2 errors of the
+transfer matrix, for the total field and for its scattered part. Run times include the assembly of the scene.
+The paper's domain is cut to array, obstacles and first focus; symmetry makes the other three foci equal.
+Exits with 1 if an error is above its required limit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import date
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from shared import cases
+from shared.cases import Case, Simulation, cube_case, error_of, extrapolate, simulate, sphere_case
+from shared.document import command_line, fill_in, measured, percent, table
+from shared.scenes import relative_error
+
+import autdtorch as at
+from autdtorch.plot.pareto import plot_pareto
+from autdtorch.plot.style import TICK_SIZE, readable
+
+DOCUMENT = "benchmarks.md"
+
+SPACINGS = (2.0, 1.5, 1.0)  # [mm]
+FINE_SPACING = 0.5
+
+REFERENCE_SPACINGS = (0.5e-3, 1e-3 / 3, 0.25e-3, 0.2e-3)
+"""Each puts the faces of the cubes between cells, so that the errors follow one power law."""
+
+SHIFTED_SPHERES = ("rigid sphere", "sphere")
+
+
+@dataclass(frozen=True)
+class Row:
+    """A measurement.
+
+    Attributes:
+        case: name of the case.
+        treatment: "default", "extrapolated" or what else distinguishes rows of a case.
+        spacing: [mm].
+        total: relative error of the field.
+        scattered: relative error of its scattered part; None if there is none.
+        seconds: run time.
+        settled: whether all simulations reached the steady state within the tolerance.
+    """
+
+    case: str
+    treatment: str
+    spacing: float
+    total: float
+    scattered: float | None
+    seconds: float
+    settled: bool
+
+
+@dataclass(frozen=True)
+class Limit:
+    """The largest errors allowed in a case at a spacing [mm], for treatments that begin with a word."""
+
+    case: str
+    treatment: str
+    spacing: float
+    total: float
+    scattered: float | None = None
+
+
+LIMITS = (
+    Limit("free space", "default", 1.0, 0.002),
+    *(
+        Limit(case, treatment, spacing, total, scattered)
+        for case in ("sphere", "rigid sphere")
+        for treatment in ("default", "worst")
+        for spacing, total, scattered in ((1.0, 0.03, 0.1), (0.5, 0.008, 0.03))
+    ),
+    Limit("slab", "default", 1.0, 0.01),
+    Limit("piston", "default", 1.0, 0.01),
+)
+
+Orders = Mapping[tuple[str, str], float]
+"""Observed order of convergence by case and treatment."""
+
+
+def make_reference() -> None:
+    """Store the transfer matrices of the cubes on fine grids."""
+    scenes: dict[str, list[dict[str, object]]] = {}
+    for name in cases.CUBES:
+        scene, matrices = cases.close_scene(name), []
+        for spacing in REFERENCE_SPACINGS:
+            propagator = at.make_propagator(scene, "box", spacing, tolerance=cases.TOLERANCE / 2, cache=False)
+            matrices.append(propagator.transfer_matrix(scene.control_points[:1]))
+            print(f"{name} at {spacing * 1e3:.4g} mm done", flush=True)
+        limit = extrapolate(REFERENCE_SPACINGS, matrices, cases.CUBE_ORDER)
+        print(f"{name}: {relative_error(matrices[-1], limit):.1e} from the finest grid", flush=True)
+        scenes[name] = [
+            {"spacing": h, "real": g.real.tolist(), "imag": g.imag.tolist()}
+            for h, g in zip(REFERENCE_SPACINGS, matrices, strict=True)
+        ]
+    cases.CUBE_MATRICES.parent.mkdir(parents=True, exist_ok=True)
+    text = json.dumps({"command": command_line(), "scenes": scenes}, indent=1)
+    cases.CUBE_MATRICES.write_text(text + "\n", "utf-8")
+
+
+def compare(case: Case, treatment: str, spacing: float, found: Simulation) -> Row:
+    """Return the errors of a transfer matrix."""
+    total, scattered = error_of(case, found.matrix)
+    print(f"{case.name}, {treatment}, {spacing:g} mm: {percent(total)}, {found.seconds:.1f} s", flush=True)
+    return Row(case.name, treatment, spacing, total, scattered, found.seconds, found.settled)
+
+
+def sweep(case: Case, spacings: Sequence[float]) -> Iterator[Row]:
+    """Simulate at each spacing [mm], and extrapolate from each two neighbours."""
+    found = [simulate(case, h) for h in spacings]
+    for h, one in zip(spacings, found, strict=True):
+        yield compare(case, "default", h, one)
+    if case.scene.obstacles:
+        for pair, both in zip(pairwise(spacings), pairwise(found), strict=True):
+            limit = extrapolate(pair, [one.matrix for one in both], case.order)
+            seconds, settled = sum(one.seconds for one in both), all(one.settled for one in both)
+            yield compare(case, "extrapolated", pair[1], Simulation(limit, seconds, settled))
+
+
+def worst_shift(name: str, spacing: float, count: int) -> Row:
+    """Return the row with the largest total error of `count` random positions of a sphere on the grid."""
+    # Equal for every sphere and, in cells, for every spacing [mm].
+    shifts = np.random.default_rng(0).uniform(-0.5, 0.5, (count, 3)) * spacing * 1e-3
+    rows = []
+    for shift in shifts.tolist():
+        case = sphere_case(name, shift)
+        rows.append(compare(case, f"worst of {count} shifts", spacing, simulate(case, spacing)))
+    return max(rows, key=lambda one: one.total)
+
+
+def worst_point(spacing: float = 1.0) -> Row:
+    """Return the error of the piston's worst direction, relative to the pressure there."""
+    case = cases.piston_case()
+    found = simulate(case, spacing)
+    worst = cases.worst_point_error(case, found.matrix)
+    return Row(case.name, "default, worst point", spacing, worst, None, found.seconds, found.settled)
+
+
+def measure(spacings: Sequence[float], shifts: int) -> list[Row]:
+    """Measure every case."""
+    simulate(sphere_case("sphere"), 2.8)  # compiles the kernel
+    swept = [cases.free_space_case(), *map(sphere_case, cases.SPHERES)]
+    if cases.CUBE_MATRICES.exists():
+        swept += map(cube_case, cases.CUBES)
+    else:
+        print("the cubes are left out: they need --make-reference once", flush=True)
+    rows = [row for case in swept for row in sweep(case, spacings)]
+    if shifts:
+        rows += [worst_shift(name, h, shifts) for name in SHIFTED_SPHERES for h in spacings]
+    for case in (cases.slab_case(), cases.wall_case()):
+        rows.append(compare(case, "default", 1.0, simulate(case, 1.0)))
+    return [*rows, worst_point()]
+
+
+def observed_order(spacings: Sequence[float], errors: Sequence[float]) -> float:
+    """Return the least-squares slope of log error over log spacing."""
+    return float(np.polyfit(np.log(spacings), np.log(errors), 1)[0])
+
+
+def series(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
+    """Return the rows by case and treatment."""
+    found: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        found.setdefault((row.case, row.treatment), []).append(row)
+    return found
+
+
+def orders(rows: Sequence[Row]) -> Orders:
+    """Return the observed order of each series with more than one spacing."""
+    return {
+        key: observed_order([one.spacing for one in mine], [one.total for one in mine])
+        for key, mine in series(rows).items()
+        if len(mine) > 1
+    }
+
+
+def exceeded(rows: Sequence[Row]) -> tuple[int, list[str]]:
+    """Return the number of limits that apply to the rows, and a line for each exceeded one."""
+    count, lines = 0, []
+    for limit in LIMITS:
+        for row in rows:
+            if (row.case, row.spacing) != (limit.case, limit.spacing):
+                continue
+            if not row.treatment.startswith(limit.treatment):
+                continue
+            both = (("total", limit.total, row.total), ("scattered", limit.scattered, row.scattered))
+            for part, most, found in both:
+                if most is None or found is None:
+                    continue
+                count += 1
+                if not found <= most:
+                    what = f"{row.case}, {row.treatment}, {row.spacing:g} mm, {part}"
+                    lines.append(f"{what}: {percent(found)}, required at most {percent(most)}")
+    return count, lines
+
+
+def errors(rows: Sequence[Row]) -> str:
+    """Return a table with a row for each case and treatment."""
+    spacings = sorted({row.spacing for row in rows}, reverse=True)
+    found, lines = orders(rows), []
+    for (case, treatment), mine in series(rows).items():
+        at_spacing = {row.spacing: row for row in mine}
+        total = [percent(at_spacing[h].total) if h in at_spacing else "" for h in spacings]
+        one = at_spacing.get(1.0)
+        scattered = "" if one is None or one.scattered is None else percent(one.scattered)
+        seconds = "" if one is None else f"{one.seconds:.3g} s{'' if one.settled else ', not settled'}"
+        order = f"{found[case, treatment]:.2f}" if (case, treatment) in found else ""
+        lines.append([readable(case), treatment, *total, scattered, seconds, order])
+    header = [*(f"{h:g} mm" for h in spacings), "scattered, 1 mm", "run time, 1 mm", "order"]
+    return table(["case", "treatment", *header], lines)
+
+
+def figure(rows: Sequence[Row]) -> Figure:
+    """Plot the error of the field over the run time, a panel for each case with more than one spacing."""
+    swept = dict.fromkeys(case for case, _ in orders(rows))
+    drawn = {
+        case: {
+            name: mine
+            for (owner, name), mine in series(rows).items()
+            if owner == case and name in ("default", "extrapolated")
+        }
+        for case in swept
+    }
+    plotted = plot_pareto(
+        {c: {n: [(r.seconds, 100 * r.total) for r in m] for n, m in by.items()} for c, by in drawn.items()},
+        "run time [s]",
+        "relative error of the field [%]",
+        names={c: {n: [f"{r.spacing:g}" for r in m] for n, m in by.items()} for c, by in drawn.items()},
+    )
+    plotted.supxlabel(f"numbers on the front: spacing [mm]\n{command_line()}", fontsize=TICK_SIZE)
+    return plotted
+
+
+def write_report(rows: Sequence[Row], folder: Path) -> list[str]:
+    """Write accuracy.json, accuracy.png and benchmarks.md into `folder`; return the exceeded limits."""
+    count, failed = exceeded(rows)
+    limits = "\n".join(failed) if failed else f"All {count} required limits are kept."
+    parts = (measured(), "![Error over run time](accuracy.png)", limits, errors(rows))
+    fill_in(DOCUMENT, "benchmark.py accuracy", parts, folder)
+    made = {"command": command_line(), "date": date.today().isoformat(), "cores": os.cpu_count()}
+    content = json.dumps({**made, "rows": [asdict(row) for row in rows]}, indent=1)
+    (folder / "accuracy.json").write_text(content + "\n", encoding="utf-8")
+    figure(rows).savefig(folder / "accuracy.png")
+    return failed
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command line."""
+    parser.add_argument(
+        "--spacings", type=float, nargs="+", default=SPACINGS, metavar="MM", help="two or more"
+    )
+    parser.add_argument("--fine", action="store_true", help="also 0.5 mm")
+    parser.add_argument("--shifts", type=int, default=5, help="positions of the sphere on the grid")
+    parser.add_argument("--make-reference", action="store_true", help="only that")
+
+
+def main(given: argparse.Namespace) -> int:
+    """Measure, or make the reference."""
+    if given.make_reference:
+        make_reference()
+        return 0
+    spacings = sorted({*given.spacings, *([FINE_SPACING] if given.fine else [])}, reverse=True)
+    if len(spacings) < 2:
+        raise SystemExit(f"argument --spacings: {given.spacings}; must be at least two different ones")
+    failed = write_report(measure(spacings, given.shifts), given.output)
+    print(*failed, sep="\n")
+    return int(bool(failed))

@@ -1,0 +1,92 @@
+"""Memory and time of gradients, beside a simulation without.
+
+    python scripts/benchmark.py gradient            5 minutes on 2 idle cores
+
+The paper's two cubes at 1 mm, 100^3 cells and their boundary layers, in 1008 steps; gradients by the drive,
+also by the materials of the cubes, and also by density and sound speed of every cell. Each case has a process
+of its own, which compiles the kernel first. Fills in a block of performance.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import NamedTuple
+
+import torch
+from shared.document import fill_in, measured, table
+from shared.processes import in_new_process, peak_memory
+from shared.scenes import paper_scene
+
+import autdtorch as at
+
+DOCUMENT = "performance.md"
+
+STEPS_PER_PERIOD, PERIODS = 14, 72
+CASES = {"drive": "drive", "cubes": "drive, cubes' materials", "maps": "drive, maps of 100^3 cells"}
+
+
+class Cost(NamedTuple):
+    """Seconds without and with gradients; largest resident set before and after [byte]."""
+
+    forward: float
+    gradient: float
+    before: int
+    most: int
+
+
+def medium(case: str, spacing: float) -> tuple[at.Scene, dict[str, torch.Tensor]]:
+    """Return the scene of a case, and the material parameters that get gradients."""
+    scene = paper_scene("two_cubes")
+    cubes = scene.obstacles
+    if case == "drive":
+        return scene, {}
+    if case == "cubes":
+        names = ("density", "sound_speed")
+        values = (
+            torch.tensor([getattr(cube, name) for cube in cubes], dtype=torch.float64) for name in names
+        )
+        return scene, dict(zip(names, values, strict=True))
+    air = at.Scene(scene.array, scene.medium, scene.frequency, scene.control_points, domain=scene.domain)
+    centers = at.cell_centers(air, spacing)
+    inside = torch.stack([cube.contains(centers) for cube in cubes]).any(dim=0)
+    density = torch.where(inside, 100.0, 1.293).double()
+    return air, {"density": density, "sound_speed": torch.full_like(density, 340.0)}
+
+
+def gradient(case: str, spacing: float, periods: int) -> Cost:
+    """Measure a case in this process."""
+    scene, given = medium(case, spacing)
+    drive = torch.ones(len(scene.array), dtype=torch.complex128)
+    settings = {"spacing": spacing, "periods": periods, "time_step": 1 / (scene.frequency * STEPS_PER_PERIOD)}
+    begin, before = time.perf_counter(), peak_memory()
+    at.differentiable_field(scene, drive, **given, **settings)
+    middle = time.perf_counter()
+    for each in (drive, *given.values()):
+        each.requires_grad_()
+    at.differentiable_field(scene, drive, **given, **settings).abs().min().backward()
+    return Cost(middle - begin, time.perf_counter() - middle, before, peak_memory())
+
+
+def measure(case: str) -> Cost:
+    """Compile the kernel, then measure."""
+    gradient("cubes", 2e-3, 9)
+    return gradient(case, 1e-3, PERIODS)
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command line."""
+    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), help="measured cases")
+
+
+def main(given: argparse.Namespace) -> None:
+    """Measure, and write the block."""
+    rows = []
+    for case in given.cases:
+        cost = in_new_process(measure, case)
+        memory = f"{cost.most / 2**30:.2f} GiB", f"{cost.before / 2**30:.2f} GiB"
+        times = f"{cost.forward:.1f} s", f"{cost.gradient / cost.forward:.2f}"
+        rows.append([CASES[case], *times, *memory])
+        print(rows[-1], flush=True)
+    header = ["gradient by", "run without", "times that", "largest resident set", "before"]
+    fill_in(DOCUMENT, "benchmark.py gradient", (measured(), table(header, rows)), given.output)

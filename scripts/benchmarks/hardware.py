@@ -1,0 +1,191 @@
+"""Hardware trials on emulated devices: results, and evaluations per second.
+
+    python scripts/benchmark.py hardware            five to ten minutes
+
+Fills in a block of hardware.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from shared.document import fill_in, measured, table
+from shared.scenes import paper_objectives
+
+import autdtorch as at
+from autdtorch import hardware
+from autdtorch.objectives.perturbations import random_rms
+from autdtorch.study.statistics import bootstrap
+
+DOCUMENT = "hardware.md"
+
+SCENE = "three_cubes"
+DEVICES = (hardware.SONICSURFACE, hardware.OPENMPD)
+METHODS = {
+    "LSSG": lambda objective, seed: at.lssg(objective),
+    "GABS": lambda objective, seed: at.gabs(objective, seed=seed),
+    "GABS, 3 passes": lambda objective, seed: at.gabs(objective, passes=3, seed=seed),
+    "identify": lambda objective, seed: at.identify(objective, seed=seed),
+}
+SNR = 30.0  # dB
+
+_CHIP = (0x2A8D, 0x1770)
+_SENSITIVITY = 0.01  # V/Pa
+_LOUDEST = 20.0  # Pa
+
+Method = Callable[[at.Objective], at.Solution]
+Sensor = Callable[[hardware.EmulatedBench, at.Scene, int], contextlib.AbstractContextManager[hardware.Sensor]]
+
+
+class Trial(NamedTuple):
+    """A trial on an emulated device: its solution, its run time [s], and the waits of a real one [s]."""
+
+    found: at.Solution
+    seconds: float
+    waits: float
+
+
+@contextlib.contextmanager
+def readings(
+    bench: hardware.EmulatedBench, scene: at.Scene, seed: int, snr: float | None = SNR
+) -> Iterator[hardware.Sensor]:
+    """Yield a sensor whose readings have noise."""
+    yield hardware.EmulatedSensor(bench, snr, seed)
+
+
+@contextlib.contextmanager
+def oscilloscope(bench: hardware.EmulatedBench, scene: at.Scene, seed: int) -> Iterator[hardware.ScopeSensor]:
+    """Yield microphones at an oscilloscope: noise in each sample, an offset, 8 bits, and slow drift."""
+    rms = _SENSITIVITY * random_rms(bench.transfer_matrix)
+    inputs = range(len(scene.control_points))
+    emulated = hardware.EmulatedScope(
+        bench.pressure,
+        scene.frequency,
+        _SENSITIVITY,
+        inputs,
+        noise=rms * 10 ** (-SNR / 20),
+        dc_offset=0.1 * rms,
+        drift=0.01,
+        seed=seed,
+    )
+    emulated.plug_into(bench, _CHIP)
+    microphones = [hardware.Microphone(number + 1, _SENSITIVITY, _LOUDEST) for number in inputs]
+    with hardware.open_scope(_CHIP, backend=bench.bus) as scope:
+        yield hardware.ScopeSensor(scope, scene.frequency, microphones)
+
+
+noiseless = partial(readings, snr=None)
+
+
+def measure(
+    simulated: at.SimulatedObjective, device: hardware.Device, sensor: Sensor, method: Method, seed: int
+) -> Trial:
+    """Run the whole loop, with its log on disk."""
+    transducers = range(len(simulated.scene.array))
+    bench = hardware.EmulatedBench(device, simulated.transfer_matrix, transducers)
+    with (
+        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder,
+        sensor(bench, simulated.scene, seed) as opened,
+        hardware.open_link(device, transducers, backend=bench.bus) as link,
+    ):
+        limited = hardware.LimitedLink(link, hardware.Limits(amplitude=1.0))
+        log = Path(folder) / "trial.jsonl"
+        objective = hardware.HardwareObjective(simulated.scene, limited, opened, log)
+        begin, slept = time.perf_counter(), bench.bus.slept
+        found = method(objective)
+        return Trial(found, time.perf_counter() - begin, bench.bus.slept - slept)
+
+
+def same_drive(simulated: at.SimulatedObjective, device: hardware.Device, name: str, seed: int) -> bool:
+    """Return whether a trial without noise finds the drive of the simulation."""
+    method = partial(METHODS[name], seed=seed)
+    expected = method(hardware.Played(simulated, device, range(len(simulated.scene.array))))
+    found = measure(simulated, device, noiseless, method, seed).found
+    return torch.allclose(found.drive, expected.drive, rtol=0, atol=1e-9)
+
+
+def with_noise(
+    simulated: at.SimulatedObjective, device: hardware.Device, sensor: Sensor, name: str, seeds: range
+) -> list[str]:
+    """Return a row of the table of noise."""
+    on_levels = hardware.Played(simulated, device, range(len(simulated.scene.array)))
+    deviations = []
+    for seed in seeds:
+        method = partial(METHODS[name], seed=seed)
+        found = measure(simulated, device, sensor, method, seed).found
+        truly = at.weakest_focus(at.true_pressure(on_levels, found.drive))
+        deviations.append(float(truly / at.weakest_focus(method(on_levels).pressure)) - 1)
+    mean = bootstrap(torch.tensor(deviations))
+    percent = [f"{100 * value:+.1f}" for value in (mean.value, mean.low, mean.high)]
+    return [
+        device.name,
+        name,
+        f"{percent[0]} ({percent[1]} to {percent[2]})",
+        f"{100 * min(deviations):+.1f} to {100 * max(deviations):+.1f}",
+        f"{sum(abs(deviation) <= 0.05 for deviation in deviations)} of {len(seeds)}",
+    ]
+
+
+def rate(simulated: at.SimulatedObjective, device: hardware.Device, seeds: range) -> list[str]:
+    """Return a row of the table of rates: GABS, the median of its trials."""
+    trials = [
+        measure(simulated, device, noiseless, partial(METHODS["GABS"], seed=seed), seed) for seed in seeds
+    ]
+    count = int(trials[0].found.evaluations)
+    seconds = float(torch.tensor([trial.seconds for trial in trials]).median())
+    frame = device.frame(torch.zeros(device.transducers, dtype=torch.complex128))
+    wire = device.wire_time(frame)
+    return [
+        device.name,
+        f"{count / seconds:.0f}",
+        f"{1 / wire:.0f}" if wire else "-",
+        f"{count / (seconds + trials[0].waits):.0f}",
+    ]
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command line."""
+    parser.add_argument("--seeds", type=int, default=10, help="trials of each kind")
+
+
+def main(given: argparse.Namespace) -> None:
+    """Measure, and write the block."""
+    simulated, seeds = paper_objectives()[SCENE], range(given.seeds)
+    pairs = [(device, name) for device in DEVICES for name in METHODS]
+    same = [same_drive(simulated, device, name, seed) for device, name in pairs for seed in seeds]
+    noisy = [
+        [where, *with_noise(simulated, device, sensor, name, seeds)]
+        for where, sensor, devices in (
+            ("readings", readings, DEVICES),
+            ("samples of an oscilloscope", oscilloscope, DEVICES[:1]),
+        )
+        for device in devices
+        for name in METHODS
+    ]
+    names = " and ".join(device.name for device in DEVICES)
+    parts = (
+        measured(),
+        f"The scene `{SCENE}` on emulated devices, {len(seeds)} seeds. Without noise {sum(same)} of\n"
+        f"{len(same)} trials find the drive of the simulation ({names}, {len(METHODS)} methods).",
+        f"Noise {SNR:g} dB below the rms pressure of random drives, in every reading or in every sample\n"
+        f"of an oscilloscope with 8 bits, an offset, slow drift and `loudest` at {_LOUDEST:g} Pa.\n"
+        "The weakest focus of the drive found, without noise, against the simulated trial of that seed:\n"
+        "mean with its 95 % interval, range, and trials within 5 %.",
+        table(["noise in", "device", "method", "mean [%]", "range [%]", "within 5 %"], noisy),
+        "Evaluations per second of GABS: the emulated loop with its log on disk and without waiting; frames\n"
+        "per second on the serial line; and evaluations per second with all waits of a bench: frames on the\n"
+        "line, off frames between calls, and 5 ms until the sound is steady. The sensor's time is extra.",
+        table(
+            ["device", "emulated loop", "line", "with waits"],
+            [rate(simulated, device, seeds) for device in DEVICES],
+        ),
+    )
+    fill_in(DOCUMENT, "benchmark.py hardware", parts, given.output)

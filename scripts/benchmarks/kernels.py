@@ -1,0 +1,128 @@
+"""Rates of the kernels, against the bandwidth of the memory.
+
+    python scripts/benchmark.py kernels           about a minute on 2 idle cores
+
+Fills in a block of performance.md. A cell of uniform air in float32 needs 12 bytes a step: two fields read,
+one written. The bandwidth comes from a triad, c = a + b / 2, on arrays larger than all caches and on arrays
+as large as a field.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numba import njit, prange
+from shared.document import fill_in, measured, table
+from shared.scenes import paper_scene
+
+from autdtorch.fdtd.grid import make_box
+from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Kernel, Receivers, Sources, uniform_state
+from autdtorch.fdtd.kernels.cpu import CpuKernel
+from autdtorch.fdtd.kernels.reference import ReferenceKernel
+from autdtorch.fdtd.stepping import Assembly, assemble, assemble_on
+from autdtorch.propagators.scene_region import region_of
+
+DOCUMENT = "performance.md"
+
+SIDE = 112
+LARGE = 100_000_000
+"""Numbers of an array larger than all caches."""
+REPEATS = 5
+"""Repeats of each measurement; the fastest counts."""
+
+
+@njit(parallel=True, cache=True)
+def triad(a, b, c):  # type: ignore[no-untyped-def]
+    """Read two numbers, write one."""
+    for k in prange(len(a)):
+        c[k] = a[k] + np.float32(0.5) * b[k]
+
+
+def fastest(step: Callable[[int], object], work: float, seconds: float) -> float:
+    """Return the work per second of `step(times)`, with about `seconds` for each repeat."""
+    step(2)
+    begin = time.perf_counter()
+    step(3)
+    times = max(3, int(3 * seconds / (time.perf_counter() - begin)))
+    spent = []
+    for _ in range(REPEATS):
+        begin = time.perf_counter()
+        step(times)
+        spent.append(time.perf_counter() - begin)
+    return work * times / min(spent)
+
+
+def bandwidth(numbers: int, seconds: float) -> float:
+    """Return the bandwidth of a triad [byte/s]."""
+    a, b, c = (np.ones(numbers, np.float32) for _ in range(3))
+    return fastest(lambda times: [triad(a, b, c) for _ in range(times)], 12 * numbers, seconds)
+
+
+def uniform(assembly: Assembly) -> Coefficients:
+    """Return the coefficients of air without boundary layers."""
+    c, nothing = assembly.coefficients, torch.zeros(0, dtype=torch.int64)
+    dtype = assembly.dtype
+    none, silent = torch.zeros(0, dtype=dtype), torch.zeros(1, dtype=dtype)
+    return Coefficients(
+        c.center, c.face, c.edge, c.corner, c.keep, nothing, torch.zeros((0, 27), dtype=dtype), nothing,
+        silent, silent, nothing, none, Columns.none(0, dtype), Columns.none(0, dtype, width=3),
+        torch.zeros((0, 2), dtype=torch.int64),
+    )  # fmt: skip
+
+
+def cell_rate(
+    kernel: Kernel, shape: tuple[int, int, int], coefficients: Coefficients, seconds: float
+) -> float:
+    """Return the cells stepped per second, without sources and receivers."""
+    state = uniform_state(shape, coefficients, 1e-20)
+    dtype = coefficients.layer_decay.dtype
+    sources = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros((0, 2)))
+    receivers = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1), dtype=dtype))
+
+    def step(times: int) -> None:
+        nonlocal state
+        signal = torch.zeros((times, 2), dtype=dtype)
+        state, _ = kernel.advance(state, coefficients, sources, receivers, signal)
+
+    return fastest(step, float(np.prod(shape)), seconds)
+
+
+def assemblies() -> dict[str, Assembly]:
+    """Assemble the scenes at 1 mm, on the whole domain and in the box."""
+    found = {"free space": assemble(region_of(paper_scene("homogeneous")), 1e-3)}
+    for name in ("three_cubes", "two_cubes"):
+        scene, label = region_of(paper_scene(name)), name.replace("_", " ")
+        found[f"{label}, full"] = assemble(scene, 1e-3)
+        found[f"{label}, box"] = assemble_on(make_box(scene, 1e-3), scene, torch.float32, None)
+    return found
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command line."""
+    parser.add_argument("--seconds", type=float, default=0.4, help="of each repeat")
+
+
+def main(given: argparse.Namespace) -> None:
+    """Measure, and write the block."""
+    lines = []
+    for name, numbers in (("beyond the caches", LARGE), (f"of {SIDE}^3", SIDE**3)):
+        rate = bandwidth(numbers, given.seconds)
+        lines.append([f"triad, arrays {name}", f"{rate / 1e9:.1f} GB/s", f"{rate / 12e9:.2f} Gcell/s"])
+    found = assemblies()
+    air, cpu, reference = found["free space"], CpuKernel(), ReferenceKernel()
+    uniform_rate = cell_rate(cpu, (SIDE,) * 3, uniform(air), given.seconds)
+    rows = [["cpu", f"uniform air, {SIDE}^3, no layers", f"{uniform_rate / 1e9:.3f}", "1"]]
+    kernels = [*(("cpu", cpu, one) for one in found), ("reference", reference, "free space")]
+    for name, kernel, scene in kernels:
+        shape = found[scene].grid.shape
+        rate = cell_rate(kernel, shape, found[scene].coefficients, given.seconds)
+        grid = f"{scene}, {' x '.join(map(str, shape))}"
+        rows.append([name, grid, f"{rate / 1e9:.3f}", f"{rate / uniform_rate:.2f}"])
+        print(rows[-1], flush=True)
+    memory = table(["bandwidth", "measured", "at 12 bytes a cell"], lines)
+    rates = table(["kernel", "grid", "Gcell/s", "of the uniform rate"], rows)
+    fill_in(DOCUMENT, "benchmark.py kernels", (measured(), memory, rates), given.output)

@@ -1,0 +1,115 @@
+"""Tasks and answers of peers as files, for programs in other environments; needs NumPy only.
+
+A peer runs as `python <name>_peer.py task.npz answer.npz`. Grids exclude the boundary layers of the peer.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+RAMP_PERIODS = 3
+"""Periods over which the drive is switched on."""
+
+DFT_PERIODS = 2
+"""Periods over which phasors are computed."""
+
+Array = NDArray[np.float32]
+Cells = NDArray[np.int64]
+
+
+class Stored:
+    """A dataclass of arrays and numbers, stored as an .npz file."""
+
+    def save(self, path: Path) -> None:
+        """Write to `path`."""
+        np.savez(path, **asdict(self))
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a file of `save`."""
+        with np.load(path) as stored:
+            found = {name: stored[name] for name in (one.name for one in fields(cls))}
+        return cls(**{name: value if value.ndim else value.item() for name, value in found.items()})
+
+
+@dataclass(frozen=True)
+class Task(Stored):
+    """A simulation.
+
+    Attributes:
+        density: of the cells (X, Y, Z) [kg/m^3].
+        sound_speed: of all cells [m/s].
+        spacing: edge of a cell [m].
+        frequency: of the drive [Hz].
+        time_step: [s].
+        steps_per_period: of the drive.
+        source_cells: driven cells (S, 3).
+        source_weights: share of the source in each cell (S,).
+        receiver_cells: recorded cells (R, 3).
+        ends: periods (E,), ascending, at which phasors are returned; the last ends the run.
+        layer_cells: thickness of the boundary layer.
+        order: of the differences in space; 0 for spectral.
+    """
+
+    density: Array
+    sound_speed: float
+    spacing: float
+    frequency: float
+    time_step: float
+    steps_per_period: int
+    source_cells: Cells
+    source_weights: Array
+    receiver_cells: Cells
+    ends: Cells
+    layer_cells: int
+    order: int
+
+    @property
+    def steps(self) -> int:
+        """The number of time steps of the run."""
+        return int(self.ends[-1]) * self.steps_per_period
+
+    def drive(self, delay: float = 0.0) -> NDArray[np.float64]:
+        """Return a ramped cosine at each step (T,), shifted by `delay` steps."""
+        turns = (np.arange(self.steps) + delay) / self.steps_per_period
+        ramp = np.clip(turns / RAMP_PERIODS, 0, 1)
+        return ramp**2 * (3 - 2 * ramp) * np.cos(2 * np.pi * turns)
+
+    def phasors(self, recorded: Array) -> NDArray[np.complex128]:
+        """Return phasors (E, R), time factor e^{-i w t}, of signals (T, R) that begin at step 0."""
+        window = DFT_PERIODS * self.steps_per_period
+        turn = np.exp(2j * np.pi / self.steps_per_period * np.arange(window)) * 2 / window
+        ends = self.ends * self.steps_per_period
+        return np.array([turn @ recorded[end - window : end] for end in ends])
+
+
+@dataclass(frozen=True)
+class Answer(Stored):
+    """The result of a peer.
+
+    Attributes:
+        phasors: pressure (E, R) at the ends of the task, in any unit.
+        setup_seconds: time before stepping, without imports and compilation.
+        stepping_seconds: time of all steps.
+        compile_seconds: time of the compilation, not counted.
+        updated_cells: cells updated per step, boundary layers included.
+    """
+
+    phasors: NDArray[np.complex128]
+    setup_seconds: float
+    stepping_seconds: float
+    compile_seconds: float
+    updated_cells: int
+
+
+def serve(simulate: Callable[[Task], Answer]) -> None:
+    """Answer the task named on the command line."""
+    task, answer = map(Path, sys.argv[1:])
+    simulate(Task.load(task)).save(answer)

@@ -1,0 +1,248 @@
+"""Run time against error of Deepwave, Devito, j-Wave and k-wave-python beside our own.
+
+    python scripts/benchmark.py peers --coarse     grids of 2 mm alone, as a trial
+    python scripts/benchmark.py peers              all
+
+Makes a virtual environment for each peer in `--venvs`, then writes peers.json, peers.png and a block of
+peers.md. Scenes, receivers and errors are those of `benchmark.py accuracy`: the transfer matrix of one focus,
+simulated from the focus by reciprocity.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import math
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from benchmarks.peer_programs.task import Answer, Task
+from benchmarks.peer_report import OURS, Point, Refusal, write_report
+from benchmarks.peer_scene import scene_grid
+from numpy.typing import NDArray
+from shared.cases import Case, cube_case, free_space_case, simulate, sphere_case
+from shared.document import percent
+from shared.scenes import relative_error
+
+DOCUMENT = "peers.md"
+
+PACKAGES: dict[str, tuple[str, ...]] = {
+    "deepwave": ("torch==2.13.0", "numpy==2.4.6", "deepwave==0.1.0"),
+    "devito": ("devito==4.8.23",),
+    "jwave": ("jwave==0.2.1", "jax==0.4.38"),
+    "kwave": ("k-wave-python==0.6.2",),
+}
+"""Packages of each peer; an environment each, as their dependencies exclude one another."""
+
+PROGRAMS = Path(__file__).parent / "peer_programs"
+
+AIR = "free space"
+CASES = {
+    AIR: free_space_case,
+    "sphere": lambda: sphere_case("sphere"),
+    "three cubes": lambda: cube_case("three_cubes"),
+    "two cubes": lambda: cube_case("two_cubes"),
+}
+
+ENDS = (14, 16, 18, 20, 25, 30, 40, 50, 60)
+"""Periods at which a run is judged; the direct sound needs 11 and the ramp 3."""
+
+AIR_PERIODS = 18
+
+OUR_SPACINGS = (2.8, 2.4, 2.0, 1.5, 1.0, 0.75, 0.5)  # [mm]
+OUR_TOLERANCE = 1e-2
+REPETITIONS = 3
+"""Repetitions of our short runs; the median counts."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """The settings of a peer's run.
+
+    Attributes:
+        peer: its name.
+        spacing: [mm].
+        order: of the differences in space; 0 for spectral.
+        offset: of cell centres from the focus [cells]. At 1 mm and less, 0 puts focus and transducers on cell
+            centres, 1/2 the faces of the cubes between them.
+        steps: time steps per period, in air and with obstacles.
+        layer_cells: of its boundary layer.
+        periods: after which a run with obstacles ends.
+        cases: names of the cases.
+    """
+
+    peer: str
+    spacing: float
+    order: int
+    offset: float
+    steps: tuple[int, int]
+    layer_cells: int
+    periods: int
+    cases: tuple[str, ...] = tuple(CASES)
+
+    def __str__(self) -> str:
+        """Return what distinguishes settings of a peer."""
+        order = f"order {self.order}, " if self.order else ""
+        return f"{self.spacing:g} mm, {order}focus {'between cells' if self.offset else 'on a cell'}"
+
+
+SETTINGS = (
+    *(
+        Setting(peer, spacing, order, offset, steps, layer, periods)
+        for peer, order, spacing, steps, layer, periods in (
+            ("deepwave", 8, 2.0, (10, 19), 8, 60),
+            ("deepwave", 4, 1.0, (18, 29), 10, 60),
+            ("deepwave", 8, 1.0, (19, 37), 10, 60),
+            ("devito", 8, 2.0, (10, 12), 8, 60),
+            ("devito", 4, 1.0, (18, 22), 10, 60),
+            ("devito", 8, 1.0, (19, 25), 10, 60),
+            ("jwave", 0, 2.0, (14, 14), 8, 60),
+        )
+        for offset in (0.0, 0.5)
+    ),
+    Setting("deepwave", 0.5, 4, 0.5, (35, 58), 16, 40),
+    Setting("devito", 0.5, 4, 0.5, (35, 45), 12, 50),
+    Setting("jwave", 1.0, 0, 0.5, (29, 29), 10, 30),
+    Setting("kwave", 2.0, 0, 0.0, (14, 14), 8, 20),
+    Setting("kwave", 1.0, 0, 0.5, (29, 29), 10, 30, (AIR, "three cubes")),
+)
+
+
+def python_of(peer: str, folder: Path) -> Path:
+    """Return the interpreter of a peer's environment in `folder`, made if it lacks the packages.
+
+    Raises:
+        subprocess.CalledProcessError: it cannot be made.
+    """
+    environment = folder / peer
+    python, done = environment / "bin" / "python", environment / "installed.txt"
+    wanted = "\n".join(PACKAGES[peer])
+    if not done.exists() or done.read_text(encoding="utf-8") != wanted:
+        print(f"{peer}: installing {', '.join(PACKAGES[peer])} in {environment}", flush=True)
+        for command in (
+            [sys.executable, "-m", "venv", "--clear", str(environment)],
+            [str(python), "-m", "pip", "install", "--quiet", *PACKAGES[peer]],
+        ):
+            subprocess.run(command, check=True, capture_output=True, text=True)
+        done.write_text(wanted, encoding="utf-8")
+    return python
+
+
+def task_of(case: Case, setting: Setting) -> tuple[Task, NDArray[np.float64]]:
+    """Return the task of a peer, and the weights (M, R) of its receivers for each transducer."""
+    scene, in_air = case.scene, not case.scene.obstacles
+    spacing = setting.spacing * 1e-3
+    grid = scene_grid(scene, spacing, setting.offset, setting.layer_cells, smooth=setting.order == 0)
+    steps = setting.steps[0 if in_air else 1]
+    # A leapfrog with this step advances a whole period in `steps`; k-space schemes do so by themselves.
+    leapfrog = math.sin(math.pi / steps) * steps / math.pi if setting.order else 1.0
+    last = min(setting.periods, AIR_PERIODS) if in_air else setting.periods
+    task = Task(
+        density=grid.density,
+        sound_speed=scene.medium.sound_speed,
+        spacing=spacing,
+        frequency=scene.frequency,
+        time_step=leapfrog / (steps * scene.frequency),
+        steps_per_period=steps,
+        source_cells=grid.source_cells,
+        source_weights=grid.source_weights,
+        receiver_cells=grid.receiver_cells,
+        ends=np.array([end for end in ENDS if end <= last]),
+        layer_cells=setting.layer_cells,
+        order=setting.order,
+    )
+    return task, grid.receiver_weights
+
+
+def answer_of(peer: str, task: Task, venvs: Path) -> Answer:
+    """Return a peer's answer.
+
+    Raises:
+        subprocess.CalledProcessError: it fails.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        asked, answered = Path(folder) / "task.npz", Path(folder) / "answer.npz"
+        task.save(asked)
+        program = [str(python_of(peer, venvs)), str(PROGRAMS / f"{peer}_peer.py")]
+        subprocess.run([*program, str(asked), str(answered)], check=True, capture_output=True, text=True)
+        return Answer.load(answered)
+
+
+def peer_points(setting: Setting, venvs: Path) -> Iterator[Point | Refusal]:
+    """Measure a peer in each case; free space, which comes first, fixes its source strength and phase."""
+    factor = None
+    for name in setting.cases:
+        case = CASES[name]()
+        task, weights = task_of(case, setting)
+        try:
+            answer = answer_of(setting.peer, task, venvs)
+        except subprocess.CalledProcessError as error:
+            yield Refusal(name, setting.peer, str(setting), reason(error))
+            return
+        found = answer.phasors @ weights.T  # transfer matrix (E, M) at the task's ends, up to a factor
+        if not np.isfinite(found).all():
+            yield Refusal(name, setting.peer, str(setting), "the run diverged")
+            continue
+        exact = case.exact[0].numpy()
+        if factor is None:
+            factor = np.vdot(found[-1], exact) / np.vdot(found[-1], found[-1])
+        rate = answer.updated_cells * task.steps / answer.stepping_seconds
+        for end, matrix in zip(task.ends.tolist(), found, strict=True):
+            seconds = answer.setup_seconds + answer.stepping_seconds * end / task.ends[-1]
+            error = float(np.linalg.norm(factor * matrix - exact) / np.linalg.norm(exact))
+            left = float(np.linalg.norm(matrix - found[-1]) / np.linalg.norm(found[-1]))
+            yield Point(name, setting.peer, str(setting), end, left, error, float(seconds), rate)
+
+
+def reason(error: subprocess.CalledProcessError) -> str:
+    """Return the last line of a failed program's messages."""
+    return (error.stderr.strip() or str(error)).splitlines()[-1]
+
+
+def our_points(name: str) -> Iterator[Point]:
+    """Measure our own solver in a case."""
+    case = CASES[name]()
+    simulate(case, OUR_SPACINGS[0])  # compiles the kernel
+    for spacing in OUR_SPACINGS:
+        found = [simulate(case, spacing, OUR_TOLERANCE) for _ in range(REPETITIONS)]
+        seconds = statistics.median(one.seconds for one in found)
+        error = relative_error(found[0].matrix, case.exact)
+        yield Point(name, OURS, f"{spacing:g} mm", None, OUR_TOLERANCE, error, seconds, None)
+
+
+def measure(settings: Sequence[Setting], venvs: Path) -> Iterator[Point | Refusal]:
+    """Measure our solver and the peers."""
+    for name in CASES:
+        yield from our_points(name)
+    for setting in settings:
+        yield from peer_points(setting, venvs)
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command line."""
+    parser.add_argument("--coarse", action="store_true", help="peers on grids of 2 mm alone")
+    venvs = Path.home() / ".cache" / "autdtorch" / "peers"
+    parser.add_argument("--venvs", type=Path, default=venvs, help="folder of the peers' environments")
+
+
+def main(given: argparse.Namespace) -> None:
+    """Measure and report."""
+    logging.getLogger("autdtorch").setLevel(logging.ERROR)  # grids are coarse on purpose
+    settings = [one for one in SETTINGS if one.spacing == 2 or not given.coarse]
+    points: list[Point] = []
+    refusals: list[Refusal] = []
+    for one in measure(settings, given.venvs):
+        if isinstance(one, Point):
+            points.append(one)
+            said = f"{percent(one.error)}, {one.seconds:.3g} s"
+        else:
+            refusals.append(one)
+            said = one.reason
+        print(f"{one.case}, {one.program}, {one.setting}: {said}", flush=True)
+    write_report(points, refusals, given.output)

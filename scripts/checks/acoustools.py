@@ -1,0 +1,191 @@
+"""Rigid sphere and cubes against AcousTools' BEM.
+
+    python scripts/check.py acoustools
+
+Needs `pip install 'autdtorch[crosscheck]'`. Fills in a block of crosschecks.md. The sources are points:
+AcousTools' pistons with radius 0. Scenes and errors are those of `benchmark.py accuracy`, with rigid cubes.
+The reference is the exact series for the sphere, and the limit of our own grids for the cubes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+
+import torch
+import vedo
+from acoustools.BEM import compute_E
+from acoustools.Mesh import calculate_features, get_CHIEF_points
+from acoustools.Utilities import forward_model_batched
+from shared.cases import (
+    CUBE_ORDER,
+    SPHERE_RADIUS,
+    Case,
+    Simulation,
+    close_scene,
+    extrapolate,
+    limit_case,
+    simulate,
+    sphere_case,
+)
+from shared.document import fill_in, measured, percent, table
+from shared.scenes import relative_error
+
+import autdtorch as at
+from autdtorch.analytic.green import free_space_matrix
+from autdtorch.scene.device_layouts import TRANSDUCER_RADIUS
+
+DOCUMENT = "crosschecks.md"
+PACKAGES = ("acoustools", "vedo")
+
+SUBDIVISIONS = (2, 3, 4)
+SPACINGS = (2.0, 1.0, 0.5)
+"""Spacings of our grids [mm]."""
+LIMIT_SPACINGS = (0.5, 1 / 3, 0.25)
+"""Spacings for the limit of the cubes [mm]; all have the faces between cells."""
+
+CHIEF_POINTS, CHIEF_DEPTH = 30, 3e-3
+"""Approximate number of inner points with zero field, and their depth [m]."""
+
+REPETITIONS = 3
+"""Repetitions of a run shorter than `SHORT`; the fastest counts."""
+SHORT = 3.0  # [s]
+
+PLANE_SPACING = 1e-3
+"""Spacing of the points behind the obstacles [m]."""
+
+ARC_RADIUS = 0.2
+"""Distance at which pistons are compared [m]."""
+ANGLES = (0, 20, 40, 60, 80)
+
+
+def rigid_cubes(count: int, spacings: Sequence[float] = LIMIT_SPACINGS) -> Case:
+    """Return the paper's three cubes, rigid, or the middle one, with the limit of our grids [mm]."""
+    scene = close_scene("three_cubes")
+    kept = scene.obstacles if count == 3 else scene.obstacles[1:2]
+    cubes = tuple(at.Box(one.center, one.size, rigid=True) for one in kept)
+    scene = dataclasses.replace(scene, obstacles=cubes)
+    name = "three rigid cubes" if count == 3 else "rigid cube"
+    empty = limit_case(name, scene, torch.zeros(()))
+    exact = extrapolate(spacings, [simulate(empty, h).matrix for h in spacings], CUBE_ORDER)
+    return limit_case(name, scene, exact)
+
+
+def sphere_mesh(scene: at.Scene, subdivisions: int) -> vedo.Mesh:
+    """Return 20 * 4^subdivisions triangles with their corners on the sphere."""
+    (sphere,) = scene.obstacles
+    return featured(vedo.IcoSphere(sphere.center, SPHERE_RADIUS, subdivisions=subdivisions))
+
+
+def cube_mesh(scene: at.Scene, subdivisions: int) -> vedo.Mesh:
+    """Return 12 * 4^subdivisions triangles per cube."""
+    cubes = [vedo.Box(one.center, size=one.size).triangulate() for one in scene.obstacles]
+    return featured(vedo.merge([cube.subdivide(subdivisions, method=1) for cube in cubes]))
+
+
+def featured(mesh: vedo.Mesh) -> vedo.Mesh:
+    """Return the mesh with areas and normals, which AcousTools needs."""
+    calculate_features(mesh)
+    return mesh
+
+
+def boundary_elements(case: Case, mesh: vedo.Mesh, chief: bool = True) -> torch.Tensor:
+    """Return AcousTools' transfer matrix (P, M) [Pa], with or without inner CHIEF points."""
+    scene = case.scene
+    normals = scene.array.normals.to(torch.complex64)
+    inside = get_CHIEF_points(mesh, CHIEF_POINTS, "uniform", scale=CHIEF_DEPTH) if chief else None
+    matrix = compute_E(
+        mesh,
+        case.points.T[None].to(torch.complex64),
+        scene.array.positions.float(),
+        use_cache_H=False,
+        H_method="LU",
+        p_ref=scene.array.source_strength,
+        norms=normals,
+        k=scene.wavenumber,
+        transducer_radius=0.0,
+        internal_points=inside,
+    )
+    return matrix[0].to(torch.complex128)
+
+
+def timed_elements(case: Case, mesh: vedo.Mesh, chief: bool) -> Simulation:
+    """Return AcousTools' matrix and its run time, without the meshing."""
+    begin = time.perf_counter()
+    matrix = boundary_elements(case, mesh, chief)
+    return Simulation(matrix, time.perf_counter() - begin, True)
+
+
+def repeated(measure: Callable[[], Simulation]) -> Simulation:
+    """Return the fastest of several measurements; a long one is not repeated."""
+    found = [measure()]
+    while found[0].seconds < SHORT and len(found) < REPETITIONS:
+        found.append(measure())
+    return min(found, key=lambda one: one.seconds)
+
+
+def rows(case: Case, meshes: Sequence[vedo.Mesh]) -> list[list[str]]:
+    """Return the errors and run times of both programs."""
+    found = []
+    for mesh in meshes:
+        plain, chief = (repeated(lambda m=mesh, c=c: timed_elements(case, m, c)) for c in (False, True))
+        both = [percent(relative_error(one.matrix, case.exact)) for one in (plain, chief)]
+        found.append([case.name, f"AcousTools, {mesh.ncells} triangles", *both, f"{chief.seconds:.3g} s"])
+        print(found[-1], flush=True)
+    simulate(case, SPACINGS[0])  # compiles the kernel
+    for spacing in SPACINGS:
+        own = repeated(lambda h=spacing: simulate(case, h))
+        error = percent(relative_error(own.matrix, case.exact))
+        found.append([case.name, f"autdtorch, {spacing:g} mm", error, "", f"{own.seconds:.3g} s"])
+        print(found[-1], flush=True)
+    return found
+
+
+def plane_times(case: Case, mesh: vedo.Mesh, spacing: float) -> str:
+    """Compare the run times for a plane of points behind the obstacles at `spacing` [mm]."""
+    points = at.Plane((80e-3, 50e-3, 50e-3), (1, 0, 0), (60e-3, 60e-3)).points(PLANE_SPACING).reshape(-1, 3)
+    wide = dataclasses.replace(case, points=points)
+    theirs, ours = timed_elements(wide, mesh, True), simulate(wide, spacing)
+    difference = percent(relative_error(ours.matrix, theirs.matrix))
+    return (
+        f"All {len(case.scene.array)} transducers to {len(points)} points of a plane behind the {case.name}: "
+        f"AcousTools with {mesh.ncells} triangles and CHIEF takes {theirs.seconds:.3g} s, autdtorch at "
+        f"{spacing:g} mm {ours.seconds:.3g} s. The two matrices differ by {difference}."
+    )
+
+
+def directivities() -> torch.Tensor:
+    """Return those of a piston at `ANGLES`: AcousTools', our disc's, and the exact far field, (3, angles)."""
+    angles = torch.deg2rad(torch.tensor(ANGLES, dtype=torch.float64))
+    arc = torch.stack((angles.sin(), torch.zeros_like(angles), angles.cos()), dim=1) * ARC_RADIUS
+    k, origin, normal = 2 * math.pi * 40e3 / 340.0, torch.zeros((1, 3)), torch.tensor([[0.0, 0.0, 1.0]])
+    theirs = forward_model_batched(
+        arc.T[None].to(torch.complex64), origin, p_ref=1.0, norms=normal.to(torch.complex64), k=k,
+        transducer_radius=TRANSDUCER_RADIUS,
+    )  # fmt: skip
+    disc = at.TransducerArray(origin, normal, source_strength=1.0, radius=TRANSDUCER_RADIUS)
+    ours = free_space_matrix(arc, disc, k)
+    x = k * TRANSDUCER_RADIUS * angles.sin().clamp(min=1e-9)
+    both = [ARC_RADIUS * field.flatten().abs() for field in (theirs, ours)]
+    return torch.stack((*both, 2 * torch.special.bessel_j1(x) / x))
+
+
+def main(given: argparse.Namespace) -> None:
+    """Compare, and write the block."""
+    sphere, cube, cubes = sphere_case("rigid sphere"), rigid_cubes(1), rigid_cubes(3)
+    meshes = [[cube_mesh(case.scene, n) for n in SUBDIVISIONS] for case in (cube, cubes)]
+    lines = rows(sphere, [sphere_mesh(sphere.scene, n) for n in SUBDIVISIONS])
+    lines += [*rows(cube, meshes[0]), *rows(cubes, meshes[1])]
+    theirs, ours, exact = directivities()[:, -1].tolist()
+    parts = (
+        f"{measured()}\n\n{', '.join(f'{name} {version(name)}' for name in PACKAGES)}.",
+        table(("scene", "program", "error", "with CHIEF", "run time (CHIEF)"), lines),
+        plane_times(cubes, meshes[1][1], 1.0),
+        f"At {ANGLES[-1]} degrees a piston has {theirs:.2f} of its pressure on the axis in AcousTools, "
+        f"{ours:.2f} here and {exact:.2f} in the exact far field.",
+    )
+    fill_in(DOCUMENT, "check.py acoustools", parts, given.output)

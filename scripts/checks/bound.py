@@ -1,0 +1,113 @@
+"""Bound on the weakest focus: no method may exceed it.
+
+    python scripts/check.py bound --scenes 1000
+
+Half of the random scenes have an unstructured transfer matrix, the others one of transducers and control
+points in air; 2 to 32 transducers, 1 to 8 foci. Exits with 1 if a score is above its bound.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import defaultdict
+
+import numpy as np
+import torch
+from shared.scenes import paper_objectives
+
+import autdtorch as at
+from autdtorch.analytic.green import free_space_matrix
+
+FREQUENCY = 40e3
+AIR = at.Medium(density=1.2, sound_speed=340.0)
+
+
+class MatrixPropagator:
+    """A propagator with a given transfer matrix."""
+
+    def __init__(self, scene: at.Scene, matrix: torch.Tensor) -> None:
+        """Keep the `matrix` (P, M)."""
+        self.scene = scene
+        self._matrix = matrix
+
+    def transfer_matrix(self) -> torch.Tensor:
+        """Return the matrix."""
+        return self._matrix
+
+
+def random_objective(generator: torch.Generator) -> at.SimulatedObjective:
+    """Return an objective of 2 to 32 transducers and 1 to 8 foci, of either kind."""
+
+    def integer(low: int, high: int) -> int:
+        return int(torch.randint(low, high + 1, (), generator=generator))
+
+    def uniform(*shape: int) -> torch.Tensor:
+        return torch.rand(shape, dtype=torch.float64, generator=generator)
+
+    transducers, foci, physical = integer(2, 32), integer(1, 8), integer(0, 1)
+    # Transducers on a 10 mm grid of 8 x 8, foci in a cube of 100 mm that begins 40 mm in front of it.
+    places = torch.randperm(64, generator=generator)[:transducers]
+    positions = 10e-3 * torch.stack([torch.zeros(transducers), places // 8, places % 8], dim=1).double()
+    points = 100e-3 * uniform(foci, 3) + torch.tensor([40e-3, -15e-3, -15e-3])
+    array = at.TransducerArray(positions, (1.0, 0.0, 0.0))
+    scene = at.Scene(array, AIR, frequency=FREQUENCY, control_points=points)
+    matrix = torch.randn(foci, transducers, dtype=torch.complex128, generator=generator)
+    if physical:
+        matrix = free_space_matrix(points, array, scene.wavenumber)
+    return at.SimulatedObjective(scene, MatrixPropagator(scene, matrix))
+
+
+def highest_scores(objective: at.SimulatedObjective) -> dict[str, float]:
+    """Return the weakest focus [Pa] that each method finds."""
+    transducers = len(objective.scene.array)
+    return {
+        "lss": at.lss(objective).score.item(),
+        "lssg": at.lssg(objective).score.item(),
+        "random_search": at.random_search(objective).score.item(),
+        "gabs": at.gabs(objective).score.item(),
+        "bayes_opt": at.bayes_opt(objective, evaluations=48, fixed_transducer=0).score.item(),
+        "identify": at.identify(objective, evaluations=4 * transducers).score.item(),
+        "gradient_ascent": at.gradient_ascent(objective).score.item(),
+    }
+
+
+def check_random_scenes(count: int, seed: int) -> int:
+    """Print the gaps to the bound in `count` random scenes; return how often a method was above it."""
+    generator = torch.Generator().manual_seed(seed)
+    gaps = defaultdict(list)
+    seconds, above = [], 0
+    for _ in range(count):
+        objective = random_objective(generator)
+        start = time.perf_counter()
+        bound = at.focus_bound(objective.transfer_matrix)
+        seconds.append(time.perf_counter() - start)
+        for name, score in highest_scores(objective).items():
+            gaps[name].append(1 - score / bound)
+            above += not score <= bound
+    print(f"{count} random scenes, seed {seed}: {above} scores above the bound")
+    print(f"  seconds a bound: median {np.median(seconds):.3f}, most {max(seconds):.3f}")
+    for name, values in gaps.items():
+        median, most = np.median(values), max(values)
+        print(f"  {name}: gap least {min(values):.1e}, median {median:.2%}, most {most:.2%}")
+    return above
+
+
+def check_paper_scenes() -> None:
+    """Print the gap of gradient ascent in the paper's scenes."""
+    for name, objective in paper_objectives().items():
+        bound = at.focus_bound(objective.transfer_matrix)
+        score = at.gradient_ascent(objective).score.item()
+        print(f"{name}: bound {bound:.4f} Pa, gradient {score:.4f} Pa, gap {1 - score / bound:.3%}")
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command line."""
+    parser.add_argument("--scenes", type=int, default=1000, help="number of random scenes")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random scenes")
+
+
+def main(given: argparse.Namespace) -> int:
+    """Run both checks."""
+    check_paper_scenes()
+    return int(check_random_scenes(given.scenes, given.seed) > 0)

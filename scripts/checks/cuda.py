@@ -1,0 +1,104 @@
+"""Compilation of the CUDA kernel without a GPU, and the resources of its launches.
+
+    python scripts/check.py cuda        some 10 seconds
+    python scripts/check.py cuda --capability 80 --dtype float64
+
+Nothing runs: Triton compiles each launch for a scene that exercises all code of a step. The registers of a
+thread limit the threads of a multiprocessor, which has 65536 registers; spilled registers go to the stack.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import torch
+import triton
+from triton.backends.compiler import GPUTarget
+from triton.runtime import driver
+from triton.runtime.jit import JITFunction
+
+from autdtorch.fdtd.kernels.cuda import BLOCKS, DeviceMedium, DeviceRun
+from autdtorch.fdtd.kernels.cuda_tables import Shape
+from autdtorch.fdtd.stepping import assemble, drive_signal
+from autdtorch.propagators.scene_region import region_of
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.obstacles import Box
+from autdtorch.scene.scene import Medium, Scene
+
+CUOBJDUMP = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
+
+
+class AbsentGpu:
+    """The part of a driver that Triton needs to compile."""
+
+    def __init__(self, capability: int) -> None:
+        """Describe a GPU of compute capability `capability`, times ten."""
+        self._target = GPUTarget("cuda", capability, 32)
+
+    def get_current_target(self) -> GPUTarget:
+        """Return the GPU."""
+        return self._target
+
+    def get_current_device(self) -> int:
+        """Return its number."""
+        return 0
+
+    def get_current_stream(self, device: int) -> int:
+        """Return a stream that nothing runs on."""
+        return 0
+
+
+def compiled(capability: int, dtype: torch.dtype) -> dict[str, Any]:
+    """Return the compiled launches of a step by name."""
+    wall = Box((12e-3, 12e-3, 20e-3), (40e-3, 40e-3, 2e-3), density=5.0, sound_speed=300.0)
+    solid = Box((12e-3, 12e-3, 10e-3), (5e-3, 6e-3, 7e-3), rigid=True)
+    array = TransducerArray.grid((2, 2), pitch=8e-3, center=(1.2e-3, 12e-3, 12e-3))
+    points, domain = [(22e-3, 8e-3, 14e-3)], ((0,) * 3, (24e-3,) * 3)
+    scene = Scene(array, Medium(1.2, 340.0), 40e3, points, (wall, solid), domain=domain)
+    assembly = assemble(region_of(scene), 1e-3, dtype)
+    sources = assembly.sources(array.positions, torch.ones(4, dtype=torch.complex128))
+    receivers = assembly.receivers(scene.control_points)
+    signal = drive_signal(assembly.steps_per_period, 0, 2).to(dtype)
+    found = {}
+
+    def compile_only(self: Any, *args: Any, grid: Any, warmup: bool, **options: Any) -> None:
+        found[self.fn.__name__] = launch(self, *args, grid=grid, warmup=True, **options)
+
+    launch = JITFunction.run
+    driver.set_active(AbsentGpu(capability))
+    with patch.object(JITFunction, "run", compile_only):
+        medium = DeviceMedium(assembly.coefficients, Shape(*assembly.grid.shape), BLOCKS, torch.device("cpu"))
+        DeviceRun(medium, assembly.silence(sources), sources, receivers, len(signal)).advance(signal)
+    return found
+
+
+def usage(kernel: Any) -> tuple[int, int]:
+    """Return registers and bytes of stack of a thread."""
+    with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
+        file.write(kernel.asm["cubin"])
+        file.flush()
+        text = subprocess.run(
+            [CUOBJDUMP, "--dump-resource-usage", file.name], check=True, capture_output=True, text=True
+        ).stdout
+    registers, stack = (int(re.search(rf"{name}:(\d+)", text)[1]) for name in ("REG", "STACK"))
+    return registers, stack
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command line."""
+    parser.add_argument("--capability", type=int, default=90, help="of the GPU, times ten; 90 is Hopper")
+    parser.add_argument("--dtype", choices=("float32", "float64"), default="float32", help="of the fields")
+
+
+def main(given: argparse.Namespace) -> None:
+    """Print the table."""
+    print("| launch | threads of a program | registers | stack [byte] |\n| --- | --- | --- | --- |")
+    for name, kernel in compiled(given.capability, getattr(torch, given.dtype)).items():
+        registers, stack = usage(kernel)
+        print(f"| {name} | {32 * kernel.metadata.num_warps} | {registers} | {stack} |")

@@ -1,0 +1,346 @@
+"""Damaged files of studies and hardware trials, which must resume.
+
+    python scripts/check.py damage --damages 300
+
+Damages the files of a study and of an emulated hardware trial at random. Each must end with the numbers of
+the undisturbed run, bit for bit. Every row that the damage left whole and every damaged file must be kept,
+and the next start must log no warning.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import functools
+import json
+import logging
+import random
+import shutil
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from unittest import mock
+
+import torch
+
+import autdtorch as at
+from autdtorch import hardware
+from autdtorch.methods.solution import Solution
+from autdtorch.study.folder import PREVIOUS
+from autdtorch.study.provenance import PROVENANCE_FILE
+from autdtorch.study.results_file import RESULTS_FILE
+from autdtorch.study.run import run_study
+from autdtorch.study.trial_file import TRIALS_FILE
+from autdtorch.utils.json_lines import SET_ASIDE
+
+LOG_FILE = "trial.jsonl"
+
+AIR = at.Medium(density=1.2, sound_speed=340.0)
+CUBE = at.Box(center=(12e-3, 0, 0), size=(6e-3, 8e-3, 4e-3), density=100.0, sound_speed=340.0)
+SOLVER = {"spacing": 2e-3, "tolerance": 0.1}
+METHODS = {
+    "gabs": functools.partial(at.gabs, levels=4),
+    "identify": functools.partial(at.identify, evaluations=12),
+}
+
+Damage = Callable[[random.Random, bytes, bytes], bytes]
+
+
+def _scene(*obstacles: at.Box) -> at.Scene:
+    array = at.TransducerArray.grid((2, 2), pitch=8e-3, center=(0, 0, 0), normal=(1, 0, 0))
+    return at.Scene(array, AIR, 40e3, [(22e-3, 3e-3, 1e-3), (20e-3, -5e-3, 4e-3)], obstacles)
+
+
+def study(folder: Path, seed: int = 0) -> list[torch.Tensor]:
+    """Start or resume a study, and return all its numbers; each seed has a cube of its own."""
+    results = run_study(
+        {"empty": _scene(), "cube": _scene(replace(CUBE, density=100.0 + seed))},
+        METHODS,
+        solver=SOLVER,
+        trials={"gabs": 5, "identify": 2},
+        seed=seed,
+        folder=folder,
+        config=f"seed: {seed}",
+    )
+    solutions = [result.solution for scene in results.scenes.values() for result in scene.methods.values()]
+    matrices = [scene.transfer_matrix for scene in results.scenes.values()]
+    return [*matrices, *(number for solution in solutions for number in _numbers(solution))]
+
+
+def trial(folder: Path, seed: int = 0) -> list[torch.Tensor]:
+    """Start or resume a hardware trial on the emulated bench, and return all its numbers."""
+    scene = _scene()
+    matrix = at.SimulatedObjective(scene, at.make_propagator(scene)).transfer_matrix
+    assert matrix is not None
+    channels = list(range(len(scene.array)))
+    bench = hardware.EmulatedBench(hardware.SONICSURFACE, matrix, channels)
+    with hardware.open_link(hardware.SONICSURFACE, channels, backend=bench.bus) as link:
+        limited = hardware.LimitedLink(link, hardware.Limits(amplitude=1.0))
+        sensor = hardware.EmulatedSensor(bench)
+        objective = hardware.HardwareObjective(scene, limited, sensor, folder / LOG_FILE, {"seed": seed})
+        try:
+            return _numbers(at.gabs(objective, levels=8, seed=seed))
+        finally:
+            objective.log.end(limited.seconds_on)
+
+
+def _numbers(solution: Solution) -> list[torch.Tensor]:
+    return [getattr(solution, field.name) for field in fields(solution)]
+
+
+def _place(rng: random.Random, content: bytes) -> int:
+    return rng.randrange(len(content))
+
+
+def _changed(rng: random.Random, content: bytes, change: int) -> bytes:
+    place = _place(rng, content)
+    return content[:place] + bytes([content[place] ^ change]) + content[place + 1 :]
+
+
+def _zeroed(rng: random.Random, content: bytes, _: bytes) -> bytes:
+    place = _place(rng, content)
+    block = content[place : place + rng.choice((8, 64, 512))]
+    return content[:place] + b"\0" * len(block) + content[place + len(block) :]
+
+
+def _lines_changed(change: Callable[[random.Random, list[bytes], list[bytes]], None]) -> Damage:
+    def damage(rng: random.Random, content: bytes, other: bytes) -> bytes:
+        lines = content.splitlines(keepends=True)
+        change(rng, lines, other.splitlines(keepends=True))
+        return b"".join(lines)
+
+    return damage
+
+
+def _swap(rng: random.Random, lines: list[bytes], _: list[bytes]) -> None:
+    one, two = rng.randrange(len(lines)), rng.randrange(len(lines))
+    lines[one], lines[two] = lines[two], lines[one]
+
+
+def _damage_end(rng: random.Random, lines: list[bytes], _: list[bytes]) -> None:
+    line = rng.randrange(len(lines))
+    lines[line] = lines[line].removesuffix(b"\n") + rng.choice((b"", b"\0", rng.randbytes(1)))
+
+
+ANY: dict[str, Damage] = {
+    "bit flipped": lambda rng, content, _: _changed(rng, content, 1 << rng.randrange(8)),
+    "byte changed": lambda rng, content, _: _changed(rng, content, rng.randrange(1, 256)),
+    "cut": lambda rng, content, _: content[: _place(rng, content)],
+    "block zeroed": _zeroed,
+    "garbage appended": lambda rng, content, _: content + rng.randbytes(rng.choice((1, 50, 5000))),
+    "emptied": lambda *_: b"",
+    "file of another": lambda _, __, other: other,
+}
+OF_LINES: dict[str, Damage] = {
+    "line removed": _lines_changed(lambda rng, lines, _: lines.pop(rng.randrange(len(lines)))),
+    "line doubled": _lines_changed(lambda rng, lines, _: lines.insert(rng.randrange(len(lines)), lines[-1])),
+    "end of a line damaged": _lines_changed(_damage_end),
+    "lines swapped": _lines_changed(_swap),
+    "garbage line": _lines_changed(
+        lambda rng, lines, _: lines.insert(rng.randrange(len(lines)), rng.randbytes(80) + b"\n")
+    ),
+    "line of another": _lines_changed(
+        lambda rng, lines, other: lines.insert(rng.randrange(len(lines)), rng.choice(other))
+    ),
+}
+"""Ways to damage any file, and a file of lines, given the content of another study or trial."""
+
+MOST_LOST = {"bit flipped": 1, "byte changed": 1, "end of a line damaged": 0}
+"""Rows that a damage can cost; others cost the rows that they touch."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A program whose files are damaged.
+
+    Attributes:
+        journal: name of its file of lines.
+        begin: starts or resumes it in a folder, and returns all its numbers.
+        numbers: of the undisturbed run.
+        states: folders of a finished and of an interrupted run.
+        another: the folder of another run.
+    """
+
+    journal: str
+    begin: Callable[[Path], list[torch.Tensor]]
+    numbers: list[torch.Tensor]
+    states: tuple[Path, Path]
+    another: Path
+
+
+def study_subject(folder: Path) -> Subject:
+    """Return a study: finished, and interrupted in its second scene."""
+    finished, half, another = (folder / name for name in ("study", "half-study", "another-study"))
+    numbers = study(finished)
+    study(another, seed=1)
+    with mock.patch("autdtorch.study.run.focus_bound", side_effect=[0.0, KeyboardInterrupt]):
+        try:
+            study(half)
+        except KeyboardInterrupt:
+            _keep_lines(half / TRIALS_FILE, 10)
+    return Subject(TRIALS_FILE, study, numbers, (finished, half), another)
+
+
+def trial_subject(folder: Path) -> Subject:
+    """Return a hardware trial: finished, and interrupted."""
+    finished, half, another = (folder / name for name in ("trial", "half-trial", "another-trial"))
+    for place in (finished, another):
+        place.mkdir()
+    numbers = trial(finished)
+    trial(another, seed=1)
+    shutil.copytree(finished, half)
+    _keep_lines(half / LOG_FILE, 12)
+    return Subject(LOG_FILE, trial, numbers, (finished, half), another)
+
+
+def _keep_lines(path: Path, count: int) -> None:
+    path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:count]))
+
+
+@contextlib.contextmanager
+def warnings_listed() -> Iterator[list[str]]:
+    """Collect the warnings of the package in a list."""
+    lines: list[str] = []
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: lines.append(record.getMessage())
+    logging.getLogger("autdtorch").addHandler(handler)
+    try:
+        yield lines
+    finally:
+        logging.getLogger("autdtorch").removeHandler(handler)
+
+
+def _content(path: Path) -> bytes:
+    return path.read_bytes() if path.exists() else b""
+
+
+def _rows(content: bytes) -> set[bytes]:
+    """Return the whole lines of a file, without the first of a log."""
+    return {line for line in content.split(b"\n")[:-1] if not line.startswith(b'{"origin": ')}
+
+
+def _made(rows: set[bytes]) -> set[bytes]:
+    """Return the rows of trials or evaluations, without the end of a log."""
+    return {row for row in rows if b'"drive": ' in row}
+
+
+def _seconds_on(rows: set[bytes]) -> float:
+    """Return the emission time in the rows of a log; 0 for a study."""
+    return max((json.loads(row).get("seconds_on", 0.0) for row in rows), default=0.0)
+
+
+def _debris(damaged: bytes, rows: set[bytes]) -> list[bytes]:
+    """Return the parts of a damaged file of lines beside these rows."""
+    for row in rows:
+        damaged = damaged.replace(row, b"\n")
+    return [line for line in damaged.split(b"\n") if line]
+
+
+def journal_problems(before: bytes, damaged: bytes, journal: Path, most_lost: int) -> list[str]:
+    """Return the broken promises about a file of lines, after the program was resumed.
+
+    Args:
+        before: its content before the damage.
+        damaged: its content after the damage.
+        journal: its path.
+        most_lost: rows that the damage can cost.
+    """
+    wrong = []
+    left = {row for row in _rows(before) if row in damaged}
+    after = _content(journal)
+    if lost := left - _rows(after):
+        wrong.append(f"{len(lost)} whole rows lost")
+    if len(lost := _rows(before) - _rows(after)) > most_lost:
+        wrong.append(f"{len(lost)} rows lost where the damage touched {most_lost}")
+    if _seconds_on(_rows(after)) < _seconds_on(left):
+        wrong.append(f"on for {_seconds_on(_rows(after))} s, where {_seconds_on(left)} s were left")
+    aside = _content(journal.with_name(journal.name + SET_ASIDE))
+    first = before.partition(b"\n")[0]  # a log with a part of its first line alone starts again
+    debris = [] if first.startswith(damaged) else _debris(damaged, left)
+    if any(one not in aside and one not in after for one in debris):
+        wrong.append("what was damaged is not kept")
+    return wrong
+
+
+def problems(subject: Subject, state: Path, folder: Path, damaged: bytes, name: str, kind: str) -> list[str]:
+    """Resume in a copy of a state with one damaged file, and return the broken promises."""
+    shutil.copytree(state, folder)
+    (folder / name).write_bytes(damaged)
+    before, journal = _content(state / subject.journal), folder / subject.journal
+    found = _content(journal)
+    left = {row for row in _rows(before) if row in found}
+    missing = len(_made(_rows(_content(subject.states[0] / subject.journal)))) - len(_made(left))
+    try:
+        numbers = subject.begin(folder)
+    except hardware.LogError as error:
+        refused = "of another trial" in str(error) and (folder / name).read_bytes() == damaged
+        return [] if refused else [f"refused: {error}"]
+    wrong = []
+    if not all(map(torch.equal, numbers, subject.numbers)):
+        wrong.append("other numbers")
+    wrong += journal_problems(before, found, journal, MOST_LOST.get(kind, len(_rows(before))))
+    if len(again := _made(_rows(_content(journal)) - left)) > missing:  # fewer if the results have them
+        wrong.append(f"{len(again)} trials or evaluations made where {missing} were missing")
+    if name in (RESULTS_FILE, PROVENANCE_FILE) and (folder / f"{PREVIOUS}1" / name).read_bytes() != damaged:
+        wrong.append("the damaged file is not kept")
+    with warnings_listed() as warned:
+        numbers = subject.begin(folder)
+    if not all(map(torch.equal, numbers, subject.numbers)) or warned:
+        wrong.append(f"the next start is not clean: {warned}")
+    return wrong
+
+
+def check(damages: int, seed: int, folder: Path) -> tuple[Counter[str], list[str]]:
+    """Damage and resume `damages` times.
+
+    Returns:
+        The number of damages by kind and file, and a line for each broken promise.
+    """
+    rng = random.Random(seed)
+    subjects = [study_subject(folder), trial_subject(folder)]
+    counts: Counter[str] = Counter()
+    wrong: list[str] = []
+    for number in range(damages):
+        subject = subjects[number % 3 // 2]
+        state = rng.choice(subject.states)
+        files = [path for path in state.rglob("*.*") if path.suffix != ".lock" and path.name != ".lock"]
+        name = str(rng.choice(sorted(files)).relative_to(state))
+        kinds = ANY | OF_LINES if name == subject.journal else ANY
+        kind = rng.choice(list(kinds))
+        twin = subject.another / name
+        if not twin.exists():  # a matrix has a name of its own
+            (twin,) = twin.parent.iterdir()
+        damaged = before = (state / name).read_bytes()
+        while damaged == before:
+            damaged = kinds[kind](rng, before, twin.read_bytes())
+        case = f"{Path(name).suffix} {kind}"
+        counts[case] += 1
+        try:
+            wrong += [
+                f"{number} {state.name} {case}: {one}"
+                for one in problems(subject, state, folder / str(number), damaged, name, kind)
+            ]
+        except Exception as error:
+            wrong.append(f"{number} {state.name} {case}: {type(error).__name__}: {error}")
+        shutil.rmtree(folder / str(number))
+    return counts, wrong
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command line."""
+    parser.add_argument("--damages", type=int, default=300, help="number of damaged files")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the damages")
+
+
+def main(given: argparse.Namespace) -> int:
+    """Damage files, and print the problems."""
+    logging.getLogger("autdtorch").propagate = False  # hundreds of expected warnings
+    with tempfile.TemporaryDirectory() as folder:
+        counts, wrong = check(given.damages, given.seed, Path(folder))
+    for case, count in sorted(counts.items()):
+        print(f"{count:4d} {case}")
+    for line in (*wrong, f"{sum(counts.values())} damages, {len(wrong)} problems"):
+        print(line)
+    return int(bool(wrong))

@@ -1,0 +1,235 @@
+"""Growth in random scenes, stepped far beyond the steady state.
+
+    python scripts/check.py stability                       500 scenes, about 12 minutes on 2 idle cores
+    python scripts/check.py stability --seed 3 --only 17    one of them
+
+Prints two Markdown tables. Each scene of `shared/random_scenes.py` runs twice: driven from silence, and from
+random pressure without a source, which excites every mode of the grid. A scene fails if a value is not
+finite, if the norm of the pressure rises more in its last half than a driven resonance can, or if the spread
+of its phasors increases. Exits with 1 if any scene fails.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import math
+import multiprocessing
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from shared.document import table
+from shared.random_scenes import LONG_SHARE, LONG_STEPS, Trial, draw_trial
+from tqdm import tqdm
+
+from autdtorch.fdtd.kernels.contract import Receivers, Sources, State
+from autdtorch.fdtd.kernels.cpu import CpuKernel
+from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, assemble, drive_dft, drive_signal
+from autdtorch.propagators.scene_region import region_of
+from autdtorch.utils.arrays import Array
+
+FEWEST_PERIODS = 3 * RAMP_PERIODS
+"""Shortest driven run; in a scene with a fast obstacle a period has hundreds of steps."""
+
+WINDOWS, SAMPLES = 32, 16
+"""Windows of a run, and samples of its norm in each; the largest counts."""
+
+LARGEST_RISE = {"driven": math.log(2.5), "free": math.log(1.2)}
+"""Rise of the logarithm of the pressure's norm over the last half of a run. A driven resonance without loss
+rises in proportion to time, to twice its norm. Without a source only beating modes rise, by less than 1.2."""
+
+WANDERING = 2.0
+"""Spread of the phasors in the last quarter of a run over that in the two quarters before it."""
+STILL = {torch.float32: 1e-3, torch.float64: 1e-6}
+"""Spread of steady phasors relative to their size."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The result of a trial.
+
+    Attributes:
+        trial: the scene.
+        rate: growth of the norm of the pressure per period over the last half, by run.
+        rise: growth over the last half, by run; logarithms.
+        finite: whether all values stayed finite.
+        wandering: spread of the phasors in the last quarter of the driven run over that before it.
+        where: place of the largest pressure at the end of the run that rose most [cells], or the error before
+            the run.
+    """
+
+    trial: Trial
+    rate: dict[str, float]
+    rise: dict[str, float]
+    finite: bool
+    wandering: float
+    where: str
+
+    @property
+    def failed(self) -> bool:
+        """Return whether anything grew."""
+        risen = any(rise > LARGEST_RISE[run] for run, rise in self.rise.items())
+        return not self.finite or risen or self.wandering > WANDERING
+
+    def __str__(self) -> str:
+        """Describe the trial and its figures."""
+        rates = ", ".join(
+            f"{run} {rate:+.2g} (x {_power(self.rise[run])})" for run, rate in self.rate.items()
+        )
+        return (
+            f"{self.trial}\n    growth per period: {rates}; phasors' spread x {self.wandering:.2g}; "
+            f"largest at {self.where}{'' if self.finite else '; NOT FINITE'}"
+        )
+
+
+def _power(logarithm: float) -> str:
+    return f"{math.exp(min(logarithm, 700)):.3g}"
+
+
+def run_trial(trial: Trial) -> Outcome:
+    """Step the scene of a trial, driven and free."""
+    try:
+        assembly = assemble(region_of(trial.scene), trial.spacing, trial.dtype)
+    except Exception as error:  # counts as a failure: all scenes are valid
+        infinite = dict.fromkeys(LARGEST_RISE, math.inf)
+        return Outcome(trial, infinite, infinite, False, math.inf, f"assembling: {error!r}")
+    period = float(assembly.steps_per_period)
+    steps = {"driven": max(trial.steps, math.ceil(FEWEST_PERIODS * period)), "free": trial.steps}
+    mass = np.ones(math.prod(assembly.grid.shape))
+    mass[assembly.heterogeneous.index] = assembly.heterogeneous.mass
+    strength = torch.full(
+        (len(trial.scene.array),), trial.scene.array.source_strength, dtype=torch.complex128
+    )
+    sources = assembly.sources(trial.scene.array.positions, strength)
+    silent = Sources(sources.index[:0], sources.force[:0])
+    receivers = assembly.receivers(trial.scene.control_points)
+    start = {"driven": assembly.silence(sources), "free": _random_state(assembly, sources, trial.number)}
+    drive = {"driven": sources, "free": silent}
+    courses = {
+        run: _course(assembly, start[run], drive[run], receivers, mass, count) for run, count in steps.items()
+    }
+    rise = {run: _rise(course.norm) for run, course in courses.items()}
+    return Outcome(
+        trial,
+        {run: value / (steps[run] / 2 / period) for run, value in rise.items()},
+        rise,
+        all(math.isfinite(value) for value in rise.values()),
+        _wandering(courses["driven"].phasor, STILL[trial.dtype]),
+        courses[max(rise, key=lambda run: rise[run])].where,
+    )
+
+
+@dataclass(frozen=True)
+class _Course:
+    """A run: largest norm of each window (n,), phasors of each block (b, R), place of the peak."""
+
+    norm: Array
+    phasor: NDArray[np.complex128]
+    where: str
+
+
+def _random_state(assembly: Assembly, sources: Sources, seed: int) -> State:
+    """Return random pressure at rest in the interior, none in rigid cells, which would keep it."""
+    grid, state = assembly.grid, assembly.silence(sources)
+    inside = tuple(slice(low, high) for low, high in zip(grid.first, grid.last, strict=True))
+    state.now[inside] = torch.from_numpy(np.random.default_rng(seed).standard_normal(grid.interior)).to(
+        assembly.dtype
+    )
+    state.now.reshape(-1)[torch.from_numpy(assembly.heterogeneous.rigid)] = 0
+    state.before.copy_(state.now)
+    return state
+
+
+def _course(
+    assembly: Assembly, state: State, sources: Sources, receivers: Receivers, mass: Array, steps: int
+) -> _Course:
+    """Step a run and record the norm of its pressure, weighted with the masses as in the energy."""
+    at_once = math.ceil(steps / (WINDOWS * SAMPLES))
+    norm, recorded = np.zeros(WINDOWS * SAMPLES), []
+    for sample in range(len(norm)):
+        signal = drive_signal(assembly.steps_per_period, sample * at_once, at_once).to(assembly.dtype)
+        state, observed = CpuKernel().advance(state, assembly.coefficients, sources, receivers, signal)
+        recorded.append(observed)
+        pressure = state.now.numpy().ravel().astype(np.float64)
+        with np.errstate(over="ignore", invalid="ignore"):  # detected below
+            norm[sample] = np.sqrt((mass * pressure**2).sum())
+    block = assembly.steps_per_period.numerator
+    whole = torch.cat(recorded)
+    phasor = [
+        drive_dft(whole[first : first + block], assembly.steps_per_period.denominator)
+        for first in range(0, len(whole) - block + 1, block)
+    ]
+    peak = np.unravel_index(np.abs(state.now.numpy()).argmax(), assembly.grid.shape)
+    where = np.array(peak) - assembly.grid.to_cells(torch.zeros((1, 3), dtype=torch.float64))[0]
+    text = "(" + ", ".join(f"{x:.1f}" for x in where) + ")"
+    return _Course(norm.reshape(WINDOWS, SAMPLES).max(axis=1), torch.stack(phasor).numpy(), text)
+
+
+def _rise(norm: Array) -> float:
+    """Return the rise of the logarithm of `norm` over the last half of its windows, by a linear fit."""
+    late = norm[len(norm) // 2 :]
+    if not np.isfinite(late).all():
+        return math.inf
+    if late.min() == 0:
+        return 0.0
+    return float(np.polyfit(np.linspace(0, 1, len(late)), np.log(late), 1)[0])
+
+
+def _wandering(phasor: NDArray[np.complex128], still: float) -> float:
+    """Return the spread of phasors (b, R) in the last quarter over that before it; 0 within `still`."""
+    quarters = np.array_split(phasor, 4)[1:]
+    early, middle, late = (float(np.linalg.norm(part - part.mean(axis=0), axis=1).max()) for part in quarters)
+    if late <= still * np.linalg.norm(phasor, axis=1).max():
+        return 0.0
+    return late / max(early, middle, 1e-300)
+
+
+def summary(outcomes: list[Outcome]) -> str:
+    """Return a table of outcomes by label; a scene counts under each of its labels."""
+    rows = []
+    for label in ("any", *sorted({label for outcome in outcomes for label in outcome.trial.labels})):
+        own = [o for o in outcomes if label == "any" or label in o.trial.labels]
+        failed, infinite = sum(o.failed for o in own), sum(not o.finite for o in own)
+        worst = [f"{max(o.rate[run] for o in own):+.1e}" for run in ("driven", "free")]
+        rows.append([label, str(len(own)), str(failed), str(infinite), *worst])
+    return table(["scenes with", "count", "failed", "not finite", "worst rate, driven", "free"], rows)
+
+
+def _numbered(task: tuple[int, int, float]) -> Outcome:
+    torch.set_num_threads(1)
+    logging.getLogger("autdtorch").setLevel(logging.ERROR)  # spacings are coarse on purpose
+    return run_trial(draw_trial(*task))
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command line."""
+    parser.add_argument("--scenes", type=int, default=500, help="number of scenes")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the scenes")
+    parser.add_argument("--only", type=int, help="number of the one scene to run")
+    parser.add_argument("--long-share", type=float, default=LONG_SHARE, help=f"share of {LONG_STEPS} steps")
+    parser.add_argument("--processes", type=int, default=2, help="scenes at once")
+
+
+def main(given: argparse.Namespace) -> int:
+    """Run the scenes; print each failure when it occurs, then the tables."""
+    if given.only is not None:
+        outcome = _numbered((given.seed, given.only, given.long_share))
+        print(outcome)
+        return int(outcome.failed)
+    tasks = [(given.seed, number, given.long_share) for number in range(given.scenes)]
+    outcomes = []
+    with multiprocessing.get_context("spawn").Pool(given.processes) as pool:
+        for outcome in tqdm(pool.imap(_numbered, tasks), total=len(tasks)):
+            outcomes.append(outcome)
+            if outcome.failed:
+                tqdm.write(f"{outcome}\n")
+    for title, inside in (
+        ("Obstacles inside the domain", True),
+        ("Obstacles that may reach out of it", False),
+    ):
+        print(f"\n{title}:\n\n{summary([o for o in outcomes if o.trial.inside == inside])}")
+    refused = sum(outcome.trial.refused for outcome in outcomes)
+    print(f"\n{refused} further scenes were refused: an obstacle too slow for the spacing.")
+    return int(any(outcome.failed for outcome in outcomes))

@@ -1,0 +1,214 @@
+"""Scenes with known transfer matrices, and errors of simulations against them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+
+import numpy as np
+import torch
+from shared.document import DOCS
+from shared.scenes import paper_scene, relative_error, uncached
+
+import autdtorch as at
+from autdtorch import analytic
+from autdtorch.analytic.green import free_space_matrix
+from autdtorch.scene.geometry import plane_basis
+
+CUBE_MATRICES = DOCS / "reference" / "cubes.json"
+TOLERANCE = 1e-3
+
+AIR = at.Medium(density=1.293, sound_speed=340.0)
+
+SPHERE_RADIUS, SPHERE_DENSITY_RATIO = 8e-3, 77.3
+SPHERES: dict[str, float | None] = {"rigid sphere": None, "sphere": 1.0, "fast sphere": 4.0}
+"""Sound speed relative to air; None: rigid."""
+FACE = 22.2e-3
+"""Front face of the slab and of the rigid wall along x [m]."""
+
+CUBES = ("three_cubes", "two_cubes")
+
+SMOOTH_ORDER = 2.0
+CUBE_ORDER = 4 / 3
+"""Orders of the error in the spacing h, for smooth surfaces and for edges. At an edge of a rigid cube the
+velocity is singular as r^(-1/3), and the energy that a grid misses goes as h^(4/3) (Grisvard 1985)."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene with its transfer matrix.
+
+    Attributes:
+        name: of the case.
+        scene: the scene.
+        points: where the pressure is compared (P, 3) [m].
+        exact: transfer matrix (P, M) [Pa].
+        scattered: norm of its scattered part; None without obstacles.
+        order: of the error in the spacing, for extrapolation.
+        method: of the propagator.
+    """
+
+    name: str
+    scene: at.Scene
+    points: torch.Tensor
+    exact: torch.Tensor
+    scattered: float | None
+    order: float
+    method: str = "box"
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """A transfer matrix (P, M) [Pa], its run time [s], and whether every run reached the steady state."""
+
+    matrix: torch.Tensor
+    seconds: float
+    settled: bool
+
+
+def simulate(case: Case, spacing: float, tolerance: float = TOLERANCE) -> Simulation:
+    """Simulate the transfer matrix at `spacing` [mm], scene assembly included in the time."""
+    begin = time.perf_counter()
+    propagator = uncached(case.scene, case.method, spacing, tolerance)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", at.SteadyStateWarning)  # `settled` reports it
+        matrix = propagator.transfer_matrix(case.points)
+    seconds = time.perf_counter() - begin
+    return Simulation(matrix, seconds, all(run.reached for run in propagator.runs))
+
+
+def extrapolate(spacings: Sequence[float], matrices: Sequence[torch.Tensor], order: float) -> torch.Tensor:
+    """Return G_0 of the least-squares fit G(h) = G_0 + C h^order (Richardson's for two spacings)."""
+    powers = np.array(spacings) ** order
+    weights = np.linalg.pinv(np.column_stack((np.ones(len(powers)), powers)))[0]
+    return sum((w * g for w, g in zip(weights.tolist(), matrices, strict=True)), start=torch.zeros(()))
+
+
+def close_scene(name: str, obstacles: Sequence[at.Obstacle] | None = None) -> at.Scene:
+    """Load a scene of the paper with its first focus alone, in the smallest domain that holds everything.
+
+    Args:
+        name: of the scene.
+        obstacles: in place of its own.
+    """
+    scene = paper_scene(name)
+    obstacles, focus = scene.obstacles if obstacles is None else tuple(obstacles), scene.control_points[:1]
+    corners = [torch.tensor([o.lower, o.upper], dtype=torch.float64) for o in obstacles]
+    held = torch.cat((scene.array.positions, focus, *corners))
+    # Whole millimetres, so that every grid lies as in the paper's domain.
+    lower, upper = 1e-3 * (1e3 * held.amin(0) - 3).floor(), 1e-3 * (1e3 * held.amax(0) + 3).ceil()
+    return dataclasses.replace(
+        scene, obstacles=obstacles, control_points=focus, domain=torch.stack((lower, upper)),
+        observation_plane=None,
+    )  # fmt: skip
+
+
+def free_space_case() -> Case:
+    """Return the paper's scene without obstacles."""
+    scene = close_scene("homogeneous")
+    exact = free_space_matrix(scene.control_points, scene.array, scene.wavenumber)
+    return Case("free space", scene, scene.control_points, exact, None, SMOOTH_ORDER, "full")
+
+
+def sphere_case(name: str, shift: Sequence[float] = (0.0, 0.0, 0.0)) -> Case:
+    """Return the paper's array and foci with a sphere between them, its centre moved by `shift` (3,) [m]."""
+    empty = paper_scene("homogeneous")
+    points = empty.control_points[:1]
+    center = 41e-3 + shift[0], 50e-3 + shift[1], 50e-3 + shift[2]
+    speed_ratio, air = SPHERES[name], empty.medium
+    where = (points, empty.array.positions, empty.wavenumber, center, SPHERE_RADIUS)
+    if speed_ratio is None:
+        sphere = at.Sphere(center, SPHERE_RADIUS, rigid=True)
+        both = [analytic.rigid_sphere(*where, scattered=scattered) for scattered in (False, True)]
+    else:
+        density, speed = SPHERE_DENSITY_RATIO * air.density, speed_ratio * air.sound_speed
+        sphere = at.Sphere(center, SPHERE_RADIUS, density=density, sound_speed=speed)
+        ratios = SPHERE_DENSITY_RATIO, speed_ratio
+        both = [analytic.fluid_sphere(*where, *ratios, scattered=scattered) for scattered in (False, True)]
+    exact, scattered = (4 * math.pi * empty.array.source_strength * part for part in both)
+    scene = close_scene("homogeneous", [sphere])
+    return Case(name, scene, points, exact, float(scattered.norm()), SMOOTH_ORDER)
+
+
+def cube_case(name: str) -> Case:
+    """Return a scene of cubes, with the limit of the stored fine grids as its transfer matrix."""
+    scene = close_scene(name)
+    stored = json.loads(CUBE_MATRICES.read_text(encoding="utf-8"))["scenes"][name]
+    matrices = [
+        torch.complex(*(torch.tensor(m[part], dtype=torch.float64) for part in ("real", "imag")))
+        for m in stored
+    ]
+    exact = extrapolate([m["spacing"] for m in stored], matrices, CUBE_ORDER)
+    return limit_case(name, scene, exact)
+
+
+def limit_case(name: str, scene: at.Scene, exact: torch.Tensor) -> Case:
+    """Return a case of cubes with a known transfer matrix."""
+    scattered = exact - free_space_matrix(scene.control_points, scene.array, scene.wavenumber)
+    return Case(name, scene, scene.control_points, exact, float(scattered.norm()), CUBE_ORDER)
+
+
+def slab_case() -> Case:
+    """Return a point source in front of a slab, with points on both sides."""
+    thickness, density_ratio, speed_ratio = 5e-3, 3.0, 1.5
+    slab = at.Box(
+        (FACE + thickness / 2, 20e-3, 20e-3),
+        (thickness, 1.0, 1.0),
+        density=density_ratio * AIR.density,
+        sound_speed=speed_ratio * AIR.sound_speed,
+    )
+    ratios = {"density_ratio": density_ratio, "speed_ratio": speed_ratio}
+    exact = partial(analytic.fluid_slab, thickness=thickness, **ratios)
+    return _layered_case("slab", slab, (14.1e-3, 34.6e-3), exact)
+
+
+def wall_case() -> Case:
+    """Return a point source and points in front of a rigid wall."""
+    wall = at.Box((FACE + 0.5, 20e-3, 20e-3), (1.0, 1.0, 1.0), rigid=True)
+    return _layered_case("rigid wall", wall, (14.1e-3,), analytic.rigid_plane)
+
+
+def _layered_case(
+    name: str, box: at.Box, planes: Sequence[float], exact: Callable[..., torch.Tensor]
+) -> Case:
+    """Return a point source before a box that leaves the domain, with points in `planes` along x [m]."""
+    array = at.TransducerArray([(8.3e-3, 19.1e-3, 20.7e-3)], (1, 0, 0))
+    points = torch.tensor(list(product(planes, (9.4e-3, 21e-3), (11.7e-3, 32.2e-3))), dtype=torch.float64)
+    scene = at.Scene(array, AIR, 40e3, points, (box,), domain=((0, 0, 0), (40e-3,) * 3))
+    where = (points, array.positions, scene.wavenumber, (FACE, 0, 0), (-1, 0, 0))
+    strength = 4 * math.pi * array.source_strength
+    total, scattered = (strength * exact(*where, scattered=part) for part in (False, True))
+    return Case(name, scene, points, total, float(scattered.norm()), SMOOTH_ORDER, "full")
+
+
+def piston_case() -> Case:
+    """Return a tilted disc of radius 5 mm between the cells, with points 0 to 60 degrees off its axis."""
+    center = torch.tensor([12.3e-3, 13.1e-3, 13.7e-3], dtype=torch.float64)
+    tilt = 2.0, 1.0, 0.6
+    array = at.TransducerArray(center[None], tilt, radius=5e-3)
+    normal, (across, _) = array.normals[0], plane_basis(tilt)
+    angles = torch.deg2rad(torch.arange(0, 61, 5, dtype=torch.float64))[:, None]
+    points = center + 20e-3 * (angles.cos() * normal + angles.sin() * across)
+    domain = torch.stack((points.amin(0).minimum(center - 6e-3), points.amax(0).maximum(center + 6e-3)))
+    scene = at.Scene(array, AIR, 40e3, points, domain=domain)
+    field = analytic.piston_field(points, array.positions, scene.wavenumber, 5e-3, tilt)
+    exact = 4 * math.pi * array.source_strength * field
+    return Case("piston", scene, points, exact, None, SMOOTH_ORDER, "full")
+
+
+def worst_point_error(case: Case, matrix: torch.Tensor) -> float:
+    """Return the largest error of a point relative to its own pressure."""
+    return float(((matrix - case.exact).abs() / case.exact.abs()).max())
+
+
+def error_of(case: Case, matrix: torch.Tensor) -> tuple[float, float | None]:
+    """Return the relative errors of a transfer matrix and of its scattered part."""
+    total = relative_error(matrix, case.exact)
+    return total, None if case.scattered is None else total * float(case.exact.norm()) / case.scattered

@@ -1,0 +1,267 @@
+"""Random scenes for stress tests: small domains, obstacles of every kind, contrast and position.
+
+A scene is 6 to 12 cells across at 3 to 20 cells per wavelength. It holds one to four obstacles, which may be
+rigid, thin, touching or overlapping, with sources and control points close to them.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from autdtorch.fdtd.grid import MIN_CELLS_PER_WAVELENGTH, make_grid
+from autdtorch.propagators.scene_region import region_of
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
+from autdtorch.scene.scene import Medium, OverlapWarning, Scene
+from autdtorch.utils.arrays import Array
+
+AIR = Medium(density=1.2, sound_speed=340.0)
+FREQUENCY = 40e3
+WAVELENGTH = AIR.sound_speed / FREQUENCY
+
+STEPS, LONG_STEPS = 2_000, 100_000
+LONG_SHARE = 0.01
+"""Share of the scenes with `LONG_STEPS`; these are the smallest, 6 cells across."""
+INSIDE_SHARE = 0.75
+"""Share of the scenes without obstacles in the boundary layer."""
+KINDS = {
+    "box": 0.25,
+    "rotated box": 0.15,
+    "sphere": 0.15,
+    "cylinder": 0.15,
+    "voxels": 0.05,
+    "mesh": 0.05,
+    "wall": 0.2,
+}
+"""Kinds of obstacles and their shares; walls are unbounded, in the scenes that allow it."""
+
+UNBOUNDED = 1e3
+"""Extent of a wall [cells]."""
+
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A random scene and its run.
+
+    Attributes:
+        number: draws the scene again.
+        scene: the scene.
+        spacing: edge of a cell [m].
+        dtype: precision of the fields.
+        steps: of each run, at least; the driven run takes `FEWEST_PERIODS` if these are more.
+        labels: special features.
+        inside: whether all obstacles are inside the domain; else some may reach into the boundary layer.
+        refused: number of scenes drawn before it with obstacles too slow for the spacing.
+    """
+
+    number: int
+    scene: Scene
+    spacing: float
+    dtype: torch.dtype
+    steps: int
+    labels: tuple[str, ...]
+    inside: bool
+    refused: int
+
+    def __str__(self) -> str:
+        """Describe the scene, lengths in cells from the lower corner of the domain."""
+        lines = [
+            f"scene {self.number}: {WAVELENGTH / self.spacing:.2f} cells per wavelength, domain "
+            f"{_cells(self.scene.domain[1], self.spacing)}, {self.dtype}, {', '.join(self.labels)}"
+        ]
+        for obstacle in self.scene.obstacles:
+            where = " to ".join(_cells(c, self.spacing) for c in (obstacle.lower, obstacle.upper))
+            lines.append(f"    {type(obstacle).__name__} {where}, {_described(obstacle)}")
+        for name, points in (
+            ("source", self.scene.array.positions),
+            ("control point", self.scene.control_points),
+        ):
+            lines += [f"    {name} {_cells(point, self.spacing)}" for point in points.tolist()]
+        return "\n".join(lines)
+
+
+def _cells(point: tuple[float, float, float] | list[float], spacing: float) -> str:
+    return "(" + ", ".join(f"{coordinate / spacing:.3f}" for coordinate in point) + ")"
+
+
+def _described(obstacle: Obstacle) -> str:
+    if obstacle.density is None or obstacle.sound_speed is None:
+        return "rigid"
+    density, speed = obstacle.density / AIR.density, obstacle.sound_speed / AIR.sound_speed
+    return f"density x {density:.3g}, speed x {speed:.3g}"
+
+
+def draw_trial(seed: int, number: int, long_share: float = LONG_SHARE) -> Trial:
+    """Draw scene `number` of a seed."""
+    rng = np.random.default_rng((seed, number))
+    long, inside, refused = bool(rng.uniform() < long_share), bool(rng.uniform() < INSIDE_SHARE), 0
+    while True:
+        spacing = WAVELENGTH / _log_uniform(rng, MIN_CELLS_PER_WAVELENGTH, 20.0)
+        domain = np.full(3, 6.0) if long else rng.integers(6, 13, 3).astype(float)
+        draft = _Draft(rng, spacing, domain, [], {"long"} if long else set())
+        for _ in range(rng.integers(1, 5)):
+            draft.add_obstacle(inside)
+        scene = draft.scene()
+        if scene is None:
+            continue
+        if not _refused(scene, spacing):
+            break
+        refused += 1
+    dtype = torch.float32 if rng.uniform() < 0.5 else torch.float64
+    steps = LONG_STEPS if long else STEPS
+    draft.labels.add(str(dtype).removeprefix("torch."))
+    return Trial(number, scene, spacing, dtype, steps, tuple(sorted(draft.labels)), inside, refused)
+
+
+def _refused(scene: Scene, spacing: float) -> bool:
+    """Return whether an obstacle is too slow for the spacing, the only valid error here."""
+    try:
+        make_grid(region_of(scene), spacing)
+    except ValueError as error:
+        if "cells per wavelength in obstacle" not in str(error):
+            raise
+        return True
+    return False
+
+
+@dataclass
+class _Draft:
+    """A scene while it is drawn, lengths in cells.
+
+    Attributes:
+        rng: random numbers.
+        spacing: edge of a cell [m].
+        domain: its extent (3,).
+        obstacles: drawn so far.
+        labels: drawn so far.
+    """
+
+    rng: np.random.Generator
+    spacing: float
+    domain: Array
+    obstacles: list[Obstacle]
+    labels: set[str]
+
+    def scene(self) -> Scene | None:
+        """Return the scene, with points in its air; None if the obstacles leave too little air."""
+        candidates = self.spacing * self.domain * self.rng.uniform(0.02, 0.98, (512, 3))
+        gap = np.min([o.signed_distance(candidates).numpy() for o in self.obstacles], axis=0) / self.spacing
+        # the distance to voxels is not exact between their centres
+        inside = np.any([o.contains(candidates, margin=1e-6).numpy() for o in self.obstacles], axis=0)
+        free, chosen = np.flatnonzero((gap > 0.2) & ~inside), []
+        if len(free) < 4:
+            return None
+        for _ in range(4):
+            near = self.rng.uniform() < 0.5
+            order = (
+                np.abs(gap[free] - self.rng.uniform(0.2, 1.5)) if near else self.rng.uniform(size=len(free))
+            )
+            chosen.append(free[order.argmin()])
+            free = np.setdiff1d(free, chosen)
+        if gap[chosen].min() < 1.5:
+            self.labels.add("point at a wall")
+        array = TransducerArray(candidates[chosen[:2]], (1.0, 0.0, 0.0), radius=0.0)
+        corners = np.array((np.zeros(3), self.spacing * self.domain))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", OverlapWarning)
+            return Scene(array, AIR, FREQUENCY, candidates[chosen[2:]], self.obstacles, domain=corners)
+
+    def add_obstacle(self, inside: bool) -> None:
+        """Draw one more, fully `inside` the domain or partly."""
+        while True:
+            obstacle, labels = self._obstacle()
+            lower, upper = np.array(obstacle.lower) / self.spacing, np.array(obstacle.upper) / self.spacing
+            if inside:
+                fits = (lower >= -1e-6).all() and (upper <= self.domain + 1e-6).all()
+            else:
+                fits = (upper > 0.1).all() and (lower < self.domain - 0.1).all()
+            if fits:
+                break
+        self.obstacles.append(obstacle)
+        self.labels |= labels
+
+    def _obstacle(self) -> tuple[Obstacle, set[str]]:
+        """Return an obstacle that may lie anywhere, and its labels."""
+        rng, aligned, thin = self.rng, self.rng.uniform() < 0.4, self.rng.uniform() < 0.25
+        kind = str(rng.choice(list(KINDS), p=list(KINDS.values())))
+        size = np.exp(rng.uniform(0, math.log(8.0), 3))
+        if kind == "wall":
+            size[np.arange(3) != rng.integers(3)] = UNBOUNDED
+        axis, turn = rng.normal(size=3), rng.uniform(-math.pi, math.pi, 3)
+        if aligned:
+            size, axis, turn = np.rint(size), np.eye(3)[rng.integers(3)], np.zeros(3)
+        if thin:
+            size[rng.integers(3)] = _log_uniform(rng, 0.1, 1.0)
+        center, place = self._center(size)
+        if aligned and place == "apart":
+            center = np.rint(2 * center) / 2
+        material, names = _material(rng)
+        obstacle = _make(kind, self.spacing * center, self.spacing * size, axis, turn, rng, material)
+        names |= {kind, place} | ({"aligned"} if aligned else set()) | ({"thin"} if thin else set())
+        return obstacle, names
+
+    def _center(self, size: Array) -> tuple[Array, str]:
+        """Return the centre of an obstacle of `size` (3,), anywhere or at the previous one, and a label."""
+        rng, chance = self.rng, self.rng.uniform()
+        if not self.obstacles or chance < 0.4:
+            return self.domain * rng.uniform(0, 1, 3), "apart"
+        last = self.obstacles[-1]
+        lower, upper = (np.array(corner) / self.spacing for corner in (last.lower, last.upper))
+        lower, upper = lower.clip(min=-self.domain), upper.clip(max=2 * self.domain)
+        middle, extent = (lower + upper) / 2, upper - lower
+        if chance < 0.7:
+            towards = np.sign(rng.normal(size=3)) * (rng.uniform(size=3) < 0.6)
+            return middle + towards * (extent + size) / 2, "touching"
+        return middle + rng.uniform(-0.5, 0.5, 3) * extent, "overlapping"
+
+
+def _material(rng: np.random.Generator) -> tuple[dict[str, Any], set[str]]:
+    """Return the material arguments of an obstacle, and labels."""
+    if rng.uniform() < 0.2:
+        return {"rigid": True}, {"rigid"}
+    density, speed = _log_uniform(rng, 1e-3, 1e4), _log_uniform(rng, 0.2, 17.0)
+    labels = {"light" if density < 1 else "heavy", "slow" if speed < 1 else "fast"}
+    return {"density": AIR.density * density, "sound_speed": AIR.sound_speed * speed}, labels
+
+
+def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(math.exp(rng.uniform(math.log(low), math.log(high))))
+
+
+def _make(
+    kind: str,
+    center: Array,
+    size: Array,
+    axis: Array,
+    turn: Array,
+    rng: np.random.Generator,
+    material: dict[str, Any],
+) -> Obstacle:
+    """Return an obstacle with its centre and size (3,) [m], axis (3,) and rotation (3,) [rad]."""
+    middle, (x, y, z), angles = tuple(center.tolist()), size.tolist(), tuple(turn.tolist())
+    if kind == "sphere":
+        return Sphere(middle, x / 2, **material)
+    if kind == "cylinder":
+        return Cylinder(middle, x / 2, z, tuple(axis.tolist()), **material)
+    if kind in ("box", "wall"):
+        return Box(middle, (x, y, z), **material)
+    if kind == "rotated box":
+        return Box(middle, (x, y, z), angles, **material)
+    if kind == "voxels":
+        mask = rng.uniform(size=(3, 3, 3)) < 0.6
+        mask[1, 1, 1] = True
+        return VoxelMask(mask, x / 3, tuple((center - x / 2).tolist()), **material)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "tetrahedron.obj"
+        path.write_text(TETRAHEDRON, encoding="utf-8")
+        return Mesh(str(path), scale=x, offset=middle, rotation=angles, **material)

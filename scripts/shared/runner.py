@@ -1,0 +1,54 @@
+"""Run one of the commands in a folder of scripts: each module with a function `main` is a command.
+
+A command's `main(given)` takes the parsed options and returns an exit status or None. `options(parser)` adds
+its options. A command with a constant `DOCUMENT` fills in a block of that page and gets the option
+`--output`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib
+import sys
+from pathlib import Path
+
+from shared.document import DOCS
+
+SCRIPTS = Path(__file__).parents[1]
+
+
+class _Help(argparse.RawDescriptionHelpFormatter, argparse.ArgumentDefaultsHelpFormatter):
+    pass
+
+
+def commands(folder: str) -> dict[str, str]:
+    """Return the summary of each command by name, without importing any."""
+    found = {}
+    for path in sorted((SCRIPTS / folder).glob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        if any(isinstance(node, ast.FunctionDef) and node.name == "main" for node in tree.body):
+            found[path.stem] = (ast.get_docstring(tree) or "").partition("\n")[0]
+    return found
+
+
+def run(folder: str, description: str) -> int:
+    """Run the command that `sys.argv` names, or list the commands; return the exit status."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=_Help)
+    names = parser.add_subparsers(metavar="NAME", dest="name")
+    chosen, module = sys.argv[1:2], None
+    for name, summary in commands(folder).items():
+        command = names.add_parser(name, help=summary, description=summary, formatter_class=_Help)
+        if chosen == [name]:
+            module = importlib.import_module(f"{folder}.{name}")
+            command.description = module.__doc__
+            if hasattr(module, "options"):
+                module.options(command)
+            if hasattr(module, "DOCUMENT"):
+                command.add_argument("--output", type=Path, default=DOCS, help="folder of the written files")
+    given = parser.parse_args()
+    if module is None:
+        parser.print_usage()
+        print(*(f"  {name:18}{summary}" for name, summary in commands(folder).items()), sep="\n")
+        return 0
+    return int(module.main(given) or 0)

@@ -1,0 +1,56 @@
+"""The paper's scenes, also with larger arrays, as scripts simulate them."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import torch
+
+import autdtorch as at
+from autdtorch.propagators import SimulatedPropagator
+
+ROOT = Path(__file__).parents[2]
+SCENES = ROOT / "configs" / "scene"
+
+PAPER = ("homogeneous", "three_cubes", "two_cubes")
+
+MIDDLE = (1e-3, 50e-3, 50e-3)
+"""Centre of the paper's array [m]."""
+
+
+def paper_scene(name: str) -> at.Scene:
+    """Load a scene of the paper."""
+    return at.load_scene(SCENES / f"{name}.yaml")
+
+
+def paper_objectives() -> dict[str, at.SimulatedObjective]:
+    """Return undisturbed objectives by scene, simulated at the default spacing."""
+    scenes = {name: paper_scene(name) for name in PAPER}
+    return {name: at.SimulatedObjective(scene, at.make_propagator(scene)) for name, scene in scenes.items()}
+
+
+def autd3_array(units: tuple[int, int] = (1, 1)) -> at.TransducerArray:
+    """Return AUTD3s of 249 point sources each, side by side in the place of the paper's array."""
+    return at.TransducerArray.autd3(
+        MIDDLE, units=units, source_strength=at.PAPER_SOURCE_STRENGTH, radius=None
+    )
+
+
+def with_array(scene: at.Scene, array: at.TransducerArray) -> at.Scene:
+    """Replace the array, in a domain that holds the old and the new one."""
+    corners = torch.cat((array.positions, torch.tensor(scene.domain, dtype=torch.float64)))
+    domain = torch.stack((corners.amin(0) - 3e-3, corners.amax(0) + 3e-3))
+    return dataclasses.replace(scene, array=array, domain=domain, observation_plane=None)
+
+
+def uncached(scene: at.Scene, method: str, spacing: float, tolerance: float = 1e-3) -> SimulatedPropagator:
+    """Return a propagator at `spacing` [mm] that reads nothing from disk."""
+    propagator = at.make_propagator(scene, method, spacing * 1e-3, tolerance=tolerance, cache=False)
+    assert isinstance(propagator, SimulatedPropagator)
+    return propagator
+
+
+def relative_error(value: torch.Tensor, exact: torch.Tensor) -> float:
+    """Return the complex relative L2 error."""
+    return float((value - exact).norm() / exact.norm())

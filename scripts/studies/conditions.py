@@ -1,0 +1,258 @@
+"""Methods under noise, few phase levels, failed transducers and drift.
+
+    python scripts/study.py conditions                              all methods of the package
+    python scripts/study.py conditions --methods gabs identify      two of them
+
+Writes conditions.png and a block of conditions.md. Each trial has an objective of its own, with noise and
+drift seeded by the number of the trial. The true score is the weakest focus that the drive found produces
+without noise on the device in its final state.
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from shared.document import command_line, fill_in, measured, table
+from shared.scenes import PAPER, paper_objectives
+
+import autdtorch as at
+from autdtorch.plot.style import TICK_SIZE, Look, label_of, looks_of, new_figure, readable, styled
+
+DOCUMENT = "conditions.md"
+SHOWN = "three_cubes"
+"""Scene of the table in the document."""
+
+Wrap = Callable[[at.Objective, int], at.Objective]
+"""Puts an objective under a condition, given the number of the trial."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method with its settings.
+
+    Attributes:
+        function: name in the package.
+        settings: keyword arguments.
+        together: whether all trials go in one call, which batches their work; only for methods whose trials
+            take equally many evaluations in every step.
+    """
+
+    function: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    together: bool = False
+
+    @property
+    def label(self) -> str:
+        """Return the name in the report."""
+        settings = (
+            value if isinstance(value, str) else f"{value} {key}" for key, value in self.settings.items()
+        )
+        return ", ".join([label_of(self.function), *settings])
+
+
+METHODS = {
+    "random_search": Method("random_search"),
+    "lss": Method("lss"),
+    "lssg": Method("lssg"),
+    "lssg_5_passes": Method("lssg", {"passes": 5}),
+    "gabs": Method("gabs"),
+    "gabs_2_passes": Method("gabs", {"passes": 2}),
+    "bayes_opt": Method("bayes_opt", together=True),
+    "bayes_opt_circle": Method("bayes_opt", {"embedding": "circle"}, together=True),
+    "identify": Method("identify"),
+    "identify_256": Method("identify", {"evaluations": 256}),
+}
+
+
+def dead(objective: at.Objective, trial: int, count: int = 1) -> at.Objective:
+    """Switch off transducers, different ones in each trial."""
+    order = torch.randperm(len(objective.scene.array), generator=torch.Generator().manual_seed(trial))
+    return at.Dead(objective, order[:count].tolist())
+
+
+def bench(objective: at.Objective, trial: int) -> at.Objective:
+    """Combine everything: 32 levels without amplitudes, one failed transducer, drift, four reads at 20 dB."""
+    drifting = at.Drift(dead(objective, trial), phase=0.3, loss=0.1, sensor=0.1, seed=trial)
+    return at.Noise(at.Quantised(drifting, 32, on_off=True), 20, reads=4, seed=trial)
+
+
+CONDITIONS: dict[str, Wrap] = {
+    "undisturbed": lambda objective, trial: objective,
+    **{f"SNR {snr} dB": lambda o, t, snr=snr: at.Noise(o, snr, seed=t) for snr in (40, 30, 20, 10)},
+    "SNR 20 dB, 4 reads": lambda objective, trial: at.Noise(objective, 20, reads=4, seed=trial),
+    **{f"{n} levels": lambda o, t, n=n: at.Quantised(o, n) for n in (256, 32, 16, 8, 4, 2)},
+    "32 levels, on/off": lambda objective, trial: at.Quantised(objective, 32, on_off=True),
+    "one dead": dead,
+    "four dead": partial(dead, count=4),
+    "drift 0.3 rad": lambda objective, trial: at.Drift(objective, phase=0.3, seed=trial),
+    "drift 1 rad": lambda objective, trial: at.Drift(objective, phase=1.0, seed=trial),
+    "drift of the sensor, 0.3": lambda objective, trial: at.Drift(objective, sensor=0.3, seed=trial),
+    "all at once": bench,
+}
+
+AXES = {
+    "signal-to-noise ratio [dB]": {
+        **{str(snr): f"SNR {snr} dB" for snr in (10, 20, 30, 40)},
+        r"$\infty$": "undisturbed",
+    },
+    "phase levels": {**{str(n): f"{n} levels" for n in (2, 4, 8, 16, 32, 256)}, "any": "undisturbed"},
+}
+"""Rows of panels: label of the axis, then ticks and their conditions."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The trials of a method in a scene under a condition.
+
+    Attributes:
+        true: weakest focus that each drive found produces (T,) [Pa].
+        observed: weakest focus observed for it (T,) [Pa].
+    """
+
+    true: torch.Tensor
+    observed: torch.Tensor
+
+    @property
+    def error(self) -> float:
+        """Return the standard error of the mean true score [Pa]; 0 for one trial."""
+        count = len(self.true)
+        return float(self.true.std() / count**0.5) if count > 1 else 0.0
+
+
+Outcomes = Mapping[tuple[str, str, str], Outcome]
+"""Outcomes by scene, condition and label of the method."""
+
+
+class SideBySide:
+    """Objectives of several trials as one, with an equal share of the rows for each."""
+
+    def __init__(self, objectives: Sequence[at.Objective]) -> None:
+        """Keep the objectives of trials 0, 1, ..."""
+        self.scene = objectives[0].scene
+        self.evaluations = 0
+        self._objectives = objectives
+
+    def __call__(self, drive: torch.Tensor) -> torch.Tensor:
+        """Observe drives (T * B, M), with the rows of a trial together."""
+        self.evaluations += len(drive)
+        shares = drive.chunk(len(self._objectives))
+        return torch.cat([own(share) for own, share in zip(self._objectives, shares, strict=True)])
+
+
+def solve(method: Method, objective: at.Objective, trials: Sequence[int]) -> at.Solution:
+    """Run trials of a method; a method without random choices takes no `trials` and no `seed`."""
+    function = getattr(at, method.function)
+    given = {"trials": list(trials), "seed": 0}
+    known = {key: value for key, value in given.items() if key in inspect.signature(function).parameters}
+    return function(objective, **method.settings, **known)
+
+
+def outcome(method: Method, objective: at.Objective, wrap: Wrap, trials: int) -> Outcome:
+    """Return true and observed scores of a method's trials under a condition."""
+    objectives = [wrap(objective, trial) for trial in range(trials)]
+    if method.together:
+        solutions = [solve(method, SideBySide(objectives), range(trials))]
+    else:
+        solutions = [solve(method, own, [trial]) for trial, own in enumerate(objectives)]
+    drives = torch.cat([solution.drive for solution in solutions])
+    true = [at.true_pressure(own, drive[None]) for own, drive in zip(objectives, drives, strict=True)]
+    return Outcome(at.weakest_focus(torch.cat(true)), torch.cat([found.score for found in solutions]))
+
+
+def keys(outcomes: Outcomes, place: int) -> list[str]:
+    """Return the scenes (0), conditions (1) or methods (2)."""
+    return list(dict.fromkeys(key[place] for key in outcomes))
+
+
+def true_scores(outcomes: Outcomes, scene: str) -> str:
+    """Return a table of mean true scores in a scene, rows of conditions and columns of methods."""
+    methods = keys(outcomes, 2)
+    rows = [
+        [condition, *(f"{outcomes[scene, condition, method].true.mean():.2f}" for method in methods)]
+        for condition in keys(outcomes, 1)
+    ]
+    return table(["condition", *methods], rows)
+
+
+def observed_over_true(outcomes: Outcomes) -> str:
+    """Return a table of the mean observed over the mean true score, mean over the scenes."""
+    scenes, methods, rows = keys(outcomes, 0), keys(outcomes, 2), []
+    for condition in keys(outcomes, 1):
+        found = [[outcomes[scene, condition, method] for scene in scenes] for method in methods]
+        ratios = [sum(float(o.observed.mean() / o.true.mean()) for o in own) / len(own) for own in found]
+        rows.append([condition, *(f"{ratio:.2f}" for ratio in ratios)])
+    return table(["condition", *methods], rows)
+
+
+@styled
+def plot_conditions(outcomes: Outcomes) -> Figure:
+    """Plot the true weakest focus over noise and over levels, a column for each scene."""
+    scenes, methods = keys(outcomes, 0), keys(outcomes, 2)
+    figure = new_figure(0.8 + 2.6 * len(scenes), 6.0)
+    panels = figure.subplots(len(AXES), len(scenes), squeeze=False, sharex="row", sharey=True)
+    for row, (label, ticks) in zip(panels, AXES.items(), strict=True):
+        for ax, scene in zip(row, scenes, strict=True):
+            for method, look in looks_of(methods).items():
+                line = [outcomes[scene, condition, method] for condition in ticks.values()]
+                _draw(ax, line, look, method)
+            ax.set_xticks(range(len(ticks)), list(ticks))
+            ax.set_xlabel(label)
+            ax.tick_params(labelsize=TICK_SIZE)
+            ax.grid(color="0.9", lw=0.6)
+        row[0].set_ylabel("true weakest focus [Pa]")
+    for ax, scene in zip(panels[0], scenes, strict=True):
+        ax.set_title(readable(scene))
+    panels[0, 0].set_ylim(bottom=0)
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=min(len(methods), 6))
+    figure.supxlabel(f"bands: standard error of the mean over trials\n{command_line()}", fontsize=TICK_SIZE)
+    return figure
+
+
+def _draw(ax: Axes, outcomes: list[Outcome], look: Look, label: str) -> None:
+    colour, marker, dashes = look
+    means = torch.stack([outcome.true.mean() for outcome in outcomes]).numpy()
+    errors = torch.tensor([outcome.error for outcome in outcomes]).numpy()
+    places = range(len(outcomes))
+    ax.fill_between(places, means - errors, means + errors, color=colour, alpha=0.2, lw=0)
+    ax.plot(places, means, color=colour, marker=marker, linestyle=dashes, ms=4, lw=1.2, label=label)
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command line."""
+    parser.add_argument(
+        "--methods", nargs="+", choices=METHODS, default=list(METHODS), help="compared methods"
+    )
+    parser.add_argument("--trials", type=int, default=20, help="trials of each method")
+
+
+def main(given: argparse.Namespace) -> None:
+    """Measure; print all tables, and write block and figure."""
+    outcomes = {}
+    for scene, objective in paper_objectives().items():
+        for condition, wrap in CONDITIONS.items():
+            for name in given.methods:
+                found = outcome(METHODS[name], objective, wrap, given.trials)
+                outcomes[scene, condition, METHODS[name].label] = found
+                print(f"{scene}, {condition}, {name}: {found.true.mean():.3f} Pa", flush=True)
+    for scene in PAPER:
+        print("", f"True weakest focus [Pa], {scene}:", "", true_scores(outcomes, scene), sep="\n")
+    print("", "Observed over true weakest focus:", "", observed_over_true(outcomes), sep="\n")
+    error = max(outcome.error for outcome in outcomes.values())
+    parts = (
+        measured(),
+        "![True weakest focus over the level of noise and over the number of phase levels](conditions.png)",
+        f"Mean true weakest focus [Pa] of {given.trials} trials in `{SHOWN}`; standard errors are at most "
+        f"{error:.2f} Pa.",
+        true_scores(outcomes, SHOWN),
+    )
+    fill_in(DOCUMENT, "study.py conditions", parts, given.output)
+    plot_conditions(outcomes).savefig(given.output / "conditions.png")

@@ -1,0 +1,99 @@
+"""Methods on arrays of 249 and 256 transducers, at equal numbers of evaluations.
+
+    python scripts/study.py large_arrays            a quarter of an hour
+
+Fills in a block of methods.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+
+import torch
+from shared.document import fill_in, measured, table
+from shared.scenes import MIDDLE, autd3_array, paper_scene, with_array
+
+import autdtorch as at
+
+DOCUMENT = "methods.md"
+
+SCENE = "two_cubes"
+ARRAYS: dict[str, Callable[[], at.TransducerArray]] = {
+    "AUTD3": autd3_array,
+    "16 x 16": partial(at.TransducerArray.grid, (16, 16), 10e-3, MIDDLE),
+}
+
+Method = Callable[..., at.Solution]
+
+METHODS: dict[str, dict[str, Method]] = {
+    "about 1000": {
+        "random search": partial(at.random_search, evaluations=1000),
+        "LSSG, 5 passes": partial(at.lssg, passes=5),
+        "GABS, 4 levels": partial(at.gabs, levels=4),
+        "BO": partial(at.bayes_opt, evaluations=1000),
+        "BO on the circle": partial(at.bayes_opt, evaluations=1000, embedding="circle"),
+        "identify": partial(at.identify, evaluations=1000),
+    },
+    "about 4000": {
+        "random search": partial(at.random_search, evaluations=4000),
+        "GABS, 16 levels": at.gabs,
+        "GABS, 4 levels, 4 passes": partial(at.gabs, levels=4, passes=4),
+    },
+    "-": {"gradient ascent": at.gradient_ascent},
+}
+"""Methods by the number of evaluations, which all but LSSG use up."""
+
+
+def run(method: Method, objective: at.Objective, trials: int) -> tuple[at.Solution, float]:
+    """Return the solution and the seconds per trial."""
+    begin = time.perf_counter()
+    function = method.func if isinstance(method, partial) else method
+    solution = method(objective) if function is at.lssg else method(objective, trials=trials)
+    return solution, (time.perf_counter() - begin) / len(solution.score)
+
+
+def measure(objectives: Mapping[str, at.SimulatedObjective], trials: int) -> list[list[str]]:
+    """Return a row for each method, with its scores as shares of the bound."""
+    bounds = {name: at.focus_bound(objective.transfer_matrix) for name, objective in objectives.items()}
+    rows = []
+    for budget, methods in METHODS.items():
+        for name, method in methods.items():
+            shares, evaluations, seconds = [], [], []
+            for where, objective in objectives.items():
+                solution, duration = run(method, objective, trials)
+                shares.append(spread(100 * solution.score / bounds[where]))
+                evaluations.append(solution.evaluations.double().mean())
+                seconds.append(duration)
+                print(where, name, shares[-1], f"{duration:.2g} s a trial", flush=True)
+            mean = torch.stack(evaluations).mean()
+            rows.append([budget, name, f"{mean:.0f}", *shares, f"{sum(seconds) / len(seconds):.2g}"])
+    return rows
+
+
+def spread(shares: torch.Tensor) -> str:
+    """Format the median and the range of the trials."""
+    if len(shares) == 1:
+        return f"{shares.item():.1f}"
+    return f"{shares.median():.1f} ({shares.min():.1f} to {shares.max():.1f})"
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command line."""
+    parser.add_argument("--trials", type=int, default=3, help="trials of each method")
+
+
+def main(given: argparse.Namespace) -> None:
+    """Measure, and write the block."""
+    scenes = {name: with_array(paper_scene(SCENE), array()) for name, array in ARRAYS.items()}
+    objectives = {name: at.SimulatedObjective(one, at.make_propagator(one)) for name, one in scenes.items()}
+    parts = (
+        measured(),
+        f"Weakest focus in % of the certified bound: median (least to greatest) of {given.trials} trials.",
+        table(
+            ["budget", "method", "evaluations", *objectives, "s a trial"], measure(objectives, given.trials)
+        ),
+    )
+    fill_in(DOCUMENT, "study.py large_arrays", parts, given.output)

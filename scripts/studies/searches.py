@@ -1,0 +1,98 @@
+"""Effect of order, levels and passes on LSSG and GABS.
+
+    python scripts/study.py searches            half a minute
+
+Fills in a block of methods.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Mapping
+from functools import partial
+
+import torch
+from shared.document import fill_in, measured, table
+from shared.scenes import PAPER, paper_objectives
+
+import autdtorch as at
+
+DOCUMENT = "methods.md"
+
+Figures = tuple[torch.Tensor, torch.Tensor]
+"""Scores (T,) [Pa] and evaluations (T,)."""
+
+
+def best_offsets(objective: at.Objective) -> Figures:
+    """Return the best of all combinations of 16 offsets per focus, with all amplitudes 1."""
+    scene = objective.scene
+    foci = at.drive_from_phases(
+        at.focus_phases(scene.array.positions, scene.control_points, scene.wavenumber)
+    )
+    levels = 2 * math.pi * torch.arange(16, dtype=torch.float64) / 16
+    offsets = torch.cartesian_prod(levels.new_zeros(1), *[levels] * (len(foci) - 1))
+    drive = at.drive_from_phases(at.phases_of(at.drive_from_phases(offsets) @ foci))
+    return at.weakest_focus(objective(drive)).max()[None], torch.tensor([len(drive)])
+
+
+def measure(objective: at.Objective, trials: int) -> dict[str, Figures]:
+    """Return scores and evaluations of every search."""
+    gabs = partial(at.gabs, trials=trials)
+    searches = {
+        "random search": partial(at.random_search, trials=trials),
+        "LSS": at.lss,
+        "LSSG": at.lssg,
+        "LSSG, 2 passes": partial(at.lssg, passes=2),
+        "GABS": gabs,
+        "GABS, 2 passes": partial(gabs, passes=2),
+        "GABS, 3 passes": partial(gabs, passes=3),
+        "GABS, 20 passes": partial(gabs, passes=20),
+        "GABS, order given": partial(at.gabs, order="given"),
+        "GABS, by strength": partial(at.gabs, order="strength"),
+        "GABS, 4 levels": partial(gabs, levels=4),
+        "GABS, 8 levels": partial(gabs, levels=8),
+        "GABS, 32 levels": partial(gabs, levels=32),
+        "GABS, 8 levels, 2 passes": partial(gabs, levels=8, passes=2),
+    }
+    solutions = {name: search(objective) for name, search in searches.items()}
+    figures = {name: (solution.score, solution.evaluations) for name, solution in solutions.items()}
+    figures["LSS, best of all offsets, amplitudes 1"] = best_offsets(objective)
+    pairs = at.gabs(objective, trials=4 * trials)
+    best, cost = pairs.score.reshape(-1, 2).amax(dim=1), pairs.evaluations.reshape(-1, 2).sum(dim=1)
+    return {**figures, "GABS, best of 2 orders": (best, cost)}
+
+
+def summary(figures: Mapping[str, Mapping[str, Figures]]) -> str:
+    """Return a table with a row for each search."""
+    rows = []
+    for name in figures[PAPER[0]]:
+        evaluations = torch.cat([figures[scene][name][1] for scene in PAPER]).double().mean()
+        cells = [spread(figures[scene][name][0]) for scene in PAPER]
+        rows.append([name, f"{evaluations:.0f}", *cells])
+    return table(["search", "evaluations", *(scene.replace("_", " ") for scene in PAPER)], rows)
+
+
+def spread(scores: torch.Tensor) -> str:
+    """Format the mean and the range of the trials."""
+    if len(scores) == 1:
+        return f"{scores.item():.2f}"
+    return f"{scores.mean():.2f} ({scores.min():.2f} to {scores.max():.2f})"
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the command line."""
+    parser.add_argument("--trials", type=int, default=50, help="trials of each random search")
+
+
+def main(given: argparse.Namespace) -> None:
+    """Measure, and write the block."""
+    objectives = paper_objectives()
+    figures = {scene: measure(objective, given.trials) for scene, objective in objectives.items()}
+    parts = (
+        measured(),
+        "Weakest focus [Pa] in the paper's scenes: mean (least to greatest) of the trials, where they\n"
+        f"differ, and mean evaluations. {given.trials} trials, 16 levels and one pass unless stated.",
+        summary(figures),
+    )
+    fill_in(DOCUMENT, "study.py searches", parts, given.output)
