@@ -13,14 +13,13 @@ import torch
 import autdtorch as at
 from autdtorch import hardware
 from autdtorch.hardware.sensors.sensor import typed
-from autdtorch.hardware.transport.autd3_network import autd3_device, autd3_kit
+from autdtorch.hardware.transport.autd3_network import autd3_kit
 from autdtorch.hardware.wiring import Wiring
 from autdtorch.objectives.perturbations import random_rms
 from autdtorch.utils.digest import digest_of
 
-DEVICES = ("sonicsurface", "openmpd", "ultraino", "autd3")
 _USUAL = "emulated"
-EMULATED = (_USUAL, *(f"emulated:{name}" for name in DEVICES))
+EMULATED = (_USUAL, *(f"emulated:{name}" for name in hardware.DEVICES))
 SENSORS = ("emulated", "scope", "file", "manual")
 MAKERS = {"keysight": hardware.KEYSIGHT, "rigol": hardware.RIGOL}
 
@@ -37,7 +36,7 @@ class Bench(NamedTuple):
 
 
 def device_name(options: argparse.Namespace) -> str:
-    """Which of `DEVICES`, real or emulated."""
+    """Which of `hardware.DEVICES`, real or emulated."""
     return "sonicsurface" if options.device == _USUAL else str(options.device).removeprefix("emulated:")
 
 
@@ -89,17 +88,9 @@ def bench_of(
 
 
 def _device(options: argparse.Namespace) -> hardware.Device:
-    match device_name(options):
-        case "openmpd" if options.boards:
-            return hardware.openmpd_boards(_openmpd_boards(options))
-        case "openmpd":
-            return hardware.OPENMPD
-        case "ultraino":
-            return hardware.ultraino_boards(_board_count(options))
-        case "autd3":
-            return autd3_device(_board_count(options))
-        case _:
-            return hardware.SONICSURFACE
+    if device_name(options) != "openmpd":
+        return hardware.DEVICES[device_name(options)].with_boards(_board_count(options))
+    return hardware.openmpd_boards(_openmpd_boards(options)) if options.boards else hardware.OPENMPD
 
 
 def _openmpd_boards(options: argparse.Namespace) -> list[at.OpenMPDBoard]:
@@ -152,7 +143,7 @@ def _link(
     if options.dry_run:
         from autdtorch.hardware.emulator.dry_run import DryPort
 
-        port: hardware.Port = DryPort(bench, device, print)
+        port: hardware.Port = DryPort(bench, print)
     elif on_network:
         from autdtorch.hardware.emulator.emulated_autd3 import EmulatedAutd3Port
 

@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from trial_bench import DEVICES, EMULATED, MAKERS, SENSORS, device_name
+from trial_bench import EMULATED, MAKERS, SENSORS, device_name
 from trial_run import METHODS
 from trial_values import ABOVE_ZERO, COUNT, DECIBELS, NOT_NEGATIVE, SEED, SHARE, chip, indices, network
 
-from autdtorch.hardware import Limits
+from autdtorch.hardware import DEVICES, Limits
 from autdtorch.hardware.link import SETTLE
 
 _DESCRIPTION = """\

@@ -43,7 +43,7 @@ NOT_CALLED_BY_USERS = {
     *("Adapter", "Device", "Dialect", "Obstacle", "OpenMPDBoard", "SimulatedPropagator", "UsbtmcPort"),
     *("BoxPropagator", "FullPropagator", "EmulatedBench.receive", "EmulatedScope.execute"),
     *("EmulatedScope.plug_into", "Oscilloscope.capture", "Oscilloscope.set_up"),
-    *("lock_log", "open_autd3"),  # the one only makes a context, the other asks the network
+    *("Device.pack", "lock_log", "open_autd3"),  # the one only makes a context, the other asks the network
 }
 
 
@@ -122,7 +122,7 @@ def scope_bus() -> EmulatedBus:
 
 #: By name of the parameter.
 ARGUMENTS: dict[str, Any] = {
-    **dict.fromkeys(("adapter", "ax", "cache", "device", "first", "reference", "save", "serial"), None),
+    **dict.fromkeys(("ax", "cache", "device", "first", "reference", "save", "serial"), None),
     **dict.fromkeys(("time_step", "watch"), None),
     **dict.fromkeys(("decibels", "higher_is_better", "on_off", "return_error", "scattered"), False),
     **dict.fromkeys(("background", "boards", "captures", "input", "passes", "readings"), 1),
@@ -259,6 +259,7 @@ OTHERS: dict[str, Any] = {
     "differentiable_field.sound_speed": [340.0],
     "load_array.path": Made(array_file),
     "load_drive.path": Made(drive_file),
+    "open_link.port": None,
     "open_scope.backend": Made(lambda _: scope_bus()),
     "openmpd_boards.boards": Made(lambda folder: [at.OpenMPDBoard.load(board_file(folder))]),
     "plot_convergence.levels": {"scene": {"bound": 3.0}},

@@ -1,7 +1,10 @@
-from .devices import OPENMPD, SONICSURFACE, ULTRAINO, Device, openmpd_boards, ultraino_boards
+from .devices import AUTD3, DEVICES, OPENMPD, SONICSURFACE, ULTRAINO
+from .devices.device import Device
+from .devices.openmpd import openmpd_boards
+from .devices.ultraino import ultraino_boards
 from .emulator.bench import EmulatedBench, EmulatedSensor
 from .emulator.emulated_scope import EmulatedScope
-from .link import Link, OffError, open_link
+from .link import Link, OffError, open_autd3, open_link
 from .log import Evaluation, EvaluationLog, LogError, lock_log
 from .objective import HardwareObjective
 from .played import Played
@@ -10,12 +13,13 @@ from .safety import LimitedLink, LimitError, Limits, Signalled, ended_by_signals
 from .sensors.oscilloscope import Microphone, Oscilloscope, ScopeSensor, open_scope
 from .sensors.scpi import KEYSIGHT, RIGOL, Dialect, Waveform
 from .sensors.sensor import FileSensor, ManualSensor, MovedMicrophone, Sensor, SensorError
-from .transport.autd3_network import open_autd3
+from .transport.port import LinkError, Port
 from .transport.serial_chips import Adapter
-from .transport.usb import LinkError, Port
 from .transport.usbtmc import UsbtmcPort
 
 __all__ = [
+    "AUTD3",
+    "DEVICES",
     "KEYSIGHT",
     "OPENMPD",
     "RIGOL",

@@ -1,4 +1,4 @@
-"""A device that plays drives, and is silent when it is let go."""
+"""A link to a device: it plays drives, and is silent when it is closed."""
 
 from __future__ import annotations
 
@@ -12,8 +12,12 @@ from typing import Any, Self
 
 import torch
 
-from autdtorch.hardware.devices import Device
-from autdtorch.hardware.transport.usb import LinkError, Port, closed_on_error, find_device
+from autdtorch.hardware.devices.autd3 import AUTD3
+from autdtorch.hardware.devices.device import Device
+from autdtorch.hardware.transport.autd3_network import Autd3Port
+from autdtorch.hardware.transport.port import LinkError, Port, SharedPort, closed_on_error
+from autdtorch.hardware.transport.serial_port import SerialPort
+from autdtorch.hardware.transport.usb import find_device
 from autdtorch.hardware.wiring import Wiring
 from autdtorch.utils.validation import invalid, not_negative, require_callable, require_kind
 
@@ -33,10 +37,10 @@ class Link:
     all transducers on, and however the block ends; at the latest when Python exits. Threads may share it.
 
     Attributes:
-        device: what hangs on the port.
-        transducers: which of the device's transducers play the drive (M,), int64.
+        device: the device at the port.
+        transducers: the device's transducers that play the drive (M,), int64.
         wiring: of the two.
-        settle: how long a drive plays before `play` returns [s].
+        settle: time that a drive plays before `play` returns [s].
     """
 
     def __init__(
@@ -50,12 +54,12 @@ class Link:
         """Switch the outputs off.
 
         Args:
-            device: what hangs on the port.
+            device: the device at the port.
             port: takes its bytes.
-            transducers: for each transducer of the scene, which of the device's it is (M,); others stay off.
-                By default the scene has all, in the order of the device.
-            settle: how long `play` waits, after the frame has gone over the wire, for the sound to stand at
-                the control points [s].
+            transducers: the device's transducer for each of the scene's (M,); others stay off. By default
+                the scene has all, in the order of the device.
+            settle: time that `play` waits, after the frame has gone over the wire, for steady sound at the
+                control points [s].
             sleep: waits for a number of seconds.
 
         Raises:
@@ -80,11 +84,11 @@ class Link:
     def play(self, drive: torch.Tensor) -> None:
         """Play a drive (M,), |q| <= 1, on the nearest levels of the device, until the next.
 
-        It returns when the sound stands: a write ends before its bytes have gone over a serial line.
+        It returns when the sound is steady: a write ends before its bytes have gone over a serial line.
 
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-            LinkError: the device does not take the bytes, or was let go.
+            LinkError: the device does not take the bytes, or is closed.
         """
         self.begin(drive)
         self.wait_for_sound()
@@ -94,12 +98,12 @@ class Link:
 
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-            LinkError: the device does not take the bytes, or was let go.
+            LinkError: the device does not take the bytes, or is closed.
         """
         frame = self.wiring.frame(drive)
         with self._lock:
             if not self._open:
-                raise LinkError(f"{self.device.name} was let go; open it anew")
+                raise LinkError(f"{self.device.name} is closed; open it again")
             self._send(frame)
 
     def wait_for_sound(self) -> None:
@@ -107,12 +111,10 @@ class Link:
         self._sleep(self.settle)
 
     def off(self) -> None:
-        """Switch all outputs of the device off; once it was let go they are.
-
-        The frame is sent twice: a device that was left in mid-frame takes the first for the rest of that.
+        """Switch all outputs of the device off; does nothing once it is closed.
 
         Raises:
-            OffError: the device does not take the bytes, nor once it was recovered.
+            OffError: the device does not take the bytes, even after a recovery.
         """
         with self._lock:
             if not self._open:  # pyusb would open it once more
@@ -123,6 +125,27 @@ class Link:
                 self._recover()
                 if not isinstance(error, LinkError):
                     raise
+
+    def close(self) -> None:
+        """Switch all outputs off and release the device.
+
+        Raises:
+            OffError: the device does not take the bytes; it is released all the same.
+            LinkError: the port cannot be given back to the system.
+        """
+        with self._lock:
+            if not self._open:
+                return
+            try:
+                self.off()
+            except LinkError:
+                with contextlib.suppress(LinkError):  # the first error says more
+                    self._release()
+                raise
+            except BaseException:  # a signal, which may come before anything is sent, or amid a recovery
+                self.close()
+                raise
+            self._release()
 
     def _recover(self) -> None:
         try:
@@ -136,33 +159,13 @@ class Link:
         silence = self.device.frame(
             torch.zeros(self.device.transducers, dtype=torch.complex128, device="cpu")
         )
-        # Twice also because a device with two buffers may be left with the last drive in the other.
+        # Twice: a device that was left in mid-frame takes the first for the rest of that frame, and one with
+        # two buffers may keep the last drive in the other.
         for _ in range(2):
             self._send(silence)
         self._port.flush()
 
-    def close(self) -> None:
-        """Switch all outputs off and let go of the device.
-
-        Raises:
-            OffError: the device does not take the bytes; it is let go all the same.
-            LinkError: the port cannot be given back to the system.
-        """
-        with self._lock:
-            if not self._open:
-                return
-            try:
-                self.off()
-            except LinkError:
-                with contextlib.suppress(LinkError):  # the first error says more
-                    self._let_go()
-                raise
-            except BaseException:  # a signal, which may come before anything is sent, or amid a recovery
-                self.close()
-                raise
-            self._let_go()
-
-    def _let_go(self) -> None:
+    def _release(self) -> None:
         self._open = False
         atexit.unregister(self.close)
         self._port.close()
@@ -172,13 +175,13 @@ class Link:
         self._sleep(self.device.wire_time(frame))
 
     def __enter__(self) -> Self:
-        """The link."""
+        """Return the link."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Switch all outputs off and let go of the device."""
+        """Switch all outputs off and release the device."""
         self.close()
 
 
@@ -188,25 +191,41 @@ def open_link(
     serial: str | None = None,
     backend: Any = None,
     settle: float = SETTLE,
+    port: str | None = None,
 ) -> Link:
-    """Find a device on USB and switch its outputs off.
+    """Find a device on USB, or at a serial port, and switch its outputs off.
 
     Args:
-        device: which.
-        transducers: for each transducer of the scene, which of the device's it is (M,); by default all in
-            order.
-        serial: number of the USB chip, where several such devices are plugged in.
+        device: the device to find.
+        transducers: the device's transducer for each of the scene's (M,); by default all in order.
+        serial: serial number of the USB chip, where several such devices are plugged in.
         backend: of pyusb; by default libusb. An emulated bench has its own, on which waiting takes no time.
-        settle: how long a drive plays before its pressure is read [s]; the time that its frame is on the wire
-            comes on top.
+        settle: time that a drive plays before its pressure is read [s], after its frame has gone over the
+            wire.
+        port: name of a serial port of the system, such as "COM3" or "/dev/ttyUSB0"; by default the chips of
+            the device are looked for over pyusb.
 
     Raises:
         LinkError: none or several such devices, or it does not take the bytes.
-        ImportError: pyusb or libusb-package is missing.
-        ValueError: no `Device`; `transducers` that it does not have, or one twice; a negative `settle`; or a
-            `serial` for a device of several boards.
+        ImportError: pyusb, libusb-package or pyserial is missing.
+        ValueError: no `Device`; `transducers` that it does not have, or one twice; a negative `settle`; a
+            `serial` for a device of several boards; or a `port` for one without a serial line.
     """
     require_kind("device", device, Device)
+    opened = _usb_port(device, serial, backend) if port is None else _serial_port(device, port)
+    with closed_on_error(opened.close):
+        if port is not None:
+            time.sleep(device.boot_time)
+        return Link(device, opened, transducers, settle, getattr(backend, "sleep", time.sleep))
+
+
+def _serial_port(device: Device, port: str) -> Port:
+    if device.baud is None:
+        raise invalid("port", port, f"must be None, as {device.name} has no serial line")
+    return SerialPort(port, device.baud)
+
+
+def _usb_port(device: Device, serial: str | None, backend: Any) -> Port:
     if serial is not None and len(device.serials) > 1:
         raise invalid("serial", serial, f"must be None, as {device.name} has {len(device.serials)} boards")
     openers = {(vendor, product): open_port for vendor, product, open_port in device.adapters}
@@ -215,55 +234,32 @@ def open_link(
         for own in device.serials if serial is None else (serial,):
             found = find_device(openers, own, backend)
             ports.append(openers[found.idVendor, found.idProduct](found))
-        port = ports[0] if len(ports) == 1 else SharedPort(ports)
-        return Link(device, port, transducers, settle, getattr(backend, "sleep", time.sleep))
+    return ports[0] if len(ports) == 1 else SharedPort(ports)
 
 
-class SharedPort:
-    """The ports of several boards, which share what is written evenly."""
+def open_autd3(
+    boards: int = 1,
+    transducers: Sequence[int] | torch.Tensor | None = None,
+    network: Any = None,
+    settle: float = SETTLE,
+) -> Link:
+    """Find boards of AUTD3 on the network and switch their outputs off.
 
-    def __init__(self, ports: Sequence[Port]) -> None:
-        """Take the `ports`, in the order of the boards."""
-        self._ports = ports
+    Their firmware is reset to its defaults first; its silencer smooths every change over a millisecond.
 
-    def write(self, data: bytes) -> None:
-        """Send each board its part of `data`; if one does not take it, the others are sent theirs.
+    Args:
+        boards: number of boards, >= 1.
+        transducers: the device's transducer for each of the scene's (M,); by default all in order.
+        network: `autd3.UdpOption` or `autd3.ServerLink`; by default UDP on the interface that finds them.
+        settle: time that a drive plays before its pressure is read [s].
 
-        Raises:
-            LinkError: a board did not take its part.
-        """
-        part = len(data) // len(self._ports)
-        parts = [data[start : start + part] for start in range(0, len(data), part)]
-        _each(lambda port, own: port.write(own), self._ports, parts)
-
-    def flush(self) -> None:
-        """Wait until all has left the chips of all boards, where they tell.
-
-        Raises:
-            LinkError: it does not leave one.
-        """
-        _each(lambda port, _: port.flush(), self._ports, self._ports)
-
-    def recover(self) -> None:
-        """Take all boards up again.
-
-        Raises:
-            LinkError: a board is gone.
-        """
-        _each(lambda port, _: port.recover(), self._ports, self._ports)
-
-    def close(self) -> None:
-        """Let go of all boards."""
-        _each(lambda port, _: port.close(), self._ports, self._ports)
-
-
-def _each(do: Callable[[Port, Any], None], ports: Sequence[Port], things: Sequence[Any]) -> None:
-    """Do it to every port, then raise the first error."""
-    errors = []
-    for port, thing in zip(ports, things, strict=True):
-        try:
-            do(port, thing)
-        except LinkError as error:
-            errors.append(error)
-    if errors:
-        raise errors[0]
+    Raises:
+        LinkError: they are not there, or do not take the commands.
+        ImportError: the packages autd3 and autd3-pattern are missing.
+        ValueError: `boards` out of range; `transducers` that they do not have, or one twice; or a negative
+            `settle`.
+    """
+    device = AUTD3.with_boards(boards)
+    port = Autd3Port(boards, network)
+    with closed_on_error(port.close):
+        return Link(device, port, transducers, settle)

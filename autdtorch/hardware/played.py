@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from autdtorch.hardware.amplitude_scale import AmplitudeScale
-from autdtorch.hardware.devices import Device
+from autdtorch.hardware.devices.device import Device
 from autdtorch.hardware.wiring import Wiring
 from autdtorch.objectives.perturbations import Condition
 from autdtorch.objectives.simulated import Objective

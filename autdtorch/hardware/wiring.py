@@ -1,4 +1,4 @@
-"""Which of a device's transducers play the drives of a scene."""
+"""The transducers of a device that play the drives of a scene."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
-from autdtorch.hardware.devices import Device
+from autdtorch.hardware.devices.device import Device
 from autdtorch.scene.drive import validate_single_drive
 from autdtorch.utils.validation import indices, require_kind
 
@@ -16,7 +16,7 @@ class Wiring:
 
     Attributes:
         device: plays the drives.
-        transducers: for each transducer of the scene, which of the device's it is (M,), int64.
+        transducers: the device's transducer for each of the scene's (M,), int64.
     """
 
     def __init__(self, device: Device, transducers: Sequence[int] | torch.Tensor | None = None) -> None:
@@ -24,8 +24,7 @@ class Wiring:
 
         Args:
             device: plays the drives.
-            transducers: for each transducer of the scene, which of the device's it is (M,); by default all
-                in order.
+            transducers: the device's transducer for each of the scene's (M,); by default all in order.
 
         Raises:
             ValueError: no device, `transducers` that it does not have, or one twice.
@@ -37,19 +36,22 @@ class Wiring:
         self.transducers = torch.tensor(places, dtype=torch.int64, device="cpu")
 
     def frame(self, drive: torch.Tensor) -> bytes:
-        """Bytes for a drive (M,), |q| <= 1, on the nearest levels.
+        """Return the bytes for a drive (M,), |q| <= 1, on the nearest levels.
 
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
         """
+        return self.device.frame(self._of_device(drive))
+
+    def quantised(self, drive: torch.Tensor) -> torch.Tensor:
+        """Return the drive (M,) on the levels of the device that is nearest to a `drive` (M,).
+
+        Raises:
+            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+        """
+        return self.device.quantised(self._of_device(drive))[self.transducers]
+
+    def _of_device(self, drive: torch.Tensor) -> torch.Tensor:
         everyone = torch.zeros(self.device.transducers, dtype=torch.complex128, device="cpu")
         everyone[self.transducers] = validate_single_drive(drive, len(self.transducers))
-        return self.device.frame(everyone)
-
-    def played(self, drive: torch.Tensor) -> torch.Tensor:
-        """What the device plays (M,) when asked for a drive (M,): the nearest on its levels.
-
-        Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-        """
-        return self.device.played(self.frame(drive))[self.transducers]
+        return everyone

@@ -5,25 +5,16 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from autdtorch.hardware.devices.levels import (
-    Levels,
-    autd3_drive,
-    autd3_levels,
-    openmpd_drive,
-    openmpd_levels,
-    sonicsurface_drive,
-    sonicsurface_levels,
-)
+from autdtorch.hardware.devices import DEVICES
 from autdtorch.io.array_file import NORMAL_COLUMNS, PLACE_COLUMNS
 from autdtorch.io.csv_table import read_table, write_table
 from autdtorch.scene.arrays import TransducerArray
-from autdtorch.scene.device_layouts import AUTD3_TRANSDUCERS
 from autdtorch.scene.drive import (
     amplitudes_of,
     drive_from_phases,
@@ -35,29 +26,7 @@ from autdtorch.utils.files import replacing
 from autdtorch.utils.numpy_file import read_arrays
 from autdtorch.utils.validation import ArrayLike, invalid, path_of, real_tensor, require_kind, require_one_of
 
-
-class _Device(NamedTuple):
-    """How the levels of a device are stored."""
-
-    transducers: int  # of one unit
-    names: tuple[str, ...]
-    levels: Callable[[torch.Tensor], tuple[torch.Tensor, ...]]
-    drive: Callable[..., torch.Tensor]
-
-
-_DEVICES: dict[str, _Device] = {
-    "autd3": _Device(
-        AUTD3_TRANSDUCERS,
-        ("phase", "intensity"),
-        autd3_levels,
-        lambda phase, intensity: autd3_drive(Levels(phase, intensity)),
-    ),
-    "openmpd": _Device(
-        256, ("phase", "duty"), openmpd_levels, lambda phase, duty: openmpd_drive(Levels(phase, duty))
-    ),
-    "sonicsurface": _Device(256, ("phase",), lambda drive: (sonicsurface_levels(drive),), sonicsurface_drive),
-}
-_LEVEL_COLUMNS = {f"{name} {column}": "" for name, device in _DEVICES.items() for column in device.names}
+_LEVEL_COLUMNS = {f"{name} {column}": "" for name, device in DEVICES.items() for column in device.columns}
 _PLAIN_COLUMNS = {"phase": "rad", "amplitude": ""}
 
 
@@ -70,16 +39,16 @@ def save_drive(
     and amplitude; `.npz` the arrays drive (M,), positions, normals, source_strength and radius. `load_array`
     reads the array from both; .csv says neither strength nor radius.
 
-    With `device`, rounded to its levels (`hardware.devices.levels`), in the order of the array, which must
-    be the device's: that of `TransducerArray.autd3`, `.sonicsurface` and `.openmpd`. `.csv` has the columns
-    unit, transducer and, say, autd3 phase and autd3 intensity; `.npz` the name `device` and uint8 arrays
-    (units, transducers of a unit): phase and intensity (AUTD3), phase and duty (OpenMPD), or phase alone.
+    With `device`, rounded to its phase levels, in the order of the array, which must be the device's: that of
+    `TransducerArray.autd3`, `.sonicsurface` and `.openmpd`. `.csv` has the columns unit, transducer and, say,
+    autd3 phase and autd3 intensity; `.npz` the name `device` and uint8 arrays (units, transducers of a unit):
+    phase and intensity (AUTD3), phase and duty (OpenMPD, Ultraino), or phase alone (SonicSurface).
 
     Args:
         path: of the file, which is replaced; its suffix says the format.
         drive: complex (M,), |q| <= 1.
         array: the M transducers.
-        device: "autd3", "openmpd", "sonicsurface", or None.
+        device: a name in `hardware.DEVICES`, as "autd3", or None.
 
     Raises:
         ValueError: another suffix or device, not a drive of the array, or an M that is no multiple of what a
@@ -91,7 +60,7 @@ def save_drive(
     if device is None:
         columns, arrays = _plain(checked, array)
     else:
-        require_one_of("device", device, tuple(_DEVICES))
+        require_one_of("device", device, tuple(DEVICES))
         columns, arrays = _levelled(checked, device)
     if kind == ".csv":
         write_table(path, columns)
@@ -116,7 +85,7 @@ def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
     arrays = read_arrays(path)
     if "device" in arrays:
         name = str(arrays["device"])
-        require_one_of(f"{path}: device", name, tuple(_DEVICES))
+        require_one_of(f"{path}: device", name, tuple(DEVICES))
         return _played(path, name, {f"{name} {key}": value.reshape(-1) for key, value in arrays.items()})
     if "drive" not in arrays:
         raise ValueError(f"{path}: no array 'drive'; must be written by save_drive")
@@ -155,23 +124,21 @@ def _plain(drive: torch.Tensor, array: TransducerArray) -> tuple[dict[str, Any],
 
 def _levelled(drive: torch.Tensor, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """Columns by header and arrays by name of the levels that a device is sent."""
-    device = _DEVICES[name]
-    units, rest = divmod(len(drive), device.transducers)
+    device = DEVICES[name]
+    units, rest = divmod(len(drive), device.board)
     if rest:
-        raise ValueError(
-            f"drive: {len(drive)} transducers; must be a multiple of {device.transducers} for {name}"
-        )
+        raise ValueError(f"drive: {len(drive)} transducers; must be a multiple of {device.board} for {name}")
     levels = [level.numpy().astype(np.uint8) for level in device.levels(drive)]
-    unit, transducer = np.divmod(np.arange(len(drive)), device.transducers)
+    unit, transducer = np.divmod(np.arange(len(drive)), device.board)
     columns = {"unit": unit, "transducer": transducer}
-    columns |= {f"{name} {key}": level for key, level in zip(device.names, levels, strict=True)}
-    arrays = {key: level.reshape(units, -1) for key, level in zip(device.names, levels, strict=True)}
+    columns |= {f"{name} {key}": level for key, level in zip(device.columns, levels, strict=True)}
+    arrays = {key: level.reshape(units, -1) for key, level in zip(device.columns, levels, strict=True)}
     return columns, arrays | {"device": name}
 
 
 def _from_columns(path: str | os.PathLike[str], table: Mapping[str, npt.NDArray[np.float64]]) -> torch.Tensor:
-    for name, device in _DEVICES.items():
-        if any(f"{name} {column}" in table for column in device.names):
+    for name, device in DEVICES.items():
+        if any(f"{name} {column}" in table for column in device.columns):
             return _played(path, name, table)
     missing = [column for column in _PLAIN_COLUMNS if column not in table]
     if missing:
@@ -183,8 +150,8 @@ def _from_columns(path: str | os.PathLike[str], table: Mapping[str, npt.NDArray[
 
 def _played(path: str | os.PathLike[str], name: str, stored: Mapping[str, npt.NDArray[Any]]) -> torch.Tensor:
     """What a device plays for levels that are stored by names such as "autd3 phase"."""
-    device = _DEVICES[name]
-    wanted = [f"{name} {column}" for column in device.names]
+    device = DEVICES[name]
+    wanted = [f"{name} {column}" for column in device.columns]
     missing = [column for column in wanted if column not in stored]
     if missing:
         raise ValueError(f"{path}: no {', '.join(missing)}; must have {', '.join(wanted)}")

@@ -16,7 +16,8 @@ import numpy as np
 import torch
 
 from autdtorch.objectives.simulated import Objective, SimulatedObjective, require_objective, validate_drives
-from autdtorch.scene.drive import amplitudes_of, drive_from_phases, phases_of, validate_drive
+from autdtorch.scene.drive import drive_from_phases, validate_drive
+from autdtorch.scene.phase_levels import PhaseLevels
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import (
     boolean,
@@ -130,11 +131,8 @@ class Quantised(Condition):
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
         """
-        drive = super().played(drive)
-        step = 2 * math.pi / self.levels
-        phases = (phases_of(drive) / step).round() % self.levels * step
-        amplitudes = amplitudes_of(drive).clamp_max(1)  # above 1 by rounding alone
-        return drive_from_phases(phases, (amplitudes >= 0.5).double() if self.on_off else amplitudes)
+        levels = PhaseLevels(self.levels, 1 if self.on_off else None)
+        return levels.drive(*levels.nearest(super().played(drive)))
 
 
 class Dead(Condition):

@@ -29,7 +29,7 @@ from shared.document import fill_in, measured, table
 
 import autdtorch as at
 from autdtorch.analytic.green import free_space_matrix
-from autdtorch.hardware.devices.levels import AUTD3_FULL, Levels, autd3_levels
+from autdtorch.hardware import AUTD3
 from autdtorch.scene.device_layouts import TRANSDUCER_RADIUS
 
 DOCUMENT = "crosschecks.md"
@@ -97,7 +97,7 @@ def largest_shift() -> float:
 
 
 def play(
-    geometry: Geometry, phases: PhaseBuffer, intensities: IntensityBuffer | int = AUTD3_FULL
+    geometry: Geometry, phases: PhaseBuffer, intensities: IntensityBuffer | int = 255
 ) -> Emission:
     """Let the emulator play a pattern."""
 
@@ -118,7 +118,7 @@ def play_focus() -> Emission:
     return play(geometry, phases)
 
 
-def play_levels(levels: Levels) -> Emission:
+def play_levels(levels: tuple[torch.Tensor, ...]) -> Emission:
     """Play levels of ours."""
     phase, amplitude = (one.to(torch.uint8).numpy()[None] for one in levels)
     return play(device(), PhaseBuffer.from_array(phase), IntensityBuffer.from_array(amplitude))
@@ -182,7 +182,7 @@ def random_drive(transducers: int) -> torch.Tensor:
 
 def rows(grid: Grid) -> tuple[list[list[str]], complex]:
     """Return the comparisons, and the ratio of their instant field to ours."""
-    array, focused, random = our_array(), play_focus(), play_levels(autd3_levels(random_drive(249)))
+    array, focused, random = our_array(), play_focus(), play_levels(AUTD3.levels(random_drive(249)))
     discs, attenuation = our_array(TRANSDUCER_RADIUS), ABSORPTION / DECIBELS_PER_NEPER
     points, theirs = rms(focused, grid)
     _, theirs_random = rms(random, grid)

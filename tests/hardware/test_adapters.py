@@ -7,31 +7,21 @@ import pytest
 import torch
 
 from autdtorch.hardware import SONICSURFACE, ULTRAINO, Device, EmulatedBench, open_link, ultraino_boards
+from autdtorch.hardware.devices.sonicsurface import SonicSurfaceFirmware
+from autdtorch.hardware.devices.ultraino import UltrainoFirmware
 from autdtorch.hardware.emulator.bus import EmulatedBus, time_out
-from autdtorch.hardware.emulator.chips import CHIPS, EmulatedCdc, EmulatedCp2102
-from autdtorch.hardware.emulator.firmware import SonicSurfaceFirmware, UltrainoFirmware
-from autdtorch.hardware.transport.serial_chips import Adapter, ch340_divisor
+from autdtorch.hardware.emulator.chips import CHIPS, EmulatedCdc
 from autdtorch.hardware.transport.usb import UDEV_RULES, find_device
 
-WIRED = [(device, adapter) for device in (SONICSURFACE, ULTRAINO) for adapter in device.adapters]
 
-
-@pytest.mark.parametrize(("device", "adapter"), WIRED)
-def test_every_adapter_brings_the_frames_to_its_device(device: Device, adapter: Adapter):
-    bench = EmulatedBench(device, torch.ones((1, 16)).cdouble(), range(16), adapter)
+@pytest.mark.parametrize("device", [SONICSURFACE, ULTRAINO])
+def test_a_serial_chip_is_set_to_the_rate_of_its_device(device: Device):
+    bench = EmulatedBench(device, torch.ones((1, 16)).cdouble(), range(16))
     with open_link(device, range(16), backend=bench.bus) as link:
         assert bench.chip.eight_n_one
         assert bench.chip.baud == pytest.approx(device.baud, rel=0.002)  # the divisor's rounding
         link.play(-torch.ones(16).cdouble())  # not what they start with
         torch.testing.assert_close(bench.drive(), -torch.ones(16).cdouble(), rtol=0, atol=1e-14)
-
-
-@pytest.mark.parametrize(
-    ("baud", "value"),
-    [(9600, 0xB202), (38400, 0x6403), (57600, 0x9803), (115_200, 0xCC03), (230_400, 0xE603)],
-)
-def test_divisors_of_a_ch340_are_those_of_the_linux_driver(baud: int, value: int):
-    assert ch340_divisor(baud) == value
 
 
 def test_what_a_row_of_boards_hands_on_is_read_and_dropped():
@@ -83,26 +73,6 @@ def test_a_chip_is_given_back_only_when_nobody_reads_from_it():
     port.close()
     assert port._reader.daemon  # for another Python would wait before it exits and switches off
     assert released_while_reading == [False, False]
-
-
-def test_a_cp2102_drops_what_waits_when_it_is_taken_and_when_it_recovers():
-    class Holding(EmulatedCp2102):
-        waits = b"\xfe"  # half a frame of another program
-
-        def write(self, data: bytes) -> None:
-            self.waits += data
-
-        def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
-            if (request, value) == (0x12, 0x000F):  # PURGE of Silicon Labs' AN571: all queues
-                self.waits = b""
-            return super().control(kind, request, value, index, data)
-
-    holding = Holding(0x10C4, 0xEA60, "A1", SonicSurfaceFirmware())
-    port = SONICSURFACE.adapters[2].open_port(find_device([(0x10C4, 0xEA60)], backend=EmulatedBus([holding])))
-    assert not holding.waits
-    port.write(bytes(100))
-    port.recover()
-    assert not holding.waits
 
 
 def test_every_chip_has_its_udev_rule():

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from autdtorch.hardware import (
+    AUTD3,
     LimitedLink,
     LimitError,
     Limits,
@@ -19,9 +20,8 @@ from autdtorch.hardware import (
     ended_by_signals,
     open_autd3,
 )
-from autdtorch.hardware.devices.levels import Levels, autd3_levels
 from autdtorch.hardware.transport import autd3_network as module
-from autdtorch.hardware.transport.autd3_network import Autd3Port, autd3_device
+from autdtorch.hardware.transport.autd3_network import Autd3Port
 from autdtorch.scene.drive import drive_from_phases
 
 
@@ -84,15 +84,6 @@ class Mute:
 
     async def close(self):
         await asyncio.Event().wait()
-
-
-def test_a_frame_is_all_phases_then_all_intensities():
-    drive = random_drive(498)
-    frame = torch.tensor(list(autd3_device(boards=2).frame(drive)))
-    assert all(map(torch.equal, Levels(frame[:498], frame[498:]), autd3_levels(drive)))
-    assert not any(autd3_device().frame(0 * drive[:249]))
-    played = autd3_device(boards=2).played(autd3_device(boards=2).frame(drive))
-    torch.testing.assert_close(played, drive, rtol=0, atol=1 / 510 + torch.pi / 256)  # half a level each
 
 
 def test_without_the_kit_there_is_a_hint(monkeypatch):
@@ -223,9 +214,9 @@ class TestWithTheKit:
         drive = random_drive(249)
 
         def play(recorder):
-            recorder.send([SetSilencer.disable(), autd3_pattern(autd3_device().frame(drive), 1)])
+            recorder.send([SetSilencer.disable(), autd3_pattern(AUTD3.frame(drive), 1)])
             recorder.tick(Duration.from_micros(100))
 
         record = emulator.Emulator(Geometry([Autd3()])).record(play)
         played = torch.from_numpy(record.phase().to_numpy()[:, -1].astype("int64"))
-        assert torch.equal(played, autd3_levels(drive).phase)
+        assert torch.equal(played, AUTD3.levels(drive)[0])

@@ -40,7 +40,7 @@ def test_boards_of_files_play_the_drive_that_was_asked_for():
     with open_link(device, backend=bench.bus) as link:
         link.play(drive)
         torch.testing.assert_close(bench.pressure(), drive, rtol=0, atol=1e-12)  # rounding of the angles
-        torch.testing.assert_close(Wiring(device).played(drive), drive, rtol=0, atol=1e-12)
+        torch.testing.assert_close(Wiring(device).quantised(drive), drive, rtol=0, atol=1e-12)
     assert bench.drive().abs().max() == 0
 
 
@@ -48,12 +48,12 @@ def test_boards_of_files_play_the_drive_that_was_asked_for():
 def test_gains_lower_the_duty(gain: float):
     one = board("half", 0, gain)
     device = openmpd_boards([one])
-    frame = device.frame(torch.ones(256).cdouble())
-    assert set(frame[256:]) == {21}  # 128 asin(gain) / pi = 21.3 and 20.9
+    full = torch.ones(256).cdouble()
+    assert set(device.frame(full)[256:]) == {21}  # 128 asin(gain) / pi = 21.3 and 20.9
     expected = torch.full((256,), math.sin(21 * math.pi / 128) / gain, dtype=torch.float64)
-    torch.testing.assert_close(device.played(frame).abs(), expected, rtol=1e-12, atol=0)
-    assert device.played(frame).angle().abs().max() < torch.pi / 128 + 1e-9
-    assert not device.played(device.frame(torch.zeros(256).cdouble())).any()
+    torch.testing.assert_close(device.quantised(full).abs(), expected, rtol=1e-12, atol=0)
+    assert device.quantised(full).angle().abs().max() < torch.pi / 128 + 1e-9
+    assert not device.quantised(0 * full).any()
 
 
 def test_a_board_that_is_not_there_is_named_and_the_others_are_let_go():

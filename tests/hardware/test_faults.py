@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from faulty_bus import FAULTS, FaultyBus
 
 from autdtorch.hardware import (
     OPENMPD,
@@ -25,7 +26,6 @@ from autdtorch.hardware import (
     ended_by_signals,
 )
 from autdtorch.hardware.emulator.bus import EmulatedBus
-from autdtorch.hardware.emulator.faults import FAULTS, FaultyBus
 from autdtorch.methods.gabs import gabs
 from autdtorch.methods.solution import Solution
 
@@ -288,7 +288,7 @@ def test_a_signal_that_is_ignored_as_by_nohup_stays_so():
 
 KILLED = f"""
 import os, signal, sys
-sys.path.insert(0, {str(Path(__file__).parent)!r})
+sys.path[:0] = {[str(folder) for folder in Path(__file__).parents[:2]]!r}
 from pathlib import Path
 from conftest import Trial, a_scene
 from test_faults import Counting, SURVIVED, measure

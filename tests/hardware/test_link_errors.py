@@ -9,9 +9,9 @@ import torch
 from usb.core import USBError, USBTimeoutError
 
 from autdtorch.hardware import OPENMPD, SONICSURFACE, ULTRAINO, Device, EmulatedBench, LinkError, open_link
+from autdtorch.hardware.devices.sonicsurface import SonicSurfaceFirmware
 from autdtorch.hardware.emulator.bus import EmulatedBus
 from autdtorch.hardware.emulator.chips import EmulatedFtdi
-from autdtorch.hardware.emulator.firmware import SonicSurfaceFirmware
 
 # Method of the backend that fails, the error of libusb, and what the message says.
 ACCESS = USBError("Access denied (insufficient permissions)", -3, errno.EACCES)

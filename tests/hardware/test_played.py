@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autdtorch.hardware import (
+    AUTD3,
     OPENMPD,
     SONICSURFACE,
     Device,
@@ -20,7 +21,6 @@ from autdtorch.hardware import (
     ultraino_boards,
 )
 from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
-from autdtorch.hardware.transport.autd3_network import autd3_device
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.scene import Medium, Scene
 
@@ -47,7 +47,7 @@ DEVICES = {
     "OpenMPD": (OPENMPD, 128, math.pi / 128),
     "OpenMPD, calibrated": (openmpd_boards([BOARD]), 128, math.pi / 128 / 0.5),
     "Ultraino": (ultraino_boards(4), 10, math.pi / 10),
-    "AUTD3": (autd3_device(), 256, 1 / 255),
+    "AUTD3": (AUTD3, 256, 1 / 255),
 }
 
 
@@ -125,7 +125,7 @@ def test_what_is_emitted_is_what_the_firmware_plays(name: str, seed: int, limit:
         (None, 1.0, "transducers: 64; must be 16, as many as the scene has"),
         ([3] * 16, 1.0, "transducers: .* each once"),
         (range(16), 1.1, "amplitude: 1.1"),
-        (range(16), 0.3, "amplitude: 0.3; must be >= 0.309, the least that Ultraino plays"),
+        (range(16), 0.3, "amplitude: 0.3; must be >= 0.309, the lowest level of Ultraino"),
     ],
 )
 def test_what_a_device_cannot_play_is_refused(transducers, amplitude: float, message: str):

@@ -132,7 +132,7 @@ def test_a_timer_of_an_earlier_link_does_not_reach_the_next(trial):
         link.play(full_on()[0])
         limited._timer.join()
         assert bench.drive().abs().min() > 0.9
-    with pytest.raises(LinkError, match="SonicSurface was let go"):
+    with pytest.raises(LinkError, match="SonicSurface is closed"):
         link.play(full_on()[0])
     assert bench.firmware.drive().abs().max() == 0
 

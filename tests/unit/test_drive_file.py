@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from autdtorch.analytic.green import free_space_matrix
-from autdtorch.hardware.devices.levels import autd3_levels
+from autdtorch.hardware import AUTD3, DEVICES
 from autdtorch.io.array_file import load_array
 from autdtorch.io.drive_file import load_drive, save_drive
 from autdtorch.scene.arrays import TransducerArray
@@ -15,6 +15,7 @@ ARRAYS = {
     "autd3": TransducerArray.autd3((0, 0, 0), units=(2, 1)),
     "openmpd": TransducerArray.openmpd((0, 0, 0)),
     "sonicsurface": TransducerArray.sonicsurface((0, 0, 0)),
+    "ultraino": TransducerArray.grid((8, 8), 10.5e-3, (0, 0, 0)),
 }
 
 
@@ -61,9 +62,9 @@ def test_levels_come_back_as_the_device_plays_them(tmp_path, device, suffix):
     save_drive(path, played, array, device)
 
     assert torch.equal(load_drive(path), played)
-    # Half a step of phase and of amplitude: of 256 and 255, 128 and pi/128 at most, 32 and on or off.
-    phase_error = {"autd3": math.pi / 256, "openmpd": math.pi / 128, "sonicsurface": math.pi / 32}[device]
-    amplitude_error = {"autd3": 1 / 510, "openmpd": math.pi / 256, "sonicsurface": 0.5}[device]
+    # Half a step of phase and of amplitude; a step of a pulse's amplitude is that of its phase at most.
+    phase_error = math.pi / DEVICES[device].phase_levels.phases
+    amplitude_error = {"autd3": 1 / 510, "sonicsurface": 0.5}.get(device, phase_error / 2)
     on = played.abs() > 0
     assert (played / drive)[on].angle().abs().max() <= phase_error + 1e-9
     assert (amplitudes_of(played) - amplitudes_of(drive)).abs().max() <= amplitude_error + 1e-9
@@ -75,7 +76,7 @@ def test_autd3_gets_bytes_in_the_order_of_its_units(tmp_path):
 
     with np.load(tmp_path / "drive.npz") as file:
         assert str(file["device"]) == "autd3"
-        for name, level in zip(("phase", "intensity"), autd3_levels(drive), strict=True):
+        for name, level in zip(("phase", "intensity"), AUTD3.levels(drive), strict=True):
             assert (file[name].dtype, file[name].shape) == (np.uint8, (2, 249))
             assert np.array_equal(file[name].ravel(), level.numpy())
 
@@ -101,8 +102,8 @@ def test_the_field_of_what_autd3_plays_is_that_of_the_drive_within_its_levels(tm
             "unit,transducer,autd3 phase\n0,0,1\n",
             r"d.csv: no autd3 intensity; must have autd3 phase, autd3 int",
         ),
-        ("autd3 phase,autd3 intensity\n256,0\n", r"d.csv: AUTD3 levels.phase: .*0 to 255"),
-        ("autd3 phase,autd3 intensity\n1.5,0\n", r"d.csv: AUTD3 levels.phase: .*0 to 255"),
+        ("autd3 phase,autd3 intensity\n256,0\n", r"d.csv: AUTD3 phase: .*0 to 255"),
+        ("autd3 phase,autd3 intensity\n1.5,0\n", r"d.csv: AUTD3 phase: .*0 to 255"),
     ],
 )
 def test_what_is_wrong_with_a_drive_file_is_said(tmp_path, text, message):
@@ -148,7 +149,7 @@ def test_a_drive_that_is_not_the_devices_is_refused(tmp_path):
     drive = drive_from_phases(torch.zeros(16))
     with pytest.raises(ValueError, match=r"16 transducers; must be a multiple of 249 for autd3"):
         save_drive(tmp_path / "d.csv", drive, array, "autd3")
-    with pytest.raises(ValueError, match=r"device: 'autd'; must be one of autd3, openmpd, sonicsurface"):
+    with pytest.raises(ValueError, match=r"device: 'autd'; must be one of autd3, openmpd, sonicsurface, u"):
         save_drive(tmp_path / "d.csv", drive, array, "autd")
     with pytest.raises(ValueError, match=r"path: .*; must end in .csv or .npz"):
         save_drive(tmp_path / "d.txt", drive, array)

@@ -1,24 +1,15 @@
-"""A bench without hardware: the device behind its USB chip, the air before it, and microphones."""
+"""A bench without hardware: a device behind its USB chip, the air before it, and microphones."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 
-from autdtorch.hardware.devices import OPENMPD, SONICSURFACE, ULTRAINO, Device
+from autdtorch.hardware.devices.device import Device
 from autdtorch.hardware.emulator.bus import EmulatedBus, EmulatedDevice
 from autdtorch.hardware.emulator.chips import CHIPS
-from autdtorch.hardware.emulator.firmware import (
-    Autd3Firmware,
-    Firmware,
-    OpenMPDFirmware,
-    SonicSurfaceFirmware,
-    UltrainoFirmware,
-)
-from autdtorch.hardware.transport.autd3_network import autd3_device
-from autdtorch.hardware.transport.serial_chips import Adapter
 from autdtorch.hardware.wiring import Wiring
 from autdtorch.objectives.perturbations import SNRS, random_rms
 from autdtorch.utils.validation import (
@@ -30,20 +21,14 @@ from autdtorch.utils.validation import (
     require_kind,
 )
 
-_FIRMWARES: dict[str, Callable[[int], Firmware]] = {
-    SONICSURFACE.name: lambda transducers: SonicSurfaceFirmware(),
-    OPENMPD.name: lambda transducers: OpenMPDFirmware(),
-    ULTRAINO.name: lambda transducers: UltrainoFirmware(transducers // ULTRAINO.transducers),
-    autd3_device().name: Autd3Firmware,
-}
-
 
 class EmulatedBench:
     """A device on an emulated USB bus, and the pressure it makes at the control points.
 
     Attributes:
         bus: backend for pyusb; without a device that is not on USB, which takes its frames by `receive`.
-        firmware: what takes the bytes behind the chip; of several boards, that of the first.
+        firmware: emulated firmware behind the chip; of several boards, that of the first.
+        transfer_matrix: (P, M) [Pa], complex128.
     """
 
     def __init__(
@@ -51,25 +36,20 @@ class EmulatedBench:
         device: Device,
         transfer_matrix: torch.Tensor,
         transducers: Sequence[int] | torch.Tensor | None = None,
-        adapter: Adapter | None = None,
         dead: Sequence[int] = (),
     ) -> None:
-        """Plug the device in.
+        """Plug the device in, on its usual chip.
 
         Args:
-            device: which.
+            device: the device to emulate.
             transfer_matrix: (P, M) of the scene on the bench [Pa].
-            transducers: for each transducer of the scene, which of the device's it is (M,); by default all
-                in order.
-            adapter: the USB chip that it hangs on; by default the usual one, if any.
-            dead: transducers of the scene that are silent, whatever the device plays.
+            transducers: the device's transducer for each of the scene's (M,); by default all in order.
+            dead: failed transducers of the scene, which stay silent.
 
         Raises:
             ValueError: `transducers` that the device does not have, not as many as the matrix has, or `dead`
                 ones that the scene does not have.
         """
-        if adapter is not None:
-            require_kind("adapter", adapter, Adapter)
         self._transducers = Wiring(device, transducers).transducers
         self.transfer_matrix = complex_tensor("transfer_matrix", transfer_matrix).to("cpu", torch.complex128)
         if self.transfer_matrix.ndim != 2 or self.transfer_matrix.shape[1] != len(self._transducers):
@@ -79,13 +59,12 @@ class EmulatedBench:
         if silent := integers("dead", dead, 0, "must be indices of transducers"):
             self._alive[indices("dead", silent, len(self._transducers))] = 0
         each = device.transducers // len(device.serials)
-        self._firmwares = [_FIRMWARES[device.name](each) for _ in device.serials]
+        self._firmwares = [device.firmware(each) for _ in device.serials]
         self.firmware = self._firmwares[0]
-        adapters = device.adapters[:1] if adapter is None else (adapter,)
         self.bus = EmulatedBus(
             [
                 CHIPS[vendor, product](vendor, product, serial or "EMULATED", firmware)
-                for vendor, product, _ in adapters
+                for vendor, product, _ in device.adapters[:1]
                 for serial, firmware in zip(device.serials, self._firmwares, strict=True)
             ]
         )
@@ -96,29 +75,32 @@ class EmulatedBench:
         return self.bus.chips[0]
 
     def receive(self, frame: bytes) -> None:
-        """Have the device take a frame without USB; several boards share it evenly."""
+        """Have the device take a frame without USB; several chips share it evenly."""
         each = len(frame) // len(self._firmwares)
         for number, firmware in enumerate(self._firmwares):
             firmware.receive(frame[each * number : each * (number + 1)])
 
+    def emitted(self) -> torch.Tensor:
+        """Return the drive (N,), complex128, that the firmware sends to the device's transducers now."""
+        return torch.cat([firmware.drive() for firmware in self._firmwares])
+
     def drive(self) -> torch.Tensor:
-        """What the scene's transducers now play (M,), complex128; 0 where they are dead."""
-        played = torch.cat([firmware.drive() for firmware in self._firmwares])
-        return played[self._transducers] * self._alive
+        """Return the drive (M,), complex128, that the scene's transducers emit now; 0 for failed ones."""
+        return self.emitted()[self._transducers] * self._alive
 
     def pressure(self) -> torch.Tensor:
-        """Phasors (P,) [Pa] at the control points now, complex128."""
+        """Return the phasors (P,) [Pa], complex128, at the control points now."""
         return self.transfer_matrix @ self.drive()
 
 
 class EmulatedSensor:
-    """A microphone at each control point of an emulated bench, with the noise of `conditions.Noise`."""
+    """A microphone at each control point of an emulated bench, with the noise of `perturbations.Noise`."""
 
     def __init__(self, bench: EmulatedBench, snr: float | None = None, seed: int = 0) -> None:
         """Set the microphones up.
 
         Args:
-            bench: where they stand.
+            bench: the bench to measure on.
             snr: 20 log10(reference / sigma) [dB], -1000 to 1000, where the reference is the rms pressure over
                 control points and random phases, all transducers fully on; None for no noise.
             seed: of the noise, >= 0.
@@ -133,7 +115,7 @@ class EmulatedSensor:
         self._sigma = 0.0 if snr is None else rms * 10 ** (-number_between("snr", snr, *SNRS, "dB") / 20)
 
     def read(self) -> torch.Tensor:
-        """Magnitudes (P,) [Pa]."""
+        """Return the magnitudes (P,) [Pa]."""
         pressure = self._bench.pressure()
         parts = torch.from_numpy(self._generator.standard_normal((len(pressure), 2)))
         return (pressure + torch.view_as_complex(self._sigma / 2**0.5 * parts)).abs()

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 from typing import ClassVar, Protocol
 
 from autdtorch.hardware.emulator.chips import Interfaces
-from autdtorch.hardware.transport.usb import INSTALL_HINT
+from autdtorch.hardware.transport.port import INSTALL_HINT
 
 try:
     from usb.backend import IBackend

@@ -1,6 +1,6 @@
-"""The USB chips of `adapters`, emulated: they decode the requests, and send on what the firmware can hear.
+"""The chips of `transport.serial_chips`, emulated: they decode requests and pass bytes on to a firmware.
 
-Written from the chips' Linux drivers and data sheets, not from `adapters`, so that the one checks the other.
+Written from the chips' Linux drivers and data sheets, not from `serial_chips`, so that one checks the other.
 """
 
 from __future__ import annotations
@@ -8,16 +8,15 @@ from __future__ import annotations
 import time
 from typing import ClassVar, TypeAlias
 
-from autdtorch.hardware.emulator.firmware import Firmware
+from autdtorch.hardware.devices.device import Firmware
 
 #: Class, subclass and protocol of each interface, and its bulk endpoints.
 Interfaces: TypeAlias = tuple[tuple[tuple[int, int, int], tuple[int, ...]], ...]
 
 _STRINGS = ("", "autdtorch", "emulated device")  # by index; the serial number comes after
-_VENDOR_DEVICE, _VENDOR_INTERFACE, _CLASS_INTERFACE = 0x40, 0x41, 0x21
-_VENDOR_QUESTION = 0xC0
+_VENDOR_DEVICE, _CLASS_INTERFACE, _VENDOR_QUESTION = 0x40, 0x21, 0xC0
 _WHILE = 0.01  # [s]
-_BAUD_TOLERANCE = 0.03  # more, and a UART loses the last of its ten bits
+_BAUD_TOLERANCE = 0.03  # beyond it a UART loses the last of its ten bits
 
 
 class EmulatedChip:
@@ -28,16 +27,16 @@ class EmulatedChip:
         vendor: idVendor.
         product: idProduct.
         strings: string descriptors by their index.
-        firmware: what takes the bytes behind the chip.
-        present: whether it is plugged in.
+        firmware: takes the bytes behind the chip.
+        present: true while it is plugged in.
         baud: rate that it is set to [bits/s].
-        eight_n_one: whether it is set to 8 bits, no parity, 1 stop bit.
+        eight_n_one: true if it is set to 8 bits, no parity, 1 stop bit.
     """
 
     interfaces: ClassVar[Interfaces] = (((0xFF, 0xFF, 0xFF), (0x81, 0x02)),)
 
     def __init__(self, vendor: int, product: int, serial: str, firmware: Firmware) -> None:
-        """Plug the chip in, as somebody else has left it."""
+        """Plug the chip in, with settings of an earlier user."""
         self.vendor = vendor
         self.product = product
         self.strings = (*_STRINGS, serial)
@@ -47,11 +46,11 @@ class EmulatedChip:
         self.eight_n_one = False
 
     def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
-        """Take a request with its data; False where the chip knows no such request, and stalls."""
+        """Take a request with its data; False for an unknown one, which stalls."""
         raise NotImplementedError
 
     def answer(self, kind: int, request: int) -> bytes | None:
-        """Answer a request; None where the chip knows no such request, and stalls."""
+        """Answer a request; None for an unknown one, which stalls."""
 
     def write(self, data: bytes) -> None:
         """Send bytes on to the firmware, which loses them at another rate or format than its own."""
@@ -63,7 +62,7 @@ class EmulatedChip:
         self.firmware.receive(data)
 
     def read(self, most: int) -> bytes:
-        """An IN packet: no device here answers."""
+        """Return an IN packet, empty: no device here answers."""
         return b""
 
 
@@ -75,7 +74,7 @@ class EmulatedFtdi(EmulatedChip):
     _EIGHTHS: ClassVar[dict[int, int]] = {0: 0, 3: 1, 2: 2, 4: 3, 1: 4, 5: 5, 6: 6, 7: 7}
 
     def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
-        """Baud rate by its divisor of 3 MHz, and data format."""
+        """Set the baud rate by its divisor of 3 MHz, and the data format."""
         if request == self._BAUD:
             self.baud = 3e6 / ((value & 0x3FFF) + self._EIGHTHS[value >> 14 | (index & 1) << 2] / 8)
         elif request == self._FORMAT:
@@ -83,58 +82,12 @@ class EmulatedFtdi(EmulatedChip):
         return kind == _VENDOR_DEVICE and request in (self._BAUD, self._FORMAT, *self._OTHERS)
 
     def answer(self, kind: int, request: int) -> bytes | None:
-        """The status of modem and line: all that was taken has been sent."""
+        """Return the status of modem and line: all bytes have been sent."""
         return self._IDLE if (kind, request) == (_VENDOR_QUESTION, self._STATUS) else None
 
     def read(self, most: int) -> bytes:
-        """An IN packet: the status alone."""
+        """Return an IN packet: the status alone."""
         return self._IDLE
-
-
-class EmulatedCh340(EmulatedChip):
-    """A CH340: registers, written in pairs."""
-
-    interfaces = (((0xFF, 0x01, 0x02), (0x82, 0x02)),)
-
-    _INIT, _WRITE, _MODEM = 0xA1, 0x9A, 0xA4
-    _PRESCALER, _DIVISOR, _LINE = 0x12, 0x13, 0x18
-
-    def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
-        """Divisor and prescaler of 48 MHz, and line control."""
-        if request == self._INIT:
-            self._registers = {self._LINE: 0}
-        elif request == self._WRITE:
-            self._registers |= {value & 0xFF: index & 0xFF, value >> 8: index >> 8}
-            prescaler, line = self._registers.get(self._PRESCALER, 0), self._registers[self._LINE]
-            clock = 48e6 / (1 << 12 - 3 * (prescaler & 3) - (prescaler >> 2 & 1))
-            self.baud = clock / (256 - self._registers.get(self._DIVISOR, 0))
-            self.eight_n_one = line & 0x7F == 0x43  # sender on, eight bits, no parity, one stop bit
-        return kind == _VENDOR_DEVICE and request in (self._INIT, self._WRITE, self._MODEM)
-
-
-class EmulatedCp2102(EmulatedChip):
-    """A CP2102: it sends when its interface was enabled."""
-
-    interfaces = (((0xFF, 0x00, 0x00), (0x81, 0x01)),)
-
-    _ENABLE, _LINE, _HANDSHAKE, _PURGE, _BAUD = 0x00, 0x03, 0x07, 0x12, 0x1E
-    _enabled = False
-
-    def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
-        """Enabling, baud rate as a number, and line control."""
-        if request == self._ENABLE:
-            self._enabled = value == 1
-        elif request == self._BAUD:
-            self.baud = float(int.from_bytes(data, "little"))
-        elif request == self._LINE:
-            self.eight_n_one = value == 8 << 8
-        known = (self._ENABLE, self._LINE, self._HANDSHAKE, self._PURGE, self._BAUD)
-        return kind == _VENDOR_INTERFACE and request in known
-
-    def write(self, data: bytes) -> None:
-        """Send bytes on, if enabled."""
-        if self._enabled:
-            super().write(data)
 
 
 class EmulatedCdc(EmulatedChip):
@@ -145,23 +98,21 @@ class EmulatedCdc(EmulatedChip):
     _LINE_CODING, _LINE_STATE = 0x20, 0x22
 
     def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
-        """Line coding: baud rate, stop bits, parity, bits."""
+        """Set the line coding: baud rate, stop bits, parity, bits."""
         if request == self._LINE_CODING:
             self.baud = float(int.from_bytes(data[:4], "little"))
             self.eight_n_one = data[4:] == bytes([0, 0, 8])
         return kind == _CLASS_INTERFACE and request in (self._LINE_CODING, self._LINE_STATE)
 
     def read(self, most: int) -> bytes:
-        """An IN packet: none comes within a while."""
+        """Return an IN packet: none comes within a while."""
         time.sleep(_WHILE)
         return b""
 
 
+#: Chips by idVendor and idProduct.
 CHIPS: dict[tuple[int, int], type[EmulatedChip]] = {
     (0x0403, 0x6001): EmulatedFtdi,
     (0x0403, 0x6014): EmulatedFtdi,
-    (0x1A86, 0x7523): EmulatedCh340,
-    (0x10C4, 0xEA60): EmulatedCp2102,
     (0x2341, 0x0042): EmulatedCdc,
 }
-"""By idVendor and idProduct."""

@@ -7,13 +7,13 @@ from autdtorch.hardware.transport.autd3_network import Autd3Port, autd3_kit
 
 
 class EmulatedAutd3Port(Autd3Port):
-    """The port of boards that are emulated on this machine: silent ones, so that a bench plays for them."""
+    """The port of boards that the kit emulates on this machine, silently; a bench plays for them."""
 
     def __init__(self, boards: int, bench: EmulatedBench) -> None:
         """Start the emulator, and connect to it.
 
         Args:
-            boards: their number.
+            boards: number of boards.
             bench: plays each frame that the boards have taken.
 
         Raises:

@@ -15,7 +15,8 @@ from autdtorch.hardware.sensors.lock_in import LockIn
 from autdtorch.hardware.sensors.scpi import KEYSIGHT, Dialect, Waveform
 from autdtorch.hardware.sensors.sensor import SensorError
 from autdtorch.hardware.sensors.vertical_scale import VerticalScale
-from autdtorch.hardware.transport.usb import LinkError, closed_on_error, find_device
+from autdtorch.hardware.transport.port import LinkError, closed_on_error
+from autdtorch.hardware.transport.usb import find_device
 from autdtorch.hardware.transport.usbtmc import UsbtmcPort
 from autdtorch.utils.validation import (
     integer_at_least,

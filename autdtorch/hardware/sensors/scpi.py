@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import torch
 
-from autdtorch.hardware.transport.usb import LinkError
+from autdtorch.hardware.transport.port import LinkError
 
 
 @dataclass(frozen=True)

@@ -1,19 +1,18 @@
-"""Finding a device on USB, bytes to and from its chip over pyusb, and what to say where that fails."""
+"""Devices on USB over pyusb: finding one, bulk transfers, and the reasons of errors."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
+from autdtorch.hardware.transport.port import INSTALL_HINT, LinkError, closed_on_error
 from autdtorch.utils.validation import require_kind
 
-#: Lets users write to the devices on Linux; to be copied to /etc/udev/rules.d.
+#: Rules that let users write to the devices on Linux; to be copied to /etc/udev/rules.d.
 UDEV_RULES = Path(__file__).with_name("70-autdtorch.rules")
-#: What brings pyusb and libusb.
-INSTALL_HINT = "pip install 'autdtorch[hardware]' brings what is needed"
 #: bmRequestType: vendor's own, recipient device; to the device, and from it.
 VENDOR_REQUEST, VENDOR_QUESTION = 0x40, 0xC0
 
@@ -21,77 +20,28 @@ _TIMEOUT_MS = 1000
 _DIRECTION, _TRANSFER_TYPE, _BULK = 0x80, 0x03, 0x02
 
 
-class LinkError(OSError):
-    """A device is missing, ambiguous, or does not do what it is asked for."""
-
-
-@contextlib.contextmanager
-def closed_on_error(close: Callable[[], None]) -> Iterator[None]:
-    """Call `close` if what follows fails; that error is raised, and says more than one of closing."""
-    try:
-        yield
-    except BaseException:
-        with contextlib.suppress(LinkError):
-            close()
-        raise
-
-
-@runtime_checkable
-class Port(Protocol):
-    """Takes the bytes for one device."""
-
-    def write(self, data: bytes) -> None:
-        """Send all of `data`.
-
-        Raises:
-            LinkError: the device did not take it.
-        """
-        ...
-
-    def flush(self) -> None:
-        """Wait until all has left the chip, where the chip tells.
-
-        Raises:
-            LinkError: it does not leave.
-        """
-        ...
-
-    def recover(self) -> None:
-        """Take up again after a write that broke off: clear a stall, drop what still waits.
-
-        Raises:
-            LinkError: the device is gone.
-        """
-        ...
-
-    def close(self) -> None:
-        """Let go of the device.
-
-        Raises:
-            LinkError: it cannot be given back to the system.
-        """
-        ...
-
-
 def find_device(chips: Collection[tuple[int, int]], serial: str | None = None, backend: Any = None) -> Any:
-    """The one USB device (`usb.core.Device`) that answers the description.
+    """Return the one USB device (`usb.core.Device`) that fits a description.
 
     Args:
-        chips: idVendor and idProduct of those that will do.
-        serial: number, where several such devices are plugged in.
-        backend: of pyusb; by default the libusb that the package libusb-package brings.
+        chips: idVendor and idProduct of those accepted.
+        serial: serial number, where several such devices are plugged in.
+        backend: of pyusb; by default the libusb of the package libusb-package.
 
     Raises:
-        LinkError: none or several such devices, with a list of what there is, or no libusb.
+        LinkError: none or several such devices, with a list of those plugged in, or no libusb.
         ImportError: pyusb or libusb-package is missing.
         ValueError: a `serial` that is no text.
     """
     if serial is not None:
         require_kind("serial", serial, str)
-    usb_core = _pyusb()
-    if backend is None:
-        backend = _libusb()
-    present = list(usb_core.find(find_all=True, backend=backend))
+    try:
+        import usb.core
+
+        backend = _libusb() if backend is None else backend
+    except ImportError as error:
+        raise ImportError(f"{error}; {INSTALL_HINT}") from error
+    present = list(usb.core.find(find_all=True, backend=backend))
     fitting = [device for device in present if (device.idVendor, device.idProduct) in chips]
     matching = [device for device in fitting if serial is None or _serial_of(device) == serial]
     if len(matching) == 1:
@@ -100,7 +50,7 @@ def find_device(chips: Collection[tuple[int, int]], serial: str | None = None, b
     if serial is not None:
         wanted += f" with serial number {serial!r}"
     listed = ", ".join(_described(device) for device in present) or "none"
-    several = "; say which by its serial number, or unplug the others"
+    several = "; give the serial number of one, or unplug the others"
     number, hint = (len(matching), several) if matching else ("no", "")
     unread = [device for device in fitting if serial is not None and _serial_of(device) is None]
     permission = f". To read an unknown serial number: {_udev(unread[0])}" if unread else ""
@@ -115,7 +65,7 @@ class UsbPort:
 
         Args:
             device: `usb.core.Device`.
-            baud: of its serial line [bits/s]; the chip takes the nearest that it has. 0 without one.
+            baud: rate of its serial line [bits/s]; the chip takes the nearest that it has. 0 without one.
 
         Raises:
             LinkError: it cannot be opened, or refuses.
@@ -142,10 +92,10 @@ class UsbPort:
             sent += taken
 
     def flush(self) -> None:
-        """Not every chip tells what it still holds."""
+        """Do nothing: not every chip reports waiting bytes."""
 
     def recover(self) -> None:
-        """Clear a stall, and drop what still waits in the chip, where it can be told to.
+        """Clear a stall, and drop waiting bytes if the chip has a request for that.
 
         Raises:
             LinkError: the chip does not answer.
@@ -169,10 +119,10 @@ class UsbPort:
             usb.util.dispose_resources(self._device)
 
     def _set_up(self) -> None:
-        """A chip without a serial line may need nothing."""
+        """Set the chip up; one without a serial line may need nothing."""
 
     def _purge(self) -> None:
-        """Not every chip can be told to."""
+        """Drop waiting bytes, if the chip has a request for that."""
 
     def _take(self) -> None:
         import usb.util
@@ -203,7 +153,7 @@ class UsbPort:
         self._call("be set up", self._device.ctrl_transfer, kind, request, value, index, data, _TIMEOUT_MS)
 
     def _receive(self, wait_ms: int) -> bytes:
-        """A packet; empty if none comes within the time [ms]."""
+        """Return a packet; empty if none comes within the time [ms]."""
         from usb.core import USBTimeoutError
 
         def read() -> bytes:
@@ -225,13 +175,15 @@ class UsbPort:
         except USBError as error:
             reason = _reason(self._device, error.errno)
             raise LinkError(f"{_described(self._device)} cannot {what}: {reason}{error}") from error
-        except NotImplementedError as error:  # what pyusb makes of libusb's "not supported"
-            reason = "libusb cannot use its driver; on Windows, give it WinUSB, with Zadig"
+        except NotImplementedError as error:  # pyusb's form of libusb's "not supported"
+            reason = (
+                "libusb cannot use its driver; on Windows, give it WinUSB, with Zadig, or use its COM port"
+            )
             raise LinkError(f"{_described(self._device)} cannot {what}: {reason}: {error}") from error
 
 
 def _reason(device: Any, number: int | None) -> str:
-    """What an errno of libusb most likely means, and what to do."""
+    """Return the likely meaning of an errno of libusb, and what to do."""
     reasons = {
         errno.EACCES: f"you may not write to it. {_udev(device)}: ",
         errno.EBUSY: "another program, or another link, has it open; close that first: ",
@@ -251,19 +203,9 @@ def _udev(device: Any) -> str:
     )
 
 
-def _pyusb() -> Any:
-    try:
-        import usb.core
-    except ImportError as error:
-        raise ImportError(f"{error}; {INSTALL_HINT}") from error
-    return usb.core
-
-
 def _libusb() -> Any:
-    try:
-        import libusb_package
-    except ImportError as error:
-        raise ImportError(f"{error}; {INSTALL_HINT}") from error
+    import libusb_package
+
     backend = libusb_package.get_libusb1_backend()
     if backend is None:
         raise LinkError("libusb-1.0 cannot be loaded: neither that of libusb-package nor one of the system")
@@ -271,12 +213,12 @@ def _libusb() -> Any:
 
 
 def _serial_of(device: Any) -> str | None:
-    """Serial number, or None where it has none or we may not ask."""
+    """Return the serial number, or None where there is none or permission is missing."""
     from usb.core import USBError
 
     try:
         number = device.serial_number
-    # pyusb's ValueError where the device gives no languages, and what it makes of libusb's "not supported"
+    # pyusb's ValueError where the device gives no languages, and its form of libusb's "not supported"
     except (USBError, ValueError, NotImplementedError):
         return None
     return None if number is None else str(number)

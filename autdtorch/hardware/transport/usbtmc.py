@@ -9,7 +9,8 @@ import struct
 import time
 from typing import Any
 
-from autdtorch.hardware.transport.usb import LinkError, UsbPort, closed_on_error
+from autdtorch.hardware.transport.port import LinkError, closed_on_error
+from autdtorch.hardware.transport.usb import UsbPort
 
 #: MsgID: a message to the instrument; asking for one, and the answer.
 TELL, ASK = 1, 2

@@ -1,28 +1,35 @@
-"""Frames against hand-worked bytes, against their own inverse, and against the firmwares."""
+"""Devices: levels and frames against hand-worked numbers, and against the emulated firmware."""
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autdtorch.hardware.devices import OPENMPD, SONICSURFACE, Device, ultraino_boards
-from autdtorch.hardware.devices.frames import (
-    levels_of_openmpd_frame,
-    levels_of_sonicsurface_frame,
-    levels_of_ultraino_frame,
-    openmpd_frame,
-    sonicsurface_frame,
-    ultraino_frame,
+from autdtorch.hardware import (
+    AUTD3,
+    DEVICES,
+    OPENMPD,
+    SONICSURFACE,
+    ULTRAINO,
+    Device,
+    EmulatedBench,
+    open_link,
 )
-from autdtorch.hardware.devices.levels import Levels, openmpd_drive, sonicsurface_drive, ultraino_drive
-from autdtorch.hardware.devices.order import sonicsurface_channels, ultraino_pins
-from autdtorch.hardware.emulator.bench import EmulatedBench
-from autdtorch.hardware.emulator.firmware import OpenMPDFirmware, SonicSurfaceFirmware, UltrainoFirmware
-from autdtorch.hardware.link import open_link
-from autdtorch.scene.drive import drive_from_phases
+from autdtorch.hardware.devices.sonicsurface import sonicsurface_channels
+from autdtorch.hardware.devices.ultraino import ultraino_pins
+from autdtorch.scene.drive import drive_from_phases, focus_phases
 
+#: Each device, on two boards if it has several, and the number of values of each of its integer levels.
+CASES = {
+    "autd3": (AUTD3.with_boards(2), (256, 256)),
+    "openmpd": (OPENMPD, (128, 65)),
+    "sonicsurface": (SONICSURFACE, (33,)),
+    "ultraino": (ULTRAINO.with_boards(2), (10, 6)),
+}
+every_device = pytest.mark.parametrize(("device", "counts"), CASES.values(), ids=CASES)
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -34,7 +41,7 @@ def one_on(transducer: int, phase: float, amplitude: float, count: int = 256) ->
 
 
 def on_the_wire(device: Device, drive: torch.Tensor) -> bytes:
-    """What the firmware behind the emulated USB chip receives when a link plays the drive."""
+    """The bytes that the firmware behind the emulated USB chip receives when a link plays the drive."""
     bench = EmulatedBench(device, torch.ones(1, device.transducers, dtype=torch.complex128))
     received = bytearray()
     with open_link(device, backend=bench.bus) as link, pytest.MonkeyPatch.context() as patch:
@@ -69,6 +76,7 @@ OPENMPD_EXAMPLES = [
     (4, -0.51 * 2 * math.pi / 128, 1.0, 1, 64),
     (5, 0.0, math.sin(math.pi / 4), 16, 32),  # half the duty starts an eighth of a period late
     (6, -2 * math.pi / 512, 0.5, 22, 21),  # duty 21.3, so that 0.25 + 21.5 rounds up
+    (7, 0.0, 0.5, 22, 21),  # 21.5 rounds to even
     (254, -math.pi, math.sin(math.pi / 8), 64 + 24, 16),
     (255, 0.1, 0.0, 0, 0),  # off
 ]
@@ -116,51 +124,62 @@ def test_ultraino_bytes(
         upper_half_first = 0 if bit >= 4 else 1
         expected[200 * (transducer // 64) + 2 * (10 * tenth + port) + upper_half_first] |= 1 << 4 + bit % 4
     expected += bytes.fromhex("30303070 30303030 10 00")  # 1 period, 0 to end, commit, switch
-    assert on_the_wire(ultraino_boards(2), one_on(transducer, phase, amplitude, 128)) == expected
+    assert on_the_wire(ULTRAINO.with_boards(2), one_on(transducer, phase, amplitude, 128)) == expected
 
 
-@settings(max_examples=30)
-@given(seeds)
-def test_sonicsurface_frame_is_undone_by_its_inverse_and_by_the_firmware(seed: int) -> None:
-    levels = random_integers(33, seed)
-    frame = sonicsurface_frame(levels)
-    assert torch.equal(levels_of_sonicsurface_frame(frame), levels)
-    firmware = SonicSurfaceFirmware()
-    for piece in pieces(frame, seed):
+def test_an_autd3_frame_is_all_phases_then_all_intensities() -> None:
+    frame = AUTD3.with_boards(2).frame(one_on(250, -math.pi / 2, 0.5, 498))
+    assert (frame[250], frame[498 + 250], sum(frame)) == (64, 128, 64 + 128)
+
+
+def test_every_device_is_tested_here() -> None:
+    assert CASES.keys() == DEVICES.keys()
+
+
+@every_device
+@settings(max_examples=15)
+@given(seed=seeds)
+def test_the_firmware_plays_the_levels_of_a_frame(device: Device, counts: tuple[int, ...], seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    levels = [torch.randint(count, (device.transducers,), generator=generator) for count in counts]
+    frame = device.pack(*levels)
+    firmware = device.firmware(device.transducers)
+    # As a chip may pass it on, in two pieces; without bit 7 no message of OpenMPD begins.
+    cut = 0 if device.name == "AUTD3" else seed % (len(frame) + 1)
+    for piece in ([bytes(7)] if device is OPENMPD else []) + [frame[:cut]] * (cut > 0) + [frame[cut:]]:
         firmware.receive(piece)
-    # One complex exponential by two routes.
-    torch.testing.assert_close(firmware.drive(), sonicsurface_drive(levels), rtol=0, atol=1e-15)
+    # Sums of up to five exponentials, and rounding of angles up to 2 pi.
+    torch.testing.assert_close(firmware.drive(), device.drive(*levels), rtol=0, atol=1e-14)
+    again = device.levels(device.drive(*levels))
+    on = levels[-1] > 0 if len(levels) == 2 else torch.ones(device.transducers, dtype=torch.bool)
+    assert all(torch.equal(one[on], other[on]) for one, other in zip(again, levels, strict=True))
+    assert not device.quantised(torch.zeros(device.transducers).cdouble()).any()
 
 
-@settings(max_examples=30)
-@given(seeds)
-def test_openmpd_frame_is_undone_by_its_inverse_and_by_the_firmware(seed: int) -> None:
-    levels = Levels(random_integers(128, seed), random_integers(65, seed + 1))
-    frame = openmpd_frame(levels)
-    assert all(map(torch.equal, levels_of_openmpd_frame(frame), levels))
-    firmware = OpenMPDFirmware()
-    firmware.receive(bytes(7))  # without bit 7 no message begins
-    for piece in pieces(frame, seed):
-        firmware.receive(piece)
-    torch.testing.assert_close(firmware.drive(), openmpd_drive(levels), rtol=0, atol=1e-15)
+@every_device
+@given(phase=st.floats(-20, 20), amplitude=st.floats(0, 1))
+def test_rounding_moves_phase_and_amplitude_by_at_most_half_a_level(device, counts, phase, amplitude) -> None:
+    drive = drive_from_phases([phase], [amplitude])
+    played = device.quantised(drive)
+    # 1e-9 is rounding. The steepest step of AUTD3's amplitude is 1/255, of a pulse's pi/phases.
+    phases = device.phase_levels.phases
+    step = {"AUTD3": 1 / 255, "SonicSurface": 1.0}.get(device.name, math.pi / phases)
+    assert abs(float(played.abs() - amplitude)) <= step / 2 + 1e-9
+    if played.abs() > 0:
+        assert abs(float((played / drive).angle())) <= math.pi / phases + 1e-9
 
 
-@settings(max_examples=10)
-@given(seeds, st.integers(1, 3))
-def test_ultraino_frame_is_undone_by_its_inverse_and_by_the_firmware(seed: int, boards: int) -> None:
-    duty = random_integers(6, seed, 64 * boards)
-    levels = Levels(random_integers(10, seed + 1, 64 * boards) * (duty > 0), duty)
-    frame = ultraino_frame(levels)
-    assert all(map(torch.equal, levels_of_ultraino_frame(frame), levels))
-    firmware = UltrainoFirmware(boards)
-    for piece in pieces(frame, seed):
-        firmware.receive(piece)
-    # Sums of up to five exponentials, and of patterns.
-    torch.testing.assert_close(firmware.drive(), ultraino_drive(levels), rtol=0, atol=1e-14)
+@every_device
+def test_a_focus_takes_minus_kd(device: Device, counts: tuple[int, ...]) -> None:
+    positions = torch.tensor([[0.0, 0.0, 0.0], [0.0, 2.125e-3, 0.0]], dtype=torch.float64)
+    # The second transducer is a quarter of a wavelength nearer: the device's phase is a quarter ahead.
+    level = device.levels(drive_from_phases(focus_phases(positions, (0, 0.1, 0), 2 * math.pi / 8.5e-3)))[0]
+    phases = device.phase_levels.phases
+    assert (level[1] - level[0]) % phases in (phases // 4, -(-phases // 4))
 
 
 def test_ultraino_starts_with_all_transducers_on_and_another_duration_would_play_old_patterns() -> None:
-    firmware = UltrainoFirmware()
+    firmware = ULTRAINO.firmware(64)
     torch.testing.assert_close(firmware.drive(), torch.ones(64).cdouble(), rtol=0, atol=1e-14)
     firmware.receive(bytes.fromhex("30303070 303030f0 30303030 10"))  # 1 period, then 3 of the second pattern
     torch.testing.assert_close(firmware.drive(), torch.ones(64).cdouble() / 4, rtol=0, atol=1e-14)
@@ -172,27 +191,36 @@ def test_every_transducer_has_a_channel_or_pin_of_its_own() -> None:
 
 
 def test_a_lone_commit_of_the_sonicsurface_brings_the_last_pattern_back() -> None:
-    first, second = random_integers(33, 0), random_integers(33, 1)
-    firmware = SonicSurfaceFirmware()
-    firmware.receive(sonicsurface_frame(first) + sonicsurface_frame(second) + b"\xfd")
-    torch.testing.assert_close(firmware.drive(), sonicsurface_drive(first), rtol=0, atol=1e-15)
+    first, second = torch.arange(256) % 33, torch.arange(256) % 32
+    firmware = SONICSURFACE.firmware(256)
+    firmware.receive(SONICSURFACE.pack(first) + SONICSURFACE.pack(second) + b"\xfd")
+    torch.testing.assert_close(firmware.drive(), SONICSURFACE.drive(first), rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("frame", [b"", bytes(258), bytes([254, *[0] * 255, 253])])
-def test_other_bytes_are_no_frame(frame: bytes) -> None:
-    with pytest.raises(ValueError, match=r"frame: \d+ bytes"):
-        levels_of_sonicsurface_frame(frame)
-    with pytest.raises(ValueError, match=r"frame: \d+ bytes"):
-        levels_of_openmpd_frame(frame)
-    with pytest.raises(ValueError, match=r"frame: \d+ bytes"):
-        levels_of_ultraino_frame(frame)
+def test_amplitudes_rounded_up_to_full_are_accepted_and_more_is_not() -> None:
+    assert OPENMPD.levels([1 + 5e-7 + 0j])[1].item() == 64
+    with pytest.raises(ValueError, match=r"drive: amplitude 1.1"):
+        AUTD3.levels([1.1 + 0j])
 
 
-def random_integers(most: int, seed: int, count: int = 256) -> torch.Tensor:
-    return torch.randint(most, (count,), generator=torch.Generator().manual_seed(seed))
+@pytest.mark.parametrize(
+    ("device", "levels", "message"),
+    [
+        (AUTD3, ([256], [0]), r"AUTD3 phase: \(256,\); .* 0 to 255"),
+        (OPENMPD, ([0], [65]), r"OpenMPD duty: \(65,\); .* 0 to 64"),
+        (OPENMPD, ([0, 1], [64]), r"OpenMPD duty: shape \(1,\); must be \(2,\)"),
+        (SONICSURFACE, ([33],), r"SonicSurface phase: \(33,\); must be integers from 0 to 32"),
+        (SONICSURFACE, (np.array([0.5]),), r"must be integers"),
+    ],
+)
+def test_levels_out_of_range_are_refused(device: Device, levels, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        device.drive(*levels)
 
 
-def pieces(frame: bytes, seed: int) -> tuple[bytes, bytes]:
-    """The frame in two pieces, as a chip may pass it on."""
-    cut = seed % (len(frame) + 1)
-    return frame[:cut], frame[cut:]
+@pytest.mark.parametrize(
+    ("device", "boards", "most"), [(SONICSURFACE, 2, 1), (ULTRAINO, 15, 14), (AUTD3, 0, None)]
+)
+def test_a_number_of_boards_that_a_device_cannot_have_is_refused(device: Device, boards: int, most) -> None:
+    with pytest.raises(ValueError, match=rf"boards: {boards}; must be .*{'>= 1' if most is None else most}"):
+        device.with_boards(boards)

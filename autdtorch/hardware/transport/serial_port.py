@@ -1,0 +1,98 @@
+"""A serial port of the operating system, by its name, over pyserial."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+
+from autdtorch.hardware.transport.port import INSTALL_HINT, LinkError
+from autdtorch.utils.validation import require_kind
+
+_TIMEOUT = 1.0  # [s]
+
+
+class SerialPort:
+    """A serial port with the driver of its operating system: 8 bits, no parity, 1 stop bit, no flow control.
+
+    It reaches every adapter that the system knows, and a COM port on Windows.
+    """
+
+    def __init__(self, name: str, baud: int) -> None:
+        """Open the port.
+
+        Args:
+            name: of the port, such as "COM3" or "/dev/ttyUSB0".
+            baud: rate of the line [bits/s].
+
+        Raises:
+            LinkError: there is no such port, another program has it open, or it refuses the rate.
+            ImportError: pyserial is missing.
+            ValueError: `name` is no text.
+        """
+        require_kind("port", name, str)
+        self._name = name
+        with self._errors("be opened", hint=True):
+            # Another program that wrote to the port would break frames.
+            self._port: Any = _pyserial().Serial(name, baud, write_timeout=_TIMEOUT, exclusive=True)
+
+    def write(self, data: bytes) -> None:
+        """Send all of `data`, and drop what came in: boards in a row echo their commands.
+
+        Raises:
+            LinkError: the port does not take it within a second.
+        """
+        with self._errors("be written to"):
+            self._port.reset_input_buffer()
+            self._port.write(data)
+
+    def flush(self) -> None:
+        """Wait until the driver has sent all bytes.
+
+        Raises:
+            LinkError: the port is gone.
+        """
+        with self._errors("be flushed"):
+            self._port.flush()
+
+    def recover(self) -> None:
+        """Drop the bytes that the driver still holds.
+
+        Raises:
+            LinkError: the port is gone.
+        """
+        with self._errors("be recovered"):
+            self._port.reset_output_buffer()
+
+    def close(self) -> None:
+        """Close the port.
+
+        Raises:
+            LinkError: the system does not close it.
+        """
+        with self._errors("be closed"):
+            self._port.close()
+
+    @contextlib.contextmanager
+    def _errors(self, what: str, hint: bool = False) -> Iterator[None]:
+        try:
+            yield
+        except ImportError:
+            raise
+        except Exception as error:  # termios.error is no OSError
+            there = f". Ports: {_listed()}" if hint else ""
+            raise LinkError(f"{self._name} cannot {what}: {error}{there}") from error
+
+
+def _pyserial() -> Any:
+    try:
+        import serial
+    except ImportError as error:
+        raise ImportError(f"{error}; {INSTALL_HINT}") from error
+    return serial
+
+
+def _listed() -> str:
+    from serial.tools.list_ports import comports
+
+    return ", ".join(f"{port.device} ({port.description})" for port in comports()) or "none"
