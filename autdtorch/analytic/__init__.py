@@ -1,8 +1,7 @@
-"""Exact solutions of the Helmholtz equation to check simulations against.
+"""Exact solutions of the Helmholtz equation, to check simulations against.
 
-Convention e^{-i w t}, outgoing e^{+ikr}/r. Every point source is that of `freespace.green`, e^{ikr} / (4 pi
-r); times 4 pi S it is a source of strength S. Ratios are of the obstacle over the medium: density_ratio is
-rho_1 / rho, speed_ratio is c_1 / c.
+The time factor is e^{-i w t}. A point source has the field e^{ikr} / (4 pi r) of `green`; times 4 pi S it has
+the source strength S. Ratios are obstacle over medium: density_ratio = rho_1 / rho, speed_ratio = c_1 / c.
 """
 
 from autdtorch.analytic.green import green

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -13,104 +13,122 @@ from autdtorch.utils.arrays import ComplexArray
 from autdtorch.utils.validation import ArrayLike, invalid, positive, real_tensor
 
 
-class Layering(Protocol):
-    """What lies behind a plane front face, seen by plane waves of horizontal wavenumber kappa [rad/m].
-
-    Responses are pressures per unit incident pressure at the front face. They hold for complex kappa too, on
-    the sheet that `vertical_wavenumber` defines.
-    """
-
-    @property
-    def wavenumber(self) -> float:
-        """Of the medium in front [rad/m]."""
-
-    @property
-    def inner_wavenumber(self) -> float:
-        """Of the fluid behind the front face [rad/m]."""
-
-    @property
-    def thickness(self) -> float:
-        """How far waves run to and fro behind the front face [m]."""
-
-    def reflected(self, kappa: ComplexArray) -> ComplexArray:
-        """The reflected pressure at the front face."""
-
-    def transmitted(self, kappa: ComplexArray, depth: float) -> ComplexArray:
-        """The total pressure at `depth` [m] >= 0 behind the front face."""
-
-
 @dataclass(frozen=True)
-class HalfSpace:
-    """A fluid without end (Brekhovskikh & Godin, Acoustics of Layered Media I (1990), section 2.2)."""
+class Layering(ABC):
+    """A fluid behind a plane front face, and its response to plane waves.
+
+    Responses are pressures over the incident pressure at the front face, for horizontal wavenumbers kappa
+    [rad/m]. They also hold for complex kappa, on the sheet that `vertical_wavenumber` defines.
+
+    Attributes:
+        wavenumber: k of the medium in front [rad/m], > 0.
+        density_ratio: rho_1 / rho of the fluid and the medium, > 0.
+        speed_ratio: c_1 / c of the fluid and the medium, > 0.
+    """
 
     wavenumber: float
     density_ratio: float
     speed_ratio: float
-    thickness: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the attributes."""
+        positive("wavenumber", self.wavenumber, "rad/m")
+        positive("density_ratio", self.density_ratio)
+        positive("speed_ratio", self.speed_ratio)
 
     @property
     def inner_wavenumber(self) -> float:
-        """Of the fluid behind the front face [rad/m]."""
+        """Wavenumber in the fluid [rad/m]."""
         return self.wavenumber / self.speed_ratio
 
-    def reflected(self, kappa: ComplexArray) -> ComplexArray:
-        """The reflected pressure at the front face."""
-        heavy = self.density_ratio * vertical_wavenumber(self.wavenumber, kappa)
-        inner = vertical_wavenumber(self.inner_wavenumber, kappa)
-        return (heavy - inner) / (heavy + inner)
+    @property
+    @abstractmethod
+    def depth(self) -> float:
+        """Distance over which waves are reflected back and forth behind the front face [m]."""
 
+    @abstractmethod
+    def reflected(self, kappa: ComplexArray) -> ComplexArray:
+        """Return the reflected pressure at the front face."""
+
+    @abstractmethod
     def transmitted(self, kappa: ComplexArray, depth: float) -> ComplexArray:
-        """The total pressure at `depth` [m] >= 0 behind the front face."""
-        heavy = self.density_ratio * vertical_wavenumber(self.wavenumber, kappa)
-        inner = vertical_wavenumber(self.inner_wavenumber, kappa)
-        return 2 * heavy / (heavy + inner) * np.exp(1j * inner * depth)
+        """Return the total pressure at `depth` [m] >= 0 behind the front face."""
+
+    def _vertical(self, kappa: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+        """Return the vertical wavenumbers outside, times the density ratio, and inside."""
+        outer = self.density_ratio * vertical_wavenumber(self.wavenumber, kappa)
+        return outer, vertical_wavenumber(self.inner_wavenumber, kappa)
 
 
 @dataclass(frozen=True)
-class Slab:
-    """A fluid layer with the medium on both sides (Brekhovskikh & Godin I, chapter 2).
+class HalfSpace(Layering):
+    """An infinite fluid (Brekhovskikh & Godin, Acoustics of Layered Media I (1990), section 2.2)."""
 
-    The transfer matrix of the layer, times e^{i gamma_1 d} so that nothing overflows where waves in it decay,
-    and in terms of sin(gamma_1 x) / gamma_1 so that gamma_1 = 0 is an ordinary case.
+    @property
+    def depth(self) -> float:
+        """Zero: no wave returns."""
+        return 0.0
+
+    def reflected(self, kappa: ComplexArray) -> ComplexArray:
+        """Return the reflected pressure at the front face."""
+        outer, inner = self._vertical(kappa)
+        return (outer - inner) / (outer + inner)
+
+    def transmitted(self, kappa: ComplexArray, depth: float) -> ComplexArray:
+        """Return the total pressure at `depth` [m] >= 0 behind the front face."""
+        outer, inner = self._vertical(kappa)
+        return 2 * outer / (outer + inner) * np.exp(1j * inner * depth)
+
+
+@dataclass(frozen=True)
+class Slab(Layering):
+    """A fluid layer in a medium (Brekhovskikh & Godin I, chapter 2).
+
+    The transfer matrix of the layer is multiplied by e^{i gamma_1 d}, so that decaying waves do not overflow.
+    It is written with sin(gamma_1 x) / gamma_1, so that gamma_1 = 0 is an ordinary case.
+
+    Attributes:
+        thickness: d [m], > 0.
     """
 
-    wavenumber: float
-    density_ratio: float
-    speed_ratio: float
     thickness: float
 
+    def __post_init__(self) -> None:
+        """Check the attributes."""
+        super().__post_init__()
+        positive("thickness", self.thickness, "m")
+
     @property
-    def inner_wavenumber(self) -> float:
-        """Of the fluid in the slab [rad/m]."""
-        return self.wavenumber / self.speed_ratio
+    def depth(self) -> float:
+        """The thickness [m]."""
+        return self.thickness
 
     def reflected(self, kappa: ComplexArray) -> ComplexArray:
-        """The reflected pressure at the front face."""
-        heavy, inner, denominator = self._terms(kappa)
+        """Return the reflected pressure at the front face."""
+        outer, inner, denominator = self._terms(kappa)
         _, sine = _scaled_cosine_and_sine(inner, self.thickness)
-        return -1j * (heavy**2 - inner**2) * sine / denominator
+        return -1j * (outer**2 - inner**2) * sine / denominator
 
     def transmitted(self, kappa: ComplexArray, depth: float) -> ComplexArray:
-        """The total pressure at `depth` [m] >= 0 behind the front face, in the slab or beyond it."""
-        heavy, inner, denominator = self._terms(kappa)
+        """Return the total pressure at `depth` [m] >= 0 behind the front face, in the slab or beyond it."""
+        outer, inner, denominator = self._terms(kappa)
         inside = min(depth, self.thickness)
-        # Seen from the back face, where p and its slope over the density are those of the transmitted wave.
+        # At the back face, p and its slope over the density are those of the transmitted wave.
         cosine, sine = _scaled_cosine_and_sine(inner, self.thickness - inside)
-        pressure = 2 * heavy * (cosine - 1j * heavy * sine) / denominator * np.exp(1j * inner * inside)
-        return pressure * np.exp(1j * heavy / self.density_ratio * (depth - inside))
+        pressure = 2 * outer * (cosine - 1j * outer * sine) / denominator * np.exp(1j * inner * inside)
+        return pressure * np.exp(1j * outer / self.density_ratio * (depth - inside))
 
     def _terms(self, kappa: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-        heavy = self.density_ratio * vertical_wavenumber(self.wavenumber, kappa)
-        inner = vertical_wavenumber(self.inner_wavenumber, kappa)
+        outer, inner = self._vertical(kappa)
         cosine, sine = _scaled_cosine_and_sine(inner, self.thickness)
-        return heavy, inner, 2 * heavy * cosine - 1j * (heavy**2 + inner**2) * sine
+        return outer, inner, 2 * outer * cosine - 1j * (outer**2 + inner**2) * sine
 
 
 def vertical_wavenumber(wavenumber: float, kappa: ComplexArray) -> ComplexArray:
-    """The root gamma of k^2 - kappa^2, cut from kappa = k upwards.
+    """Return the root gamma of k^2 - kappa^2 with the branch cut from kappa = k upwards.
 
-    For real kappa >= 0 it is that of waves which travel or decay away from their source. It is analytic in
-    the fourth quadrant and in the first to the right of k, where contours of integration run.
+    For real kappa >= 0 the wave of this gamma travels or decays away from its source. The root is analytic in
+    the fourth quadrant, and in the first to the right of k, where contours of integration run.
     """
     below: ComplexArray = np.sqrt(-1j * (wavenumber - kappa)) * np.exp(0.25j * np.pi)
     return below * np.sqrt(wavenumber + kappa)
@@ -119,9 +137,9 @@ def vertical_wavenumber(wavenumber: float, kappa: ComplexArray) -> ComplexArray:
 def step_coefficients(
     angle: ArrayLike, density_ratio: float, speed_ratio: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Pressure reflection and transmission coefficients of a plane wave at a fluid half-space.
+    """Return the reflection and transmission coefficients of a plane wave at a fluid half-space.
 
-    Beyond the critical angle the transmitted wave is the one that decays, and |R| = 1.
+    Beyond the critical angle the transmitted wave decays, and |R| = 1.
 
     Args:
         angle: of incidence, any shape [rad], in [0, pi/2).
@@ -129,8 +147,8 @@ def step_coefficients(
         speed_ratio: c_1 / c > 0.
 
     Returns:
-        R and T, complex128 in the shape of `angle`, reflected and transmitted pressure over incident pressure
-        at the face.
+        R and T, complex128 in the shape of `angle`: reflected and transmitted pressure over the incident
+        pressure at the face.
 
     Raises:
         ValueError: an argument out of the range given above.
@@ -138,13 +156,13 @@ def step_coefficients(
     Source: Brekhovskikh & Godin, Acoustics of Layered Media I (1990), section 2.2; Pierce, Acoustics,
         section 3-6.
     """
-    return _coefficients(angle, half_space(1.0, density_ratio, speed_ratio))
+    return _coefficients(angle, HalfSpace(1.0, density_ratio, speed_ratio))
 
 
 def slab_coefficients(
     angle: ArrayLike, wavenumber: float, thickness: float, density_ratio: float, speed_ratio: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Pressure reflection and transmission coefficients of a plane wave at a fluid slab in a medium.
+    """Return the reflection and transmission coefficients of a plane wave at a fluid slab in a medium.
 
     Args:
         angle: of incidence, any shape [rad], in [0, pi/2).
@@ -154,8 +172,8 @@ def slab_coefficients(
         speed_ratio: c_1 / c > 0.
 
     Returns:
-        R and T, complex128 in the shape of `angle`, the reflected pressure at the front face and the
-        transmitted pressure at the back face, over the incident pressure at the front face.
+        R and T, complex128 in the shape of `angle`: reflected pressure at the front face and transmitted
+        pressure at the back face, over the incident pressure at the front face.
 
     Raises:
         ValueError: an argument out of the range given above.
@@ -163,26 +181,7 @@ def slab_coefficients(
     Source: Brekhovskikh & Godin, Acoustics of Layered Media I (1990), chapter 2; Pierce, Acoustics,
         section 3-7.
     """
-    return _coefficients(angle, slab(wavenumber, thickness, density_ratio, speed_ratio))
-
-
-def half_space(wavenumber: float, density_ratio: float, speed_ratio: float) -> HalfSpace:
-    """A checked `HalfSpace`."""
-    return HalfSpace(
-        positive("wavenumber", wavenumber, "rad/m"),
-        positive("density_ratio", density_ratio),
-        positive("speed_ratio", speed_ratio),
-    )
-
-
-def slab(wavenumber: float, thickness: float, density_ratio: float, speed_ratio: float) -> Slab:
-    """A checked `Slab`."""
-    return Slab(
-        positive("wavenumber", wavenumber, "rad/m"),
-        positive("density_ratio", density_ratio),
-        positive("speed_ratio", speed_ratio),
-        positive("thickness", thickness, "m"),
-    )
+    return _coefficients(angle, Slab(wavenumber, density_ratio, speed_ratio, thickness))
 
 
 def _coefficients(angle: ArrayLike, layering: Layering) -> tuple[torch.Tensor, torch.Tensor]:
@@ -191,12 +190,12 @@ def _coefficients(angle: ArrayLike, layering: Layering) -> tuple[torch.Tensor, t
         raise invalid("angle", angles, "every entry must be in [0, pi/2)", "rad")
     kappa = layering.wavenumber * np.sin(angles.cpu().numpy()).astype(np.complex128)
     reflected = torch.from_numpy(np.asarray(layering.reflected(kappa)))
-    transmitted = torch.from_numpy(np.asarray(layering.transmitted(kappa, layering.thickness)))
+    transmitted = torch.from_numpy(np.asarray(layering.transmitted(kappa, layering.depth)))
     return reflected.to(angles.device), transmitted.to(angles.device)
 
 
 def _scaled_cosine_and_sine(inner: ComplexArray, length: float) -> tuple[ComplexArray, ComplexArray]:
-    """Cos(inner length) and sin(inner length) / inner, both times e^{i inner length}."""
+    """Return cos(inner length) and sin(inner length) / inner, both times e^{i inner length}."""
     phase = 2j * length * inner
     # expm1(z) / z is 1 at z = 0.
     safe = np.where(phase == 0, 1, phase)

@@ -1,4 +1,4 @@
-"""Circular piston in an infinite rigid baffle, which is a disc of monopoles."""
+"""Circular piston in an infinite rigid baffle, equivalent to a disc of monopoles."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from scipy.special import j1
 
 from autdtorch.utils.validation import ArrayLike, Vector, points_tensor, positive, real_tensor, unit_vector
 
-#: Halvings of the rim's angle towards where the rim is nearest to the receiver.
 _HALVINGS = 30
+"""Halvings of the angle along the rim towards the point nearest to the receiver."""
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
-#: Phase [rad] that 16 Gauss nodes take with errors below 1e-13.
 _PANEL_PHASE = 6.0
+"""Phase of a panel that 16 Gauss nodes integrate with errors below 1e-13 [rad]."""
 
 
 def piston_directivity(angle: ArrayLike, wavenumber: float, radius: float) -> torch.Tensor:
-    """Far field of a piston over that on its axis: 2 J_1(ka sin angle) / (ka sin angle).
+    """Return the directivity of a piston, 2 J_1(ka sin angle) / (ka sin angle), which is 1 on the axis.
 
     Args:
         angle: from the axis, any shape [rad].
@@ -42,7 +42,7 @@ def piston_directivity(angle: ArrayLike, wavenumber: float, radius: float) -> to
 
 
 def piston_on_axis(distance: ArrayLike, wavenumber: float, radius: float) -> torch.Tensor:
-    """Pressure on the axis of a piston: (e^{ik sqrt(z^2 + a^2)} - e^{ikz}) / (2 pi i k a^2).
+    """Return the pressure on the axis of a piston: (e^{ik sqrt(z^2 + a^2)} - e^{ikz}) / (2 pi i k a^2).
 
     Args:
         distance: z from the piston, any shape [m], >= 0.
@@ -50,7 +50,7 @@ def piston_on_axis(distance: ArrayLike, wavenumber: float, radius: float) -> tor
         radius: a [m], > 0.
 
     Returns:
-        complex128 in the shape of `distance` [1/m]; e^{ikz} / (4 pi z) far away, as `freespace.green`.
+        complex128 in the shape of `distance` [1/m]; e^{ikz} / (4 pi z) far away, as `green`.
 
     Raises:
         ValueError: not finite, or out of the ranges above.
@@ -62,7 +62,7 @@ def piston_on_axis(distance: ArrayLike, wavenumber: float, radius: float) -> tor
         raise ValueError(f"distance: {float(z.min()):g} m; every entry must be >= 0")
     wavenumber, radius = positive("wavenumber", wavenumber, "rad/m"), positive("radius", radius, "m")
     rim = torch.hypot(z, torch.full_like(z, radius))
-    # The difference of the two waves as a product, which keeps its digits far away.
+    # Written as a product, the difference of the two waves does not cancel far away.
     half_path = radius**2 / (rim + z) / 2
     amplitude = torch.sinc(wavenumber * half_path / math.pi) / (2 * math.pi * (rim + z))
     return amplitude * torch.exp(0.5j * wavenumber * (rim + z))
@@ -71,20 +71,20 @@ def piston_on_axis(distance: ArrayLike, wavenumber: float, radius: float) -> tor
 def piston_field(
     points: ArrayLike, sources: ArrayLike, wavenumber: float, radius: float, normal: Vector
 ) -> torch.Tensor:
-    """Pressure of pistons anywhere, near and far: the Rayleigh integral.
+    """Return the pressure of pistons in the near and far field: the Rayleigh integral.
 
-    The integral over the disc is done exactly along rays from the foot of the receiver, which leaves one
-    along the rim, (1 / ik) oint (e^{ikR} - e^{ikz}) d phi (Schoch 1941, Akust. Z. 6, 318).
+    The integral over the disc is exact along rays from the foot of the receiver's perpendicular. The integral
+    along the rim remains, (1 / ik) oint (e^{ikR} - e^{ikz}) d phi (Schoch 1941, Akust. Z. 6, 318).
 
     Args:
-        points: (P, 3) [m]; the field is the same on both sides, a baffle makes it that of the front.
-        sources: (M, 3) centres of the pistons [m].
+        points: (P, 3) [m]; the field is equal on both sides of the disc.
+        sources: centres of the pistons (M, 3) [m].
         wavenumber: k [rad/m], > 0.
         radius: a [m], > 0.
         normal: axis of all pistons (3,); any length.
 
     Returns:
-        complex128 (P, M) [1/m]; e^{ikr} / (4 pi r) on the axis far away, as `freespace.green`.
+        complex128 (P, M) [1/m]; e^{ikr} / (4 pi r) on the axis far away, as `green`.
 
     Raises:
         ValueError: not finite, wrong shape, or an argument <= 0.
@@ -101,12 +101,12 @@ def piston_field(
     z = along.abs()
     total = torch.zeros_like(offset, dtype=torch.complex128)
     for angle, weight in _rim(wavenumber * radius):
-        # 1 - cos as a square: next to the rim it is all that keeps R from zero.
+        # 1 - cos as a square: next to the rim it alone keeps R from zero.
         from_nearest = 2 * math.sin(angle / 2) ** 2
         aside = (radius - offset) ** 2 + 2 * radius * offset * from_nearest
         rim = torch.sqrt(z**2 + aside)
         edge = radius * (radius - offset + offset * from_nearest)
-        # aside = R^2 - z^2 in e^{ikR} - e^{ikz} cancels against the denominator of d phi / d angle.
+        # aside = R^2 - z^2 in e^{ikR} - e^{ikz} cancels with the denominator of d phi / d angle.
         path = aside / (rim + z)
         factor = weight * edge / (rim + z) * torch.sinc(wavenumber * path / (2 * math.pi))
         total += factor * torch.exp(0.5j * wavenumber * (rim + z))
@@ -114,7 +114,7 @@ def piston_field(
 
 
 def _rim(reach: float) -> list[tuple[float, float]]:
-    """Angles and weights over the whole rim, one half standing for both; `reach` is ka."""
+    """Return angles over half the rim and weights over all of it, for reach = ka."""
     pieces = 1 + int(reach * math.pi / 2 / _PANEL_PHASE)
     edges = [0.0]
     for halving in range(_HALVINGS, -1, -1):

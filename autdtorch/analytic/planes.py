@@ -1,4 +1,4 @@
-"""Point sources in front of an infinite plane: rigid, pressure-release, fluid half-space, fluid slab."""
+"""Point sources in front of an infinite rigid or pressure-release plane, fluid half-space or fluid slab."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from autdtorch.analytic.green import green
-from autdtorch.analytic.layers import Layering, half_space, slab, vertical_wavenumber
+from autdtorch.analytic.layers import HalfSpace, Layering, Slab, vertical_wavenumber
 from autdtorch.analytic.sommerfeld import sommerfeld_integral
 from autdtorch.utils.arrays import ComplexArray
 from autdtorch.utils.validation import (
@@ -29,7 +29,7 @@ def rigid_plane(
     *,
     scattered: bool = False,
 ) -> torch.Tensor:
-    """Field of point sources in front of a rigid plane: source plus image source.
+    """Return the field of point sources in front of a rigid plane: source plus image source.
 
     Args:
         points: (P, 3) [m], in front of the plane or on it.
@@ -37,10 +37,10 @@ def rigid_plane(
         wavenumber: k [rad/m], > 0.
         origin: a point (3,) of the plane [m].
         normal: of the plane (3,), towards points and sources; any length.
-        scattered: the reflected wave alone.
+        scattered: return the reflected wave alone.
 
     Returns:
-        complex128 (P, M) [1/m], in units of `freespace.green`.
+        complex128 (P, M) [1/m], in units of `green`.
 
     Raises:
         ValueError: not finite, wrong shape, out of the ranges above, or a point on a source or its image.
@@ -60,7 +60,7 @@ def soft_plane(
     *,
     scattered: bool = False,
 ) -> torch.Tensor:
-    """Field of point sources in front of a pressure-release plane: source minus image source.
+    """Return the field of point sources in front of a pressure-release plane: source minus image source.
 
     Arguments, returns and errors as for `rigid_plane`.
     """
@@ -79,7 +79,7 @@ def fluid_half_space(
     *,
     scattered: bool = False,
 ) -> torch.Tensor:
-    """Field of point sources in front of a fluid half-space, on both sides of its face.
+    """Return the field of point sources in front of a fluid half-space, on both sides of its face.
 
     Args:
         points: (P, 3) [m], anywhere.
@@ -89,17 +89,17 @@ def fluid_half_space(
         normal: of the face (3,), towards the sources; any length.
         density_ratio: rho_1 / rho > 0.
         speed_ratio: c_1 / c > 0.
-        scattered: the field less that of the sources in the medium without end.
+        scattered: subtract the field of the sources in the infinite medium.
 
     Returns:
-        complex128 (P, M) [1/m], in units of `freespace.green`; relative error about 1e-10 of the direct wave.
+        complex128 (P, M) [1/m], in units of `green`; relative error about 1e-10 of the direct wave.
 
     Raises:
         ValueError: not finite, wrong shape, out of the ranges above, or a point on a source.
 
     Source: Brekhovskikh & Godin, Acoustics of Layered Media II (1992), chapter 1.
     """
-    layering = half_space(wavenumber, density_ratio, speed_ratio)
+    layering = HalfSpace(wavenumber, density_ratio, speed_ratio)
     return _layered_field(points, sources, layering, origin, normal, scattered)
 
 
@@ -115,7 +115,9 @@ def fluid_slab(
     *,
     scattered: bool = False,
 ) -> torch.Tensor:
-    """Field of point sources in front of a fluid slab in a medium: in front, inside and behind.
+    """Return the field of point sources in front of a fluid slab in a medium: in front, inside and behind.
+
+    Returns, errors, source and other arguments as for `fluid_half_space`, with the front face as its face.
 
     Args:
         points: (P, 3) [m], anywhere.
@@ -123,20 +125,12 @@ def fluid_slab(
         wavenumber: k of the medium [rad/m], > 0.
         origin: a point (3,) of the front face [m].
         normal: of the front face (3,), towards the sources; any length.
-        thickness: [m], > 0.
+        thickness: of the slab [m], > 0.
         density_ratio: rho_1 / rho > 0.
         speed_ratio: c_1 / c > 0.
-        scattered: the field less that of the sources in the medium without a slab.
-
-    Returns:
-        complex128 (P, M) [1/m], in units of `freespace.green`; relative error about 1e-10 of the direct wave.
-
-    Raises:
-        ValueError: not finite, wrong shape, out of the ranges above, or a point on a source.
-
-    Source: Brekhovskikh & Godin, Acoustics of Layered Media II (1992), chapter 1.
+        scattered: subtract the field of the sources in the infinite medium.
     """
-    layering = slab(wavenumber, thickness, density_ratio, speed_ratio)
+    layering = Slab(wavenumber, density_ratio, speed_ratio, thickness)
     return _layered_field(points, sources, layering, origin, normal, scattered)
 
 
@@ -170,7 +164,7 @@ def _layered_field(
         for row, height in zip(offsets.tolist(), heights.tolist(), strict=True)
     ]
     field = torch.tensor(rows, dtype=torch.complex128, device=targets.device)
-    # In front the integral is the reflected wave, behind it is the total field.
+    # The integral is the reflected wave in front of the face, and the total field behind it.
     in_front = heights >= 0
     incident_rows = ~in_front if scattered else in_front
     if incident_rows.any():
@@ -180,7 +174,7 @@ def _layered_field(
 
 
 def _response(layering: Layering, offset: float, height: float, source_height: float) -> complex:
-    """The reflected wave at `height` >= 0, the total field below."""
+    """Return the reflected wave for `height` >= 0 [m], the total field below."""
 
     def spectrum(kappa: ComplexArray) -> ComplexArray:
         gamma = vertical_wavenumber(layering.wavenumber, kappa)
@@ -189,9 +183,7 @@ def _response(layering: Layering, offset: float, height: float, source_height: f
         return layering.transmitted(kappa, -height) * np.exp(1j * gamma * source_height)
 
     wavenumbers = (layering.wavenumber, layering.inner_wavenumber)
-    return sommerfeld_integral(
-        spectrum, wavenumbers, offset, source_height + abs(height), 2 * layering.thickness
-    )
+    return sommerfeld_integral(spectrum, wavenumbers, offset, source_height + abs(height), 2 * layering.depth)
 
 
 def _heights(positions: torch.Tensor, origin: Vector, axis: torch.Tensor) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""Point sources as sums of plane and decaying waves: the Sommerfeld integral."""
+"""Point sources as superpositions of plane and evanescent waves: the Sommerfeld integral."""
 
 from __future__ import annotations
 
@@ -16,35 +16,34 @@ from autdtorch.utils.arrays import ComplexArray
 Spectrum = Callable[[ComplexArray], ComplexArray]
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
-#: What one panel of 32 Gauss nodes takes with errors below 1e-13: this much phase [rad], and a length of this
-#: many times its distance to the nearest singularity.
-_PANEL_PHASE = 20.0
-_PANEL_LENGTH = 3.0
-#: J_0 grows to e^4 on a contour this far below the axis, in units of 1 / offset: two digits are given up.
+# A panel of 32 Gauss nodes has errors below 1e-13 up to these limits.
+_PANEL_PHASE = 20.0  # [rad] along it
+_PANEL_LENGTH = 3.0  # times the distance to the nearest singularity
 _DIP = 4.0
-#: Smallest scale of the way down to the contour: 8^-6 = 4e-6 of the dip, whose square is what it adds.
+"""Depth of the contour below the axis times the offset; J_0 grows to e^4 there, at a loss of two digits."""
 _DIAGONAL_LEGS = 6
-#: Exponents of decay after which a tail is cut: e^-40 = 4e-18.
+"""Legs of the diagonal; the first leaves out 8^-6 = 4e-6 of the dip, with an error of its square."""
 _TAIL = 40.0
+"""Exponent of decay at the end of a tail: e^-40 = 4e-18."""
 
 
 def sommerfeld_integral(
     spectrum: Spectrum, wavenumbers: tuple[float, float], offset: float, height: float, reverberation: float
 ) -> complex:
-    """(i / 4 pi) times the integral of F(kappa) J_0(kappa offset) kappa / gamma over kappa = 0 to infinity.
+    """Return i / 4 pi times the integral of F(kappa) J_0(kappa offset) kappa / gamma, kappa = 0 to infinity.
 
-    F = e^{i gamma height} gives `freespace.green` (Brekhovskikh & Godin, Acoustics of Layered Media II
-    (1992), chapter 1). Branch points and the poles of guided waves lie on the real axis, those of waves that
-    leak from a layer above it, so the contour passes below to beyond the last of them. From there both halves
-    of J_0 are followed down their steepest descent, where nothing oscillates.
+    F = e^{i gamma height} gives `green` (Brekhovskikh & Godin, Acoustics of Layered Media II, 1992, chapter
+    1). Branch points and poles of guided waves lie on the real axis and poles of leaky waves above it, so the
+    contour passes below all of them. Beyond the last one, both halves of J_0 follow their paths of
+    steepest descent, where they do not oscillate.
 
     Args:
-        spectrum: F; must decay like e^{-kappa height}, be real for real kappa beyond both wavenumbers, and
-            have no singularity but between 0 and the larger wavenumber, on or above the axis.
-        wavenumbers: k in gamma = sqrt(k^2 - kappa^2), and the inner one [rad/m].
+        spectrum: F; it must decay like e^{-kappa height} and be real for real kappa beyond both wavenumbers.
+            Singularities must lie between 0 and the larger wavenumber, on or above the axis.
+        wavenumbers: k in gamma = sqrt(k^2 - kappa^2), and the wavenumber in the layer [rad/m].
         offset: horizontal distance [m], >= 0.
         height: vertical distance [m], >= 0; not zero together with `offset`.
-        reverberation: length of the way to and fro in a layer [m], which adds to how fast F oscillates.
+        reverberation: length of the path back and forth in a layer [m], which makes F oscillate faster.
     """
     wavenumber = wavenumbers[0]
 
@@ -60,10 +59,10 @@ def sommerfeld_integral(
 def _contour(
     wavenumbers: tuple[float, float], end: float, offset: float, vertical: float
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Nodes and weights along 0, dip - i dip, end - i dip, end.
+    """Return nodes and weights along 0, dip - i dip, end - i dip, end.
 
-    The way down is diagonal, as evanescent waves that leak have poles to the left of the negative imaginary
-    axis, and in legs that grow eightfold, as waves near their cut-off have poles near 0.
+    The first part is diagonal, because evanescent leaky waves have poles to the left of the negative
+    imaginary axis. Its legs grow eightfold, because waves near their cut-off have poles near 0.
     """
     dip = 0.5 * wavenumbers[0]
     if offset > 0:
@@ -81,7 +80,7 @@ def _contour(
 def _panel_edges(
     start: complex, stop: complex, wavenumbers: tuple[float, float], offset: float, vertical: float
 ) -> npt.NDArray[np.float64]:
-    """Fractions of a leg between which panels are as long as singularities and phase let them be."""
+    """Return the edges of panels, as fractions of a leg, for the limits of phase and length."""
     length, singular = abs(stop - start), max(wavenumbers)
     nearest = max(min(-start.imag, -stop.imag), min(start.real, stop.real) - singular)
     along = np.linspace(0, 1, 2 + int(8 * length / nearest))
@@ -106,13 +105,13 @@ def _tail(integrand: Spectrum, start: float, offset: float, height: float) -> co
     direction = (height + 1j * offset) / distance
     kappa = (start + direction * along).astype(np.complex128)
     upper = np.sum(weights * direction * integrand(kappa) * hankel1(0, kappa * offset))
-    # 2 J_0 = H^(1) + H^(2), and here integrand(conj kappa) = -conj integrand(kappa): the H^(2) half, down the
-    # mirrored path, is minus the conjugate of the H^(1) half.
+    # 2 J_0 = H^(1) + H^(2), and here integrand(conj kappa) = -conj integrand(kappa): the integral of H^(2) on
+    # the mirrored path is minus the conjugate of the integral of H^(1).
     return complex(1j * upper.imag)
 
 
 def _gauss(edges: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Nodes and weights of Gauss quadrature on each interval between `edges`."""
+    """Return nodes and weights of Gauss quadrature on each interval between `edges`."""
     half = np.diff(edges)[:, None] / 2
     middle = (edges[1:] + edges[:-1])[:, None] / 2
     return (middle + half * _NODES).ravel(), (half * _WEIGHTS).ravel()

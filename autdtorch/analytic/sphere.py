@@ -1,9 +1,9 @@
-"""Point sources outside a sphere: rigid, pressure-release, fluid.
+"""Point sources outside a rigid, pressure-release or fluid sphere.
 
-The series in partial waves of Anderson (1950, JASA 22, 426; also Morse & Ingard, Theoretical Acoustics
-(1968), chapter 8), written in ratios of Hankel functions and in logarithmic derivatives, none of which
-overflows at any order. With x = ka, k_1 = k / speed_ratio, source and point at distances s and r from the
-centre and gamma between them,
+The partial-wave series of Anderson (1950, JASA 22, 426; also Morse & Ingard, Theoretical Acoustics (1968),
+chapter 8) is written with ratios of Hankel functions and logarithmic derivatives, which overflow at no order.
+With x = ka, k_1 = k / speed_ratio, distances s and r of source and point from the centre, and the angle gamma
+between them,
 
     scattered outside: (ik/4pi) sum (2n+1) [A_n h_n(x)^2] [h_n(ks) / h_n(x)] [h_n(kr) / h_n(x)] P_n(cos gamma)
     total inside:      (ik/4pi) sum (2n+1) [B_n h_n(x)] [h_n(ks) / h_n(x)] j_n(k_1 r) P_n(cos gamma).
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import torch
@@ -29,19 +29,19 @@ from autdtorch.utils.validation import (
     positive,
 )
 
-#: Of N, for orders 0 to N: (slope, pressure) such that slope * dp/d(kr) + pressure * p = 0 on the surface.
 Boundary: TypeAlias = Callable[[int], tuple[torch.Tensor | float, torch.Tensor | float]]
-#: Of k r (P,) and of N, for orders 0 to N: how the field varies with r, complex (N + 1, P).
+"""Boundary condition slope * dp/d(kr) + pressure * p = 0: from N to (slope, pressure) for the orders 0 to N."""
 Radial: TypeAlias = Callable[[torch.Tensor, int], torch.Tensor]
+"""Radial functions: from k r (P,) and N to the orders 0 to N, complex (N + 1, P)."""
 
-#: Points summed at a time, which bounds the memory that their radial functions take.
 _BLOCK = 256
-#: A series ends where its terms have fallen to this fraction of the largest.
+"""Points summed at a time, to limit memory."""
 _NEGLIGIBLE = 1e-17
-#: About what a point on the surface takes with a source 6e-4 radii off it.
+"""Fraction of the largest term at which a series ends."""
 _MOST_ORDERS = 2**16
-#: Stands for k r = 0, where the field has a limit but its factors have none.
+"""Largest number of orders; enough for a point on the surface and a source 6e-4 radii off it."""
 _CENTER = 1e-100
+"""Replacement for k r = 0, where the field has a limit but its factors do not."""
 
 
 def rigid_sphere(
@@ -53,7 +53,7 @@ def rigid_sphere(
     *,
     scattered: bool = False,
 ) -> torch.Tensor:
-    """Field of point sources outside a rigid sphere.
+    """Return the field of point sources outside a rigid sphere.
 
     Args:
         points: (P, 3) [m], outside the sphere or on it.
@@ -61,14 +61,14 @@ def rigid_sphere(
         wavenumber: k [rad/m], > 0.
         center: of the sphere (3,) [m].
         radius: of the sphere [m], > 0.
-        scattered: the scattered wave alone, which also exists at the sources.
+        scattered: return the scattered wave alone, which is finite at the sources.
 
     Returns:
-        complex128 (P, M) [1/m], in units of `freespace.green`.
+        complex128 (P, M) [1/m], in units of `green`.
 
     Raises:
         ValueError: not finite, wrong shape, out of the ranges above, a point on a source, or points and
-            sources both so near the surface that the series would not end.
+            sources so near the surface that the series does not converge in `_MOST_ORDERS` orders.
 
     Source: Morse & Ingard, Theoretical Acoustics (1968), chapter 8; Anderson (1950), JASA 22, 426, for
         rho_1 -> infinity.
@@ -86,7 +86,7 @@ def soft_sphere(
     *,
     scattered: bool = False,
 ) -> torch.Tensor:
-    """Field of point sources outside a pressure-release sphere.
+    """Return the field of point sources outside a pressure-release sphere.
 
     Arguments, returns and errors as for `rigid_sphere`.
 
@@ -107,7 +107,7 @@ def fluid_sphere(
     *,
     scattered: bool = False,
 ) -> torch.Tensor:
-    """Field of point sources outside a fluid sphere, outside and inside it.
+    """Return the field of point sources outside a fluid sphere, outside and inside it.
 
     Args:
         points: (P, 3) [m], anywhere.
@@ -117,15 +117,15 @@ def fluid_sphere(
         radius: of the sphere [m], > 0.
         density_ratio: rho_1 / rho > 0.
         speed_ratio: c_1 / c > 0.
-        scattered: the field less that of the sources in the medium without a sphere.
+        scattered: subtract the field of the sources in the infinite medium.
 
     Returns:
-        complex128 (P, M) [1/m], in units of `freespace.green`.
+        complex128 (P, M) [1/m], in units of `green`.
 
     Raises:
         ValueError: as for `rigid_sphere`, and ratios <= 0.
 
-    Source: Anderson (1950), JASA 22, 426, with the plane wave's partial waves replaced by a point source's.
+    Source: Anderson (1950), JASA 22, 426, with the partial waves of a point source for those of a plane wave.
     """
     density_ratio = positive("density_ratio", density_ratio)
     speed_ratio = positive("speed_ratio", speed_ratio)
@@ -144,7 +144,7 @@ def fluid_sphere(
 
 @dataclass(frozen=True)
 class _Setup:
-    """Checked points and sources, and where they are as seen from the centre of the sphere."""
+    """Checked points and sources, with distances and angles from the centre of the sphere."""
 
     points: torch.Tensor
     sources: torch.Tensor
@@ -156,20 +156,13 @@ class _Setup:
 
     @property
     def size(self) -> torch.Tensor:
-        """The argument ka on the surface, as a tensor without axes."""
+        """The argument ka on the surface, as a scalar tensor."""
         return self.point_distances.new_tensor(self.wavenumber * self.radius)
 
     def at(self, rows: torch.Tensor) -> _Setup:
-        """Some of the points, all of the sources."""
-        return _Setup(
-            self.points[rows],
-            self.sources,
-            self.wavenumber,
-            self.radius,
-            self.point_distances[rows],
-            self.source_distances,
-            self.cosines[rows],
-        )
+        """Select points by `rows`, with all sources."""
+        chosen = {name: getattr(self, name)[rows] for name in ("points", "point_distances", "cosines")}
+        return replace(self, **chosen)
 
 
 def _setup(points: ArrayLike, sources: ArrayLike, wavenumber: float, center: Vector, radius: float) -> _Setup:
@@ -184,7 +177,7 @@ def _setup(points: ArrayLike, sources: ArrayLike, wavenumber: float, center: Vec
     directions = torch.nn.functional.normalize(from_center, dim=1)
     cosines = directions @ torch.nn.functional.normalize(sources_from_center, dim=1).T
     distances = from_center.norm(dim=1)
-    # A point that rounding puts off the surface is on it.
+    # Points within rounding of the surface are moved onto it.
     distances = torch.where((distances - radius).abs() < LENGTH_TOLERANCE, radius, distances)
     return _Setup(targets, origins, wavenumber, radius, distances, source_distances, cosines.clamp(-1, 1))
 
@@ -198,7 +191,7 @@ def _field_outside(
     def radial(kr: torch.Tensor, orders: int) -> torch.Tensor:
         slope, pressure = boundary(orders)
         bessel, hankel = _bessel_slopes(x, orders), _hankel_slopes(x, orders)
-        # A_n h_n(x)^2, with j_n h_n (h_n'/h_n - j_n'/j_n) = i / x^2 for the product of j_n and h_n.
+        # A_n h_n(x)^2, with the Wronskian j_n h_n (h_n'/h_n - j_n'/j_n) = i / x^2.
         modes = (pressure + slope * bessel) / ((bessel - hankel) * (pressure + slope * hankel))
         return (1j / x**2 * modes)[:, None] * _hankel_fall(x, kr, orders)
 
@@ -212,7 +205,7 @@ def _field_inside(setup: _Setup, density_ratio: float, speed_ratio: float, scatt
 
     def radial(kr: torch.Tensor, orders: int) -> torch.Tensor:
         slope, pressure = boundary(orders)
-        # B_n h_n(x) j_n(x_1), times j_n(k_1 r) / j_n(x_1) with j_n = (j_n h_n) / h_n, as j_n may be zero.
+        # B_n h_n(x) j_n(x_1), times j_n(k_1 r) / j_n(x_1) with j_n = (j_n h_n) / h_n: j_n may be zero.
         modes = 1j / x**2 / (pressure + slope * _hankel_slopes(x, orders)) / _product(inner_size, orders)
         return modes[:, None] * _product(kr, orders) * _hankel_fall(kr, inner_size, orders)
 
@@ -223,12 +216,12 @@ def _field_inside(setup: _Setup, density_ratio: float, speed_ratio: float, scatt
 
 
 def _fluid_boundary(x: torch.Tensor, density_ratio: float, speed_ratio: float) -> Boundary:
-    """Continuity of p and of (1/rho) dp/dr: dp/d(kr) over p is that inside, over both ratios."""
+    """Return the condition that p and (1/rho) dp/dr are continuous."""
     return lambda orders: (1.0, -_bessel_slopes(x / speed_ratio, orders) / (density_ratio * speed_ratio))
 
 
 def _series(setup: _Setup, kr: torch.Tensor, radial: Radial, inner_size: float) -> torch.Tensor:
-    """(ik / 4 pi) times the sum over orders of (2n + 1) radial_n(kr) [h_n(ks) / h_n(x)] P_n."""
+    """Return (ik / 4 pi) times the sum over orders of (2n + 1) radial_n(kr) [h_n(ks) / h_n(x)] P_n."""
     blocks = [
         _block(setup.at(rows), kr[rows], radial, inner_size)
         for rows in torch.split(torch.arange(len(kr), device=kr.device), _BLOCK)
@@ -252,10 +245,10 @@ def _block(setup: _Setup, kr: torch.Tensor, radial: Radial, inner_size: float) -
 
 
 def _enough_orders(setup: _Setup, inner_size: float) -> int:
-    """The order past which terms stay below `_NEGLIGIBLE`.
+    """Return the order beyond which terms stay below `_NEGLIGIBLE`.
 
-    From some cube roots past ka (and k_1 a) on, what each point and source adds to a term falls from order to
-    order by the ratio of its distance to the radius, or faster.
+    Some cube roots of ka beyond ka (and k_1 a), terms decay from order to order at least by the ratios of the
+    distances of point and source to the radius.
     """
     largest = max(float(setup.size), inner_size)
     past = largest + 4 * math.cbrt(largest) + 16
@@ -272,7 +265,7 @@ def _enough_orders(setup: _Setup, inner_size: float) -> int:
 
 
 def _bessel_slopes(x: torch.Tensor, orders: int) -> torch.Tensor:
-    """j_n'(x) / j_n(x), n = 0 to orders: (orders + 1, *x.shape), by downward recurrence of j_{n-1} / j_n."""
+    """Return j_n'(x) / j_n(x), (orders + 1, *x.shape), by downward recurrence of j_{n-1} / j_n."""
     largest = float(x.max())
     start = math.ceil(max(orders, largest) + 8 * math.cbrt(largest)) + 32
     ratio = (2 * start + 1) / x
@@ -285,12 +278,12 @@ def _bessel_slopes(x: torch.Tensor, orders: int) -> torch.Tensor:
 
 
 def _hankel_slopes(x: torch.Tensor, orders: int) -> torch.Tensor:
-    """h_n'(x) / h_n(x), n = 0 to orders: (orders + 1, *x.shape)."""
+    """Return h_n'(x) / h_n(x), (orders + 1, *x.shape)."""
     return _hankel_ratios(x, orders) - (_counted(x, orders) + 1) / x
 
 
 def _hankel_ratios(x: torch.Tensor, orders: int) -> torch.Tensor:
-    """h_{n-1}(x) / h_n(x), n = 0 to orders, by upward recurrence: (orders + 1, *x.shape)."""
+    """Return h_{n-1}(x) / h_n(x), (orders + 1, *x.shape), by upward recurrence."""
     ratio = torch.full_like(x, 1j, dtype=torch.complex128)
     ratios = [ratio]
     for n in range(orders):
@@ -300,7 +293,7 @@ def _hankel_ratios(x: torch.Tensor, orders: int) -> torch.Tensor:
 
 
 def _hankel_fall(near: torch.Tensor, far: torch.Tensor, orders: int) -> torch.Tensor:
-    """h_n(far) / h_n(near), n = 0 to orders, near <= far, one of them without axes: (orders + 1, P)."""
+    """Return h_n(far) / h_n(near), (orders + 1, P), for near <= far, one of them a scalar."""
     steps_near, steps_far = _hankel_ratios(near, orders), _hankel_ratios(far, orders)
     size = max(near.numel(), far.numel())
     steps = (steps_near.reshape(orders + 1, -1) / steps_far.reshape(orders + 1, -1)).expand(-1, size).clone()
@@ -309,12 +302,12 @@ def _hankel_fall(near: torch.Tensor, far: torch.Tensor, orders: int) -> torch.Te
 
 
 def _product(x: torch.Tensor, orders: int) -> torch.Tensor:
-    """j_n(x) h_n(x), n = 0 to orders, from their Wronskian: (orders + 1, *x.shape)."""
+    """Return j_n(x) h_n(x), (orders + 1, *x.shape), from their Wronskian."""
     return 1j / x**2 / (_hankel_slopes(x, orders) - _bessel_slopes(x, orders))
 
 
 def _counted(x: torch.Tensor, orders: int) -> torch.Tensor:
-    """The orders 0 to `orders`, to be broadcast against x: (orders + 1, 1, ...)."""
+    """Return the orders 0 to `orders`, (orders + 1, 1, ...), for broadcasting with x."""
     return torch.arange(orders + 1, dtype=torch.float64, device=x.device).reshape(-1, *[1] * x.ndim)
 
 

@@ -150,7 +150,7 @@ class TransducerArray:
         """Return an array of AUTD3 units, 249 transducers each, in the order of the device, unit by unit.
 
         Args:
-            center: centre of all units (3,) [m]; the centre of a unit is that of its 18 x 14 grid.
+            center: centre of all units (3,) [m]; a unit has 18 x 14 grid places.
             normal: direction of emission (3,), the device's z.
             angle: of the device's x from u towards v [rad], with (u, v) = `plane_basis(normal)`.
             units: numbers of units along the device's x and y; unit i * units[1] + j is the i-th along x and
