@@ -30,7 +30,7 @@ from autdtorch.utils.validation import (
 )
 
 Boundary: TypeAlias = Callable[[int], tuple[torch.Tensor | float, torch.Tensor | float]]
-"""Boundary condition slope * dp/d(kr) + pressure * p = 0: from N to (slope, pressure) for the orders 0 to N."""
+"""Condition slope * dp/d(kr) + pressure * p = 0: from N to (slope, pressure) of the orders 0 to N."""
 Radial: TypeAlias = Callable[[torch.Tensor, int], torch.Tensor]
 """Radial functions: from k r (P,) and N to the orders 0 to N, complex (N + 1, P)."""
 
