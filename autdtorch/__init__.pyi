@@ -19,10 +19,10 @@ from .methods.state_file import load_state, save_state
 from .objectives.metrics import FocusMetrics, focus_metrics
 from .objectives.perturbations import Dead, Drift, Noise, Quantised, true_pressure
 from .objectives.simulated import Objective, SimulatedObjective, weakest_focus
-from .plot.fields import plot_plane, plot_planes
 from .plot.pareto import plot_pareto
+from .plot.pressure_maps import plot_plane, plot_planes
 from .plot.scaling import plot_scaling
-from .plot.scene import plot_scene
+from .plot.scene_figure import plot_scene
 from .plot.trials import plot_convergence, plot_trials
 from .plot.view3d import animate3d, view3d
 from .propagators import (

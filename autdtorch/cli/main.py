@@ -355,7 +355,7 @@ def _section(settings: Mapping[str, Any], key: str) -> dict[str, Any]:
 
 def _show(results: StudyResult, scenes: Mapping[str, Scene], folder: Path, single: bool) -> None:
     """Print the results' table; draw the plane of a single run, write the report of an experiment."""
-    from autdtorch.plot.fields import plot_plane
+    from autdtorch.plot.pressure_maps import plot_plane
     from autdtorch.study.report.study_report import write_report
 
     lines = _table_lines(results)

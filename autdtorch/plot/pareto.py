@@ -10,21 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from autdtorch.plot.style import (
-    TICK_SIZE,
-    ByMethod,
-    Look,
-    add_legend,
-    label_of,
-    log_axes,
-    looks_of,
-    methods_of,
-    new_panels,
-    numbers,
-    require_each,
-    require_scenes,
-    styled,
-)
+from autdtorch.plot.data import ByMethod, methods_of, numbers, require_each, require_scenes
+from autdtorch.plot.style import TICK_SIZE, Look, add_legend, label_of, log_axes, looks_of, new_panels, styled
 from autdtorch.utils.arrays import Array
 from autdtorch.utils.validation import ArrayLike, boolean, invalid, members, require_kind
 

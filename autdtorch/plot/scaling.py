@@ -10,19 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator
 
-from autdtorch.plot.style import (
-    TICK_SIZE,
-    ByMethod,
-    Look,
-    label_of,
-    log_axes,
-    looks_of,
-    methods_of,
-    new_figure,
-    numbers,
-    require_scenes,
-    styled,
-)
+from autdtorch.plot.data import ByMethod, methods_of, numbers, require_scenes
+from autdtorch.plot.style import TICK_SIZE, Look, label_of, log_axes, looks_of, new_figure, styled
 from autdtorch.utils.arrays import Array
 from autdtorch.utils.validation import ArrayLike, require_kind
 

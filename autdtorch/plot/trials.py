@@ -12,19 +12,16 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from autdtorch.plot.data import ByMethod, methods_of, numbers, require_scenes
 from autdtorch.plot.style import (
     TICK_SIZE,
-    ByMethod,
     Look,
     add_legend,
     label_of,
     looks_of,
-    methods_of,
     new_figure,
     new_panels,
-    numbers,
     readable,
-    require_scenes,
     styled,
     wrapped,
 )

@@ -333,7 +333,7 @@ def test_ones_own_scene_file(run: Run, tmp_path: Path, capsys: pytest.CaptureFix
 def test_an_experiment_ends_with_its_report(
     run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("autdtorch.study.report.study_report.rendering_problem", lambda: "not tried")
+    monkeypatch.setattr("autdtorch.study.report.figures.rendering_problem", lambda: "not tried")
     command = (
         "experiment=paper",
         "~methods.bayes_opt",

@@ -60,7 +60,7 @@ def test_a_trial_leaves_log_drive_and_report_and_is_not_repeated(run, tmp_path: 
     assert run(*EMULATED, "--dead", "4") == 0
     assert (out / "trial.jsonl").read_text().splitlines()[:-1] == log  # and the second run's end
     report = (out / "report.md").read_text()
-    assert "**Not heard**, counted from 0: 4." in report
+    assert "**Failed transducers**, counted from 0: 4." in report
     heard = re.search(r"with (\S+) to .* Pa, and the threshold (\S+) Pa", report, re.DOTALL)
     assert heard is not None
     assert float(heard[1]) > float(heard[2])  # the range is that of the transducers that are heard

@@ -102,6 +102,7 @@ def test_wheel_holds_configs_stub_and_type_marker(tmp_path: Path, monkeypatch: p
         entry_points = archive.read(f"autdtorch-{at.__version__}.dist-info/entry_points.txt").decode()
     wanted = {f"autdtorch/{path.relative_to(ROOT)}" for path in (ROOT / "configs").rglob("*.yaml")}
     assert wanted
-    assert wanted | {"autdtorch/__init__.pyi", "autdtorch/py.typed"} <= names
+    templates = {f"autdtorch/study/report/templates/{name}" for name in ("study.md", "page.html")}
+    assert wanted | templates | {"autdtorch/__init__.pyi", "autdtorch/py.typed"} <= names
     assert not any(name.startswith(("configs/", "tests/")) for name in names)
     assert "autdtorch = autdtorch.cli.main:main" in entry_points

@@ -18,11 +18,10 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from small_scenes import scene_of_all_kinds, small_scene
 
 import autdtorch as at
-from autdtorch.plot.drawing import clipped
-from autdtorch.plot.fields import plot_plane, plot_planes
 from autdtorch.plot.pareto import pareto_front, plot_pareto
+from autdtorch.plot.pressure_maps import plot_plane, plot_planes
 from autdtorch.plot.scaling import plot_scaling
-from autdtorch.plot.scene import plot_scene
+from autdtorch.plot.scene_figure import clipped, plot_scene
 from autdtorch.plot.style import looks_of
 from autdtorch.plot.trials import plot_convergence, plot_trials
 
@@ -317,10 +316,10 @@ def test_nothing_is_cut_off_with_all_methods() -> None:
             r"\['gabs'\]: shape \(1, 1\); must be \(trials",
         ),
         (lambda: plot_trials({"f [1]": {"empty": {"gabs": [np.nan]}}}), "every entry must be finite"),
-        (lambda: plot_trials({"f [1]": {"gabs": np.ones(3)}}), r"\['gabs'\]: .* by the names of methods"),
+        (lambda: plot_trials({"f [1]": {"gabs": np.ones(3)}}), r"\['gabs'\]: .* method names"),
         (
             lambda: plot_convergence({"gabs": np.ones((3, 4))}),
-            r"history\['gabs'\]: .*; must be values by the names",
+            r"history\['gabs'\]: .*; must be a mapping of method names",
         ),
         (lambda: plot_convergence({"empty": {}}), "at least one method"),
         (lambda: plot_convergence({"empty": {"gabs": [1.0]}}), r"must be \(trials, evaluations\)"),

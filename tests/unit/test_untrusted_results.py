@@ -13,10 +13,9 @@ from markdown_it import MarkdownIt
 
 from autdtorch.io.scene_file import load_scene
 from autdtorch.methods.gabs import gabs
-from autdtorch.study.report.document import as_page
+from autdtorch.study.report.document import as_page, code, fenced, table
 from autdtorch.study.report.study_report import write_report
 from autdtorch.study.report.summary_table import SUMMARY_FILE, save_summary
-from autdtorch.study.report.tables import code, fenced, table
 from autdtorch.study.results import StudyResult
 from autdtorch.study.results_file import load_results, save_results
 from autdtorch.study.run import run_study
@@ -35,7 +34,7 @@ HOSTILE = f"{HTML}\n{MARKDOWN}\n\n</details>\n```\n{HTML}\n[x]: https://evil.exa
 
 @pytest.fixture(autouse=True)
 def without_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("autdtorch.study.report.study_report.rendering_problem", lambda: "not tried")
+    monkeypatch.setattr("autdtorch.study.report.figures.rendering_problem", lambda: "not tried")
 
 
 def study(solver: dict[str, object] | None = None, seed: int = 0) -> StudyResult:

@@ -71,7 +71,7 @@ def test_a_probe_that_hangs_is_a_reason(
     broken_pyvista: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     broken_pyvista("import time\ntime.sleep(60)")
-    monkeypatch.setattr(sys.modules["autdtorch.plot.view3d.probe"], "_PROBE_TIMEOUT", 0.5)
+    monkeypatch.setattr(sys.modules["autdtorch.plot.view3d.opengl"], "_PROBE_TIMEOUT", 0.5)
     assert "did not end within 0.5 s" in str(rendering_problem())
 
 

@@ -1,7 +1,7 @@
 """Scenes and fields in 3D, rendered off-screen with PyVista (optional extra ``viz``); lengths in mm."""
 
 from autdtorch.plot.view3d.animation import animate3d
-from autdtorch.plot.view3d.probe import rendering_problem
+from autdtorch.plot.view3d.opengl import rendering_problem
 from autdtorch.plot.view3d.view import view3d
 
 __all__ = ["animate3d", "rendering_problem", "view3d"]

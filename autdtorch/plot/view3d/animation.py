@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageColor
 
-from autdtorch.plot.drawing import WAVE_MAP
+from autdtorch.plot.colours import WAVE_MAP
 from autdtorch.plot.view3d.export import require_suffix
-from autdtorch.plot.view3d.field import add_sheet, plane_mesh
-from autdtorch.plot.view3d.level import plane_pressure
-from autdtorch.plot.view3d.probe import require_rendering
-from autdtorch.plot.view3d.scene import (
+from autdtorch.plot.view3d.opengl import require_rendering
+from autdtorch.plot.view3d.pressure_meshes import add_sheet, plane_mesh, plane_pressure
+from autdtorch.plot.view3d.scene_meshes import (
     FIELD_BAR,
     POINT_COLOUR,
     add_bar,

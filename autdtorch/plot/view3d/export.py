@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from autdtorch.plot.drawing import MM
+from autdtorch.plot.data import MM
 from autdtorch.utils.validation import path_of
 
 if TYPE_CHECKING:

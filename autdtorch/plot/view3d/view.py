@@ -5,12 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from autdtorch.plot.drawing import FLOOR, in_decibels
+from autdtorch.plot.colours import FLOOR
+from autdtorch.plot.data import in_decibels
 from autdtorch.plot.view3d.export import require_suffix, write
-from autdtorch.plot.view3d.field import add_isosurface, add_plane
-from autdtorch.plot.view3d.level import plane_pressure, volume_magnitude, zero_level
-from autdtorch.plot.view3d.probe import require_rendering
-from autdtorch.plot.view3d.scene import add_caption, add_transducers, emitted_phases, new_plotter
+from autdtorch.plot.view3d.opengl import require_rendering
+from autdtorch.plot.view3d.pressure_meshes import (
+    add_isosurface,
+    add_plane,
+    plane_pressure,
+    volume_magnitude,
+    zero_level,
+)
+from autdtorch.plot.view3d.scene_meshes import add_caption, add_transducers, emitted_phases, new_plotter
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import ArrayLike, boolean, number_between, require_kind
 

@@ -1,4 +1,4 @@
-"""The results of a study as a table of numbers."""
+"""The file ``summary.csv``: one line of numbers for each method in each scene."""
 
 from __future__ import annotations
 
@@ -33,13 +33,12 @@ _COLUMNS: dict[str, Callable[[MethodResult, float], float | None]] = {
 def save_summary(
     results: StudyResult, swept: Mapping[tuple[str, str], Settings], path: str | os.PathLike[str]
 ) -> None:
-    """Write a CSV table, a line for each method in each scene.
+    """Write a CSV table, one line for each method in each scene.
 
     Args:
-        results: what is written.
-        swept: settings by name of scene and name of method; each key is a column, and is left out of the
-            names.
-        path: of the file.
+        results: results to write.
+        swept: settings by names of scene and method; each key is a column, and is left out of the names.
+        path: path of the file.
 
     Raises:
         OSError: the file cannot be written.

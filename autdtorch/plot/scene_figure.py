@@ -13,19 +13,17 @@ from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import NDArray
 
-from autdtorch.plot.drawing import (
+from autdtorch.plot.colours import (
     EDGE_COLOUR,
     FOCUS_COLOUR,
-    MM,
     MOST_EDGES,
     OBSTACLE_COLOUR,
     PHASE_MAP,
     PLANE_COLOUR,
     SHARP_ANGLE,
     TRANSDUCER_COLOUR,
-    clipped,
-    single_drive_phases,
 )
+from autdtorch.plot.data import MM, single_drive_phases
 from autdtorch.plot.style import TICK_SIZE, new_figure, styled
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.scene import Scene
@@ -163,3 +161,23 @@ def _scatter_transducers(ax: Axes3D, scene: Scene, phases: Array | None) -> None
     bar = ax.get_figure().colorbar(dots, ax=ax, shrink=0.6, pad=0.12)
     bar.set_ticks([0, np.pi, 2 * np.pi], labels=["0", "π", "2π"])
     bar.set_label("phase [rad]")
+
+
+def clipped(corners: Array, lower: Vector, upper: Vector) -> Array:
+    """Clip a convex polygon or a line (K, 3) to a box (Sutherland & Hodgman 1974).
+
+    Returns:
+        Corners (L, 3); L = 0 if nothing is inside. A clipped line may run back to its start.
+    """
+    for side in range(6):
+        axis, sign, bound = side // 2, (1, -1)[side % 2], (lower, upper)[side % 2][side // 2]
+        height = sign * (corners[:, axis] - bound)
+        kept = []
+        for here, there in enumerate(np.roll(np.arange(len(corners)), -1)):
+            if height[here] >= 0:
+                kept.append(corners[here])
+            if height[here] * height[there] < 0:
+                share = height[here] / (height[here] - height[there])
+                kept.append(corners[here] + share * (corners[there] - corners[here]))
+        corners = np.array(kept).reshape(-1, 3)
+    return corners

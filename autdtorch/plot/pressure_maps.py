@@ -12,19 +12,17 @@ from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
-from autdtorch.plot.drawing import FLOOR, MM, PRESSURE_MAP, in_decibels, plane_magnitude
-from autdtorch.plot.style import (
-    TICK_SIZE,
+from autdtorch.plot.colours import FLOOR, PRESSURE_MAP
+from autdtorch.plot.data import (
+    MM,
     ByMethod,
-    label_of,
+    in_decibels,
     methods_of,
-    new_figure,
-    readable,
+    plane_magnitude,
     require_each,
     require_scenes,
-    styled,
-    wrapped,
 )
+from autdtorch.plot.style import TICK_SIZE, label_of, new_figure, readable, styled, wrapped
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.arrays import Array

@@ -9,16 +9,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from autdtorch.plot.drawing import (
+from autdtorch.plot.colours import (
     EDGE_COLOUR,
-    MM,
     MOST_EDGES,
     OBSTACLE_COLOUR,
     PHASE_MAP,
     SHARP_ANGLE,
     TRANSDUCER_COLOUR,
-    single_drive_phases,
 )
+from autdtorch.plot.data import MM, single_drive_phases
 from autdtorch.scene.drive import amplitudes_of
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.scene import Scene

@@ -1,0 +1,92 @@
+"""Data of pictures: units, levels, and checks that name what cannot be drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from typing import TypeAlias
+
+import numpy as np
+
+from autdtorch.scene.drive import phases_of, validate_single_drive
+from autdtorch.utils.arrays import Array
+from autdtorch.utils.validation import ArrayLike, invalid, magnitude_tensor, real_tensor, require_kind
+
+ByMethod: TypeAlias = Mapping[str, ArrayLike]
+
+MM = 1e3  # pictures show lengths in millimetres
+
+
+def require_scenes(name: str, scenes: Mapping[str, ByMethod]) -> None:
+    """Check that there is at least one scene, each with at least one method.
+
+    Raises:
+        ValueError: otherwise.
+    """
+    accepted = "must have at least one scene, each with at least one method"
+    if not isinstance(scenes, Mapping):
+        raise invalid(name, scenes, accepted)
+    for scene, methods in scenes.items():
+        if not isinstance(methods, Mapping):
+            raise invalid(f"{name}[{scene!r}]", methods, "must be a mapping of method names to values")
+    if not scenes or not all(scenes.values()):
+        raise ValueError(f"{name}: scenes {list(scenes)}; {accepted}")
+
+
+def require_each(name: str, given: Mapping[str, object], wanted: Collection[str]) -> None:
+    """Check that a mapping has an entry for each name of `wanted`.
+
+    Raises:
+        ValueError: not a mapping, or an entry is missing.
+    """
+    require_kind(name, given, Mapping)
+    if missing := [one for one in wanted if one not in given]:
+        raise ValueError(f"{name}: none for {missing}; must have one for each of {list(wanted)}")
+
+
+def numbers(name: str, given: ArrayLike, *axes: str) -> Array:
+    """Return finite numbers, after checking their axes; an axis like "2" states its length, others are names.
+
+    Raises:
+        ValueError: not finite numbers, other axes, or empty.
+    """
+    values: Array = real_tensor(name, given).detach().cpu().numpy()
+    fits = values.ndim == len(axes) and all(
+        length == int(axis) for length, axis in zip(values.shape, axes, strict=True) if axis.isdigit()
+    )
+    if not fits or values.size == 0:
+        raise ValueError(f"{name}: shape {values.shape}; must be ({', '.join(axes)}), none of them 0")
+    return values
+
+
+def methods_of(scenes: Iterable[Mapping[str, object]]) -> list[str]:
+    """Return the methods of all scenes, each once, in order of first appearance."""
+    return list(dict.fromkeys(method for by_method in scenes for method in by_method))
+
+
+def plane_magnitude(name: str, pressure: ArrayLike) -> Array:
+    """Return |p| (Nu, Nv) of complex pressure, or of its magnitude, on a plane.
+
+    Raises:
+        ValueError: not finite numbers, not two axes, or empty.
+    """
+    magnitude: Array = real_tensor(name, magnitude_tensor(name, pressure, "Pa"), "Pa").detach().cpu().numpy()
+    if magnitude.ndim != 2 or magnitude.size == 0:
+        raise ValueError(f"{name}: shape {magnitude.shape}; must be (Nu, Nv), the points of a plane")
+    return magnitude
+
+
+def in_decibels(magnitude: Array, zero: float) -> Array:
+    """Return the level 20 lg(|p| / zero) [dB]; -inf for 0, NaN for NaN."""
+    with np.errstate(divide="ignore"):
+        level: Array = 20 * np.log10(magnitude / zero)
+    return level
+
+
+def single_drive_phases(drive: ArrayLike, transducers: int) -> Array:
+    """Return the phases (M,) in [0, 2 pi) [rad] of one drive of an array of `transducers`.
+
+    Raises:
+        ValueError: not a single drive of the array.
+    """
+    phases: Array = phases_of(validate_single_drive(drive, transducers)).detach().cpu().numpy()
+    return phases
