@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import math
 import os
@@ -115,19 +116,17 @@ class EvaluationLog:
         if evaluation is None or torch.equal(evaluation.drive, drive):
             return evaluation
         if number > self._first_again:
+            del self._evaluations[number]  # to be measured again, under its number
             return None
         raise LogError(
             f"{self.path}: evaluation {number + 1} is of another drive than the method asks for; "
             "give the method, seed and version of autdtorch of that trial, or another log"
         )
 
-    def append(
-        self, number: int, drive: torch.Tensor, pressure: torch.Tensor, seconds_on: float
-    ) -> Evaluation:
-        """Add an evaluation.
+    def append(self, drive: torch.Tensor, pressure: torch.Tensor, seconds_on: float) -> Evaluation:
+        """Add an evaluation under the first number that the log lacks.
 
         Args:
-            number: of the evaluation in the trial, counted from 0.
             drive: (M,), as it was asked for.
             pressure: (P,) [Pa], as it was read.
             seconds_on: how long the outputs were on so far [s].
@@ -139,6 +138,7 @@ class EvaluationLog:
             LogError: the file has changed meanwhile.
             OSError: the file cannot be written.
         """
+        number = next(n for n in itertools.count() if n not in self._evaluations)
         evaluation = Evaluation(_now(), drive, pressure, seconds_on)
         self._append(
             {

@@ -21,21 +21,18 @@ from autdtorch.utils.validation import invalid, path_of, require_callable, requi
 class HardwareObjective:
     """An objective whose observations are measured, one drive after the other.
 
-    The device plays the nearest drive on its levels: that is what a `Solution` holds. The log holds what was
-    asked for.
+    The device plays the nearest drive on its phase levels, which a `Solution` holds; the log holds the drive
+    that was asked for. The outputs are off while a method computes.
 
-    A trial that was interrupted goes on where its log ends: run the same method with the same seed again, and
-    it is given what the log holds, without playing it once more; after an error that goes for this object
-    too. The outputs are off while a method thinks.
+    An interrupted trial goes on where its log ends: run the same method with the same seed again, and
+    `autdtorch.run` tells it the evaluations that the log holds, without playing them once more.
 
     Attributes:
         scene: its array plays the drives, its control points are observed.
-        evaluations: number of observations so far, those from the log included; 0 again after an error.
-        log: holds them.
+        log: holds the evaluations.
     """
 
     scene: Scene
-    evaluations: int
     log: EvaluationLog
 
     def __init__(
@@ -56,7 +53,7 @@ class HardwareObjective:
             log: file of the evaluations (`EvaluationLog`); each is appended before the next begins.
             settings: what else makes the trial what it is, as JSON can hold it: method, seed, sensor. A log
                 of other settings, of another scene, device or amplitude is refused.
-            watch: is shown every evaluation.
+            watch: function that is called with every evaluation, those from the log included.
 
         Raises:
             ValueError: no scene or sensor; the link is not limited, or plays another number of transducers
@@ -79,7 +76,6 @@ class HardwareObjective:
         except (TypeError, ValueError) as error:
             raise invalid("settings", settings, "must be a mapping of what JSON can hold") from error
         self.scene = scene
-        self.evaluations = 0
         self._link = link
         self._sensor = sensor
         self._watch = watch
@@ -115,12 +111,31 @@ class HardwareObjective:
         """
         drives = validate_drives(drive, len(self.scene.array))
         try:
-            return torch.stack([self._evaluate(row) for row in drives])
-        except BaseException:
-            self.evaluations = 0  # the method has ended; begun once more, it is given what the log holds
-            raise
+            return torch.stack([self._measure(row) for row in drives])
         finally:
             self._link.off()
+
+    @property
+    def evaluations(self) -> int:
+        """Number of observations so far, those from the log included."""
+        return len(self.log.evaluations)
+
+    def recorded(self, number: int, drive: torch.Tensor) -> torch.Tensor | None:
+        """Return the pressures (P,) [Pa] of an evaluation that the log holds, or None.
+
+        Args:
+            number: of the evaluation in the trial, counted from 0.
+            drive: (M,), as it is asked for.
+
+        Raises:
+            LogError: the evaluation was of another drive.
+        """
+        evaluation = self.log.recorded(number, drive)
+        if evaluation is None:
+            return None
+        if self._watch is not None:
+            self._watch(evaluation)
+        return evaluation.pressure
 
     def played(self, drive: torch.Tensor) -> torch.Tensor:
         """What the device plays (..., M) when asked for drives (..., M); 1 is the most that the limit allows.
@@ -130,20 +145,14 @@ class HardwareObjective:
         """
         return self._link.played(drive)
 
-    def _evaluate(self, drive: torch.Tensor) -> torch.Tensor:
+    def _measure(self, drive: torch.Tensor) -> torch.Tensor:
         most = self._link.limits.evaluations
         if self.evaluations >= most:
             raise LimitError(f"{most} evaluations are made, the limit")
-        evaluation = self.log.recorded(self.evaluations, drive)
-        if evaluation is None:
-            evaluation = self._measure(drive)
-        self.evaluations += 1
-        if self._watch is not None:
-            self._watch(evaluation)
-        return evaluation.pressure
-
-    def _measure(self, drive: torch.Tensor) -> Evaluation:
         self._link.play(drive)
         pressure = checked_reading(self._sensor, len(self.scene.control_points))
         self._link.require_on()
-        return self.log.append(self.evaluations, drive, pressure, self._link.seconds_on)
+        evaluation = self.log.append(drive, pressure, self._link.seconds_on)
+        if self._watch is not None:
+            self._watch(evaluation)
+        return pressure

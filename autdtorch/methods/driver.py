@@ -72,15 +72,21 @@ def run(
         progress.advance(state.evaluations)
         while not state.done and not (stop is not None and state.evaluations and stop(state)):
             drives = method.ask(state)
-            state = method.tell(state, _observed(objective, drives, state.evaluations))
+            state = method.tell(state, observed(objective, drives, state.evaluations))
             progress.advance(len(drives))
             if path is not None:
                 save_state(path, method, state)
     return method.best(state)
 
 
-def _observed(objective: Objective, drives: torch.Tensor, number: int) -> torch.Tensor:
-    """Return pressures (B, P) [Pa] of drives (B, M), the first of which is evaluation `number`."""
+def observed(objective: Objective, drives: torch.Tensor, number: int) -> torch.Tensor:
+    """Return pressures (B, P) [Pa] of drives (B, M): recorded ones where the objective has a log with them.
+
+    Args:
+        objective: simulated or measured.
+        drives: (B, M), B >= 1.
+        number: of evaluations that the run made before.
+    """
     if not isinstance(objective, Logged):
         return objective(drives)
     known = [objective.recorded(number + row, drive) for row, drive in enumerate(drives)]

@@ -11,6 +11,7 @@ import torch
 from filelock import FileLock, Timeout
 
 from autdtorch.hardware import EmulatedSensor, LogError
+from autdtorch.methods.driver import observed
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.json_lines import SET_ASIDE, line_of, row_of
 
@@ -49,7 +50,6 @@ def test_a_full_disk_leaves_no_half_line_to_go_on_after(trial, monkeypatch, fail
                     resource.setrlimit(resource.RLIMIT_FSIZE, most)
                     signal.signal(signal.SIGXFSZ, before)
         assert trial.log.read_bytes() == whole
-        observe()  # out of the log
         observe()
     assert trial.log.read_bytes().count(b"\n") == 1 + 2
 
@@ -78,12 +78,11 @@ def test_the_log_of_another_trial_is_refused_and_left_as_it_is(trial, settings, 
 def test_a_log_of_other_drives_is_refused(trial):
     bench = trial.bench()
     with trial.link(bench) as link:
-        trial.objective(link, EmulatedSensor(bench))(full_on())
-        with pytest.raises(LogError, match="evaluation 1 is of another drive"):
-            trial.objective(link, EmulatedSensor(bench))(0.5 * full_on())
-        trial.objective(link, EmulatedSensor(bench))(full_on(3))
-        with pytest.raises(LogError, match="evaluation 3 is of another drive"):
-            trial.objective(link, EmulatedSensor(bench))(torch.cat([full_on(2), 0.5 * full_on()]))
+        objective = trial.objective(link, EmulatedSensor(bench))
+        objective(full_on(3))
+        for number in (0, 2):
+            with pytest.raises(LogError, match=f"evaluation {number + 1} is of another drive"):
+                observed(objective, 0.5 * full_on(), number)
 
 
 def drives() -> torch.Tensor:
@@ -122,13 +121,13 @@ def test_an_evaluation_that_cannot_have_been_measured_is_measured_again(trial, c
     bench = trial.bench()
     with trial.link(bench) as link:
         log = trial.objective(link, EmulatedSensor(bench)).log
-        trial.objective(link, EmulatedSensor(bench))(drives())
+        observed(trial.objective(link, EmulatedSensor(bench)), drives(), 0)
         key = digest_of(log.origin)
         lines = trial.log.read_bytes().splitlines()
         whole, lines[3] = lines[3], line_of(row_of(lines[3], key) | change, key)
         trial.log.write_bytes(b"\n".join([*lines, b""]))
         sensor = Noisy(bench)
-        trial.objective(link, sensor)(drives())
+        observed(trial.objective(link, sensor), drives(), 0)
         assert sensor.readings == 1
     assert trial.log.with_name(trial.log.name + SET_ASIDE).read_bytes() == lines[3] + b"\n"
     again = row_of(trial.log.read_bytes().splitlines()[-1], key)
@@ -151,20 +150,20 @@ def test_an_evaluation_that_cannot_have_been_measured_is_measured_again(trial, c
 def test_damage_costs_the_evaluations_it_touches_alone(trial, damage, caplog):
     bench = trial.bench()
     with trial.link(bench) as link:
-        measured = trial.objective(link, EmulatedSensor(bench))(drives())
+        measured = observed(trial.objective(link, EmulatedSensor(bench)), drives(), 0)
         lines = trial.log.read_bytes().splitlines()
         damaged = damage(lines)
         trial.log.write_bytes(b"\n".join([*damaged, b""]))
         sensor = Noisy(bench)
-        again = trial.objective(link, sensor)(drives())
+        again = observed(trial.objective(link, sensor), drives(), 0)
         assert sensor.readings == len(set(lines[1:]) - set(damaged))
         kept = (again == measured).all(dim=1)
         assert int(kept.sum()) == len(set(lines[1:]) & set(damaged))
         caplog.clear()
-        assert torch.equal(trial.objective(link, sensor)(drives()), again)
+        assert torch.equal(observed(trial.objective(link, sensor), drives(), 0), again)
         assert not caplog.messages
         with pytest.raises(LogError, match="evaluation 1 is of another drive"):
-            trial.objective(link, sensor)(0.5 * drives())
+            observed(trial.objective(link, sensor), 0.5 * drives(), 0)
 
 
 @pytest.mark.parametrize("end", [b"", b"\x0b"])
@@ -181,7 +180,7 @@ def test_the_damaged_end_of_a_line_costs_no_evaluation_and_no_second(trial, line
         sensor = Noisy(bench)
         again = trial.objective(link, sensor)
         assert again.log.seconds_on == objective.log.seconds_on > 0
-        assert torch.equal(again(drives()), measured)
+        assert torch.equal(observed(again, drives(), 0), measured)
         assert sensor.readings == 0
     assert trial.log.read_bytes() == whole
 
@@ -208,13 +207,14 @@ def test_where_a_reading_made_again_leads_elsewhere_the_trial_follows_it(trial):
     others = drives()
     others[4:] *= 0.5
     with trial.link(bench) as link:
-        trial.objective(link, EmulatedSensor(bench))(drives())
+        observed(trial.objective(link, EmulatedSensor(bench)), drives(), 0)
         lines = trial.log.read_bytes().splitlines(keepends=True)
         trial.log.write_bytes(b"".join([*lines[:3], *lines[4:]]))
         sensor = Noisy(bench)
-        pressure = trial.objective(link, sensor)(others)
+        objective = trial.objective(link, sensor)
+        pressure = [observed(objective, others[:4], 0), observed(objective, others[4:], 4)]
         assert sensor.readings == 1 + 2
-        assert torch.equal(trial.objective(link, sensor)(others), pressure)
+        assert torch.equal(observed(trial.objective(link, sensor), others, 0), torch.cat(pressure))
         assert sensor.readings == 1 + 2
 
 
@@ -278,7 +278,7 @@ def test_another_trial_is_named_by_what_was_said_first(trial):
             trial.objective(link, EmulatedSensor(bench), microphone="scope")
 
 
-def test_an_objective_that_failed_begins_again_with_what_the_log_holds(trial):
+def test_an_objective_that_failed_goes_on_where_its_log_ends(trial):
     class Interrupted(EmulatedSensor):
         def read(self):
             heard.append(None)
@@ -293,9 +293,9 @@ def test_an_objective_that_failed_begins_again_with_what_the_log_holds(trial):
         objective = trial.objective(link, Interrupted(bench))
         with pytest.raises(KeyboardInterrupt):
             objective(drives)
-        pressure = objective(drives)
+        pressure = observed(objective, drives, 0)
         assert len(heard) == 4 + 1
-        assert torch.equal(trial.objective(link, EmulatedSensor(bench))(drives), pressure)
+        assert torch.equal(observed(trial.objective(link, EmulatedSensor(bench)), drives, 0), pressure)
     assert trial.log.read_bytes().count(b"\n") == 1 + 4
 
 

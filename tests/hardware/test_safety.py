@@ -19,6 +19,7 @@ from autdtorch.hardware import (
     hears_silence,
     open_link,
 )
+from autdtorch.methods.driver import observed
 
 
 def full_on(rows: int = 1) -> torch.Tensor:
@@ -59,7 +60,8 @@ def test_the_number_of_evaluations_is_limited_over_all_of_a_trial(trial):
         bench = trial.bench()
         with trial.link(bench) as link:
             limited = LimitedLink(link, Limits(1.0, evaluations=most))
-            HardwareObjective(trial.scene, limited, EmulatedSensor(bench), trial.log)(full_on(rows))
+            objective = HardwareObjective(trial.scene, limited, EmulatedSensor(bench), trial.log)
+            observed(objective, full_on(rows), 0)
 
     observe(3, most=3)
     with pytest.raises(LimitError, match="4 evaluations are made, the limit"):
@@ -215,11 +217,11 @@ def test_a_closed_link_is_not_kept_until_python_exits(trial):
 def test_the_time_on_goes_on_with_the_trial(trial):
     bench = trial.bench()
     with trial.link(bench) as link:
-        trial.objective(link, EmulatedSensor(bench)).log.append(0, full_on()[0], torch.ones(2), 60.0)
+        trial.objective(link, EmulatedSensor(bench)).log.append(full_on()[0], torch.ones(2), 60.0)
         limited = LimitedLink(link, Limits(1.0, seconds=60.0))  # a test does not take that long
         objective = HardwareObjective(trial.scene, limited, EmulatedSensor(bench), trial.log)
         with pytest.raises(LimitError, match="on for 60 s, the limit"):
-            objective(full_on(2))  # one is in the log
+            observed(objective, full_on(2), 0)  # one is in the log
         assert limited.seconds_on == 60.0
 
 
