@@ -1,4 +1,4 @@
-"""A scene on a grid, ready to step; its drive, and what is locked in to it."""
+"""A region on a grid, ready to step; the drive signal and its Fourier transform."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells
-from autdtorch.fdtd.assembly.layer_columns import layer_columns, scaled_cells
+from autdtorch.fdtd.assembly.layer_columns import layer_columns, row_scale
 from autdtorch.fdtd.boundary import tuned_profile
 from autdtorch.fdtd.grid import Grid, make_grid
 from autdtorch.fdtd.interpolation import Interpolation, average_nodes, exclude_cells, interpolate_points
@@ -25,27 +25,28 @@ from autdtorch.utils.validation import invalid
 logger = logging.getLogger(__name__)
 
 RAMP_PERIODS = 8
-"""The drive is switched on over this many periods, so that little else than its own frequency is excited: the
-shortest waves of a grid stand almost still, and what the switch-on gives them stays (at 2 mm a ramp of 3
-periods left changes of 1e-3 a period after 60 periods, this one 5e-5)."""
+"""Periods over which the drive is switched on. A short ramp excites the shortest waves of the grid, which
+almost stand still and stay: at 2 mm, 3 periods left changes of 1e-3 per period after 60 periods, 8 periods
+5e-5."""
 
-_FAINT = 1e-20
-"""Pressure of the silence before a run, relative to the strongest force."""
+_BACKGROUND = 1e-20
+"""Initial uniform pressure, relative to the largest force. From exact zeros the wave's precursors would decay
+into subnormal numbers, on which processors are slow (2.4 times, measured at 120^3 in float32)."""
 
 _ONE_NODE = torch.ones(1, dtype=torch.float64, device="cpu")
-"""Weights of the nodes of a point."""
+"""Weight of a point with a single node."""
 
 
 @dataclass(frozen=True)
 class Assembly:
-    """A scene on a grid, ready to step.
+    """A region on a grid, ready to step.
 
     Attributes:
-        grid: where the cells are.
+        grid: the grid.
         stencil: weights in air.
-        steps_per_period: time steps a period of the drive: steps a block (numerator) over periods a block
-            (denominator).
-        coefficients: what the kernel sees.
+        steps_per_period: time steps per period of the drive: steps (numerator) and periods (denominator) of a
+            block.
+        coefficients: the input of the kernel.
         heterogeneous: the cells that are not of uniform air.
     """
 
@@ -61,42 +62,36 @@ class Assembly:
         return self.coefficients.heterogeneous_weight.dtype
 
     def silence(self, sources: Sources) -> State:
-        """The state before anything is switched on: a uniform pressure, too faint to matter.
-
-        Exact zeros would let the wave's forerunners decay into subnormal numbers, on which processors are
-        slow (2.4 times, measured at 120^3 in float32).
-        """
-        faint = _FAINT * float(sources.force.detach().abs().max())
+        """Return the state before the drive is switched on."""
+        faint = _BACKGROUND * float(sources.force.detach().abs().max())
         return uniform_state(self.grid.shape, self.coefficients, faint)
 
     def interpolation(self, points: torch.Tensor, weights: torch.Tensor = _ONE_NODE) -> Interpolation:
-        """Cells and weights of points (P, 3) [m], or nodes (P, n, 3) with `weights` (n,), in the domain."""
-        return average_nodes(self._interpolation_of_nodes(points.reshape(-1, 3)), weights.numpy())
-
-    def _interpolation_of_nodes(self, points: torch.Tensor) -> Interpolation:
-        grid = self.grid
-        found = self._in_air(points)
+        """Return cells and weights of points (P, 3) [m], or of nodes (P, n, 3) with `weights` (n,)."""
+        nodes, grid = points.reshape(-1, 3), self.grid
+        found = self._in_air(nodes)
         sound_hard = np.isin(found.index, self.heterogeneous.sound_hard)  # their pressure is not defined
-        return exclude_cells(found, grid.to_cells(points), sound_hard, grid.shape, grid.kappa)
+        found = exclude_cells(found, grid.to_cells(nodes), sound_hard, grid.shape, grid.kappa)
+        return average_nodes(found, weights.numpy())
 
     def _in_air(self, points: torch.Tensor) -> Interpolation:
-        """Interpolation as if all cells were of air."""
+        """Return the interpolation as if all cells were of air."""
         grid = self.grid
         return interpolate_points(grid.to_cells(points), grid.shape, grid.first, grid.last, grid.kappa)
 
     def touches_heterogeneous(self, points: torch.Tensor) -> bool:
-        """Return whether any of the points (N, 3) [m], in the domain, uses cells that are not of air."""
+        """Return whether the interpolation of any of the points (N, 3) [m] uses cells that are not of air."""
         return len(points) > 0 and bool(np.isin(self._in_air(points).index, self.heterogeneous.index).any())
 
     def receivers(self, points: torch.Tensor, weights: torch.Tensor = _ONE_NODE) -> Receivers:
-        """Receivers at points (P, 3) [m], or means over nodes (P, n, 3) with `weights` (n,)."""
+        """Return receivers at points (P, 3) [m], or of means over nodes (P, n, 3) with `weights` (n,)."""
         found = self.interpolation(points, weights)
         return Receivers(torch.from_numpy(found.index), torch.from_numpy(found.weight).to(self.dtype))
 
     def sources(
         self, points: torch.Tensor, strength: torch.Tensor, weights: torch.Tensor = _ONE_NODE
     ) -> Sources:
-        """Point sources at (P, 3) [m] with far field strength e^{ikr}/r, strength (P,) complex [Pa m].
+        """Return point sources at (P, 3) [m] with far field strength e^{ikr}/r, strength (P,) complex [Pa m].
 
         Nodes (P, n, 3) with `weights` (n,) share the strength of a source. Differentiable by strength.
         """
@@ -114,7 +109,7 @@ class Assembly:
 def assemble(
     region: Region, spacing: float, dtype: torch.dtype = torch.float32, time_step: float | None = None
 ) -> Assembly:
-    """Put a region on a grid of its domain, of `spacing` [m]; see `assemble_on`.
+    """Assemble a region on a grid of its domain with cells of `spacing` [m]; see `assemble_on`.
 
     Raises:
         ValueError: the spacing is too coarse for the frequency, or the time step is not stable.
@@ -123,33 +118,31 @@ def assemble(
 
 
 def assemble_on(grid: Grid, region: Region, dtype: torch.dtype, time_step: float | None) -> Assembly:
-    """Put a region on a grid, with a time step of `time_step` [s] or just below.
-
-    By default that is the largest stable one.
+    """Assemble a region on a grid, with at most a time step of `time_step` [s], by default the largest.
 
     Raises:
         ValueError: the time step is not stable.
     """
     stencil = air_stencil(grid, region)
-    heterogeneous = heterogeneous_cells(elements_of(region, grid, stencil), stencil)
-    return assembly_of(grid, stencil, heterogeneous, region.frequency, dtype, time_step)
+    cells = heterogeneous_cells(elements_of(region, grid, stencil), stencil)
+    return assembly_of(grid, stencil, cells, region.frequency, dtype, time_step)
 
 
 def air_stencil(grid: Grid, region: Region) -> Stencil:
-    """Weights of a region's air on a grid."""
+    """Return the stencil of a region's air on a grid."""
     return tuned_stencil(grid.kappa, region.attenuation * grid.spacing)
 
 
 def assembly_of(
     grid: Grid,
     stencil: Stencil,
-    heterogeneous: HeterogeneousCells,
+    cells: HeterogeneousCells,
     frequency: float,
     dtype: torch.dtype,
     time_step: float | None,
 ) -> Assembly:
-    """Make a grid ready to step whose heterogeneous cells are known; see `assemble_on`."""
-    largest = largest_eigenvalue(heterogeneous.index, heterogeneous.weight, stencil, grid.shape)
+    """Return the assembly of a grid with known heterogeneous cells; see `assemble_on`."""
+    largest = largest_eigenvalue(cells.index, cells.weight, stencil, grid.shape)
     fewest = fewest_steps(stencil, largest)
     steps_per_period = whole_steps(_wanted_steps(fewest, time_step, frequency))
     steps = float(steps_per_period)
@@ -157,36 +150,35 @@ def assembly_of(
     factor = stencil.time_factor(steps) / (1 + damping)
     keep = (1 - damping) / (1 + damping)
     profile = tuned_profile(grid.kappa, steps, grid.layer_cells)
-    face, edge, corner = factor * stencil.face, factor * stencil.edge, factor * stencil.corner
-    layer_index, layer_scale = scaled_cells(heterogeneous, stencil, grid, dtype)
-    columns, crossed, crossing = layer_columns(heterogeneous, stencil, grid, factor, dtype)
+    in_layers = ~grid.inside(cells.index)
+    columns, crossed, crossing = layer_columns(cells, stencil, grid, factor, dtype)
     coefficients = Coefficients(
         center=1 + keep - factor * stencil.total,
-        face=face,
-        edge=edge,
-        corner=corner,
+        face=factor * stencil.face,
+        edge=factor * stencil.edge,
+        corner=factor * stencil.corner,
         keep=keep,
-        heterogeneous_index=torch.from_numpy(heterogeneous.index),
-        heterogeneous_weight=torch.from_numpy(factor * heterogeneous.weight).to(dtype),
-        sound_hard_index=torch.from_numpy(heterogeneous.shell),
+        heterogeneous_index=torch.from_numpy(cells.index),
+        heterogeneous_weight=torch.from_numpy(factor * cells.weight).to(dtype),
+        sound_hard_index=torch.from_numpy(cells.shell),
         layer_decay=torch.from_numpy(profile.decay).to(dtype),
         layer_gain=torch.from_numpy(profile.gain).to(dtype),
-        layer_index=layer_index,
-        layer_scale=layer_scale,
+        layer_index=torch.from_numpy(cells.index[in_layers]),
+        layer_scale=torch.from_numpy(row_scale(cells.weight[in_layers], stencil)).to(dtype),
         columns=columns,
         crossed=crossed,
         crossing=crossing,
     )
-    logger.info(
+    logger.debug(
         "grid %s at %.3g mm, %d heterogeneous cells; %d steps in %d periods: %.4g us, %.1f %% of the limit",
-        grid.shape, grid.spacing * 1e3, len(heterogeneous.index), steps_per_period.numerator,
+        grid.shape, grid.spacing * 1e3, len(cells.index), steps_per_period.numerator,
         steps_per_period.denominator, 1e6 / (steps * frequency), 100 * fewest / steps,
     )  # fmt: skip
-    return Assembly(grid, stencil, steps_per_period, coefficients, heterogeneous)
+    return Assembly(grid, stencil, steps_per_period, coefficients, cells)
 
 
 def _wanted_steps(fewest: float, time_step: float | None, frequency: float) -> float:
-    """Steps a period of a wanted time step [s], which must be stable; `fewest` by default."""
+    """Return steps per period for a time step [s], which must be stable; `fewest` by default."""
     if time_step is None:
         return fewest
     limit = 1 / (frequency * fewest)
@@ -198,7 +190,7 @@ def _wanted_steps(fewest: float, time_step: float | None, frequency: float) -> f
 
 
 def drive_signal(steps_per_period: Fraction, first: int, count: int) -> torch.Tensor:
-    """Rows (count, 2) of cos(w t) and sin(w t) under the switch-on envelope, from step `first` on."""
+    """Return cos(w t) and sin(w t) under the switch-on envelope, (count, 2), from step `first` on."""
     step = torch.arange(first, first + count, device="cpu")
     block, turns = steps_per_period.numerator, steps_per_period.denominator
     phase = 2 * math.pi / block * torch.remainder(step * turns, block).double()
@@ -208,7 +200,10 @@ def drive_signal(steps_per_period: Fraction, first: int, count: int) -> torch.Te
 
 
 def drive_dft(recorded: torch.Tensor, periods: int) -> torch.Tensor:
-    """Phasors (R,) of one block of `periods`, recorded after each of its steps (steps, R)."""
+    """Return phasors (R,) at the drive frequency, by the Fourier transform of a block of `periods`.
+
+    The block holds the values (steps, R) recorded after each of its steps.
+    """
     steps = len(recorded)
     turn = 2 * math.pi * periods / steps * torch.arange(1, steps + 1, dtype=torch.float64, device="cpu")
     basis = 2 / steps * torch.stack((torch.cos(turn), torch.sin(turn)))

@@ -7,10 +7,14 @@ import math
 import torch
 
 from autdtorch.fdtd.adjoint import recorded
-from autdtorch.fdtd.assembly.cell_maps import cells_of_maps, domain_cells
-from autdtorch.fdtd.assembly.differentiable import DifferentiableCells, cells_of_obstacles
 from autdtorch.fdtd.grid import Grid, make_grid, require_fine, warn_if_coarse
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources
+from autdtorch.fdtd.material_gradients import (
+    DifferentiableCells,
+    cells_of_maps,
+    cells_of_obstacles,
+    domain_cells,
+)
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import block_of, fewest_periods
 from autdtorch.fdtd.stepping import Assembly, drive_dft, drive_signal

@@ -10,10 +10,10 @@ import torch
 from small_scenes import AIR, relative_error, small_scene
 
 import autdtorch as at
-from autdtorch.fdtd.assembly.cell_maps import cells_of_maps
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import heterogeneous_cells
 from autdtorch.fdtd.grid import make_grid
+from autdtorch.fdtd.material_gradients import cells_of_maps
 from autdtorch.fdtd.stepping import air_stencil
 from autdtorch.propagators.scene_region import region_of
 

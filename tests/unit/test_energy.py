@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from shared.random_scenes import draw_trial
 
+from autdtorch.fdtd.assembly.element import stiffness_matrix
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells
-from autdtorch.fdtd.assembly.interface import stiffness_matrix
 from autdtorch.fdtd.grid import make_grid
 from autdtorch.fdtd.stability import largest_eigenvalue
 from autdtorch.fdtd.stencil import OFFSETS, Stencil, tuned_stencil
@@ -20,7 +20,7 @@ SCENES = range(12)
 
 
 def dense_operator(cells: HeterogeneousCells, stencil: Stencil, shape: tuple[int, int, int]) -> np.ndarray:
-    """M^-1/2 K M^-1/2 of the varying cells that are open to sound; all others are held at zero."""
+    """M^-1/2 K M^-1/2 of the heterogeneous cells that are not sound-hard; all others are held at zero."""
     place = np.full(math.prod(shape), -1)
     open_cells = np.flatnonzero(~np.isin(cells.index, cells.sound_hard))
     place[cells.index[open_cells]] = np.arange(len(open_cells))
@@ -44,15 +44,15 @@ def test_energy_is_symmetric_positive_and_bounded(number: int) -> None:
     trial = draw_trial(0, number, long_share=1.0)
     grid = make_grid(region_of(trial.scene), trial.spacing)
     stencil = tuned_stencil(grid.kappa)
-    medium = elements_of(region_of(trial.scene), grid, stencil)
+    elements = elements_of(region_of(trial.scene), grid, stencil)
 
     # of every element by itself, which is more than it takes; what is left is rounding
-    own = np.linalg.eigvalsh(stiffness_matrix(medium.elements.coupling))
+    own = np.linalg.eigvalsh(stiffness_matrix(elements.interface.coupling))
     assert (own[:, 0] >= -1e-13 * own[:, -1]).all()
-    assert (medium.elements.mass >= 0).all()
+    assert (elements.interface.mass >= 0).all()
 
     # and of what is assembled, after rigid cells were closed and masses shared
-    cells = heterogeneous_cells(medium, stencil)
+    cells = heterogeneous_cells(elements, stencil)
     assert (cells.mass > 0).all()
     matrix = dense_operator(cells, stencil, grid.shape)
     largest = largest_eigenvalue(cells.index, cells.weight, stencil, grid.shape)

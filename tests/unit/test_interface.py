@@ -1,4 +1,4 @@
-"""Cut elements: planes and spheres through the cube between eight cell centres.
+"""Interface elements: planes and spheres through the cube between eight cell centres.
 
 In units of a cell and of air. Materials of which one has a mass and the other none show where mass goes.
 """
@@ -10,16 +10,16 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from autdtorch.fdtd.assembly.interface import (
-    FAR,
+from autdtorch.fdtd.assembly.constants import FAR
+from autdtorch.fdtd.assembly.element import (
     LATTICE,
     VERTICES,
     InterfaceElements,
     Materials,
-    interface_elements,
     stiffness_matrix,
     uniform_coupling,
 )
+from autdtorch.fdtd.assembly.interface import interface_elements
 from autdtorch.fdtd.stencil import tuned_stencil
 
 STENCIL = tuned_stencil(2 * math.pi / 8.5)
@@ -44,7 +44,11 @@ def element(
     *distance: np.ndarray, density: tuple[float, ...] = (1, 77), mass: tuple[float, ...] | None = None
 ) -> InterfaceElements:
     """One element, obstacle k of which is of material k + 1; masses are 1/density by default."""
-    materials = Materials(np.array(density, float), np.array(mass or [1 / d for d in density], float))
+    materials = Materials(
+        np.array(density, float),
+        np.array(mass or [1 / d for d in density], float),
+        np.zeros(len(density), bool),
+    )
     return interface_elements(np.stack(distance)[:, None], np.arange(len(distance)) + 1, materials, STENCIL)
 
 
@@ -121,7 +125,7 @@ def test_a_flow_through_a_surface_along_the_grid_meets_its_exact_resistance(
 def test_masses_stay_on_their_side(normal: np.ndarray, offset: float) -> None:
     distance = plane(normal, offset)
     air, solid = element(distance, mass=(1, 0)), element(distance, mass=(0, 1))
-    inside = solid.number[0] == 1
+    inside = solid.material[0] == 1
     assert (solid.mass[0, ~inside] == 0).all() or not inside.any()
     assert (air.mass[0, inside] == 0).all() or inside.all()
     assert air.mass.sum() + solid.mass.sum() == pytest.approx(1, rel=1e-14)
@@ -160,7 +164,7 @@ def test_a_plate_of_half_a_cell_between_the_vertices_is_there() -> None:
     thickness, density = 0.5, 50.0
     plate = np.abs(LATTICE[:, 0] - 0.46) - thickness / 2
     cut = element(plate, density=(1, density), mass=(0, 1))
-    assert not cut.number.any()
+    assert not cut.material.any()
     assert cut.mass.sum() == pytest.approx(thickness, rel=1e-12)
     # a flow across it meets the resistance of both
     resistance = 1 + (density - 1) * thickness
@@ -173,7 +177,7 @@ def test_a_face_through_vertices_is_corrected_from_either_side(side: int) -> Non
     density = 77.0
     distance = LATTICE[:, 0] - 1 if side < 0 else LATTICE[:, 0] - 1e-9
     cut = element(distance, density=(1, density))
-    assert set(cut.number[0]) == {0, 1}
+    assert set(cut.material[0]) == {0, 1}
     mobility = 1 / density if side < 0 else 1.0
     # the sliver of 1e-9, and rounding
     assert energy(cut, VERTICES[:, 1].astype(float)) == pytest.approx(mobility, rel=1e-6)

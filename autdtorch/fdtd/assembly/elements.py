@@ -1,8 +1,7 @@
-"""What fills the grid: the material of every element, and which elements a surface cuts."""
+"""Geometry on the grid: the material of every element, and the elements that surfaces intersect."""
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,144 +10,132 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.assembly.interface import FAR, LATTICE, InterfaceElements, Materials, interface_elements
+from autdtorch.fdtd.assembly.constants import CONTACT_GAP, FAR, HALF_DIAGONAL, SOUND_HARD_DENSITY
+from autdtorch.fdtd.assembly.element import LATTICE, InterfaceElements, Materials
+from autdtorch.fdtd.assembly.interface import interface_elements
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Fluid, Region, Shape
 from autdtorch.fdtd.stencil import Stencil
-from autdtorch.utils.arrays import Array
+from autdtorch.utils.arrays import Array, Index
 from autdtorch.utils.progress import show_progress
 
-logger = logging.getLogger(__name__)
-
-
-RIGID = 1e5
-"""Density, relative to air, that rigid obstacles are assembled with; what it leaves open is then sealed."""
-
-_REACH = 0.87
-"""Half the diagonal of an element: a surface farther from its centre does not cut it [cells]."""
-
-_TOUCHING = 1e-9
-"""What obstacles are larger by [cells], so that two that touch leave no film of air, in whatever plane."""
-
-_ELEMENTS_AT_ONCE = 4096
+_CHUNK = 4096
+"""Interface elements assembled at a time."""
 
 
 @dataclass(frozen=True)
-class Joined:
-    """Consecutive bodies of one material, which need not be told apart.
+class Elements:
+    """Elements of a grid of (nx, ny, nz) cells.
 
     Attributes:
-        shapes: the shapes it consists of.
-        number: of its material.
-        continued: whether it continues through the boundary layers, where it leaves the interior.
+        materials: density and mass of each material, air first.
+        material: material of each element (nx - 1, ny - 1, nz - 1), of an interface element at its centre.
+        index: flat indices of the interface elements (n,), ascending.
+        interface: their coupling coefficients and masses.
+    """
+
+    materials: Materials
+    material: NDArray[np.int16]
+    index: Index
+    interface: InterfaceElements
+
+
+@dataclass(frozen=True)
+class _Union:
+    """Union of consecutive bodies of one material.
+
+    Attributes:
+        shapes: the shapes of the bodies.
+        material: number of the material.
+        continued: whether they continue through the boundary layers, unchanged from the interior.
     """
 
     shapes: tuple[Shape, ...]
-    number: int
+    material: int
     continued: bool
 
     @property
     def lower(self) -> Array:
-        """Corner of the bounding box with the smallest coordinates (3,) [m]."""
+        """Lower corner of the bounding box (3,) [m]."""
         return np.asarray(np.array([shape.lower for shape in self.shapes]).min(axis=0))
 
     @property
     def upper(self) -> Array:
-        """Corner of the bounding box with the largest coordinates (3,) [m]."""
+        """Upper corner of the bounding box (3,) [m]."""
         return np.asarray(np.array([shape.upper for shape in self.shapes]).max(axis=0))
 
     def distance(self, cell: Array, grid: Grid) -> Array:
-        """Signed distance [cells] of places (..., 3) in cells."""
+        """Return the signed distance [cells] of positions (..., 3) in cells."""
         places = np.array(grid.origin) + grid.spacing * (grid.clip(cell) if self.continued else cell)
         each = [shape.signed_distance(torch.from_numpy(places)) for shape in self.shapes]
-        distance = torch.stack(each).amin(dim=0).numpy() / grid.spacing - _TOUCHING
+        distance = torch.stack(each).amin(dim=0).numpy() / grid.spacing - CONTACT_GAP
         if self.continued:
             return np.asarray(distance)
         beyond = np.maximum(np.array(grid.first) - cell, cell - np.array(grid.last) + 1).max(axis=-1) + 0.5
         return np.asarray(np.maximum(distance, beyond))
 
 
-@dataclass(frozen=True)
-class Elements:
-    """What fills the elements of a grid of (nx, ny, nz) cells.
-
-    Attributes:
-        materials: density and mass of each material, air first.
-        rigid: which materials are rigid (m,).
-        number: material of each element (nx - 1, ny - 1, nz - 1), for a cut one that of its centre.
-        cut: flat indices of the cut elements (n,), ascending.
-        elements: their coupling and masses.
-    """
-
-    materials: Materials
-    rigid: NDArray[np.bool_]
-    number: NDArray[np.int16]
-    cut: NDArray[np.int64]
-    elements: InterfaceElements
-
-
 def speed_factor(stencil: Stencil, speed_ratio: float) -> float:
-    """Symbol of air over the symbol at the wavenumber of a material `speed_ratio` times as fast.
+    """Return the symbol of air over the symbol at the wavenumber of a material `speed_ratio` times as fast.
 
-    Divided by it, the mass of a cell gives a wave in the material its right frequency.
+    A cell's mass divided by it gives a wave in the material the frequency of the drive.
     """
     return stencil.symbol / stencil.isotropic_symbol(stencil.kappa / speed_ratio)
 
 
 def flow_factor(kappa: float, speed_ratio: float) -> float:
-    """What a material's coupling and mass are multiplied with for its impedance to be right beside air.
+    """Return the factor on a material's coupling and mass that corrects its impedance next to air.
 
     Half-way between two cells a wave's slope is their difference over 2 sin(k / 2) / k, and its value their
-    mean over cos(k / 2), with the material's own k: the grid's impedance is off by tan(k / 2) / (k / 2). For
-    waves at an angle the two normal k differ, but to second order not the ratio of these factors.
+    mean over cos(k / 2), with the material's own k. The grid's impedance is off by tan(k / 2) / (k / 2). At
+    oblique incidence the two normal k differ, but the ratio of these factors is unchanged to second order.
     """
     air, own = kappa / 2, kappa / speed_ratio / 2
     return (math.tan(air) / air) / (math.tan(own) / own)
 
 
 def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
-    """Find the material of every element, and the coupling and masses of those that surfaces cut.
+    """Return the material of every element and the assembled interface elements.
 
-    Where bodies overlap the later wins. Those that are `continued` go on through the boundary layer, as they
-    leave the interior; others end before it.
+    Later bodies take precedence. Bodies that are not `continued` end before the boundary layers.
     """
-    bodies, materials, rigid = _bodies(region, stencil)
-    number = np.zeros([cells - 1 for cells in grid.shape], np.int16)
-    cut = np.zeros(number.shape, bool)
+    bodies, materials = _unions(region, stencil)
+    material = np.zeros([cells - 1 for cells in grid.shape], np.int16)
+    cut = np.zeros(material.shape, bool)
     for body in bodies:
         for window, distance in _windows(body, grid):
-            number[window][distance < 0] = body.number
-            cut[window] = (cut[window] | (distance < _REACH)) & (distance > -_REACH)
+            material[window][distance < 0] = body.material
+            cut[window] = (cut[window] | (distance < HALF_DIAGONAL)) & (distance > -HALF_DIAGONAL)
     index = np.flatnonzero(cut)
-    return Elements(materials, rigid, number, index, _cut(bodies, index, grid, materials, stencil))
+    return Elements(materials, material, index, _interface(bodies, index, grid, materials, stencil))
 
 
-def _bodies(region: Region, stencil: Stencil) -> tuple[list[Joined], Materials, NDArray[np.bool_]]:
-    """Bodies joined where consecutive ones share a material, and the materials that there are."""
+def _unions(region: Region, stencil: Stencil) -> tuple[list[_Union], Materials]:
+    """Return unions of consecutive bodies that share a material, and the materials."""
     air = region.fluid
     known: list[Fluid | None] = [air]
-    bodies: list[Joined] = []
+    unions: list[_Union] = []
     for body in region.bodies:
         if body.fluid not in known:
             known.append(body.fluid)
         kind = known.index(body.fluid), body.continued
-        if bodies and kind == (bodies[-1].number, bodies[-1].continued):
-            bodies[-1] = Joined((*bodies[-1].shapes, body.shape), *kind)
+        if unions and kind == (unions[-1].material, unions[-1].continued):
+            unions[-1] = _Union((*unions[-1].shapes, body.shape), *kind)
         else:
-            bodies.append(Joined((body.shape,), *kind))
-    density = [
-        RIGID
-        if m is None
-        else m.density / air.density / flow_factor(stencil.kappa, m.sound_speed / air.sound_speed)
-        for m in known
-    ]
-    factor = [1.0 if m is None else speed_factor(stencil, m.sound_speed / air.sound_speed) for m in known]
-    materials = Materials(np.array(density), 1 / (np.array(density) * np.array(factor)))
-    return bodies, materials, np.array([m is None for m in known])
+            unions.append(_Union((body.shape,), *kind))
+    density = np.full(len(known), SOUND_HARD_DENSITY)
+    factor = np.ones(len(known))
+    for number, fluid in enumerate(known):
+        if fluid is not None:
+            ratio = fluid.sound_speed / air.sound_speed
+            density[number] = fluid.density / air.density / flow_factor(stencil.kappa, ratio)
+            factor[number] = speed_factor(stencil, ratio)
+    sound_hard = np.array([fluid is None for fluid in known])
+    return unions, Materials(density, 1 / (density * factor), sound_hard)
 
 
-def _windows(body: Joined, grid: Grid) -> Iterator[tuple[tuple[slice, ...], Array]]:
-    """Slabs of elements around a body, with the signed distance [cells] of their centres."""
+def _windows(body: _Union, grid: Grid) -> Iterator[tuple[tuple[slice, ...], Array]]:
+    """Yield slabs of elements around a body with the signed distances [cells] of their centres."""
     middle = [np.arange(cells - 1) + 0.5 for cells in grid.shape]
     ranges = []
     for axis, low, high in zip(range(3), body.lower - grid.spacing, body.upper + grid.spacing, strict=True):
@@ -160,8 +147,8 @@ def _windows(body: Joined, grid: Grid) -> Iterator[tuple[tuple[slice, ...], Arra
         yield window, body.distance(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1), grid)
 
 
-def _distances(bodies: list[Joined], first: NDArray[np.int64], grid: Grid) -> NDArray[np.float64]:
-    """Distances (B, n, L) of bodies from the lattices of elements, by their first cells (n, 3)."""
+def _distances(bodies: list[_Union], first: Index, grid: Grid) -> Array:
+    """Return distances (K, n, L) of bodies from the lattices of elements, by their first cells (n, 3)."""
     cell = first[:, None] + LATTICE
     center = np.array(grid.origin) + grid.spacing * grid.clip(np.asarray(first + 0.5))
     distance = np.full((len(bodies), *cell.shape[:2]), FAR)
@@ -173,23 +160,19 @@ def _distances(bodies: list[Joined], first: NDArray[np.int64], grid: Grid) -> ND
     return distance
 
 
-def _cut(
-    bodies: list[Joined],
-    index: NDArray[np.int64],
-    grid: Grid,
-    materials: Materials,
-    stencil: Stencil,
+def _interface(
+    bodies: list[_Union], index: Index, grid: Grid, materials: Materials, stencil: Stencil
 ) -> InterfaceElements:
     parts = [InterfaceElements(np.zeros((0, 28)), np.zeros((0, 8)), np.zeros((0, 8), np.int64))]
-    numbers = np.array([body.number for body in bodies], np.int64)
+    numbers = np.array([body.material for body in bodies], np.int64)
     shape = tuple(cells - 1 for cells in grid.shape)
     with show_progress(len(index), "measuring surfaces") as progress:
-        for start in range(0, len(index), _ELEMENTS_AT_ONCE):
-            first = np.stack(np.unravel_index(index[start : start + _ELEMENTS_AT_ONCE], shape), axis=-1)
+        for start in range(0, len(index), _CHUNK):
+            first = np.stack(np.unravel_index(index[start : start + _CHUNK], shape), axis=-1)
             parts.append(interface_elements(_distances(bodies, first, grid), numbers, materials, stencil))
             progress.advance(len(first))
     return InterfaceElements(
         np.concatenate([part.coupling for part in parts]),
         np.concatenate([part.mass for part in parts]),
-        np.concatenate([part.number for part in parts]),
+        np.concatenate([part.material for part in parts]),
     )

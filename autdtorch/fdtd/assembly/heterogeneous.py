@@ -1,9 +1,9 @@
-"""Where the medium varies: coupling between cells, the mass of cells, and the rows a kernel steps with.
+"""Heterogeneous cells: assembled coupling coefficients, masses and stencil rows.
 
-The scheme is m_i d2p_i/dt2 = sum_j B_ij (p_j - p_i). In air B is the tuned stencil and m = 1; in another
-uniform material B is divided by its density, and m by its density and speed factor; the elements that
-surfaces cut bring their own (`surface.py`). Bonds are symmetric, which keeps reciprocity and an energy at any
-contrast.
+The scheme is m_i d2p_i/dt2 = sum_j K_ij (p_j - p_i). In air K holds the weights of the tuned stencil and
+m = 1. In another uniform material K is divided by its density, and m by its density and speed factor.
+Interface elements add their own (`interface.py`). K is symmetric, which gives reciprocity and a conserved
+energy at any contrast.
 """
 
 from __future__ import annotations
@@ -14,14 +14,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.assembly.elements import Elements
-from autdtorch.fdtd.assembly.interface import (
+from autdtorch.fdtd.assembly.constants import (
+    MASS_TRANSFERS,
+    NULL_EIGENVALUE,
+    ROW_ROUNDING,
+    ROW_SUM_MARGIN,
+    SOUND_HARD_COUPLING,
+)
+from autdtorch.fdtd.assembly.element import (
     PAIRS,
     VERTICES,
     InterfaceElements,
     stiffness_matrix,
     uniform_coupling,
 )
+from autdtorch.fdtd.assembly.elements import Elements
 from autdtorch.fdtd.stencil import Stencil, flat_offsets
 from autdtorch.utils.arrays import Array, Index
 
@@ -29,37 +36,17 @@ logger = logging.getLogger(__name__)
 
 Shape = tuple[int, int, int]
 
-_SEALED = 0.1
-"""Sum of coupling, relative to air, up to which a cell of a rigid obstacle is closed to sound; those at a
-surface have 0.3 and more, all others 0.03 at most."""
-
-_NO_ENERGY = 1e-10
-"""Share of the largest below which an eigenvalue of closed vertices is rounding. More left out would take
-energy from pressures that are nearly constant."""
-
-_ROUNDING = 1e-9
-"""Rows closer than this to those of air are air."""
-
-_ROOM = 1.1
-"""By how much rows at a surface may exceed those of a uniform material before they take mass. The largest
-eigenvalue of air is farther than that from Gershgorin's bound. With the paper's cubes 1.1 costs 3 % of the
-time step, 1.2 would cost 8 %; a slab of density ratio 3 keeps its mass."""
-
-_ROUNDS = 6
-"""Times that light cells ask for mass; once is nearly always enough."""
-
 
 @dataclass(frozen=True)
 class HeterogeneousCells:
-    """The cells whose rows differ from those of uniform air.
+    """Cells whose stencil rows differ from those of uniform air.
 
     Attributes:
         index: flat cell indices (n,), ascending.
-        weight: what (p_j - p_i) is multiplied with for the 27 neighbours, B_ij / m_i (n, 27), to be scaled
-            by the time factor.
+        weight: stencil rows K_ij / m_i on (p_j - p_i) for the 27 neighbours (n, 27), before the time factor.
         mass: m_i (n,), 1 in air.
-        sound_hard: flat indices of the cells that sound does not enter, ascending.
-        shell: those of them next to cells that it does enter; what lies behind is never reached.
+        sound_hard: flat indices of the sound-hard cells, ascending.
+        shell: sound-hard cells next to other cells; those behind them are never read.
     """
 
     index: Index
@@ -69,139 +56,125 @@ class HeterogeneousCells:
     shell: Index
 
     def mass_of(self, cells: Index) -> Array:
-        """Mass (k,) of cells (k,) that are heterogeneous or of air."""
+        """Return the mass (k,) of cells (k,) that are heterogeneous or of air."""
         mass = np.ones(len(cells))
         _, ours, theirs = np.intersect1d(self.index, cells, return_indices=True)
         mass[theirs] = self.mass[ours]
         return mass
 
 
-def heterogeneous_cells(medium: Elements, stencil: Stencil) -> HeterogeneousCells:
-    """Find the cells that a sweep of uniform air would get wrong, and their rows."""
-    x, y, z = medium.number.shape
+def heterogeneous_cells(elements: Elements, stencil: Stencil) -> HeterogeneousCells:
+    """Assemble the stencil rows of all cells that are not of uniform air."""
+    x, y, z = elements.material.shape
     shape = (x + 1, y + 1, z + 1)
-    touched = np.unique(_cut_vertices(medium, shape))
+    touched = np.unique(_vertices(elements, shape))
     touched = touched[_inner(touched, shape)]
-    coupling, mass, closed = _closed_up(medium, touched, shape, stencil)
-    mass = _shared_mass(coupling, mass, touched, shape, _largest_row(medium, stencil))
+    coupling, mass, hard = _without_sound_hard(elements, touched, shape, stencil)
+    largest = ROW_SUM_MARGIN * stencil.total * float(elements.materials.speed.max())
+    mass = _transferred_mass(coupling, mass, touched, shape, largest)
     weight = coupling / mass[:, None]
-    changed = (np.abs(weight - stencil.weights) > _ROUNDING).any(axis=1) | (mass != 1)
-    changed &= ~closed[touched]
+    changed = (np.abs(weight - stencil.weights) > ROW_ROUNDING).any(axis=1) | (mass != 1)
+    changed &= ~hard[touched]
     parts = (
         (touched[changed], weight[changed], mass[changed]),
-        _bulk(medium, touched, closed, shape, stencil),
+        _uniform_cells(elements, touched, hard, shape, stencil),
     )
     index, weight, mass = (np.concatenate(part) for part in zip(*parts, strict=True))
     order = np.argsort(index)
     around = np.unique(_neighbours(touched, shape))
-    shell = around[closed[around] & _inner(around, shape)]
-    return HeterogeneousCells(index[order], weight[order], mass[order], np.flatnonzero(closed), shell)
+    shell = around[hard[around] & _inner(around, shape)]
+    return HeterogeneousCells(index[order], weight[order], mass[order], np.flatnonzero(hard), shell)
 
 
 def _neighbours(index: Index, shape: Shape) -> Index:
-    """Flat indices (n, 27) of cells and their neighbours."""
+    """Return flat indices (n, 27) of cells and their neighbours."""
     return np.asarray(index[:, None] + flat_offsets(shape), np.int64)
 
 
 def _inner(index: Index, shape: Shape) -> NDArray[np.bool_]:
-    """Which cells (n,) are not on the rim, which stays silent."""
+    """Return which cells (n,) are not in the outermost ring, which stays zero."""
     places = np.stack(np.unravel_index(index, shape), axis=-1)
     return np.asarray(((places > 0) & (places < np.array(shape) - 1)).all(axis=1))
 
 
-def _cut_vertices(medium: Elements, shape: Shape) -> Index:
-    """Cells (n, 8) at the vertices of the cut elements."""
-    first = np.stack(np.unravel_index(medium.cut, medium.number.shape), axis=-1)
+def _vertices(elements: Elements, shape: Shape) -> Index:
+    """Return the cells (n, 8) at the vertices of the interface elements."""
+    first = np.stack(np.unravel_index(elements.index, elements.material.shape), axis=-1)
     places = np.moveaxis(first[:, None] + VERTICES, -1, 0)
     return np.asarray(np.ravel_multi_index(tuple(places), shape), np.int64)
 
 
-def _rigid(medium: Elements, shape: Shape) -> NDArray[np.bool_]:
-    """Which cells (k,) have their centre in a rigid obstacle."""
-    rigid = medium.rigid[_cell_number(medium)].ravel()
-    rigid[_cut_vertices(medium, shape)] = medium.rigid[medium.elements.number]
-    return rigid
+def _cell_material(elements: Elements) -> NDArray[np.int16]:
+    """Return the material of each cell (k,): its first element's, right where no interface is near."""
+    return np.pad(elements.material, ((1, 0),) * 3, mode="edge").ravel()
 
 
-def _closed_up(
-    medium: Elements, touched: Index, shape: Shape, stencil: Stencil
+def _without_sound_hard(
+    elements: Elements, touched: Index, shape: Shape, stencil: Stencil
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Bonds and mass of the touched cells, and which cells (k,) of rigid obstacles are closed to sound."""
-    rigid, parts = _rigid(medium, shape), medium.elements
-    inside = rigid[touched]
-    closed, known = rigid.copy(), -1
-    closed[touched] = False
+    """Return coupling and mass of the touched cells, and which cells (k,) are sound-hard."""
+    vertices, interface = _vertices(elements, shape), elements.interface
+    hard = elements.materials.sound_hard[_cell_material(elements)]
+    hard[vertices] = elements.materials.sound_hard[interface.material]
+    inside, known = hard[touched], -1
+    hard[touched] = False
     while True:
-        coupling, mass = _assembled(medium, parts, touched, shape, stencil)
-        coupling *= ~(closed[touched, None] | closed[_neighbours(touched, shape)])
-        closed[touched] |= inside & (np.abs(coupling).sum(axis=1) <= _SEALED * stencil.total)
-        if closed.sum() == known or not inside.any():
-            return coupling, mass, closed
-        known = closed.sum()
-        parts = _condensed(medium, closed, shape)
+        coupling, mass = _assembled(elements, interface, touched, shape, stencil)
+        coupling *= ~(hard[touched, None] | hard[_neighbours(touched, shape)])
+        hard[touched] |= inside & (np.abs(coupling).sum(axis=1) <= SOUND_HARD_COUPLING * stencil.total)
+        if hard.sum() == known or not inside.any():
+            return coupling, mass, hard
+        known = hard.sum()
+        interface = condensed(elements.interface, hard[vertices])
 
 
-def _condensed(medium: Elements, closed: NDArray[np.bool_], shape: Shape) -> InterfaceElements:
-    """The cut elements without their closed vertices, whose pressure takes the value of least energy.
+def condensed(interface: InterfaceElements, out: NDArray[np.bool_]) -> InterfaceElements:
+    """Eliminate vertices `out` (n, 8) from the stiffness of elements (static condensation).
 
-    Leaving out their coupling alone could make the energy of the others negative.
+    Their pressure takes the value of least energy. Dropping their coupling could make the energy negative.
     """
-    out = closed[_cut_vertices(medium, shape)]
     some = np.flatnonzero(out.any(axis=1))
     gone = out[some]
-    matrix = stiffness_matrix(medium.elements.coupling[some])
+    matrix = stiffness_matrix(interface.coupling[some])
     both = gone[:, :, None] & gone[:, None, :]
-    inverse = np.linalg.pinv(np.where(both, matrix, 0), rcond=_NO_ENERGY, hermitian=True)
+    inverse = np.linalg.pinv(np.where(both, matrix, 0), rcond=NULL_EIGENVALUE, hermitian=True)
     across = np.where(gone[:, None, :], matrix, 0)
     matrix = matrix - across @ inverse @ across.transpose(0, 2, 1)
     matrix[gone[:, :, None] | gone[:, None, :]] = 0
-    coupling, mass = medium.elements.coupling.copy(), np.where(out, 0, medium.elements.mass)
+    coupling = interface.coupling.copy()
     coupling[some] = -matrix[:, PAIRS[:, 0], PAIRS[:, 1]]
-    return InterfaceElements(coupling, mass, medium.elements.number)
+    return InterfaceElements(coupling, np.where(out, 0, interface.mass), interface.material)
 
 
 def _assembled(
-    medium: Elements, parts: InterfaceElements, touched: Index, shape: Shape, stencil: Stencil
+    elements: Elements, interface: InterfaceElements, touched: Index, shape: Shape, stencil: Stencil
 ) -> tuple[Array, Array]:
-    """Bonds (n, 27) and mass (n,) of the cells that cut elements touch, summed over their elements."""
+    """Return coupling (n, 27) and mass (n,) of the touched cells, summed over their elements."""
     coupling, mass = np.zeros((len(touched), 27)), np.zeros(len(touched))
     places = np.stack(np.unravel_index(touched, shape), axis=-1)
-    elements = tuple(cells - 1 for cells in shape)
-    cut = np.zeros(elements, bool)
-    cut.ravel()[medium.cut] = True
-    cut_pairs = np.zeros((8, 8, len(medium.cut)))
-    for column, (a, b) in enumerate(PAIRS):
-        cut_pairs[a, b] = cut_pairs[b, a] = parts.coupling[:, column]
-    air_pairs = np.zeros((8, 8))
+    cells = tuple(cells - 1 for cells in shape)
+    cut = np.zeros(cells, bool)
+    cut.ravel()[elements.index] = True
+    pairs, air_pairs = np.zeros((8, 8, len(elements.index))), np.zeros((8, 8))
+    pairs[PAIRS[:, 0], PAIRS[:, 1]] = pairs[PAIRS[:, 1], PAIRS[:, 0]] = interface.coupling.T
     air_pairs[PAIRS[:, 0], PAIRS[:, 1]] = air_pairs[PAIRS[:, 1], PAIRS[:, 0]] = uniform_coupling(stencil)
     for own, vertex in enumerate(VERTICES):
-        element = np.ravel_multi_index(tuple((places - vertex).T), elements)
+        element = np.ravel_multi_index(tuple((places - vertex).T), cells)
         is_cut = cut.ravel()[element]
-        place = np.searchsorted(medium.cut, element[is_cut])
-        number = medium.number.ravel()[element]
+        place = np.searchsorted(elements.index, element[is_cut])
+        material = elements.material.ravel()[element]
         for other, target in enumerate(VERTICES):
-            column = int((target - vertex + 1) @ (9, 3, 1))
-            part = air_pairs[own, other] / medium.materials.density[number]
-            part[is_cut] = cut_pairs[own, other, place]
-            coupling[:, column] += part
-        part = medium.materials.mass[number] / 8
-        part[is_cut] = parts.mass[place, own]
+            part = air_pairs[own, other] / elements.materials.density[material]
+            part[is_cut] = pairs[own, other, place]
+            coupling[:, int((target - vertex + 1) @ (9, 3, 1))] += part
+        part = elements.materials.mass[material] / 8
+        part[is_cut] = interface.mass[place, own]
         mass += part
     return coupling, mass
 
 
-def _cell_number(medium: Elements) -> NDArray[np.int16]:
-    """Material of each cell (nx, ny, nz): its first element's, which stands for all where none is cut."""
-    return np.pad(medium.number, ((1, 0),) * 3, mode="edge")
-
-
-def _largest_row(medium: Elements, stencil: Stencil) -> float:
-    """Sum of weights that a row may have: what air or the fastest obstacle needs, and some more."""
-    return _ROOM * stencil.total * float(medium.materials.speed.max())
-
-
-def _shared_mass(coupling: Array, mass: Array, touched: Index, shape: Shape, largest: float) -> Array:
-    """Mass (n,) with which no row sums to more than `largest`, so that none shortens the time step.
+def _transferred_mass(coupling: Array, mass: Array, touched: Index, shape: Shape, largest: float) -> Array:
+    """Return masses (n,) with which no stencil row sums to more than `largest` and shortens the time step.
 
     A light cell with strong coupling, in a heavy obstacle just below its surface, moves with the air. It
     takes mass from the cells it is coupled to; their sum is unchanged. Gershgorin's circles then bound the
@@ -209,7 +182,7 @@ def _shared_mass(coupling: Array, mass: Array, touched: Index, shape: Shape, lar
     """
     mass, need = mass.copy(), np.abs(coupling).sum(axis=1) / largest
     asked = mass.sum()
-    for _ in range(_ROUNDS):
+    for _ in range(MASS_TRANSFERS):
         light = np.flatnonzero(need > mass)
         if len(light) == 0:
             break
@@ -225,18 +198,17 @@ def _shared_mass(coupling: Array, mass: Array, touched: Index, shape: Shape, lar
         mass[light] += wish.sum(axis=1)
     mass = np.maximum(mass, need)
     if mass.sum() > asked * (1 + 1e-6):
-        logger.debug("light cells found too little mass around them: %.2g of it added", mass.sum() - asked)
+        logger.debug("light cells found too little mass around them: added %.2g", mass.sum() - asked)
     return np.where(mass > 0, mass, 1.0)
 
 
-def _bulk(
-    medium: Elements, touched: Index, closed: NDArray[np.bool_], shape: Shape, stencil: Stencil
+def _uniform_cells(
+    elements: Elements, touched: Index, hard: NDArray[np.bool_], shape: Shape, stencil: Stencil
 ) -> tuple[Index, Array, Array]:
-    """Cells inside obstacles whose sound speed is not that of air: index, weight and mass."""
-    factor = medium.materials.speed
-    number = _cell_number(medium).ravel()
-    inside = (factor != 1)[number] & ~closed
+    """Return index, weight and mass of cells inside obstacles whose sound speed is not that of air."""
+    factor, material = elements.materials.speed, _cell_material(elements)
+    inside = (factor != 1)[material] & ~hard
     inside[touched] = False
     index = np.flatnonzero(inside)
     index = index[_inner(index, shape)]
-    return index, factor[number[index], None] * stencil.weights, medium.materials.mass[number[index]]
+    return index, factor[material[index], None] * stencil.weights, elements.materials.mass[material[index]]

@@ -1,10 +1,10 @@
-"""Columns of cells on which an obstacle runs through a boundary layer.
+"""Interfaces through the boundary layers: columns of cells along the normal of a layer.
 
-The layer repeats what it touches, so that the row of a cell does not change along the layer's normal. The
-kernels stretch rows as in air, scaled to the sum of the cell's own weights: exact inside an obstacle.
-What a row at a surface differs by from that is stretched here, by column, with a memory of its own. Where two
-layers meet, the difference has a part in the product of both stretchings: columns of the one cross those of
-the other there and add to what they stretch. Without it, surfaces grow.
+A layer repeats the cells that it touches, so the stencil row of a cell is constant along the layer's normal.
+The kernels stretch rows as in air, scaled to the sum of the cell's own weights: exact inside an obstacle. The
+difference of a row at an interface from that is stretched here, by column, with a memory of its own. Where
+two layers meet, the difference has a part in the product of both stretchings: columns of one layer cross
+those of the other and add to their sums. Without it, waves along interfaces grow.
 """
 
 from __future__ import annotations
@@ -19,46 +19,40 @@ from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.kernels.contract import Columns
 from autdtorch.fdtd.stencil import OFFSETS, Stencil, flat_strides
-from autdtorch.utils.arrays import Index
+from autdtorch.utils.arrays import Array, Index
 
-_ALIKE = 1e-6
+_ROUNDING = 1e-6
 """Differences from scaled air below this, relative to a face's weight, are rounding."""
 
 _LAYERS = tuple(itertools.product(range(3), (0, 1)))
 """The boundary layers: their axis, and 1 for the one at its upper end."""
 
+_Part = tuple[Index, int, Array, Index]
+"""Columns of one layer: cells in the ring (m,), step inwards, weights (m, w) and offsets (w,)."""
 
-def row_scale(weight: NDArray[np.float64], stencil: Stencil) -> NDArray[np.float64]:
-    """Sum of each row's weights (n, 27) over that of air's."""
+
+def row_scale(weight: Array, stencil: Stencil) -> Array:
+    """Return the sum of each stencil row (n, 27) over that of air."""
     return np.asarray(weight.sum(axis=1) / stencil.total)
 
 
-def scaled_cells(
-    heterogeneous: HeterogeneousCells, stencil: Stencil, grid: Grid, dtype: torch.dtype
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Cells of the boundary layers (k,) whose rows are not of air, and their scale (k,)."""
-    here = ~grid.inside(heterogeneous.index)
-    scale = row_scale(heterogeneous.weight[here], stencil)
-    return torch.from_numpy(heterogeneous.index[here]), torch.from_numpy(scale).to(dtype)
-
-
 def layer_columns(
-    heterogeneous: HeterogeneousCells, stencil: Stencil, grid: Grid, factor: float, dtype: torch.dtype
+    cells: HeterogeneousCells, stencil: Stencil, grid: Grid, factor: float, dtype: torch.dtype
 ) -> tuple[Columns, Columns, torch.Tensor]:
-    """Find the columns whose cells are not of air, by the cell half-way through the layer.
+    """Find the columns of heterogeneous cells, by the cell half-way through the layer.
 
     Args:
-        heterogeneous: the cells that are not of air.
+        cells: the heterogeneous cells.
         stencil: weights in air.
-        grid: where the cells are.
-        factor: what the weights are multiplied with for the time step.
-        dtype: of the weights.
+        grid: the grid.
+        factor: time factor of the weights.
+        dtype: precision of the weights.
 
     Returns:
-        The columns, the crossed ones, and the places of the terms of these: see `Coefficients`.
+        The columns, the crossed ones, and the places of their terms: see `Coefficients`.
     """
-    outside = ~grid.inside(heterogeneous.index)
-    index, weight = heterogeneous.index[outside], heterogeneous.weight[outside]
+    outside = ~grid.inside(cells.index)
+    index, weight = cells.index[outside], cells.weight[outside]
     rows = weight - row_scale(weight, stencil)[:, None] * stencil.weights
     places = np.stack(np.unravel_index(index, grid.shape), axis=-1)
     strides = flat_strides(grid.shape)
@@ -66,7 +60,7 @@ def layer_columns(
     middle, inside = 1 + grid.layer_cells // 2, np.arange(1, grid.layer_cells + 2)
     parts, crossed, crossings, count = [], [], [], 0
     for axis, side in _LAYERS:
-        used = np.abs(rows[:, ahead[:, axis]]).max(axis=1, initial=0) > _ALIKE * stencil.face
+        used = np.abs(rows[:, ahead[:, axis]]).max(axis=1, initial=0) > _ROUNDING * stencil.face
         here = np.flatnonzero(used & (_depth(places, axis, side, grid) == middle))
         stride = (1 - 2 * side) * strides[axis]
         foot = index[here] - middle * stride
@@ -88,36 +82,25 @@ def layer_columns(
         crossings.append(crossing)
     depth, column = np.concatenate(crossings, axis=1)
     crossing = np.where(column < 0, grid.layer_cells * count, depth * count + column)
-    return (
-        _joined(parts, factor, grid, dtype),
-        _joined(crossed, factor, grid, dtype),
-        torch.from_numpy(crossing),
-    )
-
-
-Part = tuple[Index, int, NDArray[np.float64], Index]
-"""Columns of one layer: their cells in the ring (m,), the step inwards, weights (m, w) and offsets (w,)."""
+    columns, crossing_columns = (_joined(each, factor, grid, dtype) for each in (parts, crossed))
+    return columns, crossing_columns, torch.from_numpy(crossing)
 
 
 def _depth(places: Index, axis: int, side: int, grid: Grid) -> Index:
-    """How many cells (n,) lie inwards of the ring at one end of an axis."""
+    """Return the number of cells (n,) from the ring at one end of an axis inwards."""
     return np.asarray(grid.shape[axis] - 1 - places[:, axis] if side else places[:, axis])
 
 
-def _columns(
-    foot: Index, stride: int, rows: NDArray[np.float64], ahead: NDArray[np.bool_], strides: Index
-) -> Part:
-    """Columns from `foot` (m,) on, with what `rows` (m, 27) have in the places `ahead`, brought beside."""
+def _columns(foot: Index, stride: int, rows: Array, ahead: NDArray[np.bool_], strides: Index) -> _Part:
+    """Return columns from `foot` (m,) on: the weights `ahead` of `rows` (m, 27), moved beside the cell."""
     offsets = np.array(OFFSETS)[ahead]
     beside = np.where((offsets == 1).all(axis=0), 0, offsets)
     return foot, stride, rows[:, ahead], np.asarray(beside @ strides)
 
 
-def _joined(parts: list[Part], factor: float, grid: Grid, dtype: torch.dtype) -> Columns:
+def _joined(parts: list[_Part], factor: float, grid: Grid, dtype: torch.dtype) -> Columns:
     depth = np.arange(grid.layer_cells + 2)
     index = np.concatenate([foot[:, None] + stride * depth for foot, stride, _, _ in parts])
     offset = np.concatenate([np.broadcast_to(offset, weight.shape) for _, _, weight, offset in parts])
-    weight = np.concatenate([weight for _, _, weight, _ in parts])
-    return Columns(
-        torch.from_numpy(index), torch.from_numpy(offset), torch.from_numpy(factor * weight).to(dtype)
-    )
+    weight = torch.from_numpy(factor * np.concatenate([weight for _, _, weight, _ in parts])).to(dtype)
+    return Columns(torch.from_numpy(index), torch.from_numpy(offset), weight)

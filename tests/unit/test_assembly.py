@@ -1,4 +1,4 @@
-"""Assembled scenes: energy, mass, closing of rigid cells, and the modes of a duct."""
+"""Stages of the assembly: materials, stiffness, masses, sound-hard cells, and the modes of a duct."""
 
 import math
 
@@ -7,15 +7,16 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from autdtorch.fdtd.assembly.elements import Elements, elements_of
-from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, _condensed, heterogeneous_cells
-from autdtorch.fdtd.assembly.interface import VERTICES, InterfaceElements, Materials, stiffness_matrix
+from autdtorch.fdtd.assembly.constants import SOUND_HARD_DENSITY
+from autdtorch.fdtd.assembly.element import VERTICES, InterfaceElements, stiffness_matrix
+from autdtorch.fdtd.assembly.elements import Elements, elements_of, speed_factor
+from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, condensed, heterogeneous_cells
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.stencil import OFFSETS, tuned_stencil
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Obstacle, Sphere
-from autdtorch.scene.scene import Medium, Scene
+from autdtorch.scene.scene import Medium, OverlapWarning, Scene
 
 AIR = Medium(density=1.293, sound_speed=340.0)
 STENCIL = tuned_stencil(2 * math.pi / 8.5)
@@ -52,23 +53,29 @@ def box(
 def assembled(*obstacles: Obstacle) -> tuple[Elements, HeterogeneousCells]:
     array = TransducerArray([[2e-3, -0.9, 0.0]], (1, 0, 0))
     scene = Scene(array, AIR, 40e3, [[2e-3, 0.9, 0.0]], obstacles, domain=((-1, -1, -1), (1, 1, 1)))
-    medium = elements_of(region_of(scene), GRID, STENCIL)
-    return medium, heterogeneous_cells(medium, STENCIL)
+    elements = elements_of(region_of(scene), GRID, STENCIL)
+    return elements, heterogeneous_cells(elements, STENCIL)
 
 
-def mass_of_all(medium: Elements, cells: HeterogeneousCells) -> np.ndarray:
+def element_centers() -> np.ndarray:
+    """Centres of all elements [mm]."""
+    axis = 1e3 * (GRID.centers[0][:-1] + GRID.spacing / 2)
+    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+
+
+def mass_of_all(elements: Elements, cells: HeterogeneousCells) -> np.ndarray:
     """Mass of every cell: of those not listed, 1 at a surface, else that of the material around."""
-    mass = medium.materials.mass[np.pad(medium.number, ((1, 0),) * 3, mode="edge")].ravel()
-    first = np.stack(np.unravel_index(medium.cut, medium.number.shape), axis=-1)
+    mass = elements.materials.mass[np.pad(elements.material, ((1, 0),) * 3, mode="edge")].ravel()
+    first = np.stack(np.unravel_index(elements.index, elements.material.shape), axis=-1)
     mass[(first[:, None] + VERTICES) @ STRIDES] = 1
     mass[cells.index] = cells.mass
     return mass
 
 
-def energy(medium: Elements, cells: HeterogeneousCells) -> np.ndarray:
-    """Energy matrix of the varying cells and their neighbours, all others held at zero."""
+def stiffness(elements: Elements, cells: HeterogeneousCells) -> np.ndarray:
+    """Stiffness matrix of the heterogeneous cells and their neighbours, all others held at zero."""
     flat = np.array(OFFSETS) @ STRIDES
-    weight, mass = np.tile(STENCIL.weights, (math.prod(GRID.shape), 1)), mass_of_all(medium, cells)
+    weight, mass = np.tile(STENCIL.weights, (math.prod(GRID.shape), 1)), mass_of_all(elements, cells)
     weight[cells.index] = cells.weight
     rows = np.setdiff1d(np.unique(cells.index[:, None] + flat), cells.sound_hard)
     place = np.full(len(mass), -1)
@@ -80,6 +87,78 @@ def energy(medium: Elements, cells: HeterogeneousCells) -> np.ndarray:
         inside = (other >= 0) & (offset != 0)
         matrix[np.flatnonzero(inside), other[inside]] -= column[inside]
     return matrix
+
+
+def test_speed_of_a_material_is_tuned_to_its_own_wavenumber() -> None:
+    # frequency of a plane wave of that material's wavenumber, averaged over directions, is the drive's
+    assert speed_factor(STENCIL, 1.0) == pytest.approx(1, rel=1e-14)
+    slow = speed_factor(STENCIL, 0.5)
+    assert slow * STENCIL.isotropic_symbol(2 * STENCIL.kappa) == pytest.approx(STENCIL.symbol)
+    # (c / c_air)^2 but for the grid's dispersion
+    assert speed_factor(STENCIL, 4.0) == pytest.approx(16, rel=0.05)
+
+
+def test_materials_are_relative_to_air_and_listed_once() -> None:
+    elements, _ = assembled(
+        box((1, 1, 1), (3, 3, 3), 77.0),
+        Sphere((5e-3,) * 3, 1e-3, rigid=True),
+        box((7, 7, 7), (9, 9, 9), 77.0),
+    )
+    assert elements.materials.density.tolist() == pytest.approx([1, 77, SOUND_HARD_DENSITY])
+    assert elements.materials.mass.tolist() == pytest.approx([1, 1 / 77, 1 / SOUND_HARD_DENSITY])
+    assert elements.materials.sound_hard.tolist() == [False, False, True]
+
+
+def test_interface_elements_are_those_near_the_surface() -> None:
+    radius, center = 2.7, np.array((5.1, 4.8, 5.3))
+    elements, _ = assembled(Sphere(tuple(1e-3 * center), 1e-3 * radius, density=100.0, sound_speed=340.0))
+    distance = np.linalg.norm(element_centers() - center, axis=-1) - radius
+    assert ((elements.material == 1) == (distance < 0)).all()
+    shifts = 0.5 - np.array(list(np.ndindex(2, 2, 2)))
+    vertices = element_centers()[..., None, :] + shifts
+    within = np.linalg.norm(vertices - center, axis=-1) < radius
+    passed = within.any(axis=-1) & ~within.all(axis=-1)
+    cut = np.zeros(elements.material.shape, bool)
+    cut.ravel()[elements.index] = True
+    assert cut[passed].all()
+    assert not cut[np.abs(distance) > math.sqrt(3) / 2 + 0.01].any()  # half the diagonal
+
+
+def test_of_two_overlapping_obstacles_the_later_counts() -> None:
+    wide, core = box((2, 2, 2), (8, 8, 8), ratio=10.0), box((4, 4, 4), (6, 6, 6), ratio=50.0)
+    with pytest.warns(OverlapWarning):
+        elements, _ = assembled(wide, core)
+    off = np.abs(element_centers() - 5).max(axis=-1)
+    assert (elements.material[off < 0.9] == 2).all()
+    assert (elements.material[(off > 1.1) & (off < 2.9)] == 1).all()
+    assert (elements.material[off > 3.1] == 0).all()
+    with pytest.warns(OverlapWarning):
+        covered, _ = assembled(core, wide)
+    assert not (covered.material == 1).any()
+    assert not (covered.interface.material == 1).any()
+
+
+@pytest.mark.parametrize("speed", [1.0, 2.0])
+def test_mass_of_elements_is_that_of_the_volume(speed: float) -> None:
+    """Interface elements and uniform ones together."""
+    radius = 2.7
+    elements, _ = assembled(
+        Sphere((5.1e-3, 4.8e-3, 5.3e-3), 1e-3 * radius, density=10 * AIR.density, sound_speed=speed * 340.0)
+    )
+    masses = elements.materials.mass[elements.material].ravel()
+    masses[elements.index] = elements.interface.mass.sum(axis=1)
+    displaced = (1 - masses).sum() / (1 - elements.materials.mass[1])
+    # sub-cells of a quarter: 0.2 % measured
+    assert displaced == pytest.approx(4 / 3 * math.pi * radius**3, rel=5e-3)
+
+
+@pytest.mark.parametrize("joint", [5.0, 5.5])
+def test_boxes_of_two_materials_that_touch_leave_no_air_between_them(joint: float) -> None:
+    elements, _ = assembled(box((2, 2, 2), (joint, 8, 8), 77.0), box((joint, 2, 2), (8, 8, 8), ratio=20.0))
+    off = np.abs(element_centers() - (joint, 5, 5))
+    held = np.isin(elements.index, np.flatnonzero((off < (1, 2, 2)).all(axis=-1)))
+    assert held.any()
+    assert (elements.interface.material[held] > 0).all()
 
 
 CENTERS = st.tuples(*[st.floats(4.5, 5.5)] * 3)
@@ -104,46 +183,46 @@ OBSTACLES = st.one_of(
 
 @settings(max_examples=15)
 @given(OBSTACLES)
-def test_bonds_are_symmetric_with_an_energy_and_light_rows(obstacle: Obstacle) -> None:
-    medium, cells = assembled(obstacle)
+def test_stiffness_is_symmetric_positive_and_its_rows_are_bounded(obstacle: Obstacle) -> None:
+    elements, cells = assembled(obstacle)
     assume(len(cells.index))
-    matrix = energy(medium, cells)
+    matrix = stiffness(elements, cells)
     size = np.abs(matrix).max()
     # rounding of sums of terms up to the contrast apart
     assert np.abs(matrix - matrix.T).max() < 1e-11 * size
     assert np.linalg.eigvalsh(matrix).min() > -1e-11 * size
     # no row sums to much more than the stencil's in the fastest material: Gershgorin
-    fastest = (1 / (medium.materials.density * medium.materials.mass)).max()
+    fastest = (1 / (elements.materials.density * elements.materials.mass)).max()
     assert np.abs(cells.weight).sum(axis=1).max() < 1.1 * STENCIL.total * fastest * (1 + 1e-9)
     assert (cells.mass > 0).all()
 
 
 @settings(max_examples=10)
 @given(CENTERS, st.floats(1.5, 2.5), st.sampled_from([0.1, 10.0, 77.0, 1e5]))
-def test_sharing_moves_mass_and_adds_none(center: tuple[float, ...], radius: float, ratio: float) -> None:
-    medium, cells = assembled(sphere(center, radius, ratio))
-    of_elements = medium.materials.mass[medium.number].ravel()
-    of_elements[medium.cut] = medium.elements.mass.sum(axis=1)
+def test_mass_transfer_conserves_mass(center: tuple[float, ...], radius: float, ratio: float) -> None:
+    elements, cells = assembled(sphere(center, radius, ratio))
+    of_elements = elements.materials.mass[elements.material].ravel()
+    of_elements[elements.index] = elements.interface.mass.sum(axis=1)
     # of the elements without the outermost half cell, which is air; rounding of the largest mass
-    whole = of_elements.sum() + math.prod(GRID.shape) - math.prod(medium.number.shape)
-    assert mass_of_all(medium, cells).sum() == pytest.approx(whole, rel=1e-9)
+    whole = of_elements.sum() + math.prod(GRID.shape) - math.prod(elements.material.shape)
+    assert mass_of_all(elements, cells).sum() == pytest.approx(whole, rel=1e-9)
 
 
 @pytest.mark.parametrize("obstacles", [(), (box((2.7, 3, 3.4), (7, 7, 7.1), 1.0),)])
-def test_air_has_no_heterogeneous_cells_whatever_it_is_called(obstacles: tuple[Obstacle, ...]) -> None:
+def test_obstacles_of_air_have_no_heterogeneous_cells(obstacles: tuple[Obstacle, ...]) -> None:
     _, cells = assembled(*obstacles)
     assert len(cells.index) == len(cells.sound_hard) == 0
 
 
-def test_a_heavy_interior_of_one_material_is_swept_as_air_is() -> None:
-    # its bonds are all alike: only the surface differs (same sound speed)
+def test_the_interior_of_a_dense_obstacle_has_the_stencil_of_air() -> None:
+    # same sound speed: only the surface has other stencil rows
     _, cells = assembled(box((2, 2, 2), (8, 8, 8), 77.0))
     places = np.stack(np.unravel_index(cells.index, GRID.shape), axis=-1) - GRID.first
     assert len(cells.index) == 8**3 - 4**3
     assert (np.abs(places - 4.5).max(axis=1) >= 2.5).all()
 
 
-def test_a_face_between_two_cells_has_bonds_in_series() -> None:
+def test_coupling_across_a_face_half_way_is_in_series() -> None:
     """Half the way is in air: 2 / (1 + ratio)."""
     ratio = 77.0
     _, cells = assembled(box((4, -20, -20), (20, 20, 20), ratio))
@@ -151,37 +230,33 @@ def test_a_face_between_two_cells_has_bonds_in_series() -> None:
     row = np.searchsorted(cells.index, middle)
     across = cells.mass[row] * cells.weight[row].reshape(3, 3, 3)[2].sum()
     assert across == pytest.approx(2 / (1 + ratio), rel=1e-6)  # obstacles are 1e-9 cells larger
-    # of the air's mass the light cells behind the face ask for some: 0.3 %
+    # the light cells behind the face take 0.3 % of the air's mass
     assert cells.mass[row] == pytest.approx(1, abs=5e-3)
 
 
-def test_rigid_cells_are_closed() -> None:
+def test_no_coupling_leads_to_sound_hard_cells() -> None:
     _, cells = assembled(sphere((5, 5, 5), 2.6, None))
     centers = np.stack(np.meshgrid(*GRID.centers, indexing="ij"), axis=-1).reshape(-1, 3)
     depth = 2.6 - 1e3 * np.linalg.norm(centers - 5e-3, axis=1)
     assert (depth[cells.sound_hard] > 0).all()
-    # sound enters a cell whose elements hold some air, whose diagonal is at most sqrt(3) long
+    # a cell farther inside than the diagonal of an element has no air around it
     assert np.isin(np.flatnonzero(depth > math.sqrt(3)), cells.sound_hard).all()
-    closed = np.isin(cells.index, cells.sound_hard)
-    assert not cells.weight[closed].any()
+    assert not np.isin(cells.index, cells.sound_hard).any()
     towards = cells.index[:, None] + np.array(OFFSETS) @ STRIDES
     assert not cells.weight[np.isin(towards, cells.sound_hard)].any()
 
 
-def test_a_rigid_plate_thinner_than_a_cell_is_tight() -> None:
+def test_a_sound_hard_plate_thinner_than_a_cell_transmits_nothing() -> None:
     """Faces between the cells: nothing crosses it."""
     _, cells = assembled(box((4.1, -20, -20), (4.9, 20, 20), None))
     middle = (GRID.first + np.array((3, 5, 5))) @ STRIDES
     weight = cells.weight[np.searchsorted(cells.index, middle)].reshape(3, 3, 3)
-    assert weight[2].sum() < 1e-4 * weight[0].sum()  # the density that stands for rigid is 1e5
+    assert weight[2].sum() < 1e-4 * weight[0].sum()  # SOUND_HARD_DENSITY is 1e5
 
 
 def test_two_halves_of_a_box_are_the_box() -> None:
-    """Touching in a plane of cell centres or of faces: nothing is left of the joint.
-
-    But for the outermost two cells, of which the one shares its mass with the other.
-    """
-    for joint in (5.0, 5.5):
+    """Also where they touch in a plane of cell centres; the outermost two cells exchange mass."""
+    for joint in (5.0, 5.2, 5.5):
         halves = box((2, 2, 2), (joint, 8, 8), 77.0), box((joint, 2, 2), (8, 8, 8), 77.0)
         _, cells = assembled(*halves)
         places = np.stack(np.unravel_index(cells.index, GRID.shape), axis=-1) - GRID.first
@@ -226,16 +301,12 @@ def _duct_modes(a: float, b: float, z1: float, z2: float) -> np.ndarray:
 
 @settings(max_examples=40)
 @given(st.lists(st.floats(-6, 0), min_size=28, max_size=28), st.integers(1, 254))
-def test_condensed_elements_keep_their_energy_positive(exponents: list[float], gone: int) -> None:
-    """Bonds of all sizes, as where three materials meet: no pressure may have an energy below zero."""
-    bonds = 10.0 ** np.array(exponents)[None]
-    number, cut = np.zeros((3, 3, 3), np.int16), np.array([13])
-    elements = InterfaceElements(bonds, np.full((1, 8), 0.1), np.zeros((1, 8), np.int64))
-    medium = Elements(Materials(np.ones(1), np.ones(1)), np.zeros(1, bool), number, cut, elements)
-    closed = np.zeros((4, 4, 4), bool)
+def test_condensation_keeps_the_energy_positive(exponents: list[float], gone: int) -> None:
+    """Coupling of all sizes, as where three materials meet."""
+    coupling = 10.0 ** np.array(exponents)[None]
+    interface = InterfaceElements(coupling, np.full((1, 8), 0.1), np.zeros((1, 8), np.int64))
     out = np.array([gone >> vertex & 1 for vertex in range(8)], bool)
-    closed[tuple((VERTICES[out] + 1).T)] = True
-    matrix = stiffness_matrix(_condensed(medium, closed.ravel(), (4, 4, 4)).coupling)[0]
+    matrix = stiffness_matrix(condensed(interface, out[None]).coupling)[0]
     # rounding of the elimination
-    assert np.linalg.eigvalsh(matrix).min() > -1e-9 * bonds.max()
+    assert np.linalg.eigvalsh(matrix).min() > -1e-9 * coupling.max()
     assert not matrix[out].any()

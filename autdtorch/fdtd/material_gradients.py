@@ -1,0 +1,212 @@
+"""Heterogeneous cells that are differentiable by materials: of obstacles, or of maps of the domain.
+
+For obstacles the derivatives are central differences of the whole assembly. Maps are differentiated by
+autograd. On a map the coupling of two cells has both densities in series, 2 / (rho_i + rho_j), and a cell the
+mass 1 / (rho_i f_i), with density and speed factor f as in `assembly/elements.py`. Uniform maps give the
+stencil rows of an obstacle of that material; surfaces are staircases half-way between two cells.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from autdtorch.fdtd.assembly.elements import elements_of
+from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells
+from autdtorch.fdtd.grid import Grid, domain_extent
+from autdtorch.fdtd.kernels.contract import Sources
+from autdtorch.fdtd.region import Fluid, Region
+from autdtorch.fdtd.stencil import OFFSETS, Stencil
+from autdtorch.fdtd.stepping import Assembly, air_stencil, assembly_of
+from autdtorch.utils.arrays import Array, Index
+from autdtorch.utils.validation import fluid
+
+_STEP = 1e-4
+"""Relative step of the central differences: truncation and rounding are about 1e-8."""
+
+_RIM = 2
+"""Cells of air around the maps: the first depends on them, the second is its neighbour."""
+
+
+@dataclass(frozen=True)
+class DifferentiableCells:
+    """Heterogeneous cells and their differentiable properties.
+
+    Attributes:
+        heterogeneous: the cells.
+        weight: their stencil rows (n, 27), differentiable.
+        mass: their mass (n,), differentiable.
+    """
+
+    heterogeneous: HeterogeneousCells
+    weight: torch.Tensor
+    mass: torch.Tensor
+
+    def assembly(self, grid: Grid, region: Region, dtype: torch.dtype, time_step: float | None) -> Assembly:
+        """Return an assembly that is differentiable by its stencil rows; see `assemble_on`."""
+        stencil = air_stencil(grid, region)
+        assembly = assembly_of(grid, stencil, self.heterogeneous, region.frequency, dtype, time_step)
+        coefficients = assembly.coefficients
+        weight = (coefficients.face / stencil.face * self.weight).to(dtype)
+        return replace(assembly, coefficients=replace(coefficients, heterogeneous_weight=weight))
+
+    def driven(self, sources: Sources) -> Sources:
+        """Return the assembly's sources, differentiable also by the mass of the cells they are in."""
+        _, place, own = np.intersect1d(self.heterogeneous.index, sources.index.numpy(), return_indices=True)
+        share = torch.ones(len(sources.index), dtype=self.mass.dtype, device="cpu")
+        share[own] = torch.from_numpy(self.heterogeneous.mass[place]) / self.mass[place]
+        return Sources(sources.index, share.to(sources.force)[:, None] * sources.force)
+
+
+def cells_of_obstacles(
+    region: Region, grid: Grid, density: torch.Tensor | None = None, sound_speed: torch.Tensor | None = None
+) -> DifferentiableCells:
+    """Return the heterogeneous cells of a region's K bodies, differentiable by their materials.
+
+    Args:
+        region: gives everything that is not given here.
+        grid: the grid.
+        density: (K,) [kg/m^3]; values of sound-hard bodies are ignored.
+        sound_speed: (K,) [m/s], likewise.
+
+    Raises:
+        ValueError: a value is out of range, or a differentiated body reaches into the boundary layers.
+    """
+    stencil = air_stencil(grid, region)
+    given = {"density": density, "sound_speed": sound_speed}
+    base = _assembled(region, grid, stencil, given)
+    differences = list(_differences(region, grid, stencil, given))
+    every = [base.index, *(cells.index for _, _, sides in differences for cells in sides)]
+    index = np.unique(np.concatenate(every))
+    weight, mass = (torch.from_numpy(part) for part in _on(index, base, stencil))
+    cells = HeterogeneousCells(index, weight.numpy(), mass.numpy(), base.sound_hard, base.shell)
+    for value, step, sides in differences:
+        ahead, behind = (_on(index, side, stencil) for side in sides)
+        rows, masses = ((more - less) / (2 * step) for more, less in zip(ahead, behind, strict=True))
+        changed = np.flatnonzero(rows.any(axis=1) | (masses != 0))
+        if not grid.inside(index[changed]).all():
+            raise ValueError(
+                "density, sound_speed: an obstacle that is differentiated reaches into the boundary layers; "
+                "must end inside the domain"
+            )
+        places, shift = torch.from_numpy(changed), value - value.detach()
+        weight = weight.index_add(0, places, shift * torch.from_numpy(rows[changed]))
+        mass = mass.index_add(0, places, shift * torch.from_numpy(masses[changed]))
+    return DifferentiableCells(cells, weight, mass)
+
+
+def _differences(
+    region: Region, grid: Grid, stencil: Stencil, given: dict[str, torch.Tensor | None]
+) -> Iterator[tuple[torch.Tensor, float, list[HeterogeneousCells]]]:
+    """Yield each number that requires gradients, a step, and the cells for the number plus and minus it."""
+    for name, values in given.items():
+        if values is None or not values.requires_grad:
+            continue
+        for number, body in enumerate(region.bodies):
+            if body.fluid is None:
+                continue
+            step = _STEP * float(values.detach()[number])
+            sides = []
+            for way in (1, -1):
+                moved = values.detach().clone()
+                moved[number] += way * step
+                sides.append(_assembled(region, grid, stencil, given | {name: moved}))
+            yield values[number], step, sides
+
+
+def _assembled(
+    region: Region, grid: Grid, stencil: Stencil, given: dict[str, torch.Tensor | None]
+) -> HeterogeneousCells:
+    """Assemble a region whose K bodies have the densities (K,) and sound speeds (K,) given."""
+    bodies = list(region.bodies)
+    for number, body in enumerate(bodies):
+        if body.fluid is not None:
+            density, sound_speed = (
+                own if values is None else float(values[number])
+                for own, values in zip(body.fluid, given.values(), strict=True)
+            )
+            bodies[number] = replace(body, fluid=Fluid(*fluid(f"obstacles[{number}]", density, sound_speed)))
+    changed = replace(region, bodies=tuple(bodies))
+    return heterogeneous_cells(elements_of(changed, grid, stencil), stencil)
+
+
+def _on(index: Index, cells: HeterogeneousCells, stencil: Stencil) -> tuple[Array, Array]:
+    """Return stencil rows (n, 27) and mass (n,) of `index` (n,), which holds `cells` and cells of air."""
+    weight, mass = np.tile(stencil.weights, (len(index), 1)), np.ones(len(index))
+    place = np.searchsorted(index, cells.index)
+    weight[place], mass[place] = cells.weight, cells.mass
+    return weight, mass
+
+
+def domain_cells(region: Region, grid: Grid) -> tuple[slice, ...]:
+    """Return the cells of the domain along each axis, which maps are given for."""
+    margin = domain_extent(region, grid.spacing).margin
+    return tuple(slice(a + margin, b - margin) for a, b in zip(grid.first, grid.last, strict=True))
+
+
+def cells_of_maps(
+    region: Region, grid: Grid, density: torch.Tensor | None = None, sound_speed: torch.Tensor | None = None
+) -> DifferentiableCells:
+    """Return the heterogeneous cells of maps (nx, ny, nz) of density [kg/m^3] and sound speed [m/s].
+
+    Raises:
+        ValueError: the shape of a map is not that of the domain's cells.
+    """
+    cells = domain_cells(region, grid)
+    shape = tuple(part.stop - part.start for part in cells)
+    for name, given in (("density", density), ("sound_speed", sound_speed)):
+        if given is not None and given.shape != shape:
+            raise ValueError(f"{name}: shape {tuple(given.shape)}; must be {shape}, the cells of the domain")
+    stencil = air_stencil(grid, region)
+    air = torch.ones(shape, dtype=torch.float64, device="cpu")
+    relative = air if density is None else density / region.fluid.density
+    speed = air if sound_speed is None else sound_speed / region.fluid.sound_speed
+    relative = relative / _flow_factor(stencil, speed)
+    fluidity = relative * _speed_factor(stencil, speed)
+    weight, mass = _rows(stencil, relative, fluidity)
+    axes = [np.arange(part.start - 1, part.stop + 1) for part in cells]
+    index = np.ravel_multi_index(np.meshgrid(*axes, indexing="ij"), grid.shape).ravel()
+    nothing = np.zeros(0, np.int64)
+    values = weight.detach().numpy(), mass.detach().numpy()
+    return DifferentiableCells(HeterogeneousCells(index, *values, nothing, nothing), weight, mass)
+
+
+def _flow_factor(stencil: Stencil, speed_ratio: torch.Tensor) -> torch.Tensor:
+    """Return `elements.flow_factor` for each cell."""
+    own = stencil.kappa / 2 / speed_ratio
+    return math.tan(stencil.kappa / 2) / (stencil.kappa / 2) * own / torch.tan(own)
+
+
+def _speed_factor(stencil: Stencil, speed_ratio: torch.Tensor) -> torch.Tensor:
+    """Return `elements.speed_factor` for each cell: cos(k . n) averages to sin(|k n|) / |k n|."""
+    wave = complex(stencil.kappa, stencil.eta) / speed_ratio
+    symbol = torch.zeros_like(speed_ratio)
+    for count, weight, length in (
+        (6, stencil.face, 1.0), (12, stencil.edge, math.sqrt(2)), (8, stencil.corner, math.sqrt(3))
+    ):  # fmt: skip
+        symbol = symbol + count * weight * (1 - torch.sin(length * wave) / (length * wave)).real
+    return stencil.symbol / symbol
+
+
+def _rows(
+    stencil: Stencil, density: torch.Tensor, fluidity: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return rows and mass of the mapped cells and of those around them; `fluidity` is 1 over the mass."""
+    density, fluidity = (
+        torch.nn.functional.pad(part, (_RIM,) * 6, value=1.0) for part in (density, fluidity)
+    )
+    own = (slice(1, -1),) * 3
+    weight = [
+        2 * coupling * fluidity[own] / (density[own] + density[_shifted(offset)])
+        for coupling, offset in zip(stencil.weights, OFFSETS, strict=True)
+    ]
+    return torch.stack(weight, dim=-1).reshape(-1, 27), (1 / fluidity[own]).reshape(-1)
+
+
+def _shifted(offset: tuple[int, int, int]) -> tuple[slice, ...]:
+    """Return the slices of the neighbours at an offset, of all cells but those on the rim."""
+    return tuple(slice(1 + step, step - 1 or None) for step in offset)
