@@ -41,7 +41,7 @@ NOT_CALLED_BY_USERS = {
     *("Estimate", "Evaluation", "EvaluationLog", "FocusMetrics", "Preflight", "Run", "Solution", "Sweep"),
     "Waveform",
     *("Adapter", "Device", "Dialect", "Obstacle", "OpenMPDBoard", "SimulatedPropagator", "UsbtmcPort"),
-    *("BoxPropagator", "FullPropagator", "EmulatedBench.receive", "EmulatedScope.execute"),
+    *("EmulatedBench.receive", "EmulatedScope.execute"),
     *("EmulatedScope.plug_into", "Oscilloscope.capture", "Oscilloscope.set_up"),
     *("Device.pack", "lock_log", "open_autd3"),  # the one only makes a context, the other asks the network
 }
@@ -238,7 +238,7 @@ ARGUMENTS: dict[str, Any] = {
 
 #: Where a name means something else.
 OTHERS: dict[str, Any] = {
-    "BoxPropagator.field.drive": torch.stack([DRIVE, DRIVE]),
+    "SimulatedPropagator.field.drive": torch.stack([DRIVE, DRIVE]),
     "Dead.transducers": [1],
     "Drift.sensor": 0.1,
     "EmulatedScope.noise": 0.0,
@@ -286,8 +286,7 @@ OTHERS: dict[str, Any] = {
 
 #: Of classes that users do not make themselves.
 INSTANCES = {
-    "BoxPropagator": Made(lambda _: at.make_propagator(SCENE, "box", 2e-3, 0.5, max_periods=6)),
-    "FullPropagator": Made(lambda _: at.make_propagator(SCENE, "full", 2e-3, 0.5, max_periods=6)),
+    "SimulatedPropagator": Made(lambda _: at.make_propagator(SCENE, "box", 2e-3, 0.5, max_periods=6)),
     "OpenMPDBoard": Made(lambda folder: at.OpenMPDBoard.load(board_file(folder))),
 }
 

@@ -1,10 +1,15 @@
-"""What simulations take, counted from the geometry alone."""
+"""The cost of a grid and of the heterogeneous cells on it, from the geometry alone.
+
+The unit of time is one step of one cell of air. The constants were fitted to transfer matrices of boxes and
+domains at 0.6 to 2 mm.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from autdtorch.fdtd.grid import (
     MAX_CELLS_PER_WAVELENGTH,
@@ -12,35 +17,33 @@ from autdtorch.fdtd.grid import (
     Extent,
     layer_cells,
 )
+from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.steady_state import fewest_periods
 from autdtorch.fdtd.stencil import tuned_stencil
-from autdtorch.propagators.scene_region import region_of
-from autdtorch.scene.scene import Scene
-
-_LAYER = 4.0
-"""What a step of a cell in a boundary layer costs, in steps of a cell outside: fits the rates of boxes and
-domains in docs/performance.md, all on one core."""
-
-_BESIDE = 2_000_000
-"""What a run in a box costs beside its steps, in steps of a cell: sums over Green's function."""
-
-_PAIR = 1.0
-"""What a term of a sum over Green's function costs, in steps of a cell: 6 ns and 2 to 8 ns on one core."""
+from autdtorch.scene.obstacles import Mesh
+from autdtorch.utils.arrays import Array
 
 USUAL_PERIODS = 1.7
-"""Periods of a usual run among obstacles over the fewest: 1.0 to 3.5, by how long they ring."""
+"""Periods of a usual run among obstacles, relative to the fewest; 1.0 to 3.5 depending on the resonances."""
+
+_LAYER = 4.0
+"""Time of a step of a cell in a boundary layer; fits the rates in docs/performance.md on one core."""
+
+_BESIDE_RIGID, _BESIDE_FLUID, _SHARE_INSIDE = 1.5, 2.0, 0.5
+"""Heterogeneous cells for each area of a cell of a rigid or fluid surface; their share of the cuboid around
+an obstacle of another sound speed."""
 
 
 @dataclass(frozen=True)
 class GridCost:
-    """What a run on a grid takes, at least. Cavities that ring take more steps, on any grid.
+    """The size of a grid and the fewest steps of a run on it.
 
     Attributes:
         interior: cells per axis inside the boundary layer.
-        shape: of the whole array, boundary layers included.
-        steps: of a run.
-        steps_per_period: time steps a period of the drive.
+        shape: cells per axis, boundary layers included.
+        steps: steps of a run without resonances.
+        steps_per_period: time steps in a period of the drive.
     """
 
     interior: tuple[int, int, int]
@@ -50,59 +53,94 @@ class GridCost:
 
     @property
     def cells(self) -> int:
-        """Cells of the whole array."""
+        """Number of cells, boundary layers included."""
         return math.prod(self.shape)
 
     @property
+    def scattering(self) -> int:
+        """Cells of a box in and next to its obstacles, where an incident field acts."""
+        return self._inner(8)
+
+    @property
     def radiating(self) -> int:
-        """Cells of a box that radiate, and whose phasors a run keeps."""
-        return _shrunk(self, 4) - _shrunk(self, 8)
+        """Cells of the Huygens surface of a box, whose phasors a run keeps."""
+        return self._inner(4) - self._inner(8)
 
     @property
     def work(self) -> float:
-        """Cost of the steps, in steps of a cell outside the layers."""
+        """Time of the steps of a run."""
         return self.steps * (_LAYER * self.cells + (1 - _LAYER) * math.prod(self.interior))
 
+    def _inner(self, cells: int) -> int:
+        return math.prod(max(0, length - cells) for length in self.interior)
 
-def grid_cost(scene: Scene, extent: Extent, spacing: float) -> GridCost:
-    """What a run takes on a grid of `spacing` [m] over an extent of a scene."""
+
+def grid_cost(region: Region, extent: Extent, spacing: float) -> GridCost:
+    """Return the cost of a grid of `spacing` [m] over an extent of a region."""
     finest, coarsest = (
-        scene.wavelength / cells for cells in (MAX_CELLS_PER_WAVELENGTH, MIN_CELLS_PER_WAVELENGTH)
+        region.wavelength / cells for cells in (MAX_CELLS_PER_WAVELENGTH, MIN_CELLS_PER_WAVELENGTH)
     )
     spacing = max(finest, min(spacing, coarsest))  # others are refused later
-    kappa = scene.wavenumber * spacing
+    kappa = region.wavenumber * spacing
     interior = x, y, z = extent.interior(spacing)
     rim = layer_cells(kappa) + 1
-    stencil = tuned_stencil(kappa, scene.attenuation * spacing)
-    periods = fewest_periods(spacing * math.hypot(*interior) / scene.wavelength)
-    fastest = max(region_of(scene).sound_speeds.values()) / scene.medium.sound_speed
+    stencil = tuned_stencil(kappa, region.attenuation * spacing)
+    periods = fewest_periods(spacing * math.hypot(*interior) / region.wavelength)
+    fastest = max(region.sound_speeds.values()) / region.fluid.sound_speed
     steps_per_period = fewest_steps(stencil, stencil.largest_symbol * fastest**2)
     shape = x + 2 * rim, y + 2 * rim, z + 2 * rim
     return GridCost(interior, shape, math.ceil(periods * steps_per_period), steps_per_period)
 
 
-def most_runs(scene: Scene) -> int:
-    """Return the simulations of the control points' transfer matrix, symmetries left out."""
-    return min(len(scene.control_points), len(scene.array))
+@dataclass(frozen=True)
+class Heterogeneity:
+    """Estimated numbers of cells and elements that are not uniform air, on all grids of a scene.
 
-
-def full_cost(grid: GridCost, runs: int) -> float:
-    """Cost of runs on a domain, in steps of a cell."""
-    return runs * grid.work
-
-
-def box_cost(grids: Sequence[GridCost], passes: int, runs: int) -> float:
-    """Cost of runs in boxes, each simulated in `passes`, in steps of a cell.
-
-    Between two passes the boxes hear each other: from the cells that radiate, at those in and next to an
-    obstacle, for all runs at once.
+    Attributes:
+        cut: elements that surfaces cut.
+        cells: heterogeneous cells: beside surfaces, and inside another medium.
+        columns: elements that surfaces cut in the boundary layers.
+        meshed: heterogeneous cells at meshes.
     """
-    steps = sum(grid.work + _BESIDE for grid in grids)
-    radiating = [grid.radiating for grid in grids]
-    heard = [_shrunk(grid, 8) for grid in grids]
-    pairs = sum(radiating) * sum(heard) - sum(map(math.prod, zip(radiating, heard, strict=True)))
-    return runs * passes * steps + (passes - 1) * _PAIR * pairs
+
+    cut: float
+    cells: float
+    columns: float
+    meshed: float
 
 
-def _shrunk(grid: GridCost, cells: int) -> int:
-    return math.prod(max(0, length - cells) for length in grid.interior)
+def heterogeneity(region: Region, spacing: float, whole_domain: bool) -> Heterogeneity:
+    """Count what is not uniform air on cells of `spacing` [m].
+
+    Args:
+        region: the region.
+        spacing: edge of a cell [m].
+        whole_domain: whether the grid is that of the domain, whose boundary layers continue the obstacles, or
+            boxes that hold all obstacles.
+    """
+    inner = outer = np.array([[-np.inf] * 3, [np.inf] * 3])
+    if whole_domain:
+        inner = np.array(region.domain)
+        outer = inner + spacing * layer_cells(region.wavenumber * spacing) * np.array([[-1.0], [1.0]])
+    cut = cells = columns = meshed = 0.0
+    for body in region.bodies:
+        vertices, triangles = (part.numpy() for part in body.shape.surface())
+        doubled = _doubled_areas(np.clip(vertices, *inner)[triangles])
+        continued = _doubled_areas(np.clip(vertices, *outer)[triangles])
+        area = float(np.linalg.norm(doubled, axis=1).sum()) / 2
+        # a plane of normal n cuts |nx| + |ny| + |nz| elements for each area of a cell
+        cut += float(np.abs(doubled).sum()) / 2 / spacing**2
+        columns += (float(np.linalg.norm(continued, axis=1).sum()) / 2 - area) / spacing**2
+        beside = (_BESIDE_FLUID if body.fluid else _BESIDE_RIGID) * area / spacing**2
+        cells += beside
+        meshed += beside if isinstance(body.shape, Mesh) else 0.0
+        if body.fluid and body.fluid.sound_speed != region.fluid.sound_speed:
+            box = np.clip([body.shape.lower, body.shape.upper], *inner)
+            cells += _SHARE_INSIDE * float(np.prod(box[1] - box[0])) / spacing**3
+    return Heterogeneity(cut, cells, columns, meshed)
+
+
+def _doubled_areas(triangles: Array) -> Array:
+    """Normals (T, 3) of triangles (T, 3, 3), twice as long as their areas."""
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    return np.asarray(np.cross(b - a, c - a))

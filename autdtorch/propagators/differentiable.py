@@ -18,8 +18,8 @@ from autdtorch.fdtd.material_gradients import (
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import block_of, fewest_periods
 from autdtorch.fdtd.stepping import Assembly, drive_dft, drive_signal
+from autdtorch.propagators.backend import available_kernel, make_kernel, precision_of
 from autdtorch.propagators.scene_region import region_of, warn_of_ending_walls
-from autdtorch.propagators.stepper import KERNELS, make_kernel, precision_of
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene, require_inside
 from autdtorch.utils.validation import (
@@ -30,7 +30,6 @@ from autdtorch.utils.validation import (
     positive,
     real_tensor,
     require_kind,
-    require_one_of,
 )
 
 
@@ -77,8 +76,7 @@ def differentiable_field(
             obstacle that is differentiated and not clear of the boundary layers.
     """
     require_kind("scene", scene, Scene)
-    require_one_of("kernel", kernel, KERNELS)
-    precision = precision_of(dtype)
+    kernel, precision = available_kernel(kernel), precision_of(dtype)
     drive = validate_drive(drive, len(scene.array))
     targets = scene.control_points if points is None else points_tensor("points", points).cpu()
     require_inside(scene.domain, "points", targets)

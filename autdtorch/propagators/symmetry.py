@@ -1,9 +1,9 @@
-"""Mirror images: which simulations stand for others.
+"""Symmetries of a scene on its grid, and the runs that they make unnecessary.
 
-A symmetry maps a scene on its grid onto itself: cells onto cells with the same rows, transducers onto
-transducers. It is one of the 48 signed permutations of the axes about the grid's centre. The rows hold all
-that obstacles, their order, the domain and the boundary layers do to sound, so nothing but them is compared,
-and no kind of obstacle needs to know its symmetries. With S any of them, G[p, m] = G[S p, S m].
+A symmetry maps heterogeneous cells onto cells with equal stencil rows, and transducers onto transducers. It
+is one of the 48 signed permutations of the axes about the grid's centre. Stencil rows contain all effects of
+obstacles, their order, the domain and the boundary layers, so only rows are compared. For any symmetry S the
+transfer matrix satisfies G[p, m] = G[S p, S m].
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from autdtorch.scene.arrays import Nodes
 from autdtorch.utils.arrays import Array, Index
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
-_ALIKE = 1e-6
-"""Rows that differ by less, relative to a face's weight, differ by rounding: as for places `LENGTH_TOLERANCE`
-apart on a grid of 1 mm."""
+_ROUNDING = 1e-6
+"""Largest difference of equal stencil rows, relative to the weight of a face: that of places
+`LENGTH_TOLERANCE` apart on a grid of 1 mm."""
 
 _NONE = -1
-"""Stands for the image of a point that is none of the points."""
+"""Index of the image of a point that is none of the points."""
 
 
 @dataclass(frozen=True, eq=False)
 class Symmetry:
-    """One that a scene on its grid has.
+    """A symmetry of a scene on its grid.
 
     Attributes:
         matrix: signed permutation (3, 3).
-        center: what it leaves where it is (3,) [m].
-        transducers: transducer m comes to lie on transducer transducers[m] (M,).
+        center: fixed point (3,) [m].
+        transducers: index (M,) of the transducer that each transducer is mapped to.
     """
 
     matrix: Index
@@ -47,81 +47,90 @@ class Symmetry:
     transducers: Index
 
     def images(self, points: torch.Tensor) -> Index:
-        """Which of the points (P, 3) [m] each one comes to lie on (P,), -1 where there is none."""
+        """Return the index (P,) of the point that each of the points (P, 3) [m] is mapped to, or -1."""
         if (self.matrix == np.eye(3)).all():
             return np.arange(len(points))
         return _matched(points[:, None].numpy(), np.ones(1), self.matrix, self.center)
 
 
 @dataclass(frozen=True)
-class Plan:
-    """Which rows of a transfer matrix are simulated from points, or which columns from transducers.
+class Orbits:
+    """Symmetry orbits of the sources of a transfer matrix: one run of a representative serves an orbit.
 
     Attributes:
-        backward: whether it is from points.
-        stands: for each of them (n,) the one that stands for it, itself or one before.
-        by: the symmetry that leads to that one (n,).
-        images: what each symmetry makes of the entries of a row or column (S, k).
+        from_points: whether the sources are the points (by reciprocity) or the transducers.
+        representative: index (n,) of the representative of each of n sources, the first of its orbit.
+        symmetry: index (n,) of the symmetry that maps each source to its representative.
+        images: index (S, k) of the receiver that each symmetry maps each of k receivers to.
     """
 
-    backward: bool
-    stands: Index
-    by: Index
+    from_points: bool
+    representative: Index
+    symmetry: Index
     images: Index
 
     @property
+    def representatives(self) -> Index:
+        """Indices (runs,) of the sources to simulate."""
+        return np.flatnonzero(self.representative == np.arange(len(self.representative)))
+
+    @property
     def runs(self) -> int:
-        """How many simulations that takes."""
-        return int((self.stands == np.arange(len(self.stands))).sum())
+        """Number of simulations."""
+        return len(self.representatives)
+
+    def expand(self, rows: torch.Tensor) -> torch.Tensor:
+        """Return rows (n, k), the pressure at k receivers, of all sources from those of representatives."""
+        place = np.searchsorted(self.representatives, self.representative)
+        return rows[torch.from_numpy(place)[:, None], torch.from_numpy(self.images[self.symmetry])]
 
 
-def backward_plan(points: torch.Tensor, symmetries: list[Symmetry]) -> Plan:
-    """Rows of points (P, 3) [m] by the fewest simulations from points."""
+def orbits_of_points(points: torch.Tensor, symmetries: Sequence[Symmetry]) -> Orbits:
+    """Return the orbits of points (P, 3) [m] as sources."""
     images = np.stack([symmetry.images(points) for symmetry in symmetries])
-    return Plan(True, *_standing(images), np.stack([symmetry.transducers for symmetry in symmetries]))
+    return Orbits(True, *_representatives(images), np.stack([each.transducers for each in symmetries]))
 
 
-def forward_plan(points: torch.Tensor, symmetries: list[Symmetry]) -> Plan:
-    """Columns of transducers by the fewest simulations from them: images of all points must be points."""
+def orbits_of_transducers(points: torch.Tensor, symmetries: Sequence[Symmetry]) -> Orbits:
+    """Return the orbits of transducers as sources, by the symmetries that map the points onto themselves."""
     both = [(symmetry.images(points), symmetry.transducers) for symmetry in symmetries]
     images, transducers = zip(*[(own, to) for own, to in both if (own != _NONE).all()], strict=True)
-    return Plan(False, *_standing(np.stack(transducers)), np.stack(images))
+    return Orbits(False, *_representatives(np.stack(transducers)), np.stack(images))
 
 
-def _standing(images: Index) -> tuple[Index, Index]:
-    """First image (n,) of each and the symmetry (n,) that leads there, from all images (S, n)."""
+def _representatives(images: Index) -> tuple[Index, Index]:
+    """First image (n,) of each source and the symmetry (n,) that maps to it, from all images (S, n)."""
     known = np.where(images == _NONE, images.shape[1], images)
     return known.min(axis=0), known.argmin(axis=0)
 
 
 def symmetries(assemblies: Sequence[Assembly], transducers: Nodes) -> list[Symmetry]:
-    """All symmetries of a scene on its grid, the identity first; of several grids that alone."""
+    """Return all symmetries of a scene on its grid, the identity first; only that on several grids."""
     assembly = assemblies[0]
-    grid, varying = assembly.grid, assembly.heterogeneous
+    grid, cells = assembly.grid, assembly.heterogeneous
     center = np.array(grid.origin) + grid.spacing * (np.array(grid.shape) - 1) / 2
-    alike = _ALIKE * assembly.stencil.face
     positions, weights = transducers.positions.numpy(), transducers.weights.numpy()
     found = [Symmetry(np.eye(3, dtype=np.int64), center, np.arange(len(positions)))]
     for matrix in itertools.islice(_signed_permutations(), 1, None if len(assemblies) == 1 else 1):
         images = _matched(positions, weights, matrix, center)
-        if (images != _NONE).all() and _maps_cells(varying, grid, matrix, alike):
+        if (images != _NONE).all() and _maps_cells(cells, grid, matrix, _ROUNDING * assembly.stencil.face):
             found.append(Symmetry(matrix, center, images))
     return found
 
 
 def _signed_permutations() -> Iterator[Index]:
-    """All 48 matrices (3, 3), the identity first."""
+    """Yield all 48 matrices (3, 3), the identity first."""
     for axes in itertools.permutations(range(3)):
         for signs in itertools.product((1, -1), repeat=3):
             yield np.diag(signs) @ np.eye(3, dtype=np.int64)[list(axes)]
 
 
 def _matched(groups: Array, weights: Array, matrix: Index, center: Array) -> Index:
-    """Which group of places (N, n, 3) [m] with weights (n,) the image of each one is (N,), -1 for none."""
+    """Map groups of places (N, n, 3) [m] with weights (n,); return the group (N,) of each image, or -1."""
     count = len(weights)
     places = (groups - center).reshape(-1, 3)
     gap, nearest = KDTree(places).query(places @ matrix.T, distance_upper_bound=LENGTH_TOLERANCE)
-    # what is not found is given the index one past the last
+    # a place without a match has the index one past the last
     group, node = np.divmod(np.where(np.isfinite(gap), nearest, 0), count)
     same = np.isfinite(gap) & (weights[node] == np.tile(weights, len(groups)))
     group, same = group.reshape(-1, count), same.reshape(-1, count)
@@ -129,26 +138,26 @@ def _matched(groups: Array, weights: Array, matrix: Index, center: Array) -> Ind
     return np.asarray(np.where(whole, group[:, 0], _NONE), np.int64)
 
 
-def _maps_cells(varying: HeterogeneousCells, grid: Grid, matrix: Index, alike: float) -> bool:
-    """Whether the cells that are not of air come to lie on such with the same rows and mass."""
+def _maps_cells(cells: HeterogeneousCells, grid: Grid, matrix: Index, rounding: float) -> bool:
+    """Return whether heterogeneous cells are mapped onto cells with equal rows and mass."""
     shape = np.array(grid.shape)
     if (np.abs(matrix) @ shape != shape).any():
         return False
 
-    def image(cells: Index) -> Index:
-        double = 2 * np.stack(np.unravel_index(cells, grid.shape), axis=-1) - (shape - 1)
+    def image(index: Index) -> Index:
+        double = 2 * np.stack(np.unravel_index(index, grid.shape), axis=-1) - (shape - 1)
         places = (double @ matrix.T + (shape - 1)) // 2
         return np.asarray(np.ravel_multi_index(tuple(places.T), grid.shape), np.int64)
 
-    for cells in (varying.sound_hard, varying.shell):
-        if not np.array_equal(np.sort(image(cells)), cells):
+    for hard in (cells.sound_hard, cells.shell):
+        if not np.array_equal(np.sort(image(hard)), hard):
             return False
-    images = image(varying.index)
+    images = image(cells.index)
     order = np.argsort(images)
-    if not np.array_equal(images[order], varying.index):
+    if not np.array_equal(images[order], cells.index):
         return False
-    if not np.allclose(varying.mass, varying.mass[order], rtol=_ALIKE, atol=0):
+    if not np.allclose(cells.mass, cells.mass[order], rtol=_ROUNDING, atol=0):
         return False
-    # the neighbour at an offset of the image is the image of the one at the offset turned back
+    # a neighbour of an image is the image of the neighbour at the offset mapped back
     turned = (np.array(OFFSETS) @ matrix + 1) @ (9, 3, 1)
-    return bool((np.abs(varying.weight - varying.weight[order][:, turned]) <= alike).all())
+    return bool((np.abs(cells.weight - cells.weight[order][:, turned]) <= rounding).all())

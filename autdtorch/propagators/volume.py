@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from autdtorch.propagators.base import Propagator
+from autdtorch.propagators.simulated import Propagator
 from autdtorch.scene.drive import validate_single_drive
 from autdtorch.utils.validation import ArrayLike, invalid, positive, require_kind
 

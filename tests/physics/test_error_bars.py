@@ -11,7 +11,7 @@ from small_scenes import AIR, relative_error, small_scene
 from autdtorch import analytic
 from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd.spacing import RATIO, coarsest_spacing, grid_error, second_spacing, spacing_for
-from autdtorch.propagators import FreeSpacePropagator, FullPropagator, make_propagator
+from autdtorch.propagators import FreeSpacePropagator, SimulatedPropagator, make_propagator
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.obstacles import Sphere
 
@@ -59,8 +59,8 @@ def test_a_tolerance_chooses_a_spacing_that_meets_it() -> None:
         make_propagator(small_scene((sphere,)), "full", None, tolerance=tolerance)
         for tolerance in (0.2, 0.06)
     )
-    assert isinstance(loose, FullPropagator)
-    assert isinstance(tight, FullPropagator)
+    assert isinstance(loose, SimulatedPropagator)
+    assert isinstance(tight, SimulatedPropagator)
     assert tight.spacing < loose.spacing <= coarsest_spacing(region_of(loose.scene))
     assert relative_error(tight.transfer_matrix(), exact) < 0.06
 

@@ -20,7 +20,7 @@ def test_cells_and_runs_are_those_of_the_simulation(method: str, spacing: float)
     told = at.estimate(scene, spacing, method=method)
     propagator = at.make_propagator(scene, method, spacing)
     propagator.transfer_matrix()
-    taken = [assembly.grid.shape for assembly in propagator._assemblies]  # type: ignore[union-attr]
+    taken = [assembly.grid.shape for assembly in propagator._simulation.assemblies]  # type: ignore[union-attr]
     cells = sum(x * y * z for x, y, z in taken)
     assert told.method == method
     # a grid may be placed so that an axis has a cell more

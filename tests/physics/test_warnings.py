@@ -10,7 +10,6 @@ import torch
 from small_scenes import AIR, CUBE, small_scene
 
 from autdtorch.propagators import (
-    BoxPropagator,
     SimulatedPropagator,
     SteadyStateWarning,
     differentiable_field,
@@ -55,9 +54,10 @@ def test_a_coarse_spacing_is_told_once_for_all_obstacles(
     method: str, extent: float, caplog: pytest.LogCaptureFixture
 ) -> None:
     propagator = simulated(of_two_speeds(extent), method, 2.5e-3)
-    if isinstance(propagator, BoxPropagator):
-        assert len(propagator._boxes) == 2  # of copies of the scene, which give no OverlapWarning either
+    if method == "box":
+        assert len(propagator._simulation.assemblies) == 2
     assert propagator._second.spacing < propagator.spacing
+    assert propagator._second.planned_runs
     (message,) = messages(caplog, "coarse")
     assert "2.5 mm" in message
     for where in ("the medium", "obstacle 1", "obstacle 2"):

@@ -19,6 +19,7 @@ AIR = small_scene()
 OBJECTIVE = at.SimulatedObjective(AIR, at.make_propagator(AIR))
 FREE = at.make_propagator(AIR)
 BOX = at.make_propagator(small_scene((CUBE,)), "box", 2e-3)
+assert BOX.planned_runs > 0  # its grid is assembled
 DRIVE = at.drive_from_phases(torch.zeros(4, dtype=torch.float64))
 WIDE = small_scene((at.Box((0.1, 0.1, 0.1), (0.09, 0.09, 0.09), rigid=True),), extent=0.2)
 

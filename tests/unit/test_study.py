@@ -18,7 +18,8 @@ from autdtorch.methods.gabs import GABS, gabs
 from autdtorch.methods.lssg import LSSG, lssg
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.simulated import Objective
-from autdtorch.propagators import FreeSpacePropagator, FullPropagator, Run, SteadyStateWarning
+from autdtorch.propagators import FreeSpacePropagator, Run, SteadyStateWarning
+from autdtorch.propagators.full import DomainSimulation
 from autdtorch.scene.arrays import Nodes
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.scene import Box, Scene
@@ -101,19 +102,18 @@ def test_a_scene_without_observation_plane_has_no_areas() -> None:
 
 def test_the_runs_of_a_simulation_are_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     def simulate(
-        self: FullPropagator,
-        origins: Sequence[Nodes],
+        self: DomainSimulation,
+        sources: Sequence[Nodes],
         strength: torch.Tensor,
-        targets: Nodes,
+        receivers: Nodes,
         stepped: Callable[[int], None],
-    ) -> torch.Tensor:
-        rows = []
-        for nodes, own in zip(origins, strength, strict=True):
-            self.runs.append(Run(7, 0.1, len(self.runs) < 3, 0.5))
-            rows.append(green(targets.positions[:, 0], nodes.positions[:, 0], self.scene.wavenumber) @ own)
-        return 4 * math.pi * torch.stack(rows)
+    ) -> tuple[torch.Tensor, list[Run]]:
+        rows, places = [], receivers.positions[:, 0]
+        for nodes, own in zip(sources, strength, strict=True):
+            rows.append(green(places, nodes.positions[:, 0], self.plan.scene.wavenumber) @ own)
+        return 4 * math.pi * torch.stack(rows), [Run(7, 0.1, len(rows) == 3, 0.5)] * len(rows)
 
-    monkeypatch.setattr(FullPropagator, "_simulate", simulate)
+    monkeypatch.setattr(DomainSimulation, "_simulate", simulate)
     solver = {"method": "full", "spacing": 2e-3, "tolerance": 0.2, "kernel": "reference"}
     with pytest.warns(SteadyStateWarning):
         result = run_study({"a": scene()}, METHODS, solver=solver).scenes["a"]

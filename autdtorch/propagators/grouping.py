@@ -1,0 +1,111 @@
+"""The grids of a simulation: the whole domain, or the boxes in which obstacles are grouped."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+
+from autdtorch.fdtd.grid import Extent, bodies_extent, domain_extent
+from autdtorch.fdtd.region import Region
+from autdtorch.propagators.cost import GridCost, grid_cost
+from autdtorch.utils.arrays import Array
+
+MOST_PASSES = 12
+"""Most passes of the multiple-scattering iteration between boxes; one box is cheaper than more."""
+
+_MOST_OBSTACLES = 64
+"""Most obstacles that are grouped; more share one box."""
+
+_BOX_RUN = 2_000_000
+"""Time of a run in a box beside its steps, for sums over Green's function, in steps of a cell."""
+
+_PAIR = 1.0
+"""Time of a term of a sum over Green's function, in steps of a cell: 6 ns and 2 to 8 ns on one core."""
+
+
+@dataclass(frozen=True)
+class Grouping:
+    """Grids and the obstacles on each.
+
+    Attributes:
+        groups: ascending indices of the obstacles on each grid.
+        grids: cost of a run on each grid.
+        passes: expected passes of the multiple-scattering iteration, in each of which every box is simulated.
+    """
+
+    groups: tuple[tuple[int, ...], ...]
+    grids: tuple[GridCost, ...]
+    passes: int
+
+    @property
+    def coupled_pairs(self) -> int:
+        """Pairs of a radiating cell of one box and a scattering cell of another."""
+        return sum(one.radiating * other.scattering for one, other in permutations(self.grids, 2))
+
+    def box_cost(self, runs: int) -> float:
+        """Return the time of runs in boxes, in steps of a cell; boxes are coupled for all runs at once."""
+        steps = sum(grid.work + _BOX_RUN for grid in self.grids)
+        return runs * self.passes * steps + (self.passes - 1) * _PAIR * self.coupled_pairs
+
+
+def whole_domain(region: Region, spacing: float) -> Grouping:
+    """Return one grid of `spacing` [m] over the domain."""
+    return _one_grid(region, domain_extent(region, spacing), spacing)
+
+
+def one_box(region: Region, spacing: float) -> Grouping:
+    """Return one box of `spacing` [m] for all obstacles."""
+    return _one_grid(region, bodies_extent(region.shapes), spacing)
+
+
+def cheapest_boxes(region: Region, spacing: float, tolerance: float, runs: int) -> Grouping:
+    """Return the cheapest boxes among those that arise from joining the nearest groups, pair after pair.
+
+    The interiors of boxes, with the air around their obstacles, do not overlap.
+    """
+    best = one_box(region, spacing)
+    if len(region.bodies) > _MOST_OBSTACLES:
+        return best
+    shapes = region.shapes
+    groups: list[tuple[int, ...]] = [(index,) for index in range(len(region.bodies))]
+    while len(groups) > 1:
+        extents = [bodies_extent([shapes[index] for index in group]) for group in groups]
+        gaps = _gaps(extents, spacing)
+        if gaps.min() > 0 and (passes := _expected_passes(extents, tolerance)) <= MOST_PASSES:
+            grids = tuple(grid_cost(region, extent, spacing) for extent in extents)
+            found = Grouping(tuple(groups), grids, passes)
+            if found.box_cost(runs) < best.box_cost(runs):
+                best = found
+        first, second = sorted(map(int, np.unravel_index(gaps.argmin(), gaps.shape)))
+        joined = tuple(sorted(groups[first] + groups.pop(second)))
+        groups[first] = joined
+    return best
+
+
+def _one_grid(region: Region, extent: Extent, spacing: float) -> Grouping:
+    return Grouping((tuple(range(len(region.bodies))),), (grid_cost(region, extent, spacing),), 1)
+
+
+def _gaps(extents: Sequence[Extent], spacing: float) -> Array:
+    """Distances (B, B) [m] of boxes' interiors, along the axis where it is largest; infinite to itself."""
+    margin = np.array([(extent.margin + 1) * spacing for extent in extents])  # one: for the grid's offset
+    lower = np.array([extent.lower for extent in extents]) - margin[:, None]
+    upper = np.array([extent.upper for extent in extents]) + margin[:, None]
+    above = lower[:, None] - upper[None]
+    gaps: Array = np.maximum(above, above.transpose(1, 0, 2)).max(axis=-1)
+    np.fill_diagonal(gaps, math.inf)
+    return gaps
+
+
+def _expected_passes(extents: Sequence[Extent], tolerance: float) -> int:
+    """Expected passes: a large body of radius a scatters a / 2d of an incident field to a distance d."""
+    lower, upper = (np.array([getattr(extent, end) for extent in extents]) for end in ("lower", "upper"))
+    middle, radius = (lower + upper) / 2, np.linalg.norm(upper - lower, axis=1) / 2
+    apart = np.linalg.norm(middle[:, None] - middle, axis=-1)
+    np.fill_diagonal(apart, math.inf)
+    share = float((radius / (2 * apart)).sum(axis=1).max())
+    return max(2, math.ceil(math.log(tolerance) / math.log(share))) if share < 1 else MOST_PASSES + 1

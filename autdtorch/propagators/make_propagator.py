@@ -1,0 +1,122 @@
+"""The choice and construction of a propagator for a scene."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from typing import Literal
+
+import torch
+
+from autdtorch.fdtd.grid import warn_if_coarse
+from autdtorch.fdtd.spacing import coarsest_spacing, spacing_for
+from autdtorch.propagators.cache import DiskCache
+from autdtorch.propagators.execute import execute, with_grid_error
+from autdtorch.propagators.free_space import FreeSpacePropagator
+from autdtorch.propagators.plan import Plan, plan
+from autdtorch.propagators.scene_region import warn_of_ending_walls
+from autdtorch.propagators.simulated import SimulatedPropagator
+from autdtorch.scene.scene import Scene
+from autdtorch.utils.validation import invalid, path_of
+
+logger = logging.getLogger(__name__)
+
+CACHE_VARIABLE = "AUTDTORCH_CACHE_DIR"
+
+
+def make_propagator(
+    scene: Scene,
+    method: str = "auto",
+    spacing: float | None = 1e-3,
+    tolerance: float = 2e-3,
+    *,
+    kernel: str = "auto",
+    dtype: str | torch.dtype = "float32",
+    max_periods: int = 600,
+    time_step: float | None = None,
+    cache: str | os.PathLike[str] | Literal[False] | None = None,
+) -> FreeSpacePropagator | SimulatedPropagator:
+    """Make the propagator of a scene. Nothing is simulated before its first use.
+
+    Args:
+        scene: the scene.
+        method: "free_space": exact, without obstacles. "full": FDTD on the whole domain. "box": FDTD of the
+            scattered field in a box around the obstacles, exact elsewhere, also outside the domain. Distant
+            obstacles get boxes of their own, coupled by a multiple-scattering iteration, where that is
+            cheaper. Obstacles are simulated as a whole, including parts outside the domain. "auto": free
+            space without obstacles, full where a wall continues through the boundary layer, box where other
+            obstacles leave the domain, otherwise the cheaper of box and full. The propagator's `method` is
+            the one chosen; the reason is logged at level DEBUG.
+        spacing: edge of a cell [m], at most a third of the wavelength. The error falls with it
+            (docs/numerics.md). None: the spacing is chosen from simulations on two coarse grids so that the
+            estimated error of the transfer matrix is below `tolerance`.
+        tolerance: relative error, in (0, 1): the distance to the steady state at which a simulation ends;
+            half of it where the spacing is chosen, as the other half is left to the grid.
+        kernel: "cpu" (numba), "cuda" (Triton, on an NVIDIA GPU), "reference" (torch, slow, readable), or
+            "auto" for the fastest available.
+        dtype: precision of the fields, float32 or float64.
+        max_periods: periods of the drive after which a simulation ends in any case, with a
+            `SteadyStateWarning`. Periods are stepped in blocks of a few; the last block is completed.
+        time_step: upper limit of the time step [s]; the step used is within 3 % of it. By default the
+            largest stable one.
+        cache: folder for simulated transfer matrices, which are used again for the same scene, points,
+            settings and version of this package. By default the environment variable AUTDTORCH_CACHE_DIR,
+            or no cache if it is not set; False: no cache. Several processes may share the folder.
+
+    Returns:
+        A propagator of the scene.
+
+    Raises:
+        ValueError: an argument is out of range, the kernel needs a package that is not installed, or the
+            simulation needs more memory than available.
+    """
+    planned = plan(
+        scene, method, spacing, tolerance,
+        kernel=kernel, dtype=dtype, max_periods=max_periods, time_step=time_step,
+    )  # fmt: skip
+    disk_cache = _disk_cache(cache)
+    if planned.method == "free_space":
+        return FreeSpacePropagator(scene)
+    if spacing is None:
+        planned = _at_chosen_spacing(planned, disk_cache)
+    planned.require_feasible()
+    propagator = SimulatedPropagator(planned, disk_cache)
+    if time_step is not None:
+        logger.debug("time step %.4g us", 1e6 * propagator.time_step)  # refuses one that is not stable
+    warn_if_coarse(planned.region.sound_speeds, scene.frequency, planned.spacing)
+    warn_of_ending_walls(scene)
+    return propagator
+
+
+def _at_chosen_spacing(pilot: Plan, cache: DiskCache | None) -> Plan:
+    """Return the plan whose grid error should be half the tolerance, from simulations on two coarse grids."""
+    tolerance = pilot.tolerance / 2
+    first = pilot.at(pilot.spacing, max(tolerance, 1e-3))
+    second = first.second
+    result = execute(first, cache=cache)
+    result = with_grid_error(result, execute(second, cache=cache), second.spacing > first.spacing)
+    error = result.error
+    if not math.isfinite(error):
+        accepted = f"too few to choose a spacing: at {pilot.spacing:.3g} m no run came near its steady state"
+        raise invalid("max_periods", pilot.max_periods, accepted)
+    spacing = min(spacing_for(tolerance, error, pilot.spacing), coarsest_spacing(pilot.region))
+    chosen = pilot.at(spacing, tolerance, pilot.time_step)
+    chosen.require_feasible("tolerance", pilot.tolerance)
+    logger.info(
+        "spacing %.3g mm: the error at %.3g mm is about %.2g", 1e3 * spacing, 1e3 * pilot.spacing, error
+    )
+    return chosen
+
+
+def _disk_cache(folder: str | os.PathLike[str] | Literal[False] | None) -> DiskCache | None:
+    name = "cache"
+    if folder is None:
+        name, folder = CACHE_VARIABLE, os.environ.get(CACHE_VARIABLE) or False
+    if folder is False:
+        return None
+    path = path_of(name, folder, "a folder, or False")
+    try:
+        return DiskCache(path)
+    except OSError as error:
+        raise invalid(name, str(path), f"must be a folder, or one that can be made ({error})") from error

@@ -1,0 +1,224 @@
+"""The propagator that simulates, and the protocol of all propagators."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import Literal, Protocol, overload, runtime_checkable
+
+import torch
+
+from autdtorch.analytic.green import PAIR_BYTES
+from autdtorch.propagators.cache import DiskCache
+from autdtorch.propagators.execute import execute, simulation_of, with_grid_error
+from autdtorch.propagators.plan import Plan
+from autdtorch.propagators.simulation import Run, TransferMatrix, single_nodes
+from autdtorch.scene.drive import validate_drive
+from autdtorch.scene.scene import Scene
+from autdtorch.utils.memory import require_memory
+from autdtorch.utils.threads import one_torch_thread
+from autdtorch.utils.validation import ArrayLike, boolean, points_grid
+
+logger = logging.getLogger(__name__)
+
+
+class SteadyStateWarning(UserWarning):
+    """A simulation ended before its steady state was reached."""
+
+
+@runtime_checkable
+class Propagator(Protocol):
+    """Computes the pressure that a scene's transducers cause at points.
+
+    Attributes:
+        scene: the scene it was made for.
+    """
+
+    scene: Scene
+
+    def transfer_matrix(self, points: ArrayLike | None = None) -> torch.Tensor:
+        """Return the pressure (P, M) [Pa], complex128, of unit drives at points (P, 3) [m]."""
+        ...
+
+    def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
+        """Return the pressure [Pa] of drives (..., M) at points: complex128 (..., P).
+
+        Args:
+            drive: (..., M) complex.
+            points: (P, 3) [m]; a grid such as (Nu, Nv, 3) gives (..., Nu, Nv).
+        """
+        ...
+
+
+class SimulatedPropagator:
+    """A propagator that simulates the steady state of the drive by FDTD.
+
+    Attributes:
+        scene: the scene it was made for.
+        method: "box" or "full".
+        spacing: edge of a cell [m].
+        tolerance: relative distance to the steady state at which a run ends.
+        max_periods: periods after which a run ends in any case, with a `SteadyStateWarning`.
+        runs: all simulations in order. A run in several boxes counts as one; symmetry images and loaded
+            matrices take none.
+    """
+
+    def __init__(self, plan: Plan, cache: DiskCache | None = None) -> None:
+        """Use `make_propagator`, which checks its arguments. Nothing is computed here."""
+        self.scene = plan.scene
+        self.method = plan.method
+        self.spacing = plan.spacing
+        self.tolerance = plan.tolerance
+        self.max_periods = plan.max_periods
+        self.runs: list[Run] = []
+        self._plan = plan
+        self._cache = cache
+        self._simulation = simulation_of(plan)
+        self._control: TransferMatrix | None = None
+        self._near_logged = False
+
+    def __repr__(self) -> str:
+        """Scene, settings and number of runs."""
+        return (
+            f"SimulatedPropagator(scene {self.scene.name!r}, {self.method}, "
+            f"spacing {1e3 * self.spacing:.4g} mm, tolerance {self.tolerance:g}, {len(self.runs)} runs)"
+        )
+
+    @property
+    def time_step(self) -> float:
+        """The time step [s], of several boxes the shortest."""
+        return self._simulation.time_step
+
+    @property
+    def planned_runs(self) -> int:
+        """Number of simulations of the control points' transfer matrix."""
+        return self._simulation.orbits(self.scene.control_points).runs
+
+    @cached_property
+    def _second(self) -> SimulatedPropagator:
+        """The same simulation on another grid, for the error estimate."""
+        return SimulatedPropagator(self._plan.second, self._cache)
+
+    @overload
+    def transfer_matrix(
+        self, points: ArrayLike | None = None, return_error: Literal[False] = False
+    ) -> torch.Tensor: ...
+
+    @overload
+    def transfer_matrix(
+        self, points: ArrayLike | None = None, *, return_error: Literal[True]
+    ) -> tuple[torch.Tensor, float]: ...
+
+    @one_torch_thread()
+    def transfer_matrix(
+        self, points: ArrayLike | None = None, return_error: bool = False
+    ) -> torch.Tensor | tuple[torch.Tensor, float]:
+        """Return the transfer matrix G, from one simulation for each point or for each transducer.
+
+        By reciprocity P simulations from the points replace M from the transducers, unless a point is next
+        to an obstacle. Points or transducers in one symmetry orbit of the scene on its grid share one
+        simulation. The matrix of the control points is kept.
+
+        Args:
+            points: (P, 3) [m]; by default the scene's control points.
+            return_error: also return the estimated relative error (L2 of the whole matrix): the difference
+                to a second grid, which takes a fifth of the time where it is coarser, and the distance to
+                the steady state.
+
+        Returns:
+            complex128 (P, M) [Pa], and the error if asked for.
+
+        Raises:
+            ValueError: `points` are not finite, have another shape, are outside the domain (method "full")
+                or on a transducer (method "box").
+        """
+        with_error = boolean("return_error", return_error)
+        places = None if points is None else self._simulation.checked(points)
+        if places is not None:
+            require_memory("points", (len(places), 3), PAIR_BYTES * len(self.scene.array) * len(places))
+        result = self._result(places)
+        if with_error:
+            second = self._second
+            result = with_grid_error(result, second._result(places), coarser=second.spacing > self.spacing)
+        self._report(result.runs, self.scene.control_points if places is None else places)
+        return (result.matrix, result.error) if with_error else result.matrix
+
+    @one_torch_thread()
+    def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
+        """Return the pressure of drives at points, from a simulation for each drive or the transfer matrix.
+
+        Args:
+            drive: (..., M) complex, |q| <= 1.
+            points: (P, 3) or a grid such as (Nu, Nv, 3) [m].
+
+        Returns:
+            complex128 (..., P) or (..., Nu, Nv) [Pa]; differentiable by the drive, through the transfer
+            matrix.
+
+        Raises:
+            ValueError: drive or points of another shape or out of range, as in `transfer_matrix`.
+        """
+        drive = validate_drive(drive, len(self.scene.array))
+        points, grid = points_grid("points", points)
+        points = self._simulation.checked(points)
+        flat = drive.reshape(-1, drive.shape[-1])
+        by_matrix = drive.requires_grad or len(flat) > self._simulation.orbits(points).runs
+        rows = len(self.scene.array) if by_matrix else len(flat)
+        require_memory("points", (*grid, 3), PAIR_BYTES * rows * len(points))
+        if by_matrix:
+            result = self._executed(points)
+            self._report(result.runs, points)
+            return (drive @ result.matrix.mT).reshape(*drive.shape[:-1], *grid)
+        field = torch.zeros((len(flat), len(points)), dtype=torch.complex128, device="cpu")
+        if (loud := flat.any(dim=1)).any():
+            strength = self.scene.array.source_strength * flat[loud]
+            nodes = [self.scene.array.nodes] * len(strength)
+            field[loud], runs = self._simulation.run(nodes, strength, single_nodes(points))
+            self.runs += runs
+            self._report(runs, None)
+        return field.reshape(*drive.shape[:-1], *grid)
+
+    def _result(self, points: torch.Tensor | None) -> TransferMatrix:
+        """Return the matrix of points, by default of the control points, and the runs of this call."""
+        if points is not None:
+            return self._executed(points)
+        if self._control is not None:
+            return replace(self._control, matrix=self._control.matrix.clone(), runs=())
+        self._control = self._executed(self.scene.control_points)
+        return replace(self._control, matrix=self._control.matrix.clone())
+
+    def _executed(self, points: torch.Tensor) -> TransferMatrix:
+        result = execute(self._plan, points, self._cache, self._simulation)
+        self.runs += result.runs
+        return result
+
+    def _report(self, runs: Sequence[Run], points: torch.Tensor | None) -> None:
+        """Warn of runs that did not converge; log once if a simulated transducer is next to an obstacle.
+
+        Args:
+            runs: new runs.
+            points: (P, 3) [m] of a transfer matrix; None for runs of all transducers at once.
+        """
+        simulation, sources = self._simulation, self.scene.array.nodes.positions
+        if not runs:
+            return
+        if not self._near_logged and (points is None or not simulation.orbits(points).from_points):
+            self._near_logged = True
+            if any(simulation.near_obstacle(nodes) for nodes in sources):
+                logger.warning(
+                    "a source is within %.2g mm of an obstacle: less accurate; use a finer spacing than %.2g"
+                    " mm", 1e3 * simulation.source_clearance, 1e3 * self.spacing,
+                )  # fmt: skip
+        unsettled = [run for run in runs if not run.reached]
+        if unsettled:
+            warnings.warn(
+                f"no steady state after {max(run.periods for run in unsettled)} periods in {len(unsettled)} "
+                f"of {len(runs)} runs: estimated relative error up to "
+                f"{max(run.remaining for run in unsettled):.1e}, tolerance {self.tolerance:g}; raise "
+                "max_periods or tolerance",
+                SteadyStateWarning,
+                stacklevel=4,  # the caller of the public method, beyond its decorator
+            )

@@ -1,0 +1,178 @@
+"""A plan's grids and the runs on them."""
+
+from __future__ import annotations
+
+import logging
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+
+from autdtorch.fdtd.interpolation import interpolation_width
+from autdtorch.fdtd.steady_state import SteadyState, fewest_periods
+from autdtorch.fdtd.stepping import Assembly
+from autdtorch.propagators.backend import make_kernel
+from autdtorch.propagators.cost import USUAL_PERIODS
+from autdtorch.propagators.plan import Plan
+from autdtorch.propagators.symmetry import (
+    Orbits,
+    Symmetry,
+    orbits_of_points,
+    orbits_of_transducers,
+    symmetries,
+)
+from autdtorch.scene.arrays import Nodes
+from autdtorch.utils.progress import show_progress
+from autdtorch.utils.validation import ArrayLike
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Run:
+    """The course of one simulation.
+
+    Attributes:
+        periods: periods of the drive that were stepped, summed over boxes.
+        remaining: estimated relative distance to the steady state.
+        reached: whether that is within the tolerance.
+        seconds: time taken; other runs may have gone on at once.
+    """
+
+    periods: int
+    remaining: float
+    reached: bool
+    seconds: float
+
+    @classmethod
+    def of(cls, steady: SteadyState, seconds: float) -> Run:
+        """Record a run that took `seconds`."""
+        logger.debug("run of %d periods, %.1e from steady, %.1f s", steady.periods, steady.residual, seconds)
+        return cls(steady.periods, steady.residual, steady.converged, seconds)
+
+
+@dataclass(frozen=True)
+class TransferMatrix:
+    """A simulated transfer matrix.
+
+    Attributes:
+        matrix: complex128 (P, M) [Pa].
+        error: estimated relative error; from a single grid the distance to the steady state alone.
+        runs: the simulations it took; none if it was loaded.
+    """
+
+    matrix: torch.Tensor
+    error: float
+    runs: tuple[Run, ...]
+
+
+class Simulation(ABC):
+    """A plan's grids, which are assembled at first use, and the runs on them.
+
+    Attributes:
+        plan: the plan.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        """Make a simulation; nothing is computed yet."""
+        self.plan = plan
+        self._kernel = make_kernel(plan.kernel)
+
+    @property
+    @abstractmethod
+    def assemblies(self) -> Sequence[Assembly]:
+        """The assembled grids."""
+
+    @abstractmethod
+    def checked(self, points: ArrayLike) -> torch.Tensor:
+        """Return points (P, 3) after checking that the field can be computed there.
+
+        Raises:
+            ValueError: it cannot.
+        """
+
+    @abstractmethod
+    def near_obstacle(self, points: torch.Tensor) -> bool:
+        """Return whether the interpolation kernel of any point (N, 3) has heterogeneous cells."""
+
+    @abstractmethod
+    def _simulate(
+        self,
+        sources: Sequence[Nodes],
+        strength: torch.Tensor,
+        receivers: Nodes,
+        stepped: Callable[[int], None],
+    ) -> tuple[torch.Tensor, list[Run]]:
+        """Simulate R runs, each with N sources of strengths (R, N) that are not all zero.
+
+        `stepped` is called with numbers of periods. Returns the pressure (R, P) at P receivers, the mean over
+        the nodes of each.
+        """
+
+    @cached_property
+    def symmetries(self) -> list[Symmetry]:
+        """Symmetries of the scene on its grid."""
+        return symmetries(self.assemblies, self.plan.scene.array.nodes)
+
+    @property
+    def time_step(self) -> float:
+        """The time step [s], on several grids the shortest."""
+        most = max(assembly.steps_per_period for assembly in self.assemblies)
+        return 1 / (self.plan.scene.frequency * float(most))
+
+    @property
+    def source_clearance(self) -> float:
+        """Distance [m] from obstacles within which a source is less accurate."""
+        grid = self.assemblies[0].grid
+        return grid.spacing * interpolation_width(grid.kappa) / 2
+
+    def orbits(self, points: torch.Tensor) -> Orbits:
+        """Return the fewest runs for a transfer matrix: from transducers or, by reciprocity, from points.
+
+        Next to an obstacle only simulations from transducers are accurate.
+        """
+        forward = orbits_of_transducers(points, self.symmetries)
+        if self.near_obstacle(points):
+            return forward
+        backward = orbits_of_points(points, self.symmetries)
+        fewer = (backward.runs, len(points)) < (forward.runs, len(self.plan.scene.array))
+        return backward if fewer else forward
+
+    def transfer_matrix(self, points: torch.Tensor) -> TransferMatrix:
+        """Simulate the transfer matrix of points (P, 3)."""
+        array, targets, orbits = self.plan.scene.array, single_nodes(points), self.orbits(points)
+        sources, receivers = (targets, array.nodes) if orbits.from_points else (array.nodes, targets)
+        logger.debug(
+            "transfer matrix: %d runs serve %d %s", orbits.runs, len(orbits.representative),
+            "points" if orbits.from_points else "transducers",
+        )  # fmt: skip
+        strength = torch.full((orbits.runs, 1), array.source_strength, dtype=torch.complex128, device="cpu")
+        alone = [Nodes(sources.positions[own : own + 1], sources.weights) for own in orbits.representatives]
+        rows, runs = self.run(alone, strength, receivers)
+        rows = orbits.expand(rows)
+        remaining = max(run.remaining for run in runs)
+        return TransferMatrix(rows if orbits.from_points else rows.mT.contiguous(), remaining, tuple(runs))
+
+    def run(
+        self, sources: Sequence[Nodes], strength: torch.Tensor, receivers: Nodes
+    ) -> tuple[torch.Tensor, list[Run]]:
+        """Simulate R runs, each with N sources of strengths (R, N) [Pa m] that are not all zero.
+
+        Returns:
+            Pressure (R, P) [Pa] at P receivers, the mean over the nodes of each, and the runs.
+        """
+        plan, grids = self.plan, [assembly.grid for assembly in self.assemblies]
+        what = f"simulating {plan.scene.name}"
+        logger.info("%s: %s, cells of %.3g mm, %d runs", what, plan.method, 1e3 * plan.spacing, len(sources))
+        crossing = max(grid.diagonal / grid.wavelength for grid in grids)
+        periods = math.ceil(len(sources) * USUAL_PERIODS * fewest_periods(crossing))
+        with show_progress(periods, what) as progress:
+            return self._simulate(sources, strength, receivers, progress.advance)
+
+
+def single_nodes(points: torch.Tensor) -> Nodes:
+    """Return points (P, 3) as sources or receivers of one node each."""
+    return Nodes(points[:, None], torch.ones(1, dtype=torch.float64, device="cpu"))
