@@ -1,4 +1,4 @@
-"""What results cost and how good they are."""
+"""Pareto plots of cost and result."""
 
 from __future__ import annotations
 
@@ -27,26 +27,23 @@ def plot_pareto(
     higher_is_better: bool = False,
     names: Mapping[str, Mapping[str, Sequence[str]]] | None = None,
 ) -> Figure:
-    """Cost and result of methods or programs, with the Pareto front, a panel for each scene.
+    """Plot results against costs of methods or programs, with the Pareto front, one panel per scene.
 
-    Marked points that a line joins are the front of one method: no other point of its own is both cheaper
-    and better. The others of its points are small and pale. The broad grey line is the front of all methods
-    together, the best that can be had for a cost. Costs are on a logarithmic axis; so are errors, and scores
-    are on a linear one.
+    A line joins the Pareto front of each method; its other points are small and pale. The broad grey line is
+    the front of all methods together. Costs and errors have logarithmic axes, scores a linear one.
 
     Args:
         points: by scene and method, (N, 2): cost > 0, and error > 0 or score.
-        xlabel: what is paid, with its unit.
-        ylabel: what is had for it, with its unit.
-        higher_is_better: whether that is a score, not an error.
-        names: by scene and method, N names of the points; written at the front of all methods.
+        xlabel: label of the cost, with its unit.
+        ylabel: label of the result, with its unit.
+        higher_is_better: True if the result is a score, not an error.
+        names: by scene and method, N names of the points; shown along the front of all methods.
 
     Returns:
         The figure.
 
     Raises:
-        ValueError: no scene, points that are not (N, 2) finite numbers, or numbers <= 0 where only others
-            can be drawn.
+        ValueError: no scene, points that are not (N, 2) finite numbers, or a cost or error <= 0.
     """
     require_scenes("points", points)
     require_kind("xlabel", xlabel, str)
@@ -77,7 +74,7 @@ def plot_pareto(
         ax.margins(0.15)
         log_axes(ax, "x" if higher_is_better else "xy")
         _draw_front(ax, everything[best])
-    if higher_is_better:  # once all panels are drawn, which share the axis
+    if higher_is_better:  # after all panels, which share the axis, are drawn
         panels[0].set_ylim(bottom=min(0.0, panels[0].get_ylim()[0]))
     handles = [
         Line2D([], [], color=look.colour, marker=look.marker, markersize=5, label=label_of(method))
@@ -88,14 +85,11 @@ def plot_pareto(
 
 
 def pareto_front(points: ArrayLike, higher_is_better: bool = False) -> list[int]:
-    """Which of the points no other one beats, by cost.
+    """Return the indices of the Pareto-optimal points, by rising cost; of equal points the first.
 
     Args:
         points: (N, 2): cost, and error or score.
-        higher_is_better: whether that is a score.
-
-    Returns:
-        Their indices; of points alike the first.
+        higher_is_better: True if the second column is a score.
     """
     costs, results = numbers("points", points, "points", "2").T
     worse = -results if higher_is_better else results
@@ -130,14 +124,14 @@ def _draw_points(ax: Axes, points: Array, look: Look, higher_is_better: bool) ->
 
 
 def _write_beside(ax: Axes, point: Array, text: str, higher_is_better: bool) -> None:
-    """On the side of the front where no point is."""
+    """Write on the side of the front that has no points."""
     up, side = (3, "bottom") if higher_is_better else (-3, "top")
     where: Any = {"xytext": (-4, up), "textcoords": "offset points", "ha": "right", "va": side}
     ax.annotate(text, (point[0], point[1]), fontsize=TICK_SIZE, **where)
 
 
 def _draw_front(ax: Axes, front: Array) -> None:
-    """Steps to the edge of the panel: for a cost one has the best result that costs no more."""
+    """Draw the best result within each cost as steps up to the edge of the panel."""
     right = ax.get_xlim()[1]
     ends = np.vstack([front, (right, front[-1, 1])])
     ax.step(*ends.T, where="post", scalex=False, scaley=False, **_FRONT)

@@ -28,9 +28,8 @@ from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.arrays import Array
 from autdtorch.utils.validation import ArrayLike, boolean, members, points_tensor, require_kind
 
-_AXIS_TOLERANCE = 1e-12  # by which a unit vector along x, y or z may miss length 1 in that coordinate
-
-_OUTLINE_CELLS = 400  # along the longer side of a plane, to find where obstacles cut it
+_AXIS_TOLERANCE = 1e-12  # deviation from 1 of the coordinate of a unit vector along x, y or z
+_OUTLINE_CELLS = 400  # samples along the longer side of a plane, to outline obstacles
 
 
 @styled
@@ -42,22 +41,22 @@ def plot_plane(
     ax: Axes | None = None,
     decibels: bool = False,
 ) -> Figure:
-    """Map of the pressure magnitude on a plane, over the coordinates along its edges.
+    """Plot the pressure magnitude on a plane over the coordinates along its edges.
 
     Args:
         pressure: complex pressure or its magnitude (Nu, Nv) [Pa], at `plane.points(...)`.
-        plane: where it was taken.
+        plane: the plane.
         control_points: (P, 3) [m]; those in the plane are circled.
-        obstacles: where the plane cuts them, they are outlined.
+        obstacles: obstacles, outlined in the plane.
         ax: axes to draw into; by default those of a new figure.
-        decibels: draws levels 20 lg(|p| / largest |p|) from -30 to 0 dB, not |p| in Pa.
+        decibels: True for the level 20 lg(|p| / largest |p|) from -30 to 0 dB instead of |p| in Pa.
 
     Returns:
         The figure.
 
     Raises:
-        ValueError: `pressure` is not (Nu, Nv), or 0 everywhere and to be drawn as a level, or
-            `control_points` are not points.
+        ValueError: `pressure` is not (Nu, Nv), or 0 everywhere with `decibels`, or `control_points` are not
+            points.
     """
     require_kind("plane", plane, Plane)
     if ax is not None:
@@ -89,22 +88,22 @@ def plot_planes(
     control_points: Mapping[str, ArrayLike] | None = None,
     obstacles: Mapping[str, Iterable[Obstacle]] | None = None,
 ) -> Figure:
-    """The paper's Fig. 2: pressure maps, a row for each method and a column for each scene.
+    """Plot pressure maps, one row per method and one column per scene (the paper's Fig. 2).
 
-    The maps of one scene share their colour scale, so that methods can be compared by eye.
+    All maps of a scene share one colour scale.
 
     Args:
-        pressure: by scene and method, complex pressure or its magnitude (Nu, Nv) [Pa]. Where a scene lacks a
-            method that another has, its place stays empty.
-        planes: the plane of each scene.
-        control_points: of each scene (P, 3) [m]; those in the plane are circled.
-        obstacles: of each scene; where the plane cuts them, they are outlined.
+        pressure: by scene and method, complex pressure or its magnitude (Nu, Nv) [Pa]. Methods may differ
+            between scenes.
+        planes: plane of each scene.
+        control_points: control points of each scene (P, 3) [m]; those in the plane are circled.
+        obstacles: obstacles of each scene, outlined in the plane.
 
     Returns:
         The figure.
 
     Raises:
-        ValueError: no scene, a scene without plane, or an argument of the wrong shape.
+        ValueError: no scene, a scene without plane, or an argument of another shape.
     """
     require_scenes("pressure", pressure)
     require_each("planes", planes, pressure)
@@ -144,7 +143,7 @@ def plot_planes(
 
 
 def _name_row(ax: Axes, name: str) -> None:
-    """Write left of the axes, also where nothing is drawn in them."""
+    """Write a name left of the axes, even if they are empty."""
     style: Any = {"rotation": 90, "ha": "right", "va": "center", "ma": "center", "weight": "bold"}
     where: Any = {"xy": (0, 0.5), "xycoords": "axes fraction", "textcoords": "offset points"}
     ax.annotate(name, xytext=(-40, 0), **where, **style)
@@ -173,9 +172,9 @@ def _draw_plane(
 
 
 def _plane_axis(plane: Plane, side: int, cells: int) -> tuple[str, Array]:
-    """Axis label, and edges of the cells [mm] along side u (0) or v (1) of the plane.
+    """Return the axis label and the edges of the cells [mm] along side u (0) or v (1) of the plane.
 
-    Where the side runs along x, y or z, these are that coordinate; else the distance from the plane's centre.
+    They are x, y or z if the side is parallel to that axis, and otherwise distances from the plane's centre.
     """
     direction = plane.basis[side]
     along = MM * plane.size[side] * np.linspace(-0.5, 0.5, cells + 1)
@@ -186,7 +185,7 @@ def _plane_axis(plane: Plane, side: int, cells: int) -> tuple[str, Array]:
 
 
 def _outline(ax: Axes, plane: Plane, obstacle: Obstacle) -> None:
-    """Draw where the surface of the obstacle cuts the plane."""
+    """Draw the intersection of an obstacle's surface with the plane."""
     distance = obstacle.signed_distance(plane.points(max(plane.size) / _OUTLINE_CELLS)).numpy()
     if not distance.min() < 0 < distance.max():
         return
@@ -197,7 +196,7 @@ def _outline(ax: Axes, plane: Plane, obstacle: Obstacle) -> None:
 
 
 def _circle_points(ax: Axes, plane: Plane, points: torch.Tensor, cells: int) -> None:
-    """Circle those of the `points` (P, 3) [m] that are nearer to the plane than one of its cells is long."""
+    """Circle the `points` (P, 3) [m] that are less than one cell away from the plane."""
     center = points.new_tensor(plane.center)
     near = ((points - center) @ points.new_tensor(plane.normal)).abs() < max(plane.size) / cells
     sides = torch.stack(plane.basis).to(points)
@@ -217,7 +216,7 @@ def _circle_points(ax: Axes, plane: Plane, points: torch.Tensor, cells: int) -> 
 
 
 def _add_colour_bar(figure: Figure, mesh: QuadMesh, axes: list[Axes], orientation: str, label: str) -> None:
-    part = min(0.15, 0.45 / len(axes))  # of the height of all axes together
+    part = min(0.15, 0.45 / len(axes))  # share of the height of all axes
     bar = figure.colorbar(
         mesh, ax=axes, orientation=orientation, shrink=0.9, aspect=25, fraction=part, pad=0.05 / len(axes)
     )

@@ -1,4 +1,4 @@
-"""How costs grow."""
+"""Plots of costs against problem sizes, with fitted power laws."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from autdtorch.utils.arrays import Array
 from autdtorch.utils.validation import ArrayLike, require_kind
 
 OVERHEAD = 2.0
-"""Costs from this many times the least one on are fitted: at most half of them is what costs always."""
+"""Lower limit of the fitted costs, over the smallest cost: constant overhead is then at most half of each."""
 
 FEWEST = 3
-"""Points of a fit."""
+"""Fewest points for a fit."""
 
-_TICKS_APART = 0.12  # at least, as a share of the axis
+_TICKS_APART = 0.12  # least distance of ticks, as a share of the axis
 
 
 @dataclass(frozen=True)
 class PowerLaw:
-    """Cost = factor * size^exponent, between the sizes that it was fitted to."""
+    """The power law cost = factor * size^exponent, for sizes in the fitted range."""
 
     exponent: float
     factor: float
@@ -34,9 +34,10 @@ class PowerLaw:
 
 
 def fit_power(sizes: Sequence[float] | Array, costs: Sequence[float] | Array) -> PowerLaw | None:
-    """Least-squares line in logarithms through costs that are not constant overhead.
+    """Fit a line to the logarithms of the costs that are at least `OVERHEAD` times the smallest one.
 
-    These are at least `OVERHEAD` times the least one; None if they are fewer than `FEWEST`.
+    Returns:
+        The fit, or None if there are fewer than `FEWEST` such costs.
     """
     chosen = [pair for pair in zip(sizes, costs, strict=True) if pair[1] >= OVERHEAD * min(costs)]
     if len(chosen) < FEWEST:
@@ -48,14 +49,13 @@ def fit_power(sizes: Sequence[float] | Array, costs: Sequence[float] | Array) ->
 
 @styled
 def plot_scaling(costs: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
-    """Costs over sizes, both on logarithmic axes, with fitted powers; a row of panels for each cost.
+    """Plot costs against sizes on logarithmic axes with fitted power laws, one row of panels per cost.
 
-    The slope in the legend is the exponent of the broad pale line, a power of the size fitted to the costs
-    that are at least twice the least one, where there are three. Else it says how far the costs are apart.
+    A broad pale line is a power law, fitted to the costs that are at least twice the smallest one. The legend
+    gives its exponent as slope. With fewer than three such costs, the legend gives their range as a factor.
 
     Args:
-        costs: by label of the cost and label of the size (with units, for the axes), and method: (N, 2),
-            sizes and costs, all > 0.
+        costs: sizes and costs (N, 2), all > 0, by labels of cost and size (with units) and by method.
 
     Returns:
         The figure.
@@ -87,7 +87,7 @@ def plot_scaling(costs: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
         line[0].set_ylabel(label)
     for ax, growth in zip(panels[-1], growths, strict=True):
         ax.set_xlabel(growth)
-    for line in panels:  # once all panels are drawn: those of a row share the axis
+    for line in panels:  # after all panels of a row, which share the axis, are drawn
         log_axes(line[0], "y")
     return figure
 
@@ -114,7 +114,7 @@ def _draw_series(ax: Axes, name: str, values: Array, look: Look) -> None:
 
 
 def _mark_sizes(ax: Axes, sizes: Array) -> None:
-    """Logarithmic axes, with ticks at the sizes themselves as far as there is place."""
+    """Make the axes logarithmic, with ticks at the sizes that do not overlap."""
     log_axes(ax)
     ax.set_xmargin(0.08)
     logarithms = np.log(np.unique(sizes))

@@ -1,4 +1,4 @@
-"""The scene in 3D, drawn with Matplotlib."""
+"""Drawings of a scene in 3D with Matplotlib."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from autdtorch.scene.scene import Scene
 from autdtorch.utils.arrays import Array
 from autdtorch.utils.validation import ArrayLike, Vector, require_kind
 
-_TICKS = 5  # along the longest side; on a short one more would run into each other
+_TICKS = 5  # along the longest side; on a short side as many would overlap
 _ELEVATION, _AZIMUTH = 22.0, -118.0  # of the viewer [degrees]
 
 
 def _direction(elevation: float, azimuth: float) -> Array:
-    """Unit vector (3,) from angles [degrees]."""
+    """Return the unit vector (3,) of angles [degrees]."""
     up, around = np.radians((elevation, azimuth))
     return np.array([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)])
 
@@ -46,10 +46,12 @@ _LIGHT = _direction(50.0, -160.0)
 
 @styled
 def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
-    """The paper's Fig. 1: the scene in 3D, where `view3d` cannot render. What lies behind is not hidden.
+    """Draw a scene in 3D (the paper's Fig. 1), for machines on which `view3d` cannot render.
+
+    Objects do not hide those behind them.
 
     Args:
-        scene: what to draw.
+        scene: scene to draw.
         drive: complex (M,); colours the transducers by phase.
 
     Returns:
@@ -65,7 +67,7 @@ def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
     if scene.observation_plane is not None:
         corners = scene.observation_plane.corners[[0, 1, 3, 2]].numpy()
         ax.add_collection3d(Poly3DCollection([MM * corners], facecolor=PLANE_COLOUR, alpha=0.3, zorder=1))
-    # From far to near: with the order of drawing fixed, what comes later covers what came before.
+    # From far to near: the order of drawing is fixed, and later obstacles cover earlier ones.
     for obstacle in sorted(scene.obstacles, key=_nearness):
         _add_obstacle(ax, obstacle, scene.domain)
     foci = MM * scene.control_points.numpy()
@@ -74,7 +76,7 @@ def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
     lower, upper = (MM * np.array(corner) for corner in scene.domain)
     ax.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), zlim=(lower[2], upper[2]))
     ax.set(xlabel="x [mm]", ylabel="y [mm]")
-    ax.zaxis.set_rotate_label(False)  # which would set it upside down
+    ax.zaxis.set_rotate_label(False)  # it would be upside down
     ax.set_zlabel("z [mm]", rotation=90)
     ax.set_box_aspect(upper - lower, zoom=0.85)
     for axis, length in zip((ax.xaxis, ax.yaxis, ax.zaxis), upper - lower, strict=True):
@@ -86,15 +88,15 @@ def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
 
 
 def _nearness(obstacle: Obstacle) -> float:
-    """Position of the middle along the direction to the viewer."""
+    """Return the position of the obstacle's middle along the direction to the viewer."""
     middle = (np.array(obstacle.lower) + np.array(obstacle.upper)) / 2
     return float(middle @ _TO_VIEWER)
 
 
 def _add_obstacle(ax: Axes3D, obstacle: Obstacle, domain: tuple[Vector, Vector]) -> None:
-    """The triangles that face the viewer, shaded, and the sharp edges of these.
+    """Draw the triangles that face the viewer, shaded, and their sharp edges.
 
-    An obstacle that the domain cuts off is left open there: one looks at its far side, which is drawn first.
+    An obstacle is open where it leaves the domain. Its far side is visible there, and drawn first.
     """
     vertices, faces = (part.numpy() for part in obstacle.surface())
     corners = vertices[faces]
@@ -113,31 +115,31 @@ def _add_obstacle(ax: Axes3D, obstacle: Obstacle, domain: tuple[Vector, Vector])
 
 
 def _add_faces(ax: Axes3D, corners: Array, normals: Array, domain: tuple[Vector, Vector]) -> None:
-    """Draw what the domain holds of the triangles (F, 3, 3) [m] with unit normals (F, 3)."""
+    """Draw triangles (F, 3, 3) [m] with unit normals (F, 3), clipped to the domain."""
     light = 0.7 + 0.3 * normals @ _LIGHT
     colours = np.clip(light[:, None] * to_rgb(OBSTACLE_COLOUR), 0, 1)
     polygons = [clipped(triangle, *domain) for triangle in corners]
     left = [index for index, polygon in enumerate(polygons) if len(polygon)]
     if not left:
         return
-    # Edges of the faces' own colours close the seams between them.
+    # Edges in the colours of the faces close the seams between them.
     style: Any = {"facecolor": colours[left], "edgecolor": colours[left], "lw": 0.3, "zorder": 2}
     ax.add_collection3d(Poly3DCollection([MM * polygons[index] for index in left], **style))
 
 
 def _hidden(obstacle: Obstacle, points: Array) -> NDArray[np.bool_]:
-    """Which points (N, 3) [m] on the surface the obstacle itself hides from the viewer (N,)."""
+    """Return for points (N, 3) [m] on the surface whether the obstacle hides them from the viewer (N,)."""
     across = math.dist(obstacle.lower, obstacle.upper)
     steps = across * (np.arange(64) + 0.5) / 64
     return obstacle.contains(points[:, None] + steps[:, None] * _TO_VIEWER).any(dim=1).numpy()
 
 
 def _sharp_edges(faces: NDArray[np.int64], normals: Array, front: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Vertex pairs (E, 2) of the edges of a `front` face whose other face is turned by over `SHARP_ANGLE`."""
+    """Return the vertices (E, 2) of edges between faces at over `SHARP_ANGLE`, one of them in `front`."""
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     face = np.tile(np.arange(len(faces)), 3)
     pairs = np.sort(ends, axis=1)
-    # On a closed surface the faces of an edge follow each other in this order.
+    # On a closed surface, sorting brings the two faces of an edge together.
     order = np.lexsort(pairs.T)
     one, other = face[order[0::2]], face[order[1::2]]
     sharp = (normals[one] * normals[other]).sum(axis=1) < np.cos(SHARP_ANGLE)

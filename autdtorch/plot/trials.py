@@ -1,4 +1,4 @@
-"""How methods compare over their trials."""
+"""Plots that compare methods over their trials."""
 
 from __future__ import annotations
 
@@ -28,27 +28,27 @@ from autdtorch.plot.style import (
 from autdtorch.utils.arrays import Array
 from autdtorch.utils.validation import finite_number, require_kind
 
-# The first is broad and pale, so that what lies on it is seen.
+# The first is broad and pale, so that lines on it stay visible.
 _LEVELS: tuple[dict[str, Any], ...] = (
     {"color": "0.75", "linewidth": 2.5, "linestyle": "-"},
     {"color": "0.2", "linewidth": 1.0, "linestyle": (0, (5, 3))},
     {"color": "0.2", "linewidth": 1.0, "linestyle": (0, (1, 1.5))},
 )
 
-_WIDTH = 7.2  # of the trials' figure [inch]
-_BOX = 0.22  # least width of a box with its share of what is between [inch]
-_PANEL = (2.7, 2.6)  # of a scene's convergence [inch]
+_WIDTH = 7.2  # of a figure of boxes [inch]
+_BOX = 0.22  # least width of a box with its margin [inch]
+_PANEL = (2.7, 2.6)  # convergence of a scene [inch]
 
 
 @styled
 def plot_trials(quantities: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
-    """The paper's Fig. 3(a) to (c): how each quantity spreads over the trials, a panel for each quantity.
+    """Plot the spread of quantities over the trials, one panel per quantity (the paper's Fig. 3(a) to (c)).
 
-    A box spans the quartiles with a line at the median, its whiskers reach to the last trial within 1.5 times
-    the box, and what lies beyond is drawn as points. A method with a single trial is drawn as a diamond.
+    A box spans the quartiles, with a line at the median. Its whiskers reach to the last trial within 1.5
+    times the box; trials beyond are points. A single trial is a diamond.
 
     Args:
-        quantities: by label (with unit, for the axis), scene and method: one value for each trial (trials,).
+        quantities: by label (with unit), scene and method: one value for each trial (trials,).
 
     Returns:
         The figure.
@@ -102,21 +102,21 @@ def plot_convergence(
     levels: Mapping[str, Mapping[str, float]] | None = None,
     label: str = "weakest focus, best so far [Pa]",
 ) -> Figure:
-    """The paper's Fig. 3(d): best score so far against evaluations, a panel for each scene.
+    """Plot the best score so far against evaluations, one panel per scene (the paper's Fig. 3(d)).
 
-    A line is the median over the trials, its band spans their quartiles; a dot marks where a method ends.
+    A line is the median over the trials, a band spans their quartiles, a dot marks the end of a method.
 
     Args:
         history: by scene and method, `Solution.history` (trials, evaluations).
-        levels: by scene and label, scores to compare with; drawn across the panel.
-        label: of the score, with its unit.
+        levels: by scene and label, scores to compare with; horizontal lines.
+        label: label of the score, with its unit.
 
     Returns:
         The figure.
 
     Raises:
-        ValueError: no scene, a history that is not (trials, evaluations) finite numbers, or levels of a scene
-            without history.
+        ValueError: no scene, a history that is not (trials, evaluations) finite numbers, or levels of an
+            unknown scene.
     """
     require_scenes("history", history)
     require_kind("label", label, str)
@@ -140,7 +140,7 @@ def plot_convergence(
             height = finite_number(f"levels[{scene!r}][{name!r}]", level)
             ax.axhline(height, zorder=1, **styles[name])
         ax.set_xlim(left=0.0)
-    # Once all panels are drawn: they share the axis, and a limit set earlier would keep it from growing.
+    # After all panels are drawn: they share the axis, and a limit set earlier would keep it from growing.
     panels[0].set_ylim(bottom=min(0.0, panels[0].get_ylim()[0]))
     handles = [
         Line2D([], [], color=look.colour, linestyle=look.dashes, label=label_of(method))
@@ -164,7 +164,7 @@ def _draw_trials(ax: Axes, values: Array, position: float, width: float, look: L
         manage_ticks=False,
         patch_artist=True,
         boxprops={"facecolor": (colour, 0.4), "edgecolor": colour, "linewidth": 0.9},
-        medianprops={"color": colour, "linewidth": 2.2, "solid_capstyle": "butt"},  # seen where a box is flat
+        medianprops={"color": colour, "linewidth": 2.2, "solid_capstyle": "butt"},  # visible on a flat box
         whiskerprops=line,
         capprops=line,
         flierprops={"marker": ".", "markersize": 4, "markeredgecolor": colour, "markerfacecolor": colour},

@@ -1,4 +1,4 @@
-"""The studies of a sweep, merged into one: scenes and methods side by side, trials of all seeds together."""
+"""Merge the studies of a sweep into one, with the trials of all seeds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import torch
 from autdtorch.io.scene_file import load_scene
 from autdtorch.io.yaml_file import parse_yaml, unresolved
 from autdtorch.methods.catalogue import METHODS
-from autdtorch.methods.solution import Solution, joined
+from autdtorch.methods.solution import joined
 from autdtorch.objectives.metrics import FocusMetrics
 from autdtorch.scene.scene import Scene
 from autdtorch.study.folder import PREVIOUS
@@ -28,26 +28,23 @@ from autdtorch.utils.validation import members, path_of
 logger = logging.getLogger(__name__)
 
 Settings: TypeAlias = Mapping[str, Any]
-"""Flat, by dotted keys such as ``solver.spacing``."""
+"""Settings by dotted keys, such as ``solver.spacing``."""
 
-_Named: TypeAlias = tuple[str, Settings]
-
-_METHODS = list(METHODS)
-_FILES = "files"  # digests of what the settings name only by the path of a file
-_LONGEST_NAME = 100  # of a scene or a method; it becomes part of the names of files
+_FILES = "files"  # key of the digests of files that the settings name by their paths
+_LONGEST_NAME = 100  # bytes of a scene's or method's name, which becomes part of file names
 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """The studies of a sweep as one.
+    """The merged studies of a sweep.
 
     Attributes:
-        results: of all studies. What was swept beside scene, method and seed is part of the names, such as
-            ``gabs,levels=8``. The provenance is that of the first study, with the settings of all.
+        results: results of all studies. Swept settings other than scene, method and seed are part of the
+            names, such as ``gabs,levels=8``. The provenance is from the first study, with all settings.
         scenes: the scenes of the results, by the same names.
-        swept: the settings that tell names apart, by name of scene and name of method.
-        studies: how many were merged.
-        seeds: of these, each once.
+        swept: settings that differ between equal names, by names of scene and method.
+        studies: number of studies.
+        seeds: seeds of the studies, each once.
     """
 
     results: StudyResult
@@ -59,13 +56,13 @@ class Sweep:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """What one study found with one method in one scene, and the settings that it depends on."""
+    """The result of one method in one scene of one study, and the settings that it depends on."""
 
     scene: str
     method: str
-    section: Mapping[str, Any]
-    place: Settings
-    search: Settings
+    section: Mapping[str, Any]  # the scene's settings as in YAML
+    scene_settings: Settings
+    method_settings: Settings
     seed: int
     found: SceneResult
 
@@ -75,26 +72,27 @@ class _Part:
 
 
 def collect_results(folder: str | os.PathLike[str], modules: Collection[str] = ()) -> Sweep:
-    """Merge the studies in a folder and in the folders below it, such as those that a sweep left.
+    """Merge the studies in a folder and its subfolders, such as those of a sweep.
 
-    Studies that differ in nothing but seed and number of trials are taken as one, with the trials of all
-    seeds; a method without random choices keeps one trial. Studies that are not finished are left out, and
-    logged.
+    Studies that differ only in seed and number of trials become one, with the trials of all seeds. A method
+    without random choices keeps one trial. Unfinished studies are left out, with a warning.
 
     Args:
-        folder: where to look.
+        folder: folder of the studies.
         modules: names of trusted modules, whose obstacles scenes may name by `_target_`; see `load_scene`.
 
     Returns:
         The merged studies.
 
     Raises:
-        FileNotFoundError: there is no such folder, no finished study in it, or a file that a scene names
-            is not there (paths start from the working directory, as they did for the sweep).
-        ValueError: results of another version, or of a study that did not come from the command line.
+        FileNotFoundError: no such folder, no finished study in it, or no file of a name in a scene's settings
+            (its path starts from the working directory, as in the sweep).
+        ValueError: results of another version, or of a study that was not run from the command line.
     """
     folder, modules = path_of("folder", folder, "a folder"), members("modules", modules, str)
-    _log_unfinished(folder)
+    for file in _files(folder, PROVENANCE_FILE):
+        if not file.with_name(RESULTS_FILE).exists():
+            logger.warning("%s: not finished, left out; repeat its command to finish it", file.parent)
     studies = {file.parent: load_results(file) for file in _files(folder, RESULTS_FILE)}
     if not studies:
         raise FileNotFoundError(f"{folder}: no finished study ({RESULTS_FILE}) there or below")
@@ -103,7 +101,7 @@ def collect_results(folder: str | os.PathLike[str], modules: Collection[str] = (
     first: dict[str, Path] = {}
     for path, study in studies.items():
         if (other := first.setdefault(study.provenance.origin, path)) != path:
-            logger.warning("%s: the same study as %s, counted once", path, other)
+            logger.warning("%s: a copy of the study in %s, counted once", path, other)
     parts = [part for path, study in studies.items() for part in _parts(path, study)]
     groups, swept = _groups(parts)
     results = {scene: _merged_scene(methods) for scene, methods in groups.items()}
@@ -116,37 +114,31 @@ def collect_results(folder: str | os.PathLike[str], modules: Collection[str] = (
 
 
 def _files(folder: Path, name: str) -> list[Path]:
-    """Files of that name in the folder and below, but for those of earlier studies."""
+    """Return the files of a name in the folder and below, except those of earlier studies."""
     return sorted(file for file in folder.rglob(name) if not file.parent.name.startswith(PREVIOUS))
 
 
-def _log_unfinished(folder: Path) -> None:
-    for file in _files(folder, PROVENANCE_FILE):
-        if not file.with_name(RESULTS_FILE).exists():
-            logger.warning("%s: not finished, left out; the command that began it goes on", file.parent)
-
-
 def _parts(path: Path, study: StudyResult) -> list[_Part]:
-    where = f"{path / RESULTS_FILE}: settings"
-    settings = unresolved(parse_yaml(study.provenance.config, where), where)
+    file = path / RESULTS_FILE
+    settings = unresolved(parse_yaml(study.provenance.config, f"{file}: settings"), f"{file}: settings")
     try:
-        return list(_parts_by(settings, path, study))
+        if missing := [name for name in settings.get("scenes", ()) if name not in study.scenes]:
+            logger.warning("%s: unfinished scenes are left out: %s", path, ", ".join(missing))
+        return list(_parts_by(settings, study))
     except (KeyError, TypeError, AttributeError) as error:
         accepted = "must come from the command line"
-        raise ValueError(f"{path / RESULTS_FILE}: no settings of a study in it; {accepted}") from error
+        raise ValueError(f"{file}: no settings of a study in it; {accepted}") from error
 
 
-def _parts_by(settings: Any, path: Path, study: StudyResult) -> Iterator[_Part]:
-    if missing := [name for name in settings.get("scenes", ()) if name not in study.scenes]:
-        logger.warning("%s: scenes that are not finished are left out: %s", path, ", ".join(missing))
+def _parts_by(settings: Any, study: StudyResult) -> Iterator[_Part]:
     common = {key: settings[key] for key in ("solver", "plane_spacing") if key in settings}
     for name, found in study.scenes.items():
         section = settings["scenes"][name] if "scenes" in settings else settings["scene"]
-        place = dict(_flat({"scene": section, _FILES: settings.get(_FILES, {}).get(name), **common}))
+        of_scene = dict(_flat({"scene": section, _FILES: settings.get(_FILES, {}).get(name), **common}))
         for method in found.methods:
-            search = settings["methods"][method] if "methods" in settings else settings["method"]
-            flat = dict(_flat({"method": search}))
-            yield _Part(name, method, section, place, flat, study.provenance.seed, found)
+            chosen = settings["methods"][method] if "methods" in settings else settings["method"]
+            of_method = dict(_flat({"method": chosen}))
+            yield _Part(name, method, section, of_scene, of_method, study.provenance.seed, found)
 
 
 def _flat(value: object, key: str = "") -> Iterator[tuple[str, Any]]:
@@ -163,56 +155,55 @@ def _flat(value: object, key: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _whole(value: object) -> object:
-    """A whole number as an int, so that 4 and 4.0 are alike also to the eye."""
+    """Return a whole number as an int, so that 4 and 4.0 are equal also as text."""
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _groups(
     parts: Sequence[_Part],
 ) -> tuple[dict[str, dict[str, list[_Part]]], dict[tuple[str, str], Settings]]:
-    """Parts of the same settings, by scene and method, and the settings that make their names."""
-    places = _told_apart([(part.scene, part.place) for part in parts])
-    searches = _told_apart([(part.method, part.search) for part in parts])
+    """Group parts of equal settings by new names of scene and method; return also the swept settings."""
+    scenes = _swept([(part.scene, part.scene_settings) for part in parts])
+    methods = _swept([(part.method, part.method_settings) for part in parts])
+    order = list(METHODS)
+
+    def rank(index: int) -> tuple[object, ...]:
+        """Sort by scene, then by our order of methods, each by its swept settings."""
+        (scene, of_scene), (method, of_method) = scenes[index], methods[index]
+        place = order.index(method) if method in order else len(order)
+        return scene, _order(of_scene), place, method, _order(of_method)
+
     groups: dict[str, dict[str, list[_Part]]] = {}
     swept: dict[tuple[str, str], Settings] = {}
-    named = zip(_names(places), _names(searches), places, searches, parts, strict=True)
-    for scene, method, (_, place), (_, search), part in sorted(named, key=_rank):
-        groups.setdefault(scene, {}).setdefault(method, []).append(part)
-        swept[scene, method] = {**place, **search}
+    scene_names, method_names = _names(scenes), _names(methods)
+    for index in sorted(range(len(parts)), key=rank):
+        scene, method = scene_names[index], method_names[index]
+        groups.setdefault(scene, {}).setdefault(method, []).append(parts[index])
+        swept[scene, method] = {**scenes[index][1], **methods[index][1]}
     return groups, swept
 
 
-def _rank(named: tuple[str, str, _Named, _Named, _Part]) -> tuple[object, ...]:
-    """Scenes by name, methods in the order of ours, and each in the order of what was swept."""
-    _, _, (scene, place), (method, search), _ = named
-    rank = _METHODS.index(method) if method in _METHODS else len(_METHODS)
-    return scene, _order(place), rank, method, _order(search)
-
-
 def _order(settings: Settings) -> list[tuple[str, bool, float, str]]:
-    """For sorting: numbers by their size, and before all else."""
+    """Return a key for sorting: numbers by size, before all others."""
     return [
         (key, False, value, "") if isinstance(value, int | float) else (key, True, 0.0, str(value))
         for key, value in sorted(settings.items())
     ]
 
 
-def _told_apart(named: Sequence[_Named]) -> list[_Named]:
-    """The same names with those settings alone in which others of the name are not all alike."""
+def _swept(named: Sequence[tuple[str, Settings]]) -> list[tuple[str, Settings]]:
+    """Keep only the settings that differ between entries of equal name."""
     first: dict[str, Settings] = {}
     varying: dict[str, set[str]] = {}
     for name, settings in named:
         other = first.setdefault(name, settings)
         keys = settings.keys() | other.keys()
         varying.setdefault(name, set()).update(key for key in keys if settings.get(key) != other.get(key))
-    return [
-        (name, {key: value for key, value in settings.items() if key in varying[name]})
-        for name, settings in named
-    ]
+    return [(name, {key: own[key] for key in own if key in varying[name]}) for name, own in named]
 
 
-def _names(named: Sequence[_Named]) -> list[str]:
-    """The names with what was swept, different where that is, in characters that names of files can have."""
+def _names(named: Sequence[tuple[str, Settings]]) -> list[str]:
+    """Return names with the swept settings, distinct for distinct settings, fit for file names."""
     names = [_name(name, swept) for name, swept in named]
     digests = [digest_of(sorted(swept.items()))[:8] for _, swept in named]
     bearers: dict[str, set[str]] = {}
@@ -225,7 +216,7 @@ def _names(named: Sequence[_Named]) -> list[str]:
 
 
 def _name(name: str, swept: Settings) -> str:
-    shown = {key: value for key, value in swept.items() if key != _FILES}  # of which the paths say more
+    shown = {key: value for key, value in swept.items() if key != _FILES}  # paths say more
     ends = [key.rpartition(".")[2] for key in shown]
     alone = [ends.count(end) == 1 and end != "method" for end in ends]  # the solver has a method too
     keys = [end if short else key for key, end, short in zip(shown, ends, alone, strict=True)]
@@ -235,7 +226,7 @@ def _name(name: str, swept: Settings) -> str:
 
 
 def _word(text: object) -> str:
-    """A text in characters that names of files can have, in one byte each."""
+    """Return a text with only single-byte characters that file names can have."""
     return re.sub(r"[^\w.+-]+", "_", str(text), flags=re.ASCII).strip("_")
 
 
@@ -247,38 +238,33 @@ def _merged_scene(methods: Mapping[str, Sequence[_Part]]) -> SceneResult:
 
 
 def _merged_trials(parts: Sequence[_Part]) -> MethodResult:
-    """The trials of all seeds, of a seed those of the longest study."""
-    by_seed = {
-        part.seed: part.result for part in sorted(parts, key=lambda part: (part.seed, part.result.trials))
-    }
-    kept = list(by_seed.values())
-    if all(_same_trials(kept[0].solution, other.solution) for other in kept[1:]):
-        kept = kept[:1]  # no chance in it
+    """Join the trials of all seeds, for each seed those of its longest study."""
+    longest = sorted(parts, key=lambda part: (part.seed, part.result.trials))
+    kept = list({part.seed: part.result for part in longest}.values())
+    first = kept[0].solution
+    if all(
+        torch.equal(first.drive, other.solution.drive) and torch.equal(first.history, other.solution.history)
+        for other in kept
+    ):
+        kept = kept[:1]  # the method makes no random choices
     solution = joined([result.solution for result in kept])
-    metrics = _joined_metrics([result.metrics for result in kept])
-    # A study keeps the observation plane of one trial: of those, the one nearest to the median is shown.
+    # A study keeps the observation plane of one trial. The one nearest to the joint median is shown.
     median = float(solution.score[median_trial(solution.score)])
-    shown = [float(result.solution.score[result.shown_trial]) for result in kept]
-    nearest = min(range(len(kept)), key=lambda index: abs(shown[index] - median))
-    before = sum(result.trials for result in kept[:nearest])
+    away = [abs(float(result.solution.score[result.shown_trial]) - median) for result in kept]
+    nearest = away.index(min(away))
     return MethodResult(
         solution,
-        metrics,
+        _joined_metrics([result.metrics for result in kept]),
         torch.cat([result.seconds for result in kept]),
-        before + kept[nearest].shown_trial,
+        sum(result.trials for result in kept[:nearest]) + kept[nearest].shown_trial,
         kept[nearest].plane_pressure,
     )
 
 
-def _same_trials(one: Solution, other: Solution) -> bool:
-    """Whether all is alike that was tried, not only what was found."""
-    return torch.equal(one.drive, other.drive) and torch.equal(one.history, other.history)
-
-
 def _joined_metrics(metrics: Sequence[FocusMetrics]) -> FocusMetrics:
     names = ("mean", "min", "std", "uniformity")
-    areas = [area for each in metrics if (area := each.area) is not None]
+    areas = [one.area for one in metrics if one.area is not None]
     return FocusMetrics(
-        **{name: torch.cat([getattr(each, name) for each in metrics]) for name in names},
+        **{name: torch.cat([getattr(one, name) for one in metrics]) for name in names},
         area=torch.cat(areas) if len(areas) == len(metrics) else None,
     )

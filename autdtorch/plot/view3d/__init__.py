@@ -1,4 +1,4 @@
-"""Scenes and fields in 3D, rendered off-screen with PyVista (optional extra ``viz``); lengths in mm."""
+"""Scenes and fields in 3D with PyVista (optional extra ``viz``), rendered off-screen; lengths in mm."""
 
 from autdtorch.plot.view3d.animation import animate3d
 from autdtorch.plot.view3d.opengl import rendering_problem

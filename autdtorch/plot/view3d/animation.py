@@ -1,4 +1,4 @@
-"""The wave over one period of the drive."""
+"""Animations of the wave over one period."""
 
 from __future__ import annotations
 
@@ -31,26 +31,25 @@ if TYPE_CHECKING:
 
 _FRAME_TIME = 80  # ms; GIF counts hundredths of a second
 
-_GREYS, _SHADES = 24, 8  # of the 256 colours, those of lines and bodies, and of control points
+_GREYS, _SHADES = 24, 8  # of 256 colours: for lines and obstacles, and for control points
 
 
 def animate3d(
     scene: Scene, drive: ArrayLike, field: ArrayLike, path: str | Path, *, frames: int = 24
 ) -> None:
-    """Write a GIF of one period: the instantaneous pressure Re(p e^{-i w t}) on the observation plane.
+    """Write a GIF of the instantaneous pressure Re(p e^{-i w t}) on the observation plane over one period.
 
-    The transducers are coloured by the phase phi + w t of what they emit, which sweeps along. The first frame
-    follows the last without a jump.
+    The colours of the transducers are their phases phi + w t. The GIF repeats without a jump.
 
     Args:
-        scene: what to draw.
+        scene: scene to draw.
         drive: complex (M,).
-        field: its complex pressure on the observation plane (Nu, Nv) [Pa], at the points of `Plane.points`.
+        field: complex pressure on the observation plane (Nu, Nv) [Pa], at the points of `Plane.points`.
         path: file to write, ``.gif``.
-        frames: instants in the period, >= 2.
+        frames: number of frames in the period, >= 2.
 
     Raises:
-        RuntimeError: this machine cannot render; the message says what is missing.
+        RuntimeError: this machine cannot render; the message names the cause.
         ValueError: `drive` or `field` does not fit the scene, `field` is a magnitude, `path` has another
             suffix, or `frames` is less than 2.
     """
@@ -84,13 +83,13 @@ def animate3d(
 
 
 def _round_up(pressure: float) -> float:
-    """To one digit, so that the bar has round numbers."""
+    """Round up to one digit, for round numbers on the colour bar."""
     digit = 10.0 ** math.floor(math.log10(pressure)) if pressure else 1.0
     return digit * max(1, math.ceil(pressure / digit))
 
 
 def _colours(plotter: pyvista.Plotter) -> NDArray[np.uint8]:
-    """256 colours (256, 3) for all frames: with a palette each, what stands still would flicker."""
+    """Return one palette (256, 3) for all frames: with different palettes, static parts would flicker."""
     tables = [np.asarray(bar.lookup_table.values)[:, :3] for bar in plotter.scalar_bars.values()]
     greys = np.linspace(0, 255, _GREYS)[:, None] * np.ones(3)
     shades = np.linspace(0.3, 1.0, _SHADES)[:, None] * np.array(ImageColor.getrgb(POINT_COLOUR))

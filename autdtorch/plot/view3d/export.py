@@ -1,4 +1,4 @@
-"""Files of a 3D view."""
+"""Export of a 3D view to files."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ _LEGEND = (
 )
 _BAR = "width: 200px; height: 14px"
 _ENDS = "display: flex; justify-content: space-between"
-_EVERY = 8  # colours of a table
+_EVERY = 8  # every 8th colour of a table makes the gradient
 
 
 def require_suffix(name: str, path: str | Path, suffixes: tuple[str, ...] = _SUFFIXES) -> Path:
-    """The path after checking that its suffix says what can be written.
+    """Return the path after checking its suffix.
 
     Raises:
         ValueError: another suffix.
-        RuntimeError: what writes that file is not installed.
+        RuntimeError: the package that writes such files is not installed.
     """
     path = path_of(name, path)
     if path.suffix not in suffixes:
@@ -40,7 +40,7 @@ def require_suffix(name: str, path: str | Path, suffixes: tuple[str, ...] = _SUF
 
 
 def write(plotter: pyvista.Plotter, path: Path, caption: Sequence[str]) -> None:
-    """Write what the plotter shows, in the format of the path's suffix."""
+    """Write the view in the format of the path's suffix."""
     if path.suffix == ".png":
         plotter.screenshot(str(path))
     elif path.suffix == ".gltf":
@@ -50,9 +50,9 @@ def write(plotter: pyvista.Plotter, path: Path, caption: Sequence[str]) -> None:
 
 
 def _write_gltf(plotter: pyvista.Plotter, path: Path) -> None:
-    """In metres and without camera, which PyVista does not turn with the scene; with colours as drawn.
+    """Write glTF in metres, without the camera, which PyVista does not turn with the scene.
 
-    VTK leaves a tint on what a texture colours, and what is translucent solid.
+    The materials are corrected: VTK tints textures and makes translucent surfaces opaque.
     """
     plotter.export_gltf(str(path))
     content = json.loads(path.read_text(encoding="utf-8"))
@@ -72,7 +72,7 @@ def _write_gltf(plotter: pyvista.Plotter, path: Path) -> None:
 
 
 def _write_html(plotter: pyvista.Plotter, path: Path, caption: Sequence[str]) -> None:
-    """With colour bars of our own: the viewer in the page would draw all of them in one place."""
+    """Write HTML with separate colour bars: the viewer in the page would draw all of them in one place."""
     bars = plotter.scalar_bars
     legend = "".join(_html_bar(title.strip(), bar.lookup_table) for title, bar in bars.items())
     for bar in bars.values():
@@ -81,7 +81,7 @@ def _write_html(plotter: pyvista.Plotter, path: Path, caption: Sequence[str]) ->
     for bar in bars.values():
         bar.SetVisibility(True)
     lines = "<br>".join(caption)
-    # The viewer takes the element of class "content" for itself, or else empties the whole page.
+    # The viewer takes the element of class "content"; without one it would empty the whole page.
     legend = f'<div class="content"></div><div style="{_LEGEND}">{legend}<div>{lines}</div></div>'
     path.write_text(page.replace("</body>", f"{legend}\n</body>"), encoding="utf-8")
 

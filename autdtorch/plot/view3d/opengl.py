@@ -1,4 +1,4 @@
-"""Whether this machine can render in 3D."""
+"""Check that this machine can render in 3D."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ plotter.add_mesh(pyvista.Sphere())
 if not plotter.screenshot(return_img=True).std():
     raise SystemExit("the rendered picture is blank")
 """
-_PROBE_TIMEOUT = 120.0  # s; a first import of PyVista from a cold disk takes tens of seconds
+_PROBE_TIMEOUT = 120.0  # s; a first import of PyVista can take tens of seconds
 
 
 @functools.cache
 def rendering_problem() -> str | None:
-    """Why this machine cannot render in 3D, or None if it can; found out once per process.
+    """Return why this machine cannot render in 3D, or None if it can; checked once per process.
 
-    A child process tries it: where no OpenGL driver is found, VTK does not raise but its process is killed.
+    A child process makes the check: without an OpenGL driver, VTK raises no error but ends the process.
     """
     try:
         child = subprocess.run(
@@ -45,13 +45,13 @@ def rendering_problem() -> str | None:
 
 
 def require_rendering() -> None:
-    """Refuse to go on where it would kill the process, now or later.
+    """Check that rendering is safe, and import Triton if it is installed.
 
-    Triton holds an LLVM of its own. Imported after Mesa's software driver has loaded another, as PyTorch's
-    optimisers do, it ends the process; imported before, it does not.
+    Triton contains an LLVM. If it is imported after Mesa's software driver, which loads another LLVM, the
+    process ends. PyTorch's optimisers import Triton, so it is imported here first.
 
     Raises:
-        RuntimeError: this machine cannot render; the message says what is missing.
+        RuntimeError: this machine cannot render; the message names the cause.
     """
     problem = rendering_problem()
     if problem is not None:

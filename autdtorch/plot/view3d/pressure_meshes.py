@@ -1,4 +1,4 @@
-"""Fields as meshes: the pressure on the observation plane, and where in space it reaches a level."""
+"""Meshes of the pressure: on the observation plane, and surfaces of equal level in the domain."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-_REACH = 3.0  # wavelengths around a control point
-_SURFACE_COLOUR = "#8CD0FF"  # blue: a hue that the map of the pressure does not have
+_REACH = 3.0  # wavelengths around a control point, limit of the isosurface
+_SURFACE_COLOUR = "#8CD0FF"  # blue: not in the colour map of the pressure
 
 
 def add_plane(plotter: pyvista.Plotter, plane: Plane, level: Array | None) -> None:
-    """Draw the plane, coloured by its level (Nu, Nv) [dB]; without, a translucent sheet."""
+    """Draw the plane, coloured by its level (Nu, Nv) [dB], or translucent if there is none."""
     if level is None:
         plotter.add_mesh(
             plane_mesh(plane, np.zeros((1, 1))), color=PLANE_COLOUR, opacity=0.35, lighting=False
@@ -40,7 +40,7 @@ def add_plane(plotter: pyvista.Plotter, plane: Plane, level: Array | None) -> No
 def add_sheet(
     plotter: pyvista.Plotter, sheet: pyvista.PolyData, colours: str, limits: tuple[float, float]
 ) -> pyvista.Actor:
-    """Draw a mesh of `plane_mesh`, coloured by its values between the limits, and its frame."""
+    """Draw a mesh from `plane_mesh`, coloured by its values, and its frame."""
     actor = plotter.add_mesh(sheet, cmap=colours, clim=limits, lighting=False, show_scalar_bar=False)
     frame = sheet.extract_feature_edges()
     frame.clear_data()
@@ -49,7 +49,7 @@ def add_sheet(
 
 
 def plane_mesh(plane: Plane, values: Array) -> pyvista.PolyData:
-    """The plane with `values` (Nu, Nv) at the centres of its cells, and those next to its edge also there."""
+    """Return the plane with `values` (Nu, Nv) at its cell centres, extended to its edges."""
     import pyvista
 
     u, v = (axis.numpy() for axis in plane.basis)
@@ -59,14 +59,14 @@ def plane_mesh(plane: Plane, values: Array) -> pyvista.PolyData:
     )
     nodes = MM * (np.asarray(plane.center) + along_u[:, None, None] * u + along_v[None, :, None] * v)
     mesh = pyvista.StructuredGrid(*(nodes[:, :, None, axis] for axis in range(3)))
-    mesh["field"] = np.pad(values, 1, mode="edge").ravel(order="F")  # VTK counts the first axis fastest
+    mesh["field"] = np.pad(values, 1, mode="edge").ravel(order="F")  # in VTK the first axis varies fastest
     return mesh.extract_surface(algorithm=None)
 
 
 def add_isosurface(plotter: pyvista.Plotter, scene: Scene, level: Array, height: float) -> None:
-    """Draw where the level (Nx, Ny, Nz) [dB], at the centres of the domain's cells, is `height`.
+    """Draw the surface where the level (Nx, Ny, Nz) [dB], at the domain's cell centres, is `height`.
 
-    That is done around the control points alone: near the array the surface would hide all.
+    It is limited to the surroundings of the control points: near the array it would hide everything.
     """
     import pyvista
 
@@ -81,17 +81,17 @@ def add_isosurface(plotter: pyvista.Plotter, scene: Scene, level: Array, height:
     surface["away"] = distances(points, MM * scene.control_points).amin(dim=1).numpy()
     surface = surface.clip_scalar(scalars="away", value=MM * _REACH * scene.wavelength)
     if surface.n_cells == 0:
-        logger.warning("no isosurface: %g dB is not reached around the control points", height)
+        logger.warning("no isosurface: the level around the control points is below %g dB", height)
         return
     surface.clear_data()
     plotter.add_mesh(surface.compute_normals(), color=_SURFACE_COLOUR, opacity=0.45, smooth_shading=True)
 
 
 def plane_pressure(scene: Scene, field: ArrayLike) -> tuple[Plane, Array]:
-    """Return the scene's observation plane, and the magnitude of a `field` (Nu, Nv) on it.
+    """Return the scene's observation plane and the magnitude of a `field` (Nu, Nv) on it.
 
     Raises:
-        ValueError: not (Nu, Nv) finite numbers, or the scene has no plane.
+        ValueError: not (Nu, Nv) finite numbers, or the scene has no such plane.
     """
     magnitude = plane_magnitude("field", field)
     if scene.observation_plane is None:
@@ -100,10 +100,10 @@ def plane_pressure(scene: Scene, field: ArrayLike) -> tuple[Plane, Array]:
 
 
 def volume_magnitude(volume: ArrayLike) -> Array:
-    """Return |p| (Nx, Ny, Nz) of complex pressure or its magnitude in a domain; NaN where it is not known.
+    """Return |p| (Nx, Ny, Nz) of complex pressure, or of its magnitude; NaN where unknown.
 
     Raises:
-        ValueError: not numbers, another number of axes, a single layer of cells, infinite, or nothing known.
+        ValueError: not numbers, not three axes of at least 2, infinite, or NaN everywhere.
     """
     magnitude: Array = magnitude_tensor("volume", volume, "Pa").detach().cpu().numpy()
     if magnitude.ndim != 3 or min(magnitude.shape) < 2:
@@ -114,7 +114,7 @@ def volume_magnitude(volume: ArrayLike) -> Array:
 
 
 def zero_level(reference: float | None, on_plane: Array | None, in_domain: Array | None) -> float:
-    """The pressure of 0 dB [Pa]: the reference or the peak on the plane, or else of the volume.
+    """Return the pressure of 0 dB [Pa]: the reference, or the peak on the plane, or that in the volume.
 
     Raises:
         ValueError: the reference is not > 0, or the peak is 0.
@@ -122,7 +122,7 @@ def zero_level(reference: float | None, on_plane: Array | None, in_domain: Array
     if reference is not None:
         return positive("reference", reference, "Pa")
     name, shown = ("field", on_plane) if on_plane is not None else ("volume", in_domain)
-    if shown is None:  # no pressure is drawn
+    if shown is None:  # no pressure to draw
         return 1.0
     peak = float(np.nanmax(shown))
     if peak == 0:

@@ -1,4 +1,4 @@
-"""What a scene holds, as meshes: transducers, obstacles, control points; axes and camera."""
+"""Meshes of a scene: transducers, obstacles, control points; axes, colour bars and camera."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ if TYPE_CHECKING:
 
 _WINDOW = (1200, 860)  # pixels
 
-POINT_COLOUR = "#00C8A0"  # green: a hue that the map of the pressure does not have
+POINT_COLOUR = "#00C8A0"  # green: not in the colour map of the pressure
 _SILENT_COLOUR = "#C8C8C8"
-_PHASE_BAR = 0.03  # left edges of the colour bars in the window
+_PHASE_BAR = 0.03  # left edge of a colour bar, as a share of the window
 FIELD_BAR = 0.9
-_CAPTION = (0.85, 0.15)  # its lower left corner in the window
+_CAPTION = (0.85, 0.15)  # lower left corner, as shares of the window
 _CAMERA = (-0.75, -1.0, 0.5)  # from the centre towards the camera
 
 
 def new_plotter(scene: Scene, off_screen: bool) -> pyvista.Plotter:
-    """A plotter with obstacles, control points, axes and camera."""
+    """Return a plotter with obstacles, control points, axes and camera."""
     import pyvista
 
-    with pyvista.vtk_verbosity("error"):  # VTK warns of a missing X server, and then goes on without one
+    with pyvista.vtk_verbosity("error"):  # VTK warns of a missing X server, which it does not need
         plotter = pyvista.Plotter(off_screen=off_screen, window_size=list(_WINDOW))
     plotter.set_background("white")
     for obstacle in scene.obstacles:
@@ -53,10 +53,10 @@ def new_plotter(scene: Scene, off_screen: bool) -> pyvista.Plotter:
 
 
 def emitted_phases(drive: ArrayLike, transducers: int) -> Array:
-    """Phases (M,) in [0, 2 pi) [rad] of one drive of an array of `transducers`; NaN where it is silent.
+    """Return the phases (M,) in [0, 2 pi) [rad] of one drive; NaN for silent transducers.
 
     Raises:
-        ValueError: not one drive that the array can play.
+        ValueError: not a single drive of the array.
     """
     phases = single_drive_phases(drive, transducers)
     return np.where(amplitudes_of(drive).detach().cpu().numpy() > 0, phases, np.nan)
@@ -66,18 +66,18 @@ def add_transducers(plotter: pyvista.Plotter, scene: Scene, phases: Array | None
     """Draw the transducers as discs.
 
     Args:
-        plotter: where to.
-        scene: the transducers' scene.
-        phases: (M,) [rad], NaN for silent ones; colour the discs.
+        plotter: plotter to draw into.
+        scene: scene of the transducers.
+        phases: (M,) [rad], NaN for silent ones; colours the discs.
 
     Returns:
-        The discs, a cell or more each, with the transducers' phases over pi as "phase" if there are phases.
+        The mesh of all discs, with the phases over pi as "phase" if given.
     """
     import pyvista
 
     positions = scene.array.positions
     apart = nearest_other(positions)[0].min().item() if len(positions) > 1 else math.inf
-    # Those that are points are drawn as discs that do not touch, of one wavelength at most.
+    # Point sources are drawn as discs that do not touch, of at most one wavelength.
     radius = MM * (scene.array.radius or 0.42 * min(apart, scene.wavelength))
     points = pyvista.PolyData(MM * positions.numpy())
     points["normals"] = scene.array.normals.numpy()
@@ -116,7 +116,7 @@ def add_transducers(plotter: pyvista.Plotter, scene: Scene, phases: Array | None
 def add_bar(
     plotter: pyvista.Plotter, mesh: pyvista.Actor, title: str, *, position: float, labels: int, fmt: str
 ) -> None:
-    """Draw the colour bar of a mesh; `position` is its left edge in the window."""
+    """Draw the colour bar of a mesh; `position` is its left edge, as a share of the window."""
     bar = plotter.add_scalar_bar(
         title + "\n",  # VTK sets the title tight against the bar
         mapper=mesh.mapper,
@@ -136,13 +136,13 @@ def add_bar(
 
 
 def add_caption(plotter: pyvista.Plotter, *lines: str) -> None:
-    """Write lines below the bar of the field."""
+    """Write lines below the colour bar of the field."""
     text = plotter.add_text("\n".join(lines), position=_CAPTION, viewport=True, font_size=10, color="black")
     _use_font(text.prop)
 
 
 def _use_font(*properties: pyvista.TextProperty) -> None:
-    """Give texts the font that Matplotlib takes for its figures; VTK's own have no π."""
+    """Use the font of Matplotlib's figures; VTK's fonts have no π."""
     package = importlib.util.find_spec("matplotlib")  # PyVista needs it
     if package is None or package.origin is None:
         raise ModuleNotFoundError("matplotlib")
@@ -152,7 +152,7 @@ def _use_font(*properties: pyvista.TextProperty) -> None:
 
 
 def _add_obstacle(plotter: pyvista.Plotter, obstacle: Obstacle, domain: tuple[Vector, Vector]) -> None:
-    """The obstacle's surface and its sharp edges, cut off and left open where the domain ends."""
+    """Draw the obstacle's surface and its sharp edges, cut at the boundary of the domain."""
     import pyvista
 
     vertices, faces = obstacle.surface()
@@ -194,7 +194,7 @@ def _add_axes(plotter: pyvista.Plotter, scene: Scene) -> None:
         font_size=15,
     )
     for axis in range(3):
-        axes.SetAxisLabels(axis, None)  # PyVista's: VTK's own are at round numbers
+        axes.SetAxisLabels(axis, None)  # PyVista's are not round numbers, VTK's are
     plotter.view_vector(_CAMERA, viewup=(0.0, 0.0, 1.0))
     plotter.enable_parallel_projection()
     plotter.reset_camera()

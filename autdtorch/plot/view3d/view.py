@@ -1,4 +1,4 @@
-"""A scene and its field in 3D."""
+"""Rendered views of a scene and its field."""
 
 from __future__ import annotations
 
@@ -35,31 +35,30 @@ def view3d(
     save: str | Path | None = None,
     off_screen: bool = True,
 ) -> pyvista.Plotter:
-    """Draw transducers, obstacles, control points, observation plane and field, in millimetres.
+    """Render transducers, obstacles, control points, observation plane and field, in millimetres.
 
-    Pressures are drawn as levels 20 lg(|p| / reference), from -30 to 0 dB; the colour bar says what 0 dB is.
+    Pressures are shown as levels 20 lg(|p| / reference) from -30 to 0 dB. A caption gives the reference.
 
     Args:
-        scene: what to draw.
-        drive: complex (M,); colours the transducers by phase. Silent ones are grey.
+        scene: scene to draw.
+        drive: complex (M,); colours the transducers by phase. Silent transducers are grey.
         field: pressure on the observation plane (Nu, Nv) [Pa], complex or its magnitude, at the points of
-            `Plane.points`; colours the plane. Without it, the plane is a translucent sheet.
+            `Plane.points`; colours the plane. Without it, the plane is translucent.
         volume: pressure in the domain (Nx, Ny, Nz) [Pa], complex or its magnitude, from `volume_field`; NaN
-            where it is not known. Drawn as the surface where it has the level `isosurface`.
-        isosurface: that level [dB], in -30 to 0.
-        reference: the pressure of 0 dB [Pa], > 0. By default the largest on the plane or, without `field`, in
-            the volume. Give one to compare pictures.
-        save: file to write, by its suffix: ``.png``; ``.html`` to turn in a browser (extra ``notebook``);
-            ``.gltf`` for other 3D programs, in m and without axes and bars.
+            where unknown. It is shown as an isosurface.
+        isosurface: level of the isosurface [dB], in -30 to 0.
+        reference: the pressure of 0 dB [Pa], > 0; by default the largest of `field` or, without it, of
+            `volume`. Pictures with equal references can be compared.
+        save: file to write, ``.png``, ``.html`` (interactive; extra ``notebook``) or ``.gltf`` (for other 3D
+            programs, in m, without axes and colour bars).
         off_screen: False for a plotter whose ``show()`` opens a window.
 
     Returns:
         The plotter, for changes or ``show()``; close it when done.
 
     Raises:
-        RuntimeError: this machine cannot render, or cannot write HTML; the message says what is missing.
-        ValueError: `drive`, `field` or `volume` does not fit the scene, another argument is out of range, or
-            the suffix of `save` is another.
+        RuntimeError: this machine cannot render, or cannot write HTML; the message names the cause.
+        ValueError: `drive`, `field` or `volume` does not fit the scene, or another argument is out of range.
     """
     require_kind("scene", scene, Scene)
     off_screen = boolean("off_screen", off_screen)
