@@ -12,7 +12,7 @@ import torch
 
 import autdtorch as at
 from autdtorch import hardware
-from autdtorch.hardware.sensors.sensor import typed
+from autdtorch.hardware.sensors.by_hand import typed
 from autdtorch.hardware.transport.autd3_network import autd3_kit
 from autdtorch.hardware.wiring import Wiring
 from autdtorch.objectives.perturbations import random_rms

@@ -162,7 +162,7 @@ ARGUMENTS: dict[str, Any] = {
     "frames": 2,
     "frequency": 40e3,
     "G": MATRIX,
-    "heard": (0, 1),
+
     "height": 5e-3,
     "history": {"scene": {"gabs": [[1.0, 2.0]]}},
     "initial": 3,
@@ -242,6 +242,7 @@ OTHERS: dict[str, Any] = {
     "Dead.transducers": [1],
     "Drift.sensor": 0.1,
     "EmulatedScope.noise": 0.0,
+    "EmulatedScope.points": (0, 1),
     "EmulatedScope.pressure": lambda: MATRIX[:, 0],
     "HardwareObjective.scene": AIR_ALONE,
     "LimitedLink.link": Made(lambda _: link()),

@@ -10,9 +10,11 @@ from .objective import HardwareObjective
 from .played import Played
 from .preflight import Preflight, check_transducers, hears_silence
 from .safety import LimitedLink, LimitError, Limits, Signalled, ended_by_signals
+from .sensors.by_hand import ManualSensor, MovedMicrophone
 from .sensors.oscilloscope import Microphone, Oscilloscope, ScopeSensor, open_scope
+from .sensors.reading_file import FileSensor
 from .sensors.scpi import KEYSIGHT, RIGOL, Dialect, Waveform
-from .sensors.sensor import FileSensor, ManualSensor, MovedMicrophone, Sensor, SensorError
+from .sensors.sensor import Sensor, SensorError
 from .transport.port import LinkError, Port
 from .transport.serial_chips import Adapter
 from .transport.usbtmc import UsbtmcPort

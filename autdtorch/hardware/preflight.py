@@ -1,4 +1,4 @@
-"""Before a trial: every transducer in turn, whether the sensor hears it."""
+"""The check before a trial: every transducer is played alone, and its pressure compared with silence."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ from autdtorch.hardware.safety import LimitedLink
 from autdtorch.hardware.sensors.sensor import Sensor, checked_reading
 from autdtorch.utils.validation import integer_at_least, require_callable, require_kind
 
-#: How far above the noise a transducer is heard, in standard deviations of the noise's mean power.
+#: Threshold above the noise, in standard deviations of the noise's mean power.
 _DEVIATIONS = 6.0
+#: Threshold below the median of all transducers: 20 dB, as some sensors round silence to 0.
 _WEAK = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Preflight:
-    """What the sensor hears of each transducer alone, and of silence.
+    """The pressure of each transducer alone, and of silence.
 
     Attributes:
         pressure: of each transducer (M,) [Pa], rms over readings and control points.
-        silence: the same with the outputs off [Pa].
-        threshold: below this a transducer is not heard [Pa].
+        silence: of silence, with the outputs off [Pa].
+        threshold: pressure that a working transducer exceeds [Pa].
     """
 
     pressure: torch.Tensor
@@ -33,7 +34,7 @@ class Preflight:
 
     @property
     def dead(self) -> list[int]:
-        """The transducers that are not heard."""
+        """The failed transducers: not above the threshold."""
         return torch.nonzero(self.pressure <= self.threshold)[:, 0].tolist()
 
 
@@ -47,22 +48,21 @@ def check_transducers(
 ) -> Preflight:
     """Play every transducer alone, after silence, and switch the outputs off, however it ends.
 
-    The power of circular Gaussian noise, averaged over n readings, deviates by 1/sqrt(n) of its mean: that
-    says from which pressure on a transducer is heard. It must also be within 20 dB of the others' median, as
-    some sensors round silence to 0.
+    The power of circular Gaussian noise, averaged over n readings, deviates by 1/sqrt(n) of its mean. The
+    threshold is six deviations above that mean, or 20 dB below the median of all transducers if that is more.
 
     Args:
         link: plays them.
-        sensor: hears them.
+        sensor: reads their pressure.
         points: number of control points P that the sensor reads.
-        readings: of every transducer, >= 1.
-        background: readings of the silence, >= 1.
-        watch: is told what is read next: "silence, outputs off", then "transducer 1 of 16" and so on.
+        readings: number of readings of every transducer, >= 1.
+        background: number of readings of the silence, >= 1.
+        watch: takes the name of each reading: "silence, outputs off", then "transducer 1 of 16" and so on.
 
     Raises:
         ValueError: the link is not limited, there is no sensor or it does not give P finite magnitudes, or
             fewer than 1 readings.
-        LimitError: the outputs were on for as long as they may.
+        LimitError: the time limit of the outputs is reached.
         LinkError: the device does not take the bytes.
     """
     require_kind("link", link, LimitedLink)
@@ -91,13 +91,13 @@ def check_transducers(
 
 
 def hears_silence(sensor: Sensor, check: Preflight, points: int, readings: int = 4) -> bool:
-    """Whether the sensor hears no more than before the trial, so that the outputs are truly off.
+    """Return True if the sensor reads no more than before the trial: the outputs are truly off.
 
     Args:
-        sensor: hears P points.
+        sensor: reads P points.
         check: made before the trial.
         points: P.
-        readings: >= 1.
+        readings: number of readings, >= 1.
 
     Raises:
         ValueError: the sensor does not give P finite magnitudes, or fewer than 1 readings.

@@ -1,4 +1,4 @@
-"""What keeps a bench from harm: limits on what is played, and outputs off however a trial ends."""
+"""Safety of a bench: limits on amplitudes and times, and outputs off however a trial ends."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from autdtorch.utils.validation import integer_at_least, not_negative, number_be
 logger = logging.getLogger(__name__)
 
 # SIGTSTP, Ctrl-Z, would stop the process, and its timer, with the outputs on; so would SIGTTIN, where a trial
-# in the background of a shell asks somebody for a reading.
+# in the background of a shell asks for a reading.
 _ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGTTIN", "SIGBREAK")
 _SIGNALS = [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
 
@@ -47,15 +47,16 @@ class Signalled(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def ended_by_signals() -> Iterator[None]:
-    """Have the signals that end or stop a process raise `Signalled`, so that links are closed on the way out.
+    """Raise `Signalled` at signals that end or stop a process, so that links are closed on the way out.
 
-    These are Ctrl-C, Ctrl-Z, SIGTERM, SIGHUP, SIGQUIT and SIGTTIN; one that is ignored, as by ``nohup``,
-    stays so. One that comes on the way out does not raise: it must not interrupt the switching off. One that
-    comes later does, as Python drops what is raised in a ``__del__`` or a callback. Use it around the link.
+    The signals are Ctrl-C, Ctrl-Z, SIGTERM, SIGHUP, SIGQUIT and SIGTTIN; an ignored one, as by ``nohup``,
+    stays ignored. While a `Signalled` is on its way out, further signals do not raise: they must not
+    interrupt the switching off. Later ones do, as Python drops exceptions of a ``__del__`` or a callback. Use
+    it around the link.
 
     Raises:
-        Signalled: there was such a signal.
-        ValueError: it is used outside of the main thread, which alone hears signals.
+        Signalled: such a signal came.
+        ValueError: it is used outside of the main thread, which alone receives signals.
     """
     outside = sys.exception()
 
@@ -71,30 +72,30 @@ def ended_by_signals() -> Iterator[None]:
         for one, handler in before.items():
             signal.signal(one, handler)
 
-    heard = [one for one in _SIGNALS if signal.getsignal(one) is not signal.SIG_IGN]
-    before = {one: signal.getsignal(one) for one in heard}
+    handled = [one for one in _SIGNALS if signal.getsignal(one) is not signal.SIG_IGN]
+    before = {one: signal.getsignal(one) for one in handled}
     try:
-        for one in heard:
+        for one in handled:
             signal.signal(one, end)
         yield
     finally:
         try:
             restore()
-        except Signalled:  # there was none before, and none is raised while this one is handled
+        except Signalled:  # the first one; no other is raised while it is handled
             restore()
             raise
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a trial may ask of a device.
+    """Limits of a trial.
 
     Attributes:
-        amplitude: the most that a transducer is driven at, above 0 up to 1. Drives are scaled: a method's
-            |q| = 1 is the largest amplitude within it that the device plays.
-        evaluations: the most that a trial makes, those before it was interrupted included.
-        seconds: the most that the outputs are on in all [s].
-        seconds_in_a_row: the most that they are on without a rest [s].
+        amplitude: largest amplitude of a transducer, above 0 up to 1. Drives are scaled: a method's |q| = 1
+            is the largest amplitude level of the device within it.
+        evaluations: largest number of evaluations, with those before an interruption.
+        seconds: longest time that the outputs are on in all [s].
+        seconds_in_a_row: longest time that they are on without a rest [s].
         duty_cycle: share of the time that they may be on, above 0 up to 1: after a stretch of t s they rest
             for t (1 / duty_cycle - 1) s.
 
@@ -122,9 +123,9 @@ class LimitedLink:
     """A link that plays within limits, and switches off by itself when the time is up.
 
     Attributes:
-        link: what plays.
-        limits: of what is played.
-        logs: of the trials that it plays for; the time on that each began with is counted.
+        link: the link.
+        limits: of the trial.
+        logs: files of the trials that it plays for; the time on before each is counted.
     """
 
     def __init__(self, link: Link, limits: Limits) -> None:
@@ -132,10 +133,10 @@ class LimitedLink:
 
         Args:
             link: with its outputs off.
-            limits: of what is played.
+            limits: of the trial.
 
         Raises:
-            ValueError: no link or no limits, or the device has no amplitude up to the limit but 0.
+            ValueError: no link or no limits, or the device has no amplitude up to the limit except 0.
         """
         require_kind("link", link, Link)
         require_kind("limits", limits, Limits)
@@ -152,18 +153,17 @@ class LimitedLink:
 
     @property
     def seconds_on(self) -> float:
-        """How long the outputs were on so far [s]."""
-        with self._lock:  # the timer adds the stretch to those before
+        """Time that the outputs were on so far [s]."""
+        with self._lock:  # against the timer, which adds the stretch
             return self._seconds_before + self._stretch()
 
     def go_on(self, seconds: float) -> None:
         """Go on with a trial of an earlier process.
 
-        The time that its outputs were on counts. How long its last stretch was is not known: the duty cycle's
-        rest is that of the longest.
+        The length of its last stretch is unknown: the duty cycle's rest is that of the longest.
 
         Args:
-            seconds: how long its outputs were on [s], >= 0.
+            seconds: time that its outputs were on [s], >= 0; it counts for the limit.
 
         Raises:
             ValueError: `seconds` out of range.
@@ -172,15 +172,15 @@ class LimitedLink:
         rest = self._rest(self.limits.seconds_in_a_row)
         self._rested_at = time.monotonic() + rest
         if rest > 0:
-            logger.info("resting for %.3g s first, as the duty cycle asks", rest)
+            logger.info("resting for %.3g s first, for the duty cycle", rest)
 
     def play(self, drive: torch.Tensor) -> None:
         """Play a drive (M,), |q| <= 1, scaled to the limit, until the next, `off`, or the end of the time.
 
-        The time may end while the sound settles: `require_on` says so.
+        The time may end while the sound settles: `require_on` raises then.
 
         Raises:
-            LimitError: the outputs were on for as long as they may.
+            LimitError: the time limit of the outputs is reached.
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
             LinkError: the device does not take the bytes.
         """
@@ -202,7 +202,7 @@ class LimitedLink:
         self.link.wait_for_sound()  # without the lock, which the timer needs
 
     def played(self, drive: torch.Tensor) -> torch.Tensor:
-        """What the device plays (..., M), in the scale of `play`, when asked for drives (..., M).
+        """Return the device's nearest drives to drives (..., M), both in the scale of `play`.
 
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
@@ -210,11 +210,11 @@ class LimitedLink:
         return self._scale.played(drive)
 
     def require_on(self) -> None:
-        """Require that the outputs are on since `play`: otherwise what was read meanwhile is void.
+        """Require that the outputs are on since `play`: otherwise the readings meanwhile are void.
 
         Raises:
-            LimitError: they went off, as the time was up.
-            LinkError: they should have gone off, and the device did not take the bytes.
+            LimitError: they went off at the end of the time.
+            LinkError: the device did not take the bytes that switch them off.
         """
         self._raise_failure()
         if self._on_since is None:
@@ -225,7 +225,7 @@ class LimitedLink:
             )
 
     def off(self) -> None:
-        """Switch all outputs off, and begin the rest that the duty cycle asks for.
+        """Switch all outputs off, and begin the rest of the duty cycle.
 
         Raises:
             OffError: the device does not take the bytes.
@@ -257,15 +257,15 @@ class LimitedLink:
 
     def _time_is_up(self, since: float) -> None:
         with self._lock:
-            if self._on_since != since:  # switched off meanwhile, or on anew
+            if self._on_since != since:  # switched off meanwhile, and perhaps on again
                 return
             try:
                 self.off()
-            except Exception as error:  # for the main thread to raise, once its sensor lets it
+            except Exception as error:  # raised in the main thread, after its reading
                 self._failure = error
                 logger.error("the time is up, but: %s", error)
             else:
-                logger.warning("the time is up: the outputs are off, what is read now is void")
+                logger.warning("the time is up: the outputs are off, and this reading is void")
 
     def _raise_failure(self) -> None:
         if self._failure is not None:

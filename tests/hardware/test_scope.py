@@ -46,10 +46,10 @@ def sensor_at(scope, microphones: int, captures: int = 1) -> ScopeSensor:
 class Bench:
     """A field that does not change, and an oscilloscope in it."""
 
-    def __init__(self, pressure, dialect: Dialect = KEYSIGHT, heard=(0, 1), **properties):
+    def __init__(self, pressure, dialect: Dialect = KEYSIGHT, points=(0, 1), **properties):
         maker = dialect.name.partition(" ")[0]
         self.field = torch.tensor(pressure, dtype=torch.complex128)
-        self.scope = EmulatedScope(lambda: self.field, FREQUENCY, SENSITIVITY, heard, maker, **properties)
+        self.scope = EmulatedScope(lambda: self.field, FREQUENCY, SENSITIVITY, points, maker, **properties)
         self.instrument = EmulatedInstrument(*CHIP, "S1", self.scope)
         self.bus = EmulatedBus([self.instrument])
         self.open = open_scope(CHIP, dialect, backend=self.bus)
@@ -62,7 +62,7 @@ class Bench:
         return told
 
     def sensor(self, captures: int = 1) -> ScopeSensor:
-        return sensor_at(self.open, len(self.scope.heard), captures)
+        return sensor_at(self.open, len(self.scope.points), captures)
 
 
 @pytest.mark.parametrize("dialect", [KEYSIGHT, RIGOL], ids=lambda dialect: dialect.name)
@@ -74,7 +74,7 @@ def test_a_reading_is_the_pressure_within_the_quantisation(dialect):
     # sum(2 w |sin| / 2) / sum(w) = 2 / pi codes, the mean of |sin|.
     worst = 2 / math.pi * RESOLUTION * (1 if dialect is KEYSIGHT else 32 / 25)
     assert (reading - torch.tensor(pressure).abs()).abs().max() < worst
-    assert bench.scope.misunderstood == []
+    assert bench.scope.unknown == []
     assert "EMULATED" in bench.open.identity
 
 
@@ -105,7 +105,7 @@ def test_averaged_powers_less_the_noise_have_no_bias_where_the_noise_is_as_loud_
 
 
 def test_a_microphone_drifts_by_what_was_asked_for():
-    sensor = Bench([3.0], heard=[0], drift=0.5, seed=3).sensor()
+    sensor = Bench([3.0], points=[0], drift=0.5, seed=3).sensor()
     steps = torch.cat([sensor.read() for _ in range(100)]).log().diff()
     # A walk of rms 0.5 after 1000 captures; 99 steps tell theirs to 1 / sqrt(198), four times which are 28 %.
     assert steps.std() == pytest.approx(0.5 / math.sqrt(1000), rel=0.28)
@@ -127,11 +127,11 @@ def test_each_input_has_a_scale_on_which_it_uses_a_quarter_of_the_screen_or_more
     assert scales == pytest.approx([LOUDEST * SENSITIVITY / 3.5, half, 1e-3, 4e-3], rel=0.1)
     assert sensor.recaptures == 3
     assert sum(line.startswith(":CHANnel1:SCALe") for line in told) == 1
-    assert bench.scope.misunderstood == []
+    assert bench.scope.unknown == []
 
 
 def test_a_sound_that_is_loud_and_quiet_by_turns_is_read_on_some_scale():
-    bench = Bench([3.9], heard=[0])
+    bench = Bench([3.9], points=[0])
     execute, turns = bench.scope.execute, itertools.cycle([0.1, 3.9])
 
     def turn(line: str) -> bytes | None:
@@ -159,7 +159,7 @@ def test_silence_is_a_warning_that_names_input_and_noise(caplog):
         bench.sensor(captures=10).read()
     assert [record.getMessage()[:8] for record in caplog.records] == ["input 2:"]
     # sqrt(6 / N) of the noise of a sample
-    assert "from the noise of 0.0078 Pa" in caplog.text
+    assert "the noise of 0.0078 Pa" in caplog.text
 
 
 faults = pytest.mark.parametrize(
@@ -242,11 +242,11 @@ def test_a_capture_that_does_not_come_is_not_taken_for_the_last():
 def test_one_microphone_is_moved_from_point_to_point():
     def move(question: str) -> str:
         asked.append(question)
-        bench.scope.heard[0] = len(asked) - 1
+        bench.scope.points[0] = len(asked) - 1
         return ""
 
     asked: list[str] = []
-    bench = Bench([1.0, 2.0], heard=[0])
+    bench = Bench([1.0, 2.0], points=[0])
     sensor = MovedMicrophone(bench.sensor(), [(0.08, 0.01, 0), (0.08, -0.02, 5e-3)], move)
     assert sensor.read() == pytest.approx([1.0, 2.0], abs=RESOLUTION)
     assert asked[1] == (
@@ -256,7 +256,7 @@ def test_one_microphone_is_moved_from_point_to_point():
 
 def test_an_evaluation_through_device_and_oscilloscope_is_the_simulated_pressure(trial):
     bench = trial.bench()
-    scope = EmulatedScope(bench.pressure, FREQUENCY, SENSITIVITY, heard=[0, 1])
+    scope = EmulatedScope(bench.pressure, FREQUENCY, SENSITIVITY, points=[0, 1])
     scope.plug_into(bench, CHIP)
     drive = drive_from_phases(torch.arange(16) * 2 * math.pi / 32)
     with trial.link(bench) as link, open_scope(CHIP, backend=bench.bus) as oscilloscope:

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from autdtorch.hardware import FileSensor, ManualSensor, MovedMicrophone, SensorError
 from autdtorch.hardware.safety import Signalled, ended_by_signals
-from autdtorch.hardware.sensors import sensor
+from autdtorch.hardware.sensors import reading_file
+from autdtorch.hardware.sensors.by_hand import typed
 from autdtorch.hardware.sensors.lock_in import LockIn
-from autdtorch.hardware.sensors.sensor import typed
 
 POINTS = [(0.08, 0.01, 0.0), (0.08, -0.02, 5e-3)]
 
@@ -26,23 +26,21 @@ POINTS = [(0.08, 0.01, 0.0), (0.08, -0.02, 5e-3)]
 def test_a_sine_with_an_offset_is_found_exactly_in_any_number_of_periods(periods, phase, offset):
     step = periods / 1000 / 40e3
     angle = 2 * math.pi * 40e3 * step * torch.arange(1000, dtype=torch.float64)
-    heard = LockIn(40e3, step, 1000)(
-        offset + 0.3 * torch.stack([(angle + phase).cos(), (angle - phase).cos()])
-    )
+    fit = LockIn(40e3, step, 1000)(offset + 0.3 * torch.stack([(angle + phase).cos(), (angle - phase).cos()]))
     # Re(p e^{-i w t}) = cos(w t + phase) for p = e^{-i phase}; rounding of the offset and the angle.
     expected = 0.3 * torch.tensor([phase, -phase], dtype=torch.float64).mul(-1j).exp()
-    torch.testing.assert_close(heard.phasor, expected, rtol=0, atol=1e-12)
-    assert heard.residual.max() < 1e-12
+    torch.testing.assert_close(fit.phasor, expected, rtol=0, atol=1e-12)
+    assert fit.residual.max() < 1e-12
 
 
 @pytest.mark.parametrize("periods", [10.25, 12.3, 40.5])
 def test_a_ramp_of_slow_drift_is_kept_out_by_the_window(periods):
     ramp = torch.linspace(-0.5, 0.5, 4000, dtype=torch.float64)
-    heard = LockIn(40e3, periods / 4000 / 40e3, 4000)(ramp)
+    fit = LockIn(40e3, periods / 4000 / 40e3, 4000)(ramp)
     # The window ends with a second derivative of 2 (pi / T)^2, so that the ramp's integral against e^{iwt} is
     # at most 2 (pi / T)^2 / w^3, and the phasor 4 / T of that; without a window it were 1 / (pi periods).
     # A tenth more for the fit of the offset and for terms beyond the leading one.
-    assert heard.phasor.abs() < 1.1 / (math.pi * periods**3)
+    assert fit.phasor.abs() < 1.1 / (math.pi * periods**3)
 
 
 @pytest.mark.parametrize(
@@ -95,7 +93,7 @@ def running(monkeypatch, path: Path, *contents: str | None) -> None:
             written.replace(path)
 
     now, waiting = 0.0, iter(contents)
-    monkeypatch.setattr(sensor, "time", SimpleNamespace(sleep=sleep, monotonic=lambda: now))
+    monkeypatch.setattr(reading_file, "time", SimpleNamespace(sleep=sleep, monotonic=lambda: now))
 
 
 def test_a_file_is_read_once_it_has_changed_and_is_whole(tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""The board file (.pat) of OpenMPD and AcousTools: where one board's transducers are, and their calibration.
+"""The board file (.pat) of OpenMPD and AcousTools: places and calibration of one board's transducers.
 
 The file holds a name, the number M of transducers and that of phase levels, a line each; then M positions
 `(x, y, z)` [m], M pins, M phase offsets [degrees] and M gains, each in any number of lines.
@@ -21,13 +21,45 @@ from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.geometry import in_plane
 from autdtorch.utils.validation import ArrayLike, path_of
 
-#: Phase levels that the boards have, and `hardware.levels` makes.
+#: Number of phase levels of the boards.
 _LEVELS = 128
 
 
 class _Item(NamedTuple):
+    path: str | os.PathLike[str]
     line: int
     text: str
+
+    def tuples(self) -> Iterator[list[_Item]]:
+        """Yield the entries of each pair of parentheses, which must be three."""
+        for inside in re.findall(r"\(([^()]*)\)", self.text):
+            entries = [self._replace(text=part) for part in inside.split(",")]
+            if len(entries) != 3:
+                raise self._replace(text=inside).wrong("position", "must be (x, y, z)")
+            yield entries
+
+    def numbers(self) -> Iterator[_Item]:
+        """Yield the entries outside of parentheses."""
+        outside = re.sub(r"\([^()]*\)", "", self.text)
+        return (self._replace(text=part) for part in re.split(r"[,\s]+", outside) if part)
+
+    def real(self, field: str) -> float:
+        try:
+            number = float(self.text)
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number):
+            raise self.wrong(field, "must be a finite number")
+        return number
+
+    def integer(self, field: str) -> int:
+        try:
+            return int(self.text)
+        except ValueError as error:
+            raise self.wrong(field, "must be an integer") from error
+
+    def wrong(self, field: str, accepted: str) -> ValueError:
+        return ValueError(f"{self.path}, line {self.line}: {field} {self.text!r}; {accepted}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,43 +90,49 @@ class OpenMPDBoard:
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: it is none of a board. The message names the file, the line and what is wrong.
+            ValueError: it describes no board. The message names file, line and field.
         """
         try:
             lines = path_of("path", path).read_text(encoding="utf-8-sig").splitlines()
         except UnicodeDecodeError as error:
             raise ValueError(f"{path}: {error}; must be a text file in UTF-8") from error
-        head = [_Item(number, line.strip()) for number, line in enumerate(lines, 1) if line.strip()]
+        head = [_Item(path, number, line.strip()) for number, line in enumerate(lines, 1) if line.strip()]
         if len(head) < 4:
             raise ValueError(
                 f"{path}: {len(head)} lines; must hold name, counts, positions, pins, offsets, gains"
             )
-        name, count, levels = head[:3]
-        transducers = _integer(path, "number of transducers", count)
-        if transducers < 1:
-            raise _wrong(path, "number of transducers", count, "must be >= 1")
-        if _integer(path, "number of phase levels", levels) != _LEVELS:
-            raise _wrong(path, "number of phase levels", levels, f"must be {_LEVELS}")
-        body = head[3:]
-        positions = [_position(path, item) for item in _tuples(body)]
-        if len(positions) != transducers:
+        count = head[1].integer("number of transducers")
+        if count < 1:
+            raise head[1].wrong("number of transducers", "must be >= 1")
+        if head[2].integer("number of phase levels") != _LEVELS:
+            raise head[2].wrong("number of phase levels", f"must be {_LEVELS}")
+        positions = [
+            [part.real("position") for part in place] for item in head[3:] for place in item.tuples()
+        ]
+        if len(positions) != count:
+            raise ValueError(f"{path}: {len(positions)} positions (x, y, z); must be {count} as in line 2")
+        numbers = [number for item in head[3:] for number in item.numbers()]
+        if len(numbers) != 3 * count:
             raise ValueError(
-                f"{path}: {len(positions)} positions (x, y, z); must be {transducers} as in line 2"
+                f"{path}: {len(numbers)} numbers after the positions; must be {count} pins, "
+                f"{count} phase offsets and {count} gains"
             )
-        numbers = list(_numbers(body))
-        if len(numbers) != 3 * transducers:
-            raise ValueError(
-                f"{path}: {len(numbers)} numbers after the positions; must be {transducers} pins, "
-                f"{transducers} phase offsets and {transducers} gains"
-            )
-        pins, offsets, gains = (numbers[part * transducers :][:transducers] for part in range(3))
-        return cls(
-            name.text,
-            torch.tensor(positions, dtype=torch.float64, device="cpu"),
-            _pins(path, pins),
-            torch.deg2rad(_floats(path, "phase offset", offsets)),
-            torch.tensor([_gain(path, item) for item in gains], dtype=torch.float64, device="cpu"),
+        pins: dict[int, None] = {}
+        for item in numbers[:count]:
+            pin = item.integer("pin")
+            if pin in pins or not 0 <= pin < count:
+                raise item.wrong("pin", f"must be one of 0 to {count - 1}, each once")
+            pins[pin] = None
+        offsets = [item.real("phase offset") for item in numbers[count : 2 * count]]
+        gains = [item.real("gain") for item in numbers[2 * count :]]
+        for item, gain in zip(numbers[2 * count :], gains, strict=True):
+            if not 0 <= gain <= 1:
+                raise item.wrong("gain", "must be in [0, 1]")
+        parts = (
+            torch.tensor(part, dtype=torch.float64, device="cpu") for part in (positions, offsets, gains)
         )
+        places, degrees, factors = parts
+        return cls(head[0].text, places, tuple(pins), torch.deg2rad(degrees), factors)
 
     def array(
         self,
@@ -104,10 +142,10 @@ class OpenMPDBoard:
         source_strength: float = OPENMPD_SOURCE_STRENGTH,
         radius: float | None = TRANSDUCER_RADIUS,
     ) -> TransducerArray:
-        """The board in space; by default in its own axes.
+        """Return the board in space; by default in its own axes.
 
         Args:
-            center: where the origin of its axes goes (3,) [m].
+            center: place of the origin of its axes (3,) [m].
             normal: direction of emission (3,), its z.
             angle: of its x from u towards v [rad], (u, v) being `plane_basis(normal)`.
             source_strength: [Pa m], > 0; by default as AcousTools assumes.
@@ -121,7 +159,7 @@ class OpenMPDBoard:
         )
 
     def calibrated(self, drive: ArrayLike) -> torch.Tensor:
-        """What to send so that the transducers play `drive` (..., M): each with its gain, less its offset.
+        """Return `drive` (..., M) with each transducer's gain, and less its phase offset.
 
         Raises:
             ValueError: not a drive of M transducers.
@@ -130,7 +168,7 @@ class OpenMPDBoard:
         return wanted * torch.polar(self.gains, -self.phase_offsets).to(wanted.device)
 
     def by_pin(self, drive: ArrayLike) -> torch.Tensor:
-        """The `drive` (..., M) in the order of the pins, in which the board takes it.
+        """Return `drive` (..., M) in the order of the pins, in which the board takes it.
 
         Raises:
             ValueError: not a drive of M transducers.
@@ -138,68 +176,3 @@ class OpenMPDBoard:
         return validate_drive(drive, len(self.positions))[
             ..., torch.tensor(self.pins, dtype=torch.int64, device="cpu").argsort()
         ]
-
-
-def _tuples(items: list[_Item]) -> Iterator[_Item]:
-    for line, text in items:
-        for inside in re.findall(r"\(([^()]*)\)", text):
-            yield _Item(line, inside)
-
-
-def _numbers(items: list[_Item]) -> Iterator[_Item]:
-    """What stands outside of the parentheses."""
-    for line, text in items:
-        for part in re.split(r"[,\s]+", re.sub(r"\([^()]*\)", "", text)):
-            if part:
-                yield _Item(line, part)
-
-
-def _position(path: str | os.PathLike[str], item: _Item) -> list[float]:
-    parts = item.text.split(",")
-    if len(parts) != 3:
-        raise _wrong(path, "position", item, "must be (x, y, z)")
-    return [_float(path, "position", _Item(item.line, part)) for part in parts]
-
-
-def _pins(path: str | os.PathLike[str], items: list[_Item]) -> tuple[int, ...]:
-    pins: list[int] = []
-    seen: set[int] = set()
-    for item in items:
-        pin = _integer(path, "pin", item)
-        if pin in seen or not 0 <= pin < len(items):
-            raise _wrong(path, "pin", item, f"must be one of 0 to {len(items) - 1}, each once")
-        seen.add(pin)
-        pins.append(pin)
-    return tuple(pins)
-
-
-def _floats(path: str | os.PathLike[str], field: str, items: list[_Item]) -> torch.Tensor:
-    return torch.tensor([_float(path, field, item) for item in items], dtype=torch.float64, device="cpu")
-
-
-def _gain(path: str | os.PathLike[str], item: _Item) -> float:
-    gain = _float(path, "gain", item)
-    if not 0 <= gain <= 1:
-        raise _wrong(path, "gain", item, "must be in [0, 1]")
-    return gain
-
-
-def _float(path: str | os.PathLike[str], field: str, item: _Item) -> float:
-    try:
-        number = float(item.text)
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise _wrong(path, field, item, "must be a finite number")
-    return number
-
-
-def _integer(path: str | os.PathLike[str], field: str, item: _Item) -> int:
-    try:
-        return int(item.text)
-    except ValueError as error:
-        raise _wrong(path, field, item, "must be an integer") from error
-
-
-def _wrong(path: str | os.PathLike[str], field: str, item: _Item, accepted: str) -> ValueError:
-    return ValueError(f"{path}, line {item.line}: {field} {item.text!r}; {accepted}")

@@ -1,7 +1,4 @@
-"""A USB bus without hardware: pyusb talks to it as it talks to libusb.
-
-Everything above the wire is what drives a real device.
-"""
+"""A USB bus without hardware: a backend of pyusb in place of libusb."""
 
 from __future__ import annotations
 
@@ -26,14 +23,14 @@ _PACKET = 64
 
 
 class EmulatedDevice(Protocol):
-    """What can be plugged in.
+    """An emulated USB device.
 
     Attributes:
         interfaces: class, subclass and protocol of each, and its endpoints, those for bulk transfers.
         vendor: idVendor.
         product: idProduct.
         strings: string descriptors by their index.
-        present: whether it is plugged in.
+        present: true while it is plugged in.
     """
 
     interfaces: ClassVar[Interfaces]
@@ -43,11 +40,11 @@ class EmulatedDevice(Protocol):
     present: bool
 
     def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
-        """Take a request with its data; False where it knows no such request, and stalls."""
+        """Take a request with its data; False for an unknown one, which stalls."""
         ...
 
     def answer(self, kind: int, request: int) -> bytes | None:
-        """Answer a request; None where it knows no such request, and stalls."""
+        """Answer a request; None for an unknown one, which stalls."""
         ...
 
     def write(self, data: bytes) -> None:
@@ -55,7 +52,7 @@ class EmulatedDevice(Protocol):
         ...
 
     def read(self, most: int) -> bytes:
-        """Give a bulk transfer of at most so many bytes."""
+        """Return a bulk transfer of at most so many bytes."""
         ...
 
 
@@ -63,7 +60,7 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
     """A backend of pyusb with emulated devices, numbered by their place.
 
     Attributes:
-        chips: what may be plugged in.
+        chips: the devices, plugged in or not.
         slept: time that has passed by `sleep` [s].
     """
 
@@ -74,15 +71,15 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
         self.slept = 0.0
 
     def sleep(self, seconds: float) -> None:
-        """Let time pass on the bench, where it takes none."""
+        """Let time pass on the bench, without waiting."""
         self.slept += seconds
 
     def enumerate_devices(self) -> list[int]:
-        """Addresses of what is plugged in."""
+        """Return the addresses of the devices that are plugged in."""
         return [address for address, chip in enumerate(self.chips) if chip.present]
 
     def get_device_descriptor(self, dev: int) -> SimpleNamespace:
-        """USB 2.0, class by interface."""
+        """Return the descriptor of a device: USB 2.0, class by interface."""
         chip = self.chips[dev]
         return SimpleNamespace(
             bLength=18, bDescriptorType=1, bcdUSB=0x0200, bDeviceClass=0, bDeviceSubClass=0,
@@ -92,7 +89,7 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
         )  # fmt: skip
 
     def get_configuration_descriptor(self, dev: int, config: int) -> SimpleNamespace:
-        """The only one."""
+        """Return the descriptor of the only configuration."""
         _require(config == 0)
         return SimpleNamespace(
             bLength=9, bDescriptorType=2, wTotalLength=32, bNumInterfaces=len(self.chips[dev].interfaces),
@@ -100,7 +97,7 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
         )  # fmt: skip
 
     def get_interface_descriptor(self, dev: int, intf: int, alt: int, config: int) -> SimpleNamespace:
-        """As the chip has it."""
+        """Return the descriptor of an interface of the chip."""
         _require(config == alt == 0)
         (kind, subclass, protocol), endpoints = self.chips[dev].interfaces[intf]
         return SimpleNamespace(
@@ -110,7 +107,7 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
         )  # fmt: skip
 
     def get_endpoint_descriptor(self, dev: int, ep: int, intf: int, alt: int, config: int) -> SimpleNamespace:
-        """Bulk."""
+        """Return the descriptor of a bulk endpoint."""
         return SimpleNamespace(
             bLength=7, bDescriptorType=5, bEndpointAddress=self.chips[dev].interfaces[intf][1][ep],
             bmAttributes=2, wMaxPacketSize=_PACKET, bInterval=0, bRefresh=0, bSynchAddress=0,
@@ -118,34 +115,34 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
         )  # fmt: skip
 
     def open_device(self, dev: int) -> int:
-        """The address is the handle."""
+        """Return the handle of a device, its address."""
         self._chip(dev)
         return dev
 
     def close_device(self, dev_handle: int) -> None:
-        """Nothing is held."""
+        """Do nothing."""
 
     def set_configuration(self, dev_handle: int, config_value: int) -> None:
-        """There is only one."""
+        """Require the device to be present; it has one configuration."""
         self._chip(dev_handle)
 
     def get_configuration(self, dev_handle: int) -> int:
-        """The only one."""
+        """Return the number of the only configuration."""
         return 1
 
     def claim_interface(self, dev_handle: int, intf: int) -> None:
-        """Nobody else is there."""
+        """Require the device to be present."""
         self._chip(dev_handle)
 
     def release_interface(self, dev_handle: int, intf: int) -> None:
-        """Nobody else is there."""
+        """Do nothing."""
 
     def clear_halt(self, dev_handle: int, ep: int) -> None:
-        """Nothing stalls."""
+        """Require the device to be present."""
         self._chip(dev_handle)
 
     def is_kernel_driver_active(self, dev_handle: int, intf: int) -> bool:
-        """There is no kernel."""
+        """Return False: there is no kernel."""
         return False
 
     def ctrl_transfer(
@@ -158,7 +155,7 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
         data: array[int],
         timeout: int,
     ) -> int:
-        """String descriptors, and requests to the chip; others stall."""
+        """Answer string descriptors and requests to the chip; others stall."""
         chip = self._chip(dev_handle)
         if not bmRequestType & _FROM_DEVICE:
             if chip.control(bmRequestType, bRequest, wValue, wIndex, data.tobytes()):
@@ -173,12 +170,12 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
         return _fill(data, answer[: len(data)])
 
     def bulk_write(self, dev_handle: int, ep: int, intf: int, data: array[int], timeout: int) -> int:
-        """All of it, at once."""
+        """Take all data at once."""
         self._chip(dev_handle).write(data.tobytes())
         return len(data)
 
     def bulk_read(self, dev_handle: int, ep: int, intf: int, buff: array[int], timeout: int) -> int:
-        """What the device gives."""
+        """Fill the buffer with a bulk transfer of the device."""
         return _fill(buff, self._chip(dev_handle).read(len(buff)))
 
     def _chip(self, dev: int) -> EmulatedDevice:
@@ -189,17 +186,17 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
 
 
 def stall() -> USBError:
-    """The error of a request that a device refuses."""
+    """Return the error of a request that a device refuses."""
     return USBError("Pipe error", errno=errno.EPIPE)
 
 
 def unplugged() -> USBError:
-    """The error of a request to a device that is gone."""
+    """Return the error of a request to a device that is gone."""
     return USBError("No such device (it may have been disconnected)", errno=errno.ENODEV)
 
 
 def time_out() -> USBError:
-    """The error of a transfer that does not come to its end."""
+    """Return the error of a transfer that does not end."""
     return USBTimeoutError("Operation timed out", errno=errno.ETIMEDOUT)
 
 
@@ -214,6 +211,6 @@ def _string_descriptor(strings: Sequence[str], index: int) -> bytes:
 
 
 def _require(there: bool) -> None:
-    """Pyusb goes through what there is until an IndexError."""
+    """Raise the IndexError that ends pyusb's enumeration."""
     if not there:
         raise IndexError

@@ -1,6 +1,6 @@
 """An oscilloscope without hardware: its commands, and the waveforms of microphones on an emulated bench.
 
-Its commands are those of the makers' programming guides, not of `scpi`, so that the one checks the other.
+Written from the makers' programming guides, not from `scpi`, so that one checks the other.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from autdtorch.utils.validation import (
     require_one_of,
 )
 
-_PER = 1000  # captures after which a drift is stated
+_DRIFT_CAPTURES = 1000  # after which the rms of a drift is stated
 
 
 @dataclass(frozen=True)
 class _Maker:
     identity: str
     time_scale: str
-    capture: str  # the command after which a capture is there
+    capture: str  # the command that takes a capture
     clear: str | None
-    ignored: frozenset[str]  # settings and commands that change nothing here
+    ignored: frozenset[str]  # settings and commands without effect here
     answers: dict[str, str]
     points: int
     codes_per_division: int
     middle: int
-    clipped: tuple[int, int]  # codes of samples below and above what the converter can follow
+    clipped: tuple[int, int]  # codes of samples below and above the range of the converter
     digits: int  # in the length of a block
     scales: tuple[float, float]  # the finest and the coarsest [V/division]
 
@@ -65,13 +65,11 @@ _INPUT_SETTINGS = frozenset({"DISP", "PROB", "COUP", "OFFS", "VERN"})
 
 
 class EmulatedScope:
-    """An oscilloscope whose inputs hear microphones at the control points of a bench.
-
-    It samples with 8 bits, from a random moment on.
+    """An oscilloscope with microphones at the control points of a bench; 8 bits, from a random moment on.
 
     Attributes:
-        heard: for each input, from the first, the control point where its microphone is.
-        misunderstood: lines that it could do nothing with.
+        points: control point of the microphone at each input, from the first.
+        unknown: lines that are no known command.
     """
 
     def __init__(
@@ -79,7 +77,7 @@ class EmulatedScope:
         pressure: Callable[[], torch.Tensor],
         frequency: float,
         sensitivity: float,
-        heard: Sequence[int],
+        points: Sequence[int],
         maker: str = "Keysight",
         noise: float = 0.0,
         dc_offset: float = 0.0,
@@ -89,10 +87,10 @@ class EmulatedScope:
         """Set the bench up.
 
         Args:
-            pressure: gives the phasors (P,) [Pa] at the control points now.
+            pressure: returns the phasors (P,) [Pa] at the control points now.
             frequency: of the sound [Hz].
             sensitivity: of all microphones, with their amplifiers [V/Pa].
-            heard: for each input, from the first, the control point where its microphone is, from 0.
+            points: control point, from 0, of the microphone at each input, from the first.
             maker: of the oscilloscope, Keysight or Rigol.
             noise: rms of the white noise at every input [V].
             dc_offset: voltage at every input without sound [V].
@@ -104,8 +102,8 @@ class EmulatedScope:
         """
         require_callable("pressure", pressure)
         require_one_of("maker", maker, _MAKERS)
-        self.heard = integers("heard", heard, 0, "must be numbers of control points, from 0")
-        self.misunderstood: list[str] = []
+        self.points = integers("points", points, 0, "must be numbers of control points, from 0")
+        self.unknown: list[str] = []
         self._maker = _MAKERS[maker]
         self._pressure = pressure
         self._frequency = positive("frequency", frequency, "Hz")
@@ -116,7 +114,7 @@ class EmulatedScope:
         self._generator = np.random.default_rng(integer_at_least("seed", seed, 0))
         self._walk = 0.0
         self._time_scale = 1e-3
-        self._scales = [1.0] * len(self.heard)
+        self._scales = [1.0] * len(self.points)
         self._source = 0
         self._captured: list[tuple[bytes, float]] = []  # codes, and the scale they were taken on
 
@@ -125,11 +123,11 @@ class EmulatedScope:
         bench.bus.chips.append(EmulatedInstrument(*chip, serial, self))
 
     def execute(self, line: str) -> bytes | None:
-        """Do what a line says; the answer, if it asks for one that there is."""
+        """Execute a line, and return its answer, if it has one."""
         header, _, argument = line.partition(" ")
         header = _short(header)
         found = re.fullmatch(r"CHAN(\d):(\w+)", header)
-        number = int(found[1]) - 1 if found and 1 <= int(found[1]) <= len(self.heard) else None
+        number = int(found[1]) - 1 if found and 1 <= int(found[1]) <= len(self.points) else None
         if header == self._maker.time_scale:
             self._time_scale = float(argument)
         elif found and number is not None and found[2] == "SCAL":
@@ -145,7 +143,7 @@ class EmulatedScope:
         elif header not in self._maker.ignored and not (
             found and number is not None and found[2] in _INPUT_SETTINGS
         ):
-            self.misunderstood.append(line)
+            self.unknown.append(line)
         return None
 
     def _answer(self, header: str) -> bytes | None:
@@ -170,13 +168,13 @@ class EmulatedScope:
 
     def _capture(self) -> None:
         """Sample all inputs, from a random moment on."""
-        self._walk += self._drift / _PER**0.5 * self._generator.standard_normal()
+        self._walk += self._drift / _DRIFT_CAPTURES**0.5 * self._generator.standard_normal()
         moments = self._generator.uniform(0, 1 / self._frequency) + self._step() * np.arange(
             self._maker.points
         )
         turns = np.exp(-2j * np.pi * self._frequency * moments)
-        phasors = self._pressure().numpy()[self.heard] * self._sensitivity * np.exp(self._walk)
-        noise = self._noise * self._generator.standard_normal((len(self.heard), len(moments)))
+        phasors = self._pressure().numpy()[self.points] * self._sensitivity * np.exp(self._walk)
+        noise = self._noise * self._generator.standard_normal((len(self.points), len(moments)))
         volts = (phasors[:, None] * turns).real + self._offset + noise
         low, high = self._maker.clipped
         steps = volts * self._maker.codes_per_division / np.array(self._scales)[:, None]
@@ -185,7 +183,7 @@ class EmulatedScope:
 
 
 def _short(header: str) -> str:
-    """A header in capitals, its words in the short form: four letters, or three if the fourth is a vowel."""
+    """Return a header in capitals and short form: words of four letters, or three before a vowel."""
     return re.sub(r"[A-Z]+", lambda word: _short_word(word[0]), header.upper().removeprefix(":"))
 
 

@@ -1,6 +1,6 @@
-"""A measuring instrument on the emulated bus: USBTMC around what it makes of a line of text.
+"""The USB interface of a measuring instrument on the emulated bus: USBTMC around its lines of text.
 
-Written from the class's specification alone, not from `usbtmc`, so that the one checks the other.
+Written from the class's specification alone, not from `usbtmc`, so that one checks the other.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import ClassVar, Literal, Protocol
 from autdtorch.hardware.emulator.bus import stall, time_out
 from autdtorch.hardware.emulator.chips import Interfaces
 
-#: What can go wrong with a transfer from the instrument.
+#: Faults of a transfer from the instrument.
 Fault = Literal["time-out", "stall", "short", "garbage"]
 
 _PACKET = 64
@@ -25,7 +25,7 @@ class Instrument(Protocol):
     """An instrument behind its USB interface."""
 
     def execute(self, line: str) -> bytes | None:
-        """Do what a line says; the answer, if it asks for one that there is."""
+        """Execute a line, and return its answer, if it has one."""
         ...
 
 
@@ -37,10 +37,11 @@ class EmulatedInstrument:
         vendor: idVendor.
         product: idProduct.
         strings: string descriptors by their index.
-        present: whether it is plugged in.
-        fault: what goes wrong with every transfer from the instrument, from now on.
-        longest: bytes of a message in a transfer; longer messages come in several.
-        sends_empty_packets: after a transfer of whole packets, as USB demands; some instruments do not.
+        present: true while it is plugged in.
+        fault: fault of every transfer from the instrument, from now on.
+        longest: most bytes of a message in a transfer; longer messages come in several.
+        sends_empty_packets: true if an empty packet follows a transfer of whole packets, as USB demands; some
+            instruments send none.
     """
 
     interfaces: ClassVar[Interfaces] = (((0xFE, 0x03, 0x01), (0x82, 0x01)),)
@@ -61,11 +62,11 @@ class EmulatedInstrument:
         self._sending: bytes | None = None
 
     def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
-        """It takes no requests with data."""
+        """Refuse all requests with data."""
         return False
 
     def answer(self, kind: int, request: int) -> bytes | None:
-        """INITIATE_CLEAR and CHECK_CLEAR_STATUS, which succeed at once, and GET_CAPABILITIES."""
+        """Answer INITIATE_CLEAR and CHECK_CLEAR_STATUS, which succeed at once, and GET_CAPABILITIES."""
         if kind != _CLASS_INTERFACE:
             return None
         if request == _INITIATE_CLEAR:
@@ -78,7 +79,7 @@ class EmulatedInstrument:
         return answers.get(request)
 
     def write(self, data: bytes) -> None:
-        """A transfer: part of a message, or the wish for an answer."""
+        """Take a transfer: part of a message, or the request for an answer."""
         kind, tag, complement = data[:3]
         length = int.from_bytes(data[4:8], "little")
         if tag == 0 or tag + complement != 255:
@@ -91,7 +92,7 @@ class EmulatedInstrument:
             raise stall()
 
     def read(self, most: int) -> bytes:
-        """What fits into `most` bytes of a transfer that was asked for."""
+        """Return at most `most` bytes of a requested transfer."""
         if self.fault == "stall":
             raise stall()
         if self.fault == "garbage":
@@ -108,7 +109,7 @@ class EmulatedInstrument:
         return given
 
     def _transfer(self) -> bytes:
-        """As much of the answer as was asked for and goes into a transfer."""
+        """Return the next transfer of the answer."""
         if self._asked is None or not self._answer:
             raise time_out()
         tag, most = self._asked

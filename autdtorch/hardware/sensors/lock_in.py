@@ -1,4 +1,4 @@
-"""The part of a sampled signal that is at one frequency."""
+"""A lock-in: the component of a sampled signal at one frequency."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import torch
 from autdtorch.utils.validation import integer_at_least, invalid, positive
 
 
-class Heard(NamedTuple):
-    """What a lock-in found.
+class Fit(NamedTuple):
+    """A sine fitted to a signal.
 
     Attributes:
         phasor: p (...,) of Re(p e^{-i w t}), t = 0 at the first sample; complex128, in the signal's unit.
-        residual: rms of what is neither at the frequency nor constant (...,), float64.
+        residual: rms of the signal less sine and offset (...,), float64.
     """
 
     phasor: torch.Tensor
@@ -23,12 +23,11 @@ class Heard(NamedTuple):
 
 
 class LockIn:
-    """Fits an offset and a sine of known frequency to samples: least squares, weighted by a Hann window.
+    """A fit of an offset and a sine of known frequency: least squares, weighted by a Hann window.
 
-    An offset and a sine are found exactly, whatever number of periods the samples hold. The window keeps
-    hum, slow drift and harmonics out, which a plain fit lets in where that number is not whole; the error
-    that white noise causes grows by sqrt(3/2) above the least that any unbiased estimate can have
-    (Rife and Boorstyn 1974, doi:10.1109/TIT.1974.1055282).
+    Offset and sine are found exactly for any number of periods. The window suppresses hum, slow drift and
+    harmonics, which disturb a plain fit where that number is not whole. White noise causes an error sqrt(3/2)
+    times the lowest bound of unbiased estimates (Rife and Boorstyn 1974, doi:10.1109/TIT.1974.1055282).
 
     Attributes:
         noise_gain: white noise of variance s^2 in every sample puts an error of E|e|^2 = noise_gain s^2 on
@@ -62,9 +61,9 @@ class LockIn:
         self._fit = torch.linalg.solve(weighted @ self._basis.T, weighted)
         self.noise_gain = float(self._fit[1:].square().sum())
 
-    def __call__(self, signal: torch.Tensor) -> Heard:
-        """Phasors of signals (..., S)."""
+    def __call__(self, signal: torch.Tensor) -> Fit:
+        """Return the fits to signals (..., S)."""
         coefficients = signal.to(torch.float64) @ self._fit.T
         rest = signal - coefficients @ self._basis
         residual = (rest.square().sum(dim=-1) / (rest.shape[-1] - len(self._basis))).sqrt()
-        return Heard(torch.complex(coefficients[..., 1], coefficients[..., 2]), residual)
+        return Fit(torch.complex(coefficients[..., 1], coefficients[..., 2]), residual)

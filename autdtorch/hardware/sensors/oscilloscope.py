@@ -1,4 +1,4 @@
-"""Microphones at an oscilloscope: captures of their voltages, and the pressure at the drive frequency."""
+"""Microphones at an oscilloscope: voltages captured, pressures by a lock-in at the drive frequency."""
 
 from __future__ import annotations
 
@@ -30,19 +30,22 @@ from autdtorch.utils.validation import (
 logger = logging.getLogger(__name__)
 
 _PERIODS_A_DIVISION = 5  # 50 or 60 on a screen, 20 samples each
-_CAPTURE_TIME = 2.0  # [s] after which a capture must be there
+_CAPTURE_TIME = 2.0  # time limit of a capture [s]
 _QUIET = 5  # standard errors
 
 
 @dataclass(frozen=True)
 class Microphone:
-    """A microphone at a control point, and its way into the oscilloscope.
+    """A microphone at a control point, and its path into the oscilloscope.
 
     Attributes:
         input: number of the oscilloscope's input, from 1.
         sensitivity: of the microphone at the drive frequency [V/Pa].
-        loudest: amplitude that the input must take [Pa].
+        loudest: largest amplitude that the input must take [Pa].
         gain: of the amplifier between, as a factor.
+
+    Raises:
+        ValueError: an attribute out of range.
     """
 
     input: int
@@ -51,11 +54,7 @@ class Microphone:
     gain: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            ValueError: one is out of range.
-        """
+        """Check the attributes."""
         integer_at_least("input", self.input, 1)
         positive("sensitivity", self.sensitivity, "V/Pa")
         positive("loudest", self.loudest, "Pa")
@@ -63,24 +62,22 @@ class Microphone:
 
 
 class Oscilloscope:
-    """An oscilloscope that takes captures when it is asked to, whatever its inputs hear.
-
-    Use it as a context manager.
+    """An oscilloscope that captures on request, without a trigger signal; a context manager.
 
     Attributes:
-        identity: what it says it is.
-        finest: vertical scale that it has [V/division].
+        identity: its answer to ``*IDN?``.
+        finest: finest vertical scale [V/division].
     """
 
     identity: str
     finest: float
 
     def __init__(self, port: UsbtmcPort, dialect: Dialect = KEYSIGHT) -> None:
-        """Ask it what it is.
+        """Ask for its identity.
 
         Args:
             port: takes its commands.
-            dialect: of its maker.
+            dialect: commands of its maker.
 
         Raises:
             LinkError: it does not answer.
@@ -90,12 +87,12 @@ class Oscilloscope:
         require_kind("dialect", dialect, Dialect)
         self._port = port
         self._dialect = dialect
-        self._scales: dict[int, float] = {}  # that it was told
+        self._scales: dict[int, float] = {}  # by input, as sent
         self.identity = port.ask("*IDN?")
         self.finest = dialect.finest
 
     def set_up(self, inputs: Collection[int], time_scale: float) -> None:
-        """Set inputs and time up.
+        """Set inputs and time scale.
 
         Args:
             inputs: their numbers, from 1.
@@ -111,16 +108,16 @@ class Oscilloscope:
                 self._port.tell(command.format(input=number))
 
     def capture(self, scales: Mapping[int, float]) -> list[Waveform]:
-        """A waveform for each of the inputs, all of the same time.
+        """Return a waveform for each of the inputs, all of the same time.
 
-        What goes wrong once is logged as a warning; the oscilloscope is cleared, and captures once more.
+        A first error is logged as a warning; the oscilloscope is cleared, and captures once more.
 
         Args:
             scales: of the inputs [V/division].
 
         Raises:
-            LinkError: twice in a row, it did not take the commands, or not capture or answer in time; or it
-                does not clear.
+            LinkError: it failed twice to take the commands, or to capture or answer in time; or it does not
+                clear.
         """
         try:
             return self._capture(scales)
@@ -131,7 +128,7 @@ class Oscilloscope:
         return self._capture(scales)
 
     def close(self) -> None:
-        """Let go of it.
+        """Release it.
 
         Raises:
             LinkError: it cannot be given back to the system.
@@ -139,13 +136,13 @@ class Oscilloscope:
         self._port.close()
 
     def __enter__(self) -> Self:
-        """The oscilloscope."""
+        """Return the oscilloscope."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Let go of it."""
+        """Release it."""
         self.close()
 
     def _capture(self, scales: Mapping[int, float]) -> list[Waveform]:
@@ -171,15 +168,15 @@ class Oscilloscope:
 class ScopeSensor:
     """Microphones at an oscilloscope, one for each control point.
 
-    The amplitude at the drive frequency is taken from captures by a lock-in: hum, other tones and most of
-    the noise do not count. Readings of several captures are averaged as powers, less the power that the
-    noise has there, since the captures' phases are not known.
+    A lock-in takes the amplitude at the drive frequency from captures, without hum, other tones and most of
+    the noise. Captures are averaged as powers, less the power of the noise there, since their phases are
+    unknown.
 
-    Each input keeps the vertical scale of its last capture. What is clipped there, or too small, is captured
-    again on another scale, up to that of the loudest sound.
+    Each input keeps the vertical scale of its last capture. A waveform that is clipped on it, or too small,
+    is captured again on another scale, up to that of the loudest sound.
 
     Attributes:
-        recaptures: how often that was.
+        recaptures: number of captures that were repeated on another scale.
     """
 
     recaptures: int
@@ -197,7 +194,7 @@ class ScopeSensor:
             scope: takes the captures.
             frequency: of the drive [Hz].
             microphones: in the order of the control points.
-            captures: to average over.
+            captures: number of captures that a reading averages.
 
         Raises:
             ValueError: an argument out of range, no microphone, or two at one input.
@@ -219,7 +216,7 @@ class ScopeSensor:
         scope.set_up(self._scales.keys(), _PERIODS_A_DIVISION / self._frequency)
 
     def read(self) -> torch.Tensor:
-        """Magnitudes (P,) [Pa]; what cannot be told from noise is logged as a warning.
+        """Return magnitudes (P,) [Pa]; one within the noise is logged as a warning.
 
         Raises:
             SensorError: a capture is clipped on the coarsest scale, or too coarse or short for the frequency.
@@ -232,23 +229,20 @@ class ScopeSensor:
         quiet = power - noise < _QUIET * noise / self._captures**0.5
         for place in quiet.nonzero().flatten().tolist():
             logger.warning(
-                "input %d: %.3g Pa cannot be told from the noise of %.2g Pa",
+                "input %d: %.3g Pa is within the noise of %.2g Pa",
                 *(self._microphones[place].input, float(pressure[place]), float(noise[place].sqrt())),
             )
         return pressure
 
     def _capture(self) -> torch.Tensor:
-        """Powers (P, 2) [Pa^2]: what is heard at the frequency, and what the noise adds to that.
-
-        Each input is on a scale that suits it.
-        """
-        once_clipped: set[int] = set()  # on no finer scale in this reading, so that it comes to an end
+        """Return powers (P, 2) [Pa^2] at the frequency, and of the noise in them, on fitting scales."""
+        once_clipped: set[int] = set()  # not on a finer scale again in this reading, so that it ends
         while True:
             waveforms = self._scope.capture({number: one.now for number, one in self._scales.items()})
             lock_in = self._lock_in(waveforms)
-            heard = lock_in(torch.stack([one.volts for one in waveforms]))
+            fit = lock_in(torch.stack([one.volts for one in waveforms]))
             fitted = dict(self._scales)
-            for number, waveform, noise in zip(fitted, waveforms, heard.residual.tolist(), strict=True):
+            for number, waveform, noise in zip(fitted, waveforms, fit.residual.tolist(), strict=True):
                 if waveform.clipped:
                     once_clipped.add(number)
                 if waveform.clipped or number not in once_clipped:
@@ -263,13 +257,13 @@ class ScopeSensor:
             torch.tensor([one.resolution for one in waveforms], dtype=torch.float64, device="cpu").square()
             / 12
         )
-        variance = heard.residual.square().maximum(rounding)
+        variance = fit.residual.square().maximum(rounding)
         volts = torch.tensor([_volts(one) for one in self._microphones], dtype=torch.float64, device="cpu")
-        powers = torch.stack([heard.phasor.abs().square(), lock_in.noise_gain * variance], dim=1)
+        powers = torch.stack([fit.phasor.abs().square(), lock_in.noise_gain * variance], dim=1)
         return powers / volts[:, None].square()
 
     def _lock_in(self, waveforms: Sequence[Waveform]) -> LockIn:
-        """For waveforms that all have the same moments."""
+        """Return the lock-in for waveforms, which must be sampled at the same moments."""
         moments = {(one.time_step, len(one.volts)) for one in waveforms}
         if len(moments) > 1:
             raise SensorError(f"inputs differ in time step and number of samples: {sorted(moments)}")
@@ -283,7 +277,7 @@ class ScopeSensor:
             if waveform.clipped:
                 raise SensorError(
                     f"input {microphone.input}: {waveform.clipped} of {len(waveform.volts)} samples are "
-                    f"clipped; its microphone hears more than {microphone.loudest:g} Pa: raise `loudest`"
+                    f"clipped, by more than {microphone.loudest:g} Pa: raise `loudest`"
                 )
 
 
@@ -294,8 +288,8 @@ def open_scope(
 
     Args:
         chip: its idVendor and idProduct, as ``lsusb`` shows them.
-        dialect: of its maker.
-        serial: number, where several such are plugged in.
+        dialect: commands of its maker.
+        serial: serial number, where several such are plugged in.
         backend: of pyusb; by default libusb. An emulated bench has its own.
 
     Raises:
@@ -310,5 +304,5 @@ def open_scope(
 
 
 def _volts(microphone: Microphone) -> float:
-    """Voltage at the input for 1 Pa."""
+    """Return the voltage at the input for 1 Pa."""
     return microphone.sensitivity * microphone.gain

@@ -1,4 +1,4 @@
-"""What oscilloscopes of different makers are told over SCPI, and how their samples become volts.
+"""SCPI commands of oscilloscopes by maker, and volts from their samples.
 
 From the makers' programming guides; none was tried on a device.
 """
@@ -14,13 +14,13 @@ from autdtorch.hardware.transport.port import LinkError
 
 @dataclass(frozen=True)
 class Waveform:
-    """Samples of one input.
+    """The samples of one input.
 
     Attributes:
         volts: (S,) [V], float64.
         time_step: from sample to sample [s].
         resolution: a step of the converter [V].
-        clipped: how many samples the converter could not follow.
+        clipped: number of samples beyond the converter's range.
     """
 
     volts: torch.Tensor
@@ -35,20 +35,20 @@ class Dialect:
 
     Attributes:
         name: of the oscilloscopes that take them.
-        set_up: once; ``{time}`` stands for the time scale [s/division].
-        set_up_input: once for each ``{input}``.
-        capture: takes a capture of all inputs at once, whatever they hear: no signal has to trigger it.
-        status: asks whether the capture is there.
-        ready: the answer, if it is.
-        source: says of which ``{input}`` preamble and samples are asked for.
-        preamble: asks for ten numbers; the fifth is the time step, the last three are step, origin and
+        set_up: sent once, with the time scale ``{time}`` [s/division].
+        set_up_input: sent once for each ``{input}``.
+        capture: starts a capture of all inputs at once, without a trigger signal.
+        status: question for the end of the capture.
+        ready: answer to it at the end.
+        source: selects the ``{input}`` of preamble and samples.
+        preamble: question for ten numbers; the fifth is the time step, the last three are step, origin and
             reference of the voltage.
-        samples: asks for the samples, a byte each, as a definite-length block.
-        lowest: the least code that is no clipped sample.
-        highest: the greatest.
+        samples: question for the samples, a byte each, as a definite-length block.
+        lowest: lowest code of a sample that is not clipped.
+        highest: highest code of such a sample.
         origin_in_codes: the voltage's origin is a number of codes, not of volts.
         scale: sets the vertical ``{scale}`` of an ``{input}`` [V/division].
-        finest: scale that there is [V/division].
+        finest: finest vertical scale [V/division].
     """
 
     name: str
@@ -67,7 +67,7 @@ class Dialect:
     finest: float = 1e-3
 
     def waveform(self, preamble: str, codes: bytes) -> Waveform:
-        """The waveform that two answers describe.
+        """Return the waveform that two answers describe.
 
         Args:
             preamble: ten numbers.

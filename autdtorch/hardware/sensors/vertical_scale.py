@@ -1,4 +1,4 @@
-"""The vertical scale of an oscilloscope's input, chosen anew where a waveform does not suit it."""
+"""The vertical scale of an oscilloscope's input, adapted to the last waveform."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ from dataclasses import dataclass
 from autdtorch.hardware.sensors.scpi import Waveform
 
 _DIVISIONS = 3.5  # of a full screen, above and below the middle; there are 4 or more
-_QUIET = 0.25  # of a full screen: what fills less is put on a finer scale,
-_TARGET = 0.5  # so that it fills this much
-_COARSER = 4.0  # what clips here fills a quarter or more there, and so stays there
+_QUIET = 0.25  # share of the screen below which a waveform gets a finer scale
+_TARGET = 0.5  # share that it then fills
+_COARSER = 4.0  # a waveform that clips fills at least a quarter of a scale so much coarser
 
 
 @dataclass(frozen=True)
 class VerticalScale:
     """Volts per division, between two bounds.
 
-    From a quarter of the screen to the whole it stays as it is, and what was changed is in the middle of
-    that: a sound as loud as the last, or twice or half as loud, needs no change.
+    A waveform keeps its scale from a quarter of the screen to the whole, and a new scale has it at half: a
+    sound as loud as the last, or twice or half as loud, needs no change.
 
     Attributes:
         now: the scale [V/division].
-        finest: of the oscilloscope [V/division].
-        coarsest: that the loudest sound needs [V/division].
+        finest: finest scale of the oscilloscope [V/division].
+        coarsest: scale for the loudest sound [V/division].
     """
 
     now: float
@@ -31,17 +31,17 @@ class VerticalScale:
 
     @classmethod
     def up_to(cls, volts: float, finest: float) -> VerticalScale:
-        """The coarsest scale, on which an amplitude of `volts` [V] fills the screen."""
+        """Return the coarsest scale: an amplitude of `volts` [V] fills the screen."""
         coarsest = volts / _DIVISIONS
         return cls(coarsest, finest, coarsest)
 
     def fitted(self, waveform: Waveform, noise: float) -> VerticalScale:
-        """A scale that suits what was captured on this one; this one, if it does or no other may be.
+        """Return the scale that suits a waveform; this one, if it does or the bounds allow no other.
 
         Args:
             waveform: captured on this scale.
-            noise: its rms [V]. Where that is a step of the converter or more, no scale is finer: rounding
-                then adds 1/12 to the noise's variance at most, and no bias.
+            noise: its rms [V]. From a step of the converter on, the scale is not made finer: rounding then
+                adds 1/12 to the noise's variance at most, and no bias.
         """
         peak = float(waveform.volts.abs().max()) + waveform.resolution
         wanted = self.now

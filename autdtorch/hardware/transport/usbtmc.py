@@ -12,7 +12,7 @@ from typing import Any
 from autdtorch.hardware.transport.port import LinkError, closed_on_error
 from autdtorch.hardware.transport.usb import UsbPort
 
-#: MsgID: a message to the instrument; asking for one, and the answer.
+#: MsgID of a message to the instrument; of a request for an answer, and of the answer.
 TELL, ASK = 1, 2
 #: bmTransferAttributes: the message ends with this transfer.
 END = 1
@@ -32,27 +32,27 @@ _CHECKS = 100
 
 
 def message(kind: int, tag: int, length: int, attributes: int, data: bytes = b"") -> bytes:
-    """A bulk transfer: 12 bytes that say what it is, the data, and zeros up to a multiple of 4 bytes.
+    """Return a bulk transfer: a header of 12 bytes, the data, and zeros up to a multiple of 4 bytes.
 
     Args:
         kind: MsgID.
         tag: number of the transfer, 1 to 255; the header has its complement too.
-        length: of the data, or how much the instrument may send.
+        length: number of bytes of the data, or the most that the instrument may send.
         attributes: bmTransferAttributes.
-        data: what is sent.
+        data: bytes to send.
     """
     return _HEADER.pack(kind, tag, tag ^ 0xFF, length, attributes) + data + bytes(-len(data) % 4)
 
 
 def announced(packet: bytes, tag: int) -> tuple[int, bool]:
-    """Length of the data in an instrument's transfer, and whether its message ends with it.
+    """Return the length of the data in an instrument's transfer, and whether its message ends with it.
 
     Args:
-        packet: the transfer's first, with the header.
-        tag: of the request that it answers.
+        packet: first packet of the transfer, with the header.
+        tag: tag of the request that it answers.
 
     Raises:
-        LinkError: it does not answer that, or has more data than can have been asked for.
+        LinkError: it does not answer that request, or has more data than requested.
     """
     if len(packet) < _HEADER.size:
         raise LinkError(f"USBTMC: {len(packet)} bytes {packet.hex(' ')}; a header has {_HEADER.size}")
@@ -64,12 +64,12 @@ def announced(packet: bytes, tag: int) -> tuple[int, bool]:
 
 
 def block(data: bytes) -> bytes:
-    """What a definite-length block of IEEE 488.2 holds.
+    """Return the content of a definite-length block of IEEE 488.2.
 
-    It is ``#``, a digit, so many digits that are the number of bytes, the bytes, and maybe a line end.
+    A block is ``#``, a digit n, n digits with the number of bytes, the bytes, and maybe a line end.
 
     Raises:
-        LinkError: no such block, or a shorter one than it says.
+        LinkError: no such block, or an incomplete one.
     """
     digits = data[2 : 2 + int(data[1:2])] if data[:1] == b"#" and data[1:2].isdigit() else b""
     if not digits.isdigit():
@@ -84,7 +84,7 @@ class UsbtmcPort(UsbPort):
     """An instrument that takes commands and answers questions, as text."""
 
     def __init__(self, device: Any) -> None:
-        """Take the instrument, and clear what it still has to say.
+        """Take the instrument, and clear unread answers.
 
         Args:
             device: `usb.core.Device`.
@@ -108,7 +108,7 @@ class UsbtmcPort(UsbPort):
         self.write(message(TELL, self._next(), len(data), END, data))
 
     def ask(self, question: str) -> str:
-        """The answer to a question, as text.
+        """Return the answer to a question, as text.
 
         Raises:
             LinkError: the instrument does not take the question, or has no such answer.
@@ -120,7 +120,7 @@ class UsbtmcPort(UsbPort):
             raise LinkError(f"USBTMC: {question} is answered by {data[:40]!r}, which is no text") from error
 
     def ask_block(self, question: str) -> bytes:
-        """The answer to a question, as what a definite-length block holds.
+        """Return the answer to a question, the content of a definite-length block.
 
         Raises:
             LinkError: the instrument does not take the question, or has no such answer.
@@ -128,7 +128,7 @@ class UsbtmcPort(UsbPort):
         return block(self._answer(question))
 
     def recover(self) -> None:
-        """Clear a stall of an answer, and what else the instrument still has to take or say.
+        """Clear a stall of an answer, unread answers and incomplete commands.
 
         Raises:
             LinkError: it does not clear.
@@ -151,10 +151,10 @@ class UsbtmcPort(UsbPort):
         return received
 
     def _data(self, question: str, tag: int) -> tuple[bytes, bool]:
-        """Data of a transfer from the instrument, and whether its message ends with it.
+        """Return the data of a transfer from the instrument, and whether its message ends with it.
 
-        The transfer is read to the length that its header says: not all instruments send an empty packet
-        after one of whole packets. If one does, that is read before the next transfer.
+        The transfer is read to the length in its header: not all instruments send an empty packet after one
+        of whole packets. If one does, that is read before the next transfer.
         """
         packet = self._in.wMaxPacketSize
         received = self._piece(question, packet) or self._piece(question, packet)
@@ -190,10 +190,10 @@ class UsbtmcPort(UsbPort):
                 self._call("be cleared", self._in.read, _MOST, _TIMEOUT_MS)
             time.sleep(0.01)
         if status != SUCCESS:
-            raise LinkError(f"USBTMC: the instrument does not clear what it has to say: status {status:#04x}")
+            raise LinkError(f"USBTMC: the instrument does not clear its answers: status {status:#04x}")
         self._call("be cleared", self._out.clear_halt)
 
     def _class_request(self, request: int, length: int) -> bytes:
-        """What the interface answers, its status first."""
+        """Return the answer of the interface, its status first."""
         arguments = (CLASS_REQUEST, request, 0, self._interface, length, _TIMEOUT_MS)
         return bytes(self._call("be cleared", self._device.ctrl_transfer, *arguments))

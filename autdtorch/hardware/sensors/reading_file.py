@@ -1,0 +1,73 @@
+"""A file into which another program writes the readings."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import torch
+
+from autdtorch.hardware.sensors.sensor import SensorError
+from autdtorch.utils.validation import integer_at_least, invalid, not_negative, path_of, positive
+
+_POLL = 0.02  # [s] between looks at the file
+
+
+class FileSensor:
+    """A file into which another program writes each reading.
+
+    It holds the magnitudes of all control points [Pa] in their order, separated by blanks, commas or line
+    ends, and ends with a line end. It is best written under another name and then renamed.
+    """
+
+    def __init__(self, path: str | Path, points: int, settle: float = 0.0, timeout: float = 60.0) -> None:
+        """Set the file.
+
+        Args:
+            path: of the file, which need not exist yet.
+            points: number of control points P.
+            settle: time after a drive began in which the file may still be of the drive before [s].
+            timeout: time limit for the file to change then [s].
+
+        Raises:
+            ValueError: an argument out of range.
+        """
+        self._path = path_of("path", path)
+        self._points = integer_at_least("points", points, 1)
+        self._settle = not_negative("settle", settle, "s")
+        self._timeout = positive("timeout", timeout, "s")
+
+    def read(self) -> torch.Tensor:
+        """Return the magnitudes (P,) [Pa], once the file has changed.
+
+        Raises:
+            SensorError: it does not change in time, or then holds anything but P numbers >= 0.
+        """
+        time.sleep(self._settle)
+        before, deadline = self._stamp(), time.monotonic() + self._timeout
+        trouble = "did not change"
+        while time.monotonic() < deadline:
+            time.sleep(_POLL)
+            if self._stamp() == before:
+                continue
+            try:
+                return self._pressure()
+            except (OSError, ValueError) as error:  # it may not be complete yet
+                trouble = f"holds no reading: {error}"
+        raise SensorError(f"{self._path} {trouble}, within {self._timeout:g} s")
+
+    def _stamp(self) -> tuple[int, int, int] | None:
+        try:
+            found = self._path.stat()
+        except FileNotFoundError:
+            return None
+        return found.st_mtime_ns, found.st_size, found.st_ino
+
+    def _pressure(self) -> torch.Tensor:
+        text = self._path.read_text(encoding="utf-8")
+        if not text.endswith("\n"):
+            raise ValueError("no line end after the last number")
+        numbers = [not_negative("pressure", float(word), "Pa") for word in text.replace(",", " ").split()]
+        if len(numbers) != self._points:
+            raise invalid("pressure", numbers, f"must be {self._points} numbers", "Pa")
+        return torch.tensor(numbers, dtype=torch.float64, device="cpu")
