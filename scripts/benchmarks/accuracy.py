@@ -15,10 +15,9 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import date
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +48,7 @@ class Row:
 
     Attributes:
         case: name of the case.
-        treatment: "default", "extrapolated" or what else distinguishes rows of a case.
+        treatment: "default" or what else distinguishes rows of a case.
         spacing: [mm].
         total: relative error of the field.
         scattered: relative error of its scattered part; None if there is none.
@@ -120,18 +119,6 @@ def compare(case: Case, treatment: str, spacing: float, found: Simulation) -> Ro
     return Row(case.name, treatment, spacing, total, scattered, found.seconds, found.settled)
 
 
-def sweep(case: Case, spacings: Sequence[float]) -> Iterator[Row]:
-    """Simulate at each spacing [mm], and extrapolate from each two neighbours."""
-    found = [simulate(case, h) for h in spacings]
-    for h, one in zip(spacings, found, strict=True):
-        yield compare(case, "default", h, one)
-    if case.scene.obstacles:
-        for pair, both in zip(pairwise(spacings), pairwise(found), strict=True):
-            limit = extrapolate(pair, [one.matrix for one in both], case.order)
-            seconds, settled = sum(one.seconds for one in both), all(one.settled for one in both)
-            yield compare(case, "extrapolated", pair[1], Simulation(limit, seconds, settled))
-
-
 def worst_shift(name: str, spacing: float, count: int) -> Row:
     """Return the row with the largest total error of `count` random positions of a sphere on the grid."""
     # Equal for every sphere and, in cells, for every spacing [mm].
@@ -159,7 +146,7 @@ def measure(spacings: Sequence[float], shifts: int) -> list[Row]:
         swept += map(cube_case, cases.CUBES)
     else:
         print("the cubes are left out: they need --make-reference once", flush=True)
-    rows = [row for case in swept for row in sweep(case, spacings)]
+    rows = [compare(case, "default", h, simulate(case, h)) for case in swept for h in spacings]
     if shifts:
         rows += [worst_shift(name, h, shifts) for name in SHIFTED_SPHERES for h in spacings]
     for case in (cases.slab_case(), cases.wall_case()):
@@ -212,35 +199,33 @@ def exceeded(rows: Sequence[Row]) -> tuple[int, list[str]]:
 def errors(rows: Sequence[Row]) -> str:
     """Return a table with a row for each case and treatment."""
     spacings = sorted({row.spacing for row in rows}, reverse=True)
-    found, lines = orders(rows), []
-    for (case, treatment), mine in series(rows).items():
-        at_spacing = {row.spacing: row for row in mine}
+    cases = list(dict.fromkeys(row.case for row in rows))
+    found, by_series, lines = orders(rows), series(rows), []
+    for case, treatment in sorted(by_series, key=lambda one: cases.index(one[0])):
+        at_spacing = {row.spacing: row for row in by_series[case, treatment]}
         total = [percent(at_spacing[h].total) if h in at_spacing else "" for h in spacings]
         one = at_spacing.get(1.0)
         scattered = "" if one is None or one.scattered is None else percent(one.scattered)
         seconds = "" if one is None else f"{one.seconds:.3g} s{'' if one.settled else ', not settled'}"
         order = f"{found[case, treatment]:.2f}" if (case, treatment) in found else ""
         lines.append([readable(case), treatment, *total, scattered, seconds, order])
-    header = [*(f"{h:g} mm" for h in spacings), "scattered, 1 mm", "run time, 1 mm", "order"]
+    header = [*(f"{h:g} mm" for h in spacings), "scattered, 1 mm", "time, 1 mm", "order"]
     return table(["case", "treatment", *header], lines)
 
 
 def figure(rows: Sequence[Row]) -> Figure:
     """Plot the error of the field over the run time, a panel for each case with more than one spacing."""
-    swept = dict.fromkeys(case for case, _ in orders(rows))
-    drawn = {
-        case: {
-            name: mine
-            for (owner, name), mine in series(rows).items()
-            if owner == case and name in ("default", "extrapolated")
-        }
-        for case in swept
-    }
+    swept = {case: mine for (case, name), mine in series(rows).items() if name == "default" and len(mine) > 1}
     plotted = plot_pareto(
-        {c: {n: [(r.seconds, 100 * r.total) for r in m] for n, m in by.items()} for c, by in drawn.items()},
+        {
+            readable(case): {"autdtorch": [(r.seconds, 100 * r.total) for r in mine]}
+            for case, mine in swept.items()
+        },
         "run time [s]",
         "relative error of the field [%]",
-        names={c: {n: [f"{r.spacing:g}" for r in m] for n, m in by.items()} for c, by in drawn.items()},
+        names={
+            readable(case): {"autdtorch": [f"{r.spacing:g}" for r in mine]} for case, mine in swept.items()
+        },
     )
     plotted.supxlabel(f"numbers on the front: spacing [mm]\n{command_line()}", fontsize=TICK_SIZE)
     return plotted
@@ -250,7 +235,8 @@ def write_report(rows: Sequence[Row], folder: Path) -> list[str]:
     """Write accuracy.json, accuracy.png and benchmarks.md into `folder`; return the exceeded limits."""
     count, failed = exceeded(rows)
     limits = "\n".join(failed) if failed else f"All {count} required limits are kept."
-    parts = (measured(), "![Error over run time](accuracy.png)", limits, errors(rows))
+    legend = "Total error by spacing; scattered error and run time at 1 mm; observed order."
+    parts = (measured(), "![Error over run time](accuracy.png)", f"{legend} {limits}", errors(rows))
     fill_in(DOCUMENT, "benchmark.py accuracy", parts, folder)
     made = {"command": command_line(), "date": date.today().isoformat(), "cores": os.cpu_count()}
     content = json.dumps({**made, "rows": [asdict(row) for row in rows]}, indent=1)
@@ -259,14 +245,12 @@ def write_report(rows: Sequence[Row], folder: Path) -> list[str]:
     return failed
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command line."""
-    parser.add_argument(
-        "--spacings", type=float, nargs="+", default=SPACINGS, metavar="MM", help="two or more"
-    )
-    parser.add_argument("--fine", action="store_true", help="also 0.5 mm")
-    parser.add_argument("--shifts", type=int, default=5, help="positions of the sphere on the grid")
-    parser.add_argument("--make-reference", action="store_true", help="only that")
+OPTIONS = {
+    "--spacings": {"type": float, "nargs": "+", "default": SPACINGS, "metavar": "MM", "help": "two or more"},
+    "--fine": {"action": "store_true", "help": "also 0.5 mm"},
+    "--shifts": {"type": int, "default": 5, "help": "positions of the sphere on the grid"},
+    "--make-reference": {"action": "store_true", "help": "only that"},
+}
 
 
 def main(given: argparse.Namespace) -> int:

@@ -27,7 +27,7 @@ from autdtorch.objectives.simulated import weakest_focus
 EVALUATIONS, INITIAL, FIXED = 256, 16, 6
 REFIT_GROWTH, CANDIDATES, STARTS, CLIMB_STEPS = 1.1, 128, 2, 20
 """Schedule and search effort of the sequential loop: those of `bayes_opt`."""
-OPTIONS: dict[str, dict[str, Any]] = {
+VARIANTS: dict[str, dict[str, Any]] = {
     "as in the paper": {},
     "log_ei": {"acquisition": "log_ei"},
     "random initial points": {"initial_points": "random"},
@@ -39,14 +39,13 @@ OPTIONS: dict[str, dict[str, Any]] = {
 
 Objectives = Mapping[str, at.SimulatedObjective]
 
-
-def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command line."""
-    parser.add_argument("what", nargs="+", choices=["sequential", "options"], help="tables to print")
-    parser.add_argument("--scenes", nargs="+", default=PAPER, help="names of scenes")
-    parser.add_argument("--trials", type=int, default=50, help="trials at once")
-    parser.add_argument("--sequential-trials", type=int, default=5, help="trials with BoTorch")
-    parser.add_argument("--threads", type=int, default=1, help="threads of PyTorch")
+OPTIONS = {
+    "what": {"nargs": "+", "choices": ["sequential", "options"], "help": "tables to print"},
+    "--scenes": {"nargs": "+", "default": PAPER, "help": "names of scenes"},
+    "--trials": {"type": int, "default": 50, "help": "trials at once"},
+    "--sequential-trials": {"type": int, "default": 5, "help": "trials with BoTorch"},
+    "--threads": {"type": int, "default": 1, "help": "threads of PyTorch"},
+}
 
 
 def main(given: argparse.Namespace) -> None:
@@ -89,7 +88,7 @@ def sequential_rows(objectives: Objectives, trials: int, sequential_trials: int)
 
 def option_rows(objectives: Objectives, trials: int) -> Iterator[list[str]]:
     """Compare options."""
-    for name, given in OPTIONS.items():
+    for name, given in VARIANTS.items():
         solutions, seconds = timed(
             lambda given=given: [at.bayes_opt(o, trials=trials, **given) for o in objectives.values()]
         )

@@ -86,12 +86,12 @@ def compare(variants: dict[str, tuple[Path, dict[str, str]]], rounds: int, repea
             print(f"  {scene:24}{name:16}{median:8.3f} s ({spread})  {first / median:.2f} times", flush=True)
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command line."""
-    parser.add_argument("--against", type=Path, help="another checkout, measured in turn")
-    parser.add_argument("--processes", type=int, default=8, help="busy processes")
-    parser.add_argument("--rounds", type=int, default=3, help="processes of each variant")
-    parser.add_argument("--repeats", type=int, default=9, help="simulations in a process")
+OPTIONS = {
+    "--against": {"type": Path, "help": "another checkout, measured in turn"},
+    "--processes": {"type": int, "default": 8, "help": "busy processes"},
+    "--rounds": {"type": int, "default": 3, "help": "processes of each variant"},
+    "--repeats": {"type": int, "default": 9, "help": "simulations in a process"},
+}
 
 
 def main(given: argparse.Namespace) -> None:

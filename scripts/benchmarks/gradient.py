@@ -74,9 +74,7 @@ def measure(case: str) -> Cost:
     return gradient(case, 1e-3, PERIODS)
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command line."""
-    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), help="measured cases")
+OPTIONS = {"--cases": {"nargs": "+", "choices": CASES, "default": list(CASES), "help": "measured cases"}}
 
 
 def main(given: argparse.Namespace) -> None:

@@ -17,10 +17,7 @@ import autdtorch as at
 CASES = ((None, 47), (None, 64), (30, 64), (20, 64), (20, 128), (20, 256), (10, 64), (10, 256))
 """SNR [dB], None without noise, and evaluations."""
 
-
-def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command line."""
-    parser.add_argument("--trials", type=int, default=40, help="trials of each case")
+OPTIONS = {"--trials": {"type": int, "default": 40, "help": "trials of each case"}}
 
 
 def main(given: argparse.Namespace) -> None:

@@ -41,6 +41,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
 """Packages of each peer; an environment each, as their dependencies exclude one another."""
 
 PROGRAMS = Path(__file__).parent / "peer_programs"
+VENVS = Path.home() / ".cache" / "autdtorch" / "peers"
 
 AIR = "free space"
 CASES = {
@@ -224,11 +225,10 @@ def measure(settings: Sequence[Setting], venvs: Path) -> Iterator[Point | Refusa
         yield from peer_points(setting, venvs)
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command line."""
-    parser.add_argument("--coarse", action="store_true", help="peers on grids of 2 mm alone")
-    venvs = Path.home() / ".cache" / "autdtorch" / "peers"
-    parser.add_argument("--venvs", type=Path, default=venvs, help="folder of the peers' environments")
+OPTIONS = {
+    "--coarse": {"action": "store_true", "help": "peers on grids of 2 mm alone"},
+    "--venvs": {"type": Path, "default": VENVS, "help": "folder of the peers' environments"},
+}
 
 
 def main(given: argparse.Namespace) -> None:

@@ -44,9 +44,7 @@ def measure(name: str, method: str, spacing: float) -> list[str]:
     return [f"{name}, {method}", str(runs), *times, apart, disk]
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command line."""
-    parser.add_argument("--spacing", type=float, default=1.0, help="[mm]")
+OPTIONS = {"--spacing": {"type": float, "default": 1.0, "help": "[mm]"}}
 
 
 def main(given: argparse.Namespace) -> None:

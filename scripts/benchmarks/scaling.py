@@ -153,23 +153,21 @@ def each_series(points: Sequence[Point]) -> Iterator[list[Point]]:
         yield [point for point in points if (point.growth, point.series) == key]
 
 
-def exponents(points: Sequence[Point]) -> str:
-    """Return a table of the fitted powers, or of the range of costs where there is no fit."""
-    rows = []
+def exponents(points: Sequence[Point]) -> tuple[str, str]:
+    """Return a table of the fitted powers, and the range of times in each series without a fit."""
+    rows, ranges = [], []
     for series in each_series(points):
         if len(series) < FEWEST:
             continue
         label, symbol, fixed = GROWTHS[series[0].growth]
-        row = [label, fixed, series[0].series]
-        for attribute, _ in COSTS.values():
-            costs = [getattr(point, attribute) for point in series]
-            fit = fit_power([point.size for point in series], costs)
-            if fit is None:
-                row += ["", f"none: within a factor {max(costs) / min(costs):.2g}"]
-            else:
-                row += [f"{symbol}^{fit.exponent:.2f}", f"{fit.sizes[0]:.3g} to {fit.sizes[1]:.3g}"]
-        rows.append(row)
-    return table(["growing", "fixed", "method", "time", "fitted over", "memory", "fitted over"], rows)
+        costs = [[getattr(point, attribute) for point in series] for attribute, _ in COSTS.values()]
+        fits = [fit_power([point.size for point in series], cost) for cost in costs]
+        if fits[0] is None:
+            ranges.append(f"{label}, {series[0].series}: {max(costs[0]) / min(costs[0]):.2g} times")
+        powers = ["" if fit is None else f"{symbol}^{fit.exponent:.2f}" for fit in fits]
+        if any(powers):
+            rows.append([label, fixed, series[0].series, *powers])
+    return table(["growing", "scene", "method", "time", "memory"], rows), "; ".join(ranges)
 
 
 def figure(points: Sequence[Point]) -> Figure:
@@ -186,20 +184,21 @@ def figure(points: Sequence[Point]) -> Figure:
     return drawn
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command line."""
-    parser.add_argument("--growth", nargs="+", choices=GROWTHS, default=list(GROWTHS), help="measured sizes")
+OPTIONS = {
+    "--growth": {"nargs": "+", "choices": GROWTHS, "default": list(GROWTHS), "help": "measured sizes"},
+}
 
 
 def main(given: argparse.Namespace) -> None:
     """Measure, and write block and figure."""
     points = list(measure_all([task for task in tasks() if task.growth in given.growth]))
+    fits, ranges = exponents(points)
     parts = (
         measured(),
-        '"Box, mirror images" is the paper\'s array of 16 and its four foci, simulated in one run.',
         "![Time and memory over spacing, domain, transducers and foci](scaling.png)",
-        "Powers fitted to costs of at least twice the cheapest point of a series:",
-        exponents(points),
+        "Powers fitted to costs of at least twice the cheapest of a series.",
+        fits,
+        f"Longest over shortest time of series without a fit: {ranges or 'none'}.",
     )
     fill_in(DOCUMENT, "benchmark.py scaling", parts, given.output)
     figure(points).savefig(given.output / "scaling.png")

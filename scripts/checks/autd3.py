@@ -225,9 +225,7 @@ def run_times(grid: Grid) -> str:
     )
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command line."""
-    parser.add_argument("--resolution", type=float, default=1.0, help="of the plane [mm]")
+OPTIONS = {"--resolution": {"type": float, "default": 1.0, "help": "of the plane [mm]"}}
 
 
 def main(given: argparse.Namespace) -> None:
@@ -235,10 +233,10 @@ def main(given: argparse.Namespace) -> None:
     grid = plane(given.resolution)
     lines, factor = rows(grid)
     notes = (
-        f"Our transducers lie within {1e9 * largest_shift():.0f} nm of theirs, in their order. The instant "
-        f"field is {abs(factor):.4f} times ours and {math.degrees(cmath.phase(factor)):.1f} degrees late, by "
-        f"the emulator's model of a transducer. Its peak is {math.sqrt(2) * abs(factor):.3f} times the "
-        "emulator's own RMS field, where a sine has the square root of 2."
+        f"Transducer positions agree within {1e9 * largest_shift():.0f} nm. The emulator's instant field is "
+        f"{abs(factor):.4f} times ours and {math.degrees(cmath.phase(factor)):.1f} degrees late, by its "
+        f"model of a transducer; its peak is {math.sqrt(2) * abs(factor):.3f} times the emulator's own RMS field, "
+        "where a sine has the square root of 2."
     )
     packages = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
     differences = table(("theirs", "ours", "relative difference", "what explains it"), lines)

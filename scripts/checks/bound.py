@@ -101,10 +101,10 @@ def check_paper_scenes() -> None:
         print(f"{name}: bound {bound:.4f} Pa, gradient {score:.4f} Pa, gap {1 - score / bound:.3%}")
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command line."""
-    parser.add_argument("--scenes", type=int, default=1000, help="number of random scenes")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the random scenes")
+OPTIONS = {
+    "--scenes": {"type": int, "default": 1000, "help": "number of random scenes"},
+    "--seed": {"type": int, "default": 0, "help": "seed of the random scenes"},
+}
 
 
 def main(given: argparse.Namespace) -> int:

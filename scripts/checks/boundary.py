@@ -112,11 +112,11 @@ def _pressure(
     return drive_dft(recorded[-steps.numerator :], steps.denominator).numpy()
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command line."""
-    parser.add_argument("--cells-per-wavelength", type=float, default=8.5, help="of the grid")
-    parser.add_argument("--distance", type=int, default=9, help="cells to the layer")
-    parser.add_argument("--aside", type=int, default=12, help="cells to the other layers")
+OPTIONS = {
+    "--cells-per-wavelength": {"type": float, "default": 8.5, "help": "of the grid"},
+    "--distance": {"type": int, "default": 9, "help": "cells to the layer"},
+    "--aside": {"type": int, "default": 12, "help": "cells to the other layers"},
+}
 
 
 def main(given: argparse.Namespace) -> None:

@@ -90,10 +90,10 @@ def usage(kernel: Any) -> tuple[int, int]:
     return registers, stack
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command line."""
-    parser.add_argument("--capability", type=int, default=90, help="of the GPU, times ten; 90 is Hopper")
-    parser.add_argument("--dtype", choices=("float32", "float64"), default="float32", help="of the fields")
+OPTIONS = {
+    "--capability": {"type": int, "default": 90, "help": "of the GPU, times ten; 90 is Hopper"},
+    "--dtype": {"choices": ("float32", "float64"), "default": "float32", "help": "of the fields"},
+}
 
 
 def main(given: argparse.Namespace) -> None:

@@ -328,10 +328,10 @@ def check(damages: int, seed: int, folder: Path) -> tuple[Counter[str], list[str
     return counts, wrong
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command line."""
-    parser.add_argument("--damages", type=int, default=300, help="number of damaged files")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the damages")
+OPTIONS = {
+    "--damages": {"type": int, "default": 300, "help": "number of damaged files"},
+    "--seed": {"type": int, "default": 0, "help": "seed of the damages"},
+}
 
 
 def main(given: argparse.Namespace) -> int:

@@ -147,9 +147,7 @@ def measure(name: str) -> Cost:
     return Cost(told.memory, memory, told.seconds, seconds, told.runs, propagator.planned_runs)
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command line."""
-    parser.add_argument("--scenes", nargs="+", choices=CASES, default=list(CASES), help="checked scenes")
+OPTIONS = {"--scenes": {"nargs": "+", "choices": CASES, "default": list(CASES), "help": "checked scenes"}}
 
 
 def main(given: argparse.Namespace) -> None:

@@ -196,10 +196,10 @@ def finish(process: subprocess.Popen[bytes], folder: Path) -> None:
         raise RuntimeError((folder / _OUTPUT).read_text(encoding="utf-8"))
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command line."""
-    parser.add_argument("--kills", type=int, default=40, help="kills of each subject")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the moments")
+OPTIONS = {
+    "--kills": {"type": int, "default": 40, "help": "kills of each subject"},
+    "--seed": {"type": int, "default": 0, "help": "seed of the moments"},
+}
 
 
 def main(given: argparse.Namespace) -> int:

@@ -64,10 +64,10 @@ def run(variant: str, arguments: list[str], folder: Path) -> tuple[bool, str]:
     return ended.returncode == 0, lines[-1].strip("= ")
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command line."""
-    parser.add_argument("variant", nargs="?", choices=[*VARIANTS, "all"], default="all", help="environment")
-    parser.add_argument("arguments", nargs=argparse.REMAINDER, help="arguments of pytest")
+OPTIONS = {
+    "variant": {"nargs": "?", "choices": [*VARIANTS, "all"], "default": "all", "help": "environment"},
+    "arguments": {"nargs": argparse.REMAINDER, "help": "arguments of pytest"},
+}
 
 
 def main(given: argparse.Namespace) -> int:

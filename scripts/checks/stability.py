@@ -203,13 +203,13 @@ def _numbered(task: tuple[int, int, float]) -> Outcome:
     return run_trial(draw_trial(*task))
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command line."""
-    parser.add_argument("--scenes", type=int, default=500, help="number of scenes")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the scenes")
-    parser.add_argument("--only", type=int, help="number of the one scene to run")
-    parser.add_argument("--long-share", type=float, default=LONG_SHARE, help=f"share of {LONG_STEPS} steps")
-    parser.add_argument("--processes", type=int, default=2, help="scenes at once")
+OPTIONS = {
+    "--scenes": {"type": int, "default": 500, "help": "number of scenes"},
+    "--seed": {"type": int, "default": 0, "help": "seed of the scenes"},
+    "--only": {"type": int, "help": "number of the one scene to run"},
+    "--long-share": {"type": float, "default": LONG_SHARE, "help": f"share of {LONG_STEPS} steps"},
+    "--processes": {"type": int, "default": 2, "help": "scenes at once"},
+}
 
 
 def main(given: argparse.Namespace) -> int:

@@ -1,7 +1,7 @@
 """Run one of the commands in a folder of scripts: each module with a function `main` is a command.
 
-A command's `main(given)` takes the parsed options and returns an exit status or None. `options(parser)` adds
-its options. A command with a constant `DOCUMENT` fills in a block of that page and gets the option
+A command's `main(given)` takes the parsed options and returns an exit status or None. `OPTIONS` has the
+arguments of `add_argument` by name. A command with a constant `DOCUMENT` fills in a block of that page and gets the option
 `--output`.
 """
 
@@ -42,8 +42,8 @@ def run(folder: str, description: str) -> int:
         if chosen == [name]:
             module = importlib.import_module(f"{folder}.{name}")
             command.description = module.__doc__
-            if hasattr(module, "options"):
-                module.options(command)
+            for flag, settings in getattr(module, "OPTIONS", {}).items():
+                command.add_argument(flag, **settings)
             if hasattr(module, "DOCUMENT"):
                 command.add_argument("--output", type=Path, default=DOCS, help="folder of the written files")
     given = parser.parse_args()

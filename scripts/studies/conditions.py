@@ -90,11 +90,9 @@ CONDITIONS: dict[str, Wrap] = {
     "SNR 20 dB, 4 reads": lambda objective, trial: at.Noise(objective, 20, reads=4, seed=trial),
     **{f"{n} levels": lambda o, t, n=n: at.Quantised(o, n) for n in (256, 32, 16, 8, 4, 2)},
     "32 levels, on/off": lambda objective, trial: at.Quantised(objective, 32, on_off=True),
-    "one dead": dead,
     "four dead": partial(dead, count=4),
     "drift 0.3 rad": lambda objective, trial: at.Drift(objective, phase=0.3, seed=trial),
     "drift 1 rad": lambda objective, trial: at.Drift(objective, phase=1.0, seed=trial),
-    "drift of the sensor, 0.3": lambda objective, trial: at.Drift(objective, sensor=0.3, seed=trial),
     "all at once": bench,
 }
 
@@ -226,12 +224,10 @@ def _draw(ax: Axes, outcomes: list[Outcome], look: Look, label: str) -> None:
     ax.plot(places, means, color=colour, marker=marker, linestyle=dashes, ms=4, lw=1.2, label=label)
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command line."""
-    parser.add_argument(
-        "--methods", nargs="+", choices=METHODS, default=list(METHODS), help="compared methods"
-    )
-    parser.add_argument("--trials", type=int, default=20, help="trials of each method")
+OPTIONS = {
+    "--methods": {"nargs": "+", "choices": METHODS, "default": list(METHODS), "help": "compared methods"},
+    "--trials": {"type": int, "default": 20, "help": "trials of each method"},
+}
 
 
 def main(given: argparse.Namespace) -> None:
@@ -250,8 +246,8 @@ def main(given: argparse.Namespace) -> None:
     parts = (
         measured(),
         "![True weakest focus over the level of noise and over the number of phase levels](conditions.png)",
-        f"Mean true weakest focus [Pa] of {given.trials} trials in `{SHOWN}`; standard errors are at most "
-        f"{error:.2f} Pa.",
+        f"Mean true weakest focus [Pa] of {given.trials} trials in {readable(SHOWN)}; standard errors are at "
+        f"most {error:.2f} Pa.",
         true_scores(outcomes, SHOWN),
     )
     fill_in(DOCUMENT, "study.py conditions", parts, given.output)

@@ -100,10 +100,10 @@ def recover(drive: torch.Tensor, observed: torch.Tensor, spacing: float, steps: 
         schedule.step()
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command line."""
-    parser.add_argument("--steps", type=int, default=16, help="steps of Adam")
-    parser.add_argument("--spacing", type=float, default=1.0, help="of the model [mm]")
+OPTIONS = {
+    "--steps": {"type": int, "default": 16, "help": "steps of Adam"},
+    "--spacing": {"type": float, "default": 1.0, "help": "of the model [mm]"},
+}
 
 
 def main(given: argparse.Namespace) -> None:
