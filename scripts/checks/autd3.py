@@ -232,11 +232,11 @@ def main(given: argparse.Namespace) -> None:
     """Compare, and write the block."""
     grid = plane(given.resolution)
     lines, factor = rows(grid)
+    peak, late = math.sqrt(2) * abs(factor), math.degrees(cmath.phase(factor))
     notes = (
         f"Transducer positions agree within {1e9 * largest_shift():.0f} nm. The emulator's instant field is "
-        f"{abs(factor):.4f} times ours and {math.degrees(cmath.phase(factor)):.1f} degrees late, by its "
-        f"model of a transducer; its peak is {math.sqrt(2) * abs(factor):.3f} times the emulator's own RMS field, "
-        "where a sine has the square root of 2."
+        f"{abs(factor):.4f} times ours and {late:.1f} degrees late, by its model of a transducer; its "
+        f"peak is {peak:.3f} times the emulator's own RMS field, where a sine has the square root of 2."
     )
     packages = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
     differences = table(("theirs", "ours", "relative difference", "what explains it"), lines)
