@@ -14,9 +14,9 @@ import argparse
 import cmath
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
+from typing import Any
 
 import numpy as np
 import torch
@@ -79,11 +79,6 @@ class Emission:
         return torch.from_numpy(amplitude * np.exp(2j * np.pi * self.phases / 256))
 
 
-def device() -> Geometry:
-    """Return one AUTD3 of theirs, with transducer 0 at the origin; it emits along z."""
-    return Geometry([Autd3()])
-
-
 def our_array(radius: float = 0.0) -> at.TransducerArray:
     """Return the AUTD3 as our array, of points or of discs with a radius [m]."""
     middle = 8.5 * PITCH, 6.5 * PITCH, 0.0
@@ -92,7 +87,7 @@ def our_array(radius: float = 0.0) -> at.TransducerArray:
 
 def largest_shift() -> float:
     """Return the largest distance between their transducers and ours, in the order of the device [m]."""
-    theirs = 1e-3 * torch.from_numpy(device()[0].positions().astype(np.float64))
+    theirs = 1e-3 * torch.from_numpy(Geometry([Autd3()])[0].positions().astype(np.float64))
     return float((theirs - our_array().positions).norm(dim=1).max())
 
 
@@ -112,7 +107,7 @@ def play(
 
 def play_focus() -> Emission:
     """Play a focus of their SDK."""
-    geometry = device()
+    geometry = Geometry([Autd3()])
     phases = geometry.phase_buffer()
     focus(geometry, [1e3 * x for x in FOCUS], wavelength(Velocity.from_m_s(SOUND_SPEED)), phases)
     return play(geometry, phases)
@@ -121,7 +116,7 @@ def play_focus() -> Emission:
 def play_levels(levels: tuple[torch.Tensor, ...]) -> Emission:
     """Play levels of ours."""
     phase, amplitude = (one.to(torch.uint8).numpy()[None] for one in levels)
-    return play(device(), PhaseBuffer.from_array(phase), IntensityBuffer.from_array(amplitude))
+    return play(Geometry([Autd3()]), PhaseBuffer.from_array(phase), IntensityBuffer.from_array(amplitude))
 
 
 def plane(resolution: float) -> Grid:
@@ -132,28 +127,23 @@ def plane(resolution: float) -> Grid:
 def rms(emission: Emission, grid: Grid) -> tuple[torch.Tensor, torch.Tensor]:
     """Return their points (P, 3) [m] and RMS pressures (P,) [Pa]."""
     field = emission.record.sound_field(grid, RmsRecordOption(Velocity.from_m_s(SOUND_SPEED)))
-    return points_of(field.observe_points().to_numpy()), column(field.next(PERIOD).to_numpy())
+    return points_of(field), torch.from_numpy(field.next(PERIOD).to_numpy()[:, 0].astype(np.float64))
 
 
 def phasor(emission: Emission, grid: Grid) -> tuple[torch.Tensor, torch.Tensor]:
     """Return their points (P, 3) [m] and phasors (P,) [Pa] of the last period of the instant field."""
     option = InstantRecordOption(Velocity.from_m_s(SOUND_SPEED), Duration.from_micros(1), 512)
     field = emission.record.sound_field(grid, option)
-    points = points_of(field.observe_points().to_numpy())
+    points = points_of(field)
     field.skip(Duration.from_nanos((PERIODS - 1) * PERIOD.as_nanos()))
     pressure = field.next(PERIOD).to_numpy().astype(np.float64)
     angle = 2 * np.pi * np.arange(pressure.shape[1]) / pressure.shape[1]
     return points, torch.from_numpy(2 * (pressure @ np.exp(1j * angle)) / len(angle))
 
 
-def points_of(frame: NDArray[np.float32]) -> torch.Tensor:
-    """Return points (P, 3) [m]."""
-    return torch.from_numpy(1e-3 * frame.astype(np.float64))
-
-
-def column(frame: NDArray[np.float32]) -> torch.Tensor:
-    """Return the only column of a frame."""
-    return torch.from_numpy(frame[:, 0].astype(np.float64))
+def points_of(field: Any) -> torch.Tensor:
+    """Return the points (P, 3) of a field [m]."""
+    return torch.from_numpy(1e-3 * field.observe_points().to_numpy().astype(np.float64))
 
 
 def ours(
@@ -206,23 +196,17 @@ def rows(grid: Grid) -> tuple[list[list[str]], complex]:
     return [[field, own, f"{value:.2g}", cause] for field, own, value, cause in found], factor
 
 
-def seconds(action: Callable[[], object]) -> float:
-    """Return the run time of the second of two calls [s]."""
-    action()
-    begin = time.perf_counter()
-    action()
-    return time.perf_counter() - begin
-
-
 def run_times(grid: Grid) -> str:
-    """Compare the run times for all points."""
+    """Compare the run times for all points, each of a second call."""
     array, emission = our_array(), play_focus()
     points, _ = rms(emission, grid)
-    theirs, own = seconds(lambda: rms(emission, grid)), seconds(lambda: ours(array, emission.drive, points))
-    return (
-        f"Run times for {len(points)} points: the emulator's RMS field {theirs:.2g} s (float32, all cores), "
-        f"ours {own:.2g} s (float64, threads: {torch.get_num_threads()})."
-    )
+    ours(array, emission.drive, points)
+    begin = time.perf_counter()
+    rms(emission, grid)
+    middle = time.perf_counter()
+    ours(array, emission.drive, points)
+    own = f"{time.perf_counter() - middle:.2g} s here (float64, threads: {torch.get_num_threads()})"
+    return f"{len(points)} points take {middle - begin:.2g} s in the emulator (float32, all cores) and {own}."
 
 
 OPTIONS = {"--resolution": {"type": float, "default": 1.0, "help": "of the plane [mm]"}}

@@ -31,9 +31,13 @@ class MatrixPropagator:
         self.scene = scene
         self._matrix = matrix
 
-    def transfer_matrix(self) -> torch.Tensor:
+    def transfer_matrix(self, points: torch.Tensor | None = None) -> torch.Tensor:
         """Return the matrix."""
         return self._matrix
+
+    def field(self, drive: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+        """Return the pressure at the control points."""
+        return drive @ self._matrix.T
 
 
 def random_objective(generator: torch.Generator) -> at.SimulatedObjective:

@@ -75,30 +75,21 @@ class Trial:
 
     def __str__(self) -> str:
         """Describe the scene, lengths in cells from the lower corner of the domain."""
+
+        def cells(*points: Any) -> str:
+            scaled = (np.asarray(point) / self.spacing for point in points)
+            return " to ".join(np.array2string(point, precision=3, separator=", ") for point in scaled)
+
         lines = [
             f"scene {self.number}: {WAVELENGTH / self.spacing:.2f} cells per wavelength, domain "
-            f"{_cells(self.scene.domain[1], self.spacing)}, {self.dtype}, {', '.join(self.labels)}"
+            f"{cells(self.scene.domain[1])}, {self.dtype}, {', '.join(self.labels)}"
         ]
-        for obstacle in self.scene.obstacles:
-            where = " to ".join(_cells(c, self.spacing) for c in (obstacle.lower, obstacle.upper))
-            lines.append(f"    {type(obstacle).__name__} {where}, {_described(obstacle)}")
-        for name, points in (
-            ("source", self.scene.array.positions),
-            ("control point", self.scene.control_points),
-        ):
-            lines += [f"    {name} {_cells(point, self.spacing)}" for point in points.tolist()]
+        for one in self.scene.obstacles:
+            material = f"density {one.density}, sound speed {one.sound_speed}"
+            lines.append(f"    {type(one).__name__} {cells(one.lower, one.upper)}, {material}")
+        lines += [f"    source {cells(point)}" for point in self.scene.array.positions]
+        lines += [f"    control point {cells(point)}" for point in self.scene.control_points]
         return "\n".join(lines)
-
-
-def _cells(point: tuple[float, float, float] | list[float], spacing: float) -> str:
-    return "(" + ", ".join(f"{coordinate / spacing:.3f}" for coordinate in point) + ")"
-
-
-def _described(obstacle: Obstacle) -> str:
-    if obstacle.density is None or obstacle.sound_speed is None:
-        return "rigid"
-    density, speed = obstacle.density / AIR.density, obstacle.sound_speed / AIR.sound_speed
-    return f"density x {density:.3g}, speed x {speed:.3g}"
 
 
 def draw_trial(seed: int, number: int, long_share: float = LONG_SHARE) -> Trial:
@@ -239,13 +230,7 @@ def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 def _make(
-    kind: str,
-    center: Array,
-    size: Array,
-    axis: Array,
-    turn: Array,
-    rng: np.random.Generator,
-    material: dict[str, Any],
+    kind: str, center: Array, size: Array, axis: Array, turn: Array, rng: np.random.Generator, material: Any
 ) -> Obstacle:
     """Return an obstacle with its centre and size (3,) [m], axis (3,) and rotation (3,) [rad]."""
     middle, (x, y, z), angles = tuple(center.tolist()), size.tolist(), tuple(turn.tolist())
