@@ -91,9 +91,7 @@ def largest_shift() -> float:
     return float((theirs - our_array().positions).norm(dim=1).max())
 
 
-def play(
-    geometry: Geometry, phases: PhaseBuffer, intensities: IntensityBuffer | int = 255
-) -> Emission:
+def play(geometry: Geometry, phases: PhaseBuffer, intensities: IntensityBuffer | int = 255) -> Emission:
     """Let the emulator play a pattern."""
 
     def send(recorder: Recorder) -> None:

@@ -131,13 +131,13 @@ class _Course:
 
 
 def _random_state(assembly: Assembly, sources: Sources, seed: int) -> State:
-    """Return random pressure at rest in the interior, none in rigid cells, which would keep it."""
+    """Return random pressure at rest in the interior, none in sound-hard cells, which would keep it."""
     grid, state = assembly.grid, assembly.silence(sources)
     inside = tuple(slice(low, high) for low, high in zip(grid.first, grid.last, strict=True))
     state.now[inside] = torch.from_numpy(np.random.default_rng(seed).standard_normal(grid.interior)).to(
         assembly.dtype
     )
-    state.now.reshape(-1)[torch.from_numpy(assembly.heterogeneous.rigid)] = 0
+    state.now.reshape(-1)[torch.from_numpy(assembly.heterogeneous.sound_hard)] = 0
     state.before.copy_(state.now)
     return state
 

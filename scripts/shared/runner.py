@@ -1,8 +1,9 @@
 """Run one of the commands in a folder of scripts: each module with a function `main` is a command.
 
 A command's `main(given)` takes the parsed options and returns an exit status or None. `OPTIONS` has the
-arguments of `add_argument` by name. A command with a constant `DOCUMENT` writes a block of that page, and gets
-the option `--output`.
+arguments of `add_argument` by name. A command with a constant `DOCUMENT` writes a block of that page, and
+gets the option `--output`.
+"""
 
 from __future__ import annotations
 
