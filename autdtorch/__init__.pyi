@@ -17,8 +17,9 @@ from .methods.random_search import RandomSearch, random_search
 from .methods.solution import Solution
 from .methods.state_file import load_state, save_state
 from .objectives.metrics import FocusMetrics, focus_metrics
-from .objectives.perturbations import Dead, Drift, Noise, Quantised, true_pressure
-from .objectives.simulated import Objective, SimulatedObjective, weakest_focus
+from .objectives.objective import Objective, weakest_focus
+from .objectives.perturbations import Drift, FailedTransducers, Noise, Quantised, true_pressure
+from .objectives.simulated import SimulatedObjective
 from .plot.pareto import plot_pareto
 from .plot.pressure_maps import plot_plane, plot_planes
 from .plot.scaling import plot_scaling
@@ -50,9 +51,9 @@ __all__ = [
     "BayesOpt",
     "Box",
     "Cylinder",
-    "Dead",
     "Drift",
     "Estimate",
+    "FailedTransducers",
     "FocusMetrics",
     "GradientAscent",
     "Identify",

@@ -39,7 +39,7 @@ autodoc_default_options = {"members": True, "special-members": "__call__"}
 autodoc_preserve_defaults = True
 autodoc_type_aliases = {
     "ArrayLike": "autdtorch.utils.validation.ArrayLike",
-    "Score": "autdtorch.objectives.simulated.Score",
+    "Score": "autdtorch.objectives.objective.Score",
     "Trials": "autdtorch.methods.base.Trials",
     "Vector": "autdtorch.utils.validation.Vector",
 }

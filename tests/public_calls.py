@@ -239,7 +239,7 @@ ARGUMENTS: dict[str, Any] = {
 #: Where a name means something else.
 OTHERS: dict[str, Any] = {
     "SimulatedPropagator.field.drive": torch.stack([DRIVE, DRIVE]),
-    "Dead.transducers": [1],
+    "FailedTransducers.transducers": [1],
     "Drift.sensor": 0.1,
     "EmulatedScope.noise": 0.0,
     "EmulatedScope.points": (0, 1),
@@ -278,7 +278,7 @@ OTHERS: dict[str, Any] = {
     **{f"{kind}_sphere.center": (0.0, 0.0, 0.0) for kind in ("fluid", "rigid", "soft")},
     **{
         f"{kind}.{method}.drive": DRIVE[None]
-        for kind in ("Dead", "Drift", "Noise", "Played", "Quantised")
+        for kind in ("FailedTransducers", "Drift", "Noise", "Played", "Quantised")
         for method in ("__call__", "emitted")
     },
     "HardwareObjective.__call__.drive": DRIVE[None],

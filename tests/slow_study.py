@@ -12,7 +12,7 @@ import autdtorch.study.run
 from autdtorch.methods.base import Trials
 from autdtorch.methods.gabs import gabs
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.simulated import Objective
+from autdtorch.objectives.objective import Objective
 from autdtorch.scene.geometry import Plane
 
 PLANE = Plane(center=(20e-3, 12e-3, 12e-3), normal=(1, 0, 0), size=(20e-3, 16e-3))

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from filelock import FileLock
 
-from autdtorch.objectives.simulated import validate_magnitudes
+from autdtorch.objectives.objective import validate_magnitudes
 from autdtorch.scene.drive import validate_single_drive
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import held

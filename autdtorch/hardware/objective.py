@@ -12,7 +12,7 @@ import torch
 from autdtorch.hardware.log import Evaluation, EvaluationLog
 from autdtorch.hardware.safety import LimitedLink, LimitError
 from autdtorch.hardware.sensors.sensor import Sensor, checked_reading
-from autdtorch.objectives.simulated import validate_drives
+from autdtorch.objectives.objective import validate_drives
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.validation import invalid, path_of, require_callable, require_kind
@@ -137,7 +137,7 @@ class HardwareObjective:
             self._watch(evaluation)
         return evaluation.pressure
 
-    def played(self, drive: torch.Tensor) -> torch.Tensor:
+    def quantised(self, drive: torch.Tensor) -> torch.Tensor:
         """What the device plays (..., M) when asked for drives (..., M); 1 is the most that the limit allows.
 
         Raises:

@@ -9,12 +9,12 @@ import torch
 from autdtorch.hardware.amplitude_scale import AmplitudeScale
 from autdtorch.hardware.devices.device import Device
 from autdtorch.hardware.wiring import Wiring
-from autdtorch.objectives.perturbations import Condition
-from autdtorch.objectives.simulated import Objective
+from autdtorch.objectives.objective import Objective
+from autdtorch.objectives.perturbations import Perturbation
 from autdtorch.utils.validation import invalid
 
 
-class Played(Condition):
+class Played(Perturbation):
     """A device that plays the nearest of its levels, as it is calibrated, within the limit of a trial.
 
     What a method observes in ``Played(SimulatedObjective(...), device)`` is what it observes in a
@@ -54,6 +54,6 @@ class Played(Condition):
         self._scale = AmplitudeScale(wiring, amplitude)
         self.largest = self._scale.largest
 
-    def played(self, drive: torch.Tensor) -> torch.Tensor:
+    def quantised(self, drive: torch.Tensor) -> torch.Tensor:
         """What the device plays (..., M), in the trial's scale, when asked for drives (..., M)."""
         return self._scale.played(drive)

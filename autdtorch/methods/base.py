@@ -13,8 +13,8 @@ import torch
 
 from autdtorch.methods.ranking import NEAR_TIE, first_of_best
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.perturbations import playable
-from autdtorch.objectives.simulated import Objective, Score, require_objective, weakest_focus
+from autdtorch.objectives.objective import Objective, Score, require_objective, weakest_focus
+from autdtorch.objectives.perturbations import quantised
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.validation import integer_at_least, integers, invalid, real_tensor, require_callable
@@ -72,11 +72,11 @@ class Problem:
         scene = objective.scene
         matrix = getattr(objective, "transfer_matrix", None)
         counts = len(scene.array), len(scene.control_points)
-        return cls(*counts, goal, scene, matrix, lambda drive: playable(objective, drive))
+        return cls(*counts, goal, scene, matrix, lambda drive: quantised(objective, drive))
 
 
 class Step(NamedTuple):
-    """What a method does next.
+    """The next step of a method.
 
     Attributes:
         drives: B drives to observe for each of the L trials that go on (L, B, M); B = 0 at the end.
@@ -111,7 +111,7 @@ class State:
 
     @property
     def done(self) -> bool:
-        """Whether no drive is left to observe."""
+        """True when no drive is left to observe."""
         return self.drives.shape[:2].numel() == 0
 
     @property

@@ -1,11 +1,12 @@
 """A certified upper bound on the weakest focus over all drives (docs/decisions/bound.md).
 
-For any weights w >= 0 of the P foci, of sum 1, any z > 0 of the M transducers, and all drives |q_i| <= 1,
+The bound holds for any weights w >= 0 of the P foci with sum 1 and any z > 0 of the M transducers. For all
+drives |q_i| <= 1,
 
     min_p |(G q)_p| <= |W G q| <= |W G / Z| |Z q| <= |W G / Z| |z|,    W = diag(sqrt(w)), Z = diag(z),
 
-with the spectral norm of the matrix. The least right side is what the semidefinite relaxation gives: this is
-its dual. A minimum that is not quite reached is a bound all the same.
+with the spectral norm of the matrix. The minimum of the right side is the value of the semidefinite
+relaxation, whose dual this is. If the search ends a little above the minimum, the bound still holds.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ from numpy.typing import NDArray
 
 from autdtorch.utils.validation import ArrayLike, complex_tensor
 
-#: The spectral norm has kinks, where minima lie. Schatten norms of these orders have none, and tend to it.
+#: Orders of Schatten norms that approach the spectral norm, which has kinks at its minima.
 _ORDERS = (8, 64, 512, 4096, 32768)
 
-#: Relative to the one they start with: no step of the search may end where all weights are 0.
+#: Smallest weight, relative to its start: no step of the search may end where all weights are 0.
 _LEAST_WEIGHT = 1e-12
 
-#: Relative, on top of the bound: rounding, of the bound and of a pressure beside it, is below 1e-13.
+#: Relative margin on top of the bound; rounding of the bound and of a pressure is below 1e-13.
 _MARGIN = 1e-12
 
 _Reals: TypeAlias = NDArray[np.float64]
@@ -32,14 +33,14 @@ _Complexes: TypeAlias = NDArray[np.complex128]
 
 
 def focus_bound(G: ArrayLike) -> float:
-    """Upper bound on the pressure of the weakest focus, whatever the drive.
+    """Return an upper bound on the pressure of the weakest focus over all drives.
 
     Args:
         G: transfer matrix (P, M), complex [Pa].
 
     Returns:
-        Bound [Pa] on min_p |(G q)_p| over all drives q of amplitudes <= 1, within some 1e-5 of what the
-        semidefinite relaxation gives.
+        Bound [Pa] on min_p |(G q)_p| over all drives q of amplitudes <= 1, within about 1e-5 of the
+        semidefinite relaxation.
 
     Raises:
         ValueError: not finite complex numbers, or not (P, M) with P, M >= 1.
@@ -47,10 +48,10 @@ def focus_bound(G: ArrayLike) -> float:
     matrix = complex_tensor("G", G).detach().cpu().numpy()
     if matrix.ndim != 2 or matrix.size == 0:
         raise ValueError(f"G: shape {matrix.shape}; must be (P, M) with P, M >= 1")
-    alone = np.abs(matrix).sum(axis=1)  # what each focus reaches by itself
+    alone = np.abs(matrix).sum(axis=1)  # pressure that each focus reaches alone
     if alone.min() == 0:
         return 0.0
-    importance = (alone.min() / alone) ** 2  # of a focus; another unit would overflow sooner
+    importance = (alone.min() / alone) ** 2  # of each focus, scaled against overflow
     rows = (matrix / alone[:, None])[:, np.abs(matrix).max(axis=0) > 0]
     x = np.concatenate([np.ones(len(rows)), np.log(np.linalg.norm(rows, axis=0))])
     for order in _ORDERS:
@@ -67,13 +68,13 @@ def focus_bound(G: ArrayLike) -> float:
 
 
 def _log_bound(x: _Reals, rows: _Complexes, importance: _Reals, order: float) -> tuple[float, _Reals]:
-    """Logarithm of the bound over the least of `alone`, and its gradient.
+    """Return the logarithm of the bound over the least of `alone`, and its gradient.
 
-    The Schatten norm of this `order` stands for the spectral norm.
+    The Schatten norm of this `order` replaces the spectral norm.
 
     Args:
         x: the weights w over `importance`, then log z (P + M,).
-        rows: transfer matrix (P, M), its rows divided by `alone`: what each focus reaches by itself.
+        rows: transfer matrix (P, M), its rows divided by `alone`.
         importance: (min(alone) / alone)^2 (P,).
         order: >= 2; infinite for the spectral norm.
     """
@@ -86,7 +87,7 @@ def _log_bound(x: _Reals, rows: _Complexes, importance: _Reals, order: float) ->
     mean = weights @ importance
     log_bound = np.log(singular[0] * norm * np.linalg.norm(z)) - np.log(mean) / 2
 
-    # How the logarithm of the norm grows with the squares of the singular values
+    # Derivative of the logarithm of the norm by the squares of the singular values
     growth = (ratios / norm) ** (order - 2) / (singular[0] * norm) ** 2 / 2
     slope_weights = np.abs(columns @ right.conj().T) ** 2 @ growth - importance / mean / 2
     slope_log_z = z**2 / np.sum(z**2) - 2 * (growth * singular**2) @ np.abs(right) ** 2

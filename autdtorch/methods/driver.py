@@ -11,7 +11,7 @@ import torch
 from autdtorch.methods.base import Method, Problem, State, Trials
 from autdtorch.methods.solution import Solution
 from autdtorch.methods.state_file import load_state, save_state
-from autdtorch.objectives.simulated import Objective, Score, weakest_focus
+from autdtorch.objectives.objective import Objective, Score, weakest_focus
 from autdtorch.utils.progress import show_progress
 from autdtorch.utils.validation import path_of, require_callable, require_kind
 

@@ -20,7 +20,7 @@ from autdtorch.methods.coordinates import (
 from autdtorch.methods.driver import run
 from autdtorch.methods.ranking import best_first
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.simulated import Objective, Score, weakest_focus
+from autdtorch.objectives.objective import Objective, Score, weakest_focus
 from autdtorch.utils.validation import integer_at_least, invalid
 
 
@@ -38,8 +38,8 @@ class GABS(Method):
 
     Attributes:
         levels: number of phases in [0, 2 pi), >= 2.
-        order: of the transducers. "random": another one in each trial; "given": that of the array, as in
-            Algorithm 2; "strength": by falling score of each transducer alone; or all their indices.
+        order: of the transducers. "random": another one in each trial; "given": the order of the array, as
+            in Algorithm 2; "strength": by falling score of each transducer alone; or all their indices.
         first: index of the transducer to begin with, before the others in their order; None for the first of
             the order.
         passes: >= 1.

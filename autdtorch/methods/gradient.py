@@ -15,7 +15,7 @@ import torch
 from autdtorch.methods.base import Method, Problem, State, Step, Trials, generators_of
 from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.simulated import Objective, weakest_focus
+from autdtorch.objectives.objective import Objective, weakest_focus
 from autdtorch.utils.threads import one_torch_thread
 from autdtorch.utils.validation import integer_at_least, invalid
 

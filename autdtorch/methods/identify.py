@@ -16,7 +16,7 @@ from autdtorch.methods.base import Method, Problem, State, Step, Trials, generat
 from autdtorch.methods.driver import run
 from autdtorch.methods.gradient import climb, random_drives
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.simulated import Objective
+from autdtorch.objectives.objective import Objective
 from autdtorch.utils.threads import one_torch_thread
 from autdtorch.utils.validation import integer_at_least, invalid
 

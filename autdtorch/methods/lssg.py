@@ -19,7 +19,7 @@ from autdtorch.methods.coordinates import (
 )
 from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.simulated import Objective, Score, weakest_focus
+from autdtorch.objectives.objective import Objective, Score, weakest_focus
 from autdtorch.scene.drive import drive_from_phases, focus_phases, normalise
 from autdtorch.utils.validation import integer_at_least, invalid
 
@@ -68,7 +68,7 @@ class LSSG(Method):
 
     Attributes:
         levels: number of offsets in [0, 2 pi), >= 2.
-        order: of the foci: "given", that of the control points, or all their indices.
+        order: of the foci: "given" as the control points are, or all their indices.
         passes: >= 1.
 
     Raises:
@@ -145,7 +145,7 @@ def lssg(
     Args:
         objective: what is evaluated.
         levels: number of offsets in [0, 2 pi), >= 2.
-        order: of the foci: "given", that of the control points, or all their indices.
+        order: of the foci: "given" as the control points are, or all their indices.
         passes: >= 1.
         score: function that is maximised.
 

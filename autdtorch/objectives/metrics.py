@@ -1,4 +1,4 @@
-"""How good foci are, from pressure magnitudes alone (Fig. 3)."""
+"""Figures of merit of foci, from pressure magnitudes alone (Fig. 3)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class FocusMetrics:
     area: torch.Tensor | None
 
     def __repr__(self) -> str:
-        """The medians, with units."""
+        """Return the medians, with units."""
         area = "none" if self.area is None else f"{1e6 * _median(self.area):.4g} mm²"
         return (
             f"FocusMetrics(mean {_median(self.mean):.4g} Pa, min {_median(self.min):.4g} Pa, "
@@ -41,12 +41,11 @@ class FocusMetrics:
 def focus_metrics(
     pressure: ArrayLike, plane_pressure: ArrayLike | None = None, cell_area: float | None = None
 ) -> FocusMetrics:
-    """Figures of merit of foci.
+    """Compute the figures of merit of foci.
 
-    The area is that of all cells of the observation plane in which |p| is at least the mean pressure of the
-    foci over sqrt(2) (half its intensity), divided by the number of foci. That is our reading of the paper,
-    whose "threshold above sqrt(2) of the average sound pressure" taken as a factor would leave nearly no area
-    at all.
+    The area counts the cells of the observation plane in which |p| is at least the mean pressure of the foci
+    over sqrt(2) (half its intensity), divided by the number of foci. The paper's "threshold above sqrt(2) of
+    the average sound pressure", taken as a factor, would leave nearly no area at all.
 
     Args:
         pressure: magnitudes at the foci (..., P) [Pa].

@@ -1,9 +1,9 @@
-"""Real conditions around an objective: noise, few levels, dead transducers, drift. They nest.
+"""Perturbations around an objective: quantisation, failed transducers, drift and noise. They nest.
 
-What is wrapped first is nearest to the air: ``Quantised(Drift(Dead(objective, [3]), phase=0.1), levels=32)``
-rounds the drive, then lets the transducers drift, then silences one; ``Noise`` may come anywhere. All random
-choices follow from the seeds. They go on from row to row, however the rows are divided among calls: a trial
-that shall not depend on the trials beside it needs an objective of its own.
+The innermost perturbation acts last on the drive: ``Quantised(Drift(FailedTransducers(objective, [3]),
+phase=0.1), levels=32)`` rounds the drive, then lets the transducers drift, then switches one off. `Noise` may
+come anywhere. All random choices follow from the seeds, and go on from row to row, however the rows are
+divided among calls. A trial that must not depend on other trials therefore needs an objective of its own.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import torch
 
-from autdtorch.objectives.simulated import Objective, SimulatedObjective, require_objective, validate_drives
+from autdtorch.objectives.objective import Objective, require_objective, validate_drives
+from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.scene.drive import drive_from_phases, validate_drive
 from autdtorch.scene.phase_levels import PhaseLevels
 from autdtorch.scene.scene import Scene
@@ -36,19 +37,19 @@ _PER = 1000  # Evaluations over which the rms of a drift is stated.
 
 
 @runtime_checkable
-class Player(Protocol):
-    """An objective that knows its device's levels, as a `HardwareObjective` does."""
+class Quantiser(Protocol):
+    """An objective that knows the phase levels of its device, such as a `HardwareObjective`."""
 
-    def played(self, drive: torch.Tensor) -> torch.Tensor:
-        """What the device plays (..., M) when asked for drives (..., M); asked for that, it plays that."""
+    def quantised(self, drive: torch.Tensor) -> torch.Tensor:
+        """Return the drives (..., M) that the device plays for drives (..., M)."""
         ...
 
 
-class Condition:
-    """An objective under a condition, itself an objective; by itself it changes nothing.
+class Perturbation:
+    """Base of the perturbations: an objective around another, which it leaves unchanged.
 
     Attributes:
-        inner: the objective under the condition.
+        inner: the wrapped objective.
         scene: its scene.
         evaluations: number of observations so far through this wrapper.
     """
@@ -69,11 +70,11 @@ class Condition:
         self.evaluations = 0
 
     def __repr__(self) -> str:
-        """What is wrapped, from the outside inwards."""
+        """Return the nested objectives, from the outside inwards."""
         return f"{type(self).__name__}({self.inner!r}, {self.evaluations} evaluations)"
 
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
-        """Observe drives (B, M) under the condition: pressure magnitudes (B, P) [Pa].
+        """Observe drives (B, M), perturbed: pressure magnitudes (B, P) [Pa].
 
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
@@ -83,8 +84,8 @@ class Condition:
         self.evaluations += len(drive)
         return pressure
 
-    def played(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return the part of `emitted` that is known beforehand, for drives (..., M); a `Solution` holds it.
+    def quantised(self, drive: torch.Tensor) -> torch.Tensor:
+        """Return drives (..., M) as far as their perturbation is known beforehand; a `Solution` holds them.
 
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
@@ -92,29 +93,29 @@ class Condition:
         return validate_drive(drive, len(self.scene.array))
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return what is asked of `inner` now, when drives (B, M) are asked of this.
+        """Return the drives (B, M) that `inner` is given for drives (B, M), at present.
 
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
         """
-        return self.played(drive)
+        return self.quantised(drive)
 
     def _observe(self, drive: torch.Tensor) -> torch.Tensor:
         return self.inner(self.emitted(drive))
 
 
-class Quantised(Condition):
-    """A device that plays the nearest of few phases, and perhaps knows no amplitude but on and off.
+class Quantised(Perturbation):
+    """A device with few phase levels, and perhaps no amplitude between off and full.
 
-    This is how any method works on the levels of a device: what it observes is what the device plays, and the
-    drive of its `Solution` is on these levels.
+    With it any method works on the levels of a device: it observes the quantised drives, and its `Solution`
+    holds them.
     """
 
     def __init__(self, objective: Objective, levels: int, on_off: bool = False) -> None:
         """Wrap an objective.
 
         Args:
-            objective: what the device plays to.
+            objective: is wrapped.
             levels: number of phases in [0, 2 pi), >= 2; 32 for SonicSurface, 128 for OpenMPD, 256 for AUTD3.
             on_off: amplitudes of 0.5 and more become 1, others 0.
 
@@ -125,28 +126,28 @@ class Quantised(Condition):
         self.levels = integer_at_least("levels", levels, 2)
         self.on_off = boolean("on_off", on_off)
 
-    def played(self, drive: torch.Tensor) -> torch.Tensor:
+    def quantised(self, drive: torch.Tensor) -> torch.Tensor:
         """Return the nearest drives (..., M) that the device can play.
 
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
         """
         levels = PhaseLevels(self.levels, 1 if self.on_off else None)
-        return levels.drive(*levels.nearest(super().played(drive)))
+        return levels.drive(*levels.nearest(super().quantised(drive)))
 
 
-class Dead(Condition):
-    """Transducers that are silent, whatever they are asked for."""
+class FailedTransducers(Perturbation):
+    """Transducers that never emit."""
 
     def __init__(self, objective: Objective, transducers: Sequence[int]) -> None:
         """Wrap an objective.
 
         Args:
-            objective: what the others play to.
-            transducers: indices of the silent ones, at least one, each once.
+            objective: is wrapped.
+            transducers: indices of those that failed, at least one, each once.
 
         Raises:
-            ValueError: `transducers` is none of the above.
+            ValueError: `transducers` are no such indices.
         """
         super().__init__(objective)
         count = len(self.scene.array)
@@ -154,7 +155,7 @@ class Dead(Condition):
         self._alive[indices("transducers", transducers, count)] = 0
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return `drive` (B, M) without the silent transducers.
+        """Return `drive` (B, M) without the failed transducers.
 
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
@@ -162,11 +163,11 @@ class Dead(Condition):
         return super().emitted(drive) * self._alive
 
 
-class Drift(Condition):
-    """Transducers and sensor that change slowly: random walks, a step for every evaluation.
+class Drift(Perturbation):
+    """Transducers and sensor that drift: random walks with a step for every evaluation.
 
-    Every transducer has a phase w that walks and a loss e^{-|v|} with v walking, the sensor a gain e^u, the
-    same for all control points. All start at w = v = u = 0.
+    Every transducer has a phase w and a loss e^{-|v|}, the sensor a gain e^u for all control points. The
+    walks w, v and u start at 0.
     """
 
     def __init__(
@@ -175,7 +176,7 @@ class Drift(Condition):
         """Wrap an objective.
 
         Args:
-            objective: what drifts.
+            objective: is wrapped.
             phase: rms of a transducer's w after 1000 evaluations [rad], >= 0.
             loss: rms of its v after 1000 evaluations, >= 0; 0.1 loses about 8 % of the amplitude.
             sensor: rms of u after 1000 evaluations, >= 0.
@@ -197,7 +198,7 @@ class Drift(Condition):
         self._walk = torch.zeros_like(self._steps)
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return `drive` (B, M) as the transducers turn it after the evaluations so far.
+        """Return `drive` (B, M) with the drift after the evaluations so far.
 
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
@@ -213,13 +214,13 @@ class Drift(Condition):
         return self.inner(drive * transducers) * sensor
 
     def _factors(self, walk: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Factors of the drives (..., M), and of the observed pressures (..., 1)."""
+        """Return the factors of the drives (..., M) and of the observed pressures (..., 1)."""
         transducers = len(self.scene.array)
         phase, loss, sensor = torch.split(walk, [transducers, transducers, 1], dim=-1)
         return drive_from_phases(phase, (-loss.abs()).exp()), sensor.exp()
 
 
-class Noise(Condition):
+class Noise(Perturbation):
     """Complex circular Gaussian noise of fixed level on the phasor at every control point.
 
     A reading is |p + n|. Since all phases of n are equally likely, that has the distribution of ||p| + n|,
@@ -233,10 +234,10 @@ class Noise(Condition):
         """Wrap an objective.
 
         Args:
-            objective: what is observed.
+            objective: is wrapped.
             snr: 20 log10(reference / sigma) [dB], with sigma^2 = E |n|^2; -1000 to 1000.
-            reads: readings of each drive, >= 1, of which the mean is observed. Each reading is an
-                evaluation, here and of `objective`, and drifts go on meanwhile; a `Solution` counts drives.
+            reads: number of readings of each drive, >= 1; their mean is observed. Each reading is an
+                evaluation, here and of `objective`, and drifts go on; a `Solution` counts drives.
             seed: of the noise, >= 0.
             reference: [Pa], > 0; by default the rms pressure over control points and random phases, all
                 transducers fully on: sqrt(mean_p sum_m |G_pm|^2) of the innermost objective, which must be
@@ -261,37 +262,37 @@ class Noise(Condition):
 
 
 def true_pressure(objective: Objective, drive: torch.Tensor) -> torch.Tensor:
-    """Pressure (B, P) [Pa] that the array now really makes when asked for drives (B, M).
+    """Return the pressures (B, P) [Pa] that the array at present makes for drives (B, M).
 
-    What the device does to the drive remains: levels, dead transducers, the drift so far. What only the
-    sensor does, noise and its drift, is gone. Only the innermost objective counts these as evaluations.
+    Perturbations of the drive remain: quantisation, failed transducers, the drift so far. Those of the sensor
+    are left out: noise and its drift. Only the innermost objective counts the evaluations.
 
     Raises:
         ValueError: another shape, not finite complex numbers, or an amplitude above 1.
     """
     require_objective(objective)
     drive = validate_drives(drive, len(objective.scene.array))
-    while isinstance(objective, Condition):
+    while isinstance(objective, Perturbation):
         drive = objective.emitted(drive)
         objective = objective.inner
     return objective(drive)
 
 
-def playable(objective: Objective, drive: torch.Tensor) -> torch.Tensor:
-    """The drives (..., M) that the device is known to play when asked for `drive`: on its levels."""
-    while isinstance(objective, Condition):
-        drive = objective.played(drive)
+def quantised(objective: Objective, drive: torch.Tensor) -> torch.Tensor:
+    """Return the drives (..., M) that the device of an objective is known to play for drives (..., M)."""
+    while isinstance(objective, Perturbation):
+        drive = objective.quantised(drive)
         objective = objective.inner
-    return objective.played(drive) if isinstance(objective, Player) else drive
+    return objective.quantised(drive) if isinstance(objective, Quantiser) else drive
 
 
 def random_rms(matrix: torch.Tensor) -> float:
-    """Rms pressure [Pa] over control points and random phases, all transducers on, of a matrix (P, M)."""
+    """Return the rms pressure [Pa] over the points of a matrix (P, M) and random phases at full drive."""
     return math.sqrt(float(matrix.abs().square().sum(dim=1).mean()))
 
 
 def _innermost_rms(objective: Objective) -> float:
-    while isinstance(objective, Condition):
+    while isinstance(objective, Perturbation):
         objective = objective.inner
     matrix = objective.transfer_matrix if isinstance(objective, SimulatedObjective) else None
     if matrix is None:
@@ -300,6 +301,5 @@ def _innermost_rms(objective: Objective) -> float:
 
 
 def _generator(seed: int, kind: str) -> np.random.Generator:
-    # NumPy's, since one large draw is there the same as many small ones. The kind keeps noise and drift of
-    # one seed apart.
+    # NumPy's generator: one large draw equals many small ones. The kind separates noise and drift of a seed.
     return np.random.default_rng([integer_at_least("seed", seed, 0), *kind.encode()])

@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 
 MATRICES_FOLDER = "matrices"
 PREVIOUS = "previous-"
-"""Start of the names of the folders where files of earlier studies, and damaged ones, are kept."""
+"""Start of the names of the folders that keep files of earlier studies, and damaged ones."""
 
 _LOCK_FILE = ".lock"
 _ANOTHER = "of another study (other settings, source or packages)"
@@ -32,7 +32,7 @@ _Stored = TypeVar("_Stored", Provenance, StudyResult)
 
 
 class StudyFolder:
-    """What a study finds on disk and leaves there; see `open_folder`.
+    """The files of a study on disk; see `open_folder`.
 
     Attributes:
         path: of the folder; None where the study is kept in memory alone.
@@ -44,9 +44,9 @@ class StudyFolder:
     def __init__(
         self, path: Path | None, provenance: Provenance, scenes: Mapping[str, Scene], reuse: bool
     ) -> None:
-        """Read what the folder, which must be locked, holds of the study of this provenance.
+        """Read the files of the study with this provenance; the folder must be locked.
 
-        Each file tells by itself whether it is of the study, so that one that is damaged costs no other.
+        Each file holds its own provenance, so that a damaged one does not spoil the others.
         """
         self.path = path
         self.provenance = provenance
@@ -58,9 +58,9 @@ class StudyFolder:
             self._take_up(path)
 
     def begin(self) -> None:
-        """Set aside what the folder holds of another study or damaged, and open the file of trials.
+        """Set aside damaged files and those of another study, and open the file of trials.
 
-        Until then nothing is written: a study that is refused leaves the folder as it was.
+        Nothing is written before: a study that is refused leaves the folder as it was.
 
         Raises:
             OSError: the folder cannot be read or written.
@@ -85,10 +85,10 @@ class StudyFolder:
             self.provenance = stored
         self.trials = self._trial_file(path)
         if stored is not None or results is not None or len(self.trials):
-            del self._not_used[TRIALS_FILE]  # of which single lines are set aside
+            del self._not_used[TRIALS_FILE]  # its lines are checked one by one
 
     def _stored(self, name: str, load: Callable[[Path], _Stored], path: Path) -> _Stored | None:
-        """Return what a file holds if it is of this study; otherwise note why it is not used."""
+        """Return the content of a file of this study; otherwise note why it is not used."""
         try:
             stored = load(path)
         except FileNotFoundError:
@@ -108,11 +108,11 @@ class StudyFolder:
 
     @property
     def matrices(self) -> Path | None:
-        """Where transfer matrices are kept."""
+        """Folder of the transfer matrices, or None."""
         return None if self.path is None else self.path / MATRICES_FOLDER
 
     def save(self, name: str, scene: SceneResult, order: Mapping[str, object]) -> None:
-        """Keep a finished scene; `order` has the names of all scenes in their order.
+        """Save a finished scene; `order` holds the names of all scenes in their order.
 
         Raises:
             OSError: the folder cannot be written.
@@ -127,13 +127,13 @@ class StudyFolder:
 def open_folder(
     folder: str | os.PathLike[str] | None, provenance: Provenance, scenes: Mapping[str, Scene], reuse: bool
 ) -> Iterator[StudyFolder]:
-    """Have a folder to oneself for the time of a study; it is made if need be.
+    """Lock the folder of a study, which is made if it is missing.
 
     Args:
         folder: None to keep the study in memory alone.
         provenance: of the study.
         scenes: of the study, by name.
-        reuse: whether what the folder holds of the same origin is used again.
+        reuse: whether files of the same origin are used again.
 
     Raises:
         ValueError: another process writes into the folder.

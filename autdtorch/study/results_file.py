@@ -21,7 +21,7 @@ import autdtorch
 from autdtorch.methods.ranking import NEAR_TIE
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.metrics import FocusMetrics
-from autdtorch.objectives.simulated import validate_drives
+from autdtorch.objectives.objective import validate_drives
 from autdtorch.propagators import Run
 from autdtorch.study.provenance import Provenance
 from autdtorch.study.results import MethodResult, SceneResult, Simulation, StudyResult

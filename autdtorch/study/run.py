@@ -17,7 +17,8 @@ from autdtorch.methods.bound import focus_bound
 from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.metrics import focus_metrics
-from autdtorch.objectives.simulated import Objective, SimulatedObjective
+from autdtorch.objectives.objective import Objective
+from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.propagators import CACHE_VARIABLE, Propagator, SimulatedPropagator, make_propagator
 from autdtorch.scene.scene import Scene
 from autdtorch.study.folder import StudyFolder, open_folder

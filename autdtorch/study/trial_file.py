@@ -15,7 +15,7 @@ import torch
 from autdtorch.methods.ranking import NEAR_TIE
 from autdtorch.methods.solution import Solution, joined
 from autdtorch.objectives.metrics import focus_metrics
-from autdtorch.objectives.simulated import validate_magnitudes
+from autdtorch.objectives.objective import validate_magnitudes
 from autdtorch.scene.drive import validate_single_drive
 from autdtorch.utils.json_lines import JsonLines
 from autdtorch.utils.validation import (
@@ -30,7 +30,7 @@ from autdtorch.utils.validation import (
 TRIALS_FILE = "trials.jsonl"
 
 Trial: TypeAlias = tuple[Solution, float]
-"""What one trial found, and the seconds it took."""
+"""The solution of one trial, and the seconds it took."""
 
 Shapes: TypeAlias = Mapping[str, tuple[int, int]]
 """Numbers of transducers M and of control points P, by name of the scene."""
@@ -39,14 +39,14 @@ _METRICS = ("mean", "min", "std", "uniformity")
 
 
 class TrialFile:
-    """Trials by scene, method and number: those that the file holds, and those that are added."""
+    """The finished trials by scene, method and number, in memory and in a file."""
 
     def __init__(self, path: Path | None, origin: str, seed: int, shapes: Shapes) -> None:
-        """Read what the file holds of the study; it is left as it is until `mend`.
+        """Read the trials of the study from the file, which is not changed before `mend`.
 
         Args:
             path: of the file; None to keep the trials in memory alone.
-            origin: of the study, which its lines are told by.
+            origin: of the study; part of the checksum of its lines.
             seed: of the study, for the rows.
             shapes: of its scenes.
 
@@ -59,11 +59,11 @@ class TrialFile:
         self._lines = None if path is None else JsonLines(path, origin, self._use)
 
     def __len__(self) -> int:
-        """Number of trials."""
+        """Return the number of trials."""
         return len(self._trials)
 
     def mend(self) -> None:
-        """Set aside the lines that are damaged or not of this study, which comes before the first `append`.
+        """Set aside lines that are damaged or of another study; call it before the first `append`.
 
         Raises:
             OSError: a file cannot be written.
@@ -72,7 +72,7 @@ class TrialFile:
             self._lines.mend()
 
     def missing(self, scene: str, method: str, trials: int) -> list[int]:
-        """Which of the first `trials` trials are not there."""
+        """Return which of the first `trials` trials are not there."""
         return [trial for trial in range(trials) if (scene, method, trial) not in self._trials]
 
     def append(self, scene: str, method: str, trials: Sequence[int], found: Solution, seconds: float) -> None:
@@ -82,8 +82,8 @@ class TrialFile:
             scene: name.
             method: name.
             trials: their numbers (T,).
-            found: what they found.
-            seconds: what they took together; each is given an equal share.
+            found: their solution.
+            seconds: wall time of the block [s]; each trial is given an equal share.
 
         Raises:
             ValueError: the file has changed meanwhile.
@@ -98,7 +98,7 @@ class TrialFile:
             self._lines.append(*(self._row(scene, method, trial) for trial in added))
 
     def found(self, scene: str, method: str, trials: int) -> tuple[Solution, torch.Tensor]:
-        """What the first `trials` trials found, all of which must be there, and seconds (T,) of each."""
+        """Return the joined solution of the first `trials` trials, and seconds (T,) of each."""
         each = [self._trials[scene, method, trial] for trial in range(trials)]
         seconds = torch.tensor([share for _, share in each], dtype=torch.float64, device="cpu")
         return joined([solution for solution, _ in each]), seconds
@@ -121,7 +121,7 @@ class TrialFile:
         }
 
     def _use(self, row: dict[str, Any]) -> None:
-        """Add the trial of a row, after checking it as what a method found in a scene of the study."""
+        """Check and add the trial of a row."""
         for name in ("scene", "method"):
             require_kind(name, row[name], str)
         if row["scene"] not in self._shapes:

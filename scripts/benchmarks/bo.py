@@ -22,7 +22,7 @@ from shared.scenes import PAPER, paper_scene
 import autdtorch as at
 from autdtorch.methods.base import trial_seeds
 from autdtorch.methods.bayes.bayes import NOISE, drives_at
-from autdtorch.objectives.simulated import weakest_focus
+from autdtorch.objectives.objective import weakest_focus
 
 EVALUATIONS, INITIAL, FIXED = 256, 16, 6
 REFIT_GROWTH, CANDIDATES, STARTS, CLIMB_STEPS = 1.1, 128, 2, 20

@@ -75,7 +75,7 @@ METHODS = {
 def dead(objective: at.Objective, trial: int, count: int = 1) -> at.Objective:
     """Switch off transducers, different ones in each trial."""
     order = torch.randperm(len(objective.scene.array), generator=torch.Generator().manual_seed(trial))
-    return at.Dead(objective, order[:count].tolist())
+    return at.FailedTransducers(objective, order[:count].tolist())
 
 
 def bench(objective: at.Objective, trial: int) -> at.Objective:

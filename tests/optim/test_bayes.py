@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from autdtorch.methods.bayes.bayes import bayes_opt
-from autdtorch.objectives.simulated import weakest_focus
+from autdtorch.objectives.objective import weakest_focus
 from autdtorch.scene.drive import drive_from_phases
 
 SMALL = {"evaluations": 30, "initial": 6, "fixed_transducer": 2}

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from autdtorch.methods.lssg import lss, lssg
-from autdtorch.objectives.simulated import weakest_focus
+from autdtorch.objectives.objective import weakest_focus
 from autdtorch.scene.drive import drive_from_phases, focus_phases, normalise
 
 

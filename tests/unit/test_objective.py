@@ -1,7 +1,8 @@
 import pytest
 import torch
 
-from autdtorch.objectives.simulated import SimulatedObjective, weakest_focus
+from autdtorch.objectives.objective import weakest_focus
+from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.propagators import FreeSpacePropagator, make_propagator
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.drive import drive_from_phases

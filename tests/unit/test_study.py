@@ -17,7 +17,7 @@ from autdtorch.analytic.green import green
 from autdtorch.methods.gabs import GABS, gabs
 from autdtorch.methods.lssg import LSSG, lssg
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.simulated import Objective
+from autdtorch.objectives.objective import Objective
 from autdtorch.propagators import FreeSpacePropagator, Run, SteadyStateWarning
 from autdtorch.propagators.full import DomainSimulation
 from autdtorch.scene.arrays import Nodes

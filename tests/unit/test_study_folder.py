@@ -12,7 +12,7 @@ from small_scenes import CUBE, small_scene
 from autdtorch.methods.base import Trials
 from autdtorch.methods.gabs import gabs
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.simulated import Objective
+from autdtorch.objectives.objective import Objective
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.scene import Scene
 from autdtorch.study.folder import MATRICES_FOLDER, PREVIOUS

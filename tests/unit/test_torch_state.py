@@ -61,7 +61,7 @@ def numbers(folder: Path) -> dict[str, torch.Tensor]:
         drive = at.drive_from_phases(torch.arange(4, dtype=torch.float64, device="cpu"))
         found[f"{method} field"] = propagator.field(drive, scene.control_points + 1e-4)
     objective = at.SimulatedObjective(scene, at.make_propagator(scene, "box", 2e-3, cache=False))
-    noisy = at.Noise(at.Quantised(at.Drift(at.Dead(objective, [1]), 0.1, 5), 16), 30.0)
+    noisy = at.Noise(at.Quantised(at.Drift(at.FailedTransducers(objective, [1]), 0.1, 5), 16), 30.0)
     for name, solution in {
         "lss": at.lss(objective),
         "lssg": at.lssg(objective, passes=2),

@@ -6,7 +6,7 @@ from typing import Protocol, runtime_checkable
 
 import torch
 
-from autdtorch.objectives.simulated import validate_magnitudes
+from autdtorch.objectives.objective import validate_magnitudes
 
 
 class SensorError(OSError):

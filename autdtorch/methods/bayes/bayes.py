@@ -12,7 +12,7 @@ import torch
 from autdtorch.methods.base import Method, Problem, State, Step, Trials
 from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.simulated import Objective, Score, weakest_focus
+from autdtorch.objectives.objective import Objective, Score, weakest_focus
 from autdtorch.scene.drive import drive_from_phases
 from autdtorch.utils.threads import spread
 from autdtorch.utils.validation import integer_at_least, invalid, number_between, require_one_of

@@ -15,7 +15,7 @@ import autdtorch
 from autdtorch.hardware.log import Evaluation, EvaluationLog
 from autdtorch.hardware.preflight import Preflight
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.simulated import Objective
+from autdtorch.objectives.objective import Objective
 from autdtorch.plot.trials import plot_convergence
 from autdtorch.study.report.document import code, rendered
 from autdtorch.utils.files import naming, replace_file

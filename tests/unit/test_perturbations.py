@@ -12,16 +12,17 @@ from scipy.stats import kstest, rice
 from small_scenes import small_scene
 
 from autdtorch.methods.gabs import gabs
+from autdtorch.objectives.objective import Objective
 from autdtorch.objectives.perturbations import (
-    Condition,
-    Dead,
     Drift,
+    FailedTransducers,
     Noise,
+    Perturbation,
     Quantised,
-    playable,
+    quantised,
     true_pressure,
 )
-from autdtorch.objectives.simulated import Objective, SimulatedObjective
+from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.propagators import FreeSpacePropagator
 from autdtorch.scene.drive import drive_from_phases, phases_of
 
@@ -85,7 +86,7 @@ def test_noise_at_control_points_and_rows_is_independent() -> None:
 
 
 def test_default_reference_is_the_rms_pressure_under_random_phases(simulated: SimulatedObjective) -> None:
-    sigma = Noise(Quantised(Dead(simulated, [0]), 4), snr=20).sigma
+    sigma = Noise(Quantised(FailedTransducers(simulated, [0]), 4), snr=20).sigma
     squares = simulated(random_drive(20000)).square().mean(dim=1)
     # 4 standard errors of the mean square, halved by the root.
     error = 2 * (squares.std() / squares.mean()).item() / math.sqrt(20000)
@@ -94,7 +95,7 @@ def test_default_reference_is_the_rms_pressure_under_random_phases(simulated: Si
 
 def test_reference_must_be_given_where_nothing_tells_it(simulated: SimulatedObjective) -> None:
     replayed = SimulatedObjective(SCENE, FreeSpacePropagator(SCENE), mode="replay")
-    for objective in (replayed, Recorder(), Dead(replayed, [1])):
+    for objective in (replayed, Recorder(), FailedTransducers(replayed, [1])):
         with pytest.raises(ValueError, match="reference: None Pa; must be given where the objective has no"):
             Noise(objective, 20)
         assert Noise(objective, 20, reference=2.0).sigma == pytest.approx(0.2)
@@ -176,12 +177,12 @@ def test_levels_that_are_the_devices_are_played_as_they_are(simulated: Simulated
 
 def test_dead_transducers_are_silent_and_nobody_is_told() -> None:
     recorder = Recorder()
-    broken = Dead(recorder, [0, 2])
+    broken = FailedTransducers(recorder, [0, 2])
     drive = random_drive(3)
     broken(drive)
     assert torch.equal(recorder.heard[:, [0, 2]], torch.zeros(3, 2, dtype=torch.complex128))
     assert torch.equal(recorder.heard[:, [1, 3]], drive[:, [1, 3]])
-    assert torch.equal(playable(broken, drive), drive)
+    assert torch.equal(quantised(broken, drive), drive)
 
 
 def test_drift_has_the_stated_rms_after_1000_evaluations() -> None:
@@ -209,7 +210,7 @@ def test_drift_is_slow_and_begins_at_the_undrifted(simulated: SimulatedObjective
 
 
 def test_true_pressure_keeps_the_device_and_drops_the_sensor(simulated: SimulatedObjective) -> None:
-    drift = Drift(Dead(simulated, [1]), phase=0.5, loss=0.2, sensor=0.5, seed=1)
+    drift = Drift(FailedTransducers(simulated, [1]), phase=0.5, loss=0.2, sensor=0.5, seed=1)
     objective = Noise(Quantised(drift, 8), 10, reads=2, seed=1)
     drive = random_drive(50)
     objective(drive)
@@ -224,7 +225,7 @@ def test_true_pressure_keeps_the_device_and_drops_the_sensor(simulated: Simulate
 
 
 def test_a_solution_is_on_the_levels_of_the_device_but_knows_no_fault(simulated: SimulatedObjective) -> None:
-    objective = Noise(Quantised(Drift(Dead(simulated, [1]), phase=0.5), 8, on_off=True), 20)
+    objective = Noise(Quantised(Drift(FailedTransducers(simulated, [1]), phase=0.5), 8, on_off=True), 20)
     solution = gabs(objective, levels=16, trials=2)
     steps = solution.phases * 8 / (2 * math.pi)
     torch.testing.assert_close(steps, steps.round(), rtol=0, atol=1e-12)
@@ -234,10 +235,10 @@ def test_a_solution_is_on_the_levels_of_the_device_but_knows_no_fault(simulated:
 @pytest.mark.parametrize(
     "make",
     [
-        Condition,
+        Perturbation,
         lambda inner: Noise(inner, 20, reads=2),
         lambda inner: Quantised(inner, 4),
-        lambda inner: Dead(inner, [0]),
+        lambda inner: FailedTransducers(inner, [0]),
         lambda inner: Drift(inner, phase=0.1),
     ],
     ids=["none", "noise", "quantised", "dead", "drift"],
@@ -265,11 +266,11 @@ def test_a_drive_that_no_array_can_play_is_refused_and_not_counted(
         (lambda o: Noise(o, 20, reference=0.0), r"reference: 0\.0 Pa; must be finite and > 0"),
         (lambda o: Quantised(o, 1), "levels: 1; must be an integer >= 2"),
         (lambda o: Quantised(o, 4, on_off=1), "on_off: 1; must be true or false"),
-        (lambda o: Dead(o, []), r"transducers: \(\); must be indices from 0 to 3, each once"),
-        (lambda o: Dead(o, [4]), r"transducers: \(4,\); must be indices from 0 to 3"),
-        (lambda o: Dead(o, [1, 1]), r"transducers: \(1, 1\); must be indices"),
-        (lambda o: Dead(o, [-1]), r"transducers\[0\]: -1; must be an integer >= 0"),
-        (lambda o: Dead(o, 2), "transducers: 2; must be indices"),
+        (lambda o: FailedTransducers(o, []), r"transducers: \(\); must be indices from 0 to 3, each once"),
+        (lambda o: FailedTransducers(o, [4]), r"transducers: \(4,\); must be indices from 0 to 3"),
+        (lambda o: FailedTransducers(o, [1, 1]), r"transducers: \(1, 1\); must be indices"),
+        (lambda o: FailedTransducers(o, [-1]), r"transducers\[0\]: -1; must be an integer >= 0"),
+        (lambda o: FailedTransducers(o, 2), "transducers: 2; must be indices"),
         (lambda o: Drift(o, phase=-0.1), r"phase: -0\.1 rad; must be finite and >= 0"),
         (lambda o: Drift(o, loss=math.nan), "loss: nan; must be finite"),
         (lambda o: Drift(o, sensor="much"), "sensor: 'much'; must be a real number"),

@@ -1,0 +1,91 @@
+"""Objectives: black boxes that take drives and give the pressure magnitudes at the control points.
+
+Neither a microphone nor a thermal camera measures a phase, so a method cannot distinguish a simulated
+objective from a measured one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol, TypeAlias, runtime_checkable
+
+import torch
+
+from autdtorch.scene.drive import validate_drive
+from autdtorch.scene.scene import Scene
+from autdtorch.utils.validation import invalid, real_tensor, require_kind
+
+Score: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
+"""A goal: function of pressures (..., P) [Pa] that gives the scores (...) to maximise."""
+
+
+@runtime_checkable
+class Objective(Protocol):
+    """Observes the control points of a scene, simulated or real.
+
+    Attributes:
+        scene: its array plays the drives, and its control points are observed.
+        evaluations: number of observations so far.
+    """
+
+    scene: Scene
+
+    @property
+    def evaluations(self) -> int:
+        """Number of observations so far."""
+        ...
+
+    def __call__(self, drive: torch.Tensor) -> torch.Tensor:
+        """Observe drives (B, M), complex, |q| <= 1: pressure magnitudes (B, P) [Pa], one evaluation each."""
+        ...
+
+
+def require_objective(objective: Objective) -> None:
+    """Check that `objective` is an objective of a scene.
+
+    Raises:
+        ValueError: it is none.
+    """
+    require_kind("objective", objective, Objective)
+    require_kind("objective.scene", objective.scene, Scene)
+
+
+def validate_drives(drive: torch.Tensor, transducers: int) -> torch.Tensor:
+    """Check drives (B, M), and return them as complex128 on the CPU, without gradient.
+
+    Raises:
+        ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+    """
+    drive = validate_drive(drive, transducers).detach().cpu()
+    if drive.ndim != 2 or len(drive) == 0:
+        raise ValueError(f"drive: shape {tuple(drive.shape)}; must be (B, {transducers}) with B >= 1")
+    return drive
+
+
+def validate_magnitudes(name: str, value: object, points: int) -> torch.Tensor:
+    """Return observed magnitudes (P,) [Pa], float64, after checking them.
+
+    Args:
+        name: of the field, for messages.
+        value: observed magnitudes.
+        points: number of control points P.
+
+    Raises:
+        ValueError: not P finite real numbers >= 0.
+    """
+    pressure = real_tensor(name, value, "Pa")
+    if pressure.shape != (points,) or pressure.min() < 0:
+        raise invalid(name, value, f"must be {points} numbers >= 0", "Pa")
+    return pressure
+
+
+def weakest_focus(pressure: torch.Tensor) -> torch.Tensor:
+    """Return the pressure of the weakest focus (...) [Pa] of pressures (..., P): the paper's f = min(p_n).
+
+    Raises:
+        ValueError: not finite real numbers, or no focus.
+    """
+    pressure = real_tensor("pressure", pressure, "Pa")
+    if pressure.ndim == 0 or pressure.shape[-1] == 0:
+        raise ValueError(f"pressure: shape {tuple(pressure.shape)}; must be (..., P) with P >= 1")
+    return pressure.amin(dim=-1)
