@@ -1,16 +1,16 @@
-"""Gradients of what receivers record, by an adjoint run of any kernel.
+"""Gradients of receiver records, by an adjoint run of any kernel.
 
-Times the masses of its cells the scheme is symmetric, the boundary layers included: what a force on cell j
-makes of cell i some steps later is m_j / m_i times what one on i makes of j. So the derivatives lambda of a
-loss by the forces on all cells come from a run of the same kernel: driven in the receivers' cells by the
-loss's derivatives by what they recorded, last step first, over the masses, and read times the masses. Then
+Multiplied by the masses of its cells the scheme is symmetric, boundary layers included. The response of cell
+i to a force on cell j is m_j / m_i times that of cell j to a force on cell i. The derivatives lambda of a
+loss by the forces on all cells therefore come from a run of the same kernel. It is driven in the receivers'
+cells by the loss's derivatives over the masses, last step first, and read times the masses:
 
     dL / d force_is  = sum_t lambda_i(t) signal_s(t)
     dL / d weight_ij = sum_t lambda_i(t) (p_j(t) - p_i(t)).
 
-For the second the run itself is needed in reverse. Its state is kept at the beginning of segments, and each
-segment is stepped again, with the heterogeneous cells and their neighbours as receivers. What it costs is in
-`docs/decisions/gradients.md`.
+The second sum needs the run itself in reverse. Its state is kept at the beginning of segments, and each
+segment is stepped again with the heterogeneous cells and their neighbours as receivers.
+`docs/decisions/gradients.md` has the cost.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from autdtorch.fdtd.stepping import Assembly
 from autdtorch.utils.threads import spread
 
 _SEGMENT_BYTES = 128 * 2**20
-"""Of what is recorded in a segment at once; longer ones only where the states kept would take more."""
+"""Memory [bytes] of the record of a segment; larger only where the states kept would take more."""
 
-_CELLS_AT_ONCE = 1000
-"""Cells whose derivatives are a piece of work."""
+_CHUNK = 1000
+"""Cells whose derivatives are summed at a time."""
 
 _ROUNDING = 4
-"""Roundings of the largest singular value below which others are nothing else."""
+"""Singular values below this many roundings of the largest are zero."""
 
 
 def recorded(
     kernel: Kernel, assembly: Assembly, sources: Sources, receivers: Receivers, signal: torch.Tensor
 ) -> torch.Tensor:
-    """Step from silence, once per row of `signal` (steps, S), and record (steps, R); see `Kernel.advance`.
+    """Step from silence, once per row of `signal` (steps, S), and return the record (steps, R).
 
-    Differentiable, once, by `sources.force` and by `assembly.coefficients.heterogeneous_weight`. Stencil rows
-    in the boundary layers count as constant: their derivatives are zero.
+    Differentiable, once, by `sources.force` and by `assembly.coefficients.heterogeneous_weight`. Derivatives
+    by stencil rows in the boundary layers are zero.
 
     Raises:
         ValueError: a source or a receiver is in the boundary layers, where reciprocity does not hold.
@@ -62,7 +62,7 @@ def recorded(
 
 @dataclass(frozen=True)
 class _Run:
-    """What is constant in a run."""
+    """The constants of a run."""
 
     kernel: Kernel
     assembly: Assembly
@@ -74,31 +74,30 @@ class _Run:
         self, state: State, sources: Sources, receivers: Receivers, signal: torch.Tensor
     ) -> tuple[State, torch.Tensor]:
         """Step a copy of the state."""
-        state, heard = self.kernel.advance(
+        state, record = self.kernel.advance(
             _copy(state), self.assembly.coefficients, sources, receivers, signal
         )
-        return state, heard.cpu()
+        return state, record.cpu()
 
     def single(self, cells: torch.Tensor) -> Receivers:
-        """Cells (k,) as receivers."""
+        """Return cells (k,) as receivers."""
         return Receivers(cells[:, None], torch.ones((len(cells), 1), dtype=self.assembly.dtype, device="cpu"))
 
     def fields(
         self, state: State, sources: Sources, cells: torch.Tensor, signal: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Pressure in cells (k,) before the first of some steps (1, k), and after each (steps, k)."""
+        """Return the pressure in cells (k,) before the first step (1, k), and after each (steps, k)."""
         first = state.now.reshape(1, -1)[:, cells.to(state.now.device)].cpu()
         return first, self.advance(state, sources, self.single(cells), signal)[1]
 
     def mass(self, cells: torch.Tensor) -> torch.Tensor:
-        """Of cells (k,), no two alike."""
+        """Return the mass of distinct cells (k,)."""
         return torch.from_numpy(self.assembly.heterogeneous.mass_of(cells.numpy())).to(self.assembly.dtype)
 
     def adjoint_sources(self, slope: torch.Tensor) -> tuple[Sources, torch.Tensor]:
-        """What drives the adjoint run, and by which signals (steps, S), last step first.
+        """Return sources and signals (steps, S) of the adjoint run, last step first.
 
-        Derivatives (steps, R) of few independent signals, such as those of phasors, are brought down to
-        these: S is their rank.
+        S is the rank of the derivatives (steps, R): few for phasors.
         """
         loud = slope.any(dim=1)
         left, size, right = torch.linalg.svd(slope[loud], full_matrices=False)
@@ -118,10 +117,10 @@ class _Neighbourhood:
     """The heterogeneous cells outside the layers, and the cells whose field their derivatives need.
 
     Attributes:
-        own: which of the heterogeneous cells they are (n,).
-        index: their flat indices.
-        cells: these, their neighbours' and those of the receivers (k,), ascending.
-        offsets: to the neighbours (27,).
+        own: mask of these among the heterogeneous cells.
+        index: their flat indices (n,).
+        cells: flat indices of these, of their neighbours and of the receivers (k,), ascending.
+        offsets: flat offsets to the neighbours (27,).
         points: the receivers.
     """
 
@@ -143,15 +142,15 @@ class _Neighbourhood:
         points = Interpolation(run.receivers.index.numpy(), run.receivers.weight.numpy())
         return cls(own, index, used.nonzero().reshape(-1), offsets, points)
 
-    def heard(self, field: torch.Tensor) -> torch.Tensor:
-        """What the receivers hear (steps, R) of the field in the cells (steps, k)."""
+    def received(self, field: torch.Tensor) -> torch.Tensor:
+        """Return the record of the receivers (steps, R) from the field in the cells (steps, k)."""
         return torch.from_numpy((self.points.matrix(self.cells.numpy()) @ field.numpy().T).T)
 
     def correlate(
         self, adjoint: torch.Tensor, first: torch.Tensor, after: torch.Tensor, total: torch.Tensor
     ) -> None:
-        """Add to `total` (n, 27) the sums of lambda_i (p_j - p_i), of lambda (steps, n) and `_Run.fields`."""
-        from autdtorch.fdtd.kernels.cpu_correlation import correlate  # with numba, which takes its time
+        """Add sums of lambda_i (p_j - p_i) to `total` (n, 27), of lambda (steps, n) and `_Run.fields`."""
+        from autdtorch.fdtd.kernels.cpu_correlation import correlate  # loads numba
 
         field = torch.empty(after.shape[::-1], dtype=after.dtype, device="cpu")
         field[:, 0], field[:, 1:] = first[0], after[:-1].T
@@ -159,16 +158,16 @@ class _Neighbourhood:
         place[self.cells] = torch.arange(len(self.cells), dtype=torch.int32, device="cpu")
         tensors = adjoint.T.contiguous(), field, self.index, self.offsets, place, total
         arrays = [tensor.numpy() for tensor in tensors]
-        ends = pairwise([*range(0, len(self.index), _CELLS_AT_ONCE), len(self.index)])
+        ends = pairwise([*range(0, len(self.index), _CHUNK), len(self.index)])
         spread(lambda rows: correlate(*rows, *arrays), ends)
 
 
 class _Recorded(torch.autograd.Function):
-    """Forwards the run, backwards the adjoint run beside its segments."""
+    """The run forwards; the adjoint run and the segments it needs backwards."""
 
     @staticmethod
     def forward(ctx: Any, force: torch.Tensor, weight: torch.Tensor, run: _Run) -> torch.Tensor:
-        """Record, and keep the states at the cuts where derivatives by the weights are wanted."""
+        """Record, and keep the states at the cuts where derivatives by the weights are needed."""
         sources, steps = Sources(run.driven, force.detach()), len(run.signal)
         state = run.assembly.silence(sources)
         ctx.run, ctx.sources, ctx.around, ctx.cuts = run, sources, None, [0, steps]
@@ -176,27 +175,26 @@ class _Recorded(torch.autograd.Function):
             return run.advance(state, sources, run.receivers, run.signal)[1]
         ctx.around = around = _Neighbourhood.of(run)
         ctx.cuts, ctx.states = _cuts(steps, state, len(around.cells)), []
-        recorded = []
+        records = []
         for start, end in pairwise(ctx.cuts):
             ctx.states.append(state)
             part = run.signal[start:end]
             if end < steps:
-                state, heard = run.advance(state, sources, run.receivers, part)
+                state, record = run.advance(state, sources, run.receivers, part)
             else:  # where the backward pass begins
                 ctx.last = run.fields(state, sources, around.cells, part)
-                heard = around.heard(ctx.last[1])
-            recorded.append(heard)
-        return torch.cat(recorded)
+                record = around.received(ctx.last[1])
+            records.append(record)
+        return torch.cat(records)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, slope: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None, None]:
-        """Step the adjoint run, and again the segments that go with it."""
+        """Step the adjoint run, and again the segments."""
         run, around, steps, driven = ctx.run, ctx.around, len(slope), len(ctx.run.driven)
         by_force = torch.zeros_like(ctx.sources.force)
-        by_row = torch.zeros(
-            (0 if around is None else len(around.index), 27), dtype=by_force.dtype, device="cpu"
-        )
+        rows = 0 if around is None else len(around.index)
+        by_row = torch.zeros((rows, 27), dtype=by_force.dtype, device="cpu")
         if slope.any():
             cells = [run.driven] if around is None else [run.driven, around.index]
             mass, read = torch.cat([run.mass(group) for group in cells]), run.single(torch.cat(cells))
@@ -205,9 +203,9 @@ class _Recorded(torch.autograd.Function):
             for number in reversed(range(len(ctx.cuts) - 1)):
                 start, end = ctx.cuts[number : number + 2]
                 part = run.signal[start:end]
-                state, heard = run.advance(state, sources, read, signal[steps - end : steps - start])
-                adjoint = mass * heard.flip(0)
-                by_force += adjoint[:, :driven].double().T @ part.double()  # as in `drive_dft`
+                state, record = run.advance(state, sources, read, signal[steps - end : steps - start])
+                adjoint = mass * record.flip(0)
+                by_force += adjoint[:, :driven].double().T @ part.double()  # double: as in `drive_dft`
                 if around is not None:
                     fields = ctx.last
                     if end < steps:
@@ -221,18 +219,15 @@ class _Recorded(torch.autograd.Function):
 
 
 def _copy(state: State) -> State:
-    def copied(layer: Layer) -> Layer:
-        return layer[0].clone(), layer[1].clone()
-
-    layers = tuple(map(copied, state.layers))
-    return State(
-        state.now.clone(), state.before.clone(), layers, copied(state.columns), copied(state.crossed)
+    *layers, columns, crossed = (
+        (psi.clone(), zeta.clone()) for psi, zeta in (*state.layers, state.columns, state.crossed)
     )
+    return State(state.now.clone(), state.before.clone(), tuple(layers), columns, crossed)
 
 
 def _cuts(steps: int, state: State, cells: int) -> list[int]:
-    """Where segments begin and end: with the states kept, they hold least at the root of these lengths."""
-    memory = (*state.layers, state.columns, state.crossed)
+    """Return the ends of segments. Their record and the states kept take least memory at a root's length."""
+    memory: tuple[Layer, ...] = (*state.layers, state.columns, state.crossed)
     numbers = 2 * state.now.numel() + sum(part.numel() for layer in memory for part in layer)
     longest = max(
         _SEGMENT_BYTES / (cells * state.now.element_size()), math.sqrt(steps * numbers / (2 * cells))

@@ -1,19 +1,18 @@
 """Perfectly matched layer for the tuned stencil, with a profile tuned to the drive frequency.
 
-Along its axis a layer replaces the second difference d2 by g d(g d), with g = 1 / (1 + sigma / (alpha - i w))
-in frequency and two memory variables in time (CPML of second order: Komatitsch & Martin 2007, Pasalic &
-McGarry 2010):
+Along its axis a layer replaces the second difference d2 by g d(g d), with
+g = 1 / (1 + sigma / (alpha - i w)). In time this takes two memory variables (CPML of second order: Komatitsch
+& Martin 2007, Pasalic & McGarry 2010):
 
     psi  <- b psi  + a (u[l+1] - u[l])                      between the cells
     zeta <- b zeta + a (u[l+1] - 2 u[l] + u[l-1] + psi[l+1/2] - psi[l-1/2])        at the cells
     d2 u becomes d2 u + psi[l+1/2] - psi[l-1/2] + zeta.
 
 The 27-point sum consists of products of T_x, T_y and T_z, T_a being the sum of the two neighbours along axis
-a. With E_a u what the layer adds to d2 u, T_a + E_a takes the place of every T_a, in products too. That is
-the exact complex stretching of the *discrete* equation, the grid's edges and corners included: the equation
-stays symmetric, and a wave that meets a layer at angle t behaves as in one dimension with the wavenumber
-k cos t. The reflection is then a small linear system for each angle, and the profile is chosen to make it
-small for all of them at once.
+a. With E_a u the term that the layer adds to d2 u, T_a + E_a replaces every T_a, in products too. This is the
+exact complex stretching of the *discrete* equation, edges and corners of the grid included. The equation
+stays symmetric, and a wave at angle t behaves as in one dimension with the wavenumber k cos t. The reflection
+is then a small linear system for each angle, and the profile minimises it for all angles at once.
 """
 
 from __future__ import annotations
@@ -29,23 +28,26 @@ from scipy.optimize import least_squares
 from autdtorch.utils.arrays import Array
 
 TUNED_ANGLES = np.radians((0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 55.0, 60.0, 65.0, 70.0, 75.0, 80.0))
-
+"""Angles of incidence at which the profile is fitted [rad]."""
 
 _STARTS = ((10.0, 1.5), (20.0, 2.5))
-"""Strength and order of the power-law profiles that the fit starts from; the better end is kept."""
+"""Strength and order of the power-law profiles that the fit starts from; the better result is kept."""
+
 _SHIFT = 0.1
-"""Frequency shift alpha in units of w. A layer gives energy to waves that fade towards it, at frequencies
-above alpha: too small a shift lets the slow near field of a light obstacle grow (the fit alone would choose
-0.01, which returned ten times as much; 0.3 would cost 16 dB of reflection)."""
+"""Frequency shift alpha over w. At frequencies above alpha a layer gives energy to evanescent waves, so that
+a small shift lets the near field of a light obstacle grow. The fit alone would choose 0.01, which returns ten
+times as much; 0.3 would cost 16 dB of reflection."""
+
 _DIFFERENCE = 1e-7
-"""Of the logarithms of the damping, to tell the slopes from."""
+"""Step of the logarithms of the damping, for numerical derivatives."""
+
 _BOUNDS = (-14.0, 6.0)
-"""Range of the logarithms of the damping over w: from nothing to opaque."""
+"""Range of the logarithms of the damping over w: from none to opaque."""
 
 
 @dataclass(frozen=True)
 class LayerProfile:
-    """Recursion coefficients of a layer of n cells, from its outer end inwards, or of several (..., 1).
+    """Recursion coefficients of a layer of n cells, from its outer end inwards.
 
     Attributes:
         decay: b at the half cells 0 .. n and at the cells 1 .. n, interleaved (..., 2 n + 1).
@@ -62,25 +64,24 @@ class LayerProfile:
 
 
 def layer_profile(sigma: Array, alpha: float) -> LayerProfile:
-    """Recursion coefficients of damping `sigma` (..., 2 n + 1) and shift `alpha`, both per time step."""
+    """Return the recursion coefficients of damping `sigma` (..., 2 n + 1) and shift `alpha` per step."""
     decay = np.exp(-(sigma + alpha))
     return LayerProfile(decay, sigma / (sigma + alpha) * (decay - 1))
 
 
 def reflection(profile: LayerProfile, along: Array, turn: Array) -> NDArray[np.complex128]:
-    """Complex amplitude (..., n) of the reflected plane wave, exact for the discrete scheme.
+    """Return the complex amplitude (..., n) of the reflected plane wave, exact for the discrete scheme.
 
     Args:
         profile: the layer or layers.
-        along: wavenumber along the layer's normal, times spacing (n,) [rad]: kappa cos(angle) at the drive
-            frequency.
+        along: wavenumber along the layer's normal times spacing (n,) [rad].
         turn: angular frequency times time step (n,) [rad].
     """
     decay, gain = profile.decay[..., None, :], profile.gain[..., None, :]
     stretch = 1 + gain / (1 - decay * np.exp(1j * turn)[:, None])
     half, full = stretch[..., 0::2], stretch[..., 1::2]
-    # Unknown: pressure in cells 1 .. L of the layer, in the first cell of air, and the amplitude r of the
-    # reflected wave. In air cell j the pressure is e^{-i along j} + r e^{i along j}.
+    # Unknowns: pressure in cells 1 .. L of the layer and in the first cell of air, and the amplitude r. In
+    # air cell j the pressure is e^{-i along j} + r e^{i along j}.
     cells = profile.cells
     matrix = np.zeros((*stretch.shape[:-1], cells + 2, cells + 2), complex)
     rows = np.arange(cells)
@@ -100,10 +101,10 @@ def reflection(profile: LayerProfile, along: Array, turn: Array) -> NDArray[np.c
 
 @lru_cache(maxsize=64)
 def tuned_profile(kappa: float, steps_per_period: float, cells: int) -> LayerProfile:
-    """The profile of `cells` cells that reflects least at the drive frequency, at any angle.
+    """Return the profile of `cells` cells with the least reflection at the drive frequency, at all angles.
 
-    Every value of the damping is free. The fit takes the complex reflection, which is smooth where its
-    magnitude has a kink, at `TUNED_ANGLES`; those up to 60 degrees count ten times as much as those beyond.
+    Every value of the damping is free. The complex reflection at `TUNED_ANGLES` is fitted, as its magnitude
+    is not smooth. Angles up to 60 degrees weigh ten times as much as others.
     """
     frequency = 2 * math.pi / steps_per_period
     along, turn = kappa * np.cos(TUNED_ANGLES), np.full_like(TUNED_ANGLES, frequency)
@@ -118,7 +119,7 @@ def tuned_profile(kappa: float, steps_per_period: float, cells: int) -> LayerPro
 
     def slopes(logarithms: Array) -> Array:
         moved = logarithms + np.vstack((np.zeros_like(logarithms), _DIFFERENCE * np.eye(len(logarithms))))
-        values = residual(moved)  # all at once: twice as fast as one after the other
+        values = residual(moved)
         return np.asarray((values[1:] - values[0]).T / _DIFFERENCE)
 
     depth = np.linspace(1, 0.5 / cells, 2 * cells + 1)

@@ -1,4 +1,4 @@
-"""The grid: cubic cells over a domain with a boundary layer around it, and what fills them."""
+"""The grid: cubic cells over a domain, with a boundary layer around it."""
 
 from __future__ import annotations
 
@@ -22,32 +22,34 @@ logger = logging.getLogger(__name__)
 
 
 MIN_CELLS_PER_WAVELENGTH = 3.0
-"""Coarser grids are refused."""
+"""Fewest cells per wavelength; coarser grids are refused."""
 
 FAIR_CELLS_PER_WAVELENGTH = 4.0
-"""Coarser grids are warned of: points would need over 10 cells a side, the layer reflects over -61 dB."""
+"""Fewest cells per wavelength without a warning. Below, points would need interpolation over more than 10
+cells a side, and the layer reflects more than -61 dB."""
 
 MAX_CELLS_PER_WAVELENGTH = 500
-"""Finer grids are refused: the fit of the boundary layer begins within its bounds up to some 700."""
+"""Most cells per wavelength. The fit of the boundary layer starts within its bounds up to about 700."""
 
 MAX_CELLS = 10**9
-"""More would take over 30 GB in single precision."""
+"""Most cells of a grid: more would take over 30 GB in single precision."""
 
 AROUND = 5
-"""Cells of air between the obstacles and the boundary layer of a box. The first may vary, the next two are
-those that radiate, and the last two help to read points beside these (`scatter.py`)."""
+"""Cells of air between the obstacles and the boundary layer of a box. The first may be heterogeneous, the
+next two are the Huygens surface, and the last two serve the interpolation of points next to it
+(`scattered_field.py`)."""
 
 FINE_LAYER_CELLS, COARSE_LAYER_CELLS = 6, 8
-"""Boundary layer from 6 cells per wavelength on, and of coarser grids. It reflects less than -68 dB up to 60
-degrees, from 8.5 cells on -82 dB; the other less than -66 dB at 4.25 cells per wavelength, -32 dB at 3."""
+"""Cells of the boundary layer from 6 cells per wavelength on, and of coarser grids. Reflection up to 60
+degrees is below -68 dB (-82 dB from 8.5 cells per wavelength on); of coarser grids -66 dB at 4.25 cells and
+-32 dB at 3."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Cubic cells of a scene's domain.
+    """Cubic cells.
 
-    Cell (0, 0, 0) is the corner of the whole array: first a ring of zeros, then the boundary layer, then the
-    interior.
+    From the corner cell (0, 0, 0) inwards: a ring of zeros, the boundary layer, the interior.
 
     Attributes:
         spacing: edge of a cell [m].
@@ -90,7 +92,7 @@ class Grid:
 
     @property
     def wavelength(self) -> float:
-        """In air [m]."""
+        """Wavelength in air [m]."""
         return 2 * math.pi * self.spacing / self.kappa
 
     @property
@@ -108,27 +110,27 @@ class Grid:
         return x, y, z
 
     def to_cells(self, points: torch.Tensor) -> Array:
-        """Positions (..., 3) [m] in units of cells, cell centres being whole numbers."""
+        """Return positions (..., 3) [m] in cells; cell centres are whole numbers."""
         return np.asarray((points.numpy() - np.array(self.origin)) / self.spacing, np.float64)
 
     def inside(self, index: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which cells of flat `index` (...) are interior."""
+        """Return which cells of flat `index` (...) are interior."""
         places = np.stack(np.unravel_index(index, self.shape), axis=-1)
         return np.asarray(((places >= np.array(self.first)) & (places < np.array(self.last))).all(axis=-1))
 
     def clip(self, cells: Array) -> Array:
-        """Positions (..., 3) in cells, those in the boundary layer moved to the interior cell they touch."""
+        """Return positions (..., 3) in cells, moved from the boundary layer to the nearest interior cell."""
         return np.clip(cells, self.first, np.array(self.last) - 1)
 
 
 def layer_cells(kappa: float) -> int:
-    """Thickness of the boundary layer on a grid of wavenumber times spacing `kappa` [rad]."""
+    """Return the thickness of the boundary layer on a grid of wavenumber times spacing `kappa` [rad]."""
     return FINE_LAYER_CELLS if kappa <= 2 * math.pi / 6 else COARSE_LAYER_CELLS
 
 
 @dataclass(frozen=True)
 class Extent:
-    """What a grid covers.
+    """The space that a grid covers.
 
     Attributes:
         lower: corner with the smallest coordinates (3,) [m].
@@ -141,7 +143,7 @@ class Extent:
     margin: int
 
     def interior(self, spacing: float, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> tuple[int, int, int]:
-        """Cells per axis that cover it, the first `offset` (3,) [cells] below the lower corner."""
+        """Return the cells per axis that cover it, the first `offset` (3,) [cells] below the lower corner."""
         x, y, z = (
             math.ceil((high - low) / spacing + first - 1e-6) + 2 * self.margin
             for low, high, first in zip(self.lower, self.upper, offset, strict=True)
@@ -150,34 +152,34 @@ class Extent:
 
 
 def domain_extent(region: Region, spacing: float) -> Extent:
-    """The region's domain, and as much air around it as points in the outermost cells need."""
+    """Return the region's domain, with the air that the interpolation of points near its faces needs."""
     return Extent(*region.domain, interpolation_width(region.wavenumber * spacing) // 2 - 1)
 
 
 def bodies_extent(shapes: Sequence[Shape]) -> Extent:
-    """Shapes, of which there must be some, and the air around them."""
+    """Return the extent of one or more shapes and the air around them in a box."""
     lower = np.array([shape.lower for shape in shapes]).min(axis=0)
     upper = np.array([shape.upper for shape in shapes]).max(axis=0)
     return Extent(lower.tolist(), upper.tolist(), AROUND)
 
 
 def make_grid(region: Region, spacing: float) -> Grid:
-    """Cover the region's domain with cells of `spacing`, placed as flat faces need it (`placement.py`).
+    """Return a grid of `spacing` [m] over the region's domain, placed for flat faces (`placement.py`).
 
     Raises:
-        ValueError: fewer than `MIN_CELLS_PER_WAVELENGTH` cells a wavelength, more than
+        ValueError: fewer than `MIN_CELLS_PER_WAVELENGTH` cells per wavelength, more than
             `MAX_CELLS_PER_WAVELENGTH`, or more than `MAX_CELLS` in all.
     """
     return _covering(region, spacing, domain_extent(region, spacing))
 
 
 def make_box(region: Region, spacing: float) -> Grid:
-    """Cover the region's bodies, of which there must be some, with `AROUND` cells of air around them."""
+    """Return a grid over the region's bodies and `AROUND` cells of air around them."""
     return _covering(region, spacing, bodies_extent(region.shapes))
 
 
 def require_spacing(region: Region, spacing: float) -> None:
-    """Refuse a spacing [m] of cells that are too large or too small for a region.
+    """Check a spacing [m].
 
     Raises:
         ValueError: fewer than `MIN_CELLS_PER_WAVELENGTH` cells a wavelength, or more than
@@ -205,7 +207,7 @@ def _covering(region: Region, spacing: float, extent: Extent) -> Grid:
 
 
 def require_fine(speeds: Mapping[str, float], frequency: float, spacing: float) -> None:
-    """Refuse a spacing [m] that is too coarse for one of the sound speeds [m/s], by where.
+    """Check a spacing [m] against sound speeds [m/s] by where they are.
 
     Raises:
         ValueError: fewer than `MIN_CELLS_PER_WAVELENGTH` cells a wavelength.
@@ -218,7 +220,7 @@ def require_fine(speeds: Mapping[str, float], frequency: float, spacing: float) 
 
 
 def warn_if_coarse(speeds: Mapping[str, float], frequency: float, spacing: float) -> None:
-    """Log where a spacing [m] is coarse for the sound speeds [m/s], by where."""
+    """Log where a spacing [m] is coarse for sound speeds [m/s], given by where they are."""
     places: dict[float, list[str]] = {}
     for where, speed in speeds.items():
         if spacing > speed / frequency / FAIR_CELLS_PER_WAVELENGTH:
@@ -226,7 +228,7 @@ def warn_if_coarse(speeds: Mapping[str, float], frequency: float, spacing: float
     coarse = [f"{cells:.3g} cells per wavelength in {', '.join(where)}" for cells, where in places.items()]
     if coarse:
         logger.warning(
-            "spacing %.3g mm is coarse, %s: from %g cells to %g the error in air rises from 0.5 to 3 %%, that"
-            " of the sound speed in obstacles from 0.3 to 1 %%",
+            "spacing %.3g mm is coarse, %s: from %g cells to %g the error in air rises from 0.5 to 3 %%, and"
+            " that of the sound speed in obstacles from 0.3 to 1 %%",
             spacing * 1e3, ", ".join(coarse), FAIR_CELLS_PER_WAVELENGTH, MIN_CELLS_PER_WAVELENGTH,
         )  # fmt: skip

@@ -1,8 +1,8 @@
-"""Band-limited points: sources and receivers anywhere between the cells.
+"""Band-limited interpolation kernels: sources and receivers anywhere between the cells.
 
-A point is spread over a few cells a side by weights that reproduce every plane wave up to the drive's
-wavenumber, fitted by least squares along each axis. On a cell centre they reduce to that cell. A source and a
-receiver use the same weights, so reciprocity holds to rounding.
+The weights of a point on a few cells a side reproduce every plane wave up to the drive's wavenumber. They are
+fitted by least squares along each axis, and reduce to one cell at a cell centre. A source and a receiver use
+the same weights, so reciprocity holds to rounding.
 """
 
 from __future__ import annotations
@@ -15,46 +15,46 @@ from numpy.typing import NDArray
 from scipy.linalg import solve
 from scipy.sparse import csr_array
 
-from autdtorch.utils.arrays import Array
+from autdtorch.utils.arrays import Array, Index
 
 Shape = tuple[int, int, int]
 
 WIDTHS = (4, 6, 8, 10)
 WIDTH_ERROR = 3e-4
-"""Largest error of a centred interpolation at the drive's wavenumber: small beside that of any grid."""
+"""Largest error of a centred kernel at the drive's wavenumber: small beside that of any grid."""
 
 _REGULARISATION = 1e-5
-"""Keeps the weights small where the fit leaves them free; far below WIDTH_ERROR."""
+"""Keeps weights small where the fit does not determine them; far below WIDTH_ERROR."""
 
 _ONE_SIDED_REGULARISATION = 1e-2
-"""The same where cells are missing: what lies behind the others is extrapolated by up to a cell, and the
-field there holds more than waves of the drive's wavenumber."""
+"""Regularisation where cells are excluded. The field there is extrapolated by up to a cell, and holds more
+than waves of the drive's wavenumber."""
 
 _ONE_SIDED_REACH = 3
-"""Farthest cells, along each axis, that are then fitted: solving for more takes long."""
+"""Distance [cells] along each axis of the cells that are then fitted: larger systems take long."""
 
 
 @dataclass(frozen=True)
 class Interpolation:
-    """Cells and weights of P points, each spread over n cells.
+    """Interpolation kernels of P points on n cells each.
 
     Attributes:
         index: flat cell indices (P, n), int64.
-        weight: weights (P, n), float64; they sum to about 1.
+        weight: weights (P, n), float64, with a sum of about 1.
     """
 
-    index: NDArray[np.int64]
+    index: Index
     weight: Array
 
-    def matrix(self, cells: NDArray[np.int64]) -> csr_array:
-        """Matrix (P, k) that reads the points from the values of `cells` (k,), ascending, all of theirs."""
+    def matrix(self, cells: Index) -> csr_array:
+        """Return the matrix (P, k) from values of `cells` (k,), ascending, to values at the points."""
         rows = np.arange(len(self.index)).repeat(self.index.shape[1])
         columns = np.searchsorted(cells, self.index.ravel())
         return csr_array((self.weight.ravel(), (rows, columns)), (len(self.index), len(cells)))
 
 
 def axis_weights(offset: Array, nodes: Array, kappa: float) -> Array:
-    """Weights (P, n) of samples at `nodes` (P, n) that give a function at `offset` (P,), in cells."""
+    """Return weights (P, n) of samples at `nodes` (P, n) for values at `offset` (P,), in cells."""
     abscissa, quadrature = np.polynomial.legendre.leggauss(24)
     wavenumber, scale = kappa * (abscissa + 1) / 2, np.sqrt(quadrature / 2)
     phase = wavenumber[:, None] * (nodes - offset[:, None])[:, None, :]
@@ -65,46 +65,46 @@ def axis_weights(offset: Array, nodes: Array, kappa: float) -> Array:
 
 
 def exclude_cells(
-    points: Interpolation, cells: Array, missing: NDArray[np.bool_], shape: Shape, kappa: float
+    points: Interpolation, cells: Array, excluded: NDArray[np.bool_], shape: Shape, kappa: float
 ) -> Interpolation:
-    """Points of which some cells are missing, fitted to the others.
+    """Return kernels without the excluded cells, fitted to the others.
 
-    The fit is that of `axis_weights`, over all waves whose wavenumbers along the axes are up to the drive's.
-    Points with no cell left next to them get no weight.
+    The fit covers all waves with wavenumbers along the axes up to the drive's. Points with no cell left next
+    to them get no weight.
 
     Args:
-        points: P points on n cells.
-        cells: their positions (P, 3) in cells.
-        missing: which of their cells (P, n) do not count.
-        shape: of the whole array.
+        points: kernels of P points on n cells.
+        cells: positions of the points (P, 3) in cells.
+        excluded: mask of their cells (P, n).
+        shape: shape of the grid.
         kappa: wavenumber times spacing [rad].
     """
-    rows = np.flatnonzero(missing.any(axis=1))
+    rows = np.flatnonzero(excluded.any(axis=1))
     if len(rows) == 0:
         return points
     weight = points.weight.copy()
     weight[rows] = 0
-    # The cells of all points lie alike, so that one matrix holds the systems of all.
+    # The cells of all points have one arrangement: a single matrix holds the systems of all.
     places = _places(points.index[rows[0]], shape)
     whole = np.sinc(kappa / np.pi * (places[:, None] - places)).prod(axis=-1)
     whole += _ONE_SIDED_REGULARISATION**2 * np.eye(len(whole))
     for row in rows:
         off = np.abs(_places(points.index[row], shape) - cells[row])
-        left = np.flatnonzero(~missing[row] & (off < _ONE_SIDED_REACH).all(axis=1))
+        left = np.flatnonzero(~excluded[row] & (off < _ONE_SIDED_REACH).all(axis=1))
         if (off[left] < 1).all(axis=1).any():
             target = np.sinc(kappa / np.pi * off[left]).prod(axis=-1)
             weight[row, left] = solve(whole[np.ix_(left, left)], target, assume_a="pos", check_finite=False)
     return Interpolation(points.index, weight)
 
 
-def _places(index: NDArray[np.int64], shape: Shape) -> NDArray[np.int64]:
-    """Positions (n, 3) of cells (n,) of an array of that shape."""
+def _places(index: Index, shape: Shape) -> Index:
+    """Return positions (n, 3) of flat indices (n,)."""
     return np.stack(np.unravel_index(index, shape), axis=-1)
 
 
 @lru_cache(maxsize=64)
 def interpolation_width(kappa: float) -> int:
-    """Fewest cells per axis with which a point is interpolated to within `WIDTH_ERROR`."""
+    """Return the fewest cells per axis that interpolate to within `WIDTH_ERROR`."""
     wavenumber = np.linspace(0, kappa, 33)
     for cells in WIDTHS:
         nodes = np.arange(cells, dtype=np.float64) - (cells - 1) / 2
@@ -114,46 +114,41 @@ def interpolation_width(kappa: float) -> int:
     return WIDTHS[-1]
 
 
-def average_nodes(points: Interpolation, share: Array) -> Interpolation:
-    """Weighted means of groups of points, each cell of a group once.
+def average_nodes(nodes: Interpolation, share: Array) -> Interpolation:
+    """Return weighted means over groups of nodes, each cell of a group once.
 
     Args:
-        points: P x n points, the n of a group one after the other.
-        share: weight of each point in its group (n,).
+        nodes: kernels of P x n nodes, the n of a group in succession.
+        share: weight of each node in its group (n,).
 
     Returns:
-        P groups, each of as many cells as the largest one: the rest has the group's first cell and no weight.
+        Kernels of P groups, padded with the group's first cell and weight 0.
     """
     if len(share) == 1:
-        return points
-    index = points.index.reshape(-1, len(share) * points.index.shape[1])
-    weight = (share[:, None] * points.weight.reshape(len(index), len(share), -1)).reshape(index.shape)
+        return nodes
+    index = nodes.index.reshape(-1, len(share) * nodes.index.shape[1])
+    weight = (share[:, None] * nodes.weight.reshape(len(index), len(share), -1)).reshape(index.shape)
     groups = []
     for cells, parts in zip(index, weight, strict=True):
         unique, place = np.unique(cells, return_inverse=True)
         groups.append((unique, np.bincount(place, parts)))
     most = max(len(unique) for unique, _ in groups)
-    return Interpolation(
-        np.stack(
-            [np.pad(unique, (0, most - len(unique)), constant_values=unique[0]) for unique, _ in groups]
-        ),
-        np.stack([np.pad(total, (0, most - len(total))) for _, total in groups]),
-    )
+    padded = [
+        (np.pad(cells, (0, most - len(cells)), constant_values=cells[0]), np.pad(sums, (0, most - len(sums))))
+        for cells, sums in groups
+    ]
+    return Interpolation(*(np.stack(each) for each in zip(*padded, strict=True)))
 
 
 def interpolate_points(
-    positions: Array,
-    shape: Shape,
-    first: Shape,
-    last: Shape,
-    kappa: float,
+    positions: Array, shape: Shape, first: Shape, last: Shape, kappa: float
 ) -> Interpolation:
-    """Spread points over cells [first, last) of an array; near the rim the interpolation_width moves inwards.
+    """Return interpolation kernels on cells [first, last); near the rim they are one-sided.
 
     Args:
         positions: (P, 3) in cells, so that cell i has its centre at i.
-        shape: shape of the whole array, which decides the flat index.
-        first: first cell of each axis that may be used.
+        shape: shape of the grid.
+        first: first cell along each axis that may be used.
         last: one past the last such cell.
         kappa: wavenumber times spacing [rad].
     """

@@ -1,9 +1,9 @@
-"""The largest time step that leapfrog takes on an assembled scene.
+"""The stability limit of leapfrog on an assembled region.
 
-A step p_new = 2 p - p_old - C A p, with (A p)_i = sum_j w_ij (p_i - p_j), is stable as long as C lambda <= 4,
-lambda being the largest eigenvalue of A. The weights are w_ij = B_ij / m_i with symmetric bonds and masses. A
-therefore has the eigenvalues of the symmetric matrix with -sign(w_ij) sqrt(w_ij w_ji) off its diagonal, for
-which the weights are enough. Nothing here asks bonds to be positive.
+A step p_new = 2 p - p_old - C A p, with (A p)_i = sum_j w_ij (p_i - p_j), is stable for C lambda <= 4. Here
+lambda is the largest eigenvalue of A. Stencil rows are w_ij = K_ij / m_i with symmetric coupling K, of either
+sign, and masses m. A therefore has the eigenvalues of the symmetric matrix with -sign(w_ij) sqrt(w_ij w_ji)
+off its diagonal, which needs the rows alone.
 """
 
 from __future__ import annotations
@@ -25,39 +25,38 @@ logger = logging.getLogger(__name__)
 
 
 CLOSE = 1.03
-"""A bound within this factor of a value that is reached is taken as it is: 1.5 % of the time step."""
+"""A bound within this factor of an attained value is used as it is: 1.5 % of the time step."""
 
 MARGIN = 1.01
-"""What the iterated eigenvalue is raised by, at 0.5 % of the time step. It comes from below: 60 steps leave
-up to 2e-4, the rim of one cell 3e-4 (cubes of density ratio 1e-3 to 1e4, speed ratio 0.3 to 4)."""
+"""Factor on the iterated eigenvalue, at 0.5 % of the time step. Iteration approaches from below: 60 steps
+leave up to 2e-4, the rim of one cell 3e-4 (cubes of density ratio 1e-3 to 1e4, speed ratio 0.3 to 4)."""
 
 MOST_CELLS = 1_000_000
-"""Heterogeneous cells that are iterated on, in about five seconds; of more, the bound decides alone."""
+"""Most heterogeneous cells for the iteration, which takes about five seconds; beyond, the bound decides."""
 
 LONG_ENOUGH = 0.97
-"""Share of the longest time step that is worth having. The rest asks for blocks of more periods, and a run
-ends with a whole block: it would lose what it wins."""
+"""Least share of the largest time step. A longer step needs blocks of more periods, and a run ends with a
+whole block: nothing is gained."""
 
 _LANCZOS_STEPS = 60
 
 _ROUNDING = 1e-9
-"""Rows closer than this to those of air are air: of maps of the medium, most are."""
+"""Stencil rows within this of air's are those of air; most rows of maps are."""
 
 
 def largest_eigenvalue(
     index: NDArray[np.int64], weight: Array, stencil: Stencil, shape: tuple[int, int, int]
 ) -> float:
-    """Largest eigenvalue of a scene's operator, from above.
+    """Return an upper bound of the largest eigenvalue of the operator.
 
     The larger of two: that of uniform air, and that of the heterogeneous cells with a rim of one cell. A mode
     above those of air is bound to the heterogeneous cells and fades within a cell.
 
     Args:
-        index: flat indices (n,) of the cells whose weights differ from the stencil's, ascending; none of them
-            in the outermost layer.
-        weight: their weights w_ij (n, 27), such that m_i w_ij is symmetric for some masses.
+        index: flat indices (n,) of the heterogeneous cells, ascending, not in the outermost ring.
+        weight: their stencil rows (n, 27).
         stencil: weights of all other cells.
-        shape: cells of the grid.
+        shape: shape of the grid.
     """
     air = stencil.largest_symbol
     unlike = (np.abs(weight - stencil.weights) > _ROUNDING).any(axis=1)
@@ -70,15 +69,15 @@ def largest_eigenvalue(
     forth = np.broadcast_to(stencil.weights, (len(rows), 27)).copy()
     forth[place[index]] = weight
     back = np.where(inside, forth[neighbour, _REVERSED], stencil.weights)
-    # A bond B adds B (p_i - p_j)^2 <= max(B, 0) (1/m_i + 1/m_j) (m_i p_i^2 + m_j p_j^2) to the energy: summed
-    # over the bonds of a cell, this bounds the largest eigenvalue at any contrast.
+    # Coupling K adds K (p_i - p_j)^2 <= max(K, 0) (1/m_i + 1/m_j) (m_i p_i^2 + m_j p_j^2) to the energy.
+    # Summed over the neighbours of a cell, this bounds the largest eigenvalue at any contrast.
     bound = float(np.maximum(forth + back, 0).sum(1).max())
     if bound <= CLOSE * air:
         return bound
     if len(index) > MOST_CELLS:
         logger.info(
-            "the time step comes from a bound, up to a quarter short of the limit: the largest eigenvalue of"
-            " %d heterogeneous cells is not worked out, only of up to %d", len(index), MOST_CELLS,
+            "time step up to a quarter below the stability limit: %d heterogeneous cells, and the eigenvalue"
+            " is iterated for at most %d", len(index), MOST_CELLS,
         )  # fmt: skip
         return bound
     product = np.where(inside, forth * back, 0).clip(min=0)  # zeros by rounding may differ in sign
@@ -91,18 +90,18 @@ def largest_eigenvalue(
 
 
 _REVERSED = 26 - np.arange(27)
-"""Where `OFFSETS` holds the way back."""
+"""Index in `OFFSETS` of the opposite offset."""
 
 
 def _inner(shape: tuple[int, int, int]) -> NDArray[np.bool_]:
-    """Which cells (k,) are not in the silent ring."""
+    """Return which cells (k,) are not in the outermost ring."""
     return np.pad(np.ones([cells - 2 for cells in shape], bool), 1).ravel()
 
 
 def _with_rim(
     index: NDArray[np.int64], shape: tuple[int, int, int]
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """Cells `index` and their neighbours, ascending, and the place among them of each cell of the grid."""
+    """Return cells `index` and their neighbours, ascending, and the place of each grid cell among them."""
     found = np.zeros(math.prod(shape), bool)
     for offset in flat_offsets(shape):
         found[index + offset] = True
@@ -114,10 +113,10 @@ def _with_rim(
 
 
 def _lanczos(matrix: csr_array, steps: int) -> float:
-    """Largest Ritz value of a symmetric matrix: never above its largest eigenvalue, but for rounding.
+    """Return the largest Ritz value of a symmetric matrix, a lower bound of its largest eigenvalue.
 
-    The vectors are not made orthogonal again. That repeats Ritz values and moves none beyond the spectrum
-    (Paige 1980).
+    Without reorthogonalisation Ritz values repeat, but none leaves the spectrum (Paige 1980). The sums do not
+    use BLAS, whose result depends on the number of threads.
     """
     vector = np.random.default_rng(0).standard_normal(matrix.shape[0])
     vector /= _length(vector)
@@ -136,15 +135,15 @@ def _lanczos(matrix: csr_array, steps: int) -> float:
 
 
 def fewest_steps(stencil: Stencil, largest: float) -> float:
-    """Steps a period at the stability limit, where time factor x `largest` eigenvalue = 4."""
+    """Return steps per period at the stability limit, where time factor times `largest` eigenvalue is 4."""
     return 2 * math.pi / math.acos(1 - 2 * stencil.symbol / largest)
 
 
 def whole_steps(fewest: float) -> Fraction:
-    """Steps a period, at least `fewest`, that are whole in a block of periods: the denominator.
+    """Return at least `fewest` steps per period, a whole number in a block of q periods (denominator).
 
-    The block is the shortest whose time step is `LONG_ENOUGH`. A block of q periods loses less than 1 step in
-    q x fewest, so that 12 steps a period need up to 3 periods, 6 steps up to 6.
+    The block is the shortest whose time step is `LONG_ENOUGH`. It loses less than 1 step in q x fewest: 12
+    steps per period need q up to 3, 6 steps up to 6.
     """
     # rounding must not add a step to a number that is whole
     counts = (Fraction(math.ceil(block * fewest - 1e-9), block) for block in itertools.count(1))
@@ -152,5 +151,4 @@ def whole_steps(fewest: float) -> Fraction:
 
 
 def _length(vector: NDArray[np.float64]) -> float:
-    # not by linear algebra's libraries, whose threads share a sum as many as there are
     return math.sqrt(float((vector * vector).sum()))

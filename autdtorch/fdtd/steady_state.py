@@ -1,10 +1,9 @@
-"""The steady state of a run: stepped block by block, its limit foretold from the phasors on the way.
+"""The steady state of a run, extrapolated from the phasors of its blocks.
 
-A block is the fewest periods, three at least, that take a whole number of steps. Phasors of windows as long
-as a block, a quarter of a block apart, follow x_(n+1) = A x_n + b, as the scheme is linear. Reduced rank
-extrapolation (Eddy 1979; Sidi 2017) finds the fixed point: of all means sum g_j x_j with sum g_j = 1 it takes
-the one whose differences, sum g_j (x_(j+1) - x_j), are smallest. That removes the slowest modes first, the
-cavities'.
+A block is the fewest periods, at least three, with a whole number of steps. Phasors of windows of that
+length, a quarter of a block apart, follow x_(n+1) = A x_n + b, as the scheme is linear. Reduced rank
+extrapolation (Eddy 1979; Sidi 2017) estimates the fixed point: the mean sum g_j x_j, with sum g_j = 1, of
+least residual sum g_j (x_(j+1) - x_j). It removes the slowest modes first, those of cavities.
 """
 
 from __future__ import annotations
@@ -26,36 +25,36 @@ from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, drive_dft, drive_sig
 Phasors = NDArray[np.complex128]
 
 _FEWEST_PERIODS = 3
-"""Of a block. Shorter ones cost more work between the steps, and the phasors kept reach less far back."""
+"""Fewest periods of a block. Shorter blocks cost more overhead, and the phasors kept cover less time."""
 
 _PARTS = 4
-"""Phasors a block."""
+"""Windows per block."""
 
 _FEWEST_PHASORS, _MOST_PHASORS = 12, 64
-"""That are kept to extrapolate from: the more the better, as far as `_MOST_NUMBERS` reach."""
+"""Range of the number of phasors kept, limited by `_MOST_NUMBERS`; more extrapolate better."""
 
 _MOST_NUMBERS = 20_000_000
-"""That they hold, 320 MB."""
+"""Most complex numbers that the phasors kept may hold: 320 MB."""
 
 _MOST_FITTED = 2048
-"""Cells whose phasors decide the means; of more, this many."""
+"""Most cells whose phasors decide the means."""
 
 _ROUNDING = 1e-13
-"""Of the mean square of the differences, added to each one's so that the system can be solved."""
+"""Regularisation of the normal equations, relative to the mean square of the differences."""
 
 _CAUTION = 2.0
-"""How many times the changes of the last two blocks the distance to the limit is taken to be."""
+"""Safety factor: the residual is estimated as this many times the changes over the last two blocks."""
 
 
 @dataclass(frozen=True)
 class SteadyState:
-    """Phasors of cells and how sure they are.
+    """Phasors of cells with their estimated residual.
 
     Attributes:
-        pressure: (k,) complex, amplitude of the pressure in each cell.
+        pressure: phasors (k,), complex.
         periods: periods stepped.
-        residual: estimated relative distance to the steady state, infinite while it cannot be told.
-        converged: whether that is within the tolerance.
+        residual: estimated relative distance to the steady state, infinite while there is no estimate.
+        converged: whether the residual is within the tolerance.
     """
 
     pressure: torch.Tensor
@@ -74,18 +73,17 @@ def run_to_steady_state(
     observe: Callable[[torch.Tensor], torch.Tensor],
     stepped: Callable[[int], None],
 ) -> SteadyState:
-    """Step until the limit of what is wanted stands, or `max_periods` have passed.
+    """Step until the observed quantity has converged, or `max_periods` have passed.
 
     Args:
-        assembly: the scene on its grid.
-        kernel: what steps.
-        sources: what is driven.
-        cells: flat indices (k,) of the cells whose phasors are wanted.
-        tolerance: relative distance to the steady state at which to stop.
-        max_periods: after which to stop in any case.
-        observe: what of the phasors (k,) must stand. A run is not observe before sound has crossed the grid
-            twice.
-        stepped: is called with the number of periods after each block.
+        assembly: the region on its grid.
+        kernel: the kernel.
+        sources: the sources.
+        cells: flat indices (k,) of the cells whose phasors are needed.
+        tolerance: relative residual at which to stop.
+        max_periods: largest number of periods.
+        observe: maps phasors (k,) to the quantity that must converge, once sound has crossed the grid twice.
+        stepped: called with the number of periods after each block.
     """
     earliest = fewest_periods(assembly.grid.diagonal / assembly.grid.wavelength)
     sequence = Extrapolation(phasors_kept(len(cells)))
@@ -98,7 +96,7 @@ def run_to_steady_state(
                 sequence.append(phasor)
         limit = torch.from_numpy(sequence.limit() if len(sequence) else windows[-1][1])
         values.append(observe(limit))
-        residual = _distance(values)
+        residual = _residual(values)
         converged = count >= earliest and residual <= tolerance
         if converged or count >= max_periods:
             break
@@ -106,36 +104,36 @@ def run_to_steady_state(
 
 
 def block_of(steps_per_period: Fraction) -> tuple[int, int]:
-    """Steps and periods of a block."""
+    """Return steps and periods of a block."""
     parts = math.ceil(_FEWEST_PERIODS / steps_per_period.denominator)
     return parts * steps_per_period.numerator, parts * steps_per_period.denominator
 
 
 def fewest_periods(crossing: float) -> int:
-    """Periods of the shortest run on a grid that sound crosses within `crossing` periods."""
+    """Return the periods of the shortest run on a grid that sound crosses in `crossing` periods."""
     return RAMP_PERIODS + math.ceil(2 * crossing)
 
 
 def phasors_kept(cells: int) -> int:
-    """Return the number of phasors of so many cells that a run keeps."""
+    """Return the number of phasors that a run keeps of so many cells."""
     return min(max(_FEWEST_PHASORS, _MOST_NUMBERS // max(1, cells)), _MOST_PHASORS)
 
 
 class Extrapolation:
-    """The limit of a sequence of which the last numbers are kept, `most` of them."""
+    """Reduced rank extrapolation of a sequence, from its last `most` values."""
 
     def __init__(self, most: int) -> None:
-        """An empty sequence."""
+        """Start an empty sequence."""
         self._values: deque[Phasors] = deque(maxlen=most)
         self._steps: deque[Phasors] = deque(maxlen=most - 1)
         self._product = np.zeros((0, 0), np.complex128)
 
     def __len__(self) -> int:
-        """How many are kept."""
+        """Return the number of values kept."""
         return len(self._values)
 
     def append(self, value: Phasors) -> None:
-        """Go on with the next (k,)."""
+        """Append the next value (k,)."""
         if self._values:
             every = -(-len(value) // _MOST_FITTED)
             step = value[::every] - self._values[-1][::every]
@@ -148,7 +146,7 @@ class Extrapolation:
         self._values.append(value)
 
     def limit(self) -> Phasors:
-        """Where it goes (k,), the last number while there are too few; one at least must have been given."""
+        """Return the estimated limit (k,), or the last value while there are too few."""
         count = len(self._steps)
         size = float(np.trace(self._product).real) / max(count, 1)
         if count < 2 or not (math.isfinite(size) and size > 0):
@@ -164,7 +162,7 @@ class Extrapolation:
 def windows_of_run(
     assembly: Assembly, kernel: Kernel, sources: Sources, cells: NDArray[np.int64]
 ) -> Iterator[tuple[int, list[tuple[int, Phasors]]]]:
-    """Step from silence; after each block the periods so far, and first step and phasors of its windows."""
+    """Step from silence; yield after each block the periods so far, and start and phasors of its windows."""
     steps_per_period = assembly.steps_per_period
     steps, periods = block_of(steps_per_period)
     shift = max(1, steps // _PARTS)
@@ -172,7 +170,7 @@ def windows_of_run(
         torch.from_numpy(cells[:, None]), torch.ones((len(cells), 1), dtype=assembly.dtype, device="cpu")
     )
     state = assembly.silence(sources)
-    both = None  # what was recorded in the last two blocks (2 * steps, k)
+    both = None  # record of the last two blocks (2 * steps, k)
     for block in itertools.count():
         first = block * steps
         signal = drive_signal(steps_per_period, first, steps).to(assembly.dtype)
@@ -187,13 +185,13 @@ def windows_of_run(
 
 
 def _turned(window: torch.Tensor, start: int, periods: int) -> Phasors:
-    """Phasors (k,) of a window of `periods`, recorded (steps, k) after each step that follows `start`."""
+    """Return phasors (k,) of a window of `periods`, recorded (steps, k) after each step from `start` on."""
     turn = 2 * math.pi * (start * periods % len(window)) / len(window)
     return np.asarray(drive_dft(window, periods).cpu().numpy() * complex(math.cos(turn), math.sin(turn)))
 
 
-def _distance(values: deque[torch.Tensor]) -> float:
-    """Relative distance of the last value to the limit, as its changes in the last two blocks foretell."""
+def _residual(values: deque[torch.Tensor]) -> float:
+    """Return the residual of the last value, estimated from its changes over the last two blocks."""
     last = values[-1]
     size = float(last.norm())
     if len(values) < 3 or not size:

@@ -1,25 +1,24 @@
 """The 27-point stencil tuned to one frequency (nonstandard FDTD, Mickens 1994, Cole 2002).
 
-In uniform air the pressure is stepped by
+A step in uniform air is
 
     p_new = 2 p - p_old + C sum_j g_j (p_j - p),
 
-where g takes one value for the 6 faces, one for the 12 edges and one for the 8 corners of the surrounding
-cube. The three values make the symbol
+with one value of g for the 6 faces, one for the 12 edges and one for the 8 corners of the surrounding cube.
+The three values make the symbol
 
     L(kappa) = sum_j g_j (1 - cos(kappa . n_j)),        kappa = k h,
 
-equal to (k h)^2 for long waves and independent of the direction of a wave at the drive frequency; C then
-makes the frequency of that wave exact for the time step in use. Nothing else is tuned: other frequencies are
-only as good as they happen to be, and the steady state does not contain them.
+equal to (k h)^2 for long waves and independent of direction at the drive frequency. C makes the frequency of
+that wave exact for the time step. Other frequencies are not tuned; the steady state does not contain them.
 
 Where air absorbs, a term D (p_new - p_old) is added on the left. A wave e^{i (kappa + i eta) n - i w t} of
 attenuation eta per cell then solves
 
     2 cos(w dt) - 2 i D sin(w dt) = 2 - C L(kappa + i eta),
 
-whose real part is the condition for C, with the real part of L, and whose imaginary part gives D. Waves of
-any length are stable under the same bound on C as without loss, and D damps them.
+The real part, with the real part of L, determines C, and the imaginary part D. The bound on C for stability
+is that without loss, and D damps all waves.
 """
 
 from __future__ import annotations
@@ -39,12 +38,12 @@ OFFSETS = tuple((x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 
 
 
 def flat_strides(shape: tuple[int, int, int]) -> NDArray[np.int64]:
-    """Steps (3,) along the axes between flat indices of a grid."""
+    """Return the strides (3,) of flat indices of a grid."""
     return np.array((shape[1] * shape[2], shape[2], 1))
 
 
 def flat_offsets(shape: tuple[int, int, int]) -> NDArray[np.int64]:
-    """Steps (27,) to the neighbours between flat indices of a grid."""
+    """Return the offsets (27,) of flat indices to the neighbours."""
     return np.asarray(np.array(OFFSETS) @ flat_strides(shape), np.int64)
 
 
@@ -94,39 +93,39 @@ class Stencil:
         return float((_basis(corners) @ (self.face, self.edge, self.corner)).max())
 
     def symbol_at(self, kappa: NDArray[Any]) -> NDArray[Any]:
-        """Symbol of a real or complex wave vector times spacing, (..., 3) -> (...)."""
+        """Return the symbol (...) of real or complex wave vectors times spacing (..., 3)."""
         return np.asarray(_basis(kappa) @ (self.face, self.edge, self.corner))
 
     def isotropic_symbol(self, kappa: float) -> float:
-        """Symbol averaged over directions: what a cell with another sound speed is tuned with.
+        """Return the real part of the symbol, averaged over directions, of another sound speed.
 
-        Its real part at kappa (1 + i eta / kappa): the loss is one of time, per wavelength alike everywhere.
+        Taken at kappa (1 + i eta / kappa): the loss per wavelength is the same everywhere.
         """
         loss = self.eta / self.kappa
         return _mean_symbol(kappa * complex(1, loss), (self.face, self.edge, self.corner)).real
 
     def time_factor(self, steps_per_period: float) -> float:
-        """C: what the weights are multiplied with for `steps_per_period` steps a period, dimensionless."""
+        """Return C, the factor on the weights for `steps_per_period` steps per period."""
         return 2 * (1 - math.cos(2 * math.pi / steps_per_period)) / self.symbol
 
     def damping(self, steps_per_period: float) -> float:
-        """D: the loss of a step, dimensionless; zero where air does not absorb."""
+        """Return D, the loss of a step; zero where air does not absorb."""
         turn = 2 * math.pi / steps_per_period
         return self.time_factor(steps_per_period) * self.loss / (2 * math.sin(turn))
 
     def source_factor(self, steps_per_period: float) -> complex:
-        """Forcing per step and unit S/h of a point source whose far field is S e^{ikr}/r.
+        """Return the force per step and unit S/h of a point source with the far field S e^{ikr}/r.
 
-        The discrete Green's function is a Fourier integral over 1/(C L - 2 + 2 cos(w dt) - 2 i D sin(w dt));
-        its far field is set by the slope of the symbol where the denominator vanishes, against
-        2 (kappa + i eta) in the continuum.
+        The discrete Green's function is a Fourier integral over 1/(C L - 2 + 2 cos(w dt) - 2 i D sin(w dt)).
+        The slope of the symbol at the pole determines its far field; in the continuum it is
+        2 (kappa + i eta).
         """
         factor = self.time_factor(steps_per_period) / (1 + self.damping(steps_per_period))
         return 4 * math.pi * factor * self.slope / (2 * complex(self.kappa, self.eta))
 
 
 def _basis(kappa: NDArray[Any]) -> NDArray[Any]:
-    """Contributions (..., 3) of unit face, edge and corner weights to the symbol of kappa (..., 3)."""
+    """Return contributions (..., 3) of unit face, edge and corner weights to the symbol at kappa (..., 3)."""
     x, y, z = np.moveaxis(np.cos(kappa), -1, 0)
     face = 6 - 2 * (x + y + z)
     edge = 12 - 4 * (x * y + y * z + z * x)
@@ -135,18 +134,12 @@ def _basis(kappa: NDArray[Any]) -> NDArray[Any]:
 
 
 def _directions() -> tuple[Array, Array]:
-    """Gauss product rule over one octant of the sphere, which the symmetry of the cube repeats."""
+    """Return a Gauss product rule over one octant of the sphere; the others are symmetric."""
     nodes, weights = np.polynomial.legendre.leggauss(12)
     cosine, angle = (nodes + 1) / 2, (nodes + 1) * np.pi / 4
     sine = np.sqrt(1 - cosine**2)
-    directions = np.stack(
-        (
-            np.outer(sine, np.cos(angle)),
-            np.outer(sine, np.sin(angle)),
-            np.repeat(cosine[:, None], 12, axis=1),
-        ),
-        axis=-1,
-    )
+    x, y = np.outer(sine, np.cos(angle)), np.outer(sine, np.sin(angle))
+    directions = np.stack((x, y, np.repeat(cosine[:, None], 12, axis=1)), axis=-1)
     return directions.reshape(-1, 3), np.outer(weights, weights).reshape(-1)
 
 
@@ -154,13 +147,13 @@ _DIRECTIONS, _SOLID_ANGLES = _directions()
 
 
 def _mean_symbol(wavenumber: complex, weights: tuple[float, ...]) -> complex:
-    """Symbol at a complex wavenumber times spacing, averaged over directions."""
+    """Return the symbol at a complex wavenumber times spacing, averaged over directions."""
     return complex(np.average(_basis(wavenumber * _DIRECTIONS) @ weights, weights=_SOLID_ANGLES))
 
 
 @lru_cache(maxsize=64)
 def tuned_stencil(kappa: float, eta: float = 0.0) -> Stencil:
-    """The stencil whose symbol at `kappa` varies least over directions (least squares on the sphere).
+    """Return the stencil whose symbol at `kappa` varies least over directions (least squares).
 
     Args:
         kappa: wavenumber times spacing [rad], in (0, pi).
@@ -168,24 +161,15 @@ def tuned_stencil(kappa: float, eta: float = 0.0) -> Stencil:
     """
     basis = _basis(kappa * _DIRECTIONS)
     scale = np.sqrt(_SOLID_ANGLES / _SOLID_ANGLES.sum())[:, None]
-    # face = 1 - 4 edge - 4 corner keeps long waves right; the two that remain flatten the symbol.
+    # face = 1 - 4 edge - 4 corner keeps long waves exact; the other two flatten the symbol.
     free = basis[:, 1:] - 4 * basis[:, :1]
     mean = (scale**2 * np.concatenate((free, basis[:, :1]), axis=1)).sum(0)
-    solution = np.linalg.lstsq(scale * (free - mean[:2]), -scale[:, 0] * (basis[:, 0] - mean[2]), rcond=None)[
-        0
-    ]
+    target = -scale[:, 0] * (basis[:, 0] - mean[2])
+    solution, *_ = np.linalg.lstsq(scale * (free - mean[:2]), target, rcond=None)
     edge, corner = map(float, solution)
     weights = np.array((1 - 4 * edge - 4 * corner, edge, corner))
 
     wavenumber, step = kappa * complex(1, eta / kappa), 1e-4 * kappa
     symbol, ahead, behind = (_mean_symbol(wavenumber + shift, tuple(weights)) for shift in (0.0, step, -step))
-    return Stencil(
-        kappa=kappa,
-        eta=eta,
-        face=float(weights[0]),
-        edge=edge,
-        corner=corner,
-        symbol=symbol.real,
-        loss=symbol.imag,
-        slope=(ahead - behind) / (2 * step),
-    )
+    slope = (ahead - behind) / (2 * step)
+    return Stencil(kappa, eta, float(weights[0]), edge, corner, symbol.real, symbol.imag, slope)

@@ -13,7 +13,7 @@ from autdtorch.utils.threads import spread
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
 _PAIRS = 100_000
-"""Pairs of a point and a source in a piece of work: less than a millisecond."""
+"""Pairs of a point and a source in a task: less than a millisecond."""
 
 
 def superposition(
@@ -24,20 +24,20 @@ def superposition(
     nearest: float = 0.0,
     dtype: torch.dtype = torch.float64,
 ) -> torch.Tensor:
-    """Sum the fields of many point sources: amplitude e^{i k r} / r. Any number of fields costs little more.
+    """Return R fields of many point sources: sums of amplitude e^{i k r} / r. Each wave is computed once.
 
     Args:
         points: (P, 3) [m].
         sources: (N, 3) [m].
         amplitude: complex (N, R) [Pa m] of R fields.
         wavenumber: k + i alpha [rad/m].
-        nearest: distances below this are taken as that [m].
-        dtype: float64, or float32, which takes half the time and gives each wave to 3e-7.
+        nearest: lower limit of the distance [m].
+        dtype: float64, or float32, which takes half the time at an error of 3e-7 per wave.
 
     Returns:
-        complex128 (P, R) [Pa], whatever the number of threads.
+        complex128 (P, R) [Pa], independent of the number of threads.
     """
-    from autdtorch.fdtd.kernels.cpu_waves import (  # with numba, which takes its time
+    from autdtorch.fdtd.kernels.cpu_waves import (  # loads numba
         LANES,
         room_for,
         sum_at_points,
@@ -74,5 +74,5 @@ def _rows(columns: AnyArray) -> AnyArray:
 
 
 def _filled(rows: AnyArray, size: int, mode: Literal["edge", "constant"]) -> AnyArray:
-    """Fill rows (..., N) up to a multiple of `size`, by their last entry or by zeros."""
+    """Pad rows (..., N) to a multiple of `size` by their last entry or by zeros."""
     return np.pad(rows, (*((0, 0),) * (rows.ndim - 1), (0, -rows.shape[-1] % size)), mode)

@@ -76,7 +76,7 @@ def test_too_many_cells_get_the_bound_and_the_log_says_so(
     monkeypatch.setattr(stability, "MOST_CELLS", len(index) - 1)
     with caplog.at_level(logging.INFO):
         assert largest_eigenvalue(index, weight, STENCIL, SHAPE) > worked_out
-    assert f"the largest eigenvalue of {len(index)} heterogeneous cells is not worked out" in caplog.text
+    assert f"{len(index)} heterogeneous cells" in caplog.text
 
 
 @given(st.floats(2.5, 1e3))
