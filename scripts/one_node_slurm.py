@@ -1,13 +1,12 @@
-"""A Slurm cluster of this machine alone, for as long as a command runs.
+"""Run a command with a Slurm cluster of this machine alone.
 
     python scripts/one_node_slurm.py bash
     python scripts/one_node_slurm.py autdtorch -m hydra/launcher=slurm hydra.launcher.cpus_per_task=1 ...
 
-Daemons, keys, ports and files are the cluster's own, in a temporary folder. It needs neither systemd nor
-root, and leaves a Slurm that the machine has alone. Missing programs are installed from Debian's packages, by
-root. The cluster is a strict one: it keeps no accounts, binds a task to the cores that the task asks for,
-leaves a job few seconds from SIGTERM to SIGKILL, and queues only those jobs again that were submitted with
-`--requeue`, after 10 s where Slurm's default is 120 s.
+Daemons, keys, ports and files lie in a temporary folder, beside any Slurm of the machine. The cluster needs
+neither systemd nor root; root installs missing programs from Debian's packages. It keeps no accounts. A task
+is bound to the cores that it asks for, and a job gets a second from SIGTERM to SIGKILL. Jobs submitted with
+`--requeue` are queued again after 10 s instead of Slurm's 120 s.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from pathlib import Path
 PACKAGES = ("slurmctld", "slurmd", "slurm-client", "munge")
 PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch")
 
-PATIENCE = 30.0  # [s] for daemons to start and for jobs to end; on an idle machine both take less than one
+PATIENCE = 30.0  # [s] for daemons to start and jobs to end; an idle machine takes less than 1 s
 
 CONFIG = """\
 ClusterName=one
@@ -58,11 +57,11 @@ PartitionName=cpu Nodes={host} Default=YES
 
 
 def main() -> None:
-    """Run the command that the arguments make up."""
+    """Run the command in the arguments."""
     command = sys.argv[1:]
     if not command:
         sys.exit(__doc__)
-    signal.signal(signal.SIGINT, lambda *_: None)  # Ctrl-C is for the command
+    signal.signal(signal.SIGINT, lambda *_: None)  # Ctrl-C is for the command alone
     try:
         if missing_programs():
             install()
@@ -82,7 +81,7 @@ def install() -> None:
     """Install Slurm.
 
     Raises:
-        RuntimeError: this process may not install it, or cannot.
+        RuntimeError: the installation fails, or this process is not root.
     """
     if os.getuid() != 0 or shutil.which("apt-get") is None:
         raise RuntimeError(f"no {', '.join(missing_programs())}; root installs {' '.join(PACKAGES)}")
@@ -96,7 +95,7 @@ def install() -> None:
 
 @contextlib.contextmanager
 def one_node_slurm() -> Iterator[dict[str, str]]:
-    """Run the cluster for a while; jobs that are left in the end are killed.
+    """Run the cluster within the context; remaining jobs are killed at its end.
 
     Yields:
         The environment in which Slurm's commands, such as sbatch, find the cluster.
@@ -105,14 +104,14 @@ def one_node_slurm() -> Iterator[dict[str, str]]:
         RuntimeError: the cluster does not start.
     """
     with tempfile.TemporaryDirectory(prefix="slurm-") as name, contextlib.ExitStack() as daemons:
-        folder = Path(name)  # a short path: that of a socket has at most 107 characters
+        folder = Path(name)  # short: the path of a socket has at most 107 characters
         _configure(folder)
         environment = os.environ | {"SLURM_CONF": f"{folder}/slurm.conf"}
 
         def start(program: str, *options: str) -> None:
             with (folder / f"{program}.log").open("wb") as log:
                 command = [str(_program(program)), *options]
-                # Ctrl-C must not reach daemons: they are still needed to end the jobs.
+                # Ctrl-C must not reach the daemons, which end the jobs.
                 daemon = subprocess.Popen(
                     command, env=environment, stdout=log, stderr=log, start_new_session=True
                 )
@@ -137,14 +136,14 @@ def one_node_slurm() -> Iterator[dict[str, str]]:
 
 
 def _program(name: str) -> str | None:
-    """Path of a program, looked for where daemons are too."""
+    """Return the path of a program, also in the folders of daemons."""
     return shutil.which(name, path=f"{os.environ['PATH']}:/usr/sbin")
 
 
 def _configure(folder: Path) -> None:
     for name in ("state", "spool"):
         (folder / name).mkdir()
-    folder.chmod(0o711)  # a socket is not used where others cannot reach it
+    folder.chmod(0o711)  # clients refuse a socket that others cannot reach
     key = folder / "munge.key"
     key.touch(mode=0o600)
     key.write_bytes(os.urandom(1024))
@@ -157,7 +156,7 @@ def _configure(folder: Path) -> None:
         host=socket.gethostname().partition(".")[0],
         user=getpass.getuser(),
         ports=ports,
-        first_job=int(time.time()) % 60_000_000,  # a new one each time: submitit keeps results by number
+        first_job=int(time.time()) % 60_000_000,  # new each time: submitit keeps results by number
         cores=len(os.sched_getaffinity(0)),
         memory=os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2**21,  # half, in MB
     )
@@ -165,7 +164,7 @@ def _configure(folder: Path) -> None:
 
 
 def _wait(ready: Callable[[], bool], folder: Path) -> None:
-    """Wait until something is true; daemons say in their logs why it does not become so."""
+    """Wait until a condition is true; the error quotes the logs of the daemons."""
     end = time.monotonic() + PATIENCE
     while not ready():
         if time.monotonic() > end:

@@ -1,9 +1,9 @@
 """Bayesian optimisation: against BoTorch one trial after the other, and by options.
 
+Prints Markdown tables. Times are processor times on one thread, so that other processes matter little.
+
     python scripts/benchmark.py bo sequential --sequential-trials 10     15 minutes on an idle core
     python scripts/benchmark.py bo options                               10 minutes
-
-Prints Markdown tables. Times are processor times on one thread, so that other processes matter little.
 """
 
 from __future__ import annotations

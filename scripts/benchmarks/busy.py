@@ -1,10 +1,10 @@
 """Times of transfer matrices beside busy processes, by default and on one thread.
 
-    python scripts/benchmark.py busy                        about five minutes on 2 cores
-    python scripts/benchmark.py busy --against ../other     another checkout beside this one
-
 Each figure is the median over processes that take turns, so that all see the machine in one state. A process
 simulates each scene several times; the median counts.
+
+    python scripts/benchmark.py busy                        about five minutes on 2 cores
+    python scripts/benchmark.py busy --against ../other     another checkout beside this one
 """
 
 from __future__ import annotations

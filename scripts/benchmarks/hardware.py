@@ -1,8 +1,8 @@
 """Hardware trials on emulated devices: results, and evaluations per second.
 
-    python scripts/benchmark.py hardware            five to ten minutes
-
 Fills in a block of hardware.md.
+
+    python scripts/benchmark.py hardware            five to ten minutes
 """
 
 from __future__ import annotations

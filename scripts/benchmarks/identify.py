@@ -1,8 +1,8 @@
 """Share of the best weakest focus that identification reaches, by noise.
 
-    python scripts/benchmark.py identify
-
 Prints a Markdown table for the paper's scenes. Shares are of the true pressure of the drives found.
+
+    python scripts/benchmark.py identify
 """
 
 from __future__ import annotations

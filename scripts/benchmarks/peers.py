@@ -1,34 +1,40 @@
 """Run time against error of Deepwave, Devito, j-Wave and k-wave-python beside our own.
 
+Makes a virtual environment for each peer in `--venvs`, then writes peers.json, peers.png and a block of
+peers.md. Scenes, receivers and errors are those of `benchmark.py accuracy`: the transfer matrix of one
+focus, simulated from the focus by reciprocity.
+
     python scripts/benchmark.py peers --coarse     grids of 2 mm alone, as a trial
     python scripts/benchmark.py peers              all
-
-Makes a virtual environment for each peer in `--venvs`, then writes peers.json, peers.png and a block of
-peers.md. Scenes, receivers and errors are those of `benchmark.py accuracy`: the transfer matrix of one focus,
-simulated from the focus by reciprocity.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import logging
 import math
+import os
 import statistics
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from datetime import date
 from pathlib import Path
 
 import numpy as np
 from benchmarks.peer_programs.task import Answer, Task
-from benchmarks.peer_report import OURS, Point, Refusal, write_report
 from benchmarks.peer_scene import scene_grid
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from shared.cases import Case, cube_case, free_space_case, simulate, sphere_case
-from shared.document import percent
+from shared.document import command_line, fill_in, measured, percent, table
 from shared.scenes import relative_error
+
+from autdtorch.plot.pareto import plot_pareto
+from autdtorch.plot.style import TICK_SIZE
 
 DOCUMENT = "peers.md"
 
@@ -60,6 +66,20 @@ OUR_SPACINGS = (2.8, 2.4, 2.0, 1.5, 1.0, 0.75, 0.5)  # [mm]
 OUR_TOLERANCE = 1e-2
 REPETITIONS = 3
 """Repetitions of our short runs; the median counts."""
+
+
+OURS = "autdtorch"
+NAMES = {"deepwave": "Deepwave", "devito": "Devito", "jwave": "j-Wave", "kwave": "k-wave-python"}
+
+REQUIRED_CASE = "three cubes"
+REQUIRED = (("fastest peer", tuple(NAMES), 50), ("k-wave-python", ("kwave",), 1000))
+"""Required ratios of run times, peer over ours."""
+
+ERRORS = (0.2, 0.1, 0.05, 0.03, 0.01)
+"""Errors to which run times are compared."""
+
+STEADY = 1e-2
+"""Relative distance to the end of the run within which a peer counts as steady; our default tolerance."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +133,41 @@ SETTINGS = (
     Setting("kwave", 2.0, 0, 0.0, (14, 14), 8, 20),
     Setting("kwave", 1.0, 0, 0.5, (29, 29), 10, 30, (AIR, "three cubes")),
 )
+
+
+@dataclass(frozen=True)
+class Point:
+    """A measurement.
+
+    Attributes:
+        case: the scene.
+        program: the simulator.
+        setting: how it was run.
+        periods: after which it ended; None if it decided itself.
+        remaining: relative distance to the steady state, or to the end of the run.
+        error: complex relative L2 error of the transfer matrix.
+        seconds: run time, without imports and compilation.
+        rate: cell updates per second; None if not counted.
+    """
+
+    case: str
+    program: str
+    setting: str
+    periods: int | None
+    remaining: float
+    error: float
+    seconds: float
+    rate: float | None
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A setting that did not run, and the reason."""
+
+    case: str
+    program: str
+    setting: str
+    reason: str
 
 
 def python_of(peer: str, folder: Path) -> Path:
@@ -223,6 +278,86 @@ def measure(settings: Sequence[Setting], venvs: Path) -> Iterator[Point | Refusa
         yield from our_points(name)
     for setting in settings:
         yield from peer_points(setting, venvs)
+
+
+def write_report(points: Sequence[Point], refusals: Sequence[Refusal], folder: Path) -> None:
+    """Write peers.json, peers.png and peers.md into `folder`."""
+    steady = list(settled(points))
+    parts = [
+        measured(),
+        "![Error over run time](peers.png)",
+        "Time of steady runs to a given error, on any grid:",
+        times(steady),
+        f"Required for {REQUIRED_CASE}, in our times:",
+        requirements(steady),
+    ]
+    if refusals:
+        lines = [[r.case, NAMES[r.program], r.setting, r.reason] for r in refusals]
+        parts.append(table(["scene", "program", "setting", "did not run"], lines))
+    fill_in(DOCUMENT, "benchmark.py peers", parts, folder)
+    made = {"command": command_line(), "date": date.today().isoformat(), "cores": os.cpu_count()}
+    rows = ",\n ".join(json.dumps(_rounded(asdict(one))) for one in (*points, *refusals))
+    text = f'{json.dumps(made)[:-1]}, "rows": [\n {rows}\n]}}\n'
+    (folder / "peers.json").write_text(text, encoding="utf-8")
+    figure(points).savefig(folder / "peers.png")
+
+
+def settled(points: Sequence[Point]) -> Iterator[Point]:
+    """Yield the first point of each run after which it stays in the steady state."""
+    for run in dict.fromkeys((p.case, p.program, p.setting) for p in points):
+        mine = [p for p in points if (p.case, p.program, p.setting) == run]
+        late = [index for index, p in enumerate(mine) if p.remaining > STEADY]
+        yield mine[late[-1] + 1 if late else 0]
+
+
+def time_to(error: float, steady: Sequence[Point], case: str, *programs: str) -> float | None:
+    """Return the shortest run time to an error; None if no point reaches it."""
+    mine = (p.seconds for p in steady if p.case == case and p.program in programs and p.error <= error)
+    return min(mine, default=None)
+
+
+def requirements(steady: Sequence[Point]) -> str:
+    """Return a table of required and measured ratios of run times in `REQUIRED_CASE`, as far as reached."""
+    lines = []
+    for error in ERRORS:
+        ours = time_to(error, steady, REQUIRED_CASE, OURS)
+        for who, peers, least in REQUIRED:
+            theirs = time_to(error, steady, REQUIRED_CASE, *peers)
+            if ours is not None and theirs is not None:
+                kept = "yes" if theirs >= least * ours else "**no**"
+                lines.append([f"{percent(error)}, {who}", f"at least {least}", f"{theirs / ours:.3g}", kept])
+    return table(["time to an error", "required", "measured", "kept"], lines)
+
+
+def times(steady: Sequence[Point]) -> str:
+    """Return a table of the run times to each error."""
+    cases, lines = list(dict.fromkeys(p.case for p in steady)), []
+    found = dict.fromkeys((p.case, p.program) for p in steady)
+    for case, program in sorted(found, key=lambda one: cases.index(one[0])):
+        seconds = [time_to(error, steady, case, program) for error in ERRORS]
+        best = min(p.error for p in steady if (p.case, p.program) == (case, program))
+        cells = ["" if one is None else f"{one:.3g} s" for one in seconds]
+        lines.append([case, NAMES.get(program, program), *cells, percent(best)])
+    return table(["scene", "program", *(f"to {percent(error)}" for error in ERRORS), "best error"], lines)
+
+
+def figure(points: Sequence[Point]) -> Figure:
+    """Plot error over run time, a panel for each scene; errors over 100 % are left out."""
+    values: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    for point in points:
+        if point.error <= 1:
+            by_program = values.setdefault(point.case, {})
+            program = NAMES.get(point.program, point.program)
+            by_program.setdefault(program, []).append((point.seconds, 100 * point.error))
+    drawn = plot_pareto(
+        values, "run time of the transfer matrix of one focus [s]", "relative error of the field [%]"
+    )
+    drawn.supxlabel(command_line(), fontsize=TICK_SIZE)
+    return drawn
+
+
+def _rounded(row: dict[str, object]) -> dict[str, object]:
+    return {name: float(f"{value:.4g}") if isinstance(value, float) else value for name, value in row.items()}
 
 
 OPTIONS = {

@@ -1,9 +1,9 @@
 """Time saved by symmetry between foci, and by matrices kept on disk.
 
-    python scripts/benchmark.py runs            about 3 minutes on 2 idle cores
-
 Prints a Markdown table of the transfer matrices of the foci at 1 mm, from one run, from a run per focus, and
 from disk.
+
+    python scripts/benchmark.py runs            about 3 minutes on 2 idle cores
 """
 
 from __future__ import annotations

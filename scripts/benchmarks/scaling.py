@@ -1,12 +1,12 @@
 """Growth of time and memory with spacing, domain, transducers and foci.
 
-    python scripts/benchmark.py scaling             about 5 minutes on 2 idle cores
-
 Fills in a block of performance.md. A process of its own computes each transfer matrix, after it has loaded
-the kernels. The time includes a new propagator, the shorter of two. The memory is the
-increase of the largest resident set by the first one; memory that the kernels had freed may hide some MB.
-Two cubes are the obstacles, three in the growing domain. Symmetry saves no run for transducers and foci, as
-their circle lies off the axis, except in one point.
+the kernels. The time includes a new propagator, the shorter of two. The memory is the increase of the
+largest resident set by the first one; memory that the kernels had freed may hide some MB. Two cubes are the
+obstacles, three in the growing domain. Symmetry saves no run for transducers and foci, as their circle lies
+off the axis, except in one point.
+
+    python scripts/benchmark.py scaling             about 5 minutes on 2 idle cores
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import argparse
 import dataclasses
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from matplotlib.figure import Figure
 from shared.document import command_line, fill_in, measured, table
@@ -55,18 +55,8 @@ COSTS = {"time": ("seconds", "s"), "memory": ("megabytes", "MB")}
 """Attribute and unit of each cost."""
 
 
-@dataclass(frozen=True)
-class Task:
-    """A transfer matrix to measure.
-
-    Attributes:
-        growth: key of `GROWTHS`.
-        series: name of the series of points.
-        size: the growing size.
-        scene: the scene.
-        method: of the propagator.
-        spacing: [mm].
-    """
+class Task(NamedTuple):
+    """A transfer matrix to measure: key of `GROWTHS`, name of the series, growing size, spacing in [mm]."""
 
     growth: str
     series: str
@@ -76,8 +66,7 @@ class Task:
     spacing: float
 
 
-@dataclass(frozen=True)
-class Point:
+class Point(NamedTuple):
     """A measurement; `growth`, `series` and `size` are those of its `Task`."""
 
     growth: str
@@ -85,7 +74,6 @@ class Point:
     size: float
     seconds: float
     megabytes: float
-    runs: int
 
 
 def load_kernels(method: str) -> None:
@@ -100,11 +88,10 @@ def measure(task: Task) -> Point:
     spent, added = [], []
     for _ in range(REPEATS):
         begin = time.perf_counter()
-        propagator = uncached(task.scene, task.method, task.spacing)
-        propagator.transfer_matrix()
+        uncached(task.scene, task.method, task.spacing).transfer_matrix()
         spent.append(time.perf_counter() - begin)
         added.append(max(2**20, peak_memory() - before))
-    return Point(task.growth, task.series, task.size, min(spent), added[0] / 2**20, len(propagator.runs))
+    return Point(task.growth, task.series, task.size, min(spent), added[0] / 2**20)
 
 
 def measure_all(tasks: Sequence[Task]) -> Iterator[Point]:

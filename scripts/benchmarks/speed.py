@@ -1,10 +1,10 @@
 """Run times of the transfer matrices of the paper's scenes.
 
-    python scripts/benchmark.py speed             about 4 minutes on 2 idle cores
-
 Fills in a block of performance.md. Errors are those of `benchmark.py accuracy`, of one focus. Each matrix
 comes from a propagator of its own, assembly included, the fastest of three. Kernels are compiled before,
 except for the first call of a process.
+
+    python scripts/benchmark.py speed             about 4 minutes on 2 idle cores
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Rigid sphere and cubes against AcousTools' BEM.
 
-    python scripts/check.py acoustools
-
 Needs `pip install 'autdtorch[crosscheck]'`. Fills in a block of crosschecks.md. The sources are points:
 AcousTools' pistons with radius 0. Scenes and errors are those of `benchmark.py accuracy`, with rigid cubes.
 The reference is the exact series for the sphere, and the limit of our own grids for the cubes.
+
+    python scripts/check.py acoustools
 """
 
 from __future__ import annotations

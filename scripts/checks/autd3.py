@@ -1,11 +1,11 @@
 """Free-space fields of an AUTD3 against the emulator of its SDK.
 
-    python scripts/check.py autd3
-
 Needs `pip install 'autdtorch[crosscheck]'`. Fills in a block of crosschecks.md. The emulator has two fields.
 "RMS" is a sum of point sources without directivity or absorption, with the phases and pulse widths of the
 emulated firmware. "Instant" is the pressure over time, of square waves filtered by a model of the
 transducer.
+
+    python scripts/check.py autd3
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Bound on the weakest focus: no method may exceed it.
 
-    python scripts/check.py bound --scenes 1000
-
 Half of the random scenes have an unstructured transfer matrix, the others one of transducers and control
 points in air; 2 to 32 transducers, 1 to 8 foci. Exits with 1 if a score is above its bound.
+
+    python scripts/check.py bound --scenes 1000
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Reflection of the boundary layer, measured against a larger domain.
 
-    python scripts/check.py boundary        a few seconds on 2 idle cores
-
 Prints a Markdown table. A source and receivers lie in a row, all at one distance from a layer. A second run
-has that layer so far away that its echo does not return in time; the difference of the two is the echo. It is
-compared with the wave of the source's mirror image, with the inner face of the layer as the mirror.
+has that layer so far away that its echo does not return in time; the difference of the two is the echo. It
+is compared with the wave of the source's mirror image, with the inner face of the layer as the mirror.
+
+    python scripts/check.py boundary        a few seconds on 2 idle cores
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Compilation of the CUDA kernel without a GPU, and the resources of its launches.
 
-    python scripts/check.py cuda        some 10 seconds
-    python scripts/check.py cuda --capability 80 --dtype float64
-
 Nothing runs: Triton compiles each launch for a scene that exercises all code of a step. The registers of a
 thread limit the threads of a multiprocessor, which has 65536 registers; spilled registers go to the stack.
+
+    python scripts/check.py cuda        some 10 seconds
+    python scripts/check.py cuda --capability 80 --dtype float64
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import re
 import subprocess
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -34,26 +35,6 @@ from autdtorch.scene.scene import Medium, Scene
 CUOBJDUMP = Path(triton.__file__).parent / "backends" / "nvidia" / "bin" / "cuobjdump"
 
 
-class AbsentGpu:
-    """The part of a driver that Triton needs to compile."""
-
-    def __init__(self, capability: int) -> None:
-        """Describe a GPU of compute capability `capability`, times ten."""
-        self._target = GPUTarget("cuda", capability, 32)
-
-    def get_current_target(self) -> GPUTarget:
-        """Return the GPU."""
-        return self._target
-
-    def get_current_device(self) -> int:
-        """Return its number."""
-        return 0
-
-    def get_current_stream(self, device: int) -> int:
-        """Return a stream that nothing runs on."""
-        return 0
-
-
 def compiled(capability: int, dtype: torch.dtype) -> dict[str, Any]:
     """Return the compiled launches of a step by name."""
     wall = Box((12e-3, 12e-3, 20e-3), (40e-3, 40e-3, 2e-3), density=5.0, sound_speed=300.0)
@@ -71,7 +52,12 @@ def compiled(capability: int, dtype: torch.dtype) -> dict[str, Any]:
         found[self.fn.__name__] = launch(self, *args, grid=grid, warmup=True, **options)
 
     launch = JITFunction.run
-    driver.set_active(AbsentGpu(capability))
+    absent_gpu = SimpleNamespace(
+        get_current_target=lambda: GPUTarget("cuda", capability, 32),
+        get_current_device=lambda: 0,
+        get_current_stream=lambda device: 0,
+    )
+    driver.set_active(absent_gpu)
     with patch.object(JITFunction, "run", compile_only):
         medium = DeviceMedium(assembly.coefficients, Shape(*assembly.grid.shape), BLOCKS, torch.device("cpu"))
         DeviceRun(medium, assembly.silence(sources), sources, receivers, len(signal)).advance(signal)

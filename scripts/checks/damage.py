@@ -1,10 +1,10 @@
 """Damaged files of studies and hardware trials, which must resume.
 
-    python scripts/check.py damage --damages 300
-
 Damages the files of a study and of an emulated hardware trial at random. Each must end with the numbers of
 the undisturbed run, bit for bit. Every row that the damage left whole and every damaged file must be kept,
 and the next start must log no warning.
+
+    python scripts/check.py damage --damages 300
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Estimates of `at.estimate` against measured memory and time.
 
-    python scripts/check.py estimate            a minute or two; the machine should be idle otherwise
-
 Each scene has a process of its own, which first simulates a small scene to load the kernels. The memory is
 the peak during the simulation over the memory before (Linux with glibc).
+
+    python scripts/check.py estimate            a minute or two; the machine should be idle otherwise
 """
 
 from __future__ import annotations

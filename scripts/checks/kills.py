@@ -1,9 +1,9 @@
 """Studies, sweeps and hardware trials killed at random moments, which must resume.
 
-    python scripts/check.py kills --kills 40
-
 Uses SIGKILL, also while they start. Each must end with the numbers of the undisturbed run, bit for bit, and
 repeat nothing that was finished.
+
+    python scripts/check.py kills --kills 40
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Tests under other instruction sets, thread counts, libraries and paths.
 
+Prints the failed tests of each variant. Exits with 1 if any test failed.
+
     python scripts/check.py portability                        all variants, about an hour on 2 cores
     python scripts/check.py portability other-cpu -m optim     one variant, some tests: arguments of pytest
-
-Prints the failed tests of each variant. Exits with 1 if any test failed.
 """
 
 from __future__ import annotations

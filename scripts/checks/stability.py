@@ -1,12 +1,12 @@
 """Growth in random scenes, stepped far beyond the steady state.
 
+Prints two Markdown tables. Each scene of `shared/random_scenes.py` runs twice: driven from silence, and from
+random pressure without a source, which excites every mode of the grid. All values must stay finite. The norm
+of the pressure must rise less in its last half than a driven resonance can, and the spread of its phasors
+must not increase. Exits with 1 if any scene fails.
+
     python scripts/check.py stability                       500 scenes, about 12 minutes on 2 idle cores
     python scripts/check.py stability --seed 3 --only 17    one of them
-
-Prints two Markdown tables. Each scene of `shared/random_scenes.py` runs twice: driven from silence, and from
-random pressure without a source, which excites every mode of the grid. A scene fails if a value is not
-finite, if the norm of the pressure rises more in its last half than a driven resonance can, or if the spread
-of its phasors increases. Exits with 1 if any scene fails.
 """
 
 from __future__ import annotations

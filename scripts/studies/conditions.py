@@ -1,11 +1,11 @@
 """Methods under noise, few phase levels, failed transducers and drift.
 
-    python scripts/study.py conditions                              all methods of the package
-    python scripts/study.py conditions --methods gabs identify      two of them
-
 Writes conditions.png and a block of conditions.md. Each trial has an objective of its own, with noise and
 drift seeded by the number of the trial. The true score is the weakest focus that the drive found produces
 without noise on the device in its final state.
+
+    python scripts/study.py conditions                              all methods of the package
+    python scripts/study.py conditions --methods gabs identify      two of them
 """
 
 from __future__ import annotations
@@ -180,16 +180,6 @@ def true_scores(outcomes: Outcomes, scene: str) -> str:
     return table(["condition", *methods], rows)
 
 
-def observed_over_true(outcomes: Outcomes) -> str:
-    """Return a table of the mean observed over the mean true score, mean over the scenes."""
-    scenes, methods, rows = keys(outcomes, 0), keys(outcomes, 2), []
-    for condition in keys(outcomes, 1):
-        found = [[outcomes[scene, condition, method] for scene in scenes] for method in methods]
-        ratios = [sum(float(o.observed.mean() / o.true.mean()) for o in own) / len(own) for own in found]
-        rows.append([condition, *(f"{ratio:.2f}" for ratio in ratios)])
-    return table(["condition", *methods], rows)
-
-
 @styled
 def plot_conditions(outcomes: Outcomes) -> Figure:
     """Plot the true weakest focus over noise and over levels, a column for each scene."""
@@ -241,7 +231,6 @@ def main(given: argparse.Namespace) -> None:
                 print(f"{scene}, {condition}, {name}: {found.true.mean():.3f} Pa", flush=True)
     for scene in PAPER:
         print("", f"True weakest focus [Pa], {scene}:", "", true_scores(outcomes, scene), sep="\n")
-    print("", "Observed over true weakest focus:", "", observed_over_true(outcomes), sep="\n")
     error = max(outcome.error for outcome in outcomes.values())
     parts = (
         measured(),

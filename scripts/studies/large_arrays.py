@@ -1,8 +1,8 @@
 """Methods on arrays of 249 and 256 transducers, at equal numbers of evaluations.
 
-    python scripts/study.py large_arrays            a quarter of an hour
-
 Fills in a block of methods.md.
+
+    python scripts/study.py large_arrays            a quarter of an hour
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Position and density of a sphere, recovered from a few pressures.
 
-    python scripts/study.py recover_obstacle            4 minutes on 2 idle cores
-
 The measurement is a simulation on a grid twice as fine, with the true surface and 1 % of noise. The model is
 a density map in which the surface is smoothed over about a cell, so that position and density are tensors.
 Adam follows the gradients of `differentiable_field`.
+
+    python scripts/study.py recover_obstacle            4 minutes on 2 idle cores
 """
 
 from __future__ import annotations

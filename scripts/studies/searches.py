@@ -1,8 +1,8 @@
 """Effect of order, levels and passes on LSSG and GABS.
 
-    python scripts/study.py searches            half a minute
-
 Fills in a block of methods.md.
+
+    python scripts/study.py searches            half a minute
 """
 
 from __future__ import annotations

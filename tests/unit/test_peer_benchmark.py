@@ -7,9 +7,17 @@ import numpy as np
 import pytest
 import torch
 from benchmarks.peer_programs.task import DFT_PERIODS, Answer, Task
-from benchmarks.peer_report import OURS, Point, Refusal, requirements, settled, times, write_report
 from benchmarks.peer_scene import next_smooth, scene_grid, spread
-from benchmarks.peers import SETTINGS
+from benchmarks.peers import (
+    OURS,
+    SETTINGS,
+    Point,
+    Refusal,
+    requirements,
+    settled,
+    times,
+    write_report,
+)
 from shared import document
 from shared.cases import free_space_case, sphere_case
 

@@ -34,8 +34,8 @@ def test_no_exponent_of_costs_that_do_not_grow() -> None:
 
 
 def test_report_has_a_fit_for_each_series() -> None:
-    points = [Point("foci", "box", size, 0.1 * size**1.5, 30.0, int(size)) for size in SIZES]
-    points += [Point("domain", "full", size, 1.0, 30.0 + size, 1) for size in SIZES]
+    points = [Point("foci", "box", size, 0.1 * size**1.5, 30.0) for size in SIZES]
+    points += [Point("domain", "full", size, 1.0, 30.0 + size) for size in SIZES]
     fits, ranges = exponents(points)
     assert "| box | P^1.50 |  |" in fits
     assert ranges == "edge of the domain L [mm], full: 1 times"
