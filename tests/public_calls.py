@@ -36,14 +36,28 @@ frequency: 40000
 control_points: {type: points, positions: [[0.08, 0, 0]]}
 """
 
+METHODS = ("BayesOpt", "GABS", "GradientAscent", "Identify", "LSS", "LSSG", "RandomSearch")
+
 #: What the package itself makes, and what drivers are made of.
 NOT_CALLED_BY_USERS = {
     *("Estimate", "Evaluation", "EvaluationLog", "FocusMetrics", "Preflight", "Run", "Solution", "Sweep"),
     "Waveform",
     *("Adapter", "Device", "Dialect", "Obstacle", "OpenMPDBoard", "SimulatedPropagator", "UsbtmcPort"),
-    *("EmulatedBench.receive", "EmulatedScope.execute"),
+    *("EmulatedBench.receive", "EmulatedScope.execute", "Method", "State"),
     *("EmulatedScope.plug_into", "Oscilloscope.capture", "Oscilloscope.set_up"),
     *("Device.pack", "lock_log", "open_autd3"),  # the one only makes a context, the other asks the network
+}
+
+
+#: Methods that the driver calls, and that authors of methods implement.
+INSIDE_METHODS = {
+    "advance",
+    "begin",
+    "check",
+    "most_at_once",
+    "most_evaluations",
+    "numbers_kept",
+    "require_fit",
 }
 
 
@@ -98,6 +112,31 @@ def objective() -> at.SimulatedObjective:
     return at.SimulatedObjective(AIR_ALONE, at.make_propagator(AIR_ALONE))
 
 
+def problem() -> at.Problem:
+    return at.Problem.of(objective())
+
+
+@cache
+def state(method: str) -> at.State:
+    """A state of the method with the arguments of this file."""
+    return made(method).start(problem())
+
+
+@cache
+def made(method: str) -> Any:
+    call = Call(method, getattr(at, method))
+    return call.function(**call.arguments(Path()))
+
+
+def heard(method: str) -> torch.Tensor:
+    return torch.ones(*state(method).drives.shape[:2], 3, dtype=torch.float64)
+
+
+def state_file(folder: Path) -> Path:
+    at.save_state(folder / "state.npz", made("GABS"), state("GABS"))
+    return folder / "state.npz"
+
+
 def link() -> hardware.Link:
     return hardware.Link(hardware.SONICSURFACE, Silent(), [3, 1, 7, 5], sleep=lambda _: None)
 
@@ -123,7 +162,7 @@ def scope_bus() -> EmulatedBus:
 #: By name of the parameter.
 ARGUMENTS: dict[str, Any] = {
     **dict.fromkeys(("ax", "cache", "device", "first", "reference", "save", "serial"), None),
-    **dict.fromkeys(("time_step", "watch"), None),
+    **dict.fromkeys(("state_file", "time_step", "watch"), None),
     **dict.fromkeys(("decibels", "higher_is_better", "on_off", "return_error", "scattered"), False),
     **dict.fromkeys(("background", "boards", "captures", "input", "passes", "readings"), 1),
     **dict.fromkeys(("reads", "trials"), 1),
@@ -158,11 +197,12 @@ ARGUMENTS: dict[str, Any] = {
     "embedding": "phases",
     "evaluations": 11,
     "field": torch.ones(4, 4, dtype=torch.complex128),
+    "foci": 3,
     "folder": Made(lambda folder: folder),
     "frames": 2,
     "frequency": 40e3,
     "G": MATRIX,
-
+    "goal": at.weakest_focus,
     "height": 5e-3,
     "history": {"scene": {"gabs": [[1.0, 2.0]]}},
     "initial": 3,
@@ -199,8 +239,10 @@ ARGUMENTS: dict[str, Any] = {
     "port": Silent(),
     "positions": [[0.0, 0.0, 0.0], [0.0, 0.01, 0.0]],
     "pressure": [1.0, 2.0],
+    "problem": Made(lambda _: problem()),
     "propagator": Made(lambda _: at.make_propagator(AIR_ALONE)),
     "quantities": {"pressure [Pa]": {"scene": {"gabs": [1.0, 2.0]}}},
+    "quantise": lambda drive: drive,
     "radius": 3e-3,
     "relative_humidity": 50.0,
     "rigid": False,
@@ -228,6 +270,7 @@ ARGUMENTS: dict[str, Any] = {
     "temperature": 20.0,
     "thickness": 0.01,
     "timeout": 0.1,
+    "stop": lambda state: True,
     "tolerance": 2e-3,
     "transducers": [3, 1, 7, 5],
     "transfer_matrix": MATRIX,
@@ -250,6 +293,7 @@ OTHERS: dict[str, Any] = {
     "Medium.air.pressure": 1e5,
     "Mesh.path": Made(mesh_file),
     "OpenMPDBoard.load.path": Made(board_file),
+    "Problem.transducers": 4,
     "Oscilloscope.port": Made(lambda _: scope()._port),
     "Plane.size": (0.1, 0.1),
     "SimulatedObjective.scene": AIR_ALONE,
@@ -258,6 +302,11 @@ OTHERS: dict[str, Any] = {
     "cell_centers.scene": AIR_ALONE,
     "differentiable_field.density": [50.0],
     "differentiable_field.sound_speed": [340.0],
+    "load_state.method": Made(lambda _: made("GABS")),
+    "load_state.path": Made(state_file),
+    "run.method": Made(lambda _: made("GABS")),
+    "save_state.method": Made(lambda _: made("GABS")),
+    "save_state.state": Made(lambda _: state("GABS")),
     "load_array.path": Made(array_file),
     "load_drive.path": Made(drive_file),
     "open_link.port": None,
@@ -280,6 +329,17 @@ OTHERS: dict[str, Any] = {
         f"{kind}.{method}.drive": DRIVE[None]
         for kind in ("FailedTransducers", "Drift", "Noise", "Played", "Quantised")
         for method in ("__call__", "emitted")
+    },
+    **{
+        f"{name}.{call}.state": Made(lambda _, name=name: state(name))
+        for name in METHODS
+        for call in ("ask", "best", "tell")
+    },
+    **{
+        f"{name}.tell.pressure": Made(
+            lambda _, name=name: torch.ones(*state(name).drives.shape[:2], 3).double()
+        )
+        for name in METHODS
     },
     "HardwareObjective.__call__.drive": DRIVE[None],
     "SimulatedObjective.__call__.drive": DRIVE[None],
@@ -349,9 +409,10 @@ def _calls_of(kind: type) -> Iterator[Call]:
     if issubclass(kind, BaseException) or protocol or not_made:
         return
     yield Call(kind.__name__, kind)
+    inner = INSIDE_METHODS | getattr(kind, "__dataclass_fields__", {}).keys()  # defaults that are functions
     for name in dir(kind):
         member = inspect.getattr_static(kind, name)
         if isinstance(member, classmethod):
             yield Call(f"{kind.__name__}.{name}", getattr(kind, name))
-        elif inspect.isfunction(member) and (name == "__call__" or not name.startswith("_")):
+        elif inspect.isfunction(member) and name not in inner and (name == "__call__" or name[0] != "_"):
             yield Call(f"{kind.__name__}.{name}", member, kind)

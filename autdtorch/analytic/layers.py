@@ -31,10 +31,10 @@ class Layering(ABC):
     speed_ratio: float
 
     def __post_init__(self) -> None:
-        """Check the attributes."""
-        positive("wavenumber", self.wavenumber, "rad/m")
-        positive("density_ratio", self.density_ratio)
-        positive("speed_ratio", self.speed_ratio)
+        """Check the attributes and make them floats."""
+        object.__setattr__(self, "wavenumber", positive("wavenumber", self.wavenumber, "rad/m"))
+        object.__setattr__(self, "density_ratio", positive("density_ratio", self.density_ratio))
+        object.__setattr__(self, "speed_ratio", positive("speed_ratio", self.speed_ratio))
 
     @property
     def inner_wavenumber(self) -> float:
@@ -94,9 +94,9 @@ class Slab(Layering):
     thickness: float
 
     def __post_init__(self) -> None:
-        """Check the attributes."""
+        """Check the attributes and make them floats."""
         super().__post_init__()
-        positive("thickness", self.thickness, "m")
+        object.__setattr__(self, "thickness", positive("thickness", self.thickness, "m"))
 
     @property
     def depth(self) -> float:

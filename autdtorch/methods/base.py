@@ -17,7 +17,15 @@ from autdtorch.objectives.objective import Objective, Score, require_objective, 
 from autdtorch.objectives.perturbations import quantised
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.memory import require_memory
-from autdtorch.utils.validation import integer_at_least, integers, invalid, real_tensor, require_callable
+from autdtorch.utils.validation import (
+    complex_tensor,
+    integer_at_least,
+    integers,
+    invalid,
+    real_tensor,
+    require_callable,
+    require_kind,
+)
 
 Trials: TypeAlias = int | Sequence[int]
 """A number of trials T, or the numbers of the T trials to run, so that a study can run them in blocks."""
@@ -55,11 +63,20 @@ class Problem:
         """Check the fields.
 
         Raises:
-            ValueError: a number that is no integer >= 1, or a goal that is no function.
+            ValueError: a number that is not an integer >= 1, or another field of a wrong kind or shape.
         """
         for name in ("transducers", "foci"):
             object.__setattr__(self, name, integer_at_least(name, getattr(self, name), 1))
-        require_callable("score", self.goal)
+        require_callable("goal", self.goal)
+        require_callable("quantise", self.quantise)
+        if self.scene is not None:
+            require_kind("scene", self.scene, Scene)
+        if self.transfer_matrix is not None:
+            matrix = complex_tensor("transfer_matrix", self.transfer_matrix)
+            if matrix.shape != (self.foci, self.transducers):
+                accepted = f"must be ({self.foci}, {self.transducers})"
+                raise ValueError(f"transfer_matrix: shape {tuple(matrix.shape)}; {accepted}")
+            object.__setattr__(self, "transfer_matrix", matrix)
 
     @classmethod
     def of(cls, objective: Objective, goal: Score = weakest_focus) -> Problem:
@@ -204,6 +221,7 @@ class Method(ABC):
             ValueError: an argument out of range, a setting that does not fit the problem, or more memory
                 would be needed than there is.
         """
+        require_kind("problem", problem, Problem)
         seeds = trial_seeds(seed, trials)
         if not self.random and len(seeds) > 1:
             raise invalid("trials", trials, f"must be 1: {self.label} has no random choices")
@@ -221,6 +239,7 @@ class Method(ABC):
 
     def ask(self, state: State) -> torch.Tensor:
         """Return the drives (B, M), complex128, to observe next; none when the method is done."""
+        require_kind("state", state, State)
         return state.drives.flatten(0, 1)
 
     def tell(self, state: State, pressure: torch.Tensor) -> State:
@@ -233,6 +252,7 @@ class Method(ABC):
         Raises:
             ValueError: pressures or scores that are not finite real numbers or have the wrong shape.
         """
+        require_kind("state", state, State)
         batch = state.drives.shape[:2]
         pressure = _real("pressure of the objective", pressure, (batch.numel(), state.problem.foci), "Pa")
         pressure = pressure.reshape(*batch, -1)
@@ -244,6 +264,7 @@ class Method(ABC):
 
     def best(self, state: State) -> Solution:
         """Return the best drive of each trial so far; at least one evaluation must have been made."""
+        require_kind("state", state, State)
         history = state.best.history.cummax(dim=1).values.minimum(state.best.score[:, None])
         missing = max(0, self.most_evaluations(state.problem) - history.shape[1]) if state.done else 0
         history = torch.cat([history, history[:, -1:].expand(-1, missing)], dim=1)

@@ -59,6 +59,7 @@ def run(
         OSError: the state file cannot be read or written.
     """
     require_kind("method", method, Method)
+    require_callable("score", score)
     if stop is not None:
         require_callable("stop", stop)
     problem = Problem.of(objective, score)
