@@ -43,6 +43,48 @@ def require_each(name: str, given: Mapping[str, object], wanted: Collection[str]
         raise ValueError(f"{name}: none for {missing}; must have one for each of {list(wanted)}")
 
 
+def labelled(
+    name: str, given: Mapping[str, Mapping[str, ByMethod]], *axes: str, positive: int = 0
+) -> dict[str, dict[str, dict[str, Array]]]:
+    """Return the numbers by label, scene and method, after checking them as `by_scene` does.
+
+    Raises:
+        ValueError: no label, or the data of a label are not accepted.
+    """
+    require_kind(name, given, Mapping)
+    if not given:
+        raise ValueError(f"{name}: empty; must have at least one")
+    return {
+        label: by_scene(f"{name}[{label!r}]", own, *axes, positive=positive) for label, own in given.items()
+    }
+
+
+def by_scene(
+    name: str, given: Mapping[str, ByMethod], *axes: str, positive: int = 0
+) -> dict[str, dict[str, Array]]:
+    """Return the numbers by scene and method, after checking them.
+
+    Args:
+        name: name of the field, for messages.
+        given: numbers by scene and method.
+        axes: see `numbers`.
+        positive: how many of the first columns must be > 0.
+
+    Raises:
+        ValueError: no scene, a scene without method, or numbers that are not accepted.
+    """
+    require_scenes(name, given)
+    checked: dict[str, dict[str, Array]] = {}
+    for scene, methods in given.items():
+        for method, own in methods.items():
+            where = f"{name}[{scene!r}][{method!r}]"
+            values = numbers(where, own, *axes)
+            if positive and (least := values[:, :positive].min()) <= 0:
+                raise ValueError(f"{where}: {least:g}; must be > 0 on a logarithmic axis")
+            checked.setdefault(scene, {})[method] = values
+    return checked
+
+
 def numbers(name: str, given: ArrayLike, *axes: str) -> Array:
     """Return finite numbers, after checking their axes; an axis like "2" states its length, others are names.
 

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from autdtorch.plot.data import ByMethod, methods_of, numbers, require_each, require_scenes
+from autdtorch.plot.data import ByMethod, by_scene, methods_of, numbers, require_each
 from autdtorch.plot.style import TICK_SIZE, Look, add_legend, label_of, log_axes, looks_of, new_panels, styled
 from autdtorch.utils.arrays import Array
 from autdtorch.utils.validation import ArrayLike, boolean, invalid, members, require_kind
@@ -45,19 +45,15 @@ def plot_pareto(
     Raises:
         ValueError: no scene, points that are not (N, 2) finite numbers, or a cost or error <= 0.
     """
-    require_scenes("points", points)
+    higher_is_better = boolean("higher_is_better", higher_is_better)
+    data = by_scene("points", points, "points", "2", positive=1 if higher_is_better else 2)
     require_kind("xlabel", xlabel, str)
     require_kind("ylabel", ylabel, str)
-    higher_is_better = boolean("higher_is_better", higher_is_better)
     if names is not None:
-        require_each("names", names, points)
-    looks = looks_of(methods_of(points.values()))
-    figure, panels = new_panels(points, _PANEL, _PANEL, xlabel, ylabel, sharey=higher_is_better)
-    for ax, (scene, by_method) in zip(panels, points.items(), strict=True):
-        drawn = {
-            method: _points(f"points[{scene!r}][{method!r}]", given, higher_is_better)
-            for method, given in by_method.items()
-        }
+        require_each("names", names, data)
+    looks = looks_of(methods_of(data.values()))
+    figure, panels = new_panels(data, _PANEL, _PANEL, xlabel, ylabel, sharey=higher_is_better)
+    for ax, (scene, drawn) in zip(panels, data.items(), strict=True):
         for method, values in drawn.items():
             _draw_points(ax, values, looks[method], higher_is_better)
         everything = np.concatenate(list(drawn.values()))
@@ -98,14 +94,6 @@ def pareto_front(points: ArrayLike, higher_is_better: bool = False) -> list[int]
         if not kept or worse[index] < worse[kept[-1]]:
             kept.append(int(index))
     return kept
-
-
-def _points(name: str, given: ArrayLike, higher_is_better: bool) -> Array:
-    values = numbers(name, given, "points", "2")
-    positive = values[:, 0] if higher_is_better else values
-    if positive.min() <= 0:
-        raise ValueError(f"{name}: {positive.min():g}; must be > 0 on a logarithmic axis")
-    return values
 
 
 def _texts(name: str, given: Sequence[str], count: int) -> tuple[str, ...]:

@@ -10,10 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator
 
-from autdtorch.plot.data import ByMethod, methods_of, numbers, require_scenes
+from autdtorch.plot.data import ByMethod, labelled, methods_of
 from autdtorch.plot.style import TICK_SIZE, Look, label_of, log_axes, looks_of, new_figure, styled
 from autdtorch.utils.arrays import Array
-from autdtorch.utils.validation import ArrayLike, require_kind
 
 OVERHEAD = 2.0
 """Lower limit of the fitted costs, over the smallest cost: constant overhead is then at most half of each."""
@@ -52,7 +51,7 @@ def plot_scaling(costs: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
     """Plot costs against sizes on logarithmic axes with fitted power laws, one row of panels per cost.
 
     A broad pale line is a power law, fitted to the costs that are at least twice the smallest one. The legend
-    gives its exponent as slope. With fewer than three such costs, the legend gives their range as a factor.
+    gives its exponent as slope. With fewer than three such costs it gives the ratio of largest to smallest.
 
     Args:
         costs: sizes and costs (N, 2), all > 0, by labels of cost and size (with units) and by method.
@@ -63,40 +62,25 @@ def plot_scaling(costs: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
     Raises:
         ValueError: no cost or size, or values that are not (N, 2) finite numbers > 0.
     """
-    require_kind("costs", costs, Mapping)
-    if not costs:
-        raise ValueError("costs: empty; must have at least one")
-    for label, by_size in costs.items():
-        require_scenes(f"costs[{label!r}]", by_size)
-    growths = methods_of(costs.values())
-    looks = looks_of(methods_of(scene for by_size in costs.values() for scene in by_size.values()))
-    figure = new_figure(0.6 + 2.5 * len(growths), 0.2 + 2.7 * len(costs))
-    panels = figure.subplots(len(costs), len(growths), squeeze=False, sharex="col", sharey="row")
-    for line, (label, by_size) in zip(panels, costs.items(), strict=True):
+    data = labelled("costs", costs, "points", "2", positive=2)
+    growths = methods_of(data.values())
+    looks = looks_of(methods_of(series for by_size in data.values() for series in by_size.values()))
+    figure = new_figure(0.6 + 2.5 * len(growths), 0.2 + 2.7 * len(data))
+    panels = figure.subplots(len(data), len(growths), squeeze=False, sharex="col", sharey="row")
+    for line, (label, by_size) in zip(panels, data.items(), strict=True):
         for ax, growth in zip(line, growths, strict=True):
             if growth not in by_size:
                 ax.set_axis_off()
                 continue
-            series = {
-                method: _series(f"costs[{label!r}][{growth!r}][{method!r}]", given)
-                for method, given in by_size[growth].items()
-            }
-            for method, values in series.items():
+            for method, values in by_size[growth].items():
                 _draw_series(ax, label_of(method), values, looks[method])
-            _mark_sizes(ax, np.concatenate(list(series.values()))[:, 0])
+            _mark_sizes(ax, np.concatenate(list(by_size[growth].values()))[:, 0])
         line[0].set_ylabel(label)
     for ax, growth in zip(panels[-1], growths, strict=True):
         ax.set_xlabel(growth)
     for line in panels:  # after all panels of a row, which share the axis, are drawn
         log_axes(line[0], "y")
     return figure
-
-
-def _series(name: str, given: ArrayLike) -> Array:
-    values = numbers(name, given, "points", "2")
-    if values.min() <= 0:
-        raise ValueError(f"{name}: {values.min():g}; must be > 0 on logarithmic axes")
-    return values
 
 
 def _draw_series(ax: Axes, name: str, values: Array, look: Look) -> None:

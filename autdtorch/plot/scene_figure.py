@@ -68,7 +68,9 @@ def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
         corners = scene.observation_plane.corners[[0, 1, 3, 2]].numpy()
         ax.add_collection3d(Poly3DCollection([MM * corners], facecolor=PLANE_COLOUR, alpha=0.3, zorder=1))
     # From far to near: the order of drawing is fixed, and later obstacles cover earlier ones.
-    for obstacle in sorted(scene.obstacles, key=_nearness):
+    for obstacle in sorted(
+        scene.obstacles, key=lambda one: (np.array(one.lower) + one.upper) / 2 @ _TO_VIEWER
+    ):
         _add_obstacle(ax, obstacle, scene.domain)
     foci = MM * scene.control_points.numpy()
     ax.scatter(*foci.T, color=FOCUS_COLOUR, s=22, depthshade=False, label="control points", zorder=3)
@@ -85,12 +87,6 @@ def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
     ax.tick_params(labelsize=TICK_SIZE)
     ax.legend(loc="upper left")
     return figure
-
-
-def _nearness(obstacle: Obstacle) -> float:
-    """Return the position of the obstacle's middle along the direction to the viewer."""
-    middle = (np.array(obstacle.lower) + np.array(obstacle.upper)) / 2
-    return float(middle @ _TO_VIEWER)
 
 
 def _add_obstacle(ax: Axes3D, obstacle: Obstacle, domain: tuple[Vector, Vector]) -> None:

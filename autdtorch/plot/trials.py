@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from autdtorch.plot.data import ByMethod, methods_of, numbers, require_scenes
+from autdtorch.plot.data import ByMethod, by_scene, labelled, methods_of
 from autdtorch.plot.style import (
     TICK_SIZE,
     Look,
@@ -56,22 +56,17 @@ def plot_trials(quantities: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
     Raises:
         ValueError: no quantity or scene, or values that are not (trials,) finite numbers.
     """
-    require_kind("quantities", quantities, Mapping)
-    if not quantities:
-        raise ValueError("quantities: empty; must have at least one")
-    for label, by_scene in quantities.items():
-        require_scenes(f"quantities[{label!r}]", by_scene)
-    methods = methods_of(values for scenes in quantities.values() for values in scenes.values())
-    scenes = methods_of(quantities.values())
+    data = labelled("quantities", quantities, "trials")
+    methods = methods_of(values for scenes in data.values() for values in scenes.values())
+    scenes = methods_of(data.values())
     looks = looks_of(methods)
     width = max(_WIDTH, 1.0 + _BOX * len(scenes) * len(methods))
-    figure = new_figure(width, 0.7 + 2.1 * len(quantities))
-    axes = figure.subplots(len(quantities), squeeze=False, sharex=True)[:, 0]
+    figure = new_figure(width, 0.7 + 2.1 * len(data))
+    axes = figure.subplots(len(data), squeeze=False, sharex=True)[:, 0]
     single = dict.fromkeys(methods, True)
-    for letter, ax, (label, by_scene) in zip(ascii_lowercase, axes, quantities.items(), strict=False):
-        for scene, by_method in by_scene.items():
-            for method, given in by_method.items():
-                values = numbers(f"quantities[{label!r}][{scene!r}][{method!r}]", given, "trials")
+    for letter, ax, (label, of_scenes) in zip(ascii_lowercase, axes, data.items(), strict=False):
+        for scene, by_method in of_scenes.items():
+            for method, values in by_method.items():
                 place = 0.8 * ((methods.index(method) + 0.5) / len(methods) - 0.5)
                 _draw_trials(ax, values, scenes.index(scene) + place, 0.6 / len(methods), looks[method])
                 single[method] &= values.size == 1
@@ -80,7 +75,7 @@ def plot_trials(quantities: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
         ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]))
         ax.set_ylabel(label)
         ax.tick_params(labelsize=TICK_SIZE)
-        if len(quantities) > 1:
+        if len(data) > 1:
             ax.set_title(f"({letter})", loc="left")
     names = [wrapped(readable(scene), (width - 1.0) / len(scenes)) for scene in scenes]
     axes[-1].set_xticks(range(len(scenes)), names)
@@ -118,7 +113,7 @@ def plot_convergence(
         ValueError: no scene, a history that is not (trials, evaluations) finite numbers, or levels of an
             unknown scene.
     """
-    require_scenes("history", history)
+    histories = by_scene("history", history, "trials", "evaluations")
     require_kind("label", label, str)
     levels = {} if levels is None else levels
     require_kind("levels", levels, Mapping)
@@ -128,12 +123,11 @@ def plot_convergence(
         raise ValueError(f"levels: of scenes {list(unknown)}; must be of scenes in history: {list(history)}")
     level_labels = list(dict.fromkeys(name for by_label in levels.values() for name in by_label))
     styles = {name: _LEVELS[index % len(_LEVELS)] for index, name in enumerate(level_labels)}
-    looks = looks_of(methods_of(history.values()))
+    looks = looks_of(methods_of(histories.values()))
     figure, panels = new_panels(history, *_PANEL, "evaluations", label, sharey=True)
     title = None
-    for ax, (scene, by_method) in zip(panels, history.items(), strict=True):
-        for method, given in by_method.items():
-            values = numbers(f"history[{scene!r}][{method!r}]", given, "trials", "evaluations")
+    for ax, (scene, by_method) in zip(panels, histories.items(), strict=True):
+        for method, values in by_method.items():
             title = "median of the trials, band: quartiles" if len(values) > 1 else title
             _draw_history(ax, values, looks[method])
         for name, level in levels.get(scene, {}).items():

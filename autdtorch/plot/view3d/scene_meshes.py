@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -143,12 +142,11 @@ def add_caption(plotter: pyvista.Plotter, *lines: str) -> None:
 
 def _use_font(*properties: pyvista.TextProperty) -> None:
     """Use the font of Matplotlib's figures; VTK's fonts have no π."""
-    package = importlib.util.find_spec("matplotlib")  # PyVista needs it
-    if package is None or package.origin is None:
-        raise ModuleNotFoundError("matplotlib")
+    from matplotlib import get_data_path
+
     for text in properties:
         text.SetFontFamily(4)  # VTK_FONT_FILE
-        text.SetFontFile(str(Path(package.origin).parent / "mpl-data/fonts/ttf/DejaVuSans.ttf"))
+        text.SetFontFile(str(Path(get_data_path()) / "fonts/ttf/DejaVuSans.ttf"))
 
 
 def _add_obstacle(plotter: pyvista.Plotter, obstacle: Obstacle, domain: tuple[Vector, Vector]) -> None:
