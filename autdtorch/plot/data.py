@@ -17,11 +17,7 @@ MM = 1e3  # pictures show lengths in millimetres
 
 
 def require_scenes(name: str, scenes: Mapping[str, ByMethod]) -> None:
-    """Check that there is at least one scene, each with at least one method.
-
-    Raises:
-        ValueError: otherwise.
-    """
+    """Check that there is at least one scene, each with at least one method."""
     accepted = "must have at least one scene, each with at least one method"
     if not isinstance(scenes, Mapping):
         raise invalid(name, scenes, accepted)
@@ -33,11 +29,7 @@ def require_scenes(name: str, scenes: Mapping[str, ByMethod]) -> None:
 
 
 def require_each(name: str, given: Mapping[str, object], wanted: Collection[str]) -> None:
-    """Check that a mapping has an entry for each name of `wanted`.
-
-    Raises:
-        ValueError: not a mapping, or an entry is missing.
-    """
+    """Check that a mapping has an entry for each name of `wanted`."""
     require_kind(name, given, Mapping)
     if missing := [one for one in wanted if one not in given]:
         raise ValueError(f"{name}: none for {missing}; must have one for each of {list(wanted)}")
@@ -46,11 +38,7 @@ def require_each(name: str, given: Mapping[str, object], wanted: Collection[str]
 def labelled(
     name: str, given: Mapping[str, Mapping[str, ByMethod]], *axes: str, positive: int = 0
 ) -> dict[str, dict[str, dict[str, Array]]]:
-    """Return the numbers by label, scene and method, after checking them as `by_scene` does.
-
-    Raises:
-        ValueError: no label, or the data of a label are not accepted.
-    """
+    """Return the numbers by label, scene and method, after checking them as `by_scene` does."""
     require_kind(name, given, Mapping)
     if not given:
         raise ValueError(f"{name}: empty; must have at least one")
@@ -62,17 +50,7 @@ def labelled(
 def by_scene(
     name: str, given: Mapping[str, ByMethod], *axes: str, positive: int = 0
 ) -> dict[str, dict[str, Array]]:
-    """Return the numbers by scene and method, after checking them.
-
-    Args:
-        name: name of the field, for messages.
-        given: numbers by scene and method.
-        axes: see `numbers`.
-        positive: how many of the first columns must be > 0.
-
-    Raises:
-        ValueError: no scene, a scene without method, or numbers that are not accepted.
-    """
+    """Return the numbers by scene and method, after checking them; `positive` leading columns must be > 0."""
     require_scenes(name, given)
     checked: dict[str, dict[str, Array]] = {}
     for scene, methods in given.items():
@@ -106,11 +84,7 @@ def methods_of(scenes: Iterable[Mapping[str, object]]) -> list[str]:
 
 
 def plane_magnitude(name: str, pressure: ArrayLike) -> Array:
-    """Return |p| (Nu, Nv) of complex pressure, or of its magnitude, on a plane.
-
-    Raises:
-        ValueError: not finite numbers, not two axes, or empty.
-    """
+    """Return |p| (Nu, Nv) of complex pressure, or of its magnitude, on a plane."""
     magnitude: Array = real_tensor(name, magnitude_tensor(name, pressure, "Pa"), "Pa").detach().cpu().numpy()
     if magnitude.ndim != 2 or magnitude.size == 0:
         raise ValueError(f"{name}: shape {magnitude.shape}; must be (Nu, Nv), the points of a plane")
@@ -125,10 +99,6 @@ def in_decibels(magnitude: Array, zero: float) -> Array:
 
 
 def single_drive_phases(drive: ArrayLike, transducers: int) -> Array:
-    """Return the phases (M,) in [0, 2 pi) [rad] of one drive of an array of `transducers`.
-
-    Raises:
-        ValueError: not a single drive of the array.
-    """
+    """Return the phases (M,) in [0, 2 pi) [rad] of one drive of an array of `transducers`."""
     phases: Array = phases_of(validate_single_drive(drive, transducers)).detach().cpu().numpy()
     return phases

@@ -39,9 +39,6 @@ def plot_pareto(
         higher_is_better: True if the result is a score, not an error.
         names: by scene and method, N names of the points; shown along the front of all methods.
 
-    Returns:
-        The figure.
-
     Raises:
         ValueError: no scene, points that are not (N, 2) finite numbers, or a cost or error <= 0.
     """

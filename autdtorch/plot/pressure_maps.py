@@ -51,9 +51,6 @@ def plot_plane(
         ax: axes to draw into; by default those of a new figure.
         decibels: True for the level 20 lg(|p| / largest |p|) from -30 to 0 dB instead of |p| in Pa.
 
-    Returns:
-        The figure.
-
     Raises:
         ValueError: `pressure` is not (Nu, Nv), or 0 everywhere with `decibels`, or `control_points` are not
             points.
@@ -98,9 +95,6 @@ def plot_planes(
         planes: plane of each scene.
         control_points: control points of each scene (P, 3) [m]; those in the plane are circled.
         obstacles: obstacles of each scene, outlined in the plane.
-
-    Returns:
-        The figure.
 
     Raises:
         ValueError: no scene, a scene without plane, or an argument of another shape.

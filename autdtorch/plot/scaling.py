@@ -56,9 +56,6 @@ def plot_scaling(costs: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
     Args:
         costs: sizes and costs (N, 2), all > 0, by labels of cost and size (with units) and by method.
 
-    Returns:
-        The figure.
-
     Raises:
         ValueError: no cost or size, or values that are not (N, 2) finite numbers > 0.
     """

@@ -54,9 +54,6 @@ def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
         scene: scene to draw.
         drive: complex (M,); colours the transducers by phase.
 
-    Returns:
-        The figure.
-
     Raises:
         ValueError: `drive` does not fit the array.
     """
@@ -145,13 +142,8 @@ def _sharp_edges(faces: NDArray[np.int64], normals: Array, front: NDArray[np.boo
 
 def _scatter_transducers(ax: Axes3D, scene: Scene, phases: Array | None) -> None:
     positions = MM * scene.array.positions.numpy()
-    style: Any = {
-        "edgecolors": EDGE_COLOUR,
-        "s": 36,
-        "depthshade": False,
-        "zorder": 1,
-        "label": "transducers",
-    }
+    style: Any = {"edgecolors": EDGE_COLOUR, "s": 36, "depthshade": False, "zorder": 1}
+    style["label"] = "transducers"
     if phases is None:
         ax.scatter(*positions.T, color=TRANSDUCER_COLOUR, **style)
         return

@@ -50,9 +50,6 @@ def plot_trials(quantities: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
     Args:
         quantities: by label (with unit), scene and method: one value for each trial (trials,).
 
-    Returns:
-        The figure.
-
     Raises:
         ValueError: no quantity or scene, or values that are not (trials,) finite numbers.
     """
@@ -105,9 +102,6 @@ def plot_convergence(
         history: by scene and method, `Solution.history` (trials, evaluations).
         levels: by scene and label, scores to compare with; horizontal lines.
         label: label of the score, with its unit.
-
-    Returns:
-        The figure.
 
     Raises:
         ValueError: no scene, a history that is not (trials, evaluations) finite numbers, or levels of an

@@ -25,12 +25,7 @@ _EVERY = 8  # every 8th colour of a table makes the gradient
 
 
 def require_suffix(name: str, path: str | Path, suffixes: tuple[str, ...] = _SUFFIXES) -> Path:
-    """Return the path after checking its suffix.
-
-    Raises:
-        ValueError: another suffix.
-        RuntimeError: the package that writes such files is not installed.
-    """
+    """Return the path after checking its suffix."""
     path = path_of(name, path)
     if path.suffix not in suffixes:
         raise ValueError(f"{name}: {str(path)!r}; its suffix must be one of {', '.join(suffixes)}")

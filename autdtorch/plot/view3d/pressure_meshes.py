@@ -88,11 +88,7 @@ def add_isosurface(plotter: pyvista.Plotter, scene: Scene, level: Array, height:
 
 
 def plane_pressure(scene: Scene, field: ArrayLike) -> tuple[Plane, Array]:
-    """Return the scene's observation plane and the magnitude of a `field` (Nu, Nv) on it.
-
-    Raises:
-        ValueError: not (Nu, Nv) finite numbers, or the scene has no such plane.
-    """
+    """Return the scene's observation plane and the magnitude of a `field` (Nu, Nv) on it."""
     magnitude = plane_magnitude("field", field)
     if scene.observation_plane is None:
         raise ValueError("field: given for a scene without observation plane; must be None")
@@ -100,11 +96,7 @@ def plane_pressure(scene: Scene, field: ArrayLike) -> tuple[Plane, Array]:
 
 
 def volume_magnitude(volume: ArrayLike) -> Array:
-    """Return |p| (Nx, Ny, Nz) of complex pressure, or of its magnitude; NaN where unknown.
-
-    Raises:
-        ValueError: not numbers, not three axes of at least 2, infinite, or NaN everywhere.
-    """
+    """Return |p| (Nx, Ny, Nz) of complex pressure, or of its magnitude; NaN where unknown."""
     magnitude: Array = magnitude_tensor("volume", volume, "Pa").detach().cpu().numpy()
     if magnitude.ndim != 3 or min(magnitude.shape) < 2:
         raise ValueError(f"volume: shape {magnitude.shape}; must be (Nx, Ny, Nz), each at least 2")
@@ -114,11 +106,7 @@ def volume_magnitude(volume: ArrayLike) -> Array:
 
 
 def zero_level(reference: float | None, on_plane: Array | None, in_domain: Array | None) -> float:
-    """Return the pressure of 0 dB [Pa]: the reference, or the peak on the plane, or that in the volume.
-
-    Raises:
-        ValueError: the reference is not > 0, or the peak is 0.
-    """
+    """Return the pressure of 0 dB [Pa]: the reference, or the peak on the plane, or that in the volume."""
     if reference is not None:
         return positive("reference", reference, "Pa")
     name, shown = ("field", on_plane) if on_plane is not None else ("volume", in_domain)

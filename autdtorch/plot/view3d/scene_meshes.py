@@ -52,22 +52,13 @@ def new_plotter(scene: Scene, off_screen: bool) -> pyvista.Plotter:
 
 
 def emitted_phases(drive: ArrayLike, transducers: int) -> Array:
-    """Return the phases (M,) in [0, 2 pi) [rad] of one drive; NaN for silent transducers.
-
-    Raises:
-        ValueError: not a single drive of the array.
-    """
+    """Return the phases (M,) in [0, 2 pi) [rad] of one drive; NaN for silent transducers."""
     phases = single_drive_phases(drive, transducers)
     return np.where(amplitudes_of(drive).detach().cpu().numpy() > 0, phases, np.nan)
 
 
 def add_transducers(plotter: pyvista.Plotter, scene: Scene, phases: Array | None) -> pyvista.PolyData:
-    """Draw the transducers as discs.
-
-    Args:
-        plotter: plotter to draw into.
-        scene: scene of the transducers.
-        phases: (M,) [rad], NaN for silent ones; colours the discs.
+    """Draw the transducers as discs, coloured by their phases (M,) [rad], NaN for silent ones.
 
     Returns:
         The mesh of all discs, with the phases over pi as "phase" if given.
@@ -87,25 +78,13 @@ def add_transducers(plotter: pyvista.Plotter, scene: Scene, phases: Array | None
         points.glyph(geom=pyvista.Disc(inner=inner, outer=outer, normal=(1.0, 0.0, 0.0), c_res=48), **along)
         for inner, outer in ((0.0, radius), (radius, 1.1 * radius))
     )
-    arrow = pyvista.Arrow(
-        start=(0.1 * radius, 0.0, 0.0),
-        scale=2.0 * radius,
-        tip_length=0.35,
-        tip_radius=0.1,
-        shaft_radius=0.03,
-    )
+    shape = {"tip_length": 0.35, "tip_radius": 0.1, "shaft_radius": 0.03}
+    arrow = pyvista.Arrow(start=(0.1 * radius, 0.0, 0.0), scale=2.0 * radius, **shape)
+    colours = {"scalars": "phase", "cmap": PHASE_MAP, "clim": (0.0, 2.0), "nan_color": _SILENT_COLOUR}
     if phases is None:
-        plotter.add_mesh(face, color=TRANSDUCER_COLOUR, lighting=False)
-    else:
-        actor = plotter.add_mesh(
-            face,
-            scalars="phase",
-            cmap=PHASE_MAP,
-            clim=(0.0, 2.0),
-            nan_color=_SILENT_COLOUR,
-            lighting=False,
-            show_scalar_bar=False,
-        )
+        colours = {"color": TRANSDUCER_COLOUR}
+    actor = plotter.add_mesh(face, lighting=False, show_scalar_bar=False, **colours)
+    if phases is not None:
         add_bar(plotter, actor, "phase / π", position=_PHASE_BAR, labels=5, fmt="%.1f")
     plotter.add_mesh(rim, color=EDGE_COLOUR, lighting=False)
     plotter.add_mesh(points.glyph(geom=arrow, **along), color="#555555")
