@@ -1,4 +1,4 @@
-"""How Sphinx builds these pages and runs the tutorials: `make docs`."""
+"""Sphinx configuration; `make docs` builds the pages and runs the tutorials."""
 
 import re
 
