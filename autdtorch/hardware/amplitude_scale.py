@@ -15,7 +15,8 @@ class AmplitudeScale:
     """The scale between a trial's drives and the device's.
 
     Transducers of a calibrated device have levels of their own. None is driven above the highest of its
-    levels within the limit, so that rounding exceeds the limit nowhere.
+    levels within the limit, so that rounding exceeds the limit nowhere. Methods raise `ValueError` for
+    another shape, not finite complex numbers, or an amplitude above 1.
 
     Attributes:
         largest: amplitude of the device that is 1 in the trial: the highest level within the limit.
@@ -42,20 +43,12 @@ class AmplitudeScale:
             raise invalid("amplitude", limit, accepted)
 
     def asked(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return the drive to ask of the device, in its own scale, for a trial's `drive` (M,).
-
-        Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-        """
+        """Return the drive to ask of the device, in its own scale, for a trial's `drive` (M,)."""
         wanted = self.largest * validate_single_drive(drive, len(self._most))
         return torch.polar(wanted.abs().minimum(self._most), wanted.angle())
 
     def played(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return the device's nearest drives to drives (..., M), both in the trial's scale.
-
-        Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-        """
+        """Return the device's nearest drives to drives (..., M), both in the trial's scale."""
         drive = validate_drive(drive, len(self._most))
         # One by one, as the link plays them: no rounding may depend on the rows beside.
         rows = [self._wiring.quantised(self.asked(row)) for row in drive.reshape(-1, drive.shape[-1])]

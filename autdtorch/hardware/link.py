@@ -35,6 +35,7 @@ class Link:
 
     Use it as a context manager. The outputs are switched off when it is opened, as some devices start with
     all transducers on, and however the block ends; at the latest when Python exits. Threads may share it.
+    Methods raise `LinkError` if the device does not take the bytes; `off` and `close` then raise `OffError`.
 
     Attributes:
         device: the device at the port.
@@ -58,8 +59,7 @@ class Link:
             port: takes its bytes.
             transducers: the device's transducer for each of the scene's (M,); others stay off. By default
                 the scene has all, in the order of the device.
-            settle: time that `play` waits, after the frame has gone over the wire, for steady sound at the
-                control points [s].
+            settle: time that `play` waits, after the frame has gone over the wire, for steady sound [s].
             sleep: waits for a number of seconds.
 
         Raises:
@@ -82,9 +82,7 @@ class Link:
         atexit.register(self.close)
 
     def play(self, drive: torch.Tensor) -> None:
-        """Play a drive (M,), |q| <= 1, on the nearest levels of the device, until the next.
-
-        It returns when the sound is steady: a write ends before its bytes have gone over a serial line.
+        """Play a drive (M,) on the nearest levels, until the next; return when the sound is steady.
 
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
@@ -94,12 +92,7 @@ class Link:
         self.wait_for_sound()
 
     def begin(self, drive: torch.Tensor) -> None:
-        """Play a drive as `play` does, but return when its frame is on the device.
-
-        Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-            LinkError: the device does not take the bytes, or is closed.
-        """
+        """Play a drive as `play` does, but return when its frame is on the device."""
         frame = self.wiring.frame(drive)
         with self._lock:
             if not self._open:
@@ -111,11 +104,7 @@ class Link:
         self._sleep(self.settle)
 
     def off(self) -> None:
-        """Switch all outputs of the device off; does nothing once it is closed.
-
-        Raises:
-            OffError: the device does not take the bytes, even after a recovery.
-        """
+        """Switch all outputs of the device off, after a recovery of the port if need be."""
         with self._lock:
             if not self._open:  # pyusb would open it once more
                 return
@@ -127,12 +116,7 @@ class Link:
                     raise
 
     def close(self) -> None:
-        """Switch all outputs off and release the device.
-
-        Raises:
-            OffError: the device does not take the bytes; it is released all the same.
-            LinkError: the port cannot be given back to the system.
-        """
+        """Switch all outputs off and release the device, which happens even on an error."""
         with self._lock:
             if not self._open:
                 return

@@ -122,6 +122,8 @@ class Limits:
 class LimitedLink:
     """A link that plays within limits, and switches off by itself when the time is up.
 
+    Methods raise `LinkError` if the device does not take the bytes.
+
     Attributes:
         link: the link.
         limits: of the trial.
@@ -130,10 +132,6 @@ class LimitedLink:
 
     def __init__(self, link: Link, limits: Limits) -> None:
         """Limit a link.
-
-        Args:
-            link: with its outputs off.
-            limits: of the trial.
 
         Raises:
             ValueError: no link or no limits, or the device has no amplitude up to the limit except 0.
@@ -158,15 +156,9 @@ class LimitedLink:
             return self._seconds_before + self._stretch()
 
     def go_on(self, seconds: float) -> None:
-        """Go on with a trial of an earlier process.
+        """Go on with a trial of an earlier process, in which the outputs were on for `seconds` [s], >= 0.
 
-        The length of its last stretch is unknown: the duty cycle's rest is that of the longest.
-
-        Args:
-            seconds: time that its outputs were on [s], >= 0; it counts for the limit.
-
-        Raises:
-            ValueError: `seconds` out of range.
+        The length of its last stretch is unknown: the outputs rest as after the longest.
         """
         self._seconds_before += not_negative("seconds", seconds, "s")
         rest = self._rest(self.limits.seconds_in_a_row)
@@ -182,7 +174,6 @@ class LimitedLink:
         Raises:
             LimitError: the time limit of the outputs is reached.
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-            LinkError: the device does not take the bytes.
         """
         asked = self._scale.asked(drive)
         if self._stretch() > self.limits.seconds_in_a_row / 2:  # leave the other half to the sensor
@@ -202,11 +193,7 @@ class LimitedLink:
         self.link.wait_for_sound()  # without the lock, which the timer needs
 
     def played(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return the device's nearest drives to drives (..., M), both in the scale of `play`.
-
-        Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-        """
+        """Return the device's nearest drives to drives (..., M), both in the scale of `play`."""
         return self._scale.played(drive)
 
     def require_on(self) -> None:
@@ -214,7 +201,6 @@ class LimitedLink:
 
         Raises:
             LimitError: they went off at the end of the time.
-            LinkError: the device did not take the bytes that switch them off.
         """
         self._raise_failure()
         if self._on_since is None:
@@ -225,11 +211,7 @@ class LimitedLink:
             )
 
     def off(self) -> None:
-        """Switch all outputs off, and begin the rest of the duty cycle.
-
-        Raises:
-            OffError: the device does not take the bytes.
-        """
+        """Switch all outputs off, and begin the rest of the duty cycle."""
         with self._lock:
             if self._on_since is None:
                 return

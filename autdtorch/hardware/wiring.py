@@ -14,6 +14,8 @@ from autdtorch.utils.validation import indices, require_kind
 class Wiring:
     """A device some of whose transducers are a scene's; the others stay off.
 
+    Methods raise `ValueError` for another shape, not finite complex numbers, or an amplitude above 1.
+
     Attributes:
         device: plays the drives.
         transducers: the device's transducer for each of the scene's (M,), int64.
@@ -36,19 +38,11 @@ class Wiring:
         self.transducers = torch.tensor(places, dtype=torch.int64, device="cpu")
 
     def frame(self, drive: torch.Tensor) -> bytes:
-        """Return the bytes for a drive (M,), |q| <= 1, on the nearest levels.
-
-        Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-        """
+        """Return the bytes for a drive (M,), |q| <= 1, on the nearest levels."""
         return self.device.frame(self._of_device(drive))
 
     def quantised(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return the drive (M,) on the levels of the device that is nearest to a `drive` (M,).
-
-        Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-        """
+        """Return the drive (M,) on the levels of the device that is nearest to a `drive` (M,)."""
         return self.device.quantised(self._of_device(drive))[self.transducers]
 
     def _of_device(self, drive: torch.Tensor) -> torch.Tensor:

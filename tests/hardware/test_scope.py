@@ -3,6 +3,7 @@
 import itertools
 import logging
 import math
+import random
 import re
 
 import pytest
@@ -19,8 +20,8 @@ from autdtorch.hardware import (
     SensorError,
     open_scope,
 )
-from autdtorch.hardware.emulator.bus import EmulatedBus
-from autdtorch.hardware.emulator.instrument import EmulatedInstrument, Fault
+from autdtorch.hardware.emulator.bus import EmulatedBus, stall, time_out
+from autdtorch.hardware.emulator.instrument import EmulatedInstrument
 from autdtorch.hardware.sensors.scpi import Dialect
 from autdtorch.methods.gabs import gabs
 from autdtorch.objectives.perturbations import random_rms
@@ -43,6 +44,21 @@ def sensor_at(scope, microphones: int, captures: int = 1) -> ScopeSensor:
     )
 
 
+class FaultyInstrument(EmulatedInstrument):
+    """An instrument with a fault in every transfer from it."""
+
+    fault = None
+
+    def read(self, most: int) -> bytes:
+        if self.fault in ("stall", "time-out"):
+            raise {"stall": stall, "time-out": time_out}[self.fault]()
+        return random.Random(0).randbytes(64) if self.fault == "garbage" else super().read(most)
+
+    def _transfer(self) -> bytes:
+        transfer = super()._transfer()
+        return transfer[: len(transfer) // 2] if self.fault == "short" else transfer
+
+
 class Bench:
     """A field that does not change, and an oscilloscope in it."""
 
@@ -50,7 +66,7 @@ class Bench:
         maker = dialect.name.partition(" ")[0]
         self.field = torch.tensor(pressure, dtype=torch.complex128)
         self.scope = EmulatedScope(lambda: self.field, FREQUENCY, SENSITIVITY, points, maker, **properties)
-        self.instrument = EmulatedInstrument(*CHIP, "S1", self.scope)
+        self.instrument = FaultyInstrument(*CHIP, "S1", self.scope)
         self.bus = EmulatedBus([self.instrument])
         self.open = open_scope(CHIP, dialect, backend=self.bus)
 
@@ -175,7 +191,7 @@ faults = pytest.mark.parametrize(
 
 @faults
 def test_a_fault_that_stays_on_the_wire_ends_the_trial_silently_and_another_goes_on(trial, fault, message):
-    def measure(count: int, last: Fault | None) -> torch.Tensor:
+    def measure(count: int, last: str | None) -> torch.Tensor:
         instrument.fault = None
         with trial.link(bench) as link, open_scope(CHIP, backend=bench.bus) as oscilloscope:
             microphones = [Microphone(number, SENSITIVITY, loudest) for number in (1, 2)]
@@ -185,9 +201,7 @@ def test_a_fault_that_stays_on_the_wire_ends_the_trial_silently_and_another_goes
             return objective(drives[count - 1][None])
 
     bench = trial.bench()
-    instrument = EmulatedInstrument(
-        *CHIP, "S1", EmulatedScope(bench.pressure, FREQUENCY, SENSITIVITY, [0, 1])
-    )
+    instrument = FaultyInstrument(*CHIP, "S1", EmulatedScope(bench.pressure, FREQUENCY, SENSITIVITY, [0, 1]))
     bench.bus.chips.append(instrument)
     drives = [drive_from_phases(torch.arange(16) * step * 2 * math.pi / 32) for step in range(3)]
     loudest = float(trial.simulated(torch.stack(drives)).max())

@@ -1,27 +1,72 @@
-"""The FTDI chip as pyusb sees it: which is found, how it is set up, what goes through."""
+"""Devices on USB as pyusb sees them: chips found and set up, bytes sent, errors explained."""
 
+import builtins
 import errno
+import sys
+import threading
+import time
 
 import pytest
-from usb.core import USBError
+import torch
+from usb.core import USBError, USBTimeoutError
 
-from autdtorch.hardware import LinkError
-from autdtorch.hardware.devices.openmpd import OpenMPDFirmware
-from autdtorch.hardware.devices.sonicsurface import SonicSurfaceFirmware
-from autdtorch.hardware.emulator.bus import EmulatedBus
-from autdtorch.hardware.emulator.chips import EmulatedChip, EmulatedFtdi
-from autdtorch.hardware.transport.serial_chips import BAUD_RATE, FtdiFifo, FtdiUart, baud_divisor
-from autdtorch.hardware.transport.usb import VENDOR_REQUEST, find_device
+from autdtorch.hardware import OPENMPD, SONICSURFACE, ULTRAINO, Device, EmulatedBench, LinkError, open_link
+from autdtorch.hardware.emulator.bus import EmulatedBus, time_out
+from autdtorch.hardware.emulator.chips import CHIPS, EmulatedCdc, EmulatedChip, EmulatedFtdi
+from autdtorch.hardware.transport.serial_chips import BAUD_RATE, CdcUart, FtdiFifo, FtdiUart, baud_divisor
+from autdtorch.hardware.transport.usb import UDEV_RULES, find_device
 
-UART, FIFO = (0x0403, 0x6001), (0x0403, 0x6014)
+UART, FIFO, MEGA = (0x0403, 0x6001), (0x0403, 0x6014), (0x2341, 0x0042)
+
+# Errors as libusb raises them.
+ACCESS = USBError("Access denied (insufficient permissions)", -3, errno.EACCES)
+BUSY = USBError("Resource busy", -6, errno.EBUSY)
+GONE = USBError("No such device (it may have been disconnected)", -4, errno.ENODEV)
+BROKEN = USBError("Input/output error", -1, errno.EIO)
+STALL = USBError("Pipe error", -9, errno.EPIPE)
+TIME_OUT = USBTimeoutError("Operation timed out", -7, errno.ETIMEDOUT)
+OTHER = USBError("Overflow", -8, errno.EOVERFLOW)
 
 
 def chip(serial: str = "A1", kind: type[EmulatedChip] = EmulatedFtdi) -> EmulatedChip:
-    return kind(*UART, serial, SonicSurfaceFirmware())
+    return kind(*UART, serial, SONICSURFACE.firmware(256))
+
+
+def mega(kind: type[EmulatedCdc] = EmulatedCdc, boards: int = 1) -> EmulatedCdc:
+    return kind(*MEGA, "A1", ULTRAINO.firmware(64 * boards))
+
+
+def uart(wired: EmulatedChip, baud: int = 230_400) -> FtdiUart:
+    return FtdiUart(find_device([UART], backend=EmulatedBus([wired])), baud=baud)
+
+
+def failing(method: str, error: Exception) -> EmulatedBus:
+    bus = EmulatedBus([chip()])
+
+    def fail(*arguments: object) -> None:
+        raise error
+
+    setattr(bus, method, fail)
+    return bus
+
+
+class Bound(EmulatedBus):
+    """A bus whose interfaces have drivers of the kernel, which are put aside and come back."""
+
+    bound = frozenset({0, 1})
+
+    def is_kernel_driver_active(self, dev_handle, intf):
+        return intf in self.bound
+
+    def detach_kernel_driver(self, dev_handle, intf):
+        self.bound -= {intf}
+
+    def attach_kernel_driver(self, dev_handle, intf):
+        self.bound |= {intf}
 
 
 def test_the_device_asked_for_is_found_by_its_numbers():
-    bus = EmulatedBus([chip("A1"), EmulatedFtdi(*FIFO, "B1", OpenMPDFirmware()), chip("A2")])
+    bus = EmulatedBus([chip("A1"), EmulatedFtdi(*FIFO, "B1", OPENMPD.firmware(256)), chip("A2")])
     assert find_device([FIFO], backend=bus).serial_number == "B1"
     assert find_device([UART], serial="A2", backend=bus).address == 2
 
@@ -31,16 +76,22 @@ def test_the_device_asked_for_is_found_by_its_numbers():
     [
         ([], None, "no USB devices are 0403:6001. Plugged in: none"),
         (["A1"], "A2", r"no .* number 'A2'. Plugged in: 0403:6001 \(serial number A1\)"),
-        (
-            ["A1", "A2"],
-            None,
-            "2 USB devices .*; give the serial number .* Plugged in: .*A1.*, .*A2",
-        ),
+        (["A1", "A2"], None, "2 USB devices .*; give the serial number .* Plugged in: .*A1.*, .*A2"),
     ],
 )
-def test_none_or_several_are_an_error_that_lists_what_is_there(chips, serial, message):
+def test_none_or_several_are_an_error_that_lists_those_plugged_in(chips, serial, message):
     with pytest.raises(LinkError, match=message):
         find_device([UART], serial=serial, backend=EmulatedBus([chip(name) for name in chips]))
+
+
+@pytest.mark.parametrize("device", [SONICSURFACE, ULTRAINO])
+def test_a_serial_chip_is_set_to_the_rate_of_its_device(device: Device):
+    bench = EmulatedBench(device, torch.ones((1, 16)).cdouble(), range(16))
+    with open_link(device, range(16), backend=bench.bus) as link:
+        assert bench.chip.eight_n_one
+        assert bench.chip.baud == pytest.approx(device.baud, rel=0.002)  # the divisor's rounding
+        link.play(-torch.ones(16).cdouble())  # not what they start with
+        torch.testing.assert_close(bench.drive(), -torch.ones(16).cdouble(), rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -60,25 +111,21 @@ def test_baud_divisors_are_those_of_the_application_note(baud, value, index):
     assert baud_divisor(baud) == (value, index)
 
 
-def test_at_another_rate_the_device_hears_nothing():
+def test_at_another_rate_the_device_receives_nothing():
     wired = chip()
-    device = find_device([UART], backend=EmulatedBus([wired]))
     before = wired.firmware.drive()
-    FtdiUart(device, baud=115_200).write(bytes([254, *[32] * 256, 253]))
+    uart(wired, 115_200).write(SONICSURFACE.frame(torch.zeros(256).cdouble()))
     assert wired.firmware.drive().equal(before)
-    FtdiUart(device, baud=230_400).write(bytes([254, *[32] * 256, 253]))
+    uart(wired).write(SONICSURFACE.frame(torch.zeros(256).cdouble()))
     assert wired.firmware.drive().abs().max() == 0
 
 
-def test_a_recovery_drops_what_waits_to_be_sent_and_flushing_asks_the_chip_itself():
+def test_a_recovery_drops_waiting_bytes_and_flushing_asks_the_chip_itself():
     class Slow(EmulatedFtdi):
         waits = b""
 
         def write(self, data: bytes) -> None:
             self.waits += data
-
-        def read(self, most: int) -> bytes:
-            return b"\x01\x60"  # of the time before the write
 
         def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
             if (request, value) == (0, 1):  # SIO_TCOFLUSH of libftdi 1.5, from the host to the chip
@@ -92,7 +139,7 @@ def test_a_recovery_drops_what_waits_to_be_sent_and_flushing_asks_the_chip_itsel
 
     asked: list[int] = []
     slow = chip(kind=Slow)
-    port = FtdiUart(find_device([UART], backend=EmulatedBus([slow])), baud=230_400)
+    port = uart(slow)
     port.write(bytes(150))
     port.flush()
     assert asked == [150, 50, 0]
@@ -101,41 +148,94 @@ def test_a_recovery_drops_what_waits_to_be_sent_and_flushing_asks_the_chip_itsel
     assert not slow.waits
 
 
-def test_an_ft232r_is_told_all_that_somebody_else_may_have_left_otherwise():
+def test_an_ft232r_gets_all_settings_that_another_program_may_have_changed():
     class Listening(EmulatedFtdi):
         def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
-            told.append((request, value, index))
+            requests.append((request, value, index))
             return super().control(kind, request, value, index, data)
 
-    told: list[tuple[int, int, int]] = []
-    FtdiUart(find_device([UART], backend=EmulatedBus([chip(kind=Listening)])), baud=230_400)
+    requests: list[tuple[int, int, int]] = []
+    uart(chip(kind=Listening))
     # By the comments of ftdi_sio.h: reset; timer of 2 ms, both purges; 8 bits; no flow control; 3 MHz / 13.
-    assert told == [(0, 0, 0), (9, 2, 0), (0, 1, 0), (0, 2, 0), (4, 8, 0), (2, 0, 0), (3, 13, 0)]
+    assert requests == [(0, 0, 0), (9, 2, 0), (0, 1, 0), (0, 2, 0), (4, 8, 0), (2, 0, 0), (3, 13, 0)]
+
+
+def test_the_echo_of_a_row_of_boards_is_read_and_dropped():
+    class Waiting(EmulatedCdc):
+        """As on LUFA 100807: bytes from the board go first, and wait for the host to read them."""
+
+        unread = 0
+
+        def write(self, data: bytes) -> None:
+            until = time.monotonic() + 1.0
+            while self.unread > 64:
+                if time.monotonic() > until:
+                    raise time_out()
+                time.sleep(1e-3)
+            super().write(data)
+            self.unread += sum(byte & 0x0F != 1 for byte in data)
+
+        def read(self, most: int) -> bytes:
+            if not self.unread:
+                time.sleep(1e-3)
+                raise time_out()
+            taken = bytes(min(most, self.unread))
+            self.unread -= len(taken)
+            return taken
+
+    with open_link(ULTRAINO.with_boards(2), backend=EmulatedBus([mega(Waiting, 2)])) as link:
+        for _ in range(3):
+            link.play(torch.ones(128).cdouble())
+
+
+def test_a_chip_is_given_back_only_when_nobody_reads_from_it():
+    class Asleep(EmulatedCdc):
+        def read(self, most: int) -> bytes:
+            reading.set()
+            time.sleep(0.02)
+            reading.clear()
+            raise time_out()
+
+    class Bus(EmulatedBus):
+        def release_interface(self, dev_handle, intf):
+            released_while_reading.append(reading.is_set())
+
+    reading = threading.Event()
+    released_while_reading: list[bool] = []
+    port = CdcUart(find_device([MEGA], backend=Bus([mega(Asleep)])), baud=115_200)
+    assert reading.wait(1)
+    port.close()
+    assert port._reader.daemon  # for another Python would wait before it exits and switches off
+    assert released_while_reading == [False, False]
+
+
+def test_every_chip_has_its_udev_rule():
+    rules = UDEV_RULES.read_text()
+    for vendor, product in CHIPS:
+        assert f'ATTR{{idVendor}}=="{vendor:04x}", ATTR{{idProduct}}=="{product:04x}"' in rules
+    assert 'ENV{ID_USB_INTERFACES}=="*:fe03*:*"' in rules
+
+
+def test_the_kernels_drivers_are_put_aside_and_come_back():
+    bus = Bound([mega()])
+    port = CdcUart(find_device([MEGA], backend=bus), baud=115_200)
+    assert not bus.bound
+    port.close()
+    assert bus.bound == {0, 1}
 
 
 def test_a_chip_that_refuses_its_settings_is_given_back_to_the_kernel():
-    class Refusing(EmulatedBus):
-        attached = True
-
-        def is_kernel_driver_active(self, dev_handle, intf):
-            return self.attached
-
-        def detach_kernel_driver(self, dev_handle, intf):
-            self.attached = False
-
-        def attach_kernel_driver(self, dev_handle, intf):
-            self.attached = True
-
-        def ctrl_transfer(self, dev_handle, bmRequestType, bRequest, wValue, wIndex, data, timeout):
+    class Refusing(Bound):
+        def ctrl_transfer(self, dev_handle, bmRequestType, bRequest, *arguments):
             if bRequest == BAUD_RATE:
-                raise USBError("Pipe error", errno=errno.EPIPE)
-            assert bmRequestType != VENDOR_REQUEST or not self.attached
-            return super().ctrl_transfer(dev_handle, bmRequestType, bRequest, wValue, wIndex, data, timeout)
+                assert 0 not in self.bound
+                raise STALL
+            return super().ctrl_transfer(dev_handle, bmRequestType, bRequest, *arguments)
 
     bus = Refusing([chip()])
     with pytest.raises(LinkError, match=r"cannot be set up: .*Pipe error"):
         FtdiUart(find_device([UART], backend=bus), baud=230_400)
-    assert bus.attached
+    assert bus.bound == {0, 1}
 
 
 def test_a_chip_that_takes_nothing_more_is_an_error():
@@ -146,3 +246,95 @@ def test_a_chip_that_takes_nothing_more_is_an_error():
     port = FtdiFifo(find_device([UART], backend=Full([chip()])))
     with pytest.raises(LinkError, match="took 60 of 160 bytes"):
         port.write(bytes(160))
+
+
+@pytest.mark.parametrize(
+    ("method", "error", "message"),
+    [
+        ("open_device", ACCESS, r"cannot be opened: you may not write to it.* sudo cp .*70-autdtorch.rules"),
+        ("open_device", ACCESS, r'ATTR{idVendor}=="0403", ATTR{idProduct}=="6001", MODE="0660"'),
+        ("set_configuration", NotImplementedError(), "on Windows, give it WinUSB"),
+        ("set_configuration", BUSY, "cannot be opened: another program, or another link, has it open"),
+        ("claim_interface", BUSY, "cannot be opened: another program, or another link, has it open"),
+        ("bulk_write", GONE, "cannot be written to: it was unplugged"),
+        ("bulk_write", BROKEN, "cannot be written to: the transfer broke off; look at cable and power"),
+        ("bulk_write", TIME_OUT, r"cannot be written to: it takes or gives no bytes \(time-out\)"),
+        ("bulk_write", STALL, r"cannot be written to: it refuses \(stall\)"),
+        ("ctrl_transfer", STALL, r"cannot be set up: it refuses \(stall\)"),
+        ("bulk_write", OTHER, r"cannot be written to: \[Errno \d+\] Overflow"),
+    ],
+)
+def test_each_error_of_usb_has_a_message_of_its_own(method: str, error: Exception, message: str):
+    with pytest.raises(LinkError, match=message):
+        open_link(SONICSURFACE, backend=failing(method, error))
+
+
+@pytest.mark.parametrize(
+    ("device", "serial", "error", "message"),
+    [  # as on Windows; and without permission
+        (OPENMPD, None, NotImplementedError(), r"no USB devices .*: 0403:6001 \(serial number unknown\)"),
+        (SONICSURFACE, "A1", ACCESS, r"no USB .* number 'A1'.* unknown serial number: on Linux, sudo cp"),
+    ],
+)
+def test_devices_that_cannot_be_opened_are_listed_all_the_same(device, serial, error, message):
+    with pytest.raises(LinkError, match=message):
+        open_link(device, serial=serial, backend=failing("open_device", error))
+
+
+def test_without_libusb_there_is_an_error(monkeypatch):
+    import libusb_package
+
+    monkeypatch.setattr(libusb_package, "get_libusb1_backend", lambda: None)
+    with pytest.raises(LinkError, match=r"libusb-1.0 cannot be loaded"):
+        open_link(SONICSURFACE)
+
+
+@pytest.mark.parametrize("package", ["usb", "libusb_package", "serial"])
+def test_without_the_packages_there_is_a_hint(monkeypatch, package: str):
+    def without(name: str, *arguments: object, **named: object):
+        if name.split(".")[0] == package:
+            raise ModuleNotFoundError(f"No module named {package!r}")
+        return real(name, *arguments, **named)
+
+    real = builtins.__import__
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(ImportError, match=r"pip install 'autdtorch\[hardware\]'"):
+        open_link(SONICSURFACE, port="COM3" if package == "serial" else None)
+    if package == "usb":
+        monkeypatch.delitem(sys.modules, "autdtorch.hardware.emulator.bus")
+        with pytest.raises(ImportError, match=r"pip install 'autdtorch\[hardware\]'"):
+            import autdtorch.hardware.emulator.bus  # noqa: F401
+
+
+def test_a_warning_of_outputs_that_may_be_on_is_not_hidden_by_a_driver_that_does_not_come_back():
+    class Lost(Bound):
+        def attach_kernel_driver(self, dev_handle, intf):
+            raise GONE
+
+    bus = Lost([chip()])
+    link = open_link(SONICSURFACE, backend=bus)
+    bus.chips[0].present = False
+    with pytest.raises(LinkError, match="the outputs may still be on"):
+        link.close()
+    link.close()  # nothing is left to do
+
+
+@pytest.mark.parametrize("device", [SONICSURFACE, OPENMPD, ULTRAINO])
+def test_a_device_left_in_mid_frame_is_switched_off_all_the_same(device: Device):
+    bench = EmulatedBench(device, torch.ones((1, device.transducers)).cdouble())
+    with open_link(device, backend=bench.bus) as link:
+        link.play(torch.ones(device.transducers).cdouble())
+        frame = device.frame(torch.ones(device.transducers).cdouble())
+        bench.firmware.receive(frame[: len(frame) // 3])
+    assert bench.firmware.drive().abs().max() == 0
+
+
+def test_a_play_takes_the_time_on_the_wire_and_the_settle_time(trial):
+    bench = trial.bench()
+    with open_link(SONICSURFACE, range(16), backend=bench.bus, settle=0.02) as link:
+        before = bench.bus.slept
+        link.play(torch.ones(16).cdouble())
+        # 258 bytes of ten bits at 230400 baud, and the settle time.
+        assert bench.bus.slept - before == pytest.approx(0.0112 + 0.02, abs=1e-5)
+    with pytest.raises(ValueError, match=r"settle: -1"):
+        open_link(SONICSURFACE, backend=bench.bus, settle=-1.0)

@@ -111,15 +111,11 @@ class Device(ABC):
         return self.phase_levels.drive(*self._checked(levels, most))
 
     def quantised(self, drive: ArrayLike) -> torch.Tensor:
-        """Return the drive (..., M) that the device emits when asked for `drive`: the nearest on its levels.
-
-        Raises:
-            ValueError: not finite complex numbers, no axis, or an amplitude above 1.
-        """
+        """Return the drive (..., M) that the device emits for another: the nearest on its levels."""
         return self.drive(*self.levels(drive))
 
     def frame(self, drive: ArrayLike) -> bytes:
-        """Return the bytes for a drive (N,), |q| <= 1, on the nearest levels; zeros switch all outputs off.
+        """Return the bytes for a drive (N,) on the nearest levels; zeros switch all outputs off.
 
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.

@@ -1,7 +1,7 @@
 """The board file (.pat) of OpenMPD and AcousTools: places and calibration of one board's transducers.
 
-The file holds a name, the number M of transducers and that of phase levels, a line each; then M positions
-`(x, y, z)` [m], M pins, M phase offsets [degrees] and M gains, each in any number of lines.
+The file holds a name, the number M of transducers and the number of phase levels, a line each. M positions
+`(x, y, z)` [m], M pins, M phase offsets [degrees] and M gains follow, each in any number of lines.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ class EmulatedBench:
 
     Attributes:
         bus: backend for pyusb; without a device that is not on USB, which takes its frames by `receive`.
-        firmware: emulated firmware behind the chip; of several boards, that of the first.
+        firmware: emulated firmware behind the chip; of the first of several boards.
         transfer_matrix: (P, M) [Pa], complex128.
     """
 
@@ -71,7 +71,7 @@ class EmulatedBench:
 
     @property
     def chip(self) -> EmulatedDevice:
-        """The device's USB chip on the bus; of several boards, that of the first."""
+        """The device's USB chip on the bus; of the first of several boards."""
         return self.bus.chips[0]
 
     def receive(self, frame: bytes) -> None:

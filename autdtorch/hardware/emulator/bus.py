@@ -57,7 +57,7 @@ class EmulatedDevice(Protocol):
 
 
 class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
-    """A backend of pyusb with emulated devices, numbered by their place.
+    """A backend of pyusb with emulated devices, numbered by their place; `IBackend` describes its methods.
 
     Attributes:
         chips: the devices, plugged in or not.
@@ -75,11 +75,9 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
         self.slept += seconds
 
     def enumerate_devices(self) -> list[int]:
-        """Return the addresses of the devices that are plugged in."""
         return [address for address, chip in enumerate(self.chips) if chip.present]
 
     def get_device_descriptor(self, dev: int) -> SimpleNamespace:
-        """Return the descriptor of a device: USB 2.0, class by interface."""
         chip = self.chips[dev]
         return SimpleNamespace(
             bLength=18, bDescriptorType=1, bcdUSB=0x0200, bDeviceClass=0, bDeviceSubClass=0,
@@ -89,7 +87,6 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
         )  # fmt: skip
 
     def get_configuration_descriptor(self, dev: int, config: int) -> SimpleNamespace:
-        """Return the descriptor of the only configuration."""
         _require(config == 0)
         return SimpleNamespace(
             bLength=9, bDescriptorType=2, wTotalLength=32, bNumInterfaces=len(self.chips[dev].interfaces),
@@ -97,7 +94,6 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
         )  # fmt: skip
 
     def get_interface_descriptor(self, dev: int, intf: int, alt: int, config: int) -> SimpleNamespace:
-        """Return the descriptor of an interface of the chip."""
         _require(config == alt == 0)
         (kind, subclass, protocol), endpoints = self.chips[dev].interfaces[intf]
         return SimpleNamespace(
@@ -107,7 +103,6 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
         )  # fmt: skip
 
     def get_endpoint_descriptor(self, dev: int, ep: int, intf: int, alt: int, config: int) -> SimpleNamespace:
-        """Return the descriptor of a bulk endpoint."""
         return SimpleNamespace(
             bLength=7, bDescriptorType=5, bEndpointAddress=self.chips[dev].interfaces[intf][1][ep],
             bmAttributes=2, wMaxPacketSize=_PACKET, bInterval=0, bRefresh=0, bSynchAddress=0,
@@ -115,34 +110,26 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
         )  # fmt: skip
 
     def open_device(self, dev: int) -> int:
-        """Return the handle of a device, its address."""
         self._chip(dev)
         return dev
 
-    def close_device(self, dev_handle: int) -> None:
-        """Do nothing."""
+    def close_device(self, dev_handle: int) -> None: ...
 
     def set_configuration(self, dev_handle: int, config_value: int) -> None:
-        """Require the device to be present; it has one configuration."""
         self._chip(dev_handle)
 
     def get_configuration(self, dev_handle: int) -> int:
-        """Return the number of the only configuration."""
         return 1
 
     def claim_interface(self, dev_handle: int, intf: int) -> None:
-        """Require the device to be present."""
         self._chip(dev_handle)
 
-    def release_interface(self, dev_handle: int, intf: int) -> None:
-        """Do nothing."""
+    def release_interface(self, dev_handle: int, intf: int) -> None: ...
 
     def clear_halt(self, dev_handle: int, ep: int) -> None:
-        """Require the device to be present."""
         self._chip(dev_handle)
 
     def is_kernel_driver_active(self, dev_handle: int, intf: int) -> bool:
-        """Return False: there is no kernel."""
         return False
 
     def ctrl_transfer(
@@ -155,7 +142,6 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
         data: array[int],
         timeout: int,
     ) -> int:
-        """Answer string descriptors and requests to the chip; others stall."""
         chip = self._chip(dev_handle)
         if not bmRequestType & _FROM_DEVICE:
             if chip.control(bmRequestType, bRequest, wValue, wIndex, data.tobytes()):
@@ -170,12 +156,10 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
         return _fill(data, answer[: len(data)])
 
     def bulk_write(self, dev_handle: int, ep: int, intf: int, data: array[int], timeout: int) -> int:
-        """Take all data at once."""
         self._chip(dev_handle).write(data.tobytes())
         return len(data)
 
     def bulk_read(self, dev_handle: int, ep: int, intf: int, buff: array[int], timeout: int) -> int:
-        """Fill the buffer with a bulk transfer of the device."""
         return _fill(buff, self._chip(dev_handle).read(len(buff)))
 
     def _chip(self, dev: int) -> EmulatedDevice:
@@ -211,6 +195,5 @@ def _string_descriptor(strings: Sequence[str], index: int) -> bytes:
 
 
 def _require(there: bool) -> None:
-    """Raise the IndexError that ends pyusb's enumeration."""
     if not there:
-        raise IndexError
+        raise IndexError  # the end of pyusb's enumeration

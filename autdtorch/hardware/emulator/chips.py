@@ -20,20 +20,15 @@ _BAUD_TOLERANCE = 0.03  # beyond it a UART loses the last of its ten bits
 
 
 class EmulatedChip:
-    """A USB chip with a serial port, in front of a firmware.
+    """A USB chip with a serial port in front of a firmware; `EmulatedDevice` describes its methods.
 
     Attributes:
-        interfaces: class, subclass and protocol of each, and its endpoints, those for bulk transfers.
-        vendor: idVendor.
-        product: idProduct.
-        strings: string descriptors by their index.
         firmware: takes the bytes behind the chip.
-        present: true while it is plugged in.
         baud: rate that it is set to [bits/s].
         eight_n_one: true if it is set to 8 bits, no parity, 1 stop bit.
     """
 
-    interfaces: ClassVar[Interfaces] = (((0xFF, 0xFF, 0xFF), (0x81, 0x02)),)
+    interfaces: ClassVar[Interfaces]
 
     def __init__(self, vendor: int, product: int, serial: str, firmware: Firmware) -> None:
         """Plug the chip in, with settings of an earlier user."""
@@ -55,19 +50,18 @@ class EmulatedChip:
     def write(self, data: bytes) -> None:
         """Send bytes on to the firmware, which loses them at another rate or format than its own."""
         wanted = self.firmware.baud
-        if wanted is not None:
-            off_rate = abs(self.baud / wanted - 1) > _BAUD_TOLERANCE
-            if off_rate or not self.eight_n_one:
-                return
-        self.firmware.receive(data)
+        if wanted is None or (self.eight_n_one and abs(self.baud / wanted - 1) <= _BAUD_TOLERANCE):
+            self.firmware.receive(data)
 
     def read(self, most: int) -> bytes:
-        """Return an IN packet, empty: no device here answers."""
-        return b""
+        """Return an IN packet."""
+        raise NotImplementedError
 
 
 class EmulatedFtdi(EmulatedChip):
     """An FT232R, or an FT232H as a FIFO."""
+
+    interfaces = (((0xFF, 0xFF, 0xFF), (0x81, 0x02)),)
 
     _BAUD, _FORMAT, _STATUS, _OTHERS = 0x03, 0x04, 0x05, (0x00, 0x01, 0x02, 0x09)
     _IDLE = b"\x01\x60"

@@ -15,20 +15,12 @@ class EmulatedAutd3Port(Autd3Port):
         Args:
             boards: number of boards.
             bench: plays each frame that the boards have taken.
-
-        Raises:
-            LinkError: the emulator does not answer.
-            ImportError: the packages autd3 and autd3-pattern are missing.
         """
         self._emulator = autd3_kit().UdpEmulator(boards)
         self._bench = bench
         super().__init__(boards, self._emulator.option())
 
     def write(self, data: bytes) -> None:
-        """Play a frame.
-
-        Raises:
-            LinkError: a board did not take it.
-        """
+        """Play a frame, on boards and bench."""
         super().write(data)
         self._bench.receive(data)

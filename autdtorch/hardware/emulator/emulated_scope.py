@@ -128,9 +128,10 @@ class EmulatedScope:
         header = _short(header)
         found = re.fullmatch(r"CHAN(\d):(\w+)", header)
         number = int(found[1]) - 1 if found and 1 <= int(found[1]) <= len(self.points) else None
+        setting = found[2] if found and number is not None else ""
         if header == self._maker.time_scale:
             self._time_scale = float(argument)
-        elif found and number is not None and found[2] == "SCAL":
+        elif number is not None and setting == "SCAL":
             self._scales[number] = min(max(float(argument), self._maker.scales[0]), self._maker.scales[1])
         elif header == "WAV:SOUR":
             self._source = int(argument[-1]) - 1
@@ -140,9 +141,7 @@ class EmulatedScope:
             self._capture()
         elif header.endswith("?") and (answer := self._answer(header)) is not None:
             return answer + b"\n"
-        elif header not in self._maker.ignored and not (
-            found and number is not None and found[2] in _INPUT_SETTINGS
-        ):
+        elif header not in self._maker.ignored and setting not in _INPUT_SETTINGS:
             self.unknown.append(line)
         return None
 
@@ -184,10 +183,4 @@ class EmulatedScope:
 
 def _short(header: str) -> str:
     """Return a header in capitals and short form: words of four letters, or three before a vowel."""
-    return re.sub(r"[A-Z]+", lambda word: _short_word(word[0]), header.upper().removeprefix(":"))
-
-
-def _short_word(word: str) -> str:
-    if len(word) <= 4:
-        return word
-    return word[:3] if word[3] in "AEIOU" else word[:4]
+    return re.sub(r"([A-Z]{3})([AEIOU][A-Z]+|([A-Z])[A-Z]+)", r"\1\3", header.upper().removeprefix(":"))

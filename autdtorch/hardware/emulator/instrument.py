@@ -5,20 +5,14 @@ Written from the class's specification alone, not from `usbtmc`, so that one che
 
 from __future__ import annotations
 
-import random
-from typing import ClassVar, Literal, Protocol
+from typing import ClassVar, Protocol
 
 from autdtorch.hardware.emulator.bus import stall, time_out
 from autdtorch.hardware.emulator.chips import Interfaces
 
-#: Faults of a transfer from the instrument.
-Fault = Literal["time-out", "stall", "short", "garbage"]
-
 _PACKET = 64
 _CLASS_INTERFACE = 0xA1  # from the device
-_INITIATE_CLEAR, _CHECK_CLEAR_STATUS, _GET_CAPABILITIES = 5, 6, 7
-# success, versions 1.00, no options
-_CAPABILITIES = bytes([1, 0, 0, 1, 0, 0, *bytes(6), 0, 1, 0, 0, *bytes(8)])
+_INITIATE_CLEAR, _CHECK_CLEAR_STATUS = 5, 6
 
 
 class Instrument(Protocol):
@@ -32,13 +26,9 @@ class Instrument(Protocol):
 class EmulatedInstrument:
     """The USB interface of an instrument: USB488, without its interrupt endpoint.
 
+    `EmulatedDevice` describes its methods.
+
     Attributes:
-        interfaces: class, subclass and protocol, and the bulk endpoints.
-        vendor: idVendor.
-        product: idProduct.
-        strings: string descriptors by their index.
-        present: true while it is plugged in.
-        fault: fault of every transfer from the instrument, from now on.
         longest: most bytes of a message in a transfer; longer messages come in several.
         sends_empty_packets: true if an empty packet follows a transfer of whole packets, as USB demands; some
             instruments send none.
@@ -52,12 +42,10 @@ class EmulatedInstrument:
         self.product = product
         self.strings = ("", "autdtorch", "emulated instrument", serial)
         self.present = True
-        self.fault: Fault | None = None
         self.longest = 512
         self.sends_empty_packets = True
         self._instrument = instrument
-        self._received = b""
-        self._answer = b""
+        self._received = self._answer = b""
         self._asked: tuple[int, int] | None = None  # tag, bytes
         self._sending: bytes | None = None
 
@@ -66,17 +54,12 @@ class EmulatedInstrument:
         return False
 
     def answer(self, kind: int, request: int) -> bytes | None:
-        """Answer INITIATE_CLEAR and CHECK_CLEAR_STATUS, which succeed at once, and GET_CAPABILITIES."""
+        """Answer INITIATE_CLEAR and CHECK_CLEAR_STATUS, which succeed at once."""
         if kind != _CLASS_INTERFACE:
             return None
         if request == _INITIATE_CLEAR:
             self._received, self._answer, self._asked, self._sending = b"", b"", None, None
-        answers = {
-            _INITIATE_CLEAR: b"\x01",
-            _CHECK_CLEAR_STATUS: b"\x01\x00",
-            _GET_CAPABILITIES: _CAPABILITIES,
-        }
-        return answers.get(request)
+        return {_INITIATE_CLEAR: b"\x01", _CHECK_CLEAR_STATUS: b"\x01\x00"}.get(request)
 
     def write(self, data: bytes) -> None:
         """Take a transfer: part of a message, or the request for an answer."""
@@ -93,12 +76,6 @@ class EmulatedInstrument:
 
     def read(self, most: int) -> bytes:
         """Return at most `most` bytes of a requested transfer."""
-        if self.fault == "stall":
-            raise stall()
-        if self.fault == "garbage":
-            return random.Random(0).randbytes(_PACKET)
-        if self.fault == "time-out":
-            raise time_out()
         transfer = self._transfer() if self._sending is None else self._sending
         given, rest = transfer[:most], transfer[most:]
         whole = len(given) % _PACKET == 0
@@ -117,8 +94,7 @@ class EmulatedInstrument:
         size = min(most, self.longest)
         data, self._answer = self._answer[:size], self._answer[size:]
         header = bytes([2, tag, 255 - tag, 0, *len(data).to_bytes(4, "little"), not self._answer, 0, 0, 0])
-        transfer = header + data + bytes(-len(data) % 4)
-        return transfer[: len(transfer) // 2] if self.fault == "short" else transfer
+        return header + data + bytes(-len(data) % 4)
 
     def _take(self, data: bytes, ends: bool) -> None:
         self._received += data

@@ -12,7 +12,17 @@ from typing import Any, Self
 import torch
 
 from autdtorch.hardware.sensors.lock_in import LockIn
-from autdtorch.hardware.sensors.scpi import KEYSIGHT, Dialect, Waveform
+from autdtorch.hardware.sensors.scpi import (
+    FINEST,
+    KEYSIGHT,
+    PREAMBLE,
+    SAMPLES,
+    SCALE,
+    SET_UP_INPUT,
+    SOURCE,
+    Dialect,
+    Waveform,
+)
 from autdtorch.hardware.sensors.sensor import SensorError
 from autdtorch.hardware.sensors.vertical_scale import VerticalScale
 from autdtorch.hardware.transport.port import LinkError, closed_on_error
@@ -64,13 +74,13 @@ class Microphone:
 class Oscilloscope:
     """An oscilloscope that captures on request, without a trigger signal; a context manager.
 
+    Methods raise `LinkError` if it does not take commands or does not answer.
+
     Attributes:
         identity: its answer to ``*IDN?``.
-        finest: finest vertical scale [V/division].
     """
 
     identity: str
-    finest: float
 
     def __init__(self, port: UsbtmcPort, dialect: Dialect = KEYSIGHT) -> None:
         """Ask for its identity.
@@ -80,7 +90,6 @@ class Oscilloscope:
             dialect: commands of its maker.
 
         Raises:
-            LinkError: it does not answer.
             ValueError: no port or dialect.
         """
         require_kind("port", port, UsbtmcPort)
@@ -89,35 +98,19 @@ class Oscilloscope:
         self._dialect = dialect
         self._scales: dict[int, float] = {}  # by input, as sent
         self.identity = port.ask("*IDN?")
-        self.finest = dialect.finest
 
     def set_up(self, inputs: Collection[int], time_scale: float) -> None:
-        """Set inputs and time scale.
-
-        Args:
-            inputs: their numbers, from 1.
-            time_scale: of all inputs [s/division].
-
-        Raises:
-            LinkError: it does not take the commands.
-        """
+        """Set up inputs, by their numbers from 1, and their common `time_scale` [s/division]."""
         for command in self._dialect.set_up:
             self._port.tell(command.format(time=time_scale))
         for number in inputs:
-            for command in self._dialect.set_up_input:
+            for command in SET_UP_INPUT:
                 self._port.tell(command.format(input=number))
 
     def capture(self, scales: Mapping[int, float]) -> list[Waveform]:
-        """Return a waveform for each of the inputs, all of the same time.
+        """Return a waveform for each input in `scales` [V/division], all of the same time.
 
         A first error is logged as a warning; the oscilloscope is cleared, and captures once more.
-
-        Args:
-            scales: of the inputs [V/division].
-
-        Raises:
-            LinkError: it failed twice to take the commands, or to capture or answer in time; or it does not
-                clear.
         """
         try:
             return self._capture(scales)
@@ -128,11 +121,7 @@ class Oscilloscope:
         return self._capture(scales)
 
     def close(self) -> None:
-        """Release it.
-
-        Raises:
-            LinkError: it cannot be given back to the system.
-        """
+        """Release it."""
         self._port.close()
 
     def __enter__(self) -> Self:
@@ -148,7 +137,7 @@ class Oscilloscope:
     def _capture(self, scales: Mapping[int, float]) -> list[Waveform]:
         for number, scale in scales.items():
             if self._scales.get(number) != scale:
-                self._port.tell(self._dialect.scale.format(input=number, scale=scale))
+                self._port.tell(SCALE.format(input=number, scale=scale))
                 self._scales[number] = scale
         for command in self._dialect.capture:
             self._port.tell(command)
@@ -160,9 +149,8 @@ class Oscilloscope:
         return [self._waveform(number) for number in scales]
 
     def _waveform(self, number: int) -> Waveform:
-        self._port.tell(self._dialect.source.format(input=number))
-        preamble = self._port.ask(self._dialect.preamble)
-        return self._dialect.waveform(preamble, self._port.ask_block(self._dialect.samples))
+        self._port.tell(SOURCE.format(input=number))
+        return self._dialect.waveform(self._port.ask(PREAMBLE), self._port.ask_block(SAMPLES))
 
 
 class ScopeSensor:
@@ -173,7 +161,7 @@ class ScopeSensor:
     unknown.
 
     Each input keeps the vertical scale of its last capture. A waveform that is clipped on it, or too small,
-    is captured again on another scale, up to that of the loudest sound.
+    is captured again on another scale, up to the scale of the loudest sound.
 
     Attributes:
         recaptures: number of captures that were repeated on another scale.
@@ -205,9 +193,11 @@ class ScopeSensor:
         self._frequency = positive("frequency", frequency, "Hz")
         self._microphones = members("microphones", microphones, Microphone)
         self._captures = integer_at_least("captures", captures, 1)
+        volts = [one.sensitivity * one.gain for one in self._microphones]  # at the input, for 1 Pa
+        self._volts = torch.tensor(volts, dtype=torch.float64, device="cpu")
         self._scales = {
-            one.input: VerticalScale.up_to(one.loudest * _volts(one), scope.finest)
-            for one in self._microphones
+            one.input: VerticalScale.up_to(one.loudest * factor, FINEST)
+            for one, factor in zip(self._microphones, volts, strict=True)
         }
         self.recaptures = 0
         if not self._scales or len(self._scales) < len(self._microphones):
@@ -253,14 +243,10 @@ class ScopeSensor:
             self.recaptures += 1
         self._require_unclipped(waveforms)
         # Samples that all have the same code do not show the noise of their rounding.
-        rounding = (
-            torch.tensor([one.resolution for one in waveforms], dtype=torch.float64, device="cpu").square()
-            / 12
-        )
-        variance = fit.residual.square().maximum(rounding)
-        volts = torch.tensor([_volts(one) for one in self._microphones], dtype=torch.float64, device="cpu")
+        steps = torch.tensor([one.resolution for one in waveforms], dtype=torch.float64, device="cpu")
+        variance = fit.residual.square().maximum(steps.square() / 12)
         powers = torch.stack([fit.phasor.abs().square(), lock_in.noise_gain * variance], dim=1)
-        return powers / volts[:, None].square()
+        return powers / self._volts[:, None].square()
 
     def _lock_in(self, waveforms: Sequence[Waveform]) -> LockIn:
         """Return the lock-in for waveforms, which must be sampled at the same moments."""
@@ -301,8 +287,3 @@ def open_scope(
     port = UsbtmcPort(find_device([(vendor, product)], serial, backend))
     with closed_on_error(port.close):
         return Oscilloscope(port, dialect)
-
-
-def _volts(microphone: Microphone) -> float:
-    """Return the voltage at the input for 1 Pa."""
-    return microphone.sensitivity * microphone.gain

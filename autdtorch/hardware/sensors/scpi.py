@@ -11,6 +11,23 @@ import torch
 
 from autdtorch.hardware.transport.port import LinkError
 
+#: Finest vertical scale of both makers [V/division].
+FINEST = 1e-3
+#: Commands of both makers: of an input, with its vertical scale, and for its waveform.
+SET_UP_INPUT = (
+    ":CHANnel{input}:DISPlay ON",
+    ":CHANnel{input}:PROBe 1",
+    ":CHANnel{input}:COUPling AC",
+    ":CHANnel{input}:OFFSet 0",
+    ":CHANnel{input}:VERNier ON",  # else some scales would be rounded to 1, 2 or 5
+)
+SCALE = ":CHANnel{input}:SCALe {scale:.6g}"
+SOURCE = ":WAVeform:SOURce CHANnel{input}"
+#: Question for ten numbers: the fifth is the time step, the last are step, origin, reference of the voltage.
+PREAMBLE = ":WAVeform:PREamble?"
+#: Question for the samples, a byte each, as a definite-length block.
+SAMPLES = ":WAVeform:DATA?"
+
 
 @dataclass(frozen=True)
 class Waveform:
@@ -31,47 +48,28 @@ class Waveform:
 
 @dataclass(frozen=True)
 class Dialect:
-    """The commands of a maker.
+    """The commands of a maker, beside those of all makers.
 
     Attributes:
         name: of the oscilloscopes that take them.
         set_up: sent once, with the time scale ``{time}`` [s/division].
-        set_up_input: sent once for each ``{input}``.
         capture: starts a capture of all inputs at once, without a trigger signal.
         status: question for the end of the capture.
         ready: answer to it at the end.
-        source: selects the ``{input}`` of preamble and samples.
-        preamble: question for ten numbers; the fifth is the time step, the last three are step, origin and
-            reference of the voltage.
-        samples: question for the samples, a byte each, as a definite-length block.
-        lowest: lowest code of a sample that is not clipped.
-        highest: highest code of such a sample.
+        lowest: lowest code of a sample that is not clipped; the highest is 254.
         origin_in_codes: the voltage's origin is a number of codes, not of volts.
-        scale: sets the vertical ``{scale}`` of an ``{input}`` [V/division].
-        finest: finest vertical scale [V/division].
     """
 
     name: str
     set_up: tuple[str, ...]
-    set_up_input: tuple[str, ...]
     capture: tuple[str, ...]
     status: str
     ready: str
-    source: str = ":WAVeform:SOURce CHANnel{input}"
-    preamble: str = ":WAVeform:PREamble?"
-    samples: str = ":WAVeform:DATA?"
-    lowest: int = 1
-    highest: int = 254
-    origin_in_codes: bool = False
-    scale: str = ":CHANnel{input}:SCALe {scale:.6g}"
-    finest: float = 1e-3
+    lowest: int
+    origin_in_codes: bool
 
     def waveform(self, preamble: str, codes: bytes) -> Waveform:
-        """Return the waveform that two answers describe.
-
-        Args:
-            preamble: ten numbers.
-            codes: the samples, a byte each.
+        """Return the waveform of the answers to `PREAMBLE` and `SAMPLES`.
 
         Raises:
             LinkError: the preamble is not ten numbers, with steps above 0, or there are no samples.
@@ -86,19 +84,11 @@ class Dialect:
                 f"oscilloscope: preamble {preamble[:80]!r} and {len(codes)} samples make no waveform"
             )
         values = torch.frombuffer(bytearray(codes), dtype=torch.uint8)
-        clipped = int(((values < self.lowest) | (values > self.highest)).sum())
+        clipped = int(((values < self.lowest) | (values > 254)).sum())
         steps = values.to(torch.float64) - reference
         volts = (steps - origin) * resolution if self.origin_in_codes else steps * resolution + origin
         return Waveform(volts, time_step, resolution, clipped)
 
-
-_INPUT = (
-    ":CHANnel{input}:DISPlay ON",
-    ":CHANnel{input}:PROBe 1",
-    ":CHANnel{input}:COUPling AC",
-    ":CHANnel{input}:OFFSet 0",
-    ":CHANnel{input}:VERNier ON",  # else some scales would be rounded to 1, 2 or 5
-)
 
 #: InfiniiVision 2000, 3000 and 4000 X-Series Programmer's Guides.
 KEYSIGHT = Dialect(
@@ -111,11 +101,11 @@ KEYSIGHT = Dialect(
         ":WAVeform:UNSigned ON",
         ":WAVeform:POINts 1000",
     ),
-    set_up_input=_INPUT,
     capture=(":DIGitize",),
     status="*OPC?",
     ready="1",
     lowest=2,  # 0 is a hole, 1 clipped
+    origin_in_codes=False,
 )
 
 #: MSO1000Z/DS1000Z Programming Guide; the samples are those of the screen.
@@ -127,9 +117,9 @@ RIGOL = Dialect(
         ":WAVeform:MODE NORMal",
         ":WAVeform:FORMat BYTE",
     ),
-    set_up_input=_INPUT,
     capture=(":CLEar", ":SINGle", ":TFORce"),  # cleared, so that no old capture is taken for the new
     status=":TRIGger:STATus?",
     ready="STOP",
+    lowest=1,
     origin_in_codes=True,
 )

@@ -41,6 +41,8 @@ def autd3_kit() -> Any:
 class Autd3Port:
     """Boards of AUTD3 on the network; each write waits for the answer of all boards.
 
+    Methods raise `LinkError` if a board is not there or does not answer, `ImportError` without the kit.
+
     The kit's event loop runs in a thread of its own, where commands wait for their turn. Signals are handled
     in the main thread, so that none breaks a command off: an exception in asyncio's own code loses the
     command's wake-up, and closing the loop then waits for it for ever.
@@ -52,10 +54,6 @@ class Autd3Port:
         Args:
             boards: number of boards.
             network: `autd3.UdpOption` or `autd3.ServerLink`; by default UDP on the interface that finds them.
-
-        Raises:
-            LinkError: they are not there.
-            ImportError: the packages autd3 and autd3-pattern are missing.
         """
         autd3 = autd3_kit()
         from autd3.commands import Clear
@@ -80,11 +78,7 @@ class Autd3Port:
             self._send("be reset", Clear())
 
     def write(self, data: bytes) -> None:
-        """Play a frame; its boards have taken it when this returns.
-
-        Raises:
-            LinkError: a board did not take it.
-        """
+        """Play a frame; its boards have taken it when this returns."""
         self._send("be written to", autd3_pattern(data, self._boards))
 
     def flush(self) -> None:
@@ -94,11 +88,7 @@ class Autd3Port:
         """Do nothing: the kit leaves nothing half sent."""
 
     def close(self) -> None:
-        """Release the boards.
-
-        Raises:
-            LinkError: they do not answer; they are released all the same.
-        """
+        """Release the boards, even if they do not answer."""
 
         async def close_client() -> None:
             client, self._client = self._client, None  # the kit releases boards that do not answer with it

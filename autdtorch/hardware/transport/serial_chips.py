@@ -50,11 +50,7 @@ class FtdiUart(FtdiFifo):
     """An FT232R as a serial port: 8 bits, no parity, 1 stop bit, no flow control."""
 
     def flush(self) -> None:
-        """Wait until the chip reports that its transmitter is empty.
-
-        Raises:
-            LinkError: it does not do so within a second.
-        """
+        """Wait until the chip reports that its transmitter is empty, for at most a second."""
         deadline = time.monotonic() + _FLUSH_SECONDS
         while not self._line_status() & _TRANSMITTER_EMPTY:
             if time.monotonic() > deadline:
@@ -89,11 +85,7 @@ class CdcUart(UsbPort):
         super().__init__(device, baud)
 
     def close(self) -> None:
-        """Give the chip back to the kernel's drivers.
-
-        Raises:
-            LinkError: a driver does not take it.
-        """
+        """Give the chip back to the kernel's drivers."""
         self._closing.set()
         try:
             if self._reader.is_alive():

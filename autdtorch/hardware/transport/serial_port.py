@@ -15,7 +15,8 @@ _TIMEOUT = 1.0  # [s]
 class SerialPort:
     """A serial port with the driver of its operating system: 8 bits, no parity, 1 stop bit, no flow control.
 
-    It reaches every adapter that the system knows, and a COM port on Windows.
+    It reaches every adapter that the system knows, and a COM port on Windows. Methods raise `LinkError` if
+    the port is gone, or takes nothing for a second.
     """
 
     def __init__(self, name: str, baud: int) -> None:
@@ -37,39 +38,23 @@ class SerialPort:
             self._port: Any = _pyserial().Serial(name, baud, write_timeout=_TIMEOUT, exclusive=True)
 
     def write(self, data: bytes) -> None:
-        """Send all of `data`, and drop what came in: boards in a row echo their commands.
-
-        Raises:
-            LinkError: the port does not take it within a second.
-        """
+        """Send all of `data`, and drop all input: boards in a row echo their commands."""
         with self._errors("be written to"):
             self._port.reset_input_buffer()
             self._port.write(data)
 
     def flush(self) -> None:
-        """Wait until the driver has sent all bytes.
-
-        Raises:
-            LinkError: the port is gone.
-        """
+        """Wait until the driver has sent all bytes."""
         with self._errors("be flushed"):
             self._port.flush()
 
     def recover(self) -> None:
-        """Drop the bytes that the driver still holds.
-
-        Raises:
-            LinkError: the port is gone.
-        """
+        """Drop the bytes that the driver still holds."""
         with self._errors("be recovered"):
             self._port.reset_output_buffer()
 
     def close(self) -> None:
-        """Close the port.
-
-        Raises:
-            LinkError: the system does not close it.
-        """
+        """Close the port."""
         with self._errors("be closed"):
             self._port.close()
 

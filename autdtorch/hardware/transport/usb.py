@@ -58,7 +58,10 @@ def find_device(chips: Collection[tuple[int, int]], serial: str | None = None, b
 
 
 class UsbPort:
-    """A chip with a bulk endpoint each way, taken from the kernel's drivers."""
+    """A chip with a bulk endpoint each way, taken from the kernel's drivers.
+
+    Methods raise `LinkError` if the chip refuses, is gone, or takes nothing for a second.
+    """
 
     def __init__(self, device: Any, baud: int = 0) -> None:
         """Take the chip and set it up; if that fails it is given back.
@@ -66,9 +69,6 @@ class UsbPort:
         Args:
             device: `usb.core.Device`.
             baud: rate of its serial line [bits/s]; the chip takes the nearest that it has. 0 without one.
-
-        Raises:
-            LinkError: it cannot be opened, or refuses.
         """
         self._device = device
         self._baud = baud
@@ -79,11 +79,7 @@ class UsbPort:
             self._set_up()
 
     def write(self, data: bytes) -> None:
-        """Send all of `data`.
-
-        Raises:
-            LinkError: the chip did not take it within a second.
-        """
+        """Send all of `data`."""
         sent = 0
         while sent < len(data):
             taken = self._call("be written to", self._out.write, data[sent:], _TIMEOUT_MS)
@@ -95,20 +91,12 @@ class UsbPort:
         """Do nothing: not every chip reports waiting bytes."""
 
     def recover(self) -> None:
-        """Clear a stall, and drop waiting bytes if the chip has a request for that.
-
-        Raises:
-            LinkError: the chip does not answer.
-        """
+        """Clear a stall, and drop waiting bytes if the chip has a request for that."""
         self._call("be recovered", self._device.clear_halt, self._out.bEndpointAddress)
         self._purge()
 
     def close(self) -> None:
-        """Give the chip back to the kernel's drivers.
-
-        Raises:
-            LinkError: a driver does not take it.
-        """
+        """Give the chip back to the kernel's drivers."""
         import usb.util
 
         usb.util.dispose_resources(self._device)
@@ -118,11 +106,9 @@ class UsbPort:
         finally:
             usb.util.dispose_resources(self._device)
 
-    def _set_up(self) -> None:
-        """Set the chip up; one without a serial line may need nothing."""
+    def _set_up(self) -> None: ...
 
-    def _purge(self) -> None:
-        """Drop waiting bytes, if the chip has a request for that."""
+    def _purge(self) -> None: ...
 
     def _take(self) -> None:
         import usb.util

@@ -81,16 +81,16 @@ def block(data: bytes) -> bytes:
 
 
 class UsbtmcPort(UsbPort):
-    """An instrument that takes commands and answers questions, as text."""
+    """An instrument that takes commands and answers questions, as text.
+
+    Methods raise `LinkError` if it does not take the text, or does not answer with text, or with a block.
+    """
 
     def __init__(self, device: Any) -> None:
         """Take the instrument, and clear unread answers.
 
         Args:
             device: `usb.core.Device`.
-
-        Raises:
-            LinkError: it cannot be opened, is no such instrument, or does not clear.
         """
         super().__init__(device)
         self._tag = 0
@@ -99,20 +99,12 @@ class UsbtmcPort(UsbPort):
             self._clear()
 
     def tell(self, command: str) -> None:
-        """Send a command.
-
-        Raises:
-            LinkError: the instrument does not take it.
-        """
+        """Send a command."""
         data = f"{command}\n".encode("ascii")
         self.write(message(TELL, self._next(), len(data), END, data))
 
     def ask(self, question: str) -> str:
-        """Return the answer to a question, as text.
-
-        Raises:
-            LinkError: the instrument does not take the question, or has no such answer.
-        """
+        """Return the answer to a question, as text."""
         data = self._answer(question)
         try:
             return data.decode("ascii").strip()
@@ -120,19 +112,11 @@ class UsbtmcPort(UsbPort):
             raise LinkError(f"USBTMC: {question} is answered by {data[:40]!r}, which is no text") from error
 
     def ask_block(self, question: str) -> bytes:
-        """Return the answer to a question, the content of a definite-length block.
-
-        Raises:
-            LinkError: the instrument does not take the question, or has no such answer.
-        """
+        """Return the answer to a question, the content of a definite-length block."""
         return block(self._answer(question))
 
     def recover(self) -> None:
-        """Clear a stall of an answer, unread answers and incomplete commands.
-
-        Raises:
-            LinkError: it does not clear.
-        """
+        """Clear a stall of an answer, unread answers and incomplete commands."""
         self._call("be recovered", self._in.clear_halt)
         self._clear()
 
