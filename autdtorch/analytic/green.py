@@ -1,4 +1,4 @@
-"""The field of point sources and discs in free space, exact."""
+"""Exact fields of point sources and discs in free space."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from autdtorch.utils.neighbours import distances
 from autdtorch.utils.validation import LENGTH_TOLERANCE, ArrayLike, not_negative, points_tensor, positive
 
 PAIR_BYTES = 80.0
-"""Memory [bytes] that a point and a transducer take while their entry of a matrix is worked out."""
+"""Memory [bytes] for each entry of a transfer matrix while it is computed."""
 
 
 def green(points: ArrayLike, sources: ArrayLike, wavenumber: complex) -> torch.Tensor:
-    """Green's function of the Helmholtz equation, outgoing with e^{-i w t}: e^{i k r} / (4 pi r).
+    """Return Green's function of the Helmholtz equation, e^{i k r} / (4 pi r), outgoing with e^{-i w t}.
 
     Args:
         points: (P, 3) [m].
@@ -27,7 +27,7 @@ def green(points: ArrayLike, sources: ArrayLike, wavenumber: complex) -> torch.T
         complex128 (P, M) [1/m], on the device of `points`; not differentiable in the positions.
 
     Raises:
-        ValueError: not finite, wrong shape, k <= 0, alpha < 0, or a point on a source.
+        ValueError: an argument is not finite or has another shape, k <= 0, alpha < 0, or a point on a source.
     """
     targets = points_tensor("points", points)
     origins = points_tensor("sources", sources).to(targets.device)
@@ -43,30 +43,30 @@ def green(points: ArrayLike, sources: ArrayLike, wavenumber: complex) -> torch.T
 
 
 def free_space_matrix(points: ArrayLike, array: TransducerArray, wavenumber: complex) -> torch.Tensor:
-    """Transfer matrix of an array in free space: S e^{i k r} / r (Eq. 2), the mean of it over discs.
+    """Return the transfer matrix of an array in free space: S e^{i k r} / r (Eq. 2), averaged over discs.
 
     Args:
         points: (P, 3) [m].
-        array: the M transducers, of source strength S; the mean is taken over `array.nodes`.
+        array: M transducers of source strength S; discs are averaged over `array.nodes`.
         wavenumber: k [rad/m], > 0, or k + i alpha with an attenuation alpha >= 0 [Np/m].
 
     Returns:
         complex128 (P, M), pressure [Pa] per unit drive.
 
     Raises:
-        ValueError: not finite, wrong shape, k <= 0, alpha < 0, or a point on a node of a transducer.
+        ValueError: as in `green`; or the matrix needs more memory than available.
     """
     positions, weights = array.nodes
     points = points_tensor("points", points)
     require_memory("points", tuple(points.shape), PAIR_BYTES * len(points) * len(array))
-    # Node by node: memory for one matrix only.
+    # node by node, with memory for one matrix only
     terms = (w * green(points, at, wavenumber) for at, w in zip(positions.unbind(1), weights, strict=True))
     none = torch.zeros((), dtype=torch.complex128, device="cpu")
     return 4 * math.pi * array.source_strength * sum(terms, start=none)
 
 
 def _wavenumber(value: complex) -> tuple[float, float]:
-    """Wavenumber k and attenuation alpha of a complex wavenumber."""
+    """Return wavenumber k and attenuation alpha of a complex wavenumber."""
     if not isinstance(value, complex):
         return positive("wavenumber", value, "rad/m"), 0.0
     return positive("wavenumber.real", value.real, "rad/m"), not_negative(

@@ -17,7 +17,7 @@ import torch
 
 from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
 from autdtorch.fdtd.steady_state import Extrapolation, SteadyState
-from autdtorch.propagators.grouping import MOST_PASSES
+from autdtorch.propagators.grids import MOST_PASSES
 
 logger = logging.getLogger(__name__)
 
@@ -27,15 +27,18 @@ _LOOSEST = 0.1
 _CAUTION = 2.0
 """Safety factor: neglected scattering orders are estimated as this many times the next one."""
 
-Simulate = Callable[[int, torch.Tensor, float], SteadyState]
-"""Simulates a box, given its index, the incident field (n,) and the tolerance."""
+Observe = Callable[[torch.Tensor], torch.Tensor]
+"""Computes the quantity that must converge from phasors of cells."""
+
+Simulate = Callable[[int, torch.Tensor, float, Observe], SteadyState]
+"""Simulates a box, given its index, the incident field (n,), the tolerance and the observed quantity."""
 
 
 def coupled_runs(
     boxes: Sequence[ScatteredField],
     transforms: Sequence[NearToFar],
     driving: Sequence[torch.Tensor],
-    pressure: Callable[[torch.Tensor], torch.Tensor],
+    pressure: Observe,
     simulate: Simulate,
     tolerance: float,
 ) -> list[tuple[SteadyState, float]] | None:
@@ -68,7 +71,9 @@ def coupled_runs(
         for index, field in enumerate(driving):
             share = field.norm(dim=0) / largest
             loose = (own / share).clamp(max=_LOOSEST).tolist()
-            steady = [simulate(index, column, each) for column, each in zip(field.mT, loose, strict=True)]
+            observe = transforms[index].amplitudes
+            pairs = zip(field.mT, loose, strict=True)
+            steady = [simulate(index, column, each, observe) for column, each in pairs]
             parts.append(torch.stack([each.pressure for each in steady], dim=1))
             periods += [each.periods for each in steady]
             reached &= [each.converged for each in steady]

@@ -1,4 +1,4 @@
-"""The field of a scene as a function that autograd can go back through: to the drive and to the medium."""
+"""The field of a scene, differentiable with respect to the drive and the medium."""
 
 from __future__ import annotations
 
@@ -46,34 +46,34 @@ def differentiable_field(
     dtype: str | torch.dtype = "float32",
     time_step: float | None = None,
 ) -> torch.Tensor:
-    """Pressure of drives at points, differentiable by every tensor given, on the whole domain.
+    """Return the pressure of drives at points, differentiable by every tensor given, on the whole domain.
 
-    A loss is differentiated by an adjoint run of the same kernel, in bounded memory. Density and sound speed
-    are those of the scene's K obstacles or, in a scene without obstacles, maps of the domain's cells, whose
-    places `cell_centers` tells. Maps know no surfaces between the cells and are less accurate, but the field
-    of a map that changes smoothly with a place or a shape does so too; that of an obstacle does not, as the
-    grid shows through (docs/decisions/gradients.md).
+    The gradient is computed by an adjoint run of the same kernel, in bounded memory. Density and sound speed
+    are those of the scene's K obstacles or, in a scene without obstacles, maps of the domain's cells at
+    `cell_centers`. Maps have no surfaces between cells and are less accurate. The field changes smoothly with
+    a map that changes smoothly, but not with an obstacle that is moved across the grid
+    (docs/decisions/gradients.md).
 
     Args:
-        scene: all that is not given here.
+        scene: array, medium, domain and obstacles.
         drive: (..., M) complex, |q| <= 1; each takes a run, and its gradient one or two more.
         points: (P, 3) [m] inside the domain; by default the scene's control points.
-        density: (K,) or (nx, ny, nz) [kg/m^3], > 0. What is given for rigid obstacles does not count.
-        sound_speed: (K,) or (nx, ny, nz) [m/s], > 0, likewise.
+        density: (K,) or (nx, ny, nz) [kg/m^3], > 0; of no effect for rigid obstacles.
+        sound_speed: (K,) or (nx, ny, nz) [m/s], > 0; of no effect for rigid obstacles.
         spacing: edge of a cell [m], at most a third of the wavelength.
-        periods: of the drive that are stepped, in whole blocks of a few; the last block is locked in. By
-            default sound crosses the domain twice. What resonates needs more.
+        periods: periods of the drive that are stepped, in blocks of a few; the phasors are those of the last
+            block. By default sound crosses the domain twice; resonances need more.
         kernel: as in `make_propagator`.
         dtype: precision of the fields, float32 or float64.
-        time_step: [s], as in `make_propagator`. By default the largest stable one, which may change with the
-            medium from call to call, and the field with it by a little.
+        time_step: upper limit [s], as in `make_propagator`. The default, the largest stable one, may change
+            with the medium from call to call, and the field slightly with it.
 
     Returns:
         complex128 (..., P) [Pa].
 
     Raises:
-        ValueError: an argument of another shape or out of range, maps in a scene with obstacles, or an
-            obstacle that is differentiated and not clear of the boundary layers.
+        ValueError: an argument has another shape or is out of range, maps are given in a scene with
+            obstacles, or a differentiated obstacle reaches into the boundary layers.
     """
     require_kind("scene", scene, Scene)
     kernel, precision = available_kernel(kernel), precision_of(dtype)
@@ -94,24 +94,20 @@ def differentiable_field(
         time_step = positive("time_step", time_step, "s")
     cells = _cells(region, grid, *given)
     assembly = cells.assembly(grid, region, precision, time_step)
-    receivers, stepper = assembly.receivers(targets), make_kernel(kernel)
-    fields = [
-        _phasors(stepper, assembly, cells.driven(_sources(assembly, scene, row)), receivers, periods)
-        for row in drive.reshape(-1, drive.shape[-1])
-    ]
-    found = (
-        torch.stack(fields)
-        if fields
-        else torch.zeros((0, len(targets)), dtype=torch.complex128, device="cpu")
-    )
-    return found.reshape(*drive.shape[:-1], len(targets))
+    receivers, nodes, stepper = assembly.receivers(targets), scene.array.nodes, make_kernel(kernel)
+    fields = [torch.zeros((0, len(targets)), dtype=torch.complex128, device="cpu")]
+    for row in drive.reshape(-1, drive.shape[-1]):
+        strength = scene.array.source_strength * row.cpu()
+        sources = cells.driven(assembly.sources(nodes.positions, strength, nodes.weights))
+        fields.append(_phasors(stepper, assembly, sources, receivers, periods)[None])
+    return torch.cat(fields).reshape(*drive.shape[:-1], len(targets))
 
 
 def cell_centers(scene: Scene, spacing: float = 1e-3) -> torch.Tensor:
-    """Centres (nx, ny, nz, 3) [m] of the domain's cells, which maps of the medium are given for.
+    """Return the centres (nx, ny, nz, 3) [m] of the domain's cells, for maps of the medium.
 
     Args:
-        scene: without obstacles.
+        scene: a scene without obstacles.
         spacing: edge of a cell [m].
 
     Raises:
@@ -128,7 +124,7 @@ def cell_centers(scene: Scene, spacing: float = 1e-3) -> torch.Tensor:
 
 
 def _material(name: str, given: ArrayLike | None, scene: Scene) -> torch.Tensor | None:
-    """Values (K,) of the obstacles or (nx, ny, nz) of the cells."""
+    """Return values (K,) of the obstacles or (nx, ny, nz) of the cells, after checking them."""
     if given is None:
         return None
     values, count = real_tensor(name, given).cpu(), len(scene.obstacles)
@@ -141,7 +137,7 @@ def _material(name: str, given: ArrayLike | None, scene: Scene) -> torch.Tensor 
 
 
 def _slowest(scene: Scene, sound_speed: torch.Tensor | None) -> dict[str, float]:
-    """Return the least of the sound speeds [m/s] that are given and count, if there is one."""
+    """Return the least of the given sound speeds [m/s] that has an effect, if there is one."""
     if sound_speed is None:
         return {}
     rigid = torch.tensor([obstacle.rigid for obstacle in scene.obstacles], dtype=torch.bool, device="cpu")
@@ -157,15 +153,10 @@ def _cells(
     return cells_of_obstacles(region, grid, density, sound_speed)
 
 
-def _sources(assembly: Assembly, scene: Scene, drive: torch.Tensor) -> Sources:
-    nodes = scene.array.nodes
-    return assembly.sources(nodes.positions, scene.array.source_strength * drive.cpu(), nodes.weights)
-
-
 def _phasors(
     kernel: Kernel, assembly: Assembly, sources: Sources, receivers: Receivers, periods: int
 ) -> torch.Tensor:
-    """Phasors (P,) of the last block of a run of `periods` at least."""
+    """Return the phasors (P,) of the last block of a run of at least `periods`."""
     steps, block = block_of(assembly.steps_per_period)
     count = steps * math.ceil(periods / block)
     signal = drive_signal(assembly.steps_per_period, 0, count).to(assembly.dtype)

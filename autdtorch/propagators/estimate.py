@@ -10,15 +10,13 @@ from dataclasses import dataclass, replace
 import torch
 
 from autdtorch.fdtd.grid import domain_extent
+from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.spacing import pilot_spacing
 from autdtorch.fdtd.stepping import assemble, drive_signal
 from autdtorch.propagators.backend import make_kernel
-from autdtorch.propagators.cost import grid_cost
 from autdtorch.propagators.execute import simulation_of
+from autdtorch.propagators.grids import grid_cost
 from autdtorch.propagators.plan import plan
-from autdtorch.propagators.scene_region import region_of
-from autdtorch.scene.arrays import TransducerArray
-from autdtorch.scene.medium import Medium
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.memory import available_memory
 from autdtorch.utils.validation import positive
@@ -110,13 +108,12 @@ def estimate(
 def _rate(kernel: str, dtype: torch.dtype, cells: int) -> float:
     """Return the steps of a cell in a second, timed on a box of air with about this many cells."""
     half = _AIR_SPACING * max(1, round(cells ** (1 / 3)) - 2 * _AIR_RIM) / 2
-    array = TransducerArray([[0.0, 0.0, 0.0]], (1.0, 0.0, 0.0))
+    place = torch.zeros((1, 3), dtype=torch.float64, device="cpu")
     domain = (-half,) * 3, (half,) * 3
-    scene = Scene(array, Medium(1.2, 340.0), 40e3, [[half / 2, 0.0, 0.0]], domain=domain)
-    region = region_of(scene)
+    region = Region(Fluid(1.2, 340.0), 0.0, 40e3, (), domain, place.numpy())
     assembly, stepper = assemble(region, _AIR_SPACING, dtype), make_kernel(kernel)
-    sources = assembly.sources(array.positions, torch.ones(1, dtype=torch.complex128, device="cpu"))
-    receivers, state = assembly.receivers(scene.control_points), assembly.silence(sources)
+    sources = assembly.sources(place, torch.ones(1, dtype=torch.complex128, device="cpu"))
+    receivers, state = assembly.receivers(place + half / 2), assembly.silence(sources)
     signal = drive_signal(assembly.steps_per_period, 0, _MEASURED_STEPS).to(dtype)
     spent = math.inf
     for _ in range(3):  # the first one loads the kernel

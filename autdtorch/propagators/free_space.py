@@ -1,4 +1,4 @@
-"""The exact field of the array in free space."""
+"""The propagator of free space."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ logger = logging.getLogger(__name__)
 
 
 class FreeSpacePropagator:
-    """The exact field of the array in free space; obstacles are left out.
+    """The exact field of the array in free space; obstacles are ignored.
 
     Attributes:
         scene: the scene it was made for.
     """
 
     def __init__(self, scene: Scene) -> None:
-        """Remember the scene; a scene with obstacles is logged as such."""
+        """Make the propagator of a scene; ignored obstacles are logged."""
         require_kind("scene", scene, Scene)
         self.scene = scene
         if scene.obstacles:
             logger.warning(
-                "free_space leaves out the %d obstacles of scene %r", len(scene.obstacles), scene.name
+                "free_space ignores the %d obstacles of scene %r", len(scene.obstacles), scene.name
             )
 
     def __repr__(self) -> str:
-        """The scene."""
+        """Name of the scene."""
         return f"FreeSpacePropagator(scene {self.scene.name!r})"
 
     @overload
@@ -49,12 +49,11 @@ class FreeSpacePropagator:
     def transfer_matrix(
         self, points: ArrayLike | None = None, return_error: bool = False
     ) -> torch.Tensor | tuple[torch.Tensor, float]:
-        """Transfer matrix G (Eq. 2).
+        """Return the transfer matrix G (Eq. 2).
 
         Args:
             points: (P, 3) [m]; by default the scene's control points.
-            return_error: also return the estimated relative error: 0, or infinite where obstacles are left
-                out.
+            return_error: also return the estimated relative error: 0, or infinite if obstacles are ignored.
 
         Returns:
             complex128 (P, M) [Pa], and the error if asked for.
@@ -68,7 +67,7 @@ class FreeSpacePropagator:
         return (matrix, error) if boolean("return_error", return_error) else matrix
 
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
-        """Pressure of drives at points.
+        """Return the pressure of drives at points.
 
         Args:
             drive: (..., M) complex, |q| <= 1.

@@ -1,4 +1,4 @@
-"""The plan of a simulation: its method, its grids and what they cost, before anything is allocated."""
+"""The plan of a simulation: its method, its grids and its cost, before anything is allocated."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ import torch
 from autdtorch.analytic.green import PAIR_BYTES
 from autdtorch.fdtd.grid import MAX_CELLS, require_spacing
 from autdtorch.fdtd.interpolation import interpolation_width
-from autdtorch.fdtd.region import Region, Shape
+from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.spacing import pilot_spacing, second_spacing
 from autdtorch.fdtd.steady_state import phasors_kept
 from autdtorch.propagators.backend import available_kernel, make_kernel, precision_of
-from autdtorch.propagators.cost import USUAL_PERIODS, Heterogeneity, heterogeneity
-from autdtorch.propagators.grouping import Grouping, cheapest_boxes, one_box, whole_domain
+from autdtorch.propagators.grids import USUAL_PERIODS, Grouping, cheapest_boxes, one_box, whole_domain
+from autdtorch.propagators.heterogeneity import Heterogeneity, heterogeneity
 from autdtorch.propagators.scene_region import is_wall, region_of
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.memory import require_memory
@@ -161,14 +161,10 @@ class Plan:
         return make_kernel(self.kernel).at_once(grids[0].shape) if len(grids) == 1 else 1
 
     def require_feasible(self, field: str = "spacing", value: float | None = None) -> None:
-        """Refuse a plan of too much memory, too many cells, or cells too large or small for the region.
-
-        Args:
-            field: name of the argument that the message blames.
-            value: its value; by default the spacing.
+        """Refuse too much memory, too many cells, or cells too large or small for the region.
 
         Raises:
-            ValueError: names the field, its value and the accepted range.
+            ValueError: names the field and the value to blame, by default the spacing.
         """
         value, unit = (self.spacing, "m") if value is None else (value, "")
         require_memory(field, value, self.memory, unit)
@@ -236,27 +232,13 @@ def _cheapest(
 ) -> tuple[str, Grouping]:
     """Choose the cheapest method that is accurate for the scene, and its grids."""
     domain, boxes = whole_domain(region, spacing), cheapest_boxes(region, spacing, tolerance, runs)
-    naive = domain.grids[0]
-    gain = runs * naive.work / boxes.box_cost(runs)
-    if any(is_wall(scene, obstacle) for obstacle in scene.obstacles):
-        method, reason = "full", "a wall continues through the boundary layer"
-    elif any(_leaves_domain(region, shape) for shape in region.shapes):
-        method, reason = "box", "obstacles leave the domain, which full would cut off"
-    elif gain > 1:
-        method, reason = "box", f"{gain:.2g} times cheaper than full"
-    else:
-        method, reason = "full", f"{1 / gain:.2g} times cheaper than box"
-    grouping = boxes if method == "box" else domain
-    cells = sum(grid.cells for grid in grouping.grids)
-    steps = max(grid.steps for grid in grouping.grids) * grouping.passes
+    gain = runs * domain.grids[0].work / boxes.box_cost(runs)
+    walls = any(is_wall(scene, obstacle) for obstacle in scene.obstacles)
+    corners = [(*region.domain, shape.lower, shape.upper) for shape in region.shapes]
+    outside = any((np.less(low, first) | np.greater(high, last)).any() for first, last, low, high in corners)
+    method, grouping = ("full", domain) if walls or not (outside or gain > 1) else ("box", boxes)
     logger.debug(
-        "method auto: %s (%s), %d cells x %d steps x %d runs; the domain with a run for each transducer takes"
-        " %d cells x %d steps x %d runs", method, reason, cells, steps, runs, naive.cells, naive.steps,
-        len(scene.array),
+        "method auto: %s; full would take %.2g times as long as box (walls through the boundary layer: %s,"
+        " obstacles that leave the domain: %s)", method, gain, walls, outside,
     )  # fmt: skip
     return method, grouping
-
-
-def _leaves_domain(region: Region, shape: Shape) -> bool:
-    lower, upper = region.domain
-    return bool((np.array(shape.lower) < lower).any() or (np.array(shape.upper) > upper).any())

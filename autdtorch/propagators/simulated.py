@@ -34,7 +34,7 @@ class Propagator(Protocol):
     """Computes the pressure that a scene's transducers cause at points.
 
     Attributes:
-        scene: the scene it was made for.
+        scene: the scene.
     """
 
     scene: Scene
@@ -44,12 +44,7 @@ class Propagator(Protocol):
         ...
 
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
-        """Return the pressure [Pa] of drives (..., M) at points: complex128 (..., P).
-
-        Args:
-            drive: (..., M) complex.
-            points: (P, 3) [m]; a grid such as (Nu, Nv, 3) gives (..., Nu, Nv).
-        """
+        """Return the pressure (..., P) [Pa], complex128, of drives (..., M) at points (P, 3) or a grid."""
         ...
 
 
@@ -116,11 +111,10 @@ class SimulatedPropagator:
     def transfer_matrix(
         self, points: ArrayLike | None = None, return_error: bool = False
     ) -> torch.Tensor | tuple[torch.Tensor, float]:
-        """Return the transfer matrix G, from one simulation for each point or for each transducer.
+        """Return the transfer matrix G, from one simulation for each transducer or each point (reciprocity).
 
-        By reciprocity P simulations from the points replace M from the transducers, unless a point is next
-        to an obstacle. Points or transducers in one symmetry orbit of the scene on its grid share one
-        simulation. The matrix of the control points is kept.
+        Simulations start at the transducers if a point is next to an obstacle. Points or transducers in one
+        symmetry orbit of the scene on its grid share a simulation. The matrix of the control points is kept.
 
         Args:
             points: (P, 3) [m]; by default the scene's control points.
@@ -196,18 +190,14 @@ class SimulatedPropagator:
         return result
 
     def _report(self, runs: Sequence[Run], points: torch.Tensor | None) -> None:
-        """Warn of runs that did not converge; log once if a simulated transducer is next to an obstacle.
+        """Warn of new runs that did not converge; log once if source transducers are next to an obstacle.
 
-        Args:
-            runs: new runs.
-            points: (P, 3) [m] of a transfer matrix; None for runs of all transducers at once.
+        Runs without `points`, those of a transfer matrix, have all transducers as sources.
         """
-        simulation, sources = self._simulation, self.scene.array.nodes.positions
-        if not runs:
-            return
-        if not self._near_logged and (points is None or not simulation.orbits(points).from_points):
+        simulation = self._simulation
+        if runs and not self._near_logged and (points is None or not simulation.orbits(points).from_points):
             self._near_logged = True
-            if any(simulation.near_obstacle(nodes) for nodes in sources):
+            if any(map(simulation.near_obstacle, self.scene.array.nodes.positions)):
                 logger.warning(
                     "a source is within %.2g mm of an obstacle: less accurate; use a finer spacing than %.2g"
                     " mm", 1e3 * simulation.source_clearance, 1e3 * self.spacing,

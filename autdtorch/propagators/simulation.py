@@ -15,7 +15,7 @@ from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.steady_state import SteadyState, fewest_periods
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.propagators.backend import make_kernel
-from autdtorch.propagators.cost import USUAL_PERIODS
+from autdtorch.propagators.grids import USUAL_PERIODS
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.symmetry import (
     Orbits,
@@ -39,7 +39,7 @@ class Run:
         periods: periods of the drive that were stepped, summed over boxes.
         remaining: estimated relative distance to the steady state.
         reached: whether that is within the tolerance.
-        seconds: time taken; other runs may have gone on at once.
+        seconds: time taken, possibly beside other runs.
     """
 
     periods: int
@@ -70,14 +70,10 @@ class TransferMatrix:
 
 
 class Simulation(ABC):
-    """A plan's grids, which are assembled at first use, and the runs on them.
-
-    Attributes:
-        plan: the plan.
-    """
+    """A plan's grids, which are assembled at first use, and the runs on them."""
 
     def __init__(self, plan: Plan) -> None:
-        """Make a simulation; nothing is computed yet."""
+        """Make the simulation of a plan; nothing is computed yet."""
         self.plan = plan
         self._kernel = make_kernel(plan.kernel)
 
@@ -88,11 +84,7 @@ class Simulation(ABC):
 
     @abstractmethod
     def checked(self, points: ArrayLike) -> torch.Tensor:
-        """Return points (P, 3) after checking that the field can be computed there.
-
-        Raises:
-            ValueError: it cannot.
-        """
+        """Return points (P, 3) after checking them; a `ValueError` names one that cannot be computed."""
 
     @abstractmethod
     def near_obstacle(self, points: torch.Tensor) -> bool:
@@ -106,11 +98,7 @@ class Simulation(ABC):
         receivers: Nodes,
         stepped: Callable[[int], None],
     ) -> tuple[torch.Tensor, list[Run]]:
-        """Simulate R runs, each with N sources of strengths (R, N) that are not all zero.
-
-        `stepped` is called with numbers of periods. Returns the pressure (R, P) at P receivers, the mean over
-        the nodes of each.
-        """
+        """Do the work of `run`; `stepped` is called with numbers of periods."""
 
     @cached_property
     def symmetries(self) -> list[Symmetry]:

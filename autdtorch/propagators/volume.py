@@ -1,4 +1,4 @@
-"""The field of a drive in all of a scene's domain."""
+"""The field of a drive in the whole domain of a scene."""
 
 from __future__ import annotations
 
@@ -11,28 +11,24 @@ from autdtorch.scene.drive import validate_single_drive
 from autdtorch.utils.validation import ArrayLike, invalid, positive, require_kind
 
 _CLEARANCE = 0.5  # wavelengths around a transducer, where its own 1/r would hide the field of the others
-
 _MOST_CELLS = 10_000_000
 
 
 def volume_field(propagator: Propagator, drive: ArrayLike, spacing: float | None = None) -> torch.Tensor:
-    """Pressure of a drive at the centres of the equal cells that fill the scene's domain.
-
-    Left out are obstacles, and half a wavelength around every transducer.
+    """Return the pressure of a drive at the centres of equal cells that fill the scene's domain.
 
     Args:
-        propagator: of the scene.
+        propagator: the propagator of the scene.
         drive: complex (M,), |q| <= 1.
-        spacing: wanted edge of a cell [m], > 0; by default a quarter of the wavelength. The cells fill the
-            domain, with edges Lx / Nx, Ly / Ny and Lz / Nz.
+        spacing: approximate edge of a cell [m], > 0; by default a quarter of the wavelength.
 
     Returns:
-        complex128 (Nx, Ny, Nz) [Pa], NaN where it was left out; Nx = Lx / spacing rounded, at least 2, and Ny
-        and Nz alike.
+        complex128 (Nx, Ny, Nz) [Pa], with Nx = Lx / spacing rounded and at least 2, likewise Ny and Nz. NaN
+        in obstacles and within half a wavelength of a transducer.
 
     Raises:
-        ValueError: `drive` is not one that the array can play, `spacing` is not > 0, or gives more than 10
-            million cells.
+        ValueError: `drive` has another shape or range, `spacing` is not > 0 or gives more than 10 million
+            cells.
     """
     require_kind("propagator", propagator, Propagator)
     scene = propagator.scene
@@ -48,11 +44,11 @@ def volume_field(propagator: Propagator, drive: ArrayLike, spacing: float | None
     ]
     points = torch.cartesian_prod(*axes)
     nodes = scene.array.nodes.positions.reshape(-1, 3)
-    heard = torch.ones(len(points), dtype=torch.bool, device="cpu")
+    valid = torch.ones(len(points), dtype=torch.bool, device="cpu")
     for node in nodes:
-        heard &= torch.linalg.vector_norm(points - node, dim=1) > _CLEARANCE * scene.wavelength
+        valid &= torch.linalg.vector_norm(points - node, dim=1) > _CLEARANCE * scene.wavelength
     for obstacle in scene.obstacles:
-        heard &= ~obstacle.contains(points)
+        valid &= ~obstacle.contains(points)
     field = torch.full((len(points),), complex(math.nan, math.nan), dtype=torch.complex128, device="cpu")
-    field[heard] = propagator.field(drive, points[heard])
+    field[valid] = propagator.field(drive, points[valid])
     return field.reshape(counts)

@@ -13,8 +13,7 @@ from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd.grid import bodies_extent
 from autdtorch.propagators import SimulatedPropagator, make_propagator
 from autdtorch.propagators.box import BoxSimulation
-from autdtorch.propagators.cost import grid_cost
-from autdtorch.propagators.grouping import Grouping, cheapest_boxes, one_box
+from autdtorch.propagators.grids import Grouping, cheapest_boxes, grid_cost, one_box
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
