@@ -5,6 +5,7 @@ The unit of time is one step of one cell of air. Constants fit runs on one core 
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,6 +26,8 @@ from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.steady_state import fewest_periods
 from autdtorch.fdtd.stencil import tuned_stencil
 from autdtorch.utils.arrays import Array
+
+logger = logging.getLogger(__name__)
 
 MOST_PASSES = 12
 """Most passes of the multiple-scattering iteration between boxes; one box is cheaper than more."""
@@ -122,9 +125,34 @@ class Grouping:
         return runs * self.passes * steps + (self.passes - 1) * _PAIR * self.coupled_pairs
 
 
-def whole_domain(region: Region, spacing: float) -> Grouping:
-    """Return one grid of `spacing` [m] over the domain."""
-    return _one_grid(region, domain_extent(region, spacing), spacing)
+def choose_grids(
+    region: Region, method: str, spacing: float, tolerance: float, runs: int
+) -> tuple[str, Grouping]:
+    """Return "box" or "full" and its grids; for "auto" the cheapest that is accurate for the region.
+
+    Args:
+        region: the region.
+        method: "box", "full" or "auto".
+        spacing: edge of a cell [m].
+        tolerance: relative tolerance of the multiple-scattering iteration.
+        runs: number of simulations.
+    """
+    if method == "box":
+        return method, cheapest_boxes(region, spacing, tolerance, runs)
+    domain = _one_grid(region, domain_extent(region, spacing), spacing)
+    if method == "full":
+        return method, domain
+    boxes = cheapest_boxes(region, spacing, tolerance, runs)
+    gain = runs * domain.grids[0].work / boxes.box_cost(runs)
+    walls = any(body.continued for body in region.bodies)
+    corners = [(*region.domain, shape.lower, shape.upper) for shape in region.shapes]
+    outside = any((np.less(low, first) | np.greater(high, last)).any() for first, last, low, high in corners)
+    method, grouping = ("full", domain) if walls or not (outside or gain > 1) else ("box", boxes)
+    logger.debug(
+        "method auto: %s; full would take %.2g times as long as box (walls through the boundary layer: %s,"
+        " obstacles that leave the domain: %s)", method, gain, walls, outside,
+    )  # fmt: skip
+    return method, grouping
 
 
 def one_box(region: Region, spacing: float) -> Grouping:

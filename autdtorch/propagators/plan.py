@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
-import numpy as np
 import torch
 
 from autdtorch.analytic.green import PAIR_BYTES
@@ -18,9 +17,9 @@ from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.spacing import pilot_spacing, second_spacing
 from autdtorch.fdtd.steady_state import phasors_kept
 from autdtorch.propagators.backend import available_kernel, make_kernel, precision_of
-from autdtorch.propagators.grids import USUAL_PERIODS, Grouping, cheapest_boxes, one_box, whole_domain
+from autdtorch.propagators.grids import USUAL_PERIODS, Grouping, choose_grids, one_box
 from autdtorch.propagators.heterogeneity import Heterogeneity, heterogeneity
-from autdtorch.propagators.scene_region import is_wall, region_of
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.validation import integer_at_least, invalid, positive, require_kind, require_one_of
@@ -88,7 +87,7 @@ class Plan:
 
     def at(self, spacing: float, tolerance: float, time_step: float | None = None) -> Self:
         """Return a plan of the same method with another spacing [m], tolerance and time step [s]."""
-        grouping = _grouping(self.region, self.method, spacing, tolerance, self.runs)
+        _, grouping = choose_grids(self.region, self.method, spacing, tolerance, self.runs)
         return replace(self, spacing=spacing, tolerance=tolerance, time_step=time_step, grouping=grouping)
 
     @property
@@ -212,33 +211,7 @@ def plan(
         method = "free_space"
     if method != "free_space":
         require_spacing(region, spacing)
-    if method == "auto":
-        method, grouping = _cheapest(scene, region, spacing, tolerance, runs)
-    elif method != "free_space":
-        grouping = _grouping(region, method, spacing, tolerance, runs)
+        method, grouping = choose_grids(region, method, spacing, tolerance, runs)
     return Plan(
         scene, region, method, spacing, tolerance, kernel, precision, max_periods, time_step, grouping, runs
     )
-
-
-def _grouping(region: Region, method: str, spacing: float, tolerance: float, runs: int) -> Grouping:
-    if method == "full":
-        return whole_domain(region, spacing)
-    return cheapest_boxes(region, spacing, tolerance, runs)
-
-
-def _cheapest(
-    scene: Scene, region: Region, spacing: float, tolerance: float, runs: int
-) -> tuple[str, Grouping]:
-    """Choose the cheapest method that is accurate for the scene, and its grids."""
-    domain, boxes = whole_domain(region, spacing), cheapest_boxes(region, spacing, tolerance, runs)
-    gain = runs * domain.grids[0].work / boxes.box_cost(runs)
-    walls = any(is_wall(scene, obstacle) for obstacle in scene.obstacles)
-    corners = [(*region.domain, shape.lower, shape.upper) for shape in region.shapes]
-    outside = any((np.less(low, first) | np.greater(high, last)).any() for first, last, low, high in corners)
-    method, grouping = ("full", domain) if walls or not (outside or gain > 1) else ("box", boxes)
-    logger.debug(
-        "method auto: %s; full would take %.2g times as long as box (walls through the boundary layer: %s,"
-        " obstacles that leave the domain: %s)", method, gain, walls, outside,
-    )  # fmt: skip
-    return method, grouping

@@ -33,7 +33,7 @@ def region_of(scene: Scene) -> Region:
     )
 
 
-def is_wall(scene: Scene, obstacle: Obstacle) -> bool:
+def _is_wall(scene: Scene, obstacle: Obstacle) -> bool:
     """Return whether an obstacle is an axis-aligned wall or slab across the domain on two axes at least."""
     aligned = isinstance(obstacle, Box) and obstacle.rotation == (0.0, 0.0, 0.0)
     return aligned and len(_ends(scene, obstacle)) <= 1
@@ -42,7 +42,7 @@ def is_wall(scene: Scene, obstacle: Obstacle) -> bool:
 def warn_of_ending_walls(scene: Scene) -> None:
     """Log which walls end before the boundary layers because an earlier wall has another direction."""
     continued = zip(scene.obstacles, _continued(scene), strict=True)
-    ending = [index for index, (one, goes_on) in enumerate(continued) if is_wall(scene, one) and not goes_on]
+    ending = [index for index, (one, goes_on) in enumerate(continued) if _is_wall(scene, one) and not goes_on]
     if ending:
         logger.warning(
             "obstacle %s crosses the domain in another direction than a wall before: it ends where the"
@@ -70,7 +70,7 @@ def _continued(scene: Scene) -> list[bool]:
     """
     continued, normal = [], None
     for obstacle in scene.obstacles:
-        wall, ends = is_wall(scene, obstacle), _ends(scene, obstacle)
+        wall, ends = _is_wall(scene, obstacle), _ends(scene, obstacle)
         continued.append(wall and (not ends or normal in (None, ends[0])))
         if continued[-1] and ends:
             normal = ends[0]
