@@ -104,7 +104,7 @@ class GABS(Method):
         search = begin_ascent(alone[orders[:, 0]], orders, self.passes, place=1)
         if state.problem.transducers > 1:
             return Step(candidates(search, self.levels), search)
-        goes_on = torch.full((len(orders),), self.passes > 1, device="cpu")
+        goes_on = torch.full((len(orders),), self.passes > 1, dtype=torch.bool, device="cpu")
         search = begin_ascent(alone[orders[goes_on, 0]], orders[goes_on], self.passes - 1)
         return Step(candidates(search, self.levels), search, goes_on)
 

@@ -216,6 +216,26 @@ OUT_OF_RANGE: dict[Callable[..., Any] | str, list[tuple[dict[str, Any], str]]] =
         ({"points": [[0.1, 0.02, 0.03]]}, "points[0]: (0.1, 0.02, 0.03) m; lies on source 0, must be at lea"),
         ({"wavenumber": 1 - 0.1j}, "wavenumber.imag: -0.1 Np/m; must be finite and >= 0"),
     ],
+    "rigid_sphere": [
+        (
+            {"points": [[0, 0, 0]]},
+            "points[0]: (0.0, 0.0, 0.0) m, 0 m from the centre of the sphere; must",
+        ),
+        (
+            {"sources": [[0, 0, 0]]},
+            "sources[0]: (0.0, 0.0, 0.0) m, 0 m from the centre of the sphere; must",
+        ),
+        ({"points": [[0.1, 0.02, 0.03]]}, "points[0]: (0.1, 0.02, 0.03) m; lies on source 0"),
+    ],
+    "soft_sphere": [({"radius": -1.0}, "radius: -1.0 m; must be finite and > 0")],
+    "fluid_sphere": [({"density_ratio": 0.0}, "density_ratio: 0.0; must be finite and > 0")],
+    "rigid_plane": [({"points": [[-1, 0, 0]]}, "points[0]: (-1.0, 0.0, 0.0) m, -")],
+    "soft_plane": [({"sources": [[-1, 0, 0]]}, "sources[0]: (-1.0, 0.0, 0.0) m, -")],
+    "fluid_half_space": [({"sources": [(12e-3, 11e-3, 13e-3)]}, "m, 0 m in front of the plane; must be")],
+    "fluid_slab": [({"thickness": 0.0}, "thickness: 0.0 m; must be finite and > 0")],
+    "step_coefficients": [({"angle": [0.1, 1.6]}, "angle: (0.1, 1.6) rad; every entry must be in [0, pi/2)")],
+    "piston_on_axis": [({"distance": [-0.1]}, "distance: -0.1 m; every entry must be >= 0")],
+    "piston_field": [({"normal": (0, 0, 0)}, "normal: (0, 0, 0); must be a vector of finite length > 1e-09")],
     scene: [
         ({"frequency": 0}, "Scene.frequency: 0 Hz; must be finite and > 0"),
         ({"frequency": FAR}, "Scene.frequency: 1e+200 Hz; must be in 0.001 to 1e+12"),

@@ -25,6 +25,7 @@ vectors = hnp.arrays(float, 3, elements=st.floats(-0.2, 0.2))
 
 
 def test_a_positive_phase_turns_the_drive_clockwise():
+    assert drive_from_phases(torch.zeros(5, 1, 2), [1.0, 0.5])[3, 0].tolist() == [1.0, 0.5]  # broadcasts
     drive = drive_from_phases([0.0, math.pi / 2], [1.0, 0.5])
     expected = torch.tensor([1.0, -0.5j], dtype=torch.complex128)
     # cos(pi / 2) is 6e-17 in float64.
@@ -61,12 +62,6 @@ def test_drive_carries_the_gradient_of_phases_and_amplitudes():
     assert torch.autograd.gradcheck(drive_from_phases, (phases, amplitudes))
 
 
-def test_amplitudes_broadcast_over_phases():
-    drive = drive_from_phases(torch.zeros(5, 1, 2), [1.0, 0.5])
-    assert drive.shape == (5, 1, 2)
-    assert torch.equal(drive[3, 0], torch.tensor([1.0, 0.5], dtype=torch.complex128))
-
-
 def test_focus_phases_are_the_distance_in_radians():
     phases = focus_phases([[0, 0, 0], [0, 0, 0.5]], (0.3, 0.4, 0.0), wavenumber=10.0)
     assert phases.tolist() == pytest.approx([5.0, 10 * math.sqrt(0.5)], rel=1e-15)
@@ -78,13 +73,6 @@ def test_focus_phases_do_not_depend_on_where_the_origin_is(positions, focus, shi
     shifted = focus_phases(positions + shift, focus + shift, WAVENUMBER)
     # Coordinates of 0.4 m carry 6e-17 m of rounding each, times k = 740 rad/m.
     torch.testing.assert_close(shifted, phases, rtol=0, atol=1e-12)
-
-
-@given(positions=places, focus=vectors)
-def test_focus_phases_do_not_depend_on_the_order_or_sign_of_the_axes(positions, focus):
-    phases = focus_phases(positions, focus, WAVENUMBER)
-    turned = focus_phases(-positions[:, [2, 0, 1]], -focus[[2, 0, 1]], WAVENUMBER)
-    torch.testing.assert_close(turned, phases, rtol=1e-14, atol=1e-300)
 
 
 def test_several_foci_are_each_for_itself():

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from autdtorch.analytic.green import free_space_matrix
 from autdtorch.hardware import AUTD3, DEVICES
 from autdtorch.io.array_file import load_array
 from autdtorch.io.drive_file import load_drive, save_drive
@@ -81,27 +80,12 @@ def test_autd3_gets_bytes_in_the_order_of_its_units(tmp_path):
             assert np.array_equal(file[name].ravel(), level.numpy())
 
 
-def test_the_field_of_what_autd3_plays_is_that_of_the_drive_within_its_levels(tmp_path):
-    array = TransducerArray.autd3((0, 0, 0), normal=(0, 0, 1))
-    drive = some_drive(249)
-    save_drive(tmp_path / "drive.csv", drive, array, "autd3")
-    matrix = free_space_matrix([[0, 0, 0.1], [0.02, 0.03, 0.15]], array, wavenumber=739.0)
-
-    moved = (matrix @ (load_drive(tmp_path / "drive.csv") - drive)).abs()
-
-    # Each transducer is off by at most half a level of its phase and half of one of its amplitude.
-    assert (moved <= (math.pi / 256 + 1 / 510) * matrix.abs().sum(dim=1)).all()
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("transducer,phase [rad]\n0,1\n", r"d.csv: no column amplitude; must have phase and amplitude"),
         ("phase [rad],amplitude\n0,2\n", r"d.csv: amplitudes: from 2 to 2"),
-        (
-            "unit,transducer,autd3 phase\n0,0,1\n",
-            r"d.csv: no autd3 intensity; must have autd3 phase, autd3 int",
-        ),
+        ("unit,transducer,autd3 phase\n0,0,1\n", r"d.csv: no autd3 intensity; must have autd3 phase, "),
         ("autd3 phase,autd3 intensity\n256,0\n", r"d.csv: AUTD3 phase: .*0 to 255"),
         ("autd3 phase,autd3 intensity\n1.5,0\n", r"d.csv: AUTD3 phase: .*0 to 255"),
     ],
@@ -122,10 +106,9 @@ def test_what_is_wrong_with_an_npz_file_is_said(tmp_path):
         load_drive(tmp_path / "d.npz")
 
 
-def test_a_file_has_the_name_that_was_given(tmp_path):
-    array = TransducerArray.grid((4, 4), 10e-3, (0, 0, 0))
-    save_drive(tmp_path / "D.NPZ", drive_from_phases(torch.zeros(16)), array)
-    assert load_drive(tmp_path / "D.NPZ").shape == (16,)
+def test_a_suffix_in_capitals_is_kept(tmp_path):
+    save_drive(tmp_path / "D.NPZ", torch.ones(249) + 0j, TransducerArray.autd3((0, 0, 0)))
+    assert load_drive(tmp_path / "D.NPZ").shape == (249,)
 
 
 def test_a_write_that_breaks_off_leaves_the_file_that_was_there(tmp_path, monkeypatch):
@@ -144,14 +127,17 @@ def test_a_write_that_breaks_off_leaves_the_file_that_was_there(tmp_path, monkey
     assert [file.name for file in tmp_path.iterdir()] == ["drive.npz"]
 
 
-def test_a_drive_that_is_not_the_devices_is_refused(tmp_path):
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"device": "autd3"}, r"16 transducers; must be a multiple of 249 for autd3"),
+        ({"device": "autd"}, r"device: 'autd'; must be one of autd3, openmpd, sonicsurface, u"),
+        ({"path": "d.txt"}, r"path: .*; must end in .csv or .npz"),
+        ({"drive": torch.ones(1, 16) + 0j}, r"drive: shape \(1, 16\); must be \(16,\), a single drive"),
+    ],
+)
+def test_a_drive_that_is_not_the_devices_is_refused(tmp_path, changes, message):
     array = TransducerArray.grid((4, 4), 10e-3, (0, 0, 0))
-    drive = drive_from_phases(torch.zeros(16))
-    with pytest.raises(ValueError, match=r"16 transducers; must be a multiple of 249 for autd3"):
-        save_drive(tmp_path / "d.csv", drive, array, "autd3")
-    with pytest.raises(ValueError, match=r"device: 'autd'; must be one of autd3, openmpd, sonicsurface, u"):
-        save_drive(tmp_path / "d.csv", drive, array, "autd")
-    with pytest.raises(ValueError, match=r"path: .*; must end in .csv or .npz"):
-        save_drive(tmp_path / "d.txt", drive, array)
-    with pytest.raises(ValueError, match=r"drive: shape \(1, 16\); must be \(16,\), a single drive"):
-        save_drive(tmp_path / "d.csv", drive[None], array)
+    given = {"path": "d.csv", "drive": torch.ones(16) + 0j, "array": array} | changes
+    with pytest.raises(ValueError, match=message):
+        save_drive(**given | {"path": tmp_path / given["path"]})

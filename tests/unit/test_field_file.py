@@ -12,15 +12,13 @@ LENGTH = 1e-12  # rounding of lengths below 1 m in float64, with margin
 
 
 def box_points():
-    axes = [
-        start + 2e-3 * torch.arange(count, dtype=torch.float64)
-        for start, count in ((0.1, 4), (0, 3), (-1, 2))
-    ]
+    grid = ((0.1, 4), (0, 3), (-1, 2))
+    axes = [start + 2e-3 * torch.arange(count, dtype=torch.float64) for start, count in grid]
     return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
 
 
 def wave(points):
-    """A field that tells every point from every other."""
+    """Return a field with a different value at every point."""
     return torch.polar(1 + points[..., 0], 300 * points @ torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64))
 
 
@@ -29,12 +27,8 @@ def read_by_vtk(path):
     return pyvista.ImageData(str(path))
 
 
-PLANES = {
-    "facing x": Plane(center=(0.08, 0.05, 0.05), normal=(1, 0, 0), size=(0.04, 0.02)),
-    "facing -x": Plane(center=(0.08, 0.05, 0.05), normal=(-1, 0, 0), size=(0.04, 0.02)),
-    "facing y": Plane(center=(0.08, 0.05, 0.05), normal=(0, 1, 0), size=(0.04, 0.02)),
-    "tilted": Plane(center=(0.08, 0.05, 0.05), normal=(1, 2, 3), size=(0.04, 0.02)),
-}
+NORMALS = {"facing x": (1, 0, 0), "facing -x": (-1, 0, 0), "facing y": (0, 1, 0), "tilted": (1, 2, 3)}
+PLANES = {name: Plane((0.08, 0.05, 0.05), normal, (0.04, 0.02)) for name, normal in NORMALS.items()}
 
 
 @pytest.mark.parametrize(
@@ -88,6 +82,10 @@ def test_hdf5_says_where_its_values_are(tmp_path, points):
     assert (about["frequency"], about["time_convention"]) == (40e3, "exp(-i omega t)")
 
 
+SHEAR = torch.tensor([[1.0, 0, 0], [1, 1, 0], [0, 0, 1]]).double()
+LINE = box_points()[:, :1, :1]
+
+
 def bent(points):
     moved = points.clone()
     moved[1, 1, 1] += 1e-6
@@ -99,28 +97,17 @@ def bent(points):
     [
         ({"path": "field.vtk"}, r"path: .*field.vtk'; must end in .vti, .h5 or .hdf5"),
         ({"points": bent(box_points())}, r"points: must be a regular grid with right angles"),
-        (
-            {"points": box_points() @ torch.tensor([[1.0, 0, 0], [1, 1, 0], [0, 0, 1]]).double()},
-            "right angles",
-        ),
+        ({"points": box_points() @ SHEAR}, "right angles"),
         ({"points": 0 * box_points()}, r"points: two coincide"),
         ({"points": box_points().reshape(-1, 3)}, r"points: shape \(24, 3\); must be \(Nx, Ny, Nz, 3\)"),
         ({"pressure": wave(box_points())[0]}, r"pressure: shape \(3, 2\); must be \(4, 3, 2\) as the points"),
         ({"pressure": wave(box_points()).abs()}, r"pressure: .*must be an array of complex numbers"),
-        (
-            {"points": box_points()[:, :1, :1], "pressure": wave(box_points())[:, :1, :1]},
-            r"must have two axes",
-        ),
+        ({"points": LINE, "pressure": wave(LINE)}, r"must have two axes"),
         ({"frequency": math.nan}, r"frequency: nan Hz"),
     ],
 )
 def test_what_is_no_field_on_a_grid_is_refused(tmp_path, changes, message):
-    arguments = {
-        "path": "field.vti",
-        "pressure": wave(box_points()),
-        "points": box_points(),
-        "frequency": 40e3,
-    }
-    arguments |= changes
+    field = {"path": "field.vti", "pressure": wave(box_points()), "points": box_points(), "frequency": 40e3}
+    field |= changes
     with pytest.raises(ValueError, match=message):
-        save_field(tmp_path / arguments.pop("path"), **arguments)
+        save_field(tmp_path / field.pop("path"), **field)

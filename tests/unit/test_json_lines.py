@@ -34,6 +34,10 @@ def written(path: Path, head: bytes = b"") -> bytes:
     return path.read_bytes()
 
 
+def full(*_: object) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
 @pytest.mark.parametrize("head", [b"", HEAD], ids=["no head", "head"])
 def test_rows_come_back_and_others_follow(path: Path, head: bytes) -> None:
     content = written(path, head)
@@ -98,13 +102,15 @@ def test_whatever_was_put_into_a_file_is_set_aside_once_and_the_whole_rows_are_u
     assert path.read_bytes() == content
 
 
-def test_what_is_set_aside_is_told_in_one_line(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_damaged_lines_are_set_aside_with_a_log_line(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     first, second, third = written(path).splitlines(keepends=True)
-    path.write_bytes(first + b"\xff" + second[1:] + third + b"torn")
+    path.write_bytes(first + b"\xff" + second[1:] + third + first[:-2])
     lines, rows = read(path)
     assert rows == [ROWS[0], ROWS[2]]
     assert not caplog.messages
     lines.mend()
+    assert path.read_bytes() == first + third
+    assert path.with_name(path.name + SET_ASIDE).read_bytes() == b"\xff" + second[1:] + first[:-2] + b"\n"
     (told,) = caplog.messages
     assert "line 2 and 1 more: set aside" in told
     assert told.endswith(": its checksum is wrong; the last line broke off")
@@ -131,19 +137,6 @@ def test_the_end_of_a_line_costs_no_row(path: Path, head: bytes, caplog: pytest.
             assert not debris or debris in aside.read_bytes()
 
 
-def test_a_last_line_that_broke_off_is_kept_aside(path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    *whole, last = written(path).splitlines(keepends=True)
-    path.write_bytes(b"".join(whole) + last[:-2])
-    lines, rows = read(path)
-    assert rows == ROWS[:2]
-    lines.mend()
-    assert path.read_bytes() == b"".join(whole)
-    assert path.with_name(path.name + SET_ASIDE).read_bytes() == last[:-2] + b"\n"
-    (told,) = caplog.messages
-    assert "line 3: set aside" in told
-    assert told.endswith(": the last line broke off")
-
-
 def test_whatever_is_in_a_line_it_takes_no_time_to_take_it_apart(path: Path) -> None:
     content = written(path)
     path.write_bytes(b'{"' * 200_000 + content.replace(b"\n", b"") + b'"}' * 200_000)
@@ -168,9 +161,6 @@ def test_lines_are_set_aside_on_disk_before_they_leave_the_file(
 
 
 def test_nothing_follows_half_a_line(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(_: int) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
     content = written(path)
     lines, _ = read(path)
     with monkeypatch.context() as context:
@@ -182,21 +172,17 @@ def test_nothing_follows_half_a_line(path: Path, monkeypatch: pytest.MonkeyPatch
     assert read(path)[1] == [*ROWS, ROWS[0]]
 
 
-def test_a_row_that_its_reader_refuses_is_set_aside(path: Path) -> None:
+def test_a_row_that_its_reader_refuses_is_set_aside_with_the_reason(
+    path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     def use(row: dict[str, Any]) -> None:
         if row["number"] == 1:
             row["missing"]
 
     written(path)
     JsonLines(path, "key", use).mend()
+    assert caplog.messages[0].endswith("it has no 'missing'")
     assert read(path)[1] == [ROWS[0], ROWS[2]]
-
-
-def test_why_a_row_was_refused_is_told(path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    written(path)
-    JsonLines(path, "key", lambda row: row["missing"]).mend()
-    (told,) = caplog.messages
-    assert told.endswith("it has no 'missing'")
 
 
 def test_a_file_that_was_removed_meanwhile_is_not_begun_anew_by_its_next_line(path: Path) -> None:
@@ -214,9 +200,6 @@ def test_the_lines_of_a_file_with_another_key_are_not_used(path: Path) -> None:
 
 
 def test_nothing_is_lost_where_lines_cannot_be_set_aside(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
     damaged = b"damaged\n" + written(path)
     path.write_bytes(damaged)
     lines, _ = read(path)

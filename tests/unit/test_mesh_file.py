@@ -81,13 +81,6 @@ def test_a_face_of_fewer_than_three_vertices_is_refused_with_its_line(tmp_path: 
         read_obj(str(tmp_path / "body.obj"))
 
 
-@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
-def test_a_count_below_zero_is_refused(tmp_path: Path, kind: str) -> None:
-    (tmp_path / "body.ply").write_bytes(ply(kind).replace(b"vertex 4", b"vertex -1"))
-    with pytest.raises(ValueError, match="-1 elements 'vertex'; must be at least 0"):
-        read_ply(str(tmp_path / "body.ply"))
-
-
 @pytest.mark.parametrize(("kind", "declared"), [("ascii", "int"), ("ascii", "float"), ("binary", "float")])
 @pytest.mark.parametrize("index", ["nan", "inf", "2.5"])
 def test_an_index_that_is_no_whole_number_is_refused(

@@ -49,7 +49,7 @@ STATES = {
 
 
 def numbers(folder: Path) -> dict[str, torch.Tensor]:
-    """What a study goes through, from the scene to files and figures of merit."""
+    """Return the numbers of a study, from the scene to files and metrics."""
     found: dict[str, torch.Tensor] = {}
     ball = at.Sphere((12e-3, 20e-3, 5e-3), 3e-3, density=0.2, sound_speed=900.0)
     scene = small_scene((CUBE, ball), radius=1e-3, absorption=2.0)
