@@ -1,4 +1,4 @@
-"""What a sweep leaves, merged: which studies are one, and how the others are told apart."""
+"""Studies of a sweep, merged: which become one, and the names of the others."""
 
 from collections.abc import Callable
 from functools import partial
@@ -13,6 +13,7 @@ from autdtorch.methods.gabs import gabs
 from autdtorch.methods.lssg import lssg
 from autdtorch.methods.solution import Solution, joined
 from autdtorch.study.report.summary_table import save_summary
+from autdtorch.study.results import MethodResult
 from autdtorch.study.results_file import RESULTS_FILE
 from autdtorch.study.run import run_study
 from autdtorch.study.sweeps import Sweep, collect_results
@@ -31,7 +32,7 @@ METHODS = {"gabs": partial(gabs, levels=2), "lssg": lssg}
 
 @pytest.fixture
 def study(tmp_path: Path) -> Study:
-    """Leaves a study in a folder of its own, as a job of a sweep does."""
+    """Save a study in its own folder, like a job of a sweep."""
 
     def leave(
         scene: dict = SCENE, method: str = "gabs", seed: int = 0, trials: int = 1, files: tuple = ()
@@ -54,27 +55,33 @@ def names(sweep: Sweep) -> list[str]:
     return list(sweep.results.scenes)
 
 
-def test_seeds_of_a_method_with_chance_are_trials_even_if_two_end_alike(study: Study, tmp_path: Path) -> None:
+def only_method(folder: Path) -> MethodResult:
+    (method,) = collect_results(folder).results.scenes["air"].methods.values()
+    return method
+
+
+def test_seeds_of_a_random_method_are_trials_even_if_two_end_alike(study: Study, tmp_path: Path) -> None:
     for seed in range(8):
         study(seed=seed)
-    (method,) = collect_results(tmp_path).results.scenes["air"].methods.values()
+    method = only_method(tmp_path)
     assert method.trials == 8
-    # Three transducers of two levels each: some of eight searches end at the same drive.
+    # Three transducers of two levels each: some of eight searches end at equal drives.
     assert len({tuple(drive.tolist()) for drive in method.solution.drive}) < 8
 
 
-def test_a_method_without_chance_has_one_trial(study: Study, tmp_path: Path) -> None:
-    for seed in (0, 1):
-        study(method="lssg", seed=seed)
-    (method,) = collect_results(tmp_path).results.scenes["air"].methods.values()
-    assert method.trials == 1
-
-
-def test_of_a_seed_the_longest_study_counts(study: Study, tmp_path: Path) -> None:
-    for trials in (3, 2):
-        study(trials=trials)
-    (method,) = collect_results(tmp_path).results.scenes["air"].methods.values()
-    assert method.trials == 3
+@pytest.mark.parametrize(
+    ("studies", "trials"),
+    [
+        ([{"method": "lssg", "seed": 0}, {"method": "lssg", "seed": 1}], 1),  # no random choices
+        ([{"trials": 3}, {"trials": 2}], 3),  # of a seed, the longest study
+    ],
+)
+def test_trials_are_counted_once(
+    study: Study, tmp_path: Path, studies: list[dict[str, object]], trials: int
+) -> None:
+    for settings in studies:
+        study(**settings)
+    assert only_method(tmp_path).trials == trials
 
 
 def test_a_swept_list_is_one_setting_in_the_order_of_its_values(study: Study, tmp_path: Path) -> None:
@@ -91,8 +98,8 @@ def test_a_number_is_the_same_however_it_is_written(study: Study, tmp_path: Path
     assert names(collect_results(tmp_path)) == ["air"]
 
 
-def test_names_that_would_be_alike_are_told_apart(study: Study, tmp_path: Path) -> None:
-    """Such as paths that differ in a separator, and a file that was changed between two jobs."""
+def test_names_that_would_be_equal_get_a_digest(study: Study, tmp_path: Path) -> None:
+    # A file was changed between two jobs.
     study(files=("11",))
     study(files=("22",), seed=1)
     first, second = names(sweep := collect_results(tmp_path))
@@ -139,8 +146,7 @@ def test_a_study_that_is_there_twice_is_counted_once_and_told(
     for seed in (0, 1):
         study(seed=seed)
     (tmp_path / "0" / RESULTS_FILE).write_bytes((tmp_path / "1" / RESULTS_FILE).read_bytes())
-    (method,) = collect_results(tmp_path).results.scenes["air"].methods.values()
-    assert method.trials == 1
+    assert only_method(tmp_path).trials == 1
     (line,) = caplog.messages
     assert str(tmp_path / "0") in line
     assert str(tmp_path / "1") in line

@@ -1,4 +1,4 @@
-"""Results that somebody sent: their names stay names, and their texts stay texts in a report."""
+"""Results from others: names are safe as file names, and texts stay texts in a report."""
 
 import functools
 from dataclasses import replace
@@ -71,7 +71,7 @@ def test_results_with_such_a_name_are_refused(tmp_path: Path, name: str, field: 
 
 
 def left(folder: Path, *studies: StudyResult) -> Path:
-    """A sweep of these studies, in a folder that stands alone in `folder`."""
+    """Save a sweep of these studies in a subfolder."""
     sweep = folder / "sweep"
     for number, results in enumerate(studies):
         save_results(results, sweep / str(number))
@@ -79,7 +79,7 @@ def left(folder: Path, *studies: StudyResult) -> Path:
 
 
 def collect(sweep: Path) -> str:
-    """Do what `autdtorch collect` does; returns the page."""
+    """Do what `autdtorch collect` does; return the page."""
     found = collect_results(sweep)
     save_summary(found.results, found.swept, sweep / SUMMARY_FILE)
     page = write_report(found.results, found.scenes, sweep, "autdtorch collect", found.seeds)

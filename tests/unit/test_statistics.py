@@ -1,4 +1,4 @@
-"""Confidence intervals cover what they should, and claim nothing that so few trials cannot show."""
+"""Confidence intervals of trials, and the gap to the bound, on data with known answers."""
 
 import math
 import operator
@@ -8,10 +8,21 @@ import pytest
 import torch
 from scipy import stats
 
-from autdtorch.study.statistics import CONFIDENCE, FEWEST_TRIALS, Interval, bootstrap, share_interval
+from autdtorch.methods.solution import Solution
+from autdtorch.objectives.metrics import FocusMetrics
+from autdtorch.study.results import MethodResult
+from autdtorch.study.statistics import (
+    CONFIDENCE,
+    FEWEST_TRIALS,
+    Interval,
+    bootstrap,
+    bound_gap,
+    evaluations_to,
+    share_interval,
+)
 
 DRAWS = 200
-# Of 200 draws, each of which covers the truth with 95 %, fewer or more than these do in 1 of 1000 cases.
+# Each draw covers the truth with 95 %; fewer or more of 200 draws do so in 1 of 1000 cases.
 LEAST, MOST = (int(stats.binom.ppf(tail, DRAWS, CONFIDENCE)) for tail in (1e-3, 1 - 1e-3))
 
 
@@ -43,13 +54,9 @@ def test_the_interval_of_a_mean_is_about_that_of_students_t() -> None:
     assert (found.low, found.high) == pytest.approx(exact, abs=0.1 * float(values.std()) / math.sqrt(50) * 2)
 
 
-def test_the_same_data_give_the_same_interval() -> None:
+def test_exact_numbers_add_no_uncertainty_and_equal_data_give_equal_intervals() -> None:
     values = torch.rand(20, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     assert bootstrap(values) == bootstrap(values)
-
-
-def test_what_is_known_exactly_adds_no_uncertainty() -> None:
-    values = torch.rand(20, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     assert bootstrap(2.0, 3.0, combine=operator.sub) == Interval.exact(-1.0)
     alone, shifted = bootstrap(values), bootstrap(values, 2.0, combine=operator.sub)
     for end in ("value", "low", "high"):
@@ -92,3 +99,44 @@ def test_a_falling_function_turns_the_interval_around() -> None:
 )
 def test_numbers_have_three_digits(interval: Interval, text: str) -> None:
     assert str(interval) == text
+
+
+HISTORY = [
+    [1.0, 2.0, 9.0, 9.5],
+    [9.0, 9.0, 9.0, 9.0],
+    [1.0, 1.0, 1.0, 8.9],
+    [2.0, 9.5, 9.5, 9.5],  # ended after two evaluations
+]
+
+
+def method_result(history: list[list[float]]) -> MethodResult:
+    best = torch.tensor(history, dtype=torch.float64)
+    trials, evaluations = best.shape
+    drive = torch.ones(trials, 1, dtype=torch.complex128)
+    solution = Solution(drive, best[:, -1:], best[:, -1], torch.full((trials,), evaluations), best)
+    metrics = FocusMetrics(best[:, -1], best[:, -1], *torch.zeros(2, trials, dtype=torch.float64), None)
+    return MethodResult(solution, metrics, torch.ones(trials, dtype=torch.float64), 0, None)
+
+
+def test_evaluations_are_counted_to_the_first_that_reaches_a_score() -> None:
+    solution = method_result(HISTORY).solution
+    for score, wanted in ((9.0, [3, 1, math.inf, 2]), (9.6, [math.inf] * 4), (0.5, [1] * 4)):
+        assert evaluations_to(solution, score).tolist() == wanted
+
+
+def test_the_gap_is_that_of_the_median_score() -> None:
+    # Scores 1 to 9 have the median 5: the gap to 10 is a half, its ends are mirrored.
+    finding = bound_gap(method_result([[float(score)] for score in range(1, 10)]), 10.0)
+    assert finding.score.value == 5.0
+    assert finding.gap.value == 0.5
+    assert finding.gap.low == pytest.approx(1 - finding.score.high / 10)
+    assert finding.gap.high == pytest.approx(1 - finding.score.low / 10)
+    assert 0 < finding.gap.low < 0.5 < finding.gap.high < 1
+    assert finding.evaluations.tolist() == [math.inf] * 8 + [1]
+
+
+def test_a_single_trial_has_a_gap_without_interval_and_silence_none() -> None:
+    finding = bound_gap(method_result([[4.0, 8.0]]), 10.0)
+    assert finding.gap.value == pytest.approx(0.2)
+    assert math.isinf(finding.gap.low)
+    assert bound_gap(method_result([[0.0, 0.0]]), 0.0).gap.value == 0.0
