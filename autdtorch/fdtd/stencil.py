@@ -15,7 +15,7 @@ that wave exact for the time step. Other frequencies are not tuned; the steady s
 Where air absorbs, a term D (p_new - p_old) is added on the left. A wave e^{i (kappa + i eta) n - i w t} of
 attenuation eta per cell then solves
 
-    2 cos(w dt) - 2 i D sin(w dt) = 2 - C L(kappa + i eta),
+    2 cos(w dt) - 2 i D sin(w dt) = 2 - C L(kappa + i eta).
 
 The real part, with the real part of L, determines C, and the imaginary part D. The bound on C for stability
 is that without loss, and D damps all waves.

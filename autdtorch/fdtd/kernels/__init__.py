@@ -1,1 +1,1 @@
-"""Time-stepping kernels under one contract: a readable specification and fast versions of it."""
+"""Time-stepping kernels under one contract: a readable specification and fast versions."""

@@ -1,4 +1,4 @@
-"""Compilation of the CPU kernels by Numba, with results that do not depend on how it went."""
+"""Compilation of the CPU kernels by Numba, with the same results from a cold and a warm cache."""
 
 from __future__ import annotations
 
@@ -20,19 +20,18 @@ INNER: dict[str, Any] = {
     "no_cpython_wrapper": True,
     "no_cfunc_wrapper": True,
 }
-"""Options of functions that compiled functions call: no wrappers for Python, no tests for division by zero.
+"""Options of functions that compiled functions call: no wrappers for Python, no checks of division by zero.
 
-`fastmath` must stay off in them. It lets the compiler reorder sums, otherwise in each function that a call is
-inlined into: a kernel loaded from disk then rounds otherwise than the one just compiled."""
-
+`fastmath` must stay off. It lets the compiler reorder sums, in a different way wherever a call is inlined; a
+kernel loaded from disk then rounds differently from the one just compiled."""
 
 _HERE = Path(__file__).parent
 
 _entries: set[Any] = set()
 
 
-class _Told(event.Listener):
-    """Says in the log that a kernel is compiled, which takes seconds; to load one from disk takes none."""
+class _CompilationLog(event.Listener):
+    """Logs that a kernel is compiled, which takes seconds; loading one from disk takes none."""
 
     def __init__(self) -> None:
         self._inside = 0
@@ -40,25 +39,25 @@ class _Told(event.Listener):
     def on_start(self, event: Any) -> None:
         function = event.data["dispatcher"]
         if function in _entries and not self._inside:
-            logger.info("compiling %s: once on a machine", function.__name__)
+            logger.info("compiling %s (once per machine)", function.__name__)
         self._inside += 1
 
     def on_end(self, event: Any) -> None:
         self._inside -= 1
 
 
-event.register("numba:compile", _Told())  # type: ignore[no-untyped-call]
+event.register("numba:compile", _CompilationLog())  # type: ignore[no-untyped-call]
 
 
 def entry(folder: Path = _HERE, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Compile a function that Python calls, and keep its machine code on disk.
+    """Compile a function that Python calls, and cache its machine code on disk.
 
-    Numba compares the file of the function with the one that was compiled, but not the files of the functions
-    that it calls. The digest in the name covers all of a folder, where these must be.
+    Numba checks the file of the function for changes, but not the files of the functions that it calls. The
+    digest in the name covers a whole folder, which must hold them.
 
     Args:
-        folder: of the function.
-        **options: of Numba, beside these.
+        folder: folder of the function.
+        **options: further options of Numba.
     """
 
     def compiled(function: Callable[..., Any]) -> Any:

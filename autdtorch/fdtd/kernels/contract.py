@@ -1,14 +1,15 @@
-"""What every kernel gets and does: tensors, indices and coefficients, never a scene.
+"""The contract of all kernels: tensors, indices and coefficients in, the next state and records out.
 
-One step, from pressures `now` and `before` at two successive times to the next (all of it linear):
+A step takes the pressures `now` and `before` at two successive times to the next; all of it is linear:
 
 1. new = center now + face F + edge E + corner C - keep before, with F, E, C the sums over the 6, 12 and 8
    neighbours;
-2. in the heterogeneous cells instead new = (1 + keep) now - keep before + sum_j weight_j (now_j - now);
-3. the boundary layers add what stretches the sum of the two neighbours along each axis (`boundary.py`), as
-   in air, times `layer_scale` in heterogeneous cells, and by column what those differ by (`columns.py`);
+2. in heterogeneous cells instead new = (1 + keep) now - keep before + sum_j weight_j (now_j - now); 3. the
+boundary layers add the stretching of the two neighbours' sum along each axis (`boundary.py`), as in air,
+times
+   `layer_scale` in heterogeneous cells, and by column the difference at interfaces (`layer_columns.py`);
 4. the sources are added: new += sum_s signal_s force_s, of the S signals that they share;
-5. the outermost ring of cells and the closed cells stay zero.
+5. the outermost ring and the sound-hard cells stay zero.
 """
 
 from __future__ import annotations
@@ -19,18 +20,18 @@ from typing import Protocol
 import torch
 
 Layer = tuple[torch.Tensor, torch.Tensor]
-"""Memory of the two boundary layers of an axis, stacked (2, nx, ny, nz) low and high: psi with L + 1 half
-cells and zeta with L cells along that axis, counted inwards from outside on both sides."""
+"""Memory of the two boundary layers of an axis, (2, nx, ny, nz) low and high: psi with L + 1 half cells and
+zeta with L cells along that axis, counted inwards on both sides."""
 
 
 @dataclass(frozen=True)
 class Columns:
-    """m columns of L cells through a boundary layer, between the silent ring and the first cell inside.
+    """m columns of L cells through a boundary layer, from the ring to the first cell inside.
 
     Attributes:
         index: flat indices of their cells (m, L + 2) int64, from the ring inwards.
-        offset: from a cell to the w across the column, flat (m, w) int64.
-        weight: what those have more than in air (m, w).
+        offset: flat offsets from a cell to w cells across the column (m, w) int64.
+        weight: differences of their weights from those of air (m, w).
     """
 
     index: torch.Tensor
@@ -39,7 +40,7 @@ class Columns:
 
     @classmethod
     def none(cls, layer_cells: int, dtype: torch.dtype, width: int = 9) -> Columns:
-        """No columns: nothing but air in the layers."""
+        """Return no columns, for layers of air."""
         index, offset = (
             torch.zeros((0, cells), dtype=torch.int64, device="cpu") for cells in (layer_cells + 2, width)
         )
@@ -48,25 +49,25 @@ class Columns:
 
 @dataclass(frozen=True)
 class Coefficients:
-    """Everything about the medium that a kernel sees.
+    """The medium as a kernel sees it.
 
     Attributes:
         center: weight of the cell itself; center + 6 face + 12 edge + 8 corner = 1 + keep.
         face: weight of each of 6 neighbours.
         edge: weight of each of 12.
         corner: weight of each of 8.
-        keep: weight of the pressure before, 1 in air that does not absorb and below it otherwise.
+        keep: weight of the pressure before: 1 without absorption, else less.
         heterogeneous_index: flat indices (n,) int64 of the heterogeneous cells, ascending.
         heterogeneous_weight: their weights (n, 27).
-        sound_hard_index: flat indices (k,) int64 of the closed cells.
-        layer_decay: b of the boundary layer at half cells and cells, interleaved from outside (2 L + 1,).
+        sound_hard_index: flat indices (k,) int64 of the sound-hard cells.
+        layer_decay: b of the boundary layer at half cells and cells, interleaved, from outside (2 L + 1,).
         layer_gain: a, likewise.
         layer_index: flat indices (k,) int64 of the heterogeneous cells in the layers, ascending.
-        layer_scale: how many times air's their term is (k,).
-        columns: where surfaces run through the boundary layers.
-        crossed: where they run through two at once, along one of them.
-        crossing: place, among the terms (L, n) of the `crossed`, flat, of what is added to the sums across
-            each cell of the columns (m, L + 2) int64; L n where there is nothing.
+        layer_scale: their layer terms over those of air (k,).
+        columns: interfaces through the boundary layers.
+        crossed: interfaces through two layers at once, along one of them.
+        crossing: flat place, among the terms (L, n) of the `crossed`, of the term to add to the sums across
+            each cell of the columns (m, L + 2) int64; L n for none.
     """
 
     center: float
@@ -95,9 +96,9 @@ class Coefficients:
 class State:
     """Two pressure fields (nx, ny, nz) and the memory of the boundary layers.
 
-    It is that of E_x, E_y and E_z, and of E_y acting on E_z p, which has 2 L cells along z: those of the low
-    layer and those of the high one, counted inwards. `columns` is that of the columns, psi (L + 1, m) and
-    zeta (L, m), and `crossed` that of the crossed ones.
+    `layers` belong to E_x, E_y and E_z, and to E_y acting on E_z p. The last has 2 L cells along z: those of
+    the low and of the high layer, counted inwards. `columns` have psi (L + 1, m) and zeta (L, m), and so have
+    `crossed`.
     """
 
     now: torch.Tensor
@@ -108,7 +109,7 @@ class State:
 
 
 def uniform_state(shape: tuple[int, int, int], coefficients: Coefficients, pressure: float) -> State:
-    """A medium at rest at one pressure, on an array of `shape`."""
+    """Return the state of rest at a uniform pressure on a grid of `shape`."""
     dtype, layer_cells = coefficients.layer_decay.dtype, coefficients.layer_cells
     layers = []
     sizes = (shape, shape, shape, (*shape[:2], 2 * layer_cells))
@@ -132,11 +133,11 @@ def uniform_state(shape: tuple[int, int, int], coefficients: Coefficients, press
 
 @dataclass(frozen=True)
 class Sources:
-    """Cells that are driven, by S signals: a drive has two, cos(w t) and sin(w t), times its envelope.
+    """Driven cells and their forces by S signals; a drive has two, cos(w t) and sin(w t), with its envelope.
 
     Attributes:
-        index: flat (n,) int64, ascending, no two alike.
-        force: by each signal (n, S) [Pa]; of a drive, real and imaginary part of the phasors.
+        index: flat indices (n,) int64, ascending, distinct.
+        force: force by each signal (n, S) [Pa]; of a drive, real and imaginary part of the phasors.
     """
 
     index: torch.Tensor
@@ -145,7 +146,7 @@ class Sources:
 
 @dataclass(frozen=True)
 class Receivers:
-    """Points that are read: flat `index` (R, n) int64 and `weight` (R, n)."""
+    """R receivers: flat `index` (R, n) int64 and `weight` (R, n) of their cells."""
 
     index: torch.Tensor
     weight: torch.Tensor
@@ -155,7 +156,7 @@ class Kernel(Protocol):
     """Advances a state by whole steps."""
 
     def at_once(self, shape: tuple[int, int, int]) -> int:
-        """How many runs on an array of `shape` may go side by side, in threads: they gain by it."""
+        """Return the number of runs on a grid of `shape` that threads may step concurrently."""
         ...
 
     def advance(
@@ -169,7 +170,7 @@ class Kernel(Protocol):
         """Step once per row of `signal` (steps, S), the signals of the sources.
 
         Returns:
-            The state afterwards, which may share memory with the one given (do not use that one again), and
-            the pressure at the receivers after each step (steps, R).
+            The new state, which may share memory with the one given, and the pressure at the receivers after
+            each step (steps, R). Do not use the given state again.
         """
         ...

@@ -1,10 +1,10 @@
-"""The kernel for CPUs, in numba: the same contract as the reference, in place, on several cores.
+"""The kernel for CPUs, in numba: in place, on several cores.
 
-The planes of the grid are cut into chunks by its shape alone (`_cuts`), so that results do not depend on
-the number of threads. A step goes through each chunk once (`cpu_sweep.py`). Then the outermost planes of a
-chunk get what its neighbours owe them, and single cells what concerns them. Workers take up the chunks one by
-one (`cpu_workers.py`). A small grid is one chunk, stepped without another thread: several of its runs can go
-side by side.
+The shape of the grid alone determines its chunks of planes (`_cuts`), so that results do not depend on the
+number of threads. A step sweeps each chunk once (`cpu_sweep.py`). Then the outermost planes of a chunk
+receive the terms of its neighbours, and single cells are corrected. Workers claim the chunks one by one
+(`cpu_workers.py`). A small grid is one chunk, stepped by one thread: several runs can be stepped
+concurrently.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ from autdtorch.utils.arrays import AnyArray
 from autdtorch.utils.threads import thread_count
 
 _CHUNK_CELLS, _CHUNK_PLANES = 200_000, 32
-"""Fewest cells and planes of a chunk: what a second thread is worth, and the sums at its ends."""
+"""Fewest cells and planes of a chunk, for which a second thread and the sums at its ends pay."""
 
 _CROWDED, _FREE = 0.75, 0.9
-"""Shares of the processors' time that workers had: below the first one works alone, above the second several
-do again."""
+"""Shares of the processors' time that workers got: below the first a single worker continues, above the
+second several again."""
 
 
 @njit(**INNER)
 def _record(p, receivers, first, last, out):  # type: ignore[no-untyped-def]
-    heard, hearing = receivers
+    index, weight = receivers
     for r in range(first, last):
         total = p[0] - p[0]
-        for m in range(heard.shape[1]):
-            total += hearing[r, m] * p[heard[r, m]]
+        for m in range(index.shape[1]):
+            total += weight[r, m] * p[index[r, m]]
         out[r] = total
 
 
@@ -61,25 +61,13 @@ def _sweep_chunk(c, p, q, medium, layers, cells, room):  # type: ignore[no-untyp
     shape, weights, profile = medium[3:6], medium[6:11], medium[11:13]
     profiles = medium[13:17], medium[17:21], medium[21:25]
     sweep_planes(
-        p,
-        q,
-        first,
-        last,
-        shape,
-        weights,
-        (psi_x, zeta_x),
-        memory,
-        profile,
-        profiles,
-        cells,
-        starts,
-        own,
+        p, q, first, last, shape, weights, (psi_x, zeta_x), memory, profile, profiles, cells, starts, own
     )
 
 
 @njit(**INNER)
 def _finish_chunk(c, q, medium, cells, outermost, sources, row):  # type: ignore[no-untyped-def]
-    """Add what the neighbours owe to the outermost planes of chunk c; then set its single cells."""
+    """Add the terms of the neighbours to the outermost planes of chunk c; then set its single cells."""
     cuts, starts, driven_starts = medium[:3]
     ny, nz = int(medium[4]), int(medium[5])
     plane = ny * nz
@@ -102,7 +90,7 @@ def _finish_chunk(c, q, medium, cells, outermost, sources, row):  # type: ignore
 
 @njit(**INNER)
 def _stretch_columns(p, columns, beside, place, memory, terms):  # type: ignore[no-untyped-def]
-    """Advance the columns' memory and write their terms (L, m); `beside` has more to sum, by `place`."""
+    """Advance the columns' memory and write their terms (L, m), with summands from `beside` at `place`."""
     index, offset, weight, b_half, a_half, b_cell, a_cell = columns
     psi, zeta = memory
     count, depths = index.shape
@@ -125,7 +113,7 @@ def _stretch_columns(p, columns, beside, place, memory, terms):  # type: ignore[
 
 @njit(**INNER)
 def _finish_columns(p, q, columns, memory):  # type: ignore[no-untyped-def]
-    """Add what surfaces through the layers differ by."""
+    """Add the terms of interfaces through the layers."""
     (cut, crossed, crossing), (cut_memory, crossed_memory) = columns, memory
     shares, beside = np.zeros_like(cut_memory[1]), np.zeros_like(crossed_memory[1])
     alone, nothing = np.zeros_like(crossed[0]), np.zeros((0, 0), p.dtype)
@@ -141,10 +129,10 @@ def _advance(  # type: ignore[no-untyped-def]
     p, q, medium, layers, cells, room, columns, memory, closed, sources, receivers, signal, recorded,
     counters, give_way,
 ):  # fmt: skip
-    """Do tasks until none is left: each worker calls this with the same arguments.
+    """Do tasks until none is left; each worker calls this with the same arguments.
 
-    A step has three phases of a task for each chunk: sweep it, finish it, silence closed cells. The first one
-    records the step before.
+    A step has three phases with a task for each chunk: sweep it, finish it, set sound-hard cells to zero. The
+    first phase records the step before.
     """
     chunks, steps, read = len(medium[0]) - 1, len(signal), recorded.shape[1]
     for _ in range((3 * steps + 1) * chunks):
@@ -180,7 +168,7 @@ def _cuts(shape: tuple[int, ...]) -> NDArray[np.int64]:
 
 
 def _room(chunks: int, shape: torch.Size, layer_cells: int, dtype: type) -> tuple[AnyArray, ...]:
-    """What a chunk keeps during a step, see `sweep_planes`."""
+    """Return the workspace of the chunks during a step, see `sweep_planes`."""
     _, ny, nz = shape
     lanes = 2 * (layer_cells + 2)
     terms = (2 * layer_cells * nz, ny * lanes, 2 * layer_cells * lanes)
@@ -194,7 +182,7 @@ def _columns(c: Coefficients, columns: Columns) -> tuple[AnyArray, ...]:
 
 
 def _heterogeneous_cells(c: Coefficients, strides: NDArray[np.int64]) -> tuple[AnyArray, ...]:
-    """Their indices, weights, the offsets of these, and what the layers need to know about them."""
+    """Return indices, weights, offsets, layer scale, weights of air, and workspace."""
     offsets = np.indices((3, 3, 3)).reshape(3, -1).T - 1
     air = np.array((c.center, c.face, c.edge, c.corner))[np.abs(offsets).sum(axis=1)]
     index, weight = c.heterogeneous_index.numpy(), c.heterogeneous_weight.numpy()
@@ -205,14 +193,14 @@ def _heterogeneous_cells(c: Coefficients, strides: NDArray[np.int64]) -> tuple[A
 
 
 class CpuKernel:
-    """See `kernels.contract`; updates the state in place."""
+    """Kernel on the CPU, which updates the state in place; see `kernels.contract`."""
 
     def __init__(self) -> None:
-        """A kernel that has found the processors free so far."""
+        """Assume free processors at first."""
         self._crowded = False
 
     def at_once(self, shape: tuple[int, int, int]) -> int:
-        """One for each core, if the grid is one chunk."""
+        """Return the number of threads if the grid is one chunk, else 1."""
         return thread_count() if len(_cuts(shape)) == 2 else 1
 
     def advance(
@@ -250,7 +238,7 @@ class CpuKernel:
             (_columns(c, c.columns), _columns(c, c.crossed), c.crossing.numpy()),
             tuple((psi.numpy(), zeta.numpy()) for psi, zeta in (state.columns, state.crossed)),
             c.sound_hard_index.numpy(),
-            # contiguous: for arrays with gaps numba compiles anew, and crashed when it loaded that from disk
+            # numba compiles again for arrays with gaps, and crashed when it loaded that from disk
             (sources.index.contiguous().numpy(), sources.force.contiguous().numpy()),
             (receivers.index.contiguous().numpy(), receivers.weight.contiguous().numpy()),
             signal.contiguous().numpy(),
@@ -264,7 +252,7 @@ class CpuKernel:
         return State(now, before, state.layers, state.columns, state.crossed), recorded
 
     def _work(self, advance: Callable[[], object], chunks: int) -> None:
-        """Step on as many threads as there are chunks, and processors that are free.
+        """Step on as many threads as there are chunks and free processors.
 
         On a busy machine workers that wait for each other are slower than one alone.
         """

@@ -1,16 +1,16 @@
-"""Derivatives by the heterogeneous cells' weights, summed over the steps, on one core."""
+"""Derivatives by stencil rows, summed over the steps, on one core."""
 
 from __future__ import annotations
 
 from autdtorch.fdtd.kernels.compiled import entry
 
 
-@entry(fastmath={"reassoc", "nsz"})  # sums of products fill vectors; nothing is called that could be inlined
+@entry(fastmath={"reassoc", "nsz"})  # vectorises sums of products; nothing that could be inlined is called
 def correlate(first, last, adjoint, field, index, offsets, place, total):  # type: ignore[no-untyped-def]
-    """Add to rows `first` to `last` of `total` (n, 27) what lambda_i (p_j - p_i) sums up to over the steps.
+    """Add sums of lambda_i (p_j - p_i) over the steps to rows `first` to `last` of `total` (n, 27).
 
-    Of lambda (n, steps) in the cells `index` (n,) and p (k, steps) in these and their neighbours, at
-    `offsets` (27,); `place` tells where a cell is in p.
+    `adjoint` is lambda (n, steps) in the cells `index` (n,), `field` is p (k, steps) in these and their
+    neighbours at `offsets` (27,). `place` is the row of a cell in `field`.
     """
     for i in range(first, last):
         own = place[index[i]]

@@ -1,7 +1,7 @@
-"""How the kernel for CPUs keeps the boundary layers: flat, as `cpu_sweep.py` runs through them.
+"""Memory layout of the boundary layers in the kernel for CPUs: flat, in the order of `cpu_sweep.py`.
 
-The contract counts both layers of an axis inwards. Here the upper ones of y and z lie in the order of the
-axis, which turns the sign of psi, and what belongs to ends of rows lies in lanes.
+The contract counts both layers of an axis inwards. Here the upper layers of y and z have the order of the
+axis, which changes the sign of psi, and ends of rows are stored in lanes.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from autdtorch.fdtd.kernels.contract import Coefficients, Layer
 from autdtorch.utils.arrays import AnyArray
 
 Profile = tuple[AnyArray, AnyArray, AnyArray, AnyArray]
-"""b and a of the half cells, then b and a of the cells, each as often as `stretch` meets it."""
+"""b and a of the half cells, then b and a of the cells, repeated as `stretch` reads them."""
 
 
 def rows_profile(c: Coefficients, row: int) -> Profile:
-    """Profile of a lower layer, of rows."""
+    """Return the profile of a lower layer, for rows."""
     decay, gain = c.layer_decay.numpy(), c.layer_gain.numpy()
     b_half, a_half, b_cell, a_cell = (
         part.repeat(row) for part in (decay[0::2], gain[0::2], decay[1::2], gain[1::2])
@@ -28,7 +28,7 @@ def rows_profile(c: Coefficients, row: int) -> Profile:
 
 
 def plane_profiles(c: Coefficients, shape: torch.Size) -> tuple[AnyArray, ...]:
-    """Profiles across y, z, and y for the lanes, of both layers each."""
+    """Return the profiles across y, z, and y for the lanes, of both layers each."""
     _, ny, nz = shape
     decay, gain = c.layer_decay.numpy(), c.layer_gain.numpy()
     across_z = []
@@ -43,7 +43,7 @@ def plane_profiles(c: Coefficients, shape: torch.Size) -> tuple[AnyArray, ...]:
 
 
 def _both_rows(c: Coefficients, row: int) -> Profile:
-    """Profile of a lower layer of rows and of the upper one, one row of nothing after their cells."""
+    """Return the profiles of a lower and an upper layer of rows, with a row of zeros after their cells."""
     low = rows_profile(c, row)
     none = np.zeros(row, low[0].dtype)
     high = [part.reshape(-1, row)[::-1].ravel() for part in low]
@@ -55,14 +55,14 @@ def _both_rows(c: Coefficients, row: int) -> Profile:
 
 
 class Memory:
-    """The memory of the boundary layers in this layout, taken from a state and given back to it.
+    """Memory of the boundary layers in this layout, copied from a state and back to it.
 
     Attributes:
         arrays: psi and zeta of x, of y, of the ends of rows, and of y for these.
     """
 
     def __init__(self, layers: tuple[Layer, ...]) -> None:
-        """Copy what a state remembers; what it has of x is used as it is."""
+        """Copy the memory of a state; that of x is used in place."""
         self._layers = [[part.numpy() for part in layer] for layer in layers]
         x, (psi_y, zeta_y), (psi_z, _), (psi_yz, zeta_yz) = self._layers
         nx, ny, layer_cells = len(psi_z[0]), psi_z.shape[2], psi_z.shape[3] - 1
@@ -78,12 +78,12 @@ class Memory:
             here[...] = sign * there
 
     def give_back(self) -> None:
-        """Write it back to the state."""
+        """Copy back to the state."""
         for here, there, sign in self._pairs():
             there[...] = sign * here
 
     def _pairs(self) -> Iterator[tuple[AnyArray, AnyArray, int]]:
-        """Views of parts of the arrays and of the state; psi of upper layers changes its sign."""
+        """Yield views of the arrays and of the state; psi of upper layers changes its sign."""
         for half, number in ((True, 2), (False, 3)):
             y, z, yz = self.arrays[number], self.arrays[number + 2], self.arrays[number + 4]
             _, of_y, of_z, of_yz = (layer[not half] for layer in self._layers)

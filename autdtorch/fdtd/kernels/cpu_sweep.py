@@ -1,4 +1,4 @@
-"""One step of some planes of the grid on one core: what the kernel for CPUs does in each of its chunks.
+"""One step of a chunk of planes on one core.
 
 A step goes through the planes once. With T_a the sum of the two neighbours along axis a, stretched in the
 boundary layers, plane i of the pressure gives two planes,
@@ -6,14 +6,14 @@ boundary layers, plane i of the pressure gives two planes,
     A = face p + edge (T_y + T_z) p + corner T_y T_z p,    B = center p + face (T_y + T_z) p + edge T_y T_z p,
 
 and new_i = B_i + A_(i-1) + A_(i+1) + E_x A_i - keep before_i, where E_x is what the layers across x add. What
-those across y and z add, E_y p, E_z p and E_y E_z p, is worked out in their own cells.
+those across y and z add, E_y p, E_z p and E_y E_z p, is computed in their own cells.
 
-All arrays are flat, indexed by unsigned numbers: views of arrays cost numba more than a short row does, and
-an index that might be negative a test. Loops run over whole planes, or all rows of a layer, as if they were
-one row. What that mixes into the ring at both ends of each row is set to zero in the end.
+All arrays are flat with unsigned indices: array views cost numba more than a short row, and possibly negative
+indices a test. Loops run over whole planes, or all rows of a layer, as if they were one row. The values that
+this mixes into the ring at both ends of each row are set to zero at the end.
 
-The ends of the rows, with the layers across z, are lanes: for each row those of the low end from the ring
-inwards, L + 2, then as many of the high end, outwards.
+The ends of the rows, with the layers across z, are stored in lanes: for each row L + 2 cells of the low end,
+from the ring inwards, then as many of the high end, outwards.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def _sweep(p, at, n, row, old, old_at, total, across, weights):  # type: ignore[
 
 @njit(**INNER)
 def _heterogeneous(p, q, cells, first, last, keep):  # type: ignore[no-untyped-def]
-    """New pressure of some heterogeneous cells; in layers also what the sweep alone would make of them."""
+    """Compute new pressures of heterogeneous cells; in layers also the result of the sweep in them."""
     index, weight, offset, scale, air, new, swept = cells
     for n in range(first, last):
         cell = index[n]
@@ -64,8 +64,8 @@ def _heterogeneous(p, q, cells, first, last, keep):  # type: ignore[no-untyped-d
 def stretch(u, at, step, psi, psi_at, zeta, zeta_at, term, term_at, cells, profile, profile_at):  # type: ignore[no-untyped-def]
     """Advance the memory of a layer and write its terms.
 
-    Its axis is that in which cells lie `step` apart. There is a half cell between each cell of u from `at` on
-    and the next; `cells`, and the terms, begin with the second cell; the profile has a value for each.
+    Along its axis cells are `step` apart. There is a half cell between each cell of u from `at` on and the
+    next. The `cells` and the terms begin with the second cell; the profile has a value for each.
     """
     b_half, a_half, b_cell, a_cell = profile
     for k in range(cells + step):
@@ -82,7 +82,7 @@ def stretch(u, at, step, psi, psi_at, zeta, zeta_at, term, term_at, cells, profi
 
 @njit(**INNER)
 def _stretch_plane(p, i, shape, cells, memory, terms, ends, profiles):  # type: ignore[no-untyped-def]
-    """The layers' terms E_y p, E_z p and E_y E_z p of plane i."""
+    """Compute the layers' terms E_y p, E_z p and E_y E_z p of plane i."""
     _, ny, nz = shape
     (psi_y, zeta_y), (psi_z, zeta_z), (psi_yz, zeta_yz) = memory
     e_y, e_z, e_yz = terms
@@ -116,7 +116,7 @@ def _stretch_plane(p, i, shape, cells, memory, terms, ends, profiles):  # type: 
 
 @njit(**INNER)
 def _add_ends(q, base, shape, cells, ends):  # type: ignore[no-untyped-def]
-    """Add lanes to a plane that begins at `base`, the layers' cells of them."""
+    """Add the layers' cells of lanes to a plane that begins at `base`."""
     _, ny, nz = shape
     one, reach = _U(1), cells + _U(2)
     for j in range(one, ny - one):
@@ -129,7 +129,7 @@ def _add_ends(q, base, shape, cells, ends):  # type: ignore[no-untyped-def]
 
 @njit(**INNER)
 def _absorb_plane(q, i, shape, cells, terms, ends, weights):  # type: ignore[no-untyped-def]
-    """Add to plane i the terms of the layers across y and z, smoothed over x and the other of both."""
+    """Add the terms of the layers across y and z to plane i, smoothed over x and the other axis."""
     _, ny, nz = shape
     e_y, e_z, e_yz = terms
     _, face, edge, corner, _ = weights
@@ -194,7 +194,7 @@ def _half_cell(psi, at, u, ahead, here, n, decay, gain):  # type: ignore[no-unty
 
 @njit(**INNER)
 def _absorb_x(q, i, shape, memory, u, profile):  # type: ignore[no-untyped-def]
-    """Add to plane i what the layer across x makes of A, of which `u` holds the planes around."""
+    """Add the term of the layer across x to plane i; `u` holds A of the planes around."""
     nx, ny, nz = shape
     psi, zeta = memory
     decay, gain = profile
@@ -206,7 +206,7 @@ def _absorb_x(q, i, shape, memory, u, profile):  # type: ignore[no-untyped-def]
     outside, inside = (high, low) if side else (low, high)
     outer = (side * (cells + one) + depth - one) * plane
     inner, shift, out = outer + plane, (side * cells + depth - one) * plane, i * plane
-    # Each half cell is advanced with the first of its two planes, in the order of i.
+    # Each half cell is advanced with the first of its two planes.
     if side or depth == one:
         _half_cell(psi, outer, u, here, outside, plane, decay[two * depth - two], gain[two * depth - two])
     if not side or depth == cells:
@@ -224,7 +224,7 @@ def _absorb_x(q, i, shape, memory, u, profile):  # type: ignore[no-untyped-def]
 def sweep_planes(  # type: ignore[no-untyped-def]
     p, q, first, last, shape, weights, layer, layers, profile, profiles, cells, starts, room
 ):
-    """Step planes first .. last - 1 as if those beyond were silent; `room` then has A for the neighbours."""
+    """Step planes first .. last - 1 as if others were zero; `room` then has A for the neighbours."""
     nx, ny, nz = shape
     terms, ends, total, across, u, outermost = room
     one, two, three = _U(1), _U(2), _U(3)
@@ -240,7 +240,7 @@ def sweep_planes(  # type: ignore[no-untyped-def]
             _heterogeneous(p, q, cells, starts[i], starts[i + one], keep)
             if depth:
                 _stretch_plane(p, i, shape, depth, layers, terms, ends, profiles)
-            # what is worked out before the first plane goes where A of that plane will be
+            # the result before the first plane is stored where A of that plane will be
             old, at = (outermost, _U(0)) if i == first else (q, done * plane + nz + one)
             _sweep(p, i * plane + nz + one, n, nz, old, at, total, across, weights)
         else:

@@ -1,7 +1,7 @@
-"""Sums of spherical waves on one core: sum_s amplitude_s e^{i k r} / r for several fields at once.
+"""Sums of spherical waves on one core: sum_s amplitude_s e^{i k r} / r for several fields.
 
-Waves between one place and a block of others fill vectors. The others are the points, or the sources where
-these are more. Distances and whole turns of the phase are in double precision, the rest in that of the
+Waves between one place and a block of others are vectorised. The others are the points or the sources,
+whichever are more. Distances and whole turns of the phase are in double precision, the rest in that of the
 amplitudes. The order of all sums is fixed.
 """
 
@@ -22,18 +22,18 @@ _TERMS = 13
 """Terms of the Taylor series; the next one is below 1e-16 for arguments up to pi / 2."""
 
 _SHIFT = 1.5 * 2.0**52
-"""Added to a number and subtracted again, leaves the nearest integer."""
+"""Constant that rounds to the nearest integer when added and subtracted."""
 
 _BLOCK, _X, _Y, _Z = np.uint64(LANES), np.uint64(0), np.uint64(1), np.uint64(2)  # unsigned, see cpu_sweep.py
 
 
 def wave_of(wavenumber: complex, nearest: float) -> tuple[float, float, float]:
-    """Return turns and halvings of a wave per metre, and the shortest distance [m] that counts."""
+    """Return turns and halvings of a wave per metre, and the lower limit of the distance [m]."""
     return wavenumber.real / (2 * math.pi), wavenumber.imag / math.log(2), nearest
 
 
 def room_for(dtype: type) -> tuple[NDArray[np.generic], ...]:
-    """Return what `_waves` works with: Taylor coefficients, and arrays for a block.
+    """Return Taylor coefficients and workspace for `_waves`.
 
     The series are those of sin(2 pi u) / u and cos(2 pi u) in u^2, and of 2^-u in u.
     """
@@ -104,7 +104,7 @@ def sum_at_points(points, first, last, sources, amplitude, wave, room, fields): 
             real, imaginary = _waves((sources[0, s], sources[1, s], sources[2, s]), points, block, wave, room)
             for r in range(runs):
                 _add_waves(total, r, amplitude[0, r, s], amplitude[1, r, s], real, imaginary)
-            if (s + 1) % LANES == 0 or s + 1 == count:  # few terms in the precision of the amplitudes
+            if (s + 1) % LANES == 0 or s + 1 == count:  # limits rounding
                 fields[:, :, block] += total
                 total[:] = 0
 
@@ -123,7 +123,7 @@ def sum_over_sources(points, first, last, sources, amplitude, wave, room, fields
     The points are (3, P), the sources (3, N), the parts of their amplitudes (2, R, N / LANES, LANES).
     """
     runs, blocks = amplitude.shape[1:3]
-    # arrays of their own: the compiler must know that they do not overlap, to use vectors
+    # separate arrays, which the compiler knows not to overlap and can vectorise
     real, imaginary = np.empty((blocks, LANES), amplitude.dtype), np.empty((blocks, LANES), amplitude.dtype)
     total, less = np.empty(LANES, amplitude.dtype), np.empty(LANES, amplitude.dtype)
     for p in range(first, last):

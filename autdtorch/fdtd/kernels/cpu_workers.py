@@ -1,8 +1,7 @@
-"""Workers that step the chunks of a grid together: tasks claimed in order, and a wait that yields.
+"""Workers that step the chunks of a grid: tasks claimed in order, and a wait that yields.
 
 Tasks are numbered phase by phase. A worker claims the next one, waits until all tasks of earlier phases are
-finished, and does it. A worker that is kept from its processor delays the others by one task, and those that
-wait give way to it.
+finished, and does it. A suspended worker delays the others by one task, and waiting workers yield to it.
 """
 
 from __future__ import annotations
@@ -24,13 +23,13 @@ from autdtorch.fdtd.kernels.compiled import INNER
 from autdtorch.utils.threads import spread
 
 _CLAIMED, _FINISHED = 0, 16
-"""Places of the two counters, on cache lines of their own."""
+"""Places of the two counters, on separate cache lines."""
 
 _TICKS = 10
-"""Of the clock of a thread's time, for that to tell anything."""
+"""Fewest ticks of the thread clock for a meaningful time."""
 
 _LOOKS = 2000
-"""Looks at the counter before a waiting worker yields: a few microseconds, less than waking costs."""
+"""Polls of the counter before a waiting worker yields: a few microseconds, less than waking costs."""
 
 
 def new_counters() -> NDArray[np.int64]:
@@ -39,14 +38,14 @@ def new_counters() -> NDArray[np.int64]:
 
 
 def yield_address() -> int:
-    """Return the address of the system's function by which a thread gives way to others."""
+    """Return the address of the system's function that yields to other threads."""
     windows = os.name == "nt"
     function = ctypes.CDLL("kernel32").SwitchToThread if windows else ctypes.CDLL(None).sched_yield
     return int(ctypes.cast(function, ctypes.c_void_p).value or 0)
 
 
 def share_of_processors(work: Callable[[], object], workers: int) -> float:
-    """Have several workers do the same, and return for how much of that time they had a processor, 0 to 1."""
+    """Run `work` on several workers; return the share of the time in which they had a processor, 0 to 1."""
 
     def timed(_: int) -> float:
         begin = time.thread_time()
@@ -67,7 +66,7 @@ def _pointer(context: Any, builder: Any, signature: Any, given: Any) -> Any:
 
 
 def _add_atomically(typing_context: Any, counters: Any, place: Any, amount: Any) -> Any:
-    """Add to a counter, and return what it was."""
+    """Add to a counter and return its old value."""
 
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         return builder.atomic_rmw("add", _pointer(context, builder, signature, given), given[2], "seq_cst")
@@ -76,7 +75,7 @@ def _add_atomically(typing_context: Any, counters: Any, place: Any, amount: Any)
 
 
 def _read_atomically(typing_context: Any, counters: Any, place: Any) -> Any:
-    """Return a counter, and see all that was written before it was last added to."""
+    """Return a counter, with all writes before it was last added to (acquire)."""
 
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         return builder.load_atomic(_pointer(context, builder, signature, given), "acquire", 8)
@@ -85,7 +84,7 @@ def _read_atomically(typing_context: Any, counters: Any, place: Any) -> Any:
 
 
 def _call(typing_context: Any, address: Any) -> Any:
-    """Call the function at an address, which takes nothing."""
+    """Call the function without arguments at an address."""
 
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         function = ir.FunctionType(ir.IntType(32), [])

@@ -1,7 +1,7 @@
-"""The kernel for NVIDIA GPUs, in Triton: the same contract as the reference, on the device.
+"""The kernel for NVIDIA GPUs, in Triton.
 
-Fields, memory and coefficients stay there between calls: the states given back hold the device's tensors, and
-so does what is recorded. With TRITON_INTERPRET=1 Triton interprets the steps, slowly, on the CPU.
+Fields, memory and coefficients stay on the device between calls: returned states and records are tensors on
+it. With TRITON_INTERPRET=1 Triton interprets the steps, slowly, on the CPU.
 """
 
 from __future__ import annotations
@@ -30,15 +30,16 @@ from autdtorch.fdtd.kernels.cuda_tables import (
 from autdtorch.utils.validation import invalid
 
 _GRAPH_STEPS = 16
-"""Steps of a captured graph; even, so that both fields are again where they were."""
+"""Steps of a captured graph; even, so that both fields return to their places."""
 
 _MOST_CAPTURED = 2**25
-"""Cells up to which steps are captured. Beyond, a step should take longer than its launches: 33 million cells
-at 12 bytes need 130 us at 3 TB/s, three launches from Python some 100 us. An estimate, not measured."""
+"""Most cells of a grid whose steps are captured. Beyond, a step should take longer than its launches: 33
+million cells at 12 bytes need 130 us at 3 TB/s, three launches from Python some 100 us. An estimate, not
+measured."""
 
 
 class Blocks(NamedTuple):
-    """What one program works on; of sizes that are powers of two.
+    """Sizes of a program's work, powers of two.
 
     Attributes:
         x: planes that a tile marches through.
@@ -54,11 +55,11 @@ class Blocks(NamedTuple):
 
 
 BLOCKS = Blocks()
-"""One thread a cell. Chosen for few registers and many programs on small grids, not by timings."""
+"""One thread per cell. Chosen for few registers and many programs on small grids, not by timings."""
 
 
 class Ends(NamedTuple):
-    """Number of the program after the last one of each task of `prepare`, but for the receivers."""
+    """Number of the program after the last of each task of `prepare`, except the receivers."""
 
     z: int
     y: int
@@ -68,10 +69,10 @@ class Ends(NamedTuple):
 
 
 class DeviceMedium:
-    """A medium on the device, and room for what each step works out on the way."""
+    """A medium on the device, and workspace."""
 
     def __init__(self, c: Coefficients, shape: Shape, blocks: Blocks, device: torch.device) -> None:
-        """Put the medium `c` of a grid on a device."""
+        """Copy the medium `c` of a grid to a device."""
         self.coefficients, self.shape, self.blocks, self.device = c, shape, blocks, device
         self.cells, self.depths = c.layer_cells, triton.next_power_of_2(c.layer_cells)
         self.dtype = c.layer_decay.dtype
@@ -93,12 +94,12 @@ class DeviceMedium:
 
 
 class DeviceRun:
-    """A state that is driven and read: everything that one step after the other is launched with."""
+    """A state with its sources and receivers: the arguments of all launches."""
 
     def __init__(
         self, medium: DeviceMedium, state: State, sources: Sources, receivers: Receivers, steps: int
     ) -> None:
-        """Put a state on the medium's device, to go on in calls of `steps` each."""
+        """Copy a state to the medium's device, for calls of `steps` each."""
         self.medium, self.state, self.sources, self.receivers = medium, state, sources, receivers
         dtype, device = medium.dtype, medium.device
         self._fields = tuple(field.to(device).contiguous() for field in (state.now, state.before))
@@ -106,19 +107,19 @@ class DeviceRun:
         fresh = Memories(*(Memory(*map(torch.zeros_like, each)) for each in memory))
         self._memories = memory, fresh
         self._driven = driven_table(sources, medium.settled, dtype, device)
-        self._heard = receiver_table(receivers, steps, dtype, device)
+        self._received = receiver_table(receivers, steps, dtype, device)
         self.signal = torch.zeros((steps, sources.force.shape[1]), dtype=dtype, device=device)
         self._first = torch.zeros((), dtype=torch.int64, device=device)
         self._turn = 0
         self._graphs: dict[int, torch.cuda.CUDAGraph] = {}
 
     def goes_on(self, state: State, sources: Sources, receivers: Receivers, steps: int) -> bool:
-        """Whether this is the state that the last call gave back, driven and read as then."""
+        """Return whether this is the last call's state, with its sources and receivers."""
         same = self.state is state and self.sources is sources and self.receivers is receivers
         return same and len(self.signal) == steps
 
     def advance(self, signal: torch.Tensor) -> torch.Tensor:
-        """Step once per row of the signal; returns what the receivers recorded."""
+        """Step once per row of the signal; return the record of the receivers."""
         self.signal.copy_(signal)
         self._first.zero_()
         steps = len(signal)
@@ -126,25 +127,25 @@ class DeviceRun:
         for offset in range(steps - done):
             self._step(self._turn + offset, offset)
         self._turn = (self._turn + steps) % 2
-        heard, block = self._heard, self.medium.depths * self.medium.blocks.lanes
-        cuda_steps.read_last[(triton.cdiv(heard.size, block),)](
-            self._fields[self._turn], heard, steps - 1, LANES=block
+        received, block = self._received, self.medium.depths * self.medium.blocks.lanes
+        cuda_steps.read_last[(triton.cdiv(received.size, block),)](
+            self._fields[self._turn], received, steps - 1, LANES=block
         )
         memory = self._memories[self._turn]
         layers = tuple((each.psi, each.zeta) for each in memory)
         now, before = self._fields[self._turn], self._fields[1 - self._turn]
         self.state = State(now, before, layers[:4], *layers[4:])
-        return heard.recorded.clone()
+        return received.recorded.clone()
 
     def _captures(self, steps: int) -> bool:
         cells = self._fields[0].numel()
         return self.medium.device.type == "cuda" and steps > _GRAPH_STEPS and cells <= _MOST_CAPTURED
 
     def _replay(self, steps: int) -> int:
-        """Step by replays of a captured graph as far as it goes; returns the steps done."""
+        """Step by replays of a captured graph; return the number of steps done."""
         done = 0
         if self._turn not in self._graphs:
-            # Two steps in the open: nothing may be compiled while a graph is captured.
+            # two steps first: nothing may be compiled while a graph is captured
             for done in (1, 2):
                 self._step(self._turn + done - 1, done - 1)
             self._first += done
@@ -160,15 +161,15 @@ class DeviceRun:
         return done
 
     def _step(self, turn: int, offset: int) -> None:
-        """Launch the step of `offset` rows of the signal after the first one."""
-        m, blocks, driven, heard = self.medium, self.medium.blocks, self._driven, self._heard
+        """Launch the step `offset` rows of the signal after the first one."""
+        m, blocks, driven, received = self.medium, self.medium.blocks, self._driven, self._received
         now, old = self._fields[turn % 2], self._memories[turn % 2]
         other, new = self._fields[(turn + 1) % 2], self._memories[(turn + 1) % 2]
         lanes = m.depths * blocks.lanes
         sizes = {"CELLS": m.cells, "DEPTHS": m.depths, "LANES": blocks.lanes}
-        cuda_steps.prepare[(m.ends.crossed + triton.cdiv(heard.size, lanes),)](
-            now, other, m.shape, m.weights, m.profile, old, new, m.terms, m.heterogeneous, m.crossed, heard,
-            m.ends, self._first, offset, CROSSED_WIDTH=len(m.crossed.weight), **sizes,
+        cuda_steps.prepare[(m.ends.crossed + triton.cdiv(received.size, lanes),)](
+            now, other, m.shape, m.weights, m.profile, old, new, m.terms, m.heterogeneous, m.crossed,
+            received, m.ends, self._first, offset, CROSSED_WIDTH=len(m.crossed.weight), **sizes,
         )  # fmt: skip
         cuda_steps.sweep[(m.tiles + triton.cdiv(m.columns.size, blocks.lanes),)](
             now, other, m.shape, m.weights, m.profile, old, new, m.terms, m.columns, m.tiles,
@@ -182,19 +183,19 @@ class DeviceRun:
 
 
 class CudaKernel:
-    """See `kernels.contract`; on the current CUDA device, where the states given back stay.
+    """Kernel on the current CUDA device, where returned states stay; see `kernels.contract`.
 
     The medium and the last run stay on the device until others are given.
     """
 
     def __init__(self, blocks: Blocks = BLOCKS) -> None:
-        """Look for the device.
+        """Find the device.
 
         Args:
-            blocks: what one program works on.
+            blocks: sizes of a program's work.
 
         Raises:
-            ValueError: there is no CUDA device, and Triton does not interpret either.
+            ValueError: there is no CUDA device, and Triton does not interpret.
         """
         interpreted = triton.knobs.runtime.interpret
         if not interpreted and not torch.cuda.is_available():
@@ -205,7 +206,7 @@ class CudaKernel:
         self._run: DeviceRun | None = None
 
     def at_once(self, shape: tuple[int, int, int]) -> int:
-        """One: what stays on the device is that of the last run."""
+        """Return 1: the device holds the last run."""
         return 1
 
     @torch.no_grad()
@@ -217,14 +218,14 @@ class CudaKernel:
         receivers: Receivers,
         signal: torch.Tensor,
     ) -> tuple[State, torch.Tensor]:
-        """See `Kernel.advance`; what is recorded lies on the device."""
+        """See `Kernel.advance`; the record stays on the device."""
         shape = Shape(*state.now.shape)
         medium, run = self._medium, self._run
         if medium is None or medium.coefficients is not coefficients or medium.shape != shape:
             self._run = run = None
             self._medium = medium = DeviceMedium(coefficients, shape, self._blocks, self._device)
         if run is None or not run.goes_on(state, sources, receivers, len(signal)):
-            self._run = run = None  # gives its memory back before the next one takes some
+            self._run = run = None  # frees its memory first
             self._run = run = DeviceRun(medium, state, sources, receivers, len(signal))
         recorded = run.advance(signal)
         return run.state, recorded

@@ -5,8 +5,8 @@ the heterogeneous cells, and reads the receivers. `sweep` computes the 27-point 
 columns beside it. `settle` corrects the cells that this leaves wrong: heterogeneous, sound-hard and driven
 cells and those of columns.
 
-The memory of layers and columns is read from one place and written to another, so that no program reads what
-another one of the same launch writes: their order does not matter.
+The memory of layers and columns is read from one buffer and written to another. No program reads what another
+one of the same launch writes, so their order does not matter.
 """
 
 # The arguments are values of Triton's compiler, which has no types for them.
@@ -18,12 +18,12 @@ import triton
 import triton.language as tl
 
 CENTER, FACE, EDGE, CORNER, KEEP = (tl.constexpr(place) for place in range(5))
-"""Places in the tensor of weights. Scalars would reach the kernels in single precision."""
+"""Places in the tensor of weights; scalars would be passed in single precision."""
 
 
 @triton.jit
 def _advanced(behind, here, ahead, memory, half, cell, stride, profile, depth, mask):
-    """Memory of a layer at cells at `depth`: psi outside and inside of them, and zeta."""
+    """Return the memory of a layer at cells at `depth`: psi outside and inside of them, and zeta."""
     difference = ahead - here
     decay, gain = profile.decay + 2 * depth, profile.gain + 2 * depth
     outer = tl.load(decay - 2) * tl.load(memory.psi + half, mask=mask, other=0)
@@ -37,7 +37,7 @@ def _advanced(behind, here, ahead, memory, half, cell, stride, profile, depth, m
 
 @triton.jit
 def _stretch(behind, here, ahead, old, new, half, cell, stride, profile, depth, mask, CELLS: tl.constexpr):
-    """Advance the memory of a layer at cells at `depth`; returns their term."""
+    """Advance the memory of a layer at cells at `depth`; return their term."""
     outer, inner, zeta = _advanced(behind, here, ahead, old, half, cell, stride, profile, depth, mask)
     tl.store(new.psi + half, outer, mask=mask)
     tl.store(new.psi + half + stride, inner, mask=mask & (depth == CELLS))
@@ -47,7 +47,7 @@ def _stretch(behind, here, ahead, old, new, half, cell, stride, profile, depth, 
 
 @triton.jit
 def _row_end(p, shape, row, side, depth, mask, CELLS: tl.constexpr):
-    """Pressure behind, at and ahead of cells of the layers across z, and their places in the memory."""
+    """Return pressures behind, at and ahead of cells of the layers across z, and places in the memory."""
     inwards = 1 - 2 * side
     at = p + row.to(tl.int64) * shape.nz + (side * (shape.nz - 1) + inwards * depth)
     behind, here = tl.load(at - inwards, mask=mask, other=0), tl.load(at, mask=mask, other=0)
@@ -58,7 +58,7 @@ def _row_end(p, shape, row, side, depth, mask, CELLS: tl.constexpr):
 
 @triton.jit
 def _lanes(program, LANES: tl.constexpr, DEPTHS: tl.constexpr):
-    """A block of columns through the layers, along the second axis, and the depths in them."""
+    """Return a block of columns through the layers, along the second axis, and the depths in them."""
     return program * LANES + tl.arange(0, LANES)[None, :], 1 + tl.arange(0, DEPTHS)[:, None]
 
 
@@ -93,7 +93,7 @@ def _stretch_y(p, shape, old, new, profile, terms, program, CELLS: tl.constexpr,
 
 @triton.jit
 def _term_z(p, shape, old, profile, row, side, depth, mask, CELLS: tl.constexpr):
-    """E_z p, as `_stretch_z` makes it elsewhere in the same launch."""
+    """Return E_z p, which `_stretch_z` computes elsewhere in the same launch."""
     behind, here, ahead, half, cell = _row_end(p, shape, row, side, depth, mask, CELLS)
     outer, inner, zeta = _advanced(behind, here, ahead, old, half, cell, 1, profile, depth, mask)
     return inner - outer + zeta
@@ -121,7 +121,7 @@ def _stretch_yz(p, shape, old_z, old, new, profile, terms, program, CELLS: tl.co
 
 @triton.jit
 def _across(p, columns, terms, column, depth, mask, WIDTH: tl.constexpr, CROSSED: tl.constexpr):
-    """What the columns sum across them at `depth`; nothing in the ring."""
+    """Return the sums across the columns at `depth`; zero in the ring."""
     mask = mask & (depth > 0)
     cell = p + tl.load(columns.cell + depth * columns.size + column, mask=mask, other=0)
     total = tl.zeros(cell.shape, p.dtype.element_ty)
@@ -168,7 +168,7 @@ def _gather_heterogeneous(p, before, shape, weights, heterogeneous, program, LAN
                 kind = (x - 1) * (x - 1) + (y - 1) * (y - 1) + (z - 1) * (z - 1)
                 air += tl.load(weights + kind) * value
     scale = tl.load(heterogeneous.scale + n, mask=mask, other=0)
-    # The sweep comes to `air` and the layers' term, of which `settle` adds `scale` times what it finds.
+    # The sweep gives `air` and the layers' term; `settle` adds `scale` times that.
     tl.store(heterogeneous.settled + n, own + keep * (own - old) + change - scale * air, mask=mask)
 
 
@@ -188,7 +188,7 @@ def _read(p, receivers, row, program, LANES: tl.constexpr):
 def prepare(p, before, shape, weights, profile, old, new, terms, heterogeneous, crossed, receivers, ends,
             first, offset, CROSSED_WIDTH: tl.constexpr, CELLS: tl.constexpr, DEPTHS: tl.constexpr,
             LANES: tl.constexpr):  # fmt: skip
-    """All of a step that only reads the pressures; the receivers are read as the step before left them."""
+    """The part of a step that only reads pressures; receivers are read after the step before."""
     program = tl.program_id(0)
     if program < ends.z:
         _stretch_z(p, shape, old.z, new.z, profile, terms.z, program, CELLS, DEPTHS, LANES)
@@ -209,7 +209,7 @@ def prepare(p, before, shape, weights, profile, old, new, terms, heterogeneous, 
 
 @triton.jit
 def _plane(p, i, shape, tile, weights, terms, CELLS: tl.constexpr):
-    """Sums over a plane across x: what it adds to its own cells, and to those of the planes beside it."""
+    """Return the sums over a plane across x for its own cells and for the planes beside it."""
     ny, nz = shape.ny, shape.nz
     column, inside, near_y, near_z, in_y, in_z, place_y, place_z, place_yz = tile
     center, face, edge, corner = weights
@@ -236,7 +236,7 @@ def _plane(p, i, shape, tile, weights, terms, CELLS: tl.constexpr):
 
 @triton.jit
 def _tile(low_y, low_z, shape, CELLS: tl.constexpr, Y: tl.constexpr, Z: tl.constexpr):
-    """Cells of a tile: their place in a plane, and which of them lie where in the layers' terms."""
+    """Return the cells of a tile: their places in a plane and in the layers' terms."""
     ny, nz = shape.ny, shape.nz
     j, k = low_y + tl.arange(0, Y)[:, None], low_z + tl.arange(0, Z)[None, :]
     inside = (j >= 1) & (j < ny - 1) & (k >= 1) & (k < nz - 1)
@@ -254,7 +254,7 @@ def _tile(low_y, low_z, shape, CELLS: tl.constexpr, Y: tl.constexpr, Z: tl.const
 @triton.jit
 def _march(p, q, shape, weights, profile, old, new, terms, program, CELLS: tl.constexpr, X: tl.constexpr,
            Y: tl.constexpr, Z: tl.constexpr):  # fmt: skip
-    """Step a tile of y and z through X planes along x, each of which is summed once."""
+    """Step a tile of y and z through X planes along x; each plane is summed once."""
     nx, ny, nz = shape.nx, shape.ny, shape.nz
     tiles_y, tiles_z = tl.cdiv(ny, Y), tl.cdiv(nz, Z)
     tile = _tile(program // tiles_z % tiles_y * Y, program % tiles_z * Z, shape, CELLS, Y, Z)
@@ -288,7 +288,7 @@ def _march(p, q, shape, weights, profile, old, new, terms, program, CELLS: tl.co
 def sweep(p, q, shape, weights, profile, old, new, terms, columns, tiles, COLUMNS_WIDTH: tl.constexpr,
           CELLS: tl.constexpr, DEPTHS: tl.constexpr, LANES: tl.constexpr, X: tl.constexpr, Y: tl.constexpr,
           Z: tl.constexpr):  # fmt: skip
-    """The 27-point sum with all layers in it, in place of the pressures before; beside it, the columns."""
+    """The 27-point sum with all layers, in place of the pressures before, and the columns."""
     program = tl.program_id(0)
     if program < tiles:
         _march(p, q, shape, weights, profile, old.x, new.x, terms, program, CELLS, X, Y, Z)
@@ -300,7 +300,7 @@ def sweep(p, q, shape, weights, profile, old, new, terms, columns, tiles, COLUMN
 @triton.jit(do_not_specialize=["offset"])
 def settle(q, heterogeneous, settled, driven, shares, signal, first, offset, SHARES: tl.constexpr,
            SIGNALS: tl.constexpr, LANES: tl.constexpr):  # fmt: skip
-    """Put right the cells that the sweep leaves wrong."""
+    """Correct the cells that the sweep leaves wrong."""
     n = tl.program_id(0) * LANES + tl.arange(0, LANES)
     mask, still = n < driven.size, n < driven.settled
     at = q + tl.load(driven.cell + n, mask=mask, other=0)
@@ -315,11 +315,11 @@ def settle(q, heterogeneous, settled, driven, shares, signal, first, offset, SHA
     row = SIGNALS * (tl.load(first) + offset)
     for s in tl.static_range(SIGNALS):
         value += tl.load(signal + row + s) * tl.load(driven.force + s * driven.size + n, mask=mask, other=0)
-    closed = tl.load(settled.closed + n, mask=still, other=0) > 0
-    tl.store(at, tl.where(closed, 0, value), mask=mask)
+    hard = tl.load(settled.sound_hard + n, mask=still, other=0) > 0
+    tl.store(at, tl.where(hard, 0, value), mask=mask)
 
 
 @triton.jit(do_not_specialize=["row"])
 def read_last(p, receivers, row, LANES: tl.constexpr):
-    """The receivers after the last step, for which there is no next one to do it."""
+    """Read the receivers after the last step."""
     _read(p, receivers, row, tl.program_id(0), LANES)

@@ -1,4 +1,4 @@
-"""What the CUDA kernel steps with: the contract's tensors, on the device and in the order it reads them."""
+"""Tables of the CUDA kernel: the contract's tensors, on the device and in the order of reading."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Layer, Receiv
 
 
 class Shape(NamedTuple):
-    """Cells along x, y and z."""
+    """Number of cells along x, y and z."""
 
     nx: int
     ny: int
@@ -18,7 +18,7 @@ class Shape(NamedTuple):
 
 
 class Profile(NamedTuple):
-    """Recursion coefficients of the layers, with zeros up to the depth of a block of lanes."""
+    """Recursion coefficients of the layers, zero-padded to the depth of a block of lanes."""
 
     decay: torch.Tensor
     gain: torch.Tensor
@@ -43,98 +43,72 @@ class Memories(NamedTuple):
 
 
 class Terms(NamedTuple):
-    """What layers add to the sums across them, low layer first, both counted inwards.
+    """Terms that layers add to the sums across them, low layer first, both counted inwards."""
 
-    E_y p (nx, 2 L, nz), E_z p (nx, ny, 2 L) and E_y E_z p (nx, 2 L, 2 L); those of the columns, which are
-    added to the pressure, and of the crossed ones (L m + 1,), with a zero at the end.
-    """
-
-    y: torch.Tensor
-    z: torch.Tensor
-    yz: torch.Tensor
-    columns: torch.Tensor
-    crossed: torch.Tensor
+    y: torch.Tensor  # E_y p (nx, 2 L, nz)
+    z: torch.Tensor  # E_z p (nx, ny, 2 L)
+    yz: torch.Tensor  # E_y E_z p (nx, 2 L, 2 L)
+    columns: torch.Tensor  # added to the pressure (L m + 1,), with a zero at the end
+    crossed: torch.Tensor  # likewise, added to the columns
 
 
 class Heterogeneous(NamedTuple):
-    """n heterogeneous cells.
-
-    Attributes:
-        size: n.
-        cell: flat index (n,).
-        weight: as in the contract (27, n).
-        scale: of the layers' term, 0 outside of them (n,).
-        settled: room for their new pressure, but for `scale` times what the sweep will find (n,).
-    """
+    """n heterogeneous cells."""
 
     size: int
-    cell: torch.Tensor
-    weight: torch.Tensor
-    scale: torch.Tensor
-    settled: torch.Tensor
+    cell: torch.Tensor  # flat index (n,)
+    weight: torch.Tensor  # stencil rows (27, n)
+    scale: torch.Tensor  # of the layers' term, 0 outside of them (n,)
+    settled: torch.Tensor  # workspace: new pressure less `scale` times the result of the sweep (n,)
 
 
 class ColumnTable(NamedTuple):
-    """m columns: flat index (L + 2, m), offset and weight (w, m), place of what crosses them (L + 2, m)."""
+    """m columns."""
 
     size: int
-    cell: torch.Tensor
-    offset: torch.Tensor
-    weight: torch.Tensor
-    crossing: torch.Tensor
+    cell: torch.Tensor  # flat index (L + 2, m)
+    offset: torch.Tensor  # (w, m)
+    weight: torch.Tensor  # (w, m)
+    crossing: torch.Tensor  # place of the terms that cross them (L + 2, m)
 
 
 class Settled(NamedTuple):
-    """k cells that a sweep leaves wrong, ascending.
+    """k cells that a sweep leaves wrong, ascending."""
 
-    Attributes:
-        cell: flat index (k,).
-        heterogeneous: place among the heterogeneous cells, -1 for others (k,).
-        share: places among the columns' terms, the zero at their end included (w, k).
-        closed: 1 where closed (k,).
-    """
-
-    cell: torch.Tensor
-    heterogeneous: torch.Tensor
-    share: torch.Tensor
-    closed: torch.Tensor
+    cell: torch.Tensor  # flat index (k,)
+    heterogeneous: torch.Tensor  # place among the heterogeneous cells, -1 for others (k,)
+    share: torch.Tensor  # places among the columns' terms, including the zero at their end (w, k)
+    sound_hard: torch.Tensor  # 1 where sound-hard (k,)
 
 
 class Driven(NamedTuple):
-    """All cells to put right: the k of `Settled`, then those that are only driven.
+    """n cells to correct: the k of `Settled`, then those that are only driven."""
 
-    Attributes:
-        settled: k.
-        size: n.
-        cell: flat index (n,).
-        force: by each of the S signals (S, n).
-    """
-
-    settled: int
-    size: int
-    cell: torch.Tensor
-    force: torch.Tensor
+    settled: int  # k
+    size: int  # n
+    cell: torch.Tensor  # flat index (n,)
+    force: torch.Tensor  # by each of the S signals (S, n)
 
 
 class ReceiverTable(NamedTuple):
-    """R receivers: width w, flat index and weight (w, R), and room for what they record (steps, R)."""
+    """R receivers of w cells each."""
 
-    size: int
-    width: int
-    cell: torch.Tensor
-    weight: torch.Tensor
-    recorded: torch.Tensor
+    size: int  # R
+    width: int  # w
+    cell: torch.Tensor  # flat index (w, R)
+    weight: torch.Tensor  # (w, R)
+    recorded: torch.Tensor  # record (steps, R)
 
 
 def profile_table(c: Coefficients, depths: int, device: torch.device) -> Profile:
-    """The layers' profile for blocks of `depths` cells."""
+    """Return the layers' profile for blocks of `depths` cells."""
     missing = 2 * depths + 1 - len(c.layer_decay)
     decay, gain = (torch.nn.functional.pad(each, (0, missing)) for each in (c.layer_decay, c.layer_gain))
     return Profile(decay.to(device), gain.to(device))
 
 
 def heterogeneous_table(c: Coefficients, device: torch.device) -> Heterogeneous:
-    """The heterogeneous cells; the layers' term is scaled in those of them that lie in layers."""
+    """Return the heterogeneous cells, with the scale of the layers' term in those in layers."""
     index, count = c.heterogeneous_index.to(device), len(c.heterogeneous_index)
     order = torch.argsort(index)
     scale = torch.zeros(count, dtype=c.heterogeneous_weight.dtype, device=device)
@@ -145,7 +119,7 @@ def heterogeneous_table(c: Coefficients, device: torch.device) -> Heterogeneous:
 
 
 def column_table(columns: Columns, crossing: torch.Tensor, device: torch.device) -> ColumnTable:
-    """Columns, and the place (m, L + 2) among the terms of others of what is added to each cell's sum."""
+    """Return columns, with the places (m, L + 2) of the terms to add to each cell's sum."""
     index, offset, weight, crossing = (
         each.to(device).T.contiguous() for each in (columns.index, columns.offset, columns.weight, crossing)
     )
@@ -153,14 +127,14 @@ def column_table(columns: Columns, crossing: torch.Tensor, device: torch.device)
 
 
 def settled_table(c: Coefficients, device: torch.device) -> Settled:
-    """Heterogeneous cells, closed ones and those of columns, each of them once."""
+    """Return heterogeneous cells, sound-hard cells and those of columns, each once."""
     inside = c.columns.index.to(device).T[1:-1].reshape(-1)
-    heterogeneous, closed = c.heterogeneous_index.to(device), c.sound_hard_index.to(device)
-    cell = torch.unique(torch.cat((heterogeneous, closed, inside)))
+    heterogeneous, sound_hard = c.heterogeneous_index.to(device), c.sound_hard_index.to(device)
+    cell = torch.unique(torch.cat((heterogeneous, sound_hard, inside)))
     place = torch.full_like(cell, -1)
     place[torch.searchsorted(cell, heterogeneous)] = torch.arange(len(heterogeneous), device=device)
-    shut = torch.zeros(len(cell), dtype=torch.int8, device=device)
-    shut[torch.searchsorted(cell, closed)] = 1
+    hard = torch.zeros(len(cell), dtype=torch.int8, device=device)
+    hard[torch.searchsorted(cell, sound_hard)] = 1
     # the n-th of the terms that come to a cell is in row n
     taker, order = torch.sort(torch.searchsorted(cell, inside), stable=True)
     count = torch.bincount(taker, minlength=len(cell))
@@ -168,11 +142,11 @@ def settled_table(c: Coefficients, device: torch.device) -> Settled:
     width = int(count.max()) if len(inside) else 0
     share = torch.full((width, len(cell)), len(inside), dtype=torch.int64, device=device)
     share[nth, taker] = order
-    return Settled(cell, place, share, shut)
+    return Settled(cell, place, share, hard)
 
 
 def driven_table(sources: Sources, settled: Settled, dtype: torch.dtype, device: torch.device) -> Driven:
-    """The settled cells and the driven ones, each of them once."""
+    """Return the settled cells and the driven ones, each once."""
     index = sources.index.to(device)
     known = torch.isin(index, settled.cell)
     cell = torch.cat((settled.cell, index[~known]))
@@ -187,14 +161,14 @@ def driven_table(sources: Sources, settled: Settled, dtype: torch.dtype, device:
 def receiver_table(
     receivers: Receivers, steps: int, dtype: torch.dtype, device: torch.device
 ) -> ReceiverTable:
-    """The receivers, for runs of `steps`."""
+    """Return the receivers, for calls of `steps`."""
     index, weight = receivers.index.to(device).T.contiguous(), receivers.weight.to(device).T.contiguous()
     recorded = torch.zeros((steps, index.shape[1]), dtype=dtype, device=device)
     return ReceiverTable(index.shape[1], len(index), index, weight.to(dtype), recorded)
 
 
 def no_terms(shape: Shape, c: Coefficients, device: torch.device) -> Terms:
-    """Room for the layers' terms."""
+    """Return workspace for the layers' terms."""
     cells, (nx, ny, nz) = c.layer_cells, shape
     columns, crossed = ((cells * len(each.index) + 1,) for each in (c.columns, c.crossed))
     sizes = ((nx, 2 * cells, nz), (nx, ny, 2 * cells), (nx, 2 * cells, 2 * cells), columns, crossed)
@@ -202,7 +176,7 @@ def no_terms(shape: Shape, c: Coefficients, device: torch.device) -> Terms:
 
 
 def memories(state: State, device: torch.device) -> Memories:
-    """A state's memory on the device; shared where it is there already."""
+    """Return a state's memory on the device; shared if it is there already."""
 
     def moved(layer: Layer) -> Memory:
         psi, zeta = layer

@@ -1,4 +1,4 @@
-"""The readable kernel, in torch: the specification of every fast one, and differentiable by autograd."""
+"""The reference kernel, in torch: the readable specification, differentiable by autograd."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Layer, Receiv
 
 
 def neighbours(field: torch.Tensor, axis: int) -> torch.Tensor:
-    """Sum of the two neighbours along an axis; the result is two cells shorter along it."""
+    """Return the sum of the two neighbours along an axis, two cells shorter along it."""
     return field.narrow(axis, 0, field.shape[axis] - 2) + field.narrow(axis, 2, field.shape[axis] - 2)
 
 
 def middle(field: torch.Tensor, axis: int) -> torch.Tensor:
-    """The field without its first and last cell along an axis."""
+    """Return the field without its first and last cell along an axis."""
     return field.narrow(axis, 1, field.shape[axis] - 2)
 
 
 class ReferenceKernel:
-    """One torch expression per line of the contract, none in place, so that autograd can go back."""
+    """One torch expression per line of the contract, none of them in place."""
 
     def at_once(self, shape: tuple[int, int, int]) -> int:
-        """One: it is there to be read, not to be fast."""
+        """Return 1: this kernel is not meant to be fast."""
         return 1
 
     def advance(
@@ -70,7 +70,7 @@ def _core(field: torch.Tensor) -> torch.Tensor:
 
 
 def _offsets(field: torch.Tensor) -> torch.Tensor:
-    """Flat offsets of the 27 neighbours, row-major."""
+    """Return flat offsets of the 27 neighbours, row-major."""
     step = torch.arange(-1, 2, device="cpu")
     strides = field.stride()
     return (
@@ -81,7 +81,7 @@ def _offsets(field: torch.Tensor) -> torch.Tensor:
 
 
 def _sweep(p: torch.Tensor, c: Coefficients) -> torch.Tensor:
-    """Line 1 of the contract, without `before`, in all cells but the ring."""
+    """Return line 1 of the contract, without `before`, in all cells inside the ring."""
     along = [neighbours(p, axis) for axis in range(3)]
     faces = sum(middle(middle(along[a], b), d) for a, b, d in ((0, 1, 2), (1, 0, 2), (2, 0, 1)))
     edges = sum(middle(neighbours(along[a], b), d) for a, b, d in ((0, 1, 2), (1, 2, 0), (2, 0, 1)))
@@ -90,12 +90,12 @@ def _sweep(p: torch.Tensor, c: Coefficients) -> torch.Tensor:
 
 
 def _around(field: torch.Tensor, axis: int) -> torch.Tensor:
-    """Sum of the two neighbours along an axis in every cell; beyond the field is nothing."""
+    """Return the sum of the two neighbours along an axis in every cell; zero beyond the field."""
     return _between(neighbours(field, axis), axis, 1, 1)
 
 
 def _between(field: torch.Tensor, axis: int, before: int, after: int) -> torch.Tensor:
-    """The field with `before` and `after` cells of nothing around it along an axis."""
+    """Pad a field with `before` and `after` zeros along an axis."""
     width = [0] * 6
     width[4 - 2 * axis], width[5 - 2 * axis] = before, after
     return torch.nn.functional.pad(field, width)
@@ -104,10 +104,10 @@ def _between(field: torch.Tensor, axis: int, before: int, after: int) -> torch.T
 def _absorb(
     p: torch.Tensor, layers: tuple[Layer, ...], c: Coefficients
 ) -> tuple[tuple[Layer, ...], torch.Tensor]:
-    """Advance the boundary layers' memory; returns it and the term to add to the new pressure.
+    """Advance the boundary layers' memory; return it and the term to add to the new pressure.
 
-    With T_a the sum of the two neighbours along axis a, the layers put T_a + E_a in place of T_a everywhere
-    in the 27-point sum, products included.
+    With T_a the sum of the two neighbours along axis a, T_a + E_a replaces T_a everywhere in the 27-point
+    sum, products included.
     """
     x, y, z, yz = layers
     cells, size = c.layer_cells, p.shape
@@ -127,7 +127,7 @@ def _absorb(
     e_z, e_y = placed(ends, axis=2), placed(sides, axis=1)
     e_yz = placed(torch.split(placed(edges, axis=1), cells, dim=2), axis=2)
     across = smooth(p, 1, 2) + c.edge * (e_y + e_z) + c.corner * (_around(e_y, 2) + _around(e_z, 1) + e_yz)
-    # The ring at the array's face is silent: nothing is smoothed into it.
+    # the outermost ring stays zero: nothing is smoothed into it
     x, faces = _stretch(torch.nn.functional.pad(_core(across), (1,) * 6), x, c, 0)
     term = placed(faces, axis=0) + smooth(e_y, 0, 2) + smooth(e_z, 0, 1)
     term = term + c.edge * e_yz + c.corner * _around(e_yz, 0)
@@ -137,7 +137,7 @@ def _absorb(
 def _absorb_columns(
     flat: torch.Tensor, columns: Columns, beside: torch.Tensor, memory: Layer, c: Coefficients
 ) -> tuple[Layer, torch.Tensor]:
-    """Advance the memory of columns with more to sum across (L + 1, m); returns it and the terms (L, m)."""
+    """Advance the memory of columns, with summands `beside` (L + 1, m); return it and the terms (L, m)."""
     cells = columns.index.T[1:, :, None] + columns.offset
     across = torch.nn.functional.pad((columns.weight * flat[cells]).sum(-1) + beside, (0, 0, 1, 0))
     decay, gain = c.layer_decay[:, None], c.layer_gain[:, None]
@@ -151,7 +151,7 @@ def _absorb_columns(
 def _stretch(
     field: torch.Tensor, layer: Layer, c: Coefficients, axis: int
 ) -> tuple[Layer, tuple[torch.Tensor, torch.Tensor]]:
-    """Advance the memory of an axis; returns it and E_a of the field in the low and the high layer."""
+    """Advance the memory of an axis; return it and E_a of the field in the low and the high layer."""
     cells, shape = c.layer_cells, [1, 1, 1]
     shape[axis] = -1
     b_half, b_cell = c.layer_decay[0::2].reshape(shape), c.layer_decay[1::2].reshape(shape)
