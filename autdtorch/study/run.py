@@ -210,7 +210,8 @@ def _package(code: Method | Callable[..., Any]) -> str:
     return str(getattr(own, "__module__", "")).partition(".")[0]
 
 
-def _solve(method: StudyMethod, objective: Objective, trials: Trials, seed: int) -> Solution:
+def solve(method: StudyMethod, objective: Objective, trials: Trials, seed: int) -> Solution:
+    """Run trials of a method on an objective."""
     if isinstance(method, Method):
         return run(method, objective, trials, seed)
     taken = inspect.signature(method).parameters
@@ -238,7 +239,7 @@ def _run_scene(
     for method_name, method in methods.items():
         where = name, method_name, counts[method_name]
         progress.advance(where[2] - len(trials.missing(*where)))
-        _run_trials(where, functools.partial(_solve, method, objective, seed=seed), trials, progress)
+        _run_trials(where, functools.partial(solve, method, objective, seed=seed), trials, progress)
     found = {method_name: trials.found(name, method_name, count) for method_name, count in counts.items()}
     progress.begin(f"{name}: observation plane")
     begin = time.perf_counter()

@@ -41,6 +41,14 @@ class Progress:
         else:
             self._bar.set_description(what)
 
+    def describe(self, what: str) -> None:
+        """Show the details of the work on the bar, or in the log for developers."""
+        self._what = what
+        if self._bar is None:
+            logger.debug(what)
+        else:
+            self._bar.set_description(what)
+
     def advance(self, steps: int) -> None:
         """Count finished steps; any thread may call it."""
         with self._lock:

@@ -1,0 +1,324 @@
+"""The bench of a hardware trial, from the section `hardware` of a config: device and sensor."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from autdtorch import hardware
+from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
+from autdtorch.hardware.sensors.by_hand import typed
+from autdtorch.hardware.wiring import Wiring
+from autdtorch.objectives.perturbations import random_rms
+from autdtorch.objectives.simulated import SimulatedObjective
+from autdtorch.scene.scene import Scene
+from autdtorch.utils.digest import digest_of
+from autdtorch.utils.validation import (
+    boolean,
+    finite_number,
+    integer_at_least,
+    invalid,
+    require_known,
+    require_one_of,
+)
+
+_MAKERS = {"keysight": hardware.KEYSIGHT, "rigol": hardware.RIGOL}
+_EMULATED_SCOPE = "2a8d:1770"
+_MOST_TRANSDUCERS = 100_000  # in a range; a slip of the finger must not fill the memory
+
+_SENSORS = {
+    "emulated": ("kind", "snr"),
+    "scope": ("kind", "chip", "maker", "sensitivity", "loudest", "captures", "moved", "snr"),
+    "file": ("kind", "path"),
+    "manual": ("kind",),
+}
+"""Keys of the section `hardware.sensor`, by its `kind`."""
+
+_KEYS = (
+    "device", "emulated", "boards", "transducers", "failed", "port", "serial", "network", "settle",
+    "dry_run", "limits", "sensor",
+)  # fmt: skip
+
+
+class Bench:
+    """The device and the sensor that a config describes; nothing is opened yet.
+
+    Attributes:
+        device: the device, with its boards.
+        transducers: the device's transducer for each of the scene's.
+        by_hand: whether a person reads or moves the sensor.
+        settings: what identifies the trial beside its device, by name.
+    """
+
+    def __init__(self, section: Mapping[str, Any], scene: Scene, seed: int) -> None:
+        """Check the section.
+
+        Args:
+            section: `hardware` of the config.
+            scene: on the bench.
+            seed: of emulated noise.
+
+        Raises:
+            ValueError: a key that is unknown, out of range, or does not fit the others.
+        """
+        require_known("hardware", section, _KEYS)
+        require_one_of("hardware.device", section["device"], hardware.DEVICES)
+        self._section, self._scene, self._seed = section, scene, seed
+        self._emulated = boolean("hardware.emulated", section["emulated"]) or self.is_dry
+        self._sensor = _sensor_section(section["sensor"], self._emulated, self.is_dry)
+        _require_fit(section, self._emulated)
+        self._boards = _openmpd_boards(section)
+        self.device = self._device()
+        self.transducers = self._wired(len(scene.array))
+        self._failed = indices_of("hardware.failed", section["failed"] or [])
+        if max(self._failed, default=0) >= len(scene.array):
+            accepted = f"must be 0 to {len(scene.array) - 1}, as the scene has them"
+            raise invalid("hardware.failed", max(self._failed), accepted)
+        self.by_hand = self._sensor["kind"] == "manual" or bool(self._sensor.get("moved"))
+        self.settings = self._settings()
+        self._bench: hardware.EmulatedBench | None = None
+
+    @property
+    def is_dry(self) -> bool:
+        """Whether frames are printed and no device is opened."""
+        return boolean("hardware.dry_run", self._section["dry_run"])
+
+    def emulate(self, simulated: SimulatedObjective) -> None:
+        """Make the emulated bench, if there is one, with the transfer matrix of a simulated objective."""
+        if self._emulated and simulated.transfer_matrix is not None:
+            matrix, wired = _deviating(simulated.transfer_matrix, self._boards, self.transducers)
+            self._bench = hardware.EmulatedBench(self.device, matrix, wired, dead=self._failed)
+
+    def link(self) -> hardware.Link:
+        """Open the link to the device or its emulator."""
+        section, settle, bench = self._section, self._section["settle"], self._bench
+        on_network = section["device"] == "autd3"
+        if bench is None:
+            if on_network:
+                network = _network(section["network"])
+                return hardware.open_autd3(self._board_count(), self.transducers, network, settle)
+            serial, port = (
+                None if (text := section[key]) is None else str(text) for key in ("serial", "port")
+            )
+            return hardware.open_link(self.device, self.transducers, serial, settle=settle, port=port)
+        if self.is_dry:  # these imports need pyusb
+            from autdtorch.hardware.emulator.dry_run import DryPort
+
+            opened: hardware.Port = DryPort(bench, print)
+        elif on_network:
+            from autdtorch.hardware.emulator.emulated_autd3 import EmulatedAutd3Port
+
+            opened = EmulatedAutd3Port(self._board_count(), bench)
+        else:
+            return hardware.open_link(self.device, self.transducers, backend=bench.bus, settle=settle)
+        return hardware.Link(self.device, opened, self.transducers, settle, bench.bus.sleep)
+
+    @contextlib.contextmanager
+    def sensor(self) -> Iterator[hardware.Sensor]:
+        """Open the sensor."""
+        given, points = self._sensor, self._scene.control_points
+        match given["kind"]:
+            case "emulated" if self._bench is not None:
+                yield hardware.EmulatedSensor(self._bench, given["snr"], self._seed)
+            case "manual":
+                yield hardware.ManualSensor(points, _ask)
+            case "file":
+                yield hardware.FileSensor(given["path"], len(points))
+            case _:
+                with self._scope() as scope:
+                    inputs = range(1, 2 if given["moved"] else len(points) + 1)
+                    microphones = [
+                        hardware.Microphone(number, given["sensitivity"], given["loudest"])
+                        for number in inputs
+                    ]
+                    sensor = hardware.ScopeSensor(
+                        scope, self._scene.frequency, microphones, given["captures"]
+                    )
+                    yield hardware.MovedMicrophone(sensor, points, _ask) if given["moved"] else sensor
+
+    def _settings(self) -> dict[str, Any]:
+        settings: dict[str, Any] = {"sensor": self._sensor["kind"]}
+        if self._sensor["kind"] == "scope":
+            settings |= {
+                "sensitivity [V/Pa]": self._sensor["sensitivity"],
+                "captures": self._sensor["captures"],
+            }
+        if self._emulated:
+            settings |= {"emulated": True, "snr [dB]": self._sensor.get("snr"), "failed": self._failed}
+        if self._boards:
+            settings["boards"] = [f"{board.name} {digest_of(board)[:16]}" for board in self._boards]
+        return settings
+
+    def _device(self) -> hardware.Device:
+        if self._boards:
+            return hardware.openmpd_boards(self._boards)
+        return hardware.DEVICES[self._section["device"]].with_boards(self._board_count())
+
+    def _board_count(self) -> int:
+        boards = self._section["boards"]
+        if self._boards:
+            return len(self._boards)
+        return 1 if boards is None else integer_at_least("hardware.boards", boards, 1)
+
+    def _wired(self, count: int) -> list[int]:
+        """Return the device's transducers for the scene's `count`."""
+        field, given = "hardware.transducers", self._section["transducers"]
+        if given is None and not self._section["emulated"] and count != self.device.transducers:
+            most = f"{self.device.transducers} transducers of {self.device.name}"
+            raise invalid(field, None, f"must say which {count} of the {most} the scene's are")
+        chosen = list(range(count)) if given is None else indices_of(field, given)
+        if len(chosen) != count:
+            raise invalid(field, f"{len(chosen)} transducers", f"must be {count}, as many as the scene has")
+        wired: list[int] = Wiring(self.device, chosen).transducers.tolist()
+        return wired
+
+    def _scope(self) -> hardware.Oscilloscope:
+        given = self._sensor
+        dialect = _MAKERS[given["maker"]]
+        chip = chip_of("hardware.sensor.chip", given["chip"] or _EMULATED_SCOPE)
+        if self._bench is None:
+            return hardware.open_scope(chip, dialect)
+        snr = given["snr"]
+        rms = random_rms(self._bench.transfer_matrix)
+        emulated = hardware.EmulatedScope(
+            self._bench.pressure,
+            self._scene.frequency,
+            given["sensitivity"],
+            range(len(self._scene.control_points)),
+            dialect.name.partition(" ")[0],
+            noise=0.0 if snr is None else given["sensitivity"] * rms * 10 ** (-snr / 20),
+            seed=self._seed,
+        )
+        emulated.plug_into(self._bench, chip)
+        return hardware.open_scope(chip, dialect, backend=self._bench.bus)
+
+
+def indices_of(field: str, value: object) -> list[int]:
+    """Return indices from a list, or from text such as "3,7-9".
+
+    Raises:
+        ValueError: neither, or more than 100,000 of them.
+    """
+    if isinstance(value, list | tuple):
+        return [integer_at_least(f"{field}[{place}]", entry, 0) for place, entry in enumerate(value)]
+    try:
+        parts = [part.partition("-") for part in str(value).split(",")]
+        ranges = [range(int(low), int(high or low) + 1) for low, _, high in parts]
+    except ValueError:
+        ranges = []
+    if not ranges or not all(ranges) or sum(map(len, ranges)) > _MOST_TRANSDUCERS:
+        accepted = f"must be at most {_MOST_TRANSDUCERS} numbers, and ranges that go up, as 3,7-9"
+        raise invalid(field, value, accepted)
+    return [one for some in ranges for one in some]
+
+
+def chip_of(field: str, text: object) -> tuple[int, int]:
+    """Return idVendor and idProduct of text such as "2a8d:1770", as lsusb shows them.
+
+    Raises:
+        ValueError: other text.
+    """
+    try:
+        vendor, product = (int(part, 16) for part in str(text).split(":"))
+    except ValueError as error:
+        raise invalid(field, text, "must be VID:PID, as 2a8d:1770") from error
+    if not (0 <= vendor < 2**16 and 0 <= product < 2**16):
+        raise invalid(field, text, "must be VID:PID with four digits each, as 2a8d:1770")
+    return vendor, product
+
+
+def _sensor_section(section: object, emulated: bool, dry: bool) -> Mapping[str, Any]:
+    """Check and return the section of the sensor; in a dry run that of an emulated one."""
+    if dry:
+        return {"kind": "emulated", "snr": None}
+    if not isinstance(section, Mapping):
+        raise invalid("hardware.sensor", section, f"must be one of {', '.join(_SENSORS)}")
+    kind = section.get("kind")
+    require_one_of("hardware.sensor.kind", kind, _SENSORS)
+    require_known("hardware.sensor", section, _SENSORS[str(kind)])
+    if kind == "emulated" and not emulated:
+        raise invalid("hardware.sensor", kind, "must be scope, file or manual on a real device")
+    if section.get("snr") is not None:
+        if not emulated:
+            raise invalid("hardware.sensor.snr", section["snr"], "must be null: it is for an emulated device")
+        finite_number("hardware.sensor.snr", section["snr"])
+    if kind == "file" and section.get("path") is None:
+        raise invalid("hardware.sensor.path", None, "must be the file that holds the readings")
+    if kind == "scope":
+        require_one_of("hardware.sensor.maker", section["maker"], _MAKERS)
+        boolean("hardware.sensor.moved", section["moved"])
+        if not emulated and section["chip"] is None:
+            raise invalid(
+                "hardware.sensor.chip", None, "must be the VID:PID of the oscilloscope, as lsusb shows it"
+            )
+        if emulated and section["moved"]:
+            raise invalid("hardware.sensor.moved", True, "must be false: it is for a real device")
+    return section
+
+
+def _require_fit(section: Mapping[str, Any], emulated: bool) -> None:
+    """Check that no key is given that has no meaning for the device."""
+    device = section["device"]
+    fits = {
+        "boards": (device != "sonicsurface", "openmpd, ultraino and autd3"),
+        "network": (device == "autd3" and not emulated, "AUTD3"),
+        "serial": (device != "autd3" and not emulated, "a real device on USB"),
+        "port": (device != "autd3" and not emulated, "a real device at a serial port"),
+        "failed": (emulated, "an emulated device"),
+    }
+    for key, (fit, bench) in fits.items():
+        if section[key] not in (None, []) and not fit:
+            raise invalid(f"hardware.{key}", section[key], f"must be null: it is for {bench}")
+
+
+def _openmpd_boards(section: Mapping[str, Any]) -> list[OpenMPDBoard]:
+    """Return the boards of OpenMPD from their .pat files, if there are any."""
+    boards = section["boards"]
+    if section["device"] != "openmpd" or boards is None:
+        return []
+    if not isinstance(boards, list) or not boards:
+        raise invalid("hardware.boards", boards, "must be a list of the boards' .pat files")
+    for name in boards:
+        if not Path(str(name)).is_file():
+            raise invalid("hardware.boards", name, "no such file; must be the .pat files of the boards")
+    return [OpenMPDBoard.load(str(name)) for name in boards]
+
+
+def _deviating(
+    matrix: torch.Tensor, boards: list[OpenMPDBoard], transducers: list[int]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return transfer matrix and wiring of transducers that deviate as the boards' files say."""
+    wired = torch.tensor(transducers, device="cpu")
+    if not boards:
+        return matrix, wired
+    each = len(boards[0].pins)
+    asked = torch.ones(each, dtype=torch.complex128, device="cpu")
+    corrections = torch.cat([board.calibrated(asked) for board in boards])[wired]
+    pins = [each * number + pin for number, board in enumerate(boards) for pin in board.pins]
+    return (
+        torch.where(corrections == 0, 0, matrix / corrections),
+        torch.tensor(pins, device="cpu")[wired],
+    )
+
+
+def _network(network: object) -> Any:
+    """Return the setting `hardware.network` as the kit of AUTD3 takes it."""
+    if network is None:
+        return None
+    from autdtorch.hardware.transport.autd3_network import autd3_kit
+
+    kind, separator, port = str(network).partition(":")
+    if (kind, separator) != ("server", ":"):
+        return autd3_kit().UdpOption(str(network))
+    if not (port.isdecimal() and 0 < int(port) < 2**16):
+        raise invalid("hardware.network", network, "must be server:PORT with a port from 1 to 65535")
+    return autd3_kit().ServerLink(int(port))
+
+
+def _ask(question: str) -> str:
+    """Ask below the progress bar."""
+    return typed(f"\n{question}")

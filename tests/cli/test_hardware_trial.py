@@ -1,0 +1,283 @@
+"""Hardware trials from the command line: what they leave and show, and how they end."""
+
+import errno
+import io
+import math
+import re
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from filelock import FileLock
+
+import autdtorch.cli.hardware_command
+from autdtorch.cli.bench import indices_of
+from autdtorch.hardware import LinkError, OffError
+from autdtorch.io.drive_file import load_drive
+from autdtorch.io.scene_file import load_scene
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.study.report.hardware_report import compare
+
+SCENE = """
+name: two
+frequency: 40e3
+medium: {density: 1.2, sound_speed: 340.0}
+array: {type: grid, shape: [3, 3], pitch: 10.5e-3, center: [0, 0, 0], normal: [1, 0, 0]}
+control_points: {type: points, positions: [[80e-3, 10e-3, 0.0], [80e-3, -20e-3, 5e-3]]}
+"""
+EMULATED = ("hardware=emulated", "hardware.limits.amplitude=1")
+GABS = (*EMULATED, "method.levels=4")
+
+Run = Callable[..., int]
+
+
+@pytest.fixture
+def trial(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str, str]]:
+    """Runs a trial in the scene above; returns its status, and what it printed on stdout and stderr."""
+    (tmp_path / "ours" / "scene").mkdir(parents=True)
+    (tmp_path / "ours" / "scene" / "two.yaml").write_text(SCENE)
+
+    def command(*words: str) -> tuple[int, str, str]:
+        capsys.readouterr()
+        status = run("--config-dir", str(tmp_path / "ours"), "scene=two", "output=out", *words)
+        return status, *capsys.readouterr()
+
+    return command
+
+
+def test_a_trial_leaves_log_drive_and_report_and_is_not_repeated(trial, tmp_path: Path):
+    status, printed, log = trial(*GABS, "hardware.failed=[4]")
+    assert (status, "8 of 9 transducers work" in log) == (0, True)
+    out = tmp_path / "out"
+    assert str(Path("out") / "report.md") in printed
+    _, *evaluations, _ = lines = (out / "trial.jsonl").read_text().splitlines()
+    assert len(evaluations) == 1 + 8 * 4
+    assert trial(*GABS, "hardware.failed=[4]")[0] == 0
+    assert (out / "trial.jsonl").read_text().splitlines()[:-1] == lines  # and the second run's end
+    report = (out / "report.md").read_text()
+    assert "**Failed transducers**, counted from 0: 4." in report
+    working = re.search(r"with (\S+) to .* Pa, and the threshold (\S+) Pa", report, re.DOTALL)
+    assert working is not None
+    assert float(working[1]) > float(working[2])
+    assert report.count("| 1.000 |\n") == 3  # without noise the readings are the simulation's
+    assert (out / "convergence.png").exists()
+    assert len(load_drive(out / "drive.npz")) == 9
+
+    status, _, log = trial(*GABS)
+    assert status == 2
+    assert "of another trial, whose failed is [4], not []" in log
+
+
+def test_the_log_of_a_running_trial_is_refused_before_a_device_is_touched(trial, tmp_path: Path, monkeypatch):
+    (tmp_path / "out").mkdir()
+    monkeypatch.setattr("autdtorch.hardware.open_link", None)
+    with FileLock(tmp_path / "out" / ".trial.jsonl.lock"):  # as another process has it
+        status, _, log = trial(*GABS)
+    assert status == 2
+    assert "another process has it open for a trial" in log
+    assert not (tmp_path / "out" / "trial.jsonl").exists()
+
+
+def test_an_oscilloscope_on_the_emulated_bus_is_the_sensor(trial, tmp_path: Path):
+    status, _, log = trial(*EMULATED, "hardware/sensor=scope", "method=lssg")
+    assert (status, "9 of 9 transducers work" in log) == (0, True)
+    misfit = re.search(r"differ by\s+(\S+) %", (tmp_path / "out" / "report.md").read_text())
+    assert misfit is not None
+    assert 0 < float(misfit[1]) < 5  # 8 bits for 20 Pa, at pressures of 1 Pa
+
+
+def test_a_dry_run_shows_the_frames_and_leaves_nothing(trial, tmp_path: Path):
+    words = ("hardware=sonicsurface", "hardware.dry_run=true", "hardware.transducers='0-2,16-18,32-34'")
+    status, printed, _ = trial(*GABS[1:], *words)
+    assert status == 0
+    lines = printed.splitlines()
+    assert all(re.fullmatch("fe( [0-9a-f]{2}){256} fd", frame) for frame in lines[::2])
+    assert lines[1] == lines[-1] == "  all off"
+    assert "  16: 1 at 0" in lines  # each transducer alone, in the pre-flight check
+    assert not (tmp_path / "out").exists()
+
+
+OPENMPD = ("hardware=openmpd", "hardware.limits.amplitude=1", "hardware.transducers='0-8'")
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "message"),
+    [
+        (
+            (*GABS, "hardware.limits.evaluations=5"),
+            3,
+            "5 evaluations are made, the limit; the outputs are off",
+        ),
+        (("hardware=emulated",), 2, "hardware.limits.amplitude: none; must be given"),
+        ((*GABS, "hardware.limits.amplitude=0.5"), 2, "amplitude: 0.5; must be >= 1"),
+        ((*GABS, "hardware.limits.amplitude=0"), 2, "amplitude: 0"),
+        ((*GABS, "+hardware.limits.loudness=3"), 2, "loudness"),
+        ((*GABS, "+hardware.colour=red"), 2, "hardware: unknown key 'colour'"),
+        ((*OPENMPD, "hardware/sensor=emulated"), 2, "hardware.sensor: 'emulated'; must be scope, file or"),
+        ((*OPENMPD, "hardware/sensor=file"), 2, "hardware.sensor.path: none; must be given"),
+        (OPENMPD, 2, "hardware.sensor.chip: None; must be the oscilloscope's VID:PID"),
+        ((*OPENMPD, "hardware.sensor.chip=1:2:3"), 2, "hardware.sensor.chip: '1:2:3'; must be VID:PID"),
+        ((*OPENMPD, "hardware/sensor=manual", "hardware.failed=[1]"), 2, "hardware.failed: (1,); must be null: it is for an emulated"),
+        ((*GABS, "hardware.failed='0-9'"), 2, "hardware.failed: 9; must be 0 to 8, as the scene has them"),
+        ((*GABS, "hardware.transducers='0-7'"), 2, "hardware.transducers: '8 transducers'; must be 9"),
+        ((*GABS, "hardware.transducers='5-3'"), 2, "hardware.transducers: '5-3'; must be at most 100000"),
+        ((*GABS, "hardware.transducers='0-99999999999'"), 2, "must be at most 100000 numbers, and ranges"),
+        ((*GABS, "hardware.boards=2"), 2, "hardware.boards: 2; must be null: it is for openmpd"),
+        ((*GABS, "hardware.network=eth0"), 2, "hardware.network: 'eth0'; must be null: it is for AUTD3"),
+        ((*GABS, "hardware.sensor.snr=nan"), 2, "hardware.sensor.snr: nan; must be"),
+        (
+            (*GABS, "hardware.device=openmpd", "hardware.boards=[a.pat]"),
+            2,
+            "hardware.boards: 'a.pat'; no such",
+        ),
+        (
+            (*GABS, "hardware.device=autd3", "hardware.boards=two"),
+            2,
+            "hardware.boards: 'two'; must be an int",
+        ),
+        ((*GABS, "hardware.failed='0-8'"), 2, "hardware.sensor: 0 Pa from the strongest transducer; must be"),
+        (("hardware=sonicsurface", "hardware/sensor=manual", GABS[1]), 2, "hardware.transducers: None; must say which 9 of the 256"),
+        ((*GABS, "hardware=nowhere"), 2, "hardware: 'nowhere'; must be one of autd3, base, emulated"),
+        ((*GABS, "-m"), 2, "hardware: a sweep; must be one trial at a time"),
+    ],
+)
+def test_a_trial_that_may_not_be_made_ends_with_one_line(trial, words, status: int, message: str):
+    ended, _, log = trial(*words)
+    assert ended == status
+    assert message in log
+
+
+def test_a_bench_of_ones_own_is_a_config(trial, tmp_path: Path):
+    (tmp_path / "ours" / "hardware").mkdir()
+    (tmp_path / "ours" / "hardware" / "mine.yaml").write_text(
+        "defaults: [base, sensor: emulated, _self_]\n"
+        "device: openmpd\nemulated: true\nfailed: [4]  # it fell\nlimits: {amplitude: 0.5}\n"
+    )
+    status, _, log = trial("hardware=mine", "method=lssg")
+    assert (status, "failed transducers, counted from 0: 4" in log) == (0, True)
+    assert "hardware=mine" in (tmp_path / "out/report.md").read_text()
+
+
+@pytest.mark.parametrize("device", ["autd3", "openmpd"])
+def test_devices_of_boards_find_the_drive_of_the_simulation(trial, tmp_path: Path, device: str):
+    if device == "autd3":
+        pytest.importorskip("autd3", reason="the kit of AUTD3: install autdtorch[autd3]")
+    boards = (
+        "2" if device == "autd3" else f"[{write_board(tmp_path, 'left')},{write_board(tmp_path, 'right')}]"
+    )
+    words = (f"hardware.device={device}", f"hardware.boards={boards}", "hardware.transducers='251-259'")
+    assert trial(*GABS, *words)[0] == 0
+    report = (tmp_path / "out" / "report.md").read_text()
+    assert "transducers driven as in the simulated trial: 9 of 9" in report
+    assert report.count("| 1.000 |\n") == 3
+    if device == "openmpd":  # another file of the same name is another board
+        write_board(tmp_path, "left", gain=0.5)
+        status, _, log = trial(*GABS, *words)
+        assert (status, "of another trial, whose boards is ['left " in log) == (2, True)
+
+
+def write_board(folder: Path, name: str, gain: float = 1.0) -> str:
+    path = folder / f"{name}.pat"
+    positions = "\n".join(f"({0.0105 * (n % 16)}, {0.0105 * (n // 16)}, 0)" for n in range(256))
+    rest = "\n".join(" ".join(map(str, column)) for column in (range(255, -1, -1), [0] * 256, [gain] * 256))
+    path.write_text(f"{name}\n256\n128\n{positions}\n{rest}\n")
+    return str(path)
+
+
+@pytest.fixture
+def fail_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, Callable[[], None]], None]:
+    """Has the method fail in the simulation (0) or on the bench (1)."""
+
+    def arrange(call: int, fail: Callable[[], None]) -> None:
+        real, calls = autdtorch.cli.hardware_command.solve, []
+
+        def solve(*arguments: object) -> object:
+            calls.append(None)
+            if len(calls) == call + 1:
+                fail()
+            return real(*arguments)
+
+        monkeypatch.setattr(autdtorch.cli.hardware_command, "solve", solve)
+
+    return arrange
+
+
+OFF = "; the outputs are off, and the same command goes on where the log ends"
+
+
+@pytest.mark.parametrize(("call", "message"), [(0, ""), (1, OFF)])
+def test_a_signal_speaks_of_the_device_only_once_it_was_opened(trial, fail_at, call: int, message: str):
+    fail_at(call, lambda: signal.raise_signal(signal.SIGTERM))
+    status, _, log = trial(*GABS)
+    assert (status, log.splitlines()[-1]) == (143, f"autdtorch: SIGTERM{message}")
+
+
+@pytest.mark.parametrize("left_on", [False, True])
+def test_an_error_in_mid_trial_says_whether_the_outputs_are_off(trial, fail_at, left_on: bool):
+    def fail() -> None:
+        error = OSError(errno.ENOSPC, "No space left on device", "there.jsonl")
+        error.__context__ = OffError("they may still be on") if left_on else LinkError("stall")
+        raise error
+
+    fail_at(1, fail)
+    status, _, log = trial(*GABS)
+    then = "; they may still be on" if left_on else OFF
+    assert (status, log.splitlines()[-1]) == (2, f"autdtorch: there.jsonl: No space left on device{then}")
+
+
+@pytest.mark.parametrize("words", [(), ("hardware.dry_run=true",)])
+def test_without_pyusb_an_emulated_trial_ends_with_the_hint(trial, monkeypatch, words):
+    for name in [name for name in sys.modules if name.startswith("autdtorch.hardware.emulator.")]:
+        monkeypatch.delitem(sys.modules, name)
+    for name in ("usb", "usb.core", "usb.backend"):
+        monkeypatch.setitem(sys.modules, name, None)
+    status, _, log = trial(*GABS, *words)
+    assert (status, "pip install 'autdtorch[hardware]'" in log) == (2, True)
+
+
+def test_a_person_reads_each_transducer_and_the_silence_once(trial, monkeypatch):
+    points, evaluations = 2, 1 + 8 * 4
+    answers = io.StringIO("0\n" * points + "1\n" * points * (9 + evaluations + 1) + "0\n" * points)
+    monkeypatch.setattr("sys.stdin", answers)
+    status, printed, log = trial(*GABS, "hardware/sensor=manual")
+    assert status == 0
+    assert not answers.read()
+    assert printed.count("Pressure at control point 1 of 2") == 1 + 9 + evaluations + 2
+    assert "pre-flight check: transducer 3 of 9" in log
+
+
+def test_the_script_takes_the_same_settings(trial, monkeypatch, tmp_path: Path):
+    import hardware_trial
+
+    monkeypatch.setattr("sys.argv", ["hardware_trial.py", "method=lssg"])
+    with pytest.raises(SystemExit) as end:
+        hardware_trial.main()
+    assert end.value.code == 2  # no amplitude limit: the emulator is the default
+
+
+def test_the_factor_between_simulation_and_bench_is_found():
+    simulated = torch.rand(20, 3, dtype=torch.float64) + 1
+    fit = compare(2.5 * simulated, simulated)
+    assert fit.scale == pytest.approx(2.5, rel=1e-12)
+    assert fit.misfit < 1e-12
+
+
+def test_the_documented_scene_lies_in_the_middle_of_a_sonicsurface(tmp_path: Path):
+    """With the device turned as the documentation says, for the transducers of its command."""
+    text = (Path(__file__).parents[2] / "docs" / "hardware.md").read_text("utf-8")
+    block = re.search(r"```yaml\n(name.*?|.*?array.*?)```", text, re.DOTALL)
+    chosen = re.search(r"transducers[=:] *[\"']*([0-9][0-9,-]+)", text)
+    assert block is not None
+    assert chosen is not None
+    path = tmp_path / "my_bench.yaml"
+    path.write_text(block[1], "utf-8")
+    device = TransducerArray.sonicsurface(center=(0, 0, 0), angle=math.pi / 2)
+    places = device.positions[indices_of("transducers", chosen[1])]
+    assert torch.allclose(
+        load_scene(path).array.positions, places, rtol=0, atol=1e-9
+    )  # rounding; pitch 1e-2 m
