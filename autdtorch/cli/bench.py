@@ -253,7 +253,9 @@ def _sensor_section(section: object, emulated: bool, dry: bool) -> Mapping[str, 
         boolean("hardware.sensor.moved", section["moved"])
         if not emulated and section["chip"] is None:
             raise invalid(
-                "hardware.sensor.chip", None, "must be the VID:PID of the oscilloscope, as lsusb shows it"
+                "hardware.sensor.chip",
+                None,
+                "must be the oscilloscope's VID:PID, as lsusb shows it; or take hardware/sensor=file or manual",
             )
         if emulated and section["moved"]:
             raise invalid("hardware.sensor.moved", True, "must be false: it is for a real device")

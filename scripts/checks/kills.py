@@ -104,8 +104,8 @@ SUBJECTS = {
     ),
     "hardware trial": Subject(
         (
-            *(str(TRIAL), "--output", "out", "--device", "emulated", "--scene", "homogeneous"),
-            *("--method", "gabs", "--set", "levels=64", "--amplitude-limit", "1"),
+            *(str(TRIAL), "output=out", "method=gabs", "method.levels=64"),
+            *("hardware=emulated", "hardware.limits.amplitude=1"),
         ),
         "out/trial.jsonl",
         of_trial,
