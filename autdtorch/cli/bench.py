@@ -255,7 +255,7 @@ def _sensor_section(section: object, emulated: bool, dry: bool) -> Mapping[str, 
             raise invalid(
                 "hardware.sensor.chip",
                 None,
-                "must be the oscilloscope's VID:PID, as lsusb shows it; or take hardware/sensor=file or manual",
+                "must be the oscilloscope's VID:PID, as lsusb shows it; or hardware/sensor=file or manual",
             )
         if emulated and section["moved"]:
             raise invalid("hardware.sensor.moved", True, "must be false: it is for a real device")

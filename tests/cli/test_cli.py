@@ -202,7 +202,7 @@ BAD_METHODS = {
     "greedy": (2, "autdtorch: method: 'own.greedy'; missing a required argument: 'steps'; must take an obj"),
     "broken": (
         1,
-        "autdtorch: AttributeError: .* 'missing' \\(own.py, line 3, in broken\\); with HYDRA_FULL_ERROR=1",
+        "autdtorch: AttributeError: .* 'missing' \\(own.py, line 3, in broken\\); HYDRA_FULL_ERROR=1",
     ),
     "empty": (2, "autdtorch: method empty: None; must return a Solution"),
 }
