@@ -1,4 +1,4 @@
-"""The oscilloscope on the emulated bus: what it hears against the pressure that is there."""
+"""The oscilloscope on the emulated bus: readings against the pressure at the microphones."""
 
 import itertools
 import logging
@@ -71,11 +71,11 @@ class Bench:
         self.open = open_scope(CHIP, dialect, backend=self.bus)
 
     def listen(self) -> list[str]:
-        """What the oscilloscope is told from now on."""
-        told: list[str] = []
+        """The lines that the oscilloscope gets from now on."""
+        lines: list[str] = []
         execute = self.scope.execute
-        self.scope.execute = lambda line: told.append(line) or execute(line)
-        return told
+        self.scope.execute = lambda line: lines.append(line) or execute(line)
+        return lines
 
     def sensor(self, captures: int = 1) -> ScopeSensor:
         return sensor_at(self.open, len(self.scope.points), captures)
@@ -130,19 +130,19 @@ def test_a_microphone_drifts_by_what_was_asked_for():
 @pytest.mark.parametrize("dialect", [KEYSIGHT, RIGOL], ids=lambda dialect: dialect.name)
 def test_each_input_has_a_scale_on_which_it_uses_a_quarter_of_the_screen_or_more(dialect):
     bench = Bench([0, 0], dialect)
-    told, sensor = bench.listen(), bench.sensor()
+    lines, sensor = bench.listen(), bench.sensor()
     for quiet in (0.6, 0.4, 0.7, 0.15, 0.6):
         bench.field.copy_(torch.tensor([3.2 - 1j, 1j * quiet]))
         error = sensor.read() / bench.field.abs() - 1
         # 2 / pi codes of a quarter of 3.5 divisions, as in the test above.
         assert error.abs().max() < 2 / math.pi / (3.5 / 4 * (32 if dialect is KEYSIGHT else 25))
-    scales = [float(line.split()[1]) for line in told if line.startswith(":CHANnel2:SCALe")]
+    scales = [float(line.split()[1]) for line in lines if line.startswith(":CHANnel2:SCALe")]
     # For `loudest`; so that 6 mV fill half of 3.5 divisions, 1.5 mV on the finest; four times that for 6 mV.
     # The first capture has 17 codes: what it shows is one and a half more, at most.
     half = 6e-3 / 3.5 * 2
     assert scales == pytest.approx([LOUDEST * SENSITIVITY / 3.5, half, 1e-3, 4e-3], rel=0.1)
     assert sensor.recaptures == 3
-    assert sum(line.startswith(":CHANnel1:SCALe") for line in told) == 1
+    assert sum(line.startswith(":CHANnel1:SCALe") for line in lines) == 1
     assert bench.scope.unknown == []
 
 
@@ -218,7 +218,7 @@ def test_a_fault_that_a_clear_mends_costs_a_warning_and_no_reading(fault, messag
     bench = Bench([3.2, 0.3])
     sensor = bench.sensor()
     before = sensor.read()
-    answer, told = bench.instrument.answer, bench.listen()
+    answer, lines = bench.instrument.answer, bench.listen()
 
     def mended(kind: int, request: int) -> bytes | None:
         bench.instrument.fault = None
@@ -229,8 +229,8 @@ def test_a_fault_that_a_clear_mends_costs_a_warning_and_no_reading(fault, messag
     torch.testing.assert_close(sensor.read(), before, rtol=2 * 2 / math.pi / 28, atol=0)
     (warning,) = caplog.messages
     assert re.search(f"{message}.*; it is cleared, and captures once more", warning)
-    # The scales are told again, as they may have been what was lost.
-    assert sum("SCALe" in line for line in told) == 2
+    # The scales are sent again, as they may have been lost.
+    assert sum("SCALe" in line for line in lines) == 2
 
 
 def test_an_unplugged_oscilloscope_and_one_of_another_maker_are_errors():

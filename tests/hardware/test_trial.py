@@ -155,18 +155,20 @@ def test_the_sensor_reads_with_the_noise_of_its_snr(trial):
 
 def test_a_scene_of_other_transducers_is_refused(trial):
     bench = trial.bench()
+    with open_link(SONICSURFACE, torch.tensor([5, 3]), backend=bench.bus) as link:
+        assert link.transducers.tolist() == [5, 3]
     with open_link(SONICSURFACE, backend=bench.bus) as link, pytest.raises(ValueError, match="must be 16"):
         trial.objective(link, EmulatedSensor(bench))
     with trial.link(bench) as link, pytest.raises(ValueError, match="no trial without an amplitude limit"):
         HardwareObjective(trial.scene, link, EmulatedSensor(bench), trial.log)
+    for settings in ({1}, {"gain": torch.ones(1)}):
+        with trial.link(bench) as link:
+            limited = LimitedLink(link, Limits(1.0))
+            with pytest.raises(ValueError, match=r"settings: .* what JSON can hold"):
+                HardwareObjective(trial.scene, limited, EmulatedSensor(bench), trial.log, settings)
     with pytest.raises(ValueError, match="from 0 to 255, each once"):
         open_link(SONICSURFACE, [3, 3], backend=bench.bus)
     assert bench.firmware.drive().abs().max() == 0
-
-
-def test_the_transducers_may_be_a_tensor_as_a_link_has_them(trial):
-    with open_link(SONICSURFACE, torch.tensor([5, 3]), backend=trial.bench().bus) as link:
-        assert link.transducers.tolist() == [5, 3]
 
 
 def test_an_unplugged_device_is_an_error_that_says_so(trial):
