@@ -117,18 +117,8 @@ def fluid_slab(
 ) -> torch.Tensor:
     """Return the field of point sources in front of a fluid slab in a medium: in front, inside and behind.
 
-    Returns, errors, source and other arguments as for `fluid_half_space`, with the front face as its face.
-
-    Args:
-        points: (P, 3) [m], anywhere.
-        sources: (M, 3) [m], in front of the front face.
-        wavenumber: k of the medium [rad/m], > 0.
-        origin: a point (3,) of the front face [m].
-        normal: of the front face (3,), towards the sources; any length.
-        thickness: of the slab [m], > 0.
-        density_ratio: rho_1 / rho > 0.
-        speed_ratio: c_1 / c > 0.
-        scattered: subtract the field of the sources in the infinite medium.
+    Arguments, returns, errors and source as for `fluid_half_space`; the front face is its face, and the
+    slab has a `thickness` [m], > 0.
     """
     layering = Slab(wavenumber, density_ratio, speed_ratio, thickness)
     return _layered_field(points, sources, layering, origin, normal, scattered)

@@ -92,7 +92,7 @@ class Link:
         self.wait_for_sound()
 
     def begin(self, drive: torch.Tensor) -> None:
-        """Play a drive as `play` does, but return when its frame is on the device."""
+        """Play a drive (M,) as `play` does, but return when its frame is on the device."""
         frame = self.wiring.frame(drive)
         with self._lock:
             if not self._open:

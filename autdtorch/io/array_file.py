@@ -12,7 +12,7 @@ from autdtorch.io.csv_table import read_table
 from autdtorch.scene.arrays import PAPER_SOURCE_STRENGTH, TransducerArray
 from autdtorch.scene.geometry import device_axes, in_plane
 from autdtorch.utils.numpy_file import read_arrays
-from autdtorch.utils.validation import ArrayLike, invalid, path_of, points_tensor, real_tensor
+from autdtorch.utils.validation import ArrayLike, invalid, path_of, points_tensor, real_tensor, within
 
 PLACE_COLUMNS = {"x": "m", "y": "m", "z": "m"}
 """Columns of a CSV file with the positions of transducers, and their units."""
@@ -99,9 +99,6 @@ def _built(
     source_strength: Any = PAPER_SOURCE_STRENGTH,
     radius: Any = None,
 ) -> TransducerArray:
-    try:
-        return TransducerArray(
-            points_tensor("positions", positions), real_tensor("normals", normals), source_strength, radius
-        )
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    with within(path):
+        places, directions = points_tensor("positions", positions), real_tensor("normals", normals)
+        return TransducerArray(places, directions, source_strength, radius)

@@ -1,9 +1,9 @@
-"""Drives in files: as they are, with their array, or as the integer levels that a device is sent."""
+"""Drives in files: with full precision and their array, or as the integer levels of a device."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,15 @@ from autdtorch.scene.drive import (
 )
 from autdtorch.utils.files import replacing
 from autdtorch.utils.numpy_file import read_arrays
-from autdtorch.utils.validation import ArrayLike, invalid, path_of, real_tensor, require_kind, require_one_of
+from autdtorch.utils.validation import (
+    ArrayLike,
+    invalid,
+    path_of,
+    real_tensor,
+    require_kind,
+    require_one_of,
+    within,
+)
 
 _LEVEL_COLUMNS = {f"{name} {column}": "" for name, device in DEVICES.items() for column in device.columns}
 _PLAIN_COLUMNS = {"phase": "rad", "amplitude": ""}
@@ -33,26 +41,26 @@ _PLAIN_COLUMNS = {"phase": "rad", "amplitude": ""}
 def save_drive(
     path: str | os.PathLike[str], drive: ArrayLike, array: TransducerArray, device: str | None = None
 ) -> None:
-    """Write a drive as `.csv` or `.npz`, whole or as what a device is sent.
+    """Write a drive as `.csv` or `.npz`, with full precision or as the levels of a device.
 
-    Without `device`, with all digits: `.csv` has the columns transducer, x, y, z [m], nx, ny, nz, phase [rad]
-    and amplitude; `.npz` the arrays drive (M,), positions, normals, source_strength and radius. `load_array`
-    reads the array from both; .csv says neither strength nor radius.
+    Without `device`, `.csv` has the columns transducer, x, y, z [m], nx, ny, nz, phase [rad] and amplitude.
+    `.npz` has the arrays drive (M,), positions, normals, source_strength and radius. `load_array` reads the
+    array from both; .csv has neither strength nor radius.
 
-    With `device`, rounded to its phase levels, in the order of the array, which must be the device's: that of
-    `TransducerArray.autd3`, `.sonicsurface` and `.openmpd`. `.csv` has the columns unit, transducer and, say,
-    autd3 phase and autd3 intensity; `.npz` the name `device` and uint8 arrays (units, transducers of a unit):
-    phase and intensity (AUTD3), phase and duty (OpenMPD, Ultraino), or phase alone (SonicSurface).
+    With `device`, the drive is rounded to its phase levels. The array must have the order of the device, as
+    `TransducerArray.autd3`, `.sonicsurface` and `.openmpd` have. `.csv` has the columns unit, transducer and,
+    for example, autd3 phase and autd3 intensity. `.npz` has the name `device` and uint8 arrays (units,
+    transducers per unit): phase, and for AUTD3 intensity, for OpenMPD and Ultraino duty.
 
     Args:
-        path: of the file, which is replaced; its suffix says the format.
+        path: of the file, which is replaced; the suffix decides the format.
         drive: complex (M,), |q| <= 1.
         array: the M transducers.
-        device: a name in `hardware.DEVICES`, as "autd3", or None.
+        device: a name in `hardware.DEVICES`, such as "autd3", or None.
 
     Raises:
-        ValueError: another suffix or device, not a drive of the array, or an M that is no multiple of what a
-            unit of the device has.
+        ValueError: another suffix or device, not a drive of the array, or an M that is not a multiple of the
+            transducers of a unit.
     """
     kind = _kind(path)
     require_kind("array", array, TransducerArray)
@@ -70,15 +78,15 @@ def save_drive(
 
 
 def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
-    """The drive (M,), complex128, from a file as `save_drive` writes it; levels as the device plays them.
+    """Read a drive (M,), complex128, from a file of `save_drive`, levels as the device plays them.
 
     Args:
-        path: of the file; its suffix says the format.
+        path: of the file; the suffix decides the format.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: another suffix, or a file that holds no drive. The message names the file, and the line
-            where it has lines.
+        ValueError: another suffix, or a file without a drive. The message names the file, and the line where
+            it has lines.
     """
     if _kind(path) == ".csv":
         return _from_columns(path, read_table(path, _all_columns()))
@@ -90,7 +98,8 @@ def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
     if "drive" not in arrays:
         raise ValueError(f"{path}: no array 'drive'; must be written by save_drive")
     drive = arrays["drive"]
-    return _valid(path, lambda: validate_drive(drive.reshape(-1), drive.size))
+    with within(path):
+        return validate_drive(drive.reshape(-1), drive.size)
 
 
 def _kind(path: str | os.PathLike[str]) -> str:
@@ -106,7 +115,7 @@ def _all_columns() -> dict[str, str]:
 
 
 def _plain(drive: torch.Tensor, array: TransducerArray) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Columns by header and arrays by name of a drive that is not rounded."""
+    """Return columns by header and arrays by name of a drive with full precision."""
     positions, normals = array.positions.numpy(), array.normals.numpy()
     columns = {"transducer": np.arange(len(array))}
     columns |= {f"{name} [m]": positions[:, axis] for axis, name in enumerate(PLACE_COLUMNS)}
@@ -123,7 +132,7 @@ def _plain(drive: torch.Tensor, array: TransducerArray) -> tuple[dict[str, Any],
 
 
 def _levelled(drive: torch.Tensor, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Columns by header and arrays by name of the levels that a device is sent."""
+    """Return columns by header and arrays by name of the levels for a device."""
     device = DEVICES[name]
     units, rest = divmod(len(drive), device.board)
     if rest:
@@ -145,29 +154,21 @@ def _from_columns(path: str | os.PathLike[str], table: Mapping[str, npt.NDArray[
         raise ValueError(
             f"{path}: no column {', '.join(missing)}; must have phase and amplitude, or a device's"
         )
-    return _valid(path, lambda: drive_from_phases(table["phase"], table["amplitude"]))
+    with within(path):
+        return drive_from_phases(table["phase"], table["amplitude"])
 
 
 def _played(path: str | os.PathLike[str], name: str, stored: Mapping[str, npt.NDArray[Any]]) -> torch.Tensor:
-    """What a device plays for levels that are stored by names such as "autd3 phase"."""
+    """Return the drive of a device for levels stored by names such as "autd3 phase"."""
     device = DEVICES[name]
     wanted = [f"{name} {column}" for column in device.columns]
     missing = [column for column in wanted if column not in stored]
     if missing:
         raise ValueError(f"{path}: no {', '.join(missing)}; must have {', '.join(wanted)}")
 
-    def drive() -> torch.Tensor:
+    with within(path):
         levels = [real_tensor(column, stored[column]) for column in wanted]
-        # Whole numbers become the integers they stand for; the device refuses others.
+        # The device refuses fractions, which stay floats.
         return device.drive(
-            *(level.long() if bool((level == level.long()).all()) else level for level in levels)
+            *(level.long() if torch.equal(level, level.round()) else level for level in levels)
         )
-
-    return _valid(path, drive)
-
-
-def _valid(path: str | os.PathLike[str], make: Callable[[], torch.Tensor]) -> torch.Tensor:
-    try:
-        return make()
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error

@@ -31,6 +31,7 @@ from autdtorch.utils.validation import (
     path_of,
     points_tensor,
     require_known,
+    within,
 )
 
 Builder = Callable[..., Any]
@@ -173,10 +174,8 @@ def _build_kind(where: str, value: object, builders: Mapping[str, Builder]) -> A
 
 def _build(where: str, section: dict[str, Any], builder: Builder) -> Any:
     _check_keys(where, section, builder)
-    try:
+    with within(where):
         return builder(**section)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from error
 
 
 def _mapping(where: str, value: object) -> dict[str, Any]:

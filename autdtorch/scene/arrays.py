@@ -16,6 +16,7 @@ from autdtorch.scene.device_layouts import (
     SONICSURFACE_SOURCE_STRENGTH,
     TRANSDUCER_RADIUS,
     autd3_places,
+    centred,
     openmpd_places,
     sonicsurface_places,
 )
@@ -25,7 +26,6 @@ from autdtorch.utils.neighbours import nearest_other, require_distinct
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
-    finite_vector,
     invalid,
     not_negative,
     points_tensor,
@@ -130,12 +130,8 @@ class TransducerArray:
         count_u, count_v = positive_integers("shape", shape, 2)
         require_memory("shape", shape, _TRANSDUCER_BYTES * count_u * count_v)
         pitch = positive("pitch", pitch, "m")
-        middle = torch.tensor(finite_vector("center", center), dtype=torch.float64, device="cpu")
-        u, v = plane_basis(normal)
-        along_u = pitch * (torch.arange(count_u, dtype=torch.float64, device="cpu") - (count_u - 1) / 2)
-        along_v = pitch * (torch.arange(count_v, dtype=torch.float64, device="cpu") - (count_v - 1) / 2)
-        positions = middle + along_u[:, None, None] * u + along_v[None, :, None] * v
-        return cls(positions.reshape(-1, 3), normal, source_strength, radius)
+        places = torch.cartesian_prod(pitch * centred(count_u), pitch * centred(count_v)).reshape(-1, 2)
+        return cls(in_plane(places, center, normal), normal, source_strength, radius)
 
     @classmethod
     def autd3(
@@ -177,17 +173,8 @@ class TransducerArray:
     ) -> TransducerArray:
         """Return the array of a SonicSurface: 16 x 16 transducers row by row from the largest y, x fastest.
 
+        Arguments and errors as for `TransducerArray.autd3`; the default source strength is that of Ultraino.
         The order by channel, which the firmware needs, is applied when frames are encoded.
-
-        Args:
-            center: centre of the array (3,) [m].
-            normal: direction of emission (3,).
-            angle: of the device's x from u towards v [rad], with (u, v) = `plane_basis(normal)`.
-            source_strength: [Pa m], > 0; by default the value of Ultraino.
-            radius: of the discs [m]; None or 0 for point sources.
-
-        Raises:
-            ValueError: an argument is not finite, has the wrong shape or is out of range.
         """
         return cls(in_plane(sonicsurface_places(), center, normal, angle), normal, source_strength, radius)
 
@@ -202,17 +189,8 @@ class TransducerArray:
     ) -> TransducerArray:
         """Return the array of an OpenMPD board: 16 x 16 transducers column by column from the largest y.
 
+        Arguments and errors as for `TransducerArray.autd3`; the default source strength is AcousTools'.
         Positions are nominal; `OpenMPDBoard.load` reads the positions and calibration of one board.
-
-        Args:
-            center: centre of the array (3,) [m].
-            normal: direction of emission (3,), the device's z.
-            angle: of the device's x from u towards v [rad], with (u, v) = `plane_basis(normal)`.
-            source_strength: [Pa m], > 0; by default the value of AcousTools.
-            radius: of the discs [m]; None or 0 for point sources.
-
-        Raises:
-            ValueError: an argument is not finite, has the wrong shape or is out of range.
         """
         return cls(in_plane(openmpd_places(), center, normal, angle), normal, source_strength, radius)
 

@@ -30,7 +30,7 @@ def autd3_places(units: tuple[int, int] = (1, 1)) -> torch.Tensor:
 
     Source: autd3-core 0.12.
     """
-    along_x, along_y = (_AUTD3_PITCH * _centred(count) for count in _AUTD3_PLACES)
+    along_x, along_y = (_AUTD3_PITCH * centred(count) for count in _AUTD3_PLACES)
     unit = [
         (x, y)
         for j, y in enumerate(along_y.tolist())
@@ -38,7 +38,7 @@ def autd3_places(units: tuple[int, int] = (1, 1)) -> torch.Tensor:
         if (i, j) not in _AUTD3_MISSING
     ]
     shifts = torch.cartesian_prod(
-        *(size * _centred(count) for size, count in zip(AUTD3_UNIT, units, strict=True))
+        *(size * centred(count) for size, count in zip(AUTD3_UNIT, units, strict=True))
     )
     return (shifts[:, None] + torch.tensor(unit, dtype=torch.float64, device="cpu")).reshape(-1, 2)
 
@@ -48,7 +48,7 @@ def sonicsurface_places() -> torch.Tensor:
 
     Source: the table of emitters in its Python program, before the permutation to channels.
     """
-    across = _SQUARE_PITCH * _centred(_SQUARE_PLACES)
+    across = _SQUARE_PITCH * centred(_SQUARE_PLACES)
     return torch.cartesian_prod(-across, across).flip(1)
 
 
@@ -57,9 +57,10 @@ def openmpd_places() -> torch.Tensor:
 
     Source: the positions in the board files of OpenMPD and AcousTools.
     """
-    across = _SQUARE_PITCH * _centred(_SQUARE_PLACES)
+    across = _SQUARE_PITCH * centred(_SQUARE_PLACES)
     return torch.cartesian_prod(across, -across)
 
 
-def _centred(count: int) -> torch.Tensor:
+def centred(count: int) -> torch.Tensor:
+    """Return `count` positions one apart, around 0."""
     return torch.arange(count, dtype=torch.float64, device="cpu") - (count - 1) / 2

@@ -63,7 +63,7 @@ class Scene:
         array: the transducers.
         medium: the fluid around the obstacles.
         frequency: [Hz], 1e-3 to 1e12.
-        control_points: (P, 3) [m], float64, where the pressure is observed; all different.
+        control_points: (P, 3) [m], float64, P >= 1, where the pressure is observed; all different.
         obstacles: may touch and overlap; in an overlap the later one counts.
         observation_plane: plane of pictures and focal areas, or None.
         domain: corners (lower, upper) [m] of the simulated space; obstacles may extend beyond it.
@@ -90,20 +90,12 @@ class Scene:
         domain: ArrayLike | None = None,
         name: str = "scene",
     ) -> None:
-        """Check and copy the input.
+        """Check and copy the input; the arguments are the attributes, see `Scene`.
 
-        Args:
-            array: the transducers, outside the obstacles.
-            medium: the fluid around the obstacles.
-            frequency: [Hz], 1e-3 to 1e12.
-            control_points: (P, 3) [m], P >= 1, outside the obstacles.
-            obstacles: may touch and overlap; in an overlap the later one counts.
-            observation_plane: plane of pictures and focal areas.
-            domain: corners (lower, upper) [m] around array, control points and observation plane. Walls and
-                slabs across the domain extend to infinity; for other obstacles that leave it, see the methods
-                of `make_propagator`. By default the bounding box of everything, with obstacles, and a margin
-                of two wavelengths on each side.
-            name: for titles and file names.
+        Array and control points lie outside the obstacles. The domain, two corners (2, 3) [m], holds array,
+        control points and observation plane. Walls and slabs across it extend to infinity; for other
+        obstacles that leave it, see the methods of `make_propagator`. By default it is the bounding box of
+        everything, with a margin of two wavelengths on each side.
 
         Raises:
             ValueError: a field of the wrong type or out of range, a coordinate beyond 1e6 m, a transducer or

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,15 @@ def invalid(name: str, value: object, accepted: str, unit: str = "") -> ValueErr
     """Return the error to raise for `value` of field `name`; `accepted` says what is allowed."""
     message = f"{name}: {_shown(value)}{f' {unit}' if unit else ''}; {accepted}"
     return ValueError(" ".join(message.split("\n")))
+
+
+@contextlib.contextmanager
+def within(place: object) -> Iterator[None]:
+    """Put the name of a place, such as a file, in front of the message of a `ValueError`."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{place}: {error}") from error
 
 
 def in_unit(unit: str) -> str:
