@@ -1,7 +1,5 @@
-"""Figures draw the data they are given, with units on every axis, and change no global state."""
+"""Figures show the data they are given, with units on every axis, and change no global state."""
 
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -35,21 +33,21 @@ def mesh_of(ax: Axes) -> QuadMesh:
 
 
 def maps(figure: Figure) -> Iterator[Axes]:
-    """The axes with a map, without those of colour bars."""
+    """Return the axes of maps, without those of colour bars."""
     return (ax for ax in figure.axes if ax.get_aspect() == 1)
 
 
-def test_plane_map_draws_each_cell_at_its_coordinates_in_mm() -> None:
-    points = PLANE.points(10e-3)
+@pytest.mark.parametrize("normal", [(1, 0, 0), (-1, 0, 0)])  # the side v runs along z or against it
+def test_plane_map_draws_each_cell_at_its_coordinates_in_mm(normal: tuple[int, int, int]) -> None:
+    plane = at.Plane(PLANE.center, normal, PLANE.size)
+    points = plane.points(10e-3)
     pressure = torch.complex(points[..., 1], points[..., 2])
-    figure = plot_plane(pressure, PLANE)
-    ax = next(maps(figure))
-    mesh = mesh_of(ax)
+    figure = plot_plane(pressure, plane)
+    mesh = mesh_of(figure.axes[0])
     corners = mesh.get_coordinates()
     centers = (corners[:-1, :-1] + corners[1:, 1:]) / 2
     np.testing.assert_allclose(centers, 1e3 * points[..., 1:].numpy().swapaxes(0, 1), atol=1e-9)
     np.testing.assert_allclose(mesh.get_array(), pressure.abs().numpy().T)
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("y [mm]", "z [mm]")
     assert figure.axes[1].get_ylabel() == "|p| [Pa]"
 
 
@@ -70,16 +68,6 @@ def test_plane_axes_carry_the_name_of_the_real_axis(
     assert (ax.get_xlabel(), ax.get_ylabel()) == labels
 
 
-def test_a_side_that_runs_against_its_axis_is_drawn_at_its_coordinates() -> None:
-    plane = at.Plane(center=(0, 50e-3, 40e-3), normal=(-1, 0, 0), size=(60e-3, 40e-3))  # v = -z
-    points = plane.points(10e-3)
-    mesh = mesh_of(plot_plane(points[..., 2], plane).axes[0])
-    corners = mesh.get_coordinates()
-    centers = (corners[:-1, :-1] + corners[1:, 1:]) / 2
-    # The pressure given is the height z, so that each cell must show the height it is drawn at.
-    np.testing.assert_allclose(mesh.get_array(), 1e-3 * centers[..., 1], atol=1e-12)
-
-
 def test_control_points_in_the_plane_are_circled_and_others_are_not() -> None:
     inside, off = [80e-3, 30e-3, 45e-3], [60e-3, 30e-3, 45e-3]
     (circles,) = plot_plane(np.ones((6, 4)), PLANE, [inside, off]).axes[0].get_lines()
@@ -92,7 +80,7 @@ def test_obstacles_are_outlined_where_the_plane_cuts_them() -> None:
     ax = plot_plane(np.ones((6, 4)), PLANE, obstacles=(cut, off)).axes[0]
     (outline,) = (artist for artist in ax.collections if isinstance(artist, ContourSet))
     ((points,),) = outline.allsegs
-    # Straight lines between samples 0.15 mm apart leave the circle by far less.
+    # Straight lines between samples 0.15 mm apart deviate from the circle by far less.
     np.testing.assert_allclose(np.linalg.norm(points - [45, 38], axis=1), 10, atol=1e-3)
 
 
@@ -129,23 +117,19 @@ def test_what_is_drawn_of_an_obstacle_ends_at_the_domain() -> None:
     assert clipped(triangle, (0, 1, 0), (2, 2, 2)).shape == (0, 3)
     wall = at.Box((50e-3, 40e-3, 40e-3), (10e-3, 1.0, 1.0), rigid=True)
     ax = plot_scene(small_scene((wall,), extent=80e-3)).axes[0]
-    # The wall is open at the edges of the domain, so that its far side is drawn too; its edges are outside.
+    # The wall is open where it leaves the domain, so that its far side is drawn too. Its edges are outside.
     assert sum(isinstance(artist, Poly3DCollection) for artist in ax.collections) == 2
     assert not any(isinstance(artist, Line3DCollection) for artist in ax.collections)
 
 
-def test_plane_map_draws_into_given_axes() -> None:
+def test_plane_map_in_decibels_in_given_axes() -> None:
     ax = Figure().add_subplot()
-    assert plot_plane(np.ones((3, 2)), PLANE, ax=ax) is ax.figure
-    assert mesh_of(ax).get_array().shape == (2, 3)
-
-
-def test_a_level_is_told_from_the_peak_down_to_30_db() -> None:
-    figure = plot_plane(np.array([[2.0, 0.2], [0.0, 0.02]]), PLANE, decibels=True)
-    mesh = mesh_of(figure.axes[0])
+    figure = plot_plane(np.array([[2.0, 0.2], [0.0, 0.02]]), PLANE, ax=ax, decibels=True)
+    assert figure is ax.figure
+    mesh = mesh_of(ax)
     np.testing.assert_allclose(mesh.get_array().T, [[0, -20], [-30, -30]], atol=1e-12)  # rounding
     assert mesh.get_clim() == (-30, 0)
-    assert figure.axes[1].get_ylabel() == "level of |p| [dB], 0 dB = 2 Pa"
+    assert "0 dB = 2 Pa" in figure.axes[1].get_ylabel()
 
 
 def test_planes_of_a_scene_share_their_colour_scale() -> None:
@@ -163,11 +147,6 @@ def test_planes_of_a_scene_share_their_colour_scale() -> None:
     assert [ax.texts[0].get_text() for ax in (lssg, gabs)] == ["LSSG", "GABS"]
     drawn = [ax for ax in maps(figure) if ax.axison]
     assert all(ax.get_xlabel() == "y [mm]" and ax.get_ylabel() == "z [mm]" for ax in drawn)
-
-
-def test_planes_need_one_plane_a_scene() -> None:
-    with pytest.raises(ValueError, match=r"planes: none for \['empty'\]"):
-        plot_planes({"empty": {"gabs": np.ones((3, 2))}}, {})
 
 
 def test_trials_draw_quartiles_of_many_and_a_marker_for_one() -> None:
@@ -257,14 +236,12 @@ def test_pareto_draws_the_front_of_all_as_steps_and_names_its_points() -> None:
 
 def test_pareto_of_a_score_begins_at_0_and_costs_are_logarithmic() -> None:
     points = {"a": {"gabs": [(1.0, 3.0)]}, "b": {"gabs": [(10.0, 5.0)]}}
-    figure = plot_pareto(points, "time [s]", "score [Pa]", higher_is_better=True)
-    for ax in figure.axes:
-        assert (ax.get_xscale(), ax.get_yscale()) == ("log", "linear")
-        assert ax.get_ylim()[0] == 0
+    for ax in plot_pareto(points, "time [s]", "score [Pa]", higher_is_better=True).axes:
+        assert (ax.get_xscale(), ax.get_yscale(), ax.get_ylim()[0]) == ("log", "linear", 0)
         assert ax.get_ylim()[1] >= 5
 
 
-def test_scaling_tells_slopes_and_marks_sizes() -> None:
+def test_scaling_shows_slopes_and_sizes() -> None:
     sizes = np.array([1.0, 2.0, 4.0, 8.0])
     square, flat = np.column_stack([sizes, 3 * sizes**2]), np.column_stack([sizes, sizes**0])
     figure = plot_scaling({"time [s]": {"edge [mm]": {"box": square}, "foci": {"box": flat}}})
@@ -275,7 +252,7 @@ def test_scaling_tells_slopes_and_marks_sizes() -> None:
     assert list(first.get_xticks()) == pytest.approx(list(sizes))
 
 
-def test_nothing_is_cut_off_with_all_methods() -> None:
+def test_nothing_is_cut_off_in_figures_of_all_methods() -> None:
     scenes = ("homogeneous", "three_cubes", "two_cubes")
     values = {scene: {name: RANDOM.random(5) for name in METHODS} for scene in scenes}
     history = {scene: {name: np.ones((2, 256)) for name in METHODS} for scene in scenes}
@@ -304,23 +281,15 @@ def test_nothing_is_cut_off_with_all_methods() -> None:
         (lambda: plot_plane(np.ones(3), PLANE), r"pressure: shape \(3,\); must be \(Nu, Nv\)"),
         (lambda: plot_plane(np.zeros((2, 2)), PLANE, decibels=True), "pressure: 0 Pa everywhere"),
         (lambda: plot_planes({}, {}), "pressure: scenes"),
-        (
-            lambda: plot_pareto({"a": {"b": [(1.0,)]}}, "", ""),
-            r"\['b'\]: shape \(1, 1\); must be \(points, 2",
-        ),
+        (lambda: plot_planes({"empty": {"gabs": np.ones((3, 2))}}, {}), r"planes: none for \['empty'\]"),
+        (lambda: plot_pareto({"a": {"b": [(1.0,)]}}, "", ""), r"\['b'\]: shape \(1, 1\); must be"),
         (lambda: plot_pareto({"a": {"b": [(0.0, 1.0)]}}, "", ""), "0; must be > 0"),
         (lambda: plot_scaling({}), "costs: empty"),
         (lambda: plot_trials({}), "quantities: empty"),
-        (
-            lambda: plot_trials({"f [1]": {"empty": {"gabs": [[1.0]]}}}),
-            r"\['gabs'\]: shape \(1, 1\); must be \(trials",
-        ),
+        (lambda: plot_trials({"f [1]": {"empty": {"gabs": [[1.0]]}}}), r"\['gabs'\]: shape \(1, 1\)"),
         (lambda: plot_trials({"f [1]": {"empty": {"gabs": [np.nan]}}}), "every entry must be finite"),
         (lambda: plot_trials({"f [1]": {"gabs": np.ones(3)}}), r"\['gabs'\]: .* method names"),
-        (
-            lambda: plot_convergence({"gabs": np.ones((3, 4))}),
-            r"history\['gabs'\]: .*; must be a mapping of method names",
-        ),
+        (lambda: plot_convergence({"gabs": np.ones((3, 4))}), r"history\['gabs'\]: .*; must be a mapping"),
         (lambda: plot_convergence({"empty": {}}), "at least one method"),
         (lambda: plot_convergence({"empty": {"gabs": [1.0]}}), r"must be \(trials, evaluations\)"),
         (lambda: plot_convergence({"empty": {"gabs": [[1.0]]}}, {"two": {}}), r"levels: of scenes \['two'\]"),
@@ -360,13 +329,9 @@ def test_scene_draws_everything_in_mm() -> None:
 
 
 def test_no_global_state_is_touched() -> None:
+    from matplotlib import pyplot
+
     before = dict(mpl.rcParams)
     plot_plane(np.ones((3, 2)), PLANE)
     assert dict(mpl.rcParams) == before
-    code = (
-        "import sys, numpy, autdtorch as at\n"
-        "at.plot_plane(numpy.ones((3, 2)), at.Plane((0, 0, 0), (1, 0, 0), (1e-2, 1e-2)))\n"
-        "pyplot = sys.modules.get('matplotlib.pyplot')\n"
-        "raise SystemExit(pyplot is not None and bool(pyplot.get_fignums()))"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    assert pyplot.get_fignums() == []
