@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -22,37 +22,27 @@ from autdtorch.study.statistics import NEAR_BOUND, bound_gap
 _PLANES_A_FIGURE = 4
 
 
-@dataclass(frozen=True)
-class Figures:
-    """The figures in a folder.
+def draw_figures(results: StudyResult, scenes: Mapping[str, Scene], folder: Path) -> dict[str, Any]:
+    """Draw all figures of a study into a folder.
 
-    Attributes:
-        scenes: name and Markdown image of each scene.
-        problem: why the scenes are not rendered in 3D, or None.
-        planes: file names of the pressure maps.
-        quantities: labels of the panels of the trials.
+    Returns:
+        The values that the template of the report needs: `scenes`, names with their Markdown images;
+        `problem`, why these are not rendered in 3D, or None; `planes`, names of files; `quantities`, labels.
     """
-
-    scenes: list[tuple[str, str]]
-    problem: str | None
-    planes: list[str]
-    quantities: list[str]
-
-
-def draw_figures(results: StudyResult, scenes: Mapping[str, Scene], folder: Path) -> Figures:
-    """Draw all figures of a study into a folder."""
     problem = rendering_problem()
     for name, scene in scenes.items():
         if problem is None:
             view3d(scene, save=folder / f"fig1_{name}.png").close()
         else:
             plot_scene(scene).savefig(folder / f"fig1_{name}.png")
-    images = [(name, f"![{name}](fig1_{name}.png)") for name in scenes]
-    planes = _draw_planes(results, scenes, folder)
-    quantities = _draw_trials(results, folder)
     _draw_convergence(results, folder)
     _draw_costs(results, folder)
-    return Figures(images, problem, planes, quantities)
+    return {
+        "scenes": [(name, f"![{name}](fig1_{name}.png)") for name in scenes],
+        "problem": problem,
+        "planes": _draw_planes(results, scenes, folder),
+        "quantities": _draw_trials(results, folder),
+    }
 
 
 def _draw_planes(results: StudyResult, scenes: Mapping[str, Scene], folder: Path) -> list[str]:
