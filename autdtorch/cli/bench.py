@@ -84,7 +84,7 @@ class Bench:
 
     @property
     def is_dry(self) -> bool:
-        """Whether frames are printed and no device is opened."""
+        """True when frames are printed and no device is opened."""
         return boolean("hardware.dry_run", self._section["dry_run"])
 
     def emulate(self, simulated: SimulatedObjective) -> None:
@@ -232,7 +232,7 @@ def chip_of(field: str, text: object) -> tuple[int, int]:
 
 
 def _sensor_section(section: object, emulated: bool, dry: bool) -> Mapping[str, Any]:
-    """Check and return the section of the sensor; in a dry run that of an emulated one."""
+    """Check and return the section of the sensor; a dry run has an emulated one."""
     if dry:
         return {"kind": "emulated", "snr": None}
     if not isinstance(section, Mapping):

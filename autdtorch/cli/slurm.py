@@ -15,7 +15,7 @@ from submitit.slurm.slurm import SlurmInfoWatcher, SlurmJob
 logger = logging.getLogger(__name__)
 
 _PAUSE = 10.0  # [s] between questions to the queue; clusters want few
-_MOST_FAILURES = 30  # of squeue in a row, 5 min; a controller that starts anew is back before
+_MOST_FAILURES = 30  # failures of squeue in a row, 5 min; a controller that restarts is back before
 
 
 class QueueWatcher(SlurmInfoWatcher):

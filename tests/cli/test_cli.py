@@ -1,5 +1,6 @@
 """The command line: one run, an experiment, and what it says of wrong settings."""
 
+import dataclasses
 import inspect
 import json
 import os
@@ -16,6 +17,7 @@ from omegaconf import OmegaConf
 import autdtorch.study.run
 from autdtorch.cli.config_files import CONFIGS
 from autdtorch.cli.method_section import load_method
+from autdtorch.hardware import Limits
 from autdtorch.io.scene_file import load_scene
 from autdtorch.methods.base import Method
 from autdtorch.propagators import FreeSpacePropagator, make_propagator
@@ -377,3 +379,18 @@ def test_solver_settings_are_the_defaults_of_make_propagator() -> None:
     parameters = inspect.signature(make_propagator).parameters.values()
     defaults = {parameter.name: parameter.default for parameter in parameters if parameter.name != "scene"}
     assert OmegaConf.to_container(OmegaConf.load(CONFIGS / "solver" / "default.yaml")) == defaults
+
+
+@pytest.mark.parametrize("sensor", sorted(path.stem for path in (CONFIGS / "hardware" / "sensor").glob("*")))
+@pytest.mark.parametrize("bench", sorted(path.stem for path in (CONFIGS / "hardware").glob("*.yaml")))
+def test_every_bench_has_the_same_keys(
+    bench: str, sensor: str, composed: Callable[..., dict[str, object]]
+) -> None:
+    words = (f"hardware={bench}", f"hardware/sensor={sensor}", "hardware.limits.amplitude=1")
+    device = "sonicsurface" if bench in ("base", "emulated") else bench
+    where = ("hardware.sensor.path=x",) if sensor == "file" else ()
+    section = composed(*words, f"hardware.device={device}", *where)["hardware"]
+    assert section["device"] == device
+    assert section["sensor"]["kind"] == sensor
+    assert section["emulated"] is (bench == "emulated")
+    assert section["limits"] == dataclasses.asdict(Limits(amplitude=1))

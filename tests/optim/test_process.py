@@ -40,7 +40,7 @@ def oracle(process, points):
     scores = torch.from_numpy(smooth(points))
     standard = ((scores - scores.mean()) / scores.std())[:, None]
     kernel = ScaleKernel(MaternKernel(nu=2.5)).double()
-    variance = process.known().scale ** 2
+    variance = process.posterior().scale ** 2
     kernel.outputscale = torch.tensor(variance, dtype=torch.float64)
     kernel.base_kernel.lengthscale = torch.tensor(process.length_scale, dtype=torch.float64)
     with validate_input_scaling(False):
@@ -73,7 +73,7 @@ def test_posterior_and_likelihood_are_botorchs(circle):
     # More than the block of candidates, and not a multiple of it; some of them known.
     there = np.concatenate([np.random.default_rng(1).random((70, DIMENSIONS)), points[:5]])
     expected = model.eval().posterior(features(there, circle))
-    mean, deviation = posterior(process.known(), there)
+    mean, deviation = posterior(process.posterior(), there)
     torch.testing.assert_close(torch.from_numpy(mean), expected.mean[:, 0].detach(), **ROUNDING)
     torch.testing.assert_close(torch.from_numpy(deviation**2), expected.variance[:, 0].detach(), **ROUNDING)
 
@@ -102,17 +102,17 @@ def test_inferred_noise_is_that_of_the_scores():
     process.add(points, scores)
     process.fit()
     # 150 points alone would tell a variance to 12 %; the function in 4 dimensions takes most of them.
-    assert 0.5 < process.known().scale ** 2 * process.noise / (0.3**2 / scores.var()) < 2
+    assert 0.5 < process.posterior().scale ** 2 * process.noise / (0.3**2 / scores.var()) < 2
 
 
 @CIRCLE
 def test_points_added_one_by_one_are_as_if_fitted_together(circle):
     process, points = filled(circle)
-    before = process.known()
+    before = process.posterior()
     together = Process(DIMENSIONS, 29, circle, 1e-4)
     together.length_scale = process.length_scale
     together.add(points, smooth(points))
-    torch.testing.assert_close(before.weights[:24], together.known().weights[:24], rtol=1e-8, atol=1e-8)
+    torch.testing.assert_close(before.weights[:24], together.posterior().weights[:24], rtol=1e-8, atol=1e-8)
 
 
 @pytest.mark.parametrize("u", [5.0, 0.0, -1.0, -3.0, -9.9, -10.1, -30.0, -1e3, -1e6])
@@ -134,7 +134,7 @@ def test_expected_improvement_is_botorchs(u):
 @pytest.mark.parametrize("log", [False, True], ids=["ei", "log_ei"])
 def test_gradient_of_the_acquisition(circle, log):
     process, _ = filled(circle)
-    known = process.known()
+    known = process.posterior()
     point = np.random.default_rng(3).random(DIMENSIONS)
     gradient, room = np.empty(DIMENSIONS), tuple(np.empty((4, known.size)))
     _value(known, log, point, gradient, room)
@@ -152,7 +152,7 @@ def test_climb_ends_no_lower_than_botorchs():
     ours, theirs = [], []
     for seed in range(6):
         process, points = filled(False, seed=seed)
-        known = process.known()
+        known = process.posterior()
         acquisition = LogExpectedImprovement(oracle(process, points).eval(), best_f=known.best)
         start = np.random.default_rng(seed + 10).random(DIMENSIONS)
         point, value = _climb(known, True, start, np.zeros(DIMENSIONS), np.ones(DIMENSIONS))
@@ -175,7 +175,7 @@ def test_climb_ends_no_lower_than_botorchs():
 @CIRCLE
 def test_the_largest_is_within_bounds_and_not_below_any_candidate(circle):
     process, _ = filled(circle)
-    known = process.known()
+    known = process.posterior()
     candidates = 0.4 + 0.2 * np.random.default_rng(4).random((50, DIMENSIONS))
     lower, upper = np.full((2, DIMENSIONS), [[0.4], [0.6]])
     point = largest(known, True, candidates, lower, upper)
@@ -189,8 +189,8 @@ def test_the_largest_is_within_bounds_and_not_below_any_candidate(circle):
 
 def test_the_circle_is_periodic():
     process, points = filled(True)
-    mean, deviation = posterior(process.known(), points)
-    turned = posterior(process.known(), points + 1)
+    mean, deviation = posterior(process.posterior(), points)
+    turned = posterior(process.posterior(), points + 1)
     np.testing.assert_allclose(mean, turned[0], atol=1e-10)
     np.testing.assert_allclose(deviation, turned[1], atol=1e-6)  # the root of a variance near 0
 
@@ -201,4 +201,4 @@ def test_a_process_that_forgets_is_as_new():
     process.add(points[:8], smooth(points[:8]))
     new = Process(DIMENSIONS, 29, True, 1e-4)
     new.add(points[:8], smooth(points[:8]))
-    assert np.array_equal(process.known().weights[:8], new.known().weights[:8])
+    assert np.array_equal(process.posterior().weights[:8], new.posterior().weights[:8])

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from autdtorch.methods.bayes.process import (
-    Known,
+    Posterior,
     Vector,
     add_rows,
     compiled,
@@ -23,58 +23,58 @@ _BLOCK = 64
 """Candidates whose covariances are kept at a time: so many that they stay in the cache."""
 
 
-def largest(known: Known, log: bool, candidates: Vector, lower: Vector, upper: Vector) -> Vector:
+def largest(process: Posterior, log: bool, candidates: Vector, lower: Vector, upper: Vector) -> Vector:
     """The point (D,) between `lower` and `upper` (D,) with the largest (log) expected improvement.
 
     Args:
-        known: the process.
+        process: the process.
         log: whether the logarithm is compared and climbed.
         candidates: (C, D); compared first, then climbed from the best of them.
         lower: in turns; -inf on the circle.
         upper: in turns.
     """
-    mean, deviation = posterior(known, candidates)
-    values = _expected_improvements(mean, deviation, known.best, log)
+    mean, deviation = posterior(process, candidates)
+    values = _expected_improvements(mean, deviation, process.best, log)
     starts = candidates[np.argsort(-values, kind="stable")[:_STARTS]]
-    climbed = [_climb(known, log, start, lower, upper) for start in starts]
+    climbed = [_climb(process, log, start, lower, upper) for start in starts]
     return np.asarray(max(climbed, key=lambda found: found[1])[0])
 
 
 @compiled
-def posterior(known, points):  # type: ignore[no-untyped-def]
+def posterior(process, points):  # type: ignore[no-untyped-def]
     """Mean (C,) and standard deviation (C,) of the process, without noise, at points (C, D)."""
-    total, count = len(points), known.size
+    total, count = len(points), process.size
     mean, deviation = np.empty(total), np.empty(total)
-    scale = 1 / known.length_scale**2
+    scale = 1 / process.length_scale**2
     kernel, white = np.empty((count, _BLOCK)), np.empty(_BLOCK)
-    at, square = np.zeros((len(known.features), _BLOCK)), np.empty(_BLOCK)
+    at, square = np.zeros((len(process.features), _BLOCK)), np.empty(_BLOCK)
     for first in range(0, total, _BLOCK):
         width = min(_BLOCK, total - first)
         for c in range(width):
-            at[:, c] = features_of(points[first + c], known.circle)
+            at[:, c] = features_of(points[first + c], process.circle)
         block_mean, explained = np.zeros(_BLOCK), np.zeros(_BLOCK)
         for n in range(count):
             square[:] = 0.0
             for f in range(len(at)):
                 for c in range(_BLOCK):
-                    square[c] += (known.features[f, n] - at[f, c]) ** 2
+                    square[c] += (process.features[f, n] - at[f, c]) ** 2
             for c in range(_BLOCK):
                 kernel[n, c], _ = matern(square[c] * scale)
-                block_mean[c] += known.weights[n] * kernel[n, c]
+                block_mean[c] += process.weights[n] * kernel[n, c]
         for i in range(count):
             white[:] = 0.0
-            add_rows(white, 0, _BLOCK, known.factor[i], kernel, 0, i + 1)
+            add_rows(white, 0, _BLOCK, process.factor[i], kernel, 0, i + 1)
             for c in range(_BLOCK):
                 explained[c] += white[c] * white[c]
         for c in range(width):
             mean[first + c] = block_mean[c]
-            deviation[first + c] = known.scale * _deviation(1 - explained[c])
+            deviation[first + c] = process.scale * _deviation(1 - explained[c])
     return mean, deviation
 
 
 @compiled
 def _deviation(variance):  # type: ignore[no-untyped-def]
-    # Rounding may leave a variance below 0 at a point that is known.
+    # Rounding may leave a variance below 0 at a point that is process.
     return math.sqrt(max(variance, 1e-12))
 
 
@@ -131,31 +131,31 @@ def _expected_improvements(mean, deviation, best, log):  # type: ignore[no-untyp
 
 
 @compiled
-def _value(known, log, point, gradient, room):  # type: ignore[no-untyped-def]
+def _value(process, log, point, gradient, room):  # type: ignore[no-untyped-def]
     """Acquisition function at a point (D,), its gradient written to `gradient` (D,)."""
-    count, dimensions = known.size, len(point)
+    count, dimensions = process.size, len(point)
     kernel, slope, white, pull = room
-    at = features_of(point, known.circle)
-    covariances(known.features, count, at, known.length_scale, kernel, slope)
-    whiten(known.factor, count, kernel, white)
+    at = features_of(point, process.circle)
+    covariances(process.features, count, at, process.length_scale, kernel, slope)
+    whiten(process.factor, count, kernel, white)
     mean, explained = 0.0, 0.0
     for n in range(count):
-        mean += known.weights[n] * kernel[n]
+        mean += process.weights[n] * kernel[n]
         explained += white[n] * white[n]
-    deviation = known.scale * _deviation(1 - explained)
-    value, by_mean, by_deviation = _improvement(mean, deviation, known.best, log)
+    deviation = process.scale * _deviation(1 - explained)
+    value, by_mean, by_deviation = _improvement(mean, deviation, process.best, log)
     pull[:count] = 0.0
     for i in range(count):
         for j in range(i + 1):
-            pull[j] += white[i] * known.factor[i, j]
+            pull[j] += white[i] * process.factor[i, j]
     for n in range(count):
-        by_kernel = by_mean * known.weights[n] - by_deviation * known.scale**2 / deviation * pull[n]
+        by_kernel = by_mean * process.weights[n] - by_deviation * process.scale**2 / deviation * pull[n]
         pull[n] = 2 * slope[n] * by_kernel
     for f in range(len(at)):
         total = 0.0
         for n in range(count):
-            total += pull[n] * (at[f] - known.features[f, n])
-        if not known.circle:
+            total += pull[n] * (at[f] - process.features[f, n])
+        if not process.circle:
             gradient[f] = total
         elif f < dimensions:
             gradient[f] = -2 * math.pi * at[dimensions + f] * total
@@ -165,16 +165,16 @@ def _value(known, log, point, gradient, room):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _climb(known, log, start, lower, upper):  # type: ignore[no-untyped-def]
+def _climb(process, log, start, lower, upper):  # type: ignore[no-untyped-def]
     """Spectral projected gradient (Birgin, Martinez and Raydan 2000): the best point (D,), and its value."""
     dimensions = len(start)
-    room = (np.empty(known.size), np.empty(known.size), np.empty(known.size), np.empty(known.size))
+    room = (np.empty(process.size), np.empty(process.size), np.empty(process.size), np.empty(process.size))
     point, gradient = start.copy(), np.empty(dimensions)
-    value = _value(known, log, point, gradient, room)
+    value = _value(process, log, point, gradient, room)
     norm = math.sqrt(np.sum(gradient * gradient))
     if norm == 0:
         return point, value
-    reach = known.length_scale / (2 * math.pi) if known.circle else known.length_scale
+    reach = process.length_scale / (2 * math.pi) if process.circle else process.length_scale
     rate = 0.1 * reach / norm
     there, steeper, move = np.empty(dimensions), np.empty(dimensions), np.empty(dimensions)
     share = 0.0
@@ -189,7 +189,7 @@ def _climb(known, log, start, lower, upper):  # type: ignore[no-untyped-def]
             share = 1.0
         for d in range(dimensions):
             there[d] = point[d] + share * move[d]
-        found = _value(known, log, there, steeper, room)
+        found = _value(process, log, there, steeper, room)
         if found < value + 1e-4 * share * rise:
             # The top of the parabola through what is known of the line.
             share *= min(max(-0.5 * share * rise / (found - value - share * rise), 0.1), 0.5)

@@ -1,15 +1,13 @@
 """Gaussian process of one trial: zero mean, isotropic Matern 5/2 kernel, and noise.
 
-What a step needs is kept, and gets a row for every new point: the inverse W of the Cholesky factor of the
-correlations K + noise of the N points. A step between fits then costs O(N^2). With the standardised scores y,
-and the correlations k(x) of the points with a point x,
+The inverse W of the Cholesky factor of the correlations K + noise of the N points is updated by one row per
+point, so that a step between fits costs O(N^2). y are the standardised scores, and k(x) the correlations of
+the points with a point x. Then
 
     mean(x) = k(x)^T W^T W y,    variance(x) = s^2 (1 - |W k(x)|^2),    s^2 = |W y|^2 / N,
 
-s^2 being the variance of the process that makes y most likely.
-
-All of it is compiled, and works on the arrays of one trial alone: a trial is what it is whatever trials run
-beside it, and on however many threads.
+where s^2 is the most likely variance of the process. The compiled functions work on the arrays of one trial,
+which therefore does not depend on other trials or on the number of threads.
 """
 
 from __future__ import annotations
@@ -29,20 +27,20 @@ Vector = NDArray[np.float64]
 compiled = entry(Path(__file__).parent)
 
 LEAST_NOISE = 1e-6
-"""With less, rounding (1e-16 N / noise) shows in the posterior."""
+"""Smallest noise: with less, rounding (1e-16 N / noise) shows in the posterior."""
 
 _FIRST_NOISE = 1e-2
 _LENGTH_SCALES = 1e-2, 1e3
 _LEAST_VARIANCE = 1e-12
-"""Of the process, in variances of the scores: where they never change."""
+"""Smallest variance of the process, in variances of the scores, for scores that never change."""
 _STARTS = np.array([1.0, 4.0, 16.0, 64.0])
-"""Of the fit, in first length scales: with many phases there is a second optimum, where scores are smooth."""
+"""Starts of the fit, in first length scales: with many phases there is a second, smooth optimum."""
 _FIRST_STEP, _LAST_STEP = 0.7, 0.02
-"""Of the fit, in the logarithm of the hyperparameters."""
+"""First and last step of the fit, in the logarithm of the hyperparameters."""
 
 
-class Known(NamedTuple):
-    """What the compiled functions need of a process; arrays reach beyond the N points to its capacity.
+class Posterior(NamedTuple):
+    """The posterior, as the compiled functions take it; arrays reach beyond the N points to its capacity.
 
     Attributes:
         circle: whether a phase is a point on the circle rather than a number.
@@ -97,7 +95,7 @@ class Process:
             self.count += 1
 
     def forget(self) -> None:
-        """Begin anew, without any point and with the first hyperparameters."""
+        """Return to no points and to the first hyperparameters."""
         self.count = 0
         self.length_scale = self._first_length_scale
         if self.noise_is_fitted:
@@ -117,12 +115,12 @@ class Process:
         squares = _squared_distances(self._features, self.count)
         return float(_log_likelihood(squares, self._standard(), self.length_scale, self.noise))
 
-    def known(self) -> Known:
-        """What is known of the scores, for `posterior` and the acquisition functions."""
+    def posterior(self) -> Posterior:
+        """Return the posterior for `posterior` and the acquisition functions."""
         standard = self._standard()
         weights, explained = _weights(self._factor, standard)
         scale = math.sqrt(max(explained / self.count, _LEAST_VARIANCE))
-        return Known(
+        return Posterior(
             self.circle, self.count, self._features, self._factor, weights, self.length_scale, scale,
             standard.max(),
         )  # fmt: skip
@@ -137,7 +135,7 @@ class Process:
 
 @compiled
 def features_of(point, circle):  # type: ignore[no-untyped-def]
-    """What the distance is measured between: the phases (D,) in turns, or (cos, sin) of them (2 D,)."""
+    """Return the features of a point: its phases (D,) in turns, or their (cos, sin) (2 D,)."""
     if not circle:
         return point.copy()
     dimensions = len(point)

@@ -1,4 +1,4 @@
-"""One trial of Bayesian optimisation: what has been observed, and the next phases to observe.
+"""One trial of Bayesian optimisation: its observations, and the next phases to observe.
 
 Phases are in turns here, 0 to 1.
 """
@@ -14,13 +14,13 @@ import torch
 from autdtorch.methods.bayes.acquisition import largest
 from autdtorch.methods.bayes.process import Process
 
-_REFIT_GROWTH = 1.1  # The hyperparameters are fitted anew when there are this many times more observations.
+_REFIT_GROWTH = 1.1  # Growth of the number of observations after which the hyperparameters are fitted again.
 _CANDIDATES = 128  # Points at which the acquisition function is compared before it is climbed.
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What all trials have in common.
+    """The settings of all trials.
 
     Attributes:
         dimensions: number of phases D.
@@ -42,7 +42,7 @@ class Settings:
 
 
 class BayesTrial:
-    """Knows nothing of other trials, so that it is the same beside any of them."""
+    """A trial, independent of all others."""
 
     def __init__(self, settings: Settings, seed: int) -> None:
         """A trial that has observed nothing; `seed` is for its random choices."""
@@ -83,7 +83,7 @@ class BayesTrial:
         else:
             candidates.clamp_(0, 1)
             lower, upper = np.full((2, self._settings.dimensions), [[0.0], [1.0]])
-        point = largest(self._process.known(), self._settings.log, candidates.numpy(), lower, upper)
+        point = largest(self._process.posterior(), self._settings.log, candidates.numpy(), lower, upper)
         return torch.from_numpy(point % 1 if self._settings.circle else point)
 
     def _candidates(self) -> torch.Tensor:
