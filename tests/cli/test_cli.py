@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 import autdtorch.study.run
 from autdtorch.cli.config_files import CONFIGS
 from autdtorch.cli.method_section import load_method
-from autdtorch.hardware import Limits
+from autdtorch.hardware import DEVICES, Limits
 from autdtorch.io.scene_file import load_scene
 from autdtorch.methods.base import Method
 from autdtorch.propagators import FreeSpacePropagator, make_propagator
@@ -382,12 +382,12 @@ def test_solver_settings_are_the_defaults_of_make_propagator() -> None:
 
 
 @pytest.mark.parametrize("sensor", sorted(path.stem for path in (CONFIGS / "hardware" / "sensor").glob("*")))
-@pytest.mark.parametrize("bench", sorted(path.stem for path in (CONFIGS / "hardware").glob("*.yaml")))
+@pytest.mark.parametrize("bench", ["emulated", *DEVICES])
 def test_every_bench_has_the_same_keys(
     bench: str, sensor: str, composed: Callable[..., dict[str, object]]
 ) -> None:
     words = (f"hardware={bench}", f"hardware/sensor={sensor}", "hardware.limits.amplitude=1")
-    device = "sonicsurface" if bench in ("base", "emulated") else bench
+    device = "sonicsurface" if bench == "emulated" else bench
     where = ("hardware.sensor.path=x",) if sensor == "file" else ()
     section = composed(*words, f"hardware.device={device}", *where)["hardware"]
     assert section["device"] == device
