@@ -1,4 +1,4 @@
-# Needs python3 (3.11 or later) with pip and venv; everything else is installed into .venv by the first target.
+# Needs python3 (3.11 or later) with pip and venv. The first target installs everything else into .venv.
 
 PYTHON ?= python3
 ARGS ?=
@@ -7,7 +7,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-# "make paper trials=50" hands trials=50 to Hydra: every variable of make's command line but our own two.
+# "make paper trials=50" passes trials=50 to Hydra, and so every variable of the command line except PYTHON and ARGS.
 OVERRIDES = $(strip $(foreach name,$(filter-out PYTHON ARGS,$(.VARIABLES)),$(if \
 	$(findstring command line,$(origin $(name))),'$(name)=$($(name))')) $(ARGS))
 
@@ -21,7 +21,7 @@ help:
 	@echo "make lint    ruff, mypy, import-linter"
 	@echo "make docs    build the documentation in outputs/docs, executing its notebooks"
 	@echo "make clean   remove .venv and the tools' caches; outputs/ stays"
-	@echo "PYTHON=python3.12 chooses the interpreter that .venv is made with."
+	@echo "PYTHON=python3.12 chooses the interpreter of .venv."
 
 $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "autdtorch needs Python 3.11 or later")'
