@@ -30,11 +30,11 @@ import autdtorch as at
 class Cost(NamedTuple):
     """Estimated and measured memory [byte], time [s] and number of runs."""
 
-    told_memory: int
+    estimated_memory: int
     memory: int
-    told_seconds: float
+    estimated_seconds: float
     seconds: float
-    told_runs: int
+    estimated_runs: int
     runs: int
 
 
@@ -137,14 +137,14 @@ def measure(name: str) -> Cost:
     built = scene()
     for kind in ("box", "full"):
         at.make_propagator(paper_scene("two_cubes"), kind, 2.5e-3, dtype=dtype, cache=False).transfer_matrix()
-    told = at.estimate(built, spacing, method=method, dtype=dtype)
+    estimate = at.estimate(built, spacing, method=method, dtype=dtype)
     ctypes.CDLL("libc.so.6").malloc_trim(0)  # memory that is free already does not count
     Path("/proc/self/clear_refs").write_text("5", "ascii")  # resets the peak
     before, begin = held("VmRSS"), time.perf_counter()
     propagator = at.make_propagator(built, method, spacing, dtype=dtype, cache=False)
     propagator.transfer_matrix()
     seconds, memory = time.perf_counter() - begin, held("VmHWM") - before
-    return Cost(told.memory, memory, told.seconds, seconds, told.runs, propagator.planned_runs)
+    return Cost(estimate.memory, memory, estimate.seconds, seconds, estimate.runs, propagator.planned_runs)
 
 
 OPTIONS = {"--scenes": {"nargs": "+", "choices": CASES, "default": list(CASES), "help": "checked scenes"}}
@@ -157,11 +157,11 @@ def main(given: argparse.Namespace) -> None:
     ratios = []
     for name in given.scenes:
         cost = in_new_process(measure, name)
-        ratios.append((cost.told_memory / cost.memory, cost.told_seconds / cost.seconds))
-        memory = [f"{one / 1e6:.0f} MB" for one in (cost.told_memory, cost.memory)]
-        seconds = [f"{one:.2f} s" for one in (cost.told_seconds, cost.seconds)]
+        ratios.append((cost.estimated_memory / cost.memory, cost.estimated_seconds / cost.seconds))
+        memory = [f"{one / 1e6:.0f} MB" for one in (cost.estimated_memory, cost.memory)]
+        seconds = [f"{one:.2f} s" for one in (cost.estimated_seconds, cost.seconds)]
         both = [f"{ratio:.2f}" for ratio in ratios[-1]]
-        runs = f"{cost.told_runs}/{cost.runs}"
+        runs = f"{cost.estimated_runs}/{cost.runs}"
         print(form.format(name, *memory, both[0], *seconds, both[1], runs), flush=True)
     for what, own in zip(("memory", "time"), zip(*ratios, strict=True), strict=True):
         print(f"{what}: within a factor of {max(max(one, 1 / one) for one in own):.2f}")

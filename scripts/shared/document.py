@@ -20,7 +20,7 @@ def fill_in(document: str, command: str, parts: Iterable[str], folder: Path) -> 
 
 
 def with_block(text: str, command: str, block: str) -> str:
-    """Replace what stands between the two marks of a command.
+    """Replace the text between the two marks of a command.
 
     Raises:
         ValueError: `text` does not have exactly one pair of marks.

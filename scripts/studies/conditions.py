@@ -72,7 +72,7 @@ METHODS = {
 }
 
 
-def dead(objective: at.Objective, trial: int, count: int = 1) -> at.Objective:
+def failed(objective: at.Objective, trial: int, count: int = 1) -> at.Objective:
     """Switch off transducers, different ones in each trial."""
     order = torch.randperm(len(objective.scene.array), generator=torch.Generator().manual_seed(trial))
     return at.FailedTransducers(objective, order[:count].tolist())
@@ -80,7 +80,7 @@ def dead(objective: at.Objective, trial: int, count: int = 1) -> at.Objective:
 
 def bench(objective: at.Objective, trial: int) -> at.Objective:
     """Combine everything: 32 levels without amplitudes, one failed transducer, drift, four reads at 20 dB."""
-    drifting = at.Drift(dead(objective, trial), phase=0.3, loss=0.1, sensor=0.1, seed=trial)
+    drifting = at.Drift(failed(objective, trial), phase=0.3, loss=0.1, sensor=0.1, seed=trial)
     return at.Noise(at.Quantised(drifting, 32, on_off=True), 20, reads=4, seed=trial)
 
 
@@ -90,7 +90,7 @@ CONDITIONS: dict[str, Wrap] = {
     "SNR 20 dB, 4 reads": lambda objective, trial: at.Noise(objective, 20, reads=4, seed=trial),
     **{f"{n} levels": lambda o, t, n=n: at.Quantised(o, n) for n in (256, 32, 16, 8, 4, 2)},
     "32 levels, on/off": lambda objective, trial: at.Quantised(objective, 32, on_off=True),
-    "four dead": partial(dead, count=4),
+    "four failed": partial(failed, count=4),
     "drift 0.3 rad": lambda objective, trial: at.Drift(objective, phase=0.3, seed=trial),
     "drift 1 rad": lambda objective, trial: at.Drift(objective, phase=1.0, seed=trial),
     "all at once": bench,
