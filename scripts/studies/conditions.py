@@ -60,7 +60,6 @@ class Method:
 
 METHODS = {
     "random_search": Method("random_search"),
-    "lss": Method("lss"),
     "lssg": Method("lssg"),
     "lssg_5_passes": Method("lssg", {"passes": 5}),
     "gabs": Method("gabs"),

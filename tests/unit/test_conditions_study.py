@@ -40,7 +40,7 @@ def test_table_and_figure_show_every_scene_and_condition() -> None:
         (scene, condition, METHODS[method].label): Outcome(true, 1.2 * true)
         for scene in ("a", "b")
         for condition in conditions
-        for method in ("gabs", "lss")
+        for method in ("gabs", "lssg")
     }
     assert "| SNR 10 dB | 2.00 | 2.00 |" in true_scores(outcomes, "a")
     assert len(plot_conditions(outcomes).axes) == 4
