@@ -126,7 +126,7 @@ def _assembled(
     for number, body in enumerate(bodies):
         if body.fluid is not None:
             density, sound_speed = (
-                own if values is None else float(values[number])
+                own if values is None else values[number].item()
                 for own, values in zip(body.fluid, given.values(), strict=True)
             )
             bodies[number] = replace(body, fluid=Fluid(*fluid(f"obstacles[{number}]", density, sound_speed)))
