@@ -91,13 +91,7 @@ def check_transducers(
 
 
 def hears_silence(sensor: Sensor, check: Preflight, points: int, readings: int = 4) -> bool:
-    """Return True if the sensor reads no more than before the trial: the outputs are truly off.
-
-    Args:
-        sensor: reads P points.
-        check: made before the trial.
-        points: P.
-        readings: number of readings, >= 1.
+    """Return True if a sensor of P points reads no more than at the `check` before, with the outputs off.
 
     Raises:
         ValueError: the sensor does not give P finite magnitudes, or fewer than 1 readings.

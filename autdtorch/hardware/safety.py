@@ -33,11 +33,7 @@ class LimitError(RuntimeError):
 
 
 class Signalled(KeyboardInterrupt):
-    """A signal ends the trial.
-
-    Attributes:
-        number: of the signal.
-    """
+    """A signal, by its `number`, ends the trial."""
 
     def __init__(self, number: int) -> None:
         """Name the signal of this `number`."""

@@ -22,11 +22,7 @@ class Wiring:
     """
 
     def __init__(self, device: Device, transducers: Sequence[int] | torch.Tensor | None = None) -> None:
-        """Wire a device.
-
-        Args:
-            device: plays the drives.
-            transducers: the device's transducer for each of the scene's (M,); by default all in order.
+        """Wire a device; by default all its transducers in order.
 
         Raises:
             ValueError: no device, `transducers` that it does not have, or one twice.

@@ -14,7 +14,7 @@ from autdtorch.hardware.devices.device import Device, Firmware
 from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
 from autdtorch.hardware.transport.serial_chips import FT232H
 from autdtorch.scene.phase_levels import PhaseLevels
-from autdtorch.utils.validation import ArrayLike, invalid, members
+from autdtorch.utils.validation import ArrayLike, complex_tensor, invalid, members
 
 _BOARD = 256
 _FIRST = 0x80  # on the first byte of a message; on later bytes it sets lamp and rate
@@ -31,18 +31,20 @@ class _OpenMPD(Device):
     files: tuple[OpenMPDBoard, ...] = ()
 
     def levels(self, drive: ArrayLike) -> tuple[torch.Tensor, ...]:
-        if not self.files:
-            return super().levels(drive)
-        corrections, pins = self._calibration()
-        return super().levels((torch.as_tensor(drive) * corrections)[..., pins.argsort()])
+        if self.files:
+            parts = zip(self.files, torch.split(complex_tensor("drive", drive), _BOARD, -1), strict=True)
+            drive = torch.cat([file.by_pin(file.calibrated(part)) for file, part in parts], dim=-1)
+        return super().levels(drive)
 
     def drive(self, *levels: ArrayLike) -> torch.Tensor:
         sent = super().drive(*levels)
         if not self.files:
             return sent
-        corrections, pins = self._calibration()
-        sent = sent[..., pins]
-        return torch.where(sent == 0, sent, sent / corrections)  # rounding may take it above 1
+        ones = torch.ones(_BOARD, dtype=torch.complex128, device="cpu")
+        parts = zip(self.files, torch.split(sent, _BOARD, -1), strict=True)
+        by_file = torch.cat([part[..., list(file.pins)] for file, part in parts], dim=-1)
+        factors = torch.cat([file.calibrated(ones) for file in self.files])
+        return torch.where(by_file == 0, by_file, by_file / factors)  # rounding may take it above 1
 
     def pack(self, *levels: torch.Tensor) -> bytes:
         by_board = torch.cat([level.reshape(-1, _BOARD) for level in levels], dim=1)
@@ -53,12 +55,6 @@ class _OpenMPD(Device):
 
     def firmware(self, transducers: int) -> Firmware:
         return OpenMPDFirmware()
-
-    def _calibration(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return factor and pin (N,) of each transducer."""
-        ones = torch.ones(_BOARD, dtype=torch.complex128, device="cpu")
-        pins = [_BOARD * number + pin for number, file in enumerate(self.files) for pin in file.pins]
-        return torch.cat([file.calibrated(ones) for file in self.files]), torch.tensor(pins, device="cpu")
 
 
 class OpenMPDFirmware:

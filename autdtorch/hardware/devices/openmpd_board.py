@@ -85,9 +85,6 @@ class OpenMPDBoard:
     def load(cls, path: str | os.PathLike[str]) -> OpenMPDBoard:
         """Read a .pat file.
 
-        Args:
-            path: of the file.
-
         Raises:
             FileNotFoundError: there is no such file.
             ValueError: it describes no board. The message names file, line and field.
@@ -159,20 +156,12 @@ class OpenMPDBoard:
         )
 
     def calibrated(self, drive: ArrayLike) -> torch.Tensor:
-        """Return `drive` (..., M) with each transducer's gain, and less its phase offset.
-
-        Raises:
-            ValueError: not a drive of M transducers.
-        """
+        """Return `drive` (..., M) with each transducer's gain, and less its phase offset."""
         wanted = validate_drive(drive, len(self.positions))
         return wanted * torch.polar(self.gains, -self.phase_offsets).to(wanted.device)
 
     def by_pin(self, drive: ArrayLike) -> torch.Tensor:
-        """Return `drive` (..., M) in the order of the pins, in which the board takes it.
-
-        Raises:
-            ValueError: not a drive of M transducers.
-        """
+        """Return `drive` (..., M) in the order of the pins, in which the board takes it."""
         return validate_drive(drive, len(self.positions))[
             ..., torch.tensor(self.pins, dtype=torch.int64, device="cpu").argsort()
         ]

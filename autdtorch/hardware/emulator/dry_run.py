@@ -12,12 +12,7 @@ class DryPort:
     """A port that shows each frame in hexadecimal, and the drive that an emulated device emits for it."""
 
     def __init__(self, bench: EmulatedBench, show: Callable[[str], object]) -> None:
-        """Open no device.
-
-        Args:
-            bench: takes the frames.
-            show: takes a text for each frame.
-        """
+        """Open no device: the `bench` takes the frames, and `show` takes a text for each."""
         self._bench = bench
         self._show = show
 

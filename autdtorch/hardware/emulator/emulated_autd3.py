@@ -10,12 +10,7 @@ class EmulatedAutd3Port(Autd3Port):
     """The port of boards that the kit emulates on this machine, silently; a bench plays for them."""
 
     def __init__(self, boards: int, bench: EmulatedBench) -> None:
-        """Start the emulator, and connect to it.
-
-        Args:
-            boards: number of boards.
-            bench: plays each frame that the boards have taken.
-        """
+        """Start the emulator of `boards` boards, and connect to it."""
         self._emulator = autd3_kit().UdpEmulator(boards)
         self._bench = bench
         super().__init__(boards, self._emulator.option())

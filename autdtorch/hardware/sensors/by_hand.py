@@ -35,11 +35,7 @@ class ManualSensor:
     """A person who reads an instrument and types its values, point by point."""
 
     def __init__(self, control_points: ArrayLike, ask: Callable[[str], str] = typed) -> None:
-        """Set the points.
-
-        Args:
-            control_points: (P, 3) [m].
-            ask: shows a question and returns the answer.
+        """Set the control points (P, 3) [m], and the function that shows a question and returns the answer.
 
         Raises:
             ValueError: other control points, or `ask` is no function.

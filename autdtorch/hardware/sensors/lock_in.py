@@ -37,12 +37,7 @@ class LockIn:
     noise_gain: float
 
     def __init__(self, frequency: float, step: float, samples: int) -> None:
-        """Prepare the fit.
-
-        Args:
-            frequency: of the sine [Hz].
-            step: time from sample to sample [s].
-            samples: their number S.
+        """Prepare the fit to S `samples`, a time `step` [s] apart, of a sine of a `frequency` [Hz].
 
         Raises:
             ValueError: an argument out of range; less than two periods, or two samples a period or fewer.

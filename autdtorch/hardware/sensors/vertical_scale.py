@@ -36,12 +36,10 @@ class VerticalScale:
         return cls(coarsest, finest, coarsest)
 
     def fitted(self, waveform: Waveform, noise: float) -> VerticalScale:
-        """Return the scale that suits a waveform; this one, if it does or the bounds allow no other.
+        """Return the scale that suits a waveform on this one, with noise of an rms [V].
 
-        Args:
-            waveform: captured on this scale.
-            noise: its rms [V]. From a step of the converter on, the scale is not made finer: rounding then
-                adds 1/12 to the noise's variance at most, and no bias.
+        From a step of the converter on, noise keeps the scale from being made finer: rounding then adds 1/12
+        to the noise's variance at most, and no bias.
         """
         peak = float(waveform.volts.abs().max()) + waveform.resolution
         wanted = self.now

@@ -49,12 +49,7 @@ class Autd3Port:
     """
 
     def __init__(self, boards: int, network: Any = None) -> None:
-        """Connect, and reset the firmware to its defaults.
-
-        Args:
-            boards: number of boards.
-            network: `autd3.UdpOption` or `autd3.ServerLink`; by default UDP on the interface that finds them.
-        """
+        """Connect to `boards` boards by `network`, as of `open_autd3`, and reset their firmware."""
         autd3 = autd3_kit()
         from autd3.commands import Clear
         from autd3_core import Autd3, Geometry

@@ -27,7 +27,7 @@ def closed_on_error(close: Callable[[], None]) -> Iterator[None]:
 
 @runtime_checkable
 class Port(Protocol):
-    """A port that takes the bytes for one device. Every method raises `LinkError` where it fails."""
+    """A port that takes the bytes for one device; methods that fail raise `LinkError`."""
 
     def write(self, data: bytes) -> None:
         """Send all of `data`."""

@@ -64,11 +64,9 @@ class UsbPort:
     """
 
     def __init__(self, device: Any, baud: int = 0) -> None:
-        """Take the chip and set it up; if that fails it is given back.
+        """Take a chip (`usb.core.Device`) and set it up; if that fails it is given back.
 
-        Args:
-            device: `usb.core.Device`.
-            baud: rate of its serial line [bits/s]; the chip takes the nearest that it has. 0 without one.
+        Its serial line, if it has one, gets the rate nearest to `baud` [bits/s] that the chip has.
         """
         self._device = device
         self._baud = baud

@@ -36,7 +36,7 @@ def message(kind: int, tag: int, length: int, attributes: int, data: bytes = b""
 
     Args:
         kind: MsgID.
-        tag: number of the transfer, 1 to 255; the header has its complement too.
+        tag: number of the transfer, 1 to 255.
         length: number of bytes of the data, or the most that the instrument may send.
         attributes: bmTransferAttributes.
         data: bytes to send.
@@ -47,12 +47,8 @@ def message(kind: int, tag: int, length: int, attributes: int, data: bytes = b""
 def announced(packet: bytes, tag: int) -> tuple[int, bool]:
     """Return the length of the data in an instrument's transfer, and whether its message ends with it.
 
-    Args:
-        packet: first packet of the transfer, with the header.
-        tag: tag of the request that it answers.
-
     Raises:
-        LinkError: it does not answer that request, or has more data than requested.
+        LinkError: the first `packet` does not answer the request `tag`, or announces more than requested.
     """
     if len(packet) < _HEADER.size:
         raise LinkError(f"USBTMC: {len(packet)} bytes {packet.hex(' ')}; a header has {_HEADER.size}")
@@ -87,11 +83,7 @@ class UsbtmcPort(UsbPort):
     """
 
     def __init__(self, device: Any) -> None:
-        """Take the instrument, and clear unread answers.
-
-        Args:
-            device: `usb.core.Device`.
-        """
+        """Take the instrument (`usb.core.Device`), and clear unread answers."""
         super().__init__(device)
         self._tag = 0
         with closed_on_error(self.close):
