@@ -1,7 +1,7 @@
-"""Every public function and method, and for each of its parameters an argument that it accepts.
+"""Every public function and method, with an accepted argument for each of its parameters.
 
-Arguments go by the names of parameters, which mean the same almost everywhere. A new function is called as
-soon as it is public; only a parameter of a new name, or of another meaning, must be added here.
+Arguments belong to names of parameters, which have one meaning almost everywhere. A new function is called as
+soon as it is public; add a parameter with a new name or another meaning here, unless it has a default.
 """
 
 from __future__ import annotations
@@ -38,27 +38,19 @@ control_points: {type: points, positions: [[0.08, 0, 0]]}
 
 METHODS = ("BayesOpt", "GABS", "GradientAscent", "Identify", "LSS", "LSSG", "RandomSearch")
 
-#: What the package itself makes, and what drivers are made of.
+#: Results, parts of drivers, and calls that need a device.
 NOT_CALLED_BY_USERS = {
     *("Estimate", "Evaluation", "EvaluationLog", "FocusMetrics", "Preflight", "Run", "Solution", "Sweep"),
-    "Waveform",
     *("Adapter", "Device", "Dialect", "Obstacle", "OpenMPDBoard", "SimulatedPropagator", "UsbtmcPort"),
-    *("EmulatedBench.receive", "EmulatedScope.execute", "Method", "State"),
+    *("EmulatedBench.receive", "EmulatedScope.execute", "Method", "State", "Waveform"),
     *("EmulatedScope.plug_into", "Oscilloscope.capture", "Oscilloscope.set_up"),
     *("Device.pack", "lock_log", "open_autd3"),  # the one only makes a context, the other asks the network
 }
 
 
 #: Methods that the driver calls, and that authors of methods implement.
-INSIDE_METHODS = {
-    "advance",
-    "begin",
-    "check",
-    "most_at_once",
-    "most_evaluations",
-    "numbers_kept",
-    "require_fit",
-}
+INSIDE_METHODS = {"advance", "begin", "check", "most_at_once", "most_evaluations", "numbers_kept"}
+INSIDE_METHODS |= {"require_fit"}
 
 
 class Made(NamedTuple):
@@ -128,8 +120,8 @@ def made(method: str) -> Any:
     return call.function(**call.arguments(Path()))
 
 
-def heard(method: str) -> torch.Tensor:
-    return torch.ones(*state(method).drives.shape[:2], 3, dtype=torch.float64)
+def observed(state: at.State) -> torch.Tensor:
+    return torch.ones(*state.drives.shape[:2], 3, dtype=torch.float64)
 
 
 def state_file(folder: Path) -> Path:
@@ -159,21 +151,16 @@ def scope_bus() -> EmulatedBus:
     return EmulatedBus([EmulatedInstrument(*CHIP, "EMULATED", heard)])
 
 
-#: By name of the parameter.
+#: By name of the parameter; others have the default value.
 ARGUMENTS: dict[str, Any] = {
-    **dict.fromkeys(("ax", "cache", "device", "first", "reference", "save", "serial"), None),
-    **dict.fromkeys(("state_file", "time_step", "watch"), None),
-    **dict.fromkeys(("decibels", "higher_is_better", "on_off", "return_error", "scattered"), False),
-    **dict.fromkeys(("background", "boards", "captures", "input", "passes", "readings"), 1),
-    **dict.fromkeys(("reads", "trials"), 1),
-    **dict.fromkeys(("absorption", "dc_offset", "drift", "margin", "settle"), 0.0),
-    **dict.fromkeys(("amplitude", "duty_cycle", "gain", "loudest", "source_strength"), 1.0),
+    **dict.fromkeys(("background", "boards", "captures", "input", "readings"), 1),
+    "reads": 1,
+    "settle": 0.0,
+    **dict.fromkeys(("amplitude", "gain", "loudest"), 1.0),
     **dict.fromkeys(("center", "focus", "offset", "origin"), (12e-3, 11e-3, 13e-3)),
     **dict.fromkeys(("axis", "normal", "normals"), (1.0, 0.1, 0.2)),
-    **dict.fromkeys(("label", "name", "xlabel", "ylabel"), "text"),
-    **dict.fromkeys(("phase", "loss"), 0.1),
-    **dict.fromkeys(("fixed_transducer", "seed"), 0),
-    "acquisition": "ei",
+    **dict.fromkeys(("xlabel", "ylabel"), "text"),
+    "fixed_transducer": 0,
     "amplitudes": [1.0, 0.5, 1.0, 1.0],
     "angle": 0.3,
     "array": SCENE.array,
@@ -193,8 +180,6 @@ ARGUMENTS: dict[str, Any] = {
     "distance": [0.1, 0.2],
     "domain": SCENE.domain,
     "drive": DRIVE,
-    "dtype": "float32",
-    "embedding": "phases",
     "evaluations": 11,
     "field": torch.ones(4, 4, dtype=torch.complex128),
     "foci": 3,
@@ -202,32 +187,24 @@ ARGUMENTS: dict[str, Any] = {
     "frames": 2,
     "frequency": 40e3,
     "G": MATRIX,
-    "goal": at.weakest_focus,
     "height": 5e-3,
     "history": {"scene": {"gabs": [[1.0, 2.0]]}},
     "initial": 3,
-    "initial_points": "sobol",
     "isosurface": -3.0,
-    "kernel": "cpu",
     "levels": 4,
     "limits": hardware.Limits(1.0),
     "link": Made(lambda _: limited_link()),
     "log": Made(lambda folder: folder / "log.jsonl"),
-    "maker": "Keysight",
     "mask": np.ones((2, 2, 2), bool),
     "max_periods": 3,
     "medium": AIR,
     "method": "box",
     "microphones": [hardware.Microphone(1, 0.01, 1.0)],
-    "mode": "transfer",
-    "modules": (),
     "names": {"scene": {"gabs": ["a", "b"]}},
-    "noise": 1e-4,
     "objective": Made(lambda _: objective()),
     "observation_plane": PLANE,
     "obstacles": (CUBE,),
     "off_screen": True,
-    "order": "given",
     "path": Made(lambda folder: folder / "file.npz"),
     "periods": 4,
     "phases": [0.0, 1.0, 2.0, 3.0],
@@ -242,15 +219,11 @@ ARGUMENTS: dict[str, Any] = {
     "problem": Made(lambda _: problem()),
     "propagator": Made(lambda _: at.make_propagator(AIR_ALONE)),
     "quantities": {"pressure [Pa]": {"scene": {"gabs": [1.0, 2.0]}}},
-    "quantise": lambda drive: drive,
     "radius": 3e-3,
-    "relative_humidity": 50.0,
-    "rigid": False,
     "rotation": (0.0, 0.0, 0.1),
     "scale": 1e-3,
     "scene": SCENE,
     "scope": Made(lambda _: scope()),
-    "score": at.weakest_focus,
     "seconds": 10.0,
     "seconds_in_a_row": 5.0,
     "sensitivity": 0.01,
@@ -267,14 +240,12 @@ ARGUMENTS: dict[str, Any] = {
     "speed_ratio": 1.5,
     "starts": 2,
     "steps": 3,
-    "temperature": 20.0,
     "thickness": 0.01,
     "timeout": 0.1,
     "stop": lambda state: True,
     "tolerance": 2e-3,
     "transducers": [3, 1, 7, 5],
     "transfer_matrix": MATRIX,
-    "units": (1, 1),
     "volume": torch.ones(3, 3, 3, dtype=torch.complex128),
     "wavenumber": 7.0,
 }
@@ -335,12 +306,7 @@ OTHERS: dict[str, Any] = {
         for name in METHODS
         for call in ("ask", "best", "tell")
     },
-    **{
-        f"{name}.tell.pressure": Made(
-            lambda _, name=name: torch.ones(*state(name).drives.shape[:2], 3).double()
-        )
-        for name in METHODS
-    },
+    **{f"{name}.tell.pressure": Made(lambda _, name=name: observed(state(name))) for name in METHODS},
     "HardwareObjective.__call__.drive": DRIVE[None],
     "SimulatedObjective.__call__.drive": DRIVE[None],
 }
@@ -366,8 +332,9 @@ class Call(NamedTuple):
 
     def argument(self, parameter: str, folder: Path) -> Any:
         """A value that it accepts for a parameter."""
-        value = OTHERS.get(f"{self.name}.{parameter}", ARGUMENTS.get(parameter, LookupError))
-        assert value is not LookupError, f"tests/public_calls.py: no argument for {self.name}.{parameter}"
+        default = inspect.signature(self.function).parameters[parameter].default
+        value = OTHERS.get(f"{self.name}.{parameter}", ARGUMENTS.get(parameter, default))
+        assert value is not inspect.Parameter.empty, f"add {self.name}.{parameter} to public_calls.py"
         return value.make(folder) if isinstance(value, Made) else value
 
     def arguments(self, folder: Path) -> dict[str, Any]:

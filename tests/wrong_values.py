@@ -36,7 +36,7 @@ def deep(levels: int) -> list[Any]:
 
 
 class OwnList:
-    """What NumPy takes for a list though it is no `Sequence`."""
+    """A class that NumPy takes for a list though it is no `Sequence`."""
 
     def __init__(self) -> None:
         self.entries: list[Any] = []

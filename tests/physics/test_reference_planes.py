@@ -1,6 +1,7 @@
 """Waves at planes and slabs: energy, boundary conditions and limits; all in float64."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -17,9 +18,8 @@ THICKNESS = 6e-3
 def above_plane(heights, lateral=((0.0, 0.0), (0.01, -0.004), (0.1, 0.03))):
     """Points at several heights over ORIGIN and beside it: (place, height, 3)."""
     normal = torch.nn.functional.normalize(torch.tensor(NORMAL, dtype=torch.float64), dim=0)
-    first = torch.nn.functional.normalize(
-        torch.linalg.cross(normal, torch.tensor([1.0, 0, 0]).double()), dim=0
-    )
+    across = torch.linalg.cross(normal, torch.tensor([1.0, 0, 0]).double())
+    first = torch.nn.functional.normalize(across, dim=0)
     second = torch.linalg.cross(normal, first)
     beside = torch.tensor(lateral, dtype=torch.float64) @ torch.stack([first, second])
     up = torch.tensor(heights, dtype=torch.float64)[:, None] * normal
@@ -27,21 +27,13 @@ def above_plane(heights, lateral=((0.0, 0.0), (0.01, -0.004), (0.1, 0.03))):
 
 
 def fluid_half_space(density_ratio, speed_ratio):
-    def field(points, sources, **options):
-        return analytic.fluid_half_space(
-            points, sources, K, ORIGIN, NORMAL, density_ratio, speed_ratio, **options
-        )
-
-    return field
+    ratios = {"density_ratio": density_ratio, "speed_ratio": speed_ratio}
+    return partial(analytic.fluid_half_space, wavenumber=K, origin=ORIGIN, normal=NORMAL, **ratios)
 
 
 def fluid_slab(density_ratio, speed_ratio, thickness=THICKNESS):
-    def field(points, sources, **options):
-        return analytic.fluid_slab(
-            points, sources, K, ORIGIN, NORMAL, thickness, density_ratio, speed_ratio, **options
-        )
-
-    return field
+    ratios = {"density_ratio": density_ratio, "speed_ratio": speed_ratio, "thickness": thickness}
+    return partial(analytic.fluid_slab, wavenumber=K, origin=ORIGIN, normal=NORMAL, **ratios)
 
 
 ANGLES = torch.linspace(0, 1.55, 32, dtype=torch.float64)
@@ -208,8 +200,8 @@ def test_far_away_the_reflected_wave_is_the_image_times_the_plane_wave_coefficie
 def test_field_behind_a_half_space_decays_beyond_the_critical_angle():
     """The source is far off, at 45 degrees; c_1 / c = 4.3 turns back all beyond 13 degrees.
 
-    The decay is that of e^{-k depth sqrt(sin^2 - (c / c_1)^2)}, but for the curvature of the wave fronts, of
-    order 1 / (k D).
+    It decays as e^{-k depth sqrt(sin^2 - (c / c_1)^2)}, up to the curvature of the wave fronts, of order
+    1 / (k D).
     """
     length = 7.0
     source = above_plane([length * math.sqrt(0.5)])[0]

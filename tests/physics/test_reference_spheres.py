@@ -1,6 +1,7 @@
 """Point sources outside spheres: boundary conditions and limits; all in float64."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -23,21 +24,12 @@ def on_sphere(distances, radius=RADIUS):
     return directions.new_tensor(CENTER) + directions.new_tensor(distances)[:, None] * directions[:, None]
 
 
-def rigid_sphere(points, sources, **options):
-    return analytic.rigid_sphere(points, sources, K, CENTER, RADIUS, **options)
-
-
-def soft_sphere(points, sources, **options):
-    return analytic.soft_sphere(points, sources, K, CENTER, RADIUS, **options)
+BALL = {"wavenumber": K, "center": CENTER, "radius": RADIUS}
+rigid_sphere, soft_sphere = (partial(one, **BALL) for one in (analytic.rigid_sphere, analytic.soft_sphere))
 
 
 def fluid_sphere(density_ratio, speed_ratio):
-    def field(points, sources, **options):
-        return analytic.fluid_sphere(
-            points, sources, K, CENTER, RADIUS, density_ratio, speed_ratio, **options
-        )
-
-    return field
+    return partial(analytic.fluid_sphere, **BALL, density_ratio=density_ratio, speed_ratio=speed_ratio)
 
 
 def test_pressure_on_a_soft_sphere_is_zero():
@@ -68,7 +60,7 @@ def test_rigid_sphere_of_ka_60_holds_a_hundredth_of_its_radius_off():
     )
     field = analytic.rigid_sphere(points, source, K, CENTER, radius)
     assert abs(slope(field[None])) / (K * abs(field[0])) < 1e-4
-    # And it nearly doubles what arrives, as a plane would but for a curvature of 0.01 radii.
+    # The field nearly doubles, as at a plane; the curvature adds an error of 0.01 radii.
     assert abs(field[0] / green(points[:1], source, K) - 2) < 0.02
 
 
@@ -148,7 +140,7 @@ def test_large_sphere_is_a_plane_but_for_its_curvature(sphere, plane):
         relative(sphere(points, source, K, (0, 0, -radius), radius) - flat, points, source)
         for radius in (0.1, 0.4)
     )
-    # First order in 1 / R: a quarter of the difference at 4 times the radius, but for (8 mm / 0.1 m)^2.
+    # First order in 1 / R: a quarter of the difference at 4 times the radius, up to (8 mm / 0.1 m)^2.
     assert far == pytest.approx(near / 4, rel=0.1)
     assert far < 0.1
 

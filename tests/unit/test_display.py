@@ -1,4 +1,4 @@
-"""What a console and a notebook show of scenes, propagators and results: short, with units, and escaped."""
+"""Texts of scenes, propagators and results in a console and a notebook: short, with units, and escaped."""
 
 from xml.etree import ElementTree
 

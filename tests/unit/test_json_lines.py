@@ -121,7 +121,7 @@ def test_damaged_lines_are_set_aside_with_a_log_line(path: Path, caplog: pytest.
 
 @pytest.mark.parametrize("head", [b"", HEAD], ids=["no head", "head"])
 def test_the_end_of_a_line_costs_no_row(path: Path, head: bytes, caplog: pytest.LogCaptureFixture) -> None:
-    """Whether it is missing, another byte, or in the midst of others."""
+    """The end may be missing, another byte, or between other bytes."""
     content = written(path, head)
     aside = path.with_name(path.name + SET_ASIDE)
     for place in (place for place, byte in enumerate(content) if byte == ord("\n")):

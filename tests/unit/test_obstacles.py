@@ -102,7 +102,7 @@ def test_surface_is_on_the_obstacle_and_spans_its_bounding_box(shape):
 def test_surfaces_enclose_the_volume_and_face_outwards(box_mesh):
     assert volume(*BOX.surface()) == pytest.approx(0.24, rel=1e-12)
     assert volume(*box_mesh.surface()) == pytest.approx(0.24, rel=1e-12)
-    polygon = 24 * math.sin(math.radians(7.5)) / math.pi  # area of the 48-gon over that of its circle
+    polygon = 24 * math.sin(math.radians(7.5)) / math.pi  # area of the 48-gon over the area of its circle
     assert volume(*CYLINDER.surface()) == pytest.approx(math.pi * 0.5**2 * 1.2 * polygon, rel=1e-12)
     assert volume(*SPHERE.surface()) == pytest.approx(4 / 3 * math.pi * 0.7**3, rel=3 * SAGITTA)
     mask = np.random.default_rng(0).random((5, 4, 3)) < 0.5
@@ -143,7 +143,7 @@ def test_mesh_of_a_sphere_is_nearly_the_sphere(folder, suffix):
     assert len(mesh.vertices) == 2 + 23 * 48
     points = cloud()
     off = mesh.signed_distance(points) - SPHERE.signed_distance(points)
-    assert off.min() > -1e-5  # outside the facets, which are inside the sphere, but for rounding in the file
+    assert off.min() > -1e-5  # facets are inside the sphere; the file rounds
     assert off.max() < 0.7 * SAGITTA + 1e-5
 
 

@@ -1,4 +1,4 @@
-"""The package as a whole: what importing it costs, which module may import which, what a wheel holds."""
+"""The package as a whole: cost of the import, layers of modules, and content of a wheel."""
 
 import json
 import os
@@ -59,7 +59,7 @@ def test_import_loads_no_heavy_package(imported: tuple[float, list[str], list[st
 
 
 def test_no_public_name_is_that_of_a_module() -> None:
-    """Where one is, lazy_loader replaces the package's type, which pickle then refuses (joblib's workers)."""
+    """Otherwise lazy_loader would replace the package's type, and pickle in joblib's workers would fail."""
     assert type(at) is types.ModuleType
 
 

@@ -1,4 +1,4 @@
-"""Long work says how long it will take."""
+"""Long work has a forecast."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from autdtorch.utils import progress
 
 
 class Clock:
-    """Time that passes when it is told to."""
+    """A clock that the test moves."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -63,7 +63,7 @@ def test_there_are_ever_fewer_lines(clock: Clock, caplog: pytest.LogCaptureFixtu
 
 
 class SlowClock(Clock):
-    """Two seconds pass whenever one looks."""
+    """A clock that moves by two seconds at each reading."""
 
     def monotonic(self) -> float:
         self.now += 2.0
