@@ -57,8 +57,8 @@ def begin_ascent(weights: torch.Tensor, order: torch.Tensor, passes: int, place:
         "weights": weights,
         "before": weights,
         "order": order,
-        "place": torch.tensor(place, device="cpu"),
-        "passes": torch.tensor(passes, device="cpu"),
+        "place": torch.tensor(place, dtype=torch.int64, device="cpu"),
+        "passes": torch.tensor(passes, dtype=torch.int64, device="cpu"),
     }
 
 
@@ -89,6 +89,10 @@ def ascend(search: Search, levels: int, score: torch.Tensor) -> tuple[Search, to
     weights = candidates(search, levels)[rows, first_of_best(score)]
     place, passes = int(search["place"]) + 1, int(search["passes"])
     if place < search["order"].shape[1]:
-        return {**search, "weights": weights, "place": torch.tensor(place, device="cpu")}, rows >= 0
+        return {
+            **search,
+            "weights": weights,
+            "place": torch.tensor(place, dtype=torch.int64, device="cpu"),
+        }, rows >= 0
     goes_on = (weights != search["before"]).any(dim=1) & (passes > 1)
     return begin_ascent(weights[goes_on], search["order"][goes_on], passes - 1), goes_on

@@ -89,7 +89,8 @@ def estimate(
     Raises:
         ValueError: an argument is out of range.
     """
-    planned = plan(scene, method, positive("spacing", spacing, "m"), tolerance, kernel=kernel, dtype=dtype)
+    spacing = positive("spacing", spacing, "m")
+    planned = plan(scene, method, spacing, tolerance, kernel=kernel, dtype=dtype)
     if planned.method == "free_space":
         nodes = len(scene.array) * len(scene.control_points) * len(scene.array.nodes.weights)
         return Estimate("free_space", None, 0, 0, planned.memory, _NODE_SECONDS * nodes)

@@ -15,7 +15,7 @@ from autdtorch.methods.solution import Solution
 from autdtorch.objectives.objective import Objective, Score, weakest_focus
 from autdtorch.scene.drive import drive_from_phases
 from autdtorch.utils.threads import spread
-from autdtorch.utils.validation import integer_at_least, invalid, number_between, require_one_of
+from autdtorch.utils.validation import integer_at_least, invalid, number_between, require_kind, require_one_of
 
 if TYPE_CHECKING:
     from autdtorch.methods.bayes.trial import BayesTrial
@@ -105,6 +105,7 @@ class BayesOpt(Method):
 
     def tell(self, state: State, pressure: torch.Tensor) -> State:
         """Return the state after an observation; its processes are kept in `scratch`."""
+        require_kind("state", state, State)
         count = state.search["points"].shape[1]
         if state.scratch is None or any(trial.count != count for trial in state.scratch):
             state = replace(state, scratch=self._rebuilt(state))
