@@ -121,7 +121,7 @@ def test_scenes_without_the_same_keys_have_names_that_files_can_have(study: Stud
     assert max(map(len, found)) < 130
 
 
-def test_what_an_experiment_has_not_finished_is_said(
+def test_unfinished_scenes_are_left_out_with_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     config = {"scenes": {"air": SCENE, "lab": SCENE}, "methods": {"lssg": {"_target_": "autdtorch.lssg"}}}
@@ -140,7 +140,7 @@ def test_a_study_without_the_settings_of_the_command_line_is_refused(tmp_path: P
         collect_results(tmp_path)
 
 
-def test_a_study_that_is_there_twice_is_counted_once_and_told(
+def test_a_copy_of_a_study_is_counted_once_with_a_warning(
     study: Study, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     for seed in (0, 1):
