@@ -1,4 +1,4 @@
-"""The adjoint run of the fast kernel against the readable one under plain autograd, and against itself."""
+"""The adjoint run of the CPU kernel against autograd through the reference kernel, and against itself."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from autdtorch.scene.obstacles import Box, Obstacle, Sphere
 HEAVY = Sphere((4.7e-3, 4.2e-3, 4.6e-3), 1.7e-3, density=20.0, sound_speed=300.0)
 RIGID = Box((3.2e-3, 7e-3, 7e-3), (3e-3, 2.3e-3, 2.3e-3), rigid=True)
 WALL = Box((4e-3, 4e-3, 7.4e-3), (40e-3, 40e-3, 1e-3), density=5.0, sound_speed=340.0)
-"""Runs through the boundary layers of x and y."""
+"""Continues through the boundary layers of x and y."""
 
 STEPS = 24
 Parts = tuple[Assembly, Sources, Receivers, torch.Tensor]
@@ -29,7 +29,7 @@ Gradients = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 def parts(dtype: torch.dtype, *obstacles: Obstacle) -> Parts:
-    """A 2 x 2 array in absorbing air, what drives it, and three receivers."""
+    """Return a 2 x 2 array in absorbing air, three receivers, and a random signal."""
     scene = small_scene(obstacles, extent=9e-3, absorption=40.0)
     assembly = assemble(region_of(scene), 1.4e-3, dtype)
     strength = torch.tensor([1.0, 1j, -0.4, 0.3 - 0.7j], dtype=torch.complex128)
@@ -50,40 +50,40 @@ def differentiable(assembly: Assembly, sources: Sources) -> tuple[Assembly, Sour
 
 
 def gradients(given: Parts, kernel: Kernel | None) -> Gradients:
-    """What is recorded, and a random loss's derivatives; those of plain autograd without a kernel."""
+    """Return the record and the derivatives of a random loss, by plain autograd without a kernel."""
     assembly, sources, receivers, signal = given
     assembly, sources = differentiable(assembly, sources)
     if kernel is None:
         state, c = assembly.silence(sources), assembly.coefficients
-        _, heard = ReferenceKernel().advance(state, c, sources, receivers, signal)
+        _, record = ReferenceKernel().advance(state, c, sources, receivers, signal)
     else:
-        heard = recorded(kernel, assembly, sources, receivers, signal)
-    slope = torch.randn(heard.shape, generator=torch.Generator().manual_seed(0), dtype=heard.dtype)
-    (slope * heard).sum().backward()
-    return heard.detach(), sources.force.grad, assembly.coefficients.heterogeneous_weight.grad
+        record = recorded(kernel, assembly, sources, receivers, signal)
+    slope = torch.randn(record.shape, generator=torch.Generator().manual_seed(0), dtype=record.dtype)
+    (slope * record).sum().backward()
+    return record.detach(), sources.force.grad, assembly.coefficients.heterogeneous_weight.grad
 
 
 # float64: rounding over the steps; float32: the design's parity figure, of which rounding takes a tenth
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-4)])
-def test_fast_gradients_are_those_of_the_readable_kernel(dtype: torch.dtype, tolerance: float) -> None:
+def test_gradients_are_those_of_the_reference_kernel(dtype: torch.dtype, tolerance: float) -> None:
     given = parts(dtype, HEAVY, RIGID)
     for value, oracle in zip(gradients(given, CpuKernel()), gradients(given, None), strict=True):
         assert (value - oracle).abs().max() <= tolerance * oracle.abs().max()
 
 
 def test_walls_through_the_layers_keep_the_gradients_exact() -> None:
-    """Rows in the layers are constants; all others and the drive have the oracle's derivatives."""
+    """Derivatives by rows in the layers are zero; all others are those of autograd."""
     given = parts(torch.float64, HEAVY, WALL)
     inside = torch.from_numpy(given[0].grid.inside(given[0].heterogeneous.index))
     assert 0 < inside.sum() < len(inside)
     (_, force, weight), (_, by_force, by_weight) = (gradients(given, each) for each in (CpuKernel(), None))
     assert not weight[~inside].any()
-    # rows that differ from air's by less than 1e-9 are taken for air's, which leaves that much asymmetry
+    # rows within 1e-9 of air's are taken for air's, which leaves that much asymmetry
     assert (force - by_force).abs().max() <= 1e-10 * by_force.abs().max()
     assert (weight - by_weight)[inside].abs().max() <= 1e-10 * by_weight[inside].abs().max()
 
 
-def test_segments_are_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_segments_do_not_change_the_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
     given = parts(torch.float64, HEAVY, RIGID)
     whole = gradients(given, CpuKernel())
     monkeypatch.setattr(adjoint, "_cuts", lambda *_: [0, 9, 10, STEPS])
@@ -92,8 +92,8 @@ def test_segments_are_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
         assert (part - one).abs().max() <= 1e-13 * one.abs().max()
 
 
-def test_cuts_bound_what_is_kept() -> None:
-    """At 100^3 cells, of which all vary: states kept and the record of a segment stay below 1 GiB."""
+def test_cuts_bound_the_memory() -> None:
+    """At 100^3 heterogeneous cells the states kept and the record of a segment stay below 1 GiB."""
     state = State(torch.zeros((118,) * 3), torch.zeros(0), (), (torch.zeros(0),) * 2, (torch.zeros(0),) * 2)
     cells = 102**3
     for steps in (10, 1000, 10_000):
@@ -101,29 +101,29 @@ def test_cuts_bound_what_is_kept() -> None:
         longest = max(end - start for start, end in pairwise(cuts))
         assert (cuts[0], cuts[-1]) == (0, steps)
         kept = (len(cuts) - 1) * 2 * state.now.numel() + 2 * longest * cells
-        # the least that can be is 2 sqrt(steps x state x row); the record of short runs is 128 MiB, twice
+        # the minimum is 2 sqrt(steps x state x row); the record of short runs is 128 MiB, twice
         assert 4 * kept <= max(2.1 * 4 * (steps * 4 * state.now.numel() * cells) ** 0.5, 600 * 2**20)
 
 
 @pytest.mark.parametrize("kernel", [CpuKernel(), ReferenceKernel()], ids=["cpu", "reference"])
 def test_adjoint_dot_product(kernel: Kernel) -> None:
-    """<c, J f> = <J^T c, f>, of any forces f and any weights c of what is recorded."""
+    """<c, J f> = <J^T c, f> for forces f and weights c of the record."""
     assembly, sources, receivers, signal = parts(torch.float64, HEAVY, RIGID)
     generator = torch.Generator().manual_seed(3)
     force = torch.randn(sources.force.shape, generator=generator, dtype=torch.float64).requires_grad_()
-    heard = recorded(kernel, assembly, Sources(sources.index, force), receivers, signal)
-    slope = torch.randn(heard.shape, generator=generator, dtype=torch.float64)
-    (back,) = torch.autograd.grad(heard, force, slope)
+    record = recorded(kernel, assembly, Sources(sources.index, force), receivers, signal)
+    slope = torch.randn(record.shape, generator=generator, dtype=torch.float64)
+    (back,) = torch.autograd.grad(record, force, slope)
     # rounding over the steps
     assert float(back.flatten() @ force.detach().flatten()) == pytest.approx(
-        float(slope.flatten() @ heard.detach().flatten()), rel=1e-12
+        float(slope.flatten() @ record.detach().flatten()), rel=1e-12
     )
 
 
-def test_a_loss_that_hears_nothing_has_no_gradient() -> None:
+def test_a_constant_loss_has_no_gradient() -> None:
     assembly, sources = differentiable(*parts(torch.float64, HEAVY)[:2])
-    heard = recorded(CpuKernel(), assembly, sources, *parts(torch.float64, HEAVY)[2:])
-    (0 * heard).sum().backward()
+    record = recorded(CpuKernel(), assembly, sources, *parts(torch.float64, HEAVY)[2:])
+    (0 * record).sum().backward()
     assert not sources.force.grad.any()
     assert not assembly.coefficients.heterogeneous_weight.grad.any()
 

@@ -1,4 +1,4 @@
-"""Autograd goes back through the readable kernel: the oracle of every later adjoint."""
+"""Autograd through the reference kernel, against which the adjoint is tested."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ CELL = 3 * 72 + 4 * 9 + 4
 
 
 def pressure(force: torch.Tensor, weight: torch.Tensor, steps: int) -> torch.Tensor:
-    """What two receivers hear in `steps` steps on a tiny grid with two varying cells and layers of two
-    cells."""
-    varying = torch.tensor([CELL, CELL + 1])
+    """Return the record of two receivers on a tiny grid with two heterogeneous cells and layers of two."""
+    heterogeneous = torch.tensor([CELL, CELL + 1])
     profile = torch.tensor([2.0, 1.5, 1.0, 0.5, 0.1], dtype=torch.float64)
     decay = torch.exp(-profile - 0.1)
     gain = profile / (profile + 0.1) * (decay - 1)
@@ -24,22 +23,11 @@ def pressure(force: torch.Tensor, weight: torch.Tensor, steps: int) -> torch.Ten
         weight[:1, :9],
     )
     scaled = torch.tensor([CELL]), torch.tensor([1.3], dtype=torch.float64)
+    crossed = Columns(columns.index, columns.offset[:, 3:6], weight[1:, 9:12])
     coefficients = Coefficients(
-        0.19,
-        0.12,
-        0.06,
-        0.045,
-        0.99,
-        varying,
-        weight,
-        torch.tensor([CELL + 3]),
-        decay,
-        gain,
-        *scaled,
-        columns,
-        Columns(columns.index, columns.offset[:, 3:6], weight[1:, 9:12]),
-        torch.tensor([[2, 2, 0, 1]]),
-    )
+        0.19, 0.12, 0.06, 0.045, 0.99, heterogeneous, weight, torch.tensor([CELL + 3]), decay, gain, *scaled,
+        columns, crossed, torch.tensor([[2, 2, 0, 1]]),
+    )  # fmt: skip
     receivers = Receivers(torch.tensor([[CELL + 9], [CELL - 72]]), torch.ones((2, 1), dtype=torch.float64))
     signal = torch.stack(
         (torch.cos(torch.arange(steps) * 0.6), torch.sin(torch.arange(steps) * 0.6)), 1

@@ -1,4 +1,4 @@
-"""Kernels just compiled and those loaded from disk: equal to the last bit, and of the present source."""
+"""Compiled kernels and those loaded from disk: equal to the last bit, and of the present source."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ print(sum(sum(one.stats.cache_misses.values()) for one in _entries))
 
 
 def run(cache: Path) -> tuple[str, int]:
-    """Digest of all that a process of its own finds, and how many kernels it compiled."""
+    """Run `FOUND` in a new process; return the digest of its results and the number of kernels compiled."""
     command = [sys.executable, "-c", FOUND, str(TESTS)]
     process = subprocess.run(
         command, capture_output=True, text=True, check=True, env=os.environ | {"NUMBA_CACHE_DIR": str(cache)}
@@ -42,7 +42,7 @@ def run(cache: Path) -> tuple[str, int]:
     return digest, int(compiled_now)
 
 
-def test_a_cold_process_and_a_warm_one_find_the_same(tmp_path: Path) -> None:
+def test_cold_and_warm_caches_give_the_same_results(tmp_path: Path) -> None:
     cold, compiled_first = run(tmp_path)
     warm, compiled_again = run(tmp_path)
     assert compiled_first > 0
@@ -54,7 +54,7 @@ def test_a_cold_process_and_a_warm_one_find_the_same(tmp_path: Path) -> None:
     assert kept
 
 
-def test_any_change_of_the_kernels_compiles_anew(tmp_path: Path) -> None:
+def test_any_change_of_the_kernels_changes_the_digest(tmp_path: Path) -> None:
     (tmp_path / "one.py").write_text("a = 1\n", "utf-8")
     (tmp_path / "two.py").write_text("b = 2\n", "utf-8")
     before = compiled._digest.__wrapped__(tmp_path)

@@ -1,4 +1,4 @@
-"""The CUDA kernel against the readable one: on a GPU, or interpreted by Triton on the CPU."""
+"""The CUDA kernel against the reference kernel: on a GPU, or interpreted by Triton on the CPU."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SIZE = 9e-3
 HEAVY = Box((3.4e-3, 4.5e-3, 4.5e-3), (1.8e-3, 4e-3, 3e-3), density=100.0, sound_speed=340.0)
 RIGID = Box((3.4e-3, 4.5e-3, 4.5e-3), (2.2e-3, 5e-3, 4e-3), rigid=True)
 WALL = Box((4.5e-3, 4.5e-3, 7.3e-3), (30e-3, 30e-3, 1.2e-3), density=5.0, sound_speed=300.0)
-"""Runs through the boundary layers of x and y."""
+"""Continues through the boundary layers of x and y."""
 
 WHOLE = Blocks(x=32, y=32, z=32, lanes=1024)
 """One program a task: interpreted, a program takes the same time however large it is."""
@@ -69,7 +69,7 @@ def parts(obstacles: tuple[Obstacle, ...], dtype: torch.dtype, absorption: float
 
 
 def noise(shape: tuple[int, int, int], c: Coefficients) -> State:
-    """Noise all over the grid, which brings every part of a step into play at once."""
+    """Noise in all cells exercises every part of a step."""
     state = uniform_state(shape, c, 0.0)
     generator = torch.Generator().manual_seed(0)
     for field in (state.now, state.before):
@@ -84,8 +84,8 @@ def advance(kernel: Kernel, given: Parts, blocks: tuple[int, ...]) -> tuple[Stat
     state, recorded = noise(shape, coefficients), []
     signal = torch.randn((sum(blocks), 3), generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     for part in signal.to(coefficients.layer_decay.dtype).split(blocks):
-        state, heard = kernel.advance(state, coefficients, sources, receivers, part)
-        recorded.append(heard)
+        state, record = kernel.advance(state, coefficients, sources, receivers, part)
+        recorded.append(record)
     return state, torch.cat(recorded)
 
 
@@ -126,7 +126,7 @@ def test_cuda_kernel_is_the_reference_kernel(
     assert_same(advance(CudaKernel(BLOCKS), given, (1, 1)), expected, tolerance)
 
 
-def test_no_seam_between_programs_in_whatever_order(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_programs_run_in_any_order(monkeypatch: pytest.MonkeyPatch) -> None:
     """Interpreted, they run one after the other: here the last one first."""
     builder = interpreter.InterpreterBuilder
     place = builder.set_grid_idx
@@ -138,7 +138,7 @@ def test_no_seam_between_programs_in_whatever_order(monkeypatch: pytest.MonkeyPa
     assert_same(advance(CudaKernel(Blocks(x=16, y=16, z=8, lanes=256)), given, (1,)), expected, 1e-12)
 
 
-def test_a_state_that_was_given_back_stays_while_another_one_is_stepped() -> None:
+def test_a_returned_state_stays_while_another_is_stepped() -> None:
     given = parts((), torch.float64)
     kernel = CudaKernel(BLOCKS)
     state, _ = advance(kernel, given, (1,))
@@ -147,7 +147,7 @@ def test_a_state_that_was_given_back_stays_while_another_one_is_stepped() -> Non
     assert torch.equal(state.now, pressure)
 
 
-def test_without_a_gpu_it_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_gpu_or_triton_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ValueError, match=r"kernel: 'cuda'; needs an NVIDIA GPU"):
@@ -158,7 +158,7 @@ def test_without_a_gpu_it_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_every_launch_compiles_for_a_gpu(tmp_path: Path) -> None:
-    """The interpreter takes more than the compiler does."""
+    """The interpreter accepts more than the compiler."""
     environment = {name: value for name, value in os.environ.items() if name != "TRITON_INTERPRET"}
     run = subprocess.run(
         [sys.executable, Path(__file__).parents[2] / "scripts" / "check.py", "cuda"],

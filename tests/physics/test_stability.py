@@ -1,4 +1,4 @@
-"""Nothing grows: the first scenes of `scripts/check.py stability`, in short runs on its smallest grids."""
+"""Stability: the first scenes of `scripts/check.py stability`, in short runs on its smallest grids."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TRIALS = [replace(draw_trial(0, number, long_share=1.0), steps=1_000) for number
 
 
 @pytest.mark.parametrize("trial", TRIALS, ids=lambda trial: str(trial.number))
-def test_nothing_grows_in_a_random_scene(trial: Trial, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.ERROR)  # coarse spacings are meant
+def test_random_scenes_are_stable(trial: Trial, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.ERROR)
     outcome = run_trial(trial)
     assert not outcome.failed, str(outcome)

@@ -1,4 +1,4 @@
-"""The time step against the true limit: whole grids, through the kernel's own steps."""
+"""The time step against the stability limit of whole grids, from steps of the kernel."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ SCENES = {
 
 
 def scaled(c: Coefficients, ratio: float) -> Coefficients:
-    """The same medium with another time factor."""
+    """Return coefficients with another time factor."""
     return replace(
         c,
         center=2 - ratio * (2 - c.center),
@@ -58,7 +58,7 @@ def advance(c: Coefficients, state: State, steps: int) -> State:
 
 
 def true_eigenvalue(assembly: Assembly) -> float:
-    """Largest eigenvalue of the whole grid's operator without its layers: what a step does, by Arnoldi."""
+    """Largest eigenvalue of a step on the whole grid without its layers, by Arnoldi."""
     c = assembly.coefficients
     open_ended = replace(c, layer_gain=torch.zeros_like(c.layer_gain))
     factor = assembly.stencil.time_factor(float(assembly.steps_per_period))
@@ -101,14 +101,14 @@ def test_a_run_is_bounded_at_the_chosen_time_step_and_blows_up_above_the_limit(n
         start = float(state.now.norm())
         return float(advance(coefficients, state, steps).now.norm()) / start
 
-    # the pressure alone is no energy: in a light body it may rise by the root of the density ratio
+    # the pressure alone is not the energy: it may rise by the root of the density ratio in a light body
     assert growth(c, 3000) < 10
     # C lambda = 4 x 1.1 grows by e^{2 acosh(sqrt(1.1))} a step at the mode's frequency: e^{0.6}
     assert growth(scaled(c, ratio), 300) > 1e30
 
 
-def test_a_block_of_several_periods_locks_in_exactly() -> None:
-    """Whatever phasor goes in comes out, over blocks of any number of periods."""
+def test_the_dft_of_a_block_is_exact() -> None:
+    """Over blocks of one or several periods."""
     phasor = torch.tensor([0.3 - 2j, 1j], dtype=torch.complex128)
     for steps in (Fraction(12), Fraction(23, 2), Fraction(35, 3), Fraction(17, 4)):
         block = 100 * steps.numerator
@@ -118,18 +118,18 @@ def test_a_block_of_several_periods_locks_in_exactly() -> None:
         assert torch.allclose(drive_dft(recorded, steps.denominator), phasor, rtol=1e-12)
 
 
-def test_a_time_step_of_ones_own() -> None:
+def test_a_given_time_step() -> None:
     scene = small_scene((CUBE,))
     finest = make_propagator(scene, "full", 2e-3, time_step=2e-6)
     chosen = make_propagator(scene, "full", 2e-3)
     assert 0.97 * 2e-6 <= finest.time_step <= 2e-6
-    # the drive's frequency is exact at any time step: what is left is the tolerance, twice
+    # the drive's frequency is exact at any time step: the tolerance remains, twice
     point = scene.control_points[:1]
     difference = relative_error(finest.transfer_matrix(point), chosen.transfer_matrix(point))
     assert difference < finest.tolerance + chosen.tolerance
 
 
-def test_a_time_step_above_the_limit_is_refused_with_both_numbers() -> None:
+def test_a_time_step_above_the_limit_is_refused() -> None:
     scene = small_scene((CUBE,))
     with pytest.raises(ValueError, match=r"time_step: 3e-06 s; must be at most 2\.3719e-06 s") as error:
         make_propagator(scene, "full", 1e-3, time_step=3e-6)

@@ -1,4 +1,4 @@
-"""Walls and slabs that go on for ever, through the boundary layers, against exact solutions."""
+"""Walls and slabs through the boundary layers, against exact solutions."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_fluid_half_space_reflects() -> None:
 
 
 def slab(normal: int = 0, begin: float = FACE, thickness: float = 5e-3, density: float = 3.0) -> Box:
-    """Of a density relative to air and 1.5 times its sound speed, across an axis."""
+    """Return a slab across an axis, of a density relative to air and 1.5 times its sound speed."""
     center, size = [0.0] * 3, [1.0] * 3
     center[normal], size[normal] = begin + thickness / 2, thickness
     return Box(center, size, density=density * AIR.density, sound_speed=1.5 * AIR.sound_speed)
@@ -69,10 +69,10 @@ def test_slab_transmits(shift: float) -> None:
 
 @pytest.mark.parametrize("density", [77.0, 3.0, 0.01])
 @pytest.mark.parametrize("offset", [0.0, 0.2, 0.4, 0.8])
-def test_slabs_through_the_layers_do_not_grow(
+def test_slabs_through_the_layers_are_stable(
     density: float, offset: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Random pressure, wherever the faces lie; the slab runs through two layers and where they meet."""
+    """Random pressure, any place of the faces; the slab continues through two layers and their edge."""
     monkeypatch.setattr("autdtorch.fdtd.grid.grid_offset", lambda *_: (0.0, 0.0, 0.0))
     array = TransducerArray([(2e-3, 4e-3, 2e-3)], (1, 0, 0))
     plate = slab(2, (4 + offset) * 1e-3, 3.2e-3, density)
@@ -90,13 +90,13 @@ def test_slabs_through_the_layers_do_not_grow(
         silence = torch.zeros((300, 2), dtype=torch.float64)
         state, _ = CpuKernel().advance(state, assembly.coefficients, nobody, deaf, silence)
         sizes.append(float(state.now.norm()))
-    # without the products of two layers, or with surfaces' energy along one direction negative, these grew by
-    # more than e per period; a constant pressure may stay
+    # without the products of two layers, or with a negative energy in one direction, these grew by more than
+    # e per period; a constant pressure may stay
     assert sizes[3] < 1.05 * sizes[1]
 
 
 @pytest.mark.parametrize(
-    ("obstacle", "goes_on"),
+    ("obstacle", "continued"),
     [
         (Sphere((FACE, 12e-3, 0.0), 8e-3, density=3.0, sound_speed=340.0), False),
         (Box((FACE, 12e-3, 0.0), (8e-3, 8e-3, 80e-3), density=3.0, sound_speed=340.0), False),
@@ -105,15 +105,15 @@ def test_slabs_through_the_layers_do_not_grow(
     ],
     ids=["sphere", "post", "wall", "light slab"],
 )
-def test_only_walls_across_the_domain_go_on_through_the_layers(obstacle: Obstacle, goes_on: bool) -> None:
+def test_only_walls_across_the_domain_continue(obstacle: Obstacle, continued: bool) -> None:
     assembly = assemble(region_of(layered_scene((obstacle,), FRONT)), 2e-3)
     index = torch.cat(
         (torch.from_numpy(assembly.heterogeneous.index), torch.from_numpy(assembly.heterogeneous.sound_hard))
     )
     depth = index % assembly.grid.shape[2]
-    assert bool((depth < assembly.grid.first[2]).any()) == goes_on
-    assert (len(assembly.coefficients.columns.index) > 0) == goes_on
-    assert (len(assembly.coefficients.crossed.index) > 0) == goes_on
+    assert bool((depth < assembly.grid.first[2]).any()) == continued
+    assert (len(assembly.coefficients.columns.index) > 0) == continued
+    assert (len(assembly.coefficients.crossed.index) > 0) == continued
 
 
 def test_walls_of_another_direction_end_before_the_layers() -> None:
@@ -124,8 +124,8 @@ def test_walls_of_another_direction_end_before_the_layers() -> None:
     assert (z[before] >= assembly.grid.first[2]).all()
 
 
-def test_an_obstacle_at_a_wall_leaves_its_rows_in_the_layers() -> None:
-    """It ends before them: there all rows along the wall are alike, also those beside its end."""
+def test_an_obstacle_at_a_wall_does_not_change_its_rows_in_the_layers() -> None:
+    """All stencil rows along the wall are equal in the layers, also next to the obstacle."""
     post = Box((FACE - 3e-3, 12e-3, 20e-3), (6e-3, 7e-3, 80e-3), density=40.0, sound_speed=1e3)
     assembly = assemble(region_of(layered_scene((slab(), post), FRONT)), 1e-3, torch.float64)
     columns = assembly.coefficients.columns

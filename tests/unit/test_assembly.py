@@ -27,7 +27,7 @@ STRIDES = np.array((GRID.shape[1] * GRID.shape[2], GRID.shape[2], 1))
 
 
 def material(ratio: float | None, speed: float = 1.0) -> dict[str, float | bool]:
-    """Of a density relative to air, None for rigid, and a speed relative to air."""
+    """Return a material by density, None for sound-hard, and sound speed relative to air."""
     if ratio is None:
         return {"rigid": True}
     return {"density": ratio * AIR.density, "sound_speed": speed * AIR.sound_speed}
@@ -64,7 +64,7 @@ def element_centers() -> np.ndarray:
 
 
 def mass_of_all(elements: Elements, cells: HeterogeneousCells) -> np.ndarray:
-    """Mass of every cell: of those not listed, 1 at a surface, else that of the material around."""
+    """Mass of every cell; unlisted cells have 1 at a surface, else the mass of their material."""
     mass = elements.materials.mass[np.pad(elements.material, ((1, 0),) * 3, mode="edge")].ravel()
     first = np.stack(np.unravel_index(elements.index, elements.material.shape), axis=-1)
     mass[(first[:, None] + VERTICES) @ STRIDES] = 1
@@ -94,7 +94,7 @@ def test_speed_of_a_material_is_tuned_to_its_own_wavenumber() -> None:
     assert speed_factor(STENCIL, 1.0) == pytest.approx(1, rel=1e-14)
     slow = speed_factor(STENCIL, 0.5)
     assert slow * STENCIL.isotropic_symbol(2 * STENCIL.kappa) == pytest.approx(STENCIL.symbol)
-    # (c / c_air)^2 but for the grid's dispersion
+    # (c / c_air)^2 apart from the grid's dispersion
     assert speed_factor(STENCIL, 4.0) == pytest.approx(16, rel=0.05)
 
 
@@ -269,10 +269,9 @@ def test_two_halves_of_a_box_are_the_box() -> None:
 def test_modes_of_a_duct_of_two_fluids() -> None:
     """Between two rigid walls, part air, part heavy fluid, along the grid: its resonances are known.
 
-    With one speed, lengths a and b and impedances z1 and z2: z2 tan(k a) + z1 tan(k b) = 0. For waves that
-    meet it head on, a step of density half way between two cells is exact, but for the mass that the heavy
-    cells behind it are given to keep the time step: 0.1 % of the wavenumber at 20 cells per wavelength, 1.2 %
-    at 7.
+    With one speed, lengths a and b and impedances z1 and z2: z2 tan(k a) + z1 tan(k b) = 0. At normal
+    incidence a step of density half-way between two cells is exact, apart from the mass transferred to the
+    heavy cells behind it: 0.1 % of the wavenumber at 20 cells per wavelength, 1.2 % at 7.
     """
     far = 2000
     ends = ((-far,) * 3, (1, far, far)), ((9, -far, -far), (far,) * 3)
@@ -284,7 +283,7 @@ def test_modes_of_a_duct_of_two_fluids() -> None:
     back, _, forth = line.reshape(-1, 3, 9).sum(axis=2).T
     matrix = np.diag(back + forth) - np.diag(forth[:-1], 1) - np.diag(back[1:], -1)
     symbols = np.sort(np.linalg.eigvals(matrix).real)
-    # head on, the stencil is that of a line: symbol = 2 - 2 cos k
+    # at normal incidence the symbol is 2 - 2 cos k, as on a line
     discrete = np.arccos(1 - symbols[1:5] / 2)
     error = discrete / _duct_modes(3, 5, 1.0, 50.0)[:4] - 1
     assert abs(error[0]) < 1.5e-3

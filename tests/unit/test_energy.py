@@ -1,4 +1,4 @@
-"""The energy of random assembled scenes: never negative, and never above its bound."""
+"""The energy of random scenes: not negative, and below its bound."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def dense_operator(cells: HeterogeneousCells, stencil: Stencil, shape: tuple[int
 
 
 def assert_not_negative(matrix: np.ndarray, largest: float) -> None:
-    """No eigenvalue below 0, but for rounding: Cholesky's factors exist. Eigenvalues would take longer."""
+    """No eigenvalue below 0 by more than rounding: a Cholesky factor exists."""
     rounding = len(matrix) * np.finfo(np.float64).eps * largest
     np.linalg.cholesky(matrix + rounding * np.eye(len(matrix)))
 
@@ -46,12 +46,12 @@ def test_energy_is_symmetric_positive_and_bounded(number: int) -> None:
     stencil = tuned_stencil(grid.kappa)
     elements = elements_of(region_of(trial.scene), grid, stencil)
 
-    # of every element by itself, which is more than it takes; what is left is rounding
+    # each element by itself, which is sufficient; rounding
     own = np.linalg.eigvalsh(stiffness_matrix(elements.interface.coupling))
     assert (own[:, 0] >= -1e-13 * own[:, -1]).all()
     assert (elements.interface.mass >= 0).all()
 
-    # and of what is assembled, after rigid cells were closed and masses shared
+    # the assembled operator
     cells = heterogeneous_cells(elements, stencil)
     assert (cells.mass > 0).all()
     matrix = dense_operator(cells, stencil, grid.shape)

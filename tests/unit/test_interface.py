@@ -53,7 +53,7 @@ def element(
 
 
 def energy(cut: InterfaceElements, field: np.ndarray) -> float:
-    """Of a field (8,) at the vertices: the integral of |gradient|^2 / density."""
+    """Energy of a field (8,) at the vertices: the integral of |gradient|^2 / density."""
     return float(field @ stiffness_matrix(cut.coupling)[0] @ field)
 
 
@@ -187,9 +187,9 @@ def test_a_face_through_vertices_is_corrected_from_either_side(side: int) -> Non
 def test_a_face_along_the_grid_has_a_positive_energy_in_every_direction(
     axis: int, offset: float, contrast: float, behind: bool
 ) -> None:
-    """Else boundary layers that it runs into give energy instead of taking it.
+    """Otherwise boundary layers that it enters give energy.
 
-    Two elements in a row stand for the rest of each material; along the face the wave is one of the grid's.
+    Two elements in a row represent the rest of each material; along the face there is a wave of the grid.
     """
     normal = (-1.0 if behind else 1.0) * np.eye(3)[axis]
     cut = element(plane(normal, offset), density=(1, contrast))
@@ -204,10 +204,7 @@ def test_a_face_along_the_grid_has_a_positive_energy_in_every_direction(
 
 
 def _energy_along(chain: list[np.ndarray], axis: int, wave: np.ndarray) -> np.ndarray:
-    """Part of the energy of elements in a row that is due to the first direction along the face.
-
-    What is left of the bonds for a wave (2,) along it, less what is left without the first component.
-    """
+    """Energy of elements in a row for a wave (2,) along the face, less that without its first component."""
     sides = [other for other in range(3) if other != axis]
     matrices = []
     for turned in (wave, wave * (0, 1)):

@@ -11,7 +11,6 @@ from autdtorch.fdtd.interpolation import (
     average_nodes,
     exclude_cells,
     interpolate_points,
-    interpolation_width,
 )
 
 SHAPE = (24, 22, 20)
@@ -28,7 +27,7 @@ def wave(kappa: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("cells", [17.0, 8.5, 6.0, 4.25])
 @given(seed=st.integers(0, 2**31))
-def test_plane_waves_are_read_exactly_between_the_cells(cells: float, seed: int) -> None:
+def test_plane_waves_are_interpolated(cells: float, seed: int) -> None:
     kappa = 2 * math.pi / cells
     field, vector = wave(kappa, seed)
     positions = np.random.default_rng(seed).uniform(7, 13, (5, 3))
@@ -55,30 +54,30 @@ def test_points_within_a_cell_of_the_rim_are_read_from_inside(cells: float) -> N
 
 
 @pytest.mark.parametrize("cells", [17.0, 8.5])
-def test_points_beside_missing_cells_are_read_from_the_others(cells: float) -> None:
-    """Up to a cell beyond the last of them; with none next to a point, nothing is read."""
+def test_points_next_to_excluded_cells_use_the_others(cells: float) -> None:
+    """Up to a cell beyond the last one; a point without adjacent cells reads zero."""
     kappa = 2 * math.pi / cells
     field, vector = wave(kappa, seed=2)
     positions = np.array([[10.2, 9.6, 8.3], [10.6, 9.1, 8.8], [10.95, 9.0, 8.5], [11.01, 9.0, 8.5]])
-    spread = interpolate_points(positions, SHAPE, FIRST, LAST, kappa)
-    missing = np.unravel_index(spread.index, SHAPE)[0] > 10
-    weights = exclude_cells(spread, positions, missing, SHAPE, kappa)
-    assert not weights.weight[missing].any()
+    found = interpolate_points(positions, SHAPE, FIRST, LAST, kappa)
+    excluded = np.unravel_index(found.index, SHAPE)[0] > 10
+    weights = exclude_cells(found, positions, excluded, SHAPE, kappa)
+    assert not weights.weight[excluded].any()
     assert not weights.weight[3].any()
     read = (field[weights.index] * weights.weight).sum(1)
     # a line through the last two cells would miss up to kappa^2, 0.14 and 0.55; a parabola kappa^3
     assert np.abs(read - np.exp(1j * positions @ vector))[:3].max() < 0.1
-    kept = exclude_cells(spread, positions, np.zeros_like(missing), SHAPE, kappa)
-    assert np.array_equal(kept.weight, spread.weight)
+    kept = exclude_cells(found, positions, np.zeros_like(excluded), SHAPE, kappa)
+    assert np.array_equal(kept.weight, found.weight)
 
 
 def one_sided(cells: float) -> tuple[float, float]:
     """Rms error of plane waves and largest norm of weights, of points up to a cell beyond the last cell."""
     kappa, random = 2 * math.pi / cells, np.random.default_rng(0)
     positions = np.array((10, 8.5, 8)) + random.uniform(size=(60, 3))
-    spread = interpolate_points(positions, SHAPE, FIRST, LAST, kappa)
-    missing = np.unravel_index(spread.index, SHAPE)[0] > 10
-    weights = exclude_cells(spread, positions, missing, SHAPE, kappa)
+    found = interpolate_points(positions, SHAPE, FIRST, LAST, kappa)
+    excluded = np.unravel_index(found.index, SHAPE)[0] > 10
+    weights = exclude_cells(found, positions, excluded, SHAPE, kappa)
     errors = []
     for seed in range(20):
         field, vector = wave(kappa, seed)
@@ -87,15 +86,15 @@ def one_sided(cells: float) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("cells", [17.0, 8.5])
-def test_small_weights_beside_missing_cells_cost_no_accuracy(
+def test_small_weights_next_to_excluded_cells_cost_no_accuracy(
     cells: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Half as large as those of a fit that is hardly regularised, as near fields are no plane waves."""
+    """Half as large as with little regularisation, as near fields are not plane waves."""
     error, norm = one_sided(cells)
     monkeypatch.setattr(interpolation, "_ONE_SIDED_REGULARISATION", 1e-6)
     least_error, large = one_sided(cells)
-    # measured: 1.02 and 0.98, 0.45 and 0.50; a regularisation ten times as strong costs 1.5 and 1.35, one ten
-    # times as weak leaves 0.61 and 0.62. Nothing here hangs on rounding.
+    # measured: 1.02 and 0.98, 0.45 and 0.50; ten times the regularisation costs 1.5 and 1.35, a tenth of it
+    # leaves 0.61 and 0.62
     assert error < 1.1 * least_error
     assert norm < 0.55 * large
 
@@ -109,7 +108,7 @@ def test_a_point_on_a_cell_centre_is_that_cell() -> None:
     assert np.sort(np.abs(weights.weight[0]))[-2] < WIDTH_ERROR
 
 
-def test_merged_groups_read_the_mean_of_their_points() -> None:
+def test_groups_of_nodes_read_their_mean() -> None:
     positions = np.random.default_rng(0).uniform(7, 13, (6, 3))
     positions[4:] = positions[3]  # of the second group one point alone: fewer cells than the first
     share = np.array([0.2, 0.3, 0.5])
@@ -121,9 +120,3 @@ def test_merged_groups_read_the_mean_of_their_points() -> None:
     for index, weight in zip(groups.index, groups.weight, strict=True):
         carrying = index[weight != 0]
         assert len(np.unique(carrying)) == len(carrying)
-
-
-def test_coarser_grids_need_wider_footprints() -> None:
-    widths = [interpolation_width(2 * math.pi / cells) for cells in (17.0, 8.5, 6.0, 4.25)]
-    assert widths == sorted(widths)
-    assert widths[0] <= 6

@@ -17,8 +17,7 @@ def directions(count: int) -> np.ndarray:
 
 @pytest.mark.parametrize(("cells", "bound"), [(17.0, 1e-8), (8.5, 1e-6), (4.25, 1e-4), (3.0, 1e-3)])
 def test_symbol_is_the_same_in_every_direction(cells: float, bound: float) -> None:
-    # design section 5: relative frequency error (half that of the symbol) 4e-7 at 8.5 and 3e-5 at 4.25 cells
-    # a wavelength
+    # relative frequency error, half that of the symbol: 4e-7 at 8.5 and 3e-5 at 4.25 cells per wavelength
     stencil = tuned_stencil(2 * math.pi / cells)
     symbol = stencil.symbol_at(stencil.kappa * directions(2000))
     assert np.abs(symbol / stencil.symbol - 1).max() / 2 < bound
@@ -36,15 +35,14 @@ def test_plane_wave_at_the_drive_frequency_turns_by_one_period_in_whole_steps(
 
 @pytest.mark.parametrize(("cells", "bound"), [(17.0, 2e-3), (8.5, 1e-2), (4.25, 4e-2)])
 def test_plane_wave_falls_by_its_attenuation(cells: float, bound: float) -> None:
-    """Put into the discrete equation, e^{i (kappa + i eta) n - i w t} leaves little, in any direction."""
+    """The residual of e^{i (kappa + i eta) n - i w t} in the discrete equation, in all directions."""
     kappa, steps = 2 * math.pi / cells, 20
     eta = 5e-3 * kappa
     stencil = tuned_stencil(kappa, eta)
     damping, turn = stencil.damping(steps), 2 * math.pi / steps
     symbol = stencil.symbol_at((kappa + 1j * eta) * directions(200))
     left = 2 * math.cos(turn) - 2j * damping * math.sin(turn) - 2 + stencil.time_factor(steps) * symbol
-    # The slope of the symbol turns what is left into an error of the wavenumber: of the phase as of the
-    # symbol without loss, of the attenuation as much as the slope varies with direction.
+    # divided by the slope of the symbol it is an error of the wavenumber
     error = left / (stencil.time_factor(steps) * stencil.slope)
     assert np.abs(error).max() < bound * eta
     assert abs(np.mean(error)) < 0.1 * bound * eta
