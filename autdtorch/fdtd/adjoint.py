@@ -1,9 +1,9 @@
 """Gradients of receiver records, by an adjoint run of any kernel.
 
-Multiplied by the masses of its cells the scheme is symmetric, boundary layers included. The response of cell
-i to a force on cell j is m_j / m_i times that of cell j to a force on cell i. The derivatives lambda of a
-loss by the forces on all cells therefore come from a run of the same kernel. It is driven in the receivers'
-cells by the loss's derivatives over the masses, last step first, and read times the masses:
+Multiplied by the masses of its cells the scheme is symmetric, boundary layers included. A force on cell j
+moves cell i as a force on cell i moves cell j, times m_j / m_i. The derivatives lambda of a loss by the
+forces on all cells therefore come from a run of the same kernel. It is driven in the receivers' cells by the
+loss's derivatives over the masses, last step first, and read times the masses:
 
     dL / d force_is  = sum_t lambda_i(t) signal_s(t)
     dL / d weight_ij = sum_t lambda_i(t) (p_j(t) - p_i(t)).

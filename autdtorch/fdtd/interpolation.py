@@ -21,7 +21,7 @@ Shape = tuple[int, int, int]
 
 WIDTHS = (4, 6, 8, 10)
 WIDTH_ERROR = 3e-4
-"""Largest error of a centred kernel at the drive's wavenumber: small beside that of any grid."""
+"""Largest error of a centred kernel at the drive's wavenumber: small compared with the error of any grid."""
 
 _REGULARISATION = 1e-5
 """Keeps weights small where the fit does not determine them; far below WIDTH_ERROR."""

@@ -154,7 +154,7 @@ def cells_of_maps(
     """Return the heterogeneous cells of maps (nx, ny, nz) of density [kg/m^3] and sound speed [m/s].
 
     Raises:
-        ValueError: the shape of a map is not that of the domain's cells.
+        ValueError: a map does not have the shape of the domain's cells.
     """
     cells = domain_cells(region, grid)
     shape = tuple(part.stop - part.start for part in cells)

@@ -109,7 +109,7 @@ def _faces(region: Region, surfaces: list[tuple[Array, Array]], axis: int, origi
 def _axis_offset(faces: _Faces, transducers: Array, length: float, spacing: float) -> float:
     """Return the offset [cells] with a small mean square error of the faces, if possible a symmetric one.
 
-    Positions of transducers are distances from one end of the extent [m], `length` is that of the other end.
+    Positions of transducers are distances from one end of the extent [m], and `length` is the extent [m].
     """
     place, first, area = faces
     cells, whole = place / spacing, length / spacing

@@ -13,7 +13,7 @@ RATIO = 1.5
 """Ratio of the spacings of the two grids: the coarser costs a fifth of the finer."""
 
 ORDER = 4 / 3
-"""Assumed order of convergence: that of the field at sharp edges, twice the exponent 2/3 at a rigid wedge.
+"""Assumed order of convergence: twice the exponent 2/3 of the field at a rigid wedge.
 Curved surfaces converge with order two; their error is overestimated by three quarters."""
 
 _PILOT_CELLS = 6.0

@@ -49,8 +49,8 @@ def largest_eigenvalue(
 ) -> float:
     """Return an upper bound of the largest eigenvalue of the operator.
 
-    The larger of two: that of uniform air, and that of the heterogeneous cells with a rim of one cell. A mode
-    above those of air is bound to the heterogeneous cells and fades within a cell.
+    The larger of two eigenvalues: of uniform air, and of the heterogeneous cells with a rim of one cell. A
+    mode above those of air is bound to the heterogeneous cells and fades within a cell.
 
     Args:
         index: flat indices (n,) of the heterogeneous cells, ascending, not in the outermost ring.

@@ -17,7 +17,7 @@ def directions(count: int) -> np.ndarray:
 
 @pytest.mark.parametrize(("cells", "bound"), [(17.0, 1e-8), (8.5, 1e-6), (4.25, 1e-4), (3.0, 1e-3)])
 def test_symbol_is_the_same_in_every_direction(cells: float, bound: float) -> None:
-    # relative frequency error, half that of the symbol: 4e-7 at 8.5 and 3e-5 at 4.25 cells per wavelength
+    # relative error of the frequency, half the symbol's: 4e-7 at 8.5 and 3e-5 at 4.25 cells per wavelength
     stencil = tuned_stencil(2 * math.pi / cells)
     symbol = stencil.symbol_at(stencil.kappa * directions(2000))
     assert np.abs(symbol / stencil.symbol - 1).max() / 2 < bound

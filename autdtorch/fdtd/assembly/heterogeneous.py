@@ -205,7 +205,7 @@ def _transferred_mass(coupling: Array, mass: Array, touched: Index, shape: Shape
 def _uniform_cells(
     elements: Elements, touched: Index, hard: NDArray[np.bool_], shape: Shape, stencil: Stencil
 ) -> tuple[Index, Array, Array]:
-    """Return index, weight and mass of cells inside obstacles whose sound speed is not that of air."""
+    """Return index, weight and mass of cells inside obstacles with another sound speed than air."""
     factor, material = elements.materials.speed, _cell_material(elements)
     inside = (factor != 1)[material] & ~hard
     inside[touched] = False

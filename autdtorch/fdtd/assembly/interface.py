@@ -132,7 +132,7 @@ def _layered_coupling(
     """Return coupling coefficients (n, 28) of elements with faces across an axis, in product form.
 
     With p0 and p1 the pressures in the two planes of vertices, the energy is g (p1 - p0)^T W (p1 - p0), g
-    being the series mobility. In each plane it is that of air times a mobility t; a material counts for the
+    being the series mobility. Each plane has the energy of air times a mobility t; a material counts for the
     plane that holds its vertices, or half for each. The energy of each direction by itself must be positive,
     or waves grow in a boundary layer that the faces enter. Off-diagonal coupling in W reduces it, and is
     limited by t of the heavier side; the rest is moved to the diagonal.

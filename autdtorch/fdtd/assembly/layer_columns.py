@@ -32,7 +32,7 @@ _Part = tuple[Index, int, Array, Index]
 
 
 def row_scale(weight: Array, stencil: Stencil) -> Array:
-    """Return the sum of each stencil row (n, 27) over that of air."""
+    """Return the sums of stencil rows (n, 27), relative to air."""
     return np.asarray(weight.sum(axis=1) / stencil.total)
 
 

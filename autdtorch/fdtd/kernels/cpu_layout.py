@@ -62,7 +62,7 @@ class Memory:
     """
 
     def __init__(self, layers: tuple[Layer, ...]) -> None:
-        """Copy the memory of a state; that of x is used in place."""
+        """Copy the memory of a state, except the x layers, which are used in place."""
         self._layers = [[part.numpy() for part in layer] for layer in layers]
         x, (psi_y, zeta_y), (psi_z, _), (psi_yz, zeta_yz) = self._layers
         nx, ny, layer_cells = len(psi_z[0]), psi_z.shape[2], psi_z.shape[3] - 1

@@ -1,8 +1,8 @@
 """Sums of spherical waves on one core: sum_s amplitude_s e^{i k r} / r for several fields.
 
 Waves between one place and a block of others are vectorised. The others are the points or the sources,
-whichever are more. Distances and whole turns of the phase are in double precision, the rest in that of the
-amplitudes. The order of all sums is fixed.
+whichever are more. Distances and whole turns of the phase are in double precision, the rest in the
+precision of the amplitudes. The order of all sums is fixed.
 """
 
 from __future__ import annotations
