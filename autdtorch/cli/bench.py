@@ -294,7 +294,7 @@ def _deviating(
     matrix: torch.Tensor, boards: list[OpenMPDBoard], transducers: list[int]
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return transfer matrix and wiring of transducers that deviate as the boards' files say."""
-    wired = torch.tensor(transducers, device="cpu")
+    wired = torch.tensor(transducers, dtype=torch.int64, device="cpu")
     if not boards:
         return matrix, wired
     each = len(boards[0].pins)
@@ -303,7 +303,7 @@ def _deviating(
     pins = [each * number + pin for number, board in enumerate(boards) for pin in board.pins]
     return (
         torch.where(corrections == 0, 0, matrix / corrections),
-        torch.tensor(pins, device="cpu")[wired],
+        torch.tensor(pins, dtype=torch.int64, device="cpu")[wired],
     )
 
 

@@ -173,7 +173,7 @@ class TransducerArray:
     ) -> TransducerArray:
         """Return the array of a SonicSurface: 16 x 16 transducers row by row from the largest y, x fastest.
 
-        Arguments and errors as for `TransducerArray.autd3`; the default source strength is that of Ultraino.
+        Arguments and errors as for `TransducerArray.autd3`; the default source strength is Ultraino's.
         The order by channel, which the firmware needs, is applied when frames are encoded.
         """
         return cls(in_plane(sonicsurface_places(), center, normal, angle), normal, source_strength, radius)
@@ -199,8 +199,9 @@ class TransducerArray:
         """The monopoles of each transducer: one for a point, 80 for a disc.
 
         A disc of radius a has 5 rings at Gauss points in r^2, each of 16 equal angles and turned by half a
-        step against the next (Peirce, J. SIAM 5 (1957) 66-73). For k a <= 6 the error of the field is 1e-6 in
-        the far field at all angles, and 1e-4 of the largest pressure at a distance of a/2 from the disc.
+        step against the next (Peirce, J. SIAM 5 (1957) 66-73). For k a <= 6 the error in
+        the far field is 1e-6 at all angles. At a distance of a/2 from the disc it is 1e-4 of the largest
+        pressure.
         """
         if self.radius == 0:
             return Nodes(self.positions[:, None], torch.ones(1, dtype=torch.float64, device="cpu"))

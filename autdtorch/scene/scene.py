@@ -98,9 +98,9 @@ class Scene:
         everything, with a margin of two wavelengths on each side.
 
         Raises:
-            ValueError: a field of the wrong type or out of range, a coordinate beyond 1e6 m, a transducer or
-                control point in or on an obstacle, coincident points, a point outside the domain, or a medium
-                that absorbs more than 3 dB per wavelength.
+            ValueError: a field of the wrong type or out of range, or a coordinate beyond 1e6 m. Also a point
+                in or on an obstacle, coincident with another or outside the domain, or a medium that absorbs
+                more than 3 dB per wavelength.
 
         Warns:
             OverlapWarning: two obstacles of different materials overlap.

@@ -96,7 +96,7 @@ class BayesOpt(Method):
         trials = self._trials(problem, seeds)
         points = torch.stack([trial.initial_points() for trial in trials])
         search = {
-            "seeds": torch.tensor(seeds, device="cpu"),
+            "seeds": torch.tensor(seeds, dtype=torch.int64, device="cpu"),
             "points": points[:, :0],
             "scores": points[:, :0, 0],
             "next": points,
