@@ -216,7 +216,7 @@ SLOW = Box(CUBE.center, CUBE.size, density=100.0, sound_speed=100.0)
     [
         ({"method": "fem"}, "method: .*fem.*must be one of auto, free_space, box, full"),
         ({"spacing": 4e-3}, r"spacing: 0.004 m; must be at most 0.00283 m, 3 cells per .* in the medium"),
-        ({"spacing": 2e-5, "method": "full"}, r"spacing: 2e-05 m; (gives 1216 x 1216 x 1216 cells|needs about)"),
+        ({"spacing": 2e-5, "method": "full"}, "spacing: 2e-05 m; (gives 1216 x 1216 x 1216|needs about)"),
         ({"spacing": 1e-5, "method": "full"}, r"spacing: 1e-05 m; must be at least 1\.7e-05 m, 500 cells"),
         ({"spacing": float("nan")}, "spacing: nan"),
         ({"spacing": -1e-3}, "spacing: -0.001 m; must be finite and > 0"),

@@ -1,4 +1,4 @@
-"""Sums of spherical waves against Green's function, with more points than sources and with fewer."""
+"""Sums of spherical waves against Green's function."""
 
 from __future__ import annotations
 

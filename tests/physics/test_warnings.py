@@ -1,4 +1,4 @@
-"""Warnings of a scene and its grid: each once, for all obstacles, and none of grids that nobody asked for."""
+"""Warnings of a scene and its grid: each once for all obstacles, and none of auxiliary grids."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def of_two_speeds(extent: float) -> Scene:
 
 
 @pytest.mark.parametrize(("method", "extent"), [("box", 200e-3), ("full", 48e-3)])
-def test_a_coarse_spacing_is_told_once_for_all_obstacles(
+def test_a_coarse_spacing_is_logged_once_for_all_obstacles(
     method: str, extent: float, caplog: pytest.LogCaptureFixture
 ) -> None:
     propagator = simulated(of_two_speeds(extent), method, 2.5e-3)
@@ -65,7 +65,7 @@ def test_a_coarse_spacing_is_told_once_for_all_obstacles(
     assert "obstacle 0" not in message  # which is rigid
 
 
-def test_a_coarse_spacing_is_told_once_where_the_medium_is_differentiated(
+def test_a_coarse_spacing_is_logged_once_where_the_medium_is_differentiated(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     speed = torch.tensor([335.0], dtype=torch.float64, requires_grad=True)
@@ -75,7 +75,7 @@ def test_a_coarse_spacing_is_told_once_where_the_medium_is_differentiated(
     assert "the medium given" in message
 
 
-def test_no_grid_is_told_of_that_a_spacing_is_chosen_from(caplog: pytest.LogCaptureFixture) -> None:
+def test_pilot_grids_are_not_logged(caplog: pytest.LogCaptureFixture) -> None:
     scene = small_scene((BESIDE_ARRAY,))
     points = torch.cat((scene.control_points, scene.control_points - 0.5e-3))  # more than transducers
     simulated(dataclasses.replace(scene, control_points=points), "box", None, tolerance=0.5)
@@ -83,7 +83,7 @@ def test_no_grid_is_told_of_that_a_spacing_is_chosen_from(caplog: pytest.LogCapt
 
 
 @pytest.mark.parametrize("method", ["box", "full"])
-def test_a_source_beside_an_obstacle_is_told_once(method: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_source_beside_an_obstacle_is_logged_once(method: str, caplog: pytest.LogCaptureFixture) -> None:
     propagator = simulated(small_scene((BESIDE_ARRAY,)), method, 1.4e-3, tolerance=0.5)
     points = propagator.scene.control_points
     propagator.transfer_matrix()
@@ -96,19 +96,19 @@ def test_a_source_beside_an_obstacle_is_told_once(method: str, caplog: pytest.Lo
     assert len(messages(caplog, "of an obstacle")) == 1
 
 
-def test_runs_that_do_not_settle_are_told_of_together() -> None:
+def test_runs_that_do_not_converge_give_one_warning() -> None:
     propagator = simulated(small_scene((CUBE,)), "full", 1.4e-3, tolerance=1e-6, max_periods=8)
-    with pytest.warns(SteadyStateWarning, match=r" in (\d+) of \1 runs: ") as caught:  # on both grids
-        propagator.transfer_matrix(return_error=True)
-    assert len(caught) == 1
-    assert caught[0].filename == __file__
-    with pytest.warns(SteadyStateWarning, match=r" in 2 of 2 runs: ") as caught:
-        propagator.field(torch.stack((DRIVE, 1j * DRIVE)), propagator.scene.control_points)
-    assert len(caught) == 1
-    assert caught[0].filename == __file__
+    drives, points = torch.stack((DRIVE, 1j * DRIVE)), propagator.scene.control_points
+    for counts, call in (
+        (r"(\d+) of \1", lambda: propagator.transfer_matrix(return_error=True)),  # on both grids
+        ("2 of 2", lambda: propagator.field(drives, points)),
+    ):
+        with pytest.warns(SteadyStateWarning, match=f"after 8 periods in {counts} runs: ") as caught:
+            call()
+        assert [warning.filename for warning in caught] == [__file__]
 
 
-def test_walls_that_end_are_told_of_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_walls_that_end_are_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     walls = [
         Box((22e-3, 12e-3, 12e-3), (1e-3, 1.0, 1.0), density=2.0, sound_speed=AIR.sound_speed),
         *(Box((12e-3, y, 12e-3), (1.0, 1e-3, 1.0), density=2.0, sound_speed=340.0) for y in (1e-3, 23e-3)),
