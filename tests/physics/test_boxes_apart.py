@@ -1,4 +1,4 @@
-"""Obstacles far apart, a box each: as one box and as the whole domain, their coupling included."""
+"""Distant obstacles in boxes of their own, against one box and the whole domain."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from autdtorch.scene.scene import Scene
 EXTENT, SPACING, TOLERANCE = 64e-3, 1.4e-3, 1e-3
 NEAR = (13.8e-3, 15.2e-3, 15.2e-3)
 FAR = (NEAR[0] + 25 * SPACING, NEAR[1] + 24 * SPACING, NEAR[2] + 23 * SPACING)
-"""A sphere of 4 mm lies alike on the cells of its own box, of one box for both and of the domain."""
+"""Spheres of 4 mm have the same place on the cells of their own boxes, of one box and of the domain."""
 ARRAY = TransducerArray.grid((1, 2), pitch=8e-3, center=(1e-3, EXTENT / 2, EXTENT / 2))
 POINTS = [[61e-3, 52e-3, 55e-3]]
 
@@ -106,7 +106,7 @@ def test_near_obstacles_share_a_box_and_far_ones_where_that_is_cheaper() -> None
     assert sorted(grouping.groups) == [(0, 2), (1,)]
     assert grouping.box_cost(1) < one_box(region_of(scene), 1e-3).box_cost(1)
     # on coarse cells boundary layers fill each box: one is cheaper
-    assert cheapest(scene, 2.8e-3) == one_box(region_of(scene), 2.8e-3)
+    assert len(cheapest(scene, 2.8e-3).groups) == 1
 
 
 def cheapest(scene: Scene, spacing: float) -> Grouping:
@@ -138,11 +138,9 @@ def test_boxes_that_need_many_passes_are_joined() -> None:
     assert _cells(two)[0] * two.runs[0].periods > 2 * _cells(one)[0] * one.runs[0].periods
 
 
-def test_large_boxes_whose_surfaces_cost_more_than_the_air_between_are_joined() -> None:
+def test_large_boxes_whose_coupling_costs_more_than_the_air_between_are_joined() -> None:
     """Steps alone would favour two boxes, 0.8 to 1; the sums between them take as long once more."""
-    scene = cubes(36e-3, 180e-3)
-    assert cheapest(scene, 2e-3) == one_box(region_of(scene), 2e-3)
-    assert len(cheapest(cubes(36e-3, 360e-3), 2e-3).groups) == 2
+    assert [len(cheapest(cubes(36e-3, gap), 2e-3).groups) for gap in (180e-3, 360e-3)] == [1, 2]
 
 
 @pytest.mark.parametrize("edge", [16e-3, 36e-3])
@@ -157,7 +155,7 @@ def test_coupled_pairs_are_counted_from_the_geometry(edge: float) -> None:
 
 
 def test_plates_that_face_each_other_share_a_box() -> None:
-    """Between them sound goes to and fro: passes would be too many."""
+    """Multiple reflections between them would need too many passes."""
     plate = Box((12e-3, 32e-3, 32e-3), (2e-3, 50e-3, 50e-3), rigid=True)
     other = dataclasses.replace(plate, center=(42e-3, 32e-3, 32e-3))
     scene = far_apart(plate, other)

@@ -1,4 +1,4 @@
-"""Mirror images: one run stands for all points, or all transducers, that are images of each other."""
+"""Symmetry orbits: one run serves all points, or all transducers, that are images of each other."""
 
 from __future__ import annotations
 
@@ -31,8 +31,7 @@ CUBE = Box(MIDDLE, (5.3e-3, 6.1e-3, 6.1e-3), **HEAVY)
 FOCI = circle_points((21.3e-3, 12e-3, 12e-3), radius=7.3e-3, count=4, normal=(1, 0, 0))
 
 SETTLED = 1e-6
-"""Tolerance of the runs that are compared. Rounding makes them differ by up to about as much: the limit is
-extrapolated from differences that small. An image that is a wrong one differs by 1."""
+"""Tolerance of compared runs. Rounding makes them differ by about as much, wrong images by 1."""
 
 
 def scene(
@@ -56,8 +55,11 @@ def count(scene: Scene, method: str = "box") -> int:
 @pytest.mark.parametrize("name", ["two_cubes", "three_cubes", "sphere"])
 @pytest.mark.parametrize("spacing", [2e-3, 1.3e-3, 0.75e-3])
 def test_the_papers_scenes_take_one_run(name: str, spacing: float) -> None:
-    paper = load_scene(SCENES / f"{name}.yaml")
-    assert simulated(paper, "box", spacing).planned_runs == 1
+    assert simulated(load_scene(SCENES / f"{name}.yaml"), "box", spacing).planned_runs == 1
+
+
+def test_points_that_are_no_images_have_runs_of_their_own() -> None:
+    assert simulated(scene(CUBE, points=torch.cat((FOCI[:2], FOCI[:1] + 1e-3)))).planned_runs == 2
 
 
 @pytest.mark.parametrize("method", ["box", "full"])
@@ -83,11 +85,6 @@ def test_images_of_transducers(method: str) -> None:
     assert relative_error(matrix[:, 2:], torch.stack(direct, dim=1)) < SETTLED
 
 
-def test_points_that_are_no_images_run_by_themselves() -> None:
-    points = torch.cat((FOCI[:2], FOCI[:1] + 1e-3))
-    assert simulated(scene(CUBE, points=points)).planned_runs == 2
-
-
 SMALL = Sphere((12e-3, 12e-3, 17.5e-3), 1.4e-3, **HEAVY)
 PAIR = Sphere((12e-3, 12e-3, 6.5e-3), 1.4e-3, **HEAVY)
 TILTED = torch.tensor([[1.0, 0, 0]] * 3 + [[1, 0.01, 0]])
@@ -110,17 +107,17 @@ TILTED = torch.tensor([[1.0, 0, 0]] * 3 + [[1, 0.01, 0]])
         (8, scene(CUBE, array=TransducerArray(ARRAY.positions, (1, 0, 0), radius=2e-3))),
     ],
 )
-def test_what_breaks_a_symmetry(left: int, changed: Scene) -> None:
+def test_changes_break_symmetries(left: int, changed: Scene) -> None:
     assert count(changed) == left
 
 
-def test_the_domain_counts_where_it_is_simulated() -> None:
+def test_the_domain_has_an_effect_where_it_is_simulated() -> None:
     longer = scene(CUBE, extent=27e-3)
     assert count(longer, "full") == 2
     assert count(longer, "box") == 8
 
 
-def test_the_order_of_overlapping_obstacles_counts() -> None:
+def test_the_order_of_overlapping_obstacles_has_an_effect() -> None:
     left, right = (Box((12e-3, 12e-3, z), (4e-3, 4e-3, 4e-3), **HEAVY) for z in (9.5e-3, 14.5e-3))
     between = Box(MIDDLE, (4e-3, 4e-3, 3e-3), density=2.0, sound_speed=340.0)
     for order, left_over in (((left, right, between), 4), ((left, between, right), 2)):
@@ -148,7 +145,7 @@ def test_voxels_need_not_know_their_symmetries() -> None:
 
 
 def image(obstacle: Obstacle, exchange: bool, signs: tuple[int, int]) -> Obstacle:
-    """With y and z exchanged, if so wanted, and then mirrored about the middle."""
+    """The image of an obstacle with y and z exchanged or not, then mirrored about the middle."""
     order = [0, 2, 1] if exchange else [0, 1, 2]
     middle, sign = np.array(MIDDLE), np.array((1, *signs))
     center = tuple(middle + sign * (np.array(obstacle.center) - middle)[order])  # type: ignore[attr-defined]
@@ -202,7 +199,7 @@ def test_random_symmetric_scenes(obstacle: Obstacle, spacing: float) -> None:
 @settings(max_examples=6)
 @given(OBSTACLES, st.floats(1.2e-3, 1.6e-3), st.floats(0.05e-3, 1e-3))
 def test_random_asymmetric_scenes(obstacle: Obstacle, spacing: float, shift: float) -> None:
-    """A sphere in the middle, which alone has all symmetries, and a body off every plane of symmetry."""
+    """A sphere in the middle and a body off every plane of symmetry."""
     x, y, _ = obstacle.center  # type: ignore[attr-defined]
     off = replace(obstacle, center=(x, y, y + shift))  # type: ignore[call-arg]
     with warnings.catch_warnings():

@@ -1,4 +1,4 @@
-"""What would not fit into memory is refused before it is allocated, and control groups count."""
+"""Arguments that need more memory than available are refused; control groups limit it."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ HUGE: dict[str, tuple[str, Callable[[], object]]] = {
 
 
 @pytest.mark.parametrize("what", HUGE)
-def test_what_would_not_fit_is_refused_with_both_figures(what: str) -> None:
+def test_too_much_memory_is_refused_with_both_figures(what: str) -> None:
     field, call = HUGE[what]
     with pytest.raises(ValueError, match=rf"^{field}: .* needs about .* GB of memory, .* may use .* GB$"):
         call()
@@ -56,13 +56,12 @@ def test_what_would_not_fit_is_refused_with_both_figures(what: str) -> None:
 def test_many_points_are_refused(propagator: Propagator, monkeypatch: pytest.MonkeyPatch) -> None:
     points = at.circle_points((0.1, 0, 0), 0.02, 5000, (1, 0, 0))
     monkeypatch.setattr(memory, "available_memory", lambda: 1_000_000)
-    with pytest.raises(ValueError, match=r"^points: \(5000, 3\); needs about"):
-        propagator.transfer_matrix(points)
-    with pytest.raises(ValueError, match=r"^points: \(5000, 3\); needs about"):
-        propagator.field(DRIVE.expand(3, 4), points)
+    for call in (propagator.transfer_matrix, functools.partial(propagator.field, DRIVE.expand(3, 4))):
+        with pytest.raises(ValueError, match=r"^points: \(5000, 3\); needs about"):
+            call(points)
 
 
-def test_many_transducers_are_told_apart_without_a_matrix_of_them() -> None:
+def test_many_transducers_need_no_matrix_of_their_distances() -> None:
     array = at.TransducerArray.grid((300, 300), 10e-3, (0, 0, 0))  # 65 GB, if it took one
     assert len(array) == 90_000
 
@@ -87,7 +86,7 @@ def test_a_study_needs_the_memory_of_a_block_of_its_trials(monkeypatch: pytest.M
     assert len(study.scenes["a"].methods["random"].solution.score) == 300
 
 
-def test_a_spacing_that_is_chosen_is_refused_by_the_tolerance(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_chosen_spacing_is_refused_by_the_tolerance(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = small_scene((CUBE,))
     coarse = at.estimate(scene, 2e-3, method="box").memory
     monkeypatch.setattr(memory, "available_memory", lambda: int(3 * coarse))

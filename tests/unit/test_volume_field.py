@@ -1,4 +1,4 @@
-"""The field in the whole domain: where it is sampled, and what is left out."""
+"""The field in the whole domain."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from small_scenes import small_scene
 import autdtorch as at
 
 
-def test_a_volume_holds_the_field_of_its_points_but_in_obstacles_and_next_to_transducers() -> None:
+def test_a_volume_is_the_field_outside_obstacles_and_away_from_transducers() -> None:
     ball = at.Sphere((40e-3, 40e-3, 40e-3), 9e-3, rigid=True)
     scene = small_scene((ball,), extent=80e-3)
     propagator = at.make_propagator(scene, method="free_space")
