@@ -14,8 +14,8 @@ from autdtorch.propagators.full import DomainSimulation
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.simulation import Simulation, TransferMatrix
 from autdtorch.utils.digest import digest_of
-from autdtorch.utils.provenance import package_versions, source_digest
 from autdtorch.utils.threads import one_torch_thread
+from autdtorch.utils.versions import package_versions, source_digest
 
 logger = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ import autdtorch
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import replace_file
 from autdtorch.utils.json_lines import line_of, row_of
-from autdtorch.utils.provenance import package_versions, source_digest
+from autdtorch.utils.versions import package_versions, source_digest
 
 PROVENANCE_FILE = "provenance.json"
 
