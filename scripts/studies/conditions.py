@@ -176,7 +176,7 @@ def true_scores(outcomes: Outcomes, scene: str) -> str:
         [condition, *(f"{outcomes[scene, condition, method].true.mean():.2f}" for method in methods)]
         for condition in keys(outcomes, 1)
     ]
-    return table(["condition", *methods], rows)
+    return table(["perturbation", *methods], rows)
 
 
 @styled
