@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import warnings
 from collections import Counter
@@ -304,16 +303,6 @@ def _warn_of_overlaps(obstacles: tuple[Obstacle, ...]) -> None:
             OverlapWarning,
             stacklevel=3,
         )
-
-
-def with_obstacles(scene: Scene, obstacles: Iterable[Obstacle]) -> Scene:
-    """Return the scene with other obstacles: some of its own, or all with other materials.
-
-    The geometry is not checked again.
-    """
-    changed = copy.copy(scene)
-    object.__setattr__(changed, "obstacles", tuple(obstacles))
-    return changed
 
 
 def _material(obstacle: Obstacle) -> tuple[float | None, float | None, bool]:
