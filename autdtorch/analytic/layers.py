@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from autdtorch.utils.arrays import ComplexArray
+from autdtorch.utils.array_types import ComplexArray
 from autdtorch.utils.validation import ArrayLike, invalid, positive, real_tensor
 
 

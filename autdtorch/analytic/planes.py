@@ -8,7 +8,7 @@ import torch
 from autdtorch.analytic.green import green
 from autdtorch.analytic.layers import HalfSpace, Layering, Slab, vertical_wavenumber
 from autdtorch.analytic.sommerfeld import sommerfeld_integral
-from autdtorch.utils.arrays import ComplexArray
+from autdtorch.utils.array_types import ComplexArray
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,

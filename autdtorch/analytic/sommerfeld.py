@@ -11,7 +11,7 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.special import hankel1, jv
 
 from autdtorch.analytic.layers import vertical_wavenumber
-from autdtorch.utils.arrays import ComplexArray
+from autdtorch.utils.array_types import ComplexArray
 
 Spectrum = Callable[[ComplexArray], ComplexArray]
 

@@ -16,7 +16,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 
 from autdtorch import hardware
-from autdtorch.cli.bench import Bench
+from autdtorch.cli.bench_config import Bench
 from autdtorch.cli.method_section import load_method
 from autdtorch.cli.settings import folder_of, is_given, scene_of, section_of, solver_of
 from autdtorch.hardware.sensors.sensor import checked_reading

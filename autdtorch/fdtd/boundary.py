@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from autdtorch.utils.arrays import Array
+from autdtorch.utils.array_types import Array
 
 TUNED_ANGLES = np.radians((0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 55.0, 60.0, 65.0, 70.0, 75.0, 80.0))
 """Angles of incidence at which the profile is fitted [rad]."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.placement import grid_offset
 from autdtorch.fdtd.region import Region, Shape
-from autdtorch.utils.arrays import Array
+from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import invalid, positive
 
 logger = logging.getLogger(__name__)

@@ -22,7 +22,7 @@ from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.stencil import OFFSETS, Stencil
 from autdtorch.fdtd.stepping import Assembly, air_stencil, assembly_of
-from autdtorch.utils.arrays import Array, Index
+from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.validation import fluid
 
 _STEP = 1e-4

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from autdtorch.fdtd.region import Region, Shape
-from autdtorch.utils.arrays import Array
+from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
 _ALIGNED = 1 - 1e-9

@@ -20,7 +20,7 @@ from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.superposition import superposition
-from autdtorch.utils.arrays import Index
+from autdtorch.utils.array_types import Index
 
 _BESIDE = 1.25
 """Distance [cells] from the rim of the interior within which points are not read from the grid. Interpolation

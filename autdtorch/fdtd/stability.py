@@ -19,7 +19,7 @@ from scipy.linalg import eigvalsh_tridiagonal
 from scipy.sparse import csr_array
 
 from autdtorch.fdtd.stencil import Stencil, flat_offsets
-from autdtorch.utils.arrays import Array
+from autdtorch.utils.array_types import Array
 
 logger = logging.getLogger(__name__)
 

@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from autdtorch.utils.arrays import Array
+from autdtorch.utils.array_types import Array
 
 OFFSETS = tuple((x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1))
 """The 27 neighbour offsets in row-major order; entry 13 is the cell itself."""

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 import torch
 
-from autdtorch.utils.arrays import AnyArray
+from autdtorch.utils.array_types import AnyArray
 from autdtorch.utils.threads import spread
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 

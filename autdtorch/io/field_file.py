@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 import torch
 
-from autdtorch.utils.arrays import Array
+from autdtorch.utils.array_types import Array
 from autdtorch.utils.files import replacing
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,

@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 
 from autdtorch.scene.drive import phases_of, validate_single_drive
-from autdtorch.utils.arrays import Array
+from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import ArrayLike, invalid, magnitude_tensor, real_tensor, require_kind
 
 ByMethod: TypeAlias = Mapping[str, ArrayLike]

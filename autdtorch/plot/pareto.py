@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 
 from autdtorch.plot.data import ByMethod, by_scene, methods_of, numbers, require_each
 from autdtorch.plot.style import TICK_SIZE, Look, add_legend, label_of, log_axes, looks_of, new_panels, styled
-from autdtorch.utils.arrays import Array
+from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import ArrayLike, boolean, invalid, members, require_kind
 
 _FRONT: dict[str, Any] = {"color": "0.8", "linewidth": 4.0, "solid_joinstyle": "miter", "zorder": 1.0}

@@ -25,7 +25,7 @@ from autdtorch.plot.data import (
 from autdtorch.plot.style import TICK_SIZE, label_of, new_figure, readable, styled, wrapped
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Obstacle
-from autdtorch.utils.arrays import Array
+from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import ArrayLike, boolean, members, points_tensor, require_kind
 
 _AXIS_TOLERANCE = 1e-12  # deviation from 1 of the coordinate of a unit vector along x, y or z

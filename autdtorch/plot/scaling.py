@@ -12,7 +12,7 @@ from matplotlib.ticker import FixedLocator, NullLocator
 
 from autdtorch.plot.data import ByMethod, labelled, methods_of
 from autdtorch.plot.style import TICK_SIZE, Look, label_of, log_axes, looks_of, new_figure, styled
-from autdtorch.utils.arrays import Array
+from autdtorch.utils.array_types import Array
 
 OVERHEAD = 2.0
 """Lower limit of the fitted costs, over the smallest cost: constant overhead is then at most half of each."""

@@ -27,7 +27,7 @@ from autdtorch.plot.data import MM, single_drive_phases
 from autdtorch.plot.style import TICK_SIZE, new_figure, styled
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.arrays import Array
+from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import ArrayLike, Vector, require_kind
 
 _TICKS = 5  # along the longest side; on a short side as many would overlap

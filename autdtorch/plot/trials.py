@@ -25,7 +25,7 @@ from autdtorch.plot.style import (
     styled,
     wrapped,
 )
-from autdtorch.utils.arrays import Array
+from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import finite_number, require_kind
 
 # The first is broad and pale, so that lines on it stay visible.

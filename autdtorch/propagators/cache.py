@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from autdtorch.utils.arrays import AnyArray, ComplexArray
+from autdtorch.utils.array_types import AnyArray, ComplexArray
 from autdtorch.utils.files import replace_file
 
 logger = logging.getLogger(__name__)

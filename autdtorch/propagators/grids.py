@@ -25,7 +25,7 @@ from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.steady_state import fewest_periods
 from autdtorch.fdtd.stencil import tuned_stencil
-from autdtorch.utils.arrays import Array
+from autdtorch.utils.array_types import Array
 
 logger = logging.getLogger(__name__)
 

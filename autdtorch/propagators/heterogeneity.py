@@ -9,7 +9,7 @@ import numpy as np
 from autdtorch.fdtd.grid import layer_cells
 from autdtorch.fdtd.region import Region
 from autdtorch.scene.obstacles import Mesh
-from autdtorch.utils.arrays import Array
+from autdtorch.utils.array_types import Array
 
 _BESIDE_RIGID, _BESIDE_FLUID, _SHARE_INSIDE = 1.5, 2.0, 0.5
 """Heterogeneous cells for each area of a cell of a rigid or fluid surface; their share of the cuboid around

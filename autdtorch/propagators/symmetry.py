@@ -21,7 +21,7 @@ from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.stencil import OFFSETS
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.scene.arrays import Nodes
-from autdtorch.utils.arrays import Array, Index
+from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
 _ROUNDING = 1e-6

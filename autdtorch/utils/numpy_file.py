@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.lib import format as npy
 
-from autdtorch.utils.arrays import AnyArray
+from autdtorch.utils.array_types import AnyArray
 
 _LARGEST = 2**30  # [bytes] of unpacked arrays; a small file can hold many zeros
 _LONGEST_HEADER = 1000  # [bytes]; NumPy writes 128 for plain arrays

@@ -24,7 +24,7 @@ from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.stability import fewest_steps, whole_steps
 from autdtorch.fdtd.stencil import tuned_stencil
 from autdtorch.fdtd.stepping import RAMP_PERIODS, drive_dft, drive_signal
-from autdtorch.utils.arrays import Array
+from autdtorch.utils.array_types import Array
 
 DEGREES = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0)
 

@@ -28,7 +28,7 @@ from autdtorch.fdtd.kernels.contract import Receivers, Sources, State
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, assemble, drive_dft, drive_signal
 from autdtorch.propagators.scene_region import region_of
-from autdtorch.utils.arrays import Array
+from autdtorch.utils.array_types import Array
 
 FEWEST_PERIODS = 3 * RAMP_PERIODS
 """Shortest driven run; in a scene with a fast obstacle a period has hundreds of steps."""

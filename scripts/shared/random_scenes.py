@@ -21,7 +21,7 @@ from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
 from autdtorch.scene.scene import Medium, OverlapWarning, Scene
-from autdtorch.utils.arrays import Array
+from autdtorch.utils.array_types import Array
 
 AIR = Medium(density=1.2, sound_speed=340.0)
 FREQUENCY = 40e3

@@ -14,7 +14,7 @@ import torch
 from filelock import FileLock
 
 import autdtorch.cli.hardware_command
-from autdtorch.cli.bench import indices_of
+from autdtorch.cli.bench_config import indices_of
 from autdtorch.hardware import LinkError, OffError
 from autdtorch.io.drive_file import load_drive
 from autdtorch.io.scene_file import load_scene

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from autdtorch.fdtd.assembly.constants import SUBCELLS
 from autdtorch.fdtd.stencil import Stencil
-from autdtorch.utils.arrays import Array, Index
+from autdtorch.utils.array_types import Array, Index
 
 VERTICES = np.array(list(itertools.product((0, 1), repeat=3)))
 """Offsets of the eight vertices of an element [cells]."""

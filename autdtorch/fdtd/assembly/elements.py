@@ -16,7 +16,7 @@ from autdtorch.fdtd.assembly.interface import interface_elements
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Fluid, Region, Shape
 from autdtorch.fdtd.stencil import Stencil
-from autdtorch.utils.arrays import Array, Index
+from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.progress import show_progress
 
 _CHUNK = 4096

@@ -30,7 +30,7 @@ from autdtorch.fdtd.assembly.element import (
 )
 from autdtorch.fdtd.assembly.elements import Elements
 from autdtorch.fdtd.stencil import Stencil, flat_offsets
-from autdtorch.utils.arrays import Array, Index
+from autdtorch.utils.array_types import Array, Index
 
 logger = logging.getLogger(__name__)
 

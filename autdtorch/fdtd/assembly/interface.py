@@ -42,7 +42,7 @@ from autdtorch.fdtd.assembly.element import (
 )
 from autdtorch.fdtd.assembly.moments import distance_to_material, line_shares, subcell_means, volume_shares
 from autdtorch.fdtd.stencil import Stencil
-from autdtorch.utils.arrays import Array, Index
+from autdtorch.utils.array_types import Array, Index
 
 _SECOND = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 """Axes of the second derivatives in a quadratic fit."""

@@ -19,7 +19,7 @@ from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.kernels.contract import Columns
 from autdtorch.fdtd.stencil import OFFSETS, Stencil, flat_strides
-from autdtorch.utils.arrays import Array, Index
+from autdtorch.utils.array_types import Array, Index
 
 _ROUNDING = 1e-6
 """Differences from scaled air below this, relative to a face's weight, are rounding."""

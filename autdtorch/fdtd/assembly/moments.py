@@ -8,7 +8,7 @@ import numpy as np
 
 from autdtorch.fdtd.assembly.constants import FAR, SUBCELLS
 from autdtorch.fdtd.assembly.element import PAIRS, VERTICES
-from autdtorch.utils.arrays import Array, Index
+from autdtorch.utils.array_types import Array, Index
 
 _LOW = np.arange(SUBCELLS)
 _LINES = np.ravel_multi_index(

@@ -29,7 +29,7 @@ from autdtorch.fdtd.kernels.cpu_workers import (
     wait_for,
     yield_address,
 )
-from autdtorch.utils.arrays import AnyArray
+from autdtorch.utils.array_types import AnyArray
 from autdtorch.utils.threads import thread_count
 
 _CHUNK_CELLS, _CHUNK_PLANES = 200_000, 32

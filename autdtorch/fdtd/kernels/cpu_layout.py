@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from autdtorch.fdtd.kernels.contract import Coefficients, Layer
-from autdtorch.utils.arrays import AnyArray
+from autdtorch.utils.array_types import AnyArray
 
 Profile = tuple[AnyArray, AnyArray, AnyArray, AnyArray]
 """b and a of the half cells, then b and a of the cells, repeated as `stretch` reads them."""

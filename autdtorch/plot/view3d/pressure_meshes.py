@@ -13,7 +13,7 @@ from autdtorch.plot.data import MM, plane_magnitude
 from autdtorch.plot.view3d.scene_meshes import FIELD_BAR, add_bar
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.arrays import Array
+from autdtorch.utils.array_types import Array
 from autdtorch.utils.neighbours import distances
 from autdtorch.utils.validation import ArrayLike, magnitude_tensor, positive
 

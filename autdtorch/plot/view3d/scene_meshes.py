@@ -20,7 +20,7 @@ from autdtorch.plot.data import MM, single_drive_phases
 from autdtorch.scene.drive import amplitudes_of
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.arrays import Array
+from autdtorch.utils.array_types import Array
 from autdtorch.utils.neighbours import nearest_other
 from autdtorch.utils.validation import ArrayLike, Vector
 

@@ -11,7 +11,7 @@ import torch
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.base import Obstacle
 from autdtorch.scene.obstacles.mesh_file import read_obj, read_ply
-from autdtorch.utils.arrays import Array, Index
+from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.validation import Vector, finite_vector, invalid, path_of, positive
 
