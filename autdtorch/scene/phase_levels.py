@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 import torch
 
-from autdtorch.scene.drive import amplitudes_of, drive_from_phases, phases_of
-
 
 @dataclass(frozen=True)
 class PhaseLevels:
@@ -32,20 +30,21 @@ class PhaseLevels:
         """Return the levels nearest to a drive.
 
         Args:
-            drive: (..., M), complex, |q| <= 1.
+            drive: (..., M), complex128, |q| <= 1; not checked.
 
         Returns:
             Levels of phase and amplitude (..., M), int64; float64 for a continuous amplitude. The level of
             the phase is 0 where the amplitude is 0.
         """
-        wanted = amplitudes_of(drive).clamp_max(1)  # above 1 by rounding alone
+        wanted = drive.abs().clamp_max(1)  # above 1 by rounding alone
         if self.amplitudes is None:
             amplitude = wanted
         elif self.pulses:
             amplitude = (self.phases / math.pi * wanted.asin()).round().long()
         else:
             amplitude = (self.amplitudes * wanted + 0.5).long()
-        ahead = (phases_of(drive) / self._step - self._delay(amplitude)).round()
+        phase = torch.remainder(-drive.angle(), 2 * math.pi)
+        ahead = (phase / self._step - self._delay(amplitude)).round()
         return torch.where(amplitude > 0, -ahead.long() % self.phases, 0), amplitude
 
     def drive(self, phase: torch.Tensor, amplitude: torch.Tensor) -> torch.Tensor:
@@ -56,7 +55,7 @@ class PhaseLevels:
         elif self.amplitudes is not None:
             emitted = emitted / self.amplitudes
         ahead = (-phase % self.phases).double() + self._delay(amplitude)
-        return drive_from_phases(ahead * self._step, emitted)
+        return torch.polar(emitted, -(ahead * self._step))
 
     @property
     def _step(self) -> float:

@@ -122,7 +122,7 @@ def test_a_file_that_does_not_change_or_holds_something_else_is_an_error_in_time
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs a pseudo-terminal")
-def test_a_signal_just_before_somebody_is_waited_for_is_heard(monkeypatch):
+def test_a_signal_just_before_the_wait_for_an_answer_is_not_missed(monkeypatch):
     def interrupted(*_: object) -> None:
         signal.raise_signal(signal.SIGTERM)
 

@@ -162,7 +162,7 @@ def test_an_ft232r_gets_all_settings_that_another_program_may_have_changed():
 
 def test_the_echo_of_a_row_of_boards_is_read_and_dropped():
     class Waiting(EmulatedCdc):
-        """As on LUFA 100807: bytes from the board go first, and wait for the host to read them."""
+        """A chip on LUFA 100807: bytes from the board go first, and wait for the host to read them."""
 
         unread = 0
 

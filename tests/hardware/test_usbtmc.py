@@ -20,10 +20,10 @@ class Echo:
 
     def __init__(self, said: bytes) -> None:
         self.said = said
-        self.heard: list[str] = []
+        self.lines: list[str] = []
 
     def execute(self, line: str) -> bytes:
-        self.heard.append(line)
+        self.lines.append(line)
         return self.said
 
 
@@ -71,7 +71,7 @@ def test_a_block_of_any_bytes_comes_back_from_transfers_of_any_length(data, long
     port, echo = port_to(f"#3{len(data):03d}".encode() + data + b"\n", longest, empty)
     for _ in range(2):
         assert port.ask_block(":WAV:DATA?") == data
-    assert echo.heard == 2 * [":WAV:DATA?"]
+    assert echo.lines == 2 * [":WAV:DATA?"]
 
 
 def test_what_broke_off_is_cleared_before_the_first_question():
@@ -79,7 +79,7 @@ def test_what_broke_off_is_cleared_before_the_first_question():
     instrument = EmulatedInstrument(*CHIP, "E1", echo)
     instrument.write(message(TELL, 1, 4, 0, b"*RST"))  # a message that does not end
     assert UsbtmcPort(find_device([CHIP], backend=EmulatedBus([instrument]))).ask("*OPC?") == "1"
-    assert echo.heard == ["*OPC?"]
+    assert echo.lines == ["*OPC?"]
 
 
 def test_an_answer_that_nobody_read_is_read_before_the_clear_is_done():

@@ -98,8 +98,9 @@ class Device(ABC):
         Raises:
             ValueError: not finite complex numbers, no axis, or an amplitude above 1.
         """
-        tensor = complex_tensor("drive", drive).detach()
-        return self.phase_levels.nearest(validate_drive(tensor, tensor.shape[-1] if tensor.ndim else 0))
+        tensor = drive if isinstance(drive, torch.Tensor) else complex_tensor("drive", drive)
+        checked = validate_drive(tensor, tensor.shape[-1] if tensor.ndim else 0)
+        return self.phase_levels.nearest(checked.detach())
 
     def drive(self, *levels: ArrayLike) -> torch.Tensor:
         """Return the drive (..., M), complex128, that the device emits for levels as of `levels`.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cmath
 import math
+from functools import cache
 from typing import ClassVar
 
 import numpy as np
@@ -79,6 +80,7 @@ class SonicSurfaceFirmware:
         return by_channel[torch.from_numpy(sonicsurface_channels())]
 
 
+@cache
 def sonicsurface_channels() -> NDArray[np.intp]:
     """Return the FPGA channel (256,) of each transducer, row by row.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cmath
 import itertools
 import math
+from functools import cache
 from typing import ClassVar
 
 import numpy as np
@@ -120,6 +121,7 @@ class UltrainoFirmware:
         return torch.tensor(played, dtype=torch.complex128, device="cpu")
 
 
+@cache
 def ultraino_pins() -> NDArray[np.intp]:
     """Return the pin (64,) of the Arduino's ports of each transducer: 8 times the port, plus the bit.
 
