@@ -126,7 +126,7 @@ def _finish_columns(p, q, columns, memory):  # type: ignore[no-untyped-def]
 
 @entry()
 def _advance(  # type: ignore[no-untyped-def]
-    p, q, medium, layers, cells, room, columns, memory, closed, sources, receivers, signal, recorded,
+    p, q, medium, layers, cells, room, columns, memory, sound_hard, sources, receivers, signal, recorded,
     counters, give_way,
 ):  # fmt: skip
     """Do tasks until none is left; each worker calls this with the same arguments.
@@ -154,8 +154,8 @@ def _advance(  # type: ignore[no-untyped-def]
         elif c == 0:
             if len(columns[0][0]):
                 _finish_columns(now, new, columns, memory)
-            for n in range(len(closed)):
-                new[closed[n]] = 0
+            for n in range(len(sound_hard)):
+                new[sound_hard[n]] = 0
         finish(counters)
 
 
