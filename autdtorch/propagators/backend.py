@@ -13,7 +13,6 @@ from autdtorch.utils.validation import invalid, require_one_of
 logger = logging.getLogger(__name__)
 
 KERNELS = ("auto", "cpu", "cuda", "reference")
-DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
 def available_kernel(name: str) -> str:
@@ -55,5 +54,5 @@ def precision_of(dtype: str | torch.dtype) -> torch.dtype:
         ValueError: another precision.
     """
     name = str(dtype).removeprefix("torch.") if isinstance(dtype, torch.dtype) else dtype
-    require_one_of("dtype", name, tuple(DTYPES))
-    return DTYPES[name]
+    require_one_of("dtype", name, ("float32", "float64"))
+    return torch.float32 if name == "float32" else torch.float64

@@ -72,8 +72,8 @@ def estimate(
     """Estimate the cost of the transfer matrix of a scene's control points from its plan.
 
     Symmetries are found on a coarse grid, if that fits into memory. The speed of the kernel is measured once
-    in a process, on a box of air. The resonances of obstacles are not known in advance: the time is that of a
-    usual scene, and within a factor of two for most. An error estimate (`return_error`) takes a fifth more.
+    in a process, on a box of air. Resonances are not known in advance: the time assumes usual ones, and is
+    within a factor of two for most scenes. An error estimate (`return_error`) takes a fifth more.
 
     Args:
         scene: the scene.

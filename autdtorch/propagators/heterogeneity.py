@@ -39,8 +39,8 @@ def heterogeneity(region: Region, spacing: float, whole_domain: bool) -> Heterog
     Args:
         region: the region.
         spacing: edge of a cell [m].
-        whole_domain: whether the grid is that of the domain, whose boundary layers continue the obstacles, or
-            boxes that hold all obstacles.
+        whole_domain: True for a grid of the domain, whose boundary layers continue the obstacles; False for
+            boxes around all obstacles.
     """
     inner = outer = np.array([[-np.inf] * 3, [np.inf] * 3])
     if whole_domain:

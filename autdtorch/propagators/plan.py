@@ -61,7 +61,7 @@ class Plan:
 
     Attributes:
         scene: the scene.
-        region: the solver's region of the scene.
+        region: what the solver simulates of it.
         method: "free_space", "box" or "full".
         spacing: edge of a cell [m]; of no effect in free space.
         tolerance: relative distance to the steady state at which a run ends.
@@ -149,9 +149,17 @@ class Plan:
         """Most cells of a grid whose phasors a run keeps."""
         if self.method == "box":
             return max(grid.radiating for grid in self.grouping.grids)
-        return min(
-            self.cells, self._receivers * interpolation_width(self.region.wavenumber * self.spacing) ** 3
-        )
+        return min(self.cells, self._receivers * self._width**3)
+
+    @property
+    def _width(self) -> int:
+        """Cells per axis of the interpolation kernel of a point."""
+        return interpolation_width(self.region.wavenumber * self.spacing)
+
+    @property
+    def source_clearance(self) -> float:
+        """Distance [m] from obstacles within which a source is less accurate."""
+        return self.spacing * self._width / 2
 
     @property
     def _at_once(self) -> int:
@@ -188,7 +196,7 @@ def plan(
 ) -> Plan:
     """Plan the simulation of a scene; the arguments are those of `make_propagator`.
 
-    Without a `spacing` the plan is that of the coarse grid from which a spacing is chosen.
+    Without a `spacing`, plan the coarse grid from which a spacing is chosen.
 
     Raises:
         ValueError: an argument is out of range, or the kernel needs a package that is not installed.

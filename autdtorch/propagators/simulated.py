@@ -94,7 +94,7 @@ class SimulatedPropagator:
 
     @cached_property
     def _second(self) -> SimulatedPropagator:
-        """The same simulation on another grid, for the error estimate."""
+        """A simulation on another grid, for the error estimate."""
         return SimulatedPropagator(self._plan.second, self._cache)
 
     @overload
@@ -200,7 +200,7 @@ class SimulatedPropagator:
             if any(map(simulation.near_obstacle, self.scene.array.nodes.positions)):
                 logger.warning(
                     "a source is within %.2g mm of an obstacle: less accurate; use a finer spacing than %.2g"
-                    " mm", 1e3 * simulation.source_clearance, 1e3 * self.spacing,
+                    " mm", 1e3 * self._plan.source_clearance, 1e3 * self.spacing,
                 )  # fmt: skip
         unsettled = [run for run in runs if not run.reached]
         if unsettled:

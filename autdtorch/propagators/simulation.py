@@ -11,7 +11,6 @@ from functools import cached_property
 
 import torch
 
-from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.steady_state import SteadyState, fewest_periods
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.propagators.backend import make_kernel
@@ -110,12 +109,6 @@ class Simulation(ABC):
         """The time step [s], on several grids the shortest."""
         most = max(assembly.steps_per_period for assembly in self.assemblies)
         return 1 / (self.plan.scene.frequency * float(most))
-
-    @property
-    def source_clearance(self) -> float:
-        """Distance [m] from obstacles within which a source is less accurate."""
-        grid = self.assemblies[0].grid
-        return grid.spacing * interpolation_width(grid.kappa) / 2
 
     def orbits(self, points: torch.Tensor) -> Orbits:
         """Return the fewest runs for a transfer matrix: from transducers or, by reciprocity, from points.

@@ -25,8 +25,8 @@ from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
 _ROUNDING = 1e-6
-"""Largest difference of equal stencil rows, relative to the weight of a face: that of places
-`LENGTH_TOLERANCE` apart on a grid of 1 mm."""
+"""Largest difference of equal stencil rows, relative to the weight of a face; `LENGTH_TOLERANCE` shifts cause
+as much on a grid of 1 mm."""
 
 _NONE = -1
 """Index of the image of a point that is none of the points."""

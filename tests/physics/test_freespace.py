@@ -44,7 +44,7 @@ def test_green_solves_the_helmholtz_equation_away_from_the_source(target):
 def test_green_is_outgoing_and_of_unit_strength():
     r = torch.tensor([1e-6, 1e-3, 1e-3 + WAVELENGTH / 4], dtype=torch.float64)
     values = green(torch.stack([r, 0 * r, 0 * r], dim=1), [[0.0, 0.0, 0.0]], WAVENUMBER)[:, 0]
-    # Near the source g is 1/(4 pi r) but for k r = 7e-4.
+    # Near the source g is 1/(4 pi r), up to k r = 7e-4.
     assert abs(4 * math.pi * r[0] * values[0] - 1) < 1e-3
     # With e^{-i w t}, a quarter of a wavelength outwards turns the phase by +90 degrees.
     assert cmath.phase(values[2] / values[1]) == pytest.approx(math.pi / 2, rel=1e-12)

@@ -44,7 +44,7 @@ def test_free_space_is_exact_to_the_grid(spacing: float, tolerance: float) -> No
     assert relative_error(simulated, free_space(scene)) < tolerance
 
 
-# [dB/m]: that of air at 40 kHz, and thirty times as much, which takes a tenth of the pressure on the way
+# [dB/m]: air at 40 kHz, and thirty times as much, which attenuates by a tenth on the way
 @pytest.mark.parametrize(
     ("absorption", "spacing", "tolerance"), [(1.3, 1e-3, 5e-4), (40.0, 1e-3, 5e-4), (40.0, 2e-3, 5e-3)]
 )

@@ -62,7 +62,7 @@ def test_what_was_simulated_is_not_simulated_again(tmp_path: Path) -> None:
     first = prepared(scene, tmp_path)
     matrix, error = first.transfer_matrix(return_error=True)
     assert first.runs
-    assert len(files(tmp_path)) == 2  # that of the second grid as well
+    assert len(files(tmp_path)) == 2  # one for each grid
     again = prepared(
         Scene(scene.array, AIR, 40e3, scene.control_points, (CUBE,), domain=scene.domain), tmp_path
     )
@@ -264,7 +264,7 @@ def test_a_writer_killed_before_it_is_done_leaves_nothing_that_is_read(tmp_path:
     (left,) = tmp_path.glob(f"*{PARTIAL}")
     assert cache.load("shared", (200_000,)) is None
     cache.save("shared", np.ones(200_000), 0.0)
-    assert left.exists()  # it might be that of a process that writes
+    assert left.exists()  # another process may be writing it
     old = time.time() - 2 * ABANDONED
     os.utime(left, (old, old))
     cache.save("shared", np.ones(200_000), 0.0)

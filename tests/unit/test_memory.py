@@ -103,7 +103,7 @@ def group(folder: Path, most: object, used: int, inactive: int) -> None:
 
 @pytest.fixture
 def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where control groups are; of the process nothing else limits it."""
+    """The folder of control groups, with no other limit of the process."""
     monkeypatch.setattr(memory, "_MOUNT", tmp_path / "fs")
     monkeypatch.setattr(memory, "_CGROUP", tmp_path / "cgroup")
     monkeypatch.setattr(memory, "_left_to_process", lambda: iter(()))
