@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
 
 from autdtorch.methods.catalogue import label_of
+from autdtorch.methods.ranking import NEAR_TIE
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.metrics import FocusMetrics
+from autdtorch.objectives.objective import validate_drives
 from autdtorch.propagators import Run
 from autdtorch.study.provenance import Provenance
 from autdtorch.utils.html import html_table
+from autdtorch.utils.validation import invalid, real_tensor
 
 
 @dataclass(frozen=True)
@@ -121,6 +127,45 @@ class StudyResult:
     def _repr_html_(self) -> str:
         """Return the summary table, for Jupyter."""
         return html_table(f"Study of {self.provenance.date}", summary_rows(self))
+
+
+def stored_solution(fields: Mapping[str, Any], transducers: int, points: int) -> Solution:
+    """Return the solution of stored trials, given its `fields` by name, if a method can have found it.
+
+    Raises:
+        ValueError: another shape or type, or numbers out of range; the message names the field.
+    """
+    drive = validate_drives(fields["drive"], transducers)
+    trials = len(drive)
+    evaluations = np.asarray(fields["evaluations"])
+    if evaluations.shape != (trials,) or evaluations.dtype != np.int64 or evaluations.min() < 1:
+        raise invalid("evaluations", evaluations, f"must be {trials} integers >= 1")
+    history = real_tensor("history", fields["history"])
+    shape, most = tuple(history.shape), int(evaluations.max())
+    if history.ndim != 2 or shape[0] != trials or shape[1] < most or (history.diff() < 0).any():
+        accepted = f"must be ({trials}, {most}) or longer, no number below the one before"
+        raise ValueError(f"history: shape {shape}; {accepted}")
+    score, best = stored_numbers("score", fields["score"], trials), history[:, -1]
+    if (score > best + NEAR_TIE * best.abs()).any():  # below it is the last drive, of `identify`
+        raise invalid("score", score, f"must be at most {best.tolist()}, the best of the history")
+    pressure = stored_magnitudes("pressure", fields["pressure"], trials, points)
+    return Solution(drive, pressure, score, torch.from_numpy(evaluations), history)
+
+
+def stored_magnitudes(name: str, value: object, *shape: int) -> torch.Tensor:
+    """Return finite numbers >= 0 of a shape, after checking them."""
+    numbers = stored_numbers(name, value, *shape)
+    if numbers.min() < 0:
+        raise invalid(name, numbers, "every number must be >= 0")
+    return numbers
+
+
+def stored_numbers(name: str, value: object, *shape: int) -> torch.Tensor:
+    """Return finite numbers of a shape, after checking them."""
+    numbers = real_tensor(name, value)
+    if numbers.shape != shape:
+        raise ValueError(f"{name}: shape {tuple(numbers.shape)}; must be {shape}")
+    return numbers
 
 
 def median_trial(score: torch.Tensor) -> int:

@@ -14,17 +14,20 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import numpy as np
 import torch
 
 import autdtorch
-from autdtorch.methods.ranking import NEAR_TIE
-from autdtorch.methods.solution import Solution
 from autdtorch.objectives.metrics import FocusMetrics
-from autdtorch.objectives.objective import validate_drives
 from autdtorch.propagators import Run
 from autdtorch.study.provenance import Provenance
-from autdtorch.study.results import MethodResult, SceneResult, Simulation, StudyResult
+from autdtorch.study.results import (
+    MethodResult,
+    SceneResult,
+    Simulation,
+    StudyResult,
+    stored_magnitudes,
+    stored_solution,
+)
 from autdtorch.utils.files import replace_file
 from autdtorch.utils.validation import (
     boolean,
@@ -34,7 +37,6 @@ from autdtorch.utils.validation import (
     not_negative,
     path_of,
     positive,
-    real_tensor,
     require_name,
     require_one_of,
 )
@@ -173,7 +175,7 @@ def _write_method(group: Any, method: MethodResult) -> None:
 
 
 def _read_method(group: Any, points: int, transducers: int) -> MethodResult:
-    solution = _read_solution(group, points, transducers)
+    solution = stored_solution({key: _array(group, key) for key in _SOLUTION}, transducers, points)
     trials = len(solution.score)
     shown = integer_at_least("shown_trial", group.attrs["shown_trial"], 0)
     if shown >= trials:
@@ -185,26 +187,6 @@ def _read_method(group: Any, points: int, transducers: int) -> MethodResult:
     return MethodResult(solution, metrics, _magnitudes(group, "seconds", trials), shown, plane)
 
 
-def _read_solution(group: Any, points: int, transducers: int) -> Solution:
-    drive = validate_drives(torch.from_numpy(_array(group, "drive")), transducers)
-    trials = len(drive)
-    evaluations = _array(group, "evaluations")
-    if evaluations.shape != (trials,) or evaluations.dtype != np.int64 or evaluations.min() < 1:
-        raise invalid("evaluations", evaluations, f"must be {trials} integers >= 1")
-    most = int(evaluations.max())
-    history = real_tensor("history", _array(group, "history"))
-    shape = tuple(history.shape)
-    if history.ndim != 2 or shape[0] != trials or shape[1] < most or (history.diff() < 0).any():
-        accepted = f"must be ({trials}, {most}) or longer, no number below the one before"
-        raise ValueError(f"history: shape {shape}; {accepted}")
-    score = _numbers(group, "score", trials)
-    best = history[:, -1]
-    if (score > best + NEAR_TIE * best.abs()).any():
-        raise invalid("score", score, f"must be at most {best.tolist()}, the best of the history")
-    pressure = _magnitudes(group, "pressure", trials, points)
-    return Solution(drive, pressure, score, torch.from_numpy(evaluations), history)
-
-
 def _complex_matrix(group: Any, key: str) -> torch.Tensor:
     matrix = complex_tensor(key, _array(group, key))
     if matrix.ndim != 2 or matrix.numel() == 0:
@@ -212,18 +194,8 @@ def _complex_matrix(group: Any, key: str) -> torch.Tensor:
     return matrix
 
 
-def _magnitudes(group: Any, key: str, *shape: int) -> torch.Tensor:
-    numbers = _numbers(group, key, *shape)
-    if numbers.min() < 0:
-        raise invalid(key, numbers, "every number must be >= 0")
-    return numbers
-
-
-def _numbers(group: Any, key: str, *shape: int) -> torch.Tensor:
-    numbers = real_tensor(key, _array(group, key))
-    if numbers.shape != shape:
-        raise ValueError(f"{key}: shape {tuple(numbers.shape)}; must be {shape}")
-    return numbers
+def _magnitudes(group: Any, key: str, trials: int) -> torch.Tensor:
+    return stored_magnitudes(key, _array(group, key), trials)
 
 
 def _array(group: Any, key: str) -> Any:

@@ -12,20 +12,11 @@ from typing import Any, TypeAlias
 
 import torch
 
-from autdtorch.methods.ranking import NEAR_TIE
 from autdtorch.methods.solution import Solution, joined
 from autdtorch.objectives.metrics import focus_metrics
-from autdtorch.objectives.objective import validate_magnitudes
-from autdtorch.scene.drive import validate_single_drive
+from autdtorch.study.results import stored_solution
 from autdtorch.utils.json_lines import JsonLines
-from autdtorch.utils.validation import (
-    finite_number,
-    integer_at_least,
-    invalid,
-    not_negative,
-    real_tensor,
-    require_kind,
-)
+from autdtorch.utils.validation import integer_at_least, invalid, not_negative, real_tensor, require_kind
 
 TRIALS_FILE = "trials.jsonl"
 
@@ -130,22 +121,13 @@ class TrialFile:
         if where in self._trials:
             raise invalid("trial", where, "must be there once")
         transducers, foci = self._shapes[row["scene"]]
-        drive = torch.view_as_complex(real_tensor("drive", row["drive"]))
-        evaluations = integer_at_least("evaluations", row["evaluations"], 1)
-        history = real_tensor("history", row["history"])
-        if history.shape != (evaluations,) or (history.diff() < 0).any():
-            raise invalid("history", history, f"must be {evaluations} numbers, none below the one before")
-        score = finite_number("score", row["score"])
-        best = float(history[-1])
-        if score > best + NEAR_TIE * abs(best):  # the last drive, of `identify`
-            raise invalid("score", score, f"must be at most {best:g}, the best of the history")
-        solution = Solution(
-            validate_single_drive(drive, transducers)[None],
-            validate_magnitudes("pressure", row["pressure"], foci)[None],
-            torch.tensor([score], dtype=torch.float64, device="cpu"),
-            torch.tensor([evaluations], dtype=torch.int64, device="cpu"),
-            history[None],
-        )
+        fields: dict[str, Any] = {
+            name: [row[name]] for name in ("pressure", "score", "evaluations", "history")
+        }
+        fields["drive"] = torch.view_as_complex(real_tensor("drive", row["drive"]))[None]
+        solution = stored_solution(fields, transducers, foci)
+        if solution.history.shape[1] != int(solution.evaluations):
+            raise invalid("history", row["history"], f"must be {row['evaluations']} numbers")
         self._trials[where] = solution, not_negative("seconds", row["seconds"], "s")
 
 
