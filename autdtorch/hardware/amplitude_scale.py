@@ -15,23 +15,14 @@ class AmplitudeScale:
     """The scale between a trial's drives and the device's.
 
     Transducers of a calibrated device have levels of their own. None is driven above the highest of its
-    levels within the limit, so that rounding exceeds the limit nowhere. Methods raise `ValueError` for
-    another shape, not finite complex numbers, or an amplitude above 1.
+    levels within the limit, so that rounding exceeds the limit nowhere.
 
     Attributes:
         largest: amplitude of the device that is 1 in the trial: the highest level within the limit.
     """
 
     def __init__(self, wiring: Wiring, amplitude: float) -> None:
-        """Find the levels within a limit.
-
-        Args:
-            wiring: plays the drives.
-            amplitude: limit of every transducer, above 0 up to 1.
-
-        Raises:
-            ValueError: `amplitude` out of range, or the device has no level up to it except 0.
-        """
+        """Find the levels within a limit, above 0 up to 1; `ValueError` if that leaves only 0."""
         self._wiring = wiring
         limit = number_between("amplitude", positive("amplitude", amplitude), 0.0, 1.0)
         self._most = self._amplitudes(self._highest(limit))
@@ -47,7 +38,7 @@ class AmplitudeScale:
         wanted = self.largest * validate_single_drive(drive, len(self._most))
         return torch.polar(wanted.abs().minimum(self._most), wanted.angle())
 
-    def played(self, drive: torch.Tensor) -> torch.Tensor:
+    def quantised(self, drive: torch.Tensor) -> torch.Tensor:
         """Return the device's nearest drives to drives (..., M), both in the trial's scale."""
         drive = validate_drive(drive, len(self._most))
         # One by one, as the link plays them: no rounding may depend on the rows beside.

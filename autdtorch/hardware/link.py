@@ -7,8 +7,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Sequence
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import torch
 
@@ -30,7 +29,7 @@ class OffError(LinkError):
     """A device was not switched off: its outputs may still be on."""
 
 
-class Link:
+class Link(contextlib.AbstractContextManager["Link"]):
     """A device at the end of a port: `play` a drive, and it plays until the next, or until `off`.
 
     Use it as a context manager. The outputs are switched off when it is opened, as some devices start with
@@ -40,7 +39,6 @@ class Link:
     Attributes:
         device: the device at the port.
         transducers: the device's transducers that play the drive (M,), int64.
-        wiring: of the two.
         settle: time that a drive plays before `play` returns [s].
     """
 
@@ -70,9 +68,7 @@ class Link:
         require_kind("device", device, Device)
         require_kind("port", port, Port)
         require_callable("sleep", sleep)
-        self.device = device
-        self._port = port
-        self._sleep = sleep
+        self.device, self._port, self._sleep = device, port, sleep
         self._lock = threading.RLock()
         self._open = True
         self.off()
@@ -140,9 +136,8 @@ class Link:
             raise OffError(f"{error}; the outputs may still be on: switch the device's power off") from error
 
     def _send_silence(self) -> None:
-        silence = self.device.frame(
-            torch.zeros(self.device.transducers, dtype=torch.complex128, device="cpu")
-        )
+        off = torch.zeros(self.device.transducers, dtype=torch.complex128, device="cpu")
+        silence = self.device.frame(off)
         # Twice: a device that was left in mid-frame takes the first for the rest of that frame, and one with
         # two buffers may keep the last drive in the other.
         for _ in range(2):
@@ -158,13 +153,7 @@ class Link:
         self._port.write(frame)
         self._sleep(self.device.wire_time(frame))
 
-    def __enter__(self) -> Self:
-        """Return the link."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Switch all outputs off and release the device."""
         self.close()
 
@@ -184,8 +173,7 @@ def open_link(
         transducers: the device's transducer for each of the scene's (M,); by default all in order.
         serial: serial number of the USB chip, where several such devices are plugged in.
         backend: of pyusb; by default libusb. An emulated bench has its own, on which waiting takes no time.
-        settle: time that a drive plays before its pressure is read [s], after its frame has gone over the
-            wire.
+        settle: time that a drive plays before its pressure is read [s], without the frame's own time.
         port: name of a serial port of the system, such as "COM3" or "/dev/ttyUSB0"; by default the chips of
             the device are looked for over pyusb.
 
@@ -196,17 +184,16 @@ def open_link(
             `serial` for a device of several boards; or a `port` for one without a serial line.
     """
     require_kind("device", device, Device)
-    opened = _usb_port(device, serial, backend) if port is None else _serial_port(device, port)
+    if port is None:
+        opened = _usb_port(device, serial, backend)
+    elif device.baud is None:
+        raise invalid("port", port, f"must be None, as {device.name} has no serial line")
+    else:
+        opened = SerialPort(port, device.baud)
     with closed_on_error(opened.close):
         if port is not None:
             time.sleep(device.boot_time)
         return Link(device, opened, transducers, settle, getattr(backend, "sleep", time.sleep))
-
-
-def _serial_port(device: Device, port: str) -> Port:
-    if device.baud is None:
-        raise invalid("port", port, f"must be None, as {device.name} has no serial line")
-    return SerialPort(port, device.baud)
 
 
 def _usb_port(device: Device, serial: str | None, backend: Any) -> Port:

@@ -27,7 +27,7 @@ _ORIGIN, _NUMBER = "origin", "evaluation"
 
 
 class LogError(ValueError):
-    """A log is of another trial, in use, or none."""
+    """A log belongs to another trial, is in use, or is not a log."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +35,10 @@ class Evaluation:
     """A line of the log.
 
     Attributes:
-        time: when it was written, UTC, ISO 8601.
-        drive: (M,), complex128, as it was asked for.
-        pressure: (P,) [Pa], float64, as it was read.
-        seconds_on: how long the outputs were on so far [s].
+        time: time of writing, UTC, ISO 8601.
+        drive: (M,), complex128, as requested.
+        pressure: (P,) [Pa], float64, as read.
+        seconds_on: total time that the outputs were on so far [s].
     """
 
     time: str
@@ -48,35 +48,29 @@ class Evaluation:
 
 
 class EvaluationLog:
-    """A line of JSON that says what the trial is, one for each evaluation, one for the end of each process.
+    """A file with a line of JSON for the trial's settings, for each evaluation, and for each process's end.
 
-    A line is on disk before the next evaluation begins, so that the end of the process, at whatever moment,
-    costs at most the evaluation in flight. Other processes are kept from the log until `end`, or until nobody
-    holds this object any more.
+    A line is on disk before the next evaluation begins: a process that ends at any moment loses at most the
+    evaluation in flight. The log is locked until `end`, or until this object is released.
 
     Attributes:
         path: of the file.
-        origin: what the trial is, by name.
-        goes_on: whether the file was there before.
-        seconds_on: how long the outputs were on in all, as its lines say [s].
+        origin: settings of the trial, by name.
+        goes_on: true if the file has existed before.
+        seconds_on: total time that the outputs were on, by its lines [s].
     """
 
-    path: Path
-    origin: dict[str, Any]
-    goes_on: bool
-    seconds_on: float
-
     def __init__(self, path: str | Path, origin: Mapping[str, Any], transducers: int, points: int) -> None:
-        """Begin the file, or read what it holds of the same trial.
+        """Begin the file, or read the evaluations of the same trial from it.
 
-        Damaged lines, and a last one that broke off, are set aside; their evaluations will be made again. A
-        log without evaluations, of another trial, is begun anew.
+        Damaged and incomplete lines are set aside; their evaluations will be made again. The log of another
+        trial is overwritten if it holds no evaluation.
 
         Args:
             path: of the file.
-            origin: what the trial is: what JSON can hold, by name, the most telling first.
-            transducers: M, of each drive.
-            points: P, of each pressure.
+            origin: settings of the trial by name, values of JSON; the first that differs is reported.
+            transducers: number of transducers M.
+            points: number of control points P.
 
         Raises:
             LogError: the file is of a trial of another origin, no such log, or open in another process.
@@ -96,21 +90,17 @@ class EvaluationLog:
 
     @property
     def evaluations(self) -> list[Evaluation]:
-        """The evaluations that the file holds, in the order of their numbers."""
+        """The evaluations in the file, in the order of their numbers."""
         return [evaluation for _, evaluation in sorted(self._evaluations.items())]
 
     def recorded(self, number: int, drive: torch.Tensor) -> Evaluation | None:
-        """Return an evaluation, or None where it has to be made.
+        """Return the evaluation of a `number`, from 0, and a requested `drive` (M,); None if it must be made.
 
-        An evaluation whose line was lost is made again, and may be read differently. What was recorded after
-        it is still valid where the method asks for the recorded drive, and is made again where it does not.
-
-        Args:
-            number: of the evaluation in the trial, counted from 0.
-            drive: (M,), as it is asked for.
+        An evaluation whose line was lost is made again, and its reading may differ. A later evaluation stays
+        valid if the method asks for the recorded drive, and is made again otherwise.
 
         Raises:
-            LogError: it was of another drive, though all before it is as it was.
+            LogError: it has another drive, and no earlier line was lost.
         """
         evaluation = self._evaluations.get(number)
         if evaluation is None or torch.equal(evaluation.drive, drive):
@@ -124,15 +114,12 @@ class EvaluationLog:
         )
 
     def append(self, drive: torch.Tensor, pressure: torch.Tensor, seconds_on: float) -> Evaluation:
-        """Add an evaluation under the first number that the log lacks.
+        """Add an evaluation under the first number that the log lacks, and return it with its time.
 
         Args:
-            drive: (M,), as it was asked for.
-            pressure: (P,) [Pa], as it was read.
-            seconds_on: how long the outputs were on so far [s].
-
-        Returns:
-            The evaluation, with its time.
+            drive: (M,), as requested.
+            pressure: (P,) [Pa], as read.
+            seconds_on: total time that the outputs were on so far [s].
 
         Raises:
             LogError: the file has changed meanwhile.
@@ -140,24 +127,15 @@ class EvaluationLog:
         """
         number = next(n for n in itertools.count() if n not in self._evaluations)
         evaluation = Evaluation(_now(), drive, pressure, seconds_on)
-        self._append(
-            {
-                _NUMBER: number,
-                "time": evaluation.time,
-                "drive": torch.view_as_real(drive).tolist(),
-                "pressure": pressure.tolist(),
-                "seconds_on": seconds_on,
-            }
-        )
+        read = {"pressure": pressure.tolist(), "seconds_on": seconds_on}
+        asked = {"time": evaluation.time, "drive": torch.view_as_real(drive).tolist()}
+        self._append({_NUMBER: number, **asked, **read})
         self._keep(number, evaluation)
         self.seconds_on = seconds_on
         return evaluation
 
     def end(self, seconds_on: float) -> None:
-        """Say how long the outputs were on when the process ends, its other playing included.
-
-        Args:
-            seconds_on: how long the outputs were on so far [s].
+        """Record the total time that the outputs were on, `seconds_on` [s], and release the log.
 
         Raises:
             LogError: the file has changed meanwhile.
@@ -168,7 +146,7 @@ class EvaluationLog:
         self.seconds_on = seconds_on
 
     def _take_up(self) -> tuple[JsonLines, bool]:
-        """Read the file if it is of this trial, else empty it; also returns whether it was there."""
+        """Read the file of this trial, or begin it; also return true if it has existed before."""
         head = line_of({_ORIGIN: self.origin}) + b"\n"
         content = self.path.read_bytes() if self.path.exists() else b""
         lines = JsonLines(self.path, digest_of(self.origin), self._use, head)
@@ -181,7 +159,7 @@ class EvaluationLog:
         return JsonLines(self.path, digest_of(self.origin), self._use, head), False
 
     def _require_empty(self, content: bytes) -> None:
-        """Check that a file, of which no line is of this trial, is the log of another without evaluations."""
+        """Require that a file without lines of this trial is the log of another, without evaluations."""
         try:
             stored = row_of(content.partition(b"\n")[0])[_ORIGIN]
             require_kind(_ORIGIN, stored, dict)
@@ -195,19 +173,16 @@ class EvaluationLog:
             )
 
     def _use(self, row: dict[str, Any]) -> None:
-        """Take up the evaluation of a line, or its time alone, after checking it as what was measured."""
+        """Validate a line, and keep its evaluation, if it has one, and its time."""
         datetime.fromisoformat(row["time"])
         seconds_on = not_negative("seconds_on", row["seconds_on"], "s")
         if _NUMBER in row:
             transducers, points = self._shape
             drive = torch.view_as_complex(real_tensor("drive", row["drive"]))
-            evaluation = Evaluation(
-                row["time"],
-                validate_single_drive(drive, transducers),
-                validate_magnitudes("pressure", row["pressure"], points),
-                seconds_on,
-            )
-            self._keep(integer_at_least(_NUMBER, row[_NUMBER], 0), evaluation)
+            drive = validate_single_drive(drive, transducers)
+            pressure = validate_magnitudes("pressure", row["pressure"], points)
+            number = integer_at_least(_NUMBER, row[_NUMBER], 0)
+            self._keep(number, Evaluation(row["time"], drive, pressure, seconds_on))
         self.seconds_on = max(self.seconds_on, seconds_on)
 
     def _keep(self, number: int, evaluation: Evaluation) -> None:
@@ -224,10 +199,7 @@ class EvaluationLog:
 
 @contextlib.contextmanager
 def lock_log(path: str | Path) -> Iterator[None]:
-    """Keep other processes from a log; this one may lock it once more, as a notebook does.
-
-    Args:
-        path: of the file, which need not be there yet.
+    """Keep other processes from a log at `path`, which need not exist; this process may lock it again.
 
     Raises:
         LogError: another process has it.
@@ -241,7 +213,7 @@ def lock_log(path: str | Path) -> Iterator[None]:
 
 
 def _difference(stored: Mapping[str, Any], origin: Mapping[str, Any]) -> str:
-    """How two origins differ in JSON, where 1, 1.0 and true are not the same, and the order counts."""
+    """Describe the difference of two origins in JSON, where 1, 1.0 and true differ, and the order counts."""
     for name in (*origin, *stored):
         texts = [json.dumps(one[name]) if name in one else None for one in (stored, origin)]
         if texts[0] != texts[1]:

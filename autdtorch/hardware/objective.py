@@ -1,4 +1,4 @@
-"""The objective that a device and a sensor make: measured where `SimulatedObjective` simulates."""
+"""The objective of a device and a sensor: measured where `SimulatedObjective` simulates."""
 
 from __future__ import annotations
 
@@ -21,19 +21,16 @@ from autdtorch.utils.validation import invalid, path_of, require_callable, requi
 class HardwareObjective:
     """An objective whose observations are measured, one drive after the other.
 
-    The device plays the nearest drive on its phase levels, which a `Solution` holds; the log holds the drive
-    that was asked for. The outputs are off while a method computes.
+    The device plays the nearest drive on its phase levels, which a `Solution` holds; the log holds the
+    requested drive. The outputs are off while a method computes.
 
-    An interrupted trial goes on where its log ends: run the same method with the same seed again, and
-    `autdtorch.run` tells it the evaluations that the log holds, without playing them once more.
+    To continue an interrupted trial, run the same method with the same seed again: `autdtorch.run` takes the
+    evaluations in the log from there.
 
     Attributes:
         scene: its array plays the drives, its control points are observed.
         log: holds the evaluations.
     """
-
-    scene: Scene
-    log: EvaluationLog
 
     def __init__(
         self,
@@ -47,12 +44,12 @@ class HardwareObjective:
         """Prepare the observations.
 
         Args:
-            scene: what is on the bench.
-            link: plays the drives; its device's transducers stand where the scene says.
+            scene: the scene on the bench.
+            link: plays the drives; its device's transducers are those of the scene.
             sensor: reads the pressure at the scene's control points.
             log: file of the evaluations (`EvaluationLog`); each is appended before the next begins.
-            settings: what else makes the trial what it is, as JSON can hold it: method, seed, sensor. A log
-                of other settings, of another scene, device or amplitude is refused.
+            settings: further settings that identify the trial, values of JSON: method, seed, sensor. A log
+                of other settings, or of another scene, device or amplitude, is refused.
             watch: function that is called with every evaluation, those from the log included.
 
         Raises:
@@ -75,10 +72,7 @@ class HardwareObjective:
             json.dumps(named := {} if settings is None else {**settings})
         except (TypeError, ValueError) as error:
             raise invalid("settings", settings, "must be a mapping of what JSON can hold") from error
-        self.scene = scene
-        self._link = link
-        self._sensor = sensor
-        self._watch = watch
+        self.scene, self._link, self._sensor, self._watch = scene, link, sensor, watch
         origin = {
             "scene": f"{scene.name} {digest_of(scene)[:16]}",
             "device": link.link.device.name,
@@ -93,19 +87,15 @@ class HardwareObjective:
         link.logs.add(place)
 
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
-        """Play each of several drives and read the control points; the outputs are off however it ends.
+        """Play drives (B, M), |q| <= 1, one by one; return magnitudes (B, P) [Pa], float64.
 
-        Args:
-            drive: (B, M) complex, |q| <= 1.
-
-        Returns:
-            Pressure magnitudes (B, P) [Pa], float64.
+        The outputs are off afterwards, also after an error.
 
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1; or a sensor that
                 does not give a finite magnitude for each control point.
             LogError: the log is of other drives, or has changed meanwhile.
-            LimitError: the trial has made all that it may.
+            LimitError: a limit of the trial is reached.
             LinkError: the device does not take the bytes.
             OSError: the log cannot be written.
         """
@@ -121,14 +111,11 @@ class HardwareObjective:
         return len(self.log.evaluations)
 
     def recorded(self, number: int, drive: torch.Tensor) -> torch.Tensor | None:
-        """Return the pressures (P,) [Pa] of an evaluation that the log holds, or None.
+        """Return the pressures (P,) [Pa] of an evaluation in the log, or None; see `EvaluationLog.recorded`.
 
         Args:
-            number: of the evaluation in the trial, counted from 0.
-            drive: (M,), as it is asked for.
-
-        Raises:
-            LogError: the evaluation was of another drive.
+            number: number of the evaluation in the trial, from 0.
+            drive: (M,), as requested.
         """
         evaluation = self.log.recorded(number, drive)
         if evaluation is None:
@@ -138,12 +125,12 @@ class HardwareObjective:
         return evaluation.pressure
 
     def quantised(self, drive: torch.Tensor) -> torch.Tensor:
-        """What the device plays (..., M) when asked for drives (..., M); 1 is the most that the limit allows.
+        """Return the device's nearest drives to drives (..., M); |q| = 1 is the highest level in the limit.
 
         Raises:
             ValueError: another shape, not finite complex numbers, or an amplitude above 1.
         """
-        return self._link.played(drive)
+        return self._link.quantised(drive)
 
     def _measure(self, drive: torch.Tensor) -> torch.Tensor:
         most = self._link.limits.evaluations

@@ -1,4 +1,4 @@
-"""What a device plays of a drive, around any objective: for the simulation of a trial."""
+"""The quantisation of drives by a device, around any objective: for the simulation of a trial."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from autdtorch.utils.validation import invalid
 class Played(Perturbation):
     """A device that plays the nearest of its levels, as it is calibrated, within the limit of a trial.
 
-    What a method observes in ``Played(SimulatedObjective(...), device)`` is what it observes in a
-    `HardwareObjective` without noise, but for the pressures' scale, and it finds the very same drive.
+    With ``Played(SimulatedObjective(...), device)`` a method finds the same drive as with a
+    `HardwareObjective` without noise. The pressures differ by a factor.
 
     Attributes:
-        largest: the amplitude of the device that is |q| = 1: its highest level within the limit.
+        largest: amplitude of the device that is |q| = 1 in the trial: its highest level within the limit.
     """
 
     def __init__(
@@ -34,26 +34,24 @@ class Played(Perturbation):
         """Wrap an objective.
 
         Args:
-            objective: what the device plays to.
-            device: which.
-            transducers: for each transducer of the scene, which of the device's it is (M,); by default all
-                in order.
-            amplitude: the limit of the trial, as in `Limits`; |q| = 1 is the largest amplitude within it.
+            objective: simulates the pressure of the device's drives.
+            device: the device whose levels are used.
+            transducers: the device's transducer for each of the scene's (M,); by default all in order.
+            amplitude: amplitude limit of the trial, as in `Limits`.
 
         Raises:
             ValueError: `transducers` that the device does not have, one twice, or not as many as the scene
-                has; `amplitude` out of range, or the device has none up to it but 0.
+                has; or an `amplitude` out of range or below the device's lowest level.
         """
         super().__init__(objective)
         wiring = Wiring(device, transducers)
         count = len(self.scene.array)
         if len(wiring.transducers) != count:
-            raise invalid(
-                "transducers", len(wiring.transducers), f"must be {count}, as many as the scene has"
-            )
+            accepted = f"must be {count}, as many as the scene has"
+            raise invalid("transducers", len(wiring.transducers), accepted)
         self._scale = AmplitudeScale(wiring, amplitude)
         self.largest = self._scale.largest
 
     def quantised(self, drive: torch.Tensor) -> torch.Tensor:
-        """What the device plays (..., M), in the trial's scale, when asked for drives (..., M)."""
-        return self._scale.played(drive)
+        """Return the device's nearest drives to drives (..., M), both in the trial's scale."""
+        return self._scale.quantised(drive)

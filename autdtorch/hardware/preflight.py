@@ -34,7 +34,7 @@ class Preflight:
 
     @property
     def dead(self) -> list[int]:
-        """The failed transducers: not above the threshold."""
+        """The failed transducers, whose pressure is not above the threshold."""
         return torch.nonzero(self.pressure <= self.threshold)[:, 0].tolist()
 
 
@@ -52,9 +52,9 @@ def check_transducers(
     threshold is six deviations above that mean, or 20 dB below the median of all transducers if that is more.
 
     Args:
-        link: plays them.
+        link: plays the transducers.
         sensor: reads their pressure.
-        points: number of control points P that the sensor reads.
+        points: number of control points P.
         readings: number of readings of every transducer, >= 1.
         background: number of readings of the silence, >= 1.
         watch: takes the name of each reading: "silence, outputs off", then "transducer 1 of 16" and so on.

@@ -36,7 +36,7 @@ class Signalled(KeyboardInterrupt):
     """A signal, by its `number`, ends the trial."""
 
     def __init__(self, number: int) -> None:
-        """Name the signal of this `number`."""
+        """Name the signal."""
         super().__init__(signal.Signals(number).name)
         self.number = number
 
@@ -134,8 +134,7 @@ class LimitedLink:
         """
         require_kind("link", link, Link)
         require_kind("limits", limits, Limits)
-        self.link = link
-        self.limits = limits
+        self.link, self.limits = link, limits
         self.logs: set[Path] = set()
         self._scale = AmplitudeScale(link.wiring, limits.amplitude)
         self._lock = threading.RLock()
@@ -188,9 +187,9 @@ class LimitedLink:
             self.link.begin(asked)
         self.link.wait_for_sound()  # without the lock, which the timer needs
 
-    def played(self, drive: torch.Tensor) -> torch.Tensor:
+    def quantised(self, drive: torch.Tensor) -> torch.Tensor:
         """Return the device's nearest drives to drives (..., M), both in the scale of `play`."""
-        return self._scale.played(drive)
+        return self._scale.quantised(drive)
 
     def require_on(self) -> None:
         """Require that the outputs are on since `play`: otherwise the readings meanwhile are void.
@@ -201,10 +200,8 @@ class LimitedLink:
         self._raise_failure()
         if self._on_since is None:
             self._seconds_left()
-            most = self.limits.seconds_in_a_row
-            raise LimitError(
-                f"settling and reading took longer than the outputs may stay on, {most:g} s in a row"
-            )
+            most = f"{self.limits.seconds_in_a_row:g} s in a row"
+            raise LimitError(f"settling and reading took longer than the outputs may stay on, {most}")
 
     def off(self) -> None:
         """Switch all outputs off, and begin the rest of the duty cycle."""

@@ -14,19 +14,13 @@ from autdtorch.utils.validation import indices, require_kind
 class Wiring:
     """A device some of whose transducers are a scene's; the others stay off.
 
-    Methods raise `ValueError` for another shape, not finite complex numbers, or an amplitude above 1.
-
     Attributes:
         device: plays the drives.
         transducers: the device's transducer for each of the scene's (M,), int64.
     """
 
     def __init__(self, device: Device, transducers: Sequence[int] | torch.Tensor | None = None) -> None:
-        """Wire a device; by default all its transducers in order.
-
-        Raises:
-            ValueError: no device, `transducers` that it does not have, or one twice.
-        """
+        """Wire a device; by default all its transducers in order."""
         require_kind("device", device, Device)
         self.device = device
         chosen = range(device.transducers) if transducers is None else transducers
@@ -38,7 +32,7 @@ class Wiring:
         return self.device.frame(self._of_device(drive))
 
     def quantised(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return the drive (M,) on the levels of the device that is nearest to a `drive` (M,)."""
+        """Return the device's nearest drive (M,) to a `drive` (M,)."""
         return self.device.quantised(self._of_device(drive))[self.transducers]
 
     def _of_device(self, drive: torch.Tensor) -> torch.Tensor:

@@ -19,8 +19,7 @@ _BITS = 10  # of a byte on a serial line: start, 8, stop
 class Firmware(Protocol):
     """The emulated firmware of a device; written from its sources, not from the frames that it checks.
 
-    Attributes:
-        baud: rate of the serial line that it reads [bits/s]; None for a FIFO.
+    Its serial line has `baud` [bits/s]; None for a FIFO.
     """
 
     baud: ClassVar[int | None]
@@ -76,24 +75,14 @@ class Device(ABC):
         return self.board * self.boards
 
     def with_boards(self, boards: int) -> Self:
-        """Return the device with a number of `boards`.
-
-        Raises:
-            ValueError: `boards` out of range.
-        """
+        """Return the device with a number of `boards`; `ValueError` if out of range."""
         boards = integer_at_least("boards", boards, 1)
         if self.most_boards is not None and boards > self.most_boards:
             raise invalid("boards", boards, f"must be 1 to {self.most_boards} for {self.name}")
         return replace(self, boards=boards)
 
     def levels(self, drive: ArrayLike) -> tuple[torch.Tensor, ...]:
-        """Return the integer levels nearest to a drive.
-
-        Args:
-            drive: (..., M) complex, |q| <= 1.
-
-        Returns:
-            A tensor (..., M), int64, for each of `columns`.
+        """Return the levels nearest to a drive (..., M), |q| <= 1: int64 (..., M) for each of `columns`.
 
         Raises:
             ValueError: not finite complex numbers, no axis, or an amplitude above 1.

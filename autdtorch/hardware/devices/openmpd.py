@@ -24,8 +24,7 @@ _FIRST = 0x80  # on the first byte of a message; on later bytes it sets lamp and
 class _OpenMPD(Device):
     """A message to a board is 256 phases, the first of them with bit 7, then 256 duties, by pin.
 
-    Attributes:
-        files: description of each board; without them transducers are in the order of the pins.
+    Without `files`, which describe the boards, transducers are in the order of the pins.
     """
 
     files: tuple[OpenMPDBoard, ...] = ()

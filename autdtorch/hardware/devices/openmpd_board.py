@@ -95,9 +95,8 @@ class OpenMPDBoard:
             raise ValueError(f"{path}: {error}; must be a text file in UTF-8") from error
         head = [_Item(path, number, line.strip()) for number, line in enumerate(lines, 1) if line.strip()]
         if len(head) < 4:
-            raise ValueError(
-                f"{path}: {len(head)} lines; must hold name, counts, positions, pins, offsets, gains"
-            )
+            accepted = "must hold name, counts, positions, pins, offsets, gains"
+            raise ValueError(f"{path}: {len(head)} lines; {accepted}")
         count = head[1].integer("number of transducers")
         if count < 1:
             raise head[1].wrong("number of transducers", "must be >= 1")
@@ -110,10 +109,8 @@ class OpenMPDBoard:
             raise ValueError(f"{path}: {len(positions)} positions (x, y, z); must be {count} as in line 2")
         numbers = [number for item in head[3:] for number in item.numbers()]
         if len(numbers) != 3 * count:
-            raise ValueError(
-                f"{path}: {len(numbers)} numbers after the positions; must be {count} pins, "
-                f"{count} phase offsets and {count} gains"
-            )
+            accepted = f"must be {count} pins, {count} phase offsets and {count} gains"
+            raise ValueError(f"{path}: {len(numbers)} numbers after the positions; {accepted}")
         pins: dict[int, None] = {}
         for item in numbers[:count]:
             pin = item.integer("pin")
@@ -151,9 +148,8 @@ class OpenMPDBoard:
         Raises:
             ValueError: an argument is not finite, has the wrong shape or is out of range.
         """
-        return TransducerArray(
-            in_plane(self.positions, center, normal, angle), normal, source_strength, radius
-        )
+        places = in_plane(self.positions, center, normal, angle)
+        return TransducerArray(places, normal, source_strength, radius)
 
     def calibrated(self, drive: ArrayLike) -> torch.Tensor:
         """Return `drive` (..., M) with each transducer's gain, and less its phase offset."""
@@ -162,6 +158,5 @@ class OpenMPDBoard:
 
     def by_pin(self, drive: ArrayLike) -> torch.Tensor:
         """Return `drive` (..., M) in the order of the pins, in which the board takes it."""
-        return validate_drive(drive, len(self.positions))[
-            ..., torch.tensor(self.pins, dtype=torch.int64, device="cpu").argsort()
-        ]
+        by_pin = torch.tensor(self.pins, dtype=torch.int64, device="cpu").argsort()
+        return validate_drive(drive, len(self.positions))[..., by_pin]

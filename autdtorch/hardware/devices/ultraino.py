@@ -152,12 +152,5 @@ ULTRAINO = _Ultraino(
 
 
 def ultraino_boards(boards: int = 1) -> Device:
-    """Return boards Mega-64 of Ultraino in a row, 64 transducers each.
-
-    Args:
-        boards: their number, 1 to 14.
-
-    Raises:
-        ValueError: `boards` out of range.
-    """
+    """Return 1 to 14 boards Mega-64 of Ultraino in a row, 64 transducers each; else `ValueError`."""
     return ULTRAINO.with_boards(boards)

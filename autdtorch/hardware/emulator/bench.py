@@ -55,9 +55,9 @@ class EmulatedBench:
         if self.transfer_matrix.ndim != 2 or self.transfer_matrix.shape[1] != len(self._transducers):
             shape = tuple(self.transfer_matrix.shape)
             raise ValueError(f"transfer_matrix: shape {shape}; must be (P, {len(self._transducers)})")
-        self._alive = torch.ones(len(self._transducers), dtype=torch.float64, device="cpu")
-        if silent := integers("dead", dead, 0, "must be indices of transducers"):
-            self._alive[indices("dead", silent, len(self._transducers))] = 0
+        self._working = torch.ones(len(self._transducers), dtype=torch.float64, device="cpu")
+        if failed := integers("dead", dead, 0, "must be indices of transducers"):
+            self._working[indices("dead", failed, len(self._transducers))] = 0
         each = device.transducers // len(device.serials)
         self._firmwares = [device.firmware(each) for _ in device.serials]
         self.firmware = self._firmwares[0]
@@ -86,7 +86,7 @@ class EmulatedBench:
 
     def drive(self) -> torch.Tensor:
         """Return the drive (M,), complex128, that the scene's transducers emit now; 0 for failed ones."""
-        return self.emitted()[self._transducers] * self._alive
+        return self.emitted()[self._transducers] * self._working
 
     def pressure(self) -> torch.Tensor:
         """Return the phasors (P,) [Pa], complex128, at the control points now."""

@@ -23,15 +23,7 @@ _PACKET = 64
 
 
 class EmulatedDevice(Protocol):
-    """An emulated USB device.
-
-    Attributes:
-        interfaces: class, subclass and protocol of each, and its endpoints, those for bulk transfers.
-        vendor: idVendor.
-        product: idProduct.
-        strings: string descriptors by their index.
-        present: true while it is plugged in.
-    """
+    """An emulated USB device: idVendor, idProduct, strings by index; `present` while it is plugged in."""
 
     interfaces: ClassVar[Interfaces]
     vendor: int
@@ -133,24 +125,17 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
         return False
 
     def ctrl_transfer(
-        self,
-        dev_handle: int,
-        bmRequestType: int,
-        bRequest: int,
-        wValue: int,
-        wIndex: int,
-        data: array[int],
-        timeout: int,
+        self, dev_handle: int, kind: int, request: int, value: int, index: int, data: array[int], timeout: int
     ) -> int:
         chip = self._chip(dev_handle)
-        if not bmRequestType & _FROM_DEVICE:
-            if chip.control(bmRequestType, bRequest, wValue, wIndex, data.tobytes()):
+        if not kind & _FROM_DEVICE:
+            if chip.control(kind, request, value, index, data.tobytes()):
                 return len(data)
             raise stall()
-        if bmRequestType == _STANDARD_FROM_DEVICE and (bRequest, wValue >> 8) == (_GET_DESCRIPTOR, _STRING):
-            answer: bytes | None = _string_descriptor(chip.strings, wValue & 0xFF)
+        if kind == _STANDARD_FROM_DEVICE and (request, value >> 8) == (_GET_DESCRIPTOR, _STRING):
+            answer: bytes | None = _string_descriptor(chip.strings, value & 0xFF)
         else:
-            answer = chip.answer(bmRequestType, bRequest)
+            answer = chip.answer(kind, request)
         if answer is None:
             raise stall()
         return _fill(data, answer[: len(data)])

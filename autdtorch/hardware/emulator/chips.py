@@ -22,23 +22,17 @@ _BAUD_TOLERANCE = 0.03  # beyond it a UART loses the last of its ten bits
 class EmulatedChip:
     """A USB chip with a serial port in front of a firmware; `EmulatedDevice` describes its methods.
 
-    Attributes:
-        firmware: takes the bytes behind the chip.
-        baud: rate that it is set to [bits/s].
-        eight_n_one: true if it is set to 8 bits, no parity, 1 stop bit.
+    It is set to `baud` [bits/s]; `eight_n_one` is true for 8 bits, no parity, 1 stop bit.
     """
 
     interfaces: ClassVar[Interfaces]
 
     def __init__(self, vendor: int, product: int, serial: str, firmware: Firmware) -> None:
         """Plug the chip in, with settings of an earlier user."""
-        self.vendor = vendor
-        self.product = product
-        self.strings = (*_STRINGS, serial)
+        self.vendor, self.product, self.strings = vendor, product, (*_STRINGS, serial)
         self.present = True
         self.firmware = firmware
-        self.baud = 9600.0
-        self.eight_n_one = False
+        self.baud, self.eight_n_one = 9600.0, False
 
     def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
         """Take a request with its data; False for an unknown one, which stalls."""

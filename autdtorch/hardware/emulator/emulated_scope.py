@@ -168,9 +168,8 @@ class EmulatedScope:
     def _capture(self) -> None:
         """Sample all inputs, from a random moment on."""
         self._walk += self._drift / _DRIFT_CAPTURES**0.5 * self._generator.standard_normal()
-        moments = self._generator.uniform(0, 1 / self._frequency) + self._step() * np.arange(
-            self._maker.points
-        )
+        samples = np.arange(self._maker.points)
+        moments = self._generator.uniform(0, 1 / self._frequency) + self._step() * samples
         turns = np.exp(-2j * np.pi * self._frequency * moments)
         phasors = self._pressure().numpy()[self.points] * self._sensitivity * np.exp(self._walk)
         noise = self._noise * self._generator.standard_normal((len(self.points), len(moments)))

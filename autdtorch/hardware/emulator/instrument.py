@@ -26,24 +26,19 @@ class Instrument(Protocol):
 class EmulatedInstrument:
     """The USB interface of an instrument: USB488, without its interrupt endpoint.
 
-    `EmulatedDevice` describes its methods.
-
-    Attributes:
-        longest: most bytes of a message in a transfer; longer messages come in several.
-        sends_empty_packets: true if an empty packet follows a transfer of whole packets, as USB demands; some
-            instruments send none.
+    `EmulatedDevice` describes its methods. A message longer than `longest` bytes comes in several transfers.
+    If `sends_empty_packets`, an empty packet follows a transfer of whole packets, as USB demands; some
+    instruments send none.
     """
 
     interfaces: ClassVar[Interfaces] = (((0xFE, 0x03, 0x01), (0x82, 0x01)),)
 
     def __init__(self, vendor: int, product: int, serial: str, instrument: Instrument) -> None:
         """Plug it in."""
-        self.vendor = vendor
-        self.product = product
+        self.vendor, self.product = vendor, product
         self.strings = ("", "autdtorch", "emulated instrument", serial)
-        self.present = True
+        self.present = self.sends_empty_packets = True
         self.longest = 512
-        self.sends_empty_packets = True
         self._instrument = instrument
         self._received = self._answer = b""
         self._asked: tuple[int, int] | None = None  # tag, bytes

@@ -16,12 +16,9 @@ _SIGNAL_PERIOD = 0.2  # [s] between looks for a signal
 
 
 def typed(question: str) -> str:
-    """Return the answer that is typed to a question.
+    """Return the answer that is typed to a question; `EOFError` if the input has ended.
 
     At a terminal, `input` alone misses a signal that comes just before it begins to wait, until the answer.
-
-    Raises:
-        EOFError: the input has ended.
     """
     if not sys.stdin.isatty() or os.name != "posix":
         return input(question)
@@ -65,10 +62,7 @@ class ManualSensor:
 
 
 class MovedMicrophone:
-    """A sensor with one microphone that a person moves from control point to control point.
-
-    The drive plays on meanwhile.
-    """
+    """A sensor with one microphone that a person moves between control points while the drive plays."""
 
     def __init__(self, sensor: Sensor, control_points: ArrayLike, ask: Callable[[str], str] = typed) -> None:
         """Set the points.
@@ -83,9 +77,8 @@ class MovedMicrophone:
         """
         require_kind("sensor", sensor, Sensor)
         require_callable("ask", ask)
-        self._sensor = sensor
+        self._sensor, self._ask = sensor, ask
         self._points = points_tensor("control_points", control_points)
-        self._ask = ask
 
     def read(self) -> torch.Tensor:
         """Return magnitudes (P,) [Pa].

@@ -34,13 +34,10 @@ class LockIn:
             the phasor: 6 over the number of samples, if they hold many periods.
     """
 
-    noise_gain: float
-
     def __init__(self, frequency: float, step: float, samples: int) -> None:
-        """Prepare the fit to S `samples`, a time `step` [s] apart, of a sine of a `frequency` [Hz].
+        """Prepare the fit of a sine of a `frequency` [Hz] to S `samples`, a time `step` [s] apart.
 
-        Raises:
-            ValueError: an argument out of range; less than two periods, or two samples a period or fewer.
+        `ValueError` for less than two periods, or two samples a period or fewer.
         """
         cycles = positive("frequency", frequency, "Hz") * positive("step", step, "s")
         samples = integer_at_least("samples", samples, 4)

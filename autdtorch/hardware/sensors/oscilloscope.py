@@ -2,27 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import torch
 
+from autdtorch.hardware.sensors import scpi
 from autdtorch.hardware.sensors.lock_in import LockIn
-from autdtorch.hardware.sensors.scpi import (
-    FINEST,
-    KEYSIGHT,
-    PREAMBLE,
-    SAMPLES,
-    SCALE,
-    SET_UP_INPUT,
-    SOURCE,
-    Dialect,
-    Waveform,
-)
+from autdtorch.hardware.sensors.scpi import KEYSIGHT, Dialect, Waveform
 from autdtorch.hardware.sensors.sensor import SensorError
 from autdtorch.hardware.sensors.vertical_scale import VerticalScale
 from autdtorch.hardware.transport.port import LinkError, closed_on_error
@@ -71,7 +62,7 @@ class Microphone:
         positive("gain", self.gain)
 
 
-class Oscilloscope:
+class Oscilloscope(contextlib.AbstractContextManager["Oscilloscope"]):
     """An oscilloscope that captures on request, without a trigger signal; a context manager.
 
     Methods raise `LinkError` if it does not take commands or does not answer.
@@ -80,22 +71,15 @@ class Oscilloscope:
         identity: its answer to ``*IDN?``.
     """
 
-    identity: str
-
     def __init__(self, port: UsbtmcPort, dialect: Dialect = KEYSIGHT) -> None:
-        """Ask for its identity.
-
-        Args:
-            port: takes its commands.
-            dialect: commands of its maker.
+        """Ask the oscilloscope at a `port` for its identity; `dialect` has the commands of its maker.
 
         Raises:
             ValueError: no port or dialect.
         """
         require_kind("port", port, UsbtmcPort)
         require_kind("dialect", dialect, Dialect)
-        self._port = port
-        self._dialect = dialect
+        self._port, self._dialect = port, dialect
         self._scales: dict[int, float] = {}  # by input, as sent
         self.identity = port.ask("*IDN?")
 
@@ -104,7 +88,7 @@ class Oscilloscope:
         for command in self._dialect.set_up:
             self._port.tell(command.format(time=time_scale))
         for number in inputs:
-            for command in SET_UP_INPUT:
+            for command in scpi.SET_UP_INPUT:
                 self._port.tell(command.format(input=number))
 
     def capture(self, scales: Mapping[int, float]) -> list[Waveform]:
@@ -121,23 +105,17 @@ class Oscilloscope:
         return self._capture(scales)
 
     def close(self) -> None:
-        """Release it."""
+        """Release the oscilloscope."""
         self._port.close()
 
-    def __enter__(self) -> Self:
-        """Return the oscilloscope."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Release it."""
+    def __exit__(self, *_: object) -> None:
+        """Release the oscilloscope."""
         self.close()
 
     def _capture(self, scales: Mapping[int, float]) -> list[Waveform]:
         for number, scale in scales.items():
             if self._scales.get(number) != scale:
-                self._port.tell(SCALE.format(input=number, scale=scale))
+                self._port.tell(scpi.SCALE.format(input=number, scale=scale))
                 self._scales[number] = scale
         for command in self._dialect.capture:
             self._port.tell(command)
@@ -149,8 +127,8 @@ class Oscilloscope:
         return [self._waveform(number) for number in scales]
 
     def _waveform(self, number: int) -> Waveform:
-        self._port.tell(SOURCE.format(input=number))
-        return self._dialect.waveform(self._port.ask(PREAMBLE), self._port.ask_block(SAMPLES))
+        self._port.tell(scpi.SOURCE.format(input=number))
+        return self._dialect.waveform(self._port.ask(scpi.PREAMBLE), self._port.ask_block(scpi.SAMPLES))
 
 
 class ScopeSensor:
@@ -167,14 +145,8 @@ class ScopeSensor:
         recaptures: number of captures that were repeated on another scale.
     """
 
-    recaptures: int
-
     def __init__(
-        self,
-        scope: Oscilloscope,
-        frequency: float,
-        microphones: Sequence[Microphone],
-        captures: int = 1,
+        self, scope: Oscilloscope, frequency: float, microphones: Sequence[Microphone], captures: int = 1
     ) -> None:
         """Set the oscilloscope up.
 
@@ -196,7 +168,7 @@ class ScopeSensor:
         volts = [one.sensitivity * one.gain for one in self._microphones]  # at the input, for 1 Pa
         self._volts = torch.tensor(volts, dtype=torch.float64, device="cpu")
         self._scales = {
-            one.input: VerticalScale.up_to(one.loudest * factor, FINEST)
+            one.input: VerticalScale.up_to(one.loudest * factor, scpi.FINEST)
             for one, factor in zip(self._microphones, volts, strict=True)
         }
         self.recaptures = 0
@@ -218,10 +190,8 @@ class ScopeSensor:
         # The power of noise alone has a standard error of its own size, over the root of the captures.
         quiet = power - noise < _QUIET * noise / self._captures**0.5
         for place in quiet.nonzero().flatten().tolist():
-            logger.warning(
-                "input %d: %.3g Pa is within the noise of %.2g Pa",
-                *(self._microphones[place].input, float(pressure[place]), float(noise[place].sqrt())),
-            )
+            values = self._microphones[place].input, float(pressure[place]), float(noise[place].sqrt())
+            logger.warning("input %d: %.3g Pa is within the noise of %.2g Pa", *values)
         return pressure
 
     def _capture(self) -> torch.Tensor:
@@ -261,10 +231,9 @@ class ScopeSensor:
     def _require_unclipped(self, waveforms: Sequence[Waveform]) -> None:
         for microphone, waveform in zip(self._microphones, waveforms, strict=True):
             if waveform.clipped:
-                raise SensorError(
-                    f"input {microphone.input}: {waveform.clipped} of {len(waveform.volts)} samples are "
-                    f"clipped, by more than {microphone.loudest:g} Pa: raise `loudest`"
-                )
+                clipped = f"{waveform.clipped} of {len(waveform.volts)} samples are clipped"
+                loudest = f"by more than {microphone.loudest:g} Pa: raise `loudest`"
+                raise SensorError(f"input {microphone.input}: {clipped}, {loudest}")
 
 
 def open_scope(

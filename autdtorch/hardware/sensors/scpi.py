@@ -69,7 +69,7 @@ class Dialect:
     origin_in_codes: bool
 
     def waveform(self, preamble: str, codes: bytes) -> Waveform:
-        """Return the waveform of the answers to `PREAMBLE` and `SAMPLES`.
+        """Return the waveform of the answers to the questions for preamble and samples.
 
         Raises:
             LinkError: the preamble is not ten numbers, with steps above 0, or there are no samples.
@@ -80,9 +80,8 @@ class Dialect:
         except (ValueError, IndexError) as error:
             raise LinkError(f"oscilloscope: preamble {preamble[:80]!r}; must be ten numbers") from error
         if not (time_step > 0 and resolution > 0 and codes):
-            raise LinkError(
-                f"oscilloscope: preamble {preamble[:80]!r} and {len(codes)} samples make no waveform"
-            )
+            given = f"preamble {preamble[:80]!r} and {len(codes)} samples"
+            raise LinkError(f"oscilloscope: {given} make no waveform")
         values = torch.frombuffer(bytearray(codes), dtype=torch.uint8)
         clipped = int(((values < self.lowest) | (values > 254)).sum())
         steps = values.to(torch.float64) - reference

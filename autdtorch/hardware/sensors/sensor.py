@@ -23,9 +23,5 @@ class Sensor(Protocol):
 
 
 def checked_reading(sensor: Sensor, points: int) -> torch.Tensor:
-    """Return the reading (P,) [Pa], float64, of a sensor.
-
-    Raises:
-        ValueError: not P finite magnitudes.
-    """
+    """Return the reading (P,) [Pa], float64, of a sensor; `ValueError` if not P finite magnitudes."""
     return validate_magnitudes("pressure of the sensor", sensor.read(), points)

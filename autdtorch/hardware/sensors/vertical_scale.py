@@ -16,8 +16,8 @@ _COARSER = 4.0  # a waveform that clips fills at least a quarter of a scale so m
 class VerticalScale:
     """Volts per division, between two bounds.
 
-    A waveform keeps its scale from a quarter of the screen to the whole, and a new scale has it at half: a
-    sound as loud as the last, or twice or half as loud, needs no change.
+    A waveform keeps its scale if it fills a quarter of the screen or more, and fills half of it on a new one:
+    a sound twice or half as loud as the last needs no change.
 
     Attributes:
         now: the scale [V/division].
@@ -36,10 +36,10 @@ class VerticalScale:
         return cls(coarsest, finest, coarsest)
 
     def fitted(self, waveform: Waveform, noise: float) -> VerticalScale:
-        """Return the scale that suits a waveform on this one, with noise of an rms [V].
+        """Return the scale for the next waveform, from one on this scale with noise of an rms [V].
 
-        From a step of the converter on, noise keeps the scale from being made finer: rounding then adds 1/12
-        to the noise's variance at most, and no bias.
+        The scale is not made finer if the noise exceeds a step of the converter: rounding then adds at most
+        1/12 to its variance, and no bias.
         """
         peak = float(waveform.volts.abs().max()) + waveform.resolution
         wanted = self.now

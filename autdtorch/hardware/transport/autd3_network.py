@@ -24,11 +24,7 @@ _Asked = tuple[_Command, SimpleQueue[BaseException | None]]  # with the queue th
 
 
 def autd3_kit() -> Any:
-    """Return the package autd3, if all parts of the kit are there.
-
-    Raises:
-        ImportError: the packages autd3 and autd3-pattern are missing.
-    """
+    """Return the package autd3; `ImportError` if a part of the kit is missing."""
     try:
         import autd3
         import autd3_core  # noqa: F401
@@ -43,9 +39,8 @@ class Autd3Port:
 
     Methods raise `LinkError` if a board is not there or does not answer, `ImportError` without the kit.
 
-    The kit's event loop runs in a thread of its own, where commands wait for their turn. Signals are handled
-    in the main thread, so that none breaks a command off: an exception in asyncio's own code loses the
-    command's wake-up, and closing the loop then waits for it for ever.
+    The kit's event loop runs in a thread of its own, and signals are handled in the main thread. A signal
+    in asyncio's own code would lose the command's wake-up, and closing the loop would wait for it for ever.
     """
 
     def __init__(self, boards: int, network: Any = None) -> None:

@@ -16,7 +16,7 @@ class LinkError(OSError):
 
 @contextlib.contextmanager
 def closed_on_error(close: Callable[[], None]) -> Iterator[None]:
-    """Call `close` if the block fails, and raise that error rather than one of closing."""
+    """Call `close` if the block fails, and raise the block's error rather than one of closing."""
     try:
         yield
     except BaseException:

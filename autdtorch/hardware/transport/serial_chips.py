@@ -34,7 +34,7 @@ _READ_MS = 50
 
 
 class FtdiFifo(UsbPort):
-    """An FT232H as a FIFO. That its EEPROM puts it into this mode is inferred, not verified."""
+    """An FT232H as a FIFO; its EEPROM is assumed to select this mode."""
 
     def _set_up(self) -> None:
         self._request(RESET, RESET_CHIP)
@@ -73,9 +73,9 @@ class FtdiUart(FtdiFifo):
 class CdcUart(UsbPort):
     """A serial port of USB's own class, as on an Arduino Mega 2560: 8 bits, no parity, 1 stop bit.
 
-    A thread reads and drops all input, as cdc_acm does: an Ultraino sends the bytes for its next board, and
-    its commands, back to USB too. Older firmwares of the Arduino's chip (Arduino-usbserial on LUFA 100807)
-    wait 0.1 s for every byte that is not read, and pass nothing on meanwhile.
+    A thread reads and drops all input, as cdc_acm does: an Ultraino echoes commands and the bytes for its
+    next board. Older firmwares of the Arduino's chip (Arduino-usbserial on LUFA 100807) pause for 0.1 s at
+    every byte that is not read.
     """
 
     def __init__(self, device: Any, baud: int) -> None:
@@ -106,13 +106,7 @@ class CdcUart(UsbPort):
 
 
 class Adapter(NamedTuple):
-    """A USB chip that a device may hang on.
-
-    Attributes:
-        vendor: idVendor.
-        product: idProduct.
-        open_port: opens a `usb.core.Device`.
-    """
+    """A USB chip of a device: idVendor, idProduct, and the function that opens a `usb.core.Device`."""
 
     vendor: int
     product: int

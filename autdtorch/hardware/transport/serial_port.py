@@ -20,17 +20,7 @@ class SerialPort:
     """
 
     def __init__(self, name: str, baud: int) -> None:
-        """Open the port.
-
-        Args:
-            name: of the port, such as "COM3" or "/dev/ttyUSB0".
-            baud: rate of the line [bits/s].
-
-        Raises:
-            LinkError: there is no such port, another program has it open, or it refuses the rate.
-            ImportError: pyserial is missing.
-            ValueError: `name` is no text.
-        """
+        """Open the port of a `name` such as "COM3" or "/dev/ttyUSB0", at `baud` bits/s."""
         require_kind("port", name, str)
         self._name = name
         with self._errors("be opened", hint=True):

@@ -21,17 +21,10 @@ _DIRECTION, _TRANSFER_TYPE, _BULK = 0x80, 0x03, 0x02
 
 
 def find_device(chips: Collection[tuple[int, int]], serial: str | None = None, backend: Any = None) -> Any:
-    """Return the one USB device (`usb.core.Device`) that fits a description.
+    """Return the one USB device (`usb.core.Device`) whose idVendor and idProduct are in `chips`.
 
-    Args:
-        chips: idVendor and idProduct of those accepted.
-        serial: serial number, where several such devices are plugged in.
-        backend: of pyusb; by default the libusb of the package libusb-package.
-
-    Raises:
-        LinkError: none or several such devices, with a list of those plugged in, or no libusb.
-        ImportError: pyusb or libusb-package is missing.
-        ValueError: a `serial` that is no text.
+    `LinkError` if none or several have them and the `serial` number, or without libusb; `ImportError` without
+    pyusb or libusb-package.
     """
     if serial is not None:
         require_kind("serial", serial, str)
@@ -68,8 +61,7 @@ class UsbPort:
 
         Its serial line, if it has one, gets the rate nearest to `baud` [bits/s] that the chip has.
         """
-        self._device = device
-        self._baud = baud
+        self._device, self._baud = device, baud
         self._detached: list[int] = []
         with closed_on_error(self.close):
             self._call("be opened", self._take)
@@ -160,9 +152,7 @@ class UsbPort:
             reason = _reason(self._device, error.errno)
             raise LinkError(f"{_described(self._device)} cannot {what}: {reason}{error}") from error
         except NotImplementedError as error:  # pyusb's form of libusb's "not supported"
-            reason = (
-                "libusb cannot use its driver; on Windows, give it WinUSB, with Zadig, or use its COM port"
-            )
+            reason = "libusb cannot use its driver; on Windows, give it WinUSB by Zadig, or use its COM port"
             raise LinkError(f"{_described(self._device)} cannot {what}: {reason}: {error}") from error
 
 

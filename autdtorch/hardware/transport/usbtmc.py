@@ -34,21 +34,16 @@ _CHECKS = 100
 def message(kind: int, tag: int, length: int, attributes: int, data: bytes = b"") -> bytes:
     """Return a bulk transfer: a header of 12 bytes, the data, and zeros up to a multiple of 4 bytes.
 
-    Args:
-        kind: MsgID.
-        tag: number of the transfer, 1 to 255.
-        length: number of bytes of the data, or the most that the instrument may send.
-        attributes: bmTransferAttributes.
-        data: bytes to send.
+    The header holds `kind` (MsgID), `tag` (1 to 255), `length` (of the data, or the most that the instrument
+    may send) and `attributes` (bmTransferAttributes).
     """
     return _HEADER.pack(kind, tag, tag ^ 0xFF, length, attributes) + data + bytes(-len(data) % 4)
 
 
 def announced(packet: bytes, tag: int) -> tuple[int, bool]:
-    """Return the length of the data in an instrument's transfer, and whether its message ends with it.
+    """Return the length of the data in an instrument's transfer, and true if its message ends with it.
 
-    Raises:
-        LinkError: the first `packet` does not answer the request `tag`, or announces more than requested.
+    `LinkError` if the first `packet` does not answer the request `tag`, or announces more than requested.
     """
     if len(packet) < _HEADER.size:
         raise LinkError(f"USBTMC: {len(packet)} bytes {packet.hex(' ')}; a header has {_HEADER.size}")
@@ -60,12 +55,9 @@ def announced(packet: bytes, tag: int) -> tuple[int, bool]:
 
 
 def block(data: bytes) -> bytes:
-    """Return the content of a definite-length block of IEEE 488.2.
+    """Return the content of a definite-length block of IEEE 488.2; `LinkError` if it is none, or incomplete.
 
-    A block is ``#``, a digit n, n digits with the number of bytes, the bytes, and maybe a line end.
-
-    Raises:
-        LinkError: no such block, or an incomplete one.
+    A block is ``#``, a digit n, n digits with the number of bytes, the bytes, and optionally a line end.
     """
     digits = data[2 : 2 + int(data[1:2])] if data[:1] == b"#" and data[1:2].isdigit() else b""
     if not digits.isdigit():
@@ -120,14 +112,12 @@ class UsbtmcPort(UsbPort):
             self.write(message(ASK, tag, _MOST, 0))
             data, ended = self._data(question, tag)
             if not data and not ended:
-                raise LinkError(
-                    f"USBTMC: the answer to {question} does not go on after {len(received)} bytes"
-                )
+                raise LinkError(f"USBTMC: the answer to {question} stops after {len(received)} bytes")
             received += data
         return received
 
     def _data(self, question: str, tag: int) -> tuple[bytes, bool]:
-        """Return the data of a transfer from the instrument, and whether its message ends with it.
+        """Return the data of a transfer from the instrument, and true if its message ends with it.
 
         The transfer is read to the length in its header: not all instruments send an empty packet after one
         of whole packets. If one does, that is read before the next transfer.
