@@ -12,7 +12,7 @@ from autdtorch.utils.neighbours import distances
 from autdtorch.utils.validation import LENGTH_TOLERANCE, ArrayLike, not_negative, points_tensor, positive
 
 PAIR_BYTES = 80.0
-"""Memory [bytes] for each entry of a transfer matrix while it is computed."""
+"""Memory for each entry of a transfer matrix while it is computed [bytes]."""
 
 
 def green(points: ArrayLike, sources: ArrayLike, wavenumber: complex) -> torch.Tensor:
@@ -43,18 +43,10 @@ def green(points: ArrayLike, sources: ArrayLike, wavenumber: complex) -> torch.T
 
 
 def free_space_matrix(points: ArrayLike, array: TransducerArray, wavenumber: complex) -> torch.Tensor:
-    """Return the transfer matrix of an array in free space: S e^{i k r} / r (Eq. 2), averaged over discs.
+    """Return the transfer matrix (P, M), complex128, of an array in free space: S e^{i k r} / r (Eq. 2).
 
-    Args:
-        points: (P, 3) [m].
-        array: M transducers of source strength S; discs are averaged over `array.nodes`.
-        wavenumber: k [rad/m], > 0, or k + i alpha with an attenuation alpha >= 0 [Np/m].
-
-    Returns:
-        complex128 (P, M), pressure [Pa] per unit drive.
-
-    Raises:
-        ValueError: as in `green`; or the matrix needs more memory than available.
+    The mean over discs is that over `array.nodes`. Arguments and errors as for `green`; pressure [Pa] per
+    unit drive.
     """
     positions, weights = array.nodes
     points = points_tensor("points", points)
@@ -69,6 +61,5 @@ def _wavenumber(value: complex) -> tuple[float, float]:
     """Return wavenumber k and attenuation alpha of a complex wavenumber."""
     if not isinstance(value, complex):
         return positive("wavenumber", value, "rad/m"), 0.0
-    return positive("wavenumber.real", value.real, "rad/m"), not_negative(
-        "wavenumber.imag", value.imag, "Np/m"
-    )
+    k = positive("wavenumber.real", value.real, "rad/m")
+    return k, not_negative("wavenumber.imag", value.imag, "Np/m")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,21 +13,27 @@ from autdtorch.utils.validation import ArrayLike, invalid, positive, real_tensor
 
 
 @dataclass(frozen=True)
-class Layering(ABC):
-    """A fluid behind a plane front face, and its response to plane waves.
+class Layering:
+    """A fluid behind a plane front face, a half-space or a slab in a medium, and its response to plane waves.
 
     Responses are pressures over the incident pressure at the front face, for horizontal wavenumbers kappa
-    [rad/m]. They also hold for complex kappa, on the sheet that `vertical_wavenumber` defines.
+    [rad/m]. They also hold for complex kappa, on the sheet that `vertical_wavenumber` defines. The transfer
+    matrix of a slab is multiplied by e^{i gamma_1 d}, so that decaying waves do not overflow. It is written
+    with sin(gamma_1 x) / gamma_1, so that gamma_1 = 0 is an ordinary case.
+
+    Source: Brekhovskikh & Godin, Acoustics of Layered Media I (1990), section 2.2 and chapter 2.
 
     Attributes:
         wavenumber: k of the medium in front [rad/m], > 0.
         density_ratio: rho_1 / rho of the fluid and the medium, > 0.
         speed_ratio: c_1 / c of the fluid and the medium, > 0.
+        thickness: d of a slab [m], > 0; None for a half-space.
     """
 
     wavenumber: float
     density_ratio: float
     speed_ratio: float
+    thickness: float | None = None
 
     def __post_init__(self) -> None:
         """Check the attributes and make them floats."""
@@ -42,76 +47,23 @@ class Layering(ABC):
         return self.wavenumber / self.speed_ratio
 
     @property
-    @abstractmethod
     def depth(self) -> float:
         """Distance over which waves are reflected back and forth behind the front face [m]."""
-
-    @abstractmethod
-    def reflected(self, kappa: ComplexArray) -> ComplexArray:
-        """Return the reflected pressure at the front face."""
-
-    @abstractmethod
-    def transmitted(self, kappa: ComplexArray, depth: float) -> ComplexArray:
-        """Return the total pressure at `depth` [m] >= 0 behind the front face."""
-
-    def _vertical(self, kappa: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-        """Return the vertical wavenumbers outside, times the density ratio, and inside."""
-        outer = self.density_ratio * vertical_wavenumber(self.wavenumber, kappa)
-        return outer, vertical_wavenumber(self.inner_wavenumber, kappa)
-
-
-@dataclass(frozen=True)
-class HalfSpace(Layering):
-    """An infinite fluid (Brekhovskikh & Godin, Acoustics of Layered Media I (1990), section 2.2)."""
-
-    @property
-    def depth(self) -> float:
-        """Zero: no wave returns."""
-        return 0.0
-
-    def reflected(self, kappa: ComplexArray) -> ComplexArray:
-        """Return the reflected pressure at the front face."""
-        outer, inner = self._vertical(kappa)
-        return (outer - inner) / (outer + inner)
-
-    def transmitted(self, kappa: ComplexArray, depth: float) -> ComplexArray:
-        """Return the total pressure at `depth` [m] >= 0 behind the front face."""
-        outer, inner = self._vertical(kappa)
-        return 2 * outer / (outer + inner) * np.exp(1j * inner * depth)
-
-
-@dataclass(frozen=True)
-class Slab(Layering):
-    """A fluid layer in a medium (Brekhovskikh & Godin I, chapter 2).
-
-    The transfer matrix of the layer is multiplied by e^{i gamma_1 d}, so that decaying waves do not overflow.
-    It is written with sin(gamma_1 x) / gamma_1, so that gamma_1 = 0 is an ordinary case.
-
-    Attributes:
-        thickness: d [m], > 0.
-    """
-
-    thickness: float
-
-    def __post_init__(self) -> None:
-        """Check the attributes and make them floats."""
-        super().__post_init__()
-        object.__setattr__(self, "thickness", positive("thickness", self.thickness, "m"))
-
-    @property
-    def depth(self) -> float:
-        """The thickness [m]."""
-        return self.thickness
+        return self.thickness or 0.0
 
     def reflected(self, kappa: ComplexArray) -> ComplexArray:
         """Return the reflected pressure at the front face."""
         outer, inner, denominator = self._terms(kappa)
+        if self.thickness is None:
+            return (outer - inner) / denominator
         _, sine = _scaled_cosine_and_sine(inner, self.thickness)
         return -1j * (outer**2 - inner**2) * sine / denominator
 
     def transmitted(self, kappa: ComplexArray, depth: float) -> ComplexArray:
-        """Return the total pressure at `depth` [m] >= 0 behind the front face, in the slab or beyond it."""
+        """Return the total pressure at `depth` [m] >= 0 behind the front face, in the fluid or beyond it."""
         outer, inner, denominator = self._terms(kappa)
+        if self.thickness is None:
+            return 2 * outer / denominator * np.exp(1j * inner * depth)
         inside = min(depth, self.thickness)
         # At the back face, p and its slope over the density are those of the transmitted wave.
         cosine, sine = _scaled_cosine_and_sine(inner, self.thickness - inside)
@@ -119,7 +71,11 @@ class Slab(Layering):
         return pressure * np.exp(1j * outer / self.density_ratio * (depth - inside))
 
     def _terms(self, kappa: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-        outer, inner = self._vertical(kappa)
+        """Return the vertical wavenumbers outside, times the density ratio, and inside, and a denominator."""
+        outer = self.density_ratio * vertical_wavenumber(self.wavenumber, kappa)
+        inner = vertical_wavenumber(self.inner_wavenumber, kappa)
+        if self.thickness is None:
+            return outer, inner, outer + inner
         cosine, sine = _scaled_cosine_and_sine(inner, self.thickness)
         return outer, inner, 2 * outer * cosine - 1j * (outer**2 + inner**2) * sine
 
@@ -127,8 +83,8 @@ class Slab(Layering):
 def vertical_wavenumber(wavenumber: float, kappa: ComplexArray) -> ComplexArray:
     """Return the root gamma of k^2 - kappa^2 with the branch cut from kappa = k upwards.
 
-    For real kappa >= 0 the wave of this gamma travels or decays away from its source. The root is analytic in
-    the fourth quadrant, and in the first to the right of k, where contours of integration run.
+    For real kappa >= 0 the wave travels or decays away from its source. The root is analytic in the fourth
+    quadrant, and in the first to the right of k, where contours of integration run.
     """
     below: ComplexArray = np.sqrt(-1j * (wavenumber - kappa)) * np.exp(0.25j * np.pi)
     return below * np.sqrt(wavenumber + kappa)
@@ -147,8 +103,8 @@ def step_coefficients(
         speed_ratio: c_1 / c > 0.
 
     Returns:
-        R and T, complex128 in the shape of `angle`: reflected and transmitted pressure over the incident
-        pressure at the face.
+        R and T, complex128 in the shape of `angle`: reflected and transmitted pressure at the faces over the
+        incident pressure at the front face.
 
     Raises:
         ValueError: an argument out of the range given above.
@@ -156,7 +112,7 @@ def step_coefficients(
     Source: Brekhovskikh & Godin, Acoustics of Layered Media I (1990), section 2.2; Pierce, Acoustics,
         section 3-6.
     """
-    return _coefficients(angle, HalfSpace(1.0, density_ratio, speed_ratio))
+    return _coefficients(angle, Layering(1.0, density_ratio, speed_ratio))
 
 
 def slab_coefficients(
@@ -164,24 +120,14 @@ def slab_coefficients(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the reflection and transmission coefficients of a plane wave at a fluid slab in a medium.
 
-    Args:
-        angle: of incidence, any shape [rad], in [0, pi/2).
-        wavenumber: k of the medium [rad/m], > 0.
-        thickness: [m], > 0.
-        density_ratio: rho_1 / rho > 0.
-        speed_ratio: c_1 / c > 0.
-
-    Returns:
-        R and T, complex128 in the shape of `angle`: reflected pressure at the front face and transmitted
-        pressure at the back face, over the incident pressure at the front face.
-
-    Raises:
-        ValueError: an argument out of the range given above.
+    Arguments, returns and errors as for `step_coefficients`, with `wavenumber` k of the medium [rad/m], > 0,
+    and `thickness` [m], > 0.
 
     Source: Brekhovskikh & Godin, Acoustics of Layered Media I (1990), chapter 2; Pierce, Acoustics,
         section 3-7.
     """
-    return _coefficients(angle, Slab(wavenumber, density_ratio, speed_ratio, thickness))
+    thickness = positive("thickness", thickness, "m")
+    return _coefficients(angle, Layering(wavenumber, density_ratio, speed_ratio, thickness))
 
 
 def _coefficients(angle: ArrayLike, layering: Layering) -> tuple[torch.Tensor, torch.Tensor]:

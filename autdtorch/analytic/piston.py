@@ -44,16 +44,8 @@ def piston_directivity(angle: ArrayLike, wavenumber: float, radius: float) -> to
 def piston_on_axis(distance: ArrayLike, wavenumber: float, radius: float) -> torch.Tensor:
     """Return the pressure on the axis of a piston: (e^{ik sqrt(z^2 + a^2)} - e^{ikz}) / (2 pi i k a^2).
 
-    Args:
-        distance: z from the piston, any shape [m], >= 0.
-        wavenumber: k [rad/m], > 0.
-        radius: a [m], > 0.
-
-    Returns:
-        complex128 in the shape of `distance` [1/m]; e^{ikz} / (4 pi z) far away, as `green`.
-
-    Raises:
-        ValueError: not finite, or out of the ranges above.
+    `distance` is z from the piston [m], any shape, >= 0; the rest is as for `piston_directivity`.
+    The result [1/m], complex128 in the shape of `distance`, is e^{ikz} / (4 pi z) far away, as `green`.
 
     Source: Pierce, Acoustics, section 5-7; Morse & Ingard, Theoretical Acoustics (1968), section 7.4.
     """

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 
 from autdtorch.analytic.green import green
-from autdtorch.analytic.layers import HalfSpace, Layering, Slab, vertical_wavenumber
+from autdtorch.analytic.layers import Layering, vertical_wavenumber
 from autdtorch.analytic.sommerfeld import sommerfeld_integral
 from autdtorch.utils.array_types import ComplexArray
 from autdtorch.utils.validation import (
@@ -16,6 +18,7 @@ from autdtorch.utils.validation import (
     boolean,
     finite_vector,
     points_tensor,
+    positive,
     unit_vector,
 )
 
@@ -81,25 +84,13 @@ def fluid_half_space(
 ) -> torch.Tensor:
     """Return the field of point sources in front of a fluid half-space, on both sides of its face.
 
-    Args:
-        points: (P, 3) [m], anywhere.
-        sources: (M, 3) [m], in front of the face.
-        wavenumber: k of the medium in front [rad/m], > 0.
-        origin: a point (3,) of the face [m].
-        normal: of the face (3,), towards the sources; any length.
-        density_ratio: rho_1 / rho > 0.
-        speed_ratio: c_1 / c > 0.
-        scattered: subtract the field of the sources in the infinite medium.
-
-    Returns:
-        complex128 (P, M) [1/m], in units of `green`; relative error about 1e-10 of the direct wave.
-
-    Raises:
-        ValueError: not finite, wrong shape, out of the ranges above, or a point on a source.
+    Arguments, returns and errors as for `rigid_plane`, with the ratios of `step_coefficients`; the points may
+    be anywhere. With `scattered`, the field of the sources in the infinite medium is subtracted. The error is
+    about 1e-10 of the direct wave.
 
     Source: Brekhovskikh & Godin, Acoustics of Layered Media II (1992), chapter 1.
     """
-    layering = HalfSpace(wavenumber, density_ratio, speed_ratio)
+    layering = Layering(wavenumber, density_ratio, speed_ratio)
     return _layered_field(points, sources, layering, origin, normal, scattered)
 
 
@@ -117,10 +108,10 @@ def fluid_slab(
 ) -> torch.Tensor:
     """Return the field of point sources in front of a fluid slab in a medium: in front, inside and behind.
 
-    Arguments, returns, errors and source as for `fluid_half_space`; the front face is its face, and the
-    slab has a `thickness` [m], > 0.
+    Arguments, returns and errors as for `rigid_plane`, otherwise as for `fluid_half_space`; the slab has a
+    `thickness` [m], > 0.
     """
-    layering = Slab(wavenumber, density_ratio, speed_ratio, thickness)
+    layering = Layering(wavenumber, density_ratio, speed_ratio, positive("thickness", thickness, "m"))
     return _layered_field(points, sources, layering, origin, normal, scattered)
 
 
@@ -130,9 +121,8 @@ def _image_wave(
     targets = points_tensor("points", points)
     origins = points_tensor("sources", sources).to(targets.device)
     axis = targets.new_tensor(unit_vector("normal", normal))
-    _require_in_front("points", targets, _heights(targets, origin, axis), -LENGTH_TOLERANCE)
-    heights = _heights(origins, origin, axis)
-    _require_in_front("sources", origins, heights, -LENGTH_TOLERANCE)
+    _heights("points", targets, origin, axis, -LENGTH_TOLERANCE)
+    heights = _heights("sources", origins, origin, axis, -LENGTH_TOLERANCE)
     return green(targets, origins - 2 * heights[:, None] * axis, wavenumber)
 
 
@@ -143,10 +133,8 @@ def _layered_field(
     targets = points_tensor("points", points)
     origins = points_tensor("sources", sources).to(targets.device)
     axis = targets.new_tensor(unit_vector("normal", normal))
-    heights = _heights(targets, origin, axis)
-    source_heights = _heights(origins, origin, axis)
-    _require_in_front("sources", origins, source_heights, LENGTH_TOLERANCE)
-    above = source_heights.tolist()
+    heights = _heights("points", targets, origin, axis)
+    above = _heights("sources", origins, origin, axis, LENGTH_TOLERANCE).tolist()
     between = targets[:, None] - origins
     offsets = (between - (between @ axis)[..., None] * axis).norm(dim=-1)
     rows = [
@@ -155,11 +143,10 @@ def _layered_field(
     ]
     field = torch.tensor(rows, dtype=torch.complex128, device=targets.device)
     # The integral is the reflected wave in front of the face, and the total field behind it.
-    in_front = heights >= 0
-    incident_rows = ~in_front if scattered else in_front
-    if incident_rows.any():
+    incident = (heights >= 0) != scattered
+    if incident.any():
         sign = -1 if scattered else 1
-        field[incident_rows] += sign * green(targets[incident_rows], origins, layering.wavenumber)
+        field[incident] += sign * green(targets[incident], origins, layering.wavenumber)
     return field
 
 
@@ -176,14 +163,15 @@ def _response(layering: Layering, offset: float, height: float, source_height: f
     return sommerfeld_integral(spectrum, wavenumbers, offset, source_height + abs(height), 2 * layering.depth)
 
 
-def _heights(positions: torch.Tensor, origin: Vector, axis: torch.Tensor) -> torch.Tensor:
-    return (positions - axis.new_tensor(finite_vector("origin", origin))) @ axis
-
-
-def _require_in_front(name: str, positions: torch.Tensor, heights: torch.Tensor, least: float) -> None:
+def _heights(
+    name: str, positions: torch.Tensor, origin: Vector, axis: torch.Tensor, least: float = -math.inf
+) -> torch.Tensor:
+    """Return the heights [m] of positions over the plane, none below `least`."""
+    heights = (positions - axis.new_tensor(finite_vector("origin", origin))) @ axis
     lowest = int(heights.argmin())
     if heights[lowest] < least:
         raise ValueError(
             f"{name}[{lowest}]: {tuple(positions[lowest].tolist())} m, {float(heights[lowest]):g} m in front "
             f"of the plane; must be at least {least:g} m"
         )
+    return heights

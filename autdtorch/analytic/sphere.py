@@ -109,21 +109,8 @@ def fluid_sphere(
 ) -> torch.Tensor:
     """Return the field of point sources outside a fluid sphere, outside and inside it.
 
-    Args:
-        points: (P, 3) [m], anywhere.
-        sources: (M, 3) [m], outside the sphere.
-        wavenumber: k of the medium outside [rad/m], > 0.
-        center: of the sphere (3,) [m].
-        radius: of the sphere [m], > 0.
-        density_ratio: rho_1 / rho > 0.
-        speed_ratio: c_1 / c > 0.
-        scattered: subtract the field of the sources in the infinite medium.
-
-    Returns:
-        complex128 (P, M) [1/m], in units of `green`.
-
-    Raises:
-        ValueError: as for `rigid_sphere`, and ratios <= 0.
+    Arguments, returns and errors as for `rigid_sphere`, with the ratios of `step_coefficients`;
+    points may be anywhere. With `scattered`, the field of the sources in the infinite medium is subtracted.
 
     Source: Anderson (1950), JASA 22, 426, with the partial waves of a point source for those of a plane wave.
     """

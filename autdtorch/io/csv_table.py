@@ -27,19 +27,9 @@ _UNITS: dict[str, dict[str, float]] = {
 
 
 def read_table(path: str | os.PathLike[str], columns: Mapping[str, str]) -> dict[str, Column]:
-    """Read a table; empty lines and lines that start with # are skipped.
+    """Return the columns (R,) of a table in SI units, by name; empty lines and # comments are skipped.
 
-    Args:
-        path: of the file, in UTF-8, with commas.
-        columns: SI units by name of the columns that may occur: "m" (or mm in the file), "rad" (or deg), "".
-
-    Returns:
-        The columns (R,) of the file in SI units, by name.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: an unknown or repeated column, a missing or unknown unit, a row of another length, a cell
-            that is not a finite number, or no row. The message names file, line and column.
+    `columns` has the SI unit of each name that may occur: "m" (or mm in the file), "rad" (or deg), "".
     """
     rows = _rows(path)
     try:

@@ -109,16 +109,7 @@ def _read(where: str, source: str | os.PathLike[str] | Mapping[str, Any]) -> obj
 def _part(
     where: str, key: str, value: object, air: Builder, folder: Path, modules: tuple[str, ...]
 ) -> object:
-    """Build one argument of `Scene`.
-
-    Args:
-        where: name of the section, for messages.
-        key: name of the argument.
-        value: content of the section.
-        air: builder of a medium of air.
-        folder: where paths start.
-        modules: trusted modules.
-    """
+    """Build one argument of `Scene`; `air` makes a medium of air, and paths start from `folder`."""
     match key:
         case "medium":
             section = _mapping(where, value)

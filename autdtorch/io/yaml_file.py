@@ -44,12 +44,7 @@ class _Extent:
 
 
 def load_yaml(path: str | os.PathLike[str]) -> Config:
-    """Read a YAML file with the checks of `parse_yaml`.
-
-    Raises:
-        OSError: the file cannot be read.
-        ValueError: bad content. The message names the file, and the line if it is known.
-    """
+    """Read a YAML file with the checks of `parse_yaml`."""
     with Path(path).open(encoding="utf-8") as file:
         try:
             text = file.read(_LARGEST + 1)
@@ -59,15 +54,7 @@ def load_yaml(path: str | os.PathLike[str]) -> Config:
 
 
 def parse_yaml(text: str, where: str) -> Config:
-    """Read YAML with OmegaConf, after checking the size with aliases expanded.
-
-    Args:
-        text: a mapping or a list.
-        where: name of the text, for messages.
-
-    Raises:
-        ValueError: not YAML, with a tag, too large or too deep.
-    """
+    """Read a mapping or list in YAML with OmegaConf, after checking the size with aliases expanded."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
     from yaml import MarkedYAMLError, YAMLError  # type: ignore[import-untyped]
@@ -84,11 +71,7 @@ def parse_yaml(text: str, where: str) -> Config:
 
 
 def unresolved(config: Config, where: str) -> Any:
-    """Return a configuration as checked dictionaries and lists, with unresolved interpolations.
-
-    Raises:
-        ValueError: as for `plain`.
-    """
+    """Return a configuration as checked dictionaries and lists, with unresolved interpolations."""
     from omegaconf import OmegaConf
 
     return plain(OmegaConf.to_container(config, resolve=False), where)
@@ -97,14 +80,9 @@ def unresolved(config: Config, where: str) -> Any:
 def plain(value: Any, where: str) -> Any:
     """Return mappings, sequences and scalars as checked dictionaries and lists.
 
-    Args:
-        value: interpolations of an OmegaConf node are resolved; check a node from others by `unresolved`
-            before.
-        where: name of the value, for messages.
-
-    Raises:
-        ValueError: too large, too deep, or a text with an interpolation other than one whole `${key}`. Others
-            could call a resolver, which reads the environment, or grow without limit.
+    A text may have no interpolation other than one whole `${key}`. Others could call a resolver, which reads
+    the environment, or grow without limit. Interpolations of an OmegaConf node are resolved; check a node
+    from others by `unresolved` before.
     """
     from omegaconf import OmegaConf
 

@@ -26,16 +26,7 @@ _DRY_AIR, _WATER = 28.9647e-3, 18.01528e-3  # kg/mol
 
 
 def vapour_fraction(temperature: float, relative_humidity: float, pressure: float) -> float:
-    """Return the molar fraction of water vapour in air (ISO 9613-1, Eqs. B.1 to B.3).
-
-    Args:
-        temperature: [deg C], -20 to 50.
-        relative_humidity: [%], 0 to 100.
-        pressure: ambient [Pa], 50e3 to 200e3.
-
-    Raises:
-        ValueError: an argument is not a number in its range.
-    """
+    """Return the molar fraction of water vapour in air (ISO 9613-1, Eqs. B.1 to B.3); see `Medium.air`."""
     celsius = number_between("temperature", temperature, *TEMPERATURES, "deg C")
     humidity = number_between("relative_humidity", relative_humidity, 0.0, 100.0, "%")
     pressure = number_between("pressure", pressure, *PRESSURES, "Pa")
@@ -46,20 +37,12 @@ def vapour_fraction(temperature: float, relative_humidity: float, pressure: floa
 def density_and_sound_speed(
     temperature: float, relative_humidity: float, pressure: float
 ) -> tuple[float, float]:
-    """Return the density [kg/m^3] and sound speed [m/s] of humid air as an ideal gas.
+    """Return the density [kg/m^3] and sound speed [m/s] of humid air as an ideal gas; see `Medium.air`.
 
     Air molecules have 5 degrees of freedom and water molecules 6, so that c^2 = (7 + x)/(5 + x) R T / M with
     the vapour fraction x (Bohn, J. Audio Eng. Soc. 36 (1988) 223-231). Between 0 and 30 deg C the result is
     within 0.05 % of the real-gas formula of Cramer (J. Acoust. Soc. Am. 93 (1993) 2510-2516), which is
     accurate to 0.03 %.
-
-    Args:
-        temperature: [deg C], -20 to 50.
-        relative_humidity: [%], 0 to 100.
-        pressure: ambient [Pa], 50e3 to 200e3.
-
-    Raises:
-        ValueError: an argument is not a number in its range.
     """
     x = vapour_fraction(temperature, relative_humidity, pressure)
     thermal = _GAS_CONSTANT * (temperature + _ZERO_CELSIUS) / ((1 - x) * _DRY_AIR + x * _WATER)
@@ -67,19 +50,10 @@ def density_and_sound_speed(
 
 
 def absorption(temperature: float, relative_humidity: float, pressure: float, frequency: float) -> float:
-    """Return the absorption of a pure tone [dB/m] by ISO 9613-1:1993, Eqs. 3 to 5.
+    """Return the absorption of a pure tone [dB/m] by ISO 9613-1:1993, Eqs. 3 to 5; see `Medium.air`.
 
     The standard states an accuracy of 10 % for vapour fractions of 0.05 to 5 %, of 20 % down to 0.005 %, and
     of 50 % in drier air.
-
-    Args:
-        temperature: [deg C], -20 to 50.
-        relative_humidity: [%], 0 to 100.
-        pressure: ambient [Pa], 50e3 to 200e3.
-        frequency: [Hz], 4e-4 to 10 times the pressure in Pa.
-
-    Raises:
-        ValueError: an argument is not a number in its range.
     """
     percent = 100 * vapour_fraction(temperature, relative_humidity, pressure)
     least, most = (limit * pressure for limit in FREQUENCIES_BY_PRESSURE)

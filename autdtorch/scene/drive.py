@@ -45,9 +45,8 @@ def drive_from_phases(phases: ArrayLike, amplitudes: ArrayLike | None = None) ->
     try:
         shape = np.broadcast_shapes(a.shape, phi.shape)
     except ValueError as error:
-        raise ValueError(
-            f"amplitudes: shape {tuple(a.shape)}; must broadcast with phases, {tuple(phi.shape)}"
-        ) from error
+        accepted = f"must broadcast with phases, {tuple(phi.shape)}"
+        raise ValueError(f"amplitudes: shape {tuple(a.shape)}; {accepted}") from error
     return torch.polar(a.expand(shape), -phi.expand(shape))
 
 
@@ -64,11 +63,7 @@ def phases_of(drive: ArrayLike) -> torch.Tensor:
 
 
 def amplitudes_of(drive: ArrayLike) -> torch.Tensor:
-    """Return the amplitudes |q| of a `drive` (..., M).
-
-    Raises:
-        ValueError: not finite complex numbers.
-    """
+    """Return the amplitudes |q| of a `drive` (..., M); errors as for `phases_of`."""
     return complex_tensor("drive", drive).abs()
 
 
@@ -96,11 +91,7 @@ def focus_phases(positions: ArrayLike, focus: ArrayLike, wavenumber: float) -> t
 
 
 def normalise(drive: ArrayLike) -> torch.Tensor:
-    """Scale a `drive` (..., M) to a largest amplitude of 1 over the last axis (Eq. 6).
-
-    Raises:
-        ValueError: not finite complex numbers, or a drive that is zero everywhere.
-    """
+    """Scale a `drive` (..., M) to a largest amplitude of 1 over the last axis (Eq. 6)."""
     drive = complex_tensor("drive", drive)
     if drive.ndim == 0 or drive.shape[-1] == 0:
         raise ValueError(f"drive: shape {tuple(drive.shape)}; must be (..., M) with M >= 1")
@@ -111,15 +102,7 @@ def normalise(drive: ArrayLike) -> torch.Tensor:
 
 
 def validate_drive(drive: ArrayLike, transducers: int) -> torch.Tensor:
-    """Return `drive` as complex128 after checking that it suits an array of `transducers`.
-
-    Args:
-        drive: complex (..., M), |q| <= 1 up to rounding.
-        transducers: M.
-
-    Raises:
-        ValueError: not finite complex numbers, a last axis other than M, or an amplitude above 1.
-    """
+    """Return `drive` as complex128 after checking that it is complex (..., transducers) with |q| <= 1."""
     drive = complex_tensor("drive", drive)
     if drive.ndim == 0 or drive.shape[-1] != transducers:
         raise ValueError(f"drive: shape {tuple(drive.shape)}; must be (..., {transducers})")
@@ -131,11 +114,7 @@ def validate_drive(drive: ArrayLike, transducers: int) -> torch.Tensor:
 
 
 def validate_single_drive(drive: ArrayLike, transducers: int) -> torch.Tensor:
-    """Return a single `drive` (M,), checked as by `validate_drive`.
-
-    Raises:
-        ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-    """
+    """Return a single `drive` (M,), checked as by `validate_drive`."""
     drive = validate_drive(drive, transducers)
     if drive.ndim != 1:
         raise ValueError(f"drive: shape {tuple(drive.shape)}; must be ({transducers},), a single drive")

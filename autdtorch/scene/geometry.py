@@ -23,14 +23,13 @@ from autdtorch.utils.validation import (
     unit_vector,
 )
 
-_POINT_BYTES = 100.0
-"""Memory for each generated point [bytes]."""
+_POINT_BYTES = 100.0  # for each generated point
 
 
 class Coordinates(torch.Tensor):
     """A tensor on the CPU that `numpy.array` takes without a warning. Operations return plain tensors.
 
-    NumPy 2 passes `copy` to `__array__` and warns that PyTorch's own method does not accept it.
+    NumPy 2 warns that PyTorch's own `__array__` does not accept `copy`.
     """
 
     __torch_function__ = torch._C._disabled_torch_function_impl  # type: ignore[assignment]
@@ -49,19 +48,10 @@ class Coordinates(torch.Tensor):
 
 
 def plane_basis(normal: ArrayLike) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return orthonormal axes (u, v) of the plane with `normal`, right-handed: u x v = normal / |normal|.
+    """Return orthonormal axes (u, v), (3,) each, of the plane with `normal` (3,): u x v = normal / |normal|.
 
     u is the projection into the plane of the coordinate axis that cyclically follows the axis nearest to
     `normal`. So normal +x gives (y, z), +y (z, x), +z (x, y), and -x gives (y, -z).
-
-    Args:
-        normal: (3,), of any length > 0.
-
-    Returns:
-        Two unit tensors (3,), float64.
-
-    Raises:
-        ValueError: `normal` is not three finite numbers, or is zero.
     """
     n = torch.tensor(unit_vector("normal", normal), dtype=torch.float64, device="cpu")
     axis = (int(n.abs().argmax()) + 1) % 3
@@ -74,19 +64,10 @@ def plane_basis(normal: ArrayLike) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def in_plane(places: ArrayLike, center: ArrayLike, normal: ArrayLike, angle: float = 0.0) -> torch.Tensor:
-    """Transform positions from the coordinates of a flat device to those of the scene.
+    """Transform positions (M, 2) or (M, 3) [m] from the coordinates of a device to those of the scene.
 
-    Args:
-        places: (M, 2) [m], or (M, 3) with heights along `normal`.
-        center: position of the device's origin (3,) [m].
-        normal: direction of its z axis (3,).
-        angle: of its x axis from u towards v [rad], with (u, v) = `plane_basis(normal)`.
-
-    Returns:
-        Points (M, 3) [m], float64.
-
-    Raises:
-        ValueError: an argument is not finite or has the wrong shape.
+    A third column has heights along `normal`. The device has its origin at `center` (3,) [m] and the axes of
+    `device_axes`. Returns (M, 3) [m], float64.
     """
     local = real_tensor("places", places, "m").detach().cpu()
     if local.ndim != 2 or local.shape[1] not in (2, 3):
@@ -96,10 +77,9 @@ def in_plane(places: ArrayLike, center: ArrayLike, normal: ArrayLike, angle: flo
 
 
 def device_axes(normal: ArrayLike, angle: float = 0.0) -> torch.Tensor:
-    """Return the axes x, y and z of a device, the rows of (3, 3), for its `normal` and `angle` [rad].
+    """Return the axes x, y and z of a device, the rows of (3, 3).
 
-    Raises:
-        ValueError: `normal` is not three finite numbers, or is zero; `angle` is not finite.
+    z is along `normal`; x is turned by `angle` [rad] from u towards v, with (u, v) = `plane_basis(normal)`.
     """
     turn = finite_number("angle", angle, "rad")
     u, v = plane_basis(normal)
@@ -109,15 +89,9 @@ def device_axes(normal: ArrayLike, angle: float = 0.0) -> torch.Tensor:
 
 
 def rotation_matrix(rotation: Vector) -> torch.Tensor:
-    """Return the matrix of the rotation about the fixed axes x, then y, then z.
+    """Return the matrix R (3, 3) of the rotation by angles (a, b, c) [rad] about the fixed axes x, y, z.
 
-    R = Rz(c) Ry(b) Rx(a) (extrinsic Euler angles); rotations are right-handed: (0, 0, pi/2) turns x into y.
-
-    Args:
-        rotation: (a, b, c) [rad].
-
-    Returns:
-        (3, 3), float64, for column vectors: R r.
+    R = Rz(c) Ry(b) Rx(a), for column vectors (extrinsic Euler angles); (0, 0, pi/2) turns x into y.
     """
     matrix = torch.eye(3, dtype=torch.float64, device="cpu")
     for axis, angle in enumerate(rotation):
@@ -193,13 +167,10 @@ class Plane:
         return self._at(signs * self.size[0] / 2, signs * self.size[1] / 2).reshape(4, 3)
 
     def points(self, spacing: float) -> torch.Tensor:
-        """Return the centres of equal cells that fill the plane.
+        """Return the centres (Nu, Nv, 3) [m], float64, of equal cells that fill the plane.
 
         Args:
-            spacing: target edge of a cell [m], > 0; the edges are Lu / Nu and Lv / Nv.
-
-        Returns:
-            Points (Nu, Nv, 3) [m], float64; Nu = Lu / spacing, rounded to at least 1, and Nv likewise.
+            spacing: wanted edge [m], > 0; Nu is Lu / spacing, rounded to at least 1, and Nv likewise.
 
         Raises:
             ValueError: `spacing` is not a finite number > 0.

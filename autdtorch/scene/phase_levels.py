@@ -27,14 +27,9 @@ class PhaseLevels:
     pulses: bool = False
 
     def nearest(self, drive: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the levels nearest to a drive.
+        """Return the levels of phase and amplitude nearest to a drive (..., M) with |q| <= 1, not checked.
 
-        Args:
-            drive: (..., M), complex128, |q| <= 1; not checked.
-
-        Returns:
-            Levels of phase and amplitude (..., M), int64; float64 for a continuous amplitude. The level of
-            the phase is 0 where the amplitude is 0.
+        Both are int64, a continuous amplitude float64. The phase level is 0 where the amplitude is 0.
         """
         wanted = drive.abs().clamp_max(1)  # above 1 by rounding alone
         if self.amplitudes is None:

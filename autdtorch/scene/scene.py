@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import warnings
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from operator import attrgetter
 
 import torch
 
@@ -33,14 +34,10 @@ from autdtorch.utils.validation import (
 
 _OVERLAP_SAMPLES = 16  # along each axis of the intersection of two bounding boxes
 _DEFAULT_MARGIN = 2.0  # [wavelengths] of air on each side, where no domain is given
-
 _FARTHEST = 1e6  # [m] along an axis; far beyond any simulation, and volumes do not overflow
 _FREQUENCIES = 1e-3, 1e12  # [Hz]
-
 _DECIBELS = 20 / math.log(10)  # in a neper
-
 _USUAL_EXTENT = 0.1, 2000.0  # [wavelengths] across array and control points
-
 _MOST_ABSORPTION = 3.0  # [dB per wavelength]: the model assumes a small imaginary part of the wavenumber
 
 
@@ -113,9 +110,8 @@ class Scene:
             raise invalid("Scene.name", name, "must be text of at least one character")
         object.__setattr__(self, "array", array)
         object.__setattr__(self, "medium", medium)
-        frequency = number_between(
-            "Scene.frequency", positive("Scene.frequency", frequency, "Hz"), *_FREQUENCIES, "Hz"
-        )
+        positive("Scene.frequency", frequency, "Hz")
+        frequency = number_between("Scene.frequency", frequency, *_FREQUENCIES, "Hz")
         object.__setattr__(self, "frequency", frequency)
         points = points_tensor("Scene.control_points", control_points).cpu()
         object.__setattr__(self, "control_points", points.as_subclass(Coordinates))
@@ -124,7 +120,10 @@ class Scene:
         object.__setattr__(self, "name", name)
         _require_near(self)
         object.__setattr__(self, "domain", self._bounds() if domain is None else _corners(domain))
-        _require_propagating(self)
+        most = _MOST_ABSORPTION / self.wavelength
+        if medium.absorption > most:
+            accepted = f"must be at most {most:.4g} dB/m, {_MOST_ABSORPTION:g} dB per wavelength"
+            raise invalid("Scene.medium.absorption", medium.absorption, accepted, "dB/m")
         _require_separate_points(self)
         _require_in_domain(self)
         _warn_of_overlaps(self.obstacles)
@@ -167,12 +166,10 @@ class Scene:
     def _repr_html_(self) -> str:
         """Return a table of the scene's contents, for Jupyter."""
         medium = self.medium
+        fluid = f"{medium.density:.4g} kg/m³, {medium.sound_speed:.4g} m/s"
         facts = [
             ("frequency", f"{self.frequency / 1e3:.4g} kHz, wavelength {1e3 * self.wavelength:.4g} mm"),
-            (
-                "medium",
-                f"{medium.density:.4g} kg/m³, {medium.sound_speed:.4g} m/s, {medium.absorption:.3g} dB/m",
-            ),
+            ("medium", f"{fluid}, {medium.absorption:.3g} dB/m"),
             ("transducers", f"{len(self.array)}, of source strength {self.array.source_strength:.4g} Pa m"),
             ("control points", str(len(self.control_points))),
             ("obstacles", ", ".join(_kinds(self.obstacles)) or "none"),
@@ -186,10 +183,7 @@ class Scene:
         return " x ".join(f"{(high - low) / unit:.{digits}g}" for low, high in zip(lower, upper, strict=True))
 
     def _bounds(self) -> tuple[Vector, Vector]:
-        corners = [
-            torch.tensor([o.lower, o.upper], dtype=torch.float64, device="cpu") for o in self.obstacles
-        ]
-        points = torch.cat([points for _, points in _contents(self)] + corners)
+        points = torch.cat([points for _, points in (*_contents(self), *_obstacle_corners(self))])
         margin = _DEFAULT_MARGIN * self.wavelength
         return _corners(torch.stack([points.amin(dim=0) - margin, points.amax(dim=0) + margin]))
 
@@ -219,13 +213,6 @@ def _points(scene: Scene) -> dict[str, torch.Tensor]:
     return {"Scene.array.positions": scene.array.positions, "Scene.control_points": scene.control_points}
 
 
-def _require_propagating(scene: Scene) -> None:
-    most = _MOST_ABSORPTION / scene.wavelength
-    if scene.medium.absorption > most:
-        accepted = f"must be at most {most:.4g} dB/m, {_MOST_ABSORPTION:g} dB per wavelength"
-        raise invalid("Scene.medium.absorption", scene.medium.absorption, accepted, "dB/m")
-
-
 def _contents(scene: Scene) -> list[tuple[str, torch.Tensor]]:
     """Return names and points (N, 3) [m] of everything that must be inside the domain."""
     contents = list(_points(scene).items())
@@ -237,13 +224,16 @@ def _contents(scene: Scene) -> list[tuple[str, torch.Tensor]]:
     return contents
 
 
+def _obstacle_corners(scene: Scene) -> Iterator[tuple[str, torch.Tensor]]:
+    for index, body in enumerate(scene.obstacles):
+        corners = torch.tensor([body.lower, body.upper], dtype=torch.float64, device="cpu")
+        yield f"Scene.obstacles[{index}] corner", corners
+
+
 def _require_near(scene: Scene) -> None:
     """Refuse coordinates so large that cells could not be counted."""
-    for name, points in _contents(scene):
+    for name, points in (*_contents(scene), *_obstacle_corners(scene)):
         _require_within(name, points)
-    for index, obstacle in enumerate(scene.obstacles):
-        corners = torch.tensor([obstacle.lower, obstacle.upper], dtype=torch.float64, device="cpu")
-        _require_within(f"Scene.obstacles[{index}] corner", corners)
 
 
 def _require_within(name: str, points: torch.Tensor) -> None:
@@ -291,11 +281,12 @@ def _warn_of_overlaps(obstacles: tuple[Obstacle, ...]) -> None:
 
     The intersection of two bounding boxes is sampled at the centres of `_OVERLAP_SAMPLES`^3 cells.
     """
+    material = attrgetter("density", "sound_speed", "rigid")
     pairs = [
         f"{index} overlaps {earlier}"
         for index, obstacle in enumerate(obstacles)
         for earlier, other in enumerate(obstacles[:index])
-        if _material(obstacle) != _material(other) and _overlap(obstacle, other)
+        if material(obstacle) != material(other) and _overlap(obstacle, other)
     ]
     if pairs:
         warnings.warn(
@@ -303,10 +294,6 @@ def _warn_of_overlaps(obstacles: tuple[Obstacle, ...]) -> None:
             OverlapWarning,
             stacklevel=3,
         )
-
-
-def _material(obstacle: Obstacle) -> tuple[float | None, float | None, bool]:
-    return obstacle.density, obstacle.sound_speed, obstacle.rigid
 
 
 def _overlap(obstacle: Obstacle, other: Obstacle) -> bool:
@@ -335,11 +322,7 @@ def _extent(lower: Vector, upper: Vector) -> str:
 
 
 def require_inside(domain: tuple[Vector, Vector], name: str, points: torch.Tensor) -> None:
-    """Refuse points (N, 3) [m] outside the corners (lower, upper) of a domain.
-
-    Raises:
-        ValueError: names the first point outside, as an entry of `name`.
-    """
+    """Refuse points (N, 3) [m] outside the corners (lower, upper) of a domain."""
     lower, upper = (torch.tensor(corner, dtype=torch.float64, device="cpu") for corner in domain)
     outside = ((points < lower - LENGTH_TOLERANCE) | (points > upper + LENGTH_TOLERANCE)).any(dim=-1)
     if outside.any():

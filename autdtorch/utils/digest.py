@@ -19,9 +19,6 @@ def digest_of(*parts: object) -> str:
 
     Two values have the same digest only if they agree to the last bit. Of a dataclass, compared fields and
     arrays count, and the source code where the class is not autdtorch's own.
-
-    Raises:
-        TypeError: a value of another kind.
     """
     digest = hashlib.sha256()
     for part in parts:

@@ -38,9 +38,6 @@ def replacing(path: Path) -> Iterator[Path]:
 
     Readers find the old file or the new one, never a part of it, also if several processes write it at once.
     The partial files that killed writers left in the folder are removed.
-
-    Raises:
-        OSError: the file cannot be written.
     """
     partial = path.with_name(f"{path.name}.{uuid.uuid4().hex}{PARTIAL}")
     with naming(path):
@@ -56,11 +53,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def replace_file(path: Path, content: bytes) -> None:
-    """Write a file as `replacing` does.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write a file as `replacing` does."""
     with replacing(path) as partial:
         partial.write_bytes(content)
 
@@ -75,15 +68,7 @@ def _remove_abandoned(folder: Path) -> None:
 
 @contextlib.contextmanager
 def held(lock: FileLock, refusal: Exception) -> Iterator[None]:
-    """Hold a lock; the system frees it when the process ends, however it ends.
-
-    Args:
-        lock: acquired at once or not at all.
-        refusal: raised if another process holds the lock.
-
-    Raises:
-        OSError: the lock file cannot be written.
-    """
+    """Hold a lock, acquired at once, or raise `refusal`; the system frees it however the process ends."""
     try:
         lock.acquire(timeout=0)
     except Timeout as error:

@@ -22,31 +22,16 @@ SET_ASIDE = ".damaged"
 _SEAM = re.compile(rb'(?=\{")|(?<="\})')  # possible start or end of a row without nested objects
 _WRONG_CHECKSUM = "its checksum is wrong"
 _BROKE_OFF = "the last line broke off"
-_DAMAGE = (
-    ValueError,
-    KeyError,
-    TypeError,
-    OverflowError,
-    RuntimeError,
-)  # errors of a refused row
+_DAMAGE = (ValueError, KeyError, TypeError, OverflowError, RuntimeError)  # errors of a refused row
 
 
 def line_of(row: Mapping[str, Any], key: str = "") -> bytes:
-    """Return a row as a line without its newline; the last field is the checksum of the rest.
-
-    Args:
-        row: JSON values by name; at least one.
-        key: the owner of the line. It is part of the checksum, so that lines of other owners are refused.
-    """
+    """Return a row as a line without newline; its last field is the checksum of the rest and the `key`."""
     return _with_checksum(json.dumps(row)[:-1].encode(), key)
 
 
 def row_of(line: bytes, key: str = "") -> dict[str, Any]:
-    """Return the row of a line made by `line_of`; nothing is parsed before the checksum is verified.
-
-    Raises:
-        ValueError: the line is damaged, or has another key.
-    """
+    """Return the row of a line made by `line_of`; nothing is parsed before the checksum is verified."""
     if not _is_whole(line, key):
         raise ValueError(_WRONG_CHECKSUM)
     return _row(line)
@@ -66,14 +51,8 @@ class JsonLines:
     ) -> None:
         """Read the file if it exists, without changing it.
 
-        Args:
-            path: of the file.
-            key: the owner of the lines.
-            use: called with each row. It refuses a row by a `ValueError`, `KeyError` or `TypeError`.
-            head: first line of the file, with its newline.
-
-        Raises:
-            OSError: the file cannot be read.
+        `key` is the owner of the lines and `head` the first line, with its newline. `use` is called with each
+        row and refuses it by a `ValueError`, `KeyError` or `TypeError`.
         """
         content = path.read_bytes() if path.exists() else b""
         lines = content.removeprefix(head).split(b"\n")
@@ -92,15 +71,10 @@ class JsonLines:
         self._path, self._key = path, key
         mended = head + b"".join(line + b"\n" for line in good)
         self._mended = None if content == mended else mended
-        self._was_there = bool(content)
-        self._size = len(mended)
+        self._was_there, self._size = bool(content), len(mended)
 
     def mend(self) -> None:
-        """Move damaged and refused lines to another file, and restore newlines and a missing head.
-
-        Raises:
-            OSError: a file cannot be written; the file that was read is then unchanged.
-        """
+        """Move damaged and refused lines to another file, and restore newlines and a missing head."""
         if self._mended is None:
             return
         if self._refused:
@@ -111,12 +85,7 @@ class JsonLines:
         self._mended = None
 
     def append(self, *rows: Mapping[str, Any]) -> None:
-        """Append rows, which are on disk on return; after an error the file is unchanged.
-
-        Raises:
-            ValueError: the file has changed since it was read or last appended to.
-            OSError: the file cannot be written, or was removed.
-        """
+        """Append rows, which are on disk on return; after an error the file is unchanged."""
         rest = memoryview(b"".join(line_of(row, self._key) + b"\n" for row in rows))
         mode = "r+b" if self._size else "ab"  # "ab" would create a removed file again
         with naming(self._path), self._path.open(mode, buffering=0) as file:
@@ -144,11 +113,7 @@ class JsonLines:
 
 
 def _parts(line: bytes, key: str) -> Iterator[tuple[bool, bytes]]:
-    """Split a line in which the newlines of other lines were lost.
-
-    Yields:
-        Whole rows (True) and the text between them (False), in order.
-    """
+    """Yield whole rows (True) and the text between them (False) of a line in which newlines were lost."""
     if _is_whole(line, key):
         yield True, line
         return
@@ -170,18 +135,17 @@ def _refusal(use: Callable[[dict[str, Any]], None], whole: bytes) -> str | None:
 
 
 def _row(whole: bytes) -> dict[str, Any]:
-    row: dict[str, Any] = json.loads(_body(whole) + b"}")
+    row: dict[str, Any] = json.loads(whole[:-_END] + b"}")
     return row
 
 
-def _body(line: bytes) -> bytes:
-    return line[: -len(_with_checksum(b"", ""))]
-
-
 def _is_whole(line: bytes, key: str) -> bool:
-    return line == _with_checksum(_body(line), key)
+    return line == _with_checksum(line[:-_END], key)
 
 
 def _with_checksum(body: bytes, key: str) -> bytes:
     checksum = hashlib.sha256(key.encode() + b"\n" + body).hexdigest()
     return body + f', "sha256": "{checksum}"}}'.encode()
+
+
+_END = len(_with_checksum(b"", ""))

@@ -26,17 +26,7 @@ def available_memory() -> int:
 
 
 def require_memory(field: str, value: object, needed: float, unit: str = "") -> None:
-    """Refuse an argument that needs more memory than is available.
-
-    Args:
-        field: name of the argument.
-        value: its value.
-        needed: memory [bytes].
-        unit: of the value.
-
-    Raises:
-        ValueError: `needed` exceeds the available memory; the message has both figures.
-    """
+    """Refuse an argument of which the memory needed [bytes] exceeds the available."""
     if needed > (available := available_memory()):
         left = f"this process may use {available / 1e9:.3g} GB"
         raise invalid(field, value, f"needs about {needed / 1e9:.3g} GB of memory, {left}", unit)

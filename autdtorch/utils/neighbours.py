@@ -32,11 +32,7 @@ def nearest_other(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def require_distinct(name: str, points: torch.Tensor) -> None:
-    """Check that no two of the `points` (P, 3) [m] coincide.
-
-    Raises:
-        ValueError: two points closer than `LENGTH_TOLERANCE`.
-    """
+    """Check that no two of the `points` (P, 3) [m] coincide."""
     if len(points) < 2:
         return
     apart, other = nearest_other(points)

@@ -38,13 +38,7 @@ _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0
 
 
 def read_arrays(path: str | os.PathLike[str]) -> dict[str, AnyArray]:
-    """Read the arrays of a .npz file by name; the array of a .npy file has the name "".
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: another or a damaged file, Python objects in it, or more than 1 GiB when unpacked. The
-            message names the file.
-    """
+    """Read the arrays of a .npz file by name; the array of a .npy file has the name ""."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"{os.fspath(path)}: there is no such file")
     try:

@@ -73,12 +73,7 @@ class Progress:
 
 @contextlib.contextmanager
 def show_progress(steps: int, what: str = "") -> Iterator[Progress]:
-    """Show the progress of a task.
-
-    Args:
-        steps: their number, or an estimate of it.
-        what: name of the first task.
-    """
+    """Show the progress of a task of `steps`, or an estimate of it; `what` names the first part."""
     if not sys.stderr.isatty() or multiprocessing.parent_process() is not None:
         yield Progress(steps, what, None)
         return

@@ -65,8 +65,7 @@ if hasattr(os, "register_at_fork"):
 def thread_count() -> int:
     """Return the number of threads that work may be spread over.
 
-    It is PyTorch's number, set by `torch.set_num_threads` or OMP_NUM_THREADS, and at most the number of
-    processors that this process may use.
+    It is PyTorch's, set by `torch.set_num_threads` or OMP_NUM_THREADS, and at most the processors available.
     """
     given = _given.get()
     return min(_outside.threads(), _processors()) if given is None else given
@@ -89,13 +88,10 @@ def one_torch_thread() -> Iterator[None]:
 
 
 def spread(function: Callable[[T], R], items: Iterable[T], most: int | None = None) -> list[R]:
-    """Return the values of a function for all items, computed on several threads.
+    """Return the values of a function for all items, computed on `most` threads, by default `thread_count()`.
 
-    Args:
-        function: of one item; it releases the interpreter lock most of the time. Nested calls of `spread` in
-            it use one thread.
-        items: each goes to the next free thread, so that a delayed thread costs at most one item.
-        most: largest number of threads; by default `thread_count()`.
+    The function should release the interpreter lock most of the time; nested calls of `spread` use one
+    thread. Each item goes to the next free thread, so that a delayed thread costs at most one item.
     """
     items = list(items)
     threads = min(thread_count() if most is None else most, len(items))

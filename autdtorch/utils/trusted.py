@@ -18,16 +18,9 @@ TARGET = "_target_"
 
 
 def load_trusted(where: str, target: object, modules: Collection[Any], ours: str = "") -> Callable[..., Any]:
-    """Import a function or class that one of the trusted modules defines.
+    """Import a function or class, "package.module.name", that one of the trusted modules defines.
 
-    Args:
-        where: name of the key, for messages.
-        target: its value, such as "package.module.name".
-        modules: names of the trusted modules.
-        ours: names that autdtorch itself offers in this place, for messages.
-
-    Raises:
-        ValueError: another module, a module that cannot be imported, or neither function nor class of it.
+    `where` names the key in messages, which also list what autdtorch itself offers there, `ours`.
     """
     module, _, name = str(target).rpartition(".")
     if module not in modules:

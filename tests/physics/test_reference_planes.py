@@ -85,10 +85,7 @@ def test_image_sources_meet_the_conditions_on_their_planes():
     sources = above_plane([0.004, 0.02])[0]
     rigid, soft = (
         sampled(lambda points, plane=plane: plane(points, sources, K, ORIGIN, NORMAL), above_plane(heights))
-        for plane, heights in (
-            (analytic.rigid_plane, [0, STEP, 2 * STEP]),
-            (analytic.soft_plane, [0]),
-        )
+        for plane, heights in ((analytic.rigid_plane, [0, STEP, 2 * STEP]), (analytic.soft_plane, [0]))
     )
     incident = sampled(lambda points: green(points, sources, K), above_plane([0]))[:, 0]
     assert ((slope(rigid) / (K * incident)).abs() < SLOPE_TOLERANCE).all()

@@ -217,14 +217,8 @@ OUT_OF_RANGE: dict[Callable[..., Any] | str, list[tuple[dict[str, Any], str]]] =
         ({"wavenumber": 1 - 0.1j}, "wavenumber.imag: -0.1 Np/m; must be finite and >= 0"),
     ],
     "rigid_sphere": [
-        (
-            {"points": [[0, 0, 0]]},
-            "points[0]: (0.0, 0.0, 0.0) m, 0 m from the centre of the sphere; must",
-        ),
-        (
-            {"sources": [[0, 0, 0]]},
-            "sources[0]: (0.0, 0.0, 0.0) m, 0 m from the centre of the sphere; must",
-        ),
+        ({"points": [[0, 0, 0]]}, "points[0]: (0.0, 0.0, 0.0) m, 0 m from the centre of the sphere; must"),
+        ({"sources": [[0, 0, 0]]}, "sources[0]: (0.0, 0.0, 0.0) m, 0 m from the centre of the sphere; must"),
         ({"points": [[0.1, 0.02, 0.03]]}, "points[0]: (0.1, 0.02, 0.03) m; lies on source 0"),
     ],
     "soft_sphere": [({"radius": -1.0}, "radius: -1.0 m; must be finite and > 0")],

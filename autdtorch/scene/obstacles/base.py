@@ -58,14 +58,11 @@ class Obstacle(ABC):
         """Corner of the bounding box with the largest coordinates (3,) [m]."""
 
     def contains(self, points: ArrayLike, margin: float = 0.0) -> torch.Tensor:
-        """Return whether each point lies inside.
+        """Return whether each point lies inside, bool (...).
 
         Args:
             points: (..., 3) [m].
             margin: distance by which the obstacle is enlarged on every side [m], >= 0.
-
-        Returns:
-            bool (...).
 
         Raises:
             ValueError: `points` are not finite real numbers or have another last axis, or `margin` is < 0.
@@ -75,13 +72,10 @@ class Obstacle(ABC):
         return self._inside(points.reshape(-1, 3), margin).reshape(points.shape[:-1])
 
     def signed_distance(self, points: ArrayLike) -> torch.Tensor:
-        """Return the distance of each point to the surface, negative inside.
+        """Return the distance of each point to the surface, float64 (...) [m], negative inside.
 
         Args:
             points: (..., 3) [m].
-
-        Returns:
-            float64 (...) [m].
 
         Raises:
             ValueError: `points` are not finite real numbers or have another last axis.
@@ -91,10 +85,9 @@ class Obstacle(ABC):
 
     @abstractmethod
     def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return triangles for drawing, counter-clockwise as seen from outside.
+        """Return vertices (V, 3) [m], float64, and triangles of their indices (F, 3), int64, for drawing.
 
-        Returns:
-            Vertices (V, 3) [m], float64, and the vertices of each triangle (F, 3), int64.
+        Triangles are counter-clockwise as seen from outside.
         """
 
     def _inside(self, points: torch.Tensor, margin: float) -> torch.Tensor:

@@ -22,10 +22,7 @@ _FARTHEST = 1e100
 
 
 class _MeshPath(str):
-    """The path of a mesh file with the triangles read from it.
-
-    `dataclasses.replace` passes it on to the new mesh, so that the file is read once.
-    """
+    """The path of a mesh file and its triangles; `dataclasses.replace` passes both on, so it is read once."""
 
     vertices: Array
     faces: Index
@@ -119,11 +116,7 @@ def _checked_path(given: object) -> str:
 
 
 def _read(path: str) -> tuple[Array, Index]:
-    """Return the distinct vertices (V, 3) and the outward faces (F, 3) of a watertight mesh.
-
-    Raises:
-        ValueError: not a mesh file, or not watertight.
-    """
+    """Return the distinct vertices (V, 3) and the outward faces (F, 3) of a watertight mesh."""
     import igl
 
     readers = {".obj": read_obj, ".ply": read_ply}

@@ -25,12 +25,7 @@ _LENGTH = " length"  # suffix of the column with the lengths of a list
 
 
 def read_obj(path: str) -> Triangles:
-    """Read the triangles of an OBJ file; polygons become fans of triangles.
-
-    Raises:
-        OverflowError: an index is too large.
-        ValueError: a bad vertex or face. The message names the line.
-    """
+    """Read the triangles of an OBJ file; polygons become fans of triangles."""
     vertices: list[list[float]] = []
     faces: list[list[int]] = []
     with Path(path).open(encoding="utf-8", errors="replace") as lines:
@@ -51,14 +46,7 @@ def read_obj(path: str) -> Triangles:
 
 
 def read_ply(path: str) -> Triangles:
-    """Read the triangles of a PLY file.
-
-    Raises:
-        LookupError: an unknown type, or no vertices or faces.
-        OverflowError: a number is too large.
-        ValueError: not a PLY file, faces other than triangles, fractional indices, numbers of another type
-            than declared, negative counts, or less data than declared.
-    """
+    """Read the triangles of a PLY file."""
     content = Path(path).read_bytes()
     if (head := _HEAD.match(content)) is None:
         raise ValueError("no header of a PLY file")

@@ -29,15 +29,12 @@ from -x, +x, -y to +z."""
 
 
 def revolved(profile: torch.Tensor, center: Vector, axis: Vector) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the surface of the body of revolution of a profile.
+    """Return the surface, vertices (V, 3) [m] and triangles (F, 3), of a body of revolution.
 
     Args:
         profile: (K, 2) [m], distance from the axis and position along it, upwards; both ends on the axis.
         center: origin of the positions along the axis (3,) [m].
         axis: unit vector (3,).
-
-    Returns:
-        Vertices (V, 3) [m] and triangles (F, 3); every ring has `SEGMENTS` vertices.
     """
     rings, count = len(profile) - 2, SEGMENTS
     u, v = plane_basis(axis)

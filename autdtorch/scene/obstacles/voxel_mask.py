@@ -66,18 +66,15 @@ class VoxelMask(Obstacle):
         sound_speed: float | None = None,
         rigid: bool = False,
     ) -> VoxelMask:
-        """Read the mask from a NumPy file.
+        """Read the mask from a NumPy file, .npy or .npz with a single array.
 
         Args:
-            path: .npy, or .npz that holds a single array.
+            path: of the file.
             spacing: edge of a voxel [m], > 0.
             origin: corner of voxel (0, 0, 0) with the smallest coordinates (3,) [m].
-            density: of the material [kg/m^3], 1e-9 to 1e9; None if rigid.
-            sound_speed: of the material [m/s], 1e-3 to 1e6; None if rigid.
+            density: of the material [kg/m^3]; None if rigid.
+            sound_speed: of the material [m/s]; None if rigid.
             rigid: True for walls that do not move.
-
-        Returns:
-            The obstacle.
 
         Raises:
             ValueError: no such file, or no single array in it; see also `VoxelMask`.

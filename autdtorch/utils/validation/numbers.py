@@ -19,11 +19,7 @@ _SOUND_SPEEDS = 1e-3, 1e6  # [m/s]
 
 
 def finite_number(name: str, value: object, unit: str = "") -> float:
-    """Return `value` as a finite float.
-
-    Raises:
-        ValueError: not a real number (text, booleans and complex numbers are refused), NaN or infinite.
-    """
+    """Return `value` as a finite float; text, booleans and complex numbers are refused."""
     if isinstance(value, torch.Tensor | np.ndarray) and value.ndim == 0 and is_plain(value):
         value = value.item()
     if not is_plain(value) or not isinstance(value, numbers.Real):
@@ -40,11 +36,7 @@ def finite_number(name: str, value: object, unit: str = "") -> float:
 
 
 def positive(name: str, value: object, unit: str = "") -> float:
-    """Return `value` as a finite float > 0.
-
-    Raises:
-        ValueError: not a finite real number, or <= 0.
-    """
+    """Return `value` as a finite float > 0."""
     number = finite_number(name, value, unit)
     if number <= 0:
         raise invalid(name, value, "must be finite and > 0", unit)
@@ -52,11 +44,7 @@ def positive(name: str, value: object, unit: str = "") -> float:
 
 
 def not_negative(name: str, value: object, unit: str = "") -> float:
-    """Return `value` as a finite float >= 0.
-
-    Raises:
-        ValueError: not a finite real number, or < 0.
-    """
+    """Return `value` as a finite float >= 0."""
     number = finite_number(name, value, unit)
     if number < 0:
         raise invalid(name, value, "must be finite and >= 0", unit)
@@ -64,11 +52,7 @@ def not_negative(name: str, value: object, unit: str = "") -> float:
 
 
 def number_between(name: str, value: object, least: float, most: float, unit: str = "") -> float:
-    """Return `value` as a float in `least` to `most`, ends included.
-
-    Raises:
-        ValueError: not a real number, NaN or outside the range.
-    """
+    """Return `value` as a float in `least` to `most`, ends included."""
     number = finite_number(name, value, unit)
     if not least <= number <= most:
         raise invalid(name, value, f"must be in {least:g} to {most:g}", unit)
@@ -76,16 +60,7 @@ def number_between(name: str, value: object, least: float, most: float, unit: st
 
 
 def fluid(kind: str, density: object, sound_speed: object) -> tuple[float, float]:
-    """Return the checked density [kg/m^3] and sound speed [m/s] of a fluid.
-
-    Args:
-        kind: name of the owner of both fields.
-        density: 1e-9 to 1e9 [kg/m^3].
-        sound_speed: 1e-3 to 1e6 [m/s].
-
-    Raises:
-        ValueError: not a number, or out of range.
-    """
+    """Return density [kg/m^3] and sound speed [m/s] of a fluid, checked as fields of `kind`."""
     rho = positive(f"{kind}.density", density, "kg/m^3")
     c = positive(f"{kind}.sound_speed", sound_speed, "m/s")
     return (
@@ -95,22 +70,14 @@ def fluid(kind: str, density: object, sound_speed: object) -> tuple[float, float
 
 
 def boolean(name: str, value: object) -> bool:
-    """Return `value`, True or False, as a bool.
-
-    Raises:
-        ValueError: another kind of value, numbers included.
-    """
+    """Return `value`, True or False, as a bool."""
     if not isinstance(value, bool | np.bool_):
         raise invalid(name, value, "must be true or false")
     return bool(value)
 
 
 def integer_at_least(name: str, value: object, minimum: int) -> int:
-    """Return `value` as an int >= `minimum`; whole floats are refused too.
-
-    Raises:
-        ValueError: not an integer, below `minimum`, or >= 2^63.
-    """
+    """Return `value` as an int >= `minimum`; whole floats are refused too."""
     number = int(value) if is_plain(value) and isinstance(value, numbers.Integral) else minimum - 1
     if not minimum <= number <= _LARGEST:
         most = " and < 2^63" if number > _LARGEST else ""
@@ -119,11 +86,7 @@ def integer_at_least(name: str, value: object, minimum: int) -> int:
 
 
 def integers(name: str, value: object, minimum: int, accepted: str) -> list[int]:
-    """Return `value`, a sequence or an array with one axis, as integers >= `minimum`.
-
-    Raises:
-        ValueError: another kind of value (the message then quotes `accepted`), or an entry out of range.
-    """
+    """Return `value`, a sequence or an array with one axis, as integers >= `minimum`."""
     if isinstance(value, torch.Tensor | np.ndarray) and is_dense(value):  # entries need not be Integral
         value = value.tolist()
     if isinstance(value, str | bytes) or not isinstance(value, Sequence):
@@ -136,11 +99,7 @@ def integers(name: str, value: object, minimum: int, accepted: str) -> list[int]
 
 
 def positive_integers(name: str, value: object, count: int) -> tuple[int, ...]:
-    """Return `value` as `count` integers >= 1.
-
-    Raises:
-        ValueError: another number of entries, or an entry that is not an integer >= 1.
-    """
+    """Return `value` as `count` integers >= 1."""
     accepted = f"must be {count} integers >= 1"
     entries = integers(name, value, 1, accepted)
     if len(entries) != count:
@@ -149,11 +108,7 @@ def positive_integers(name: str, value: object, count: int) -> tuple[int, ...]:
 
 
 def indices(name: str, value: object, count: int) -> list[int]:
-    """Return `value` as indices from 0 to `count` - 1: at least one, without repetition.
-
-    Raises:
-        ValueError: another kind of value, an index out of range, a repeated index, or none.
-    """
+    """Return `value` as indices from 0 to `count` - 1: at least one, without repetition."""
     chosen = integers(name, value, 0, f"must be indices from 0 to {count - 1}")
     if not chosen or len(set(chosen)) < len(chosen) or max(chosen) >= count:
         raise invalid(name, chosen, f"must be indices from 0 to {count - 1}, each once")

@@ -16,23 +16,14 @@ _LONGEST_NAME = 100  # bytes
 
 
 def require_name(field: str, name: object) -> None:
-    """Check a name that becomes part of the names of files and HDF5 groups.
-
-    Raises:
-        ValueError: not text, empty, longer than 100 bytes, dots only, or with characters other than letters,
-            digits and _ . + -.
-    """
+    """Check a name that becomes part of the names of files and HDF5 groups."""
     if not isinstance(name, str) or not _NAME.fullmatch(name) or len(name.encode()) > _LONGEST_NAME:
         accepted = "a name must be text of letters, digits and _ . + -, not of dots alone"
         raise invalid(field, name, f"{accepted}, with at most {_LONGEST_NAME} bytes")
 
 
 def path_of(name: str, value: object, what: str = "a file") -> Path:
-    """Return `value` as the path of `what`, which need not exist.
-
-    Raises:
-        ValueError: neither text nor a path, empty, or with a null character.
-    """
+    """Return `value` as the path of `what`, which need not exist."""
     text = os.fspath(value) if isinstance(value, str | os.PathLike) else None
     if not isinstance(text, str) or not text or "\0" in text:
         raise invalid(name, value, f"must be the path of {what}")
@@ -40,22 +31,14 @@ def path_of(name: str, value: object, what: str = "a file") -> Path:
 
 
 def require_one_of(name: str, value: object, accepted: Iterable[str]) -> None:
-    """Check that `value` is one of the accepted texts.
-
-    Raises:
-        ValueError: another value.
-    """
+    """Check that `value` is one of the accepted texts."""
     accepted = tuple(accepted)
     if not isinstance(value, str) or value not in accepted:
         raise invalid(name, value, f"must be one of {', '.join(accepted)}")
 
 
 def require_known(where: str, given: Iterable[Any], allowed: Collection[str], what: str = "key") -> None:
-    """Refuse keys that are not allowed.
-
-    Raises:
-        ValueError: names the first such key and, if there is one, the allowed key most like it.
-    """
+    """Refuse keys that are not allowed."""
     for key in given:
         if key not in allowed:
             found = f"unknown {what} {key!r}{hint(key, allowed)}"
@@ -69,22 +52,14 @@ def hint(given: object, allowed: Iterable[str]) -> str:
 
 
 def require_kind(name: str, value: object, kind: type) -> None:
-    """Check that `value` is an instance of a class or protocol.
-
-    Raises:
-        ValueError: an instance of another class.
-    """
+    """Check that `value` is an instance of a class or protocol."""
     if not isinstance(value, kind):
         article = "an" if kind.__name__[0] in "AEIOU" else "a"
         raise invalid(name, value, f"must be {article} {kind.__name__}")
 
 
 def members(name: str, value: object, kind: type) -> tuple[Any, ...]:
-    """Return the entries of an iterable, all instances of a class, as a tuple.
-
-    Raises:
-        ValueError: text, not an iterable, or an entry of another class.
-    """
+    """Return the entries of an iterable, all instances of a class, as a tuple."""
     accepted = f"must be a sequence, each entry of class {kind.__name__}"
     if isinstance(value, str | bytes):
         raise invalid(name, value, accepted)
@@ -98,10 +73,6 @@ def members(name: str, value: object, kind: type) -> tuple[Any, ...]:
 
 
 def require_callable(name: str, value: object) -> None:
-    """Check that `value` can be called.
-
-    Raises:
-        ValueError: not callable.
-    """
+    """Check that `value` can be called."""
     if not callable(value):
         raise invalid(name, value, "must be a function")

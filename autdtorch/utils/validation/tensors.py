@@ -21,21 +21,13 @@ any wavelength."""
 
 
 def finite_vector(name: str, value: object, unit: str = "m") -> Vector:
-    """Return `value` as three finite floats.
-
-    Raises:
-        ValueError: not three real numbers, NaN or infinite.
-    """
+    """Return `value` as three finite floats."""
     x, y, z = _entries(name, value, 3, unit)
     return x, y, z
 
 
 def positive_entries(name: str, value: object, count: int, unit: str = "m") -> tuple[float, ...]:
-    """Return `value` as `count` finite floats > 0.
-
-    Raises:
-        ValueError: not `count` real numbers, or an entry that is NaN, infinite or <= 0.
-    """
+    """Return `value` as `count` finite floats > 0."""
     entries = _entries(name, value, count, unit)
     if min(entries) <= 0:
         raise invalid(name, value, "every entry must be finite and > 0", unit)
@@ -43,11 +35,7 @@ def positive_entries(name: str, value: object, count: int, unit: str = "m") -> t
 
 
 def unit_vector(name: str, value: object) -> Vector:
-    """Return `value`, three finite floats, scaled to length 1.
-
-    Raises:
-        ValueError: not three finite real numbers, or too short to have a direction.
-    """
+    """Return `value`, three finite floats, scaled to length 1."""
     vector = finite_vector(name, value, unit="")
     length = math.hypot(*vector)
     # A shorter vector may be the rounding error of a difference of metres, whose direction is noise.
@@ -58,11 +46,7 @@ def unit_vector(name: str, value: object) -> Vector:
 
 
 def real_tensor(name: str, value: object, unit: str = "") -> torch.Tensor:
-    """Return `value` as a finite float64 tensor of any shape; a tensor keeps its device and its gradient.
-
-    Raises:
-        ValueError: ragged, not real numbers, masked, not dense, NaN or infinite.
-    """
+    """Return `value` as a finite float64 tensor of any shape; a tensor keeps its device and its gradient."""
     accepted = f"must be an array of real numbers{in_unit(unit)}"
     tensor = _tensor(name, value, accepted)
     if tensor.is_complex():
@@ -76,9 +60,6 @@ def complex_tensor(name: str, value: object) -> torch.Tensor:
     """Return `value` as a finite complex128 tensor of any shape; a tensor keeps its device and its gradient.
 
     A lazy conjugate is resolved, because not every PyTorch function takes one.
-
-    Raises:
-        ValueError: ragged, real (as phases in place of a drive), masked, not dense, NaN or infinite.
     """
     accepted = "must be an array of complex numbers"
     tensor = _tensor(name, value, accepted)
@@ -90,21 +71,13 @@ def complex_tensor(name: str, value: object) -> torch.Tensor:
 
 
 def magnitude_tensor(name: str, value: object, unit: str = "") -> torch.Tensor:
-    """Return |value| as a float64 tensor of any shape; complex numbers, NaN and infinity are accepted.
-
-    Raises:
-        ValueError: ragged, not numbers, masked or not dense.
-    """
+    """Return |value| as a float64 tensor of any shape; complex numbers, NaN and infinity are accepted."""
     tensor = _tensor(name, value, f"must be an array of numbers{in_unit(unit)}")
     return tensor.to(torch.complex128 if tensor.is_complex() else torch.float64).abs()
 
 
 def points_tensor(name: str, value: object) -> torch.Tensor:
-    """Return `value` as points (P, 3) [m], P >= 1: a float64 copy without gradient, on the device of `value`.
-
-    Raises:
-        ValueError: another shape, no point, not real numbers, NaN or infinite.
-    """
+    """Return a float64 copy of `value`, points (P, 3) [m], P >= 1, on its device and without gradient."""
     points = real_tensor(name, value, "m")
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise ValueError(f"{name}: shape {tuple(points.shape)}; must be (P, 3) with P >= 1")
@@ -112,11 +85,7 @@ def points_tensor(name: str, value: object) -> torch.Tensor:
 
 
 def points_grid(name: str, value: object) -> tuple[torch.Tensor, torch.Size]:
-    """Return points on a grid (..., 3) [m] as `points_tensor` does, and the shape (...) of the grid.
-
-    Raises:
-        ValueError: another shape, no point, not real numbers, NaN or infinite.
-    """
+    """Return points on a grid (..., 3) [m] as `points_tensor` does, and the shape (...) of the grid."""
     points = real_tensor(name, value, "m")
     if points.ndim < 2 or points.shape[-1] != 3 or points.numel() == 0:
         raise ValueError(f"{name}: shape {tuple(points.shape)}; must be (P, 3) or (..., P, 3) with P >= 1")
