@@ -9,23 +9,20 @@ import time
 from small_scenes import CUBE, small_scene
 
 import autdtorch.study.run
-from autdtorch.methods.base import Trials
 from autdtorch.methods.gabs import gabs
-from autdtorch.methods.solution import Solution
-from autdtorch.objectives.objective import Objective
 from autdtorch.scene.geometry import Plane
 
 PLANE = Plane(center=(20e-3, 12e-3, 12e-3), normal=(1, 0, 0), size=(20e-3, 16e-3))
 SOLVER = {"method": "auto", "spacing": 2e-3, "tolerance": 0.1, "kernel": "reference"}
 
 
-def slow_gabs(objective: Objective, trials: Trials = 1, seed: int = 0) -> Solution:
+def slow_gabs(objective, trials=1, seed=0):
     """GABS that takes a while."""
     time.sleep(0.15)
     return gabs(objective, levels=4, trials=trials, seed=seed)
 
 
-def main() -> None:
+def main():
     """Run the study into the folder that the command line names."""
     slow_gabs.__module__ = gabs.__module__  # results of others' methods are not used again
     autdtorch.study.run.BLOCK = 1

@@ -2,8 +2,7 @@
 
 import logging
 import sys
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
 
@@ -13,7 +12,7 @@ Run = Callable[..., int]
 
 
 @pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
+def run(tmp_path, monkeypatch):
     """Runs a command line in an empty folder; returns its exit status."""
     root, package = logging.getLogger(), logging.getLogger("autdtorch")
     handlers, levels = root.handlers[:], (root.level, package.level)
@@ -21,7 +20,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     monkeypatch.setattr(sys, "path", sys.path[:])  # the command adds the working directory
 
-    def command(*arguments: str) -> int:
+    def command(*arguments):
         monkeypatch.setattr(sys, "argv", ["autdtorch", *arguments])
         try:
             main()

@@ -6,7 +6,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -34,14 +34,14 @@ EXPERIMENTS = sorted(path.stem for path in (CONFIGS / "experiment").glob("*.yaml
 SINGLE_FILES = ("results.h5", "trials.jsonl", "provenance.json", ".lock", "plane.png")
 
 
-def written(folder: Path) -> set[str]:
+def written(folder):
     """All files below a folder, by their path in it."""
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.fixture
-def composed() -> Iterator[Callable[..., dict[str, object]]]:
-    def config(*overrides: str) -> dict[str, object]:
+def composed():
+    def config(*overrides):
         # `output` refers to Hydra's own settings, which compose() leaves out.
         return OmegaConf.to_container(compose("config", [*overrides, "output=x"]), resolve=True)
 
@@ -49,7 +49,7 @@ def composed() -> Iterator[Callable[..., dict[str, object]]]:
         yield config
 
 
-def test_every_config_is_found() -> None:
+def test_every_config_is_found():
     assert {"homogeneous", "three_cubes", "two_cubes"} <= set(SCENES)
     assert {"lssg", "bo", "gabs"} <= set(METHODS)
     assert "default" in SOLVERS
@@ -57,27 +57,23 @@ def test_every_config_is_found() -> None:
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_every_scene_builds_and_has_the_name_of_its_file(
-    name: str, composed: Callable[..., dict[str, object]]
-) -> None:
+def test_every_scene_builds_and_has_the_name_of_its_file(name, composed):
     assert load_scene(composed(f"scene={name}")["scene"]).name == name
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_every_method_builds_with_known_settings(
-    name: str, composed: Callable[..., dict[str, object]]
-) -> None:
+def test_every_method_builds_with_known_settings(name, composed):
     assert isinstance(load_method("method", composed(f"method={name}")["method"], ()), Method)
 
 
 @pytest.mark.parametrize("name", SOLVERS)
-def test_every_solver_builds(name: str, composed: Callable[..., dict[str, object]]) -> None:
+def test_every_solver_builds(name, composed):
     config = composed(f"solver={name}")
     assert isinstance(make_propagator(load_scene(config["scene"]), **config["solver"]), FreeSpacePropagator)
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_every_experiment_builds(name: str, composed: Callable[..., dict[str, object]]) -> None:
+def test_every_experiment_builds(name, composed):
     config = composed(f"experiment={name}")
     assert "scene" not in config
     assert "method" not in config
@@ -85,7 +81,7 @@ def test_every_experiment_builds(name: str, composed: Callable[..., dict[str, ob
     assert all(load_method(name, method, ()) for name, method in config["methods"].items())
 
 
-def test_the_papers_experiment(composed: Callable[..., dict[str, object]]) -> None:
+def test_the_papers_experiment(composed):
     config = composed("experiment=paper")
     assert list(config["scenes"]) == ["homogeneous", "three_cubes", "two_cubes"]
     assert list(config["methods"]) == ["lssg", "bayes_opt", "gabs", "identify", "gradient_ascent"]
@@ -121,15 +117,9 @@ WRONG = [
         ["method._target_=tabu.search", "modules=tabu"],
         r"method\._target_: 'tabu\.search'; .*No module named 'tabu'",
     ),
-    (
-        ["method._target_=.foo.gabs", "modules=.foo"],
-        r"method\._target_: '\.foo\.gabs'; must be a module",
-    ),
+    (["method._target_=.foo.gabs", "modules=.foo"], r"method\._target_: '\.foo\.gabs'; must be a module"),
     (["method._target_=gabs", "modules=''"], r"method\._target_: 'gabs'; must be a module"),
-    (
-        ["method._target_='a b.gabs'", "modules='a b'"],
-        r"method\._target_: 'a b\.gabs'; must be a module",
-    ),
+    (["method._target_='a b.gabs'", "modules='a b'"], r"method\._target_: 'a b\.gabs'; must be a module"),
     (["method._target_=autdtorch"], r"method\._target_: 'autdtorch'; must be one of"),
     (["~method._target_"], "method: no _target_"),
     (
@@ -157,15 +147,8 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("arguments", "message"), WRONG, ids=[" ".join(arguments) for arguments, _ in WRONG])
-def test_a_wrong_command_gets_one_line(
-    arguments: list[str],
-    message: str,
-    run: Run,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def refuse(*_: object) -> None:
+def test_a_wrong_command_gets_one_line(arguments, message, run, tmp_path, capsys, monkeypatch):
+    def refuse(*_):
         raise AssertionError("simulated before all settings were checked")
 
     monkeypatch.setattr(autdtorch.study.run, "_run_scene", refuse)
@@ -177,16 +160,14 @@ def test_a_wrong_command_gets_one_line(
     assert re.match(rf"autdtorch: {message}", line), line
 
 
-def test_the_traceback_comes_back_where_it_is_asked_for(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_traceback_comes_back_where_it_is_asked_for(run, monkeypatch):
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     with pytest.raises(ValueError, match=r"^seed: -1; must be an integer >= 0$"):
         run("seed=-1")
     assert os.environ["HYDRA_FULL_ERROR"] == "1"
 
 
-def test_a_scene_that_is_not_yaml_is_named_with_its_line(
-    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_scene_that_is_not_yaml_is_named_with_its_line(run, tmp_path, capsys):
     (tmp_path / "mine" / "scene").mkdir(parents=True)
     (tmp_path / "mine" / "scene" / "duct.yaml").write_text("frequency: 40e3\n\tarray: {}\n", encoding="utf-8")
     assert run("--config-dir", "mine", "scene=duct") == 2
@@ -211,9 +192,7 @@ BAD_METHODS = {
 
 
 @pytest.mark.parametrize("name", BAD_METHODS)
-def test_an_error_of_ones_own_method_is_told_in_one_line(
-    name: str, run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_error_of_ones_own_method_is_told_in_one_line(name, run, tmp_path, capsys, monkeypatch):
     monkeypatch.delitem(sys.modules, "own", raising=False)
     (tmp_path / "own.py").write_text(OWN_METHODS, encoding="utf-8")
     status, message = BAD_METHODS[name]
@@ -233,9 +212,7 @@ BAD_MODULES = {
 
 
 @pytest.mark.parametrize("name", BAD_MODULES)
-def test_a_module_that_cannot_be_imported_is_told_in_one_line_with_the_reason(
-    name: str, run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_module_that_cannot_be_imported_is_told_in_one_line_with_the_reason(name, run, tmp_path, capsys):
     content, reason = BAD_MODULES[name]
     (tmp_path / f"{name}.py").write_text(content, encoding="utf-8")
     assert run(f"method._target_={name}.search", f"modules={name}") == 2
@@ -245,17 +222,17 @@ def test_a_module_that_cannot_be_imported_is_told_in_one_line_with_the_reason(
     )
 
 
-def test_the_version_is_ours(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_version_is_ours(run, capsys):
     assert run("--version") == 0
     assert capsys.readouterr().out == f"autdtorch {autdtorch.__version__}\n"
 
 
-def test_the_environment_is_left_as_it_was(run: Run) -> None:
+def test_the_environment_is_left_as_it_was(run):
     assert run("seed=-1") == 2
     assert "HYDRA_FULL_ERROR" not in os.environ
 
 
-def test_one_scene_and_one_method(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_scene_and_one_method(run, tmp_path, capsys):
     assert run("scene=homogeneous", "method=gabs", "solver.method=free_space", "trials=2") == 0
     folder = tmp_path / "outputs" / "homogeneous_gabs"
     assert written(tmp_path) == {f"outputs/homogeneous_gabs/{name}" for name in SINGLE_FILES}
@@ -272,9 +249,7 @@ def test_one_scene_and_one_method(run: Run, tmp_path: Path, capsys: pytest.Captu
     assert "homogeneous: gabs, trials 1 to 2 of 2" in captured.err
 
 
-def test_what_is_finished_is_not_computed_again(
-    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_finished_is_not_computed_again(run, tmp_path, capsys, monkeypatch):
     command = ("scene=homogeneous", "method=lssg", "output=here")
     assert run(*command) == 0
     table = capsys.readouterr().out
@@ -288,9 +263,7 @@ def test_what_is_finished_is_not_computed_again(
         run(*command[:-1], "output=elsewhere")
 
 
-def test_where_matrices_are_kept_changes_no_result(
-    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_where_matrices_are_kept_changes_no_result(run, tmp_path, capsys):
     command = ("scene=homogeneous", "method=lssg", "solver.method=free_space", "plane_spacing=10e-3")
     for folder in ("one", "two"):
         assert run(*command, f"solver.cache={tmp_path / folder}", "output=out") == 0
@@ -298,9 +271,7 @@ def test_where_matrices_are_kept_changes_no_result(
     assert "re-using homogeneous" in capsys.readouterr().err
 
 
-def test_a_changed_obstacle_file_is_computed_again(
-    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_changed_obstacle_file_is_computed_again(run, tmp_path, capsys):
     obstacle = "{type: voxel_mask, path: mask.npy, spacing: 1e-3, origin: [40e-3, 0, 0], rigid: true}"
     command = (
         *("method=lssg", "solver.method=free_space", "plane_spacing=10e-3", "output=out"),
@@ -312,9 +283,7 @@ def test_a_changed_obstacle_file_is_computed_again(
         assert ("re-using" in capsys.readouterr().err) is reused
 
 
-def test_a_changed_array_file_is_computed_again(
-    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_changed_array_file_is_computed_again(run, tmp_path, capsys):
     array = "{type: file, path: array.csv, center: [1e-3, 50e-3, 50e-3], normal: [1, 0, 0]}"
     command = ("method=lssg", "plane_spacing=10e-3", "output=out", "~scene.array", f"+scene.array={array}")
     for pitch, reused in ((10, False), (10, True), (11, False)):
@@ -323,7 +292,7 @@ def test_a_changed_array_file_is_computed_again(
         assert ("re-using" in capsys.readouterr().err) is reused
 
 
-def test_ones_own_scene_file(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ones_own_scene_file(run, tmp_path, capsys):
     (tmp_path / "mine" / "scene").mkdir(parents=True)
     text = (CONFIGS / "scene" / "homogeneous.yaml").read_text(encoding="utf-8")
     own = text.replace("count: 4", "count: 2")
@@ -332,9 +301,7 @@ def test_ones_own_scene_file(run: Run, tmp_path: Path, capsys: pytest.CaptureFix
     assert load_results(tmp_path / "outputs" / "pair_lssg").scenes["pair"].transfer_matrix.shape == (2, 16)
 
 
-def test_an_experiment_ends_with_its_report(
-    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_experiment_ends_with_its_report(run, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("autdtorch.study.report.figures.rendering_problem", lambda: "not tried")
     command = (
         "experiment=paper",
@@ -353,10 +320,8 @@ def test_an_experiment_ends_with_its_report(
     assert f"`autdtorch {' '.join(command)} solver.method=free_space`" in report.replace("'", "")
 
 
-def test_ctrl_c_ends_with_one_line_and_its_status(
-    run: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(*_: object) -> None:
+def test_ctrl_c_ends_with_one_line_and_its_status(run, capsys, monkeypatch):
+    def interrupted(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(autdtorch.study.run, "_run_scene", interrupted)
@@ -365,7 +330,7 @@ def test_ctrl_c_ends_with_one_line_and_its_status(
     assert line.startswith("autdtorch: interrupted; ")
 
 
-def test_help_tells_what_there_is(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_tells_what_there_is(run, tmp_path, capsys):
     assert run("--help") == 0
     text = capsys.readouterr().out
     assert "autdtorch experiment=paper" in text
@@ -374,7 +339,7 @@ def test_help_tells_what_there_is(run: Run, tmp_path: Path, capsys: pytest.Captu
     assert written(tmp_path) == set()
 
 
-def test_solver_settings_are_the_defaults_of_make_propagator() -> None:
+def test_solver_settings_are_the_defaults_of_make_propagator():
     """One truth: a script and the command line simulate alike."""
     parameters = inspect.signature(make_propagator).parameters.values()
     defaults = {parameter.name: parameter.default for parameter in parameters if parameter.name != "scene"}
@@ -383,9 +348,7 @@ def test_solver_settings_are_the_defaults_of_make_propagator() -> None:
 
 @pytest.mark.parametrize("sensor", sorted(path.stem for path in (CONFIGS / "hardware" / "sensor").glob("*")))
 @pytest.mark.parametrize("bench", ["emulated", *DEVICES])
-def test_every_bench_has_the_same_keys(
-    bench: str, sensor: str, composed: Callable[..., dict[str, object]]
-) -> None:
+def test_every_bench_has_the_same_keys(bench, sensor, composed):
     words = (f"hardware={bench}", f"hardware/sensor={sensor}", "hardware.limits.amplitude=1")
     device = "sonicsurface" if bench == "emulated" else bench
     where = ("hardware.sensor.path=x",) if sensor == "file" else ()

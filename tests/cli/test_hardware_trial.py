@@ -35,14 +35,12 @@ Run = Callable[..., int]
 
 
 @pytest.fixture
-def trial(
-    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., tuple[int, str, str]]:
+def trial(run, tmp_path, capsys):
     """Runs a trial in the scene above; returns its status, and what it printed on stdout and stderr."""
     (tmp_path / "ours" / "scene").mkdir(parents=True)
     (tmp_path / "ours" / "scene" / "two.yaml").write_text(SCENE)
 
-    def command(*words: str) -> tuple[int, str, str]:
+    def command(*words):
         capsys.readouterr()
         status = run("--config-dir", str(tmp_path / "ours"), "scene=two", "output=out", *words)
         return status, *capsys.readouterr()
@@ -50,7 +48,7 @@ def trial(
     return command
 
 
-def test_a_trial_leaves_log_drive_and_report_and_is_not_repeated(trial, tmp_path: Path):
+def test_a_trial_leaves_log_drive_and_report_and_is_not_repeated(trial, tmp_path):
     status, printed, log = trial(*GABS, "hardware.failed=[4]")
     assert (status, "8 of 9 transducers work" in log) == (0, True)
     out = tmp_path / "out"
@@ -73,7 +71,7 @@ def test_a_trial_leaves_log_drive_and_report_and_is_not_repeated(trial, tmp_path
     assert "of another trial, whose failed is [4], not []" in log
 
 
-def test_the_log_of_a_running_trial_is_refused_before_a_device_is_touched(trial, tmp_path: Path, monkeypatch):
+def test_the_log_of_a_running_trial_is_refused_before_a_device_is_touched(trial, tmp_path, monkeypatch):
     (tmp_path / "out").mkdir()
     monkeypatch.setattr("autdtorch.hardware.open_link", None)
     with FileLock(tmp_path / "out" / ".trial.jsonl.lock"):  # as another process has it
@@ -83,7 +81,7 @@ def test_the_log_of_a_running_trial_is_refused_before_a_device_is_touched(trial,
     assert not (tmp_path / "out" / "trial.jsonl").exists()
 
 
-def test_an_oscilloscope_on_the_emulated_bus_is_the_sensor(trial, tmp_path: Path):
+def test_an_oscilloscope_on_the_emulated_bus_is_the_sensor(trial, tmp_path):
     status, _, log = trial(*EMULATED, "hardware/sensor=scope", "method=lssg")
     assert (status, "9 of 9 transducers work" in log) == (0, True)
     misfit = re.search(r"differ by\s+(\S+) %", (tmp_path / "out" / "report.md").read_text())
@@ -91,7 +89,7 @@ def test_an_oscilloscope_on_the_emulated_bus_is_the_sensor(trial, tmp_path: Path
     assert 0 < float(misfit[1]) < 5  # 8 bits for 20 Pa, at pressures of 1 Pa
 
 
-def test_a_dry_run_shows_the_frames_and_leaves_nothing(trial, tmp_path: Path):
+def test_a_dry_run_shows_the_frames_and_leaves_nothing(trial, tmp_path):
     words = ("hardware=sonicsurface", "hardware.dry_run=true", "hardware.transducers='0-2,16-18,32-34'")
     status, printed, _ = trial(*GABS[1:], *words)
     assert status == 0
@@ -154,13 +152,13 @@ OPENMPD = ("hardware=openmpd", "hardware.limits.amplitude=1", "hardware.transduc
         ((*GABS, "-m"), 2, "hardware: a sweep; must be one trial at a time"),
     ],
 )
-def test_a_trial_that_may_not_be_made_ends_with_one_line(trial, words, status: int, message: str):
+def test_a_trial_that_may_not_be_made_ends_with_one_line(trial, words, status, message):
     ended, _, log = trial(*words)
     assert ended == status
     assert message in log
 
 
-def test_a_bench_of_ones_own_is_a_config(trial, tmp_path: Path):
+def test_a_bench_of_ones_own_is_a_config(trial, tmp_path):
     (tmp_path / "ours" / "hardware").mkdir()
     (tmp_path / "ours" / "hardware" / "mine.yaml").write_text(
         "defaults: [base, sensor: emulated, _self_]\n"
@@ -172,7 +170,7 @@ def test_a_bench_of_ones_own_is_a_config(trial, tmp_path: Path):
 
 
 @pytest.mark.parametrize("device", ["autd3", "openmpd"])
-def test_devices_of_boards_find_the_drive_of_the_simulation(trial, tmp_path: Path, device: str):
+def test_devices_of_boards_find_the_drive_of_the_simulation(trial, tmp_path, device):
     if device == "autd3":
         pytest.importorskip("autd3", reason="the kit of AUTD3: install autdtorch[autd3]")
     boards = (
@@ -189,7 +187,7 @@ def test_devices_of_boards_find_the_drive_of_the_simulation(trial, tmp_path: Pat
         assert (status, "of another trial, whose boards is ['left " in log) == (2, True)
 
 
-def write_board(folder: Path, name: str, gain: float = 1.0) -> str:
+def write_board(folder, name, gain=1.0):
     path = folder / f"{name}.pat"
     positions = "\n".join(f"({0.0105 * (n % 16)}, {0.0105 * (n // 16)}, 0)" for n in range(256))
     rest = "\n".join(" ".join(map(str, column)) for column in (range(255, -1, -1), [0] * 256, [gain] * 256))
@@ -198,13 +196,13 @@ def write_board(folder: Path, name: str, gain: float = 1.0) -> str:
 
 
 @pytest.fixture
-def fail_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[int, Callable[[], None]], None]:
+def fail_at(monkeypatch):
     """Has the method fail in the simulation (0) or on the bench (1)."""
 
-    def arrange(call: int, fail: Callable[[], None]) -> None:
+    def arrange(call, fail):
         real, calls = autdtorch.cli.hardware_command.solve, []
 
-        def solve(*arguments: object) -> object:
+        def solve(*arguments):
             calls.append(None)
             if len(calls) == call + 1:
                 fail()
@@ -219,15 +217,15 @@ OFF = "; the outputs are off, and the same command goes on where the log ends"
 
 
 @pytest.mark.parametrize(("call", "message"), [(0, ""), (1, OFF)])
-def test_a_signal_speaks_of_the_device_only_once_it_was_opened(trial, fail_at, call: int, message: str):
+def test_a_signal_speaks_of_the_device_only_once_it_was_opened(trial, fail_at, call, message):
     fail_at(call, lambda: signal.raise_signal(signal.SIGTERM))
     status, _, log = trial(*GABS)
     assert (status, log.splitlines()[-1]) == (143, f"autdtorch: SIGTERM{message}")
 
 
 @pytest.mark.parametrize("left_on", [False, True])
-def test_an_error_in_mid_trial_says_whether_the_outputs_are_off(trial, fail_at, left_on: bool):
-    def fail() -> None:
+def test_an_error_in_mid_trial_says_whether_the_outputs_are_off(trial, fail_at, left_on):
+    def fail():
         error = OSError(errno.ENOSPC, "No space left on device", "there.jsonl")
         error.__context__ = OffError("they may still be on") if left_on else LinkError("stall")
         raise error
@@ -259,7 +257,7 @@ def test_a_person_reads_each_transducer_and_the_silence_once(trial, monkeypatch)
     assert "pre-flight check: transducer 3 of 9" in log
 
 
-def test_the_script_takes_the_same_settings(trial, monkeypatch, tmp_path: Path):
+def test_the_script_takes_the_same_settings(trial, monkeypatch, tmp_path):
     import hardware_trial
 
     monkeypatch.setattr("sys.argv", ["hardware_trial.py", "method=lssg"])
@@ -275,7 +273,7 @@ def test_the_factor_between_simulation_and_bench_is_found():
     assert fit.misfit < 1e-12
 
 
-def test_the_documented_scene_lies_in_the_middle_of_a_sonicsurface(tmp_path: Path):
+def test_the_documented_scene_lies_in_the_middle_of_a_sonicsurface(tmp_path):
     """With the device turned as the documentation says, for the transducers of its command."""
     text = (Path(__file__).parents[2] / "docs" / "hardware.md").read_text("utf-8")
     block = re.search(r"```yaml\n(name.*?)```", text, re.DOTALL)

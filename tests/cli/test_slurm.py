@@ -7,8 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -27,7 +26,7 @@ LAUNCHER = ("hydra/launcher=slurm", "hydra.launcher.timeout_min=5", "hydra.launc
 
 
 @pytest.fixture
-def slurm() -> Iterator[dict[str, str]]:
+def slurm():
     """The environment in which Slurm's commands find the cluster."""
     if missing := missing_programs():
         pytest.skip(f"no {', '.join(missing)}; python scripts/one_node_slurm.py true installs them")
@@ -35,20 +34,20 @@ def slurm() -> Iterator[dict[str, str]]:
         yield environment
 
 
-def job_folder(sweep: Path, seed: int) -> Path:
+def job_folder(sweep, seed):
     (folder,) = sweep.glob(f"*seed={seed}*")
     return folder
 
 
-def finished_trials(sweep: Path, seed: int) -> int:
+def finished_trials(sweep, seed):
     return sum(file.read_bytes().count(b"\n") for file in sweep.glob(f"*seed={seed}*/trials.jsonl"))
 
 
-def answer(slurm: dict[str, str], *command: str) -> str:
+def answer(slurm, *command):
     return subprocess.check_output(command, env=slurm, text=True)
 
 
-def kill(job: str, slurm: dict[str, str]) -> None:
+def kill(job, slurm):
     """Kill the process of a job, as a node short of memory does."""
     number = answer(slurm, "squeue", "--noheader", "--format=%A", f"--job={job}").strip()
     rows = [line.split() for line in answer(slurm, "scontrol", "listpids", number).splitlines()]
@@ -56,14 +55,12 @@ def kill(job: str, slurm: dict[str, str]) -> None:
     os.kill(process, signal.SIGKILL)
 
 
-def run_out_of_time(job: str, slurm: dict[str, str]) -> None:
+def run_out_of_time(job, slurm):
     """Send a job what Slurm sends before the time limit."""
     answer(slurm, "scancel", "--signal=USR2", job)
 
 
-def test_disturbed_jobs_end_with_the_numbers_of_undisturbed_ones(
-    slurm: dict[str, str], tmp_path: Path, run: Run
-) -> None:
+def test_disturbed_jobs_end_with_the_numbers_of_undisturbed_ones(slurm, tmp_path, run):
     assert run("-m", *SWEEP) == 0
     undisturbed, disturbed = tmp_path / "multirun", tmp_path / "auf Slurm, gestört"
     command = [sys.executable, "-m", "autdtorch", "-m", *LAUNCHER, "hydra.launcher.cpus_per_task=1"]
@@ -97,7 +94,7 @@ def test_disturbed_jobs_end_with_the_numbers_of_undisturbed_ones(
             assert values[0].equal(values[1]), key
 
 
-def test_a_job_may_use_the_cores_that_it_asks_for(slurm: dict[str, str], tmp_path: Path) -> None:
+def test_a_job_may_use_the_cores_that_it_asks_for(slurm, tmp_path):
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):
         launcher = compose("config", ["hydra/launcher=slurm"], return_hydra_config=True).hydra.launcher
     cores, output = len(os.sched_getaffinity(0)), tmp_path / "cores"

@@ -4,7 +4,6 @@ import csv
 import os
 import signal
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
@@ -20,19 +19,19 @@ Run = Callable[..., int]
 QUICK = ("scene=homogeneous", "plane_spacing=0.02")
 
 
-def jobs(folder: Path) -> list[str]:
+def jobs(folder):
     return sorted(file.parent.name for file in folder.rglob("results.h5"))
 
 
 @pytest.mark.parametrize("launcher", ["basic", "joblib", "submitit_local"])
-def test_a_sweep_has_a_folder_for_each_job(run: Run, tmp_path: Path, launcher: str) -> None:
+def test_a_sweep_has_a_folder_for_each_job(run, tmp_path, launcher):
     assert run("-m", f"hydra/launcher={launcher}", *QUICK, "method=gabs,lssg") == 0
     assert jobs(tmp_path) == [
         f"method={name},plane_spacing=0.02,scene=homogeneous" for name in ("gabs", "lssg")
     ]
 
 
-def test_jobs_in_one_scene_share_its_matrices(run: Run, tmp_path: Path) -> None:
+def test_jobs_in_one_scene_share_its_matrices(run, tmp_path):
     coarse = ("scene=sphere", "solver.spacing=2.8e-3", "solver.tolerance=0.1", "plane_spacing=0.02")
     assert run("-m", *coarse, "method=lss,lssg") == 0
     (matrix,) = (tmp_path / "multirun" / "matrices").iterdir()
@@ -40,7 +39,7 @@ def test_jobs_in_one_scene_share_its_matrices(run: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="SIGKILL is of POSIX")
-def test_a_killed_sweep_goes_on_with_the_same_command(run: Run, tmp_path: Path) -> None:
+def test_a_killed_sweep_goes_on_with_the_same_command(run, tmp_path):
     command = ("-m", *QUICK, "method=gabs,identify", "trials=2")
     sweep = Subject(("-m", "autdtorch", *command), "multirun/*/trials.jsonl", of_studies)
     process = sweep.start(tmp_path)
@@ -55,7 +54,7 @@ def test_a_killed_sweep_goes_on_with_the_same_command(run: Run, tmp_path: Path) 
     assert all(map(torch.equal, found, undisturbed))
 
 
-def test_a_real_cluster_has_its_config() -> None:
+def test_a_real_cluster_has_its_config():
     """All keys are those of the plugin, else Hydra refuses them; what runs out of time is queued again."""
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):
         launcher = compose("config", ["hydra/launcher=slurm"], return_hydra_config=True).hydra.launcher
@@ -63,18 +62,14 @@ def test_a_real_cluster_has_its_config() -> None:
     assert launcher.max_num_timeout > 0
 
 
-def test_without_slurm_it_says_so(
-    run: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_slurm_it_says_so(run, capsys, monkeypatch):
     monkeypatch.setenv("PATH", "")
     assert run("-m", "hydra/launcher=slurm", *QUICK) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith('autdtorch: Could not detect "srun"')
 
 
-def test_where_a_job_fails_the_others_go_on(
-    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_where_a_job_fails_the_others_go_on(run, tmp_path, capsys):
     assert run("-m", *QUICK, "method.levels=1,4") == 2
     (folder,) = jobs(tmp_path)
     assert folder.startswith("method.levels=4,")
@@ -82,7 +77,7 @@ def test_where_a_job_fails_the_others_go_on(
     assert "job 0 failed: method gabs: levels: 1; must be an integer >= 2" in errors[-1]
 
 
-def test_the_folder_of_a_job_has_a_name_that_every_file_system_takes(run: Run, tmp_path: Path) -> None:
+def test_the_folder_of_a_job_has_a_name_that_every_file_system_takes(run, tmp_path):
     overrides = [f"scene.control_points.{key}" for key in ("center.0=8e-2", "radius=29e-3", "angle=0.1")]
     overrides += ["scene.medium.sound_speed=341", "scene.array.pitch=11e-3", "solver.cache=some/where"]
     assert run("-m", *QUICK, "method=lssg", *overrides) == 0
@@ -90,24 +85,20 @@ def test_the_folder_of_a_job_has_a_name_that_every_file_system_takes(run: Run, t
     assert len(folder) <= 150
 
 
-def test_jobs_that_differ_in_a_character_that_folders_cannot_have_do_not_share_one(
-    run: Run, tmp_path: Path
-) -> None:
+def test_jobs_that_differ_in_a_character_that_folders_cannot_have_do_not_share_one(run, tmp_path):
     names = ("scene.name='a b'", "scene.name='a/b'")
     for name in names:
         assert run("-m", *QUICK, "method=lssg", name) == 0
     assert len(jobs(tmp_path)) == 2
 
 
-def test_a_sweep_says_where_its_folders_are_set(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_sweep_says_where_its_folders_are_set(run, capsys):
     assert run("-m", *QUICK, "output=here") == 2
     assert "a sweep has a folder for each job in hydra.sweep.dir" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("launcher", ["basic", "joblib"])
-def test_a_method_of_ones_own_is_found_in_the_working_directory(
-    run: Run, tmp_path: Path, launcher: str
-) -> None:
+def test_a_method_of_ones_own_is_found_in_the_working_directory(run, tmp_path, launcher):
     (tmp_path / "climbing.py").write_text(
         "import autdtorch as at\n\n"
         "def climb(objective, steps, trials, seed):\n"
@@ -127,9 +118,7 @@ def test_a_method_of_ones_own_is_found_in_the_working_directory(
     assert method[1].solution.evaluations.tolist() == [5, 5, 5]
 
 
-def test_collected_seeds_are_trials_and_other_settings_make_names(
-    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_collected_seeds_are_trials_and_other_settings_make_names(run, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("autdtorch.study.report.figures.rendering_problem", lambda: "not tried")
     assert run("-m", *QUICK, "method=gabs", "method.levels=4,8", "seed=0,1", "trials=2") == 0
     assert run("-m", *QUICK, "method=lssg", "seed=0,1") == 0
@@ -168,9 +157,7 @@ def test_collected_seeds_are_trials_and_other_settings_make_names(
     assert "in the folders that the settings name: `results.h5`" in report
 
 
-def test_an_unfinished_study_is_left_out(
-    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unfinished_study_is_left_out(run, tmp_path, capsys):
     assert run("-m", *QUICK, "method=gabs,lssg") == 0
     next(file for file in tmp_path.rglob("results.h5") if "lssg" in file.parent.name).unlink()
     assert collect_results(tmp_path).studies == 1

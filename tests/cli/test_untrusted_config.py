@@ -23,12 +23,12 @@ EXPERIMENT = f"{GLOBAL}defaults: [{', '.join(DEFAULT)}]\n"
 class Touch:
     """When it is unpickled, it leaves the file `canary`."""
 
-    def __reduce__(self) -> tuple[object, ...]:
+    def __reduce__(self):
         return Path.touch, (Path("canary"),)
 
 
 @pytest.fixture
-def send(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Send:
+def send(run, tmp_path, monkeypatch):
     """Writes files below a folder `sent`; beside it are a pickle and a module that leave `canary`."""
     here = tmp_path / "here"
     here.mkdir()
@@ -40,7 +40,7 @@ def send(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Send:
         "from pathlib import Path\nfrom torch import load\nPath('canary').touch()\n", encoding="utf-8"
     )
 
-    def write(files: dict[str, str]) -> None:
+    def write(files):
         for name, text in files.items():
             path = here / "sent" / name
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -49,7 +49,7 @@ def send(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Send:
     return write
 
 
-def bomb(first: str, line: str) -> str:
+def bomb(first, line):
     """Ten levels, each of ten times the one before."""
     return "".join([first, *(line.format(this=n, all=", ".join([f"*a{n - 1}"] * 10)) for n in range(1, 10))])
 
@@ -79,12 +79,12 @@ DEFAULTS = (
 )
 
 
-def scene(name: str) -> str:
+def scene(name):
     return SCENE.replace("name: homogeneous", f"name: {name}")
 
 
 #: By folder of the file that is sent: its text, and the key that the one line names.
-ATTACKS: dict[str, list[tuple[str, str]]] = {
+ATTACKS = {
     "method": [
         (LINES, "method._target_"),
         (f"_target_: autdtorch.lssg\nlevels: {CALL}\n", "method.levels._target_"),
@@ -129,15 +129,7 @@ CASES = [(group, text, key) for group, cases in ATTACKS.items() for text, key in
 
 
 @pytest.mark.parametrize(("group", "text", "key"), CASES, ids=[f"{group} {key}" for group, _, key in CASES])
-def test_an_attack_by_a_config_ends_in_one_line(
-    group: str,
-    text: str,
-    key: str,
-    run: Run,
-    send: Send,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_an_attack_by_a_config_ends_in_one_line(group, text, key, run, send, tmp_path, capsys):
     send({f"{group}/x.yaml": text, "evil/run.yaml": f"x: {CALL}\n"})
     before = set(tmp_path.rglob("*"))
     assert run("--config-dir", "sent", f"{group}=x", "plane_spacing=0.02") == 2
@@ -149,26 +141,20 @@ def test_an_attack_by_a_config_ends_in_one_line(
     assert set(tmp_path.rglob("*")) == before  # no canary, nothing elsewhere
 
 
-def test_a_primary_config_sets_nothing_of_hydras(
-    run: Run, send: Send, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_primary_config_sets_nothing_of_hydras(run, send, tmp_path, capsys):
     send({"x.yaml": f"hydra: {{callbacks: {{x: {CALL}}}}}\n"})
     assert run("--config-dir", "sent", "--config-name", "x") == 2
     assert "x.yaml: hydra" in capsys.readouterr().err
     assert not list(tmp_path.rglob("canary"))
 
 
-def test_a_name_that_goes_up_does_not_move_the_output(
-    run: Run, send: Send, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_name_that_goes_up_does_not_move_the_output(run, send, tmp_path, capsys):
     send({"x.yaml": SCENE})
     assert run("--config-dir", "sent", "scene=../x", "plane_spacing=0.02") == 2
     assert "output: 'outputs/../x_gabs'" in capsys.readouterr().err
 
 
-def test_what_hydra_is_made_of_is_not_taken_from_a_folder_of_configs(
-    run: Run, send: Send, tmp_path: Path
-) -> None:
+def test_what_hydra_is_made_of_is_not_taken_from_a_folder_of_configs(run, send, tmp_path):
     """Hydra looks there before it asks its plugins for what they are called."""
     groups = ("config", "launcher/basic", "launcher/joblib", "sweeper/basic", "job_logging/stdout")
     send({f"hydra/{group}.yaml": f"{GLOBAL}hydra: {{callbacks: {{x: {CALL}}}}}\n" for group in groups})
@@ -176,7 +162,7 @@ def test_what_hydra_is_made_of_is_not_taken_from_a_folder_of_configs(
     assert not list(tmp_path.rglob("canary"))
 
 
-def test_a_launcher_of_ones_own_comes_from_a_folder_that_is_trusted(run: Run, send: Send) -> None:
+def test_a_launcher_of_ones_own_comes_from_a_folder_that_is_trusted(run, send):
     send({"hydra/launcher/mine.yaml": "defaults: [joblib]\nn_jobs: 2\n"})
     command = ("-m", "hydra/launcher=mine", "method=lssg", "plane_spacing=0.02")
     assert run("--config-dir", "sent", *command) == 2
@@ -184,9 +170,7 @@ def test_a_launcher_of_ones_own_comes_from_a_folder_that_is_trusted(run: Run, se
 
 
 @pytest.mark.parametrize("target", ["climbing.load", "climbing.torch", "climbing.no", "climbing.torch.load"])
-def test_of_a_trusted_module_only_its_own_functions_are_methods(
-    target: str, run: Run, send: Send, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_of_a_trusted_module_only_its_own_functions_are_methods(target, run, send, tmp_path, capsys):
     (tmp_path / "here" / "climbing.py").write_text("import torch\nfrom torch import load\n", encoding="utf-8")
     send({"method/x.yaml": LINES.replace("torch.load", target)})
     assert run("--config-dir", "sent", "method=x", "modules=[climbing, evil]") == 2
@@ -195,7 +179,7 @@ def test_of_a_trusted_module_only_its_own_functions_are_methods(
     assert not list(tmp_path.rglob("canary"))  # nor is a module imported that no method needs
 
 
-def test_the_command_line_may_name_any_folder(run: Run, tmp_path: Path) -> None:
+def test_the_command_line_may_name_any_folder(run, tmp_path):
     command = ("method=lssg", "plane_spacing=0.02", f"output={tmp_path / 'out'}")
     assert run(*command, f"solver.cache={tmp_path / 'cache'}") == 0
     assert (tmp_path / "out" / "results.h5").is_file()

@@ -13,22 +13,22 @@ MakeObjective = Callable[[torch.Tensor], SimulatedObjective]
 class MatrixPropagator:
     """A propagator of which nothing is known but its transfer matrix."""
 
-    def __init__(self, scene: Scene, matrix: torch.Tensor) -> None:
+    def __init__(self, scene, matrix):
         self.scene = scene
         self._matrix = matrix
 
-    def transfer_matrix(self, points: torch.Tensor | None = None) -> torch.Tensor:
+    def transfer_matrix(self, points=None):
         return self._matrix
 
-    def field(self, drive: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+    def field(self, drive, points):
         return drive @ self._matrix.T
 
 
 @pytest.fixture(scope="session")
-def make_objective() -> MakeObjective:
+def make_objective():
     """Objective of any transfer matrix (P, M): transducers in a row, control points in one 80 mm away."""
 
-    def make(matrix: torch.Tensor) -> SimulatedObjective:
+    def make(matrix):
         points, transducers = matrix.shape
         positions = torch.zeros(transducers, 3, dtype=torch.float64)
         positions[:, 1] = 10e-3 * torch.arange(transducers)
@@ -42,10 +42,10 @@ def make_objective() -> MakeObjective:
 
 
 @pytest.fixture(scope="session")
-def random_matrix() -> Callable[[int, int, int], torch.Tensor]:
+def random_matrix():
     """Transfer matrix (points, transducers) without any structure."""
 
-    def make(points: int, transducers: int, seed: int) -> torch.Tensor:
+    def make(points, transducers, seed):
         generator = torch.Generator().manual_seed(seed)
         return torch.randn(points, transducers, dtype=torch.complex128, generator=generator)
 
@@ -53,7 +53,7 @@ def random_matrix() -> Callable[[int, int, int], torch.Tensor]:
 
 
 @pytest.fixture(scope="session")
-def paper_objective() -> SimulatedObjective:
+def paper_objective():
     """The paper's array and four foci in empty air."""
     from autdtorch.analytic.green import free_space_matrix
     from autdtorch.scene.geometry import circle_points

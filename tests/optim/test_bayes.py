@@ -35,20 +35,6 @@ def test_fixed_transducer_stays_at_phase_zero_and_all_are_fully_on(solution):
     torch.testing.assert_close(solution.amplitudes, torch.ones(2, 4).double(), rtol=1e-15, atol=0)
 
 
-def test_a_trial_is_the_same_alone_bit_for_bit(make_objective, matrix, solution):
-    alone = bayes_opt(make_objective(matrix), trials=1, seed=5, **SMALL)
-    assert torch.equal(alone.drive[0], solution.drive[0])
-    assert torch.equal(alone.history[0], solution.history[0])
-    assert not torch.equal(solution.drive[1], solution.drive[0])
-
-
-def test_evaluations_are_counted(make_objective, matrix):
-    objective = make_objective(matrix)
-    solution = bayes_opt(objective, evaluations=8, initial=5, trials=2, fixed_transducer=0)
-    assert solution.evaluations.tolist() == [8, 8]
-    assert objective.evaluations == 16
-
-
 def test_score_that_never_changes_is_no_error(make_objective, matrix):
     objective = make_objective(matrix)
     solution = bayes_opt(

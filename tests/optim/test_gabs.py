@@ -80,6 +80,10 @@ def test_first_transducer_leads_every_random_order(make_objective, random_matrix
     torch.testing.assert_close(solution.history[:, 0], matrix[0, 3].abs().expand(5), rtol=1e-14, atol=0)
     assert torch.equal(solution.drive[:, 3], torch.ones(5, dtype=torch.complex128))
     assert len({tuple(row.tolist()) for row in solution.history}) > 1
+    levels = solution.phases * 4 / (2 * math.pi)
+    torch.testing.assert_close(levels, levels.round(), rtol=0, atol=1e-12)
+    on = solution.amplitudes  # each transducer is on or off, up to the rounding of its cosine and sine
+    torch.testing.assert_close(on, on.round(), rtol=1e-15, atol=0)
 
 
 def test_a_trial_ends_where_no_single_transducer_can_improve(make_objective, random_matrix):
@@ -113,10 +117,6 @@ def test_a_trial_that_ends_early_keeps_its_last_score(make_objective, random_mat
     for trial in range(8):
         end = int(solution.evaluations[trial])
         assert (solution.history[trial, end - 1 :] == solution.score[trial]).all()
-        alone = gabs(objective, levels=4, passes=9, trials=[trial])
-        assert torch.equal(alone.history[0], solution.history[trial])
-        assert torch.equal(alone.drive[0], solution.drive[trial])
-        assert torch.equal(alone.evaluations[0], solution.evaluations[trial])
 
 
 @pytest.mark.parametrize("levels", [3, 16])
@@ -129,27 +129,10 @@ def test_single_point_gets_all_but_what_the_levels_cost(make_objective, random_m
     assert (score <= matrix.abs().sum() * (1 + 1e-12)).all()
 
 
-def test_evaluations_are_counted(make_objective, random_matrix):
-    objective = make_objective(random_matrix(2, 5, 0))
-    solution = gabs(objective, levels=7, trials=3)
-    assert solution.evaluations.tolist() == [1 + 4 * 7] * 3
-    assert objective.evaluations == 3 * (1 + 4 * 7)
-
-
 def test_one_transducer_alone_needs_one_evaluation(make_objective, random_matrix):
     solution = gabs(make_objective(random_matrix(2, 1, 0)))
     assert solution.evaluations.tolist() == [1]
     assert solution.drive.tolist() == [[1 + 0j]]
-
-
-def test_phases_are_on_the_levels(make_objective, random_matrix):
-    solution = gabs(make_objective(random_matrix(2, 6, 5)), levels=8, trials=4)
-    steps = solution.phases * 8 / (2 * math.pi)
-    torch.testing.assert_close(steps, steps.round(), rtol=0, atol=1e-12)
-    amplitudes = (
-        solution.amplitudes
-    )  # each transducer is on or off, up to the rounding of its cosine and sine
-    torch.testing.assert_close(amplitudes, amplitudes.round(), rtol=1e-15, atol=0)
 
 
 def test_paper_ranking_in_empty_air(paper_objective):

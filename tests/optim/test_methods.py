@@ -1,6 +1,9 @@
-"""What holds for every method."""
+"""What holds for every method: ask and tell, files of states, trials, and settings that are refused."""
 
 import math
+import subprocess
+import sys
+from dataclasses import dataclass
 from functools import partial
 
 import pytest
@@ -8,50 +11,164 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autdtorch.methods.bayes.bayes import bayes_opt
-from autdtorch.methods.gabs import gabs
-from autdtorch.methods.gradient import gradient_ascent
-from autdtorch.methods.identify import identify
-from autdtorch.methods.lssg import lss, lssg
-from autdtorch.methods.random_search import random_search
+import autdtorch as at
+from autdtorch.methods.base import Step, trial_seed
 from autdtorch.methods.ranking import NEAR_TIE
 from autdtorch.objectives.perturbations import Quantised
 
-
-def small_bayes_opt(objective, **options):
-    return bayes_opt(objective, evaluations=9, initial=6, fixed_transducer=1, **options)
-
-
-BLACK_BOX_METHODS = {
-    "lss": lss,
-    "lssg": lssg,
-    "gabs": partial(gabs, trials=2),
-    "gabs by strength": partial(gabs, order="strength", trials=2),
-    "bayes_opt": partial(small_bayes_opt, trials=2),
-    "random_search": partial(random_search, evaluations=70, trials=2),
-    "identify": partial(identify, evaluations=30, trials=2),
-}
-EVERY_METHOD = BLACK_BOX_METHODS | {"gradient_ascent": partial(gradient_ascent, trials=2)}
-METHODS = pytest.mark.parametrize("method", EVERY_METHOD.values(), ids=EVERY_METHOD.keys())
+BLACK_BOX = [
+    at.LSS(),
+    at.LSSG(levels=4, passes=2),
+    at.GABS(levels=4),
+    at.GABS(levels=4, passes=3),
+    at.GABS(levels=3, order="strength"),
+    at.RandomSearch(evaluations=130),
+    at.Identify(evaluations=30),
+    at.BayesOpt(evaluations=12, initial=5, fixed_transducer=1),
+]
+METHODS = [*BLACK_BOX, at.GradientAscent(steps=20)]
+RANDOM = [method for method in METHODS if method.random]
 
 
-@METHODS
+def each(methods):
+    return pytest.mark.parametrize("method", methods, ids=lambda method: repr(method)[:25])
+
+
+@pytest.fixture
+def objective(make_objective, random_matrix):
+    return make_objective(random_matrix(3, 5, 0))
+
+
+@dataclass(frozen=True)
+class OneByOne(at.Method):
+    """A method of one's own: one random drive after the other."""
+
+    evaluations: int = 5
+
+    def most_evaluations(self, problem):
+        return self.evaluations
+
+    def begin(self, problem, seeds):
+        drives = [torch.full((1, problem.transducers), 1j**seed) for seed in seeds]
+        return Step(torch.stack(drives).to(torch.complex128), {})
+
+    def advance(self, state, pressure, score):
+        done = state.best.history.shape[1] == self.evaluations
+        return Step(state.drives[:, :0] if done else state.drives * 1j, {})
+
+
+@each(METHODS)
+def test_a_loop_of_ones_own_with_states_from_a_file_finds_what_run_finds(objective, method, tmp_path):
+    trials, path, problem = 2 if method.random else 1, tmp_path / "state.npz", at.Problem.of(objective)
+    state = first = method.start(problem, seed=3, trials=trials)
+    while len(drives := method.ask(state)):
+        pressure = objective(drives)
+        at.save_state(path, method, method.tell(state, pressure))
+        again = method.tell(state, pressure)
+        state = at.load_state(path, method, problem)
+        assert torch.equal(method.ask(state), method.ask(again))  # telling changes no state
+    assert (state.done, first.evaluations) == (True, 0)
+    torch.manual_seed(1)
+    global_state = torch.get_rng_state()
+    found, expected = method.best(state), at.run(method, objective, seed=3, trials=trials)
+    assert torch.equal(torch.get_rng_state(), global_state)
+    assert torch.equal(found.drive, expected.drive)
+    assert torch.equal(found.history, expected.history)
+
+
+def test_a_run_stops_and_goes_on_from_its_file(objective, tmp_path):
+    method, path = at.GABS(levels=4), tmp_path / "state.npz"
+    stopped = at.run(method, objective, state_file=path, stop=lambda state: state.evaluations >= 9)
+    assert stopped.evaluations.tolist() == [9] == [objective.evaluations]
+    whole = at.run(method, objective, state_file=path)
+    assert objective.evaluations == 17
+    assert torch.equal(whole.drive, at.run(method, objective).drive)
+    for other in (at.GABS(levels=5), at.LSSG()):
+        with pytest.raises(ValueError, match=r"state\.npz: state of .*gabs.*; must be of"):
+            at.run(other, objective, state_file=path)
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(ValueError, match=r"state\.npz"):
+        at.run(method, objective, state_file=path)
+
+
+def test_a_method_of_ones_own_runs_as_ours_do(objective):
+    solution = at.run(OneByOne(), objective, trials=3)
+    assert solution.evaluations.tolist() == [5] * 3
+    # A common phase changes no magnitude: all its drives are as good, and the first is kept.
+    first = [torch.full((5,), 1j ** trial_seed(0, trial)) for trial in range(3)]
+    assert torch.equal(solution.drive, torch.stack(first))
+    assert (OneByOne.name, OneByOne.label) == ("OneByOne", "OneByOne")
+
+
+def test_the_goal_is_a_function_of_its_own(objective):
+    solution = at.run(at.RandomSearch(6), objective, score=lambda pressure: pressure.mean(dim=-1))
+    assert torch.equal(solution.score, solution.pressure.mean(dim=-1))
+
+
+class Broken:
+    """An objective with a broken sensor."""
+
+    def __init__(self, objective, pressure):
+        self.scene, self.evaluations, self.pressure = objective.scene, 0, pressure
+
+    def __call__(self, drive):
+        return self.pressure
+
+
+@pytest.mark.parametrize(
+    ("pressure", "score", "message"),
+    [
+        (torch.full((2, 3), torch.nan), at.weakest_focus, "pressure of the objective: .*nan.* Pa"),
+        (torch.ones(2, 2), at.weakest_focus, r"objective: shape \(2, 2\); must be \(2, 3\)"),
+        (torch.ones(2, 3) * 1j, at.weakest_focus, "pressure of the objective: .*real"),
+        (torch.ones(2, 3), lambda pressure: pressure, r"score: shape \(1, 2, 3\); must be \(1, 2\)"),
+    ],
+    ids=["nan", "shape", "complex", "score"],
+)
+def test_pressures_and_scores_of_another_kind_are_refused(objective, pressure, score, message):
+    with pytest.raises(ValueError, match=message):
+        at.run(at.RandomSearch(evaluations=2), Broken(objective, pressure), score=score)
+
+
+def test_a_problem_without_geometry_or_matrix_is_refused_where_they_are_needed():
+    problem = at.Problem(transducers=4, foci=2)
+    assert at.GABS().start(problem).drives.shape == (1, 1, 4)
+    for method, field in ((at.LSS(), "problem.scene"), (at.GradientAscent(), "objective")):
+        with pytest.raises(ValueError, match=field):
+            method.start(problem)
+    with pytest.raises(ValueError, match="trials: 2; must be 1"):
+        at.LSSG().start(problem, trials=2)
+    with pytest.raises(ValueError, match="transducers: 0"):
+        at.Problem(transducers=0, foci=2)
+
+
+def test_different_seeds_and_trials_are_unrelated():
+    seeds = {trial_seed(seed, trial) for seed in range(20) for trial in range(50)}
+    assert len(seeds) == 1000
+    assert 0 <= min(seeds) < max(seeds) < 2**63  # torch takes no more than 63 bits
+
+
+def test_importing_the_methods_loads_no_numba():
+    code = (
+        "import sys, autdtorch.methods.catalogue;"
+        "sys.exit(any(name.split('.')[0] == 'numba' for name in sys.modules))"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@each(METHODS)
 @pytest.mark.parametrize("seed", range(3))
-def test_no_focus_beats_the_triangle_bound(make_objective, random_matrix, method, seed):
+def test_solution_is_consistent(make_objective, random_matrix, method, seed):
     matrix = random_matrix(3, 5, seed)
-    pressure = method(make_objective(matrix)).pressure
-    assert (pressure <= matrix.abs().sum(dim=1) * (1 + 1e-12)).all()
-
-
-@METHODS
-def test_solution_is_consistent(make_objective, random_matrix, method):
-    objective = make_objective(random_matrix(3, 5, 0))
-    solution = method(objective)
+    objective = make_objective(matrix)
+    solution = at.run(method, objective, trials=2 if method.random else 1)
     trials, evaluations = solution.history.shape
     assert solution.drive.shape == (trials, 5)
     assert solution.pressure.shape == (trials, 3)
-    assert solution.evaluations.tolist() == [evaluations] * trials
-    assert objective.evaluations == trials * evaluations
+    assert (solution.pressure <= matrix.abs().sum(dim=1) * (1 + 1e-12)).all()  # the triangle bound
+    assert objective.evaluations == solution.evaluations.sum()
+    if getattr(method, "passes", 1) == 1:  # else a trial may end early
+        assert solution.evaluations.tolist() == [evaluations] * trials
     assert (solution.history.diff(dim=1) >= 0).all()
     # The last drive, which identify returns, is the best but for rounding.
     torch.testing.assert_close(solution.history[:, -1], solution.score, rtol=1e-4, atol=0)
@@ -61,54 +178,25 @@ def test_solution_is_consistent(make_objective, random_matrix, method):
     assert torch.equal(objective(solution.drive), solution.pressure)
 
 
-@pytest.mark.parametrize("method", BLACK_BOX_METHODS.values(), ids=BLACK_BOX_METHODS.keys())
+@each(BLACK_BOX)
 @pytest.mark.parametrize("on_off", [False, True])
-def test_on_a_device_of_few_levels_the_drive_is_the_one_it_played(
-    make_objective, random_matrix, method, on_off
-):
-    inner = make_objective(random_matrix(3, 5, 0))
-    solution = method(Quantised(inner, 6, on_off))
+def test_on_a_device_of_few_levels_the_drive_is_the_one_it_played(objective, method, on_off):
+    solution = at.run(method, Quantised(objective, 6, on_off), trials=2 if method.random else 1)
     steps = solution.phases * 6 / (2 * math.pi)
     torch.testing.assert_close(steps, steps.round(), rtol=0, atol=1e-12)
     # Played without the wrapper it gives what was observed; both roundings of an amplitude differ.
-    torch.testing.assert_close(inner(solution.drive), solution.pressure, rtol=1e-12, atol=0)
+    torch.testing.assert_close(objective(solution.drive), solution.pressure, rtol=1e-12, atol=0)
 
 
-@METHODS
-def test_same_again_and_no_global_random_state(make_objective, random_matrix, method):
-    matrix = random_matrix(3, 5, 0)
-    torch.manual_seed(1)
-    state = torch.get_rng_state()
-    first = method(make_objective(matrix))
-    assert torch.equal(torch.get_rng_state(), state)
-    torch.manual_seed(2)
-    again = method(make_objective(matrix))
-    assert torch.equal(first.drive, again.drive)
-    assert torch.equal(first.history, again.history)
-
-
-@pytest.mark.parametrize(
-    "method",
-    [
-        gabs,
-        partial(gabs, passes=3),
-        small_bayes_opt,
-        partial(random_search, evaluations=70),
-        identify,
-        gradient_ascent,
-    ],
-    ids=["gabs", "gabs, 3 passes", "bayes_opt", "random_search", "identify", "gradient_ascent"],
-)
-def test_a_trial_depends_on_its_seed_and_not_on_the_trials_beside_it(make_objective, random_matrix, method):
-    objective = make_objective(random_matrix(3, 6, 0))
-    many = method(objective, trials=4, seed=3)
-    few = method(objective, trials=2, seed=3)
-    assert torch.equal(many.drive[:2], few.drive)
-    assert torch.equal(many.history[:2], few.history)
-    some = method(objective, trials=[3, 1], seed=3)
-    assert torch.equal(some.drive, many.drive[[3, 1]])
-    assert torch.equal(some.history, many.history[[3, 1]])
-    assert not torch.equal(method(objective, trials=4, seed=4).drive, many.drive)
+@each(RANDOM)
+def test_a_trial_depends_on_its_seed_and_not_on_the_trials_beside_it(objective, method):
+    many = at.run(method, objective, trials=4, seed=3)
+    for trials in ([0, 1], [3, 1]):
+        some = at.run(method, objective, trials=trials, seed=3)
+        for name in ("drive", "history", "evaluations"):
+            assert torch.equal(getattr(some, name), getattr(many, name)[trials])
+    if getattr(method, "order", "random") == "random":
+        assert not torch.equal(at.run(method, objective, trials=4, seed=4).drive, many.drive)
 
 
 @pytest.mark.parametrize(
@@ -120,7 +208,7 @@ def test_a_trial_of_bayes_opt_is_the_same_in_any_block_and_on_any_number_of_thre
     make_objective, random_matrix, options
 ):
     objective = make_objective(random_matrix(3, 7, 0))
-    run = partial(bayes_opt, objective, evaluations=60, initial=8, fixed_transducer=1, seed=3, **options)
+    run = partial(at.bayes_opt, objective, evaluations=60, initial=8, fixed_transducer=1, seed=3, **options)
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
@@ -134,10 +222,8 @@ def test_a_trial_of_bayes_opt_is_the_same_in_any_block_and_on_any_number_of_thre
         torch.set_num_threads(threads)
 
 
-@pytest.mark.parametrize("method", [identify, gradient_ascent])
-def test_a_method_of_small_steps_takes_one_thread_and_gives_the_others_back(
-    make_objective, random_matrix, method, monkeypatch
-):
+@pytest.mark.parametrize("method", [at.identify, at.gradient_ascent])
+def test_a_method_of_small_steps_takes_one_thread_and_gives_the_others_back(objective, method, monkeypatch):
     used = set()
     monkeypatch.setattr(
         "autdtorch.methods.gradient._pressure",
@@ -146,19 +232,16 @@ def test_a_method_of_small_steps_takes_one_thread_and_gives_the_others_back(
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(2)
-        method(make_objective(random_matrix(2, 3, 0)))
+        method(objective)
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(threads)
     assert used == {1}
 
 
-@pytest.mark.parametrize("method", [lssg, partial(gabs, trials=3)], ids=["lssg", "gabs"])
+@pytest.mark.parametrize("method", [at.lssg, partial(at.gabs, trials=3)], ids=["lssg", "gabs"])
 @settings(max_examples=25)
-@given(
-    turns=st.lists(st.floats(0, 2 * math.pi), min_size=3, max_size=3),
-    seed=st.integers(0, 1000),
-)
+@given(turns=st.lists(st.floats(0, 2 * math.pi), min_size=3, max_size=3), seed=st.integers(0, 1000))
 def test_phases_at_the_control_points_are_never_seen(make_objective, random_matrix, method, turns, seed):
     matrix = random_matrix(3, 5, seed)
     turned = matrix * torch.polar(torch.ones(3).double(), torch.tensor(turns).double())[:, None]
@@ -171,53 +254,38 @@ def test_phases_at_the_control_points_are_never_seen(make_objective, random_matr
 @pytest.mark.parametrize(
     ("method", "options", "message"),
     [
-        (lssg, {"levels": 1}, "levels: 1; must be an integer >= 2"),
-        (lssg, {"levels": 16.0}, r"levels: 16\.0; must be an integer >= 2"),
-        (lssg, {"passes": 0}, "passes: 0; must be an integer >= 1"),
-        (lssg, {"order": "random"}, "order: 'random'; must be \"given\" or the indices of all, each once"),
-        (lssg, {"order": [1, 1]}, r"order: .1, 1.; must be"),
-        (gabs, {"passes": 1.5}, r"passes: 1\.5; must be an integer >= 1"),
-        (gabs, {"order": "loudest"}, 'order: \'loudest\'; must be "random", "given", "strength" or'),
-        (gabs, {"order": [0, 1, 2, 3]}, r"order: .0, 1, 2, 3.; must be the indices 0 to 4, each once"),
-        (gabs, {"order": [0, 1, 2, 3, 3]}, r"order: .0, 1, 2, 3, 3.; must be"),
-        (gabs, {"order": [0, 1, 2, 3, 4.0]}, r"order\[4\]: 4\.0; must be an integer >= 0"),
-        (gabs, {"order": None}, "order: None; must be"),
-        (gabs, {"first": 5}, "first: 5; must be an integer from 0 to 4"),
-        (gabs, {"first": -1}, "first: -1; must be an integer >= 0"),
-        (random_search, {"evaluations": 0}, "evaluations: 0; must be an integer >= 1"),
-        (random_search, {"levels": 1}, "levels: 1; must be an integer >= 2"),
-        (random_search, {"trials": 0}, "trials: 0; must be an integer >= 1"),
-        (gabs, {"levels": 0}, "levels: 0; must be an integer >= 2"),
-        (gabs, {"trials": 0}, "trials: 0; must be an integer >= 1"),
-        (gabs, {"trials": True}, "trials: True; must be an integer"),
-        (gabs, {"trials": []}, r"trials: \(\); must be an integer >= 1, or trial numbers, each once"),
-        (gabs, {"trials": [2, 2]}, r"trials: \(2, 2\); must be an integer >= 1, or trial numbers, each"),
-        (gabs, {"trials": [0, -1]}, r"trials\[1\]: -1; must be an integer >= 0"),
-        (gabs, {"seed": -1}, "seed: -1; must be an integer >= 0"),
-        (gradient_ascent, {"starts": 0}, "starts: 0; must be an integer >= 1"),
-        (gradient_ascent, {"steps": 1}, "steps: 1; must be an integer >= 2"),
-        (
-            identify,
-            {"evaluations": 13},
-            "evaluations: 13; must be an integer >= 14, to identify 5 tr",
-        ),
-        (identify, {"evaluations": 64.0}, r"evaluations: 64\.0; must be an integer >= "),
-        (identify, {"trials": 0}, "trials: 0; must be an integer >= 1"),
-        (bayes_opt, {"trials": 0}, "trials: 0; must be an integer >= 1"),
-        (bayes_opt, {"seed": 0.5}, r"seed: 0\.5; must be an integer >= 0"),
-        (bayes_opt, {"initial": 1}, "initial: 1; must be an integer >= 2"),
-        (bayes_opt, {"evaluations": 16, "initial": 16}, "evaluations: 16; must be an integer >= 17"),
-        (bayes_opt, {"fixed_transducer": 5}, "fixed_transducer: 5; must be an integer from 0 to 4"),
-        (bayes_opt, {"fixed_transducer": -1}, "fixed_transducer: -1; must be an integer >= 0"),
-        (bayes_opt, {"acquisition": "ucb"}, "acquisition: 'ucb'; must be one of ei, log_ei"),
-        (bayes_opt, {"embedding": None}, "embedding: None; must be one of phases, circle"),
-        (bayes_opt, {"initial_points": "grid"}, "initial_points: 'grid'; must be one of sobol, random"),
-        (bayes_opt, {"noise": "fixed"}, "noise: 'fixed'; must be one of inferred"),
-        (bayes_opt, {"noise": 0}, "noise: 0; must be in 1e-06 to 1"),
+        (at.lssg, {"levels": 16.0}, r"levels: 16\.0; must be an integer >= 2"),
+        (at.lssg, {"passes": 0}, "passes: 0; must be an integer >= 1"),
+        (at.lssg, {"order": "random"}, "order: 'random'; must be \"given\" or the indices of all"),
+        (at.lssg, {"order": [1, 1, 0]}, r"order: .1, 1, 0.; must be"),
+        (at.gabs, {"levels": 1}, "levels: 1; must be an integer >= 2"),
+        (at.gabs, {"passes": 1.5}, r"passes: 1\.5; must be an integer >= 1"),
+        (at.gabs, {"order": "loudest"}, 'order: \'loudest\'; must be "random", "given", "strength" or'),
+        (at.gabs, {"order": [0, 1, 2, 3]}, r"order: .0, 1, 2, 3.; must be the indices 0 to 4, each once"),
+        (at.gabs, {"order": [0, 1, 2, 3, 4.0]}, r"order\[4\]: 4\.0; must be an integer >= 0"),
+        (at.gabs, {"first": 5}, "first: 5; must be an integer from 0 to 4"),
+        (at.gabs, {"first": -1}, "first: -1; must be an integer >= 0"),
+        (at.gabs, {"trials": 0}, "trials: 0; must be an integer >= 1"),
+        (at.gabs, {"trials": []}, r"trials: \(\); must be an integer >= 1, or trial numbers, each once"),
+        (at.gabs, {"trials": [2, 2]}, r"trials: \(2, 2\); must be"),
+        (at.gabs, {"trials": [0, -1]}, r"trials\[1\]: -1; must be an integer >= 0"),
+        (at.gabs, {"seed": -1}, "seed: -1; must be an integer >= 0"),
+        (at.random_search, {"evaluations": 0}, "evaluations: 0; must be an integer >= 1"),
+        (at.random_search, {"levels": 1}, "levels: 1; must be an integer >= 2"),
+        (at.gradient_ascent, {"starts": 0}, "starts: 0; must be an integer >= 1"),
+        (at.gradient_ascent, {"steps": 1}, "steps: 1; must be an integer >= 2"),
+        (at.identify, {"evaluations": 13}, "evaluations: 13; must be an integer >= 14"),
+        (at.bayes_opt, {"initial": 1}, "initial: 1; must be an integer >= 2"),
+        (at.bayes_opt, {"evaluations": 16}, "evaluations: 16; must be an integer >= 17"),
+        (at.bayes_opt, {"fixed_transducer": 5}, "fixed_transducer: 5; must be an integer from 0 to 4"),
+        (at.bayes_opt, {"acquisition": "ucb"}, "acquisition: 'ucb'; must be one of ei, log_ei"),
+        (at.bayes_opt, {"embedding": None}, "embedding: None; must be one of phases, circle"),
+        (at.bayes_opt, {"initial_points": "grid"}, "initial_points: 'grid'; must be one of sobol, random"),
+        (at.bayes_opt, {"noise": "fixed"}, "noise: 'fixed'; must be one of inferred"),
+        (at.bayes_opt, {"noise": 0}, "noise: 0; must be in 1e-06 to 1"),
     ],
 )
-def test_bad_hyperparameters_are_named(make_objective, random_matrix, method, options, message):
-    objective = make_objective(random_matrix(2, 5, 0))
+def test_bad_hyperparameters_are_named(objective, method, options, message):
     with pytest.raises(ValueError, match=message):
         method(objective, **options)
     assert objective.evaluations == 0
@@ -225,4 +293,4 @@ def test_bad_hyperparameters_are_named(make_objective, random_matrix, method, op
 
 def test_bayes_opt_needs_two_transducers(make_objective, random_matrix):
     with pytest.raises(ValueError, match="transducers of the objective's array: 1; must be an integer >= 2"):
-        bayes_opt(make_objective(random_matrix(2, 1, 0)), fixed_transducer=0)
+        at.bayes_opt(make_objective(random_matrix(2, 1, 0)), fixed_transducer=0)

@@ -10,10 +10,8 @@ from autdtorch.scene.drive import drive_from_phases
 
 def test_longer_search_begins_with_the_shorter(make_objective, random_matrix):
     objective = make_objective(random_matrix(3, 5, 0))
-    long = random_search(objective, evaluations=200, trials=3)
-    short = random_search(objective, evaluations=64, trials=3)
+    long, short = (random_search(objective, evaluations=count, trials=3) for count in (200, 64))
     assert torch.equal(long.history[:, :64], short.history)
-    assert long.evaluations.tolist() == [200] * 3
 
 
 def test_scores_are_those_of_uniform_phases(make_objective, random_matrix):

@@ -12,7 +12,6 @@ from scipy.stats import kstest, rice
 from small_scenes import small_scene
 
 from autdtorch.methods.gabs import gabs
-from autdtorch.objectives.objective import Objective
 from autdtorch.objectives.perturbations import (
     Drift,
     FailedTransducers,
@@ -35,37 +34,37 @@ amplitudes = st.lists(st.just(0.0) | st.floats(1e-9, 1), min_size=4, max_size=4)
 class Recorder:
     """Hears 1 Pa everywhere and notes what it is asked for."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.scene = SCENE
         self.evaluations = 0
-        self.drives: list[torch.Tensor] = []
+        self.drives = []
 
-    def __call__(self, drive: torch.Tensor) -> torch.Tensor:
+    def __call__(self, drive):
         self.evaluations += len(drive)
         self.drives.append(drive)
         return torch.ones(len(drive), 3, dtype=torch.float64)
 
     @property
-    def heard(self) -> torch.Tensor:
+    def heard(self):
         return torch.cat(self.drives)
 
 
 @pytest.fixture
-def simulated() -> SimulatedObjective:
+def simulated():
     return SimulatedObjective(SCENE, FreeSpacePropagator(SCENE))
 
 
-def random_drive(rows: int, seed: int = 0) -> torch.Tensor:
+def random_drive(rows, seed=0):
     generator = torch.Generator().manual_seed(seed)
     return drive_from_phases(6.28 * torch.rand(rows, 4, dtype=torch.float64, generator=generator))
 
 
-def fully_on(rows: int) -> torch.Tensor:
+def fully_on(rows):
     return torch.ones(rows, 4, dtype=torch.complex128)
 
 
 @pytest.mark.parametrize("snr", [20.0, 6.0, 0.0, -10.0])
-def test_readings_are_rice_distributed(snr: float) -> None:
+def test_readings_are_rice_distributed(snr):
     count = 20000
     noise = Noise(Recorder(), snr, seed=3, reference=1.0)
     readings = noise(fully_on(count))[:, 1].numpy()
@@ -76,7 +75,7 @@ def test_readings_are_rice_distributed(snr: float) -> None:
     assert kstest(readings, expected.cdf).statistic < 1.95 / math.sqrt(count)
 
 
-def test_noise_at_control_points_and_rows_is_independent() -> None:
+def test_noise_at_control_points_and_rows_is_independent():
     readings = Noise(Recorder(), 20, reference=1.0)(fully_on(20000))
     # Deviation of an estimated correlation: 1 / sqrt(samples); 4 of them.
     points = torch.corrcoef(readings.T) - torch.eye(3)
@@ -85,7 +84,7 @@ def test_noise_at_control_points_and_rows_is_independent() -> None:
     assert abs(rows) < 4 / math.sqrt(20000)
 
 
-def test_default_reference_is_the_rms_pressure_under_random_phases(simulated: SimulatedObjective) -> None:
+def test_default_reference_is_the_rms_pressure_under_random_phases(simulated):
     sigma = Noise(Quantised(FailedTransducers(simulated, [0]), 4), snr=20).sigma
     squares = simulated(random_drive(20000)).square().mean(dim=1)
     # 4 standard errors of the mean square, halved by the root.
@@ -93,7 +92,7 @@ def test_default_reference_is_the_rms_pressure_under_random_phases(simulated: Si
     assert 10 * sigma == pytest.approx(squares.mean().sqrt().item(), rel=error)
 
 
-def test_reference_must_be_given_where_nothing_tells_it(simulated: SimulatedObjective) -> None:
+def test_reference_must_be_given_where_nothing_tells_it(simulated):
     replayed = SimulatedObjective(SCENE, FreeSpacePropagator(SCENE), mode="replay")
     for objective in (replayed, Recorder(), FailedTransducers(replayed, [1])):
         with pytest.raises(ValueError, match="reference: None Pa; must be given where the objective has no"):
@@ -101,7 +100,7 @@ def test_reference_must_be_given_where_nothing_tells_it(simulated: SimulatedObje
         assert Noise(objective, 20, reference=2.0).sigma == pytest.approx(0.2)
 
 
-def test_reads_are_averaged_and_counted() -> None:
+def test_reads_are_averaged_and_counted():
     recorder = Recorder()
     noise = Noise(recorder, 20, reads=25, reference=1.0)
     assert noise(fully_on(2000)).shape == (2000, 3)
@@ -111,7 +110,7 @@ def test_reads_are_averaged_and_counted() -> None:
     assert (one.std() / many.std()).item() == pytest.approx(5, rel=8 / math.sqrt(2 * 6000))
 
 
-def test_noise_far_below_the_pressure_changes_nothing(simulated: SimulatedObjective) -> None:
+def test_noise_far_below_the_pressure_changes_nothing(simulated):
     drive = random_drive(10)
     noisy = Noise(simulated, 400)(drive)
     # Noise of 1e-20 of the reference: below rounding.
@@ -127,9 +126,7 @@ def test_noise_far_below_the_pressure_changes_nothing(simulated: SimulatedObject
     ],
     ids=["noise", "reads", "drift"],
 )
-def test_randomness_follows_from_the_seed_however_the_rows_are_divided(
-    make: type, simulated: SimulatedObjective
-) -> None:
+def test_randomness_follows_from_the_seed_however_the_rows_are_divided(make, simulated):
     drive = random_drive(40)
     torch.manual_seed(1)
     state = torch.get_rng_state()
@@ -142,7 +139,7 @@ def test_randomness_follows_from_the_seed_however_the_rows_are_divided(
     assert not torch.allclose(make(simulated, 6)(drive), together)
 
 
-def test_noise_and_drift_of_one_seed_are_unrelated() -> None:
+def test_noise_and_drift_of_one_seed_are_unrelated():
     recorder = Recorder()
     Drift(recorder, phase=1.0, seed=4)(fully_on(3000))
     steps = torch.diff(recorder.heard[:, 0].angle())
@@ -152,9 +149,7 @@ def test_noise_and_drift_of_one_seed_are_unrelated() -> None:
 
 
 @given(phases=phases, amplitudes=amplitudes, levels=st.integers(2, 256), on_off=st.booleans())
-def test_quantised_is_the_nearest_and_stays(
-    phases: list[float], amplitudes: list[float], levels: int, on_off: bool
-) -> None:
+def test_quantised_is_the_nearest_and_stays(phases, amplitudes, levels, on_off):
     device = Quantised(Recorder(), levels, on_off)
     drive = drive_from_phases([phases], [amplitudes])
     played = device.emitted(drive)
@@ -167,7 +162,7 @@ def test_quantised_is_the_nearest_and_stays(
     torch.testing.assert_close(device.emitted(played), played, rtol=1e-12, atol=0)
 
 
-def test_levels_that_are_the_devices_are_played_as_they_are(simulated: SimulatedObjective) -> None:
+def test_levels_that_are_the_devices_are_played_as_they_are(simulated):
     plain = gabs(simulated, levels=16, trials=3)
     device = gabs(Quantised(simulated, 32, on_off=True), levels=16, trials=3)
     # The same phases but for their last digit.
@@ -175,7 +170,7 @@ def test_levels_that_are_the_devices_are_played_as_they_are(simulated: Simulated
     torch.testing.assert_close(device.history, plain.history, rtol=1e-13, atol=0)
 
 
-def test_dead_transducers_are_silent_and_nobody_is_told() -> None:
+def test_dead_transducers_are_silent_and_nobody_is_told():
     recorder = Recorder()
     broken = FailedTransducers(recorder, [0, 2])
     drive = random_drive(3)
@@ -185,7 +180,7 @@ def test_dead_transducers_are_silent_and_nobody_is_told() -> None:
     assert torch.equal(quantised(broken, drive), drive)
 
 
-def test_drift_has_the_stated_rms_after_1000_evaluations() -> None:
+def test_drift_has_the_stated_rms_after_1000_evaluations():
     ends = []
     for seed in range(100):
         recorder = Recorder()
@@ -201,7 +196,7 @@ def test_drift_has_the_stated_rms_after_1000_evaluations() -> None:
     assert (drives.abs() <= 1).all()
 
 
-def test_drift_is_slow_and_begins_at_the_undrifted(simulated: SimulatedObjective) -> None:
+def test_drift_is_slow_and_begins_at_the_undrifted(simulated):
     drift = Drift(simulated, phase=0.3)
     drive = random_drive(1)
     # One step has an rms of 0.3 / sqrt(1000) = 0.0095 rad a transducer; 5 of them, at the foci's terms.
@@ -209,7 +204,7 @@ def test_drift_is_slow_and_begins_at_the_undrifted(simulated: SimulatedObjective
     assert ((drift(drive) - simulated(drive)).abs() <= bound).all()
 
 
-def test_true_pressure_keeps_the_device_and_drops_the_sensor(simulated: SimulatedObjective) -> None:
+def test_true_pressure_keeps_the_device_and_drops_the_sensor(simulated):
     drift = Drift(FailedTransducers(simulated, [1]), phase=0.5, loss=0.2, sensor=0.5, seed=1)
     objective = Noise(Quantised(drift, 8), 10, reads=2, seed=1)
     drive = random_drive(50)
@@ -224,7 +219,7 @@ def test_true_pressure_keeps_the_device_and_drops_the_sensor(simulated: Simulate
     assert not torch.allclose(true, simulated(drive), rtol=1e-2)
 
 
-def test_a_solution_is_on_the_levels_of_the_device_but_knows_no_fault(simulated: SimulatedObjective) -> None:
+def test_a_solution_is_on_the_levels_of_the_device_but_knows_no_fault(simulated):
     objective = Noise(Quantised(Drift(FailedTransducers(simulated, [1]), phase=0.5), 8, on_off=True), 20)
     solution = gabs(objective, levels=16, trials=2)
     steps = solution.phases * 8 / (2 * math.pi)
@@ -243,10 +238,8 @@ def test_a_solution_is_on_the_levels_of_the_device_but_knows_no_fault(simulated:
     ],
     ids=["none", "noise", "quantised", "dead", "drift"],
 )
-def test_a_drive_that_no_array_can_play_is_refused_and_not_counted(
-    make: type, simulated: SimulatedObjective
-) -> None:
-    objective: Objective = make(simulated)
+def test_a_drive_that_no_array_can_play_is_refused_and_not_counted(make, simulated):
+    objective = make(simulated)
     for wrong in (random_drive(2)[:, :3], random_drive(2)[0], 2 * random_drive(2), random_drive(2).real):
         with pytest.raises(ValueError, match="drive"):
             objective(wrong)
@@ -277,6 +270,6 @@ def test_a_drive_that_no_array_can_play_is_refused_and_not_counted(
         (lambda o: Drift(o, seed=0.5), r"seed: 0\.5; must be an integer >= 0"),
     ],
 )
-def test_bad_arguments_are_named(make: type, message: str, simulated: SimulatedObjective) -> None:
+def test_bad_arguments_are_named(make, message, simulated):
     with pytest.raises(ValueError, match=message):
         make(simulated)

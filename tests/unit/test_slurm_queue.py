@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
@@ -15,12 +14,12 @@ Squeue = Callable[[str], None]
 
 
 @pytest.fixture
-def squeue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Squeue:
+def squeue(tmp_path, monkeypatch):
     """Puts a shell script in the place of `squeue`; there is none before."""
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(slurm, "_PAUSE", 0.0)
 
-    def install(script: str) -> None:
+    def install(script):
         (tmp_path / "squeue").write_text(f"#!/bin/sh\n{script}\n", encoding="utf-8")
         (tmp_path / "squeue").chmod(0o755)
 
@@ -28,13 +27,13 @@ def squeue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Squeue:
 
 
 @pytest.fixture
-def watcher() -> QueueWatcher:
+def watcher():
     watcher = QueueWatcher("logs/%j")
     watcher.register_job("7_0")
     return watcher
 
 
-def answering(*rows: tuple[str, str, str]) -> str:
+def answering(*rows):
     """A script that fills each row into the format that it is given, as `squeue` does."""
     lines = ['for format; do case "$format" in --format=*) format=${format#--format=};; esac; done']
     for row in rows:
@@ -45,16 +44,14 @@ def answering(*rows: tuple[str, str, str]) -> str:
     return "\n".join(lines)
 
 
-def test_a_job_without_a_reason_is_in_the_queue(squeue: Squeue, watcher: QueueWatcher) -> None:
+def test_a_job_without_a_reason_is_in_the_queue(squeue, watcher):
     squeue(answering(("7", "RUNNING", ""), ("8", "PENDING", "Priority")))
     assert not watcher.is_done("7_0")
     squeue(answering(("8", "PENDING", "")))
     assert watcher.is_done("7_0")
 
 
-def test_why_jobs_wait_is_told_with_all_words_of_the_reason(
-    squeue: Squeue, watcher: QueueWatcher, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_why_jobs_wait_is_told_with_all_words_of_the_reason(squeue, watcher, caplog):
     squeue(answering(("7", "PENDING", "ReqNodeNotAvail, Reserved | for maintenance")))
     with caplog.at_level(logging.INFO):
         assert not watcher.is_done("7_0")
@@ -72,12 +69,8 @@ FAILURES = {
 
 @pytest.mark.parametrize(("script", "reason"), FAILURES.values(), ids=FAILURES.keys())
 def test_a_squeue_that_fails_for_good_ends_the_wait_in_a_line_that_says_what_to_do(
-    squeue: Squeue,
-    watcher: QueueWatcher,
-    caplog: pytest.LogCaptureFixture,
-    script: str | None,
-    reason: str,
-) -> None:
+    squeue, watcher, caplog, script, reason
+):
     if script is not None:
         squeue(script)
     with caplog.at_level(logging.INFO):
@@ -90,7 +83,7 @@ def test_a_squeue_that_fails_for_good_ends_the_wait_in_a_line_that_says_what_to_
     assert "\n" not in str(caught.value) + told
 
 
-def test_failures_are_counted_anew_after_an_answer(squeue: Squeue, watcher: QueueWatcher) -> None:
+def test_failures_are_counted_anew_after_an_answer(squeue, watcher):
     for _ in range(2):
         squeue("exit 1")
         for _ in range(slurm._MOST_FAILURES - 1):

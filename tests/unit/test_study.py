@@ -5,8 +5,6 @@ import itertools
 import logging
 import math
 import os
-from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import pytest
 import torch
@@ -16,13 +14,10 @@ import autdtorch.study.run
 from autdtorch.analytic.green import green
 from autdtorch.methods.gabs import GABS, gabs
 from autdtorch.methods.lssg import LSSG, lssg
-from autdtorch.methods.solution import Solution
-from autdtorch.objectives.objective import Objective
 from autdtorch.propagators import FreeSpacePropagator, Run, SteadyStateWarning
 from autdtorch.propagators.full import DomainSimulation
-from autdtorch.scene.arrays import Nodes
 from autdtorch.scene.geometry import Plane
-from autdtorch.scene.scene import Box, Scene
+from autdtorch.scene.scene import Scene
 from autdtorch.study.results_file import RESULTS_FILE, load_results
 from autdtorch.study.run import run_study
 from autdtorch.study.trial_file import TRIALS_FILE
@@ -32,23 +27,23 @@ METHODS = {"lssg": LSSG(levels=4), "gabs": GABS(levels=4)}
 FREE_SPACE = {"method": "free_space"}
 
 
-def scene(plane: Plane | None = PLANE, obstacles: tuple[Box, ...] = ()) -> Scene:
+def scene(plane=PLANE, obstacles=()):
     plain = small_scene()
     return Scene(plain.array, AIR, 40e3, plain.control_points, obstacles, plane, plain.domain)
 
 
 @pytest.fixture
-def scenes() -> dict[str, Scene]:
+def scenes():
     return {"second": scene(), "first": scene()}
 
 
 @pytest.fixture
-def count_runs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def count_runs(monkeypatch):
     """Names of the scenes that are computed, in order."""
-    computed: list[str] = []
+    computed = []
     run_scene = autdtorch.study.run._run_scene
 
-    def counted(name: str, *rest: object) -> object:
+    def counted(name, *rest):
         computed.append(name)
         return run_scene(name, *rest)
 
@@ -56,7 +51,7 @@ def count_runs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return computed
 
 
-def test_every_trial_of_every_method_has_its_figures(scenes: dict[str, Scene], tmp_path: Path) -> None:
+def test_every_trial_of_every_method_has_its_figures(scenes, tmp_path):
     results = run_study(
         scenes, METHODS, solver=FREE_SPACE, trials=3, seed=2, plane_spacing=2e-3, folder=tmp_path
     )
@@ -83,8 +78,8 @@ def test_every_trial_of_every_method_has_its_figures(scenes: dict[str, Scene], t
     assert len((tmp_path / TRIALS_FILE).read_text(encoding="utf-8").splitlines()) == 2 * 4
 
 
-def test_the_same_seed_gives_the_same_drives_and_another_gives_others(scenes: dict[str, Scene]) -> None:
-    def drive(seed: int) -> torch.Tensor:
+def test_the_same_seed_gives_the_same_drives_and_another_gives_others(scenes):
+    def drive(seed):
         results = run_study(scenes, METHODS, solver=FREE_SPACE, trials=8, seed=seed)
         return results.scenes["first"].methods["gabs"].solution.drive
 
@@ -92,7 +87,7 @@ def test_the_same_seed_gives_the_same_drives_and_another_gives_others(scenes: di
     assert not torch.equal(drive(0), drive(1))
 
 
-def test_a_scene_without_observation_plane_has_no_areas() -> None:
+def test_a_scene_without_observation_plane_has_no_areas():
     result = run_study({"a": scene(None, obstacles=(CUBE,))}, METHODS, solver=FREE_SPACE).scenes["a"]
     assert result.obstacles == 1
     for method in result.methods.values():
@@ -100,14 +95,8 @@ def test_a_scene_without_observation_plane_has_no_areas() -> None:
         assert method.plane_pressure is None
 
 
-def test_the_runs_of_a_simulation_are_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
-    def simulate(
-        self: DomainSimulation,
-        sources: Sequence[Nodes],
-        strength: torch.Tensor,
-        receivers: Nodes,
-        stepped: Callable[[int], None],
-    ) -> tuple[torch.Tensor, list[Run]]:
+def test_the_runs_of_a_simulation_are_recorded(monkeypatch):
+    def simulate(self, sources, strength, receivers, stepped):
         rows, places = [], receivers.positions[:, 0]
         for nodes, own in zip(sources, strength, strict=True):
             rows.append(green(places, nodes.positions[:, 0], self.plan.scene.wavenumber) @ own)
@@ -127,9 +116,7 @@ def test_the_runs_of_a_simulation_are_recorded(monkeypatch: pytest.MonkeyPatch) 
     )
 
 
-def test_finished_scenes_of_the_same_settings_are_used_again(
-    scenes: dict[str, Scene], count_runs: list[str], tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_finished_scenes_of_the_same_settings_are_used_again(scenes, count_runs, tmp_path, caplog):
     study = functools.partial(run_study, scenes, METHODS, solver=FREE_SPACE, folder=tmp_path)
     first = study(config="a: 1")
     with caplog.at_level(logging.INFO, logger="autdtorch.study.folder"):
@@ -145,9 +132,7 @@ def test_finished_scenes_of_the_same_settings_are_used_again(
     assert count_runs == ["second", "first"] * 3
 
 
-def test_changed_source_is_computed_again(
-    scenes: dict[str, Scene], count_runs: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_changed_source_is_computed_again(scenes, count_runs, tmp_path, monkeypatch):
     study = functools.partial(run_study, scenes, METHODS, solver=FREE_SPACE, folder=tmp_path, config="a: 1")
     study()
     monkeypatch.setattr("autdtorch.study.provenance.source_digest", lambda: "changed")
@@ -155,12 +140,10 @@ def test_changed_source_is_computed_again(
     assert count_runs == ["second", "first"] * 2
 
 
-def test_a_study_goes_on_after_the_scenes_that_were_finished(
-    scenes: dict[str, Scene], count_runs: list[str], tmp_path: Path
-) -> None:
-    objectives: list[Objective] = []
+def test_a_study_goes_on_after_the_scenes_that_were_finished(scenes, count_runs, tmp_path):
+    objectives = []
 
-    def interrupted(objective: Objective) -> Solution:
+    def interrupted(objective):
         solution = lssg(objective)
         objectives.append(objective)
         if len(objectives) == 2:
@@ -178,15 +161,13 @@ def test_a_study_goes_on_after_the_scenes_that_were_finished(
     assert list(load_results(tmp_path).scenes) == ["second", "first"]
 
 
-def test_killed_while_writing_the_last_complete_file_stays(
-    scenes: dict[str, Scene], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_killed_while_writing_the_last_complete_file_stays(scenes, tmp_path, monkeypatch):
     study = functools.partial(run_study, scenes, METHODS, solver=FREE_SPACE, folder=tmp_path, config="a: 1")
     write_scene = autdtorch.study.results_file._write_scene
-    complete: list[bytes] = []
+    complete = []
     calls = itertools.count(1)
 
-    def killed(group: object, scene: object) -> None:
+    def killed(group, scene):
         if next(calls) == 3:  # the second scene, when the file is written for the second time
             complete.append((tmp_path / RESULTS_FILE).read_bytes())
             raise KeyboardInterrupt
@@ -199,9 +180,7 @@ def test_killed_while_writing_the_last_complete_file_stays(
     assert list(load_results(tmp_path).scenes) == ["second"]
 
 
-def test_an_unreadable_file_is_computed_again(
-    scenes: dict[str, Scene], count_runs: list[str], tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_unreadable_file_is_computed_again(scenes, count_runs, tmp_path, caplog):
     study = functools.partial(run_study, scenes, METHODS, solver=FREE_SPACE, folder=tmp_path, config="a: 1")
     study()
     file = tmp_path / RESULTS_FILE
@@ -224,10 +203,7 @@ def test_an_unreadable_file_is_computed_again(
         ({"methods": {3: gabs}}, "methods: 3; a name must be text"),
         ({"methods": gabs}, "methods: .*; must be a mapping of names to methods"),
         ({"methods": {"m": None}}, r"methods\.m: None; must be a Method or a function of an objective"),
-        (
-            {"methods": {"m": lambda: None}},
-            r"methods\.m: .*; .*function .*too many positional",
-        ),
+        ({"methods": {"m": lambda: None}}, r"methods\.m: .*; .*function .*too many positional"),
         ({"methods": {"m": dict}}, r"methods\.m: .*; must be a Method or a function"),
         ({"solver": [1]}, r"solver: \(1,\); must be a mapping of arguments"),
         ({"solver": {"x": 1}}, "solver: unknown key 'x'; allowed keys: method, spacing"),
@@ -246,10 +222,8 @@ def test_an_unreadable_file_is_computed_again(
         ({"methods": {"gabs": GABS(first=16)}}, "method gabs: first: 16; must be an integer from 0 to"),
     ],
 )
-def test_settings_are_checked_before_anything_is_simulated(
-    changes: dict[str, object], message: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(*_: object) -> None:
+def test_settings_are_checked_before_anything_is_simulated(changes, message, monkeypatch):
+    def refuse(*_):
         raise AssertionError("simulated before all settings were checked")
 
     monkeypatch.setattr(autdtorch.study.run, "_run_scene", refuse)
@@ -259,9 +233,7 @@ def test_settings_are_checked_before_anything_is_simulated(
     assert "\n" not in str(caught.value)
 
 
-def test_another_study_is_kept_and_a_refused_one_moves_nothing(
-    scenes: dict[str, Scene], tmp_path: Path
-) -> None:
+def test_another_study_is_kept_and_a_refused_one_moves_nothing(scenes, tmp_path):
     study = functools.partial(run_study, scenes, METHODS, folder=tmp_path)
     for config in ("a: 1", "a: 2", "a: 3"):
         study(solver=FREE_SPACE, config=config)
@@ -272,8 +244,8 @@ def test_another_study_is_kept_and_a_refused_one_moves_nothing(
 
 
 @pytest.mark.parametrize("returned", [1, 3])
-def test_a_method_returns_the_trials_it_is_asked_for(returned: int) -> None:
-    def method(objective: Objective, trials: Sequence[int], seed: int) -> Solution:
+def test_a_method_returns_the_trials_it_is_asked_for(returned):
+    def method(objective, trials, seed):
         return gabs(objective, levels=4, trials=returned, seed=seed)
 
     with pytest.raises(ValueError, match=rf"method own: {returned} trials; must be the trials \[0, 1\]"):

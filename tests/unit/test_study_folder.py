@@ -2,22 +2,16 @@
 
 import functools
 import logging
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
 from small_scenes import CUBE, small_scene
 
-from autdtorch.methods.base import Trials
 from autdtorch.methods.gabs import gabs
-from autdtorch.methods.solution import Solution
-from autdtorch.objectives.objective import Objective
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.scene import Scene
 from autdtorch.study.folder import MATRICES_FOLDER, PREVIOUS
 from autdtorch.study.provenance import PROVENANCE_FILE, load_provenance
-from autdtorch.study.results import StudyResult
 from autdtorch.study.results_file import RESULTS_FILE, load_results
 from autdtorch.study.run import run_study
 from autdtorch.study.trial_file import TRIALS_FILE
@@ -27,7 +21,7 @@ FILES = (RESULTS_FILE, TRIALS_FILE, PROVENANCE_FILE)
 SIMULATED = {"method": "auto", "spacing": 2e-3, "tolerance": 0.2, "kernel": "reference"}
 
 
-def study(folder: Path | None, seed: int = 0, config: str = "config", **changes: object) -> StudyResult:
+def study(folder, seed=0, config="config", **changes):
     arguments = {
         "scenes": {"one": small_scene(), "two": small_scene(extent=30e-3)},
         "methods": {"gabs": functools.partial(gabs, levels=4)},
@@ -38,20 +32,20 @@ def study(folder: Path | None, seed: int = 0, config: str = "config", **changes:
     return run_study(**arguments, folder=folder, config=f"{config} {seed}", seed=seed)  # type: ignore[arg-type]
 
 
-def numbers(results: StudyResult) -> torch.Tensor:
+def numbers(results):
     solutions = [scene.methods["gabs"].solution for scene in results.scenes.values()]
     return torch.cat([torch.cat([solution.drive, solution.history], dim=1) for solution in solutions])
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def contents(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
 
 
 @pytest.fixture
-def warnings(caplog: pytest.LogCaptureFixture) -> Callable[[], list[str]]:
+def warnings(caplog):
     """Gives what was warned of since it was asked last."""
 
-    def since() -> list[str]:
+    def since():
         messages = [one.getMessage() for one in caplog.records if one.levelno >= logging.WARNING]
         caplog.clear()
         return messages
@@ -69,9 +63,7 @@ def warnings(caplog: pytest.LogCaptureFixture) -> Callable[[], list[str]]:
         lambda content: b"{" * 10**6,
     ],
 )
-def test_a_damaged_file_is_kept_and_costs_no_trial(
-    tmp_path: Path, warnings: Callable[[], list[str]], name: str, damage: Callable[[bytes], bytes]
-) -> None:
+def test_a_damaged_file_is_kept_and_costs_no_trial(tmp_path, warnings, name, damage):
     undisturbed, before = study(tmp_path), contents(tmp_path)
     damaged = damage(before[name])
     (tmp_path / name).write_bytes(damaged)
@@ -89,7 +81,7 @@ def test_a_damaged_file_is_kept_and_costs_no_trial(
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_file_of_another_study_is_not_used_and_costs_no_other(tmp_path: Path, name: str) -> None:
+def test_a_file_of_another_study_is_not_used_and_costs_no_other(tmp_path, name):
     own, other = tmp_path / "own", tmp_path / "other"
     undisturbed, before = study(own), contents(own)
     assert not torch.equal(numbers(study(other, seed=1)), numbers(undisturbed))
@@ -104,7 +96,7 @@ def test_a_file_of_another_study_is_not_used_and_costs_no_other(tmp_path: Path, 
         assert contents(own)[TRIALS_FILE] == before[TRIALS_FILE]
 
 
-def test_another_study_is_kept_whole(tmp_path: Path, warnings: Callable[[], list[str]]) -> None:
+def test_another_study_is_kept_whole(tmp_path, warnings):
     study(tmp_path)
     before = contents(tmp_path)
     study(tmp_path, seed=1)
@@ -114,9 +106,7 @@ def test_another_study_is_kept_whole(tmp_path: Path, warnings: Callable[[], list
 
 
 @pytest.mark.parametrize("missing", [RESULTS_FILE, PROVENANCE_FILE])
-def test_lines_of_trials_are_set_aside_where_another_file_is_of_the_study(
-    tmp_path: Path, missing: str
-) -> None:
+def test_lines_of_trials_are_set_aside_where_another_file_is_of_the_study(tmp_path, missing):
     undisturbed = study(tmp_path)
     (tmp_path / missing).unlink()
     damaged = (tmp_path / TRIALS_FILE).read_bytes().replace(b'"trial"', b'"tria1"')
@@ -126,9 +116,7 @@ def test_lines_of_trials_are_set_aside_where_another_file_is_of_the_study(
     assert not (tmp_path / f"{PREVIOUS}1").exists()
 
 
-def test_trials_alone_are_used_and_a_damaged_one_is_run_again(
-    tmp_path: Path, warnings: Callable[[], list[str]], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_trials_alone_are_used_and_a_damaged_one_is_run_again(tmp_path, warnings, caplog):
     caplog.set_level(logging.INFO)
     undisturbed = study(tmp_path)
     assert "re-using" not in caplog.text
@@ -144,15 +132,13 @@ def test_trials_alone_are_used_and_a_damaged_one_is_run_again(
     assert again[:-1] == [lines[0], *lines[2:]]
 
 
-def test_a_study_that_is_kept_in_memory_leaves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_study_that_is_kept_in_memory_leaves_nothing(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert torch.equal(numbers(study(None)), numbers(study(tmp_path / "kept")))
     assert [path.name for path in tmp_path.iterdir()] == ["kept"]
 
 
-def test_a_damaged_matrix_is_computed_again(tmp_path: Path, warnings: Callable[[], list[str]]) -> None:
+def test_a_damaged_matrix_is_computed_again(tmp_path, warnings):
     simulated = functools.partial(study, tmp_path, scenes={"cube": small_scene((CUBE,))}, solver=SIMULATED)
     undisturbed = simulated()
     matrices = contents(tmp_path / MATRICES_FOLDER)
@@ -166,7 +152,7 @@ def test_a_damaged_matrix_is_computed_again(tmp_path: Path, warnings: Callable[[
     assert contents(tmp_path / MATRICES_FOLDER) == matrices
 
 
-def test_trials_of_other_shapes_do_not_count_though_the_settings_are_called_the_same(tmp_path: Path) -> None:
+def test_trials_of_other_shapes_do_not_count_though_the_settings_are_called_the_same(tmp_path):
     study(tmp_path, scenes={"one": small_scene()})
     (tmp_path / RESULTS_FILE).unlink()
     small = small_scene()
@@ -176,13 +162,13 @@ def test_trials_of_other_shapes_do_not_count_though_the_settings_are_called_the_
     assert found.methods["gabs"].solution.drive.shape == (3, 6)
 
 
-def test_with_a_method_of_ones_own_everything_is_computed_again(tmp_path: Path) -> None:
-    def own(objective: Objective, trials: Trials, seed: int) -> Solution:
+def test_with_a_method_of_ones_own_everything_is_computed_again(tmp_path):
+    def own(objective, trials, seed):
         found = gabs(objective, levels=2, trials=trials, seed=seed)
         calls.append(trials)
         return found
 
-    calls: list[Trials] = []
+    calls = []
     for count in (1, 2):
         study(tmp_path, methods={"gabs": functools.partial(own)})
         assert len(calls) == count * 2  # two scenes, a block of trials each
@@ -190,7 +176,7 @@ def test_with_a_method_of_ones_own_everything_is_computed_again(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_folder_in_the_place_of_a_file_is_told_and_nothing_is_lost(tmp_path: Path, name: str) -> None:
+def test_a_folder_in_the_place_of_a_file_is_told_and_nothing_is_lost(tmp_path, name):
     study(tmp_path)
     (tmp_path / name).unlink()
     (tmp_path / name).mkdir()
@@ -200,7 +186,7 @@ def test_a_folder_in_the_place_of_a_file_is_told_and_nothing_is_lost(tmp_path: P
     assert contents(tmp_path) == before
 
 
-def test_a_link_to_a_file_is_used_as_the_file(tmp_path: Path, warnings: Callable[[], list[str]]) -> None:
+def test_a_link_to_a_file_is_used_as_the_file(tmp_path, warnings):
     folder = tmp_path / "study"
     study(folder)
     for name in FILES:

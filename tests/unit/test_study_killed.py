@@ -2,7 +2,6 @@
 
 import os
 import signal
-from pathlib import Path
 
 import pytest
 import torch
@@ -17,7 +16,7 @@ STUDY = SUBJECTS["study"]
 
 
 @pytest.mark.skipif(os.name != "posix", reason="SIGKILL is of POSIX")
-def test_killed_again_and_again_a_study_ends_with_the_same_numbers(tmp_path: Path) -> None:
+def test_killed_again_and_again_a_study_ends_with_the_same_numbers(tmp_path):
     folders = calm, killed = tmp_path / "calm", tmp_path / "killed"
     for folder in folders:
         folder.mkdir()
@@ -36,7 +35,7 @@ def test_killed_again_and_again_a_study_ends_with_the_same_numbers(tmp_path: Pat
     assert STUDY.lines(killed) == undisturbed.lines == 12
 
 
-def test_a_second_process_on_the_same_folder_is_refused(tmp_path: Path) -> None:
+def test_a_second_process_on_the_same_folder_is_refused(tmp_path):
     with FileLock(tmp_path / ".lock"), pytest.raises(ValueError, match="another process writes there"):
         run_study({"a": small_scene()}, {"gabs": gabs}, solver={"method": "free_space"}, folder=tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == [".lock"]

@@ -1,7 +1,6 @@
 """Finished trials come back bit for bit, and only what a method can have found in a scene of the study."""
 
 import json
-from pathlib import Path
 
 import pytest
 import torch
@@ -15,13 +14,13 @@ ORIGIN = "the study's"
 SHAPES = {"a": (3, 2)}
 
 
-def opened(path: Path | None, seed: int = 0) -> TrialFile:
+def opened(path, seed=0):
     file = TrialFile(path, ORIGIN, seed, SHAPES)
     file.mend()
     return file
 
 
-def found(trials: int, evaluations: int, seed: int = 0) -> Solution:
+def found(trials, evaluations, seed=0):
     generator = torch.Generator().manual_seed(seed)
     drive = torch.randn(trials, 3, dtype=torch.complex128, generator=generator).sgn()
     pressure = torch.rand(trials, 2, dtype=torch.float64, generator=generator)
@@ -30,17 +29,17 @@ def found(trials: int, evaluations: int, seed: int = 0) -> Solution:
     return Solution(drive, pressure, score, torch.full((trials,), evaluations), history)
 
 
-def assert_equal(one: Solution, other: Solution) -> None:
+def assert_equal(one, other):
     for name in ("drive", "pressure", "score", "evaluations", "history"):
         assert torch.equal(getattr(one, name), getattr(other, name)), name
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
+def path(tmp_path):
     return tmp_path / TRIALS_FILE
 
 
-def test_trials_come_back_bit_for_bit_in_their_order(path: Path) -> None:
+def test_trials_come_back_bit_for_bit_in_their_order(path):
     solution = found(4, 5)
     order = torch.tensor([2, 0, 3, 1])
     parts = [order[:3], order[3:]]
@@ -57,7 +56,7 @@ def test_trials_come_back_bit_for_bit_in_their_order(path: Path) -> None:
         assert seconds.tolist() == [2.0, 6.0, 2.0, 2.0]
 
 
-def test_trials_that_ended_early_go_on_with_their_last_value(path: Path) -> None:
+def test_trials_that_ended_early_go_on_with_their_last_value(path):
     file = opened(path)
     file.append("a", "gabs", [0], found(1, 3), 1.0)
     file.append("a", "gabs", [1], found(1, 5, seed=1), 1.0)
@@ -67,7 +66,7 @@ def test_trials_that_ended_early_go_on_with_their_last_value(path: Path) -> None
     assert back.history[0, 3:].tolist() == [back.score[0].item()] * 2
 
 
-def test_a_line_a_trial_with_its_figures(path: Path) -> None:
+def test_a_line_a_trial_with_its_figures(path):
     opened(path, 3).append("a", "lssg", [0], found(1, 2), 1.5)
     row = json.loads(path.read_text(encoding="utf-8"))
     weakest, strongest = sorted(row["pressure"])
@@ -79,7 +78,7 @@ def test_a_line_a_trial_with_its_figures(path: Path) -> None:
     assert row["score"] == row["history"][-1]
 
 
-def test_whatever_is_cut_off_costs_no_earlier_trial(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_whatever_is_cut_off_costs_no_earlier_trial(path, caplog):
     file = opened(path)
     for trial in range(3):
         file.append("a", "gabs", [trial], found(1, 2, seed=trial), 1.0)
@@ -96,7 +95,7 @@ def test_whatever_is_cut_off_costs_no_earlier_trial(path: Path, caplog: pytest.L
     assert "the last line broke off" in caplog.text
 
 
-def test_without_a_path_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_path_nothing_is_written(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     file = opened(None)
     solution = found(2, 2)
@@ -106,7 +105,7 @@ def test_without_a_path_nothing_is_written(tmp_path: Path, monkeypatch: pytest.M
 
 
 @pytest.fixture
-def lines(path: Path) -> list[bytes]:
+def lines(path):
     """Lines of three trials, in the file."""
     opened(path).append("a", "gabs", range(3), found(3, 4), 3.0)
     return path.read_bytes().splitlines()
@@ -140,9 +139,7 @@ def lines(path: Path) -> list[bytes]:
         {"method": {"a": 1}},
     ],
 )
-def test_what_no_method_can_have_found_does_not_count(
-    path: Path, lines: list[bytes], change: dict[str, object]
-) -> None:
+def test_what_no_method_can_have_found_does_not_count(path, lines, change):
     lines[1] = line_of(row_of(lines[1], ORIGIN) | change, ORIGIN)
     path.write_bytes(b"\n".join([*lines, b""]))
     file = opened(path)
@@ -151,7 +148,7 @@ def test_what_no_method_can_have_found_does_not_count(
     assert path.with_name(path.name + SET_ASIDE).read_bytes() == lines[1] + b"\n"
 
 
-def test_a_row_without_one_of_its_fields_does_not_count(path: Path, lines: list[bytes]) -> None:
+def test_a_row_without_one_of_its_fields_does_not_count(path, lines):
     row = row_of(lines[1], ORIGIN)
     names = "scene", "method", "trial", "score", "evaluations", "seconds", "pressure", "drive", "history"
     for name in names:
@@ -172,26 +169,24 @@ def test_a_row_without_one_of_its_fields_does_not_count(path: Path, lines: list[
         lambda line: b"",
     ],
 )
-def test_a_line_that_was_not_written_so_does_not_count(path: Path, lines: list[bytes], damage) -> None:
+def test_a_line_that_was_not_written_so_does_not_count(path, lines, damage):
     path.write_bytes(b"\n".join([lines[0], damage(lines[1]), lines[2], b""]))
     assert opened(path).missing("a", "gabs", 3) == [1]
 
 
-def test_the_trials_of_another_study_do_not_count(path: Path, lines: list[bytes]) -> None:
+def test_the_trials_of_another_study_do_not_count(path, lines):
     other = TrialFile(path, "another", 0, SHAPES)
     assert len(other) == 0
     assert path.read_bytes().splitlines() == lines
 
 
-def test_a_trial_of_a_scene_that_the_study_does_not_have_is_told_so(
-    path: Path, lines: list[bytes], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_trial_of_a_scene_that_the_study_does_not_have_is_told_so(path, lines, caplog):
     TrialFile(path, ORIGIN, 0, {"b": (3, 2)}).mend()
     assert caplog.messages[0].endswith("scene: 'a'; must be one of this study: b")
 
 
 @pytest.mark.parametrize("score", [0.5, 1 + NEAR_TIE / 2])
-def test_a_last_drive_that_scored_below_the_best_or_near_it_comes_back(path: Path, score: float) -> None:
+def test_a_last_drive_that_scored_below_the_best_or_near_it_comes_back(path, score):
     """As `identify` returns it."""
     solution = found(1, 4)
     solution.score[0] = score * solution.history[0, -1]
