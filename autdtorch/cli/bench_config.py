@@ -301,10 +301,8 @@ def _deviating(
     asked = torch.ones(each, dtype=torch.complex128, device="cpu")
     corrections = torch.cat([board.calibrated(asked) for board in boards])[wired]
     pins = [each * number + pin for number, board in enumerate(boards) for pin in board.pins]
-    return (
-        torch.where(corrections == 0, 0, matrix / corrections),
-        torch.tensor(pins, dtype=torch.int64, device="cpu")[wired],
-    )
+    places = torch.tensor(pins, dtype=torch.int64, device="cpu")[wired]
+    return torch.where(corrections == 0, 0, matrix / corrections), places
 
 
 def _network(network: object) -> Any:

@@ -2,13 +2,10 @@
 
 import logging
 import sys
-from collections.abc import Callable
 
 import pytest
 
 from autdtorch.cli.main import main
-
-Run = Callable[..., int]
 
 
 @pytest.fixture
@@ -37,3 +34,30 @@ def run(tmp_path, monkeypatch):
     root.handlers[:] = handlers
     root.setLevel(levels[0])
     package.setLevel(levels[1])
+
+
+@pytest.fixture
+def refused(run, capsys):
+    """Runs a command line that is refused; returns the one line of its error."""
+
+    def command(*arguments):
+        capsys.readouterr()
+        assert run(*arguments) == 2
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        (line,) = captured.err.splitlines()
+        return line
+
+    return command
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Writes a text file below the folder of the test."""
+
+    def text_file(name, text):
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+
+    return text_file

@@ -6,7 +6,6 @@ import math
 import re
 import signal
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -31,14 +30,11 @@ control_points: {type: points, positions: [[80e-3, 10e-3, 0.0], [80e-3, -20e-3, 
 EMULATED = ("hardware=emulated", "hardware.limits.amplitude=1")
 GABS = (*EMULATED, "method.levels=4")
 
-Run = Callable[..., int]
-
 
 @pytest.fixture
-def trial(run, tmp_path, capsys):
+def trial(run, write, tmp_path, capsys):
     """Runs a trial in the scene above; returns its status, and what it printed on stdout and stderr."""
-    (tmp_path / "ours" / "scene").mkdir(parents=True)
-    (tmp_path / "ours" / "scene" / "two.yaml").write_text(SCENE)
+    write("ours/scene/two.yaml", SCENE)
 
     def command(*words):
         capsys.readouterr()
@@ -76,8 +72,7 @@ def test_the_log_of_a_running_trial_is_refused_before_a_device_is_touched(trial,
     monkeypatch.setattr("autdtorch.hardware.open_link", None)
     with FileLock(tmp_path / "out" / ".trial.jsonl.lock"):  # as another process has it
         status, _, log = trial(*GABS)
-    assert status == 2
-    assert "another process has it open for a trial" in log
+    assert (status, "another process has it open for a trial" in log) == (2, True)
     assert not (tmp_path / "out" / "trial.jsonl").exists()
 
 
@@ -104,66 +99,46 @@ OPENMPD = ("hardware=openmpd", "hardware.limits.amplitude=1", "hardware.transduc
 
 
 @pytest.mark.parametrize(
-    ("words", "status", "message"),
+    ("words", "message"),
     [
-        (
-            (*GABS, "hardware.limits.evaluations=5"),
-            3,
-            "5 evaluations are made, the limit; the outputs are off",
-        ),
-        (("hardware=emulated",), 2, "hardware.limits.amplitude: none; must be given"),
-        ((*GABS, "hardware.limits.amplitude=0.5"), 2, "amplitude: 0.5; must be >= 1"),
-        ((*GABS, "hardware.limits.amplitude=0"), 2, "amplitude: 0"),
-        ((*GABS, "+hardware.limits.loudness=3"), 2, "loudness"),
-        ((*GABS, "+hardware.colour=red"), 2, "hardware: unknown key 'colour'"),
-        ((*OPENMPD, "hardware/sensor=emulated"), 2, "hardware.sensor: 'emulated'; must be scope, file or"),
-        ((*OPENMPD, "hardware/sensor=file"), 2, "hardware.sensor.path: none; must be given"),
-        (OPENMPD, 2, "hardware.sensor.chip: None; must be the oscilloscope's VID:PID"),
-        ((*OPENMPD, "hardware.sensor.chip=1:2:3"), 2, "hardware.sensor.chip: '1:2:3'; must be VID:PID"),
-        (
-            (*OPENMPD, "hardware/sensor=manual", "hardware.failed=[1]"),
-            2,
-            "hardware.failed: (1,); must be null: it is for an emulated",
-        ),
-        ((*GABS, "hardware.failed='0-9'"), 2, "hardware.failed: 9; must be 0 to 8, as the scene has them"),
-        ((*GABS, "hardware.transducers='0-7'"), 2, "hardware.transducers: '8 transducers'; must be 9"),
-        ((*GABS, "hardware.transducers='5-3'"), 2, "hardware.transducers: '5-3'; must be at most 100000"),
-        ((*GABS, "hardware.transducers='0-99999999999'"), 2, "must be at most 100000 numbers, and ranges"),
-        ((*GABS, "hardware.boards=2"), 2, "hardware.boards: 2; must be null: it is for openmpd"),
-        ((*GABS, "hardware.network=eth0"), 2, "hardware.network: 'eth0'; must be null: it is for AUTD3"),
-        ((*GABS, "hardware.sensor.snr=nan"), 2, "hardware.sensor.snr: nan; must be"),
-        (
-            (*GABS, "hardware.device=openmpd", "hardware.boards=[a.pat]"),
-            2,
-            "hardware.boards: 'a.pat'; no such",
-        ),
-        (
-            (*GABS, "hardware.device=autd3", "hardware.boards=two"),
-            2,
-            "hardware.boards: 'two'; must be an int",
-        ),
-        ((*GABS, "hardware.failed='0-8'"), 2, "hardware.sensor: 0 Pa from the strongest transducer; must be"),
-        (
-            ("hardware=sonicsurface", "hardware/sensor=manual", GABS[1]),
-            2,
-            "hardware.transducers: None; must say which 9 of the 256",
-        ),
-        ((*GABS, "hardware=nowhere"), 2, "hardware: 'nowhere'; must be one of autd3, base, emulated"),
-        ((*GABS, "-m"), 2, "hardware: a sweep; must be one trial at a time"),
+        (("hardware=emulated",), "hardware.limits.amplitude: none; must be given"),
+        ((*GABS, "hardware.limits.amplitude=0.5"), "amplitude: 0.5; must be >= 1"),
+        ((*GABS, "hardware.limits.amplitude=0"), "amplitude: 0"),
+        ((*GABS, "+hardware.limits.loudness=3"), "loudness"),
+        ((*GABS, "+hardware.colour=red"), "hardware: unknown key 'colour'"),
+        ((*OPENMPD, "hardware/sensor=emulated"), "hardware.sensor: 'emulated'; must be scope, file or"),
+        ((*OPENMPD, "hardware/sensor=file"), "hardware.sensor.path: none; must be given"),
+        (OPENMPD, "hardware.sensor.chip: None; must be the oscilloscope's VID:PID"),
+        ((*OPENMPD, "hardware.sensor.chip=1:2:3"), "hardware.sensor.chip: '1:2:3'; must be VID:PID"),
+        ((*OPENMPD, "hardware/sensor=manual", "hardware.failed=[1]"), "hardware.failed: (1,); must be null"),
+        ((*GABS, "hardware.failed='0-9'"), "hardware.failed: 9; must be 0 to 8, as the scene has them"),
+        ((*GABS, "hardware.transducers='0-7'"), "hardware.transducers: '8 transducers'; must be 9"),
+        ((*GABS, "hardware.transducers='5-3'"), "hardware.transducers: '5-3'; must be at most 100000"),
+        ((*GABS, "hardware.transducers='0-99999999999'"), "must be at most 100000 numbers, and ranges"),
+        ((*GABS, "hardware.boards=2"), "hardware.boards: 2; must be null: it is for openmpd"),
+        ((*GABS, "hardware.network=eth0"), "hardware.network: 'eth0'; must be null: it is for AUTD3"),
+        ((*GABS, "hardware.sensor.snr=nan"), "hardware.sensor.snr: nan; must be"),
+        ((*GABS, "hardware.device=openmpd", "hardware.boards=[a.pat]"), "hardware.boards: 'a.pat'; no such"),
+        ((*GABS, "hardware.device=autd3", "hardware.boards=two"), "hardware.boards: 'two'; must be an int"),
+        ((*GABS, "hardware.failed='0-8'"), "hardware.sensor: 0 Pa from the strongest transducer; must be"),
+        (("hardware=sonicsurface", "hardware/sensor=manual", GABS[1]), "transducers: None; must say which 9"),
+        ((*GABS, "hardware=nowhere"), "hardware: 'nowhere'; must be one of autd3, base, emulated"),
+        ((*GABS, "-m"), "hardware: a sweep; must be one trial at a time"),
     ],
 )
-def test_a_trial_that_may_not_be_made_ends_with_one_line(trial, words, status, message):
-    ended, _, log = trial(*words)
-    assert ended == status
-    assert message in log
+def test_a_trial_that_may_not_be_made_ends_with_one_line(trial, words, message):
+    status, _, log = trial(*words)
+    assert (status, message in log) == (2, True)
 
 
-def test_a_bench_of_ones_own_is_a_config(trial, tmp_path):
-    (tmp_path / "ours" / "hardware").mkdir()
-    (tmp_path / "ours" / "hardware" / "mine.yaml").write_text(
-        "defaults: [base, sensor: emulated, _self_]\n"
-        "device: openmpd\nemulated: true\nfailed: [4]  # it fell\nlimits: {amplitude: 0.5}\n"
-    )
+def test_a_limit_ends_a_trial_with_a_status_of_its_own(trial):
+    status, _, log = trial(*GABS, "hardware.limits.evaluations=5")
+    assert (status, "5 evaluations are made, the limit; the outputs are off" in log) == (3, True)
+
+
+def test_a_bench_of_ones_own_is_a_config(trial, write, tmp_path):
+    bench = "device: openmpd\nemulated: true\nfailed: [4]  # it fell\nlimits: {amplitude: 0.5}\n"
+    write("ours/hardware/mine.yaml", f"defaults: [base, sensor: emulated, _self_]\n{bench}")
     status, _, log = trial("hardware=mine", "method=lssg")
     assert (status, "failed transducers, counted from 0: 4" in log) == (0, True)
     assert "hardware=mine" in (tmp_path / "out/report.md").read_text()
@@ -173,9 +148,8 @@ def test_a_bench_of_ones_own_is_a_config(trial, tmp_path):
 def test_devices_of_boards_find_the_drive_of_the_simulation(trial, tmp_path, device):
     if device == "autd3":
         pytest.importorskip("autd3", reason="the kit of AUTD3: install autdtorch[autd3]")
-    boards = (
-        "2" if device == "autd3" else f"[{write_board(tmp_path, 'left')},{write_board(tmp_path, 'right')}]"
-    )
+    files = ",".join(write_board(tmp_path, name) for name in ("left", "right"))
+    boards = "2" if device == "autd3" else f"[{files}]"
     words = (f"hardware.device={device}", f"hardware.boards={boards}", "hardware.transducers='251-259'")
     assert trial(*GABS, *words)[0] == 0
     report = (tmp_path / "out" / "report.md").read_text()
@@ -284,6 +258,5 @@ def test_the_documented_scene_lies_in_the_middle_of_a_sonicsurface(tmp_path):
     path.write_text(block[1], "utf-8")
     device = TransducerArray.sonicsurface(center=(0, 0, 0), angle=math.pi / 2)
     places = device.positions[indices_of("transducers", chosen[1])]
-    assert torch.allclose(
-        load_scene(path).array.positions, places, rtol=0, atol=1e-9
-    )  # rounding; pitch 1e-2 m
+    # Rounding, of a pitch of 1e-2 m.
+    assert torch.allclose(load_scene(path).array.positions, places, rtol=0, atol=1e-9)

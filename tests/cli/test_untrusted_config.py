@@ -2,15 +2,11 @@
 
 import pickle
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from autdtorch.cli.config_files import CONFIGS
-
-Run = Callable[..., int]
-Send = Callable[[dict[str, str]], None]
 
 SCENE = (CONFIGS / "scene" / "homogeneous.yaml").read_text(encoding="utf-8")
 CALL = "{_target_: torch.load, f: evil.pt, weights_only: false}"
@@ -28,25 +24,19 @@ class Touch:
 
 
 @pytest.fixture
-def send(run, tmp_path, monkeypatch):
+def send(write, tmp_path, monkeypatch):
     """Writes files below a folder `sent`; beside it are a pickle and a module that leave `canary`."""
-    here = tmp_path / "here"
-    here.mkdir()
-    monkeypatch.chdir(here)
+    write("here/evil.py", "from pathlib import Path\nfrom torch import load\nPath('canary').touch()\n")
+    (tmp_path / "here" / "evil.pt").write_bytes(pickle.dumps(Touch()))
     monkeypatch.setenv("SECRET", "hunter2")
     monkeypatch.delitem(sys.modules, "evil", raising=False)
-    (here / "evil.pt").write_bytes(pickle.dumps(Touch()))
-    (here / "evil.py").write_text(
-        "from pathlib import Path\nfrom torch import load\nPath('canary').touch()\n", encoding="utf-8"
-    )
 
-    def write(files):
+    def send_all(files):
+        monkeypatch.chdir(tmp_path / "here")  # after `run` has changed it
         for name, text in files.items():
-            path = here / "sent" / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(text, encoding="utf-8")
+            write(f"here/sent/{name}", text)
 
-    return write
+    return send_all
 
 
 def bomb(first, line):
@@ -129,29 +119,27 @@ CASES = [(group, text, key) for group, cases in ATTACKS.items() for text, key in
 
 
 @pytest.mark.parametrize(("group", "text", "key"), CASES, ids=[f"{group} {key}" for group, _, key in CASES])
-def test_an_attack_by_a_config_ends_in_one_line(group, text, key, run, send, tmp_path, capsys):
+def test_an_attack_by_a_config_ends_in_one_line(group, text, key, refused, send, tmp_path):
     send({f"{group}/x.yaml": text, "evil/run.yaml": f"x: {CALL}\n"})
     before = set(tmp_path.rglob("*"))
-    assert run("--config-dir", "sent", f"{group}=x", "plane_spacing=0.02") == 2
-    captured = capsys.readouterr()
-    (line,) = captured.err.splitlines()
+    line = refused("--config-dir", "sent", f"{group}=x", "plane_spacing=0.02")
     assert key in line
     assert len(line) < 600
-    assert "hunter2" not in captured.out + line
+    assert "hunter2" not in line
     assert set(tmp_path.rglob("*")) == before  # no canary, nothing elsewhere
 
 
-def test_a_primary_config_sets_nothing_of_hydras(run, send, tmp_path, capsys):
+def test_a_primary_config_sets_nothing_of_hydras(refused, send, tmp_path):
     send({"x.yaml": f"hydra: {{callbacks: {{x: {CALL}}}}}\n"})
-    assert run("--config-dir", "sent", "--config-name", "x") == 2
-    assert "x.yaml: hydra" in capsys.readouterr().err
+    assert "x.yaml: hydra" in refused("--config-dir", "sent", "--config-name", "x")
     assert not list(tmp_path.rglob("canary"))
 
 
-def test_a_name_that_goes_up_does_not_move_the_output(run, send, tmp_path, capsys):
+def test_a_name_that_goes_up_does_not_move_the_output(refused, send):
     send({"x.yaml": SCENE})
-    assert run("--config-dir", "sent", "scene=../x", "plane_spacing=0.02") == 2
-    assert "output: 'outputs/../x_gabs'" in capsys.readouterr().err
+    assert "output: 'outputs/../x_gabs'" in refused(
+        "--config-dir", "sent", "scene=../x", "plane_spacing=0.02"
+    )
 
 
 def test_what_hydra_is_made_of_is_not_taken_from_a_folder_of_configs(run, send, tmp_path):
@@ -170,11 +158,10 @@ def test_a_launcher_of_ones_own_comes_from_a_folder_that_is_trusted(run, send):
 
 
 @pytest.mark.parametrize("target", ["climbing.load", "climbing.torch", "climbing.no", "climbing.torch.load"])
-def test_of_a_trusted_module_only_its_own_functions_are_methods(target, run, send, tmp_path, capsys):
-    (tmp_path / "here" / "climbing.py").write_text("import torch\nfrom torch import load\n", encoding="utf-8")
+def test_of_a_trusted_module_only_its_own_functions_are_methods(target, refused, send, write, tmp_path):
+    write("here/climbing.py", "import torch\nfrom torch import load\n")
     send({"method/x.yaml": LINES.replace("torch.load", target)})
-    assert run("--config-dir", "sent", "method=x", "modules=[climbing, evil]") == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    line = refused("--config-dir", "sent", "method=x", "modules=[climbing, evil]")
     assert f"method._target_: '{target}'" in line
     assert not list(tmp_path.rglob("canary"))  # nor is a module imported that no method needs
 

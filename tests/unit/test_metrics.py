@@ -17,11 +17,11 @@ def plane_distances(size, cells):
 
 
 def test_figures_of_known_pressures():
-    metrics = focus_metrics([[1.0, 3.0], [2.0, 2.0]])
-    assert metrics.mean.tolist() == [2.0, 2.0]
-    assert metrics.min.tolist() == [1.0, 2.0]
-    assert metrics.std.tolist() == [1.0, 0.0]  # of the population: the foci are all there are
-    assert metrics.uniformity.tolist() == [0.5, 1.0]
+    metrics = focus_metrics([[1.0, 3.0], [2.0, 2.0], [0.0, 0.0]])
+    assert metrics.mean.tolist() == [2.0, 2.0, 0.0]
+    assert metrics.min.tolist() == [1.0, 2.0, 0.0]
+    assert metrics.std.tolist() == [1.0, 0.0, 0.0]  # of the population: the foci are all there are
+    assert metrics.uniformity.tolist() == [0.5, 1.0, 1.0]
     assert metrics.area is None
 
 
@@ -46,27 +46,21 @@ def test_order_of_the_foci_does_not_matter(pressure, random):
         )
 
 
-def test_silence_is_uniform():
-    assert focus_metrics([0.0, 0.0]).uniformity == 1
-
-
-def test_area_of_a_disc_is_shared_among_the_foci():
-    radius, cells, size = 20e-3, 400, 100e-3
+@pytest.mark.parametrize(
+    ("shape", "radius", "foci"),
+    [
+        (lambda distance: (distance < 20e-3).double(), 20e-3, 4),
+        # Half the intensity of a Gaussian focus: exp(-r^2 / 2w^2) = 1 / sqrt(2) at r^2 = w^2 log 2.
+        (lambda distance: torch.exp(-(distance**2) / 2e-4), 10e-3 * math.sqrt(math.log(2)), 1),
+    ],
+    ids=["disc", "gaussian"],
+)
+def test_the_area_within_half_the_intensity_is_shared_among_the_foci(shape, radius, foci):
+    cells, size = 400, 100e-3
     cell = size / cells
-    disc = (plane_distances(size, cells) < radius).double()
-    area = focus_metrics([1.0, 1.0, 1.0, 1.0], disc, cell**2).area
+    area = focus_metrics([1.0] * foci, shape(plane_distances(size, cells)), cell**2).area
     # Only cells cut by the circle can be wrong, about 8 radius / cell of them, and on average by nothing.
-    assert 4 * area.item() == pytest.approx(math.pi * radius**2, abs=8 * radius * cell)
-
-
-def test_area_of_a_gaussian_focus_is_that_within_half_its_intensity():
-    width, cells, size = 10e-3, 400, 100e-3
-    cell = size / cells
-    plane = torch.exp(-(plane_distances(size, cells) ** 2) / (2 * width**2))
-    # exp(-r^2 / 2w^2) = 1 / sqrt(2) at r^2 = w^2 log 2.
-    radius = width * math.sqrt(math.log(2))
-    area = focus_metrics([1.0], plane, cell**2).area
-    assert area.item() == pytest.approx(math.pi * radius**2, abs=8 * radius * cell)
+    assert foci * area.item() == pytest.approx(math.pi * radius**2, abs=8 * radius * cell)
 
 
 def test_area_belongs_to_the_drive_whose_plane_it_is():

@@ -1,24 +1,18 @@
 import pytest
 import torch
+from small_scenes import AIR, small_scene
 
 from autdtorch.objectives.objective import weakest_focus
 from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.propagators import FreeSpacePropagator, make_propagator
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.drive import drive_from_phases
-from autdtorch.scene.scene import Medium, Scene
-
-POINTS = ((80e-3, 10e-3, 0.0), (80e-3, -20e-3, 5e-3))
+from autdtorch.scene.scene import Scene
 
 
 @pytest.fixture
 def scene():
-    return Scene(
-        TransducerArray.grid((2, 2), pitch=10e-3, center=(0, 0, 0)),
-        Medium(1.2, 340.0),
-        frequency=40e3,
-        control_points=torch.tensor(POINTS),
-    )
+    return small_scene()
 
 
 @pytest.fixture
@@ -75,7 +69,7 @@ def test_a_row_does_not_depend_on_the_number_of_threads():
     # 340204 products: wherever a thread begins it is in the middle of a row.
     array = TransducerArray.grid((17, 1), pitch=10e-3, center=(0, 0, 0))
     points = torch.tensor([(80e-3, 1e-2 * y, 0.0) for y in range(4)])
-    scene = Scene(array, Medium(1.2, 340.0), frequency=40e3, control_points=points)
+    scene = Scene(array, AIR, frequency=40e3, control_points=points)
     objective = SimulatedObjective(scene, make_propagator(scene, "free_space"))
     phases = torch.rand(5003, 17, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     drive = drive_from_phases(6 * phases)
@@ -109,15 +103,12 @@ def test_drive_that_no_array_can_play_is_refused_and_not_counted(scene, drive, c
     assert objective.evaluations == 0
 
 
-def test_unknown_mode_is_refused(scene):
+def test_an_unknown_mode_or_a_propagator_of_another_scene_is_refused(scene):
+    propagator = make_propagator(scene, "free_space")
     with pytest.raises(ValueError, match=r"mode: 'guess'; must be"):
-        SimulatedObjective(scene, make_propagator(scene, "free_space"), "guess")
-
-
-def test_propagator_of_another_scene_is_refused(scene):
-    other = Scene(scene.array, scene.medium, frequency=41e3, control_points=scene.control_points)
+        SimulatedObjective(scene, propagator, "guess")
     with pytest.raises(ValueError, match="propagator's scene"):
-        SimulatedObjective(other, make_propagator(scene, "free_space"))
+        SimulatedObjective(small_scene(extent=30e-3), propagator)
 
 
 def test_weakest_focus_is_the_minimum_over_the_last_axis():

@@ -32,7 +32,7 @@ amplitudes = st.lists(st.just(0.0) | st.floats(1e-9, 1), min_size=4, max_size=4)
 
 
 class Recorder:
-    """Hears 1 Pa everywhere and notes what it is asked for."""
+    """Observes 1 Pa everywhere and keeps the drives."""
 
     def __init__(self):
         self.scene = SCENE
@@ -44,8 +44,7 @@ class Recorder:
         self.drives.append(drive)
         return torch.ones(len(drive), 3, dtype=torch.float64)
 
-    @property
-    def heard(self):
+    def played(self):
         return torch.cat(self.drives)
 
 
@@ -110,13 +109,6 @@ def test_reads_are_averaged_and_counted():
     assert (one.std() / many.std()).item() == pytest.approx(5, rel=8 / math.sqrt(2 * 6000))
 
 
-def test_noise_far_below_the_pressure_changes_nothing(simulated):
-    drive = random_drive(10)
-    noisy = Noise(simulated, 400)(drive)
-    # Noise of 1e-20 of the reference: below rounding.
-    torch.testing.assert_close(noisy, simulated(drive), rtol=1e-14, atol=0)
-
-
 @pytest.mark.parametrize(
     "make",
     [
@@ -142,7 +134,7 @@ def test_randomness_follows_from_the_seed_however_the_rows_are_divided(make, sim
 def test_noise_and_drift_of_one_seed_are_unrelated():
     recorder = Recorder()
     Drift(recorder, phase=1.0, seed=4)(fully_on(3000))
-    steps = torch.diff(recorder.heard[:, 0].angle())
+    steps = torch.diff(recorder.played()[:, 0].angle())
     readings = Noise(Recorder(), 40, seed=4, reference=1.0)(fully_on(3000))[1:, 0]
     # 4 / sqrt(samples), as above.
     assert abs(torch.corrcoef(torch.stack([steps, readings]))[0, 1]) < 4 / math.sqrt(3000)
@@ -175,8 +167,8 @@ def test_dead_transducers_are_silent_and_nobody_is_told():
     broken = FailedTransducers(recorder, [0, 2])
     drive = random_drive(3)
     broken(drive)
-    assert torch.equal(recorder.heard[:, [0, 2]], torch.zeros(3, 2, dtype=torch.complex128))
-    assert torch.equal(recorder.heard[:, [1, 3]], drive[:, [1, 3]])
+    assert torch.equal(recorder.played()[:, [0, 2]], torch.zeros(3, 2, dtype=torch.complex128))
+    assert torch.equal(recorder.played()[:, [1, 3]], drive[:, [1, 3]])
     assert torch.equal(quantised(broken, drive), drive)
 
 
@@ -185,7 +177,7 @@ def test_drift_has_the_stated_rms_after_1000_evaluations():
     for seed in range(100):
         recorder = Recorder()
         readings = Drift(recorder, phase=0.2, loss=0.1, sensor=0.05, seed=seed)(fully_on(1000))
-        ends.append((recorder.heard[-1], readings[-1]))
+        ends.append((recorder.played()[-1], readings[-1]))
     drives, readings = (torch.stack(part) for part in zip(*ends, strict=True))
     # Deviations of 400 and of 100 samples, each known to 1 / sqrt(2 n); 4 of that.
     few, many = 4 / math.sqrt(200), 4 / math.sqrt(800)
@@ -219,14 +211,6 @@ def test_true_pressure_keeps_the_device_and_drops_the_sensor(simulated):
     assert not torch.allclose(true, simulated(drive), rtol=1e-2)
 
 
-def test_a_solution_is_on_the_levels_of_the_device_but_knows_no_fault(simulated):
-    objective = Noise(Quantised(Drift(FailedTransducers(simulated, [1]), phase=0.5), 8, on_off=True), 20)
-    solution = gabs(objective, levels=16, trials=2)
-    steps = solution.phases * 8 / (2 * math.pi)
-    torch.testing.assert_close(steps, steps.round(), rtol=0, atol=1e-12)
-    assert objective.evaluations == solution.evaluations.sum()
-
-
 @pytest.mark.parametrize(
     "make",
     [
@@ -253,7 +237,6 @@ def test_a_drive_that_no_array_can_play_is_refused_and_not_counted(make, simulat
     ("make", "message"),
     [
         (lambda o: Noise(o, math.inf), "snr: inf dB; must be finite"),
-        (lambda o: Noise(o, "20"), "snr: '20'; must be a real number"),
         (lambda o: Noise(o, 20, reads=0), "reads: 0; must be an integer >= 1"),
         (lambda o: Noise(o, 20, seed=-1), "seed: -1; must be an integer >= 0"),
         (lambda o: Noise(o, 20, reference=0.0), r"reference: 0\.0 Pa; must be finite and > 0"),
@@ -261,11 +244,9 @@ def test_a_drive_that_no_array_can_play_is_refused_and_not_counted(make, simulat
         (lambda o: Quantised(o, 4, on_off=1), "on_off: 1; must be true or false"),
         (lambda o: FailedTransducers(o, []), r"transducers: \(\); must be indices from 0 to 3, each once"),
         (lambda o: FailedTransducers(o, [4]), r"transducers: \(4,\); must be indices from 0 to 3"),
-        (lambda o: FailedTransducers(o, [1, 1]), r"transducers: \(1, 1\); must be indices"),
         (lambda o: FailedTransducers(o, [-1]), r"transducers\[0\]: -1; must be an integer >= 0"),
         (lambda o: FailedTransducers(o, 2), "transducers: 2; must be indices"),
         (lambda o: Drift(o, phase=-0.1), r"phase: -0\.1 rad; must be finite and >= 0"),
-        (lambda o: Drift(o, loss=math.nan), "loss: nan; must be finite"),
         (lambda o: Drift(o, sensor="much"), "sensor: 'much'; must be a real number"),
         (lambda o: Drift(o, seed=0.5), r"seed: 0\.5; must be an integer >= 0"),
     ],

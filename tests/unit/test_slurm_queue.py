@@ -58,16 +58,14 @@ def test_why_jobs_wait_is_told_with_all_words_of_the_reason(squeue, watcher, cap
     assert caplog.messages == ["jobs wait in the queue: ReqNodeNotAvail, Reserved | for maintenance"]
 
 
-FAILURES = {
-    "missing": (None, "No such file or directory: 'squeue'"),
-    "refused": (
-        "echo 'slurm_load_jobs error:' >&2\necho 'no controller' >&2\nexit 1",
-        "error: no controller",
-    ),
-}
+REFUSE = "echo 'slurm_load_jobs error:' >&2\necho 'no controller' >&2\nexit 1"
 
 
-@pytest.mark.parametrize(("script", "reason"), FAILURES.values(), ids=FAILURES.keys())
+@pytest.mark.parametrize(
+    ("script", "reason"),
+    [(None, "No such file or directory: 'squeue'"), (REFUSE, "error: no controller")],
+    ids=["missing", "refused"],
+)
 def test_a_squeue_that_fails_for_good_ends_the_wait_in_a_line_that_says_what_to_do(
     squeue, watcher, caplog, script, reason
 ):
