@@ -55,16 +55,7 @@ class Bench:
     """
 
     def __init__(self, section: Mapping[str, Any], scene: Scene, seed: int) -> None:
-        """Check the section.
-
-        Args:
-            section: `hardware` of the config.
-            scene: on the bench.
-            seed: of emulated noise.
-
-        Raises:
-            ValueError: a key that is unknown, out of range, or does not fit the others.
-        """
+        """Check the section `hardware` of a config; `seed` is that of emulated noise."""
         require_known("hardware", section, _KEYS)
         require_one_of("hardware.device", section["device"], hardware.DEVICES)
         self._section, self._scene, self._seed = section, scene, seed
@@ -101,9 +92,7 @@ class Bench:
             if on_network:
                 network = _network(section["network"])
                 return hardware.open_autd3(self._board_count(), self.transducers, network, settle)
-            serial, port = (
-                None if (text := section[key]) is None else str(text) for key in ("serial", "port")
-            )
+            serial, port = (None if section[key] is None else str(section[key]) for key in ("serial", "port"))
             return hardware.open_link(self.device, self.transducers, serial, settle=settle, port=port)
         if self.is_dry:  # these imports need pyusb
             from autdtorch.hardware.emulator.dry_run import DryPort
@@ -131,22 +120,16 @@ class Bench:
             case _:
                 with self._scope() as scope:
                     inputs = range(1, 2 if given["moved"] else len(points) + 1)
-                    microphones = [
-                        hardware.Microphone(number, given["sensitivity"], given["loudest"])
-                        for number in inputs
-                    ]
-                    sensor = hardware.ScopeSensor(
-                        scope, self._scene.frequency, microphones, given["captures"]
-                    )
+                    each = given["sensitivity"], given["loudest"]
+                    heads = [hardware.Microphone(number, *each) for number in inputs]
+                    sensor = hardware.ScopeSensor(scope, self._scene.frequency, heads, given["captures"])
                     yield hardware.MovedMicrophone(sensor, points, _ask) if given["moved"] else sensor
 
     def _settings(self) -> dict[str, Any]:
         settings: dict[str, Any] = {"sensor": self._sensor["kind"]}
         if self._sensor["kind"] == "scope":
-            settings |= {
-                "sensitivity [V/Pa]": self._sensor["sensitivity"],
-                "captures": self._sensor["captures"],
-            }
+            settings["sensitivity [V/Pa]"] = self._sensor["sensitivity"]
+            settings["captures"] = self._sensor["captures"]
         if self._emulated:
             settings |= {"emulated": True, "snr [dB]": self._sensor.get("snr"), "failed": self._failed}
         if self._boards:
@@ -198,11 +181,7 @@ class Bench:
 
 
 def indices_of(field: str, value: object) -> list[int]:
-    """Return indices from a list, or from text such as "3,7-9".
-
-    Raises:
-        ValueError: neither, or more than 100,000 of them.
-    """
+    """Return indices from a list, or from text such as "3,7-9"."""
     if isinstance(value, list | tuple):
         return [integer_at_least(f"{field}[{place}]", entry, 0) for place, entry in enumerate(value)]
     try:
@@ -217,11 +196,7 @@ def indices_of(field: str, value: object) -> list[int]:
 
 
 def chip_of(field: str, text: object) -> tuple[int, int]:
-    """Return idVendor and idProduct of text such as "2a8d:1770", as lsusb shows them.
-
-    Raises:
-        ValueError: other text.
-    """
+    """Return idVendor and idProduct of text such as "2a8d:1770", as lsusb shows them."""
     try:
         vendor, product = (int(part, 16) for part in str(text).split(":"))
     except ValueError as error:
@@ -252,11 +227,10 @@ def _sensor_section(section: object, emulated: bool, dry: bool) -> Mapping[str, 
         require_one_of("hardware.sensor.maker", section["maker"], _MAKERS)
         boolean("hardware.sensor.moved", section["moved"])
         if not emulated and section["chip"] is None:
-            raise invalid(
-                "hardware.sensor.chip",
-                None,
-                "must be the oscilloscope's VID:PID, as lsusb shows it; or hardware/sensor=file or manual",
+            accepted = (
+                "must be the oscilloscope's VID:PID, as lsusb shows it; or hardware/sensor=file or manual"
             )
+            raise invalid("hardware.sensor.chip", None, accepted)
         if emulated and section["moved"]:
             raise invalid("hardware.sensor.moved", True, "must be false: it is for a real device")
     return section

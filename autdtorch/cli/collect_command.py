@@ -16,11 +16,7 @@ of one's own, which the module NAME defines."""
 
 
 def collect(arguments: list[str]) -> None:
-    """Merge the studies of the folder that the arguments name.
-
-    Raises:
-        ValueError: not one folder, or no study in it.
-    """
+    """Merge the studies of the folder that the arguments name."""
     from autdtorch.study.report.study_report import write_report
     from autdtorch.study.report.summary_table import SUMMARY_FILE, save_summary
     from autdtorch.study.sweeps import collect_results

@@ -34,11 +34,7 @@ class FileConfigSource(file_config_source.FileConfigSource):
     """
 
     def load_config(self, config_path: str) -> ConfigResult:
-        """Read a file.
-
-        Raises:
-            ValueError: the YAML is not accepted, or a config from others could change Hydra's settings.
-        """
+        """Read a file; YAML from others must not change Hydra's settings."""
         path = os.path.realpath(os.path.join(self.path, self._normalize_file_name(config_path)))
         shown = os.path.relpath(path)
         config = load_yaml(shown)

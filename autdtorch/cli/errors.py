@@ -36,9 +36,6 @@ def stop(error: BaseException) -> NoReturn:
     The status is 2 where a setting is refused or a file cannot be written, and 3 where a limit of a hardware
     trial is reached. After a signal it is 128 and its number, and 1 after any other error, such as one in a
     user's own method.
-
-    Raises:
-        SystemExit: always.
     """
     print(f"autdtorch: {in_one_line(error)}", file=sys.stderr)
     sys.exit(_status(error))

@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -31,6 +31,8 @@ from autdtorch.utils.validation import require_known
 
 logger = logging.getLogger(__name__)
 
+_Measured: TypeAlias = tuple[Solution, torch.Tensor, hardware.Preflight, hardware.EvaluationLog]
+
 _LOG_FILE, _DRIVE_FILE = "trial.jsonl", "drive.npz"
 _GOES_ON = "the same command goes on where the log ends"
 
@@ -38,16 +40,7 @@ _GOES_ON = "the same command goes on where the log ends"
 def hardware_trial(settings: dict[str, Any], modules: list[Any], output: Any) -> None:
     """Run a method on a device, or on its emulator.
 
-    Args:
-        settings: of the job, with a section `hardware`.
-        modules: names of the modules that the user trusts.
-        output: setting of that name.
-
-    Raises:
-        ValueError: a setting out of range, or a log of another trial.
-        LimitError: a limit of the trial is reached.
-        LinkError: the device does not take the bytes.
-        Signalled: the process was told to end. Every error carries a note on whether the outputs are off.
+    Every error carries a note on whether the outputs are off.
     """
     trial = None
     try:
@@ -72,11 +65,7 @@ def _left_on(error: BaseException | None) -> BaseException | None:
 
 
 class _Trial:
-    """A trial that was simulated; `run` plays it.
-
-    Attributes:
-        begun: whether the device was opened, and the log is the trial's.
-    """
+    """A trial that was simulated; `run` plays it. `begun`: whether the device was opened."""
 
     def __init__(self, settings: dict[str, Any], modules: list[Any], output: Any) -> None:
         """Check the settings, and run the method in the simulation."""
@@ -125,9 +114,7 @@ class _Trial:
         weakest = float(again.mean(dim=0).min())
         print(f"weakest focus {weakest:.4g} Pa, measured once more; the report is {report}")
 
-    def _measure(
-        self, log: Path
-    ) -> tuple[Solution, torch.Tensor, hardware.Preflight, hardware.EvaluationLog]:
+    def _measure(self, log: Path) -> _Measured:
         """Check the transducers, run the method on the device, and read the drive it found again (R, P)."""
         bench, points = self._bench, len(self._scene.control_points)
         readings = 1 if bench.by_hand else 4
@@ -180,10 +167,8 @@ class _Trial:
         if len(check.dead) == count:
             loudest = ", and try a lower loudest" if self._settings["sensor"] == "scope" else ""
             strongest = f"{float(check.pressure.max()):.3g} Pa from the strongest transducer"
-            accepted = (
-                f"must be above {check.threshold:.3g} Pa; check the device's power, and the sensor{loudest}"
-            )
-            raise ValueError(f"hardware.sensor: {strongest}; {accepted}")
+            accepted = f"above {check.threshold:.3g} Pa; check the device's power, and the sensor{loudest}"
+            raise ValueError(f"hardware.sensor: {strongest}; must be {accepted}")
         logger.info("%d of %d transducers work", count - len(check.dead), count)
         if check.dead:
             logger.warning("failed transducers, counted from 0: %s", ", ".join(map(str, check.dead)))

@@ -54,11 +54,7 @@ class SlurmCallback(Callback):
 
 
 def main() -> None:
-    """Run the command line.
-
-    Raises:
-        SystemExit: after one line on stderr where it fails; `errors.stop` has the statuses.
-    """
+    """Run the command line; `errors.stop` has the statuses where it fails."""
     wanted = os.environ.get(FULL_ERROR)
     os.environ[FULL_ERROR] = "1"  # makes Hydra pass exceptions on, which it would print in its own way
     error: BaseException

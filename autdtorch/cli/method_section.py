@@ -19,14 +19,8 @@ _NO_SETTINGS = ("objective", "trials", "seed", "score")  # the first three are t
 def load_method(where: str, section: Mapping[str, Any], modules: Collection[Any]) -> StudyMethod:
     """Make the method that a section names by `_target_`, with the section's settings.
 
-    Args:
-        where: name of the section, for messages.
-        section: a config file may have written it.
-        modules: that the user trusts. A section can name their functions and their subclasses of `Method`,
-            and the methods of autdtorch.
-
-    Raises:
-        ValueError: no such method, or a setting that is unknown, missing or out of range.
+    A config file may have written the section. It can name the methods of autdtorch, and the functions and
+    subclasses of `Method` of the trusted `modules`.
     """
     if TARGET not in section:
         raise ValueError(f"{where}: no _target_; must name a method such as autdtorch.gabs")
@@ -41,9 +35,7 @@ def load_method(where: str, section: Mapping[str, Any], modules: Collection[Any]
         given = [key for key in ("trials", "seed") if key in signature.parameters]
         signature.bind("objective", **dict.fromkeys(given))
     except TypeError as error:
-        accepted = (
-            "must take an objective, the method's settings, and trials and seed if it has random choices"
-        )
+        accepted = "must take an objective, its settings, and trials and seed if it has random choices"
         raise ValueError(f"{where}: {section[TARGET]!r}; {error}; {accepted}") from error
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error

@@ -24,11 +24,7 @@ _TARGETS = re.compile(rf"(method|methods\.[^.]+|(scene|scenes\.[^.]+)\.obstacles
 
 
 def settings_of(config: DictConfig) -> tuple[dict[str, Any], list[Any], Any]:
-    """Return checked settings without `modules` and `output`, and these two.
-
-    Raises:
-        ValueError: an unknown key, a key by which Hydra calls functions, or modules named by a config file.
-    """
+    """Return checked settings without `modules` and `output`, and these two."""
     settings = plain(config, "settings")
     require_known("settings", settings, (*_SETTINGS, *_PLACES))
     require_no_calls(settings)
@@ -39,11 +35,7 @@ def settings_of(config: DictConfig) -> tuple[dict[str, Any], list[Any], Any]:
 
 
 def section_of(settings: Mapping[str, Any], key: str) -> dict[str, Any]:
-    """Return the section of a key.
-
-    Raises:
-        ValueError: there is none.
-    """
+    """Return the section of a key, which must be there."""
     section = settings.get(key)
     if not isinstance(section, dict):
         raise ValueError(f"{key}: {section!r}; must be a mapping of keys to values")

@@ -22,11 +22,7 @@ class QueueWatcher(SlurmInfoWatcher):
     """Tells submitit when the jobs have left the queue, and the user why they wait there."""
 
     def __init__(self, logs: str) -> None:
-        """Watch no job yet.
-
-        Args:
-            logs: folder of the log of a job, with "%j" for the job's number.
-        """
+        """Watch no job yet; `logs` is the folder of the log of a job, with "%j" for its number."""
         super().__init__()
         self._logs = logs
         self._numbers: set[str] = set()
@@ -49,9 +45,6 @@ class QueueWatcher(SlurmInfoWatcher):
 
         submitit asks for a job without a result, and gives up the sweep if that job has ended. A job that was
         killed is therefore not done before the others.
-
-        Raises:
-            ChildProcessError: `squeue` fails, time and again.
         """
         if time.monotonic() >= self._next_question:
             self._next_question = time.monotonic() + _PAUSE
@@ -95,9 +88,5 @@ class QueueWatcher(SlurmInfoWatcher):
 
 
 def watch_queue(logs: str) -> None:
-    """Have submitit ask the queue for all jobs that it submits from now on.
-
-    Args:
-        logs: folder of the log of a job, with "%j" for the job's number.
-    """
+    """Have submitit ask the queue for all jobs that it submits from now on; `logs` as in `QueueWatcher`."""
     SlurmJob.watcher = QueueWatcher(logs)

@@ -8,7 +8,7 @@ import shlex
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
@@ -20,18 +20,13 @@ if TYPE_CHECKING:
     from autdtorch.study.results import StudyResult
     from autdtorch.study.run import StudyMethod
 
+    _Parts: TypeAlias = tuple[dict[str, Scene], dict[str, StudyMethod]]
+
 PLANE_FILE = "plane.png"
 
 
 def study(settings: dict[str, Any], modules: list[Any], output: Any, sweep: Path | None) -> None:
-    """Run a study.
-
-    Args:
-        settings: of the job.
-        modules: names of the modules that the user trusts.
-        output: setting of that name.
-        sweep: folder of the sweep that the job belongs to, or None.
-    """
+    """Run a study; `sweep` is the folder of the sweep that the job belongs to, if any."""
     from autdtorch.propagators import CACHE_VARIABLE
     from autdtorch.study.run import run_study
 
@@ -70,9 +65,7 @@ def print_table(results: StudyResult, *more: str) -> None:
     sys.stdout.flush()
 
 
-def _single(
-    settings: Mapping[str, Any], modules: list[Any]
-) -> tuple[dict[str, Scene], dict[str, StudyMethod]]:
+def _single(settings: Mapping[str, Any], modules: list[Any]) -> _Parts:
     """Return the one scene and the one method, each by its name."""
     from autdtorch.cli.method_section import load_method
     from autdtorch.study.run import name_of
@@ -82,9 +75,7 @@ def _single(
     return {HydraConfig.get().runtime.choices["scene"]: scene}, {name_of(method): method}
 
 
-def _experiment(
-    settings: Mapping[str, Any], modules: list[Any]
-) -> tuple[dict[str, Scene], dict[str, StudyMethod]]:
+def _experiment(settings: Mapping[str, Any], modules: list[Any]) -> _Parts:
     """Return the scenes and the methods of an experiment, by name."""
     from autdtorch.cli.method_section import load_method
 
@@ -128,8 +119,6 @@ def _show(results: StudyResult, scenes: Mapping[str, Scene], folder: Path, singl
     (result,) = results.scenes.values()
     (method,) = result.methods.values()
     if method.plane_pressure is not None and scene.observation_plane is not None:
-        figure = plot_plane(
-            method.plane_pressure, scene.observation_plane, scene.control_points, scene.obstacles
-        )
-        figure.savefig(folder / PLANE_FILE)
+        seen = scene.observation_plane, scene.control_points, scene.obstacles
+        plot_plane(method.plane_pressure, *seen).savefig(folder / PLANE_FILE)
     print_table(results, f"The results are in {shown}")

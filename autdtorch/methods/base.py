@@ -60,11 +60,7 @@ class Problem:
     quantise: Callable[[torch.Tensor], torch.Tensor] = field(default=lambda drive: drive)
 
     def __post_init__(self) -> None:
-        """Check the fields.
-
-        Raises:
-            ValueError: a number that is not an integer >= 1, or another field of a wrong kind or shape.
-        """
+        """Check the fields."""
         for name in ("transducers", "foci"):
             object.__setattr__(self, name, integer_at_least(name, getattr(self, name), 1))
         require_callable("goal", self.goal)
@@ -178,11 +174,7 @@ class Method(ABC):
         """
 
     def check(self, problem: Problem) -> None:  # noqa: B027 - most methods have nothing to check
-        """Check the settings against the problem.
-
-        Raises:
-            ValueError: a setting that does not fit.
-        """
+        """Check the settings against the problem; `ValueError` where one does not fit."""
 
     def most_at_once(self, problem: Problem) -> int:
         """Return the largest number of drives that a trial has observed in one step."""
@@ -194,11 +186,7 @@ class Method(ABC):
         return _SCORE_NUMBERS * self.most_evaluations(problem) + drive * self.most_at_once(problem)
 
     def require_fit(self, problem: Problem, trials: int) -> None:
-        """Check settings and memory, without beginning.
-
-        Raises:
-            ValueError: a setting that does not fit the problem, or needs more memory than there is.
-        """
+        """Check settings and memory against a problem; `ValueError` where they do not fit."""
         self.check(problem)
         counts = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         whole = {name: value for name, value in counts.items() if isinstance(value, int)}
@@ -307,11 +295,7 @@ def restored(states: torch.Tensor) -> list[torch.Generator]:
 
 
 def trial_seeds(seed: int, trials: Trials) -> list[int]:
-    """Return the seed of each trial, which does not depend on the other trials.
-
-    Raises:
-        ValueError: a seed below 0, no trial, a trial twice, or a trial below 0.
-    """
+    """Return the seed of each trial, which does not depend on the other trials."""
     seed = integer_at_least("seed", seed, 0)
     if isinstance(trials, numbers.Integral):
         count = integer_at_least("trials", trials, 1)

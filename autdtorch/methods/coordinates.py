@@ -21,11 +21,7 @@ Search = Mapping[str, torch.Tensor]
 
 
 def order_setting(order: str | Sequence[int], names: Sequence[str]) -> str | tuple[int, ...]:
-    """Return the setting `order`: one of `names`, or indices.
-
-    Raises:
-        ValueError: anything else.
-    """
+    """Return the setting `order`, one of `names` or indices, after checking it."""
     if isinstance(order, str) and order in names:
         return order
     quoted = ", ".join(f'"{name}"' for name in names)
@@ -37,11 +33,7 @@ def order_setting(order: str | Sequence[int], names: Sequence[str]) -> str | tup
 
 
 def require_all(order: str | Sequence[int], count: int) -> None:
-    """Check that an order given by indices has `count` of them.
-
-    Raises:
-        ValueError: it has another number.
-    """
+    """Check that an order given by indices has `count` of them."""
     if not isinstance(order, str) and len(order) != count:
         raise invalid("order", order, f"must be the indices 0 to {count - 1}, each once")
 
@@ -69,9 +61,8 @@ def candidates(search: Search, levels: int) -> torch.Tensor:
     or the drift since, does not hold a phase for ever.
     """
     weights = search["weights"]
-    choices = drive_from_phases(
-        2 * math.pi * torch.arange(levels, dtype=torch.float64, device="cpu") / levels
-    )
+    turns = torch.arange(levels, dtype=torch.float64, device="cpu")
+    choices = drive_from_phases(2 * math.pi * turns / levels)
     found = weights[:, None].repeat(1, levels, 1)
     rows = torch.arange(len(weights), device="cpu")
     found[rows, :, search["order"][:, int(search["place"])]] = choices
@@ -89,10 +80,7 @@ def ascend(search: Search, levels: int, score: torch.Tensor) -> tuple[Search, to
     weights = candidates(search, levels)[rows, first_of_best(score)]
     place, passes = int(search["place"]) + 1, int(search["passes"])
     if place < search["order"].shape[1]:
-        return {
-            **search,
-            "weights": weights,
-            "place": torch.tensor(place, dtype=torch.int64, device="cpu"),
-        }, rows >= 0
+        following = torch.tensor(place, dtype=torch.int64, device="cpu")
+        return {**search, "weights": weights, "place": following}, rows >= 0
     goes_on = (weights != search["before"]).any(dim=1) & (passes > 1)
     return begin_ascent(weights[goes_on], search["order"][goes_on], passes - 1), goes_on

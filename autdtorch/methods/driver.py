@@ -83,10 +83,7 @@ def run(
 def observed(objective: Objective, drives: torch.Tensor, number: int) -> torch.Tensor:
     """Return pressures (B, P) [Pa] of drives (B, M): recorded ones where the objective has a log with them.
 
-    Args:
-        objective: simulated or measured.
-        drives: (B, M), B >= 1.
-        number: of evaluations that the run made before.
+    The run made `number` evaluations before.
     """
     if not isinstance(objective, Logged):
         return objective(drives)

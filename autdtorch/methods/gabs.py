@@ -8,15 +8,8 @@ from typing import ClassVar, Literal
 
 import torch
 
+from autdtorch.methods import coordinates
 from autdtorch.methods.base import Method, Problem, State, Step, Trials, generators_of
-from autdtorch.methods.coordinates import (
-    ascend,
-    begin_ascent,
-    candidates,
-    indices_of,
-    order_setting,
-    require_all,
-)
 from autdtorch.methods.driver import run
 from autdtorch.methods.ranking import best_first
 from autdtorch.methods.solution import Solution
@@ -59,14 +52,16 @@ class GABS(Method):
     def __post_init__(self) -> None:
         """Check the settings."""
         object.__setattr__(self, "levels", integer_at_least("levels", self.levels, 2))
-        object.__setattr__(self, "order", order_setting(self.order, ("random", "given", "strength")))
+        object.__setattr__(
+            self, "order", coordinates.order_setting(self.order, ("random", "given", "strength"))
+        )
         object.__setattr__(self, "passes", integer_at_least("passes", self.passes, 1))
         if self.first is not None:
             object.__setattr__(self, "first", integer_at_least("first", self.first, 0))
 
     def check(self, problem: Problem) -> None:
         """Check order and first transducer against the number of transducers."""
-        require_all(self.order, problem.transducers)
+        coordinates.require_all(self.order, problem.transducers)
         if self.first is not None and self.first >= problem.transducers:
             accepted = f"must be an integer from 0 to {problem.transducers - 1}"
             raise invalid("first", self.first, accepted)
@@ -86,7 +81,7 @@ class GABS(Method):
         alone = torch.eye(problem.transducers, dtype=torch.complex128, device="cpu")
         if self.order == "strength":
             return Step(alone.expand(len(seeds), -1, -1), {})
-        orders = indices_of(self.order, problem.transducers).expand(len(seeds), -1)
+        orders = coordinates.indices_of(self.order, problem.transducers).expand(len(seeds), -1)
         if self.order == "random":
             count = problem.transducers
             shuffled = [torch.randperm(count, generator=own, device="cpu") for own in generators_of(seeds)]
@@ -97,16 +92,16 @@ class GABS(Method):
     def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
         """Compare the phases of the next transducer."""
         if "weights" in state.search:
-            search, goes_on = ascend(state.search, self.levels, score)
-            return Step(candidates(search, self.levels), search, goes_on)
+            search, goes_on = coordinates.ascend(state.search, self.levels, score)
+            return Step(coordinates.candidates(search, self.levels), search, goes_on)
         orders = state.search["orders"] if state.search else self._first_before(best_first(score))
         alone = torch.eye(state.problem.transducers, dtype=torch.complex128, device="cpu")
-        search = begin_ascent(alone[orders[:, 0]], orders, self.passes, place=1)
+        search = coordinates.begin_ascent(alone[orders[:, 0]], orders, self.passes, place=1)
         if state.problem.transducers > 1:
-            return Step(candidates(search, self.levels), search)
+            return Step(coordinates.candidates(search, self.levels), search)
         goes_on = torch.full((len(orders),), self.passes > 1, dtype=torch.bool, device="cpu")
-        search = begin_ascent(alone[orders[goes_on, 0]], orders[goes_on], self.passes - 1)
-        return Step(candidates(search, self.levels), search, goes_on)
+        search = coordinates.begin_ascent(alone[orders[goes_on, 0]], orders[goes_on], self.passes - 1)
+        return Step(coordinates.candidates(search, self.levels), search, goes_on)
 
     def _first_before(self, orders: torch.Tensor) -> torch.Tensor:
         """Return `orders` (T, M) with the transducer `first` moved to the front."""
@@ -126,22 +121,5 @@ def gabs(
     seed: int = 0,
     score: Score = weakest_focus,
 ) -> Solution:
-    """Run `GABS` on an objective.
-
-    Args:
-        objective: what is evaluated.
-        levels: number of phases in [0, 2 pi), >= 2.
-        order: of the transducers: "random", "given", "strength", or all their indices.
-        first: index of the transducer to begin with, or None.
-        passes: >= 1.
-        trials: number of trials T, >= 1, or their numbers.
-        seed: of the random orders, >= 0.
-        score: function that is maximised.
-
-    Returns:
-        The best drive observed in each trial.
-
-    Raises:
-        ValueError: an argument out of range, or pressures or scores that are not finite.
-    """
+    """Run `GABS` with these settings on an objective; see `GABS` and `run`."""
     return run(GABS(levels, order, first, passes), objective, trials, seed, score=score)

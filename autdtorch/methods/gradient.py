@@ -79,46 +79,22 @@ class GradientAscent(Method):
 def gradient_ascent(
     objective: Objective, starts: int = 32, steps: int = 300, trials: Trials = 1, seed: int = 0
 ) -> Solution:
-    """Run `GradientAscent` on an objective.
-
-    Args:
-        objective: simulated, with a `transfer_matrix`.
-        starts: number of drives that a trial starts from, >= 1.
-        steps: of each climb, >= 2.
-        trials: number of trials T, >= 1, or their numbers.
-        seed: of the random phases, >= 0.
-
-    Returns:
-        The drive of each trial.
-
-    Raises:
-        ValueError: an argument out of range, or an objective without a transfer matrix.
-    """
+    """Run `GradientAscent` with these settings on an objective with a transfer matrix; see `run`."""
     return run(GradientAscent(starts, steps), objective, trials, seed)
 
 
 def random_drives(count: int, transducers: int, generator: torch.Generator) -> torch.Tensor:
     """Return drives (count, M) of amplitudes 1 and random phases."""
-    phases = (
-        2 * math.pi * torch.rand(count, transducers, dtype=torch.float64, generator=generator, device="cpu")
-    )
-    return torch.polar(torch.ones_like(phases), phases)
+    turns = torch.rand(count, transducers, dtype=torch.float64, generator=generator, device="cpu")
+    return torch.polar(torch.ones_like(turns), 2 * math.pi * turns)
 
 
 @one_torch_thread()
 def climb(matrix: torch.Tensor, drive: torch.Tensor, steps: int) -> torch.Tensor:
-    """Climb the weakest focus by projected gradient ascent with momentum.
+    """Return the highest drive (M,) of projected gradient ascents with momentum from drives (S, M).
 
-    The ascent maximises a smooth minimum, -T log sum_p exp(-|p_p| / T), whose temperature T falls until it
-    is the minimum.
-
-    Args:
-        matrix: transfer matrix (P, M), complex128.
-        drive: S drives to start from (S, M).
-        steps: >= 2.
-
-    Returns:
-        The highest drive (M,), amplitudes <= 1.
+    The ascent maximises a smooth minimum over the foci of `matrix` (P, M), -T log sum_p exp(-|p_p| / T). Its
+    temperature T falls until it is the minimum.
     """
     velocity = torch.zeros_like(drive)
     for progress in torch.linspace(0, 1, steps, dtype=torch.float64, device="cpu").tolist():

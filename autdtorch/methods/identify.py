@@ -116,20 +116,7 @@ class Identify(Method):
 
 
 def identify(objective: Objective, evaluations: int = 64, trials: Trials = 1, seed: int = 0) -> Solution:
-    """Run `Identify` on an objective.
-
-    Args:
-        objective: what is evaluated.
-        evaluations: number of evaluations of a trial, >= 3 M - 1.
-        trials: number of trials T, >= 1, or their numbers.
-        seed: of the random phases, >= 0.
-
-    Returns:
-        The last drive of each trial; with noise it is better than the one of the highest reading.
-
-    Raises:
-        ValueError: an argument out of range, or pressures that are not finite.
-    """
+    """Run `Identify` with these settings on an objective; see `Identify` and `run`."""
     return run(Identify(evaluations), objective, trials, seed)
 
 
@@ -141,9 +128,8 @@ def _search(drives: torch.Tensor, observed: torch.Tensor, generator: torch.Gener
     leaves the local minima that trap a fit. The rows are then fitted, and the best fit is taken.
     """
     transducers, foci = drives.shape[1], observed.shape[1]
-    guesses = torch.randn(
-        transducers, foci * _GUESSES, dtype=torch.complex128, generator=generator, device="cpu"
-    )
+    size = transducers, foci * _GUESSES
+    guesses = torch.randn(size, dtype=torch.complex128, generator=generator, device="cpu")
     magnitudes = observed.repeat_interleave(_GUESSES, dim=1)
     inverse = torch.linalg.pinv(drives)
     phasors = drives @ guesses
@@ -152,9 +138,8 @@ def _search(drives: torch.Tensor, observed: torch.Tensor, generator: torch.Gener
         phasors = phasors + drives @ (inverse @ (2 * right - phasors)) - right
     rows = _fit(drives, magnitudes, inverse @ phasors)
     misfit = ((drives @ rows).abs() - magnitudes).square().sum(dim=0).reshape(foci, _GUESSES)
-    return rows.reshape(transducers, foci, _GUESSES)[
-        :, torch.arange(foci, device="cpu"), misfit.argmin(dim=1)
-    ]
+    every = torch.arange(foci, device="cpu")
+    return rows.reshape(transducers, foci, _GUESSES)[:, every, misfit.argmin(dim=1)]
 
 
 @one_torch_thread()

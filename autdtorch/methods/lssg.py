@@ -8,19 +8,13 @@ from typing import ClassVar, Literal
 
 import torch
 
+from autdtorch.methods import coordinates
 from autdtorch.methods.base import Method, Problem, State, Step
-from autdtorch.methods.coordinates import (
-    ascend,
-    begin_ascent,
-    candidates,
-    indices_of,
-    order_setting,
-    require_all,
-)
 from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.objective import Objective, Score, weakest_focus
 from autdtorch.scene.drive import drive_from_phases, focus_phases, normalise
+from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import integer_at_least, invalid
 
 
@@ -37,7 +31,7 @@ class LSS(Method):
 
     def check(self, problem: Problem) -> None:
         """Check that the problem has a scene."""
-        _require_scene(problem)
+        _scene(problem)
 
     def most_evaluations(self, problem: Problem) -> int:
         """Return 1."""
@@ -86,13 +80,13 @@ class LSSG(Method):
     def __post_init__(self) -> None:
         """Check the settings."""
         object.__setattr__(self, "levels", integer_at_least("levels", self.levels, 2))
-        object.__setattr__(self, "order", order_setting(self.order, ("given",)))
+        object.__setattr__(self, "order", coordinates.order_setting(self.order, ("given",)))
         object.__setattr__(self, "passes", integer_at_least("passes", self.passes, 1))
 
     def check(self, problem: Problem) -> None:
         """Check that the problem has a scene, and the order against the number of foci."""
-        _require_scene(problem)
-        require_all(self.order, problem.foci)
+        _scene(problem)
+        coordinates.require_all(self.order, problem.foci)
 
     def most_evaluations(self, problem: Problem) -> int:
         """Return the evaluations of all passes."""
@@ -106,30 +100,21 @@ class LSSG(Method):
         """Compare the offsets of the first focus."""
         foci = _focus_drives(problem)
         start = torch.ones(1, problem.foci, dtype=torch.complex128, device="cpu")
-        search = begin_ascent(start, indices_of(self.order, problem.foci)[None], self.passes)
-        return Step(normalise(candidates(search, self.levels) @ foci), {**search, "foci": foci})
+        search = coordinates.begin_ascent(
+            start, coordinates.indices_of(self.order, problem.foci)[None], self.passes
+        )
+        return Step(normalise(coordinates.candidates(search, self.levels) @ foci), {**search, "foci": foci})
 
     def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
         """Compare the offsets of the next focus."""
         foci = state.search["foci"]
-        search, goes_on = ascend(state.search, self.levels, score)
-        drives = normalise(candidates(search, self.levels) @ foci)
+        search, goes_on = coordinates.ascend(state.search, self.levels, score)
+        drives = normalise(coordinates.candidates(search, self.levels) @ foci)
         return Step(drives, {**search, "foci": foci}, goes_on)
 
 
 def lss(objective: Objective, score: Score = weakest_focus) -> Solution:
-    """Run `LSS` on an objective.
-
-    Args:
-        objective: what is evaluated.
-        score: function that is reported; nothing is searched.
-
-    Returns:
-        One trial, since the method has no random choices.
-
-    Raises:
-        ValueError: pressures or scores that are not finite.
-    """
+    """Run `LSS` on an objective, with a `score` to report; see `run`."""
     return run(LSS(), objective, score=score)
 
 
@@ -140,31 +125,17 @@ def lssg(
     passes: int = 1,
     score: Score = weakest_focus,
 ) -> Solution:
-    """Run `LSSG` on an objective.
-
-    Args:
-        objective: what is evaluated.
-        levels: number of offsets in [0, 2 pi), >= 2.
-        order: of the foci: "given" as the control points are, or all their indices.
-        passes: >= 1.
-        score: function that is maximised.
-
-    Returns:
-        One trial, since the method has no random choices.
-
-    Raises:
-        ValueError: an argument out of range, or pressures or scores that are not finite.
-    """
+    """Run `LSSG` with these settings on an objective: one trial; see `LSSG` and `run`."""
     return run(LSSG(levels, order, passes), objective, score=score)
 
 
-def _require_scene(problem: Problem) -> None:
+def _scene(problem: Problem) -> Scene:
     if problem.scene is None:
         raise invalid("problem.scene", None, "must be a scene: the phases of the foci need its geometry")
+    return problem.scene
 
 
 def _focus_drives(problem: Problem) -> torch.Tensor:
     """Return the drives that aim at each focus in free space (P, M)."""
-    scene = problem.scene
-    assert scene is not None
+    scene = _scene(problem)
     return drive_from_phases(focus_phases(scene.array.positions, scene.control_points, scene.wavenumber))

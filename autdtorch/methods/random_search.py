@@ -62,9 +62,8 @@ class RandomSearch(Method):
 
     def _drawn(self, generators: Sequence[torch.Generator], transducers: int, done: int) -> Step:
         size = min(_AT_ONCE, self.evaluations - done), transducers
-        turns = torch.stack(
-            [torch.rand(size, dtype=torch.float64, generator=own, device="cpu") for own in generators]
-        )
+        drawn = [torch.rand(size, dtype=torch.float64, generator=own, device="cpu") for own in generators]
+        turns = torch.stack(drawn)
         if self.levels is not None:
             turns = (self.levels * turns).floor() / self.levels
         return Step(drive_from_phases(2 * math.pi * turns), {"generators": states_of(generators)})
@@ -78,20 +77,5 @@ def random_search(
     seed: int = 0,
     score: Score = weakest_focus,
 ) -> Solution:
-    """Run `RandomSearch` on an objective.
-
-    Args:
-        objective: what is evaluated.
-        evaluations: number of evaluations of a trial, >= 1.
-        levels: number of phases in [0, 2 pi) to draw from, >= 2; None for any phase.
-        trials: number of trials T, >= 1, or their numbers.
-        seed: of the phases, >= 0.
-        score: function that is maximised.
-
-    Returns:
-        The best drive observed in each trial.
-
-    Raises:
-        ValueError: an argument out of range, or pressures or scores that are not finite.
-    """
+    """Run `RandomSearch` with these settings on an objective; see `RandomSearch` and `run`."""
     return run(RandomSearch(evaluations, levels), objective, trials, seed, score=score)

@@ -6,7 +6,6 @@ import dataclasses
 import io
 import json
 import os
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from autdtorch.utils.numpy_file import read_arrays
 from autdtorch.utils.validation import path_of, require_kind
 
 _BEST, _SEARCH, _ORIGIN = "best.", "search.", "origin"
+_COLUMNS = tuple(field.name for field in dataclasses.fields(Solution))
 
 
 def save_state(path: str | os.PathLike[str], method: Method, state: State) -> None:
@@ -35,7 +35,7 @@ def save_state(path: str | os.PathLike[str], method: Method, state: State) -> No
     require_kind("method", method, Method)
     require_kind("state", state, State)
     tensors = {"trials": state.trials, "drives": state.drives}
-    tensors |= {f"{_BEST}{field.name}": getattr(state.best, field.name) for field in _columns()}
+    tensors |= {f"{_BEST}{name}": getattr(state.best, name) for name in _COLUMNS}
     tensors |= {f"{_SEARCH}{name}": tensor for name, tensor in state.search.items()}
     arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in tensors.items()}
     arrays[_ORIGIN] = np.array(_origin(method, state.problem))
@@ -64,20 +64,15 @@ def load_state(path: str | os.PathLike[str], method: Method, problem: Problem) -
         raise ValueError(f"{os.fspath(path)}: state of {found or 'nothing'}; must be of {origin}")
     try:
         tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
-        best = Solution(**{field.name: tensors[f"{_BEST}{field.name}"] for field in _columns()})
-        state = State(problem, tensors["trials"], tensors["drives"], _parts(tensors, _SEARCH), best)
+        best = Solution(**{name: tensors[f"{_BEST}{name}"] for name in _COLUMNS})
+        search = {
+            name.removeprefix(_SEARCH): tensor for name, tensor in tensors.items() if name.startswith(_SEARCH)
+        }
+        state = State(problem, tensors["trials"], tensors["drives"], search, best)
         _require_consistent(state)
     except (KeyError, TypeError, IndexError, ValueError) as error:
         raise ValueError(f"{os.fspath(path)}: {error}; must be a file of save_state") from error
     return state
-
-
-def _columns() -> tuple[dataclasses.Field[Any], ...]:
-    return dataclasses.fields(Solution)
-
-
-def _parts(tensors: Mapping[str, torch.Tensor], start: str) -> dict[str, torch.Tensor]:
-    return {name.removeprefix(start): value for name, value in tensors.items() if name.startswith(start)}
 
 
 def _origin(method: Method, problem: Problem) -> str:
@@ -87,11 +82,7 @@ def _origin(method: Method, problem: Problem) -> str:
 
 
 def _require_consistent(state: State) -> None:
-    """Check the shapes and types of what all methods share.
-
-    Raises:
-        ValueError: another shape or type.
-    """
+    """Check the shapes and types of what all methods share."""
     count, transducers, foci = len(state.best.score), state.problem.transducers, state.problem.foci
     evaluations = state.best.history.shape[-1]
     wanted = {

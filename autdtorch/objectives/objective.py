@@ -41,21 +41,13 @@ class Objective(Protocol):
 
 
 def require_objective(objective: Objective) -> None:
-    """Check that `objective` is an objective of a scene.
-
-    Raises:
-        ValueError: it is none.
-    """
+    """Check that `objective` is an objective of a scene."""
     require_kind("objective", objective, Objective)
     require_kind("objective.scene", objective.scene, Scene)
 
 
 def validate_drives(drive: torch.Tensor, transducers: int) -> torch.Tensor:
-    """Check drives (B, M), and return them as complex128 on the CPU, without gradient.
-
-    Raises:
-        ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-    """
+    """Check drives (B, M), B >= 1, and return them as complex128 on the CPU, without gradient."""
     drive = validate_drive(drive, transducers).detach().cpu()
     if drive.ndim != 2 or len(drive) == 0:
         raise ValueError(f"drive: shape {tuple(drive.shape)}; must be (B, {transducers}) with B >= 1")
@@ -63,16 +55,7 @@ def validate_drives(drive: torch.Tensor, transducers: int) -> torch.Tensor:
 
 
 def validate_magnitudes(name: str, value: object, points: int) -> torch.Tensor:
-    """Return observed magnitudes (P,) [Pa], float64, after checking them.
-
-    Args:
-        name: of the field, for messages.
-        value: observed magnitudes.
-        points: number of control points P.
-
-    Raises:
-        ValueError: not P finite real numbers >= 0.
-    """
+    """Return observed magnitudes (P,) [Pa] of `points` control points as float64, after checking them."""
     pressure = real_tensor(name, value, "Pa")
     if pressure.shape != (points,) or pressure.min() < 0:
         raise invalid(name, value, f"must be {points} numbers >= 0", "Pa")

@@ -59,11 +59,7 @@ class Perturbation:
     evaluations: int
 
     def __init__(self, objective: Objective) -> None:
-        """Wrap an objective.
-
-        Raises:
-            ValueError: no objective.
-        """
+        """Wrap an objective."""
         require_objective(objective)
         self.inner = objective
         self.scene = objective.scene
@@ -74,30 +70,18 @@ class Perturbation:
         return f"{type(self).__name__}({self.inner!r}, {self.evaluations} evaluations)"
 
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
-        """Observe drives (B, M), perturbed: pressure magnitudes (B, P) [Pa].
-
-        Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-        """
+        """Observe drives (B, M), perturbed: pressure magnitudes (B, P) [Pa]."""
         drive = validate_drives(drive, len(self.scene.array))
         pressure = self._observe(drive)
         self.evaluations += len(drive)
         return pressure
 
     def quantised(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return drives (..., M) as far as their perturbation is known beforehand; a `Solution` holds them.
-
-        Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-        """
+        """Return drives (..., M) perturbed as far as is known beforehand; a `Solution` holds them."""
         return validate_drive(drive, len(self.scene.array))
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return the drives (B, M) that `inner` is given for drives (B, M), at present.
-
-        Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-        """
+        """Return the drives (B, M) that `inner` is given for drives (B, M), at present."""
         return self.quantised(drive)
 
     def _observe(self, drive: torch.Tensor) -> torch.Tensor:
@@ -127,11 +111,7 @@ class Quantised(Perturbation):
         self.on_off = boolean("on_off", on_off)
 
     def quantised(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return the nearest drives (..., M) that the device can play.
-
-        Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-        """
+        """Return the nearest drives (..., M) that the device can play."""
         levels = PhaseLevels(self.levels, 1 if self.on_off else None)
         return levels.drive(*levels.nearest(super().quantised(drive)))
 
@@ -155,11 +135,7 @@ class FailedTransducers(Perturbation):
         self._alive[indices("transducers", transducers, count)] = 0
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return `drive` (B, M) without the failed transducers.
-
-        Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-        """
+        """Return `drive` (B, M) without the failed transducers."""
         return super().emitted(drive) * self._alive
 
 
@@ -186,11 +162,7 @@ class Drift(Perturbation):
             ValueError: an argument out of range.
         """
         super().__init__(objective)
-        rms = (
-            not_negative("phase", phase, "rad"),
-            not_negative("loss", loss),
-            not_negative("sensor", sensor),
-        )
+        rms = not_negative("phase", phase, "rad"), not_negative("loss", loss), not_negative("sensor", sensor)
         transducers = len(self.scene.array)
         steps = np.repeat(rms, (transducers, transducers, 1)) / math.sqrt(_PER)
         self._generator = _generator(seed, "Drift")
@@ -198,11 +170,7 @@ class Drift(Perturbation):
         self._walk = torch.zeros_like(self._steps)
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return `drive` (B, M) with the drift after the evaluations so far.
-
-        Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
-        """
+        """Return `drive` (B, M) with the drift after the evaluations so far."""
         return super().emitted(drive) * self._factors(self._walk)[0]
 
     def _observe(self, drive: torch.Tensor) -> torch.Tensor:

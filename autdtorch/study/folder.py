@@ -61,9 +61,6 @@ class StudyFolder:
         """Set aside damaged files and those of another study, and open the file of trials.
 
         Nothing is written before: a study that is refused leaves the folder as it was.
-
-        Raises:
-            OSError: the folder cannot be read or written.
         """
         if self.path is None:
             return
@@ -112,11 +109,7 @@ class StudyFolder:
         return None if self.path is None else self.path / MATRICES_FOLDER
 
     def save(self, name: str, scene: SceneResult, order: Mapping[str, object]) -> None:
-        """Save a finished scene; `order` holds the names of all scenes in their order.
-
-        Raises:
-            OSError: the folder cannot be written.
-        """
+        """Save a finished scene; `order` holds the names of all scenes in their order."""
         self.scenes[name] = scene
         self.scenes = {other: self.scenes[other] for other in order if other in self.scenes}
         if self.path is not None:
@@ -127,17 +120,9 @@ class StudyFolder:
 def open_folder(
     folder: str | os.PathLike[str] | None, provenance: Provenance, scenes: Mapping[str, Scene], reuse: bool
 ) -> Iterator[StudyFolder]:
-    """Lock the folder of a study, which is made if it is missing.
+    """Lock the folder of a study, which is made if it is missing; None keeps the study in memory alone.
 
-    Args:
-        folder: None to keep the study in memory alone.
-        provenance: of the study.
-        scenes: of the study, by name.
-        reuse: whether files of the same origin are used again.
-
-    Raises:
-        ValueError: another process writes into the folder.
-        OSError: the folder cannot be made, read or written.
+    With `reuse`, files of the same origin are used again.
     """
     if folder is None:
         yield StudyFolder(None, provenance, scenes, reuse)

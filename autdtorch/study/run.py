@@ -252,9 +252,8 @@ def _run_scene(
         for method_name, (solution, seconds) in found.items()
     }
     simulation = _simulation(propagator, matrix_seconds, plane_seconds)
-    return SceneResult(
-        len(scene.obstacles), transfer_matrix, focus_bound(transfer_matrix), simulation, results
-    )
+    bound = focus_bound(transfer_matrix)
+    return SceneResult(len(scene.obstacles), transfer_matrix, bound, simulation, results)
 
 
 def _run_trials(
@@ -291,9 +290,8 @@ def _plane_points(scene: Scene, spacing: float) -> torch.Tensor | None:
     if plane is None:
         return None
     if spacing > min(plane.size):
-        raise invalid(
-            "plane_spacing", spacing, f"must be at most {min(plane.size):g} m, the plane's edge", "m"
-        )
+        accepted = f"must be at most {min(plane.size):g} m, the plane's edge"
+        raise invalid("plane_spacing", spacing, accepted, "m")
     count = math.prod(max(1, round(length / spacing)) for length in plane.size)
     if count > _MOST_SAMPLES:
         accepted = f"gives {count} samples of the observation plane, must be at most {_MOST_SAMPLES}"
@@ -331,9 +329,8 @@ def _method_result(
 
 def _simulation(propagator: Propagator, matrix_seconds: float, plane_seconds: float) -> Simulation:
     wavelength = propagator.scene.wavelength
-    if isinstance(propagator, SimulatedPropagator):
-        spacing, tolerance, runs = propagator.spacing, propagator.tolerance, tuple(propagator.runs)
-        return Simulation(
-            propagator.method, wavelength, spacing, tolerance, runs, matrix_seconds, plane_seconds
-        )
-    return Simulation("free_space", wavelength, None, None, (), matrix_seconds, plane_seconds)
+    seconds = matrix_seconds, plane_seconds
+    if not isinstance(propagator, SimulatedPropagator):
+        return Simulation("free_space", wavelength, None, None, (), *seconds)
+    settings = propagator.spacing, propagator.tolerance
+    return Simulation(propagator.method, wavelength, *settings, tuple(propagator.runs), *seconds)

@@ -35,14 +35,7 @@ class TrialFile:
     def __init__(self, path: Path | None, origin: str, seed: int, shapes: Shapes) -> None:
         """Read the trials of the study from the file, which is not changed before `mend`.
 
-        Args:
-            path: of the file; None to keep the trials in memory alone.
-            origin: of the study; part of the checksum of its lines.
-            seed: of the study, for the rows.
-            shapes: of its scenes.
-
-        Raises:
-            OSError: the file cannot be read.
+        Without a path the trials are kept in memory alone. The origin is part of the checksum of the lines.
         """
         self._seed = seed
         self._shapes = shapes
@@ -54,11 +47,7 @@ class TrialFile:
         return len(self._trials)
 
     def mend(self) -> None:
-        """Set aside lines that are damaged or of another study; call it before the first `append`.
-
-        Raises:
-            OSError: a file cannot be written.
-        """
+        """Set aside lines that are damaged or of another study; call it before the first `append`."""
         if self._lines is not None:
             self._lines.mend()
 
@@ -69,16 +58,7 @@ class TrialFile:
     def append(self, scene: str, method: str, trials: Sequence[int], found: Solution, seconds: float) -> None:
         """Add the trials of a block; those that the file holds already stay as they are.
 
-        Args:
-            scene: name.
-            method: name.
-            trials: their numbers (T,).
-            found: their solution.
-            seconds: wall time of the block [s]; each trial is given an equal share.
-
-        Raises:
-            ValueError: the file has changed meanwhile.
-            OSError: the file cannot be written.
+        Each trial is given an equal share of the wall time `seconds` [s] of the block.
         """
         share = seconds / len(trials)
         added = [trial for trial in trials if (scene, method, trial) not in self._trials]

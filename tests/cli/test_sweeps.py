@@ -70,7 +70,7 @@ def test_where_a_job_fails_the_others_go_on(run, tmp_path, capsys):
     (folder,) = jobs(tmp_path)
     assert folder.startswith("method.levels=4,")
     errors = capsys.readouterr().err.splitlines()
-    assert "job 0 failed: method gabs: levels: 1; must be an integer >= 2" in errors[-1]
+    assert "job 0 failed: method: levels: 1; must be an integer >= 2" in errors[-1]
 
 
 def test_the_folder_of_a_job_has_a_name_that_every_file_system_takes(run, tmp_path):
