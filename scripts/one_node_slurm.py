@@ -59,8 +59,9 @@ PartitionName=cpu Nodes={host} Default=YES
 def main() -> None:
     """Run the command in the arguments."""
     command = sys.argv[1:]
-    if not command:
-        sys.exit(__doc__)
+    if command in ([], ["-h"], ["--help"]):
+        print(__doc__)
+        sys.exit(0 if command else 2)
     signal.signal(signal.SIGINT, lambda *_: None)  # Ctrl-C is for the command alone
     try:
         if missing_programs():
