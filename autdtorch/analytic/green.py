@@ -9,7 +9,14 @@ import torch
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.neighbours import distances
-from autdtorch.utils.validation import LENGTH_TOLERANCE, ArrayLike, not_negative, points_tensor, positive
+from autdtorch.utils.validation import (
+    LENGTH_TOLERANCE,
+    ArrayLike,
+    invalid,
+    not_negative,
+    points_tensor,
+    positive,
+)
 
 PAIR_BYTES = 80.0
 """Memory for each entry of a transfer matrix while it is computed [bytes]."""
@@ -35,10 +42,8 @@ def green(points: ArrayLike, sources: ArrayLike, wavenumber: complex) -> torch.T
     r = distances(targets, origins)
     if r.min() < LENGTH_TOLERANCE:
         point, source = divmod(int(r.argmin()), len(origins))
-        raise ValueError(
-            f"points[{point}]: {tuple(targets[point].tolist())} m; lies on source {source}, "
-            f"must be at least {LENGTH_TOLERANCE:g} m away"
-        )
+        accepted = f"lies on source {source}, must be at least {LENGTH_TOLERANCE:g} m away"
+        raise invalid(f"points[{point}]", tuple(targets[point].tolist()), accepted, "m")
     return torch.polar(torch.exp(-alpha * r) / (4 * math.pi * r), k * r)
 
 

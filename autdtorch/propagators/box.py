@@ -1,4 +1,10 @@
-"""FDTD of the scattered field in boxes around the obstacles; the field elsewhere is exact."""
+"""FDTD of the scattered field in boxes around the obstacles; the field elsewhere is exact.
+
+Several boxes are coupled by a multiple-scattering iteration. In each pass every box is simulated, driven by
+the field that the others radiated in the pass before. A pass adds one scattering order. The sums follow
+x_(n+1) = T x_n + b like the phasors of a run, and are extrapolated in the same way; weakly coupled boxes need
+three or four passes. Later passes contribute little, and are simulated to looser tolerances.
+"""
 
 from __future__ import annotations
 
@@ -9,21 +15,34 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 
+import numpy as np
 import torch
 
 from autdtorch.fdtd.grid import make_box
-from autdtorch.fdtd.scattered_field import ScatteredField
-from autdtorch.fdtd.steady_state import SteadyState, run_to_steady_state
+from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
+from autdtorch.fdtd.steady_state import Extrapolation, SteadyState, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble_on
-from autdtorch.propagators.coupling import Observe, coupled_runs
+from autdtorch.propagators.grids import MOST_PASSES
 from autdtorch.propagators.plan import MOST_JUDGED
-from autdtorch.propagators.simulation import Run, Simulation
+from autdtorch.propagators.simulation import Run, Simulation, Stepped
 from autdtorch.scene.arrays import Nodes
 from autdtorch.utils.neighbours import nearest
 from autdtorch.utils.threads import one_torch_thread, spread
 from autdtorch.utils.validation import LENGTH_TOLERANCE, ArrayLike, invalid, points_tensor
 
 logger = logging.getLogger(__name__)
+
+_LOOSEST = 0.1
+"""Largest tolerance of a run, relative to its pass."""
+
+_CAUTION = 2.0
+"""Safety factor: neglected scattering orders are estimated as this many times the next one."""
+
+Observe = Callable[[torch.Tensor], torch.Tensor]
+"""Computes the quantity that must converge from phasors of cells."""
+
+Simulate = Callable[[int, torch.Tensor, float, Observe], SteadyState]
+"""Simulates a box, given its index, the incident field (n,), the tolerance and the observed quantity."""
 
 
 class BoxSimulation(Simulation):
@@ -39,15 +58,12 @@ class BoxSimulation(Simulation):
         """The assembled boxes."""
         plan = self.plan
         plan.require_feasible()
-        bodies = plan.region.bodies
-        parts = [
-            replace(plan.region, bodies=tuple(bodies[one] for one in group)) for group in plan.grouping.groups
-        ]
-        grids = [make_box(part, plan.spacing) for part in parts]
-        return [
-            ScatteredField(assemble_on(grid, part, plan.dtype, plan.time_step), plan.scene.complex_wavenumber)
-            for grid, part in zip(grids, parts, strict=True)
-        ]
+        boxes = []
+        for group in plan.grouping.groups:
+            part = replace(plan.region, bodies=tuple(plan.region.bodies[one] for one in group))
+            assembly = assemble_on(make_box(part, plan.spacing), part, plan.dtype, plan.time_step)
+            boxes.append(ScatteredField(assembly, plan.scene.complex_wavenumber))
+        return boxes
 
     @property
     def assemblies(self) -> Sequence[Assembly]:
@@ -74,22 +90,13 @@ class BoxSimulation(Simulation):
 
     @torch.no_grad()
     def _simulate(
-        self,
-        sources: Sequence[Nodes],
-        strength: torch.Tensor,
-        receivers: Nodes,
-        stepped: Callable[[int], None],
+        self, sources: Sequence[Nodes], strength: torch.Tensor, receivers: Nodes, stepped: Stepped
     ) -> tuple[torch.Tensor, list[Run]]:
         boxes, plan, points = self.boxes, self.plan, receivers.positions
         drives = list(zip(sources, strength, strict=True))
         weights = receivers.weights.to(torch.complex128)
-        incident = torch.stack(
-            [
-                boxes[0].incident(points.reshape(-1, 3), *nodes, own).reshape(points.shape[:-1]) @ weights
-                for nodes, own in drives
-            ],
-            dim=1,
-        )
+        fields = [boxes[0].incident(points.reshape(-1, 3), *nodes, own) for nodes, own in drives]
+        incident = torch.stack([field.reshape(points.shape[:-1]) @ weights for field in fields], dim=1)
         transforms = [box.near_to_far(*receivers) for box in boxes]
         every = math.ceil(len(points) / MOST_JUDGED)
         matrix = torch.cat([transform.matrix(every) for transform in transforms], dim=1)
@@ -134,3 +141,78 @@ class BoxSimulation(Simulation):
             silent = torch.where(obstacle.contains(points).any(dim=1), obstacle.rigid, silent)
         total = incident + sum(scattered)
         return total.mT.masked_fill(silent, 0), list(map(Run.of, steady, seconds))
+
+
+def coupled_runs(
+    boxes: Sequence[ScatteredField],
+    transforms: Sequence[NearToFar],
+    driving: Sequence[torch.Tensor],
+    pressure: Observe,
+    simulate: Simulate,
+    tolerance: float,
+) -> list[tuple[SteadyState, float]] | None:
+    """Iterate between boxes until the pressure at the receivers has converged.
+
+    Args:
+        boxes: boxes whose interiors do not overlap.
+        transforms: near-to-far-field transform of each box to the receivers.
+        driving: incident field (n, R) of R runs, where it drives each box.
+        pressure: computes the pressure (P, R) at the receivers from the phasors (k, R) of all boxes' cells.
+        simulate: simulates one box.
+        tolerance: relative; half of it is for the runs and half for the iteration.
+
+    Returns:
+        Phasors of all boxes' cells and seconds for each of R runs; None without convergence in `MOST_PASSES`.
+    """
+    begin = time.perf_counter()
+    runs = driving[0].shape[1]
+    largest = torch.stack([field.norm(dim=0) for field in driving]).amax(dim=0)
+    sums = torch.zeros((), dtype=torch.complex128, device="cpu")
+    sequences = [Extrapolation(MOST_PASSES) for _ in range(runs)]
+    periods, reached = np.zeros(runs, np.int64), np.ones(runs, bool)
+    cells = sum(len(transform.cells) for transform in transforms)
+    value, size = pressure(driving[0].new_zeros((cells, runs))), None
+    left = torch.zeros(runs, dtype=torch.float64, device="cpu")
+    for number in range(1, MOST_PASSES + 1):
+        parts = []
+        own = tolerance / 2 ** (number + 1)  # half the tolerance in all passes
+        unsettled = torch.zeros((len(boxes), runs), dtype=torch.float64, device="cpu")
+        for index, field in enumerate(driving):
+            share = field.norm(dim=0) / largest
+            loose = (own / share).clamp(max=_LOOSEST).tolist()
+            observe = transforms[index].amplitudes
+            pairs = zip(field.mT, loose, strict=True)
+            steady = [simulate(index, column, each, observe) for column, each in pairs]
+            parts.append(torch.stack([each.pressure for each in steady], dim=1))
+            periods += [each.periods for each in steady]
+            reached &= [each.converged for each in steady]
+            remaining = [each.residual for each in steady]
+            unsettled[index] = share * torch.tensor(remaining, dtype=torch.float64, device="cpu")
+        left += unsettled.amax(dim=0)
+        sums = sums + torch.cat(parts)
+        for sequence, column in zip(sequences, sums.mT.numpy(), strict=True):
+            sequence.append(column)
+        phasors = torch.from_numpy(np.stack([sequence.limit() for sequence in sequences], axis=1))
+        amplitudes = [transform.amplitudes(part) for transform, part in zip(transforms, parts, strict=True)]
+        before, value = value, pressure(phasors)
+        smaller, size = size, torch.cat(amplitudes).norm(dim=0)
+        change = (value - before).norm(dim=0) / value.norm(dim=0).clamp(min=torch.finfo(torch.float64).tiny)
+        if smaller is not None:
+            remaining = _CAUTION * change * (size / smaller).clamp(max=1)
+            if (remaining <= tolerance / 2).all():
+                seconds = (time.perf_counter() - begin) / runs
+                logger.debug("%d boxes, %d passes of multiple scattering", len(boxes), number)
+                return [
+                    (SteadyState(column, int(count), float(distance), bool(every)), seconds)
+                    for column, count, distance, every in zip(
+                        phasors.mT, periods, left + remaining, reached, strict=True
+                    )
+                ]
+        radiating = list(zip(boxes, amplitudes, strict=True))
+        driving = [
+            torch.stack([box.radiated(part, own.driven) for box, part in radiating if box is not own]).sum(
+                dim=0
+            )
+            for own in boxes
+        ]
+    return None

@@ -21,18 +21,10 @@ SUFFIX = ".matrix"
 
 
 class DiskCache:
-    """A folder of complex matrices, each with one number, under their digests.
-
-    Attributes:
-        folder: the folder.
-    """
+    """A folder of complex matrices, each with one number, under their digests."""
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
-        """Make the folder if it is missing.
-
-        Raises:
-            OSError: the folder cannot be made.
-        """
+        """Make the folder if it is missing."""
         self.folder = Path(folder)
         self.folder.mkdir(parents=True, exist_ok=True)
 

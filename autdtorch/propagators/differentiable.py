@@ -7,18 +7,12 @@ import math
 import torch
 
 from autdtorch.fdtd.adjoint import recorded
-from autdtorch.fdtd.grid import Grid, make_grid, require_fine, warn_if_coarse
+from autdtorch.fdtd.grid import make_grid, require_fine, warn_if_coarse
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources
-from autdtorch.fdtd.material_gradients import (
-    DifferentiableCells,
-    cells_of_maps,
-    cells_of_obstacles,
-    domain_cells,
-)
-from autdtorch.fdtd.region import Region
+from autdtorch.fdtd.material_gradients import cells_of_maps, cells_of_obstacles, domain_cells
 from autdtorch.fdtd.steady_state import block_of, fewest_periods
 from autdtorch.fdtd.stepping import Assembly, drive_dft, drive_signal
-from autdtorch.propagators.backend import available_kernel, make_kernel, precision_of
+from autdtorch.propagators.plan import available_kernel, make_kernel, precision_of
 from autdtorch.propagators.scene_region import region_of, warn_of_ending_walls
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene, require_inside
@@ -90,9 +84,9 @@ def differentiable_field(
     if periods is None:
         periods = fewest_periods(grid.diagonal / grid.wavelength)
     periods = integer_at_least("periods", periods, 1)
-    if time_step is not None:
-        time_step = positive("time_step", time_step, "s")
-    cells = _cells(region, grid, *given)
+    time_step = None if time_step is None else positive("time_step", time_step, "s")
+    by_maps = any(one is not None and one.ndim == 3 for one in given)
+    cells = (cells_of_maps if by_maps else cells_of_obstacles)(region, grid, *given)
     assembly = cells.assembly(grid, region, precision, time_step)
     receivers, nodes, stepper = assembly.receivers(targets), scene.array.nodes, make_kernel(kernel)
     fields = [torch.zeros((0, len(targets)), dtype=torch.complex128, device="cpu")]
@@ -116,11 +110,9 @@ def cell_centers(scene: Scene, spacing: float = 1e-3) -> torch.Tensor:
     require_kind("scene", scene, Scene)
     region = region_of(scene)
     grid = make_grid(region, positive("spacing", spacing, "m"))
-    axes = [
-        torch.from_numpy(axis[part])
-        for axis, part in zip(grid.centers, domain_cells(region, grid), strict=True)
-    ]
-    return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
+    inside = zip(grid.centers, domain_cells(region, grid), strict=True)
+    axes = torch.meshgrid(*(torch.from_numpy(axis[part]) for axis, part in inside), indexing="ij")
+    return torch.stack(axes, dim=-1)
 
 
 def _material(name: str, given: ArrayLike | None, scene: Scene) -> torch.Tensor | None:
@@ -143,14 +135,6 @@ def _slowest(scene: Scene, sound_speed: torch.Tensor | None) -> dict[str, float]
     rigid = torch.tensor([obstacle.rigid for obstacle in scene.obstacles], dtype=torch.bool, device="cpu")
     speeds = sound_speed.detach() if sound_speed.ndim == 3 else sound_speed.detach()[~rigid]
     return {"the medium given": float(speeds.min())} if speeds.numel() else {}
-
-
-def _cells(
-    region: Region, grid: Grid, density: torch.Tensor | None, sound_speed: torch.Tensor | None
-) -> DifferentiableCells:
-    if any(given is not None and given.ndim == 3 for given in (density, sound_speed)):
-        return cells_of_maps(region, grid, density, sound_speed)
-    return cells_of_obstacles(region, grid, density, sound_speed)
 
 
 def _phasors(

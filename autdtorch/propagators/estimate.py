@@ -13,10 +13,9 @@ from autdtorch.fdtd.grid import domain_extent
 from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.spacing import pilot_spacing
 from autdtorch.fdtd.stepping import assemble, drive_signal
-from autdtorch.propagators.backend import make_kernel
 from autdtorch.propagators.execute import simulation_of
 from autdtorch.propagators.grids import grid_cost
-from autdtorch.propagators.plan import plan
+from autdtorch.propagators.plan import make_kernel, plan
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.memory import available_memory
 from autdtorch.utils.validation import positive
@@ -54,10 +53,8 @@ class Estimate:
     def __repr__(self) -> str:
         """Return all values with units."""
         grid = "" if self.spacing is None else f" at {1e3 * self.spacing:.4g} mm, {self.cells:,} cells"
-        return (
-            f"Estimate({self.method}{grid}, {self.runs} runs, {self.memory / 1e6:,.0f} MB, "
-            f"{self.seconds:.2g} s)"
-        )
+        cost = f"{self.runs} runs, {self.memory / 1e6:,.0f} MB, {self.seconds:.2g} s"
+        return f"Estimate({self.method}{grid}, {cost})"
 
 
 def estimate(
@@ -79,12 +76,9 @@ def estimate(
         scene: the scene.
         spacing: edge of a cell [m].
         tolerance: relative distance to the steady state, in (0, 1).
-        method: as in `make_propagator`.
-        kernel: as in `make_propagator`.
-        dtype: as in `make_propagator`.
-
-    Returns:
-        Cells, runs, memory and time.
+        method: as in `make_propagator`, as are `kernel` and `dtype`.
+        kernel: the kernel.
+        dtype: precision of the fields.
 
     Raises:
         ValueError: an argument is out of range.
@@ -110,8 +104,7 @@ def _rate(kernel: str, dtype: torch.dtype, cells: int) -> float:
     """Return the steps of a cell in a second, timed on a box of air with about this many cells."""
     half = _AIR_SPACING * max(1, round(cells ** (1 / 3)) - 2 * _AIR_RIM) / 2
     place = torch.zeros((1, 3), dtype=torch.float64, device="cpu")
-    domain = (-half,) * 3, (half,) * 3
-    region = Region(Fluid(1.2, 340.0), 0.0, 40e3, (), domain, place.numpy())
+    region = Region(Fluid(1.2, 340.0), 0.0, 40e3, (), ((-half,) * 3, (half,) * 3), place.numpy())
     assembly, stepper = assemble(region, _AIR_SPACING, dtype), make_kernel(kernel)
     sources = assembly.sources(place, torch.ones(1, dtype=torch.complex128, device="cpu"))
     receivers, state = assembly.receivers(place + half / 2), assembly.silence(sources)

@@ -35,16 +35,9 @@ def execute(
     cache: DiskCache | None = None,
     simulation: Simulation | None = None,
 ) -> TransferMatrix:
-    """Return the transfer matrix of a plan with grids.
+    """Return the transfer matrix of a plan with grids at points (P, 3) [m], simulated or from the cache.
 
-    Args:
-        plan: the plan.
-        points: (P, 3) [m]; by default the scene's control points.
-        cache: holds transfer matrices of earlier executions; a matrix that has converged is added.
-        simulation: of the plan; by default one is made.
-
-    Raises:
-        ValueError: the grids need more memory than available, or the time step is not stable.
+    The points are by default the control points. A matrix that has converged is added to the cache.
     """
     points = plan.scene.control_points if points is None else points
     simulation = simulation_of(plan) if simulation is None else simulation

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -13,7 +13,7 @@ import torch
 from autdtorch.fdtd.steady_state import run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble
 from autdtorch.propagators.plan import MOST_JUDGED
-from autdtorch.propagators.simulation import Run, Simulation
+from autdtorch.propagators.simulation import Run, Simulation, Stepped
 from autdtorch.scene.arrays import Nodes
 from autdtorch.scene.scene import require_inside
 from autdtorch.utils.threads import one_torch_thread
@@ -43,11 +43,7 @@ class DomainSimulation(Simulation):
 
     @torch.no_grad()
     def _simulate(
-        self,
-        sources: Sequence[Nodes],
-        strength: torch.Tensor,
-        receivers: Nodes,
-        stepped: Callable[[int], None],
+        self, sources: Sequence[Nodes], strength: torch.Tensor, receivers: Nodes, stepped: Stepped
     ) -> tuple[torch.Tensor, list[Run]]:
         (assembly,), plan = self.assemblies, self.plan
         points = assembly.interpolation(receivers.positions, receivers.weights)
@@ -56,11 +52,10 @@ class DomainSimulation(Simulation):
         some = read[:: math.ceil(len(receivers.positions) / MOST_JUDGED)]
         rows, runs = [], []
         for nodes, own in zip(sources, strength, strict=True):
-            begin = time.perf_counter()
+            begin, forces = time.perf_counter(), assembly.sources(nodes.positions, own, nodes.weights)
             steady = run_to_steady_state(
-                assembly, self._kernel, assembly.sources(nodes.positions, own, nodes.weights), cells,
-                plan.tolerance, plan.max_periods, lambda phasor: torch.from_numpy(some @ phasor.numpy()),
-                stepped,
+                assembly, self._kernel, forces, cells, plan.tolerance, plan.max_periods,
+                lambda phasor: torch.from_numpy(some @ phasor.numpy()), stepped,
             )  # fmt: skip
             runs.append(Run.of(steady, time.perf_counter() - begin))
             rows.append(torch.from_numpy(read @ steady.pressure.numpy()))

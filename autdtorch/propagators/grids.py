@@ -128,15 +128,7 @@ class Grouping:
 def choose_grids(
     region: Region, method: str, spacing: float, tolerance: float, runs: int
 ) -> tuple[str, Grouping]:
-    """Return "box" or "full" and its grids; for "auto" the cheapest that is accurate for the region.
-
-    Args:
-        region: the region.
-        method: "box", "full" or "auto".
-        spacing: edge of a cell [m].
-        tolerance: relative tolerance of the multiple-scattering iteration.
-        runs: number of simulations.
-    """
+    """Return "box" or "full" and its grids; for "auto" the cheapest that is accurate for the region."""
     if method == "box":
         return method, cheapest_boxes(region, spacing, tolerance, runs)
     domain = _one_grid(region, domain_extent(region, spacing), spacing)

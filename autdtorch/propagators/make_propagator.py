@@ -71,10 +71,7 @@ def make_propagator(
         ValueError: an argument is out of range, the kernel needs a package that is not installed, or the
             simulation needs more memory than available.
     """
-    planned = plan(
-        scene, method, spacing, tolerance,
-        kernel=kernel, dtype=dtype, max_periods=max_periods, time_step=time_step,
-    )  # fmt: skip
+    planned = plan(scene, method, spacing, tolerance, kernel, dtype, max_periods, time_step)
     disk_cache = _disk_cache(cache)
     if planned.method == "free_space":
         return FreeSpacePropagator(scene)
@@ -94,9 +91,8 @@ def _at_chosen_spacing(pilot: Plan, cache: DiskCache | None) -> Plan:
     tolerance = pilot.tolerance / 2
     first = pilot.at(pilot.spacing, max(tolerance, 1e-3))
     second = first.second
-    result = execute(first, cache=cache)
-    result = with_grid_error(result, execute(second, cache=cache), second.spacing > first.spacing)
-    error = result.error
+    results = execute(first, cache=cache), execute(second, cache=cache)
+    error = with_grid_error(*results, second.spacing > first.spacing).error
     if not math.isfinite(error):
         accepted = f"too few to choose a spacing: at {pilot.spacing:.3g} m no run came near its steady state"
         raise invalid("max_periods", pilot.max_periods, accepted)

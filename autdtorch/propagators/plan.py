@@ -6,27 +6,31 @@ import logging
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib.util import find_spec
 from typing import Self
 
+import numpy as np
 import torch
 
 from autdtorch.analytic.green import PAIR_BYTES
-from autdtorch.fdtd.grid import MAX_CELLS, require_spacing
+from autdtorch.fdtd.grid import MAX_CELLS, layer_cells, require_spacing
 from autdtorch.fdtd.interpolation import interpolation_width
+from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.spacing import pilot_spacing, second_spacing
 from autdtorch.fdtd.steady_state import phasors_kept
-from autdtorch.propagators.backend import available_kernel, make_kernel, precision_of
 from autdtorch.propagators.grids import USUAL_PERIODS, Grouping, choose_grids, one_box
-from autdtorch.propagators.heterogeneity import Heterogeneity, heterogeneity
 from autdtorch.propagators.scene_region import region_of
+from autdtorch.scene.obstacles import Mesh
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.array_types import Array
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.validation import integer_at_least, invalid, positive, require_kind, require_one_of
 
 logger = logging.getLogger(__name__)
 
 METHODS = ("auto", "free_space", "box", "full")
+KERNELS = ("auto", "cpu", "cuda", "reference")
 
 MOST_JUDGED = 64
 """Receivers whose pressure decides when a run has converged."""
@@ -54,20 +58,34 @@ adds to that."""
 _RUN_STEPS, _SCENE_STEPS = 4e7, 1e8
 """Further time of a run and of a scene."""
 
+_BESIDE_RIGID, _BESIDE_FLUID, _SHARE_INSIDE = 1.5, 2.0, 0.5
+"""Heterogeneous cells for each area of a cell of a rigid or fluid surface; their share of the cuboid around
+an obstacle of another sound speed."""
+
+
+@dataclass(frozen=True)
+class Heterogeneity:
+    """Estimated numbers of cells and elements that are not uniform air, on all grids of a plan.
+
+    Attributes:
+        cut: elements that surfaces cut.
+        cells: heterogeneous cells: beside surfaces, and inside another medium.
+        columns: elements that surfaces cut in the boundary layers.
+        meshed: heterogeneous cells at meshes.
+    """
+
+    cut: float
+    cells: float
+    columns: float
+    meshed: float
+
 
 @dataclass(frozen=True)
 class Plan:
     """A simulation of a scene and its cost.
 
     Attributes:
-        scene: the scene.
-        region: what the solver simulates of it.
-        method: "free_space", "box" or "full".
         spacing: edge of a cell [m]; of no effect in free space.
-        tolerance: relative distance to the steady state at which a run ends.
-        kernel: "cpu", "cuda" or "reference".
-        dtype: precision of the fields.
-        max_periods: periods of the drive after which a run ends in any case.
         time_step: upper limit of the time step [s]; None for the largest stable one.
         grouping: the grids, and the obstacles on each; no grids in free space.
         runs: number of simulations of the control points' transfer matrix; `plan` neglects symmetries.
@@ -138,7 +156,28 @@ class Plan:
 
     @cached_property
     def _heterogeneity(self) -> Heterogeneity:
-        return heterogeneity(self.region, self.spacing, self.method == "full")
+        """Counts from the geometry: on boxes around all obstacles, or on the domain and its layers."""
+        region, spacing = self.region, self.spacing
+        inner = outer = np.array([[-np.inf] * 3, [np.inf] * 3])
+        if self.method == "full":
+            inner = np.array(region.domain)
+            outer = inner + spacing * layer_cells(region.wavenumber * spacing) * np.array([[-1.0], [1.0]])
+        cut = cells = columns = meshed = 0.0
+        for body in region.bodies:
+            vertices, triangles = (part.numpy() for part in body.shape.surface())
+            doubled = _doubled_areas(np.clip(vertices, *inner)[triangles])
+            continued = _doubled_areas(np.clip(vertices, *outer)[triangles])
+            area = float(np.linalg.norm(doubled, axis=1).sum()) / 2
+            # a plane of normal n cuts |nx| + |ny| + |nz| elements for each area of a cell
+            cut += float(np.abs(doubled).sum()) / 2 / spacing**2
+            columns += (float(np.linalg.norm(continued, axis=1).sum()) / 2 - area) / spacing**2
+            beside = (_BESIDE_FLUID if body.fluid else _BESIDE_RIGID) * area / spacing**2
+            cells += beside
+            meshed += beside if isinstance(body.shape, Mesh) else 0.0
+            if body.fluid and body.fluid.sound_speed != region.fluid.sound_speed:
+                box = np.clip([body.shape.lower, body.shape.upper], *inner)
+                cells += _SHARE_INSIDE * float(np.prod(box[1] - box[0])) / spacing**3
+        return Heterogeneity(cut, cells, columns, meshed)
 
     @property
     def _receivers(self) -> int:
@@ -168,11 +207,7 @@ class Plan:
         return make_kernel(self.kernel).at_once(grids[0].shape) if len(grids) == 1 else 1
 
     def require_feasible(self, field: str = "spacing", value: float | None = None) -> None:
-        """Refuse too much memory, too many cells, or cells too large or small for the region.
-
-        Raises:
-            ValueError: names the field and the value to blame, by default the spacing.
-        """
+        """Refuse too much memory or too many cells, and name the field and the value to blame."""
         value, unit = (self.spacing, "m") if value is None else (value, "")
         require_memory(field, value, self.memory, unit)
         for grid in self.grouping.grids:
@@ -188,19 +223,12 @@ def plan(
     method: str = "auto",
     spacing: float | None = 1e-3,
     tolerance: float = 2e-3,
-    *,
     kernel: str = "auto",
     dtype: str | torch.dtype = "float32",
     max_periods: int = 600,
     time_step: float | None = None,
 ) -> Plan:
-    """Plan the simulation of a scene; the arguments are those of `make_propagator`.
-
-    Without a `spacing`, plan the coarse grid from which a spacing is chosen.
-
-    Raises:
-        ValueError: an argument is out of range, or the kernel needs a package that is not installed.
-    """
+    """Plan a simulation, with the arguments of `make_propagator`; no spacing gives the first coarse grid."""
     require_kind("scene", scene, Scene)
     region, kernel, precision = region_of(scene), available_kernel(kernel), precision_of(dtype)
     spacing = pilot_spacing(region) if spacing is None else positive("spacing", spacing, "m")
@@ -208,8 +236,7 @@ def plan(
     if tolerance >= 1:
         raise invalid("tolerance", tolerance, "must be in (0, 1)")
     max_periods = integer_at_least("max_periods", max_periods, 1)
-    if time_step is not None:
-        time_step = positive("time_step", time_step, "s")
+    time_step = None if time_step is None else positive("time_step", time_step, "s")
     require_one_of("method", method, METHODS)
     if method == "box" and not scene.obstacles:
         raise invalid("method", method, "needs a scene with obstacles; take free_space")
@@ -223,3 +250,44 @@ def plan(
     return Plan(
         scene, region, method, spacing, tolerance, kernel, precision, max_periods, time_step, grouping, runs
     )
+
+
+def available_kernel(name: str) -> str:
+    """Return the checked name of a kernel, the fastest available for "auto"."""
+    require_one_of("kernel", name, KERNELS)
+    has_triton = find_spec("triton") is not None
+    if name == "auto":
+        has_cuda = torch.cuda.is_available()
+        name = "cuda" if has_cuda and has_triton else "cpu"
+        logger.debug("kernel auto: %s (CUDA device: %s, Triton: %s)", name, has_cuda, has_triton)
+    if name == "cuda" and not has_triton:
+        raise invalid("kernel", name, "needs Triton: pip install 'autdtorch[cuda]'")
+    return name
+
+
+def make_kernel(name: str) -> Kernel:
+    """Make the kernel that `available_kernel` returned."""
+    if name == "reference":
+        from autdtorch.fdtd.kernels.reference import ReferenceKernel
+
+        return ReferenceKernel()
+    if name == "cuda":
+        from autdtorch.fdtd.kernels.cuda import CudaKernel
+
+        return CudaKernel()
+    from autdtorch.fdtd.kernels.cpu import CpuKernel
+
+    return CpuKernel()
+
+
+def precision_of(dtype: str | torch.dtype) -> torch.dtype:
+    """Return the precision of the fields, float32 or float64, after checking it."""
+    name = str(dtype).removeprefix("torch.") if isinstance(dtype, torch.dtype) else dtype
+    require_one_of("dtype", name, ("float32", "float64"))
+    return torch.float32 if name == "float32" else torch.float64
+
+
+def _doubled_areas(triangles: Array) -> Array:
+    """Return normals (T, 3) of triangles (T, 3, 3), twice as long as their areas."""
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    return np.asarray(np.cross(b - a, c - a))

@@ -19,18 +19,13 @@ def region_of(scene: Scene) -> Region:
     Parallel walls and slabs across the domain continue through the boundary layers. Other obstacles that
     reach beyond the domain end before the layers.
     """
-    bodies = tuple(
-        Body(obstacle, _fluid(obstacle), continued)
-        for obstacle, continued in zip(scene.obstacles, _continued(scene), strict=True)
-    )
-    return Region(
-        Fluid(scene.medium.density, scene.medium.sound_speed),
-        scene.attenuation,
-        scene.frequency,
-        bodies,
-        scene.domain,
-        np.asarray(scene.array.positions.numpy()),
-    )
+    bodies = []
+    for one, continued in zip(scene.obstacles, _continued(scene), strict=True):
+        rigid = one.density is None or one.sound_speed is None
+        bodies.append(Body(one, None if rigid else Fluid(one.density, one.sound_speed), continued))
+    medium, positions = scene.medium, np.asarray(scene.array.positions.numpy())
+    air = Fluid(medium.density, medium.sound_speed)
+    return Region(air, scene.attenuation, scene.frequency, tuple(bodies), scene.domain, positions)
 
 
 def _is_wall(scene: Scene, obstacle: Obstacle) -> bool:
@@ -48,12 +43,6 @@ def warn_of_ending_walls(scene: Scene) -> None:
             "obstacle %s crosses the domain in another direction than a wall before: it ends where the"
             " boundary layer begins, and its end reflects", ", ".join(map(str, ending)),
         )  # fmt: skip
-
-
-def _fluid(obstacle: Obstacle) -> Fluid | None:
-    if obstacle.density is None or obstacle.sound_speed is None:
-        return None
-    return Fluid(obstacle.density, obstacle.sound_speed)
 
 
 def _ends(scene: Scene, obstacle: Obstacle) -> list[int]:

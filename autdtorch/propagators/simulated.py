@@ -63,24 +63,17 @@ class SimulatedPropagator:
 
     def __init__(self, plan: Plan, cache: DiskCache | None = None) -> None:
         """Use `make_propagator`, which checks its arguments. Nothing is computed here."""
-        self.scene = plan.scene
-        self.method = plan.method
-        self.spacing = plan.spacing
-        self.tolerance = plan.tolerance
-        self.max_periods = plan.max_periods
+        self.scene, self.method, self.spacing = plan.scene, plan.method, plan.spacing
+        self.tolerance, self.max_periods = plan.tolerance, plan.max_periods
         self.runs: list[Run] = []
-        self._plan = plan
-        self._cache = cache
-        self._simulation = simulation_of(plan)
+        self._plan, self._cache, self._simulation = plan, cache, simulation_of(plan)
         self._control: TransferMatrix | None = None
         self._near_logged = False
 
     def __repr__(self) -> str:
         """Scene, settings and number of runs."""
-        return (
-            f"SimulatedPropagator(scene {self.scene.name!r}, {self.method}, "
-            f"spacing {1e3 * self.spacing:.4g} mm, tolerance {self.tolerance:g}, {len(self.runs)} runs)"
-        )
+        settings = f"{self.method}, spacing {1e3 * self.spacing:.4g} mm, tolerance {self.tolerance:g}"
+        return f"SimulatedPropagator(scene {self.scene.name!r}, {settings}, {len(self.runs)} runs)"
 
     @property
     def time_step(self) -> float:
@@ -179,8 +172,8 @@ class SimulatedPropagator:
         """Return the matrix of points, by default of the control points, and the runs of this call."""
         if points is not None:
             return self._executed(points)
-        if self._control is not None:
-            return replace(self._control, matrix=self._control.matrix.clone(), runs=())
+        if kept := self._control:
+            return replace(kept, matrix=kept.matrix.clone(), runs=())
         self._control = self._executed(self.scene.control_points)
         return replace(self._control, matrix=self._control.matrix.clone())
 

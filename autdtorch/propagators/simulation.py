@@ -13,9 +13,8 @@ import torch
 
 from autdtorch.fdtd.steady_state import SteadyState, fewest_periods
 from autdtorch.fdtd.stepping import Assembly
-from autdtorch.propagators.backend import make_kernel
 from autdtorch.propagators.grids import USUAL_PERIODS
-from autdtorch.propagators.plan import Plan
+from autdtorch.propagators.plan import Plan, make_kernel
 from autdtorch.propagators.symmetry import (
     Orbits,
     Symmetry,
@@ -28,6 +27,8 @@ from autdtorch.utils.progress import show_progress
 from autdtorch.utils.validation import ArrayLike
 
 logger = logging.getLogger(__name__)
+
+Stepped = Callable[[int], None]
 
 
 @dataclass(frozen=True)
@@ -91,11 +92,7 @@ class Simulation(ABC):
 
     @abstractmethod
     def _simulate(
-        self,
-        sources: Sequence[Nodes],
-        strength: torch.Tensor,
-        receivers: Nodes,
-        stepped: Callable[[int], None],
+        self, sources: Sequence[Nodes], strength: torch.Tensor, receivers: Nodes, stepped: Stepped
     ) -> tuple[torch.Tensor, list[Run]]:
         """Do the work of `run`; `stepped` is called with numbers of periods."""
 
@@ -111,13 +108,10 @@ class Simulation(ABC):
         return 1 / (self.plan.scene.frequency * float(most))
 
     def orbits(self, points: torch.Tensor) -> Orbits:
-        """Return the fewest runs for a transfer matrix: from transducers or, by reciprocity, from points.
-
-        Next to an obstacle only simulations from transducers are accurate.
-        """
+        """Return the fewest runs for a transfer matrix: from transducers or, by reciprocity, from points."""
         forward = orbits_of_transducers(points, self.symmetries)
         if self.near_obstacle(points):
-            return forward
+            return forward  # only these are accurate there
         backward = orbits_of_points(points, self.symmetries)
         fewer = (backward.runs, len(points)) < (forward.runs, len(self.plan.scene.array))
         return backward if fewer else forward
@@ -126,24 +120,20 @@ class Simulation(ABC):
         """Simulate the transfer matrix of points (P, 3)."""
         array, targets, orbits = self.plan.scene.array, single_nodes(points), self.orbits(points)
         sources, receivers = (targets, array.nodes) if orbits.from_points else (array.nodes, targets)
-        logger.debug(
-            "transfer matrix: %d runs serve %d %s", orbits.runs, len(orbits.representative),
-            "points" if orbits.from_points else "transducers",
-        )  # fmt: skip
+        begins = "points" if orbits.from_points else "transducers"
+        logger.debug("transfer matrix: %d runs serve %d %s", orbits.runs, len(orbits.representative), begins)
         strength = torch.full((orbits.runs, 1), array.source_strength, dtype=torch.complex128, device="cpu")
         alone = [Nodes(sources.positions[own : own + 1], sources.weights) for own in orbits.representatives]
-        rows, runs = self.run(alone, strength, receivers)
-        rows = orbits.expand(rows)
-        remaining = max(run.remaining for run in runs)
+        found, runs = self.run(alone, strength, receivers)
+        rows, remaining = orbits.expand(found), max(run.remaining for run in runs)
         return TransferMatrix(rows if orbits.from_points else rows.mT.contiguous(), remaining, tuple(runs))
 
     def run(
         self, sources: Sequence[Nodes], strength: torch.Tensor, receivers: Nodes
     ) -> tuple[torch.Tensor, list[Run]]:
-        """Simulate R runs, each with N sources of strengths (R, N) [Pa m] that are not all zero.
+        """Return the pressure (R, P) [Pa] at P receivers of R runs with N sources each, and the runs.
 
-        Returns:
-            Pressure (R, P) [Pa] at P receivers, the mean over the nodes of each, and the runs.
+        The strengths (R, N) [Pa m] of a run are not all zero; receivers take the mean over their nodes.
         """
         plan, grids = self.plan, [assembly.grid for assembly in self.assemblies]
         what = f"simulating {plan.scene.name}"

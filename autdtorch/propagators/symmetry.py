@@ -9,7 +9,7 @@ transfer matrix satisfies G[p, m] = G[S p, S m].
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,13 +34,7 @@ _NONE = -1
 
 @dataclass(frozen=True, eq=False)
 class Symmetry:
-    """A symmetry of a scene on its grid.
-
-    Attributes:
-        matrix: signed permutation (3, 3).
-        center: fixed point (3,) [m].
-        transducers: index (M,) of the transducer that each transducer is mapped to.
-    """
+    """A symmetry: a signed permutation (3, 3), its fixed point (3,) [m] and the transducers' images (M,)."""
 
     matrix: Index
     center: Array
@@ -111,18 +105,13 @@ def symmetries(assemblies: Sequence[Assembly], transducers: Nodes) -> list[Symme
     center = np.array(grid.origin) + grid.spacing * (np.array(grid.shape) - 1) / 2
     positions, weights = transducers.positions.numpy(), transducers.weights.numpy()
     found = [Symmetry(np.eye(3, dtype=np.int64), center, np.arange(len(positions)))]
-    for matrix in itertools.islice(_signed_permutations(), 1, None if len(assemblies) == 1 else 1):
+    turns = itertools.product(itertools.permutations(range(3)), itertools.product((1, -1), repeat=3))
+    for axes, signs in itertools.islice(turns, 1, None if len(assemblies) == 1 else 1):
+        matrix = np.diag(signs) @ np.eye(3, dtype=np.int64)[list(axes)]
         images = _matched(positions, weights, matrix, center)
         if (images != _NONE).all() and _maps_cells(cells, grid, matrix, _ROUNDING * assembly.stencil.face):
             found.append(Symmetry(matrix, center, images))
     return found
-
-
-def _signed_permutations() -> Iterator[Index]:
-    """Yield all 48 matrices (3, 3), the identity first."""
-    for axes in itertools.permutations(range(3)):
-        for signs in itertools.product((1, -1), repeat=3):
-            yield np.diag(signs) @ np.eye(3, dtype=np.int64)[list(axes)]
 
 
 def _matched(groups: Array, weights: Array, matrix: Index, center: Array) -> Index:
@@ -149,14 +138,12 @@ def _maps_cells(cells: HeterogeneousCells, grid: Grid, matrix: Index, rounding: 
         places = (double @ matrix.T + (shape - 1)) // 2
         return np.asarray(np.ravel_multi_index(tuple(places.T), grid.shape), np.int64)
 
-    for hard in (cells.sound_hard, cells.shell):
-        if not np.array_equal(np.sort(image(hard)), hard):
-            return False
+    if not all(np.array_equal(np.sort(image(hard)), hard) for hard in (cells.sound_hard, cells.shell)):
+        return False
     images = image(cells.index)
     order = np.argsort(images)
-    if not np.array_equal(images[order], cells.index):
-        return False
-    if not np.allclose(cells.mass, cells.mass[order], rtol=_ROUNDING, atol=0):
+    same_mass = np.allclose(cells.mass, cells.mass[order], rtol=_ROUNDING, atol=0)
+    if not (np.array_equal(images[order], cells.index) and same_mass):
         return False
     # a neighbour of an image is the image of the neighbour at the offset mapped back
     turned = (np.array(OFFSETS) @ matrix + 1) @ (9, 3, 1)

@@ -93,7 +93,7 @@ def test_points_in_a_box_read_its_grid_and_receive_the_other() -> None:
 
 
 def test_boxes_whose_iteration_does_not_converge_are_joined(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("autdtorch.propagators.coupling.MOST_PASSES", 1)
+    monkeypatch.setattr("autdtorch.propagators.box.MOST_PASSES", 1)
     apart, one = boxes(spheres()), together(spheres())
     assert torch.equal(apart.transfer_matrix(), one.transfer_matrix())
     assert [run.periods for run in apart.runs] == [run.periods for run in one.runs]

@@ -202,8 +202,7 @@ def test_a_damaged_file_is_computed_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "body",
-    [b"", b"\0" * 15, np.zeros(6, complex).tobytes(), np.zeros(8, complex).tobytes(), b"\xff" * 112],
+    "body", [b"", b"\0" * 15, np.zeros(6, complex).tobytes(), np.zeros(8, complex).tobytes(), b"\xff" * 112]
 )
 def test_a_forged_matrix_of_another_length_or_not_finite_is_computed_again(
     tmp_path: Path, body: bytes
