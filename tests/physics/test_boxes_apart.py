@@ -1,7 +1,5 @@
 """Distant obstacles in boxes of their own, against one box and the whole domain."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 
@@ -17,7 +15,7 @@ from autdtorch.propagators.grids import Grouping, cheapest_boxes, grid_cost, one
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
-from autdtorch.scene.obstacles import Box, Obstacle, Sphere
+from autdtorch.scene.obstacles import Box, Sphere
 from autdtorch.scene.scene import Scene
 
 EXTENT, SPACING, TOLERANCE = 64e-3, 1.4e-3, 1e-3
@@ -28,43 +26,45 @@ ARRAY = TransducerArray.grid((1, 2), pitch=8e-3, center=(1e-3, EXTENT / 2, EXTEN
 POINTS = [[61e-3, 52e-3, 55e-3]]
 
 
-def boxes(scene: Scene, spacing: float = SPACING, grouping: Grouping | None = None) -> SimulatedPropagator:
+def boxes(scene, spacing=SPACING, grouping=None):
     """A propagator with the cheapest boxes, or with those of a grouping."""
     planned = plan(scene, "box", spacing, TOLERANCE)
-    return SimulatedPropagator(
-        planned if grouping is None else dataclasses.replace(planned, grouping=grouping)
-    )
+    return SimulatedPropagator(dataclasses.replace(planned, grouping=grouping or planned.grouping))
 
 
-def together(scene: Scene, spacing: float = SPACING) -> SimulatedPropagator:
+def together(scene, spacing=SPACING):
     """A propagator with all obstacles in one box."""
-    return SimulatedPropagator(plan(scene, "box", spacing, TOLERANCE).in_one_box())
+    return boxes(scene, spacing, one_box(region_of(scene), spacing))
 
 
-def far_apart(*obstacles: Obstacle) -> Scene:
+def cells(propagator):
+    return [math.prod(assembly.grid.shape) for assembly in propagator._simulation.assemblies]
+
+
+def far_apart(*obstacles):
     return Scene(ARRAY, AIR, 40e3, POINTS, obstacles, domain=((0, 0, 0), (EXTENT,) * 3))
 
 
-def spheres(**material: float | bool) -> Scene:
-    return far_apart(*(Sphere(center, 4e-3, **(material or {"rigid": True})) for center in (NEAR, FAR)))  # type: ignore[arg-type]
+def spheres(**material):
+    return far_apart(*(Sphere(center, 4e-3, **(material or {"rigid": True})) for center in (NEAR, FAR)))
 
 
 @pytest.mark.parametrize(
     "scene", [spheres(), spheres(density=100.0, sound_speed=340.0)], ids=["rigid", "dense"]
 )
-def test_boxes_apart_are_one_box_and_the_domain(scene: Scene) -> None:
+def test_boxes_apart_are_one_box_and_the_domain(scene):
     apart, one = boxes(scene), together(scene)
     full = make_propagator(scene, "full", SPACING, tolerance=TOLERANCE)
     matrix = apart.transfer_matrix()
-    assert [len(_cells(each)) for each in (apart, one)] == [2, 1]
+    assert [len(cells(each)) for each in (apart, one)] == [2, 1]
     assert relative_error(matrix, one.transfer_matrix()) < TOLERANCE
     # the domain has the grid's error in air as well, 0.2 % at 1.4 mm over this distance
     assert relative_error(matrix, full.transfer_matrix()) < 4e-3
     # what was stepped: both boxes the same number of cells, to a few
-    assert max(_cells(apart)) * apart.runs[0].periods < 0.8 * _cells(one)[0] * one.runs[0].periods
+    assert max(cells(apart)) * apart.runs[0].periods < 0.8 * cells(one)[0] * one.runs[0].periods
 
 
-def test_without_coupling_the_error_would_be_far_above_the_tolerance() -> None:
+def test_without_coupling_the_error_would_be_far_above_the_tolerance():
     scene = spheres()
     matrix = boxes(scene).transfer_matrix()
     free = free_space_matrix(scene.control_points, ARRAY, scene.wavenumber)
@@ -72,7 +72,7 @@ def test_without_coupling_the_error_would_be_far_above_the_tolerance() -> None:
     assert relative_error(free + alone, matrix) > 4 * TOLERANCE
 
 
-def test_reciprocity_between_boxes() -> None:
+def test_reciprocity_between_boxes():
     """From a point between the boxes to the transducers as back."""
     points = torch.tensor([[30e-3, 31e-3, 32e-3]], dtype=torch.float64)
     propagator = make_propagator(spheres(), "box", SPACING, tolerance=1e-6, dtype="float64")
@@ -85,21 +85,21 @@ def test_reciprocity_between_boxes() -> None:
     assert relative_error(backward, forward) < 2e-4
 
 
-def test_points_in_a_box_read_its_grid_and_receive_the_other() -> None:
+def test_points_in_a_box_read_its_grid_and_receive_the_other():
     scene, drive = spheres(), torch.ones(2, dtype=torch.complex128)
     points = [[20e-3, 15e-3, 15.3e-3], [14e-3, 15e-3, 9.5e-3], [50e-3, 43.5e-3, 48e-3]]
     apart, one = (propagator.field(drive, points) for propagator in (boxes(scene), together(scene)))
     assert relative_error(apart, one) < TOLERANCE
 
 
-def test_boxes_whose_iteration_does_not_converge_are_joined(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_boxes_whose_iteration_does_not_converge_are_joined(monkeypatch):
     monkeypatch.setattr("autdtorch.propagators.box.MOST_PASSES", 1)
     apart, one = boxes(spheres()), together(spheres())
     assert torch.equal(apart.transfer_matrix(), one.transfer_matrix())
     assert [run.periods for run in apart.runs] == [run.periods for run in one.runs]
 
 
-def test_near_obstacles_share_a_box_and_far_ones_where_that_is_cheaper() -> None:
+def test_near_obstacles_share_a_box_and_far_ones_where_that_is_cheaper():
     near = Sphere((NEAR[0], NEAR[1], NEAR[2] + 9e-3), 3e-3, rigid=True)
     scene = far_apart(Sphere(NEAR, 4e-3, rigid=True), Sphere(FAR, 4e-3, rigid=True), near)
     grouping = cheapest(scene, 1e-3)
@@ -109,11 +109,11 @@ def test_near_obstacles_share_a_box_and_far_ones_where_that_is_cheaper() -> None
     assert len(cheapest(scene, 2.8e-3).groups) == 1
 
 
-def cheapest(scene: Scene, spacing: float) -> Grouping:
+def cheapest(scene, spacing):
     return cheapest_boxes(region_of(scene), spacing, TOLERANCE, runs=1)
 
 
-def cubes(edge: float, gap: float) -> Scene:
+def cubes(edge, gap):
     """Two rigid cubes in a row."""
     first = (20e-3 + edge / 2,) * 3
     second = (first[0] + edge + gap, *first[1:])
@@ -122,29 +122,29 @@ def cubes(edge: float, gap: float) -> Scene:
     return Scene(array, AIR, 40e3, [(second[0] + edge + 10e-3, 35e-3, 37e-3)], obstacles)
 
 
-def box_each(scene: Scene, spacing: float) -> Grouping:
+def box_each(scene, spacing):
     """Its two obstacles, a box each."""
     grids = tuple(grid_cost(region_of(scene), bodies_extent([one]), spacing) for one in scene.obstacles)
     return Grouping(((0,), (1,)), grids, passes=3)
 
 
-def test_boxes_that_need_many_passes_are_joined() -> None:
+def test_boxes_that_need_many_passes_are_joined():
     scene, spacing = cubes(8e-3, 48e-3), 2e-3
     one, two = boxes(scene, spacing), boxes(scene, spacing, box_each(scene, spacing))
     for propagator in (one, two):
         propagator.transfer_matrix()
-    assert [len(_cells(each)) for each in (one, two)] == [1, 2]
+    assert [len(cells(each)) for each in (one, two)] == [1, 2]
     # one pass would cost 0.8 of one box, all of them cost 2.7
-    assert _cells(two)[0] * two.runs[0].periods > 2 * _cells(one)[0] * one.runs[0].periods
+    assert cells(two)[0] * two.runs[0].periods > 2 * cells(one)[0] * one.runs[0].periods
 
 
-def test_large_boxes_whose_coupling_costs_more_than_the_air_between_are_joined() -> None:
+def test_large_boxes_whose_coupling_costs_more_than_the_air_between_are_joined():
     """Steps alone would favour two boxes, 0.8 to 1; the sums between them take as long once more."""
     assert [len(cheapest(cubes(36e-3, gap), 2e-3).groups) for gap in (180e-3, 360e-3)] == [1, 2]
 
 
 @pytest.mark.parametrize("edge", [16e-3, 36e-3])
-def test_coupled_pairs_are_counted_from_the_geometry(edge: float) -> None:
+def test_coupled_pairs_are_counted_from_the_geometry(edge):
     scene, spacing = cubes(edge, 60e-3), 2e-3
     apart = box_each(scene, spacing)
     planned = dataclasses.replace(plan(scene, "box", spacing), grouping=apart)
@@ -154,13 +154,8 @@ def test_coupled_pairs_are_counted_from_the_geometry(edge: float) -> None:
     assert 0.5 < pairs / apart.coupled_pairs < 2
 
 
-def test_plates_that_face_each_other_share_a_box() -> None:
+def test_plates_that_face_each_other_share_a_box():
     """Multiple reflections between them would need too many passes."""
     plate = Box((12e-3, 32e-3, 32e-3), (2e-3, 50e-3, 50e-3), rigid=True)
     other = dataclasses.replace(plate, center=(42e-3, 32e-3, 32e-3))
-    scene = far_apart(plate, other)
-    assert len(cheapest(scene, 1e-3).groups) == 1
-
-
-def _cells(propagator: SimulatedPropagator) -> list[int]:
-    return [math.prod(assembly.grid.shape) for assembly in propagator._simulation.assemblies]
+    assert len(cheapest(far_apart(plate, other), 1e-3).groups) == 1

@@ -21,9 +21,7 @@ WAVENUMBER = 2 * math.pi / WAVELENGTH
 points = hnp.arrays(float, (5, 3), elements=st.floats(-0.1, 0.1))
 
 
-@pytest.fixture
-def array():
-    return TransducerArray.grid((4, 4), pitch=10e-3, center=(1e-3, 50e-3, 50e-3), source_strength=0.7)
+ARRAY = TransducerArray.grid((4, 4), pitch=10e-3, center=(1e-3, 50e-3, 50e-3), source_strength=0.7)
 
 
 @pytest.mark.parametrize("target", [(17e-3, 0.0, 0.0), (10e-3, -20e-3, 30e-3), (-60e-3, 40e-3, 1e-3)])
@@ -57,21 +55,21 @@ def test_green_is_reciprocal(here, there):
     assert torch.equal(green(here, there, WAVENUMBER), green(there, here, WAVENUMBER).T)
 
 
-def test_matrix_is_equation_2_term_by_term(array):
+def test_matrix_is_equation_2_term_by_term():
     targets = [(80e-3, 50e-3, 50e-3), (80e-3, 20e-3, 50e-3), (33e-3, 1e-3, 99e-3)]
-    matrix = free_space_matrix(targets, array, WAVENUMBER)
+    matrix = free_space_matrix(targets, ARRAY, WAVENUMBER)
     for row, target in zip(matrix.tolist(), targets, strict=True):
-        for entry, source in zip(row, array.positions.tolist(), strict=True):
+        for entry, source in zip(row, ARRAY.positions.tolist(), strict=True):
             r = math.dist(target, source)
             # Phases reach k r = 80 rad: 1e-14 of rounding.
             assert cmath.isclose(entry, 0.7 * cmath.exp(1j * WAVENUMBER * r) / r, rel_tol=1e-13)
 
 
-def test_absorption_lets_every_contribution_fall_by_its_path(array):
+def test_absorption_lets_every_contribution_fall_by_its_path():
     targets, alpha = [(80e-3, 50e-3, 50e-3), (33e-3, 1e-3, 99e-3)], 4.6
-    lossless = free_space_matrix(targets, array, WAVENUMBER)
-    path = distances(torch.tensor(targets, dtype=torch.float64), array.positions)
-    lossy = free_space_matrix(targets, array, complex(WAVENUMBER, alpha))
+    lossless = free_space_matrix(targets, ARRAY, WAVENUMBER)
+    path = distances(torch.tensor(targets, dtype=torch.float64), ARRAY.positions)
+    lossy = free_space_matrix(targets, ARRAY, complex(WAVENUMBER, alpha))
     torch.testing.assert_close(lossy, lossless * torch.exp(-alpha * path), rtol=1e-14, atol=0)
 
 
@@ -129,10 +127,9 @@ def test_disc_off_its_axis_near_by():
     phases=hnp.arrays(float, 16, elements=st.floats(0, 2 * math.pi)),
 )
 def test_equation_3_puts_every_contribution_in_phase_at_the_focus(focus, phases):
-    array = TransducerArray.grid((4, 4), pitch=10e-3, center=(1e-3, 50e-3, 50e-3), source_strength=0.7)
-    row = free_space_matrix(focus[None], array, WAVENUMBER)[0]
-    limit = (0.7 / distances(torch.from_numpy(focus[None]), array.positions)).sum()
-    focused = row @ drive_from_phases(focus_phases(array.positions, focus, WAVENUMBER))
+    row = free_space_matrix(focus[None], ARRAY, WAVENUMBER)[0]
+    limit = (0.7 / distances(torch.from_numpy(focus[None]), ARRAY.positions)).sum()
+    focused = row @ drive_from_phases(focus_phases(ARRAY.positions, focus, WAVENUMBER))
     # Phases reach k r = 130 rad: 3e-14 of rounding; the sum of S/r is real, so the phase of p is zero too.
     torch.testing.assert_close(focused, limit.to(torch.complex128), rtol=1e-13, atol=0)
     # No other phases do better.

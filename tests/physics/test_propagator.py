@@ -1,7 +1,5 @@
 """The full-domain propagator against exact fields and against itself."""
 
-from __future__ import annotations
-
 import itertools
 import math
 
@@ -11,24 +9,22 @@ from small_scenes import AIR, CUBE, relative_error, small_scene
 
 from autdtorch.analytic.green import free_space_matrix
 from autdtorch.objectives.simulated import SimulatedObjective
-from autdtorch.propagators import FreeSpacePropagator, SimulatedPropagator, make_propagator
+from autdtorch.propagators import FreeSpacePropagator, make_propagator
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.drive import drive_from_phases
 from autdtorch.scene.geometry import plane_basis
 from autdtorch.scene.scene import Box, Scene
 
 
-def full(scene: Scene, spacing: float = 1e-3, **settings: object) -> SimulatedPropagator:
-    propagator = make_propagator(scene, "full", spacing, **settings)  # type: ignore[arg-type]
-    assert isinstance(propagator, SimulatedPropagator)
-    return propagator
+def full(scene, spacing=1e-3, **settings):
+    return make_propagator(scene, "full", spacing, **settings)
 
 
-def free_space(scene: Scene) -> torch.Tensor:
+def free_space(scene):
     return free_space_matrix(scene.control_points, scene.array, scene.complex_wavenumber)
 
 
-def random_drive(rows: int, transducers: int, seed: int = 0) -> torch.Tensor:
+def random_drive(rows, transducers, seed=0):
     generator = torch.Generator().manual_seed(seed)
     return drive_from_phases(6.28 * torch.rand((rows, transducers), generator=generator, dtype=torch.float64))
 
@@ -38,7 +34,7 @@ def random_drive(rows: int, transducers: int, seed: int = 0) -> torch.Tensor:
 @pytest.mark.parametrize(
     ("spacing", "tolerance"), [(0.7e-3, 1e-3), (1e-3, 2e-3), (2e-3, 1e-2), (2.8e-3, 4e-2)]
 )
-def test_free_space_is_exact_to_the_grid(spacing: float, tolerance: float) -> None:
+def test_free_space_is_exact_to_the_grid(spacing, tolerance):
     scene = small_scene()
     simulated = full(scene, spacing, tolerance=tolerance / 10).transfer_matrix()
     assert relative_error(simulated, free_space(scene)) < tolerance
@@ -48,7 +44,7 @@ def test_free_space_is_exact_to_the_grid(spacing: float, tolerance: float) -> No
 @pytest.mark.parametrize(
     ("absorption", "spacing", "tolerance"), [(1.3, 1e-3, 5e-4), (40.0, 1e-3, 5e-4), (40.0, 2e-3, 5e-3)]
 )
-def test_absorption_is_exact_to_the_grid(absorption: float, spacing: float, tolerance: float) -> None:
+def test_absorption_is_exact_to_the_grid(absorption, spacing, tolerance):
     scene, lossless = small_scene(absorption=absorption), small_scene()
     simulated, without = (
         full(each, spacing, tolerance=1e-5, dtype="float64").transfer_matrix() for each in (scene, lossless)
@@ -61,7 +57,7 @@ def test_absorption_is_exact_to_the_grid(absorption: float, spacing: float, tole
     assert relative_error(loss, exact_loss) < 1e-2
 
 
-def test_piston_radiates_as_a_piston() -> None:
+def test_piston_radiates_as_a_piston():
     """A tilted disc of 5 mm between the cells against Rayleigh's integral, to 60 degrees from its normal."""
     center, distance = torch.tensor([12.3e-3, 13.1e-3, 13.7e-3], dtype=torch.float64), 20e-3
     array = TransducerArray(center[None], (2.0, 1.0, 0.6), radius=5e-3)
@@ -81,19 +77,7 @@ def test_piston_radiates_as_a_piston() -> None:
     assert exact[6].abs() < 0.2 * exact[0].abs()
 
 
-def test_reciprocity_of_discs() -> None:
-    """A disc receives the mean over its nodes: simulated from the control points and from the transducers."""
-    scene = small_scene((CUBE,), radius=3.9e-3, extent=28e-3)
-    propagator = full(scene, tolerance=1e-5)
-    backward = propagator.transfer_matrix()
-    more = torch.cat((scene.control_points, scene.control_points + 1e-3))
-    forward = propagator.transfer_matrix(more)[: len(scene.control_points)]
-    assert len(propagator.runs) == 3 + 4
-    # both are 1e-5 from the steady state, and single precision adds as much
-    assert relative_error(backward, forward) < 5e-5
-
-
-def test_field_of_a_plane_right_up_to_the_faces_of_the_domain() -> None:
+def test_field_of_a_plane_right_up_to_the_faces_of_the_domain():
     scene = small_scene()
     lines = torch.linspace(0, 24e-3, 13, dtype=torch.float64)
     points = torch.tensor(
@@ -105,20 +89,35 @@ def test_field_of_a_plane_right_up_to_the_faces_of_the_domain() -> None:
     assert relative_error(simulated, FreeSpacePropagator(scene).field(drive, points)) < 3e-3
 
 
-def test_reciprocity() -> None:
-    """From points next to the domain's edges and corners to the transducers as back."""
-    scene = small_scene()
-    points = torch.tensor([[23.8e-3, 0.3e-3, 23.5e-3], [23.6e-3, 12.2e-3, 0.2e-3]], dtype=torch.float64)
-    propagator = full(scene, tolerance=1e-7, dtype="float64")
-    backward = propagator.transfer_matrix(points)
-    assert len(propagator.runs) == 2  # 2 points, 4 transducers: from the points
-    forward = propagator.transfer_matrix(torch.cat((points, points + 1e-4 * (12e-3 - points))))[:2]
-    assert len(propagator.runs) == 2 + 4
-    # the scheme is symmetric, its layers and their corners included: what is left is the tolerance
-    assert relative_error(backward, forward) < 1e-6
+CORNERS = torch.tensor([[23.8e-3, 0.3e-3, 23.5e-3], [23.6e-3, 12.2e-3, 0.2e-3]], dtype=torch.float64)
+DISCS = small_scene((CUBE,), radius=3.9e-3, extent=28e-3)
 
 
-def test_replay_and_transfer_objectives_agree() -> None:
+@pytest.mark.parametrize(
+    ("scene", "points", "settings", "bound"),
+    [
+        # next to edges and corners: the scheme is symmetric with its layers, what is left is the tolerance
+        (small_scene(), CORNERS, {"tolerance": 1e-7, "dtype": "float64"}, 1e-6),
+        # a disc receives the mean over its nodes; 1e-5 from the steady state, single precision adds as much
+        (DISCS, DISCS.control_points, {"tolerance": 1e-5}, 5e-5),
+        # Green's function is symmetric, too
+        (small_scene((CUBE,)), None, {"method": "box", "tolerance": 1e-6, "dtype": "float64"}, 1e-4),
+    ],
+    ids=["edges", "discs", "box"],
+)
+def test_reciprocity(scene, points, settings, bound):
+    """From the points, and from the four transducers where there are more points than these."""
+    propagator = make_propagator(scene, **{"method": "full", "spacing": 1e-3, **settings})
+    points = scene.control_points if points is None else points
+    backward, count = propagator.transfer_matrix(points), len(points)
+    assert len(propagator.runs) == count
+    more = torch.cat((points, points + 1e-2 * (12e-3 - points), points[:1] + 2e-2 * (12e-3 - points[:1])))
+    forward = propagator.transfer_matrix(more)[:count]
+    assert len(propagator.runs) == count + 4
+    assert relative_error(backward, forward) < bound
+
+
+def test_replay_and_transfer_objectives_agree():
     scene = small_scene((CUBE,))
     propagator = full(scene, tolerance=1e-5, dtype="float64")
     drive = random_drive(3, 4, seed=1)
@@ -131,18 +130,18 @@ def test_replay_and_transfer_objectives_agree() -> None:
 
 @pytest.mark.parametrize("method", ["full", "box"])
 @pytest.mark.parametrize("absorption", [0.0, 40.0])
-def test_an_obstacle_of_air_is_no_obstacle(absorption: float, method: str) -> None:
+def test_an_obstacle_of_air_is_no_obstacle(absorption, method):
     cube = Box(CUBE.center, CUBE.size, density=AIR.density, sound_speed=AIR.sound_speed)
     scene = small_scene((cube,), absorption=absorption)
     simulated = make_propagator(scene, method, 1e-3, tolerance=1e-4).transfer_matrix()
     assert relative_error(simulated, free_space(scene)) < 2e-3
 
 
-def test_very_heavy_is_rigid() -> None:
+def test_very_heavy_is_rigid():
     """A body of rising density tends to the rigid one; the gap falls with the density ratio."""
 
-    def matrix(**material: float | bool) -> torch.Tensor:
-        scene = small_scene((Box(CUBE.center, CUBE.size, **material),))  # type: ignore[arg-type]
+    def matrix(**material):
+        scene = small_scene((Box(CUBE.center, CUBE.size, **material),))
         return full(scene, tolerance=1e-5, max_periods=400).transfer_matrix()
 
     rigid = matrix(rigid=True)
@@ -151,7 +150,7 @@ def test_very_heavy_is_rigid() -> None:
     assert gaps[1] < 0.02 * gaps[0]
 
 
-def test_image_source_at_a_rigid_wall() -> None:
+def test_image_source_at_a_rigid_wall():
     """A wide rigid plate acts as a mirror: p = e^{ikr}/r + e^{ikr'}/r', with r' from the image behind it."""
     plate = Box(center=(31e-3, 24e-3, 24e-3), size=(4e-3, 46e-3, 46e-3), rigid=True)
     array = TransducerArray([[21e-3, 24e-3, 24e-3]], normals=(1, 0, 0))
@@ -165,7 +164,7 @@ def test_image_source_at_a_rigid_wall() -> None:
     assert relative_error(simulated, exact) < 0.08
 
 
-def test_the_distance_to_the_steady_state_is_below_the_tolerance() -> None:
+def test_the_distance_to_the_steady_state_is_below_the_tolerance():
     """In a scene with resonances."""
     scene = small_scene((CUBE,))
     settled, *others = (
@@ -177,7 +176,7 @@ def test_the_distance_to_the_steady_state_is_below_the_tolerance() -> None:
 
 
 @pytest.mark.parametrize("method", ["free_space", "full"])
-def test_a_grid_of_points_gives_a_grid_of_pressures(method: str) -> None:
+def test_a_grid_of_points_gives_a_grid_of_pressures(method):
     propagator = make_propagator(small_scene(), method, 2e-3)
     points = torch.stack(2 * [propagator.scene.control_points[:2]])
     for drive in (random_drive(1, 4), random_drive(3, 4)):  # by simulation, and by the transfer matrix
@@ -187,7 +186,7 @@ def test_a_grid_of_points_gives_a_grid_of_pressures(method: str) -> None:
         propagator.field(drive, points[0, 0])
 
 
-def test_field_is_linear_and_differentiable_in_the_drive() -> None:
+def test_field_is_linear_and_differentiable_in_the_drive():
     scene = small_scene((CUBE,))
     propagator = full(scene, 2e-3)
     points = scene.control_points[:2]
@@ -203,11 +202,6 @@ def test_field_is_linear_and_differentiable_in_the_drive() -> None:
     assert not propagator.transfer_matrix(points).requires_grad
 
 
-def test_free_space_warns_of_ignored_obstacles(caplog: pytest.LogCaptureFixture) -> None:
-    make_propagator(small_scene((CUBE,)), "free_space")
-    assert "1 obstacles" in caplog.text
-
-
 SLOW = Box(CUBE.center, CUBE.size, density=100.0, sound_speed=100.0)
 
 
@@ -218,35 +212,33 @@ SLOW = Box(CUBE.center, CUBE.size, density=100.0, sound_speed=100.0)
         ({"spacing": 4e-3}, r"spacing: 0.004 m; must be at most 0.00283 m, 3 cells per .* in the medium"),
         ({"spacing": 2e-5, "method": "full"}, "spacing: 2e-05 m; (gives 1216 x 1216 x 1216|needs about)"),
         ({"spacing": 1e-5, "method": "full"}, r"spacing: 1e-05 m; must be at least 1\.7e-05 m, 500 cells"),
-        ({"spacing": float("nan")}, "spacing: nan"),
         ({"spacing": -1e-3}, "spacing: -0.001 m; must be finite and > 0"),
         ({"tolerance": 1.5}, r"tolerance: 1.5; must be in \(0, 1\)"),
-        ({"tolerance": 0}, "tolerance: 0; must be finite and > 0"),
         ({"kernel": "fortran"}, "kernel: .*fortran.*must be one of auto, cpu, cuda, reference"),
         ({"dtype": "float16"}, "dtype: .*float16.*must be one of float32, float64"),
         ({"max_periods": 0}, "max_periods: 0"),
+        ({"method": "box", "scene": small_scene()}, "method: 'box'; needs a scene with obstacles"),
         ({"time_step": 0.0}, "time_step: 0.0 s; must be finite and > 0"),
         ({"scene": small_scene((SLOW,))}, "spacing: 0.001 m; must be at most 0.000833 m, .* in obstacle 0"),
     ],
 )  # fmt: skip
-def test_bad_arguments_are_named(arguments: dict[str, object], message: str) -> None:
+def test_bad_arguments_are_named(arguments, message):
     with pytest.raises(ValueError, match=message):
-        make_propagator(**{"scene": small_scene((CUBE,)), **arguments})  # type: ignore[arg-type]
+        make_propagator(**{"scene": small_scene((CUBE,)), **arguments})
 
 
-def test_points_outside_the_domain_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"points\[1\]: .*must be inside the domain"):
-        full(small_scene((CUBE,)), 2e-3).transfer_matrix([[10e-3, 3e-3, 3e-3], [10e-3, 25e-3, 3e-3]])
+@pytest.mark.parametrize(
+    ("method", "message"),
+    [("full", "must be inside the domain"), ("box", "lies on a transducer, must be at")],
+)
+def test_points_outside_the_domain_or_on_a_transducer_are_refused(method, message):
+    scene = small_scene((CUBE,))
+    second = scene.array.positions[2].tolist() if method == "box" else [10e-3, 25e-3, 3e-3]
+    with pytest.raises(ValueError, match=rf"points\[1\]: .* {message}"):
+        make_propagator(scene, method, 2e-3).transfer_matrix([[10e-3, 3e-3, 3e-3], second])
 
 
-def test_a_coarse_grid_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
-    full(small_scene((CUBE,)), 2e-3)
-    assert "coarse" not in caplog.text
-    full(small_scene((CUBE,)), 2.5e-3)
-    assert "spacing 2.5 mm" in caplog.text
-
-
-def test_silent_drives_need_no_run() -> None:
+def test_silent_drives_need_no_run():
     propagator = full(small_scene((CUBE,)), 2e-3)
     points = propagator.scene.control_points
     assert not propagator.field(torch.zeros(4, dtype=torch.complex128), points).any()
@@ -254,7 +246,7 @@ def test_silent_drives_need_no_run() -> None:
     assert len(propagator.runs) == 0
 
 
-def test_pressure_right_at_a_rigid_wall() -> None:
+def test_pressure_right_at_a_rigid_wall():
     """A point a tenth of a cell off the wall is interpolated from cells in front of it."""
     wall = Box(center=(20e-3, 15e-3, 15e-3), size=(4e-3, 28e-3, 28e-3), rigid=True)
     points = [[18e-3 - distance, 15e-3, 15e-3] for distance in (0.1e-3, 0.5e-3, 1e-3)]

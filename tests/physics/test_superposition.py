@@ -1,7 +1,5 @@
 """Sums of spherical waves against Green's function."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -11,7 +9,7 @@ from autdtorch.analytic.green import green
 from autdtorch.fdtd.superposition import superposition
 
 
-def places(points: int, sources: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def places(points, sources):
     generator = torch.Generator().manual_seed(0)
     targets = 0.1 * torch.rand((points, 3), generator=generator, dtype=torch.float64)
     targets[0] = torch.tensor([3.0, -2.0, 1.0], dtype=torch.float64)
@@ -23,9 +21,7 @@ def places(points: int, sources: int) -> tuple[torch.Tensor, torch.Tensor, torch
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 4e-6)])
 @pytest.mark.parametrize("wavenumber", [complex(740.0), complex(740.0, 5.0), complex(740.0, 700.0)])
 @pytest.mark.parametrize(("points", "sources"), [(40, 5000), (5000, 40), (1, 1), (65, 64), (64, 65)])
-def test_the_sum_is_that_of_greens_functions(
-    points: int, sources: int, wavenumber: complex, dtype: torch.dtype, tolerance: float
-) -> None:
+def test_the_sum_is_that_of_greens_functions(points, sources, wavenumber, dtype, tolerance):
     targets, origins, amplitude = places(points, sources)
     summed = superposition(targets, origins, amplitude, wavenumber, dtype=dtype)
     exact = 4 * math.pi * green(targets, origins, wavenumber) @ amplitude
@@ -34,13 +30,13 @@ def test_the_sum_is_that_of_greens_functions(
     assert (summed - exact).abs().max() < tolerance * amplitude.norm() * largest + 1e-30
 
 
-def test_distances_are_cut_off() -> None:
+def test_distances_are_cut_off():
     _, origins, amplitude = places(1, 1)
     alone = superposition(origins, origins, amplitude, 740.0, nearest=1e-3)
     assert alone[0, 0].abs() == pytest.approx(float(1e3 * amplitude[0, 0].abs()), rel=1e-12)
 
 
-def test_without_points_or_sources_nothing_is_summed() -> None:
+def test_without_points_or_sources_nothing_is_summed():
     targets, origins, amplitude = places(3, 2)
     assert superposition(targets[:0], origins, amplitude, 740.0).shape == (0, 3)
     assert torch.equal(
@@ -48,7 +44,7 @@ def test_without_points_or_sources_nothing_is_summed() -> None:
     )
 
 
-def test_the_number_of_threads_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_threads_changes_no_bit(monkeypatch):
     targets, origins, amplitude = places(3000, 200)
     sums = []
     for threads in (1, 2, 5):

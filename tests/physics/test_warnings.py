@@ -1,22 +1,18 @@
 """Warnings of a scene and its grid: each once for all obstacles, and none of auxiliary grids."""
 
-from __future__ import annotations
-
 import dataclasses
-import warnings
 
 import pytest
 import torch
 from small_scenes import AIR, CUBE, small_scene
 
 from autdtorch.propagators import (
-    SimulatedPropagator,
     SteadyStateWarning,
     differentiable_field,
     make_propagator,
 )
 from autdtorch.scene.obstacles import Box, Sphere
-from autdtorch.scene.scene import OverlapWarning, Scene
+from autdtorch.scene.scene import OverlapWarning
 
 DRIVE = torch.ones(4, dtype=torch.complex128)
 
@@ -24,35 +20,28 @@ DRIVE = torch.ones(4, dtype=torch.complex128)
 BESIDE_ARRAY = Box(center=(5.3e-3, 12e-3, 12e-3), size=(4e-3, 14e-3, 14e-3), rigid=True)
 
 
-def messages(caplog: pytest.LogCaptureFixture, text: str) -> list[str]:
+def messages(caplog, text):
     return [message for message in caplog.messages if text in message]
 
 
-def simulated(scene: Scene, method: str, spacing: float | None, **settings: float) -> SimulatedPropagator:
-    propagator = make_propagator(scene, method, spacing, **{"tolerance": 0.1, **settings})
-    assert isinstance(propagator, SimulatedPropagator)
-    return propagator
+def simulated(scene, method, spacing, **settings):
+    return make_propagator(scene, method, spacing, **{"tolerance": 0.1, **settings})
 
 
-def of_two_speeds(extent: float) -> Scene:
+def of_two_speeds(extent):
     """A rigid sphere and, in the opposite corner, a slow one around another of another material."""
     near, far = (14e-3,) * 3, (extent - 14e-3,) * 3
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", OverlapWarning)
-        return small_scene(
-            (
-                Sphere(near, 4e-3, rigid=True),
-                Sphere(far, 4e-3, density=100.0, sound_speed=320.0),
-                Sphere(far, 2e-3, density=50.0, sound_speed=330.0),
-            ),
-            extent,
-        )
+    obstacles = (
+        Sphere(near, 4e-3, rigid=True),
+        Sphere(far, 4e-3, density=100.0, sound_speed=320.0),
+        Sphere(far, 2e-3, density=50.0, sound_speed=330.0),
+    )
+    with pytest.warns(OverlapWarning):
+        return small_scene(obstacles, extent)
 
 
 @pytest.mark.parametrize(("method", "extent"), [("box", 200e-3), ("full", 48e-3)])
-def test_a_coarse_spacing_is_logged_once_for_all_obstacles(
-    method: str, extent: float, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_coarse_spacing_is_logged_once_for_all_obstacles(method, extent, caplog):
     propagator = simulated(of_two_speeds(extent), method, 2.5e-3)
     if method == "box":
         assert len(propagator._simulation.assemblies) == 2
@@ -60,14 +49,11 @@ def test_a_coarse_spacing_is_logged_once_for_all_obstacles(
     assert propagator._second.planned_runs
     (message,) = messages(caplog, "coarse")
     assert "2.5 mm" in message
-    for where in ("the medium", "obstacle 1", "obstacle 2"):
-        assert where in message
+    assert all(where in message for where in ("the medium", "obstacle 1", "obstacle 2"))
     assert "obstacle 0" not in message  # which is rigid
 
 
-def test_a_coarse_spacing_is_logged_once_where_the_medium_is_differentiated(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_a_coarse_spacing_is_logged_once_where_the_medium_is_differentiated(caplog):
     speed = torch.tensor([335.0], dtype=torch.float64, requires_grad=True)
     field = differentiable_field(small_scene((CUBE,)), DRIVE, sound_speed=speed, spacing=2.5e-3)
     field.abs().sum().backward()
@@ -75,7 +61,12 @@ def test_a_coarse_spacing_is_logged_once_where_the_medium_is_differentiated(
     assert "the medium given" in message
 
 
-def test_pilot_grids_are_not_logged(caplog: pytest.LogCaptureFixture) -> None:
+def test_free_space_warns_of_ignored_obstacles(caplog):
+    make_propagator(small_scene((CUBE,)), "free_space")
+    assert "1 obstacles" in caplog.text
+
+
+def test_pilot_grids_are_not_logged(caplog):
     scene = small_scene((BESIDE_ARRAY,))
     points = torch.cat((scene.control_points, scene.control_points - 0.5e-3))  # more than transducers
     simulated(dataclasses.replace(scene, control_points=points), "box", None, tolerance=0.5)
@@ -83,7 +74,7 @@ def test_pilot_grids_are_not_logged(caplog: pytest.LogCaptureFixture) -> None:
 
 
 @pytest.mark.parametrize("method", ["box", "full"])
-def test_a_source_beside_an_obstacle_is_logged_once(method: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_source_beside_an_obstacle_is_logged_once(method, caplog):
     propagator = simulated(small_scene((BESIDE_ARRAY,)), method, 1.4e-3, tolerance=0.5)
     points = propagator.scene.control_points
     propagator.transfer_matrix()
@@ -96,7 +87,7 @@ def test_a_source_beside_an_obstacle_is_logged_once(method: str, caplog: pytest.
     assert len(messages(caplog, "of an obstacle")) == 1
 
 
-def test_runs_that_do_not_converge_give_one_warning() -> None:
+def test_runs_that_do_not_converge_give_one_warning():
     propagator = simulated(small_scene((CUBE,)), "full", 1.4e-3, tolerance=1e-6, max_periods=8)
     drives, points = torch.stack((DRIVE, 1j * DRIVE)), propagator.scene.control_points
     for counts, call in (
@@ -108,7 +99,7 @@ def test_runs_that_do_not_converge_give_one_warning() -> None:
         assert [warning.filename for warning in caught] == [__file__]
 
 
-def test_walls_that_end_are_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_walls_that_end_are_logged_once(caplog):
     walls = [
         Box((22e-3, 12e-3, 12e-3), (1e-3, 1.0, 1.0), density=2.0, sound_speed=AIR.sound_speed),
         *(Box((12e-3, y, 12e-3), (1.0, 1e-3, 1.0), density=2.0, sound_speed=340.0) for y in (1e-3, 23e-3)),

@@ -8,7 +8,7 @@ from small_scenes import small_scene
 import autdtorch as at
 
 
-def test_a_volume_is_the_field_outside_obstacles_and_away_from_transducers() -> None:
+def test_a_volume_is_the_field_outside_obstacles_and_away_from_transducers():
     ball = at.Sphere((40e-3, 40e-3, 40e-3), 9e-3, rigid=True)
     scene = small_scene((ball,), extent=80e-3)
     propagator = at.make_propagator(scene, method="free_space")
@@ -27,7 +27,7 @@ def test_a_volume_is_the_field_outside_obstacles_and_away_from_transducers() -> 
     assert torch.equal(volume.isnan(), left_out)
 
 
-def test_a_volume_refuses_several_drives_and_too_many_cells() -> None:
+def test_a_volume_refuses_several_drives_and_too_many_cells():
     scene = small_scene(extent=80e-3)
     propagator = at.make_propagator(scene, method="free_space")
     drive = at.drive_from_phases(torch.zeros(len(scene.array)))
