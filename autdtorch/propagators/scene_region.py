@@ -21,8 +21,9 @@ def region_of(scene: Scene) -> Region:
     """
     bodies = []
     for one, continued in zip(scene.obstacles, _continued(scene), strict=True):
-        rigid = one.density is None or one.sound_speed is None
-        bodies.append(Body(one, None if rigid else Fluid(one.density, one.sound_speed), continued))
+        density, speed = one.density, one.sound_speed
+        fluid = None if density is None or speed is None else Fluid(density, speed)
+        bodies.append(Body(one, fluid, continued))
     medium, positions = scene.medium, np.asarray(scene.array.positions.numpy())
     air = Fluid(medium.density, medium.sound_speed)
     return Region(air, scene.attenuation, scene.frequency, tuple(bodies), scene.domain, positions)
