@@ -9,16 +9,14 @@ import torch
 
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import Plane
-from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
+from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
 from autdtorch.scene.scene import Medium, Scene
 
 AIR = Medium(density=1.293, sound_speed=340.0)
 CUBE = Box(center=(12e-3, 12e-3, 12e-3), size=(6e-3, 8e-3, 4e-3), density=100.0, sound_speed=340.0)
 
 
-def small_scene(
-    obstacles: tuple[Obstacle, ...] = (), extent: float = 24e-3, absorption: float = 0.0, radius: float = 0.0
-) -> Scene:
+def small_scene(obstacles=(), extent=0.024, absorption=0.0, radius=0.0):
     """A 2 x 2 array at one face of a cube of air, three control points near the other, none on a cell."""
     array = TransducerArray.grid((2, 2), pitch=8e-3, center=(1.2e-3, extent / 2, extent / 2), radius=radius)
     air = Medium(AIR.density, AIR.sound_speed, absorption)

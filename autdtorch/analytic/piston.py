@@ -10,11 +10,9 @@ from scipy.special import j1
 
 from autdtorch.utils.validation import ArrayLike, Vector, points_tensor, positive, real_tensor, unit_vector
 
-_HALVINGS = 30
-"""Halvings of the angle along the rim towards the point nearest to the receiver."""
+_HALVINGS = 30  # halvings of the angle along the rim towards the point nearest to the receiver
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
-_PANEL_PHASE = 6.0
-"""Phase of a panel that 16 Gauss nodes integrate with errors below 1e-13 [rad]."""
+_PANEL_PHASE = 6.0  # phase of a panel that 16 Gauss nodes integrate with errors below 1e-13 [rad]
 
 
 def piston_directivity(angle: ArrayLike, wavenumber: float, radius: float) -> torch.Tensor:

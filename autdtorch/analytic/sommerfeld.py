@@ -23,8 +23,7 @@ _DIP = 4.0
 """Depth of the contour below the axis times the offset; J_0 grows to e^4 there, at a loss of two digits."""
 _DIAGONAL_LEGS = 6
 """Legs of the diagonal; the first leaves out 8^-6 = 4e-6 of the dip, with an error of its square."""
-_TAIL = 40.0
-"""Exponent of decay at the end of a tail: e^-40 = 4e-18."""
+_TAIL = 40.0  # exponent of decay at the end of a tail: e^-40 = 4e-18
 
 
 def sommerfeld_integral(

@@ -34,14 +34,11 @@ Boundary: TypeAlias = Callable[[int], tuple[torch.Tensor | float, torch.Tensor |
 Radial: TypeAlias = Callable[[torch.Tensor, int], torch.Tensor]
 """Radial functions: from k r (P,) and N to the orders 0 to N, complex (N + 1, P)."""
 
-_BLOCK = 256
-"""Points summed at a time, to limit memory."""
-_NEGLIGIBLE = 1e-17
-"""Fraction of the largest term at which a series ends."""
+_BLOCK = 256  # points summed at a time, to limit memory
+_NEGLIGIBLE = 1e-17  # fraction of the largest term at which a series ends
 _MOST_ORDERS = 2**16
 """Largest number of orders; enough for a point on the surface and a source 6e-4 radii off it."""
-_CENTER = 1e-100
-"""Replacement for k r = 0, where the field has a limit but its factors do not."""
+_CENTER = 1e-100  # replacement for k r = 0, where the field has a limit but its factors do not
 
 
 def rigid_sphere(

@@ -36,6 +36,8 @@ from autdtorch.utils.validation import (
 
 _LEVEL_COLUMNS = {f"{name} {column}": "" for name, device in DEVICES.items() for column in device.columns}
 _PLAIN_COLUMNS = {"phase": "rad", "amplitude": ""}
+_NUMBERING = {"unit": "", "transducer": ""}
+_COLUMNS = _NUMBERING | PLACE_COLUMNS | NORMAL_COLUMNS | _PLAIN_COLUMNS | _LEVEL_COLUMNS
 
 
 def save_drive(
@@ -89,7 +91,7 @@ def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
             it has lines.
     """
     if _kind(path) == ".csv":
-        return _from_columns(path, read_table(path, _all_columns()))
+        return _from_columns(path, read_table(path, _COLUMNS))
     arrays = read_arrays(path)
     if "device" in arrays:
         name = str(arrays["device"])
@@ -109,11 +111,6 @@ def _kind(path: str | os.PathLike[str]) -> str:
     return kind
 
 
-def _all_columns() -> dict[str, str]:
-    numbering = {"unit": "", "transducer": ""}
-    return numbering | PLACE_COLUMNS | NORMAL_COLUMNS | _PLAIN_COLUMNS | _LEVEL_COLUMNS
-
-
 def _plain(drive: torch.Tensor, array: TransducerArray) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return columns by header and arrays by name of a drive with full precision."""
     positions, normals = array.positions.numpy(), array.normals.numpy()
@@ -121,14 +118,8 @@ def _plain(drive: torch.Tensor, array: TransducerArray) -> tuple[dict[str, Any],
     columns |= {f"{name} [m]": positions[:, axis] for axis, name in enumerate(PLACE_COLUMNS)}
     columns |= {name: normals[:, axis] for axis, name in enumerate(NORMAL_COLUMNS)}
     columns |= {"phase [rad]": phases_of(drive).numpy(), "amplitude": amplitudes_of(drive).numpy()}
-    arrays = {
-        "drive": drive.numpy(),
-        "positions": positions,
-        "normals": normals,
-        "source_strength": array.source_strength,
-        "radius": array.radius,
-    }
-    return columns, arrays
+    arrays = {"drive": drive.numpy(), "positions": positions, "normals": normals}
+    return columns, arrays | {"source_strength": array.source_strength, "radius": array.radius}
 
 
 def _levelled(drive: torch.Tensor, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -151,9 +142,8 @@ def _from_columns(path: str | os.PathLike[str], table: Mapping[str, npt.NDArray[
             return _played(path, name, table)
     missing = [column for column in _PLAIN_COLUMNS if column not in table]
     if missing:
-        raise ValueError(
-            f"{path}: no column {', '.join(missing)}; must have phase and amplitude, or a device's"
-        )
+        accepted = "must have phase and amplitude, or a device's"
+        raise ValueError(f"{path}: no column {', '.join(missing)}; {accepted}")
     with within(path):
         return drive_from_phases(table["phase"], table["amplitude"])
 
@@ -169,6 +159,4 @@ def _played(path: str | os.PathLike[str], name: str, stored: Mapping[str, npt.ND
     with within(path):
         levels = [real_tensor(column, stored[column]) for column in wanted]
         # The device refuses fractions, which stay floats.
-        return device.drive(
-            *(level.long() if torch.equal(level, level.round()) else level for level in levels)
-        )
+        return device.drive(*(one.long() if torch.equal(one, one.round()) else one for one in levels))

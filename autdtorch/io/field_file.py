@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import NamedTuple
 
 import h5py
 import numpy as np
@@ -107,14 +107,11 @@ def _grid(points: Array) -> _Grid:
 def _write_hdf5(path: Path, pressure: torch.Tensor, grid: _Grid, frequency: float) -> None:
     with h5py.File(path, "w") as file:
         data = file.create_dataset("pressure", data=pressure.numpy(), compression="gzip", shuffle=True)
-        data.attrs["units"] = "Pa"
-        data.attrs["origin"] = grid.origin
-        data.attrs["spacing"] = grid.spacing[: pressure.ndim]
-        data.attrs["axes"] = grid.axes[: pressure.ndim]
-        data.attrs["length_units"] = "m"
-        data.attrs["frequency"] = frequency
-        data.attrs["frequency_units"] = "Hz"
-        data.attrs["time_convention"] = "exp(-i omega t)"
+        axes = slice(pressure.ndim)
+        places = {"origin": grid.origin, "spacing": grid.spacing[axes], "axes": grid.axes[axes]}
+        units = {"units": "Pa", "length_units": "m", "frequency_units": "Hz"}
+        wave = {"frequency": frequency, "time_convention": "exp(-i omega t)"}
+        data.attrs.update(places | units | wave)
 
 
 def _along_coordinates(pressure: Array, grid: _Grid) -> tuple[Array, _Grid]:
@@ -135,11 +132,8 @@ def _along_coordinates(pressure: Array, grid: _Grid) -> tuple[Array, _Grid]:
 def _write_vti(path: Path, pressure: torch.Tensor, grid: _Grid, frequency: float) -> None:
     values = pressure.numpy().reshape(*pressure.shape, *(1,) * (3 - pressure.ndim))
     values, grid = _along_coordinates(values, grid)
-    arrays = {
-        "pressure_real": values.real,
-        "pressure_imag": values.imag,
-        "pressure_magnitude": np.abs(values),
-    }
+    arrays = {"pressure_real": values.real, "pressure_imag": values.imag}
+    arrays["pressure_magnitude"] = np.abs(values)
     extent = " ".join(f"0 {count - 1}" for count in values.shape)
     size = values.size * 8
     # Each appended block follows its length.
@@ -149,7 +143,7 @@ def _write_vti(path: Path, pressure: torch.Tensor, grid: _Grid, frequency: float
     )
     # VTK wants the axes as columns.
     header = f"""<?xml version="1.0"?>
-<VTKFile type="ImageData" version="1.0" byte_order="{_byte_order()}" header_type="UInt64">
+<VTKFile type="ImageData" version="1.0" byte_order="{sys.byteorder.capitalize()}Endian" header_type="UInt64">
 <ImageData WholeExtent="{extent}" Origin="{_text(grid.origin)}" Spacing="{_text(grid.spacing)}"
  Direction="{_text(grid.axes.T)}">
 <FieldData>
@@ -164,19 +158,10 @@ def _write_vti(path: Path, pressure: torch.Tensor, grid: _Grid, frequency: float
 _"""
     with path.open("wb") as file:
         file.write(header.encode("ascii"))
-        for block in arrays.values():
-            _append(file, block)
+        for block in arrays.values():  # its length, then the values with x fastest
+            file.write(np.uint64(size).tobytes())
+            file.write(np.asarray(block, dtype=np.float64).tobytes(order="F"))
         file.write(b"\n</AppendedData>\n</VTKFile>\n")
-
-
-def _append(file: BinaryIO, block: Array) -> None:
-    """Append a block of data: its length, then the values with x fastest."""
-    file.write(np.uint64(block.size * 8).tobytes())
-    file.write(np.asarray(block, dtype=np.float64).tobytes(order="F"))
-
-
-def _byte_order() -> str:
-    return "LittleEndian" if sys.byteorder == "little" else "BigEndian"
 
 
 def _text(numbers: Array) -> str:

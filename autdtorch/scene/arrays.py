@@ -38,22 +38,16 @@ from autdtorch.utils.validation import (
 PAPER_SOURCE_STRENGTH = 1 / (4 * math.pi)
 """Source strength in the paper's Eq. 2: on-axis pressure at full drive times distance [Pa m]."""
 
-_TRANSDUCER_BYTES = 500.0
-"""Memory for each transducer [bytes], with the search for its neighbours."""
+_TRANSDUCER_BYTES = 500.0  # memory for each transducer [bytes], with the search for its neighbours
 
 _RINGS, _RING_NODES = 5, 16
 
 
 class Nodes(NamedTuple):
-    """The monopoles of N sources or receivers of equal shape.
+    """The monopoles of N sources or receivers of equal shape, n each, in float64."""
 
-    Attributes:
-        positions: of the n nodes of each source (N, n, 3) [m], float64.
-        weights: of the nodes (n,), float64, with the sum 1.
-    """
-
-    positions: torch.Tensor
-    weights: torch.Tensor
+    positions: torch.Tensor  # (N, n, 3) [m]
+    weights: torch.Tensor  # (n,), with the sum 1
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -83,13 +77,10 @@ class TransducerArray:
         source_strength: float = PAPER_SOURCE_STRENGTH,
         radius: float | None = None,
     ) -> None:
-        """Check and copy the input.
+        """Check and copy the input; the arguments are the attributes, see `TransducerArray`.
 
-        Args:
-            positions: (M, 3) [m], M >= 1.
-            normals: (M, 3), or (3,) for all; of any length > 0.
-            source_strength: [Pa m], > 0.
-            radius: of the discs [m], at most half the distance of the nearest two; None or 0 for points.
+        A single normal (3,), of any length, serves all. The radius is at most half the distance of the
+        nearest two, None or 0 for points.
 
         Raises:
             ValueError: not finite, wrong shape, zero normal, strength <= 0, two transducers at one position,
@@ -199,9 +190,8 @@ class TransducerArray:
         """The monopoles of each transducer: one for a point, 80 for a disc.
 
         A disc of radius a has 5 rings at Gauss points in r^2, each of 16 equal angles and turned by half a
-        step against the next (Peirce, J. SIAM 5 (1957) 66-73). For k a <= 6 the error in
-        the far field is 1e-6 at all angles. At a distance of a/2 from the disc it is 1e-4 of the largest
-        pressure.
+        step against the next (Peirce, J. SIAM 5 (1957) 66-73). For k a <= 6 the error in the far field is
+        1e-6 at all angles. At a distance of a/2 from the disc it is 1e-4 of the largest pressure.
         """
         if self.radius == 0:
             return Nodes(self.positions[:, None], torch.ones(1, dtype=torch.float64, device="cpu"))

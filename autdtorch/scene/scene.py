@@ -156,12 +156,10 @@ class Scene:
 
     def __repr__(self) -> str:
         """Return name, frequency, counts and extent, with units."""
-        return (
-            f"Scene({self.name!r}, {self.frequency / 1e3:.4g} kHz, "
-            f"wavelength {1e3 * self.wavelength:.4g} mm, {len(self.array)} transducers, "
-            f"{len(self.control_points)} control points, {len(self.obstacles)} obstacles, "
-            f"domain {self._size()} mm)"
-        )
+        wave = f"{self.frequency / 1e3:.4g} kHz, wavelength {1e3 * self.wavelength:.4g} mm"
+        counts = f"{len(self.array)} transducers, {len(self.control_points)} control points"
+        space = f"{len(self.obstacles)} obstacles, domain {self._size()} mm"
+        return f"Scene({self.name!r}, {wave}, {counts}, {space})"
 
     def _repr_html_(self) -> str:
         """Return a table of the scene's contents, for Jupyter."""
@@ -268,12 +266,9 @@ def _warn_of_units(scene: Scene) -> None:
     extent = float((points.amax(dim=0) - points.amin(dim=0)).norm())
     least, most = (bound * scene.wavelength for bound in _USUAL_EXTENT)
     if not least <= extent <= most:
-        warnings.warn(
-            f"Scene: {extent:.4g} m from end to end of array and control points, but a wavelength of "
-            f"{scene.wavelength:.4g} m; are lengths in m and the frequency in Hz?",
-            ScaleWarning,
-            stacklevel=3,
-        )
+        found = f"{extent:.4g} m from end to end of array and control points, but a wavelength of"
+        text = f"Scene: {found} {scene.wavelength:.4g} m; are lengths in m and the frequency in Hz?"
+        warnings.warn(text, ScaleWarning, stacklevel=3)
 
 
 def _warn_of_overlaps(obstacles: tuple[Obstacle, ...]) -> None:
@@ -289,11 +284,8 @@ def _warn_of_overlaps(obstacles: tuple[Obstacle, ...]) -> None:
         if material(obstacle) != material(other) and _overlap(obstacle, other)
     ]
     if pairs:
-        warnings.warn(
-            f"Scene.obstacles: {', '.join(pairs)}, of another material; where both are, the later counts",
-            OverlapWarning,
-            stacklevel=3,
-        )
+        text = f"{', '.join(pairs)}, of another material; where both are, the later counts"
+        warnings.warn(f"Scene.obstacles: {text}", OverlapWarning, stacklevel=3)
 
 
 def _overlap(obstacle: Obstacle, other: Obstacle) -> bool:

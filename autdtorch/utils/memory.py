@@ -12,11 +12,9 @@ from autdtorch.utils.validation import invalid
 
 _CGROUP = Path("/proc/self/cgroup")
 _MOUNT = Path("/sys/fs/cgroup")
-_FILES = {
-    2: ("memory.max", "memory.current", "inactive_file"),
-    1: ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
-}
-"""Files of a control group by version: the limit, the memory in use, and the reclaimable part of it."""
+# Files of a control group by version: the limit, the memory in use, and the reclaimable part of it.
+_FILES_1 = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+_FILES_2 = ("memory.max", "memory.current", "inactive_file")
 
 
 def available_memory() -> int:
@@ -26,7 +24,7 @@ def available_memory() -> int:
 
 
 def require_memory(field: str, value: object, needed: float, unit: str = "") -> None:
-    """Refuse an argument of which the memory needed [bytes] exceeds the available."""
+    """Refuse an argument that needs more memory [bytes] than is available."""
     if needed > (available := available_memory()):
         left = f"this process may use {available / 1e9:.3g} GB"
         raise invalid(field, value, f"needs about {needed / 1e9:.3g} GB of memory, {left}", unit)
@@ -38,15 +36,15 @@ def _left_in_groups() -> Iterator[int]:
         for line in _CGROUP.read_text("utf-8").splitlines():
             _, controllers, path = line.split(":", 2)
             if not controllers:
-                root, version = _MOUNT, 2
+                root, files = _MOUNT, _FILES_2
             elif "memory" in controllers.split(","):
-                root, version = _MOUNT / "memory", 1
+                root, files = _MOUNT / "memory", _FILES_1
             else:
                 continue
             here = root / path.lstrip("/")
             for folder in (here, *here.parents):
                 if folder.is_relative_to(root):
-                    yield from _left_in_group(folder, *_FILES[version])
+                    yield from _left_in_group(folder, *files)
 
 
 def _left_in_group(folder: Path, limit: str, usage: str, inactive: str) -> Iterator[int]:

@@ -19,20 +19,9 @@ _LARGEST = 2**30  # [bytes] of unpacked arrays; a small file can hold many zeros
 _LONGEST_HEADER = 1000  # [bytes]; NumPy writes 128 for plain arrays
 _PLAIN = "biufcU"  # kinds of dtype: numbers and text
 
-#: Errors of NumPy and zipfile for damaged files.
-_DAMAGE = (
-    OSError,
-    ValueError,
-    TypeError,
-    LookupError,
-    EOFError,
-    OverflowError,
-    RuntimeError,
-    SyntaxError,
-    tokenize.TokenError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
+# Errors of NumPy and zipfile for damaged files.
+_DAMAGE = (OSError, ValueError, TypeError, LookupError, EOFError, OverflowError, RuntimeError, SyntaxError)
+_ARCHIVE_DAMAGE = (tokenize.TokenError, zipfile.BadZipFile, zlib.error)
 
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
@@ -50,7 +39,7 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, AnyArray]:
             if (size := sum(member.file_size for member in members)) > _LARGEST:
                 raise ValueError(f"{size} bytes, more than {_LARGEST}")
             return {member.filename.removesuffix(".npy"): _member(archive, member) for member in members}
-    except _DAMAGE as error:
+    except (*_DAMAGE, *_ARCHIVE_DAMAGE) as error:
         raise ValueError(f"{os.fspath(path)}: {error}; must hold plain NumPy arrays") from error
 
 

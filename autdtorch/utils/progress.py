@@ -15,8 +15,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 logger = logging.getLogger(__name__)
 
-_PATIENCE = 3.0
-"""Time after which the bar or the first forecast in the log appears [s]."""
+_PATIENCE = 3.0  # time after which the bar or the first forecast in the log appears [s]
 
 
 class Progress:
@@ -24,10 +23,7 @@ class Progress:
 
     def __init__(self, steps: int, what: str, bar: tqdm[None] | None) -> None:
         """Show the progress on `bar`, or in the log if it is None; `steps` may be an estimate."""
-        self._bar = bar
-        self._steps = steps
-        self._what = what
-        self._done = 0
+        self._bar, self._steps, self._what, self._done = bar, steps, what, 0
         self._begun = time.monotonic()
         self._first: tuple[float, int] | None = None  # time and number of the first steps
         self._next = _PATIENCE
@@ -35,17 +31,13 @@ class Progress:
 
     def begin(self, what: str) -> None:
         """Name the current task."""
-        self._what = what
-        if self._bar is None:
-            logger.info(what)
-        else:
-            self._bar.set_description(what)
+        self.describe(what, logging.INFO)
 
-    def describe(self, what: str) -> None:
+    def describe(self, what: str, level: int = logging.DEBUG) -> None:
         """Show the details of the work on the bar, or in the log for developers."""
         self._what = what
         if self._bar is None:
-            logger.debug(what)
+            logger.log(level, what)
         else:
             self._bar.set_description(what)
 

@@ -31,7 +31,6 @@ def board(tmp_path):
 
 def test_board_is_read_in_full(board):
     read = OpenMPDBoard.load(board)
-
     assert (read.name, read.pins) == ("FT123456", (2, 0, 3, 1))
     assert read.positions.tolist() == [[-5e-3, 5e-3, 0], [-5e-3, -5e-3, 0], [5e-3, 5e-3, 0], [5e-3, -5e-3, 0]]
     assert read.phase_offsets.tolist() == pytest.approx([math.pi / 2, -math.pi / 4, 0, math.pi])
@@ -40,7 +39,6 @@ def test_board_is_read_in_full(board):
 
 def test_calibrated_drive_takes_off_the_offsets_and_multiplies_by_the_gains(board):
     sent = OpenMPDBoard.load(board).calibrated([1 + 0j, 1 + 0j, 1j, 1 + 0j])
-
     # A transducer that is a quarter of a period ahead in arg q is sent a quarter less.
     expected = torch.tensor([-1j, 0.5 * np.exp(0.25j * np.pi), 1j, -1 + 0j], dtype=torch.complex128)
     torch.testing.assert_close(sent, expected, rtol=0, atol=1e-15)
@@ -81,7 +79,6 @@ array: {type: file, path: board_1.pat, center: [0, 0, 20e-3], normal: [0, 0, -1]
 control_points: {type: points, positions: [[0, 0, -80e-3]]}
 """)
     array = load_scene(board.parent / "scene.yaml").array
-
     # Facing -z, (u, v) is (x, -y), so that the board is turned over about x.
     expected = OpenMPDBoard.load(board).positions * torch.tensor([1.0, -1.0, -1.0])
     expected[:, 2] += 20e-3
@@ -94,7 +91,6 @@ def test_csv_is_read_in_its_units_and_pointed_up_by_default(tmp_path):
     path = tmp_path / "array.csv"
     path.write_text("# my array\nz [m], x [mm], y [mm]\n0.5, 10, 20\n\n0.5, -10, 20\n")
     array = load_array(path, source_strength=2.0)
-
     torch.testing.assert_close(
         array.positions, torch.tensor([[10e-3, 20e-3, 0.5], [-10e-3, 20e-3, 0.5]]).double(), rtol=0, atol=1e-9
     )
@@ -106,7 +102,6 @@ def test_normals_turn_with_the_array(tmp_path):
     path = tmp_path / "array.csv"
     path.write_text("x [m],y [m],z [m],nx,ny,nz\n0.01,0,0,1,0,0\n0,0,0,0,0,2\n")
     array = load_array(path, center=(0, 0, 1), normal=(1, 0, 0))
-
     # Facing +x, the file's x goes to u = y and its z to x.
     assert array.positions.tolist() == [[0, 0.01, 1], [0, 0, 1]]
     assert array.normals.tolist() == [[0, 1, 0], [1, 0, 0]]
@@ -116,7 +111,6 @@ def test_npz_needs_positions_and_normals_alone(tmp_path):
     array = TransducerArray.grid((2, 3), 10e-3, (0, 0, 0), radius=4e-3)
     np.savez(tmp_path / "array.npz", positions=array.positions, normals=array.normals)
     read = load_array(tmp_path / "array.npz")
-
     assert torch.equal(read.positions, array.positions)
     assert torch.equal(read.normals, array.normals)
     assert (read.source_strength, read.radius) == (PAPER_SOURCE_STRENGTH, 0)

@@ -20,11 +20,7 @@ FLAT = {"type": "box", "center": [0, 0, 0], "size": [1, 1, 0], "rigid": True}
         ("medium", ..., "scene mapping: missing key 'medium'; allowed keys"),
         ("array.pitch", ..., "scene mapping: array: missing key 'pitch'"),
         ("control_points.type", ..., "control_points: type: None; must be one of circle, points"),
-        (
-            "array.type",
-            "gird",
-            "array: type: 'gird'; must be one of grid, positions, autd3, sonicsurface, openm",
-        ),
+        ("array.type", "gird", "array: type: 'gird'; must be one of grid, positions, autd3"),
         ("array.type", ["grid"], "array: type: ('grid',); must be one of"),
         ("medium", 340.0, "medium: 340.0; must be a mapping of keys to"),
         ("obstacles", {"type": "box"}, "obstacles: {'type': 'box'}; must be a list"),

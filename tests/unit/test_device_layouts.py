@@ -13,7 +13,6 @@ ROUNDING = 1e-12  # of lengths below 1 m in float64, with margin
 
 def test_autd3_counts_row_by_row_and_leaves_out_three():
     array = TransducerArray.autd3((0, 0, 0), normal=(0, 0, 1))
-
     place = (array.positions[:, :2] - array.positions[0, :2]) / PITCH
     counted = place.round().long().tolist()
     # As autd3-core 0.12 has them: 18 in the first row; (1, 1), (2, 1) and (16, 1) are missing in the second.
@@ -29,7 +28,6 @@ def test_autd3_counts_row_by_row_and_leaves_out_three():
 def test_units_of_autd3_lie_side_by_side():
     one = TransducerArray.autd3((1e-3, 50e-3, 50e-3))
     four = TransducerArray.autd3((1e-3, 50e-3, 50e-3), units=(2, 2))
-
     assert (len(one), len(four)) == (249, 996)
     assert four.positions.mean(0) == pytest.approx(one.positions.mean(0), abs=ROUNDING)
     extent = four.positions.amax(0) - four.positions.amin(0)
@@ -42,7 +40,6 @@ def test_units_of_autd3_lie_side_by_side():
 def test_square_boards_begin_at_the_top_left():
     rows = TransducerArray.sonicsurface((0, 0, 0), normal=(0, 0, 1)).positions * 1e3
     columns = TransducerArray.openmpd((0, 0, 0), normal=(0, 0, 1)).positions * 1e3
-
     first, right, below, last = [-78.75, 78.75, 0], [-68.25, 78.75, 0], [-78.75, 68.25, 0], [78.75, -78.75, 0]
     for positions, second, seventeenth in ((rows, right, below), (columns, below, right)):
         for index, place in ((0, first), (1, second), (16, seventeenth), (255, last)):
@@ -54,7 +51,6 @@ def test_devices_go_where_they_are_put(device):
     make = getattr(TransducerArray, device)
     flat = make((0, 0, 0), normal=(0, 0, 1))
     turned = make((0.1, 0.2, 0.3), normal=(0, 2, 0), angle=math.pi / 2)
-
     # Facing +y, (u, v) is (z, x); turned by a right angle, the device's x is v = x and its y is -u = -z.
     x, y, _ = flat.positions.T
     expected = torch.stack((0.1 + x, torch.full_like(x, 0.2), 0.3 - y), dim=1)

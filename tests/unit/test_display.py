@@ -1,5 +1,6 @@
 """Texts of scenes, propagators and results in a console and a notebook: short, with units, and escaped."""
 
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import pytest
@@ -12,7 +13,6 @@ from autdtorch.objectives.perturbations import Noise
 from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.plot.style import ShownFigure
 from autdtorch.propagators import make_propagator
-from autdtorch.scene.scene import Scene
 from autdtorch.study.provenance import Provenance
 from autdtorch.study.results import MethodResult, SceneResult, Simulation, StudyResult
 
@@ -35,9 +35,20 @@ def results(objective: SimulatedObjective) -> StudyResult:
 def test_reprs_are_short_and_hold_no_tensors(objective: SimulatedObjective, results: StudyResult) -> None:
     scene = results.scenes["a<b"]
     method = scene.methods["gabs"]
-    box = make_propagator(small_scene((CUBE,)), "box", spacing=2e-3)
+    given = small_scene((CUBE,), radius=1e-3)
+    box = make_propagator(given, "box", spacing=2e-3)
     noisy = Noise(objective, snr=30.0)
-    whole = [results, results.provenance, scene, scene.simulation, method, method.solution, method.metrics]
+    whole = [
+        given,
+        given.array,
+        results,
+        results.provenance,
+        scene,
+        scene.simulation,
+        method,
+        method.solution,
+        method.metrics,
+    ]
     for thing in (box, objective, noisy, *whole):
         assert len(repr(thing)) < 200  # characters, two lines of a console
         assert "tensor(" not in repr(thing)
@@ -52,10 +63,8 @@ def test_tables_tell_what_was_reached_and_escape_names(results: StudyResult) -> 
 
 
 def test_a_scene_shows_its_name_escaped() -> None:
-    given = small_scene((CUBE,))
-    scene = Scene(given.array, given.medium, 40e3, given.control_points, given.obstacles, name="<b>")
-    shown = ElementTree.fromstring(scene._repr_html_())
-    assert "<b>" in "".join(shown.itertext())
+    scene = replace(small_scene((CUBE,)), name="<b>")
+    assert "<b>" in "".join(ElementTree.fromstring(scene._repr_html_()).itertext())
 
 
 def test_a_notebook_shows_figures_by_itself() -> None:

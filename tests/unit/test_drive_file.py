@@ -24,26 +24,23 @@ def some_drive(count):
     return drive_from_phases(phases, torch.rand(count, generator=generator, dtype=torch.float64))
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".npz"])
+@pytest.mark.parametrize("suffix", [".csv", ".NPZ"])
 def test_drive_and_array_come_back(tmp_path, suffix):
     array = TransducerArray.autd3((0.1, 0.2, 0.3), normal=(1, 2, 3))
     drive = some_drive(249)
     save_drive(tmp_path / f"drive{suffix}", drive, array)
-
     read, places = load_drive(tmp_path / f"drive{suffix}"), load_array(tmp_path / f"drive{suffix}")
-
     # .npz keeps all bits; .csv keeps phase and amplitude, from which q is computed again.
-    torch.testing.assert_close(read, drive, rtol=0, atol=0 if suffix == ".npz" else 1e-14)
+    torch.testing.assert_close(read, drive, rtol=0, atol=0 if suffix == ".NPZ" else 1e-14)
     torch.testing.assert_close(places.positions, array.positions, rtol=0, atol=1e-15)
     torch.testing.assert_close(places.normals, array.normals, rtol=0, atol=1e-15)
-    if suffix == ".npz":
+    if suffix == ".NPZ":
         assert (places.source_strength, places.radius) == (array.source_strength, array.radius)
 
 
 def test_csv_can_be_read_by_a_person(tmp_path):
     array = TransducerArray([[0, 0, 0], [0, 10e-3, 0]], (1, 0, 0))
     save_drive(tmp_path / "drive.csv", drive_from_phases([0.25, 1.5], [1, 0.5]), array)
-
     assert (tmp_path / "drive.csv").read_text().splitlines() == [
         "transducer,x [m],y [m],z [m],nx,ny,nz,phase [rad],amplitude",
         "0,0.0,0.0,0.0,1.0,0.0,0.0,0.25,1.0",
@@ -59,7 +56,6 @@ def test_levels_come_back_as_the_device_plays_them(tmp_path, device, suffix):
     save_drive(path, drive, array, device)
     played = load_drive(path)
     save_drive(path, played, array, device)
-
     assert torch.equal(load_drive(path), played)
     # Half a step of phase and of amplitude; a step of a pulse's amplitude is that of its phase at most.
     phase_error = math.pi / DEVICES[device].phase_levels.phases
@@ -72,7 +68,6 @@ def test_levels_come_back_as_the_device_plays_them(tmp_path, device, suffix):
 def test_autd3_gets_bytes_in_the_order_of_its_units(tmp_path):
     drive = some_drive(498)
     save_drive(tmp_path / "drive.npz", drive, ARRAYS["autd3"], "autd3")
-
     with np.load(tmp_path / "drive.npz") as file:
         assert str(file["device"]) == "autd3"
         for name, level in zip(("phase", "intensity"), AUTD3.levels(drive), strict=True):
@@ -104,11 +99,6 @@ def test_what_is_wrong_with_an_npz_file_is_said(tmp_path):
         np.save(file, np.ones(3))  # a single array, as .npy
     with pytest.raises(ValueError, match=r"d.npz: no array 'drive'"):
         load_drive(tmp_path / "d.npz")
-
-
-def test_a_suffix_in_capitals_is_kept(tmp_path):
-    save_drive(tmp_path / "D.NPZ", torch.ones(249) + 0j, TransducerArray.autd3((0, 0, 0)))
-    assert load_drive(tmp_path / "D.NPZ").shape == (249,)
 
 
 def test_a_write_that_breaks_off_leaves_the_file_that_was_there(tmp_path, monkeypatch):

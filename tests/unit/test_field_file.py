@@ -39,9 +39,7 @@ PLANES = {name: Plane((0.08, 0.05, 0.05), normal, (0.04, 0.02)) for name, normal
 def test_vtk_finds_every_value_at_its_point(tmp_path, points):
     pressure = wave(points)
     save_field(tmp_path / "field.vti", pressure, points, frequency=40e3)
-
     image = read_by_vtk(tmp_path / "field.vti")
-
     assert image.n_points == pressure.numel()
     ours = points.reshape(-1, 3).numpy()
     nearest = [image.find_closest_point(point) for point in ours]
@@ -55,9 +53,7 @@ def test_vtk_finds_every_value_at_its_point(tmp_path, points):
 def test_vtk_gets_x_fastest_and_planes_along_coordinates_without_directions(tmp_path):
     save_field(tmp_path / "box.vti", wave(box_points()), box_points(), frequency=40e3)
     save_field(tmp_path / "plane.vti", wave(p := PLANES["facing -x"].points(5e-3)), p, frequency=40e3)
-
     box, plane = read_by_vtk(tmp_path / "box.vti"), read_by_vtk(tmp_path / "plane.vti")
-
     assert (box.dimensions, box.spacing) == ((4, 3, 2), pytest.approx((2e-3,) * 3))
     flat = wave(box_points()).numpy().ravel(order="F")
     np.testing.assert_array_equal(box.point_data["pressure_real"], flat.real)
@@ -70,7 +66,6 @@ def test_vtk_gets_x_fastest_and_planes_along_coordinates_without_directions(tmp_
 def test_hdf5_says_where_its_values_are(tmp_path, points):
     pressure = wave(points)
     save_field(tmp_path / "field.h5", pressure, points, frequency=40e3)
-
     with h5py.File(tmp_path / "field.h5", "r") as file:
         data = file["pressure"]
         np.testing.assert_array_equal(data[()], pressure.numpy())

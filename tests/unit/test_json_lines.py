@@ -143,9 +143,7 @@ def test_whatever_is_in_a_line_it_takes_no_time_to_take_it_apart(path: Path) -> 
     assert read(path)[1] == ROWS
 
 
-def test_lines_are_set_aside_on_disk_before_they_leave_the_file(
-    path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_lines_are_set_aside_on_disk_before_they_leave_the_file(path, monkeypatch, caplog):
     damaged = b"damaged\n" + written(path, HEAD)
     path.write_bytes(damaged)
     aside = path.with_name(path.name + SET_ASIDE)
@@ -172,9 +170,7 @@ def test_nothing_follows_half_a_line(path: Path, monkeypatch: pytest.MonkeyPatch
     assert read(path)[1] == [*ROWS, ROWS[0]]
 
 
-def test_a_row_that_its_reader_refuses_is_set_aside_with_the_reason(
-    path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_row_that_its_reader_refuses_is_set_aside_with_the_reason(path, caplog):
     def use(row: dict[str, Any]) -> None:
         if row["number"] == 1:
             row["missing"]
@@ -192,11 +188,6 @@ def test_a_file_that_was_removed_meanwhile_is_not_begun_anew_by_its_next_line(pa
     with pytest.raises(FileNotFoundError, match=r"rows\.jsonl"):
         lines.append(ROWS[1])
     assert not path.exists()
-
-
-def test_the_lines_of_a_file_with_another_key_are_not_used(path: Path) -> None:
-    written(path)
-    assert read(path, "another")[1] == []
 
 
 def test_nothing_is_lost_where_lines_cannot_be_set_aside(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

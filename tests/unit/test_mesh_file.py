@@ -74,12 +74,6 @@ def test_ply(tmp_path: Path, kind: str, corners: str) -> None:
     assert faces.tolist() == [list(face) for face in FACES]
 
 
-def test_a_face_of_fewer_than_three_vertices_is_refused_with_its_line(tmp_path: Path) -> None:
-    (tmp_path / "body.obj").write_text(f"{OBJ['plain']}f 1 2\n", encoding="utf-8")
-    with pytest.raises(ValueError, match=r"line 12: .* vertices; must be at least 3"):
-        read_obj(str(tmp_path / "body.obj"))
-
-
 @pytest.mark.parametrize("index", ["nan", "inf", "2.5"])
 def test_a_float_index_that_is_not_a_whole_number_is_refused(tmp_path: Path, index: str) -> None:
     content = ply("binary_little_endian").replace(b"uchar int vertex", b"uchar float vertex")

@@ -30,20 +30,17 @@ def cube(x, y, z, edge):
     return Box(center=center, size=(1e-3 * edge,) * 3, density=100.0, sound_speed=340.0)
 
 
-def test_wave_quantities_follow_from_frequency_and_medium():
-    scene = paper_scene()
-    assert scene.wavelength == pytest.approx(8.5e-3, rel=1e-15)
-    assert scene.angular_frequency == pytest.approx(2 * math.pi * 40e3, rel=1e-15)
-    assert scene.wavenumber * scene.wavelength == pytest.approx(2 * math.pi, rel=1e-15)
-
-
-def test_attenuation_is_in_nepers():
+def test_waves_follow_from_frequency_and_medium_and_attenuation_is_in_nepers():
     scene = paper_scene(medium=Medium(density=1.293, sound_speed=340.0, absorption=40.0))
     assert abs(cmath.exp(1j * scene.complex_wavenumber * 0.5)) == pytest.approx(
         10 ** (-0.5 * 40 / 20), rel=1e-13
     )
     assert scene.complex_wavenumber.real == scene.wavenumber
     assert paper_scene().attenuation == 0
+    assert (scene.wavelength, scene.angular_frequency) == pytest.approx(
+        (8.5e-3, 2 * math.pi * 40e3), rel=1e-15
+    )
+    assert scene.wavenumber * scene.wavelength == pytest.approx(2 * math.pi, rel=1e-15)
 
 
 def test_box_is_half_open():
@@ -128,13 +125,6 @@ def test_given_domain_is_kept_and_may_be_touched():
     assert paper_scene(domain=np.array(domain)).domain == domain
 
 
-def test_scene_keeps_its_own_copy_of_the_control_points():
-    points = torch.tensor([[80e-3, 50e-3, 50e-3]], dtype=torch.float64)
-    scene = paper_scene(control_points=points)
-    points += 1.0
-    assert scene.control_points.tolist() == [[80e-3, 50e-3, 50e-3]]
-
-
 def test_a_scene_is_frozen_and_its_changed_copy_is_checked():
     scene = paper_scene(obstacles=[cube(41, 50, 50, 10)])
     with pytest.raises(dataclasses.FrozenInstanceError):
@@ -144,19 +134,19 @@ def test_a_scene_is_frozen_and_its_changed_copy_is_checked():
         dataclasses.replace(scene, control_points=[(41e-3, 50e-3, 50e-3)])
 
 
-def test_scene_survives_pickling():
+def test_scene_keeps_its_own_copies_and_survives_pickling():
     plane = Plane(center=(80e-3, 50e-3, 50e-3), normal=(1, 0, 0), size=(0.1, 0.1))
-    scene = paper_scene(obstacles=[cube(41, 50, 50, 10)], observation_plane=plane, name="one cube")
+    points = torch.tensor([[80e-3, 50e-3, 50e-3]], dtype=torch.float64)
+    array = TransducerArray.grid((4, 4), 10e-3, (1e-3, 50e-3, 50e-3), (1, 2, 3), 2.0, 4e-3)
+    scene = paper_scene(
+        array=array, control_points=points, obstacles=[cube(41, 50, 50, 10)], observation_plane=plane
+    )
+    points += 1.0  # the scene has its own copy
+    assert scene.control_points.tolist() == [[80e-3, 50e-3, 50e-3]]
     copy = pickle.loads(pickle.dumps(scene))
     assert torch.equal(copy.control_points, scene.control_points)
-    assert torch.equal(copy.array.positions, scene.array.positions)
+    assert torch.equal(copy.array.positions, array.positions)
+    assert torch.equal(copy.array.normals, array.normals)
+    assert (copy.array.source_strength, copy.array.radius) == (2.0, 4e-3)
     for field in ("medium", "frequency", "obstacles", "observation_plane", "domain", "name"):
         assert getattr(copy, field) == getattr(scene, field)
-
-
-def test_repr_names_counts_and_units():
-    scene = paper_scene(domain=((0, 0, 0), (0.1, 0.1, 0.1)), name="homogeneous")
-    assert repr(scene) == (
-        "Scene('homogeneous', 40 kHz, wavelength 8.5 mm, 16 transducers, 4 control points, "
-        "0 obstacles, domain 100 x 100 x 100 mm)"
-    )

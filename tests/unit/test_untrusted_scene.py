@@ -121,9 +121,7 @@ def test_a_mapping_that_expands_is_refused(value: object) -> None:
         ("${medium.a}", "Interpolation key 'medium.a' not found"),
     ],
 )
-def test_a_missing_value_is_reported_in_a_line_with_its_key(
-    tmp_path: Path, kind: str, value: str, reason: str
-) -> None:
+def test_a_missing_value_is_reported_in_a_line_with_its_key(tmp_path, kind, value, reason):
     source, where = given(kind, scene() | {"array": value}, tmp_path)
     with pytest.raises(ValueError, match=re.escape(f"{where}: array: {reason}")) as caught:
         load_scene(source)
@@ -160,9 +158,7 @@ READS += [r"\${oc.env:SECRET}", "${oc.decode:SECRET}", "${name}${name}"]  # the 
 
 @pytest.mark.parametrize("kind", ["file", "mapping", "node"])
 @pytest.mark.parametrize("text", READS)
-def test_an_interpolation_is_a_whole_key_without_resolver(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, text: str
-) -> None:
+def test_an_interpolation_is_a_whole_key_without_resolver(tmp_path, monkeypatch, kind, text):
     monkeypatch.setenv("SECRET", "hunter2")
     source, _ = given(kind, scene() | {"name": text, "array": {"path": "x"}}, tmp_path)
     with pytest.raises(ValueError, match=": name: ") as caught:
@@ -222,9 +218,7 @@ ARRAYS = {
 
 
 @pytest.mark.parametrize("content", ARRAYS.values(), ids=ARRAYS.keys())
-def test_arrays_in_files_are_checked_before_they_are_allocated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: bytes
-) -> None:
+def test_arrays_in_files_are_checked_before_they_are_allocated(tmp_path, monkeypatch, content):
     monkeypatch.chdir(tmp_path)
     Path("mask.npy").write_bytes(content)
     Path("array.npz").write_bytes(npz(content))

@@ -34,11 +34,9 @@ class Obstacle(ABC):
         kind = type(self).__name__
         object.__setattr__(self, "rigid", boolean(f"{kind}.rigid", self.rigid))
         if self.rigid:
-            if self.density is not None or self.sound_speed is not None:
-                material = (self.density, self.sound_speed)
-                raise invalid(
-                    f"{kind}.rigid", material, "must have either a material or rigid=True, not both"
-                )
+            if (material := (self.density, self.sound_speed)) != (None, None):
+                accepted = "must have either a material or rigid=True, not both"
+                raise invalid(f"{kind}.rigid", material, accepted)
             return
         if self.density is None or self.sound_speed is None:
             missing = "density" if self.density is None else "sound_speed"

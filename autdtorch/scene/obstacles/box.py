@@ -50,9 +50,8 @@ class Box(Obstacle):
         """Return two triangles for each face; see `Obstacle.surface`."""
         signs = torch.tensor([-0.5, 0.5], dtype=torch.float64, device="cpu")
         corners = torch.cartesian_prod(signs, signs, signs) * signs.new_tensor(self.size)
-        return signs.new_tensor(self.center) + corners @ rotation_matrix(
-            self.rotation
-        ).T, BOX_TRIANGLES.clone()
+        vertices = signs.new_tensor(self.center) + corners @ rotation_matrix(self.rotation).T
+        return vertices, BOX_TRIANGLES.clone()
 
     def _corner(self, share: float) -> Vector:
         turn = rotation_matrix(self.rotation).abs()

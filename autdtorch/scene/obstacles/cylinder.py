@@ -52,10 +52,8 @@ class Cylinder(Obstacle):
     def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return a prism with its edges on the cylinder; see `Obstacle.surface`."""
         radius, half = self.radius, self.height / 2
-        profile = torch.tensor(
-            [(0, -half), (radius, -half), (radius, half), (0, half)], dtype=torch.float64, device="cpu"
-        )
-        return revolved(profile, self.center, self.axis)
+        profile = [(0, -half), (radius, -half), (radius, half), (0, half)]
+        return revolved(torch.tensor(profile, dtype=torch.float64, device="cpu"), self.center, self.axis)
 
     def _corner(self, sign: float) -> Vector:
         x, y, z = (

@@ -17,8 +17,7 @@ from autdtorch.utils.validation import Vector, finite_vector, invalid, path_of, 
 
 _FORMATS = (".stl", ".obj", ".ply")
 
-_FARTHEST = 1e100
-"""Largest coordinate of a vertex, in units of the file; volumes do not overflow."""
+_FARTHEST = 1e100  # largest coordinate of a vertex, in units of the file; volumes do not overflow
 
 
 class _MeshPath(str):

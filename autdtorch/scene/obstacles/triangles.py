@@ -12,18 +12,8 @@ from autdtorch.utils.validation import Vector
 SEGMENTS = 48
 """Sides of the polygon drawn for a circle: corners on the circle, sides up to 0.2 % of the radius inside."""
 
-BOX_TRIANGLES = torch.tensor(
-    [
-        *((0, 1, 3), (0, 3, 2)),
-        *((4, 6, 7), (4, 7, 5)),
-        *((0, 4, 5), (0, 5, 1)),
-        *((2, 3, 7), (2, 7, 6)),
-        *((0, 2, 6), (0, 6, 4)),
-        *((1, 5, 7), (1, 7, 3)),
-    ],
-    dtype=torch.int64,
-    device="cpu",
-)
+_BOX = "013 032 467 475 045 051 237 276 026 064 157 173"
+BOX_TRIANGLES = torch.tensor([[*map(int, face)] for face in _BOX.split()], dtype=torch.int64, device="cpu")
 """Triangles of a box with corners in the order of `torch.cartesian_prod`, two for each face
 from -x, +x, -y to +z."""
 

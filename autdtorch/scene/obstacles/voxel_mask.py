@@ -18,8 +18,7 @@ from autdtorch.utils.digest import digest_of
 from autdtorch.utils.numpy_file import read_arrays
 from autdtorch.utils.validation import Vector, finite_vector, invalid, is_dense, path_of, positive
 
-_AIR = 2
-"""Voxels of air around the body in the distance transform; points farther away use a search tree."""
+_AIR = 2  # voxels of air around the body in the distance transform; points farther away use a search tree
 
 
 @dataclass(frozen=True)
@@ -66,15 +65,9 @@ class VoxelMask(Obstacle):
         sound_speed: float | None = None,
         rigid: bool = False,
     ) -> VoxelMask:
-        """Read the mask from a NumPy file, .npy or .npz with a single array.
+        """Read the mask from `path`, a .npy file or an .npz file with a single array.
 
-        Args:
-            path: of the file.
-            spacing: edge of a voxel [m], > 0.
-            origin: corner of voxel (0, 0, 0) with the smallest coordinates (3,) [m].
-            density: of the material [kg/m^3]; None if rigid.
-            sound_speed: of the material [m/s]; None if rigid.
-            rigid: True for walls that do not move.
+        For the other arguments see `VoxelMask`, and for the material see `Obstacle`.
 
         Raises:
             ValueError: no such file, or no single array in it; see also `VoxelMask`.

@@ -11,8 +11,7 @@ import torch
 
 from autdtorch.utils.validation.values import in_unit, invalid, is_dense, is_plain
 
-_LARGEST = 2**63 - 1
-"""Largest integer that NumPy and PyTorch count with."""
+_LARGEST = 2**63 - 1  # largest integer that NumPy and PyTorch count with
 
 _DENSITIES = 1e-9, 1e9  # [kg/m^3]; far beyond all materials, and squares of their ratios do not overflow
 _SOUND_SPEEDS = 1e-3, 1e6  # [m/s]
