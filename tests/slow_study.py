@@ -31,15 +31,8 @@ def main():
         "cube": dataclasses.replace(small_scene((CUBE,)), observation_plane=PLANE),
     }
     print("ready", flush=True)
-    autdtorch.study.run.run_study(
-        scenes,
-        {"gabs": slow_gabs},
-        solver=SOLVER,
-        trials=6,
-        plane_spacing=4e-3,
-        folder=sys.argv[1],
-        config="a",
-    )
+    settings = {"trials": 6, "plane_spacing": 4e-3, "folder": sys.argv[1], "config": "a"}
+    autdtorch.study.run.run_study(scenes, {"gabs": slow_gabs}, solver=SOLVER, **settings)
 
 
 if __name__ == "__main__":

@@ -47,11 +47,7 @@ _KEYS = (
 class Bench:
     """The device and the sensor that a config describes; nothing is opened yet.
 
-    Attributes:
-        device: the device, with its boards.
-        transducers: the device's transducer for each of the scene's.
-        by_hand: whether a person reads or moves the sensor.
-        settings: what identifies the trial beside its device, by name.
+    `transducers` are the device's for each of the scene's. `settings` identify the trial beside its device.
     """
 
     def __init__(self, section: Mapping[str, Any], scene: Scene, seed: int) -> None:

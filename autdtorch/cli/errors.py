@@ -38,20 +38,14 @@ def stop(error: BaseException) -> NoReturn:
     user's own method.
     """
     print(f"autdtorch: {in_one_line(error)}", file=sys.stderr)
-    sys.exit(_status(error))
+    if isinstance(error, KeyboardInterrupt):
+        sys.exit(128 + getattr(error, "number", signal.SIGINT))  # as a shell reports it
+    sys.exit(_LIMITED if _is_limit(error) else _REFUSED if _is_refusal(error) else _FAILED)
 
 
 def in_one_line(error: BaseException) -> str:
     """Return the message of an error, with its notes, in one line."""
     return "; ".join([_message(error), *getattr(error, "__notes__", [])])
-
-
-def _status(error: BaseException) -> int:
-    if isinstance(error, KeyboardInterrupt):
-        return 128 + getattr(error, "number", signal.SIGINT)  # as a shell reports it
-    if _is_limit(error):
-        return _LIMITED
-    return _REFUSED if _is_refusal(error) else _FAILED
 
 
 def _is_limit(error: BaseException) -> bool:

@@ -76,11 +76,7 @@ class Problem:
 
     @classmethod
     def of(cls, objective: Objective, goal: Score = weakest_focus) -> Problem:
-        """Return the problem that an objective poses.
-
-        Raises:
-            ValueError: no objective, or a goal that is no function.
-        """
+        """Return the problem that an objective poses."""
         require_objective(objective)
         scene = objective.scene
         matrix = getattr(objective, "transfer_matrix", None)
@@ -204,10 +200,6 @@ class Method(ABC):
 
         Returns:
             A state whose drives wait to be observed.
-
-        Raises:
-            ValueError: an argument out of range, a setting that does not fit the problem, or more memory
-                would be needed than there is.
         """
         require_kind("problem", problem, Problem)
         seeds = trial_seeds(seed, trials)
@@ -236,9 +228,6 @@ class Method(ABC):
         Args:
             state: whose drives were observed.
             pressure: magnitudes at the control points (B, P) [Pa].
-
-        Raises:
-            ValueError: pressures or scores that are not finite real numbers or have the wrong shape.
         """
         require_kind("state", state, State)
         batch = state.drives.shape[:2]

@@ -87,10 +87,9 @@ def observed(objective: Objective, drives: torch.Tensor, number: int) -> torch.T
     """
     if not isinstance(objective, Logged):
         return objective(drives)
-    known = [objective.recorded(number + row, drive) for row, drive in enumerate(drives)]
-    missing = [row for row, pressure in enumerate(known) if pressure is None]
-    if not missing:
-        return torch.stack([pressure for pressure in known if pressure is not None])
-    measured = dict(zip(missing, objective(drives[missing]), strict=True))
-    rows = [measured[row] if pressure is None else pressure for row, pressure in enumerate(known)]
-    return torch.stack(rows)
+    recorded = [objective.recorded(number + row, drive) for row, drive in enumerate(drives)]
+    found = {row: pressure for row, pressure in enumerate(recorded) if pressure is not None}
+    missing = [row for row in range(len(drives)) if row not in found]
+    if missing:
+        found |= dict(zip(missing, objective(drives[missing]), strict=True))
+    return torch.stack([found[row] for row in range(len(drives))])

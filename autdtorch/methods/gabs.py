@@ -36,9 +36,6 @@ class GABS(Method):
         first: index of the transducer to begin with, before the others in their order; None for the first of
             the order.
         passes: >= 1.
-
-    Raises:
-        ValueError: a setting out of range.
     """
 
     name: ClassVar[str] = "gabs"

@@ -37,9 +37,6 @@ class GradientAscent(Method):
     Attributes:
         starts: number of drives that a trial starts from, >= 1.
         steps: of each climb, >= 2.
-
-    Raises:
-        ValueError: a setting out of range.
     """
 
     name: ClassVar[str] = "gradient_ascent"

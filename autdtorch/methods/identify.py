@@ -40,9 +40,6 @@ class Identify(Method):
 
     Attributes:
         evaluations: number of evaluations of a trial, >= 3 M - 1. More of them average noise.
-
-    Raises:
-        ValueError: a setting out of range.
     """
 
     name: ClassVar[str] = "identify"

@@ -64,9 +64,6 @@ class LSSG(Method):
         levels: number of offsets in [0, 2 pi), >= 2.
         order: of the foci: "given" as the control points are, or all their indices.
         passes: >= 1.
-
-    Raises:
-        ValueError: a setting out of range.
     """
 
     name: ClassVar[str] = "lssg"

@@ -26,9 +26,6 @@ class RandomSearch(Method):
     Attributes:
         evaluations: number of evaluations of a trial, >= 1.
         levels: number of phases in [0, 2 pi) to draw from, >= 2; None for any phase.
-
-    Raises:
-        ValueError: a setting out of range.
     """
 
     name: ClassVar[str] = "random_search"

@@ -63,11 +63,7 @@ def validate_magnitudes(name: str, value: object, points: int) -> torch.Tensor:
 
 
 def weakest_focus(pressure: torch.Tensor) -> torch.Tensor:
-    """Return the pressure of the weakest focus (...) [Pa] of pressures (..., P): the paper's f = min(p_n).
-
-    Raises:
-        ValueError: not finite real numbers, or no focus.
-    """
+    """Return the pressure of the weakest focus (...) [Pa] of pressures (..., P): the paper's f = min(p_n)."""
     pressure = real_tensor("pressure", pressure, "Pa")
     if pressure.ndim == 0 or pressure.shape[-1] == 0:
         raise ValueError(f"pressure: shape {tuple(pressure.shape)}; must be (..., P) with P >= 1")

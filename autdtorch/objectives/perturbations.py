@@ -102,9 +102,6 @@ class Quantised(Perturbation):
             objective: is wrapped.
             levels: number of phases in [0, 2 pi), >= 2; 32 for SonicSurface, 128 for OpenMPD, 256 for AUTD3.
             on_off: amplitudes of 0.5 and more become 1, others 0.
-
-        Raises:
-            ValueError: `levels` is not an integer >= 2, or `on_off` no boolean.
         """
         super().__init__(objective)
         self.levels = integer_at_least("levels", levels, 2)
@@ -125,9 +122,6 @@ class FailedTransducers(Perturbation):
         Args:
             objective: is wrapped.
             transducers: indices of those that failed, at least one, each once.
-
-        Raises:
-            ValueError: `transducers` are no such indices.
         """
         super().__init__(objective)
         count = len(self.scene.array)
@@ -157,9 +151,6 @@ class Drift(Perturbation):
             loss: rms of its v after 1000 evaluations, >= 0; 0.1 loses about 8 % of the amplitude.
             sensor: rms of u after 1000 evaluations, >= 0.
             seed: of the walks, >= 0.
-
-        Raises:
-            ValueError: an argument out of range.
         """
         super().__init__(objective)
         rms = not_negative("phase", phase, "rad"), not_negative("loss", loss), not_negative("sensor", sensor)
@@ -210,9 +201,6 @@ class Noise(Perturbation):
             reference: [Pa], > 0; by default the rms pressure over control points and random phases, all
                 transducers fully on: sqrt(mean_p sum_m |G_pm|^2) of the innermost objective, which must be
                 simulated from a transfer matrix.
-
-        Raises:
-            ValueError: an argument out of range, or no `reference` where there is no transfer matrix.
         """
         super().__init__(objective)
         level = number_between("snr", snr, *SNRS, "dB")
@@ -234,9 +222,6 @@ def true_pressure(objective: Objective, drive: torch.Tensor) -> torch.Tensor:
 
     Perturbations of the drive remain: quantisation, failed transducers, the drift so far. Those of the sensor
     are left out: noise and its drift. Only the innermost objective counts the evaluations.
-
-    Raises:
-        ValueError: another shape, not finite complex numbers, or an amplitude above 1.
     """
     require_objective(objective)
     drive = validate_drives(drive, len(objective.scene.array))

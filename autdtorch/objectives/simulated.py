@@ -36,9 +36,6 @@ class SimulatedObjective:
             propagator: simulates the scene.
             mode: "transfer" simulates the transfer matrix G once, here, and observes |G q|, since the field
                 is linear in the drive. "replay" runs a simulation for every evaluation, as the paper does.
-
-        Raises:
-            ValueError: another mode, no propagator, or one of another scene.
         """
         require_kind("scene", scene, Scene)
         require_kind("propagator", propagator, Propagator)
@@ -67,9 +64,6 @@ class SimulatedObjective:
         Returns:
             Pressure magnitudes (B, P) [Pa], float64, on the CPU, without gradient. In mode "transfer" a row
             is rounded alike, whatever the other rows and the number of threads.
-
-        Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
         """
         drive = validate_drives(drive, len(self.scene.array))
         self.evaluations += len(drive)

@@ -34,11 +34,7 @@ _Stored = TypeVar("_Stored", Provenance, StudyResult)
 class StudyFolder:
     """The files of a study on disk; see `open_folder`.
 
-    Attributes:
-        path: of the folder; None where the study is kept in memory alone.
-        provenance: of the study, with the date when it was first begun.
-        scenes: results of the scenes that are finished, by name.
-        trials: finished trials of all scenes.
+    `provenance` has the date when the study was first begun; `scenes` are the finished ones, by name.
     """
 
     def __init__(

@@ -7,7 +7,7 @@ import inspect
 import math
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias
 
 import torch
@@ -265,7 +265,9 @@ def _run_trials(
     for block in (range(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)):
         if missing.isdisjoint(block):
             continue
-        progress.begin(f"{scene}: {method}, {_numbered(block)} of {count}")
+        first, last = block[0] + 1, block[-1] + 1
+        numbers = f"trial {first}" if first == last else f"trials {first} to {last}"
+        progress.begin(f"{scene}: {method}, {numbers} of {count}")
         begin = time.perf_counter()
         solution = solve(trials=block)
         seconds = time.perf_counter() - begin
@@ -276,12 +278,6 @@ def _run_trials(
             raise invalid(f"method {method}", len(solution.score), accepted, "trials")
         trials.append(scene, method, block, solution, seconds)
         progress.advance(len(missing.intersection(block)))
-
-
-def _numbered(trials: Sequence[int]) -> str:
-    """Trials as people count them, from 1 on."""
-    first, last = trials[0] + 1, trials[-1] + 1
-    return f"trial {first}" if first == last else f"trials {first} to {last}"
 
 
 def _plane_points(scene: Scene, spacing: float) -> torch.Tensor | None:

@@ -77,15 +77,6 @@ def test_every_trial_of_every_method_has_its_figures(scenes, tmp_path):
     assert len((tmp_path / TRIALS_FILE).read_text(encoding="utf-8").splitlines()) == 2 * 4
 
 
-def test_the_same_seed_gives_the_same_drives_and_another_gives_others(scenes):
-    def drive(seed):
-        results = run_study(scenes, METHODS, solver=FREE_SPACE, trials=8, seed=seed)
-        return results.scenes["first"].methods["gabs"].solution.drive
-
-    assert torch.equal(drive(0), drive(0))
-    assert not torch.equal(drive(0), drive(1))
-
-
 def test_a_scene_without_observation_plane_has_no_areas():
     result = run_study({"a": scene(None, obstacles=(CUBE,))}, METHODS, solver=FREE_SPACE).scenes["a"]
     assert result.obstacles == 1

@@ -43,7 +43,7 @@ def contents(folder):
 
 @pytest.fixture
 def warnings(caplog):
-    """Gives what was warned of since it was asked last."""
+    """Returns the warnings since the last call."""
 
     def since():
         messages = [one.getMessage() for one in caplog.records if one.levelno >= logging.WARNING]

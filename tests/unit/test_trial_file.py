@@ -95,15 +95,6 @@ def test_whatever_is_cut_off_costs_no_earlier_trial(path, caplog):
     assert "the last line broke off" in caplog.text
 
 
-def test_without_a_path_nothing_is_written(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    file = opened(None)
-    solution = found(2, 2)
-    file.append("a", "gabs", [0, 1], solution, 1.0)
-    assert_equal(file.found("a", "gabs", 2)[0], solution)
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.fixture
 def lines(path):
     """Lines of three trials, in the file."""
