@@ -51,7 +51,7 @@ class Bench:
     """
 
     def __init__(self, section: Mapping[str, Any], scene: Scene, seed: int) -> None:
-        """Check the section `hardware` of a config; `seed` is that of emulated noise."""
+        """Check the section `hardware` of a config; `seed` is the seed of emulated noise."""
         require_known("hardware", section, _KEYS)
         require_one_of("hardware.device", section["device"], hardware.DEVICES)
         self._section, self._scene, self._seed = section, scene, seed

@@ -1,4 +1,4 @@
-"""Running the command line in this process: a subprocess would import PyTorch anew for each."""
+"""Fixtures that run the command line in this process: a subprocess would have to import PyTorch each time."""
 
 import logging
 import sys

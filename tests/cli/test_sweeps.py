@@ -135,7 +135,7 @@ def test_collected_seeds_are_trials_and_other_settings_make_names(run, tmp_path,
         ("homogeneous", "gabs", "4"),
         ("homogeneous", "gabs", "8"),
     ]
-    # The summary's median is that of all trials.
+    # The summary's median is over all trials.
     assert float(rows[2]["median score [Pa]"]) == pytest.approx(
         float(methods["gabs,levels=8"].solution.score.quantile(0.5)), rel=1e-12
     )

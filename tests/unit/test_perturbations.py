@@ -1,4 +1,4 @@
-"""What real conditions do to an objective."""
+"""Perturbations: quantisation, failed transducers, drift and noise around an objective."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def test_quantised_is_the_nearest_and_stays(phases, amplitudes, levels, on_off):
 def test_levels_that_are_the_devices_are_played_as_they_are(simulated):
     plain = gabs(simulated, levels=16, trials=3)
     device = gabs(Quantised(simulated, 32, on_off=True), levels=16, trials=3)
-    # The same phases but for their last digit.
+    # Phases that differ in their last digit only.
     torch.testing.assert_close(device.drive, plain.drive, rtol=0, atol=1e-14)
     torch.testing.assert_close(device.history, plain.history, rtol=1e-13, atol=0)
 

@@ -1,4 +1,4 @@
-"""What the watcher of a sweep's jobs makes of `squeue`: its answers, and that there are none."""
+"""The watcher of a sweep's jobs reads the answers of `squeue`, and notices failures."""
 
 import logging
 from collections.abc import Callable

@@ -98,9 +98,9 @@ def test_the_runs_of_a_simulation_are_recorded(monkeypatch):
         result = run_study({"a": scene()}, METHODS, solver=solver).scenes["a"]
     simulation = result.simulation
     assert (simulation.method, simulation.spacing, simulation.tolerance) == ("full", 2e-3, 0.2)
-    # The transfer matrix of 3 control points, and the plane, in which one transducer stands for all four.
+    # The transfer matrix of 3 control points, and the plane: one simulation for four equivalent transducers.
     assert simulation.runs == (Run(7, 0.1, True, 0.5),) * 3 + (Run(7, 0.1, False, 0.5),)
-    # Reciprocity, which is what the transfer matrix was simulated by, is exact but for rounding.
+    # The transfer matrix was simulated by reciprocity, which is exact up to rounding.
     torch.testing.assert_close(
         result.transfer_matrix, FreeSpacePropagator(scene()).transfer_matrix(), rtol=1e-12, atol=0
     )

@@ -157,7 +157,7 @@ def test_the_trials_of_another_study_or_scene_do_not_count(path, lines, caplog):
 
 @pytest.mark.parametrize("score", [0.5, 1 + NEAR_TIE / 2])
 def test_a_last_drive_that_scored_below_the_best_or_near_it_comes_back(path, score):
-    """As `identify` returns it."""
+    """`identify` returns such a drive."""
     solution = found(1, 4)
     solution.score[0] = score * solution.history[0, -1]
     opened(path).append("a", "identify", [0], solution, 1.0)
