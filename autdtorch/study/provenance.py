@@ -22,21 +22,13 @@ _TYPES = {"config": str, "seed": int, "versions": dict, "source_digest": str, "d
 
 @dataclass(frozen=True)
 class Provenance:
-    """Everything that the results of a study depend on.
+    """Everything that the results of a study depend on."""
 
-    Attributes:
-        config: all settings, as YAML text.
-        seed: of the random choices.
-        versions: of autdtorch, Python, the numerical packages and the platform.
-        source_digest: SHA-256 of the package's source.
-        date: start of the study, UTC, ISO 8601.
-    """
-
-    config: str
+    config: str  # all settings, as YAML text
     seed: int
-    versions: dict[str, str]
-    source_digest: str
-    date: str
+    versions: dict[str, str]  # of autdtorch, Python, the numerical packages and the platform
+    source_digest: str  # SHA-256 of the package's source
+    date: str  # start of the study, UTC, ISO 8601
 
     @property
     def origin(self) -> str:
@@ -53,11 +45,7 @@ class Provenance:
 
     @classmethod
     def from_fields(cls, fields: dict[str, Any]) -> Provenance:
-        """Build from the fields read from a file.
-
-        Raises:
-            ValueError: a field is missing, unknown or of another type.
-        """
+        """Build from the fields read from a file, after checking their names and types."""
         if {key: type(value) for key, value in fields.items()} != _TYPES:
             accepted = ", ".join(f"{key} ({kind.__name__})" for key, kind in _TYPES.items())
             raise ValueError(f"fields {', '.join(fields)}; must be {accepted}")
@@ -65,12 +53,7 @@ class Provenance:
 
 
 def provenance_now(config: str, seed: int) -> Provenance:
-    """Return the provenance of a study that starts now, with the source and packages of this process.
-
-    Args:
-        config: all settings, as YAML text.
-        seed: of the random choices.
-    """
+    """Return the provenance of a study that starts now, with the source and packages of this process."""
     versions = {"autdtorch": autdtorch.__version__, "python": platform.python_version()}
     versions |= package_versions()
     versions["platform"] = platform.platform()
@@ -79,21 +62,12 @@ def provenance_now(config: str, seed: int) -> Provenance:
 
 
 def save_provenance(provenance: Provenance, folder: str | os.PathLike[str]) -> None:
-    """Write the provenance of a study into its folder, with a checksum.
-
-    Raises:
-        OSError: the folder cannot be written.
-    """
+    """Write the provenance of a study into its folder, with a checksum."""
     replace_file(Path(folder) / PROVENANCE_FILE, line_of(asdict(provenance)) + b"\n")
 
 
 def load_provenance(folder: str | os.PathLike[str]) -> Provenance:
-    """Read the provenance that `save_provenance` wrote.
-
-    Raises:
-        ValueError: the file is damaged, or of another version.
-        OSError: the file cannot be read; a `FileNotFoundError` if it does not exist.
-    """
+    """Read the provenance that `save_provenance` wrote; refuse a damaged file or one of another version."""
     path = Path(folder) / PROVENANCE_FILE
     content = path.read_bytes()
     try:

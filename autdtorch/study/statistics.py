@@ -78,12 +78,11 @@ def bootstrap(
     """Return an average over trials, or a combination of averages, with its bootstrap interval.
 
     The interval is the expanded percentile interval of Hesterberg, "What teachers should know about the
-    bootstrap", The American Statistician 69 (2015) 371, which is not too narrow for few trials. Equal data
-    give equal intervals.
+    bootstrap", The American Statistician 69 (2015) 371, which is not too narrow for few trials. It is
+    unknown if a sample has fewer than `FEWEST_TRIALS`. Equal data give equal intervals.
 
     Args:
-        samples: values of independent trials (T,), resampled independently; a plain number is exact. If a
-            sample has fewer than `FEWEST_TRIALS`, the interval is unknown.
+        samples: values of independent trials (T,), resampled independently; a plain number is exact.
         average: NumPy's mean or median.
         combine: elementwise function of the averages, one argument for each sample.
     """
@@ -113,27 +112,18 @@ def bootstrap(
 
 
 def share_interval(successes: torch.Tensor) -> Interval:
-    """Return the share of successful trials (T,) with Wilson's interval.
-
-    The bootstrap would take a share of 0 or 1 as certain.
-    """
+    """Return the share of successful trials (T,) with Wilson's interval: a bootstrap is certain of 0 or 1."""
     found = stats.binomtest(int(successes.sum()), len(successes)).proportion_ci(CONFIDENCE, method="wilson")
     return Interval(float(successes.double().mean()), float(found.low), float(found.high))
 
 
 @dataclass(frozen=True, eq=False)
 class BoundGap:
-    """The distance of a method's score from the certified bound.
+    """The distance of a method's score from the certified bound."""
 
-    Attributes:
-        score: median over the trials [Pa].
-        gap: 1 - score / bound.
-        evaluations: evaluations of each trial until it was near the bound (T,), float64; inf if it never was.
-    """
-
-    score: Interval
-    gap: Interval
-    evaluations: torch.Tensor
+    score: Interval  # median over the trials [Pa]
+    gap: Interval  # 1 - score / bound
+    evaluations: torch.Tensor  # of each trial until it was near the bound (T,), float64; inf if never
 
 
 def bound_gap(method: MethodResult, bound: float) -> BoundGap:
@@ -144,10 +134,9 @@ def bound_gap(method: MethodResult, bound: float) -> BoundGap:
 
 
 def evaluations_to(solution: Solution, score: float) -> torch.Tensor:
-    """Return the evaluations until each trial's best score reached `score` (T,), float64.
+    """Return the evaluations until each trial's best score reached `score` (T,), float64; inf if it did not.
 
-    A trial that ended below counts as inf. The median over the trials is then right if more than half of
-    them reached the score.
+    The median over the trials is right if more than half of them reached the score.
     """
     reached = solution.history >= score
     first = reached.int().argmax(dim=1).double() + 1

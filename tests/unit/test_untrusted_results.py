@@ -61,13 +61,14 @@ def test_a_study_refuses_a_name_that_is_no_part_of_a_file_name(name: str) -> Non
 def test_results_with_such_a_name_are_refused(tmp_path: Path, name: str, field: str) -> None:
     results = study()
     (scene,) = results.scenes.values()
-    if field == "scenes":
-        scenes = {name: scene}
-    else:
-        scenes = {"air": replace(scene, methods={name: scene.methods["gabs"]})}
-    save_results(replace(results, scenes=scenes), tmp_path)
+    other = {"air": replace(scene, methods={name: scene.methods["gabs"]})}
+    save_results(replace(results, scenes={name: scene} if field == "scenes" else other), tmp_path)
     with pytest.raises(ValueError, match=rf"results\.h5: {field}: "):
         load_results(tmp_path)
+
+
+def with_origin(results: StudyResult, **changes: object) -> StudyResult:
+    return replace(results, provenance=replace(results.provenance, **changes))
 
 
 def left(folder: Path, *studies: StudyResult) -> Path:
@@ -95,22 +96,17 @@ def test_the_names_of_what_was_swept_stay_in_the_folder(tmp_path: Path) -> None:
 
 
 def test_settings_that_expand_are_refused(tmp_path: Path) -> None:
-    bomb = "scene: &a0 [lol, lol]\n" + "".join(
-        f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 11)
-    )
-    results = study()
-    sweep = left(tmp_path, replace(results, provenance=replace(results.provenance, config=bomb)))
+    tens = (f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 11))
+    config = "scene: &a0 [lol, lol]\n" + "".join(tens)
     with pytest.raises(ValueError, match=r"results\.h5.*line"):
-        collect_results(sweep)
+        collect_results(left(tmp_path, with_origin(study(), config=config)))
 
 
 def test_the_scene_of_results_reads_no_variable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SECRET", "hunter2")
-    results = study()
     config = yaml.safe_dump({"scene": {**SCENE, "name": "${oc.env:SECRET}"}, "method": {}})
-    sweep = left(tmp_path, replace(results, provenance=replace(results.provenance, config=config)))
     with pytest.raises(ValueError, match=r"name: '\$\{oc\.env:SECRET\}'"):
-        collect_results(sweep)
+        collect_results(left(tmp_path, with_origin(study(), config=config)))
 
 
 @pytest.mark.parametrize("end", ["", ".partial"])
@@ -143,12 +139,10 @@ ATTRIBUTES = {"lang", "charset", "name", "content", "class", "src", "alt"}
 
 
 def test_a_report_shows_hostile_texts_as_texts(tmp_path: Path) -> None:
-    results = study()
-    provenance = results.provenance
     versions = {"autdtorch": HOSTILE, HOSTILE: "1"}
-    hostile = replace(provenance, config=HOSTILE, versions=versions, source_digest=HOSTILE, date=HOSTILE)
-    scenes = {"air": load_scene(SCENE)}
-    page = write_report(replace(results, provenance=hostile), scenes, tmp_path, HOSTILE).read_text("utf-8")
+    texts = dict.fromkeys(("config", "source_digest", "date"), HOSTILE)
+    hostile = with_origin(study(), versions=versions, **texts)
+    page = write_report(hostile, {"air": load_scene(SCENE)}, tmp_path, HOSTILE).read_text("utf-8")
     found = Tags(page).found
     assert {tag for tag, _, _ in found} <= OURS
     assert {name for _, name, _ in found if name} <= ATTRIBUTES
@@ -180,11 +174,9 @@ def test_a_page_takes_images_of_its_folder_alone(tmp_path: Path, source: str) ->
 @given(st.text() | st.text("`|\\<b>![a](c)\n\r "))
 def test_code_is_code_whatever_the_text(text: str) -> None:
     parse = MarkdownIt("commonmark").enable("table").parse
-    (inline,) = (token for token in parse(f"x {code(text)} y") if token.type == "inline")
-    assert {part.type for part in inline.children or ()} <= {"text", "code_inline"}
     (block,) = parse(fenced(text))
     assert block.type == "fence"
-    rows = [["head", "value"], ["x", code(text)]]
-    cells = [token for token in parse(table(rows)) if token.type == "inline"]
-    assert len(cells) == 4
-    assert {part.type for part in cells[-1].children or ()} <= {"text", "code_inline"}
+    for shown, count in ((f"x {code(text)} y", 1), (table([["head", "value"], ["x", code(text)]]), 4)):
+        cells = [token for token in parse(shown) if token.type == "inline"]
+        assert len(cells) == count
+        assert {part.type for part in cells[-1].children or ()} <= {"text", "code_inline"}

@@ -32,8 +32,7 @@ def scene() -> at.Scene:
 
 @pytest.fixture
 def renderer() -> None:
-    problem = rendering_problem()
-    if problem is not None:
+    if problem := rendering_problem():
         pytest.skip(problem)
 
 
@@ -63,11 +62,7 @@ def broken_pyvista(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[
     ],
 )
 def test_a_failed_check_is_a_reason_not_to_render(
-    scene: at.Scene,
-    broken_pyvista: Callable[[str], None],
-    monkeypatch: pytest.MonkeyPatch,
-    code: str,
-    cause: str,
+    scene: at.Scene, broken_pyvista: Callable[[str], None], monkeypatch, code: str, cause: str
 ) -> None:
     if "sleep" in code:
         monkeypatch.setattr(sys.modules["autdtorch.plot.view3d.opengl"], "_PROBE_TIMEOUT", 0.5)
@@ -78,7 +73,7 @@ def test_a_failed_check_is_a_reason_not_to_render(
 
 
 def test_bad_input_is_refused_before_anything_is_rendered(
-    scene: at.Scene, broken_pyvista: Callable[[str], None]
+    scene: at.Scene, broken_pyvista: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     broken_pyvista("raise SystemExit('not reached')")
     drive = torch.ones(12, dtype=torch.complex128)
@@ -99,6 +94,9 @@ def test_bad_input_is_refused_before_anything_is_rendered(
     for message, call in calls.items():
         with pytest.raises(ValueError, match=message):
             call()
+    monkeypatch.setitem(sys.modules, "trame_pyvista", None)
+    with pytest.raises(RuntimeError, match=r"save: 'scene.html' needs trame-pyvista"):
+        view3d(scene, save="scene.html")
 
 
 @pytest.mark.usefixtures("renderer")
@@ -111,34 +109,28 @@ def test_a_picture_is_written_and_not_blank(scene: at.Scene, tmp_path: Path) -> 
     # The 12 discs are drawn without lighting, in an exact colour: at least 100 pixels each.
     disc = np.abs(picture[..., :3] - np.array([0x00, 0x72, 0xB2]) / 255).max(axis=-1) < 0.01
     assert disc.sum() > 1200
-
-
-@pytest.mark.usefixtures("renderer")
-def test_triton_is_imported_before_a_driver_that_would_make_it_crash(scene: at.Scene) -> None:
-    view3d(scene).close()
+    # Imported after the driver, Triton would end the process.
     assert find_spec("triton") is None or "triton" in sys.modules
 
 
 @pytest.mark.usefixtures("renderer")
-def test_obstacles_are_drawn_where_they_are_in_millimetres(tmp_path: Path) -> None:
+def test_obstacles_are_drawn_where_they_are_in_millimetres_as_far_as_the_domain(tmp_path: Path) -> None:
+    def bounds(scene: at.Scene) -> list[tuple[float, ...]]:
+        plotter = view3d(scene)
+        found = [mesh.bounds for mesh in plotter.meshes]
+        plotter.close()
+        return found
+
+    wall = at.Box((50e-3, 40e-3, 40e-3), (10e-3, 1.0, 1.0), rigid=True)
+    outside = at.Sphere((85e-3, 85e-3, 85e-3), 8e-3, rigid=True)  # only its bounding box is inside
+    drawn = bounds(small_scene((wall, outside), extent=80e-3))
+    assert any(np.allclose(one, (45, 55, 0, 80, 0, 80), atol=1e-4) for one in drawn)  # VTK keeps float32
     scene = scene_of_all_kinds(tmp_path)
-    plotter = view3d(scene)
-    drawn = [mesh.bounds for mesh in plotter.meshes]
-    plotter.close()
+    drawn = bounds(scene)
     for obstacle in scene.obstacles:
         vertices, _ = obstacle.surface()
         wanted = 1e3 * torch.stack([vertices.amin(dim=0), vertices.amax(dim=0)]).T.reshape(-1).numpy()
-        assert any(np.allclose(bounds, wanted, atol=1e-4) for bounds in drawn)  # VTK keeps float32
-
-
-@pytest.mark.usefixtures("renderer")
-def test_a_wall_is_drawn_as_far_as_the_domain() -> None:
-    wall = at.Box((50e-3, 40e-3, 40e-3), (10e-3, 1.0, 1.0), rigid=True)
-    outside = at.Sphere((85e-3, 85e-3, 85e-3), 8e-3, rigid=True)  # only its bounding box is inside
-    plotter = view3d(small_scene((wall, outside), extent=80e-3))
-    bounds = [mesh.bounds for mesh in plotter.meshes]
-    plotter.close()
-    assert any(np.allclose(found, (45, 55, 0, 80, 0, 80), atol=1e-4) for found in bounds)  # VTK keeps float32
+        assert any(np.allclose(one, wanted, atol=1e-4) for one in drawn)
 
 
 @pytest.mark.usefixtures("renderer")
@@ -174,12 +166,9 @@ def test_the_isosurface_lies_where_the_volume_has_its_level(scene: at.Scene) -> 
     # isosurface of half a pascal is a sphere of 10 mm.
     lower, upper = np.array(scene.domain)
     counts = np.round((upper - lower) / 2e-3).astype(int)
-    axes = [
-        low + (high - low) * (np.arange(n) + 0.5) / n
-        for low, high, n in zip(lower, upper, counts, strict=True)
-    ]
+    cells = np.moveaxis(np.indices(counts), 0, -1) + 0.5
     center = scene.control_points[0].numpy()
-    away = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) - center
+    away = lower + (upper - lower) * cells / counts - center
     volume = 5e-3 / np.linalg.norm(away, axis=-1)
     volume[away[..., 0] > 2e-3] = np.nan
     plotter = view3d(scene, volume=volume, isosurface=20 * math.log10(0.5), reference=1.0)
@@ -219,15 +208,9 @@ def test_a_page_has_a_legend_of_its_own(scene: at.Scene, tmp_path: Path) -> None
     assert 'src="http' not in page
 
 
-def test_a_page_says_what_it_needs(scene: at.Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "trame_pyvista", None)
-    with pytest.raises(RuntimeError, match=r"needs trame-pyvista: pip install 'autdtorch\[notebook\]'"):
-        view3d(scene, save="scene.html")
-
-
 @pytest.mark.usefixtures("renderer")
 def test_an_animation_turns_the_wave_through_one_period(scene: at.Scene, tmp_path: Path) -> None:
-    from PIL import Image
+    from PIL import Image, ImageSequence
 
     assert scene.observation_plane is not None
     drive = at.drive_from_phases(torch.zeros(len(scene.array)))
@@ -235,9 +218,7 @@ def test_an_animation_turns_the_wave_through_one_period(scene: at.Scene, tmp_pat
     animate3d(scene, drive, field, tmp_path / "wave.gif", frames=2)
     with Image.open(tmp_path / "wave.gif") as wave:
         assert (wave.n_frames, wave.info["loop"]) == (2, 0)
-        first = np.asarray(wave.convert("RGB"), float)
-        wave.seek(1)
-        second = np.asarray(wave.convert("RGB"), float)
+        first, second = (np.asarray(one.convert("RGB"), float) for one in ImageSequence.Iterator(wave))
     # Half a period later the pressure has the other sign: red where blue was. Elsewhere nothing moves.
     redness = first[..., 0] - first[..., 2], second[..., 0] - second[..., 2]
     assert np.abs(redness[0]).max() > 100

@@ -22,74 +22,47 @@ from autdtorch.study.statistics import Interval, bootstrap, share_interval
 Comparison: TypeAlias = tuple[str, list[Interval]]
 """Our numbers in one scene as text, and margins that are all positive if the claim holds there."""
 
+Margin: TypeAlias = Callable[[Interval, float], Interval]
 Compare: TypeAlias = Callable[[SceneResult, SceneResult], Comparison]
 
 LSSG, BO, GABS = "lssg", "bayes_opt", "gabs"
 
-MUCH_WEAKER = 1 / math.sqrt(2)
-"""Below this share of another pressure (half the intensity), a pressure is much weaker; above it, kept."""
-
-SAME_LEVEL = 0.1
-"""Areas are at the same level if they differ by less than this share of the larger one."""
-
-CONVERGED = 0.01
-"""A trial has converged if its last `LAST_PART` of evaluations raises the score by at most this share."""
-
-LAST_PART = 0.1
-"""See `CONVERGED`."""
-
-FORMED = 0.5
-"""Foci have formed if the weakest has at least this share of their mean pressure."""
+MUCH_WEAKER = 1 / math.sqrt(2)  # half the intensity; a pressure above this share of another one is kept
+SAME_LEVEL = 0.1  # areas are at the same level if they differ by less than this share of the larger one
+LAST_PART = 0.1  # last share of the evaluations
+CONVERGED = 0.01  # a trial has converged if its last part raises the score by at most this share
+FORMED = 0.5  # foci have formed if the weakest has at least this share of their mean pressure
 
 _UNITS = {"mean": ("Pa", 1.0), "std": ("Pa", 1.0), "area": ("mm²", 1e6), "evaluations": ("", 1.0)}
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The outcome of a claim.
+    """The outcome of a claim."""
 
-    Attributes:
-        holds: whether every comparison comes out as claimed.
-        clear: whether the confidence intervals of the decisive comparisons leave no doubt.
-        evidence: our numbers, line by line.
-    """
-
-    holds: bool
-    clear: bool
-    evidence: tuple[str, ...]
+    holds: bool  # every comparison comes out as claimed
+    clear: bool  # the confidence intervals of the decisive comparisons leave no doubt
+    evidence: tuple[str, ...]  # our numbers, line by line
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Claim:
-    """A claim of the paper.
-
-    Attributes:
-        text: the claim.
-        reading: the comparison, with the threshold where the paper's words are vague.
-        methods: names of the methods it compares; scenes without them are left out.
-        compare: compares in one scene, given the result of the first scene without obstacles.
-        obstacles: whether it is about scenes with or without obstacles; None for both.
-        scene: name of the only scene it is about.
-        area: whether it needs the area of the foci.
-        needs_empty: whether it needs a scene without obstacles.
-        heading: first line of the evidence.
-    """
+    """A claim of the paper."""
 
     text: str
-    reading: str
-    methods: tuple[str, ...] = (BO, GABS)
-    compare: Compare
-    obstacles: bool | None = None
-    scene: str = ""
-    area: bool = False
-    needs_empty: bool = False
-    heading: str = ""
+    reading: str  # the comparison, with the threshold where the paper's words are vague
+    compare: Compare  # compares in one scene, given the result of the first scene without obstacles
+    methods: tuple[str, ...] = (BO, GABS)  # scenes without them are left out
+    obstacles: bool | None = None  # about scenes with or without obstacles; None for both
+    scene: str = ""  # name of the only scene it is about
+    area: bool = False  # needs the area of the foci
+    needs_empty: bool = False  # needs a scene without obstacles
+    heading: str = ""  # first line of the evidence
 
     def judge(self, results: StudyResult) -> Verdict | None:
         """Return the verdict of the results, or None if they lack methods or scenes of the claim."""
-        usable = {
-            name: scene for name, scene in results.scenes.items() if set(self.methods) <= scene.methods.keys()
-        }
+        wanted = set(self.methods)
+        usable = {name: scene for name, scene in results.scenes.items() if wanted <= scene.methods.keys()}
         empty = [scene for scene in usable.values() if scene.obstacles == 0]
         chosen = {name: scene for name, scene in usable.items() if self._is_about(name, scene)}
         if not chosen or (self.needs_empty and not empty):
@@ -97,20 +70,15 @@ class Claim:
         found = {name: self.compare(scene, (empty or [scene])[0]) for name, scene in chosen.items()}
         margins = [margin for _, one in found.values() for margin in one]
         holds = all(margin.value > 0 for margin in margins)
-        if holds:
-            clear = all(margin.low > 0 for margin in margins)
-        else:
-            clear = any(margin.high <= 0 for margin in margins)
+        surely_holds = all(margin.low > 0 for margin in margins)
+        clear = surely_holds if holds else any(margin.high <= 0 for margin in margins)
         lines = [f"{name}: {text}" for name, (text, _) in found.items()]
         return Verdict(holds, clear, tuple([self.heading, *lines] if self.heading else lines))
 
     def _is_about(self, name: str, scene: SceneResult) -> bool:
         with_area = all(method.metrics.area is not None for method in scene.methods.values())
-        return (
-            self.obstacles in (None, scene.obstacles > 0)
-            and self.scene in ("", name)
-            and (with_area or not self.area)
-        )
+        fits = self.obstacles in (None, scene.obstacles > 0) and self.scene in ("", name)
+        return fits and (with_area or not self.area)
 
 
 def judge_claims(results: StudyResult) -> list[tuple[Claim, Verdict | None]]:
@@ -158,7 +126,7 @@ def _ordered(smaller: str, larger: tuple[str, ...], quantity: str) -> Compare:
     return compare
 
 
-def _share_of_empty(methods: tuple[str, ...], margin: Callable[[Interval, float], Interval]) -> Compare:
+def _share_of_empty(methods: tuple[str, ...], margin: Margin) -> Compare:
     """Compare the mean pressure with that without obstacles; `margin` is `_above` or `_below`."""
 
     def compare(scene: SceneResult, empty: SceneResult) -> Comparison:
@@ -201,87 +169,83 @@ def _foci_form(scene: SceneResult, _: SceneResult) -> Comparison:
     return _listed({"BO": bo, "GABS": gabs}), [_above(bo, FORMED), _above(gabs, FORMED)]
 
 
-_SHARE = "share of the pressure without obstacles"
+def _compared_with_empty(
+    text: str, reading: str, margin: Margin, methods: tuple[str, ...], scene: str = ""
+) -> Claim:
+    """Return a claim on shares of the pressure without obstacles."""
+    heading = "share of the pressure without obstacles"
+    compare = _share_of_empty(methods, margin)
+    return Claim(text, reading, compare, methods, True, scene, needs_empty=True, heading=heading)
+
 
 CLAIMS = (
     Claim(
-        text="LSSG gives weaker foci than BO and GABS, without and with obstacles.",
-        reading="mean pressure of the foci, in every scene",
-        methods=(LSSG, BO, GABS),
-        compare=_ordered(LSSG, (BO, GABS), "mean"),
+        "LSSG gives weaker foci than BO and GABS, without and with obstacles.",
+        "mean pressure of the foci, in every scene",
+        _ordered(LSSG, (BO, GABS), "mean"),
+        (LSSG, BO, GABS),
     ),
-    Claim(
-        text="With three cubes, the pressure of LSSG is much weaker than without obstacles.",
-        reading=f"much weaker: mean pressure below {MUCH_WEAKER:.2f} (half the intensity) of that without "
-        "obstacles",
-        methods=(LSSG,),
-        compare=_share_of_empty((LSSG,), _below),
-        scene="three_cubes",
-        obstacles=True,
-        needs_empty=True,
-        heading=_SHARE,
+    _compared_with_empty(
+        "With three cubes, the pressure of LSSG is much weaker than without obstacles.",
+        f"much weaker: mean pressure below {MUCH_WEAKER:.2f} (half the intensity) of that without obstacles",
+        _below,
+        (LSSG,),
+        "three_cubes",
     ),
-    Claim(
-        text="With obstacles in general, the mean pressure of LSSG is much weaker than without.",
-        reading="as claim 2, in every scene with obstacles",
-        methods=(LSSG,),
-        compare=_share_of_empty((LSSG,), _below),
-        obstacles=True,
-        needs_empty=True,
-        heading=_SHARE,
+    _compared_with_empty(
+        "With obstacles in general, the mean pressure of LSSG is much weaker than without.",
+        "as claim 2, in every scene with obstacles",
+        _below,
+        (LSSG,),
     ),
-    Claim(
-        text="BO and GABS keep a strong pressure with obstacles.",
-        reading=f"kept: mean pressure above {MUCH_WEAKER:.2f} of that without obstacles by the same method, "
+    _compared_with_empty(
+        "BO and GABS keep a strong pressure with obstacles.",
+        f"kept: mean pressure above {MUCH_WEAKER:.2f} of that without obstacles by the same method, "
         "in every scene with obstacles",
-        compare=_share_of_empty((BO, GABS), _above),
-        obstacles=True,
-        needs_empty=True,
-        heading=_SHARE,
+        _above,
+        (BO, GABS),
     ),
     Claim(
-        text="The mean pressure of GABS is higher than that of BO.",
-        reading="in every scene",
-        compare=_ordered(BO, (GABS,), "mean"),
+        "The mean pressure of GABS is higher than that of BO.",
+        "in every scene",
+        _ordered(BO, (GABS,), "mean"),
     ),
     Claim(
-        text="Without obstacles, the foci of GABS and BO have areas at the same level.",
-        reading=f"same level: less than {SAME_LEVEL:.0%} apart",
-        compare=_same_area,
+        "Without obstacles, the foci of GABS and BO have areas at the same level.",
+        f"same level: less than {SAME_LEVEL:.0%} apart",
+        _same_area,
         obstacles=False,
         area=True,
     ),
     Claim(
-        text="With obstacles, the foci of GABS have a smaller area than those of BO.",
-        reading="in every scene with obstacles",
-        compare=_ordered(GABS, (BO,), "area"),
+        "With obstacles, the foci of GABS have a smaller area than those of BO.",
+        "in every scene with obstacles",
+        _ordered(GABS, (BO,), "area"),
         obstacles=True,
         area=True,
     ),
     Claim(
-        text="The standard deviation among the foci is lower for BO than for GABS.",
-        reading="in every scene",
-        compare=_ordered(BO, (GABS,), "std"),
+        "The standard deviation among the foci is lower for BO than for GABS.",
+        "in every scene",
+        _ordered(BO, (GABS,), "std"),
     ),
     Claim(
-        text="BO may converge within the evaluations it is given, GABS needs all of its own.",
-        reading=f"converged: the last {LAST_PART:.0%} of the evaluations raise the score by at most "
-        f"{CONVERGED:.0%}; more than half of the trials of BO, less than half of those of GABS, in every "
-        "scene",
-        compare=_convergence,
+        "BO may converge within the evaluations it is given, GABS needs all of its own.",
+        f"converged: the last {LAST_PART:.0%} of the evaluations raise the score by at most {CONVERGED:.0%}; "
+        "more than half of the trials of BO, less than half of those of GABS, in every scene",
+        _convergence,
         heading="share of the trials that converged",
     ),
     Claim(
-        text="LSSG needs the fewest evaluations.",
-        reading="in every scene (the paper: LSSG 64, BO 256, GABS 256)",
-        methods=(LSSG, BO, GABS),
-        compare=_ordered(LSSG, (BO, GABS), "evaluations"),
+        "LSSG needs the fewest evaluations.",
+        "in every scene (the paper: LSSG 64, BO 256, GABS 256)",
+        _ordered(LSSG, (BO, GABS), "evaluations"),
+        (LSSG, BO, GABS),
     ),
     Claim(
-        text="With BO and GABS the foci form, without and with obstacles.",
-        reading=f"formed: the weakest focus has over {FORMED:.0%} of the mean pressure of the foci, in every "
-        "scene",
-        compare=_foci_form,
+        "With BO and GABS the foci form, without and with obstacles.",
+        f"formed: the weakest focus has over {FORMED:.0%} of the mean pressure of the foci, in every scene",
+        _foci_form,
         heading="weakest focus over mean",
     ),
 )

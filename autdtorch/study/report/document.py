@@ -60,12 +60,9 @@ def rendered(template: str, **values: object) -> str:
 
 
 def as_page(text: str, folder: Path) -> str:
-    """Return a report as one HTML file.
+    """Return a report in Markdown without links as one HTML file; its first line is the title.
 
-    Args:
-        text: Markdown without links; its first line is the title. HTML is shown as text, except for the tags
-            of the report itself.
-        folder: folder of its images, which are PNG files.
+    HTML is shown as text, except for the tags of the report itself. Images are PNG files in `folder`.
 
     Raises:
         OSError: an image cannot be read.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +23,7 @@ _PLANES_A_FIGURE = 4
 
 
 def draw_figures(results: StudyResult, scenes: Mapping[str, Scene], folder: Path) -> dict[str, Any]:
-    """Draw all figures of a study into a folder.
-
-    Returns:
-        The values that the template of the report needs: `scenes`, names with their Markdown images;
-        `problem`, why these are not rendered in 3D, or None; `planes`, names of files; `quantities`, labels.
-    """
+    """Draw all figures of a study into a folder; return the values that the template of the report needs."""
     problem = rendering_problem()
     for name, scene in scenes.items():
         if problem is None:
@@ -39,57 +34,50 @@ def draw_figures(results: StudyResult, scenes: Mapping[str, Scene], folder: Path
     _draw_costs(results, folder)
     return {
         "scenes": [(name, f"![{name}](fig1_{name}.png)") for name in scenes],
-        "problem": problem,
+        "problem": problem,  # why the scenes are not rendered in 3D, or None
         "planes": _draw_planes(results, scenes, folder),
         "quantities": _draw_trials(results, folder),
     }
 
 
 def _draw_planes(results: StudyResult, scenes: Mapping[str, Scene], folder: Path) -> list[str]:
-    pressure = {
-        name: {
-            method: result.plane_pressure
-            for method, result in found.methods.items()
-            if result.plane_pressure is not None
-        }
-        for name, found in results.scenes.items()
-    }
+    pressure = _by_method(results, lambda result: result.plane_pressure)
     planes = {name: plane for name in pressure if (plane := scenes[name].observation_plane) is not None}
-    names = [name for name in planes if pressure[name]]
+    names = list(planes)
     files: list[str] = []
     for start in range(0, len(names), _PLANES_A_FIGURE):
         part = names[start : start + _PLANES_A_FIGURE]
         files.append(f"fig2_{len(files) + 1}.png" if files else "fig2.png")
-        figure = plot_planes(
-            {name: pressure[name] for name in part},
-            planes,
-            {name: scenes[name].control_points for name in part},
-            {name: scenes[name].obstacles for name in part},
-        )
+        points = {name: scenes[name].control_points for name in part}
+        obstacles = {name: scenes[name].obstacles for name in part}
+        figure = plot_planes({name: pressure[name] for name in part}, planes, points, obstacles)
         figure.savefig(folder / files[-1])
     return files
 
 
 def _draw_trials(results: StudyResult, folder: Path) -> list[str]:
-    quantities = {"mean pressure of the foci [Pa]": _metric(results, "mean")}
-    if areas := _metric(results, "area", scale=1e6):
+    quantities = {"mean pressure of the foci [Pa]": _by_method(results, lambda result: result.metrics.mean)}
+    if areas := _by_method(results, _area_in_mm2):
         quantities["area per focus [mm²]"] = areas
-    quantities["std among the foci [Pa]"] = _metric(results, "std")
+    quantities["std among the foci [Pa]"] = _by_method(results, lambda result: result.metrics.std)
     plot_trials(quantities).savefig(folder / "fig3abc.png")
     return list(quantities)
 
 
-def _metric(results: StudyResult, name: str, scale: float = 1.0) -> dict[str, dict[str, torch.Tensor]]:
-    """Return a figure of merit by scene and method, without scenes that lack it."""
-    values = {
-        scene: {
-            method: scale * value
-            for method, result in found.methods.items()
-            if (value := getattr(result.metrics, name)) is not None
-        }
-        for scene, found in results.scenes.items()
-    }
-    return {scene: by_method for scene, by_method in values.items() if by_method}
+def _area_in_mm2(method: MethodResult) -> torch.Tensor | None:
+    return None if method.metrics.area is None else 1e6 * method.metrics.area
+
+
+def _by_method(
+    results: StudyResult, quantity: Callable[[MethodResult], torch.Tensor | None]
+) -> dict[str, dict[str, torch.Tensor]]:
+    """Return a quantity by scene and method, without methods and scenes that lack it."""
+    found: dict[str, dict[str, torch.Tensor]] = {}
+    for scene, result in results.scenes.items():
+        for name, method in result.methods.items():
+            if (value := quantity(method)) is not None:
+                found.setdefault(scene, {})[name] = value
+    return found
 
 
 def _draw_convergence(results: StudyResult, folder: Path) -> None:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 
 import autdtorch
@@ -27,15 +30,10 @@ _TIME = "%Y-%m-%d %H:%M:%S"
 
 @dataclass(frozen=True)
 class Comparison:
-    """A least-squares fit of simulated to measured pressures.
+    """A least-squares fit of simulated to measured pressures."""
 
-    Attributes:
-        scale: factor from simulated to measured pressures.
-        misfit: rms of the remaining difference, divided by the measured rms.
-    """
-
-    scale: float
-    misfit: float
+    scale: float  # factor from simulated to measured pressures
+    misfit: float  # rms of the remaining difference, divided by the measured rms
 
 
 def compare(measured: torch.Tensor, simulated: torch.Tensor) -> Comparison:
@@ -59,10 +57,10 @@ def write_hardware_report(
     preflight: Preflight,
     command: str,
 ) -> Path:
-    """Write `report.md` and its figure.
+    """Write `report.md` and its figure into a folder, which is made if it does not exist; return its path.
 
     Args:
-        folder: folder for both; made if it does not exist.
+        folder: folder for both.
         log: evaluation log of the trial.
         found: solution of the search on the bench, one trial.
         again: readings (R, P) [Pa] of that drive after the search.
@@ -70,12 +68,6 @@ def write_hardware_report(
         expected: solution of the same method on `simulated`.
         preflight: check before the trial.
         command: command line that repeats the trial.
-
-    Returns:
-        The path of the report.
-
-    Raises:
-        OSError: the folder cannot be made or written.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -128,23 +120,18 @@ def write_hardware_report(
     return path
 
 
-def _value(own: object) -> str:
+def _value(own: Any) -> str:
     """Return a setting as JSON, consecutive integers as a range."""
-    if isinstance(own, list) and len(own) > 2 and all(isinstance(one, int) for one in own):
-        low, high = own[0], own[-1]
-        if own == list(range(low, high + 1)):
-            return f"{low} to {high}"
+    integers = isinstance(own, list) and len(own) > 2 and all(isinstance(one, int) for one in own)
+    if integers and own == list(range(own[0], own[-1] + 1)):
+        return f"{own[0]} to {own[-1]}"
     return json.dumps(own, ensure_ascii=False)
 
 
 def _interval(evaluations: Sequence[Evaluation]) -> float:
     """Return the median interval [s] between evaluations, which an interruption does not change."""
-    times = torch.tensor(
-        [datetime.fromisoformat(evaluation.time).timestamp() for evaluation in evaluations],
-        dtype=torch.float64,
-        device="cpu",
-    )
-    return float(times.diff().median()) if len(times) > 1 else 0.0
+    times = [datetime.fromisoformat(evaluation.time).timestamp() for evaluation in evaluations]
+    return statistics.median_low(np.diff(times).tolist()) if len(times) > 1 else 0.0
 
 
 def _points(places: torch.Tensor, *pressures: torch.Tensor) -> list[list[str]]:

@@ -9,18 +9,10 @@ from pathlib import Path
 
 from autdtorch.methods.catalogue import label_of
 from autdtorch.scene.scene import Scene
+from autdtorch.study.report import tables
 from autdtorch.study.report.claims import BO, GABS, judge_claims
 from autdtorch.study.report.document import as_page, rendered
 from autdtorch.study.report.figures import draw_figures
-from autdtorch.study.report.tables import (
-    BASELINE,
-    NEAR,
-    claim_rows,
-    extent,
-    gap_rows,
-    is_baseline,
-    simulation_rows,
-)
 from autdtorch.study.results import StudyResult, summary_rows
 from autdtorch.study.results_file import RESULTS_FILE
 from autdtorch.study.statistics import FEWEST_TRIALS
@@ -39,7 +31,7 @@ def write_report(
     command: str,
     seeds: Sequence[int] = (),
 ) -> Path:
-    """Write `report.md` and its figures, and both as one file `report.html`.
+    """Write `report.md` and its figures, and both as one file `report.html`, whose path is returned.
 
     Args:
         results: results to report.
@@ -47,9 +39,6 @@ def write_report(
         folder: folder for the report and its figures; made if it does not exist.
         command: command line that repeats the study.
         seeds: seeds of the studies that `results` were merged from; empty for a single study in `folder`.
-
-    Returns:
-        The path of `report.html`.
 
     Raises:
         OSError: the folder cannot be made or written.
@@ -85,18 +74,18 @@ def _markdown(
         provenance=results.provenance,
         versions=", ".join(f"{name} {version}" for name, version in results.provenance.versions.items()),
         seeds=seeds,
-        trials=", ".join(f"{label_of(name)} {extent(numbers)}" for name, numbers in counts.items()),
+        trials=", ".join(f"{label_of(name)} {tables.extent(numbers)}" for name, numbers in counts.items()),
         few=[label_of(name) for name in (BO, GABS) if max(counts.get(name, [_FEW_TRIALS])) < _FEW_TRIALS],
         fewest_trials=FEWEST_TRIALS,
         figures=draw_figures(results, scenes, folder),
         summary=summary_rows(results),
-        claims=claim_rows(judged),
+        claims=tables.claim_rows(judged),
         claims_in_all=len(judged),
         claims_without_data=[n for n, (_, verdict) in enumerate(judged, start=1) if verdict is None],
-        gaps=gap_rows(results),
-        near=NEAR,
-        baseline=label_of(BASELINE) if any(map(is_baseline, counts)) else "",
-        simulations=simulation_rows(results),
+        gaps=tables.gap_rows(results),
+        near=tables.NEAR,
+        baseline=label_of(tables.BASELINE) if any(map(tables.is_baseline, counts)) else "",
+        simulations=tables.simulation_rows(results),
         tolerances=[f"{one:g}" for one in sorted(one for one in tolerances if one is not None)],
         results_file=RESULTS_FILE,
         trials_file=TRIALS_FILE,

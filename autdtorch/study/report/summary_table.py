@@ -35,13 +35,7 @@ def save_summary(
 ) -> None:
     """Write a CSV table, one line for each method in each scene.
 
-    Args:
-        results: results to write.
-        swept: settings by names of scene and method; each key is a column, and is left out of the names.
-        path: path of the file.
-
-    Raises:
-        OSError: the file cannot be written.
+    The swept settings, by names of scene and method, are columns and are left out of the names.
     """
     keys = sorted({key for settings in swept.values() for key in settings})
     with replacing(Path(path)) as partial, partial.open("w", newline="", encoding="utf-8") as file:
