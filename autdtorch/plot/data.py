@@ -12,6 +12,7 @@ from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import ArrayLike, invalid, magnitude_tensor, real_tensor, require_kind
 
 ByMethod: TypeAlias = Mapping[str, ArrayLike]
+Checked: TypeAlias = dict[str, dict[str, Array]]  # by scene and method
 
 MM = 1e3  # pictures show lengths in millimetres
 
@@ -37,22 +38,19 @@ def require_each(name: str, given: Mapping[str, object], wanted: Collection[str]
 
 def labelled(
     name: str, given: Mapping[str, Mapping[str, ByMethod]], *axes: str, positive: int = 0
-) -> dict[str, dict[str, dict[str, Array]]]:
+) -> dict[str, Checked]:
     """Return the numbers by label, scene and method, after checking them as `by_scene` does."""
     require_kind(name, given, Mapping)
     if not given:
         raise ValueError(f"{name}: empty; must have at least one")
-    return {
-        label: by_scene(f"{name}[{label!r}]", own, *axes, positive=positive) for label, own in given.items()
-    }
+    names = {label: f"{name}[{label!r}]" for label in given}
+    return {label: by_scene(names[label], own, *axes, positive=positive) for label, own in given.items()}
 
 
-def by_scene(
-    name: str, given: Mapping[str, ByMethod], *axes: str, positive: int = 0
-) -> dict[str, dict[str, Array]]:
+def by_scene(name: str, given: Mapping[str, ByMethod], *axes: str, positive: int = 0) -> Checked:
     """Return the numbers by scene and method, after checking them; `positive` leading columns must be > 0."""
     require_scenes(name, given)
-    checked: dict[str, dict[str, Array]] = {}
+    checked: Checked = {}
     for scene, methods in given.items():
         for method, own in methods.items():
             where = f"{name}[{scene!r}][{method!r}]"
@@ -64,16 +62,10 @@ def by_scene(
 
 
 def numbers(name: str, given: ArrayLike, *axes: str) -> Array:
-    """Return finite numbers, after checking their axes; an axis like "2" states its length, others are names.
-
-    Raises:
-        ValueError: not finite numbers, other axes, or empty.
-    """
+    """Return finite numbers, after checking their `axes`: "2" states a length, other texts are names."""
     values: Array = real_tensor(name, given).detach().cpu().numpy()
-    fits = values.ndim == len(axes) and all(
-        length == int(axis) for length, axis in zip(values.shape, axes, strict=True) if axis.isdigit()
-    )
-    if not fits or values.size == 0:
+    lengths = [int(axis) if axis.isdigit() else own for axis, own in zip(axes, values.shape, strict=False)]
+    if values.ndim != len(axes) or list(values.shape) != lengths or values.size == 0:
         raise ValueError(f"{name}: shape {values.shape}; must be ({', '.join(axes)}), none of them 0")
     return values
 

@@ -57,11 +57,9 @@ def plot_pareto(
         best = pareto_front(everything, higher_is_better)
         if names is not None:
             require_each(f"names[{scene!r}]", names[scene], drawn)
-            texts = [
-                text
-                for method, values in drawn.items()
-                for text in _texts(f"names[{scene!r}][{method!r}]", names[scene][method], len(values))
-            ]
+            texts: list[str] = []
+            for method, values in drawn.items():
+                texts += _texts(f"names[{scene!r}][{method!r}]", names[scene][method], len(values))
             for index in best:
                 _write_beside(ax, everything[index], texts[index], higher_is_better)
         ax.margins(0.15)
@@ -78,12 +76,7 @@ def plot_pareto(
 
 
 def pareto_front(points: ArrayLike, higher_is_better: bool = False) -> list[int]:
-    """Return the indices of the Pareto-optimal points, by rising cost; of equal points the first.
-
-    Args:
-        points: (N, 2): cost, and error or score.
-        higher_is_better: True if the second column is a score.
-    """
+    """Return the indices of the Pareto-optimal points (N, 2), by rising cost; of equal points the first."""
     costs, results = numbers("points", points, "points", "2").T
     worse = -results if higher_is_better else results
     kept: list[int] = []

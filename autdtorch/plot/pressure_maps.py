@@ -12,16 +12,9 @@ from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
+from autdtorch.plot import data
 from autdtorch.plot.colours import FLOOR, PRESSURE_MAP
-from autdtorch.plot.data import (
-    MM,
-    ByMethod,
-    in_decibels,
-    methods_of,
-    plane_magnitude,
-    require_each,
-    require_scenes,
-)
+from autdtorch.plot.data import MM, ByMethod, plane_magnitude, require_each
 from autdtorch.plot.style import TICK_SIZE, label_of, new_figure, readable, styled, wrapped
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Obstacle
@@ -71,9 +64,10 @@ def plot_plane(
     if decibels:
         if peak == 0:
             raise ValueError("pressure: 0 Pa everywhere; must be more somewhere to have a level in dB")
-        values = np.maximum(in_decibels(magnitude, peak), FLOOR)
+        values = np.maximum(data.in_decibels(magnitude, peak), FLOOR)
         limits, label = (FLOOR, 0.0), f"level of |p| [dB], 0 dB = {peak:.3g} Pa"
-    mesh = _draw_plane(ax, values, plane, points, obstacles, limits)
+    mesh = _draw_plane(ax, values, plane, points, obstacles)
+    mesh.set_clim(*limits)
     _add_colour_bar(figure, mesh, [ax], "vertical", label)
     return figure
 
@@ -99,7 +93,7 @@ def plot_planes(
     Raises:
         ValueError: no scene, a scene without plane, or an argument of another shape.
     """
-    require_scenes("pressure", pressure)
+    data.require_scenes("pressure", pressure)
     require_each("planes", planes, pressure)
     for scene in pressure:
         require_kind(f"planes[{scene!r}]", planes[scene], Plane)
@@ -107,17 +101,15 @@ def plot_planes(
         require_each("control_points", control_points, pressure)
     if obstacles is not None:
         require_each("obstacles", obstacles, pressure)
-    methods = methods_of(pressure.values())
+    methods = data.methods_of(pressure.values())
     full = all(method in maps for method in methods for maps in pressure.values())
     alike = full and len({planes[scene] for scene in pressure}) == 1
     figure = new_figure(2.2 * len(pressure) + 0.7, 2.2 * len(methods) + 0.8)
     axes = figure.subplots(len(methods), len(pressure), squeeze=False)
     for column, (scene, maps) in zip(axes.T, pressure.items(), strict=True):
-        magnitudes = {
-            method: plane_magnitude(f"pressure[{scene!r}][{method!r}]", field)
-            for method, field in maps.items()
-        }
-        limits = (0.0, max(magnitude.max() for magnitude in magnitudes.values()))
+        names = {method: f"pressure[{scene!r}][{method!r}]" for method in maps}
+        magnitudes = {method: plane_magnitude(names[method], field) for method, field in maps.items()}
+        peak = max(magnitude.max() for magnitude in magnitudes.values())
         points = None
         if control_points is not None:
             points = points_tensor(f"control_points[{scene!r}]", control_points[scene])
@@ -126,7 +118,8 @@ def plot_planes(
             if method not in magnitudes:
                 ax.set_axis_off()
                 continue
-            mesh = _draw_plane(ax, magnitudes[method], planes[scene], points, outlined, limits)
+            mesh = _draw_plane(ax, magnitudes[method], planes[scene], points, outlined)
+            mesh.set_clim(0.0, peak)
             if alike:
                 ax.label_outer()
         column[0].set_title(wrapped(readable(scene), 2.0), weight="bold")
@@ -144,18 +137,11 @@ def _name_row(ax: Axes, name: str) -> None:
 
 
 def _draw_plane(
-    ax: Axes,
-    values: Array,
-    plane: Plane,
-    points: torch.Tensor | None,
-    obstacles: Iterable[Obstacle],
-    limits: tuple[float, float],
+    ax: Axes, values: Array, plane: Plane, points: torch.Tensor | None, obstacles: Iterable[Obstacle]
 ) -> QuadMesh:
-    (label_u, edges_u), (label_v, edges_v) = (
-        _plane_axis(plane, side, cells) for side, cells in enumerate(values.shape)
-    )
-    low, high = limits
-    mesh = ax.pcolormesh(edges_u, edges_v, values.T, cmap=PRESSURE_MAP, vmin=low, vmax=high, rasterized=True)
+    axes = (_plane_axis(plane, side, cells) for side, cells in enumerate(values.shape))
+    (label_u, edges_u), (label_v, edges_v) = axes
+    mesh = ax.pcolormesh(edges_u, edges_v, values.T, cmap=PRESSURE_MAP, rasterized=True)
     for obstacle in obstacles:
         _outline(ax, plane, obstacle)
     if points is not None:
@@ -197,22 +183,14 @@ def _circle_points(ax: Axes, plane: Plane, points: torch.Tensor, cells: int) -> 
     axes = sides.abs().argmax(dim=1)
     along_axis = sides.abs().amax(dim=1) > 1 - _AXIS_TOLERANCE
     coordinates = torch.where(along_axis, points[:, axes], (points - center) @ sides.T)[near]
-    ax.plot(
-        *(MM * coordinates.T.cpu().numpy()),
-        linestyle="none",
-        marker="o",
-        markersize=9,
-        markerfacecolor="none",
-        markeredgecolor="white",
-        markeredgewidth=1.2,
-        path_effects=[withStroke(linewidth=2.6, foreground="black")],
-    )
+    style: Any = {"marker": "o", "ms": 9, "mfc": "none", "mec": "white", "mew": 1.2, "linestyle": "none"}
+    outline = [withStroke(linewidth=2.6, foreground="black")]
+    ax.plot(*(MM * coordinates.T.cpu().numpy()), path_effects=outline, **style)
 
 
 def _add_colour_bar(figure: Figure, mesh: QuadMesh, axes: list[Axes], orientation: str, label: str) -> None:
     part = min(0.15, 0.45 / len(axes))  # share of the height of all axes
-    bar = figure.colorbar(
-        mesh, ax=axes, orientation=orientation, shrink=0.9, aspect=25, fraction=part, pad=0.05 / len(axes)
-    )
+    shape: Any = {"shrink": 0.9, "aspect": 25, "fraction": part, "pad": 0.05 / len(axes)}
+    bar = figure.colorbar(mesh, ax=axes, orientation=orientation, **shape)
     bar.set_label(label)
     bar.ax.tick_params(labelsize=TICK_SIZE)

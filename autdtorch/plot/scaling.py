@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,12 +15,8 @@ from autdtorch.plot.data import ByMethod, labelled, methods_of
 from autdtorch.plot.style import TICK_SIZE, Look, label_of, log_axes, looks_of, new_figure, styled
 from autdtorch.utils.array_types import Array
 
-OVERHEAD = 2.0
-"""Lower limit of the fitted costs, over the smallest cost: constant overhead is then at most half of each."""
-
-FEWEST = 3
-"""Fewest points for a fit."""
-
+OVERHEAD = 2.0  # fitted costs are at least this many times the smallest: overhead is at most half of each
+FEWEST = 3  # points for a fit
 _TICKS_APART = 0.12  # least distance of ticks, as a share of the axis
 
 
@@ -33,11 +30,7 @@ class PowerLaw:
 
 
 def fit_power(sizes: Sequence[float] | Array, costs: Sequence[float] | Array) -> PowerLaw | None:
-    """Fit a line to the logarithms of the costs that are at least `OVERHEAD` times the smallest one.
-
-    Returns:
-        The fit, or None if there are fewer than `FEWEST` such costs.
-    """
+    """Fit the costs that are at least `OVERHEAD` times the smallest; None if fewer than `FEWEST` are."""
     chosen = [pair for pair in zip(sizes, costs, strict=True) if pair[1] >= OVERHEAD * min(costs)]
     if len(chosen) < FEWEST:
         return None
@@ -89,9 +82,8 @@ def _draw_series(ax: Axes, name: str, values: Array, look: Look) -> None:
         name += f", slope {fit.exponent:.1f}".replace("-", "\N{MINUS SIGN}")
     elif len(values) >= FEWEST:
         name += f", within a factor {costs.max() / costs.min():.2g}"
-    ax.plot(
-        sizes, costs, color=look.colour, marker=look.marker, linestyle=look.dashes, ms=4, lw=1.2, label=name
-    )
+    style: Any = {"color": look.colour, "marker": look.marker, "linestyle": look.dashes, "label": name}
+    ax.plot(sizes, costs, ms=4, lw=1.2, **style)
 
 
 def _mark_sizes(ax: Axes, sizes: Array) -> None:

@@ -13,16 +13,7 @@ from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import NDArray
 
-from autdtorch.plot.colours import (
-    EDGE_COLOUR,
-    FOCUS_COLOUR,
-    MOST_EDGES,
-    OBSTACLE_COLOUR,
-    PHASE_MAP,
-    PLANE_COLOUR,
-    SHARP_ANGLE,
-    TRANSDUCER_COLOUR,
-)
+from autdtorch.plot import colours
 from autdtorch.plot.data import MM, single_drive_phases
 from autdtorch.plot.style import TICK_SIZE, new_figure, styled
 from autdtorch.scene.obstacles import Obstacle
@@ -62,15 +53,13 @@ def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
     figure = new_figure(5.2, 4.2)
     ax = cast(Axes3D, figure.add_subplot(projection="3d", computed_zorder=False))
     if scene.observation_plane is not None:
-        corners = scene.observation_plane.corners[[0, 1, 3, 2]].numpy()
-        ax.add_collection3d(Poly3DCollection([MM * corners], facecolor=PLANE_COLOUR, alpha=0.3, zorder=1))
+        corners = MM * scene.observation_plane.corners[[0, 1, 3, 2]].numpy()
+        ax.add_collection3d(Poly3DCollection([corners], facecolor=colours.PLANE_COLOUR, alpha=0.3, zorder=1))
     # From far to near: the order of drawing is fixed, and later obstacles cover earlier ones.
-    for obstacle in sorted(
-        scene.obstacles, key=lambda one: (np.array(one.lower) + one.upper) / 2 @ _TO_VIEWER
-    ):
+    for obstacle in sorted(scene.obstacles, key=lambda one: (np.array(one.lower) + one.upper) @ _TO_VIEWER):
         _add_obstacle(ax, obstacle, scene.domain)
     foci = MM * scene.control_points.numpy()
-    ax.scatter(*foci.T, color=FOCUS_COLOUR, s=22, depthshade=False, label="control points", zorder=3)
+    ax.scatter(*foci.T, color=colours.FOCUS_COLOUR, s=22, depthshade=False, label="control points", zorder=3)
     _scatter_transducers(ax, scene, phases)
     lower, upper = (MM * np.array(corner) for corner in scene.domain)
     ax.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), zlim=(lower[2], upper[2]))
@@ -100,23 +89,23 @@ def _add_obstacle(ax: Axes3D, obstacle: Obstacle, domain: tuple[Vector, Vector])
         _add_faces(ax, corners[~front], normals[~front], domain)
     _add_faces(ax, corners[front], normals[front], domain)
     edges = vertices[_sharp_edges(faces, normals, front)]
-    if len(edges) > MOST_EDGES:
+    if len(edges) > colours.MOST_EDGES:
         return
     lines = [clipped(edge, *domain) for edge in edges[~_hidden(obstacle, edges.mean(axis=1))]]
     if lines := [MM * line for line in lines if len(line)]:  # Matplotlib refuses a collection of none
-        ax.add_collection3d(Line3DCollection(lines, colors=EDGE_COLOUR, lw=0.8, zorder=2))
+        ax.add_collection3d(Line3DCollection(lines, colors=colours.EDGE_COLOUR, lw=0.8, zorder=2))
 
 
 def _add_faces(ax: Axes3D, corners: Array, normals: Array, domain: tuple[Vector, Vector]) -> None:
     """Draw triangles (F, 3, 3) [m] with unit normals (F, 3), clipped to the domain."""
     light = 0.7 + 0.3 * normals @ _LIGHT
-    colours = np.clip(light[:, None] * to_rgb(OBSTACLE_COLOUR), 0, 1)
+    shades = np.clip(light[:, None] * to_rgb(colours.OBSTACLE_COLOUR), 0, 1)
     polygons = [clipped(triangle, *domain) for triangle in corners]
     left = [index for index, polygon in enumerate(polygons) if len(polygon)]
     if not left:
         return
     # Edges in the colours of the faces close the seams between them.
-    style: Any = {"facecolor": colours[left], "edgecolor": colours[left], "lw": 0.3, "zorder": 2}
+    style: Any = {"facecolor": shades[left], "edgecolor": shades[left], "lw": 0.3, "zorder": 2}
     ax.add_collection3d(Poly3DCollection([MM * polygons[index] for index in left], **style))
 
 
@@ -135,29 +124,28 @@ def _sharp_edges(faces: NDArray[np.int64], normals: Array, front: NDArray[np.boo
     # On a closed surface, sorting brings the two faces of an edge together.
     order = np.lexsort(pairs.T)
     one, other = face[order[0::2]], face[order[1::2]]
-    sharp = (normals[one] * normals[other]).sum(axis=1) < np.cos(SHARP_ANGLE)
+    sharp = (normals[one] * normals[other]).sum(axis=1) < np.cos(colours.SHARP_ANGLE)
     edges: NDArray[np.int64] = pairs[order[0::2]][sharp & (front[one] | front[other])]
     return edges
 
 
 def _scatter_transducers(ax: Axes3D, scene: Scene, phases: Array | None) -> None:
     positions = MM * scene.array.positions.numpy()
-    style: Any = {"edgecolors": EDGE_COLOUR, "s": 36, "depthshade": False, "zorder": 1}
+    style: Any = {"edgecolors": colours.EDGE_COLOUR, "s": 36, "depthshade": False, "zorder": 1}
     style["label"] = "transducers"
     if phases is None:
-        ax.scatter(*positions.T, color=TRANSDUCER_COLOUR, **style)
+        ax.scatter(*positions.T, color=colours.TRANSDUCER_COLOUR, **style)
         return
-    dots = ax.scatter(*positions.T, c=phases, cmap=PHASE_MAP, vmin=0, vmax=2 * np.pi, **style)
+    dots = ax.scatter(*positions.T, c=phases, cmap=colours.PHASE_MAP, vmin=0, vmax=2 * np.pi, **style)
     bar = ax.get_figure().colorbar(dots, ax=ax, shrink=0.6, pad=0.12)
     bar.set_ticks([0, np.pi, 2 * np.pi], labels=["0", "π", "2π"])
     bar.set_label("phase [rad]")
 
 
 def clipped(corners: Array, lower: Vector, upper: Vector) -> Array:
-    """Clip a convex polygon or a line (K, 3) to a box (Sutherland & Hodgman 1974).
+    """Clip a convex polygon or a line (K, 3) to a box (Sutherland & Hodgman 1974), to L >= 0 corners (L, 3).
 
-    Returns:
-        Corners (L, 3); L = 0 if nothing is inside. A clipped line may run back to its start.
+    A clipped line may run back to its start.
     """
     for side in range(6):
         axis, sign, bound = side // 2, (1, -1)[side % 2], (lower, upper)[side % 2][side // 2]

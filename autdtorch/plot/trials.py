@@ -12,19 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from autdtorch.plot import style
 from autdtorch.plot.data import ByMethod, by_scene, labelled, methods_of
-from autdtorch.plot.style import (
-    TICK_SIZE,
-    Look,
-    add_legend,
-    label_of,
-    looks_of,
-    new_figure,
-    new_panels,
-    readable,
-    styled,
-    wrapped,
-)
+from autdtorch.plot.style import TICK_SIZE, Look, add_legend, label_of, looks_of, styled
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import finite_number, require_kind
 
@@ -58,7 +48,7 @@ def plot_trials(quantities: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
     scenes = methods_of(data.values())
     looks = looks_of(methods)
     width = max(_WIDTH, 1.0 + _BOX * len(scenes) * len(methods))
-    figure = new_figure(width, 0.7 + 2.1 * len(data))
+    figure = style.new_figure(width, 0.7 + 2.1 * len(data))
     axes = figure.subplots(len(data), squeeze=False, sharex=True)[:, 0]
     single = dict.fromkeys(methods, True)
     for letter, ax, (label, of_scenes) in zip(ascii_lowercase, axes, data.items(), strict=False):
@@ -74,7 +64,7 @@ def plot_trials(quantities: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
         ax.tick_params(labelsize=TICK_SIZE)
         if len(data) > 1:
             ax.set_title(f"({letter})", loc="left")
-    names = [wrapped(readable(scene), (width - 1.0) / len(scenes)) for scene in scenes]
+    names = [style.wrapped(style.readable(scene), (width - 1.0) / len(scenes)) for scene in scenes]
     axes[-1].set_xticks(range(len(scenes)), names)
     axes[-1].set_xlim(-0.5, len(scenes) - 0.5)
     axes[-1].set_xlabel("scene")
@@ -118,7 +108,7 @@ def plot_convergence(
     level_labels = list(dict.fromkeys(name for by_label in levels.values() for name in by_label))
     styles = {name: _LEVELS[index % len(_LEVELS)] for index, name in enumerate(level_labels)}
     looks = looks_of(methods_of(histories.values()))
-    figure, panels = new_panels(history, *_PANEL, "evaluations", label, sharey=True)
+    figure, panels = style.new_panels(history, *_PANEL, "evaluations", label, sharey=True)
     title = None
     for ax, (scene, by_method) in zip(panels, histories.items(), strict=True):
         for method, values in by_method.items():

@@ -22,13 +22,21 @@ _TYPES = {"config": str, "seed": int, "versions": dict, "source_digest": str, "d
 
 @dataclass(frozen=True)
 class Provenance:
-    """Everything that the results of a study depend on."""
+    """Everything that the results of a study depend on.
 
-    config: str  # all settings, as YAML text
+    Attributes:
+        config: all settings, as YAML text.
+        seed: of the random choices.
+        versions: of autdtorch, Python, the numerical packages and the platform.
+        source_digest: SHA-256 of the package's source.
+        date: start of the study, UTC, ISO 8601.
+    """
+
+    config: str
     seed: int
-    versions: dict[str, str]  # of autdtorch, Python, the numerical packages and the platform
-    source_digest: str  # SHA-256 of the package's source
-    date: str  # start of the study, UTC, ISO 8601
+    versions: dict[str, str]
+    source_digest: str
+    date: str
 
     @property
     def origin(self) -> str:

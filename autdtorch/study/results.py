@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -45,10 +46,8 @@ class Simulation:
     def __repr__(self) -> str:
         """Return method, settings and times, with units."""
         grid = "" if self.spacing is None else f"spacing {1e3 * self.spacing:.4g} mm, {len(self.runs)} runs, "
-        return (
-            f"Simulation({self.method}, {grid}matrix {self.matrix_seconds:.2g} s, "
-            f"plane {self.plane_seconds:.2g} s)"
-        )
+        times = f"matrix {self.matrix_seconds:.2g} s, plane {self.plane_seconds:.2g} s"
+        return f"Simulation({self.method}, {grid}{times})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,26 +144,20 @@ def stored_solution(fields: Mapping[str, Any], transducers: int, points: int) ->
     if history.ndim != 2 or shape[0] != trials or shape[1] < most or (history.diff() < 0).any():
         accepted = f"must be ({trials}, {most}) or longer, no number below the one before"
         raise ValueError(f"history: shape {shape}; {accepted}")
-    score, best = stored_numbers("score", fields["score"], trials), history[:, -1]
+    score, best = stored_numbers("score", fields["score"], trials, least=-math.inf), history[:, -1]
     if (score > best + NEAR_TIE * best.abs()).any():  # below it is the last drive, of `identify`
         raise invalid("score", score, f"must be at most {best.tolist()}, the best of the history")
-    pressure = stored_magnitudes("pressure", fields["pressure"], trials, points)
+    pressure = stored_numbers("pressure", fields["pressure"], trials, points)
     return Solution(drive, pressure, score, torch.from_numpy(evaluations), history)
 
 
-def stored_magnitudes(name: str, value: object, *shape: int) -> torch.Tensor:
-    """Return finite numbers >= 0 of a shape, after checking them."""
-    numbers = stored_numbers(name, value, *shape)
-    if numbers.min() < 0:
-        raise invalid(name, numbers, "every number must be >= 0")
-    return numbers
-
-
-def stored_numbers(name: str, value: object, *shape: int) -> torch.Tensor:
-    """Return finite numbers of a shape, after checking them."""
+def stored_numbers(name: str, value: object, *shape: int, least: float = 0.0) -> torch.Tensor:
+    """Return finite numbers of a shape and >= `least`, after checking them."""
     numbers = real_tensor(name, value)
     if numbers.shape != shape:
         raise ValueError(f"{name}: shape {tuple(numbers.shape)}; must be {shape}")
+    if numbers.min() < least:
+        raise invalid(name, numbers, f"every number must be >= {least:g}")
     return numbers
 
 

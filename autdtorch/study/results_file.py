@@ -25,7 +25,7 @@ from autdtorch.study.results import (
     SceneResult,
     Simulation,
     StudyResult,
-    stored_magnitudes,
+    stored_numbers,
     stored_solution,
 )
 from autdtorch.utils.files import replace_file
@@ -43,7 +43,6 @@ from autdtorch.utils.validation import (
 
 RESULTS_FILE = "results.h5"
 
-_SIMULATIONS = ("free_space", "box", "full")
 _SIMULATION = ("method", "wavelength", "spacing", "tolerance", "matrix_seconds", "plane_seconds")
 _RUN = ("periods", "remaining", "reached", "seconds")
 _SOLUTION = ("drive", "pressure", "score", "evaluations", "history")
@@ -54,11 +53,7 @@ _DAMAGE = (OSError, KeyError, ValueError, TypeError, AttributeError, OverflowErr
 
 
 def save_results(results: StudyResult, folder: str | os.PathLike[str]) -> None:
-    """Write the results of a study into a folder, which is made if it does not exist.
-
-    Raises:
-        OSError: the folder cannot be made or written.
-    """
+    """Write the results of a study into a folder, which is made if it does not exist."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     content = io.BytesIO()  # on a full disk, HDF5 would raise no OSError but fail when it closes the file
@@ -141,7 +136,7 @@ def _read_scene(group: Any) -> SceneResult:
 def _read_simulation(group: Any) -> Simulation:
     attributes, runs = group.attrs, _entry(group, "runs")
     columns = [_array(runs, key).tolist() for key in _RUN]
-    require_one_of("method", attributes["method"], _SIMULATIONS)
+    require_one_of("method", attributes["method"], ("free_space", "box", "full"))
     return Simulation(
         attributes["method"],
         positive("wavelength", attributes["wavelength"], "m"),
@@ -156,12 +151,8 @@ def _read_simulation(group: Any) -> Simulation:
 def _run(periods: Any, remaining: Any, reached: Any, seconds: Any) -> Run:
     if not remaining >= 0:  # infinite if there was no estimate
         raise invalid("remaining", remaining, "must be >= 0")
-    return Run(
-        integer_at_least("periods", periods, 1),
-        float(remaining),
-        boolean("reached", reached),
-        not_negative("seconds", seconds, "s"),
-    )
+    periods, reached = integer_at_least("periods", periods, 1), boolean("reached", reached)
+    return Run(periods, float(remaining), reached, not_negative("seconds", seconds, "s"))
 
 
 def _write_method(group: Any, method: MethodResult) -> None:
@@ -195,7 +186,7 @@ def _complex_matrix(group: Any, key: str) -> torch.Tensor:
 
 
 def _magnitudes(group: Any, key: str, trials: int) -> torch.Tensor:
-    return stored_magnitudes(key, _array(group, key), trials)
+    return stored_numbers(key, _array(group, key), trials)
 
 
 def _array(group: Any, key: str) -> Any:

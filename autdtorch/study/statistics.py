@@ -15,13 +15,9 @@ from autdtorch.methods.solution import Solution
 from autdtorch.study.results import MethodResult
 
 CONFIDENCE = 0.95
-
+# Fewest trials for an interval: of 5, even the full range covers the median with only 1 - 2 / 2^5 < 95 %.
 FEWEST_TRIALS = 6
-"""Fewest trials for an interval: of 5, even the full range covers the median with only 1 - 2 / 2^5 < 95 %."""
-
-NEAR_BOUND = 0.9
-"""A score of at least this share of the bound is near the bound."""
-
+NEAR_BOUND = 0.9  # a score of at least this share of the bound is near it
 _RESAMPLES = 4999
 _SEED = 0
 
@@ -99,16 +95,11 @@ def bootstrap(
     if trials < FEWEST_TRIALS:
         return Interval.unknown(value)
     student = stats.t.ppf((1 + CONFIDENCE) / 2, trials - 1)
-    found = stats.bootstrap(
-        drawn,
-        statistic,
-        n_resamples=_RESAMPLES,
-        vectorized=True,
-        confidence_level=1 - 2 * stats.norm.sf(math.sqrt(trials / (trials - 1)) * student),
-        method="percentile",
-        rng=np.random.default_rng(_SEED),
-    ).confidence_interval
-    return Interval(value, float(found.low), float(found.high))
+    expanded = 1 - 2 * stats.norm.sf(math.sqrt(trials / (trials - 1)) * student)
+    settings: Any = {"n_resamples": _RESAMPLES, "vectorized": True, "method": "percentile"}
+    rng = np.random.default_rng(_SEED)
+    found = stats.bootstrap(drawn, statistic, confidence_level=expanded, rng=rng, **settings)
+    return Interval(value, *map(float, found.confidence_interval))
 
 
 def share_interval(successes: torch.Tensor) -> Interval:

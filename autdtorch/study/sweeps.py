@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import os
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -71,6 +72,9 @@ class _Part:
         return self.found.methods[self.method]
 
 
+_Groups: TypeAlias = dict[str, dict[str, list[_Part]]]
+
+
 def collect_results(folder: str | os.PathLike[str], modules: Collection[str] = ()) -> Sweep:
     """Merge the studies in a folder and its subfolders, such as those of a sweep.
 
@@ -80,9 +84,6 @@ def collect_results(folder: str | os.PathLike[str], modules: Collection[str] = (
     Args:
         folder: folder of the studies.
         modules: names of trusted modules, whose obstacles scenes may name by `_target_`; see `load_scene`.
-
-    Returns:
-        The merged studies.
 
     Raises:
         FileNotFoundError: no such folder, no finished study in it, or no file of a name in a scene's settings
@@ -142,16 +143,13 @@ def _parts_by(settings: Any, study: StudyResult) -> Iterator[_Part]:
 
 
 def _flat(value: object, key: str = "") -> Iterator[tuple[str, Any]]:
-    items: Iterable[tuple[object, object]]
+    if isinstance(value, list) and any(isinstance(entry, dict) for entry in value):
+        value = dict(enumerate(value))
     if isinstance(value, dict):
-        items = value.items()
-    elif isinstance(value, list) and any(isinstance(entry, dict) for entry in value):
-        items = enumerate(value)
+        for name, entry in value.items():
+            yield from _flat(entry, f"{key}.{name}" if key else str(name))
     else:
         yield key, [_whole(entry) for entry in value] if isinstance(value, list) else _whole(value)
-        return
-    for name, entry in items:
-        yield from _flat(entry, f"{key}.{name}" if key else str(name))
 
 
 def _whole(value: object) -> object:
@@ -159,9 +157,7 @@ def _whole(value: object) -> object:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def _groups(
-    parts: Sequence[_Part],
-) -> tuple[dict[str, dict[str, list[_Part]]], dict[tuple[str, str], Settings]]:
+def _groups(parts: Sequence[_Part]) -> tuple[_Groups, dict[tuple[str, str], Settings]]:
     """Group parts of equal settings by new names of scene and method; return also the swept settings."""
     scenes = _swept([(part.scene, part.scene_settings) for part in parts])
     methods = _swept([(part.method, part.method_settings) for part in parts])
@@ -173,7 +169,7 @@ def _groups(
         place = order.index(method) if method in order else len(order)
         return scene, _order(of_scene), place, method, _order(of_method)
 
-    groups: dict[str, dict[str, list[_Part]]] = {}
+    groups: _Groups = {}
     swept: dict[tuple[str, str], Settings] = {}
     scene_names, method_names = _names(scenes), _names(methods)
     for index in sorted(range(len(parts)), key=rank):
@@ -204,14 +200,11 @@ def _swept(named: Sequence[tuple[str, Settings]]) -> list[tuple[str, Settings]]:
 
 def _names(named: Sequence[tuple[str, Settings]]) -> list[str]:
     """Return names with the swept settings, distinct for distinct settings, fit for file names."""
-    names = [_name(name, swept) for name, swept in named]
-    digests = [digest_of(sorted(swept.items()))[:8] for _, swept in named]
-    bearers: dict[str, set[str]] = {}
-    for name, digest in zip(names, digests, strict=True):
-        bearers.setdefault(name, set()).add(digest)
+    found = [(_name(name, swept), digest_of(sorted(swept.items()))[:8]) for name, swept in named]
+    bearers = Counter(name for name, _ in set(found))
     return [
-        f"{name[:_LONGEST_NAME]}-{digest}" if len(name) > _LONGEST_NAME or len(bearers[name]) > 1 else name
-        for name, digest in zip(names, digests, strict=True)
+        f"{name[:_LONGEST_NAME]}-{digest}" if len(name) > _LONGEST_NAME or bearers[name] > 1 else name
+        for name, digest in found
     ]
 
 
@@ -241,11 +234,9 @@ def _merged_trials(parts: Sequence[_Part]) -> MethodResult:
     """Join the trials of all seeds, for each seed those of its longest study."""
     longest = sorted(parts, key=lambda part: (part.seed, part.result.trials))
     kept = list({part.seed: part.result for part in longest}.values())
-    first = kept[0].solution
-    if all(
-        torch.equal(first.drive, other.solution.drive) and torch.equal(first.history, other.solution.history)
-        for other in kept
-    ):
+    one = kept[0].solution
+    others = [result.solution for result in kept]
+    if all(torch.equal(one.drive, it.drive) and torch.equal(one.history, it.history) for it in others):
         kept = kept[:1]  # the method makes no random choices
     solution = joined([result.solution for result in kept])
     # A study keeps the observation plane of one trial. The one nearest to the joint median is shown.
@@ -262,9 +253,7 @@ def _merged_trials(parts: Sequence[_Part]) -> MethodResult:
 
 
 def _joined_metrics(metrics: Sequence[FocusMetrics]) -> FocusMetrics:
-    names = ("mean", "min", "std", "uniformity")
     areas = [one.area for one in metrics if one.area is not None]
-    return FocusMetrics(
-        **{name: torch.cat([getattr(one, name) for one in metrics]) for name in names},
-        area=torch.cat(areas) if len(areas) == len(metrics) else None,
-    )
+    names = ("mean", "min", "std", "uniformity")
+    joint = {name: torch.cat([getattr(one, name) for one in metrics]) for name in names}
+    return FocusMetrics(**joint, area=torch.cat(areas) if len(areas) == len(metrics) else None)

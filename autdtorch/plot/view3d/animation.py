@@ -11,18 +11,10 @@ from numpy.typing import NDArray
 from PIL import Image, ImageColor
 
 from autdtorch.plot.colours import WAVE_MAP
+from autdtorch.plot.view3d import scene_meshes as meshes
 from autdtorch.plot.view3d.export import require_suffix
 from autdtorch.plot.view3d.opengl import require_rendering
 from autdtorch.plot.view3d.pressure_meshes import add_sheet, plane_mesh, plane_pressure
-from autdtorch.plot.view3d.scene_meshes import (
-    FIELD_BAR,
-    POINT_COLOUR,
-    add_bar,
-    add_caption,
-    add_transducers,
-    emitted_phases,
-    new_plotter,
-)
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import ArrayLike, complex_tensor, integer_at_least, require_kind
 
@@ -54,19 +46,19 @@ def animate3d(
             suffix, or `frames` is less than 2.
     """
     require_kind("scene", scene, Scene)
-    phases = emitted_phases(drive, len(scene.array))
+    phases = meshes.emitted_phases(drive, len(scene.array))
     plane, _ = plane_pressure(scene, field)
     pressure = complex_tensor("field", field).detach().cpu().numpy()
     frames = integer_at_least("frames", frames, 2)
     path = require_suffix("path", path, (".gif",))
     require_rendering()
-    plotter = new_plotter(scene, off_screen=True)
-    discs = add_transducers(plotter, scene, phases)
+    plotter = meshes.new_plotter(scene, off_screen=True)
+    discs = meshes.add_transducers(plotter, scene, phases)
     sheet = plane_mesh(plane, pressure.real)
     limit = _round_up(float(np.abs(pressure).max()))
     actor = add_sheet(plotter, sheet, WAVE_MAP, (-limit, limit))
-    add_bar(plotter, actor, "p(t) [Pa]", position=FIELD_BAR, labels=5, fmt="%.3g")
-    add_caption(plotter, f"one period: {1e6 / scene.frequency:.3g} µs")
+    meshes.add_bar(plotter, actor, "p(t) [Pa]", position=meshes.FIELD_BAR, labels=5, fmt="%.3g")
+    meshes.add_caption(plotter, f"one period: {1e6 / scene.frequency:.3g} µs")
     emitted = discs["phase"].copy()
     pictures = []
     for turn in np.arange(frames) / frames:
@@ -92,7 +84,7 @@ def _colours(plotter: pyvista.Plotter) -> NDArray[np.uint8]:
     """Return one palette (256, 3) for all frames: with different palettes, static parts would flicker."""
     tables = [np.asarray(bar.lookup_table.values)[:, :3] for bar in plotter.scalar_bars.values()]
     greys = np.linspace(0, 255, _GREYS)[:, None] * np.ones(3)
-    shades = np.linspace(0.3, 1.0, _SHADES)[:, None] * np.array(ImageColor.getrgb(POINT_COLOUR))
+    shades = np.linspace(0.3, 1.0, _SHADES)[:, None] * np.array(ImageColor.getrgb(meshes.POINT_COLOUR))
     each = (256 - _GREYS - _SHADES) // len(tables)
     maps = [table[np.linspace(0, len(table) - 1, each).astype(int)] for table in tables]
     return np.concatenate([greys, shades, *maps]).astype(np.uint8)

@@ -16,9 +16,8 @@ if TYPE_CHECKING:
 
 _SUFFIXES = (".png", ".html", ".gltf")
 
-_LEGEND = (
-    "position: fixed; z-index: 1; left: 16px; top: 16px; display: flex; gap: 32px; font: 14px sans-serif"
-)
+_LEGEND = "position: fixed; z-index: 1; left: 16px; top: 16px; display: flex; gap: 32px; "
+_LEGEND += "font: 14px sans-serif"
 _BAR = "width: 200px; height: 14px"
 _ENDS = "display: flex; justify-content: space-between"
 _EVERY = 8  # every 8th colour of a table makes the gradient

@@ -25,13 +25,8 @@ def rendering_problem() -> str | None:
     A child process makes the check: without an OpenGL driver, VTK raises no error but ends the process.
     """
     try:
-        child = subprocess.run(
-            [sys.executable, "-c", _PROBE],
-            capture_output=True,
-            text=True,
-            timeout=_PROBE_TIMEOUT,
-            check=False,
-        )
+        command = [sys.executable, "-c", _PROBE]
+        child = subprocess.run(command, capture_output=True, text=True, timeout=_PROBE_TIMEOUT, check=False)
     except subprocess.TimeoutExpired:
         cause = f"a trial rendering did not end within {_PROBE_TIMEOUT:g} s"
     else:
@@ -49,12 +44,8 @@ def require_rendering() -> None:
 
     Triton contains an LLVM. If it is imported after Mesa's software driver, which loads another LLVM, the
     process ends. PyTorch's optimisers import Triton, so it is imported here first.
-
-    Raises:
-        RuntimeError: this machine cannot render; the message names the cause.
     """
-    problem = rendering_problem()
-    if problem is not None:
+    if problem := rendering_problem():
         raise RuntimeError(problem)
     if importlib.util.find_spec("triton") is not None:
         importlib.import_module("triton")

@@ -29,9 +29,8 @@ _SURFACE_COLOUR = "#8CD0FF"  # blue: not in the colour map of the pressure
 def add_plane(plotter: pyvista.Plotter, plane: Plane, level: Array | None) -> None:
     """Draw the plane, coloured by its level (Nu, Nv) [dB], or translucent if there is none."""
     if level is None:
-        plotter.add_mesh(
-            plane_mesh(plane, np.zeros((1, 1))), color=PLANE_COLOUR, opacity=0.35, lighting=False
-        )
+        sheet = plane_mesh(plane, np.zeros((1, 1)))
+        plotter.add_mesh(sheet, color=PLANE_COLOUR, opacity=0.35, lighting=False)
         return
     actor = add_sheet(plotter, plane_mesh(plane, np.maximum(level, FLOOR)), PRESSURE_MAP, (FLOOR, 0.0))
     add_bar(plotter, actor, "pressure [dB]", position=FIELD_BAR, labels=7, fmt="%.0f")

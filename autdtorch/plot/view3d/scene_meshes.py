@@ -8,14 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from autdtorch.plot.colours import (
-    EDGE_COLOUR,
-    MOST_EDGES,
-    OBSTACLE_COLOUR,
-    PHASE_MAP,
-    SHARP_ANGLE,
-    TRANSDUCER_COLOUR,
-)
+from autdtorch.plot import colours
 from autdtorch.plot.data import MM, single_drive_phases
 from autdtorch.scene.drive import amplitudes_of
 from autdtorch.scene.obstacles import Obstacle
@@ -35,6 +28,10 @@ _PHASE_BAR = 0.03  # left edge of a colour bar, as a share of the window
 FIELD_BAR = 0.9
 _CAPTION = (0.85, 0.15)  # lower left corner, as shares of the window
 _CAMERA = (-0.75, -1.0, 0.5)  # from the centre towards the camera
+
+
+_BAR = {"vertical": True, "position_y": 0.25, "width": 0.05, "height": 0.5, "color": "black"}
+_BAR |= {"title_font_size": 20, "label_font_size": 18, "unconstrained_font_size": True}
 
 
 def new_plotter(scene: Scene, off_screen: bool) -> pyvista.Plotter:
@@ -60,8 +57,7 @@ def emitted_phases(drive: ArrayLike, transducers: int) -> Array:
 def add_transducers(plotter: pyvista.Plotter, scene: Scene, phases: Array | None) -> pyvista.PolyData:
     """Draw the transducers as discs, coloured by their phases (M,) [rad], NaN for silent ones.
 
-    Returns:
-        The mesh of all discs, with the phases over pi as "phase" if given.
+    The mesh of all discs is returned, with the phases over pi as "phase" if given.
     """
     import pyvista
 
@@ -80,13 +76,13 @@ def add_transducers(plotter: pyvista.Plotter, scene: Scene, phases: Array | None
     )
     shape = {"tip_length": 0.35, "tip_radius": 0.1, "shaft_radius": 0.03}
     arrow = pyvista.Arrow(start=(0.1 * radius, 0.0, 0.0), scale=2.0 * radius, **shape)
-    colours = {"scalars": "phase", "cmap": PHASE_MAP, "clim": (0.0, 2.0), "nan_color": _SILENT_COLOUR}
+    look = {"scalars": "phase", "cmap": colours.PHASE_MAP, "clim": (0.0, 2.0), "nan_color": _SILENT_COLOUR}
     if phases is None:
-        colours = {"color": TRANSDUCER_COLOUR}
-    actor = plotter.add_mesh(face, lighting=False, show_scalar_bar=False, **colours)
+        look = {"color": colours.TRANSDUCER_COLOUR}
+    actor = plotter.add_mesh(face, lighting=False, show_scalar_bar=False, **look)
     if phases is not None:
         add_bar(plotter, actor, "phase / π", position=_PHASE_BAR, labels=5, fmt="%.1f")
-    plotter.add_mesh(rim, color=EDGE_COLOUR, lighting=False)
+    plotter.add_mesh(rim, color=colours.EDGE_COLOUR, lighting=False)
     plotter.add_mesh(points.glyph(geom=arrow, **along), color="#555555")
     return face
 
@@ -98,17 +94,10 @@ def add_bar(
     bar = plotter.add_scalar_bar(
         title + "\n",  # VTK sets the title tight against the bar
         mapper=mesh.mapper,
-        vertical=True,
-        position_x=position,
-        position_y=0.25,
-        width=0.05,
-        height=0.5,
         n_labels=labels,
         fmt=fmt,
-        color="black",
-        title_font_size=20,
-        label_font_size=18,
-        unconstrained_font_size=True,
+        position_x=position,
+        **_BAR,
     )
     _use_font(bar.GetTitleTextProperty(), bar.GetLabelTextProperty())
 
@@ -140,13 +129,12 @@ def _add_obstacle(plotter: pyvista.Plotter, obstacle: Obstacle, domain: tuple[Ve
                 surface = surface.clip(normal=normal, origin=MM * np.array(corner))
     if surface.n_cells == 0:  # only its bounding box reaches into the domain
         return
-    normals = surface.compute_normals(
-        split_vertices=True, feature_angle=math.degrees(SHARP_ANGLE), auto_orient_normals=False
-    )
-    plotter.add_mesh(normals, color=OBSTACLE_COLOUR, ambient=0.35, smooth_shading=True)
-    edges = surface.extract_feature_edges(math.degrees(SHARP_ANGLE))
-    if 0 < edges.n_cells <= MOST_EDGES:
-        plotter.add_mesh(edges, color=EDGE_COLOUR, line_width=2, lighting=False)
+    sharp = math.degrees(colours.SHARP_ANGLE)
+    normals = surface.compute_normals(split_vertices=True, feature_angle=sharp, auto_orient_normals=False)
+    plotter.add_mesh(normals, color=colours.OBSTACLE_COLOUR, ambient=0.35, smooth_shading=True)
+    edges = surface.extract_feature_edges(sharp)
+    if 0 < edges.n_cells <= colours.MOST_EDGES:
+        plotter.add_mesh(edges, color=colours.EDGE_COLOUR, line_width=2, lighting=False)
 
 
 def _add_control_points(plotter: pyvista.Plotter, scene: Scene) -> None:
@@ -159,17 +147,10 @@ def _add_control_points(plotter: pyvista.Plotter, scene: Scene) -> None:
 
 def _add_axes(plotter: pyvista.Plotter, scene: Scene) -> None:
     lower, upper = scene.domain
-    axes = plotter.show_bounds(
-        bounds=[MM * corner[axis] for axis in range(3) for corner in (lower, upper)],
-        xtitle="x [mm]",
-        ytitle="y [mm]",
-        ztitle="z [mm]",
-        grid="back",
-        location="outer",
-        fmt="%.0f",
-        color="black",
-        font_size=15,
-    )
+    bounds = [MM * corner[axis] for axis in range(3) for corner in (lower, upper)]
+    titles = {f"{name}title": f"{name} [mm]" for name in "xyz"}
+    style = {"grid": "back", "location": "outer", "fmt": "%.0f", "color": "black", "font_size": 15}
+    axes = plotter.show_bounds(bounds=bounds, **titles, **style)
     for axis in range(3):
         axes.SetAxisLabels(axis, None)  # PyVista's are not round numbers, VTK's are
     plotter.view_vector(_CAMERA, viewup=(0.0, 0.0, 1.0))

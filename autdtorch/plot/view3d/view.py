@@ -7,15 +7,9 @@ from typing import TYPE_CHECKING
 
 from autdtorch.plot.colours import FLOOR
 from autdtorch.plot.data import in_decibels
+from autdtorch.plot.view3d import pressure_meshes as meshes
 from autdtorch.plot.view3d.export import require_suffix, write
 from autdtorch.plot.view3d.opengl import require_rendering
-from autdtorch.plot.view3d.pressure_meshes import (
-    add_isosurface,
-    add_plane,
-    plane_pressure,
-    volume_magnitude,
-    zero_level,
-)
 from autdtorch.plot.view3d.scene_meshes import add_caption, add_transducers, emitted_phases, new_plotter
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import ArrayLike, boolean, number_between, require_kind
@@ -63,20 +57,20 @@ def view3d(
     require_kind("scene", scene, Scene)
     off_screen = boolean("off_screen", off_screen)
     phases = None if drive is None else emitted_phases(drive, len(scene.array))
-    on_plane = None if field is None else plane_pressure(scene, field)[1]
-    in_domain = None if volume is None else volume_magnitude(volume)
+    on_plane = None if field is None else meshes.plane_pressure(scene, field)[1]
+    in_domain = None if volume is None else meshes.volume_magnitude(volume)
     height = number_between("isosurface", isosurface, FLOOR, 0.0, "dB")
-    zero = zero_level(reference, on_plane, in_domain)
+    zero = meshes.zero_level(reference, on_plane, in_domain)
     path = None if save is None else require_suffix("save", save)
     require_rendering()
     plotter = new_plotter(scene, off_screen)
     add_transducers(plotter, scene, phases)
     if scene.observation_plane is not None:
         level = None if on_plane is None else in_decibels(on_plane, zero)
-        add_plane(plotter, scene.observation_plane, level)
+        meshes.add_plane(plotter, scene.observation_plane, level)
     caption = [] if on_plane is None and in_domain is None else [f"0 dB = {zero:.3g} Pa"]
     if in_domain is not None:
-        add_isosurface(plotter, scene, in_decibels(in_domain, zero), height)
+        meshes.add_isosurface(plotter, scene, in_decibels(in_domain, zero), height)
         caption.append(f"surface: {height:g} dB")
     add_caption(plotter, *caption)
     if path is not None:

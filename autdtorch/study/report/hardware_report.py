@@ -107,12 +107,8 @@ def write_hardware_report(
         fits=_fits(scene.control_points, measured, predicted),
         scale=fit.scale,
         misfit=_percent(fit.misfit),
-        detected=len(alone),
-        weakest_alone=f"{alone.min():.3g}",
-        strongest_alone=f"{alone.max():.3g}",
-        silence=f"{preflight.silence:.3g}",
-        threshold=f"{preflight.threshold:.3g}",
-        failed=preflight.dead,
+        alone=alone,
+        preflight=preflight,
         settings=[["setting", "value"], *([name, code(_value(own))] for name, own in log.origin.items())],
     )
     path = folder / REPORT_FILE

@@ -13,11 +13,8 @@ from autdtorch.study.report.claims import Claim, Verdict
 from autdtorch.study.results import MethodResult, SceneResult, StudyResult
 from autdtorch.study.statistics import NEAR_BOUND, bound_gap
 
-BASELINE = "gradient_ascent"
-"""The method that is a baseline, not a competitor: it knows the transfer matrix."""
-
+BASELINE = "gradient_ascent"  # not a competitor: it knows the transfer matrix
 NEAR = f"{100 * NEAR_BOUND:.0f} %"
-
 _NO_NUMBER = "-"
 
 
@@ -81,14 +78,10 @@ def _simulation_cells(scene: SceneResult) -> list[str]:
     head = [simulation.method, f"{1e3 * simulation.spacing:g}", f"{cells:.1f}"]
     if not runs:
         return [*head, "0, kept on disk", *["-"] * 3, *seconds]
-    return [
-        *head,
-        str(len(runs)),
-        extent([run.periods for run in runs]),
-        f"{max(run.remaining for run in runs):.1e}",
-        "yes" if all(run.reached for run in runs) else f"not in {sum(not run.reached for run in runs)} runs",
-        *seconds,
-    ]
+    missed = sum(not run.reached for run in runs)
+    reached = f"not in {missed} runs" if missed else "yes"
+    remaining = f"{max(run.remaining for run in runs):.1e}"
+    return [*head, str(len(runs)), extent([run.periods for run in runs]), remaining, reached, *seconds]
 
 
 def extent(counts: Sequence[int]) -> str:
