@@ -146,6 +146,9 @@ class Bench:
     def _wired(self, count: int) -> list[int]:
         """Return the device's transducers for the scene's `count`."""
         field, given = "hardware.transducers", self._section["transducers"]
+        if count > self.device.transducers:
+            accepted = f"must be at most {self.device.transducers}, as {self.device.name} has"
+            raise invalid("scene", f"{count} transducers", accepted)
         if given is None and not self._section["emulated"] and count != self.device.transducers:
             most = f"{self.device.transducers} transducers of {self.device.name}"
             raise invalid(field, None, f"must say which {count} of the {most} the scene's are")
