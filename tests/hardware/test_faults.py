@@ -1,4 +1,4 @@
-"""What goes wrong in mid-trial: outputs off, one clear line, a log that loads, and a trial that goes on."""
+"""Faults during a trial: outputs off, an error of one line, a log that loads, and a trial that continues."""
 
 import signal
 import subprocess
@@ -53,8 +53,19 @@ def measure(trial, bench: EmulatedBench, sensor: Sensor, device: Device = SONICS
         return METHOD(trial.objective(link, sensor))
 
 
+def play(trial, bench: EmulatedBench, device: Device = SONICSURFACE, arm: Callable[[Link], object] = bool):
+    """Play a full drive, then end; `arm` takes the link before."""
+    with ended_by_signals(), trial.link(bench, device) as link:
+        arm(link)
+        link.play(torch.ones(16, dtype=torch.complex128))
+
+
+def is_off(bench: EmulatedBench) -> bool:
+    return not bench.firmware.drive().any()
+
+
 def bytes_before(device: Device, evaluations: int) -> int:
-    """How many bytes the device has taken in mid-frame of an evaluation: off frames are sent in pairs."""
+    """The number of bytes before a fault in mid-frame of an evaluation; off frames are sent in pairs."""
     frame = len(device.frame(torch.zeros(256, dtype=torch.complex128)))
     calls = 1 + (evaluations - 1) // 2
     return frame * (2 + evaluations + 2 * calls) + 3 * frame // 4
@@ -83,7 +94,7 @@ def test_a_fault_of_the_bus_ends_the_trial_with_the_outputs_off(trial, fault, de
     if fault == "unplug":
         assert "outputs may still be on" in str(raised.value)
     else:
-        assert bench.firmware.drive().abs().max() == 0
+        assert is_off(bench)
     require_that_it_goes_on(trial, device)
 
 
@@ -91,10 +102,9 @@ def test_a_fault_of_the_bus_ends_the_trial_with_the_outputs_off(trial, fault, de
 def test_a_fault_in_the_last_off_frame_is_mended(trial, fault):
     bench = trial.bench()
     bench.bus = FaultyBus([bench.chip], fault, 258 * (2 + 1) + 100)
-    with trial.link(bench) as link:
-        link.play(torch.ones(16, dtype=torch.complex128))
+    play(trial, bench)
     assert bench.bus.struck
-    assert bench.firmware.drive().abs().max() == 0
+    assert is_off(bench)
 
 
 def nobody(question: str) -> str:
@@ -106,6 +116,8 @@ def nobody(question: str) -> str:
     [
         (lambda: [1.0, float("nan")], "pressure of the sensor"),
         (lambda: ["noise", 1.0], "pressure of the sensor"),
+        (lambda: [1.0], "pressure of the sensor"),
+        (lambda: [1.0, -1.0], "pressure of the sensor"),
         (ManualSensor([(0, 0, 0), (1, 0, 0)], nobody).read, "nobody answers"),
         (FileSensor("no/such/file", 2, timeout=0.01).read, "did not change"),
     ],
@@ -118,7 +130,7 @@ def test_garbage_from_the_sensor_ends_the_trial_with_the_outputs_off(trial, read
     bench = trial.bench()
     with pytest.raises((ValueError, OSError), match=message):
         measure(trial, bench, Garbled(bench))
-    assert bench.firmware.drive().abs().max() == 0
+    assert is_off(bench)
     require_that_it_goes_on(trial)
 
 
@@ -143,7 +155,7 @@ def test_a_signal_ends_the_trial_with_the_outputs_off(trial, number):
     bench = trial.bench()
     with pytest.raises(Signalled, match=number.name):
         measure(trial, bench, Counting(bench, disturb))
-    assert bench.firmware.drive().abs().max() == 0
+    assert is_off(bench)
     assert signal.getsignal(number) is before
     require_that_it_goes_on(trial)
 
@@ -151,66 +163,48 @@ def test_a_signal_ends_the_trial_with_the_outputs_off(trial, number):
 @pytest.mark.parametrize("device", [SONICSURFACE, OPENMPD], ids=lambda device: device.name)
 def test_signals_in_mid_frame_and_while_switching_off_leave_the_outputs_off(trial, device):
     class Interrupting(EmulatedBus):
+        armed = False
+
+        def arm(self, _: Link) -> None:
+            self.armed = True
+
         def bulk_write(self, dev_handle, ep, intf, data, timeout):
             written = super().bulk_write(dev_handle, ep, intf, data[:300], timeout)
-            if loud:
+            if self.armed:
                 signal.raise_signal(signal.SIGTERM)
             return written
 
-    def interrupted_trial() -> None:
-        with ended_by_signals(), trial.link(bench, device) as link:
-            loud.append(True)
-            link.play(torch.ones(16, dtype=torch.complex128))
-
-    loud: list[bool] = []
     bench = trial.bench(device)
     bench.bus = Interrupting([bench.chip])
     with pytest.raises(Signalled):
-        interrupted_trial()
-    assert bench.firmware.drive().abs().max() == 0
+        play(trial, bench, device, bench.bus.arm)
+    assert is_off(bench)
 
 
-def test_a_signal_while_the_last_off_frame_is_mended_leaves_the_outputs_off(trial, monkeypatch):
-    def interrupted(*arguments: object) -> None:
+@pytest.mark.parametrize("interrupted", ["recovery", "off"])
+def test_a_signal_amid_or_just_before_the_last_off_frame_leaves_the_outputs_off(
+    trial, monkeypatch, interrupted
+):
+    def interrupt(*_: object) -> None:
         monkeypatch.undo()
-        raise KeyboardInterrupt
+        signal.raise_signal(signal.SIGTERM)
 
-    def interrupted_trial() -> None:
-        with trial.link(bench) as link:
-            link.play(torch.ones(16, dtype=torch.complex128))
-            monkeypatch.setattr(bench.bus, "clear_halt", interrupted)
+    def arm(link: Link) -> None:
+        if interrupted == "recovery":
+            monkeypatch.setattr(bench.bus, "clear_halt", interrupt)
+        else:
+            monkeypatch.setattr(link, "off", interrupt)
 
     bench = trial.bench()
     bench.bus = FaultyBus([bench.chip], "time-out", 258 * (2 + 1) + 100)
-    with pytest.raises(KeyboardInterrupt):
-        interrupted_trial()
-    assert bench.firmware.drive().abs().max() == 0
-
-
-def test_a_signal_just_before_the_switching_off_leaves_the_outputs_off(trial):
-    class Interrupted(Link):
-        def off(self):
-            if loud:
-                loud.clear()
-                signal.raise_signal(signal.SIGTERM)
-            super().off()
-
-    def interrupted_trial() -> None:
-        with ended_by_signals(), trial.link(bench) as link:
-            link.__class__ = Interrupted
-            loud.append(True)
-            link.play(torch.ones(16, dtype=torch.complex128))
-
-    loud: list[bool] = []
-    bench = trial.bench()
     with pytest.raises(Signalled):
-        interrupted_trial()
-    assert bench.firmware.drive().abs().max() == 0
+        play(trial, bench, arm=arm)
+    assert is_off(bench)
 
 
 @pytest.mark.usefixtures("not_ignored")
 @pytest.mark.parametrize("number", [signal.SIGINT])
-def test_two_signals_at_once_end_the_trial_without_a_word_of_the_second(monkeypatch, number):
+def test_two_signals_at_once_end_the_trial_by_the_first(monkeypatch, number):
     def both() -> None:
         with ended_by_signals():
             signal.pthread_sigmask(signal.SIG_BLOCK, {number, signal.SIGTERM})
@@ -248,7 +242,7 @@ def test_after_a_signal_that_python_drops_the_next_ends_the_trial(monkeypatch):
 
 
 @pytest.mark.parametrize("handlers_set", [2, 7], ids=["begins", "ends"])  # of 6, and 6 as they were
-def test_a_signal_as_the_listening_begins_or_ends_leaves_the_handlers_as_they_were(monkeypatch, handlers_set):
+def test_a_signal_as_the_handling_begins_or_ends_leaves_the_handlers_as_they_were(monkeypatch, handlers_set):
     def set_and_interrupt(number, handler):
         before = set_handler(number, handler)
         changes.append(number)
@@ -256,23 +250,19 @@ def test_a_signal_as_the_listening_begins_or_ends_leaves_the_handlers_as_they_we
             signal.raise_signal(signal.SIGTERM)
         return before
 
-    def listen() -> None:
-        with ended_by_signals():
-            pass
-
     def harmless(*_) -> None: ...
 
     changes: list[int] = []
     set_handler = signal.signal
-    heard = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP, signal.SIGTTIN]
-    before = [set_handler(number, harmless) for number in heard]
+    names = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGTTIN")
+    before = {number: set_handler(number, harmless) for number in map(signal.Signals.__getitem__, names)}
     monkeypatch.setattr(signal, "signal", set_and_interrupt)
     try:
-        with pytest.raises(Signalled):
-            listen()
-        assert all(signal.getsignal(number) is harmless for number in heard)
+        with pytest.raises(Signalled), ended_by_signals():
+            pass
+        assert all(signal.getsignal(number) is harmless for number in before)
     finally:
-        for number, handler in zip(heard, before, strict=True):
+        for number, handler in before.items():
             set_handler(number, handler)
 
 

@@ -1,4 +1,4 @@
-"""What a log is refused for, and what is done to its file."""
+"""Logs of trials: damage, locks, and refusals."""
 
 import errno
 import signal
@@ -20,69 +20,80 @@ def full_on(rows: int = 1) -> torch.Tensor:
     return torch.ones(rows, 16, dtype=torch.complex128)
 
 
+@pytest.fixture
+def bench(trial):
+    return trial.bench()
+
+
+@pytest.fixture
+def begin(trial, bench):
+    """Return a function that begins a trial on the bench, or takes its log up."""
+    with trial.link(bench) as link:
+        yield lambda sensor=None, **settings: trial.objective(
+            link, sensor or EmulatedSensor(bench), **settings
+        )
+
+
 @pytest.mark.parametrize("failing", ["write", "fsync"])
-def test_a_full_disk_leaves_no_half_line_to_go_on_after(trial, monkeypatch, failing: str):
+def test_a_full_disk_leaves_no_half_line_to_go_on_after(trial, begin, monkeypatch, failing: str):
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    def observe() -> None:
-        objective(full_on())
-
-    bench = trial.bench()
-    with trial.link(bench) as link:
-        objective = trial.objective(link, EmulatedSensor(bench))
-        objective(full_on())
-        whole = trial.log.read_bytes()
+    objective = begin()
+    objective(full_on())
+    whole = trial.log.read_bytes()
+    if failing == "fsync":
         with monkeypatch.context() as context:
-            if failing == "fsync":
-                context.setattr("os.fsync", full)
-                with pytest.raises(OSError, match=r"No space left on device: .*trial\.jsonl"):
-                    observe()
-            else:
-                resource = pytest.importorskip("resource", reason="limits of processes are POSIX's")
-                most = resource.getrlimit(resource.RLIMIT_FSIZE)
-                before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-                resource.setrlimit(resource.RLIMIT_FSIZE, (len(whole) + 10, most[1]))  # ten bytes are left
-                try:
-                    with pytest.raises(OSError, match=r"File too large: .*trial\.jsonl"):
-                        observe()
-                finally:
-                    resource.setrlimit(resource.RLIMIT_FSIZE, most)
-                    signal.signal(signal.SIGXFSZ, before)
-        assert trial.log.read_bytes() == whole
-        observe()
+            context.setattr("os.fsync", full)
+            with pytest.raises(OSError, match=r"No space left on device: .*trial\.jsonl"):
+                objective(full_on())
+    else:
+        resource = pytest.importorskip("resource", reason="limits of processes are POSIX's")
+        most = resource.getrlimit(resource.RLIMIT_FSIZE)
+        before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (len(whole) + 10, most[1]))  # ten bytes are left
+        try:
+            with pytest.raises(OSError, match=r"File too large: .*trial\.jsonl"):
+                objective(full_on())
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, most)
+            signal.signal(signal.SIGXFSZ, before)
+    assert trial.log.read_bytes() == whole
+    objective(full_on())
     assert trial.log.read_bytes().count(b"\n") == 1 + 2
 
 
+SCOPE = {"microphone": "scope", "captures": 4}
+
+
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    ("logged", "settings", "message"),
     [
-        ({"seed": 2}, "of another trial, whose seed is 2, not 1"),
-        ({"seed": 1.0}, r"of another trial, whose seed is 1\.0, not 1;"),
-        ({"seed": True}, "of another trial, whose seed is True, not 1;"),
-        ({"seed": 1, "dead": []}, r"of another trial, whose dead is \[\], not absent"),
-        ({"seed": 1, "dead": None}, "of another trial, whose dead is None, not absent"),
-        ({}, "of another trial, whose seed is absent, not 1"),
+        ({"seed": 2}, {"seed": 1}, "of another trial, whose seed is 2, not 1"),
+        ({"seed": 1.0}, {"seed": 1}, r"whose seed is 1\.0, not 1;"),
+        ({"seed": True}, {"seed": 1}, "whose seed is True, not 1;"),
+        ({"seed": 1, "failed": []}, {"seed": 1}, r"whose failed is \[\], not absent"),
+        ({"seed": 1, "failed": None}, {"seed": 1}, "whose failed is None, not absent"),
+        ({}, {"seed": 1}, "whose seed is absent, not 1"),
+        (SCOPE, {"microphone": "file"}, "whose microphone is scope, not file"),  # the first that differs
+        (SCOPE, {"microphone": "scope"}, "whose captures is 4, not absent"),
+        (SCOPE, dict(reversed(SCOPE.items())), "settings come in another order: .*microphone, captures;"),
     ],
 )
-def test_the_log_of_another_trial_is_refused_and_left_as_it_is(trial, settings, message: str):
-    bench = trial.bench()
-    with trial.link(bench) as link:
-        trial.objective(link, EmulatedSensor(bench), **settings)(full_on())
-        content = trial.log.read_bytes()
-        with pytest.raises(LogError, match=message):
-            trial.objective(link, EmulatedSensor(bench), seed=1)
+def test_the_log_of_another_trial_is_refused_and_left_as_it_is(trial, begin, logged, settings, message: str):
+    begin(**logged)(full_on())
+    content = trial.log.read_bytes()
+    with pytest.raises(LogError, match=message):
+        begin(**settings)
     assert trial.log.read_bytes() == content
 
 
-def test_a_log_of_other_drives_is_refused(trial):
-    bench = trial.bench()
-    with trial.link(bench) as link:
-        objective = trial.objective(link, EmulatedSensor(bench))
-        objective(full_on(3))
-        for number in (0, 2):
-            with pytest.raises(LogError, match=f"evaluation {number + 1} is of another drive"):
-                observed(objective, 0.5 * full_on(), number)
+def test_a_log_of_other_drives_is_refused(begin):
+    objective = begin()
+    objective(full_on(3))
+    for number in (0, 2):
+        with pytest.raises(LogError, match=f"evaluation {number + 1} is of another drive"):
+            observed(objective, 0.5 * full_on(), number)
 
 
 def drives() -> torch.Tensor:
@@ -117,18 +128,15 @@ class Noisy(EmulatedSensor):
         {"evaluation": 2.0},
     ],
 )
-def test_an_evaluation_that_cannot_have_been_measured_is_measured_again(trial, change):
-    bench = trial.bench()
-    with trial.link(bench) as link:
-        log = trial.objective(link, EmulatedSensor(bench)).log
-        observed(trial.objective(link, EmulatedSensor(bench)), drives(), 0)
-        key = digest_of(log.origin)
-        lines = trial.log.read_bytes().splitlines()
-        whole, lines[3] = lines[3], line_of(row_of(lines[3], key) | change, key)
-        trial.log.write_bytes(b"\n".join([*lines, b""]))
-        sensor = Noisy(bench)
-        observed(trial.objective(link, sensor), drives(), 0)
-        assert sensor.readings == 1
+def test_an_evaluation_that_cannot_have_been_measured_is_measured_again(trial, bench, begin, change):
+    observed(begin(), drives(), 0)
+    key = digest_of(begin().log.origin)
+    lines = trial.log.read_bytes().splitlines()
+    whole, lines[3] = lines[3], line_of(row_of(lines[3], key) | change, key)
+    trial.log.write_bytes(b"\n".join([*lines, b""]))
+    sensor = Noisy(bench)
+    observed(begin(sensor), drives(), 0)
+    assert sensor.readings == 1
     assert trial.log.with_name(trial.log.name + SET_ASIDE).read_bytes() == lines[3] + b"\n"
     again = row_of(trial.log.read_bytes().splitlines()[-1], key)
     assert again["evaluation"] == row_of(whole, key)["evaluation"]
@@ -147,167 +155,121 @@ def test_an_evaluation_that_cannot_have_been_measured_is_measured_again(trial, c
         lambda lines: [*lines, *lines],
     ],
 )
-def test_damage_costs_the_evaluations_it_touches_alone(trial, damage, caplog):
-    bench = trial.bench()
-    with trial.link(bench) as link:
-        measured = observed(trial.objective(link, EmulatedSensor(bench)), drives(), 0)
-        lines = trial.log.read_bytes().splitlines()
-        damaged = damage(lines)
-        trial.log.write_bytes(b"\n".join([*damaged, b""]))
-        sensor = Noisy(bench)
-        again = observed(trial.objective(link, sensor), drives(), 0)
-        assert sensor.readings == len(set(lines[1:]) - set(damaged))
-        kept = (again == measured).all(dim=1)
-        assert int(kept.sum()) == len(set(lines[1:]) & set(damaged))
-        caplog.clear()
-        assert torch.equal(observed(trial.objective(link, sensor), drives(), 0), again)
-        assert not caplog.messages
-        with pytest.raises(LogError, match="evaluation 1 is of another drive"):
-            observed(trial.objective(link, sensor), 0.5 * drives(), 0)
+def test_damage_costs_the_evaluations_it_touches_alone(trial, bench, begin, damage, caplog):
+    measured = observed(begin(), drives(), 0)
+    lines = trial.log.read_bytes().splitlines()
+    damaged = damage(lines)
+    trial.log.write_bytes(b"\n".join([*damaged, b""]))
+    sensor = Noisy(bench)
+    again = observed(begin(sensor), drives(), 0)
+    assert sensor.readings == len(set(lines[1:]) - set(damaged))
+    kept = (again == measured).all(dim=1)
+    assert int(kept.sum()) == len(set(lines[1:]) & set(damaged))
+    caplog.clear()
+    assert torch.equal(observed(begin(sensor), drives(), 0), again)
+    assert not caplog.messages
+    with pytest.raises(LogError, match="evaluation 1 is of another drive"):
+        observed(begin(sensor), 0.5 * drives(), 0)
 
 
 @pytest.mark.parametrize("end", [b"", b"\x0b"])
 @pytest.mark.parametrize("line", [0, 3, -1])
-def test_the_damaged_end_of_a_line_costs_no_evaluation_and_no_second(trial, line: int, end: bytes):
-    bench = trial.bench()
-    with trial.link(bench) as link:
-        objective = trial.objective(link, EmulatedSensor(bench))
-        measured = objective(drives())
-        whole = trial.log.read_bytes()
-        lines = whole.splitlines(keepends=True)
-        lines[line] = lines[line][:-1] + end
-        trial.log.write_bytes(b"".join(lines))
-        sensor = Noisy(bench)
-        again = trial.objective(link, sensor)
-        assert again.log.seconds_on == objective.log.seconds_on > 0
-        assert torch.equal(observed(again, drives(), 0), measured)
-        assert sensor.readings == 0
+def test_the_damaged_end_of_a_line_costs_no_evaluation_and_no_second(trial, bench, begin, line, end: bytes):
+    objective = begin()
+    measured = objective(drives())
+    whole = trial.log.read_bytes()
+    lines = whole.splitlines(keepends=True)
+    lines[line] = lines[line][:-1] + end
+    trial.log.write_bytes(b"".join(lines))
+    sensor = Noisy(bench)
+    again = begin(sensor)
+    assert again.log.seconds_on == objective.log.seconds_on > 0
+    assert torch.equal(observed(again, drives(), 0), measured)
+    assert sensor.readings == 0
     assert trial.log.read_bytes() == whole
 
 
-def test_settings_in_another_order_are_another_trial(trial):
-    bench = trial.bench()
-    with trial.link(bench) as link:
-        trial.objective(link, EmulatedSensor(bench), seed=1, captures=4)(full_on())
-        with pytest.raises(LogError, match=r"settings come in another order: .*seed, captures;"):
-            trial.objective(link, EmulatedSensor(bench), captures=4, seed=1)
-
-
-def test_a_forged_first_line_is_refused_as_no_log(trial):
-    forged = line_of({"origin": "Kyoto"}) + b'\n{"evaluation": 0}\n'
-    trial.log.write_bytes(forged)
-    bench = trial.bench()
-    with trial.link(bench) as link, pytest.raises(LogError, match="first line cannot be read"):
-        trial.objective(link, EmulatedSensor(bench))
-    assert trial.log.read_bytes() == forged
-
-
-def test_where_a_reading_made_again_leads_elsewhere_the_trial_follows_it(trial):
-    bench = trial.bench()
+def test_where_a_reading_made_again_leads_elsewhere_the_trial_follows_it(trial, bench, begin):
     others = drives()
     others[4:] *= 0.5
-    with trial.link(bench) as link:
-        observed(trial.objective(link, EmulatedSensor(bench)), drives(), 0)
-        lines = trial.log.read_bytes().splitlines(keepends=True)
-        trial.log.write_bytes(b"".join([*lines[:3], *lines[4:]]))
-        sensor = Noisy(bench)
-        objective = trial.objective(link, sensor)
-        pressure = [observed(objective, others[:4], 0), observed(objective, others[4:], 4)]
-        assert sensor.readings == 1 + 2
-        assert torch.equal(observed(trial.objective(link, sensor), others, 0), torch.cat(pressure))
-        assert sensor.readings == 1 + 2
+    observed(begin(), drives(), 0)
+    lines = trial.log.read_bytes().splitlines(keepends=True)
+    trial.log.write_bytes(b"".join([*lines[:3], *lines[4:]]))
+    sensor = Noisy(bench)
+    objective = begin(sensor)
+    pressure = [observed(objective, others[:4], 0), observed(objective, others[4:], 4)]
+    assert sensor.readings == 1 + 2
+    assert torch.equal(observed(begin(sensor), others, 0), torch.cat(pressure))
+    assert sensor.readings == 1 + 2
 
 
 @pytest.mark.parametrize(
     "content",
     [
-        "a week's notes",
-        '{"origin": "Kyoto"}\n',
-        '{"origin": {}}\n{"notes": 1}\n',
-        "notes\n",
-        "time,drive\n1,2\n",
-        '{"origin": {"a',
-        "[" * 10**6 + "\n",
+        b"a week's notes",
+        b'{"origin": "Kyoto"}\n',
+        line_of({"origin": "Kyoto"}) + b'\n{"evaluation": 0}\n',  # with a digest
+        b'{"origin": {}}\n{"notes": 1}\n',
+        b"notes\n",
+        b"time,drive\n1,2\n",
+        b'{"origin": {"a',
+        b"[" * 10**6 + b"\n",
     ],
 )
-def test_a_file_that_is_no_log_is_refused_and_left_as_it_is(trial, content: str):
-    trial.log.write_text(content)
-    bench = trial.bench()
-    with trial.link(bench) as link, pytest.raises(LogError, match=r"trial\.jsonl.* trial"):
-        trial.objective(link, EmulatedSensor(bench))
-    assert trial.log.read_text() == content
+def test_a_file_that_is_no_log_is_refused_and_left_as_it_is(trial, begin, content: bytes):
+    trial.log.write_bytes(content)
+    with pytest.raises(LogError, match=r"trial\.jsonl.* trial"):
+        begin()
+    assert trial.log.read_bytes() == content
 
 
-def test_a_folder_in_the_place_of_the_log_is_told(trial):
+def test_a_folder_in_the_place_of_the_log_is_an_error(trial, begin):
     trial.log.mkdir()
-    bench = trial.bench()
-    with trial.link(bench) as link, pytest.raises(IsADirectoryError, match="trial\\.jsonl"):
-        trial.objective(link, EmulatedSensor(bench))
+    with pytest.raises(IsADirectoryError, match="trial\\.jsonl"):
+        begin()
 
 
 @pytest.mark.parametrize("ended", [True, False])
-def test_a_log_without_evaluations_is_begun_anew_by_other_settings(trial, ended: bool, caplog):
-    bench = trial.bench()
-    with trial.link(bench) as link:
-        first = trial.objective(link, EmulatedSensor(bench), seed=1)
-        if ended:
-            first.log.end(seconds_on=1.0)
-        second = trial.objective(link, EmulatedSensor(bench), seed=2)
-        assert not second.log.goes_on
-        second(full_on())
-        assert second.log.seconds_on < 1
-        assert len(trial.objective(link, EmulatedSensor(bench), seed=2).log.evaluations) == 1
+def test_a_log_without_evaluations_is_begun_anew_by_other_settings(trial, begin, ended: bool, caplog):
+    first = begin(seed=1)
+    assert not first.log.goes_on
+    assert begin(seed=1).log.goes_on  # as if killed before its first evaluation
+    if ended:
+        first.log.end(seconds_on=1.0)
+    second = begin(seed=2)
+    assert not second.log.goes_on
+    second(full_on())
+    assert second.log.seconds_on < 1
+    assert len(begin(seed=2).log.evaluations) == 1
     assert not caplog.messages
     assert [path.name for path in trial.log.parent.iterdir() if path.suffix == SET_ASIDE] == []
 
 
-def test_a_trial_killed_before_its_first_evaluation_goes_on(trial):
-    bench = trial.bench()
-    with trial.link(bench) as link:
-        assert not trial.objective(link, EmulatedSensor(bench)).log.goes_on
-        assert trial.objective(link, EmulatedSensor(bench)).log.goes_on
-
-
-def test_another_trial_is_named_by_what_was_said_first(trial):
-    bench = trial.bench()
-    with trial.link(bench) as link:
-        trial.objective(link, EmulatedSensor(bench), microphone="scope", captures=4)(full_on())
-        with pytest.raises(LogError, match="whose microphone is scope, not file"):
-            trial.objective(link, EmulatedSensor(bench), microphone="file")
-        with pytest.raises(LogError, match="whose captures is 4, not absent"):
-            trial.objective(link, EmulatedSensor(bench), microphone="scope")
-
-
-def test_an_objective_that_failed_goes_on_where_its_log_ends(trial):
-    class Interrupted(EmulatedSensor):
+def test_an_objective_that_failed_goes_on_where_its_log_ends(trial, bench, begin):
+    class Interrupted(Noisy):
         def read(self):
-            heard.append(None)
-            if len(heard) == 3:
+            if self.readings == 2:
+                self.readings += 1
                 raise KeyboardInterrupt
             return super().read()
 
-    heard: list[None] = []
-    bench = trial.bench()
-    drives = torch.linspace(0.5, 1, 4)[:, None] * full_on()
-    with trial.link(bench) as link:
-        objective = trial.objective(link, Interrupted(bench))
-        with pytest.raises(KeyboardInterrupt):
-            objective(drives)
-        pressure = observed(objective, drives, 0)
-        assert len(heard) == 4 + 1
-        assert torch.equal(observed(trial.objective(link, EmulatedSensor(bench)), drives, 0), pressure)
-    assert trial.log.read_bytes().count(b"\n") == 1 + 4
+    sensor = Interrupted(bench)
+    objective = begin(sensor)
+    with pytest.raises(KeyboardInterrupt):
+        objective(drives())
+    pressure = observed(objective, drives(), 0)
+    assert sensor.readings == 6 + 1
+    assert torch.equal(observed(begin(), drives(), 0), pressure)
+    assert trial.log.read_bytes().count(b"\n") == 1 + 6
 
 
-def test_of_two_objectives_on_one_log_the_second_to_measure_is_refused(trial):
-    bench = trial.bench()
-    with trial.link(bench) as link:
-        one, other = (trial.objective(link, EmulatedSensor(bench)) for _ in range(2))
-        one(full_on())
-        whole = trial.log.read_bytes()
-        with pytest.raises(LogError, match="has changed meanwhile"):
-            other(full_on())
-        assert trial.log.read_bytes() == whole
+def test_of_two_objectives_on_one_log_the_second_to_measure_is_refused(trial, begin):
+    one, other = begin(), begin()
+    one(full_on())
+    whole = trial.log.read_bytes()
+    with pytest.raises(LogError, match="has changed meanwhile"):
+        other(full_on())
+    assert trial.log.read_bytes() == whole
 
 
 LOCKING = """
@@ -323,23 +285,19 @@ def lock_of(log: Path) -> Path:
     return log.with_name(f".{log.name}.lock")
 
 
-def test_a_log_is_open_in_one_process_alone_and_free_once_it_is_killed(trial):
-    other = subprocess.Popen(
-        [sys.executable, "-c", LOCKING, lock_of(trial.log)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    )
-    with other:
+def test_a_log_is_open_in_one_process_alone_and_free_once_it_is_killed(trial, begin):
+    command = [sys.executable, "-c", LOCKING, lock_of(trial.log)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         other.stdout.readline()
-        bench = trial.bench()
-        with trial.link(bench) as link:
-            with pytest.raises(LogError, match="another process has it open for a trial"):
-                trial.objective(link, EmulatedSensor(bench))
-            assert not trial.log.exists()
-            other.kill()
-            other.wait()
-            trial.objective(link, EmulatedSensor(bench))(full_on())
+        with pytest.raises(LogError, match="another process has it open for a trial"):
+            begin()
+        assert not trial.log.exists()
+        other.kill()
+        other.wait()
+        begin()(full_on())
 
 
-def test_a_log_is_free_once_it_has_ended_or_its_objective_is_gone(trial):
+def test_a_log_is_free_once_it_has_ended_or_its_objective_is_gone(trial, begin):
     def is_free() -> bool:
         try:
             with stranger.acquire(timeout=0):
@@ -347,13 +305,11 @@ def test_a_log_is_free_once_it_has_ended_or_its_objective_is_gone(trial):
         except Timeout:
             return False
 
-    bench = trial.bench()
     stranger = FileLock(lock_of(trial.log))  # as another process has it
-    with trial.link(bench) as link:
-        ended = trial.objective(link, EmulatedSensor(bench))
-        ended.log.end(seconds_on=0.0)
-        assert is_free()
-        gone = trial.objective(link, EmulatedSensor(bench))
-        assert not is_free()
-        del gone
-        assert is_free()
+    ended = begin()
+    ended.log.end(seconds_on=0.0)
+    assert is_free()
+    gone = begin()
+    assert not is_free()
+    del gone
+    assert is_free()

@@ -319,16 +319,6 @@ def test_a_warning_of_outputs_that_may_be_on_is_not_hidden_by_a_driver_that_does
     link.close()  # nothing is left to do
 
 
-@pytest.mark.parametrize("device", [SONICSURFACE, OPENMPD, ULTRAINO])
-def test_a_device_left_in_mid_frame_is_switched_off_all_the_same(device: Device):
-    bench = EmulatedBench(device, torch.ones((1, device.transducers)).cdouble())
-    with open_link(device, backend=bench.bus) as link:
-        link.play(torch.ones(device.transducers).cdouble())
-        frame = device.frame(torch.ones(device.transducers).cdouble())
-        bench.firmware.receive(frame[: len(frame) // 3])
-    assert bench.firmware.drive().abs().max() == 0
-
-
 def test_a_play_takes_the_time_on_the_wire_and_the_settle_time(trial):
     bench = trial.bench()
     with open_link(SONICSURFACE, range(16), backend=bench.bus, settle=0.02) as link:
