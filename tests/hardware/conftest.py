@@ -37,9 +37,9 @@ class Trial:
     simulated: SimulatedObjective
     log: Path
 
-    def bench(self, device: Device = SONICSURFACE, dead: Sequence[int] = ()) -> EmulatedBench:
+    def bench(self, device: Device = SONICSURFACE, failed: Sequence[int] = ()) -> EmulatedBench:
         assert self.simulated.transfer_matrix is not None
-        return EmulatedBench(device, self.simulated.transfer_matrix, TRANSDUCERS, dead=dead)
+        return EmulatedBench(device, self.simulated.transfer_matrix, TRANSDUCERS, dead=failed)
 
     def link(self, bench: EmulatedBench, device: Device = SONICSURFACE) -> Link:
         return open_link(device, TRANSDUCERS, backend=bench.bus)

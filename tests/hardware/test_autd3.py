@@ -10,16 +10,8 @@ import threading
 import pytest
 import torch
 
-from autdtorch.hardware import (
-    AUTD3,
-    LimitedLink,
-    LimitError,
-    Limits,
-    LinkError,
-    Signalled,
-    ended_by_signals,
-    open_autd3,
-)
+from autdtorch.hardware import AUTD3, LimitedLink, LimitError, Limits, LinkError, open_autd3
+from autdtorch.hardware.safety import Signalled, ended_by_signals
 from autdtorch.hardware.transport import autd3_network as module
 from autdtorch.hardware.transport.autd3_network import Autd3Port
 from autdtorch.scene.drive import drive_from_phases
@@ -132,9 +124,9 @@ class TestWithTheKit:
             limited = LimitedLink(link, Limits(1.0, seconds_in_a_row=0.02))
             limited.play(random_drive(249))
             limited._timer.join()
-            loops = [thread for thread in threading.enumerate() if thread.name == "AUTD3"]
+            loops = [thread.daemon for thread in threading.enumerate() if thread.name == "AUTD3"]
             assert loops
-            assert all(one.daemon for one in loops)  # for others Python would wait before it exits
+            assert all(loops)  # for others Python would wait before it exits
             assert played[2:] == [True, False, False]  # after the two of opening; on, then off twice
             with pytest.raises(LimitError, match="in a row"):
                 limited.require_on()
@@ -209,12 +201,10 @@ class TestWithTheKit:
         from autd3.commands import SetSilencer
         from autd3_core import Autd3, Duration, Geometry
 
-        from autdtorch.hardware.transport.autd3_network import autd3_pattern
-
         drive = random_drive(249)
 
         def play(recorder):
-            recorder.send([SetSilencer.disable(), autd3_pattern(AUTD3.frame(drive), 1)])
+            recorder.send([SetSilencer.disable(), module.autd3_pattern(AUTD3.frame(drive), 1)])
             recorder.tick(Duration.from_micros(100))
 
         record = emulator.Emulator(Geometry([Autd3()])).record(play)

@@ -6,12 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from autdtorch.hardware import (
-    EmulatedBench,
-    LinkError,
-    open_link,
-    openmpd_boards,
-)
+from autdtorch.hardware import EmulatedBench, LinkError, open_link, openmpd_boards
 from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
 from autdtorch.hardware.wiring import Wiring
 from autdtorch.scene.drive import drive_from_phases
@@ -58,9 +53,7 @@ def test_gains_lower_the_duty(gain: float):
 
 def test_a_board_that_is_not_there_is_named_and_the_others_are_let_go():
     present = EmulatedBench(openmpd_boards([board("left", 1)]), torch.ones((1, 256)).cdouble())
-    with pytest.raises(
-        LinkError, match=r"no USB devices .* 'right'. Plugged in: 0403:6014 \(serial number left\)"
-    ):
+    with pytest.raises(LinkError, match=r"no USB devices .* 'right'. Plugged in: .* \(serial number left\)"):
         open_link(openmpd_boards([board("left", 1), board("right", 2)]), backend=present.bus)
     with open_link(openmpd_boards([board("left", 1)]), backend=present.bus):
         pass

@@ -18,8 +18,6 @@ from autdtorch.hardware import (
     EmulatedBench,
     open_link,
 )
-from autdtorch.hardware.devices.sonicsurface import sonicsurface_channels
-from autdtorch.hardware.devices.ultraino import ultraino_pins
 from autdtorch.scene.drive import drive_from_phases, focus_phases
 
 #: Each device, on two boards if it has several, and the number of values of each of its integer levels.
@@ -29,6 +27,7 @@ CASES = {
     "sonicsurface": (SONICSURFACE, (33,)),
     "ultraino": (ULTRAINO.with_boards(2), (10, 6)),
 }
+assert CASES.keys() == DEVICES.keys()
 every_device = pytest.mark.parametrize(("device", "counts"), CASES.values(), ids=CASES)
 seeds = st.integers(0, 2**32 - 1)
 
@@ -132,10 +131,6 @@ def test_an_autd3_frame_is_all_phases_then_all_intensities() -> None:
     assert (frame[250], frame[498 + 250], sum(frame)) == (64, 128, 64 + 128)
 
 
-def test_every_device_is_tested_here() -> None:
-    assert CASES.keys() == DEVICES.keys()
-
-
 @every_device
 @settings(max_examples=15)
 @given(seed=seeds)
@@ -185,11 +180,6 @@ def test_ultraino_starts_with_all_transducers_on_and_another_duration_would_play
     torch.testing.assert_close(firmware.drive(), torch.ones(64).cdouble() / 4, rtol=0, atol=1e-14)
 
 
-def test_every_transducer_has_a_channel_or_pin_of_its_own() -> None:
-    assert sorted(sonicsurface_channels()) == list(range(256))
-    assert len(set(ultraino_pins())) == 64
-
-
 def test_a_lone_commit_of_the_sonicsurface_brings_the_last_pattern_back() -> None:
     first, second = torch.arange(256) % 33, torch.arange(256) % 32
     firmware = SONICSURFACE.firmware(256)
@@ -218,9 +208,7 @@ def test_levels_out_of_range_are_refused(device: Device, levels, message: str) -
         device.drive(*levels)
 
 
-@pytest.mark.parametrize(
-    ("device", "boards", "most"), [(SONICSURFACE, 2, 1), (ULTRAINO, 15, 14), (AUTD3, 0, None)]
-)
-def test_a_number_of_boards_that_a_device_cannot_have_is_refused(device: Device, boards: int, most) -> None:
-    with pytest.raises(ValueError, match=rf"boards: {boards}; must be .*{'>= 1' if most is None else most}"):
+@pytest.mark.parametrize(("device", "boards"), [(SONICSURFACE, 2), (ULTRAINO, 15), (AUTD3, 0)])
+def test_a_number_of_boards_that_a_device_cannot_have_is_refused(device: Device, boards: int) -> None:
+    with pytest.raises(ValueError, match=rf"boards: {boards}; must be"):
         device.with_boards(boards)

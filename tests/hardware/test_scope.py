@@ -36,12 +36,8 @@ RESOLUTION = LOUDEST / 3.5 / 32  # [Pa]: 3.5 divisions of 32 codes, on the coars
 
 def sensor_at(scope, microphones: int, captures: int = 1) -> ScopeSensor:
     inputs = range(1, 1 + microphones)
-    return ScopeSensor(
-        scope,
-        FREQUENCY,
-        [Microphone(number, SENSITIVITY / 10, LOUDEST, gain=10) for number in inputs],
-        captures,
-    )
+    placed = [Microphone(number, SENSITIVITY / 10, LOUDEST, gain=10) for number in inputs]
+    return ScopeSensor(scope, FREQUENCY, placed, captures)
 
 
 class FaultyInstrument(EmulatedInstrument):
@@ -70,7 +66,7 @@ class Bench:
         self.bus = EmulatedBus([self.instrument])
         self.open = open_scope(CHIP, dialect, backend=self.bus)
 
-    def listen(self) -> list[str]:
+    def record(self) -> list[str]:
         """The lines that the oscilloscope gets from now on."""
         lines: list[str] = []
         execute = self.scope.execute
@@ -130,7 +126,7 @@ def test_a_microphone_drifts_by_what_was_asked_for():
 @pytest.mark.parametrize("dialect", [KEYSIGHT, RIGOL], ids=lambda dialect: dialect.name)
 def test_each_input_has_a_scale_on_which_it_uses_a_quarter_of_the_screen_or_more(dialect):
     bench = Bench([0, 0], dialect)
-    lines, sensor = bench.listen(), bench.sensor()
+    lines, sensor = bench.record(), bench.sensor()
     for quiet in (0.6, 0.4, 0.7, 0.15, 0.6):
         bench.field.copy_(torch.tensor([3.2 - 1j, 1j * quiet]))
         error = sensor.read() / bench.field.abs() - 1
@@ -163,9 +159,7 @@ def test_a_sound_that_is_loud_and_quiet_by_turns_is_read_on_some_scale():
 
 def test_overload_is_an_error_that_names_input_and_pressure():
     bench = Bench([1.0, 6.0])
-    with pytest.raises(
-        SensorError, match=r"input 2: \d+ of 1000 samples are clipped.* more than 4 Pa: raise"
-    ):
+    with pytest.raises(SensorError, match=r"input 2: \d+ of 1000 samples are clipped.* more than 4 Pa"):
         bench.sensor().read()
 
 
@@ -173,9 +167,9 @@ def test_silence_is_a_warning_that_names_input_and_noise(caplog):
     bench = Bench([0.1, 0.0], noise=0.1 * SENSITIVITY, seed=0)
     with caplog.at_level(logging.WARNING):
         bench.sensor(captures=10).read()
-    assert [record.getMessage()[:8] for record in caplog.records] == ["input 2:"]
-    # sqrt(6 / N) of the noise of a sample
-    assert "the noise of 0.0078 Pa" in caplog.text
+    warnings = [record.getMessage() for record in caplog.records if record.name.endswith(".oscilloscope")]
+    assert [text[:8] for text in warnings] == ["input 2:"]
+    assert "the noise of 0.0078 Pa" in warnings[0]  # sqrt(6 / N) of the noise of a sample
 
 
 faults = pytest.mark.parametrize(
@@ -218,7 +212,7 @@ def test_a_fault_that_a_clear_mends_costs_a_warning_and_no_reading(fault, messag
     bench = Bench([3.2, 0.3])
     sensor = bench.sensor()
     before = sensor.read()
-    answer, lines = bench.instrument.answer, bench.listen()
+    answer, lines = bench.instrument.answer, bench.record()
 
     def mended(kind: int, request: int) -> bytes | None:
         bench.instrument.fault = None
@@ -227,7 +221,7 @@ def test_a_fault_that_a_clear_mends_costs_a_warning_and_no_reading(fault, messag
     bench.instrument.answer, bench.instrument.fault = mended, fault
     # Each errs by 2 / pi codes of 28 at most, a quarter of the screen.
     torch.testing.assert_close(sensor.read(), before, rtol=2 * 2 / math.pi / 28, atol=0)
-    (warning,) = caplog.messages
+    (warning,) = [record.getMessage() for record in caplog.records if record.name.endswith(".oscilloscope")]
     assert re.search(f"{message}.*; it is cleared, and captures once more", warning)
     # The scales are sent again, as they may have been lost.
     assert sum("SCALe" in line for line in lines) == 2
@@ -266,20 +260,6 @@ def test_one_microphone_is_moved_from_point_to_point():
     assert asked[1] == (
         "Move the microphone to control point 2 of 2 at (80.0, -20.0, 5.0) mm, then press Enter. "
     )
-
-
-def test_an_evaluation_through_device_and_oscilloscope_is_the_simulated_pressure(trial):
-    bench = trial.bench()
-    scope = EmulatedScope(bench.pressure, FREQUENCY, SENSITIVITY, points=[0, 1])
-    scope.plug_into(bench, CHIP)
-    drive = drive_from_phases(torch.arange(16) * 2 * math.pi / 32)
-    with trial.link(bench) as link, open_scope(CHIP, backend=bench.bus) as oscilloscope:
-        loudest = 1.1 * float(trial.simulated(drive[None]).max())
-        microphones = [Microphone(number, SENSITIVITY, loudest) for number in (1, 2)]
-        sensor = ScopeSensor(oscilloscope, FREQUENCY, microphones)
-        measured = trial.objective(link, sensor)(drive[None])
-    worst = 2 / math.pi * loudest / 3.5 / 32
-    torch.testing.assert_close(measured, trial.simulated(drive[None]), rtol=0, atol=worst)
 
 
 def test_a_method_finds_the_simulations_focus_through_a_noisy_oscilloscope(trial):

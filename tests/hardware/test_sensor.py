@@ -63,19 +63,16 @@ def test_a_manual_sensor_asks_for_each_point_until_the_answer_is_a_pressure():
     assert ManualSensor(POINTS, ask).read().tolist() == [12.5, 300.0]
     assert questions[0] == "Pressure at control point 1 of 2 at (80.0, 10.0, 0.0) mm [Pa]: "
     for question, answer in zip(questions[2:], ("1,5", "-1", "nan"), strict=True):
-        assert question.startswith(f"'{answer}': must be a number >= 0 with a decimal point, as 1.5\n")
+        assert question.startswith(f"'{answer}': must be a number >= 0")
 
 
-def test_the_end_of_the_input_is_an_error():
+def test_the_end_of_the_input_and_a_sensor_of_several_points_that_moves_are_errors():
     def ask(question: str) -> str:
         raise EOFError
 
     for silent in (ManualSensor(POINTS, ask), MovedMicrophone(ManualSensor(POINTS[:1], ask), POINTS, ask)):
         with pytest.raises(SensorError, match="nobody answers"):
             silent.read()
-
-
-def test_a_sensor_that_moves_reads_one_point_at_a_time():
     with pytest.raises(ValueError, match=r"of the sensor: .*must be 1 numbers"):
         MovedMicrophone(ManualSensor(POINTS, lambda question: "1"), POINTS, lambda question: "").read()
 

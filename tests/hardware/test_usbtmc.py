@@ -27,12 +27,14 @@ class Echo:
         return self.said
 
 
+def port_of(instrument: EmulatedInstrument) -> UsbtmcPort:
+    return UsbtmcPort(find_device([CHIP], backend=EmulatedBus([instrument])))
+
+
 def port_to(said: bytes, longest: int = 512, empty: bool = True) -> tuple[UsbtmcPort, Echo]:
-    echo = Echo(said)
-    instrument = EmulatedInstrument(*CHIP, "E1", echo)
-    instrument.longest = longest
-    instrument.sends_empty_packets = empty
-    return UsbtmcPort(find_device([CHIP], backend=EmulatedBus([instrument]))), echo
+    instrument = EmulatedInstrument(*CHIP, "E1", echo := Echo(said))
+    instrument.longest, instrument.sends_empty_packets = longest, empty
+    return port_of(instrument), echo
 
 
 def test_a_message_is_header_text_and_padding():
@@ -75,10 +77,9 @@ def test_a_block_of_any_bytes_comes_back_from_transfers_of_any_length(data, long
 
 
 def test_what_broke_off_is_cleared_before_the_first_question():
-    echo = Echo(b"1\n")
-    instrument = EmulatedInstrument(*CHIP, "E1", echo)
+    instrument = EmulatedInstrument(*CHIP, "E1", echo := Echo(b"1\n"))
     instrument.write(message(TELL, 1, 4, 0, b"*RST"))  # a message that does not end
-    assert UsbtmcPort(find_device([CHIP], backend=EmulatedBus([instrument]))).ask("*OPC?") == "1"
+    assert port_of(instrument).ask("*OPC?") == "1"
     assert echo.lines == ["*OPC?"]
 
 
@@ -96,8 +97,7 @@ def test_an_answer_that_nobody_read_is_read_before_the_clear_is_done():
             rest, self.rest = self.rest, b""
             return rest or super().read(most)
 
-    instrument = Full(*CHIP, "E1", Echo(b"2\n"))
-    assert UsbtmcPort(find_device([CHIP], backend=EmulatedBus([instrument]))).ask("*OPC?") == "2"
+    assert port_of(Full(*CHIP, "E1", Echo(b"2\n"))).ask("*OPC?") == "2"
 
 
 def test_tags_go_round():
@@ -105,13 +105,7 @@ def test_tags_go_round():
     assert {port.ask("*OPC?") for _ in range(150)} == {"1"}  # two tags each, of 255
 
 
-@pytest.mark.parametrize(
-    ("said", "message"),
-    [
-        (b"\xff\xfe\n", "which is no text"),
-        (b"", "timed out"),
-    ],
-)
+@pytest.mark.parametrize(("said", "message"), [(b"\xff\xfe\n", "which is no text"), (b"", "timed out")])
 def test_an_answer_that_is_no_text_or_does_not_come_is_an_error(said, message):
     with pytest.raises(LinkError, match=message):
         port_to(said)[0].ask("*IDN?")
