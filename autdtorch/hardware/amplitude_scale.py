@@ -15,10 +15,8 @@ class AmplitudeScale:
     """The scale between a trial's drives and the device's.
 
     Transducers of a calibrated device have levels of their own. None is driven above the highest of its
-    levels within the limit, so that rounding exceeds the limit nowhere.
-
-    Attributes:
-        largest: amplitude of the device that is 1 in the trial: the highest level within the limit.
+    levels within the limit, so that rounding exceeds the limit nowhere. The device's amplitude that is 1 in
+    the trial is `largest`.
     """
 
     def __init__(self, wiring: Wiring, amplitude: float) -> None:

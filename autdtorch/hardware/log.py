@@ -54,7 +54,7 @@ class EvaluationLog:
     evaluation in flight. The log is locked until `end`, or until this object is released.
 
     Attributes:
-        path: of the file.
+        path: path of the file.
         origin: settings of the trial, by name.
         goes_on: true if the file has existed before.
         seconds_on: total time that the outputs were on, by its lines [s].
@@ -67,7 +67,7 @@ class EvaluationLog:
         trial is overwritten if it holds no evaluation.
 
         Args:
-            path: of the file.
+            path: path of the file.
             origin: settings of the trial by name, values of JSON; the first that differs is reported.
             transducers: number of transducers M.
             points: number of control points P.

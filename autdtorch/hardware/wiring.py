@@ -12,12 +12,7 @@ from autdtorch.utils.validation import indices, require_kind
 
 
 class Wiring:
-    """A device some of whose transducers are a scene's; the others stay off.
-
-    Attributes:
-        device: plays the drives.
-        transducers: the device's transducer for each of the scene's (M,), int64.
-    """
+    """A device, and its transducer for each of a scene's (M,), int64; other transducers stay off."""
 
     def __init__(self, device: Device, transducers: Sequence[int] | torch.Tensor | None = None) -> None:
         """Wire a device; by default all its transducers in order."""

@@ -8,18 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from autdtorch.hardware import (
-    SONICSURFACE,
-    Device,
-    EmulatedBench,
-    HardwareObjective,
-    LimitedLink,
-    Limits,
-    Link,
-    Played,
-    Sensor,
-    open_link,
-)
+from autdtorch import hardware as hw
 from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.propagators import make_propagator
 from autdtorch.scene.arrays import TransducerArray
@@ -37,19 +26,19 @@ class Trial:
     simulated: SimulatedObjective
     log: Path
 
-    def bench(self, device: Device = SONICSURFACE, failed: Sequence[int] = ()) -> EmulatedBench:
+    def bench(self, device: hw.Device = hw.SONICSURFACE, failed: Sequence[int] = ()) -> hw.EmulatedBench:
         assert self.simulated.transfer_matrix is not None
-        return EmulatedBench(device, self.simulated.transfer_matrix, TRANSDUCERS, dead=failed)
+        return hw.EmulatedBench(device, self.simulated.transfer_matrix, TRANSDUCERS, dead=failed)
 
-    def link(self, bench: EmulatedBench, device: Device = SONICSURFACE) -> Link:
-        return open_link(device, TRANSDUCERS, backend=bench.bus)
+    def link(self, bench: hw.EmulatedBench, device: hw.Device = hw.SONICSURFACE) -> hw.Link:
+        return hw.open_link(device, TRANSDUCERS, backend=bench.bus)
 
-    def played(self, device: Device = SONICSURFACE, amplitude: float = 1.0) -> Played:
-        return Played(self.simulated, device, TRANSDUCERS, amplitude)
+    def played(self, device: hw.Device = hw.SONICSURFACE, amplitude: float = 1.0) -> hw.Played:
+        return hw.Played(self.simulated, device, TRANSDUCERS, amplitude)
 
-    def objective(self, link: Link, sensor: Sensor, **settings: object) -> HardwareObjective:
-        limited = LimitedLink(link, Limits(amplitude=1.0))
-        return HardwareObjective(self.scene, limited, sensor, self.log, settings)
+    def objective(self, link: hw.Link, sensor: hw.Sensor, **settings: object) -> hw.HardwareObjective:
+        limited = hw.LimitedLink(link, hw.Limits(amplitude=1.0))
+        return hw.HardwareObjective(self.scene, limited, sensor, self.log, settings)
 
 
 def a_scene() -> tuple[Scene, SimulatedObjective]:

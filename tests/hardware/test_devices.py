@@ -8,26 +8,17 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autdtorch.hardware import (
-    AUTD3,
-    DEVICES,
-    OPENMPD,
-    SONICSURFACE,
-    ULTRAINO,
-    Device,
-    EmulatedBench,
-    open_link,
-)
+from autdtorch import hardware as hw
 from autdtorch.scene.drive import drive_from_phases, focus_phases
 
 #: Each device, on two boards if it has several, and the number of values of each of its integer levels.
 CASES = {
-    "autd3": (AUTD3.with_boards(2), (256, 256)),
-    "openmpd": (OPENMPD, (128, 65)),
-    "sonicsurface": (SONICSURFACE, (33,)),
-    "ultraino": (ULTRAINO.with_boards(2), (10, 6)),
+    "autd3": (hw.AUTD3.with_boards(2), (256, 256)),
+    "openmpd": (hw.OPENMPD, (128, 65)),
+    "sonicsurface": (hw.SONICSURFACE, (33,)),
+    "ultraino": (hw.ULTRAINO.with_boards(2), (10, 6)),
 }
-assert CASES.keys() == DEVICES.keys()
+assert CASES.keys() == hw.DEVICES.keys()
 every_device = pytest.mark.parametrize(("device", "counts"), CASES.values(), ids=CASES)
 seeds = st.integers(0, 2**32 - 1)
 
@@ -39,11 +30,11 @@ def one_on(transducer: int, phase: float, amplitude: float, count: int = 256) ->
     return drive
 
 
-def on_the_wire(device: Device, drive: torch.Tensor) -> bytes:
+def on_the_wire(device: hw.Device, drive: torch.Tensor) -> bytes:
     """The bytes that the firmware behind the emulated USB chip receives when a link plays the drive."""
-    bench = EmulatedBench(device, torch.ones(1, device.transducers, dtype=torch.complex128))
+    bench = hw.EmulatedBench(device, torch.ones(1, device.transducers, dtype=torch.complex128))
     received = bytearray()
-    with open_link(device, backend=bench.bus) as link, pytest.MonkeyPatch.context() as patch:
+    with hw.open_link(device, backend=bench.bus) as link, pytest.MonkeyPatch.context() as patch:
         patch.setattr(bench.firmware, "receive", received.extend)
         link.play(drive)
     return bytes(received)
@@ -103,7 +94,7 @@ ULTRAINO_EXAMPLES = [
 def test_sonicsurface_bytes(transducer: int, phase: float, amplitude: float, place: int, byte: int) -> None:
     expected = bytearray([254, *[32] * 256, 253])
     expected[place] = byte
-    assert on_the_wire(SONICSURFACE, one_on(transducer, phase, amplitude)) == expected
+    assert on_the_wire(hw.SONICSURFACE, one_on(transducer, phase, amplitude)) == expected
 
 
 @pytest.mark.parametrize(("transducer", "phase", "amplitude", "byte", "duty"), OPENMPD_EXAMPLES)
@@ -111,7 +102,7 @@ def test_openmpd_bytes(transducer: int, phase: float, amplitude: float, byte: in
     expected = bytearray(512)
     expected[0] = 128
     expected[transducer], expected[256 + transducer] = byte, duty
-    assert on_the_wire(OPENMPD, one_on(transducer, phase, amplitude)) == expected
+    assert on_the_wire(hw.OPENMPD, one_on(transducer, phase, amplitude)) == expected
 
 
 @pytest.mark.parametrize(("transducer", "phase", "amplitude", "port", "bit", "tenths"), ULTRAINO_EXAMPLES)
@@ -123,25 +114,27 @@ def test_ultraino_bytes(
         upper_half_first = 0 if bit >= 4 else 1
         expected[200 * (transducer // 64) + 2 * (10 * tenth + port) + upper_half_first] |= 1 << 4 + bit % 4
     expected += bytes.fromhex("30303070 30303030 10 00")  # 1 period, 0 to end, commit, switch
-    assert on_the_wire(ULTRAINO.with_boards(2), one_on(transducer, phase, amplitude, 128)) == expected
+    assert on_the_wire(hw.ULTRAINO.with_boards(2), one_on(transducer, phase, amplitude, 128)) == expected
 
 
 def test_an_autd3_frame_is_all_phases_then_all_intensities() -> None:
-    frame = AUTD3.with_boards(2).frame(one_on(250, -math.pi / 2, 0.5, 498))
+    frame = hw.AUTD3.with_boards(2).frame(one_on(250, -math.pi / 2, 0.5, 498))
     assert (frame[250], frame[498 + 250], sum(frame)) == (64, 128, 64 + 128)
 
 
 @every_device
 @settings(max_examples=15)
 @given(seed=seeds)
-def test_the_firmware_plays_the_levels_of_a_frame(device: Device, counts: tuple[int, ...], seed: int) -> None:
+def test_the_firmware_plays_the_levels_of_a_frame(
+    device: hw.Device, counts: tuple[int, ...], seed: int
+) -> None:
     generator = torch.Generator().manual_seed(seed)
     levels = [torch.randint(count, (device.transducers,), generator=generator) for count in counts]
     frame = device.pack(*levels)
     firmware = device.firmware(device.transducers)
     # As a chip may pass it on, in two pieces; without bit 7 no message of OpenMPD begins.
     cut = 0 if device.name == "AUTD3" else seed % (len(frame) + 1)
-    for piece in ([bytes(7)] if device is OPENMPD else []) + [frame[:cut]] * (cut > 0) + [frame[cut:]]:
+    for piece in ([bytes(7)] if device is hw.OPENMPD else []) + [frame[:cut]] * (cut > 0) + [frame[cut:]]:
         firmware.receive(piece)
     # Sums of up to five exponentials, and rounding of angles up to 2 pi.
     torch.testing.assert_close(firmware.drive(), device.drive(*levels), rtol=0, atol=1e-14)
@@ -165,7 +158,7 @@ def test_rounding_moves_phase_and_amplitude_by_at_most_half_a_level(device, coun
 
 
 @every_device
-def test_a_focus_takes_minus_kd(device: Device, counts: tuple[int, ...]) -> None:
+def test_a_focus_takes_minus_kd(device: hw.Device, counts: tuple[int, ...]) -> None:
     positions = torch.tensor([[0.0, 0.0, 0.0], [0.0, 2.125e-3, 0.0]], dtype=torch.float64)
     # The second transducer is a quarter of a wavelength nearer: the device's phase is a quarter ahead.
     level = device.levels(drive_from_phases(focus_phases(positions, (0, 0.1, 0), 2 * math.pi / 8.5e-3)))[0]
@@ -174,7 +167,7 @@ def test_a_focus_takes_minus_kd(device: Device, counts: tuple[int, ...]) -> None
 
 
 def test_ultraino_starts_with_all_transducers_on_and_another_duration_would_play_old_patterns() -> None:
-    firmware = ULTRAINO.firmware(64)
+    firmware = hw.ULTRAINO.firmware(64)
     torch.testing.assert_close(firmware.drive(), torch.ones(64).cdouble(), rtol=0, atol=1e-14)
     firmware.receive(bytes.fromhex("30303070 303030f0 30303030 10"))  # 1 period, then 3 of the second pattern
     torch.testing.assert_close(firmware.drive(), torch.ones(64).cdouble() / 4, rtol=0, atol=1e-14)
@@ -182,33 +175,33 @@ def test_ultraino_starts_with_all_transducers_on_and_another_duration_would_play
 
 def test_a_lone_commit_of_the_sonicsurface_brings_the_last_pattern_back() -> None:
     first, second = torch.arange(256) % 33, torch.arange(256) % 32
-    firmware = SONICSURFACE.firmware(256)
-    firmware.receive(SONICSURFACE.pack(first) + SONICSURFACE.pack(second) + b"\xfd")
-    torch.testing.assert_close(firmware.drive(), SONICSURFACE.drive(first), rtol=0, atol=1e-14)
+    firmware = hw.SONICSURFACE.firmware(256)
+    firmware.receive(hw.SONICSURFACE.pack(first) + hw.SONICSURFACE.pack(second) + b"\xfd")
+    torch.testing.assert_close(firmware.drive(), hw.SONICSURFACE.drive(first), rtol=0, atol=1e-14)
 
 
 def test_amplitudes_rounded_up_to_full_are_accepted_and_more_is_not() -> None:
-    assert OPENMPD.levels([1 + 5e-7 + 0j])[1].item() == 64
+    assert hw.OPENMPD.levels([1 + 5e-7 + 0j])[1].item() == 64
     with pytest.raises(ValueError, match=r"drive: amplitude 1.1"):
-        AUTD3.levels([1.1 + 0j])
+        hw.AUTD3.levels([1.1 + 0j])
 
 
 @pytest.mark.parametrize(
     ("device", "levels", "message"),
     [
-        (AUTD3, ([256], [0]), r"AUTD3 phase: \(256,\); .* 0 to 255"),
-        (OPENMPD, ([0], [65]), r"OpenMPD duty: \(65,\); .* 0 to 64"),
-        (OPENMPD, ([0, 1], [64]), r"OpenMPD duty: shape \(1,\); must be \(2,\)"),
-        (SONICSURFACE, ([33],), r"SonicSurface phase: \(33,\); must be integers from 0 to 32"),
-        (SONICSURFACE, (np.array([0.5]),), r"must be integers"),
+        (hw.AUTD3, ([256], [0]), r"AUTD3 phase: \(256,\); .* 0 to 255"),
+        (hw.OPENMPD, ([0], [65]), r"OpenMPD duty: \(65,\); .* 0 to 64"),
+        (hw.OPENMPD, ([0, 1], [64]), r"OpenMPD duty: shape \(1,\); must be \(2,\)"),
+        (hw.SONICSURFACE, ([33],), r"SonicSurface phase: \(33,\); must be integers from 0 to 32"),
+        (hw.SONICSURFACE, (np.array([0.5]),), r"must be integers"),
     ],
 )
-def test_levels_out_of_range_are_refused(device: Device, levels, message: str) -> None:
+def test_levels_out_of_range_are_refused(device: hw.Device, levels, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         device.drive(*levels)
 
 
-@pytest.mark.parametrize(("device", "boards"), [(SONICSURFACE, 2), (ULTRAINO, 15), (AUTD3, 0)])
-def test_a_number_of_boards_that_a_device_cannot_have_is_refused(device: Device, boards: int) -> None:
+@pytest.mark.parametrize(("device", "boards"), [(hw.SONICSURFACE, 2), (hw.ULTRAINO, 15), (hw.AUTD3, 0)])
+def test_a_number_of_boards_that_a_device_cannot_have_is_refused(device: hw.Device, boards: int) -> None:
     with pytest.raises(ValueError, match=rf"boards: {boards}; must be"):
         device.with_boards(boards)

@@ -11,20 +11,7 @@ import pytest
 import torch
 from faulty_bus import FAULTS, FaultyBus
 
-from autdtorch.hardware import (
-    OPENMPD,
-    SONICSURFACE,
-    Device,
-    EmulatedBench,
-    EmulatedSensor,
-    FileSensor,
-    Link,
-    LinkError,
-    ManualSensor,
-    Sensor,
-    Signalled,
-    ended_by_signals,
-)
+from autdtorch import hardware as hw
 from autdtorch.hardware.emulator.bus import EmulatedBus
 from autdtorch.methods.gabs import gabs
 from autdtorch.methods.solution import Solution
@@ -34,10 +21,10 @@ EVALUATIONS = 1 + 15 * 2
 SURVIVED = 10  # evaluations before the fault
 
 
-class Counting(EmulatedSensor):
+class Counting(hw.EmulatedSensor):
     """Counts its readings; `disturb` is called with their number before each."""
 
-    def __init__(self, bench: EmulatedBench, disturb: Callable[[int], object] = int) -> None:
+    def __init__(self, bench: hw.EmulatedBench, disturb: Callable[[int], object] = int) -> None:
         super().__init__(bench)
         self.readings = 0
         self._disturb = disturb
@@ -48,30 +35,37 @@ class Counting(EmulatedSensor):
         return super().read()
 
 
-def measure(trial, bench: EmulatedBench, sensor: Sensor, device: Device = SONICSURFACE) -> Solution:
-    with ended_by_signals(), trial.link(bench, device) as link:
+def measure(
+    trial, bench: hw.EmulatedBench, sensor: hw.Sensor, device: hw.Device = hw.SONICSURFACE
+) -> Solution:
+    with hw.ended_by_signals(), trial.link(bench, device) as link:
         return METHOD(trial.objective(link, sensor))
 
 
-def play(trial, bench: EmulatedBench, device: Device = SONICSURFACE, arm: Callable[[Link], object] = bool):
+def play(
+    trial,
+    bench: hw.EmulatedBench,
+    device: hw.Device = hw.SONICSURFACE,
+    arm: Callable[[hw.Link], object] = bool,
+):
     """Play a full drive, then end; `arm` takes the link before."""
-    with ended_by_signals(), trial.link(bench, device) as link:
+    with hw.ended_by_signals(), trial.link(bench, device) as link:
         arm(link)
         link.play(torch.ones(16, dtype=torch.complex128))
 
 
-def is_off(bench: EmulatedBench) -> bool:
+def is_off(bench: hw.EmulatedBench) -> bool:
     return not bench.firmware.drive().any()
 
 
-def bytes_before(device: Device, evaluations: int) -> int:
+def bytes_before(device: hw.Device, evaluations: int) -> int:
     """The number of bytes before a fault in mid-frame of an evaluation; off frames are sent in pairs."""
     frame = len(device.frame(torch.zeros(256, dtype=torch.complex128)))
     calls = 1 + (evaluations - 1) // 2
     return frame * (2 + evaluations + 2 * calls) + 3 * frame // 4
 
 
-def require_that_it_goes_on(trial, device: Device = SONICSURFACE) -> None:
+def require_that_it_goes_on(trial, device: hw.Device = hw.SONICSURFACE) -> None:
     """The log has what was measured, and the rest leads to what an undisturbed trial finds."""
     bench = trial.bench(device)
     sensor = Counting(bench)
@@ -82,13 +76,13 @@ def require_that_it_goes_on(trial, device: Device = SONICSURFACE) -> None:
     torch.testing.assert_close(found.history, expected.history, rtol=1e-12, atol=0)  # another order of sums
 
 
-@pytest.mark.parametrize("device", [SONICSURFACE, OPENMPD], ids=lambda device: device.name)
+@pytest.mark.parametrize("device", [hw.SONICSURFACE, hw.OPENMPD], ids=lambda device: device.name)
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_of_the_bus_ends_the_trial_with_the_outputs_off(trial, fault, device):
     bench = trial.bench(device)
     bench.bus = FaultyBus([bench.chip], fault, bytes_before(device, SURVIVED))
-    with pytest.raises(LinkError) as raised:
-        measure(trial, bench, EmulatedSensor(bench), device)
+    with pytest.raises(hw.LinkError) as raised:
+        measure(trial, bench, hw.EmulatedSensor(bench), device)
     assert "\n" not in str(raised.value)
     assert bench.bus.struck
     if fault == "unplug":
@@ -118,8 +112,8 @@ def nobody(question: str) -> str:
         (lambda: ["noise", 1.0], "pressure of the sensor"),
         (lambda: [1.0], "pressure of the sensor"),
         (lambda: [1.0, -1.0], "pressure of the sensor"),
-        (ManualSensor([(0, 0, 0), (1, 0, 0)], nobody).read, "nobody answers"),
-        (FileSensor("no/such/file", 2, timeout=0.01).read, "did not change"),
+        (hw.ManualSensor([(0, 0, 0), (1, 0, 0)], nobody).read, "nobody answers"),
+        (hw.FileSensor("no/such/file", 2, timeout=0.01).read, "did not change"),
     ],
 )
 def test_garbage_from_the_sensor_ends_the_trial_with_the_outputs_off(trial, reading, message):
@@ -153,19 +147,19 @@ def test_a_signal_ends_the_trial_with_the_outputs_off(trial, number):
 
     before = signal.getsignal(number)
     bench = trial.bench()
-    with pytest.raises(Signalled, match=number.name):
+    with pytest.raises(hw.Signalled, match=number.name):
         measure(trial, bench, Counting(bench, disturb))
     assert is_off(bench)
     assert signal.getsignal(number) is before
     require_that_it_goes_on(trial)
 
 
-@pytest.mark.parametrize("device", [SONICSURFACE, OPENMPD], ids=lambda device: device.name)
+@pytest.mark.parametrize("device", [hw.SONICSURFACE, hw.OPENMPD], ids=lambda device: device.name)
 def test_signals_in_mid_frame_and_while_switching_off_leave_the_outputs_off(trial, device):
     class Interrupting(EmulatedBus):
         armed = False
 
-        def arm(self, _: Link) -> None:
+        def arm(self, _: hw.Link) -> None:
             self.armed = True
 
         def bulk_write(self, dev_handle, ep, intf, data, timeout):
@@ -176,7 +170,7 @@ def test_signals_in_mid_frame_and_while_switching_off_leave_the_outputs_off(tria
 
     bench = trial.bench(device)
     bench.bus = Interrupting([bench.chip])
-    with pytest.raises(Signalled):
+    with pytest.raises(hw.Signalled):
         play(trial, bench, device, bench.bus.arm)
     assert is_off(bench)
 
@@ -189,7 +183,7 @@ def test_a_signal_amid_or_just_before_the_last_off_frame_leaves_the_outputs_off(
         monkeypatch.undo()
         signal.raise_signal(signal.SIGTERM)
 
-    def arm(link: Link) -> None:
+    def arm(link: hw.Link) -> None:
         if interrupted == "recovery":
             monkeypatch.setattr(bench.bus, "clear_halt", interrupt)
         else:
@@ -197,7 +191,7 @@ def test_a_signal_amid_or_just_before_the_last_off_frame_leaves_the_outputs_off(
 
     bench = trial.bench()
     bench.bus = FaultyBus([bench.chip], "time-out", 258 * (2 + 1) + 100)
-    with pytest.raises(Signalled):
+    with pytest.raises(hw.Signalled):
         play(trial, bench, arm=arm)
     assert is_off(bench)
 
@@ -206,7 +200,7 @@ def test_a_signal_amid_or_just_before_the_last_off_frame_leaves_the_outputs_off(
 @pytest.mark.parametrize("number", [signal.SIGINT])
 def test_two_signals_at_once_end_the_trial_by_the_first(monkeypatch, number):
     def both() -> None:
-        with ended_by_signals():
+        with hw.ended_by_signals():
             signal.pthread_sigmask(signal.SIG_BLOCK, {number, signal.SIGTERM})
             signal.raise_signal(number)  # to this thread, as other threads do not block it
             signal.raise_signal(signal.SIGTERM)
@@ -214,7 +208,7 @@ def test_two_signals_at_once_end_the_trial_by_the_first(monkeypatch, number):
 
     lost: list[object] = []
     monkeypatch.setattr(sys, "unraisablehook", lost.append)
-    with pytest.raises(Signalled, match="SIGINT"):
+    with pytest.raises(hw.Signalled, match="SIGINT"):
         both()
     assert not lost
 
@@ -225,19 +219,19 @@ def test_after_a_signal_that_python_drops_the_next_ends_the_trial(monkeypatch):
             signal.raise_signal(signal.SIGTERM)
 
     def trial() -> None:
-        with ended_by_signals():
+        with hw.ended_by_signals():
             Dropping()
             signal.raise_signal(signal.SIGTERM)
 
     dropped: list[object] = []
     monkeypatch.setattr(sys, "unraisablehook", lambda event: dropped.append(event.exc_type))
-    with pytest.raises(Signalled) as first:
+    with pytest.raises(hw.Signalled) as first:
         trial()
-    assert dropped == [Signalled]
+    assert dropped == [hw.Signalled]
     try:
         raise first.value
-    except Signalled:  # what is handled around a trial does not count
-        with pytest.raises(Signalled):
+    except hw.Signalled:  # what is handled around a trial does not count
+        with pytest.raises(hw.Signalled):
             trial()
 
 
@@ -258,7 +252,7 @@ def test_a_signal_as_the_handling_begins_or_ends_leaves_the_handlers_as_they_wer
     before = {number: set_handler(number, harmless) for number in map(signal.Signals.__getitem__, names)}
     monkeypatch.setattr(signal, "signal", set_and_interrupt)
     try:
-        with pytest.raises(Signalled), ended_by_signals():
+        with pytest.raises(hw.Signalled), hw.ended_by_signals():
             pass
         assert all(signal.getsignal(number) is harmless for number in before)
     finally:
@@ -269,7 +263,7 @@ def test_a_signal_as_the_handling_begins_or_ends_leaves_the_handlers_as_they_wer
 def test_a_signal_that_is_ignored_as_by_nohup_stays_so():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with ended_by_signals():
+        with hw.ended_by_signals():
             signal.raise_signal(signal.SIGHUP)
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:

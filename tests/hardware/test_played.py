@@ -1,4 +1,4 @@
-"""What a device is said to play, against the firmware that plays it."""
+"""The quantisation of drives, against the emulated firmware of each device."""
 
 import math
 
@@ -7,19 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autdtorch.hardware import (
-    AUTD3,
-    OPENMPD,
-    SONICSURFACE,
-    Device,
-    EmulatedBench,
-    LimitedLink,
-    Limits,
-    Link,
-    Played,
-    openmpd_boards,
-    ultraino_boards,
-)
+from autdtorch import hardware as hw
 from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.scene import Medium, Scene
@@ -43,18 +31,18 @@ def board() -> OpenMPDBoard:
 BOARD = board()
 #: Phases of each device, and the largest step of its amplitude: of a pulse's the first, by the least gain.
 DEVICES = {
-    "SonicSurface": (SONICSURFACE, 32, 1.0),
-    "OpenMPD": (OPENMPD, 128, math.pi / 128),
-    "OpenMPD, calibrated": (openmpd_boards([BOARD]), 128, math.pi / 128 / 0.5),
-    "Ultraino": (ultraino_boards(4), 10, math.pi / 10),
-    "AUTD3": (AUTD3, 256, 1 / 255),
+    "SonicSurface": (hw.SONICSURFACE, 32, 1.0),
+    "OpenMPD": (hw.OPENMPD, 128, math.pi / 128),
+    "OpenMPD, calibrated": (hw.openmpd_boards([BOARD]), 128, math.pi / 128 / 0.5),
+    "Ultraino": (hw.ultraino_boards(4), 10, math.pi / 10),
+    "AUTD3": (hw.AUTD3, 256, 1 / 255),
 }
 
 
-class Bench(EmulatedBench):
+class Bench(hw.EmulatedBench, hw.Port):
     """A port too, so that a device needs no USB; its pressures are what the transducers emit."""
 
-    def __init__(self, device: Device) -> None:
+    def __init__(self, device: hw.Device) -> None:
         calibrated = device.serials == (BOARD.name,)
         emits = torch.ones(256).cdouble() / (BOARD.calibrated(torch.ones(256).cdouble()) if calibrated else 1)
         pins = [BOARD.pins[place] if calibrated else place for place in TRANSDUCERS]
@@ -62,12 +50,6 @@ class Bench(EmulatedBench):
 
     def write(self, data: bytes) -> None:
         self.receive(data)
-
-    def flush(self) -> None: ...
-
-    def recover(self) -> None: ...
-
-    def close(self) -> None: ...
 
 
 class Silence:
@@ -91,19 +73,19 @@ def random_drives(seed: int) -> torch.Tensor:
 @pytest.mark.parametrize("name", DEVICES)
 @settings(max_examples=6)
 @given(seed=st.integers(0, 2**31), limit=st.sampled_from([1.0, 0.8, 0.35]))
-def test_what_is_emitted_is_what_the_firmware_plays(name: str, seed: int, limit: float):
+def test_the_firmware_plays_the_quantised_drive(name: str, seed: int, limit: float):
     device, phases, step = DEVICES[name]
-    limit = 1.0 if device is SONICSURFACE else limit
+    limit = 1.0 if device is hw.SONICSURFACE else limit
     drives = random_drives(seed)
-    played = Played(Silence(), device, TRANSDUCERS, limit)
+    played = hw.Played(Silence(), device, TRANSDUCERS, limit)
     emitted = played.emitted(drives)
     # Rounding, of the levels' trigonometry.
     torch.testing.assert_close(played.emitted(emitted), emitted, rtol=0, atol=1e-12)
     assert torch.equal(played.emitted(drives.T.contiguous().T[1:2]), emitted[1:2])
 
     bench = Bench(device)
-    with Link(device, bench, TRANSDUCERS, sleep=bench.bus.sleep) as link:
-        limited = LimitedLink(link, Limits(limit))
+    with hw.Link(device, bench, TRANSDUCERS, sleep=bench.bus.sleep) as link:
+        limited = hw.LimitedLink(link, hw.Limits(limit))
         limited.play(torch.ones(16).cdouble())
         full = bench.pressure().abs().max()
         assert limit - step < full <= limit + 1e-6  # the tolerance of an amplitude
@@ -122,12 +104,14 @@ def test_what_is_emitted_is_what_the_firmware_plays(name: str, seed: int, limit:
 @pytest.mark.parametrize(
     ("transducers", "amplitude", "message"),
     [
-        (None, 1.0, "transducers: 64; must be 16, as many as the scene has"),
+        (None, 1.0, "transducers: 64; must be 16"),
         ([3] * 16, 1.0, "transducers: .* each once"),
         (range(16), 1.1, "amplitude: 1.1"),
         (range(16), 0.3, "amplitude: 0.3; must be >= 0.309, the lowest level of Ultraino"),
     ],
 )
-def test_what_a_device_cannot_play_is_refused(transducers, amplitude: float, message: str):
+def test_limits_and_transducers_that_a_device_does_not_have_are_refused(
+    transducers, amplitude: float, message: str
+):
     with pytest.raises(ValueError, match=message):
-        Played(Silence(), ultraino_boards(), transducers, amplitude)
+        hw.Played(Silence(), hw.ultraino_boards(), transducers, amplitude)

@@ -7,19 +7,7 @@ import weakref
 import pytest
 import torch
 
-from autdtorch.hardware import (
-    OPENMPD,
-    SONICSURFACE,
-    EmulatedSensor,
-    HardwareObjective,
-    LimitedLink,
-    LimitError,
-    Limits,
-    LinkError,
-    check_transducers,
-    hears_silence,
-    open_link,
-)
+from autdtorch import hardware as hw
 from autdtorch.methods.driver import observed
 
 FULL = torch.ones(16, dtype=torch.complex128)
@@ -30,18 +18,18 @@ def limited(trial, failed=(), **limits):
     """A bench, and a link to it with limits."""
     bench = trial.bench(failed=failed)
     with trial.link(bench) as link:
-        yield bench, LimitedLink(link, Limits(1.0, **limits))
+        yield bench, hw.LimitedLink(link, hw.Limits(1.0, **limits))
 
 
-def objective_on(trial, link: LimitedLink, sensor) -> HardwareObjective:
-    return HardwareObjective(trial.scene, link, sensor, trial.log)
+def objective_on(trial, link: hw.LimitedLink, sensor) -> hw.HardwareObjective:
+    return hw.HardwareObjective(trial.scene, link, sensor, trial.log)
 
 
 @pytest.mark.parametrize("limit", [1.0, 0.9, 0.5, 0.03])
 def test_no_transducer_is_driven_above_the_limit(trial, limit: float):
-    bench = trial.bench(OPENMPD)
-    with trial.link(bench, OPENMPD) as link:
-        LimitedLink(link, Limits(amplitude=limit)).play(FULL)
+    bench = trial.bench(hw.OPENMPD)
+    with trial.link(bench, hw.OPENMPD) as link:
+        hw.LimitedLink(link, hw.Limits(amplitude=limit)).play(FULL)
         amplitudes = bench.drive().abs()
         assert amplitudes.max() <= limit * (1 + 1e-9)
         # A step of the duty is at most pi / 128 of the amplitude, and one of the candidates 1 / 256.
@@ -51,19 +39,19 @@ def test_no_transducer_is_driven_above_the_limit(trial, limit: float):
 def test_a_device_without_amplitude_plays_in_full_or_not_at_all(trial):
     refused = pytest.raises(ValueError, match=r"amplitude: 0\.9; must be >= 1, .* SonicSurface")
     with trial.link(trial.bench()) as link, refused:
-        LimitedLink(link, Limits(amplitude=0.9))
+        hw.LimitedLink(link, hw.Limits(amplitude=0.9))
 
 
 def test_an_invalid_drive_is_not_scaled_into_a_valid_one_and_starts_no_clock(trial):
-    bench = trial.bench(OPENMPD)
-    with trial.link(bench, OPENMPD) as link:
-        link = LimitedLink(link, Limits(0.5))
+    bench = trial.bench(hw.OPENMPD)
+    with trial.link(bench, hw.OPENMPD) as link:
+        link = hw.LimitedLink(link, hw.Limits(0.5))
         for drive, message in ((FULL[None], r"shape \(1, 16\)"), (1.5 * FULL, r"drive: amplitude 1\.5")):
             with pytest.raises(ValueError, match=message):
                 link.play(drive)
         assert link.seconds_on == 0
         assert link._timer is None
-    assert EmulatedSensor(bench).read().max() == 0
+    assert hw.EmulatedSensor(bench).read().max() == 0
 
 
 @pytest.mark.parametrize(
@@ -72,9 +60,9 @@ def test_an_invalid_drive_is_not_scaled_into_a_valid_one_and_starts_no_clock(tri
 )
 def test_limits_out_of_range_are_refused(name: str, value: float):
     with pytest.raises(ValueError, match=name):
-        Limits(**{"amplitude": 1.0, name: value})
+        hw.Limits(**{"amplitude": 1.0, name: value})
     with pytest.raises(TypeError, match="amplitude"):
-        Limits()
+        hw.Limits()
 
 
 def test_the_outputs_rest_as_the_duty_cycle_asks(trial):
@@ -96,7 +84,7 @@ def test_the_outputs_rest_as_the_duty_cycle_asks(trial):
     ],
 )
 def test_while_a_sensor_takes_too_long_the_outputs_go_off(trial, limits, message: str):
-    class Slow(EmulatedSensor):
+    class Slow(hw.EmulatedSensor):
         def read(self):
             time.sleep(0.2)
             amplitudes.append(float(bench.drive().abs().max()))
@@ -105,12 +93,12 @@ def test_while_a_sensor_takes_too_long_the_outputs_go_off(trial, limits, message
     amplitudes: list[float] = []
     with limited(trial, **limits) as (bench, link):
         objective = objective_on(trial, link, Slow(bench))
-        with pytest.raises(LimitError, match=message):
+        with pytest.raises(hw.LimitError, match=message):
             objective(FULL[None])
         assert amplitudes == [0.0]
         assert not objective.log.evaluations
-        with pytest.raises(LimitError, match=message):
-            check_transducers(link, Slow(bench), points=2, readings=1, background=1)
+        with pytest.raises(hw.LimitError, match=message):
+            hw.check_transducers(link, Slow(bench), points=2, readings=1, background=1)
 
 
 def test_while_the_sound_settles_the_timer_may_switch_off(trial):
@@ -122,11 +110,11 @@ def test_while_the_sound_settles_the_timer_may_switch_off(trial):
     amplitudes: list[float] = []
     bench = trial.bench()
     bench.bus.sleep = sleep
-    with open_link(SONICSURFACE, range(16), backend=bench.bus, settle=0.2) as link:
-        limits = LimitedLink(link, Limits(1.0, seconds_in_a_row=0.02))
+    with hw.open_link(hw.SONICSURFACE, range(16), backend=bench.bus, settle=0.2) as link:
+        limits = hw.LimitedLink(link, hw.Limits(1.0, seconds_in_a_row=0.02))
         limits.play(FULL)
         assert amplitudes == [0.0]
-        with pytest.raises(LimitError, match="settling and reading took longer"):
+        with pytest.raises(hw.LimitError, match="settling and reading took longer"):
             limits.require_on()
 
 
@@ -144,14 +132,14 @@ def test_a_timer_that_comes_late_reaches_neither_the_next_stretch_nor_the_next_l
         later.play(FULL)
         link._timer.join()
         assert bench.drive().abs().min() > 0.9
-    with pytest.raises(LinkError, match="SonicSurface is closed"):
+    with pytest.raises(hw.LinkError, match="SonicSurface is closed"):
         later.play(FULL)
     assert bench.firmware.drive().abs().max() == 0
 
 
-@pytest.mark.parametrize("error", [LinkError("stuck"), RuntimeError("stuck")])
+@pytest.mark.parametrize("error", [hw.LinkError("stuck"), RuntimeError("stuck")])
 def test_a_timer_that_cannot_switch_off_says_so_at_once_and_ends_the_trial(trial, error, monkeypatch, caplog):
-    class Asleep(EmulatedSensor):
+    class Asleep(hw.EmulatedSensor):
         def read(self):
             link._timer.join()
             logged.append("the time is up, but: stuck" in caplog.text)
@@ -173,7 +161,7 @@ def test_a_timer_that_cannot_switch_off_says_so_at_once_and_ends_the_trial(trial
 
 
 def test_an_error_of_the_sensor_leaves_the_outputs_off_on_an_open_link(trial):
-    class Broken(EmulatedSensor):
+    class Broken(hw.EmulatedSensor):
         def read(self):
             if bench.drive().abs().max() > 0:
                 raise OSError("gone")
@@ -184,7 +172,7 @@ def test_an_error_of_the_sensor_leaves_the_outputs_off_on_an_open_link(trial):
             objective_on(trial, link, Broken(bench))(FULL[None])
         assert bench.firmware.drive().abs().max() == 0
         with pytest.raises(OSError, match="gone"):
-            check_transducers(link, Broken(bench), points=2)
+            hw.check_transducers(link, Broken(bench), points=2)
         assert bench.firmware.drive().abs().max() == 0
 
 
@@ -207,31 +195,31 @@ def test_a_link_left_open_is_switched_off_when_python_exits_and_a_closed_one_is_
 def test_the_number_of_evaluations_is_limited_over_all_of_a_trial(trial):
     def observe(rows: int, most: int) -> None:
         with limited(trial, evaluations=most) as (bench, link):
-            observed(objective_on(trial, link, EmulatedSensor(bench)), FULL.expand(rows, -1), 0)
+            observed(objective_on(trial, link, hw.EmulatedSensor(bench)), FULL.expand(rows, -1), 0)
 
     observe(3, most=3)
-    with pytest.raises(LimitError, match="4 evaluations are made, the limit"):
+    with pytest.raises(hw.LimitError, match="4 evaluations are made, the limit"):
         observe(5, most=4)
     observe(5, most=5)
 
 
 def test_the_time_on_goes_on_with_the_trial(trial):
     with limited(trial, seconds=60.0) as (bench, link):  # a test does not take that long
-        trial.objective(link.link, EmulatedSensor(bench)).log.append(FULL, torch.ones(2), 60.0)
-        objective = objective_on(trial, link, EmulatedSensor(bench))
-        with pytest.raises(LimitError, match="on for 60 s, the limit"):
+        trial.objective(link.link, hw.EmulatedSensor(bench)).log.append(FULL, torch.ones(2), 60.0)
+        objective = objective_on(trial, link, hw.EmulatedSensor(bench))
+        with pytest.raises(hw.LimitError, match="on for 60 s, the limit"):
             observed(objective, FULL.expand(2, -1), 0)  # one is in the log
         assert link.seconds_on == 60.0
 
 
 def test_the_time_of_an_earlier_check_counts_and_is_rested_from(trial):
     with limited(trial) as (bench, link):
-        sensor = EmulatedSensor(bench)
+        sensor = hw.EmulatedSensor(bench)
         log = objective_on(trial, link, sensor).log
-        check_transducers(link, sensor, points=2)
+        hw.check_transducers(link, sensor, points=2)
         log.end(link.seconds_on)
         before = link.seconds_on
-        again = LimitedLink(link.link, Limits(1.0, seconds_in_a_row=0.05, duty_cycle=0.25))
+        again = hw.LimitedLink(link.link, hw.Limits(1.0, seconds_in_a_row=0.05, duty_cycle=0.25))
         begin = time.monotonic()
         objective = objective_on(trial, again, sensor)
         assert again.seconds_on == before > 0
@@ -253,7 +241,7 @@ def test_a_chip_that_does_not_confirm_the_off_frame_is_an_error(trial, monkeypat
     bench = trial.bench()
     link = trial.link(bench)
     bench.chip.answer = lambda kind, request: status  # 0x20: room for more, but not all is sent
-    with pytest.raises(LinkError, match=message):
+    with pytest.raises(hw.LinkError, match=message):
         link.close()
 
 
@@ -261,18 +249,18 @@ def test_a_chip_that_does_not_confirm_the_off_frame_is_an_error(trial, monkeypat
 def test_the_check_finds_the_failed_transducers(trial, snr):
     read: list[str] = []
     with limited(trial, failed=[3, 9]) as (bench, link):
-        sensor = EmulatedSensor(bench, snr)
-        check = check_transducers(link, sensor, points=2, watch=read.append)
+        sensor = hw.EmulatedSensor(bench, snr)
+        check = hw.check_transducers(link, sensor, points=2, watch=read.append)
         assert check.dead == [3, 9]
         assert read == ["silence, outputs off", *(f"transducer {n} of 16" for n in range(1, 17))]
         assert bench.firmware.drive().abs().max() == 0
-        assert hears_silence(sensor, check, points=2)
+        assert hw.hears_silence(sensor, check, points=2)
         link.play(FULL)
-        assert not hears_silence(sensor, check, points=2)
+        assert not hw.hears_silence(sensor, check, points=2)
 
 
 def test_a_transducer_20_db_below_the_others_has_failed_where_silence_is_read_as_0(trial):
-    class Leaking(EmulatedSensor):
+    class Leaking(hw.EmulatedSensor):
         leak = 0.0
 
         def read(self):
@@ -283,5 +271,5 @@ def test_a_transducer_20_db_below_the_others_has_failed_where_silence_is_read_as
         sensor = Leaking(bench)
         for share, failed in ((0.05, [3]), (0.2, [])):  # of the amplitude; 20 dB are 0.1
             sensor.leak = share * typical
-            check = check_transducers(link, sensor, points=2)
+            check = hw.check_transducers(link, sensor, points=2)
             assert (check.silence, check.dead) == (0, failed)

@@ -9,17 +9,7 @@ import re
 import pytest
 import torch
 
-from autdtorch.hardware import (
-    KEYSIGHT,
-    RIGOL,
-    EmulatedScope,
-    LinkError,
-    Microphone,
-    MovedMicrophone,
-    ScopeSensor,
-    SensorError,
-    open_scope,
-)
+from autdtorch import hardware as hw
 from autdtorch.hardware.emulator.bus import EmulatedBus, stall, time_out
 from autdtorch.hardware.emulator.instrument import EmulatedInstrument
 from autdtorch.hardware.sensors.scpi import Dialect
@@ -34,10 +24,10 @@ LOUDEST = 4.0  # [Pa]
 RESOLUTION = LOUDEST / 3.5 / 32  # [Pa]: 3.5 divisions of 32 codes, on the coarsest scale
 
 
-def sensor_at(scope, microphones: int, captures: int = 1) -> ScopeSensor:
+def sensor_at(scope, microphones: int, captures: int = 1) -> hw.ScopeSensor:
     inputs = range(1, 1 + microphones)
-    placed = [Microphone(number, SENSITIVITY / 10, LOUDEST, gain=10) for number in inputs]
-    return ScopeSensor(scope, FREQUENCY, placed, captures)
+    placed = [hw.Microphone(number, SENSITIVITY / 10, LOUDEST, gain=10) for number in inputs]
+    return hw.ScopeSensor(scope, FREQUENCY, placed, captures)
 
 
 class FaultyInstrument(EmulatedInstrument):
@@ -58,13 +48,13 @@ class FaultyInstrument(EmulatedInstrument):
 class Bench:
     """A field that does not change, and an oscilloscope in it."""
 
-    def __init__(self, pressure, dialect: Dialect = KEYSIGHT, points=(0, 1), **properties):
+    def __init__(self, pressure, dialect: Dialect = hw.KEYSIGHT, points=(0, 1), **properties):
         maker = dialect.name.partition(" ")[0]
         self.field = torch.tensor(pressure, dtype=torch.complex128)
-        self.scope = EmulatedScope(lambda: self.field, FREQUENCY, SENSITIVITY, points, maker, **properties)
+        self.scope = hw.EmulatedScope(lambda: self.field, FREQUENCY, SENSITIVITY, points, maker, **properties)
         self.instrument = FaultyInstrument(*CHIP, "S1", self.scope)
         self.bus = EmulatedBus([self.instrument])
-        self.open = open_scope(CHIP, dialect, backend=self.bus)
+        self.open = hw.open_scope(CHIP, dialect, backend=self.bus)
 
     def record(self) -> list[str]:
         """The lines that the oscilloscope gets from now on."""
@@ -73,18 +63,18 @@ class Bench:
         self.scope.execute = lambda line: lines.append(line) or execute(line)
         return lines
 
-    def sensor(self, captures: int = 1) -> ScopeSensor:
+    def sensor(self, captures: int = 1) -> hw.ScopeSensor:
         return sensor_at(self.open, len(self.scope.points), captures)
 
 
-@pytest.mark.parametrize("dialect", [KEYSIGHT, RIGOL], ids=lambda dialect: dialect.name)
+@pytest.mark.parametrize("dialect", [hw.KEYSIGHT, hw.RIGOL], ids=lambda dialect: dialect.name)
 def test_a_reading_is_the_pressure_within_the_quantisation(dialect):
     pressure = [3.2 - 1j, 0.3j]
     bench = Bench(pressure, dialect, dc_offset=0.003)
     reading = bench.sensor().read()
     # Rounding errs by at most half a code. All errors with the sign of the sine and of one phase make
     # sum(2 w |sin| / 2) / sum(w) = 2 / pi codes, the mean of |sin|.
-    worst = 2 / math.pi * RESOLUTION * (1 if dialect is KEYSIGHT else 32 / 25)
+    worst = 2 / math.pi * RESOLUTION * (1 if dialect is hw.KEYSIGHT else 32 / 25)
     assert (reading - torch.tensor(pressure).abs()).abs().max() < worst
     assert bench.scope.unknown == []
     assert "EMULATED" in bench.open.identity
@@ -123,7 +113,7 @@ def test_a_microphone_drifts_by_what_was_asked_for():
     assert steps.std() == pytest.approx(0.5 / math.sqrt(1000), rel=0.28)
 
 
-@pytest.mark.parametrize("dialect", [KEYSIGHT, RIGOL], ids=lambda dialect: dialect.name)
+@pytest.mark.parametrize("dialect", [hw.KEYSIGHT, hw.RIGOL], ids=lambda dialect: dialect.name)
 def test_each_input_has_a_scale_on_which_it_uses_a_quarter_of_the_screen_or_more(dialect):
     bench = Bench([0, 0], dialect)
     lines, sensor = bench.record(), bench.sensor()
@@ -131,7 +121,7 @@ def test_each_input_has_a_scale_on_which_it_uses_a_quarter_of_the_screen_or_more
         bench.field.copy_(torch.tensor([3.2 - 1j, 1j * quiet]))
         error = sensor.read() / bench.field.abs() - 1
         # 2 / pi codes of a quarter of 3.5 divisions, as in the test above.
-        assert error.abs().max() < 2 / math.pi / (3.5 / 4 * (32 if dialect is KEYSIGHT else 25))
+        assert error.abs().max() < 2 / math.pi / (3.5 / 4 * (32 if dialect is hw.KEYSIGHT else 25))
     scales = [float(line.split()[1]) for line in lines if line.startswith(":CHANnel2:SCALe")]
     # For `loudest`; so that 6 mV fill half of 3.5 divisions, 1.5 mV on the finest; four times that for 6 mV.
     # The first capture has 17 codes: what it shows is one and a half more, at most.
@@ -159,7 +149,7 @@ def test_a_sound_that_is_loud_and_quiet_by_turns_is_read_on_some_scale():
 
 def test_overload_is_an_error_that_names_input_and_pressure():
     bench = Bench([1.0, 6.0])
-    with pytest.raises(SensorError, match=r"input 2: \d+ of 1000 samples are clipped.* more than 4 Pa"):
+    with pytest.raises(hw.SensorError, match=r"input 2: \d+ of 1000 samples are clipped.* more than 4 Pa"):
         bench.sensor().read()
 
 
@@ -187,19 +177,21 @@ faults = pytest.mark.parametrize(
 def test_a_fault_that_stays_on_the_wire_ends_the_trial_silently_and_another_goes_on(trial, fault, message):
     def measure(count: int, last: str | None) -> torch.Tensor:
         instrument.fault = None
-        with trial.link(bench) as link, open_scope(CHIP, backend=bench.bus) as oscilloscope:
-            microphones = [Microphone(number, SENSITIVITY, loudest) for number in (1, 2)]
-            objective = trial.objective(link, ScopeSensor(oscilloscope, FREQUENCY, microphones))
+        with trial.link(bench) as link, hw.open_scope(CHIP, backend=bench.bus) as oscilloscope:
+            microphones = [hw.Microphone(number, SENSITIVITY, loudest) for number in (1, 2)]
+            objective = trial.objective(link, hw.ScopeSensor(oscilloscope, FREQUENCY, microphones))
             objective(torch.stack(drives[: count - 1]))
             instrument.fault = last
             return objective(drives[count - 1][None])
 
     bench = trial.bench()
-    instrument = FaultyInstrument(*CHIP, "S1", EmulatedScope(bench.pressure, FREQUENCY, SENSITIVITY, [0, 1]))
+    instrument = FaultyInstrument(
+        *CHIP, "S1", hw.EmulatedScope(bench.pressure, FREQUENCY, SENSITIVITY, [0, 1])
+    )
     bench.bus.chips.append(instrument)
     drives = [drive_from_phases(torch.arange(16) * step * 2 * math.pi / 32) for step in range(3)]
     loudest = float(trial.simulated(torch.stack(drives)).max())
-    with pytest.raises(LinkError, match=message):
+    with pytest.raises(hw.LinkError, match=message):
         measure(2, fault)
     assert bench.firmware.drive().abs().max() == 0
     assert len(trial.log.read_text().splitlines()) == 2  # what the trial is, and one evaluation
@@ -229,21 +221,21 @@ def test_a_fault_that_a_clear_mends_costs_a_warning_and_no_reading(fault, messag
 
 def test_an_unplugged_oscilloscope_and_one_of_another_maker_are_errors():
     bench = Bench([1.0, 2.0])
-    with pytest.raises(LinkError, match="TRIGger:STATus"):  # a Keysight does not know it
-        sensor_at(open_scope(CHIP, RIGOL, backend=bench.bus), 2).read()
+    with pytest.raises(hw.LinkError, match="TRIGger:STATus"):  # a Keysight does not know it
+        sensor_at(hw.open_scope(CHIP, hw.RIGOL, backend=bench.bus), 2).read()
     sensor = bench.sensor()
     bench.instrument.present = False
-    with pytest.raises(LinkError, match="disconnected"):
+    with pytest.raises(hw.LinkError, match="disconnected"):
         sensor.read()
 
 
 def test_a_capture_that_does_not_come_is_not_taken_for_the_last():
-    bench = Bench([1.0, 2.0], RIGOL)
+    bench = Bench([1.0, 2.0], hw.RIGOL)
     sensor = bench.sensor()
     sensor.read()
     execute = bench.scope.execute
     bench.scope.execute = lambda line: None if line == ":TFORce" else execute(line)
-    with pytest.raises(LinkError, match=r"answer :WAVeform:PREamble\?.*time-out"):
+    with pytest.raises(hw.LinkError, match=r"answer :WAVeform:PREamble\?.*time-out"):
         sensor.read()
 
 
@@ -255,7 +247,7 @@ def test_one_microphone_is_moved_from_point_to_point():
 
     asked: list[str] = []
     bench = Bench([1.0, 2.0], points=[0])
-    sensor = MovedMicrophone(bench.sensor(), [(0.08, 0.01, 0), (0.08, -0.02, 5e-3)], move)
+    sensor = hw.MovedMicrophone(bench.sensor(), [(0.08, 0.01, 0), (0.08, -0.02, 5e-3)], move)
     assert sensor.read() == pytest.approx([1.0, 2.0], abs=RESOLUTION)
     assert asked[1] == (
         "Move the microphone to control point 2 of 2 at (80.0, -20.0, 5.0) mm, then press Enter. "
@@ -267,18 +259,18 @@ def test_a_method_finds_the_simulations_focus_through_a_noisy_oscilloscope(trial
     matrix = trial.simulated.transfer_matrix
     # 30 dB below the rms pressure over control points and random phases, in every sample.
     noise = SENSITIVITY * random_rms(matrix) * 10 ** (-30 / 20)
-    scope = EmulatedScope(bench.pressure, FREQUENCY, SENSITIVITY, [0, 1], noise=noise, drift=0.01)
+    scope = hw.EmulatedScope(bench.pressure, FREQUENCY, SENSITIVITY, [0, 1], noise=noise, drift=0.01)
     scope.plug_into(bench, CHIP)
     loudest = float(matrix.abs().sum(dim=1).max())
-    with trial.link(bench) as link, open_scope(CHIP, backend=bench.bus) as oscilloscope:
-        microphones = [Microphone(number, SENSITIVITY, loudest) for number in (1, 2)]
-        sensor = ScopeSensor(oscilloscope, FREQUENCY, microphones)
+    with trial.link(bench) as link, hw.open_scope(CHIP, backend=bench.bus) as oscilloscope:
+        microphones = [hw.Microphone(number, SENSITIVITY, loudest) for number in (1, 2)]
+        sensor = hw.ScopeSensor(oscilloscope, FREQUENCY, microphones)
         found = gabs(trial.objective(link, sensor), levels=4)
     expected = gabs(trial.played(), levels=4).score
     assert float(trial.simulated(found.drive).min()) == pytest.approx(float(expected), rel=0.05)
 
 
-@pytest.mark.parametrize("microphones", [[], [Microphone(1, 0.01, 1.0), Microphone(1, 0.01, 1.0)]])
+@pytest.mark.parametrize("microphones", [[], [hw.Microphone(1, 0.01, 1.0), hw.Microphone(1, 0.01, 1.0)]])
 def test_microphones_without_inputs_of_their_own_are_refused(microphones):
     with pytest.raises(ValueError, match=r"microphones: .*at inputs of their own"):
-        ScopeSensor(Bench([1.0, 2.0]).open, FREQUENCY, microphones)
+        hw.ScopeSensor(Bench([1.0, 2.0]).open, FREQUENCY, microphones)

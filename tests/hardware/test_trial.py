@@ -6,17 +6,7 @@ from functools import partial
 import pytest
 import torch
 
-from autdtorch.hardware import (
-    OPENMPD,
-    SONICSURFACE,
-    Device,
-    EmulatedSensor,
-    HardwareObjective,
-    LimitedLink,
-    Limits,
-    open_link,
-    ultraino_boards,
-)
+from autdtorch import hardware as hw
 from autdtorch.methods.gabs import gabs
 from autdtorch.methods.identify import identify
 from autdtorch.methods.lssg import lssg
@@ -31,17 +21,17 @@ def full_on() -> torch.Tensor:
 @pytest.mark.parametrize(
     ("device", "method", "amplitude"),
     [
-        (SONICSURFACE, partial(gabs, levels=8), 1.0),
-        (OPENMPD, partial(identify, evaluations=64), 0.7),
-        (ultraino_boards(3), lssg, 0.8),
+        (hw.SONICSURFACE, partial(gabs, levels=8), 1.0),
+        (hw.OPENMPD, partial(identify, evaluations=64), 0.7),
+        (hw.ultraino_boards(3), lssg, 0.8),
     ],
     ids=["SonicSurface", "OpenMPD", "Ultraino"],
 )
 def test_without_noise_a_method_finds_the_same_drive_as_in_simulation(trial, device, method, amplitude):
     bench = trial.bench(device)
     with trial.link(bench, device) as link:
-        limited = LimitedLink(link, Limits(amplitude))
-        measured = HardwareObjective(trial.scene, limited, EmulatedSensor(bench), trial.log)
+        limited = hw.LimitedLink(link, hw.Limits(amplitude))
+        measured = hw.HardwareObjective(trial.scene, limited, hw.EmulatedSensor(bench), trial.log)
         found = method(measured)
         limited.play(found.drive[0])
         full = bench.drive().abs().max()
@@ -76,16 +66,16 @@ def test_a_drive_in_any_guise_is_measured_and_comes_back_from_the_log(trial):
     guises = [drive, drive.conj(), drive.cdouble().requires_grad_(), torch.stack([drive, drive]).T[:, 1]]
     bench = trial.bench()
     with trial.link(bench) as link:
-        objective = trial.objective(link, EmulatedSensor(bench))
+        objective = trial.objective(link, hw.EmulatedSensor(bench))
         measured = torch.cat([objective(one[None]) for one in guises])
-        again = trial.objective(link, EmulatedSensor(bench))
+        again = trial.objective(link, hw.EmulatedSensor(bench))
         assert torch.equal(torch.cat([again(one[None]) for one in guises]), measured)
     expected = trial.played()(torch.stack([drive, drive.conj(), drive, drive]))
     torch.testing.assert_close(measured, expected, rtol=1e-12, atol=0)
 
 
 def test_an_evaluation_is_logged_before_the_next_is_played(trial):
-    class Watching(EmulatedSensor):
+    class Watching(hw.EmulatedSensor):
         def read(self):
             lines.append(trial.log.read_bytes().count(b"\n"))
             return super().read()
@@ -110,23 +100,23 @@ def test_the_outputs_are_off_before_and_after_however_it_ends(trial, error: type
 
 
 @pytest.mark.parametrize(
-    "device", [SONICSURFACE, OPENMPD, ultraino_boards(3)], ids=lambda device: device.name
+    "device", [hw.SONICSURFACE, hw.OPENMPD, hw.ultraino_boards(3)], ids=lambda device: device.name
 )
 @pytest.mark.parametrize("sent", [1, 100, 257])
-def test_the_outputs_are_off_after_a_frame_that_broke_off(trial, device: Device, sent: int):
+def test_the_outputs_are_off_after_a_frame_that_broke_off(trial, device: hw.Device, sent: int):
     bench = trial.bench(device)
     with trial.link(bench, device) as link:
         link.play(full_on())
         bench.chip.write(device.frame(torch.ones(device.transducers, dtype=torch.complex128))[:sent])
     assert bench.firmware.drive().abs().max() == 0
-    if device is SONICSURFACE:
+    if device is hw.SONICSURFACE:
         bench.chip.write(b"\xfd")  # swaps the two patterns
         assert bench.firmware.drive().abs().max() == 0
 
 
 def test_the_sensor_reads_with_the_noise_of_its_snr(trial):
     bench = trial.bench()
-    sensor = EmulatedSensor(bench, snr=10.0)
+    sensor = hw.EmulatedSensor(bench, snr=10.0)
     variance = random_rms(bench.transfer_matrix) ** 2 / 10
     with trial.link(bench) as link:
         for drive in (full_on(), 0 * full_on()):
@@ -139,17 +129,20 @@ def test_the_sensor_reads_with_the_noise_of_its_snr(trial):
 
 def test_a_scene_of_other_transducers_is_refused(trial):
     bench = trial.bench()
-    with open_link(SONICSURFACE, torch.tensor([5, 3]), backend=bench.bus) as link:
+    with hw.open_link(hw.SONICSURFACE, torch.tensor([5, 3]), backend=bench.bus) as link:
         assert link.transducers.tolist() == [5, 3]
-    with open_link(SONICSURFACE, backend=bench.bus) as link, pytest.raises(ValueError, match="must be 16"):
-        trial.objective(link, EmulatedSensor(bench))
+    with (
+        hw.open_link(hw.SONICSURFACE, backend=bench.bus) as link,
+        pytest.raises(ValueError, match="must be 16"),
+    ):
+        trial.objective(link, hw.EmulatedSensor(bench))
     with trial.link(bench) as link, pytest.raises(ValueError, match="no trial without an amplitude limit"):
-        HardwareObjective(trial.scene, link, EmulatedSensor(bench), trial.log)
+        hw.HardwareObjective(trial.scene, link, hw.EmulatedSensor(bench), trial.log)
     for settings in ({1}, {"gain": torch.ones(1)}):
         with trial.link(bench) as link:
-            limited = LimitedLink(link, Limits(1.0))
+            limited = hw.LimitedLink(link, hw.Limits(1.0))
             with pytest.raises(ValueError, match=r"settings: .* what JSON can hold"):
-                HardwareObjective(trial.scene, limited, EmulatedSensor(bench), trial.log, settings)
+                hw.HardwareObjective(trial.scene, limited, hw.EmulatedSensor(bench), trial.log, settings)
     with pytest.raises(ValueError, match="from 0 to 255, each once"):
-        open_link(SONICSURFACE, [3, 3], backend=bench.bus)
+        hw.open_link(hw.SONICSURFACE, [3, 3], backend=bench.bus)
     assert bench.firmware.drive().abs().max() == 0

@@ -13,7 +13,7 @@ from usb.core import USBError, USBTimeoutError
 from autdtorch.hardware import OPENMPD, SONICSURFACE, ULTRAINO, Device, EmulatedBench, LinkError, open_link
 from autdtorch.hardware.emulator.bus import EmulatedBus, time_out
 from autdtorch.hardware.emulator.chips import CHIPS, EmulatedCdc, EmulatedChip, EmulatedFtdi
-from autdtorch.hardware.transport.serial_chips import BAUD_RATE, CdcUart, FtdiFifo, FtdiUart, baud_divisor
+from autdtorch.hardware.transport.serial_chips import BAUD_RATE, CdcUart, FtdiUart, baud_divisor
 from autdtorch.hardware.transport.usb import UDEV_RULES, find_device
 
 UART, FIFO, MEGA = (0x0403, 0x6001), (0x0403, 0x6014), (0x2341, 0x0042)
@@ -36,8 +36,8 @@ def mega(kind: type[EmulatedCdc] = EmulatedCdc, boards: int = 1) -> EmulatedCdc:
     return kind(*MEGA, "A1", ULTRAINO.firmware(64 * boards))
 
 
-def uart(wired: EmulatedChip, baud: int = 230_400) -> FtdiUart:
-    return FtdiUart(find_device([UART], backend=EmulatedBus([wired])), baud=baud)
+def uart(wired: EmulatedChip) -> FtdiUart:
+    return FtdiUart(find_device([UART], backend=EmulatedBus([wired])), baud=230_400)
 
 
 def failing(method: str, error: Exception) -> EmulatedBus:
@@ -218,23 +218,15 @@ def test_the_kernels_drivers_come_back_also_if_a_chip_refuses_its_settings():
     assert bus.bound == {0, 1}
 
 
-def test_a_chip_that_takes_nothing_more_is_an_error():
-    class Full(EmulatedBus):
-        def bulk_write(self, dev_handle, ep, intf, data, timeout):
-            return min(len(data), 60 if len(data) > 100 else 0)
-
-    port = FtdiFifo(find_device([UART], backend=Full([chip()])))
-    with pytest.raises(LinkError, match="took 60 of 160 bytes"):
-        port.write(bytes(160))
-
-
 @pytest.mark.parametrize(
     ("method", "error", "message"),
     [
-        ("open_device", ACCESS, r"cannot be opened: you may not write to it.* sudo cp .*70-autdtorch.rules"),
-        ("open_device", ACCESS, r'ATTR{idVendor}=="0403", ATTR{idProduct}=="6001", MODE="0660"'),
+        (
+            "open_device",
+            ACCESS,
+            'sudo cp .*70-autdtorch.rules.*idVendor}=="0403", .*idProduct}=="6001"',
+        ),
         ("set_configuration", NotImplementedError(), "on Windows, give it WinUSB"),
-        ("set_configuration", BUSY, "cannot be opened: another program, or another link, has it open"),
         ("claim_interface", BUSY, "cannot be opened: another program, or another link, has it open"),
         ("bulk_write", GONE, "cannot be written to: it was unplugged"),
         ("bulk_write", BROKEN, "cannot be written to: the transfer broke off; look at cable and power"),

@@ -26,11 +26,9 @@ class Firmware(Protocol):
 
     def receive(self, data: bytes) -> None:
         """Take bytes, in pieces of any length."""
-        ...
 
     def drive(self) -> torch.Tensor:
         """Return the drive (N,), complex128, that the transducers emit now."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ class EmulatedBench:
     """A device on an emulated USB bus, and the pressure it makes at the control points.
 
     Attributes:
-        bus: backend for pyusb; without a device that is not on USB, which takes its frames by `receive`.
+        bus: backend for pyusb; empty if the device is not on USB, and takes its frames by `receive`.
         firmware: emulated firmware behind the chip; of the first of several boards.
         transfer_matrix: (P, M) [Pa], complex128.
     """
@@ -78,7 +78,7 @@ class EmulatedBench:
         """Have the device take a frame without USB; several chips share it evenly."""
         each = len(frame) // len(self._firmwares)
         for number, firmware in enumerate(self._firmwares):
-            firmware.receive(frame[each * number : each * (number + 1)])
+            firmware.receive(frame[each * number :][:each])
 
     def emitted(self) -> torch.Tensor:
         """Return the drive (N,), complex128, that the firmware sends to the device's transducers now."""

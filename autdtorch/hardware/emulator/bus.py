@@ -33,34 +33,25 @@ class EmulatedDevice(Protocol):
 
     def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
         """Take a request with its data; False for an unknown one, which stalls."""
-        ...
 
     def answer(self, kind: int, request: int) -> bytes | None:
         """Answer a request; None for an unknown one, which stalls."""
-        ...
 
     def write(self, data: bytes) -> None:
         """Take a bulk transfer."""
-        ...
 
     def read(self, most: int) -> bytes:
         """Return a bulk transfer of at most so many bytes."""
-        ...
 
 
 class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
-    """A backend of pyusb with emulated devices, numbered by their place; `IBackend` describes its methods.
-
-    Attributes:
-        chips: the devices, plugged in or not.
-        slept: time that has passed by `sleep` [s].
-    """
+    """A backend of pyusb with emulated devices, numbered by their place; `IBackend` describes its methods."""
 
     def __init__(self, chips: Sequence[EmulatedDevice]) -> None:
         """Plug the devices in."""
         super().__init__()
-        self.chips = list(chips)
-        self.slept = 0.0
+        self.chips = list(chips)  # plugged in or not
+        self.slept = 0.0  # [s]
 
     def sleep(self, seconds: float) -> None:
         """Let time pass on the bench, without waiting."""

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from autdtorch.hardware.emulator.bench import EmulatedBench
+from autdtorch.hardware.transport.port import Port
 from autdtorch.scene.drive import amplitudes_of, phases_of
 
 
-class DryPort:
+class DryPort(Port):
     """A port that shows each frame in hexadecimal, and the drive that an emulated device emits for it."""
 
     def __init__(self, bench: EmulatedBench, show: Callable[[str], object]) -> None:
@@ -23,12 +24,3 @@ class DryPort:
         pairs = zip(amplitudes_of(drive).tolist(), phases_of(drive).rad2deg().tolist(), strict=True)
         emitted = [f"{number}: {a:.3g} at {phase:.4g}" for number, (a, phase) in enumerate(pairs) if a > 0]
         self._show(f"{data.hex(' ')}\n  {', '.join(emitted) or 'all off'}")
-
-    def flush(self) -> None:
-        """Do nothing: no byte waits."""
-
-    def recover(self) -> None:
-        """Do nothing: no write breaks off."""
-
-    def close(self) -> None:
-        """Do nothing: no device is open."""

@@ -113,9 +113,8 @@ class EmulatedScope:
         self._drift = not_negative("drift", drift)
         self._generator = np.random.default_rng(integer_at_least("seed", seed, 0))
         self._walk = 0.0
-        self._time_scale = 1e-3
+        self._time_scale, self._source = 1e-3, 0
         self._scales = [1.0] * len(self.points)
-        self._source = 0
         self._captured: list[tuple[bytes, float]] = []  # codes, and the scale they were taken on
 
     def plug_into(self, bench: EmulatedBench, chip: tuple[int, int], serial: str = "EMULATED") -> None:

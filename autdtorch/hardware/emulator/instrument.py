@@ -20,7 +20,6 @@ class Instrument(Protocol):
 
     def execute(self, line: str) -> bytes | None:
         """Execute a line, and return its answer, if it has one."""
-        ...
 
 
 class EmulatedInstrument:

@@ -11,12 +11,7 @@ from autdtorch.utils.validation import integer_at_least, invalid, positive
 
 
 class Fit(NamedTuple):
-    """A sine fitted to a signal.
-
-    Attributes:
-        phasor: p (...,) of Re(p e^{-i w t}), t = 0 at the first sample; complex128, in the signal's unit.
-        residual: rms of the signal less sine and offset (...,), float64.
-    """
+    """A sine fitted to a signal: p (...,) of Re(p e^{-i w t}), t = 0 at the first sample; rms of the rest."""
 
     phasor: torch.Tensor
     residual: torch.Tensor

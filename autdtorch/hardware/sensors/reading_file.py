@@ -16,8 +16,8 @@ _POLL = 0.02  # [s] between looks at the file
 class FileSensor:
     """A file into which another program writes each reading.
 
-    It holds the magnitudes of all control points [Pa] in their order, separated by blanks, commas or line
-    ends, and ends with a line end. It is best written under another name and then renamed.
+    The file holds the magnitudes of all control points [Pa] in their order, separated by blanks, commas or
+    line ends, and ends with a line end. Write it under another name, then rename it.
     """
 
     def __init__(self, path: str | Path, points: int, settle: float = 0.0, timeout: float = 60.0) -> None:

@@ -19,7 +19,6 @@ class Sensor(Protocol):
 
     def read(self) -> torch.Tensor:
         """Return magnitudes (P,) [Pa] at the control points, once the field is steady."""
-        ...
 
 
 def checked_reading(sensor: Sensor, points: int) -> torch.Tensor:

@@ -14,15 +14,10 @@ _COARSER = 4.0  # a waveform that clips fills at least a quarter of a scale so m
 
 @dataclass(frozen=True)
 class VerticalScale:
-    """Volts per division, between two bounds.
+    """The scale `now` [V/division], from the oscilloscope's `finest` to the `coarsest` for the loudest sound.
 
     A waveform keeps its scale if it fills a quarter of the screen or more, and fills half of it on a new one:
     a sound twice or half as loud as the last needs no change.
-
-    Attributes:
-        now: the scale [V/division].
-        finest: finest scale of the oscilloscope [V/division].
-        coarsest: scale for the loudest sound [V/division].
     """
 
     now: float

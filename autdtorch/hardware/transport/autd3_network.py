@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from autdtorch.hardware.transport.port import LinkError, closed_on_error
+from autdtorch.hardware.transport.port import LinkError, Port, closed_on_error
 
 #: Time that the kit waits for an answer [ms]; its own 10 ms run out on a busy computer.
 _ANSWER_MS = 100
@@ -34,7 +34,7 @@ def autd3_kit() -> Any:
     return autd3
 
 
-class Autd3Port:
+class Autd3Port(Port):
     """Boards of AUTD3 on the network; each write waits for the answer of all boards.
 
     Methods raise `LinkError` if a board is not there or does not answer, `ImportError` without the kit.
@@ -70,12 +70,6 @@ class Autd3Port:
     def write(self, data: bytes) -> None:
         """Play a frame; its boards have taken it when this returns."""
         self._send("be written to", autd3_pattern(data, self._boards))
-
-    def flush(self) -> None:
-        """Do nothing: `write` has waited for the answers."""
-
-    def recover(self) -> None:
-        """Do nothing: the kit leaves nothing half sent."""
 
     def close(self) -> None:
         """Release the boards, even if they do not answer."""

@@ -27,23 +27,25 @@ def closed_on_error(close: Callable[[], None]) -> Iterator[None]:
 
 @runtime_checkable
 class Port(Protocol):
-    """A port that takes the bytes for one device; methods that fail raise `LinkError`."""
+    """A port that takes the bytes for one device; methods that fail raise `LinkError`.
+
+    A port that subclasses this does nothing in the methods that it leaves out.
+    """
 
     def write(self, data: bytes) -> None:
         """Send all of `data`."""
-        ...
 
     def flush(self) -> None:
         """Wait until all bytes have left the chip, if the chip can say so."""
-        ...
+        return
 
     def recover(self) -> None:
         """Clear a stall and drop waiting bytes after a write that broke off."""
-        ...
+        return
 
     def close(self) -> None:
         """Release the device."""
-        ...
+        return
 
 
 class SharedPort:

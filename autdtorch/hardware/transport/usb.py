@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
-from autdtorch.hardware.transport.port import INSTALL_HINT, LinkError, closed_on_error
+from autdtorch.hardware.transport.port import INSTALL_HINT, LinkError, Port, closed_on_error
 from autdtorch.utils.validation import require_kind
 
 #: Rules that let users write to the devices on Linux; to be copied to /etc/udev/rules.d.
@@ -50,7 +50,7 @@ def find_device(chips: Collection[tuple[int, int]], serial: str | None = None, b
     raise LinkError(f"{number} USB devices are {wanted}{hint}. Plugged in: {listed}{permission}")
 
 
-class UsbPort:
+class UsbPort(Port):
     """A chip with a bulk endpoint each way, taken from the kernel's drivers.
 
     Methods raise `LinkError` if the chip refuses, is gone, or takes nothing for a second.
@@ -76,9 +76,6 @@ class UsbPort:
             if taken == 0:
                 raise LinkError(f"{_described(self._device)} took {sent} of {len(data)} bytes")
             sent += taken
-
-    def flush(self) -> None:
-        """Do nothing: not every chip reports waiting bytes."""
 
     def recover(self) -> None:
         """Clear a stall, and drop waiting bytes if the chip has a request for that."""
