@@ -1,11 +1,12 @@
-"""Faults of an emulated USB bus: the effects of a loose plug, a busy hub or a hung chip on a transfer."""
+"""Faults of an emulated bench: a loose plug, a busy hub or a hung chip, and whatever disturbs a sensor."""
 
 from __future__ import annotations
 
 from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal, TypeAlias
 
+from autdtorch.hardware import EmulatedBench, EmulatedSensor
 from autdtorch.hardware.emulator.bus import EmulatedBus, EmulatedDevice, stall, time_out, unplugged
 
 #: "time-out" and "short write": a transfer ends in mid-frame, with an error or without, and the chip takes
@@ -47,3 +48,17 @@ class FaultyBus(EmulatedBus):
         if self._fault == "short write":
             return 0
         raise {"time-out": time_out, "stall": stall, "unplug": unplugged}[self._fault]()
+
+
+class Disturbed(EmulatedSensor):
+    """Counts its readings; `disturb` is called with their number before each."""
+
+    def __init__(self, bench: EmulatedBench, disturb: Callable[[int], object] = int) -> None:
+        super().__init__(bench)
+        self.readings = 0
+        self._disturb = disturb
+
+    def read(self):
+        self.readings += 1
+        self._disturb(self.readings)
+        return super().read()

@@ -1,7 +1,6 @@
 """AUTD3 by its kit, against the emulator of its network protocol that the kit brings."""
 
 import asyncio
-import builtins
 import contextlib
 import signal
 import subprocess
@@ -76,18 +75,6 @@ class Mute:
 
     async def close(self):
         await asyncio.Event().wait()
-
-
-def test_without_the_kit_there_is_a_hint(monkeypatch):
-    def without(name: str, *arguments: object, **named: object):
-        if name.split(".")[0] == "autd3":
-            raise ModuleNotFoundError("No module named 'autd3'")
-        return real(name, *arguments, **named)
-
-    real = builtins.__import__
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(ImportError, match=r"pip install 'autdtorch\[autd3\]'"):
-        open_autd3()
 
 
 class TestWithTheKit:

@@ -145,19 +145,6 @@ def test_the_firmware_plays_the_levels_of_a_frame(
 
 
 @every_device
-@given(phase=st.floats(-20, 20), amplitude=st.floats(0, 1))
-def test_rounding_moves_phase_and_amplitude_by_at_most_half_a_level(device, counts, phase, amplitude) -> None:
-    drive = drive_from_phases([phase], [amplitude])
-    played = device.quantised(drive)
-    # 1e-9 is rounding. The steepest step of AUTD3's amplitude is 1/255, of a pulse's pi/phases.
-    phases = device.phase_levels.phases
-    step = {"AUTD3": 1 / 255, "SonicSurface": 1.0}.get(device.name, math.pi / phases)
-    assert abs(float(played.abs() - amplitude)) <= step / 2 + 1e-9
-    if played.abs() > 0:
-        assert abs(float((played / drive).angle())) <= math.pi / phases + 1e-9
-
-
-@every_device
 def test_a_focus_takes_minus_kd(device: hw.Device, counts: tuple[int, ...]) -> None:
     positions = torch.tensor([[0.0, 0.0, 0.0], [0.0, 2.125e-3, 0.0]], dtype=torch.float64)
     # The second transducer is a quarter of a wavelength nearer: the device's phase is a quarter ahead.

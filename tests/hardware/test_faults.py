@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from faulty_bus import FAULTS, FaultyBus
+from faulty_bus import FAULTS, Disturbed, FaultyBus
 
 from autdtorch import hardware as hw
 from autdtorch.hardware.emulator.bus import EmulatedBus
@@ -19,20 +19,6 @@ from autdtorch.methods.solution import Solution
 METHOD = partial(gabs, levels=2, order="given")
 EVALUATIONS = 1 + 15 * 2
 SURVIVED = 10  # evaluations before the fault
-
-
-class Counting(hw.EmulatedSensor):
-    """Counts its readings; `disturb` is called with their number before each."""
-
-    def __init__(self, bench: hw.EmulatedBench, disturb: Callable[[int], object] = int) -> None:
-        super().__init__(bench)
-        self.readings = 0
-        self._disturb = disturb
-
-    def read(self):
-        self.readings += 1
-        self._disturb(self.readings)
-        return super().read()
 
 
 def measure(
@@ -68,7 +54,7 @@ def bytes_before(device: hw.Device, evaluations: int) -> int:
 def require_that_it_goes_on(trial, device: hw.Device = hw.SONICSURFACE) -> None:
     """The log has what was measured, and the rest leads to what an undisturbed trial finds."""
     bench = trial.bench(device)
-    sensor = Counting(bench)
+    sensor = Disturbed(bench)
     found = measure(trial, bench, sensor, device)
     assert sensor.readings == EVALUATIONS - SURVIVED
     expected = METHOD(trial.played(device))
@@ -117,7 +103,7 @@ def nobody(question: str) -> str:
     ],
 )
 def test_garbage_from_the_sensor_ends_the_trial_with_the_outputs_off(trial, reading, message):
-    class Garbled(Counting):
+    class Garbled(Disturbed):
         def read(self):
             return super().read() if self.readings < SURVIVED else reading()
 
@@ -148,7 +134,7 @@ def test_a_signal_ends_the_trial_with_the_outputs_off(trial, number):
     before = signal.getsignal(number)
     bench = trial.bench()
     with pytest.raises(hw.Signalled, match=number.name):
-        measure(trial, bench, Counting(bench, disturb))
+        measure(trial, bench, Disturbed(bench, disturb))
     assert is_off(bench)
     assert signal.getsignal(number) is before
     require_that_it_goes_on(trial)
@@ -275,13 +261,14 @@ import os, signal, sys
 sys.path[:0] = {[str(folder) for folder in Path(__file__).parents[:2]]!r}
 from pathlib import Path
 from conftest import Trial, a_scene
-from test_faults import Counting, SURVIVED, measure
+from faulty_bus import Disturbed
+from test_faults import SURVIVED, measure
 def kill(readings):
     if readings > SURVIVED:
         os.kill(os.getpid(), signal.SIGKILL)
 trial = Trial(*a_scene(), Path(sys.argv[1]))
 bench = trial.bench()
-measure(trial, bench, Counting(bench, kill))
+measure(trial, bench, Disturbed(bench, kill))
 """
 
 
@@ -299,7 +286,7 @@ def test_a_last_line_that_broke_off_costs_its_evaluation_alone(trial, lost, capl
 
     bench = trial.bench()
     with pytest.raises(KeyboardInterrupt):
-        measure(trial, bench, Counting(bench, disturb))
+        measure(trial, bench, Disturbed(bench, disturb))
     trial.log.write_bytes(trial.log.read_bytes()[:-lost])
     require_that_it_goes_on(trial)
     assert "the last line broke off" in caplog.text

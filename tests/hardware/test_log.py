@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from faulty_bus import Disturbed
 from filelock import FileLock, Timeout
 
 from autdtorch.hardware import EmulatedSensor, LogError
@@ -88,25 +89,14 @@ def test_the_log_of_another_trial_is_refused_and_left_as_it_is(trial, begin, log
     assert trial.log.read_bytes() == content
 
 
-def test_a_log_of_other_drives_is_refused(begin):
-    objective = begin()
-    objective(full_on(3))
-    for number in (0, 2):
-        with pytest.raises(LogError, match=f"evaluation {number + 1} is of another drive"):
-            observed(objective, 0.5 * full_on(), number)
-
-
 def drives() -> torch.Tensor:
     return torch.linspace(0.5, 1, 6)[:, None] * full_on()
 
 
-class Noisy(EmulatedSensor):
-    """Reads something else every time; `readings` is their number."""
-
-    readings = 0
+class Noisy(Disturbed):
+    """Its readings are all different."""
 
     def read(self) -> torch.Tensor:
-        self.readings += 1
         return super().read() + self.readings
 
 
@@ -223,12 +213,6 @@ def test_a_file_that_is_no_log_is_refused_and_left_as_it_is(trial, begin, conten
     assert trial.log.read_bytes() == content
 
 
-def test_a_folder_in_the_place_of_the_log_is_an_error(trial, begin):
-    trial.log.mkdir()
-    with pytest.raises(IsADirectoryError, match="trial\\.jsonl"):
-        begin()
-
-
 @pytest.mark.parametrize("ended", [True, False])
 def test_a_log_without_evaluations_is_begun_anew_by_other_settings(trial, begin, ended: bool, caplog):
     first = begin(seed=1)
@@ -246,14 +230,11 @@ def test_a_log_without_evaluations_is_begun_anew_by_other_settings(trial, begin,
 
 
 def test_an_objective_that_failed_goes_on_where_its_log_ends(trial, bench, begin):
-    class Interrupted(Noisy):
-        def read(self):
-            if self.readings == 2:
-                self.readings += 1
-                raise KeyboardInterrupt
-            return super().read()
+    def interrupt(reading: int) -> None:
+        if reading == 3:
+            raise KeyboardInterrupt
 
-    sensor = Interrupted(bench)
+    sensor = Noisy(bench, interrupt)
     objective = begin(sensor)
     with pytest.raises(KeyboardInterrupt):
         objective(drives())

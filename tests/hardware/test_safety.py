@@ -6,6 +6,7 @@ import weakref
 
 import pytest
 import torch
+from faulty_bus import Disturbed
 
 from autdtorch import hardware as hw
 from autdtorch.methods.driver import observed
@@ -84,21 +85,19 @@ def test_the_outputs_rest_as_the_duty_cycle_asks(trial):
     ],
 )
 def test_while_a_sensor_takes_too_long_the_outputs_go_off(trial, limits, message: str):
-    class Slow(hw.EmulatedSensor):
-        def read(self):
-            time.sleep(0.2)
-            amplitudes.append(float(bench.drive().abs().max()))
-            return super().read()
+    def wait(_: int) -> None:
+        time.sleep(0.2)
+        amplitudes.append(float(bench.drive().abs().max()))
 
     amplitudes: list[float] = []
     with limited(trial, **limits) as (bench, link):
-        objective = objective_on(trial, link, Slow(bench))
+        objective = objective_on(trial, link, Disturbed(bench, wait))
         with pytest.raises(hw.LimitError, match=message):
             objective(FULL[None])
         assert amplitudes == [0.0]
         assert not objective.log.evaluations
         with pytest.raises(hw.LimitError, match=message):
-            hw.check_transducers(link, Slow(bench), points=2, readings=1, background=1)
+            hw.check_transducers(link, Disturbed(bench, wait), points=2, readings=1, background=1)
 
 
 def test_while_the_sound_settles_the_timer_may_switch_off(trial):
@@ -119,7 +118,7 @@ def test_while_the_sound_settles_the_timer_may_switch_off(trial):
 
 
 def test_a_timer_that_comes_late_reaches_neither_the_next_stretch_nor_the_next_link(trial):
-    with limited(trial, seconds_in_a_row=0.05) as (bench, link):
+    with limited(trial, seconds_in_a_row=0.5) as (bench, link):
         link.play(FULL)
         late = link._timer
         assert late.daemon  # for another Python would wait before it exits and switches off
@@ -139,18 +138,16 @@ def test_a_timer_that_comes_late_reaches_neither_the_next_stretch_nor_the_next_l
 
 @pytest.mark.parametrize("error", [hw.LinkError("stuck"), RuntimeError("stuck")])
 def test_a_timer_that_cannot_switch_off_says_so_at_once_and_ends_the_trial(trial, error, monkeypatch, caplog):
-    class Asleep(hw.EmulatedSensor):
-        def read(self):
-            link._timer.join()
-            logged.append("the time is up, but: stuck" in caplog.text)
-            return super().read()
+    def wait(_: int) -> None:
+        link._timer.join()
+        logged.append("the time is up, but: stuck" in caplog.text)
 
     def fail() -> None:
         raise error
 
     logged: list[bool] = []
     with limited(trial, seconds_in_a_row=0.02) as (bench, link):
-        objective = objective_on(trial, link, Asleep(bench))
+        objective = objective_on(trial, link, Disturbed(bench, wait))
         monkeypatch.setattr(link.link, "off", fail)
         with pytest.raises(type(error), match="stuck"):
             objective(FULL[None])
@@ -161,18 +158,16 @@ def test_a_timer_that_cannot_switch_off_says_so_at_once_and_ends_the_trial(trial
 
 
 def test_an_error_of_the_sensor_leaves_the_outputs_off_on_an_open_link(trial):
-    class Broken(hw.EmulatedSensor):
-        def read(self):
-            if bench.drive().abs().max() > 0:
-                raise OSError("gone")
-            return super().read()
+    def fail(_: int) -> None:
+        if bench.drive().any():
+            raise OSError("gone")
 
     with limited(trial) as (bench, link):
         with pytest.raises(OSError, match="gone"):
-            objective_on(trial, link, Broken(bench))(FULL[None])
+            objective_on(trial, link, Disturbed(bench, fail))(FULL[None])
         assert bench.firmware.drive().abs().max() == 0
         with pytest.raises(OSError, match="gone"):
-            hw.check_transducers(link, Broken(bench), points=2)
+            hw.check_transducers(link, Disturbed(bench, fail), points=2)
         assert bench.firmware.drive().abs().max() == 0
 
 

@@ -5,6 +5,7 @@ from functools import partial
 
 import pytest
 import torch
+from faulty_bus import Disturbed
 
 from autdtorch import hardware as hw
 from autdtorch.methods.gabs import gabs
@@ -75,15 +76,13 @@ def test_a_drive_in_any_guise_is_measured_and_comes_back_from_the_log(trial):
 
 
 def test_an_evaluation_is_logged_before_the_next_is_played(trial):
-    class Watching(hw.EmulatedSensor):
-        def read(self):
-            lines.append(trial.log.read_bytes().count(b"\n"))
-            return super().read()
+    def watch(_: int) -> None:
+        lines.append(trial.log.read_bytes().count(b"\n"))
 
     lines: list[int] = []
     bench = trial.bench()
     with trial.link(bench) as link:
-        trial.objective(link, Watching(bench))(full_on().expand(3, -1))
+        trial.objective(link, Disturbed(bench, watch))(full_on().expand(3, -1))
     assert lines == [1, 2, 3]  # the first says what the trial is
 
 

@@ -10,9 +10,10 @@ import pytest
 import torch
 from usb.core import USBError, USBTimeoutError
 
-from autdtorch.hardware import OPENMPD, SONICSURFACE, ULTRAINO, Device, EmulatedBench, LinkError, open_link
+from autdtorch.hardware import OPENMPD, SONICSURFACE, ULTRAINO, Device, EmulatedBench, LinkError
 from autdtorch.hardware.emulator.bus import EmulatedBus, time_out
 from autdtorch.hardware.emulator.chips import CHIPS, EmulatedCdc, EmulatedChip, EmulatedFtdi
+from autdtorch.hardware.link import open_autd3, open_link
 from autdtorch.hardware.transport.serial_chips import BAUD_RATE, CdcUart, FtdiUart, baud_divisor
 from autdtorch.hardware.transport.usb import UDEV_RULES, find_device
 
@@ -261,7 +262,7 @@ def test_without_libusb_there_is_an_error(monkeypatch):
         open_link(SONICSURFACE)
 
 
-@pytest.mark.parametrize("package", ["usb", "libusb_package", "serial"])
+@pytest.mark.parametrize("package", ["usb", "libusb_package", "serial", "autd3"])
 def test_without_the_packages_there_is_a_hint(monkeypatch, package: str):
     def without(name: str, *arguments: object, **named: object):
         if name.split(".")[0] == package:
@@ -270,8 +271,9 @@ def test_without_the_packages_there_is_a_hint(monkeypatch, package: str):
 
     real = builtins.__import__
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(ImportError, match=r"pip install 'autdtorch\[hardware\]'"):
-        open_link(SONICSURFACE, port="COM3" if package == "serial" else None)
+    extra = "autd3" if package == "autd3" else "hardware"
+    with pytest.raises(ImportError, match=rf"pip install 'autdtorch\[{extra}\]'"):
+        open_autd3() if extra == "autd3" else open_link(SONICSURFACE, port={"serial": "COM3"}.get(package))
     if package == "usb":
         monkeypatch.delitem(sys.modules, "autdtorch.hardware.emulator.bus")
         with pytest.raises(ImportError, match=r"pip install 'autdtorch\[hardware\]'"):
