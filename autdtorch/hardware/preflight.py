@@ -12,10 +12,8 @@ from autdtorch.hardware.safety import LimitedLink
 from autdtorch.hardware.sensors.sensor import Sensor, checked_reading
 from autdtorch.utils.validation import integer_at_least, require_callable, require_kind
 
-#: Threshold above the noise, in standard deviations of the noise's mean power.
-_DEVIATIONS = 6.0
-#: Threshold below the median of all transducers: 20 dB, as some sensors round silence to 0.
-_WEAK = 0.1
+_DEVIATIONS = 6.0  # threshold above the noise, in standard deviations of its mean power
+_WEAK = 0.1  # threshold below the median of all transducers: 20 dB, as some sensors round silence to 0
 
 
 @dataclass(frozen=True, eq=False)

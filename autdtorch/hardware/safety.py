@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
@@ -108,21 +108,20 @@ class Limits:
     def __post_init__(self) -> None:
         """Check the attributes."""
         integer_at_least("evaluations", self.evaluations, 1)
-        for field in fields(self):
-            if field.name != "evaluations":
-                positive(field.name, getattr(self, field.name))
+        for name in ("amplitude", "seconds", "seconds_in_a_row", "duty_cycle"):
+            positive(name, getattr(self, name))
         for name in ("amplitude", "duty_cycle"):
             number_between(name, getattr(self, name), 0.0, 1.0)
 
 
 class LimitedLink:
-    """A link that plays within limits, and switches off by itself when the time is up.
+    """A link that plays within the `limits` of a trial, and switches off by itself when the time is up.
 
     Methods raise `LinkError` if the device does not take the bytes.
 
     Attributes:
         link: the link.
-        limits: of the trial.
+        limits: limits of the trial.
         logs: files of the trials that it plays for; the time on before each is counted.
     """
 

@@ -21,8 +21,7 @@ from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.geometry import in_plane
 from autdtorch.utils.validation import ArrayLike, path_of
 
-#: Number of phase levels of the boards.
-_LEVELS = 128
+_LEVELS = 128  # phase levels of the boards
 
 
 class _Item(NamedTuple):

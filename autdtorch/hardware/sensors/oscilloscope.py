@@ -63,12 +63,9 @@ class Microphone:
 
 
 class Oscilloscope(contextlib.AbstractContextManager["Oscilloscope"]):
-    """An oscilloscope that captures on request, without a trigger signal; a context manager.
+    """An oscilloscope that captures on request, without a trigger signal; `identity` answers ``*IDN?``.
 
-    Methods raise `LinkError` if it does not take commands or does not answer.
-
-    Attributes:
-        identity: its answer to ``*IDN?``.
+    Use it as a context manager. Methods raise `LinkError` if it does not take commands or does not answer.
     """
 
     def __init__(self, port: UsbtmcPort, dialect: Dialect = KEYSIGHT) -> None:
@@ -139,10 +136,7 @@ class ScopeSensor:
     unknown.
 
     Each input keeps the vertical scale of its last capture. A waveform that is clipped on it, or too small,
-    is captured again on another scale, up to the scale of the loudest sound.
-
-    Attributes:
-        recaptures: number of captures that were repeated on another scale.
+    is captured again on another scale, up to the scale of the loudest sound; `recaptures` counts these.
     """
 
     def __init__(
@@ -242,10 +236,10 @@ def open_scope(
     """Find an oscilloscope on USB.
 
     Args:
-        chip: its idVendor and idProduct, as ``lsusb`` shows them.
+        chip: idVendor and idProduct, as ``lsusb`` shows them.
         dialect: commands of its maker.
         serial: serial number, where several such are plugged in.
-        backend: of pyusb; by default libusb. An emulated bench has its own.
+        backend: backend of pyusb; by default libusb. An emulated bench has its own.
 
     Raises:
         ValueError: `chip` is not two numbers.

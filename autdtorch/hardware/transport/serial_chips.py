@@ -19,11 +19,8 @@ from autdtorch.hardware.transport.usb import UsbPort
 RESET, FLOW_CONTROL, BAUD_RATE, DATA_FORMAT, STATUS, LATENCY = 0x00, 0x02, 0x03, 0x04, 0x05, 0x09
 #: wValue of RESET. The names of the purges in ftdi_sio, RX and TX, are from the chip's side (libftdi 1.5).
 RESET_CHIP, PURGE_OUTPUT, PURGE_INPUT = 0, 1, 2
-#: wValue of DATA_FORMAT: 8 bits, no parity, 1 stop bit.
-EIGHT_N_ONE = 0x0008
-#: Modem and line status, with which every IN packet of FTDI begins.
-STATUS_BYTES = 2
-
+EIGHT_N_ONE = 0x0008  # wValue of DATA_FORMAT: 8 bits, no parity, 1 stop bit
+STATUS_BYTES = 2  # of modem and line, with which every IN packet of FTDI begins
 _LATENCY_MS = 2
 _TRANSMITTER_EMPTY = 0x40  # of the second status byte
 _FLUSH_SECONDS = 1.0

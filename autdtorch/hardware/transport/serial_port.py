@@ -23,9 +23,13 @@ class SerialPort:
         """Open the port of a `name` such as "COM3" or "/dev/ttyUSB0", at `baud` bits/s."""
         require_kind("port", name, str)
         self._name = name
+        try:
+            import serial
+        except ImportError as error:
+            raise ImportError(f"{error}; {INSTALL_HINT}") from error
         with self._errors("be opened", hint=True):
             # Another program that wrote to the port would break frames.
-            self._port: Any = _pyserial().Serial(name, baud, write_timeout=_TIMEOUT, exclusive=True)
+            self._port: Any = serial.Serial(name, baud, write_timeout=_TIMEOUT, exclusive=True)
 
     def write(self, data: bytes) -> None:
         """Send all of `data`, and drop all input: boards in a row echo their commands."""
@@ -52,19 +56,9 @@ class SerialPort:
     def _errors(self, what: str, hint: bool = False) -> Iterator[None]:
         try:
             yield
-        except ImportError:
-            raise
         except Exception as error:  # termios.error is no OSError
             there = f". Ports: {_listed()}" if hint else ""
             raise LinkError(f"{self._name} cannot {what}: {error}{there}") from error
-
-
-def _pyserial() -> Any:
-    try:
-        import serial
-    except ImportError as error:
-        raise ImportError(f"{error}; {INSTALL_HINT}") from error
-    return serial
 
 
 def _listed() -> str:

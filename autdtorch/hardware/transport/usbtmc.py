@@ -12,18 +12,13 @@ from typing import Any
 from autdtorch.hardware.transport.port import LinkError, closed_on_error
 from autdtorch.hardware.transport.usb import UsbPort
 
-#: MsgID of a message to the instrument; of a request for an answer, and of the answer.
-TELL, ASK = 1, 2
-#: bmTransferAttributes: the message ends with this transfer.
-END = 1
-#: bInterfaceClass and bInterfaceSubClass.
-INTERFACE_CLASS = (0xFE, 0x03)
-#: bmRequestType: from the instrument, of the class, recipient interface; its bRequests, and their first byte.
-CLASS_REQUEST = 0xA1
-INITIATE_CLEAR, CHECK_CLEAR_STATUS = 5, 6
-SUCCESS, PENDING = 1, 2
-#: bmClear of a pending clear: the rest of an answer must be read first.
-IN_WAITS = 1
+TELL, ASK = 1, 2  # MsgID of a message to the instrument; of a request for an answer, and of the answer
+END = 1  # bmTransferAttributes: the message ends with this transfer
+INTERFACE_CLASS = (0xFE, 0x03)  # bInterfaceClass and bInterfaceSubClass
+CLASS_REQUEST = 0xA1  # bmRequestType: from the instrument, of the class, recipient interface
+INITIATE_CLEAR, CHECK_CLEAR_STATUS = 5, 6  # its bRequests
+SUCCESS, PENDING = 1, 2  # first byte of their answers
+IN_WAITS = 1  # bmClear of a pending clear: the rest of an answer must be read first
 
 _HEADER = struct.Struct("<BBBxLB3x")
 _MOST = 2**16  # bytes of an answer in one transfer
