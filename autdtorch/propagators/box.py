@@ -118,20 +118,18 @@ class BoxSimulation(Simulation):
             steady = simulate(0, field, plan.tolerance, lambda part: direct + matrix @ part)
             return steady, time.perf_counter() - begin
 
-        found: list[tuple[SteadyState, float]] | None
         if len(boxes) == 1:
             found = spread(alone, range(len(drives)), self._kernel.at_once(boxes[0].assembly.grid.shape))
         else:
-            driving = [
-                torch.stack([box.driving(*nodes, own) for nodes, own in drives], dim=1) for box in boxes
-            ]
-            found = coupled_runs(
+            pairs = [[box.driving(*nodes, own) for nodes, own in drives] for box in boxes]
+            driving = [torch.stack(fields, dim=1) for fields in pairs]
+            found = _coupled(
                 boxes, transforms, driving, lambda part: incident[::every] + matrix @ part, simulate,
                 plan.tolerance,
             )  # fmt: skip
-        if found is None:
-            logger.debug("the iteration between %d boxes does not converge: one box instead", len(boxes))
-            return self._in_one_box._simulate(sources, strength, receivers, stepped)
+            if not found:
+                logger.debug("the iteration between %d boxes does not converge: one box instead", len(boxes))
+                return self._in_one_box._simulate(sources, strength, receivers, stepped)
         steady, seconds = zip(*found, strict=True)
         phasors = torch.stack([each.pressure for each in steady], dim=1)
         parts = torch.split(phasors, [len(transform.cells) for transform in transforms])
@@ -143,26 +141,19 @@ class BoxSimulation(Simulation):
         return total.mT.masked_fill(silent, 0), list(map(Run.of, steady, seconds))
 
 
-def coupled_runs(
+def _coupled(
     boxes: Sequence[ScatteredField],
     transforms: Sequence[NearToFar],
     driving: Sequence[torch.Tensor],
     pressure: Observe,
     simulate: Simulate,
     tolerance: float,
-) -> list[tuple[SteadyState, float]] | None:
-    """Iterate between boxes until the pressure at the receivers has converged.
+) -> list[tuple[SteadyState, float]]:
+    """Iterate until the pressure (P, R) of R runs has converged; return nothing without convergence.
 
-    Args:
-        boxes: boxes whose interiors do not overlap.
-        transforms: near-to-far-field transform of each box to the receivers.
-        driving: incident field (n, R) of R runs, where it drives each box.
-        pressure: computes the pressure (P, R) at the receivers from the phasors (k, R) of all boxes' cells.
-        simulate: simulates one box.
-        tolerance: relative; half of it is for the runs and half for the iteration.
-
-    Returns:
-        Phasors of all boxes' cells and seconds for each of R runs; None without convergence in `MOST_PASSES`.
+    The incident field `driving` is (n, R) on each box. Half of the relative tolerance is for the runs, half
+    for the iteration. `pressure` maps the phasors (k, R) of all boxes' cells to the receivers. The result is
+    the phasors of these cells and the seconds of each run.
     """
     begin = time.perf_counter()
     runs = driving[0].shape[1]
@@ -181,13 +172,12 @@ def coupled_runs(
             share = field.norm(dim=0) / largest
             loose = (own / share).clamp(max=_LOOSEST).tolist()
             observe = transforms[index].amplitudes
-            pairs = zip(field.mT, loose, strict=True)
-            steady = [simulate(index, column, each, observe) for column, each in pairs]
+            steady = [simulate(index, *each, observe) for each in zip(field.mT, loose, strict=True)]
             parts.append(torch.stack([each.pressure for each in steady], dim=1))
             periods += [each.periods for each in steady]
             reached &= [each.converged for each in steady]
-            remaining = [each.residual for each in steady]
-            unsettled[index] = share * torch.tensor(remaining, dtype=torch.float64, device="cpu")
+            residuals = torch.tensor([each.residual for each in steady], dtype=torch.float64, device="cpu")
+            unsettled[index] = share * residuals
         left += unsettled.amax(dim=0)
         sums = sums + torch.cat(parts)
         for sequence, column in zip(sequences, sums.mT.numpy(), strict=True):
@@ -202,12 +192,8 @@ def coupled_runs(
             if (remaining <= tolerance / 2).all():
                 seconds = (time.perf_counter() - begin) / runs
                 logger.debug("%d boxes, %d passes of multiple scattering", len(boxes), number)
-                return [
-                    (SteadyState(column, int(count), float(distance), bool(every)), seconds)
-                    for column, count, distance, every in zip(
-                        phasors.mT, periods, left + remaining, reached, strict=True
-                    )
-                ]
+                found = zip(phasors.mT, periods.tolist(), (left + remaining).tolist(), reached, strict=True)
+                return [(SteadyState(*each[:3], bool(each[3])), seconds) for each in found]
         radiating = list(zip(boxes, amplitudes, strict=True))
         driving = [
             torch.stack([box.radiated(part, own.driven) for box, part in radiating if box is not own]).sum(
@@ -215,4 +201,4 @@ def coupled_runs(
             )
             for own in boxes
         ]
-    return None
+    return []

@@ -77,7 +77,11 @@ def differentiable_field(
     given = _material("density", density, scene), _material("sound_speed", sound_speed, scene)
     region = region_of(scene)
     grid = make_grid(region, positive("spacing", spacing, "m"))
-    speeds = region.sound_speeds | _slowest(scene, given[1])
+    speeds, given_speed = region.sound_speeds, given[1]
+    if given_speed is not None:
+        rigid = torch.tensor([one.rigid for one in scene.obstacles], dtype=torch.bool, device="cpu")
+        effective = given_speed.detach() if given_speed.ndim == 3 else given_speed.detach()[~rigid]
+        speeds = speeds | ({"the medium given": float(effective.min())} if effective.numel() else {})
     require_fine(speeds, scene.frequency, spacing)
     warn_if_coarse(speeds, scene.frequency, spacing)
     warn_of_ending_walls(scene)
@@ -126,15 +130,6 @@ def _material(name: str, given: ArrayLike | None, scene: Scene) -> torch.Tensor 
     if values.numel() and values.detach().min() <= 0:
         raise invalid(name, float(values.detach().min()), "every entry must be > 0")
     return values
-
-
-def _slowest(scene: Scene, sound_speed: torch.Tensor | None) -> dict[str, float]:
-    """Return the least of the given sound speeds [m/s] that has an effect, if there is one."""
-    if sound_speed is None:
-        return {}
-    rigid = torch.tensor([obstacle.rigid for obstacle in scene.obstacles], dtype=torch.bool, device="cpu")
-    speeds = sound_speed.detach() if sound_speed.ndim == 3 else sound_speed.detach()[~rigid]
-    return {"the medium given": float(speeds.min())} if speeds.numel() else {}
 
 
 def _phasors(

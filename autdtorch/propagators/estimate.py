@@ -21,10 +21,8 @@ from autdtorch.utils.memory import available_memory
 from autdtorch.utils.validation import positive
 
 _MEASURED_STEPS, _MEASURED_CELLS = 80, (300_000, 1_000_000)
-"""Number of steps that are timed, and cells of the small and the large grid they are timed on."""
-
 _AIR_SPACING, _AIR_RIM = 1e-3, 28
-"""Spacing [m] of these grids, and cells on each side of their domain."""
+"""Timed steps on a small and a large grid of so many cells; their spacing [m] and cells beside the domain."""
 
 _NODE_SECONDS = 4e-8
 """Time [s] of a pair of a point and a node of a transducer in free space."""

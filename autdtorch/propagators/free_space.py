@@ -28,9 +28,8 @@ class FreeSpacePropagator:
         require_kind("scene", scene, Scene)
         self.scene = scene
         if scene.obstacles:
-            logger.warning(
-                "free_space ignores the %d obstacles of scene %r", len(scene.obstacles), scene.name
-            )
+            count = len(scene.obstacles)
+            logger.warning("free_space ignores the %d obstacles of scene %r", count, scene.name)
 
     def __repr__(self) -> str:
         """Name of the scene."""
@@ -40,12 +39,10 @@ class FreeSpacePropagator:
     def transfer_matrix(
         self, points: ArrayLike | None = None, return_error: Literal[False] = False
     ) -> torch.Tensor: ...
-
     @overload
     def transfer_matrix(
         self, points: ArrayLike | None = None, *, return_error: Literal[True]
     ) -> tuple[torch.Tensor, float]: ...
-
     def transfer_matrix(
         self, points: ArrayLike | None = None, return_error: bool = False
     ) -> torch.Tensor | tuple[torch.Tensor, float]:

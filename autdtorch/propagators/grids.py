@@ -45,14 +45,7 @@ over Green's function."""
 
 @dataclass(frozen=True)
 class GridCost:
-    """The size of a grid and the fewest steps of a run on it.
-
-    Attributes:
-        interior: cells per axis inside the boundary layer.
-        shape: cells per axis, boundary layers included.
-        steps: steps of a run without resonances.
-        steps_per_period: time steps in a period of the drive.
-    """
+    """The cells per axis of a grid, inside its boundary layers and with them, and the fewest steps of a run."""
 
     interior: tuple[int, int, int]
     shape: tuple[int, int, int]
@@ -102,13 +95,7 @@ def grid_cost(region: Region, extent: Extent, spacing: float) -> GridCost:
 
 @dataclass(frozen=True)
 class Grouping:
-    """Grids and the obstacles on each.
-
-    Attributes:
-        groups: ascending indices of the obstacles on each grid.
-        grids: cost of a run on each grid.
-        passes: expected passes of the multiple-scattering iteration, in each of which every box is simulated.
-    """
+    """Grids with the ascending indices of the obstacles on each, and the expected passes between boxes."""
 
     groups: tuple[tuple[int, ...], ...]
     grids: tuple[GridCost, ...]
@@ -171,8 +158,7 @@ def cheapest_boxes(region: Region, spacing: float, tolerance: float, runs: int) 
             if found.box_cost(runs) < best.box_cost(runs):
                 best = found
         first, second = sorted(map(int, np.unravel_index(gaps.argmin(), gaps.shape)))
-        joined = tuple(sorted(groups[first] + groups.pop(second)))
-        groups[first] = joined
+        groups[first] = tuple(sorted((*groups[first], *groups.pop(second))))
     return best
 
 

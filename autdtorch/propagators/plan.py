@@ -131,9 +131,8 @@ class Plan:
         block = 3 * max(grid.steps_per_period for grid in grids)
         run = _FIELD_NUMBERS * self.dtype.itemsize * self.cells
         run += kept * (16 * phasors_kept(kept) + 48 * block)
-        judged = 0
-        if self.method == "box":
-            judged = min(MOST_JUDGED, max(len(self.scene.control_points), len(self.scene.array)))
+        receivers = max(len(self.scene.control_points), len(self.scene.array))
+        judged = min(MOST_JUDGED, receivers) if self.method == "box" else 0
         lasting = _CELL_BYTES * self.cells + _CELL_MEMORY * filled.cells + _COLUMN_BYTES * filled.columns
         assembled = min(_ELEMENTS * filled.cut / len(grids), _MOST_ELEMENTS)
         running = 24 * judged * kept + min(self.runs, self._at_once) * run
@@ -149,9 +148,8 @@ class Plan:
         ringing = USUAL_PERIODS if filled.cells and passes == 1 else 1.0
         run = _RUN_STEPS + ringing * passes * stepping
         assembly = _SCENE_STEPS + _ASSEMBLY_STEPS * filled.cells + _MESH_STEPS * filled.meshed
-        pairs = 0
-        if self.method == "box":
-            pairs = sum(grid.radiating for grid in grids) * self._receivers
+        radiating = sum(grid.radiating for grid in grids) if self.method == "box" else 0
+        pairs = radiating * self._receivers
         return assembly + _PAIR_STEPS * pairs + math.ceil(self.runs / self._at_once) * run
 
     @cached_property
@@ -213,8 +211,9 @@ class Plan:
         for grid in self.grouping.grids:
             if grid.cells > MAX_CELLS:
                 shape = " x ".join(map(str, grid.shape))
-                accepted = f"gives {shape} cells, must be at most {MAX_CELLS:.0e} in all"
-                raise invalid(field, value, accepted, unit)
+                raise invalid(
+                    field, value, f"gives {shape} cells, must be at most {MAX_CELLS:.0e} in all", unit
+                )
         require_spacing(self.region, self.spacing)
 
 

@@ -14,11 +14,7 @@ logger = logging.getLogger(__name__)
 
 
 def region_of(scene: Scene) -> Region:
-    """Return the region that the solver simulates for a scene.
-
-    Parallel walls and slabs across the domain continue through the boundary layers. Other obstacles that
-    reach beyond the domain end before the layers.
-    """
+    """Return the region of a scene; parallel walls across it continue through the boundary layers."""
     bodies = []
     for one, continued in zip(scene.obstacles, _continued(scene), strict=True):
         density, speed = one.density, one.sound_speed

@@ -94,12 +94,10 @@ class SimulatedPropagator:
     def transfer_matrix(
         self, points: ArrayLike | None = None, return_error: Literal[False] = False
     ) -> torch.Tensor: ...
-
     @overload
     def transfer_matrix(
         self, points: ArrayLike | None = None, *, return_error: Literal[True]
     ) -> tuple[torch.Tensor, float]: ...
-
     @one_torch_thread()
     def transfer_matrix(
         self, points: ArrayLike | None = None, return_error: bool = False
@@ -142,8 +140,7 @@ class SimulatedPropagator:
             points: (P, 3) or a grid such as (Nu, Nv, 3) [m].
 
         Returns:
-            complex128 (..., P) or (..., Nu, Nv) [Pa]; differentiable by the drive, through the transfer
-            matrix.
+            complex128 (..., P) or (..., Nu, Nv) [Pa]; differentiable by the drive.
 
         Raises:
             ValueError: drive or points of another shape or out of range, as in `transfer_matrix`.
@@ -183,9 +180,9 @@ class SimulatedPropagator:
         return result
 
     def _report(self, runs: Sequence[Run], points: torch.Tensor | None) -> None:
-        """Warn of new runs that did not converge; log once if source transducers are next to an obstacle.
+        """Warn of new runs that did not converge; log once if a source is next to an obstacle.
 
-        Runs without `points`, those of a transfer matrix, have all transducers as sources.
+        Without `points`, all transducers were sources.
         """
         simulation = self._simulation
         if runs and not self._near_logged and (points is None or not simulation.orbits(points).from_points):
@@ -195,13 +192,10 @@ class SimulatedPropagator:
                     "a source is within %.2g mm of an obstacle: less accurate; use a finer spacing than %.2g"
                     " mm", 1e3 * self._plan.source_clearance, 1e3 * self.spacing,
                 )  # fmt: skip
-        unsettled = [run for run in runs if not run.reached]
-        if unsettled:
+        if unsettled := [run for run in runs if not run.reached]:
+            periods, error = max(run.periods for run in unsettled), max(run.remaining for run in unsettled)
             warnings.warn(
-                f"no steady state after {max(run.periods for run in unsettled)} periods in {len(unsettled)} "
-                f"of {len(runs)} runs: estimated relative error up to "
-                f"{max(run.remaining for run in unsettled):.1e}, tolerance {self.tolerance:g}; raise "
-                "max_periods or tolerance",
-                SteadyStateWarning,
-                stacklevel=4,  # the caller of the public method, beyond its decorator
-            )
+                f"no steady state after {periods} periods in {len(unsettled)} of {len(runs)} runs: estimated "
+                f"relative error up to {error:.1e}, tolerance {self.tolerance:g}; raise max_periods or "
+                "tolerance", SteadyStateWarning, stacklevel=4,  # the caller of the public, decorated method
+            )  # fmt: skip

@@ -49,13 +49,10 @@ class Symmetry:
 
 @dataclass(frozen=True)
 class Orbits:
-    """Symmetry orbits of the sources of a transfer matrix: one run of a representative serves an orbit.
+    """Symmetry orbits of n sources, points (by reciprocity) or transducers: one run serves an orbit.
 
-    Attributes:
-        from_points: whether the sources are the points (by reciprocity) or the transducers.
-        representative: index (n,) of the representative of each of n sources, the first of its orbit.
-        symmetry: index (n,) of the symmetry that maps each source to its representative.
-        images: index (S, k) of the receiver that each symmetry maps each of k receivers to.
+    The representative (n,) of each source is the first of its orbit; `symmetry` (n,) maps the source to it.
+    Each symmetry maps each of k receivers to another, `images` (S, k).
     """
 
     from_points: bool

@@ -27,8 +27,7 @@ def volume_field(propagator: Propagator, drive: ArrayLike, spacing: float | None
         in obstacles and within half a wavelength of a transducer.
 
     Raises:
-        ValueError: `drive` has another shape or range, `spacing` is not > 0 or gives more than 10 million
-            cells.
+        ValueError: `drive` or `spacing` is out of range, or there are more than 10 million cells.
     """
     require_kind("propagator", propagator, Propagator)
     scene = propagator.scene
@@ -38,14 +37,11 @@ def volume_field(propagator: Propagator, drive: ArrayLike, spacing: float | None
     counts = [max(2, round(float(length) / spacing)) for length in upper - lower]
     if math.prod(counts) > _MOST_CELLS:
         raise invalid("spacing", spacing, f"gives {counts} cells, must give at most {_MOST_CELLS}", "m")
-    axes = [
-        low + (high - low) * (torch.arange(count, dtype=torch.float64, device="cpu") + 0.5) / count
-        for low, high, count in zip(lower, upper, counts, strict=True)
-    ]
-    points = torch.cartesian_prod(*axes)
-    nodes = scene.array.nodes.positions.reshape(-1, 3)
+    steps = [torch.arange(count, dtype=torch.float64, device="cpu") + 0.5 for count in counts]
+    axes = zip(lower, upper, steps, counts, strict=True)
+    points = torch.cartesian_prod(*(low + (high - low) * step / count for low, high, step, count in axes))
     valid = torch.ones(len(points), dtype=torch.bool, device="cpu")
-    for node in nodes:
+    for node in scene.array.nodes.positions.reshape(-1, 3):
         valid &= torch.linalg.vector_norm(points - node, dim=1) > _CLEARANCE * scene.wavelength
     for obstacle in scene.obstacles:
         valid &= ~obstacle.contains(points)

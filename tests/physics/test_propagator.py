@@ -1,6 +1,5 @@
 """The full-domain propagator against exact fields and against itself."""
 
-import itertools
 import math
 
 import pytest
@@ -31,9 +30,7 @@ def random_drive(rows, transducers, seed=0):
 
 # required of the paper's scene: 0.5 % at 1 mm, 2 % at 2 mm; this small one has its points closer to the
 # boundary layers. At 2.8 mm, 3 cells per wavelength, the layers send back up to 1.6 % each (-36 dB).
-@pytest.mark.parametrize(
-    ("spacing", "tolerance"), [(0.7e-3, 1e-3), (1e-3, 2e-3), (2e-3, 1e-2), (2.8e-3, 4e-2)]
-)
+@pytest.mark.parametrize(("spacing", "tolerance"), [(7e-4, 1e-3), (1e-3, 2e-3), (2e-3, 1e-2), (2.8e-3, 4e-2)])
 def test_free_space_is_exact_to_the_grid(spacing, tolerance):
     scene = small_scene()
     simulated = full(scene, spacing, tolerance=tolerance / 10).transfer_matrix()
@@ -45,9 +42,9 @@ def test_free_space_is_exact_to_the_grid(spacing, tolerance):
     ("absorption", "spacing", "tolerance"), [(1.3, 1e-3, 5e-4), (40.0, 1e-3, 5e-4), (40.0, 2e-3, 5e-3)]
 )
 def test_absorption_is_exact_to_the_grid(absorption, spacing, tolerance):
-    scene, lossless = small_scene(absorption=absorption), small_scene()
+    scene, lossless = both = small_scene(absorption=absorption), small_scene()
     simulated, without = (
-        full(each, spacing, tolerance=1e-5, dtype="float64").transfer_matrix() for each in (scene, lossless)
+        full(one, spacing, tolerance=1e-5, dtype="float64").transfer_matrix() for one in both
     )
     # no worse than without loss: 0.03 % at 1 mm, 0.4 % at 2 mm
     assert relative_error(simulated, free_space(scene)) < tolerance
@@ -63,13 +60,13 @@ def test_piston_radiates_as_a_piston():
     array = TransducerArray(center[None], (2.0, 1.0, 0.6), radius=5e-3)
     normal = array.normals[0]
     u, v = plane_basis(normal)
-    points = []
-    for around, angles in ((0.3, range(0, 61, 10)), (3.4, range(10, 61, 10))):
-        across = math.cos(around) * u + math.sin(around) * v
-        points += [math.cos(math.radians(t)) * normal + math.sin(math.radians(t)) * across for t in angles]
-    points_on_arcs = center + distance * torch.stack(points)
+    across = {angle: math.cos(angle) * u + math.sin(angle) * v for angle in (0.3, 3.4)}
+    arcs = [(t, 0.3) for t in range(0, 61, 10)] + [(t, 3.4) for t in range(10, 61, 10)]
+    points = [
+        math.cos(math.radians(t)) * normal + math.sin(math.radians(t)) * across[side] for t, side in arcs
+    ]
     domain = ((6e-3, 1e-3, 7e-3), (33e-3, 34e-3, 21e-3))
-    scene = Scene(array, AIR, 40e3, points_on_arcs, domain=domain)
+    scene = Scene(array, AIR, 40e3, center + distance * torch.stack(points), domain=domain)
     simulated, exact = full(scene, 1.25e-3, tolerance=1e-4).transfer_matrix(), free_space(scene)
     # required: 1 %; the grid's error for points is 0.1 % at 1.25 mm
     assert ((simulated - exact).abs() / exact.abs()).max() < 2e-3
@@ -80,9 +77,7 @@ def test_piston_radiates_as_a_piston():
 def test_field_of_a_plane_right_up_to_the_faces_of_the_domain():
     scene = small_scene()
     lines = torch.linspace(0, 24e-3, 13, dtype=torch.float64)
-    points = torch.tensor(
-        [(22e-3, float(y), float(z)) for y, z in itertools.product(lines, lines)], dtype=torch.float64
-    )
+    points = torch.cartesian_prod(torch.tensor([22e-3], dtype=torch.float64), lines, lines)
     drive = random_drive(1, 4)[0]
     simulated = full(scene, tolerance=1e-4).field(drive, points)
     # error as of the points above
@@ -167,12 +162,12 @@ def test_image_source_at_a_rigid_wall():
 def test_the_distance_to_the_steady_state_is_below_the_tolerance():
     """In a scene with resonances."""
     scene = small_scene((CUBE,))
-    settled, *others = (
-        full(scene, tolerance=tolerance, dtype="float64").transfer_matrix()
+    matrices = {
+        tolerance: full(scene, tolerance=tolerance, dtype="float64").transfer_matrix()
         for tolerance in (1e-7, 1e-2, 1e-3, 1e-4)
-    )
-    for matrix, tolerance in zip(others, (1e-2, 1e-3, 1e-4), strict=True):
-        assert relative_error(matrix, settled) < tolerance
+    }
+    for tolerance, matrix in matrices.items():
+        assert relative_error(matrix, matrices[1e-7]) <= tolerance
 
 
 @pytest.mark.parametrize("method", ["free_space", "full"])
@@ -195,7 +190,6 @@ def test_field_is_linear_and_differentiable_in_the_drive():
     field = propagator.field(drive, points)
     assert torch.allclose(field.detach(), drive.detach() @ matrix.mT, rtol=1e-6)
     field[0, 1].abs().backward()
-    assert drive.grad is not None
     # d|p|/dq* = (p/|p|) conj(G), torch's convention for a real function of a complex variable
     phase = field[0, 1].detach() / field[0, 1].detach().abs()
     assert torch.allclose(drive.grad[0], phase * matrix[1].conj(), rtol=1e-6)

@@ -6,11 +6,7 @@ import pytest
 import torch
 from small_scenes import AIR, CUBE, small_scene
 
-from autdtorch.propagators import (
-    SteadyStateWarning,
-    differentiable_field,
-    make_propagator,
-)
+from autdtorch.propagators import SteadyStateWarning, differentiable_field, make_propagator
 from autdtorch.scene.obstacles import Box, Sphere
 from autdtorch.scene.scene import OverlapWarning
 
@@ -43,8 +39,7 @@ def of_two_speeds(extent):
 @pytest.mark.parametrize(("method", "extent"), [("box", 200e-3), ("full", 48e-3)])
 def test_a_coarse_spacing_is_logged_once_for_all_obstacles(method, extent, caplog):
     propagator = simulated(of_two_speeds(extent), method, 2.5e-3)
-    if method == "box":
-        assert len(propagator._simulation.assemblies) == 2
+    assert len(propagator._simulation.assemblies) == (2 if method == "box" else 1)
     assert propagator._second.spacing < propagator.spacing
     assert propagator._second.planned_runs
     (message,) = messages(caplog, "coarse")
