@@ -40,7 +40,7 @@ def execute(
     The points are by default the control points. A matrix that has converged is added to the cache.
     """
     points = plan.scene.control_points if points is None else points
-    simulation = simulation_of(plan) if simulation is None else simulation
+    simulation = simulation or simulation_of(plan)
     if cache is None:
         return simulation.transfer_matrix(points)
     key = cache_key(plan, points)

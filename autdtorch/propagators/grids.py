@@ -45,7 +45,7 @@ over Green's function."""
 
 @dataclass(frozen=True)
 class GridCost:
-    """The cells per axis of a grid, inside its boundary layers and with them, and the fewest steps of a run."""
+    """The cells per axis of a grid, without and with its boundary layers, and the fewest steps of a run."""
 
     interior: tuple[int, int, int]
     shape: tuple[int, int, int]
@@ -124,8 +124,8 @@ def choose_grids(
     boxes = cheapest_boxes(region, spacing, tolerance, runs)
     gain = runs * domain.grids[0].work / boxes.box_cost(runs)
     walls = any(body.continued for body in region.bodies)
-    corners = [(*region.domain, shape.lower, shape.upper) for shape in region.shapes]
-    outside = any((np.less(low, first) | np.greater(high, last)).any() for first, last, low, high in corners)
+    first, last = region.domain
+    outside = any((np.less(one.lower, first) | np.greater(one.upper, last)).any() for one in region.shapes)
     method, grouping = ("full", domain) if walls or not (outside or gain > 1) else ("box", boxes)
     logger.debug(
         "method auto: %s; full would take %.2g times as long as box (walls through the boundary layer: %s,"
@@ -144,19 +144,16 @@ def cheapest_boxes(region: Region, spacing: float, tolerance: float, runs: int) 
 
     The interiors of boxes, with the air around their obstacles, do not overlap.
     """
-    best = one_box(region, spacing)
-    if len(region.bodies) > _MOST_OBSTACLES:
+    best, shapes = one_box(region, spacing), region.shapes
+    if len(shapes) > _MOST_OBSTACLES:
         return best
-    shapes = region.shapes
-    groups: list[tuple[int, ...]] = [(index,) for index in range(len(region.bodies))]
+    groups: list[tuple[int, ...]] = [(index,) for index in range(len(shapes))]
     while len(groups) > 1:
         extents = [bodies_extent([shapes[index] for index in group]) for group in groups]
         gaps = _gaps(extents, spacing)
         if gaps.min() > 0 and (passes := _expected_passes(extents, tolerance)) <= MOST_PASSES:
             grids = tuple(grid_cost(region, extent, spacing) for extent in extents)
-            found = Grouping(tuple(groups), grids, passes)
-            if found.box_cost(runs) < best.box_cost(runs):
-                best = found
+            best = min(best, Grouping(tuple(groups), grids, passes), key=lambda found: found.box_cost(runs))
         first, second = sorted(map(int, np.unravel_index(gaps.argmin(), gaps.shape)))
         groups[first] = tuple(sorted((*groups[first], *groups.pop(second))))
     return best

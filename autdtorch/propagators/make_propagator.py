@@ -99,9 +99,8 @@ def _at_chosen_spacing(pilot: Plan, cache: DiskCache | None) -> Plan:
     spacing = min(spacing_for(tolerance, error, pilot.spacing), coarsest_spacing(pilot.region))
     chosen = pilot.at(spacing, tolerance, pilot.time_step)
     chosen.require_feasible("tolerance", pilot.tolerance)
-    logger.info(
-        "spacing %.3g mm: the error at %.3g mm is about %.2g", 1e3 * spacing, 1e3 * pilot.spacing, error
-    )
+    shown = 1e3 * spacing, 1e3 * pilot.spacing, error
+    logger.info("spacing %.3g mm: the error at %.3g mm is about %.2g", *shown)
     return chosen
 
 

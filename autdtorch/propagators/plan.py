@@ -45,7 +45,7 @@ _CELL_MEMORY, _ELEMENT_BYTES, _COLUMN_BYTES = 2_000.0, 20_500.0, 8_000.0
 that a surface cuts in a boundary layer."""
 
 _ELEMENTS, _MOST_ELEMENTS = 1.4, 4096
-"""Elements that are assembled for each that a surface cuts, as some are only near it; the most at once."""
+"""Elements assembled for each that a surface cuts, as some are only near it; the most at once."""
 
 _CELL_STEPS, _COLUMN_STEPS = 35.0, 250.0
 """Time of a step of a heterogeneous cell, and of one that a surface cuts in a boundary layer. This and the

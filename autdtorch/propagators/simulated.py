@@ -169,10 +169,9 @@ class SimulatedPropagator:
         """Return the matrix of points, by default of the control points, and the runs of this call."""
         if points is not None:
             return self._executed(points)
-        if kept := self._control:
-            return replace(kept, matrix=kept.matrix.clone(), runs=())
-        self._control = self._executed(self.scene.control_points)
-        return replace(self._control, matrix=self._control.matrix.clone())
+        kept = self._control
+        result = self._control = kept or self._executed(self.scene.control_points)
+        return replace(result, matrix=result.matrix.clone(), runs=() if kept else result.runs)
 
     def _executed(self, points: torch.Tensor) -> TransferMatrix:
         result = execute(self._plan, points, self._cache, self._simulation)
