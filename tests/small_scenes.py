@@ -7,6 +7,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from autdtorch.fdtd.kernels.contract import Receivers, Sources, State
+from autdtorch.fdtd.stepping import Assembly, assemble
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
@@ -14,6 +17,8 @@ from autdtorch.scene.scene import Medium, Scene
 
 AIR = Medium(density=1.293, sound_speed=340.0)
 CUBE = Box(center=(12e-3, 12e-3, 12e-3), size=(6e-3, 8e-3, 4e-3), density=100.0, sound_speed=340.0)
+NO_SOURCES = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros((0, 2), dtype=torch.float64))
+NO_RECEIVERS = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1), dtype=torch.float64))
 
 
 def small_scene(obstacles=(), extent=0.024, absorption=0.0, radius=0.0):
@@ -49,6 +54,20 @@ def scene_of_all_kinds(folder: Path) -> Scene:
         obstacles=obstacles,
         observation_plane=Plane((80e-3, 50e-3, 50e-3), (1, 0, 0), (0.1, 0.1)),
     )
+
+
+def assembled_parts(scene: Scene, spacing: float, dtype: torch.dtype) -> tuple[Assembly, Sources, Receivers]:
+    """A small scene on its grid, its transducers with four phasors, and its control points."""
+    assembly = assemble(region_of(scene), spacing, dtype)
+    strength = torch.tensor([1.0, 1j, -0.4, 0.3 - 0.7j], dtype=torch.complex128)
+    sources = assembly.sources(scene.array.positions, strength)
+    return assembly, sources, assembly.receivers(scene.control_points)
+
+
+def all_tensors(state: State, recorded: torch.Tensor) -> list[torch.Tensor]:
+    """All results of a run: pressure, record, and the memory of layers and columns."""
+    memory = (*state.layers, state.columns, state.crossed)
+    return [state.now, state.before, recorded, *(part for layer in memory for part in layer)]
 
 
 def relative_error(value: torch.Tensor, reference: torch.Tensor) -> float:

@@ -1,26 +1,27 @@
 """Gradients of receiver records, by an adjoint run of any kernel.
 
 Multiplied by the masses of its cells the scheme is symmetric, boundary layers included. A force on cell j
-moves cell i as a force on cell i moves cell j, times m_j / m_i. The derivatives lambda of a loss by the
-forces on all cells therefore come from a run of the same kernel. It is driven in the receivers' cells by the
-loss's derivatives over the masses, last step first, and read times the masses:
+moves cell i as a force on cell i moves cell j, times m_j / m_i. The derivatives lambda of a loss by all
+forces come from a run of the same kernel, driven in the receivers' cells by the loss's derivatives over the
+masses, last step first, and read times the masses:
 
     dL / d force_is  = sum_t lambda_i(t) signal_s(t)
     dL / d weight_ij = sum_t lambda_i(t) (p_j(t) - p_i(t)).
 
-The second sum needs the run itself in reverse. Its state is kept at the beginning of segments, and each
-segment is stepped again with the heterogeneous cells and their neighbours as receivers.
-`docs/decisions/gradients.md` has the cost.
+The second sum needs the run itself in reverse. Its state is kept at the beginning of segments, which are
+stepped again with the heterogeneous cells and their neighbours as receivers (`docs/decisions/gradients.md`).
 """
 
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
 import torch
+from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from autdtorch.fdtd.interpolation import Interpolation
@@ -29,26 +30,20 @@ from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.utils.threads import spread
 
+# Memory [bytes] of the record of a segment; larger only where the states kept would take more
 _SEGMENT_BYTES = 128 * 2**20
-"""Memory [bytes] of the record of a segment; larger only where the states kept would take more."""
-
-_CHUNK = 1000
-"""Cells whose derivatives are summed at a time."""
-
-_ROUNDING = 4
-"""Singular values below this many roundings of the largest are zero."""
+_CHUNK = 1000  # Cells whose derivatives are summed at a time
+_ROUNDING = 4  # Singular values below this many roundings of the largest are zero
 
 
 def recorded(
-    kernel: Kernel, assembly: Assembly, sources: Sources, receivers: Receivers, signal: torch.Tensor
-) -> torch.Tensor:
+    kernel: Kernel, assembly: Assembly, sources: Sources, receivers: Receivers, signal: Tensor
+) -> Tensor:
     """Step from silence, once per row of `signal` (steps, S), and return the record (steps, R).
 
-    Differentiable, once, by `sources.force` and by `assembly.coefficients.heterogeneous_weight`. Derivatives
-    by stencil rows in the boundary layers are zero.
-
-    Raises:
-        ValueError: a source or a receiver is in the boundary layers, where reciprocity does not hold.
+    Differentiable, once, by `sources.force` and by `heterogeneous_weight`; derivatives by rows in the
+    boundary layers are zero. Sources and receivers must be outside of the layers, where reciprocity does not
+    hold.
     """
     for name, index in (("sources", sources.index), ("receivers", receivers.index)):
         if not assembly.grid.inside(index.numpy()).all():
@@ -56,7 +51,7 @@ def recorded(
     weight = assembly.coefficients.heterogeneous_weight
     coefficients = replace(assembly.coefficients, heterogeneous_weight=weight.detach())
     run = _Run(kernel, replace(assembly, coefficients=coefficients), sources.index, receivers, signal)
-    result: torch.Tensor = _Recorded.apply(sources.force, weight, run)  # type: ignore[no-untyped-call]
+    result: Tensor = _Recorded.apply(sources.force, weight, run)  # type: ignore[no-untyped-call]
     return result
 
 
@@ -66,39 +61,33 @@ class _Run:
 
     kernel: Kernel
     assembly: Assembly
-    driven: torch.Tensor
+    driven: Tensor
     receivers: Receivers
-    signal: torch.Tensor
+    signal: Tensor
 
     def advance(
-        self, state: State, sources: Sources, receivers: Receivers, signal: torch.Tensor
-    ) -> tuple[State, torch.Tensor]:
+        self, state: State, sources: Sources, receivers: Receivers, signal: Tensor
+    ) -> tuple[State, Tensor]:
         """Step a copy of the state."""
-        state, record = self.kernel.advance(
-            _copy(state), self.assembly.coefficients, sources, receivers, signal
-        )
+        c = self.assembly.coefficients
+        state, record = self.kernel.advance(deepcopy(state), c, sources, receivers, signal)
         return state, record.cpu()
 
-    def single(self, cells: torch.Tensor) -> Receivers:
+    def single(self, cells: Tensor) -> Receivers:
         """Return cells (k,) as receivers."""
         return Receivers(cells[:, None], torch.ones((len(cells), 1), dtype=self.assembly.dtype, device="cpu"))
 
-    def fields(
-        self, state: State, sources: Sources, cells: torch.Tensor, signal: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def fields(self, state: State, sources: Sources, cells: Tensor, signal: Tensor) -> tuple[Tensor, Tensor]:
         """Return the pressure in cells (k,) before the first step (1, k), and after each (steps, k)."""
         first = state.now.reshape(1, -1)[:, cells.to(state.now.device)].cpu()
         return first, self.advance(state, sources, self.single(cells), signal)[1]
 
-    def mass(self, cells: torch.Tensor) -> torch.Tensor:
+    def mass(self, cells: Tensor) -> Tensor:
         """Return the mass of distinct cells (k,)."""
         return torch.from_numpy(self.assembly.heterogeneous.mass_of(cells.numpy())).to(self.assembly.dtype)
 
-    def adjoint_sources(self, slope: torch.Tensor) -> tuple[Sources, torch.Tensor]:
-        """Return sources and signals (steps, S) of the adjoint run, last step first.
-
-        S is the rank of the derivatives (steps, R): few for phasors.
-        """
+    def adjoint_sources(self, slope: Tensor) -> tuple[Sources, Tensor]:
+        """Return sources and signals (steps, S) of the adjoint run, last step first; S is a rank."""
         loud = slope.any(dim=1)
         left, size, right = torch.linalg.svd(slope[loud], full_matrices=False)
         rank = int((size > _ROUNDING * torch.finfo(slope.dtype).eps * size[:1]).sum())
@@ -114,20 +103,12 @@ class _Run:
 
 @dataclass(frozen=True)
 class _Neighbourhood:
-    """The heterogeneous cells outside the layers, and the cells whose field their derivatives need.
+    """The heterogeneous cells outside the layers, and the cells whose field their derivatives need."""
 
-    Attributes:
-        own: mask of these among the heterogeneous cells.
-        index: their flat indices (n,).
-        cells: flat indices of these, of their neighbours and of the receivers (k,), ascending.
-        offsets: flat offsets to the neighbours (27,).
-        points: the receivers.
-    """
-
-    own: torch.Tensor
-    index: torch.Tensor
-    cells: torch.Tensor
-    offsets: torch.Tensor
+    own: Tensor  # mask of these among the heterogeneous cells
+    index: Tensor  # their flat indices (n,)
+    cells: Tensor  # flat indices of these, of their neighbours and of the receivers (k,), ascending
+    offsets: Tensor  # flat offsets to the neighbours (27,)
     points: Interpolation
 
     @classmethod
@@ -142,17 +123,15 @@ class _Neighbourhood:
         points = Interpolation(run.receivers.index.numpy(), run.receivers.weight.numpy())
         return cls(own, index, used.nonzero().reshape(-1), offsets, points)
 
-    def received(self, field: torch.Tensor) -> torch.Tensor:
+    def received(self, field: Tensor) -> Tensor:
         """Return the record of the receivers (steps, R) from the field in the cells (steps, k)."""
         return torch.from_numpy((self.points.matrix(self.cells.numpy()) @ field.numpy().T).T)
 
-    def correlate(
-        self, adjoint: torch.Tensor, first: torch.Tensor, after: torch.Tensor, total: torch.Tensor
-    ) -> None:
+    def correlate(self, adjoint: Tensor, first: Tensor, after: Tensor, total: Tensor) -> None:
         """Add sums of lambda_i (p_j - p_i) to `total` (n, 27), of lambda (steps, n) and `_Run.fields`."""
         from autdtorch.fdtd.kernels.cpu_correlation import correlate  # loads numba
 
-        field = torch.empty(after.shape[::-1], dtype=after.dtype, device="cpu")
+        field = after.new_empty(after.shape[::-1])
         field[:, 0], field[:, 1:] = first[0], after[:-1].T
         place = torch.zeros(int(self.cells[-1]) + 1, dtype=torch.int32, device="cpu")
         place[self.cells] = torch.arange(len(self.cells), dtype=torch.int32, device="cpu")
@@ -166,7 +145,7 @@ class _Recorded(torch.autograd.Function):
     """The run forwards; the adjoint run and the segments it needs backwards."""
 
     @staticmethod
-    def forward(ctx: Any, force: torch.Tensor, weight: torch.Tensor, run: _Run) -> torch.Tensor:
+    def forward(ctx: Any, force: Tensor, weight: Tensor, run: _Run) -> Tensor:
         """Record, and keep the states at the cuts where derivatives by the weights are needed."""
         sources, steps = Sources(run.driven, force.detach()), len(run.signal)
         state = run.assembly.silence(sources)
@@ -189,7 +168,7 @@ class _Recorded(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, slope: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None, None]:
+    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor, Tensor | None, None]:
         """Step the adjoint run, and again the segments."""
         run, around, steps, driven = ctx.run, ctx.around, len(slope), len(ctx.run.driven)
         by_force = torch.zeros_like(ctx.sources.force)
@@ -218,19 +197,13 @@ class _Recorded(torch.autograd.Function):
         return by_force, by_weight, None
 
 
-def _copy(state: State) -> State:
-    *layers, columns, crossed = (
-        (psi.clone(), zeta.clone()) for psi, zeta in (*state.layers, state.columns, state.crossed)
-    )
-    return State(state.now.clone(), state.before.clone(), tuple(layers), columns, crossed)
-
-
 def _cuts(steps: int, state: State, cells: int) -> list[int]:
     """Return the ends of segments. Their record and the states kept take least memory at a root's length."""
     memory: tuple[Layer, ...] = (*state.layers, state.columns, state.crossed)
     numbers = 2 * state.now.numel() + sum(part.numel() for layer in memory for part in layer)
-    longest = max(
-        _SEGMENT_BYTES / (cells * state.now.element_size()), math.sqrt(steps * numbers / (2 * cells))
+    fitting, least = (
+        _SEGMENT_BYTES / (cells * state.now.element_size()),
+        math.sqrt(steps * numbers / (2 * cells)),
     )
-    count = math.ceil(steps / longest)
+    count = math.ceil(steps / max(fitting, least))
     return [steps * number // count for number in range(count + 1)]

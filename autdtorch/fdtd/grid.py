@@ -20,48 +20,31 @@ from autdtorch.utils.validation import invalid, positive
 
 logger = logging.getLogger(__name__)
 
-
-MIN_CELLS_PER_WAVELENGTH = 3.0
-"""Fewest cells per wavelength; coarser grids are refused."""
-
+MIN_CELLS_PER_WAVELENGTH = 3.0  # Fewest cells per wavelength; coarser grids are refused
+# Fewest cells per wavelength without a warning. Below, points would need interpolation over more than 10
+# cells a side, and the layer reflects more than -61 dB.
 FAIR_CELLS_PER_WAVELENGTH = 4.0
-"""Fewest cells per wavelength without a warning. Below, points would need interpolation over more than 10
-cells a side, and the layer reflects more than -61 dB."""
-
+# Most cells per wavelength. The fit of the boundary layer starts within its bounds up to about 700.
 MAX_CELLS_PER_WAVELENGTH = 500
-"""Most cells per wavelength. The fit of the boundary layer starts within its bounds up to about 700."""
-
-MAX_CELLS = 10**9
-"""Most cells of a grid: more would take over 30 GB in single precision."""
-
+MAX_CELLS = 10**9  # Most cells of a grid: more would take over 30 GB in single precision
+# Cells of air between the obstacles and the boundary layer of a box. The first may be heterogeneous, the next
+# two are the Huygens surface, and the last two serve the interpolation of points next to it
+# (`scattered_field.py`).
 AROUND = 5
-"""Cells of air between the obstacles and the boundary layer of a box. The first may be heterogeneous, the
-next two are the Huygens surface, and the last two serve the interpolation of points next to it
-(`scattered_field.py`)."""
-
+# Cells of the boundary layer from 6 cells per wavelength on, and of coarser grids. Reflection up to 60
+# degrees is below -68 dB (-82 dB from 8.5 cells per wavelength on); of coarser grids -66 dB at 4.25 cells and
+# -32 dB at 3.
 FINE_LAYER_CELLS, COARSE_LAYER_CELLS = 6, 8
-"""Cells of the boundary layer from 6 cells per wavelength on, and of coarser grids. Reflection up to 60
-degrees is below -68 dB (-82 dB from 8.5 cells per wavelength on); of coarser grids -66 dB at 4.25 cells and
--32 dB at 3."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Cubic cells.
+    """Cubic cells; from cell (0, 0, 0) inwards a ring of zeros, the boundary layer and the interior."""
 
-    From the corner cell (0, 0, 0) inwards: a ring of zeros, the boundary layer, the interior.
-
-    Attributes:
-        spacing: edge of a cell [m].
-        interior: cells per axis inside the boundary layer.
-        origin: centre of cell (0, 0, 0) [m].
-        kappa: wavenumber in air times spacing [rad].
-    """
-
-    spacing: float
-    interior: tuple[int, int, int]
-    origin: tuple[float, float, float]
-    kappa: float
+    spacing: float  # edge of a cell [m]
+    interior: tuple[int, int, int]  # cells per axis inside the boundary layer
+    origin: tuple[float, float, float]  # centre of cell (0, 0, 0) [m]
+    kappa: float  # wavenumber in air times spacing [rad]
 
     @property
     def layer_cells(self) -> int:
@@ -130,17 +113,11 @@ def layer_cells(kappa: float) -> int:
 
 @dataclass(frozen=True)
 class Extent:
-    """The space that a grid covers.
+    """The space that a grid covers."""
 
-    Attributes:
-        lower: corner with the smallest coordinates (3,) [m].
-        upper: corner with the largest coordinates (3,) [m].
-        margin: cells around that, before the boundary layer begins.
-    """
-
-    lower: Sequence[float]
-    upper: Sequence[float]
-    margin: int
+    lower: Sequence[float]  # corner with the smallest coordinates (3,) [m]
+    upper: Sequence[float]  # corner with the largest coordinates (3,) [m]
+    margin: int  # cells around that, before the boundary layer begins
 
     def interior(self, spacing: float, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> tuple[int, int, int]:
         """Return the cells per axis that cover it, the first `offset` (3,) [cells] below the lower corner."""
@@ -164,12 +141,7 @@ def bodies_extent(shapes: Sequence[Shape]) -> Extent:
 
 
 def make_grid(region: Region, spacing: float) -> Grid:
-    """Return a grid of `spacing` [m] over the region's domain, placed for flat faces (`placement.py`).
-
-    Raises:
-        ValueError: fewer than `MIN_CELLS_PER_WAVELENGTH` cells per wavelength, more than
-            `MAX_CELLS_PER_WAVELENGTH`, or more than `MAX_CELLS` in all.
-    """
+    """Return a grid of `spacing` [m] over the region's domain, placed for flat faces (`placement.py`)."""
     return _covering(region, spacing, domain_extent(region, spacing))
 
 
@@ -179,12 +151,7 @@ def make_box(region: Region, spacing: float) -> Grid:
 
 
 def require_spacing(region: Region, spacing: float) -> None:
-    """Check a spacing [m].
-
-    Raises:
-        ValueError: fewer than `MIN_CELLS_PER_WAVELENGTH` cells a wavelength, or more than
-            `MAX_CELLS_PER_WAVELENGTH`.
-    """
+    """Check the number of cells per wavelength of a spacing [m]."""
     positive("spacing", spacing, "m")
     require_fine(region.sound_speeds, region.frequency, spacing)
     finest = region.wavelength / MAX_CELLS_PER_WAVELENGTH
@@ -207,11 +174,7 @@ def _covering(region: Region, spacing: float, extent: Extent) -> Grid:
 
 
 def require_fine(speeds: Mapping[str, float], frequency: float, spacing: float) -> None:
-    """Check a spacing [m] against sound speeds [m/s] by where they are.
-
-    Raises:
-        ValueError: fewer than `MIN_CELLS_PER_WAVELENGTH` cells a wavelength.
-    """
+    """Check that a spacing [m] resolves sound speeds [m/s], given by where they are."""
     for where, speed in speeds.items():
         coarsest = speed / frequency / MIN_CELLS_PER_WAVELENGTH
         if spacing > coarsest:

@@ -18,33 +18,23 @@ from scipy.sparse import csr_array
 from autdtorch.utils.array_types import Array, Index
 
 Shape = tuple[int, int, int]
-
 WIDTHS = (4, 6, 8, 10)
+# Largest error of a centred kernel at the drive's wavenumber: small compared with the error of any grid
 WIDTH_ERROR = 3e-4
-"""Largest error of a centred kernel at the drive's wavenumber: small compared with the error of any grid."""
-
-_REGULARISATION = 1e-5
-"""Keeps weights small where the fit does not determine them; far below WIDTH_ERROR."""
-
+_REGULARISATION = 1e-5  # Keeps weights small where the fit does not determine them; far below WIDTH_ERROR
+# Regularisation where cells are excluded. The field there is extrapolated by up to a cell, and holds more
+# than waves of the drive's wavenumber.
 _ONE_SIDED_REGULARISATION = 1e-2
-"""Regularisation where cells are excluded. The field there is extrapolated by up to a cell, and holds more
-than waves of the drive's wavenumber."""
-
+# Distance [cells] along each axis of the cells that are then fitted: larger systems take long
 _ONE_SIDED_REACH = 3
-"""Distance [cells] along each axis of the cells that are then fitted: larger systems take long."""
 
 
 @dataclass(frozen=True)
 class Interpolation:
-    """Interpolation kernels of P points on n cells each.
+    """Interpolation kernels of P points on n cells each."""
 
-    Attributes:
-        index: flat cell indices (P, n), int64.
-        weight: weights (P, n), float64, with a sum of about 1.
-    """
-
-    index: Index
-    weight: Array
+    index: Index  # flat cell indices (P, n), int64
+    weight: Array  # weights (P, n), float64, with a sum of about 1
 
     def matrix(self, cells: Index) -> csr_array:
         """Return the matrix (P, k) from values of `cells` (k,), ascending, to values at the points."""
@@ -67,17 +57,10 @@ def axis_weights(offset: Array, nodes: Array, kappa: float) -> Array:
 def exclude_cells(
     points: Interpolation, cells: Array, excluded: NDArray[np.bool_], shape: Shape, kappa: float
 ) -> Interpolation:
-    """Return kernels without the excluded cells, fitted to the others.
+    """Return kernels of points at `cells` (P, 3) without the `excluded` cells (P, n), fitted to the others.
 
-    The fit covers all waves with wavenumbers along the axes up to the drive's. Points with no cell left next
-    to them get no weight.
-
-    Args:
-        points: kernels of P points on n cells.
-        cells: positions of the points (P, 3) in cells.
-        excluded: mask of their cells (P, n).
-        shape: shape of the grid.
-        kappa: wavenumber times spacing [rad].
+    The fit covers all waves up to the drive's wavenumber. Points with no cell left next to them get no
+    weight.
     """
     rows = np.flatnonzero(excluded.any(axis=1))
     if len(rows) == 0:
@@ -115,43 +98,26 @@ def interpolation_width(kappa: float) -> int:
 
 
 def average_nodes(nodes: Interpolation, share: Array) -> Interpolation:
-    """Return weighted means over groups of nodes, each cell of a group once.
-
-    Args:
-        nodes: kernels of P x n nodes, the n of a group in succession.
-        share: weight of each node in its group (n,).
-
-    Returns:
-        Kernels of P groups, padded with the group's first cell and weight 0.
-    """
+    """Return means, weighted by `share` (n,), over groups of n kernels; padded with weight 0."""
     if len(share) == 1:
         return nodes
     index = nodes.index.reshape(-1, len(share) * nodes.index.shape[1])
     weight = (share[:, None] * nodes.weight.reshape(len(index), len(share), -1)).reshape(index.shape)
     groups = []
-    for cells, parts in zip(index, weight, strict=True):
-        unique, place = np.unique(cells, return_inverse=True)
+    for own, parts in zip(index, weight, strict=True):
+        unique, place = np.unique(own, return_inverse=True)
         groups.append((unique, np.bincount(place, parts)))
     most = max(len(unique) for unique, _ in groups)
-    padded = [
-        (np.pad(cells, (0, most - len(cells)), constant_values=cells[0]), np.pad(sums, (0, most - len(sums))))
-        for cells, sums in groups
-    ]
-    return Interpolation(*(np.stack(each) for each in zip(*padded, strict=True)))
+    cells = [np.pad(own, (0, most - len(own)), constant_values=own[0]) for own, _ in groups]
+    return Interpolation(
+        np.stack(cells), np.stack([np.pad(sums, (0, most - len(sums))) for _, sums in groups])
+    )
 
 
 def interpolate_points(
     positions: Array, shape: Shape, first: Shape, last: Shape, kappa: float
 ) -> Interpolation:
-    """Return interpolation kernels on cells [first, last); near the rim they are one-sided.
-
-    Args:
-        positions: (P, 3) in cells, so that cell i has its centre at i.
-        shape: shape of the grid.
-        first: first cell along each axis that may be used.
-        last: one past the last such cell.
-        kappa: wavenumber times spacing [rad].
-    """
+    """Return kernels of positions (P, 3) in cells on cells [first, last), one-sided near the rim."""
     index = np.zeros((len(positions), 1), np.int64)
     weight = np.ones((len(positions), 1))
     for axis in range(3):

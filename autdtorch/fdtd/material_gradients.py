@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells
@@ -25,29 +26,20 @@ from autdtorch.fdtd.stepping import Assembly, air_stencil, assembly_of
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.validation import fluid
 
-_STEP = 1e-4
-"""Relative step of the central differences: truncation and rounding are about 1e-8."""
-
-_RIM = 2
-"""Cells of air around the maps: the first depends on them, the second is its neighbour."""
+_STEP = 1e-4  # Relative step of the central differences: truncation and rounding are about 1e-8
+_RIM = 2  # Cells of air around the maps: the first depends on them, the second is its neighbour
 
 
 @dataclass(frozen=True)
 class DifferentiableCells:
-    """Heterogeneous cells and their differentiable properties.
-
-    Attributes:
-        heterogeneous: the cells.
-        weight: their stencil rows (n, 27), differentiable.
-        mass: their mass (n,), differentiable.
-    """
+    """Heterogeneous cells and their differentiable properties."""
 
     heterogeneous: HeterogeneousCells
-    weight: torch.Tensor
-    mass: torch.Tensor
+    weight: Tensor  # their stencil rows (n, 27), differentiable
+    mass: Tensor  # their mass (n,), differentiable
 
     def assembly(self, grid: Grid, region: Region, dtype: torch.dtype, time_step: float | None) -> Assembly:
-        """Return an assembly that is differentiable by its stencil rows; see `assemble_on`."""
+        """Return an assembly that is differentiable by its stencil rows; see `assembly_of`."""
         stencil = air_stencil(grid, region)
         assembly = assembly_of(grid, stencil, self.heterogeneous, region.frequency, dtype, time_step)
         coefficients = assembly.coefficients
@@ -63,19 +55,9 @@ class DifferentiableCells:
 
 
 def cells_of_obstacles(
-    region: Region, grid: Grid, density: torch.Tensor | None = None, sound_speed: torch.Tensor | None = None
+    region: Region, grid: Grid, density: Tensor | None = None, sound_speed: Tensor | None = None
 ) -> DifferentiableCells:
-    """Return the heterogeneous cells of a region's K bodies, differentiable by their materials.
-
-    Args:
-        region: gives everything that is not given here.
-        grid: the grid.
-        density: (K,) [kg/m^3]; values of sound-hard bodies are ignored.
-        sound_speed: (K,) [m/s], likewise.
-
-    Raises:
-        ValueError: a value is out of range, or a differentiated body reaches into the boundary layers.
-    """
+    """Return the cells of K bodies, differentiable by density and sound speed (K,); rigid ones are not."""
     stencil = air_stencil(grid, region)
     given = {"density": density, "sound_speed": sound_speed}
     base = _assembled(region, grid, stencil, given)
@@ -89,10 +71,8 @@ def cells_of_obstacles(
         rows, masses = ((more - less) / (2 * step) for more, less in zip(ahead, behind, strict=True))
         changed = np.flatnonzero(rows.any(axis=1) | (masses != 0))
         if not grid.inside(index[changed]).all():
-            raise ValueError(
-                "density, sound_speed: an obstacle that is differentiated reaches into the boundary layers; "
-                "must end inside the domain"
-            )
+            reason = "an obstacle that is differentiated reaches into the boundary layers"
+            raise ValueError(f"density, sound_speed: {reason}; must end inside the domain")
         places, shift = torch.from_numpy(changed), value - value.detach()
         weight = weight.index_add(0, places, shift * torch.from_numpy(rows[changed]))
         mass = mass.index_add(0, places, shift * torch.from_numpy(masses[changed]))
@@ -100,17 +80,14 @@ def cells_of_obstacles(
 
 
 def _differences(
-    region: Region, grid: Grid, stencil: Stencil, given: dict[str, torch.Tensor | None]
-) -> Iterator[tuple[torch.Tensor, float, list[HeterogeneousCells]]]:
+    region: Region, grid: Grid, stencil: Stencil, given: dict[str, Tensor | None]
+) -> Iterator[tuple[Tensor, float, list[HeterogeneousCells]]]:
     """Yield each number that requires gradients, a step, and the cells for the number plus and minus it."""
     for name, values in given.items():
         if values is None or not values.requires_grad:
             continue
-        for number, body in enumerate(region.bodies):
-            if body.fluid is None:
-                continue
-            step = _STEP * float(values.detach()[number])
-            sides = []
+        for number in (number for number, body in enumerate(region.bodies) if body.fluid is not None):
+            step, sides = _STEP * float(values.detach()[number]), []
             for way in (1, -1):
                 moved = values.detach().clone()
                 moved[number] += way * step
@@ -119,7 +96,7 @@ def _differences(
 
 
 def _assembled(
-    region: Region, grid: Grid, stencil: Stencil, given: dict[str, torch.Tensor | None]
+    region: Region, grid: Grid, stencil: Stencil, given: dict[str, Tensor | None]
 ) -> HeterogeneousCells:
     """Assemble a region whose K bodies have the densities (K,) and sound speeds (K,) given."""
     bodies = list(region.bodies)
@@ -149,13 +126,9 @@ def domain_cells(region: Region, grid: Grid) -> tuple[slice, ...]:
 
 
 def cells_of_maps(
-    region: Region, grid: Grid, density: torch.Tensor | None = None, sound_speed: torch.Tensor | None = None
+    region: Region, grid: Grid, density: Tensor | None = None, sound_speed: Tensor | None = None
 ) -> DifferentiableCells:
-    """Return the heterogeneous cells of maps (nx, ny, nz) of density [kg/m^3] and sound speed [m/s].
-
-    Raises:
-        ValueError: a map does not have the shape of the domain's cells.
-    """
+    """Return the heterogeneous cells of maps (nx, ny, nz) of density [kg/m^3] and sound speed [m/s]."""
     cells = domain_cells(region, grid)
     shape = tuple(part.stop - part.start for part in cells)
     for name, given in (("density", density), ("sound_speed", sound_speed)):
@@ -165,7 +138,8 @@ def cells_of_maps(
     air = torch.ones(shape, dtype=torch.float64, device="cpu")
     relative = air if density is None else density / region.fluid.density
     speed = air if sound_speed is None else sound_speed / region.fluid.sound_speed
-    relative = relative / _flow_factor(stencil, speed)
+    half, own = stencil.kappa / 2, stencil.kappa / 2 / speed  # `elements.flow_factor`
+    relative = relative / (math.tan(half) / half * own / torch.tan(own))
     fluidity = relative * _speed_factor(stencil, speed)
     weight, mass = _rows(stencil, relative, fluidity)
     axes = [np.arange(part.start - 1, part.stop + 1) for part in cells]
@@ -175,13 +149,7 @@ def cells_of_maps(
     return DifferentiableCells(HeterogeneousCells(index, *values, nothing, nothing), weight, mass)
 
 
-def _flow_factor(stencil: Stencil, speed_ratio: torch.Tensor) -> torch.Tensor:
-    """Return `elements.flow_factor` for each cell."""
-    own = stencil.kappa / 2 / speed_ratio
-    return math.tan(stencil.kappa / 2) / (stencil.kappa / 2) * own / torch.tan(own)
-
-
-def _speed_factor(stencil: Stencil, speed_ratio: torch.Tensor) -> torch.Tensor:
+def _speed_factor(stencil: Stencil, speed_ratio: Tensor) -> Tensor:
     """Return `elements.speed_factor` for each cell: cos(k . n) averages to sin(|k n|) / |k n|."""
     wave = complex(stencil.kappa, stencil.eta) / speed_ratio
     symbol = torch.zeros_like(speed_ratio)
@@ -192,21 +160,13 @@ def _speed_factor(stencil: Stencil, speed_ratio: torch.Tensor) -> torch.Tensor:
     return stencil.symbol / symbol
 
 
-def _rows(
-    stencil: Stencil, density: torch.Tensor, fluidity: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
+def _rows(stencil: Stencil, density: Tensor, fluidity: Tensor) -> tuple[Tensor, Tensor]:
     """Return rows and mass of the mapped cells and of those around them; `fluidity` is 1 over the mass."""
     density, fluidity = (
         torch.nn.functional.pad(part, (_RIM,) * 6, value=1.0) for part in (density, fluidity)
     )
-    own = (slice(1, -1),) * 3
-    weight = [
-        2 * coupling * fluidity[own] / (density[own] + density[_shifted(offset)])
-        for coupling, offset in zip(stencil.weights, OFFSETS, strict=True)
-    ]
+    own, weight = (slice(1, -1),) * 3, []
+    for coupling, offset in zip(stencil.weights, OFFSETS, strict=True):
+        beside = tuple(slice(1 + step, step - 1 or None) for step in offset)
+        weight.append(2 * coupling * fluidity[own] / (density[own] + density[beside]))
     return torch.stack(weight, dim=-1).reshape(-1, 27), (1 / fluidity[own]).reshape(-1)
-
-
-def _shifted(offset: tuple[int, int, int]) -> tuple[slice, ...]:
-    """Return the slices of the neighbours at an offset, of all cells but those on the rim."""
-    return tuple(slice(1 + step, step - 1 or None) for step in offset)

@@ -1,13 +1,10 @@
 """Placement of the grid: axis-aligned faces lie half-way between cell centres where possible.
 
 The air between the last cell centre and a rigid face, d cells behind it, adds its mass to that cell's. The
-standing wave on the grid needs the mass 1/2 + tan(kappa d) / (2 tan(kappa / 2)). This is 1/2 + d + kappa^2
-(d^3/3 - d/12) + ..., and the last term is missing. It vanishes for d = 1/2 and is largest, kappa^2 / 4, for a
-face that just touches the next centre. A curved surface has all distances and a small mean; an axis-aligned
-face has one.
-
-Among similar placements the grid takes a symmetric one. A mirror-symmetric scene is then symmetric on the
-grid, too, which saves runs (`propagators/symmetry.py`).
+standing wave on the grid needs the mass 1/2 + tan(kappa d) / (2 tan(kappa / 2)) = 1/2 + d + kappa^2 (d^3/3 -
+d/12) + ..., and the last term is missing. It vanishes for d = 1/2 and is largest, kappa^2 / 4, for a face
+that just touches the next centre. Among similar placements the grid takes a symmetric one: a symmetric
+scene needs fewer runs (`propagators/symmetry.py`).
 """
 
 from __future__ import annotations
@@ -22,58 +19,32 @@ from autdtorch.fdtd.region import Region, Shape
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
-_ALIGNED = 1 - 1e-9
-"""Smallest cosine between the normal of an axis-aligned face and the axis."""
-
+_ALIGNED = 1 - 1e-9  # Smallest cosine between the normal of an axis-aligned face and the axis
+# Distance of a face from a cell centre [cells] up to which the centre lies on it, and so in the obstacle
 _TOUCHING = 1e-6
-"""Distance of a face from a cell centre [cells] up to which the centre lies on it, and so in the obstacle."""
-
-_ROUNDING = 1e-6
-"""Excess over whole cells [cells] that needs no further cell."""
-
+_ROUNDING = 1e-6  # Excess over whole cells [cells] that needs no further cell
+# Candidate placements within a cell, in addition to those with a face half-way between centres. They start
+# from a symmetric one, so that mirrored faces have mirrored candidates.
 _STEPS = 20
-"""Candidate placements within a cell, in addition to those with a face half-way between centres. They start
-from a symmetric one, so that mirrored faces have mirrored candidates."""
-
-_SYMMETRIC = 0, _STEPS // 2
-"""Symmetric candidates: a cell or a face between cells in the middle."""
-
-_WORTHWHILE = 0.9
-"""Error of an asymmetric placement, relative to the symmetric one, below which it is taken."""
-
+_SYMMETRIC = 0, _STEPS // 2  # Symmetric candidates: a cell or a face between cells in the middle
+_WORTHWHILE = 0.9  # Error of an asymmetric placement, relative to the symmetric one, below which it is taken
+# Additional error [kappa^2, rms] allowed to a symmetric grid if the faces are symmetric: a quarter of the
+# largest. `docs/decisions/runs.md` has the errors.
 _ALLOWANCE = 0.07
-"""Additional error [kappa^2, rms] allowed to a symmetric grid if the faces are symmetric: a quarter of the
-largest. `docs/decisions/runs.md` has the errors."""
 
 
 class _Faces(NamedTuple):
-    """F axis-aligned faces.
+    """F axis-aligned faces."""
 
-    Attributes:
-        place: distance from one end of the extent (F,) [m].
-        first: 1 where the lighter side comes first, -1 where the heavier does (F,).
-        area: area (F,) [m^2].
-    """
-
-    place: Array
-    first: Array
-    area: Array
+    place: Array  # distance from one end of the extent (F,) [m]
+    first: Array  # 1 where the lighter side comes first, -1 where the heavier does (F,)
+    area: Array  # area (F,) [m^2]
 
 
 def grid_offset(
     region: Region, spacing: float, lower: Sequence[float], upper: Sequence[float]
 ) -> tuple[float, float, float]:
-    """Return the offset of a grid's first cell below a lower corner, per axis [cells], in [0, 1).
-
-    By default the grid extends equally far beyond both corners. Faces change that where another placement is
-    clearly better.
-
-    Args:
-        region: gives the bodies.
-        spacing: edge of a cell [m].
-        lower: lower corner of the extent (3,) [m].
-        upper: upper corner of the extent (3,) [m].
-    """
+    """Return the offset of a grid's first cell below a lower corner (3,) [m], per axis [cells], in [0, 1)."""
     surfaces = [_triangles(shape) for shape in region.shapes]
     x, y, z = (
         _axis_offset(_faces(region, surfaces, axis, low), region.sources[:, axis] - low, high - low, spacing)
@@ -107,10 +78,7 @@ def _faces(region: Region, surfaces: list[tuple[Array, Array]], axis: int, origi
 
 
 def _axis_offset(faces: _Faces, transducers: Array, length: float, spacing: float) -> float:
-    """Return the offset [cells] with a small mean square error of the faces, if possible a symmetric one.
-
-    Positions of transducers are distances from one end of the extent [m], and `length` is the extent [m].
-    """
+    """Return the offset [cells] with a small mean square error of the faces, if possible a symmetric one."""
     place, first, area = faces
     cells, whole = place / spacing, length / spacing
     middle = (math.ceil(whole - _ROUNDING) - whole) / 2

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from autdtorch.utils.validation import Vector
 
@@ -26,55 +26,38 @@ class Shape(Protocol):
     @property
     def lower(self) -> Vector:
         """Corner of the bounding box with the smallest coordinates (3,) [m]."""
-        ...
 
     @property
     def upper(self) -> Vector:
         """Corner of the bounding box with the largest coordinates (3,) [m]."""
-        ...
 
-    def signed_distance(self, points: torch.Tensor, /) -> torch.Tensor:
+    def signed_distance(self, points: Tensor, /) -> Tensor:
         """Return the distance (...) [m] of points (..., 3) to the surface, negative inside."""
-        ...
 
-    def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def surface(self) -> tuple[Tensor, Tensor]:
         """Return vertices (V, 3) [m] and triangles (F, 3), counter-clockwise as seen from outside."""
-        ...
 
 
 @dataclass(frozen=True)
 class Body:
-    """A shape of one material.
-
-    Attributes:
-        shape: its geometry.
-        fluid: its material, None where it is sound-hard.
-        continued: whether it continues through the boundary layers instead of ending before them.
-    """
+    """A shape of one material."""
 
     shape: Shape
-    fluid: Fluid | None
-    continued: bool = False
+    fluid: Fluid | None  # its material, None where it is sound-hard
+    continued: bool = False  # whether it continues through the boundary layers instead of ending before them
 
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A fluid with bodies in it, at one frequency.
+    """A fluid with bodies in it, at one frequency."""
 
-    Attributes:
-        fluid: the fluid around the bodies, called air.
-        attenuation: its attenuation [Np/m].
-        frequency: frequency of the drive [Hz].
-        bodies: may overlap; the later one counts.
-        domain: corners (lower, upper) [m] of the space that a grid of the whole domain covers.
-        sources: positions of the transducers (M, 3) [m]; a grid stays symmetric where they are.
-    """
-
-    fluid: Fluid
-    attenuation: float
-    frequency: float
-    bodies: tuple[Body, ...]
+    fluid: Fluid  # the fluid around the bodies, called air
+    attenuation: float  # its attenuation [Np/m]
+    frequency: float  # frequency of the drive [Hz]
+    bodies: tuple[Body, ...]  # may overlap; the later one counts
+    # corners (lower, upper) [m] of the space that a grid of the whole domain covers
     domain: tuple[Vector, Vector]
+    # positions of the transducers (M, 3) [m]; a grid stays symmetric where they are
     sources: NDArray[np.float64]
 
     @property
@@ -95,7 +78,6 @@ class Region:
     @property
     def sound_speeds(self) -> dict[str, float]:
         """Sound speeds [m/s] by where they are, for messages."""
-        fluids = {f"obstacle {index}": body.fluid for index, body in enumerate(self.bodies) if body.fluid}
-        return {"the medium": self.fluid.sound_speed} | {
-            where: fluid.sound_speed for where, fluid in fluids.items()
-        }
+        fluids = {f"obstacle {index}": body.fluid for index, body in enumerate(self.bodies)}
+        everywhere = {"the medium": self.fluid} | fluids
+        return {where: fluid.sound_speed for where, fluid in everywhere.items() if fluid}

@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 import torch
 from scipy.sparse import csr_array
+from torch import Tensor
 
 from autdtorch.fdtd.interpolation import Interpolation
 from autdtorch.fdtd.kernels.contract import Sources
@@ -22,33 +23,26 @@ from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.superposition import superposition
 from autdtorch.utils.array_types import Index
 
+# Distance [cells] from the rim of the interior within which points are not read from the grid. Interpolation
+# is poor there, and the Huygens surface, two cells from the rim, is farther than half a cell from such a
+# point.
 _BESIDE = 1.25
-"""Distance [cells] from the rim of the interior within which points are not read from the grid. Interpolation
-is poor there, and the Huygens surface, two cells from the rim, is farther than half a cell from such a
-point."""
-
-_NEAREST = 0.5
-"""Distance [cells] from a source at which the singular incident field is cut off."""
+_NEAREST = 0.5  # Distance [cells] from a source at which the singular incident field is cut off
 
 
 @dataclass(frozen=True)
 class ScatteredField:
-    """An assembled box with its incident and radiated fields.
-
-    Attributes:
-        assembly: the box.
-        wavenumber: complex wavenumber in air [rad/m].
-    """
+    """An assembled box with its incident and radiated fields."""
 
     assembly: Assembly
-    wavenumber: complex
+    wavenumber: complex  # complex wavenumber in air [rad/m]
 
     @property
-    def driven(self) -> torch.Tensor:
+    def driven(self) -> Tensor:
         """Positions (n, 3) [m] where the incident field is needed: heterogeneous cells and neighbours."""
         return self.positions(self._driven[0])
 
-    def sources(self, field: torch.Tensor) -> Sources:
+    def sources(self, field: Tensor) -> Sources:
         """Return the forces of an incident field, given (n,) at the `driven` positions."""
         assembly = self.assembly
         incident = field.numpy()[self._driven[1]]
@@ -59,25 +53,17 @@ class ScatteredField:
         return Sources(torch.from_numpy(assembly.heterogeneous.index), both)
 
     def incident(
-        self,
-        points: torch.Tensor,
-        nodes: torch.Tensor,
-        weights: torch.Tensor,
-        strength: torch.Tensor,
-        nearest: float = 0.0,
-    ) -> torch.Tensor:
-        """Return the incident field (P,) at points (P, 3) [m].
-
-        Its N sources have nodes (N, n, 3) [m] with `weights` (n,) and strengths (N,) [Pa m].
-        """
+        self, points: Tensor, nodes: Tensor, weights: Tensor, strength: Tensor, nearest: float = 0.0
+    ) -> Tensor:
+        """Return the incident field (P,) at points (P, 3) [m] of sources with nodes (N, n, 3) [m]."""
         amplitude = strength.repeat_interleave(len(weights)) * weights.repeat(len(strength))
         return self._sum(points, nodes.reshape(-1, 3), amplitude[:, None], nearest)[:, 0]
 
-    def driving(self, nodes: torch.Tensor, weights: torch.Tensor, strength: torch.Tensor) -> torch.Tensor:
+    def driving(self, nodes: Tensor, weights: Tensor, strength: Tensor) -> Tensor:
         """Return the incident field (n,) at the `driven` positions; see `incident`."""
         return self.incident(self.driven, nodes, weights, strength, _NEAREST * self.assembly.grid.spacing)
 
-    def near_to_far(self, nodes: torch.Tensor, weights: torch.Tensor) -> NearToFar:
+    def near_to_far(self, nodes: Tensor, weights: Tensor) -> NearToFar:
         """Return the transform to P targets: means with `weights` (n,) over nodes (P, n, 3) [m]."""
         _, surface, outward = self._surface
         within = self.inside(nodes)
@@ -86,22 +72,22 @@ class ScatteredField:
         picked = Interpolation(surface[:, None], np.ones((len(surface), 1))).matrix(cells)
         return NearToFar(self, nodes, weights, within, cells, outward @ picked, inner.matrix(cells))
 
-    def radiated(self, amplitude: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+    def radiated(self, amplitude: Tensor, points: Tensor) -> Tensor:
         """Return fields (P, R) at points (P, 3) [m] of the Huygens surface with amplitudes (n, R) [Pa m]."""
         return self._sum(points, self._surface[0], amplitude, 0.0)
 
-    def at_surface(self, sources: torch.Tensor, amplitude: torch.Tensor) -> torch.Tensor:
+    def at_surface(self, sources: Tensor, amplitude: Tensor) -> Tensor:
         """Return fields (n, R) at the Huygens surface of sources (N, 3) [m], amplitudes (N, R) [Pa m]."""
         return self._sum(self._surface[0], sources, amplitude, 0.0)
 
-    def inside(self, points: torch.Tensor) -> torch.Tensor:
+    def inside(self, points: Tensor) -> Tensor:
         """Return which points (..., 3) are read from the grid; others are clear of the Huygens surface."""
         grid = self.assembly.grid
         cells = torch.from_numpy(grid.to_cells(points))
         first, last = torch.tensor([grid.first, grid.last], dtype=torch.int64, device="cpu").unbind()
         return ((cells > first + _BESIDE) & (cells < last - 1 - _BESIDE)).all(dim=-1)
 
-    def positions(self, cells: Index) -> torch.Tensor:
+    def positions(self, cells: Index) -> Tensor:
         """Return the centres (n, 3) [m] of cells."""
         grid = self.assembly.grid
         places = np.stack(np.unravel_index(cells, grid.shape), axis=-1)
@@ -115,7 +101,7 @@ class ScatteredField:
         return cells, place.reshape(around.shape)
 
     @cached_property
-    def _surface(self) -> tuple[torch.Tensor, Index, csr_array]:
+    def _surface(self) -> tuple[Tensor, Index, csr_array]:
         """Positions (n, 3) of the Huygens surface, the cells (m,) it reads, and their weights (n, m)."""
         assembly = self.assembly
         grid, stencil = assembly.grid, assembly.stencil
@@ -136,59 +122,43 @@ class ScatteredField:
         value = value * stencil.weights[column] * step[row, column]
         return self.positions(index), cells, csr_array((value, (row, place)), (len(index), len(cells)))
 
-    def _sum(
-        self, points: torch.Tensor, sources: torch.Tensor, amplitude: torch.Tensor, nearest: float
-    ) -> torch.Tensor:
+    def _sum(self, points: Tensor, sources: Tensor, amplitude: Tensor, nearest: float) -> Tensor:
         return superposition(points, sources, amplitude, self.wavenumber, nearest, self.assembly.dtype)
 
 
 @dataclass(frozen=True)
 class NearToFar:
-    """Near-to-far-field transform from phasors of a box's cells to the scattered field at P targets.
-
-    Attributes:
-        box: the box.
-        nodes: nodes of the targets (P, n, 3) [m].
-        weights: weights of a target's nodes (n,).
-        within: mask of the nodes in the box, where its cells are read (P, n).
-        cells: flat indices (k,) of the cells whose phasors are needed.
-        outward: amplitudes of the Huygens surface from those phasors.
-        inward: field at the nodes in the box from those phasors.
-    """
+    """Near-to-far-field transform from phasors of a box's cells to the scattered field at P targets."""
 
     box: ScatteredField
-    nodes: torch.Tensor
-    weights: torch.Tensor
-    within: torch.Tensor
-    cells: Index
-    outward: csr_array
-    inward: csr_array
+    nodes: Tensor  # nodes of the targets (P, n, 3) [m]
+    weights: Tensor  # weights of a target's nodes (n,)
+    within: Tensor  # mask of the nodes in the box, where its cells are read (P, n)
+    cells: Index  # flat indices (k,) of the cells whose phasors are needed
+    outward: csr_array  # amplitudes of the Huygens surface from those phasors
+    inward: csr_array  # field at the nodes in the box from those phasors
 
-    def field(self, phasors: torch.Tensor) -> torch.Tensor:
+    def field(self, phasors: Tensor) -> Tensor:
         """Return scattered fields (P, R) at the targets, from the cells' phasors (k, R) in R runs."""
         field = torch.zeros((*self.within.shape, phasors.shape[1]), dtype=torch.complex128, device="cpu")
         field[self.within] = torch.from_numpy(self.inward @ phasors.numpy())
         field[~self.within] = self.box.radiated(self.amplitudes(phasors), self.nodes[~self.within])
         return torch.einsum("pnr,n->pr", field, self.weights.to(field.dtype))
 
-    def amplitudes(self, phasors: torch.Tensor) -> torch.Tensor:
+    def amplitudes(self, phasors: Tensor) -> Tensor:
         """Return amplitudes (n, R) [Pa m] of the Huygens surface, from the cells' phasors (k, R)."""
         return torch.from_numpy(self.outward @ phasors.numpy())
 
-    def matrix(self, every: int) -> torch.Tensor:
+    def matrix(self, every: int) -> Tensor:
         """Return the matrix from phasors (k,) to the scattered field at each `every`-th target."""
         within, share = self.within[::every], self.weights.expand(self.within[::every].shape)
         target = torch.arange(len(within), device="cpu")[:, None].expand(within.shape)
         outside = self.nodes[::every][~within]
         amplitude = torch.zeros((len(outside), len(within)), dtype=torch.complex128, device="cpu")
-        amplitude[torch.arange(len(outside), device="cpu"), target[~within]] = share[~within].to(
-            amplitude.dtype
-        )
+        amplitude[torch.arange(len(outside), device="cpu"), target[~within]] = share[~within] + 0j
         received = self.box.at_surface(outside, amplitude)  # reciprocity of Green's function
         number = torch.zeros(self.within.shape, dtype=torch.int64, device="cpu")
         number[self.within] = torch.arange(int(self.within.sum()), device="cpu")
-        picked = csr_array(
-            (share[within].numpy(), (target[within].numpy(), number[::every][within].numpy())),
-            (len(within), self.inward.shape[0]),
-        )
+        place = target[within].numpy(), number[::every][within].numpy()
+        picked = csr_array((share[within].numpy(), place), (len(within), self.inward.shape[0]))
         return torch.from_numpy((self.outward.T @ received.numpy()).T + (picked @ self.inward).toarray())

@@ -9,15 +9,11 @@ import torch
 from autdtorch.fdtd.grid import FAIR_CELLS_PER_WAVELENGTH
 from autdtorch.fdtd.region import Region
 
-RATIO = 1.5
-"""Ratio of the spacings of the two grids: the coarser costs a fifth of the finer."""
-
+RATIO = 1.5  # Ratio of the spacings of the two grids: the coarser costs a fifth of the finer
+# Assumed order of convergence: twice the exponent 2/3 of the field at a rigid wedge. Curved surfaces converge
+# with order two; their error is overestimated by three quarters.
 ORDER = 4 / 3
-"""Assumed order of convergence: twice the exponent 2/3 of the field at a rigid wedge.
-Curved surfaces converge with order two; their error is overestimated by three quarters."""
-
-_PILOT_CELLS = 6.0
-"""Cells per wavelength of the finer of two grids that a spacing is chosen from."""
+_PILOT_CELLS = 6.0  # Cells per wavelength of the finer of two grids that a spacing is chosen from
 
 
 def coarsest_spacing(region: Region) -> float:

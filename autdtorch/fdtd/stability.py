@@ -19,44 +19,28 @@ from scipy.linalg import eigvalsh_tridiagonal
 from scipy.sparse import csr_array
 
 from autdtorch.fdtd.stencil import Stencil, flat_offsets
-from autdtorch.utils.array_types import Array
+from autdtorch.utils.array_types import Array, Index
 
 logger = logging.getLogger(__name__)
 
-
-CLOSE = 1.03
-"""A bound within this factor of an attained value is used as it is: 1.5 % of the time step."""
-
+CLOSE = 1.03  # A bound within this factor of an attained value is used as it is: 1.5 % of the time step
+# Factor on the iterated eigenvalue, at 0.5 % of the time step. Iteration approaches from below: 60 steps
+# leave up to 2e-4, the rim of one cell 3e-4 (cubes of density ratio 1e-3 to 1e4, speed ratio 0.3 to 4).
 MARGIN = 1.01
-"""Factor on the iterated eigenvalue, at 0.5 % of the time step. Iteration approaches from below: 60 steps
-leave up to 2e-4, the rim of one cell 3e-4 (cubes of density ratio 1e-3 to 1e4, speed ratio 0.3 to 4)."""
-
+# Most heterogeneous cells for the iteration, which takes about five seconds; beyond, the bound decides
 MOST_CELLS = 1_000_000
-"""Most heterogeneous cells for the iteration, which takes about five seconds; beyond, the bound decides."""
-
+# Least share of the largest time step. A longer step needs blocks of more periods, and a run ends with a
+# whole block: nothing is gained.
 LONG_ENOUGH = 0.97
-"""Least share of the largest time step. A longer step needs blocks of more periods, and a run ends with a
-whole block: nothing is gained."""
-
 _LANCZOS_STEPS = 60
-
-_ROUNDING = 1e-9
-"""Stencil rows within this of air's are those of air; most rows of maps are."""
+_ROUNDING = 1e-9  # Stencil rows within this of air's are those of air; most rows of maps are
 
 
-def largest_eigenvalue(
-    index: NDArray[np.int64], weight: Array, stencil: Stencil, shape: tuple[int, int, int]
-) -> float:
+def largest_eigenvalue(index: Index, weight: Array, stencil: Stencil, shape: tuple[int, int, int]) -> float:
     """Return an upper bound of the largest eigenvalue of the operator.
 
-    The larger of two eigenvalues: of uniform air, and of the heterogeneous cells with a rim of one cell. A
-    mode above those of air is bound to the heterogeneous cells and fades within a cell.
-
-    Args:
-        index: flat indices (n,) of the heterogeneous cells, ascending, not in the outermost ring.
-        weight: their stencil rows (n, 27).
-        stencil: weights of all other cells.
-        shape: shape of the grid.
+    The larger one of uniform air, and of the heterogeneous cells `index` (n,), ascending, with a rim of one
+    cell: a mode above those of air is bound to these cells and fades within a cell.
     """
     air = stencil.largest_symbol
     unlike = (np.abs(weight - stencil.weights) > _ROUNDING).any(axis=1)
@@ -89,23 +73,15 @@ def largest_eigenvalue(
     return min(bound, max(air, MARGIN * reached))
 
 
-_REVERSED = 26 - np.arange(27)
-"""Index in `OFFSETS` of the opposite offset."""
+_REVERSED = 26 - np.arange(27)  # Index in `OFFSETS` of the opposite offset
 
 
-def _inner(shape: tuple[int, int, int]) -> NDArray[np.bool_]:
-    """Return which cells (k,) are not in the outermost ring."""
-    return np.pad(np.ones([cells - 2 for cells in shape], bool), 1).ravel()
-
-
-def _with_rim(
-    index: NDArray[np.int64], shape: tuple[int, int, int]
-) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+def _with_rim(index: Index, shape: tuple[int, int, int]) -> tuple[Index, NDArray[np.int32]]:
     """Return cells `index` and their neighbours, ascending, and the place of each grid cell among them."""
     found = np.zeros(math.prod(shape), bool)
     for offset in flat_offsets(shape):
         found[index + offset] = True
-    found &= _inner(shape)
+    found &= np.pad(np.ones([cells - 2 for cells in shape], bool), 1).ravel()  # not in the outermost ring
     rows = np.flatnonzero(found)
     place = np.full(len(found), -1, np.int32)
     place[rows] = np.arange(len(rows))
@@ -119,14 +95,14 @@ def _lanczos(matrix: csr_array, steps: int) -> float:
     use BLAS, whose result depends on the number of threads.
     """
     vector = np.random.default_rng(0).standard_normal(matrix.shape[0])
-    vector /= _length(vector)
+    vector /= math.sqrt((vector * vector).sum())
     previous, beta = np.zeros_like(vector), 0.0
     diagonal, beside = [], []
     for _ in range(steps):
         image = matrix @ vector - beta * previous
         diagonal.append(float((vector * image).sum()))
         image -= diagonal[-1] * vector
-        beta = _length(image)
+        beta = math.sqrt((image * image).sum())
         if beta <= 1e-12 * abs(diagonal[0]):  # the vectors span an invariant space
             break
         beside.append(beta)
@@ -140,15 +116,10 @@ def fewest_steps(stencil: Stencil, largest: float) -> float:
 
 
 def whole_steps(fewest: float) -> Fraction:
-    """Return at least `fewest` steps per period, a whole number in a block of q periods (denominator).
+    """Return at least `fewest` steps per period, a whole number in the shortest block that is `LONG_ENOUGH`.
 
-    The block is the shortest whose time step is `LONG_ENOUGH`. It loses less than 1 step in q x fewest: 12
-    steps per period need q up to 3, 6 steps up to 6.
+    A block of q periods, the denominator, loses less than 1 step in q x fewest.
     """
     # rounding must not add a step to a number that is whole
     counts = (Fraction(math.ceil(block * fewest - 1e-9), block) for block in itertools.count(1))
     return next(count for count in counts if fewest >= LONG_ENOUGH * count)
-
-
-def _length(vector: NDArray[np.float64]) -> float:
-    return math.sqrt(float((vector * vector).sum()))

@@ -18,76 +18,53 @@ from fractions import Fraction
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources
 from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, drive_dft, drive_signal
+from autdtorch.utils.array_types import Index
 
 Phasors = NDArray[np.complex128]
-
+# Fewest periods of a block. Shorter blocks cost more overhead, and the phasors kept cover less time.
 _FEWEST_PERIODS = 3
-"""Fewest periods of a block. Shorter blocks cost more overhead, and the phasors kept cover less time."""
-
-_PARTS = 4
-"""Windows per block."""
-
+_PARTS = 4  # Windows per block
+# Range of the number of phasors kept, limited by `_MOST_NUMBERS`; more extrapolate better
 _FEWEST_PHASORS, _MOST_PHASORS = 12, 64
-"""Range of the number of phasors kept, limited by `_MOST_NUMBERS`; more extrapolate better."""
-
-_MOST_NUMBERS = 20_000_000
-"""Most complex numbers that the phasors kept may hold: 320 MB."""
-
-_MOST_FITTED = 2048
-"""Most cells whose phasors decide the means."""
-
-_ROUNDING = 1e-13
-"""Regularisation of the normal equations, relative to the mean square of the differences."""
-
+_MOST_NUMBERS = 20_000_000  # Most complex numbers that the phasors kept may hold: 320 MB
+_MOST_FITTED = 2048  # Most cells whose phasors decide the means
+_ROUNDING = 1e-13  # Regularisation of the normal equations, relative to the mean square of the differences
+# Safety factor: the residual is estimated as this many times the changes over the last two blocks
 _CAUTION = 2.0
-"""Safety factor: the residual is estimated as this many times the changes over the last two blocks."""
 
 
 @dataclass(frozen=True)
 class SteadyState:
-    """Phasors of cells with their estimated residual.
+    """Phasors of cells with their estimated residual."""
 
-    Attributes:
-        pressure: phasors (k,), complex.
-        periods: periods stepped.
-        residual: estimated relative distance to the steady state, infinite while there is no estimate.
-        converged: whether the residual is within the tolerance.
-    """
-
-    pressure: torch.Tensor
-    periods: int
-    residual: float
-    converged: bool
+    pressure: Tensor  # phasors (k,), complex
+    periods: int  # periods stepped
+    residual: float  # estimated relative distance to the steady state, infinite while there is no estimate
+    converged: bool  # whether the residual is within the tolerance
 
 
 def run_to_steady_state(
     assembly: Assembly,
     kernel: Kernel,
     sources: Sources,
-    cells: NDArray[np.int64],
+    cells: Index,
     tolerance: float,
     max_periods: int,
-    observe: Callable[[torch.Tensor], torch.Tensor],
+    observe: Callable[[Tensor], Tensor],
     stepped: Callable[[int], None],
 ) -> SteadyState:
-    """Step until the observed quantity has converged, or `max_periods` have passed.
+    """Step until the relative residual is within `tolerance`, or `max_periods` have passed.
 
-    Args:
-        assembly: the region on its grid.
-        kernel: the kernel.
-        sources: the sources.
-        cells: flat indices (k,) of the cells whose phasors are needed.
-        tolerance: relative residual at which to stop.
-        max_periods: largest number of periods.
-        observe: maps phasors (k,) to the quantity that must converge, once sound has crossed the grid twice.
-        stepped: called with the number of periods after each block.
+    `observe` maps the phasors of `cells` (k,) to the quantity that must converge, once sound has crossed the
+    grid twice. `stepped` is called with the number of periods after each block.
     """
     earliest = fewest_periods(assembly.grid.diagonal / assembly.grid.wavelength)
     sequence = Extrapolation(phasors_kept(len(cells)))
-    values: deque[torch.Tensor] = deque(maxlen=3)
+    values: deque[Tensor] = deque(maxlen=3)
     ramp = math.ceil(RAMP_PERIODS * assembly.steps_per_period)
     for count, windows in windows_of_run(assembly, kernel, sources, cells):
         stepped(block_of(assembly.steps_per_period)[1])
@@ -160,15 +137,14 @@ class Extrapolation:
 
 
 def windows_of_run(
-    assembly: Assembly, kernel: Kernel, sources: Sources, cells: NDArray[np.int64]
+    assembly: Assembly, kernel: Kernel, sources: Sources, cells: Index
 ) -> Iterator[tuple[int, list[tuple[int, Phasors]]]]:
     """Step from silence; yield after each block the periods so far, and start and phasors of its windows."""
     steps_per_period = assembly.steps_per_period
     steps, periods = block_of(steps_per_period)
     shift = max(1, steps // _PARTS)
-    receivers = Receivers(
-        torch.from_numpy(cells[:, None]), torch.ones((len(cells), 1), dtype=assembly.dtype, device="cpu")
-    )
+    ones = torch.ones((len(cells), 1), dtype=assembly.dtype, device="cpu")
+    receivers = Receivers(torch.from_numpy(cells[:, None]), ones)
     state = assembly.silence(sources)
     both = None  # record of the last two blocks (2 * steps, k)
     for block in itertools.count():
@@ -184,13 +160,13 @@ def windows_of_run(
         yield (block + 1) * periods, [(start, _turned(window, start, periods)) for start, window in windows]
 
 
-def _turned(window: torch.Tensor, start: int, periods: int) -> Phasors:
+def _turned(window: Tensor, start: int, periods: int) -> Phasors:
     """Return phasors (k,) of a window of `periods`, recorded (steps, k) after each step from `start` on."""
     turn = 2 * math.pi * (start * periods % len(window)) / len(window)
     return np.asarray(drive_dft(window, periods).cpu().numpy() * complex(math.cos(turn), math.sin(turn)))
 
 
-def _residual(values: deque[torch.Tensor]) -> float:
+def _residual(values: deque[Tensor]) -> float:
     """Return the residual of the last value, estimated from its changes over the last two blocks."""
     last = values[-1]
     size = float(last.norm())

@@ -1,29 +1,24 @@
 """The 27-point stencil tuned to one frequency (nonstandard FDTD, Mickens 1994, Cole 2002).
 
-A step in uniform air is
-
-    p_new = 2 p - p_old + C sum_j g_j (p_j - p),
-
-with one value of g for the 6 faces, one for the 12 edges and one for the 8 corners of the surrounding cube.
-The three values make the symbol
+A step in uniform air is p_new = 2 p - p_old + C sum_j g_j (p_j - p), with one value of g for the 6 faces, one
+for the 12 edges and one for the 8 corners of the surrounding cube. The three values make the symbol
 
     L(kappa) = sum_j g_j (1 - cos(kappa . n_j)),        kappa = k h,
 
 equal to (k h)^2 for long waves and independent of direction at the drive frequency. C makes the frequency of
 that wave exact for the time step. Other frequencies are not tuned; the steady state does not contain them.
 
-Where air absorbs, a term D (p_new - p_old) is added on the left. A wave e^{i (kappa + i eta) n - i w t} of
-attenuation eta per cell then solves
+Where air absorbs, a term D (p_new - p_old) is added on the left. With attenuation eta per cell, a wave solves
 
-    2 cos(w dt) - 2 i D sin(w dt) = 2 - C L(kappa + i eta).
+    2 cos(w dt) - 2 i D sin(w dt) = 2 - C L(kappa + i eta):
 
-The real part, with the real part of L, determines C, and the imaginary part D. The bound on C for stability
-is that without loss, and D damps all waves.
+the real part determines C, and the imaginary part D. D damps all waves; the bound on C is that without loss.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -33,43 +28,32 @@ from numpy.typing import NDArray
 
 from autdtorch.utils.array_types import Array
 
+# The 27 neighbour offsets in row-major order; entry 13 is the cell itself
 OFFSETS = tuple((x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1))
-"""The 27 neighbour offsets in row-major order; entry 13 is the cell itself."""
 
 
-def flat_strides(shape: tuple[int, int, int]) -> NDArray[np.int64]:
+def flat_strides(shape: Sequence[int]) -> NDArray[np.int64]:
     """Return the strides (3,) of flat indices of a grid."""
     return np.array((shape[1] * shape[2], shape[2], 1))
 
 
-def flat_offsets(shape: tuple[int, int, int]) -> NDArray[np.int64]:
+def flat_offsets(shape: Sequence[int]) -> NDArray[np.int64]:
     """Return the offsets (27,) of flat indices to the neighbours."""
     return np.asarray(np.array(OFFSETS) @ flat_strides(shape), np.int64)
 
 
 @dataclass(frozen=True)
 class Stencil:
-    """Spatial weights tuned at one wavenumber.
+    """Spatial weights tuned at one wavenumber."""
 
-    Attributes:
-        kappa: wavenumber times spacing at which the stencil is tuned [rad].
-        eta: attenuation times spacing [Np].
-        face: weight of the 6 face neighbours.
-        edge: weight of the 12 edge neighbours.
-        corner: weight of the 8 corner neighbours.
-        symbol: real part of the symbol at kappa + i eta, averaged over directions.
-        loss: imaginary part of it.
-        slope: derivative of the symbol at kappa + i eta, averaged over directions.
-    """
-
-    kappa: float
-    eta: float
-    face: float
-    edge: float
-    corner: float
-    symbol: float
-    loss: float
-    slope: complex
+    kappa: float  # wavenumber times spacing at which the stencil is tuned [rad]
+    eta: float  # attenuation times spacing [Np]
+    face: float  # weight of the 6 face neighbours
+    edge: float  # weight of the 12 edge neighbours
+    corner: float  # weight of the 8 corner neighbours
+    symbol: float  # real part of the symbol at kappa + i eta, averaged over directions
+    loss: float  # imaginary part of it
+    slope: complex  # derivative of the symbol at kappa + i eta, averaged over directions
 
     @property
     def weights(self) -> Array:
@@ -84,11 +68,7 @@ class Stencil:
 
     @property
     def largest_symbol(self) -> float:
-        """Largest value of the symbol over all waves the grid can carry.
-
-        The symbol is affine in each cos(kappa_i) by itself, so its extremes lie at the corners of the
-        Brillouin zone.
-        """
+        """Largest symbol of all waves: at a corner of the Brillouin zone, as it is affine in cosines."""
         corners = np.array([(x, y, z) for x in (0, np.pi) for y in (0, np.pi) for z in (0, np.pi)])
         return float((_basis(corners) @ (self.face, self.edge, self.corner)).max())
 
@@ -97,10 +77,7 @@ class Stencil:
         return np.asarray(_basis(kappa) @ (self.face, self.edge, self.corner))
 
     def isotropic_symbol(self, kappa: float) -> float:
-        """Return the real part of the symbol, averaged over directions, of another sound speed.
-
-        Taken at kappa (1 + i eta / kappa): the loss per wavelength is the same everywhere.
-        """
+        """Return the mean real part of the symbol of another sound speed; the loss per wavelength is kept."""
         loss = self.eta / self.kappa
         return _mean_symbol(kappa * complex(1, loss), (self.face, self.edge, self.corner)).real
 
@@ -117,8 +94,7 @@ class Stencil:
         """Return the force per step and unit S/h of a point source with the far field S e^{ikr}/r.
 
         The discrete Green's function is a Fourier integral over 1/(C L - 2 + 2 cos(w dt) - 2 i D sin(w dt)).
-        The slope of the symbol at the pole determines its far field; in the continuum it is
-        2 (kappa + i eta).
+        Its far field follows from the slope of the symbol at the pole, in the continuum 2 (kappa + i eta).
         """
         factor = self.time_factor(steps_per_period) / (1 + self.damping(steps_per_period))
         return 4 * math.pi * factor * self.slope / (2 * complex(self.kappa, self.eta))
@@ -153,12 +129,7 @@ def _mean_symbol(wavenumber: complex, weights: tuple[float, ...]) -> complex:
 
 @lru_cache(maxsize=64)
 def tuned_stencil(kappa: float, eta: float = 0.0) -> Stencil:
-    """Return the stencil whose symbol at `kappa` varies least over directions (least squares).
-
-    Args:
-        kappa: wavenumber times spacing [rad], in (0, pi).
-        eta: attenuation times spacing [Np], small beside kappa.
-    """
+    """Return the stencil whose symbol at `kappa` in (0, pi) varies least over directions (least squares)."""
     basis = _basis(kappa * _DIRECTIONS)
     scale = np.sqrt(_SOLID_ANGLES / _SOLID_ANGLES.sum())[:, None]
     # face = 1 - 4 edge - 4 corner keeps long waves exact; the other two flatten the symbol.

@@ -9,6 +9,7 @@ from fractions import Fraction
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells
@@ -24,37 +25,26 @@ from autdtorch.utils.validation import invalid
 
 logger = logging.getLogger(__name__)
 
+# Periods over which the drive is switched on. A short ramp excites the shortest waves of the grid, which
+# almost stand still and stay: at 2 mm, 3 periods left changes of 1e-3 per period after 60 periods, 8 periods
+# 5e-5.
 RAMP_PERIODS = 8
-"""Periods over which the drive is switched on. A short ramp excites the shortest waves of the grid, which
-almost stand still and stay: at 2 mm, 3 periods left changes of 1e-3 per period after 60 periods, 8 periods
-5e-5."""
-
+# Initial uniform pressure, relative to the largest force. From exact zeros the wave's precursors would decay
+# into subnormal numbers, on which processors are slow (2.4 times, measured at 120^3 in float32).
 _BACKGROUND = 1e-20
-"""Initial uniform pressure, relative to the largest force. From exact zeros the wave's precursors would decay
-into subnormal numbers, on which processors are slow (2.4 times, measured at 120^3 in float32)."""
-
-_ONE_NODE = torch.ones(1, dtype=torch.float64, device="cpu")
-"""Weight of a point with a single node."""
+_ONE_NODE = torch.ones(1, dtype=torch.float64, device="cpu")  # Weight of a point with a single node
 
 
 @dataclass(frozen=True)
 class Assembly:
-    """A region on a grid, ready to step.
-
-    Attributes:
-        grid: the grid.
-        stencil: weights in air.
-        steps_per_period: time steps per period of the drive: steps (numerator) and periods (denominator) of a
-            block.
-        coefficients: the input of the kernel.
-        heterogeneous: the cells that are not of uniform air.
-    """
+    """A region on a grid, ready to step."""
 
     grid: Grid
-    stencil: Stencil
+    stencil: Stencil  # weights in air
+    # time steps per period of the drive: steps (numerator) and periods (denominator) of a block
     steps_per_period: Fraction
-    coefficients: Coefficients
-    heterogeneous: HeterogeneousCells
+    coefficients: Coefficients  # the input of the kernel
+    heterogeneous: HeterogeneousCells  # the cells that are not of uniform air
 
     @property
     def dtype(self) -> torch.dtype:
@@ -66,7 +56,7 @@ class Assembly:
         faint = _BACKGROUND * float(sources.force.detach().abs().max())
         return uniform_state(self.grid.shape, self.coefficients, faint)
 
-    def interpolation(self, points: torch.Tensor, weights: torch.Tensor = _ONE_NODE) -> Interpolation:
+    def interpolation(self, points: Tensor, weights: Tensor = _ONE_NODE) -> Interpolation:
         """Return cells and weights of points (P, 3) [m], or of nodes (P, n, 3) with `weights` (n,)."""
         nodes, grid = points.reshape(-1, 3), self.grid
         found = self._in_air(nodes)
@@ -74,23 +64,21 @@ class Assembly:
         found = exclude_cells(found, grid.to_cells(nodes), sound_hard, grid.shape, grid.kappa)
         return average_nodes(found, weights.numpy())
 
-    def _in_air(self, points: torch.Tensor) -> Interpolation:
+    def _in_air(self, points: Tensor) -> Interpolation:
         """Return the interpolation as if all cells were of air."""
         grid = self.grid
         return interpolate_points(grid.to_cells(points), grid.shape, grid.first, grid.last, grid.kappa)
 
-    def touches_heterogeneous(self, points: torch.Tensor) -> bool:
+    def touches_heterogeneous(self, points: Tensor) -> bool:
         """Return whether the interpolation of any of the points (N, 3) [m] uses cells that are not of air."""
         return len(points) > 0 and bool(np.isin(self._in_air(points).index, self.heterogeneous.index).any())
 
-    def receivers(self, points: torch.Tensor, weights: torch.Tensor = _ONE_NODE) -> Receivers:
+    def receivers(self, points: Tensor, weights: Tensor = _ONE_NODE) -> Receivers:
         """Return receivers at points (P, 3) [m], or of means over nodes (P, n, 3) with `weights` (n,)."""
         found = self.interpolation(points, weights)
         return Receivers(torch.from_numpy(found.index), torch.from_numpy(found.weight).to(self.dtype))
 
-    def sources(
-        self, points: torch.Tensor, strength: torch.Tensor, weights: torch.Tensor = _ONE_NODE
-    ) -> Sources:
+    def sources(self, points: Tensor, strength: Tensor, weights: Tensor = _ONE_NODE) -> Sources:
         """Return point sources at (P, 3) [m] with far field strength e^{ikr}/r, strength (P,) complex [Pa m].
 
         Nodes (P, n, 3) with `weights` (n,) share the strength of a source. Differentiable by strength.
@@ -99,9 +87,7 @@ class Assembly:
         factor = self.stencil.source_factor(float(self.steps_per_period)) / self.grid.spacing
         index, inverse = np.unique(found.index, return_inverse=True)
         force = (strength[:, None] * torch.from_numpy(factor * found.weight)).reshape(-1)
-        total = torch.zeros(len(index), dtype=force.dtype, device="cpu").index_add(
-            0, torch.from_numpy(inverse.reshape(-1)), force
-        )
+        total = force.new_zeros(len(index)).index_add(0, torch.from_numpy(inverse.reshape(-1)), force)
         total = total / torch.from_numpy(self.heterogeneous.mass_of(index))
         return Sources(torch.from_numpy(index), torch.view_as_real(total).to(self.dtype))
 
@@ -109,20 +95,12 @@ class Assembly:
 def assemble(
     region: Region, spacing: float, dtype: torch.dtype = torch.float32, time_step: float | None = None
 ) -> Assembly:
-    """Assemble a region on a grid of its domain with cells of `spacing` [m]; see `assemble_on`.
-
-    Raises:
-        ValueError: the spacing is too coarse for the frequency, or the time step is not stable.
-    """
+    """Assemble a region on a grid of its domain with cells of `spacing` [m]; see `assemble_on`."""
     return assemble_on(make_grid(region, spacing), region, dtype, time_step)
 
 
 def assemble_on(grid: Grid, region: Region, dtype: torch.dtype, time_step: float | None) -> Assembly:
-    """Assemble a region on a grid, with at most a time step of `time_step` [s], by default the largest.
-
-    Raises:
-        ValueError: the time step is not stable.
-    """
+    """Assemble a region on a grid, with at most a time step of `time_step` [s], by default the largest."""
     stencil = air_stencil(grid, region)
     cells = heterogeneous_cells(elements_of(region, grid, stencil), stencil)
     return assembly_of(grid, stencil, cells, region.frequency, dtype, time_step)
@@ -189,7 +167,7 @@ def _wanted_steps(fewest: float, time_step: float | None, frequency: float) -> f
     return 1 / (frequency * time_step)
 
 
-def drive_signal(steps_per_period: Fraction, first: int, count: int) -> torch.Tensor:
+def drive_signal(steps_per_period: Fraction, first: int, count: int) -> Tensor:
     """Return cos(w t) and sin(w t) under the switch-on envelope, (count, 2), from step `first` on."""
     step = torch.arange(first, first + count, device="cpu")
     block, turns = steps_per_period.numerator, steps_per_period.denominator
@@ -199,11 +177,8 @@ def drive_signal(steps_per_period: Fraction, first: int, count: int) -> torch.Te
     return torch.stack((envelope * torch.cos(phase), envelope * torch.sin(phase)), dim=1)
 
 
-def drive_dft(recorded: torch.Tensor, periods: int) -> torch.Tensor:
-    """Return phasors (R,) at the drive frequency, by the Fourier transform of a block of `periods`.
-
-    The block holds the values (steps, R) recorded after each of its steps.
-    """
+def drive_dft(recorded: Tensor, periods: int) -> Tensor:
+    """Return phasors (R,) at the drive frequency of a record (steps, R) of `periods`."""
     steps = len(recorded)
     turn = 2 * math.pi * periods / steps * torch.arange(1, steps + 1, dtype=torch.float64, device="cpu")
     basis = 2 / steps * torch.stack((torch.cos(turn), torch.sin(turn)))

@@ -7,15 +7,14 @@ from itertools import pairwise
 
 import pytest
 import torch
-from small_scenes import small_scene
+from small_scenes import assembled_parts, small_scene
 
 from autdtorch.fdtd import adjoint
 from autdtorch.fdtd.adjoint import recorded
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources, State
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
-from autdtorch.fdtd.stepping import Assembly, assemble
-from autdtorch.propagators.scene_region import region_of
+from autdtorch.fdtd.stepping import Assembly
 from autdtorch.scene.obstacles import Box, Obstacle, Sphere
 
 HEAVY = Sphere((4.7e-3, 4.2e-3, 4.6e-3), 1.7e-3, density=20.0, sound_speed=300.0)
@@ -30,23 +29,16 @@ Gradients = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 def parts(dtype: torch.dtype, *obstacles: Obstacle) -> Parts:
     """Return a 2 x 2 array in absorbing air, three receivers, and a random signal."""
+    signal = torch.randn((STEPS, 2), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     scene = small_scene(obstacles, extent=9e-3, absorption=40.0)
-    assembly = assemble(region_of(scene), 1.4e-3, dtype)
-    strength = torch.tensor([1.0, 1j, -0.4, 0.3 - 0.7j], dtype=torch.complex128)
-    return (
-        assembly,
-        assembly.sources(scene.array.positions, strength),
-        assembly.receivers(scene.control_points),
-        torch.randn((STEPS, 2), generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(dtype),
-    )
+    return *assembled_parts(scene, 1.4e-3, dtype), signal.to(dtype)
 
 
 def differentiable(assembly: Assembly, sources: Sources) -> tuple[Assembly, Sources]:
     weight = assembly.coefficients.heterogeneous_weight.clone().requires_grad_()
     coefficients = replace(assembly.coefficients, heterogeneous_weight=weight)
-    return replace(assembly, coefficients=coefficients), replace(
-        sources, force=sources.force.clone().requires_grad_()
-    )
+    force = sources.force.clone().requires_grad_()
+    return replace(assembly, coefficients=coefficients), replace(sources, force=force)
 
 
 def gradients(given: Parts, kernel: Kernel | None) -> Gradients:

@@ -43,8 +43,3 @@ def test_gradients_by_source_and_medium() -> None:
     force = torch.randn((2, 2), generator=generator, dtype=torch.float64).requires_grad_()
     weight = (0.05 * torch.rand((2, 27), generator=generator, dtype=torch.float64)).requires_grad_()
     assert torch.autograd.gradcheck(lambda f, w: pressure(f, w, steps=5), (force, weight))
-
-
-def test_no_graph_is_kept_unless_asked_for() -> None:
-    force, weight = torch.ones((2, 2), dtype=torch.float64), torch.full((2, 27), 0.03, dtype=torch.float64)
-    assert not pressure(force, weight, steps=3).requires_grad

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from small_scenes import CUBE, relative_error, small_scene
+from small_scenes import CUBE, all_tensors, relative_error, small_scene
 
 pytest.importorskip("triton", reason="the CUDA kernel needs Triton: install autdtorch[cuda]")
 
@@ -52,20 +52,13 @@ def parts(obstacles: tuple[Obstacle, ...], dtype: torch.dtype, absorption: float
     inner = torch.zeros(shape, dtype=torch.bool)
     inner[1:-1, 1:-1, 1:-1] = True
     somewhere = torch.nonzero(inner.reshape(-1)).reshape(-1)[::97]
-    special = [
-        each.reshape(-1)[::5]
-        for each in (c.heterogeneous_index, c.sound_hard_index, c.columns.index[:, 1:-1])
-    ]
-    index = torch.unique(torch.cat((somewhere, *special)))
+    special = c.heterogeneous_index, c.sound_hard_index, c.columns.index[:, 1:-1]
+    index = torch.unique(torch.cat((somewhere, *(each.reshape(-1)[::5] for each in special))))
     index = index[torch.randperm(len(index), generator=generator)]
     force = torch.randn((len(index), 3), dtype=torch.float64, generator=generator)
     weight = torch.rand((len(index) // 2, 2), dtype=torch.float64, generator=generator).to(dtype)
-    return (
-        shape,
-        c,
-        Sources(index, force.to(dtype)),
-        Receivers(index[: 2 * len(weight)].reshape(-1, 2), weight),
-    )
+    receivers = Receivers(index[: 2 * len(weight)].reshape(-1, 2), weight)
+    return shape, c, Sources(index, force.to(dtype)), receivers
 
 
 def noise(shape: tuple[int, int, int], c: Coefficients) -> State:
@@ -91,12 +84,7 @@ def advance(kernel: Kernel, given: Parts, blocks: tuple[int, ...]) -> tuple[Stat
 
 def assert_same(one: tuple[State, torch.Tensor], other: tuple[State, torch.Tensor], tolerance: float) -> None:
     """Fields, all memory and what was recorded, relative to the peak of each."""
-
-    def tensors(state: State, recorded: torch.Tensor) -> list[torch.Tensor]:
-        memory = [each for layer in (*state.layers, state.columns, state.crossed) for each in layer]
-        return [state.now, state.before, recorded, *memory]
-
-    for value, reference in zip(tensors(*one), tensors(*other), strict=True):
+    for value, reference in zip(all_tensors(*one), all_tensors(*other), strict=True):
         assert value.shape == reference.shape
         if reference.numel():
             assert (value.cpu() - reference).abs().max() <= tolerance * reference.abs().max()

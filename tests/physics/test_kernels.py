@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from small_scenes import CUBE, small_scene
+from small_scenes import CUBE, NO_RECEIVERS, NO_SOURCES, all_tensors, assembled_parts, small_scene
 
 from autdtorch.fdtd.kernels.contract import Coefficients, Kernel, Receivers, Sources, State, uniform_state
 from autdtorch.fdtd.kernels.cpu import CpuKernel, _cuts
@@ -27,26 +27,13 @@ PLATE = Box((12e-3, 12e-3, 21.7e-3), (30e-3, 40e-3, 1.7e-3), density=5.0, sound_
 
 
 def scene_parts(dtype: torch.dtype, absorption: float = 0.0) -> tuple[Assembly, Sources, Receivers]:
-    scene = small_scene((CUBE, RIGID, FAST, PLATE), extent=24e-3, absorption=absorption)
-    assembly = assemble(region_of(scene), 1e-3, dtype)
-    strength = torch.tensor([1.0, 1j, -0.4, 0.3 - 0.7j], dtype=torch.complex128)
-    return (
-        assembly,
-        assembly.sources(scene.array.positions, strength),
-        assembly.receivers(scene.control_points),
-    )
+    return assembled_parts(small_scene((CUBE, RIGID, FAST, PLATE), absorption=absorption), 1e-3, dtype)
 
 
 def advance(kernel: Kernel, dtype: torch.dtype, steps: int) -> tuple[State, torch.Tensor]:
     assembly, sources, receivers = scene_parts(dtype, absorption=40.0)
     signal = drive_signal(assembly.steps_per_period, 0, steps).to(dtype)
     return kernel.advance(assembly.silence(sources), assembly.coefficients, sources, receivers, signal)
-
-
-def tensors(state: State, recorded: torch.Tensor) -> list[torch.Tensor]:
-    """All results of a run: pressure, record, and the memory of layers and columns."""
-    memory = (*state.layers, state.columns, state.crossed)
-    return [state.now, recorded, *(part for layer in memory for part in layer)]
 
 
 # float64: rounding grows with the steps and the sums of 27 terms; float32: the design's parity figure, 1e-4
@@ -56,7 +43,9 @@ def tensors(state: State, recorded: torch.Tensor) -> list[torch.Tensor]:
 def test_cpu_kernel_is_the_reference_kernel(dtype: torch.dtype, tolerance: float, steps: int) -> None:
     state, recorded = advance(CpuKernel(), dtype, steps)
     expected, expected_recorded = advance(ReferenceKernel(), dtype, steps)
-    for value, reference in zip(tensors(state, recorded), tensors(expected, expected_recorded), strict=True):
+    for value, reference in zip(
+        all_tensors(state, recorded), all_tensors(expected, expected_recorded), strict=True
+    ):
         assert (value - reference).abs().max() <= tolerance * max(float(reference.abs().max()), 1e-30)
 
 
@@ -69,12 +58,12 @@ def test_chunks_of_planes_are_the_whole(chunks: int, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("autdtorch.fdtd.kernels.cpu._CHUNK_PLANES", planes // chunks)
     assert len(_cuts(whole[0].now.shape)) == chunks + 1
     parts = advance(CpuKernel(), torch.float64, 41)
-    for value, reference in zip(tensors(*parts), tensors(*whole), strict=True):
+    for value, reference in zip(all_tensors(*parts), all_tensors(*whole), strict=True):
         assert (value - reference).abs().max() <= 1e-12 * reference.abs().max()
     for threads in (1, 3):
         monkeypatch.setattr("autdtorch.fdtd.kernels.cpu.thread_count", lambda count=threads: count)
         again = advance(CpuKernel(), torch.float64, 41)
-        assert all(map(torch.equal, tensors(*again), tensors(*parts)))
+        assert all(map(torch.equal, all_tensors(*again), all_tensors(*parts)))
 
 
 def test_one_worker_steps_where_processors_are_busy(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,21 +102,13 @@ def test_a_mode_of_a_closed_box_keeps_its_frequency_and_amplitude(kernel: Kernel
     )
     mode = x[:, None, None] * y[None, :, None] * z[None, None, :]
     cx, cy, cz = (math.cos(k) for k in wave)
-    turn = math.acos(
-        (
-            c.center
-            + 2 * c.face * (cx + cy + cz)
-            + 4 * c.edge * (cx * cy + cy * cz + cz * cx)
-            + 8 * c.corner * cx * cy * cz
-        )
-        / 2
-    )
+    along, beside = c.face * (cx + cy + cz), 2 * c.edge * (cx * cy + cy * cz + cz * cx)
+    turn = math.acos(c.center / 2 + along + beside + 4 * c.corner * cx * cy * cz)
     state = uniform_state(shape, c, 0.0)
     state.now.copy_(mode)
     state.before.copy_(mode * math.cos(turn))
-    nobody = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros((0, 2), dtype=torch.float64))
-    deaf = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1), dtype=torch.float64))
-    state, _ = kernel.advance(state, c, nobody, deaf, torch.zeros((steps, 2), dtype=torch.float64))
+    silence = torch.zeros((steps, 2), dtype=torch.float64)
+    state, _ = kernel.advance(state, c, NO_SOURCES, NO_RECEIVERS, silence)
     # rounding of 400 steps, each of relative size 1e-16, adds up at worst in proportion to steps^2
     assert (state.now - mode * math.cos(turn * steps)).abs().max() < 1e-10
 

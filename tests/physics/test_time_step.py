@@ -10,18 +10,15 @@ import numpy as np
 import pytest
 import torch
 from scipy.sparse.linalg import LinearOperator, eigs
-from small_scenes import CUBE, relative_error, small_scene
+from small_scenes import CUBE, NO_RECEIVERS, NO_SOURCES, relative_error, small_scene
 
-from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, State, uniform_state
+from autdtorch.fdtd.kernels.contract import Coefficients, State, uniform_state
 from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.stepping import Assembly, assemble, drive_dft, drive_signal
 from autdtorch.propagators import make_propagator
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.scene import Box
-
-NOBODY = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros((0, 2), dtype=torch.float64))
-DEAF = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1), dtype=torch.float64))
 
 
 def cube(density: float, sound_speed: float = 340.0) -> tuple[Box, ...]:
@@ -43,18 +40,13 @@ SCENES = {
 
 def scaled(c: Coefficients, ratio: float) -> Coefficients:
     """Return coefficients with another time factor."""
-    return replace(
-        c,
-        center=2 - ratio * (2 - c.center),
-        face=ratio * c.face,
-        edge=ratio * c.edge,
-        corner=ratio * c.corner,
-        heterogeneous_weight=ratio * c.heterogeneous_weight,
-    )
+    names = ("face", "edge", "corner", "heterogeneous_weight")
+    return replace(c, center=2 - ratio * (2 - c.center), **{name: ratio * getattr(c, name) for name in names})
 
 
 def advance(c: Coefficients, state: State, steps: int) -> State:
-    return CpuKernel().advance(state, c, NOBODY, DEAF, torch.zeros((steps, 2), dtype=torch.float64))[0]
+    silence = torch.zeros((steps, 2), dtype=torch.float64)
+    return CpuKernel().advance(state, c, NO_SOURCES, NO_RECEIVERS, silence)[0]
 
 
 def true_eigenvalue(assembly: Assembly) -> float:

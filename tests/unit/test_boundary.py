@@ -68,11 +68,3 @@ def test_layer_gives_little_energy_to_evanescent_fields(
     ]
     # measured: 0.08, 0.02, 0.01 and 0.02; a tenth of the frequency shift gives 0.48, 0.35, 0.28 and 0.19
     assert max(given) < most
-
-
-def test_a_layer_without_damping_is_a_wall() -> None:
-    # zero pressure behind it: total reflection
-    profile = tuned_profile(2 * math.pi / 8.5, 13, 4)
-    silent = type(profile)(profile.decay, np.zeros_like(profile.gain))
-    reflected = reflection(silent, np.array([0.3, 0.7]), np.full(2, 2 * math.pi / 13))
-    assert np.allclose(np.abs(reflected), 1, atol=1e-12)

@@ -1,13 +1,14 @@
 """The reference element: the cube between eight cell centres, its vertices.
 
-The scheme is a sum over elements of a stiffness matrix, given by 28 coupling coefficients between pairs of
-vertices, and of a lumped mass at each vertex. Lengths are in cells, densities and masses relative to air.
+The scheme is a sum over elements of a stiffness matrix, given by 28 coupling coefficients between vertices,
+and of a lumped mass at each vertex. Lengths are in cells, densities and masses relative to air.
 """
 
 from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,35 +17,24 @@ from autdtorch.fdtd.assembly.constants import SUBCELLS
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
 
+# Offsets of the eight vertices of an element [cells]
 VERTICES = np.array(list(itertools.product((0, 1), repeat=3)))
-"""Offsets of the eight vertices of an element [cells]."""
-
-PAIRS = np.array(list(itertools.combinations(range(8), 2)))
-"""The 28 pairs of vertices that are coupled."""
-
+PAIRS = np.array(list(itertools.combinations(range(8), 2)))  # The 28 pairs of vertices that are coupled
+# Number of edges along each axis between the vertices of a pair (28, 3)
 EDGES_BETWEEN = np.abs(VERTICES[PAIRS[:, 0]] - VERTICES[PAIRS[:, 1]])
-"""Number of edges along each axis between the vertices of a pair (28, 3)."""
-
+# Points of an element at which signed distances are needed (125, 3), from its first vertex [cells]
 LATTICE = np.array(list(itertools.product(range(SUBCELLS + 1), repeat=3))) / SUBCELLS
-"""Points of an element at which signed distances are needed (125, 3), from its first vertex [cells]."""
-
+# Indices of the vertices in `LATTICE`
 CORNERS = np.ravel_multi_index((VERTICES * SUBCELLS).T, (SUBCELLS + 1,) * 3)
-"""Indices of the vertices in `LATTICE`."""
 
 
 @dataclass(frozen=True)
 class Materials:
-    """Materials relative to air, which is number 0.
+    """Materials relative to air, which is number 0."""
 
-    Attributes:
-        density: density (m,).
-        mass: mass of a cell (m,).
-        sound_hard: whether the material is sound-hard (m,).
-    """
-
-    density: Array
-    mass: Array
-    sound_hard: NDArray[np.bool_]
+    density: Array  # density (m,)
+    mass: Array  # mass of a cell (m,)
+    sound_hard: NDArray[np.bool_]  # whether the material is sound-hard (m,)
 
     @property
     def speed(self) -> Array:
@@ -52,26 +42,16 @@ class Materials:
         return 1 / (self.density * self.mass)
 
 
-@dataclass(frozen=True)
-class InterfaceElements:
-    """Contributions of n elements that surfaces intersect.
+class InterfaceElements(NamedTuple):
+    """Contributions of n elements that surfaces intersect."""
 
-    Attributes:
-        coupling: coupling coefficients of the `PAIRS` (n, 28).
-        mass: lumped mass at the vertices (n, 8).
-        material: number of the material at each vertex (n, 8).
-    """
-
-    coupling: Array
-    mass: Array
-    material: Index
+    coupling: Array  # coupling coefficients of the `PAIRS` (n, 28)
+    mass: Array  # lumped mass at the vertices (n, 8)
+    material: Index  # number of the material at each vertex (n, 8)
 
 
 def coupling_by_edges(stencil: Stencil) -> Array:
-    """Return the coupling coefficients in air of vertices that are 0 to 3 edges apart (4,).
-
-    Four elements share a face of the stencil, two share an edge.
-    """
+    """Return the coupling (4,) in air by edges between vertices; 4 elements share a face, 2 an edge."""
     return np.array((0.0, stencil.face / 4, stencil.edge / 2, stencil.corner))
 
 

@@ -19,40 +19,27 @@ from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.progress import show_progress
 
-_CHUNK = 4096
-"""Interface elements assembled at a time."""
+_CHUNK = 4096  # Interface elements assembled at a time
 
 
 @dataclass(frozen=True)
 class Elements:
-    """Elements of a grid of (nx, ny, nz) cells.
+    """Elements of a grid of (nx, ny, nz) cells."""
 
-    Attributes:
-        materials: density and mass of each material, air first.
-        material: material of each element (nx - 1, ny - 1, nz - 1), of an interface element at its centre.
-        index: flat indices of the interface elements (n,), ascending.
-        interface: their coupling coefficients and masses.
-    """
-
-    materials: Materials
+    materials: Materials  # density and mass of each material, air first
+    # material of each element (nx - 1, ny - 1, nz - 1), of an interface element at its centre
     material: NDArray[np.int16]
-    index: Index
-    interface: InterfaceElements
+    index: Index  # flat indices of the interface elements (n,), ascending
+    interface: InterfaceElements  # their coupling coefficients and masses
 
 
 @dataclass(frozen=True)
 class _Union:
-    """Union of consecutive bodies of one material.
-
-    Attributes:
-        shapes: the shapes of the bodies.
-        material: number of the material.
-        continued: whether they continue through the boundary layers, unchanged from the interior.
-    """
+    """Union of consecutive bodies of one material."""
 
     shapes: tuple[Shape, ...]
     material: int
-    continued: bool
+    continued: bool  # whether they continue through the boundary layers, unchanged from the interior
 
     @property
     def lower(self) -> Array:
@@ -76,10 +63,7 @@ class _Union:
 
 
 def speed_factor(stencil: Stencil, speed_ratio: float) -> float:
-    """Return the symbol of air over the symbol at the wavenumber of a material `speed_ratio` times as fast.
-
-    A cell's mass divided by it gives a wave in the material the frequency of the drive.
-    """
+    """Return the factor by which to divide masses, so that a wave in a material has the drive's frequency."""
     return stencil.symbol / stencil.isotropic_symbol(stencil.kappa / speed_ratio)
 
 
@@ -95,10 +79,7 @@ def flow_factor(kappa: float, speed_ratio: float) -> float:
 
 
 def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
-    """Return the material of every element and the assembled interface elements.
-
-    Later bodies take precedence. Bodies that are not `continued` end before the boundary layers.
-    """
+    """Return the material of every element, set by the last body there, and the interface elements."""
     bodies, materials = _unions(region, stencil)
     material = np.zeros([cells - 1 for cells in grid.shape], np.int16)
     cut = np.zeros(material.shape, bool)
@@ -171,8 +152,4 @@ def _interface(
             first = np.stack(np.unravel_index(index[start : start + _CHUNK], shape), axis=-1)
             parts.append(interface_elements(_distances(bodies, first, grid), numbers, materials, stencil))
             progress.advance(len(first))
-    return InterfaceElements(
-        np.concatenate([part.coupling for part in parts]),
-        np.concatenate([part.mass for part in parts]),
-        np.concatenate([part.material for part in parts]),
-    )
+    return InterfaceElements(*(np.concatenate(each) for each in zip(*parts, strict=True)))

@@ -1,9 +1,8 @@
 """Heterogeneous cells: assembled coupling coefficients, masses and stencil rows.
 
 The scheme is m_i d2p_i/dt2 = sum_j K_ij (p_j - p_i). In air K holds the weights of the tuned stencil and
-m = 1. In another uniform material K is divided by its density, and m by its density and speed factor.
-Interface elements add their own (`interface.py`). K is symmetric, which gives reciprocity and a conserved
-energy at any contrast.
+m = 1. Another uniform material divides K by its density, and m by density and speed factor. Interface
+elements add their own. K is symmetric: reciprocity and a conserved energy at any contrast.
 """
 
 from __future__ import annotations
@@ -14,13 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.assembly.constants import (
-    MASS_TRANSFERS,
-    NULL_EIGENVALUE,
-    ROW_ROUNDING,
-    ROW_SUM_MARGIN,
-    SOUND_HARD_COUPLING,
-)
+from autdtorch.fdtd.assembly import constants
 from autdtorch.fdtd.assembly.element import (
     PAIRS,
     VERTICES,
@@ -39,21 +32,14 @@ Shape = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class HeterogeneousCells:
-    """Cells whose stencil rows differ from those of uniform air.
+    """Cells whose stencil rows differ from those of uniform air."""
 
-    Attributes:
-        index: flat cell indices (n,), ascending.
-        weight: stencil rows K_ij / m_i on (p_j - p_i) for the 27 neighbours (n, 27), before the time factor.
-        mass: m_i (n,), 1 in air.
-        sound_hard: flat indices of the sound-hard cells, ascending.
-        shell: sound-hard cells next to other cells; those behind them are never read.
-    """
-
-    index: Index
+    index: Index  # flat cell indices (n,), ascending
+    # stencil rows K_ij / m_i on (p_j - p_i) for the 27 neighbours (n, 27), before the time factor
     weight: Array
-    mass: Array
-    sound_hard: Index
-    shell: Index
+    mass: Array  # m_i (n,), 1 in air
+    sound_hard: Index  # flat indices of the sound-hard cells, ascending
+    shell: Index  # sound-hard cells next to other cells; those behind them are never read
 
     def mass_of(self, cells: Index) -> Array:
         """Return the mass (k,) of cells (k,) that are heterogeneous or of air."""
@@ -70,16 +56,14 @@ def heterogeneous_cells(elements: Elements, stencil: Stencil) -> HeterogeneousCe
     touched = np.unique(_vertices(elements, shape))
     touched = touched[_inner(touched, shape)]
     coupling, mass, hard = _without_sound_hard(elements, touched, shape, stencil)
-    largest = ROW_SUM_MARGIN * stencil.total * float(elements.materials.speed.max())
+    largest = constants.ROW_SUM_MARGIN * stencil.total * float(elements.materials.speed.max())
     mass = _transferred_mass(coupling, mass, touched, shape, largest)
     weight = coupling / mass[:, None]
-    changed = (np.abs(weight - stencil.weights) > ROW_ROUNDING).any(axis=1) | (mass != 1)
+    changed = (np.abs(weight - stencil.weights) > constants.ROW_ROUNDING).any(axis=1) | (mass != 1)
     changed &= ~hard[touched]
-    parts = (
-        (touched[changed], weight[changed], mass[changed]),
-        _uniform_cells(elements, touched, hard, shape, stencil),
-    )
-    index, weight, mass = (np.concatenate(part) for part in zip(*parts, strict=True))
+    surface = touched[changed], weight[changed], mass[changed]
+    uniform = _uniform_cells(elements, touched, hard, shape, stencil)
+    index, weight, mass = (np.concatenate(part) for part in zip(surface, uniform, strict=True))
     order = np.argsort(index)
     around = np.unique(_neighbours(touched, shape))
     shell = around[hard[around] & _inner(around, shape)]
@@ -121,7 +105,9 @@ def _without_sound_hard(
     while True:
         coupling, mass = _assembled(elements, interface, touched, shape, stencil)
         coupling *= ~(hard[touched, None] | hard[_neighbours(touched, shape)])
-        hard[touched] |= inside & (np.abs(coupling).sum(axis=1) <= SOUND_HARD_COUPLING * stencil.total)
+        hard[touched] |= inside & (
+            np.abs(coupling).sum(axis=1) <= constants.SOUND_HARD_COUPLING * stencil.total
+        )
         if hard.sum() == known or not inside.any():
             return coupling, mass, hard
         known = hard.sum()
@@ -137,7 +123,7 @@ def condensed(interface: InterfaceElements, out: NDArray[np.bool_]) -> Interface
     gone = out[some]
     matrix = stiffness_matrix(interface.coupling[some])
     both = gone[:, :, None] & gone[:, None, :]
-    inverse = np.linalg.pinv(np.where(both, matrix, 0), rcond=NULL_EIGENVALUE, hermitian=True)
+    inverse = np.linalg.pinv(np.where(both, matrix, 0), rcond=constants.NULL_EIGENVALUE, hermitian=True)
     across = np.where(gone[:, None, :], matrix, 0)
     matrix = matrix - across @ inverse @ across.transpose(0, 2, 1)
     matrix[gone[:, :, None] | gone[:, None, :]] = 0
@@ -182,7 +168,7 @@ def _transferred_mass(coupling: Array, mass: Array, touched: Index, shape: Shape
     """
     mass, need = mass.copy(), np.abs(coupling).sum(axis=1) / largest
     asked = mass.sum()
-    for _ in range(MASS_TRANSFERS):
+    for _ in range(constants.MASS_TRANSFERS):
         light = np.flatnonzero(need > mass)
         if len(light) == 0:
             break

@@ -19,15 +19,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.assembly.constants import (
-    ABSENT_SHARE,
-    DIAGONAL_SHARE,
-    FAR,
-    LARGEST_CURVATURE,
-    LEAST_GRADIENT,
-    PLANE_VARIATION,
-    SUBCELLS,
-)
+from autdtorch.fdtd.assembly import constants, moments
 from autdtorch.fdtd.assembly.element import (
     CORNERS,
     EDGES_BETWEEN,
@@ -40,12 +32,11 @@ from autdtorch.fdtd.assembly.element import (
     stiffness_matrix,
     uniform_coupling,
 )
-from autdtorch.fdtd.assembly.moments import distance_to_material, line_shares, subcell_means, volume_shares
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
 
+# Axes of the second derivatives in a quadratic fit
 _SECOND = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-"""Axes of the second derivatives in a quadratic fit."""
 
 
 def _quadratic(x: Array) -> Array:
@@ -55,42 +46,38 @@ def _quadratic(x: Array) -> Array:
 
 
 _FIT = np.linalg.pinv(_quadratic(LATTICE - 0.5))
-_SUBCENTRES = (np.array(list(np.ndindex((SUBCELLS,) * 3))) + 0.5) / SUBCELLS
+_SUBCENTRES = (np.array(list(np.ndindex((constants.SUBCELLS,) * 3))) + 0.5) / constants.SUBCELLS
+# Trilinear shape functions of the vertices at the centres of the sub-cells (64, 8)
 _HATS = np.prod(np.where(VERTICES == 1, _SUBCENTRES[:, None], 1 - _SUBCENTRES[:, None]), axis=2)
-"""Trilinear shape functions of the vertices at the centres of the sub-cells (64, 8)."""
 
 
 def interface_elements(
     distance: Array, material: Index, materials: Materials, stencil: Stencil
 ) -> InterfaceElements:
-    """Return the stiffness and mass of elements that surfaces intersect.
+    """Return the stiffness and mass of n elements that surfaces of K bodies intersect.
 
-    Args:
-        distance: signed distance of K bodies at the `LATTICE` of n elements (K, n, 125) [cells]; `FAR` for
-            bodies that are not near. Later bodies take precedence.
-        material: material of each body (K,).
-        materials: the materials.
-        stencil: weights in air.
+    `distance` (K, n, 125) is `FAR` for bodies that are not near. Later bodies take precedence.
     """
     count = len(materials.density)
     # bodies that do not intersect an element must not enter its shares
-    distance = np.where((distance > 0).all(axis=2, keepdims=True), FAR, distance)
-    distance = np.where((distance < 0).all(axis=2, keepdims=True), -FAR, distance)
-    volumes = volume_shares(distance, material, count)
-    coupling = series_coupling(line_shares(distance, material, count), materials, stencil)
+    distance = np.where((distance > 0).all(axis=2, keepdims=True), constants.FAR, distance)
+    distance = np.where((distance < 0).all(axis=2, keepdims=True), -constants.FAR, distance)
+    volumes = moments.shares(moments.volume_coverage, distance, material, count)
+    lines = moments.shares(moments.line_coverage, distance, material, count)
+    coupling = series_coupling(lines, materials, stencil)
     vertex = vertex_materials(distance, material)
     layered = _layered_axis(distance)
     for axis in range(3):
         own = layered == axis
         coupling[own] = _layered_coupling(axis, vertex[own], volumes[own], materials, stencil)
     held = (vertex[:, :, None] == np.arange(count)).any(axis=1)
-    present = volumes.mean(axis=1) > ABSENT_SHARE
+    present = volumes.mean(axis=1) > constants.ABSENT_SHARE
     two = (held.sum(axis=1) == 2) & (present <= held).all(axis=1)
     chosen = np.flatnonzero(two & (layered < 0))
     if len(chosen):
         inner = count - 1 - held[chosen, ::-1].argmax(axis=1)
         outer = held[chosen].argmax(axis=1)
-        level = distance_to_material(distance[:, chosen], material, inner)
+        level = moments.distance_to_material(distance[:, chosen], material, inner)
         sides = materials.density[np.stack((outer, inner), axis=1)]
         flat, correction = _correction(level, sides, volumes[chosen], materials, coupling[chosen])
         coupling[chosen[flat]] += correction
@@ -107,22 +94,17 @@ def vertex_materials(distance: Array, material: Index) -> Index:
 
 def series_coupling(lines: Array, materials: Materials, stencil: Stencil) -> Array:
     """Return coupling coefficients (n, 28) with the density averaged along each line (n, 112, m)."""
-    density = (lines @ materials.density).reshape(-1, len(PAIRS), SUBCELLS).mean(axis=2)
+    density = (lines @ materials.density).reshape(-1, len(PAIRS), constants.SUBCELLS).mean(axis=2)
     return np.asarray(uniform_coupling(stencil) / density)
-
-
-def lumped(density: Array) -> Array:
-    """Return integrals (n, 8) of a density in the sub-cells (n, 64) times the vertices' shape functions."""
-    return np.asarray(density @ _HATS / SUBCELLS**3)
 
 
 def _layered_axis(distance: Array) -> Index:
     """Return the only axis (n,) along which signed distances (K, n, 125) vary, or -1."""
-    cube = distance.reshape(*distance.shape[:2], *(SUBCELLS + 1,) * 3)
+    cube = distance.reshape(*distance.shape[:2], *(constants.SUBCELLS + 1,) * 3)
     found = np.full(distance.shape[1], -1)
     for axis in range(3):
         others = tuple(other + 2 for other in range(3) if other != axis)
-        found[np.ptp(cube, axis=others).max(axis=(0, 2), initial=0) < PLANE_VARIATION] = axis
+        found[np.ptp(cube, axis=others).max(axis=(0, 2), initial=0) < constants.PLANE_VARIATION] = axis
     return found
 
 
@@ -151,7 +133,7 @@ def _layered_coupling(
     sides = materials.density[vertex]
     lightest, heaviest = sides.min(axis=1), sides.max(axis=1)
     heavy = np.where(materials.density >= heaviest[:, None], share, 0).sum(axis=1)
-    allowed = (lightest / heaviest + 1) / 2 + DIAGONAL_SHARE * heavy
+    allowed = (lightest / heaviest + 1) / 2 + constants.DIAGONAL_SHARE * heavy
     kept = np.minimum(1, allowed * density / heaviest)[:, None]
     even = np.where(straight, uniform[across].sum() / 4, 0)
     link = np.where(across, kept * uniform + (1 - kept) * even, -kept * beside) / density[:, None]
@@ -161,23 +143,16 @@ def _layered_coupling(
 def _correction(
     level: Array, sides: Array, volumes: Array, materials: Materials, coupling: Array
 ) -> tuple[NDArray[np.bool_], Array]:
-    """Return coupling coefficients that give local solutions of two-material elements their exact energy.
+    """Return which elements have one normal (n,), and coupling that gives local solutions their exact energy.
 
-    Args:
-        level: signed distance to the surface (n, 125), negative in the inner material.
-        sides: density of the outer and the inner material (n, 2).
-        volumes: shares of the materials in the sub-cells (n, 64, m).
-        materials: the materials.
-        coupling: coefficients in series (n, 28).
-
-    Returns:
-        Which elements have one normal (n,), and the coefficients to add in those.
+    `level` (n, 125) is the signed distance to the surface, negative in the inner material. `sides` (n, 2)
+    holds the densities of the outer and the inner material, and `coupling` (n, 28) is in series.
     """
     fit = level @ _FIT.T
     steep = np.linalg.norm(fit[:, 1:4], axis=1)
-    flat = steep > LEAST_GRADIENT
+    flat = steep > constants.LEAST_GRADIENT
     level, sides, volumes, coupling, fit, steep = (
-        part[flat] for part in (level, sides, volumes, coupling, fit, steep)
+        p[flat] for p in (level, sides, volumes, coupling, fit, steep)
     )
     normal = fit[:, 1:4] / steep[:, None]
     tangents = _tangents(normal)
@@ -191,9 +166,9 @@ def _correction(
     fields = np.concatenate((along, kinked[:, :, None]), axis=2)
 
     # Exact energies of the first two by quadrature over the sub-cells; the third keeps its own.
-    depth = subcell_means(level)
+    depth = moments.subcell_means(level)
     stretch = np.eye(2) - depth[:, :, None, None] * bend[:, None]
-    mobility = (volumes @ (1 / materials.density)) / SUBCELLS**3
+    mobility = (volumes @ (1 / materials.density)) / constants.SUBCELLS**3
     energy = np.zeros((len(level), 3, 3))
     energy[:, :2, :2] = np.einsum("nq,nqab,nqcb->nac", mobility, stretch, stretch)
     flow = stiffness_matrix(coupling) @ fields
@@ -218,7 +193,7 @@ def _curvature(fit: Array, tangents: Array) -> Array:
     for column, (a, b) in enumerate(_SECOND, start=4):
         hessian[:, a, b] = hessian[:, b, a] = fit[:, column]
     bend = tangents @ hessian @ tangents.transpose(0, 2, 1)
-    bend[np.abs(np.linalg.eigvalsh(bend)).max(axis=1) > LARGEST_CURVATURE] = 0
+    bend[np.abs(np.linalg.eigvalsh(bend)).max(axis=1) > constants.LARGEST_CURVATURE] = 0
     return bend
 
 
@@ -226,9 +201,9 @@ def _lumped_mass(vertex: Index, volumes: Array, materials: Materials) -> Array:
     """Return masses at the vertices (n, 8): each material's at the vertices in it, if there are any."""
     total = np.zeros(vertex.shape)
     for own, mass in enumerate(materials.mass):
-        volume = lumped(volumes[:, :, own])
+        volume = volumes[:, :, own] @ _HATS / constants.SUBCELLS**3
         kept = volume * (vertex == own)
         whole, held = volume.sum(axis=1, keepdims=True), kept.sum(axis=1, keepdims=True)
-        has = held > ABSENT_SHARE * whole
+        has = held > constants.ABSENT_SHARE * whole
         total += mass * np.where(has, kept * whole / np.where(has, held, 1), volume)
     return total

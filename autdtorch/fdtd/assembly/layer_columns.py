@@ -21,14 +21,11 @@ from autdtorch.fdtd.kernels.contract import Columns
 from autdtorch.fdtd.stencil import OFFSETS, Stencil, flat_strides
 from autdtorch.utils.array_types import Array, Index
 
-_ROUNDING = 1e-6
-"""Differences from scaled air below this, relative to a face's weight, are rounding."""
-
+_ROUNDING = 1e-6  # Differences from scaled air below this, relative to a face's weight, are rounding
+# The boundary layers: their axis, and 1 for the one at its upper end
 _LAYERS = tuple(itertools.product(range(3), (0, 1)))
-"""The boundary layers: their axis, and 1 for the one at its upper end."""
-
+# Columns of one layer: cells in the ring (m,), step inwards, weights (m, w) and offsets (w,)
 _Part = tuple[Index, int, Array, Index]
-"""Columns of one layer: cells in the ring (m,), step inwards, weights (m, w) and offsets (w,)."""
 
 
 def row_scale(weight: Array, stencil: Stencil) -> Array:
@@ -39,18 +36,7 @@ def row_scale(weight: Array, stencil: Stencil) -> Array:
 def layer_columns(
     cells: HeterogeneousCells, stencil: Stencil, grid: Grid, factor: float, dtype: torch.dtype
 ) -> tuple[Columns, Columns, torch.Tensor]:
-    """Find the columns of heterogeneous cells, by the cell half-way through the layer.
-
-    Args:
-        cells: the heterogeneous cells.
-        stencil: weights in air.
-        grid: the grid.
-        factor: time factor of the weights.
-        dtype: precision of the weights.
-
-    Returns:
-        The columns, the crossed ones, and the places of their terms: see `Coefficients`.
-    """
+    """Return the columns, the crossed ones and the places of their terms; see `Coefficients`."""
     outside = ~grid.inside(cells.index)
     index, weight = cells.index[outside], cells.weight[outside]
     rows = weight - row_scale(weight, stencil)[:, None] * stencil.weights

@@ -10,33 +10,10 @@ from autdtorch.fdtd.assembly.constants import FAR, SUBCELLS
 from autdtorch.fdtd.assembly.element import PAIRS, VERTICES
 from autdtorch.utils.array_types import Array, Index
 
-_LOW = np.arange(SUBCELLS)
-_LINES = np.ravel_multi_index(
-    np.moveaxis(
-        SUBCELLS * VERTICES[PAIRS[:, 0], None]
-        + np.arange(SUBCELLS + 1)[:, None] * (VERTICES[PAIRS[:, 1]] - VERTICES[PAIRS[:, 0]])[:, None],
-        -1,
-        0,
-    ),
-    (SUBCELLS + 1,) * 3,
-)
-"""Indices in the lattice of the points along the line between each pair of vertices (28, 5)."""
-
-
-def volume_shares(distance: Array, material: Index, count: int) -> Array:
-    """Return the share of each of `count` materials in the sub-cells of elements (n, 64, count).
-
-    Args:
-        distance: signed distance of K bodies at the lattice of n elements (K, n, 125) [cells].
-        material: material of each body (K,).
-        count: number of materials.
-    """
-    return _shares(_volume_coverage, distance, material, count)
-
-
-def line_shares(distance: Array, material: Index, count: int) -> Array:
-    """Return the share of each material in quarters of the lines between vertices (n, 112, count)."""
-    return _shares(_line_coverage, distance, material, count)
+_FROM, _TO = VERTICES[PAIRS[:, 0], None], VERTICES[PAIRS[:, 1], None]
+_ALONG = SUBCELLS * _FROM + np.arange(SUBCELLS + 1)[:, None] * (_TO - _FROM)
+# Indices in the lattice of the points along the line between each pair of vertices (28, 5)
+_LINES = np.ravel_multi_index(tuple(np.moveaxis(_ALONG, -1, 0)), (SUBCELLS + 1,) * 3)
 
 
 def distance_to_material(distance: Array, material: Index, inner: Index) -> Array:
@@ -50,16 +27,13 @@ def distance_to_material(distance: Array, material: Index, inner: Index) -> Arra
 
 def subcell_means(values: Array) -> Array:
     """Return the means (n, 64) of lattice values (n, 125) over the corners of each sub-cell."""
-    return _over_subcells(_cube(values), None).reshape(len(values), SUBCELLS**3)
+    cube = values.reshape(-1, *(SUBCELLS + 1,) * 3)
+    return _over_subcells(cube, None).reshape(len(values), SUBCELLS**3)
 
 
-def _cube(values: Array) -> Array:
-    return values.reshape(*values.shape[:-1], *(SUBCELLS + 1,) * 3)
-
-
-def _volume_coverage(distance: Array) -> Array:
+def volume_coverage(distance: Array) -> Array:
     """Return the share of each sub-cell (..., 64) inside a body: exact for axis-aligned faces."""
-    cube = _cube(distance)
+    cube = distance.reshape(*distance.shape[:-1], *(SUBCELLS + 1,) * 3)
     mean, *slopes = (_over_subcells(cube, along) for along in (None, -3, -2, -1))
     width = np.abs(slopes).sum(axis=0)
     share = np.clip(0.5 - mean / np.maximum(width, 1e-12), 0, 1)
@@ -69,12 +43,12 @@ def _volume_coverage(distance: Array) -> Array:
 def _over_subcells(cube: Array, along: int | None) -> Array:
     """Return the mean over the corners of each sub-cell, of values or of differences along an axis."""
     for axis in (-3, -2, -1):
-        low, high = np.take(cube, _LOW, axis), np.take(cube, _LOW + 1, axis)
+        low, high = (np.take(cube, np.arange(SUBCELLS) + end, axis) for end in (0, 1))
         cube = high - low if axis == along else (low + high) / 2
     return cube
 
 
-def _line_coverage(distance: Array) -> Array:
+def line_coverage(distance: Array) -> Array:
     """Return the share inside a body of each quarter of the lines between vertices (..., 112)."""
     ends = distance[..., _LINES]
     low = np.minimum(ends[..., :-1], ends[..., 1:])
@@ -83,10 +57,11 @@ def _line_coverage(distance: Array) -> Array:
     return np.asarray(share.reshape(*distance.shape[:-1], -1))
 
 
-def _shares(coverage: Callable[[Array], Array], distance: Array, material: Index, count: int) -> Array:
+def shares(coverage: Callable[[Array], Array], distance: Array, material: Index, count: int) -> Array:
     """Return the share of each material (n, q, count) in the q parts that `coverage` divides an element into.
 
-    Touching bodies leave no air between them: the union of all bodies decides the share of air.
+    Touching bodies, with distances (K, n, 125) [cells], leave no air between them: their union decides its
+    share.
     """
     covered = coverage(distance)
     share = np.zeros((*covered.shape[1:], count))

@@ -26,7 +26,6 @@ INNER: dict[str, Any] = {
 kernel loaded from disk then rounds differently from the one just compiled."""
 
 _HERE = Path(__file__).parent
-
 _entries: set[Any] = set()
 
 
@@ -54,10 +53,6 @@ def entry(folder: Path = _HERE, **options: Any) -> Callable[[Callable[..., Any]]
 
     Numba checks the file of the function for changes, but not the files of the functions that it calls. The
     digest in the name covers a whole folder, which must hold them.
-
-    Args:
-        folder: folder of the function.
-        **options: further options of Numba.
     """
 
     def compiled(function: Callable[..., Any]) -> Any:

@@ -4,10 +4,10 @@ A step takes the pressures `now` and `before` at two successive times to the nex
 
 1. new = center now + face F + edge E + corner C - keep before, with F, E, C the sums over the 6, 12 and 8
    neighbours;
-2. in heterogeneous cells instead new = (1 + keep) now - keep before + sum_j weight_j (now_j - now); 3. the
-boundary layers add the stretching of the two neighbours' sum along each axis (`boundary.py`), as in air,
-times
-   `layer_scale` in heterogeneous cells, and by column the difference at interfaces (`layer_columns.py`);
+2. in heterogeneous cells instead new = (1 + keep) now - keep before + sum_j weight_j (now_j - now);
+3. the boundary layers add the stretching of the two neighbours' sum along each axis (`boundary.py`), as in
+   air, times `layer_scale` in heterogeneous cells, and by column the difference at interfaces
+   (`layer_columns.py`);
 4. the sources are added: new += sum_s signal_s force_s, of the S signals that they share;
 5. the outermost ring and the sound-hard cells stay zero.
 """
@@ -18,73 +18,50 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import torch
+from torch import Tensor
 
-Layer = tuple[torch.Tensor, torch.Tensor]
-"""Memory of the two boundary layers of an axis, (2, nx, ny, nz) low and high: psi with L + 1 half cells and
-zeta with L cells along that axis, counted inwards on both sides."""
+# Memory of the two boundary layers of an axis, (2, nx, ny, nz) low and high: psi with L + 1 half cells and
+# zeta with L cells along that axis, counted inwards on both sides
+Layer = tuple[Tensor, Tensor]
 
 
 @dataclass(frozen=True)
 class Columns:
-    """m columns of L cells through a boundary layer, from the ring to the first cell inside.
+    """m columns of L cells through a boundary layer, from the ring to the first cell inside."""
 
-    Attributes:
-        index: flat indices of their cells (m, L + 2) int64, from the ring inwards.
-        offset: flat offsets from a cell to w cells across the column (m, w) int64.
-        weight: differences of their weights from those of air (m, w).
-    """
-
-    index: torch.Tensor
-    offset: torch.Tensor
-    weight: torch.Tensor
+    index: Tensor  # flat indices of their cells (m, L + 2) int64, from the ring inwards
+    offset: Tensor  # flat offsets from a cell to w cells across the column (m, w) int64
+    weight: Tensor  # differences of their weights from those of air (m, w)
 
     @classmethod
     def none(cls, layer_cells: int, dtype: torch.dtype, width: int = 9) -> Columns:
         """Return no columns, for layers of air."""
-        index, offset = (
-            torch.zeros((0, cells), dtype=torch.int64, device="cpu") for cells in (layer_cells + 2, width)
-        )
-        return cls(index, offset, torch.zeros((0, width), dtype=dtype, device="cpu"))
+        index = torch.zeros((0, layer_cells + 2), dtype=torch.int64, device="cpu")
+        return cls(index, index[:, :1].expand(0, width), torch.zeros((0, width), dtype=dtype, device="cpu"))
 
 
 @dataclass(frozen=True)
 class Coefficients:
-    """The medium as a kernel sees it.
+    """The medium as a kernel sees it."""
 
-    Attributes:
-        center: weight of the cell itself; center + 6 face + 12 edge + 8 corner = 1 + keep.
-        face: weight of each of 6 neighbours.
-        edge: weight of each of 12.
-        corner: weight of each of 8.
-        keep: weight of the pressure before: 1 without absorption, else less.
-        heterogeneous_index: flat indices (n,) int64 of the heterogeneous cells, ascending.
-        heterogeneous_weight: their weights (n, 27).
-        sound_hard_index: flat indices (k,) int64 of the sound-hard cells.
-        layer_decay: b of the boundary layer at half cells and cells, interleaved, from outside (2 L + 1,).
-        layer_gain: a, likewise.
-        layer_index: flat indices (k,) int64 of the heterogeneous cells in the layers, ascending.
-        layer_scale: their layer terms over those of air (k,).
-        columns: interfaces through the boundary layers.
-        crossed: interfaces through two layers at once, along one of them.
-        crossing: flat place, among the terms (L, n) of the `crossed`, of the term to add to the sums across
-            each cell of the columns (m, L + 2) int64; L n for none.
-    """
-
-    center: float
-    face: float
-    edge: float
-    corner: float
-    keep: float
-    heterogeneous_index: torch.Tensor
-    heterogeneous_weight: torch.Tensor
-    sound_hard_index: torch.Tensor
-    layer_decay: torch.Tensor
-    layer_gain: torch.Tensor
-    layer_index: torch.Tensor
-    layer_scale: torch.Tensor
-    columns: Columns
-    crossed: Columns
-    crossing: torch.Tensor
+    center: float  # weight of the cell itself; center + 6 face + 12 edge + 8 corner = 1 + keep
+    face: float  # weight of each of 6 neighbours
+    edge: float  # weight of each of 12
+    corner: float  # weight of each of 8
+    keep: float  # weight of the pressure before: 1 without absorption, else less
+    heterogeneous_index: Tensor  # flat indices (n,) int64 of the heterogeneous cells, ascending
+    heterogeneous_weight: Tensor  # their weights (n, 27)
+    sound_hard_index: Tensor  # flat indices (k,) int64 of the sound-hard cells
+    # b of the boundary layer at half cells and cells, interleaved, from outside (2 L + 1,)
+    layer_decay: Tensor
+    layer_gain: Tensor  # a, likewise
+    layer_index: Tensor  # flat indices (k,) int64 of the heterogeneous cells in the layers, ascending
+    layer_scale: Tensor  # their layer terms over those of air (k,)
+    columns: Columns  # interfaces through the boundary layers
+    crossed: Columns  # interfaces through two layers at once, along one of them
+    # flat place, among the terms (L, n) of the `crossed`, of the term to add to the sums across each cell of
+    # the columns (m, L + 2) int64; L n for none
+    crossing: Tensor
 
     @property
     def layer_cells(self) -> int:
@@ -101,8 +78,8 @@ class State:
     `crossed`.
     """
 
-    now: torch.Tensor
-    before: torch.Tensor
+    now: Tensor
+    before: Tensor
     layers: tuple[Layer, ...]
     columns: Layer
     crossed: Layer
@@ -110,46 +87,35 @@ class State:
 
 def uniform_state(shape: tuple[int, int, int], coefficients: Coefficients, pressure: float) -> State:
     """Return the state of rest at a uniform pressure on a grid of `shape`."""
-    dtype, layer_cells = coefficients.layer_decay.dtype, coefficients.layer_cells
-    layers = []
-    sizes = (shape, shape, shape, (*shape[:2], 2 * layer_cells))
-    for axis, size in zip((0, 1, 2, 1), sizes, strict=True):
-        half, full = [2, *size], [2, *size]
-        half[axis + 1], full[axis + 1] = layer_cells + 1, layer_cells
-        layers.append(
-            (torch.zeros(half, dtype=dtype, device="cpu"), torch.zeros(full, dtype=dtype, device="cpu"))
-        )
-    core = torch.full([cells - 2 for cells in shape], pressure, dtype=dtype, device="cpu")
+    c, cells = coefficients, coefficients.layer_cells
+
+    def silent(*size: int, axis: int) -> Layer:
+        psi, zeta = ((*size[:axis], along, *size[axis + 1 :]) for along in (cells + 1, cells))
+        return c.layer_decay.new_zeros(psi), c.layer_decay.new_zeros(zeta)
+
+    sizes = (shape, shape, shape, (*shape[:2], 2 * cells))
+    layers = (silent(2, *size, axis=axis + 1) for axis, size in zip((0, 1, 2, 1), sizes, strict=True))
+    core = c.layer_decay.new_full([length - 2 for length in shape], pressure)
     now = torch.nn.functional.pad(core, (1,) * 6)
-    columns, crossed = (
-        (
-            torch.zeros((layer_cells + 1, count), dtype=dtype, device="cpu"),
-            torch.zeros((layer_cells, count), dtype=dtype, device="cpu"),
-        )
-        for count in (len(coefficients.columns.index), len(coefficients.crossed.index))
-    )
+    columns, crossed = (silent(0, len(each.index), axis=0) for each in (c.columns, c.crossed))
     return State(now, now.clone(), tuple(layers), columns, crossed)
 
 
 @dataclass(frozen=True)
 class Sources:
-    """Driven cells and their forces by S signals; a drive has two, cos(w t) and sin(w t), with its envelope.
+    """Driven cells and their forces by S signals; a drive has cos(w t) and sin(w t), with its envelope."""
 
-    Attributes:
-        index: flat indices (n,) int64, ascending, distinct.
-        force: force by each signal (n, S) [Pa]; of a drive, real and imaginary part of the phasors.
-    """
-
-    index: torch.Tensor
-    force: torch.Tensor
+    index: Tensor  # flat indices (n,) int64, ascending, distinct
+    # force by each signal (n, S) [Pa]; of a drive, real and imaginary part of the phasors
+    force: Tensor
 
 
 @dataclass(frozen=True)
 class Receivers:
     """R receivers: flat `index` (R, n) int64 and `weight` (R, n) of their cells."""
 
-    index: torch.Tensor
-    weight: torch.Tensor
+    index: Tensor
+    weight: Tensor
 
 
 class Kernel(Protocol):
@@ -157,20 +123,12 @@ class Kernel(Protocol):
 
     def at_once(self, shape: tuple[int, int, int]) -> int:
         """Return the number of runs on a grid of `shape` that threads may step concurrently."""
-        ...
 
     def advance(
-        self,
-        state: State,
-        coefficients: Coefficients,
-        sources: Sources,
-        receivers: Receivers,
-        signal: torch.Tensor,
-    ) -> tuple[State, torch.Tensor]:
-        """Step once per row of `signal` (steps, S), the signals of the sources.
+        self, state: State, c: Coefficients, sources: Sources, receivers: Receivers, signal: Tensor
+    ) -> tuple[State, Tensor]:
+        """Step once per row of `signal` (steps, S); return the new state and the record (steps, R).
 
-        Returns:
-            The new state, which may share memory with the one given, and the pressure at the receivers after
-            each step (steps, R). Do not use the given state again.
+        The new state may share memory with the one given, which must not be used again. The record holds the
+        pressure at the receivers after each step.
         """
-        ...

@@ -32,12 +32,11 @@ from autdtorch.fdtd.kernels.cpu_workers import (
 from autdtorch.utils.array_types import AnyArray
 from autdtorch.utils.threads import thread_count
 
+# Fewest cells and planes of a chunk, for which a second thread and the sums at its ends pay
 _CHUNK_CELLS, _CHUNK_PLANES = 200_000, 32
-"""Fewest cells and planes of a chunk, for which a second thread and the sums at its ends pay."""
-
+# Shares of the processors' time that workers got: below the first a single worker continues, above the second
+# several again
 _CROWDED, _FREE = 0.75, 0.9
-"""Shares of the processors' time that workers got: below the first a single worker continues, above the
-second several again."""
 
 
 @njit(**INNER)
@@ -204,15 +203,9 @@ class CpuKernel:
         return thread_count() if len(_cuts(shape)) == 2 else 1
 
     def advance(
-        self,
-        state: State,
-        coefficients: Coefficients,
-        sources: Sources,
-        receivers: Receivers,
-        signal: torch.Tensor,
+        self, state: State, c: Coefficients, sources: Sources, receivers: Receivers, signal: torch.Tensor
     ) -> tuple[State, torch.Tensor]:
         """See `Kernel.advance`."""
-        c = coefficients
         shape, cuts = state.now.shape, _cuts(state.now.shape)
         plane = shape[1] * shape[2]
         dtype = c.heterogeneous_weight.numpy().dtype.type
@@ -252,10 +245,7 @@ class CpuKernel:
         return State(now, before, state.layers, state.columns, state.crossed), recorded
 
     def _work(self, advance: Callable[[], object], chunks: int) -> None:
-        """Step on as many threads as there are chunks and free processors.
-
-        On a busy machine workers that wait for each other are slower than one alone.
-        """
+        """Step on as many threads as chunks and free processors; workers that wait are slower than one."""
         workers = 1 if self._crowded else min(thread_count(), chunks)
         share = share_of_processors(advance, workers)
         if chunks > 1:

@@ -14,17 +14,14 @@ import torch
 from autdtorch.fdtd.kernels.contract import Coefficients, Layer
 from autdtorch.utils.array_types import AnyArray
 
+# b and a of the half cells, then b and a of the cells, repeated as `stretch` reads them
 Profile = tuple[AnyArray, AnyArray, AnyArray, AnyArray]
-"""b and a of the half cells, then b and a of the cells, repeated as `stretch` reads them."""
 
 
 def rows_profile(c: Coefficients, row: int) -> Profile:
     """Return the profile of a lower layer, for rows."""
     decay, gain = c.layer_decay.numpy(), c.layer_gain.numpy()
-    b_half, a_half, b_cell, a_cell = (
-        part.repeat(row) for part in (decay[0::2], gain[0::2], decay[1::2], gain[1::2])
-    )
-    return b_half, a_half, b_cell, a_cell
+    return decay[0::2].repeat(row), gain[0::2].repeat(row), decay[1::2].repeat(row), gain[1::2].repeat(row)
 
 
 def plane_profiles(c: Coefficients, shape: torch.Size) -> tuple[AnyArray, ...]:
@@ -47,19 +44,13 @@ def _both_rows(c: Coefficients, row: int) -> Profile:
     low = rows_profile(c, row)
     none = np.zeros(row, low[0].dtype)
     high = [part.reshape(-1, row)[::-1].ravel() for part in low]
-    b_half, a_half = (np.concatenate(both) for both in zip(low[:2], high[:2], strict=True))
-    b_cell, a_cell = (
-        np.concatenate((first, none, second, none)) for first, second in zip(low[2:], high[2:], strict=True)
-    )
+    b_half, a_half = (np.concatenate((low[part], high[part])) for part in (0, 1))
+    b_cell, a_cell = (np.concatenate((low[part], none, high[part], none)) for part in (2, 3))
     return b_half, a_half, b_cell, a_cell
 
 
 class Memory:
-    """Memory of the boundary layers in this layout, copied from a state and back to it.
-
-    Attributes:
-        arrays: psi and zeta of x, of y, of the ends of rows, and of y for these.
-    """
+    """Memory of the layers, copied from a state: psi and zeta of x, y, ends of rows, and y for these."""
 
     def __init__(self, layers: tuple[Layer, ...]) -> None:
         """Copy the memory of a state, except the x layers, which are used in place."""
@@ -67,12 +58,8 @@ class Memory:
         x, (psi_y, zeta_y), (psi_z, _), (psi_yz, zeta_yz) = self._layers
         nx, ny, layer_cells = len(psi_z[0]), psi_z.shape[2], psi_z.shape[3] - 1
         lanes = 2 * (layer_cells + 2)
-        sizes = (
-            psi_y.shape,
-            zeta_y.shape,
-            *2 * ((nx, ny, lanes),),
-            *((*p.shape[:3], lanes) for p in (psi_yz, zeta_yz)),
-        )
+        of_yz = ((*part.shape[:3], lanes) for part in (psi_yz, zeta_yz))
+        sizes = (psi_y.shape, zeta_y.shape, *2 * ((nx, ny, lanes),), *of_yz)
         self.arrays = (*x, *(np.zeros(size, psi_y.dtype) for size in sizes))
         for here, there, sign in self._pairs():
             here[...] = sign * there

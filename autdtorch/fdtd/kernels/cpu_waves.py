@@ -15,15 +15,9 @@ from numpy.typing import NDArray
 
 from autdtorch.fdtd.kernels.compiled import INNER, entry
 
-LANES = 64
-"""Places in a block; their waves stay in the first-level cache."""
-
-_TERMS = 13
-"""Terms of the Taylor series; the next one is below 1e-16 for arguments up to pi / 2."""
-
-_SHIFT = 1.5 * 2.0**52
-"""Constant that rounds to the nearest integer when added and subtracted."""
-
+LANES = 64  # Places in a block; their waves stay in the first-level cache
+_TERMS = 13  # Terms of the Taylor series; the next one is below 1e-16 for arguments up to pi / 2
+_SHIFT = 1.5 * 2.0**52  # Constant that rounds to the nearest integer when added and subtracted
 _BLOCK, _X, _Y, _Z = np.uint64(LANES), np.uint64(0), np.uint64(1), np.uint64(2)  # unsigned, see cpu_sweep.py
 
 

@@ -22,14 +22,10 @@ from numpy.typing import NDArray
 from autdtorch.fdtd.kernels.compiled import INNER
 from autdtorch.utils.threads import spread
 
-_CLAIMED, _FINISHED = 0, 16
-"""Places of the two counters, on separate cache lines."""
-
-_TICKS = 10
-"""Fewest ticks of the thread clock for a meaningful time."""
-
+_CLAIMED, _FINISHED = 0, 16  # Places of the two counters, on separate cache lines
+_TICKS = 10  # Fewest ticks of the thread clock for a meaningful time
+# Polls of the counter before a waiting worker yields: a few microseconds, less than waking costs
 _LOOKS = 2000
-"""Polls of the counter before a waiting worker yields: a few microseconds, less than waking costs."""
 
 
 def new_counters() -> NDArray[np.int64]:

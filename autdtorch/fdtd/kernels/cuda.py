@@ -11,51 +11,31 @@ from typing import NamedTuple
 
 import torch
 import triton
+from torch import Tensor
 
 from autdtorch.fdtd.kernels import cuda_steps
+from autdtorch.fdtd.kernels import cuda_tables as tables
 from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, State
-from autdtorch.fdtd.kernels.cuda_tables import (
-    Memories,
-    Memory,
-    Shape,
-    column_table,
-    driven_table,
-    heterogeneous_table,
-    memories,
-    no_terms,
-    profile_table,
-    receiver_table,
-    settled_table,
-)
 from autdtorch.utils.validation import invalid
 
-_GRAPH_STEPS = 16
-"""Steps of a captured graph; even, so that both fields return to their places."""
-
+_GRAPH_STEPS = 16  # Steps of a captured graph; even, so that both fields return to their places
+# Most cells of a grid whose steps are captured. Beyond, a step should take longer than its launches: 33
+# million cells at 12 bytes need 130 us at 3 TB/s, three launches from Python some 100 us. An estimate, not
+# measured.
 _MOST_CAPTURED = 2**25
-"""Most cells of a grid whose steps are captured. Beyond, a step should take longer than its launches: 33
-million cells at 12 bytes need 130 us at 3 TB/s, three launches from Python some 100 us. An estimate, not
-measured."""
 
 
 class Blocks(NamedTuple):
-    """Sizes of a program's work, powers of two.
+    """Sizes of a program's work, powers of two."""
 
-    Attributes:
-        x: planes that a tile marches through.
-        y: rows of a tile.
-        z: cells of its rows, which are contiguous.
-        lanes: columns through a boundary layer.
-    """
-
-    x: int = 16
-    y: int = 8
-    z: int = 32
-    lanes: int = 16
+    x: int = 16  # planes that a tile marches through
+    y: int = 8  # rows of a tile
+    z: int = 32  # cells of its rows, which are contiguous
+    lanes: int = 16  # columns through a boundary layer
 
 
+# One thread per cell. Chosen for few registers and many programs on small grids, not by timings.
 BLOCKS = Blocks()
-"""One thread per cell. Chosen for few registers and many programs on small grids, not by timings."""
 
 
 class Ends(NamedTuple):
@@ -71,20 +51,19 @@ class Ends(NamedTuple):
 class DeviceMedium:
     """A medium on the device, and workspace."""
 
-    def __init__(self, c: Coefficients, shape: Shape, blocks: Blocks, device: torch.device) -> None:
+    def __init__(self, c: Coefficients, shape: tables.Shape, blocks: Blocks, device: torch.device) -> None:
         """Copy the medium `c` of a grid to a device."""
         self.coefficients, self.shape, self.blocks, self.device = c, shape, blocks, device
         self.cells, self.depths = c.layer_cells, triton.next_power_of_2(c.layer_cells)
         self.dtype = c.layer_decay.dtype
-        self.weights = torch.tensor(
-            [c.center, c.face, c.edge, c.corner, c.keep], dtype=self.dtype, device=device
-        )
-        self.profile = profile_table(c, self.depths, device)
-        self.heterogeneous = heterogeneous_table(c, device)
-        self.columns = column_table(c.columns, c.crossing, device)
-        self.crossed = column_table(c.crossed, c.crossing[:0], device)
-        self.settled = settled_table(c, device)
-        self.terms = no_terms(shape, c, device)
+        weights = c.center, c.face, c.edge, c.corner, c.keep
+        self.weights = torch.tensor(weights, dtype=self.dtype, device=device)
+        self.profile = tables.profile_table(c, self.depths, device)
+        self.heterogeneous = tables.heterogeneous_table(c, device)
+        self.columns = tables.column_table(c.columns, c.crossing, device)
+        self.crossed = tables.column_table(c.crossed, c.crossing[:0], device)
+        self.settled = tables.settled_table(c, device)
+        self.terms = tables.no_terms(shape, c, device)
         nx, ny, nz = shape
         z, y, yz = (2 * triton.cdiv(rows, blocks.lanes) for rows in (nx * ny, nx * nz, 2 * self.cells * nx))
         heterogeneous = triton.cdiv(self.heterogeneous.size, self.depths * blocks.lanes)
@@ -103,11 +82,11 @@ class DeviceRun:
         self.medium, self.state, self.sources, self.receivers = medium, state, sources, receivers
         dtype, device = medium.dtype, medium.device
         self._fields = tuple(field.to(device).contiguous() for field in (state.now, state.before))
-        memory = memories(state, device)
-        fresh = Memories(*(Memory(*map(torch.zeros_like, each)) for each in memory))
+        memory = tables.memories(state, device)
+        fresh = tables.Memories(*(tables.Memory(*map(torch.zeros_like, each)) for each in memory))
         self._memories = memory, fresh
-        self._driven = driven_table(sources, medium.settled, dtype, device)
-        self._received = receiver_table(receivers, steps, dtype, device)
+        self._driven = tables.driven_table(sources, medium.settled, dtype, device)
+        self._received = tables.receiver_table(receivers, steps, dtype, device)
         self.signal = torch.zeros((steps, sources.force.shape[1]), dtype=dtype, device=device)
         self._first = torch.zeros((), dtype=torch.int64, device=device)
         self._turn = 0
@@ -118,7 +97,7 @@ class DeviceRun:
         same = self.state is state and self.sources is sources and self.receivers is receivers
         return same and len(self.signal) == steps
 
-    def advance(self, signal: torch.Tensor) -> torch.Tensor:
+    def advance(self, signal: Tensor) -> Tensor:
         """Step once per row of the signal; return the record of the receivers."""
         self.signal.copy_(signal)
         self._first.zero_()
@@ -128,9 +107,8 @@ class DeviceRun:
             self._step(self._turn + offset, offset)
         self._turn = (self._turn + steps) % 2
         received, block = self._received, self.medium.depths * self.medium.blocks.lanes
-        cuda_steps.read_last[(triton.cdiv(received.size, block),)](
-            self._fields[self._turn], received, steps - 1, LANES=block
-        )
+        grid = (triton.cdiv(received.size, block),)
+        cuda_steps.read_last[grid](self._fields[self._turn], received, steps - 1, LANES=block)
         memory = self._memories[self._turn]
         layers = tuple((each.psi, each.zeta) for each in memory)
         now, before = self._fields[self._turn], self._fields[1 - self._turn]
@@ -183,20 +161,10 @@ class DeviceRun:
 
 
 class CudaKernel:
-    """Kernel on the current CUDA device, where returned states stay; see `kernels.contract`.
-
-    The medium and the last run stay on the device until others are given.
-    """
+    """Kernel on the current CUDA device, which keeps states, the medium and the last run; see `Kernel`."""
 
     def __init__(self, blocks: Blocks = BLOCKS) -> None:
-        """Find the device.
-
-        Args:
-            blocks: sizes of a program's work.
-
-        Raises:
-            ValueError: there is no CUDA device, and Triton does not interpret.
-        """
+        """Find the device; Triton may interpret without one."""
         interpreted = triton.knobs.runtime.interpret
         if not interpreted and not torch.cuda.is_available():
             raise invalid("kernel", "cuda", "needs an NVIDIA GPU: torch.cuda.is_available() is false")
@@ -211,19 +179,14 @@ class CudaKernel:
 
     @torch.no_grad()
     def advance(
-        self,
-        state: State,
-        coefficients: Coefficients,
-        sources: Sources,
-        receivers: Receivers,
-        signal: torch.Tensor,
-    ) -> tuple[State, torch.Tensor]:
+        self, state: State, c: Coefficients, sources: Sources, receivers: Receivers, signal: Tensor
+    ) -> tuple[State, Tensor]:
         """See `Kernel.advance`; the record stays on the device."""
-        shape = Shape(*state.now.shape)
+        shape = tables.Shape(*state.now.shape)
         medium, run = self._medium, self._run
-        if medium is None or medium.coefficients is not coefficients or medium.shape != shape:
+        if medium is None or medium.coefficients is not c or medium.shape != shape:
             self._run = run = None
-            self._medium = medium = DeviceMedium(coefficients, shape, self._blocks, self._device)
+            self._medium = medium = DeviceMedium(c, shape, self._blocks, self._device)
         if run is None or not run.goes_on(state, sources, receivers, len(signal)):
             self._run = run = None  # frees its memory first
             self._run = run = DeviceRun(medium, state, sources, receivers, len(signal))

@@ -17,8 +17,8 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
+# Places in the tensor of weights; scalars would be passed in single precision
 CENTER, FACE, EDGE, CORNER, KEEP = (tl.constexpr(place) for place in range(5))
-"""Places in the tensor of weights; scalars would be passed in single precision."""
 
 
 @triton.jit

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Layer, Receivers, Sources, State
 
@@ -20,15 +21,15 @@ class Shape(NamedTuple):
 class Profile(NamedTuple):
     """Recursion coefficients of the layers, zero-padded to the depth of a block of lanes."""
 
-    decay: torch.Tensor
-    gain: torch.Tensor
+    decay: Tensor
+    gain: Tensor
 
 
 class Memory(NamedTuple):
     """Memory of the two layers of an axis or of columns, as in `contract.State`."""
 
-    psi: torch.Tensor
-    zeta: torch.Tensor
+    psi: Tensor
+    zeta: Tensor
 
 
 class Memories(NamedTuple):
@@ -45,40 +46,40 @@ class Memories(NamedTuple):
 class Terms(NamedTuple):
     """Terms that layers add to the sums across them, low layer first, both counted inwards."""
 
-    y: torch.Tensor  # E_y p (nx, 2 L, nz)
-    z: torch.Tensor  # E_z p (nx, ny, 2 L)
-    yz: torch.Tensor  # E_y E_z p (nx, 2 L, 2 L)
-    columns: torch.Tensor  # added to the pressure (L m + 1,), with a zero at the end
-    crossed: torch.Tensor  # likewise, added to the columns
+    y: Tensor  # E_y p (nx, 2 L, nz)
+    z: Tensor  # E_z p (nx, ny, 2 L)
+    yz: Tensor  # E_y E_z p (nx, 2 L, 2 L)
+    columns: Tensor  # added to the pressure (L m + 1,), with a zero at the end
+    crossed: Tensor  # likewise, added to the columns
 
 
 class Heterogeneous(NamedTuple):
     """n heterogeneous cells."""
 
     size: int
-    cell: torch.Tensor  # flat index (n,)
-    weight: torch.Tensor  # stencil rows (27, n)
-    scale: torch.Tensor  # of the layers' term, 0 outside of them (n,)
-    settled: torch.Tensor  # workspace: new pressure less `scale` times the result of the sweep (n,)
+    cell: Tensor  # flat index (n,)
+    weight: Tensor  # stencil rows (27, n)
+    scale: Tensor  # of the layers' term, 0 outside of them (n,)
+    settled: Tensor  # workspace: new pressure less `scale` times the result of the sweep (n,)
 
 
 class ColumnTable(NamedTuple):
     """m columns."""
 
     size: int
-    cell: torch.Tensor  # flat index (L + 2, m)
-    offset: torch.Tensor  # (w, m)
-    weight: torch.Tensor  # (w, m)
-    crossing: torch.Tensor  # place of the terms that cross them (L + 2, m)
+    cell: Tensor  # flat index (L + 2, m)
+    offset: Tensor  # (w, m)
+    weight: Tensor  # (w, m)
+    crossing: Tensor  # place of the terms that cross them (L + 2, m)
 
 
 class Settled(NamedTuple):
     """k cells that a sweep leaves wrong, ascending."""
 
-    cell: torch.Tensor  # flat index (k,)
-    heterogeneous: torch.Tensor  # place among the heterogeneous cells, -1 for others (k,)
-    share: torch.Tensor  # places among the columns' terms, including the zero at their end (w, k)
-    sound_hard: torch.Tensor  # 1 where sound-hard (k,)
+    cell: Tensor  # flat index (k,)
+    heterogeneous: Tensor  # place among the heterogeneous cells, -1 for others (k,)
+    share: Tensor  # places among the columns' terms, including the zero at their end (w, k)
+    sound_hard: Tensor  # 1 where sound-hard (k,)
 
 
 class Driven(NamedTuple):
@@ -86,8 +87,8 @@ class Driven(NamedTuple):
 
     settled: int  # k
     size: int  # n
-    cell: torch.Tensor  # flat index (n,)
-    force: torch.Tensor  # by each of the S signals (S, n)
+    cell: Tensor  # flat index (n,)
+    force: Tensor  # by each of the S signals (S, n)
 
 
 class ReceiverTable(NamedTuple):
@@ -95,9 +96,9 @@ class ReceiverTable(NamedTuple):
 
     size: int  # R
     width: int  # w
-    cell: torch.Tensor  # flat index (w, R)
-    weight: torch.Tensor  # (w, R)
-    recorded: torch.Tensor  # record (steps, R)
+    cell: Tensor  # flat index (w, R)
+    weight: Tensor  # (w, R)
+    recorded: Tensor  # record (steps, R)
 
 
 def profile_table(c: Coefficients, depths: int, device: torch.device) -> Profile:
@@ -118,7 +119,7 @@ def heterogeneous_table(c: Coefficients, device: torch.device) -> Heterogeneous:
     return Heterogeneous(count, index.contiguous(), weight, scale, torch.zeros_like(scale))
 
 
-def column_table(columns: Columns, crossing: torch.Tensor, device: torch.device) -> ColumnTable:
+def column_table(columns: Columns, crossing: Tensor, device: torch.device) -> ColumnTable:
     """Return columns, with the places (m, L + 2) of the terms to add to each cell's sum."""
     index, offset, weight, crossing = (
         each.to(device).T.contiguous() for each in (columns.index, columns.offset, columns.weight, crossing)

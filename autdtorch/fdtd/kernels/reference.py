@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Layer, Receivers, Sources, State
+from autdtorch.fdtd.stencil import flat_offsets
 
 
-def neighbours(field: torch.Tensor, axis: int) -> torch.Tensor:
+def neighbours(field: Tensor, axis: int) -> Tensor:
     """Return the sum of the two neighbours along an axis, two cells shorter along it."""
     return field.narrow(axis, 0, field.shape[axis] - 2) + field.narrow(axis, 2, field.shape[axis] - 2)
 
 
-def middle(field: torch.Tensor, axis: int) -> torch.Tensor:
+def middle(field: Tensor, axis: int) -> Tensor:
     """Return the field without its first and last cell along an axis."""
     return field.narrow(axis, 1, field.shape[axis] - 2)
 
@@ -25,36 +27,26 @@ class ReferenceKernel:
         return 1
 
     def advance(
-        self,
-        state: State,
-        coefficients: Coefficients,
-        sources: Sources,
-        receivers: Receivers,
-        signal: torch.Tensor,
-    ) -> tuple[State, torch.Tensor]:
+        self, state: State, c: Coefficients, sources: Sources, receivers: Receivers, signal: Tensor
+    ) -> tuple[State, Tensor]:
         """See `Kernel.advance`."""
         recorded = []
         for row in signal:
-            state = self._step(state, coefficients, sources.index, (sources.force * row).sum(-1))
+            state = self._step(state, c, sources.index, (sources.force * row).sum(-1))
             recorded.append((state.now.reshape(-1)[receivers.index] * receivers.weight).sum(-1))
         return state, torch.stack(recorded)
 
-    def _step(self, state: State, c: Coefficients, driven: torch.Tensor, force: torch.Tensor) -> State:
+    def _step(self, state: State, c: Coefficients, driven: Tensor, force: Tensor) -> State:
         new = torch.nn.functional.pad(_sweep(state.now, c) - c.keep * _core(state.before), (1,) * 6)
         flat_now, flat_before = state.now.reshape(-1), state.before.reshape(-1)
         own, before = flat_now[c.heterogeneous_index], flat_before[c.heterogeneous_index]
-        change = (
-            c.heterogeneous_weight
-            * (flat_now[c.heterogeneous_index[:, None] + _offsets(state.now)] - own[:, None])
-        ).sum(-1)
+        around = c.heterogeneous_index[:, None] + torch.from_numpy(flat_offsets(state.now.shape))
+        change = (c.heterogeneous_weight * (flat_now[around] - own[:, None])).sum(-1)
         kept = own + c.keep * (own - before)
-        new = new.reshape(-1).index_copy(0, c.heterogeneous_index, kept + change)
-        new = new.reshape(state.now.shape)
+        new = new.reshape(-1).index_copy(0, c.heterogeneous_index, kept + change).reshape(state.now.shape)
         layers, term = _absorb(state.now, state.layers, c)
-        flat_term = term.reshape(-1)
-        term = flat_term.index_copy(0, c.layer_index, c.layer_scale * flat_term[c.layer_index]).reshape(
-            term.shape
-        )
+        term = term.reshape(-1)
+        term = term.index_copy(0, c.layer_index, c.layer_scale * term[c.layer_index]).reshape(new.shape)
         nothing = torch.zeros(c.crossed.index.T[1:].shape, dtype=flat_now.dtype, device="cpu")
         crossed, beside = _absorb_columns(flat_now, c.crossed, nothing, state.crossed, c)
         beside = torch.nn.functional.pad(beside.reshape(-1), (0, 1))[c.crossing.T[1:]]
@@ -65,22 +57,11 @@ class ReferenceKernel:
         return State(new.reshape(state.now.shape), state.now, layers, columns, crossed)
 
 
-def _core(field: torch.Tensor) -> torch.Tensor:
+def _core(field: Tensor) -> Tensor:
     return field[1:-1, 1:-1, 1:-1]
 
 
-def _offsets(field: torch.Tensor) -> torch.Tensor:
-    """Return flat offsets of the 27 neighbours, row-major."""
-    step = torch.arange(-1, 2, device="cpu")
-    strides = field.stride()
-    return (
-        (step * strides[0])[:, None, None]
-        + (step * strides[1])[None, :, None]
-        + (step * strides[2])[None, None, :]
-    ).reshape(-1)
-
-
-def _sweep(p: torch.Tensor, c: Coefficients) -> torch.Tensor:
+def _sweep(p: Tensor, c: Coefficients) -> Tensor:
     """Return line 1 of the contract, without `before`, in all cells inside the ring."""
     along = [neighbours(p, axis) for axis in range(3)]
     faces = sum(middle(middle(along[a], b), d) for a, b, d in ((0, 1, 2), (1, 0, 2), (2, 0, 1)))
@@ -89,34 +70,28 @@ def _sweep(p: torch.Tensor, c: Coefficients) -> torch.Tensor:
     return c.center * _core(p) + c.face * faces + c.edge * edges + c.corner * corners
 
 
-def _around(field: torch.Tensor, axis: int) -> torch.Tensor:
+def _around(field: Tensor, axis: int) -> Tensor:
     """Return the sum of the two neighbours along an axis in every cell; zero beyond the field."""
     return _between(neighbours(field, axis), axis, 1, 1)
 
 
-def _between(field: torch.Tensor, axis: int, before: int, after: int) -> torch.Tensor:
+def _between(field: Tensor, axis: int, before: int, after: int) -> Tensor:
     """Pad a field with `before` and `after` zeros along an axis."""
     width = [0] * 6
     width[4 - 2 * axis], width[5 - 2 * axis] = before, after
     return torch.nn.functional.pad(field, width)
 
 
-def _absorb(
-    p: torch.Tensor, layers: tuple[Layer, ...], c: Coefficients
-) -> tuple[tuple[Layer, ...], torch.Tensor]:
-    """Advance the boundary layers' memory; return it and the term to add to the new pressure.
-
-    With T_a the sum of the two neighbours along axis a, T_a + E_a replaces T_a everywhere in the 27-point
-    sum, products included.
-    """
+def _absorb(p: Tensor, layers: tuple[Layer, ...], c: Coefficients) -> tuple[tuple[Layer, ...], Tensor]:
+    """Advance the layers' memory; return it and the term that replacing all T_a by T_a + E_a adds."""
     x, y, z, yz = layers
     cells, size = c.layer_cells, p.shape
 
-    def smooth(field: torch.Tensor, first: int, second: int) -> torch.Tensor:
+    def smooth(field: Tensor, first: int, second: int) -> Tensor:
         one, other = _around(field, first), _around(field, second)
         return c.face * field + c.edge * (one + other) + c.corner * _around(one, second)
 
-    def placed(sides: tuple[torch.Tensor, ...], axis: int) -> torch.Tensor:
+    def placed(sides: tuple[Tensor, ...], axis: int) -> Tensor:
         low, high = sides
         rest = size[axis] - cells - 1
         return _between(low, axis, 1, rest) + _between(torch.flip(high, (axis,)), axis, rest, 1)
@@ -135,8 +110,8 @@ def _absorb(
 
 
 def _absorb_columns(
-    flat: torch.Tensor, columns: Columns, beside: torch.Tensor, memory: Layer, c: Coefficients
-) -> tuple[Layer, torch.Tensor]:
+    flat: Tensor, columns: Columns, beside: Tensor, memory: Layer, c: Coefficients
+) -> tuple[Layer, Tensor]:
     """Advance the memory of columns, with summands `beside` (L + 1, m); return it and the terms (L, m)."""
     cells = columns.index.T[1:, :, None] + columns.offset
     across = torch.nn.functional.pad((columns.weight * flat[cells]).sum(-1) + beside, (0, 0, 1, 0))
@@ -148,9 +123,7 @@ def _absorb_columns(
     return (psi, zeta), slope + zeta
 
 
-def _stretch(
-    field: torch.Tensor, layer: Layer, c: Coefficients, axis: int
-) -> tuple[Layer, tuple[torch.Tensor, torch.Tensor]]:
+def _stretch(field: Tensor, layer: Layer, c: Coefficients, axis: int) -> tuple[Layer, tuple[Tensor, Tensor]]:
     """Advance the memory of an axis; return it and E_a of the field in the low and the high layer."""
     cells, shape = c.layer_cells, [1, 1, 1]
     shape[axis] = -1
