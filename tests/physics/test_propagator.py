@@ -61,7 +61,8 @@ def test_piston_radiates_as_a_piston():
     normal = array.normals[0]
     u, v = plane_basis(normal)
     across = {angle: math.cos(angle) * u + math.sin(angle) * v for angle in (0.3, 3.4)}
-    arcs = [(math.radians(t), side) for side in across for t in range(0, 61, 10)]
+    arcs = [(math.radians(t), 0.3) for t in range(0, 61, 10)]
+    arcs += [(math.radians(t), 3.4) for t in range(10, 61, 10)]
     points = [math.cos(t) * normal + math.sin(t) * across[side] for t, side in arcs]
     domain = ((6e-3, 1e-3, 7e-3), (33e-3, 34e-3, 21e-3))
     scene = Scene(array, AIR, 40e3, center + distance * torch.stack(points), domain=domain)
