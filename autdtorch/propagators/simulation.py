@@ -137,7 +137,8 @@ class Simulation(ABC):
         """
         plan, grids = self.plan, [assembly.grid for assembly in self.assemblies]
         what = f"simulating {plan.scene.name}"
-        logger.info("%s: %s, cells of %.3g mm, %d runs", what, plan.method, 1e3 * plan.spacing, len(sources))
+        count = "1 run" if len(sources) == 1 else f"{len(sources)} runs"
+        logger.info("%s: %s, cells of %.3g mm, %s", what, plan.method, 1e3 * plan.spacing, count)
         crossing = max(grid.diagonal / grid.wavelength for grid in grids)
         periods = math.ceil(len(sources) * USUAL_PERIODS * fewest_periods(crossing))
         with show_progress(periods, what) as progress:
