@@ -4,15 +4,67 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autdtorch.fdtd import stability
 from autdtorch.fdtd.stability import fewest_steps, largest_eigenvalue, whole_steps
-from autdtorch.fdtd.stencil import tuned_stencil
+from autdtorch.fdtd.stencil import OFFSETS, tuned_stencil
 
 STENCIL = tuned_stencil(2 * math.pi / 8.5)
 SHAPE = (8, 8, 8)
+
+
+def random_weights(seed: int, contrast: float, negative: float) -> tuple[np.ndarray, np.ndarray]:
+    """Heterogeneous cells in air: symmetric coupling, some of it negative, over random masses."""
+    rng = np.random.default_rng(seed)
+    inside = np.zeros(SHAPE, bool)
+    inside[2:-2, 2:-2, 2:-2] = True
+    index, strides = np.flatnonzero(inside), np.array((64, 8, 1))
+    mass, weight = np.ones(math.prod(SHAPE)), np.tile(STENCIL.weights, (math.prod(SHAPE), 1))
+    mass[index] = contrast ** rng.uniform(-1, 1, len(index))
+    for column, offset in enumerate(OFFSETS[14:], start=14):
+        for cell, other in zip(index, index + strides @ offset, strict=True):
+            if inside.flat[other]:
+                coupling = (
+                    weight[cell, column] * rng.uniform(-negative, 1) * math.sqrt(mass[cell] * mass[other])
+                )
+                weight[cell, column], weight[other, 26 - column] = (
+                    coupling / mass[cell],
+                    coupling / mass[other],
+                )
+            else:
+                weight[cell, column] /= mass[cell]
+        for cell, other in zip(index, index - strides @ offset, strict=True):
+            if not inside.flat[other]:
+                weight[cell, 26 - column] /= mass[cell]
+    return index, weight[index]
+
+
+def dense(index: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """The operator on all cells but the outermost, which are held at zero."""
+    inner = np.zeros(SHAPE, bool)
+    inner[1:-1, 1:-1, 1:-1] = True
+    rows = np.flatnonzero(inner)
+    full = np.tile(STENCIL.weights, (inner.size, 1))
+    full[index] = weight
+    matrix = np.zeros((inner.size, inner.size))
+    for offset, column in zip(np.array(OFFSETS) @ (64, 8, 1), full.T, strict=True):
+        matrix[rows, rows + offset] -= column[rows]
+    matrix[rows, rows] += full[rows].sum(1)
+    return matrix[np.ix_(rows, rows)]
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 10**6), st.floats(1, 1e4), st.sampled_from([0.0, 0.2]))
+def test_largest_eigenvalue_is_never_below_the_truth_and_close_to_it(
+    seed: int, contrast: float, negative: float
+) -> None:
+    index, weight = random_weights(seed, contrast, negative)
+    truth = max(np.abs(np.linalg.eigvals(dense(index, weight))).max(), STENCIL.largest_symbol)
+    found = largest_eigenvalue(index, weight, STENCIL, SHAPE)
+    # above: the margin, or the width within which a bound is taken as it is
+    assert truth * (1 - 1e-9) <= found <= truth * max(stability.MARGIN, stability.CLOSE)
 
 
 def test_of_uniform_air_it_is_that_of_the_shortest_wave() -> None:
@@ -21,10 +73,7 @@ def test_of_uniform_air_it_is_that_of_the_shortest_wave() -> None:
 
 
 def test_many_cells_get_the_bound(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    inside = np.zeros(SHAPE, bool)
-    inside[2:-2, 2:-2, 2:-2] = True
-    index = np.flatnonzero(inside)
-    weight = np.tile(4 * STENCIL.weights, (len(index), 1))  # a body of a quarter of the mass
+    index, weight = random_weights(0, contrast=100.0, negative=0.2)
     iterated = largest_eigenvalue(index, weight, STENCIL, SHAPE)
     monkeypatch.setattr(stability, "MOST_CELLS", len(index) - 1)
     with caplog.at_level(logging.INFO):
