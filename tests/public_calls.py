@@ -59,10 +59,10 @@ class Made(NamedTuple):
     make: Callable[[Path], Any]
 
 
-class Silent:
+class Silent(hardware.Port):
     """A port that nothing hangs on, and a sensor that always reads the same."""
 
-    def write(self, data):
+    def read(self):
         return torch.ones(3, dtype=torch.float64)
 
 
