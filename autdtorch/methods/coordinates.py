@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 
@@ -60,12 +61,9 @@ def candidates(search: Search, levels: int) -> torch.Tensor:
     The present phase is among them, so that a choice is made among observations of one time: a lucky reading,
     or the drift since, does not hold a phase for ever.
     """
-    weights = search["weights"]
-    turns = torch.arange(levels, dtype=torch.float64, device="cpu")
-    choices = drive_from_phases(2 * math.pi * turns / levels)
-    found = weights[:, None].repeat(1, levels, 1)
-    rows = torch.arange(len(weights), device="cpu")
-    found[rows, :, search["order"][:, int(search["place"])]] = choices
+    found = search["weights"][:, None].repeat(1, levels, 1)
+    rows = torch.arange(len(found), device="cpu")
+    found[rows, :, search["order"][:, int(search["place"])]] = _phases(levels)
     return found
 
 
@@ -77,10 +75,18 @@ def ascend(search: Search, levels: int, score: torch.Tensor) -> tuple[Search, to
         that changed none of its weights.
     """
     rows = torch.arange(len(score), device="cpu")
-    weights = candidates(search, levels)[rows, first_of_best(score)]
     place, passes = int(search["place"]) + 1, int(search["passes"])
+    weights = search["weights"].clone()
+    weights[rows, search["order"][:, place - 1]] = _phases(levels)[first_of_best(score)]
     if place < search["order"].shape[1]:
         following = torch.tensor(place, dtype=torch.int64, device="cpu")
         return {**search, "weights": weights, "place": following}, rows >= 0
     goes_on = (weights != search["before"]).any(dim=1) & (passes > 1)
     return begin_ascent(weights[goes_on], search["order"][goes_on], passes - 1), goes_on
+
+
+@functools.lru_cache(maxsize=8)
+def _phases(levels: int) -> torch.Tensor:
+    """Return e^{-i phi} (levels,) of the phases to compare."""
+    turns = torch.arange(levels, dtype=torch.float64, device="cpu")
+    return drive_from_phases(2 * math.pi * turns / levels)

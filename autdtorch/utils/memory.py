@@ -10,6 +10,8 @@ import psutil
 
 from autdtorch.utils.validation import invalid
 
+_NEGLIGIBLE = 1e6  # bytes; asking the system takes a millisecond
+
 _CGROUP = Path("/proc/self/cgroup")
 _MOUNT = Path("/sys/fs/cgroup")
 # Files of a control group by version: the limit, the memory in use, and the reclaimable part of it.
@@ -25,6 +27,8 @@ def available_memory() -> int:
 
 def require_memory(field: str, value: object, needed: float, unit: str = "") -> None:
     """Refuse an argument that needs more memory [bytes] than is available."""
+    if needed < _NEGLIGIBLE:
+        return
     if needed > (available := available_memory()):
         left = f"this process may use {available / 1e9:.3g} GB"
         raise invalid(field, value, f"needs about {needed / 1e9:.3g} GB of memory, {left}", unit)
