@@ -132,8 +132,8 @@ class _Trial:
             self.begun = not bench.is_dry
             at_the_end.callback(lambda: objective.log.end(limited.seconds_on))
             at_the_end.callback(limited.off)
-            if objective.log.evaluations:
-                logger.info("going on after %d evaluations", len(objective.log.evaluations))
+            if objective.evaluations:
+                logger.info("going on after %d evaluations", objective.evaluations)
             progress.begin("checking the transducers, one by one")
             preflight = self._preflight(limited, sensor, readings, progress)
             progress.begin(f"running {name_of(self._method)} on {bench.device.name}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import json
 import math
 import os
@@ -81,12 +80,18 @@ class EvaluationLog:
         self.seconds_on = 0.0
         self._shape = transducers, points
         self._evaluations: dict[int, Evaluation] = {}
+        self._lacking = 0  # no evaluation below this number is missing
         self._first_again = math.inf  # number of the first evaluation that was made after later ones
         with contextlib.ExitStack() as held:
             held.enter_context(lock_log(path))
             self._lines, self.goes_on = self._take_up()
             self._lines.mend()
             self._held = held.pop_all()
+
+    @property
+    def count(self) -> int:
+        """The number of evaluations in the file."""
+        return len(self._evaluations)
 
     @property
     def evaluations(self) -> list[Evaluation]:
@@ -107,6 +112,7 @@ class EvaluationLog:
             return evaluation
         if number > self._first_again:
             del self._evaluations[number]  # to be measured again, under its number
+            self._lacking = min(self._lacking, number)
             return None
         raise LogError(
             f"{self.path}: evaluation {number + 1} is of another drive than the method asks for; "
@@ -125,7 +131,9 @@ class EvaluationLog:
             LogError: the file has changed meanwhile.
             OSError: the file cannot be written.
         """
-        number = next(n for n in itertools.count() if n not in self._evaluations)
+        while self._lacking in self._evaluations:
+            self._lacking += 1
+        number = self._lacking
         evaluation = Evaluation(_now(), drive, pressure, seconds_on)
         read = {"pressure": pressure.tolist(), "seconds_on": seconds_on}
         asked = {"time": evaluation.time, "drive": torch.view_as_real(drive).tolist()}

@@ -108,7 +108,7 @@ class HardwareObjective:
     @property
     def evaluations(self) -> int:
         """Number of observations so far, those from the log included."""
-        return len(self.log.evaluations)
+        return self.log.count
 
     def recorded(self, number: int, drive: torch.Tensor) -> torch.Tensor | None:
         """Return the pressures (P,) [Pa] of an evaluation in the log, or None; see `EvaluationLog.recorded`.
