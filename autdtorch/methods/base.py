@@ -104,6 +104,7 @@ class State:
 
     Attributes:
         problem: what is solved.
+        seeds: of the T trials.
         trials: indices of the L trials that go on (L,), of 0 to T - 1.
         drives: B drives for each of them to observe next (L, B, M), complex128.
         search: what the method needs to go on: tensors by name.
@@ -112,6 +113,7 @@ class State:
     """
 
     problem: Problem
+    seeds: tuple[int, ...]
     trials: torch.Tensor
     drives: torch.Tensor
     search: Mapping[str, torch.Tensor]
@@ -215,7 +217,8 @@ class Method(ABC):
             torch.zeros(count, dtype=torch.int64, device="cpu"),
             torch.empty(count, 0, dtype=torch.float64, device="cpu"),
         )
-        return State(problem, torch.arange(count, device="cpu"), step.drives, step.search, empty)
+        places = torch.arange(count, device="cpu")
+        return State(problem, tuple(seeds), places, step.drives, step.search, empty)
 
     def ask(self, state: State) -> torch.Tensor:
         """Return the drives (B, M), complex128, to observe next; none when the method is done."""

@@ -8,12 +8,12 @@ from typing import Protocol, runtime_checkable
 
 import torch
 
-from autdtorch.methods.base import Method, Problem, State, Trials
+from autdtorch.methods.base import Method, Problem, State, Trials, trial_seeds
 from autdtorch.methods.solution import Solution
 from autdtorch.methods.state_file import load_state, save_state
 from autdtorch.objectives.objective import Objective, Score, weakest_focus
 from autdtorch.utils.progress import show_progress
-from autdtorch.utils.validation import path_of, require_callable, require_kind
+from autdtorch.utils.validation import invalid, path_of, require_callable, require_kind
 
 
 @runtime_checkable
@@ -55,7 +55,7 @@ def run(
 
     Raises:
         ValueError: an argument out of range, pressures or scores that are not finite, or a state file of
-            another method or problem.
+            another method, problem, seed or other trials.
         OSError: the state file cannot be read or written.
     """
     require_kind("method", method, Method)
@@ -66,6 +66,8 @@ def run(
     path = None if state_file is None else path_of("state_file", state_file)
     if path is not None and path.exists():
         state = load_state(path, method, problem)
+        if state.seeds != tuple(trial_seeds(seed, trials)):
+            raise invalid("state_file", str(path), "must be the state of the same seed and trials")
     else:
         state = method.start(problem, seed, trials)
     most = method.most_evaluations(problem) * len(state.best.score)

@@ -34,7 +34,8 @@ def save_state(path: str | os.PathLike[str], method: Method, state: State) -> No
     """
     require_kind("method", method, Method)
     require_kind("state", state, State)
-    tensors = {"trials": state.trials, "drives": state.drives}
+    seeds = torch.tensor(state.seeds, dtype=torch.int64, device="cpu")
+    tensors = {"seeds": seeds, "trials": state.trials, "drives": state.drives}
     tensors |= {f"{_BEST}{name}": getattr(state.best, name) for name in _COLUMNS}
     tensors |= {f"{_SEARCH}{name}": tensor for name, tensor in state.search.items()}
     arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in tensors.items()}
@@ -68,7 +69,8 @@ def load_state(path: str | os.PathLike[str], method: Method, problem: Problem) -
         search = {
             name.removeprefix(_SEARCH): tensor for name, tensor in tensors.items() if name.startswith(_SEARCH)
         }
-        state = State(problem, tensors["trials"], tensors["drives"], search, best)
+        seeds = tuple(map(int, arrays["seeds"]))
+        state = State(problem, seeds, tensors["trials"], tensors["drives"], search, best)
         _require_consistent(state)
     except (KeyError, TypeError, IndexError, ValueError) as error:
         raise ValueError(f"{os.fspath(path)}: {error}; must be a file of save_state") from error
@@ -83,7 +85,7 @@ def _origin(method: Method, problem: Problem) -> str:
 
 def _require_consistent(state: State) -> None:
     """Check the shapes and types of what all methods share."""
-    count, transducers, foci = len(state.best.score), state.problem.transducers, state.problem.foci
+    count, transducers, foci = len(state.seeds), state.problem.transducers, state.problem.foci
     evaluations = state.best.history.shape[-1]
     wanted = {
         "trials": (state.trials, (len(state.trials),), torch.int64),

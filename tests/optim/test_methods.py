@@ -86,6 +86,11 @@ def test_a_run_stops_and_goes_on_from_its_file(objective, tmp_path):
     for other in (at.GABS(levels=5), at.LSSG()):
         with pytest.raises(ValueError, match=r"state\.npz: state of .*gabs.*; must be of"):
             at.run(other, objective, state_file=path)
+    for others in ({"seed": 1}, {"trials": 2}):
+        with pytest.raises(
+            ValueError, match=r"state_file: .*state\.npz'; must be .* the same seed and trials"
+        ):
+            at.run(method, objective, state_file=path, **others)
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(ValueError, match=r"state\.npz"):
         at.run(method, objective, state_file=path)

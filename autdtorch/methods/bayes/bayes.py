@@ -96,7 +96,6 @@ class BayesOpt(Method):
         trials = self._trials(problem, seeds)
         points = torch.stack([trial.initial_points() for trial in trials])
         search = {
-            "seeds": torch.tensor(seeds, dtype=torch.int64, device="cpu"),
             "points": points[:, :0],
             "scores": points[:, :0, 0],
             "next": points,
@@ -142,7 +141,7 @@ class BayesOpt(Method):
     def _rebuilt(self, state: State) -> list[BayesTrial]:
         """Return the trials after the observations so far, as their search left them."""
         points, scores = state.search["points"], state.search["scores"]
-        trials = self._trials(state.problem, state.search["seeds"].tolist())
+        trials = self._trials(state.problem, state.seeds)
         for trial in trials:
             trial.initial_points()  # draws from the generator
         ends = [self.initial, *range(self.initial + 1, points.shape[1] + 1)] if points.shape[1] else []
