@@ -1,10 +1,8 @@
 """Obstacles: boxes, spheres, cylinders, meshes and voxel masks, of a fluid material or rigid."""
 
-from autdtorch.scene.obstacles.base import Obstacle
-from autdtorch.scene.obstacles.box import Box
-from autdtorch.scene.obstacles.cylinder import Cylinder
-from autdtorch.scene.obstacles.mesh import Mesh
-from autdtorch.scene.obstacles.sphere import Sphere
-from autdtorch.scene.obstacles.voxel_mask import VoxelMask
-
-__all__ = ["Box", "Cylinder", "Mesh", "Obstacle", "Sphere", "VoxelMask"]
+from autdtorch.scene.obstacles.base import Obstacle as Obstacle
+from autdtorch.scene.obstacles.mesh import Mesh as Mesh
+from autdtorch.scene.obstacles.primitives import Box as Box
+from autdtorch.scene.obstacles.primitives import Cylinder as Cylinder
+from autdtorch.scene.obstacles.primitives import Sphere as Sphere
+from autdtorch.scene.obstacles.voxel_mask import VoxelMask as VoxelMask

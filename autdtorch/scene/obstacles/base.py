@@ -96,12 +96,6 @@ class Obstacle(ABC):
         """Return the signed distances (N,) [m] of checked `points` (N, 3) [m]."""
 
 
-def distance_from_excess(excess: torch.Tensor) -> torch.Tensor:
-    """Return signed distances (N,) from the distances (N, K) of points beyond K perpendicular faces."""
-    outside: torch.Tensor = torch.linalg.vector_norm(excess.clamp(min=0), dim=-1)
-    return outside + excess.amax(dim=-1).clamp(max=0)
-
-
 def _points(given: ArrayLike) -> torch.Tensor:
     points = real_tensor("points", given, "m")
     if points.ndim == 0 or points.shape[-1] != 3:
