@@ -6,8 +6,7 @@ import math
 
 import pytest
 
-from autdtorch.scene.air import absorption, density_and_sound_speed, vapour_fraction
-from autdtorch.scene.scene import Medium
+from autdtorch.scene.medium import Medium, vapour_fraction
 
 ATMOSPHERE = 101325.0
 
@@ -26,7 +25,7 @@ def midband(nominal: float) -> float:
     ],
 )
 def test_absorption_is_that_of_the_table(temperature, humidity, frequency, tabulated):
-    computed = 1e3 * absorption(temperature, humidity, ATMOSPHERE, midband(frequency))
+    computed = 1e3 * Medium.air(temperature, humidity, ATMOSPHERE, midband(frequency)).absorption
     assert computed == pytest.approx(tabulated, rel=5e-3)
 
 
@@ -41,7 +40,7 @@ def test_absorption_is_that_of_the_table(temperature, humidity, frequency, tabul
 )
 def test_absorption_in_octaves(temperature: float, humidity: float, tabulated: tuple[float, ...]) -> None:
     octaves = [midband(1000 * 2**n) for n in range(-4, 4)]
-    computed = [1e3 * absorption(temperature, humidity, ATMOSPHERE, f) for f in octaves]
+    computed = [1e3 * Medium.air(temperature, humidity, ATMOSPHERE, f).absorption for f in octaves]
     # half a unit of the last digit printed: 0.05 dB/km, from 100 on 0.5 dB/km
     assert computed == pytest.approx(tabulated, abs=0.055, rel=2.5e-3)
 
@@ -53,21 +52,19 @@ def test_far_above_the_relaxations_absorption_is_classical() -> None:
     """
     for pressure in (ATMOSPHERE, 2 / 3 * ATMOSPHERE):
         classical = 8.686 * 1.84e-11 * 5e5**2 * ATMOSPHERE / pressure
-        relaxing = absorption(20, 0, pressure, 5e5) - classical
+        relaxing = Medium.air(20, 0, pressure, 5e5).absorption - classical
         assert 0 < relaxing < 1e-4 * classical
 
 
-def test_sound_speed_of_dry_air() -> None:
+def test_density_and_sound_speed() -> None:
     # measured: 331.45 m/s with 0.03 % of CO2 (Cramer 1993), of which a real gas makes 0.13 m/s
-    assert density_and_sound_speed(0, 0, ATMOSPHERE)[1] == pytest.approx(331.45, rel=5e-4)
+    assert Medium.air(0, 0).sound_speed == pytest.approx(331.45, rel=5e-4)
     # ISO 9613-1 and every handbook: 343.2 m/s and 1.204 kg/m^3 at 20 deg C
-    assert density_and_sound_speed(20, 0, ATMOSPHERE) == pytest.approx((1.204, 343.2), rel=2e-4)
-
-
-def test_sound_speed_of_a_real_gas_is_half_a_per_mille_off() -> None:
-    # the zero-frequency formula of Cramer 1993 with 0.04 % of CO2, at one atmosphere
+    dry = Medium.air(20, 0)
+    assert (dry.density, dry.sound_speed) == pytest.approx((1.204, 343.2), rel=2e-4)
+    # the zero-frequency formula of Cramer 1993, a real gas with 0.04 % of CO2
     for humidity, speed in ((50, 343.987), (0, 343.359)):
-        assert density_and_sound_speed(20, humidity, ATMOSPHERE)[1] == pytest.approx(speed, rel=5e-4)
+        assert Medium.air(20, humidity).sound_speed == pytest.approx(speed, rel=5e-4)
 
 
 def test_vapour() -> None:
@@ -77,8 +74,5 @@ def test_vapour() -> None:
         assert found == pytest.approx(saturation, rel=2e-3)
 
 
-def test_medium_of_air() -> None:
-    density, sound_speed = density_and_sound_speed(25, 40, 90e3)
-    assert Medium.air(25, 40, 90e3, 25e3) == Medium(density, sound_speed, absorption(25, 40, 90e3, 25e3))
-    # the figure in every data sheet of 40 kHz air transducers: about 1.3 dB/m
+def test_absorption_at_40_khz_is_that_of_data_sheets() -> None:
     assert Medium.air().absorption == pytest.approx(1.3, abs=0.05)
