@@ -9,17 +9,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from autdtorch.scene.device_layouts import (
-    AUTD3_SOURCE_STRENGTH,
-    AUTD3_TRANSDUCERS,
-    OPENMPD_SOURCE_STRENGTH,
-    SONICSURFACE_SOURCE_STRENGTH,
-    TRANSDUCER_RADIUS,
-    autd3_places,
-    centred,
-    openmpd_places,
-    sonicsurface_places,
-)
 from autdtorch.scene.geometry import Coordinates, in_plane, plane_basis
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.neighbours import nearest_other, require_distinct
@@ -37,6 +26,23 @@ from autdtorch.utils.validation import (
 
 PAPER_SOURCE_STRENGTH = 1 / (4 * math.pi)
 """Source strength in the paper's Eq. 2: on-axis pressure at full drive times distance [Pa m]."""
+
+# Source strengths [Pa m] in programs for the devices. They differ by nearly a factor of 2 for similar
+# transducers, and not all say whether peak or RMS: measure your own.
+AUTD3_SOURCE_STRENGTH = 4.386  # AUTD3 SDK
+OPENMPD_SOURCE_STRENGTH = 3.4  # AcousTools
+SONICSURFACE_SOURCE_STRENGTH = 2.53  # Ultraino
+
+TRANSDUCER_RADIUS = 4.5e-3
+"""Radius of the radiating disc of a 10 mm transducer for 40 kHz [m] (AcousTools, Ultraino)."""
+
+AUTD3_TRANSDUCERS = 249
+AUTD3_UNIT = 192e-3, 151.4e-3
+"""Width and height of an AUTD3 unit with its rim [m]."""
+
+_AUTD3_PLACES, _AUTD3_PITCH = (18, 14), 10.16e-3
+_AUTD3_MISSING = {(1, 1), (2, 1), (16, 1)}  # grid places (x, y) of screws and connectors
+_SQUARE_PLACES, _SQUARE_PITCH = 16, 10.5e-3
 
 _TRANSDUCER_BYTES = 500.0  # memory for each transducer [bytes], with the search for its neighbours
 
@@ -121,7 +127,7 @@ class TransducerArray:
         count_u, count_v = positive_integers("shape", shape, 2)
         require_memory("shape", shape, _TRANSDUCER_BYTES * count_u * count_v)
         pitch = positive("pitch", pitch, "m")
-        places = torch.cartesian_prod(pitch * centred(count_u), pitch * centred(count_v)).reshape(-1, 2)
+        places = torch.cartesian_prod(pitch * _centred(count_u), pitch * _centred(count_v)).reshape(-1, 2)
         return cls(in_plane(places, center, normal), normal, source_strength, radius)
 
     @classmethod
@@ -150,7 +156,7 @@ class TransducerArray:
         """
         count_x, count_y = positive_integers("units", units, 2)
         require_memory("units", units, _TRANSDUCER_BYTES * AUTD3_TRANSDUCERS * count_x * count_y)
-        positions = in_plane(autd3_places((count_x, count_y)), center, normal, angle)
+        positions = in_plane(_autd3_places(count_x, count_y), center, normal, angle)
         return cls(positions, normal, source_strength, radius)
 
     @classmethod
@@ -165,9 +171,12 @@ class TransducerArray:
         """Return the array of a SonicSurface: 16 x 16 transducers row by row from the largest y, x fastest.
 
         Arguments and errors as for `TransducerArray.autd3`; the default source strength is Ultraino's.
-        The order by channel, which the firmware needs, is applied when frames are encoded.
+        The order is that of the table of emitters in the device's Python program. The order by channel, which
+        the firmware needs, is applied when frames are encoded.
         """
-        return cls(in_plane(sonicsurface_places(), center, normal, angle), normal, source_strength, radius)
+        across = _SQUARE_PITCH * _centred(_SQUARE_PLACES)
+        places = torch.cartesian_prod(-across, across).flip(1)
+        return cls(in_plane(places, center, normal, angle), normal, source_strength, radius)
 
     @classmethod
     def openmpd(
@@ -183,7 +192,9 @@ class TransducerArray:
         Arguments and errors as for `TransducerArray.autd3`; the default source strength is AcousTools'.
         Positions are nominal; `OpenMPDBoard.load` reads the positions and calibration of one board.
         """
-        return cls(in_plane(openmpd_places(), center, normal, angle), normal, source_strength, radius)
+        across = _SQUARE_PITCH * _centred(_SQUARE_PLACES)
+        places = torch.cartesian_prod(across, -across)
+        return cls(in_plane(places, center, normal, angle), normal, source_strength, radius)
 
     @property
     def nodes(self) -> Nodes:
@@ -216,6 +227,28 @@ class TransducerArray:
             f"TransducerArray({len(self)} transducers around ({x:.4g}, {y:.4g}, {z:.4g}) mm, "
             f"{size}source strength {self.source_strength:.4g} Pa m)"
         )
+
+
+def _autd3_places(count_x: int, count_y: int) -> torch.Tensor:
+    """Return positions (M, 2) [m] along x and y of AUTD3 units, as in autd3-core 0.12.
+
+    A unit is row by row with x fastest; of several units, y is fastest.
+    """
+    along_x, along_y = (_AUTD3_PITCH * _centred(count) for count in _AUTD3_PLACES)
+    unit = [
+        (x, y)
+        for j, y in enumerate(along_y.tolist())
+        for i, x in enumerate(along_x.tolist())
+        if (i, j) not in _AUTD3_MISSING
+    ]
+    width, height = AUTD3_UNIT
+    shifts = torch.cartesian_prod(width * _centred(count_x), height * _centred(count_y))
+    return (shifts[:, None] + torch.tensor(unit, dtype=torch.float64, device="cpu")).reshape(-1, 2)
+
+
+def _centred(count: int) -> torch.Tensor:
+    """Return `count` positions one apart, around 0."""
+    return torch.arange(count, dtype=torch.float64, device="cpu") - (count - 1) / 2
 
 
 def _disc_rule() -> tuple[torch.Tensor, torch.Tensor]:

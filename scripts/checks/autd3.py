@@ -30,7 +30,7 @@ from shared.document import fill_in, measured, table
 import autdtorch as at
 from autdtorch.analytic.green import free_space_matrix
 from autdtorch.hardware import AUTD3
-from autdtorch.scene.device_layouts import TRANSDUCER_RADIUS
+from autdtorch.scene.arrays import TRANSDUCER_RADIUS
 
 DOCUMENT = "crosschecks.md"
 PACKAGES = ("autd3-emulator", "autd3-pattern")

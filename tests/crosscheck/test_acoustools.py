@@ -17,7 +17,7 @@ from shared.scenes import relative_error
 
 import autdtorch as at
 from autdtorch.analytic.green import free_space_matrix
-from autdtorch.scene.device_layouts import TRANSDUCER_RADIUS
+from autdtorch.scene.arrays import TRANSDUCER_RADIUS
 
 
 def test_both_come_to_the_series_of_a_rigid_sphere() -> None:

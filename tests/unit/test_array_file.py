@@ -7,8 +7,7 @@ import torch
 from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
 from autdtorch.io.array_file import load_array
 from autdtorch.io.scene_file import load_scene
-from autdtorch.scene.arrays import PAPER_SOURCE_STRENGTH, TransducerArray
-from autdtorch.scene.device_layouts import OPENMPD_SOURCE_STRENGTH
+from autdtorch.scene.arrays import OPENMPD_SOURCE_STRENGTH, PAPER_SOURCE_STRENGTH, TransducerArray
 
 BOARD = """FT123456
 4

@@ -3,8 +3,7 @@ import math
 import pytest
 import torch
 
-from autdtorch.scene.arrays import TransducerArray
-from autdtorch.scene.device_layouts import AUTD3_UNIT
+from autdtorch.scene.arrays import AUTD3_UNIT, TransducerArray
 from autdtorch.utils.neighbours import distances
 
 PITCH = 10.16e-3

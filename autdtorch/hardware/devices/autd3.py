@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from autdtorch.hardware.devices.device import Device, Firmware
-from autdtorch.scene.device_layouts import AUTD3_TRANSDUCERS
+from autdtorch.scene.arrays import AUTD3_TRANSDUCERS
 from autdtorch.scene.phase_levels import PhaseLevels
 
 

@@ -15,8 +15,7 @@ from typing import NamedTuple
 
 import torch
 
-from autdtorch.scene.arrays import TransducerArray
-from autdtorch.scene.device_layouts import OPENMPD_SOURCE_STRENGTH, TRANSDUCER_RADIUS
+from autdtorch.scene.arrays import OPENMPD_SOURCE_STRENGTH, TRANSDUCER_RADIUS, TransducerArray
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.geometry import in_plane
 from autdtorch.utils.validation import ArrayLike, path_of
