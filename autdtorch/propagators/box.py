@@ -22,7 +22,7 @@ from autdtorch.fdtd.grid import make_box
 from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
 from autdtorch.fdtd.steady_state import Extrapolation, SteadyState, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble_on
-from autdtorch.propagators.grids import MOST_PASSES
+from autdtorch.propagators.grids import MOST_PASSES, one_box
 from autdtorch.propagators.plan import MOST_JUDGED
 from autdtorch.propagators.simulation import Run, Simulation, Stepped
 from autdtorch.scene.arrays import Nodes
@@ -72,7 +72,8 @@ class BoxSimulation(Simulation):
 
     @cached_property
     def _in_one_box(self) -> BoxSimulation:
-        return BoxSimulation(self.plan.in_one_box())
+        plan = self.plan
+        return BoxSimulation(replace(plan, grouping=one_box(plan.region, plan.spacing)))
 
     def checked(self, points: ArrayLike) -> torch.Tensor:
         """Return points (P, 3) after checking that none is on a transducer."""

@@ -8,16 +8,24 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
+import torch
 
+from autdtorch.propagators.plan import Plan
 from autdtorch.utils.array_types import AnyArray, ComplexArray
+from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import replace_file
+from autdtorch.utils.versions import package_versions, source_digest
 
 logger = logging.getLogger(__name__)
 
 SUFFIX = ".matrix"
+
+_NO_EFFECT = ("control_points", "observation_plane", "name")
+"""Scene fields that do not affect the pressure; left out of the key."""
 
 
 class DiskCache:
@@ -65,3 +73,12 @@ class DiskCache:
 def _with_checksum(digest: str, shape: tuple[int, ...], body: bytes) -> bytes:
     named = f"{digest} {shape}\n".encode()
     return hashlib.sha256(named + body).hexdigest().encode() + b"\n" + body
+
+
+def cache_key(plan: Plan, points: torch.Tensor) -> str:
+    """Return a digest of everything that affects the transfer matrix of points (P, 3) [m]."""
+    scene = {entry.name: getattr(plan.scene, entry.name) for entry in fields(plan.scene)}
+    settings = {entry.name: getattr(plan, entry.name) for entry in fields(plan)}
+    settings |= {"scene": None, "region": None, "runs": None, "dtype": str(plan.dtype)}
+    affecting = {name: part for name, part in scene.items() if name not in _NO_EFFECT}
+    return digest_of(source_digest(), package_versions(), settings, affecting, points)

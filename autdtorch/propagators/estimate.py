@@ -13,9 +13,9 @@ from autdtorch.fdtd.grid import domain_extent
 from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.spacing import pilot_spacing
 from autdtorch.fdtd.stepping import assemble, drive_signal
-from autdtorch.propagators.execute import simulation_of
 from autdtorch.propagators.grids import grid_cost
 from autdtorch.propagators.plan import make_kernel, plan
+from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.memory import available_memory
 from autdtorch.utils.validation import positive
@@ -90,7 +90,7 @@ def estimate(
     factor = max(1, math.floor(pilot_spacing(planned.region) / spacing))
     pilot = planned.at(spacing * factor, planned.tolerance)
     if pilot.memory < available_memory():
-        planned = replace(planned, runs=simulation_of(pilot).orbits(scene.control_points).runs)
+        planned = replace(planned, runs=SimulatedPropagator(pilot).planned_runs)
     small, large = _MEASURED_CELLS
     cells = small if max(grid.cells for grid in planned.grouping.grids) < large / 2 else large
     seconds = planned.work / _rate(planned.kernel, planned.dtype, cells)

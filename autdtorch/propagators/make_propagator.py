@@ -12,11 +12,10 @@ import torch
 from autdtorch.fdtd.grid import warn_if_coarse
 from autdtorch.fdtd.spacing import coarsest_spacing, spacing_for
 from autdtorch.propagators.cache import DiskCache
-from autdtorch.propagators.execute import execute, with_grid_error
 from autdtorch.propagators.free_space import FreeSpacePropagator
 from autdtorch.propagators.plan import Plan, plan
 from autdtorch.propagators.scene_region import warn_of_ending_walls
-from autdtorch.propagators.simulated import SimulatedPropagator
+from autdtorch.propagators.simulated import SimulatedPropagator, execute
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import invalid, path_of
 
@@ -89,10 +88,7 @@ def make_propagator(
 def _at_chosen_spacing(pilot: Plan, cache: DiskCache | None) -> Plan:
     """Return the plan whose grid error should be half the tolerance, from simulations on two coarse grids."""
     tolerance = pilot.tolerance / 2
-    first = pilot.at(pilot.spacing, max(tolerance, 1e-3))
-    second = first.second
-    results = execute(first, cache=cache), execute(second, cache=cache)
-    error = with_grid_error(*results, second.spacing > first.spacing).error
+    error = execute(pilot.at(pilot.spacing, max(tolerance, 1e-3)), cache).error
     if not math.isfinite(error):
         accepted = f"too few to choose a spacing: at {pilot.spacing:.3g} m no run came near its steady state"
         raise invalid("max_periods", pilot.max_periods, accepted)

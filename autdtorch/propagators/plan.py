@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.util import find_spec
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.spacing import pilot_spacing, second_spacing
 from autdtorch.fdtd.steady_state import phasors_kept
-from autdtorch.propagators.grids import USUAL_PERIODS, Grouping, choose_grids, one_box
+from autdtorch.propagators.grids import USUAL_PERIODS, Grouping, choose_grids
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.obstacles import Mesh
 from autdtorch.scene.scene import Scene
@@ -63,21 +63,13 @@ _BESIDE_RIGID, _BESIDE_FLUID, _SHARE_INSIDE = 1.5, 2.0, 0.5
 an obstacle of another sound speed."""
 
 
-@dataclass(frozen=True)
-class Heterogeneity:
-    """Estimated numbers of cells and elements that are not uniform air, on all grids of a plan.
+class Heterogeneity(NamedTuple):
+    """Estimated numbers of cells and elements that are not uniform air, on all grids of a plan."""
 
-    Attributes:
-        cut: elements that surfaces cut.
-        cells: heterogeneous cells: beside surfaces, and inside another medium.
-        columns: elements that surfaces cut in the boundary layers.
-        meshed: heterogeneous cells at meshes.
-    """
-
-    cut: float
-    cells: float
-    columns: float
-    meshed: float
+    cut: float  # elements that surfaces cut
+    cells: float  # heterogeneous cells: beside surfaces, and inside another medium
+    columns: float  # elements that surfaces cut in the boundary layers
+    meshed: float  # heterogeneous cells at meshes
 
 
 @dataclass(frozen=True)
@@ -112,10 +104,6 @@ class Plan:
     def second(self) -> Self:
         """The plan on a second grid, for an estimate of the grid's error."""
         return self.at(second_spacing(self.region, self.spacing), self.tolerance)
-
-    def in_one_box(self) -> Self:
-        """Return a plan with all obstacles in one box."""
-        return replace(self, grouping=one_box(self.region, self.spacing))
 
     @property
     def cells(self) -> int:

@@ -12,8 +12,10 @@ from typing import Literal, Protocol, overload, runtime_checkable
 import torch
 
 from autdtorch.analytic.green import PAIR_BYTES
-from autdtorch.propagators.cache import DiskCache
-from autdtorch.propagators.execute import execute, simulation_of, with_grid_error
+from autdtorch.fdtd.spacing import grid_error
+from autdtorch.propagators.box import BoxSimulation
+from autdtorch.propagators.cache import DiskCache, cache_key
+from autdtorch.propagators.full import DomainSimulation
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.simulation import Run, TransferMatrix, single_nodes
 from autdtorch.scene.drive import validate_drive
@@ -66,7 +68,8 @@ class SimulatedPropagator:
         self.scene, self.method, self.spacing = plan.scene, plan.method, plan.spacing
         self.tolerance, self.max_periods = plan.tolerance, plan.max_periods
         self.runs: list[Run] = []
-        self._plan, self._cache, self._simulation = plan, cache, simulation_of(plan)
+        self._plan, self._cache = plan, cache
+        self._simulation = DomainSimulation(plan) if plan.method == "full" else BoxSimulation(plan)
         self._control: TransferMatrix | None = None
         self._near_logged = False
 
@@ -124,10 +127,7 @@ class SimulatedPropagator:
         places = None if points is None else self._simulation.checked(points)
         if places is not None:
             require_memory("points", (len(places), 3), PAIR_BYTES * len(self.scene.array) * len(places))
-        result = self._result(places)
-        if with_error:
-            second = self._second
-            result = with_grid_error(result, second._result(places), coarser=second.spacing > self.spacing)
+        result = self._with_error(places) if with_error else self._result(places)
         self._report(result.runs, self.scene.control_points if places is None else places)
         return (result.matrix, result.error) if with_error else result.matrix
 
@@ -174,9 +174,25 @@ class SimulatedPropagator:
         return replace(result, matrix=result.matrix.clone(), runs=() if kept else result.runs)
 
     def _executed(self, points: torch.Tensor) -> TransferMatrix:
-        result = execute(self._plan, points, self._cache, self._simulation)
+        """Return the matrix of points, simulated or from the cache. One that has converged is added to it."""
+        cache, key = self._cache, ""
+        if cache is not None:
+            key = cache_key(self._plan, points)
+            if (found := cache.load(key, (len(points), len(self.scene.array)))) is not None:
+                logger.info("transfer matrix of %s loaded from %s", self.scene.name, cache.folder)
+                return TransferMatrix(torch.from_numpy(found[0]), found[1], ())
+        result = self._simulation.transfer_matrix(points)
         self.runs += result.runs
+        if cache is not None and all(run.reached for run in result.runs):
+            cache.save(key, result.matrix.numpy(), result.error)
         return result
+
+    @one_torch_thread()
+    def _with_error(self, points: torch.Tensor | None) -> TransferMatrix:
+        """Return the matrix of points with its error, estimated from a second grid."""
+        first, second = self._result(points), self._second._result(points)
+        difference = grid_error(first.matrix, second.matrix, coarser=self._second.spacing > self.spacing)
+        return TransferMatrix(first.matrix, first.error + difference, first.runs + second.runs)
 
     def _report(self, runs: Sequence[Run], points: torch.Tensor | None) -> None:
         """Warn of new runs that did not converge; log once if a source is next to an obstacle.
@@ -198,3 +214,8 @@ class SimulatedPropagator:
                 f"relative error up to {error:.1e}, tolerance {self.tolerance:g}; raise max_periods or "
                 "tolerance", SteadyStateWarning, stacklevel=4,  # the caller of the public, decorated method
             )  # fmt: skip
+
+
+def execute(plan: Plan, cache: DiskCache | None = None) -> TransferMatrix:
+    """Return the transfer matrix of the control points with its error, estimated from a second grid."""
+    return SimulatedPropagator(plan, cache)._with_error(None)

@@ -13,8 +13,7 @@ import torch
 from small_scenes import AIR, CUBE, small_scene
 
 from autdtorch.propagators import SteadyStateWarning, make_propagator
-from autdtorch.propagators.cache import SUFFIX, DiskCache, _with_checksum
-from autdtorch.propagators.execute import cache_key
+from autdtorch.propagators.cache import SUFFIX, DiskCache, _with_checksum, cache_key
 from autdtorch.propagators.plan import plan
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Mesh, Sphere, VoxelMask
@@ -134,7 +133,7 @@ def test_another_version_of_the_code_or_of_a_package_has_another_key(monkeypatch
     planned = plan(small_scene((CUBE,)), "box", SPACING)
     keys = {cache_key(planned, planned.scene.control_points)}
     for name, value in (("source_digest", "changed"), ("package_versions", {"torch": "0"})):
-        monkeypatch.setattr(f"autdtorch.propagators.execute.{name}", lambda value=value: value)
+        monkeypatch.setattr(f"autdtorch.propagators.cache.{name}", lambda value=value: value)
         keys.add(cache_key(planned, planned.scene.control_points))
     assert len(keys) == 3
 
