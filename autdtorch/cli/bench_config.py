@@ -11,8 +11,8 @@ import torch
 
 from autdtorch import hardware
 from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
+from autdtorch.hardware.played import Wiring
 from autdtorch.hardware.sensors.by_hand import typed
-from autdtorch.hardware.wiring import Wiring
 from autdtorch.objectives.perturbations import random_rms
 from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.scene.scene import Scene
@@ -90,16 +90,11 @@ class Bench:
                 return hardware.open_autd3(self._board_count(), self.transducers, network, settle)
             serial, port = (None if section[key] is None else str(section[key]) for key in ("serial", "port"))
             return hardware.open_link(self.device, self.transducers, serial, settle=settle, port=port)
-        if self.is_dry:  # these imports need pyusb
-            from autdtorch.hardware.emulator.dry_run import DryPort
-
-            opened: hardware.Port = DryPort(bench, print)
-        elif on_network:
-            from autdtorch.hardware.emulator.emulated_autd3 import EmulatedAutd3Port
-
-            opened = EmulatedAutd3Port(self._board_count(), bench)
-        else:
+        if not (self.is_dry or on_network):
             return hardware.open_link(self.device, self.transducers, backend=bench.bus, settle=settle)
+        from autdtorch.hardware.emulator.bench import DryPort, EmulatedAutd3Port  # needs pyusb
+
+        opened = DryPort(bench, print) if self.is_dry else EmulatedAutd3Port(self._board_count(), bench)
         return hardware.Link(self.device, opened, self.transducers, settle, bench.bus.sleep)
 
     @contextlib.contextmanager

@@ -13,11 +13,11 @@ import torch
 
 from autdtorch.hardware.devices.autd3 import AUTD3
 from autdtorch.hardware.devices.device import Device
+from autdtorch.hardware.played import Wiring
 from autdtorch.hardware.transport.autd3_network import Autd3Port
 from autdtorch.hardware.transport.port import LinkError, Port, SharedPort, closed_on_error
 from autdtorch.hardware.transport.serial_port import SerialPort
 from autdtorch.hardware.transport.usb import find_device
-from autdtorch.hardware.wiring import Wiring
 from autdtorch.utils.validation import invalid, not_negative, require_callable, require_kind
 
 #: Default settle time [s]. Sound goes 1.7 m in it; a T4010A1 rings up in some 30 periods, 0.75 ms, as the

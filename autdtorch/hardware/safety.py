@@ -16,8 +16,8 @@ from types import FrameType
 
 import torch
 
-from autdtorch.hardware.amplitude_scale import AmplitudeScale
 from autdtorch.hardware.link import Link
+from autdtorch.hardware.played import AmplitudeScale
 from autdtorch.utils.validation import integer_at_least, not_negative, number_between, positive, require_kind
 
 logger = logging.getLogger(__name__)

@@ -8,7 +8,7 @@ import torch
 
 from autdtorch.hardware import EmulatedBench, LinkError, open_link, openmpd_boards
 from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
-from autdtorch.hardware.wiring import Wiring
+from autdtorch.hardware.played import Wiring
 from autdtorch.scene.drive import drive_from_phases
 
 

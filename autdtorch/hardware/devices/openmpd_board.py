@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,7 +17,7 @@ import torch
 from autdtorch.scene.arrays import OPENMPD_SOURCE_STRENGTH, TRANSDUCER_RADIUS, TransducerArray
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.geometry import in_plane
-from autdtorch.utils.validation import ArrayLike, path_of
+from autdtorch.utils.validation import ArrayLike, path_of, real_tensor
 
 _LEVELS = 128  # phase levels of the boards
 
@@ -27,19 +26,6 @@ class _Item(NamedTuple):
     path: str | os.PathLike[str]
     line: int
     text: str
-
-    def tuples(self) -> Iterator[list[_Item]]:
-        """Yield the entries of each pair of parentheses, which must be three."""
-        for inside in re.findall(r"\(([^()]*)\)", self.text):
-            entries = [self._replace(text=part) for part in inside.split(",")]
-            if len(entries) != 3:
-                raise self._replace(text=inside).wrong("position", "must be (x, y, z)")
-            yield entries
-
-    def numbers(self) -> Iterator[_Item]:
-        """Yield the entries outside of parentheses."""
-        outside = re.sub(r"\([^()]*\)", "", self.text)
-        return (self._replace(text=part) for part in re.split(r"[,\s]+", outside) if part)
 
     def real(self, field: str) -> float:
         try:
@@ -100,12 +86,18 @@ class OpenMPDBoard:
             raise head[1].wrong("number of transducers", "must be >= 1")
         if head[2].integer("number of phase levels") != _LEVELS:
             raise head[2].wrong("number of phase levels", f"must be {_LEVELS}")
-        positions = [
-            [part.real("position") for part in place] for item in head[3:] for place in item.tuples()
-        ]
+        positions: list[list[float]] = []
+        numbers: list[_Item] = []
+        for item in head[3:]:
+            for inside in re.findall(r"\(([^()]*)\)", item.text):
+                place = [item._replace(text=part) for part in inside.split(",")]
+                if len(place) != 3:
+                    raise item._replace(text=inside).wrong("position", "must be (x, y, z)")
+                positions.append([part.real("position") for part in place])
+            outside = re.sub(r"\([^()]*\)", "", item.text)
+            numbers += [item._replace(text=part) for part in re.split(r"[,\s]+", outside) if part]
         if len(positions) != count:
             raise ValueError(f"{path}: {len(positions)} positions (x, y, z); must be {count} as in line 2")
-        numbers = [number for item in head[3:] for number in item.numbers()]
         if len(numbers) != 3 * count:
             accepted = f"must be {count} pins, {count} phase offsets and {count} gains"
             raise ValueError(f"{path}: {len(numbers)} numbers after the positions; {accepted}")
@@ -120,10 +112,7 @@ class OpenMPDBoard:
         for item, gain in zip(numbers[2 * count :], gains, strict=True):
             if not 0 <= gain <= 1:
                 raise item.wrong("gain", "must be in [0, 1]")
-        parts = (
-            torch.tensor(part, dtype=torch.float64, device="cpu") for part in (positions, offsets, gains)
-        )
-        places, degrees, factors = parts
+        places, degrees, factors = (real_tensor("board", part) for part in (positions, offsets, gains))
         return cls(head[0].text, places, tuple(pins), torch.deg2rad(degrees), factors)
 
     def array(

@@ -111,14 +111,11 @@ class UltrainoFirmware:
         return own if self._next is None else torch.cat([own, self._next.drive()])
 
     def _fundamentals(self, pattern: bytearray) -> torch.Tensor:
+        bits = np.unpackbits(np.frombuffer(pattern, np.uint8), bitorder="little")
+        high = bits.reshape(self._TENTHS, -1)[:, ultraino_pins()]
         turn = 2j * math.pi / self._TENTHS
-        played = [0j] * 64
-        for transducer, pin in enumerate(ultraino_pins()):
-            port, bit = divmod(int(pin), 8)
-            high = [pattern[self._PORTS * tenth + port] >> bit & 1 for tenth in range(self._TENTHS)]
-            sum_ = sum(on * cmath.exp(turn * (tenth - 2)) for tenth, on in enumerate(high))
-            played[transducer] = math.sin(math.pi / self._TENTHS) * sum_
-        return torch.tensor(played, dtype=torch.complex128, device="cpu")
+        played = np.stack([on * cmath.exp(turn * (tenth - 2)) for tenth, on in enumerate(high)]).sum(axis=0)
+        return torch.from_numpy(math.sin(math.pi / self._TENTHS) * played)
 
 
 @cache

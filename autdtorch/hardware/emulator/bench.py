@@ -1,8 +1,8 @@
-"""A bench without hardware: a device behind its USB chip, the air before it, and microphones."""
+"""A bench without hardware: a device behind its USB chip or port, the air before it, and microphones."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -10,8 +10,11 @@ import torch
 from autdtorch.hardware.devices.device import Device
 from autdtorch.hardware.emulator.bus import EmulatedBus, EmulatedDevice
 from autdtorch.hardware.emulator.chips import CHIPS
-from autdtorch.hardware.wiring import Wiring
+from autdtorch.hardware.played import Wiring
+from autdtorch.hardware.transport.autd3_network import Autd3Port, autd3_kit
+from autdtorch.hardware.transport.port import Port
 from autdtorch.objectives.perturbations import SNRS, random_rms
+from autdtorch.scene.drive import amplitudes_of, phases_of
 from autdtorch.utils.validation import (
     complex_tensor,
     indices,
@@ -91,6 +94,37 @@ class EmulatedBench:
     def pressure(self) -> torch.Tensor:
         """Return the phasors (P,) [Pa], complex128, at the control points now."""
         return self.transfer_matrix @ self.drive()
+
+
+class DryPort(Port):
+    """A port that shows each frame in hexadecimal, and the drive that an emulated device emits for it."""
+
+    def __init__(self, bench: EmulatedBench, show: Callable[[str], object]) -> None:
+        """Open no device: the `bench` takes the frames, and `show` takes a text for each."""
+        self._bench, self._show = bench, show
+
+    def write(self, data: bytes) -> None:
+        """Show the frame; amplitude and phase [deg] of each of the device's transducers below it."""
+        self._bench.receive(data)
+        drive = self._bench.emitted()
+        pairs = zip(amplitudes_of(drive).tolist(), phases_of(drive).rad2deg().tolist(), strict=True)
+        emitted = [f"{number}: {a:.3g} at {phase:.4g}" for number, (a, phase) in enumerate(pairs) if a > 0]
+        self._show(f"{data.hex(' ')}\n  {', '.join(emitted) or 'all off'}")
+
+
+class EmulatedAutd3Port(Autd3Port):
+    """The port of AUTD3 boards that the kit emulates on this machine, silently; a bench plays for them."""
+
+    def __init__(self, boards: int, bench: EmulatedBench) -> None:
+        """Start the emulator of `boards` boards, and connect to it."""
+        self._emulator = autd3_kit().UdpEmulator(boards)
+        self._bench = bench
+        super().__init__(boards, self._emulator.option())
+
+    def write(self, data: bytes) -> None:
+        """Play a frame, on boards and bench."""
+        super().write(data)
+        self._bench.receive(data)
 
 
 class EmulatedSensor:

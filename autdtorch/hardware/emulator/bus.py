@@ -6,9 +6,8 @@ import errno
 from array import array
 from collections.abc import Sequence
 from types import SimpleNamespace
-from typing import ClassVar, Protocol
+from typing import ClassVar, TypeAlias
 
-from autdtorch.hardware.emulator.chips import Interfaces
 from autdtorch.hardware.transport.port import INSTALL_HINT
 
 try:
@@ -21,27 +20,36 @@ _GET_DESCRIPTOR, _STRING, _ENGLISH = 0x06, 0x03, 0x0409
 _FROM_DEVICE, _STANDARD_FROM_DEVICE = 0x80, 0x80
 _PACKET = 64
 
+#: Class, subclass and protocol of each interface, and its bulk endpoints.
+Interfaces: TypeAlias = tuple[tuple[tuple[int, int, int], tuple[int, ...]], ...]
 
-class EmulatedDevice(Protocol):
-    """An emulated USB device: idVendor, idProduct, strings by index; `present` while it is plugged in."""
+
+class EmulatedDevice:
+    """An emulated USB device; `present` while it is plugged in."""
 
     interfaces: ClassVar[Interfaces]
-    vendor: int
-    product: int
-    strings: tuple[str, str, str, str]
-    present: bool
+
+    def __init__(self, vendor: int, product: int, serial: str) -> None:
+        """Plug the device in, with idVendor, idProduct and serial number."""
+        self.vendor, self.product = vendor, product
+        self.strings = ("", "autdtorch", "emulated device", serial)  # by index
+        self.present = True
 
     def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
         """Take a request with its data; False for an unknown one, which stalls."""
+        return False
 
     def answer(self, kind: int, request: int) -> bytes | None:
         """Answer a request; None for an unknown one, which stalls."""
+        return None
 
     def write(self, data: bytes) -> None:
         """Take a bulk transfer."""
+        raise NotImplementedError
 
     def read(self, most: int) -> bytes:
         """Return a bulk transfer of at most so many bytes."""
+        raise NotImplementedError
 
 
 class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types

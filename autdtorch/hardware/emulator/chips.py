@@ -6,50 +6,33 @@ Written from the chips' Linux drivers and data sheets, not from `serial_chips`, 
 from __future__ import annotations
 
 import time
-from typing import ClassVar, TypeAlias
+from typing import ClassVar
 
 from autdtorch.hardware.devices.device import Firmware
+from autdtorch.hardware.emulator.bus import EmulatedDevice
 
-#: Class, subclass and protocol of each interface, and its bulk endpoints.
-Interfaces: TypeAlias = tuple[tuple[tuple[int, int, int], tuple[int, ...]], ...]
-
-_STRINGS = ("", "autdtorch", "emulated device")  # by index; the serial number comes after
 _VENDOR_DEVICE, _CLASS_INTERFACE, _VENDOR_QUESTION = 0x40, 0x21, 0xC0
 _WHILE = 0.01  # [s]
 _BAUD_TOLERANCE = 0.03  # beyond it a UART loses the last of its ten bits
 
 
-class EmulatedChip:
-    """A USB chip with a serial port in front of a firmware; `EmulatedDevice` describes its methods.
+class EmulatedChip(EmulatedDevice):
+    """A USB chip with a serial port in front of a firmware.
 
     It is set to `baud` [bits/s]; `eight_n_one` is true for 8 bits, no parity, 1 stop bit.
     """
 
-    interfaces: ClassVar[Interfaces]
-
     def __init__(self, vendor: int, product: int, serial: str, firmware: Firmware) -> None:
         """Plug the chip in, with settings of an earlier user."""
-        self.vendor, self.product, self.strings = vendor, product, (*_STRINGS, serial)
-        self.present = True
+        super().__init__(vendor, product, serial)
         self.firmware = firmware
         self.baud, self.eight_n_one = 9600.0, False
-
-    def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
-        """Take a request with its data; False for an unknown one, which stalls."""
-        raise NotImplementedError
-
-    def answer(self, kind: int, request: int) -> bytes | None:
-        """Answer a request; None for an unknown one, which stalls."""
 
     def write(self, data: bytes) -> None:
         """Send bytes on to the firmware, which loses them at another rate or format than its own."""
         wanted = self.firmware.baud
         if wanted is None or (self.eight_n_one and abs(self.baud / wanted - 1) <= _BAUD_TOLERANCE):
             self.firmware.receive(data)
-
-    def read(self, most: int) -> bytes:
-        """Return an IN packet."""
-        raise NotImplementedError
 
 
 class EmulatedFtdi(EmulatedChip):

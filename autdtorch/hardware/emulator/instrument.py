@@ -5,10 +5,9 @@ Written from the class's specification alone, not from `usbtmc`, so that one che
 
 from __future__ import annotations
 
-from typing import ClassVar, Protocol
+from typing import Protocol
 
-from autdtorch.hardware.emulator.bus import stall, time_out
-from autdtorch.hardware.emulator.chips import Interfaces
+from autdtorch.hardware.emulator.bus import EmulatedDevice, stall, time_out
 
 _PACKET = 64
 _CLASS_INTERFACE = 0xA1  # from the device
@@ -22,30 +21,24 @@ class Instrument(Protocol):
         """Execute a line, and return its answer, if it has one."""
 
 
-class EmulatedInstrument:
+class EmulatedInstrument(EmulatedDevice):
     """The USB interface of an instrument: USB488, without its interrupt endpoint.
 
-    `EmulatedDevice` describes its methods. A message longer than `longest` bytes comes in several transfers.
+    A message longer than `longest` bytes comes in several transfers.
     If `sends_empty_packets`, an empty packet follows a transfer of whole packets, as USB demands; some
     instruments send none.
     """
 
-    interfaces: ClassVar[Interfaces] = (((0xFE, 0x03, 0x01), (0x82, 0x01)),)
+    interfaces = (((0xFE, 0x03, 0x01), (0x82, 0x01)),)
 
     def __init__(self, vendor: int, product: int, serial: str, instrument: Instrument) -> None:
         """Plug it in."""
-        self.vendor, self.product = vendor, product
-        self.strings = ("", "autdtorch", "emulated instrument", serial)
-        self.present = self.sends_empty_packets = True
-        self.longest = 512
+        super().__init__(vendor, product, serial)
+        self.sends_empty_packets, self.longest = True, 512
         self._instrument = instrument
         self._received = self._answer = b""
         self._asked: tuple[int, int] | None = None  # tag, bytes
         self._sending: bytes | None = None
-
-    def control(self, kind: int, request: int, value: int, index: int, data: bytes) -> bool:
-        """Refuse all requests with data."""
-        return False
 
     def answer(self, kind: int, request: int) -> bytes | None:
         """Answer INITIATE_CLEAR and CHECK_CLEAR_STATUS, which succeed at once."""

@@ -15,7 +15,6 @@ from autdtorch.hardware.sensors import scpi
 from autdtorch.hardware.sensors.lock_in import LockIn
 from autdtorch.hardware.sensors.scpi import KEYSIGHT, Dialect, Waveform
 from autdtorch.hardware.sensors.sensor import SensorError
-from autdtorch.hardware.sensors.vertical_scale import VerticalScale
 from autdtorch.hardware.transport.port import LinkError, closed_on_error
 from autdtorch.hardware.transport.usb import find_device
 from autdtorch.hardware.transport.usbtmc import UsbtmcPort
@@ -33,6 +32,11 @@ logger = logging.getLogger(__name__)
 _PERIODS_A_DIVISION = 5  # 50 or 60 on a screen, 20 samples each
 _CAPTURE_TIME = 2.0  # time limit of a capture [s]
 _QUIET = 5  # standard errors
+# Vertical scales. A sound twice or half as loud as the last needs no change.
+_DIVISIONS = 3.5  # of a full screen, above and below the middle; there are 4 or more
+_KEPT = 0.25  # share of the screen below which a waveform gets a finer scale
+_TARGET = 0.5  # share that it then fills
+_COARSER = 4.0  # a waveform that clips fills at least a quarter of a scale so much coarser
 
 
 @dataclass(frozen=True)
@@ -161,10 +165,11 @@ class ScopeSensor:
         self._captures = integer_at_least("captures", captures, 1)
         volts = [one.sensitivity * one.gain for one in self._microphones]  # at the input, for 1 Pa
         self._volts = torch.tensor(volts, dtype=torch.float64, device="cpu")
-        self._scales = {
-            one.input: VerticalScale.up_to(one.loudest * factor, scpi.FINEST)
+        self._coarsest = {
+            one.input: one.loudest * factor / _DIVISIONS
             for one, factor in zip(self._microphones, volts, strict=True)
         }
+        self._scales = self._coarsest
         self.recaptures = 0
         if not self._scales or len(self._scales) < len(self._microphones):
             inputs = [one.input for one in self._microphones]
@@ -192,7 +197,7 @@ class ScopeSensor:
         """Return powers (P, 2) [Pa^2] at the frequency, and of the noise in them, on fitting scales."""
         once_clipped: set[int] = set()  # not on a finer scale again in this reading, so that it ends
         while True:
-            waveforms = self._scope.capture({number: one.now for number, one in self._scales.items()})
+            waveforms = self._scope.capture(self._scales)
             lock_in = self._lock_in(waveforms)
             fit = lock_in(torch.stack([one.volts for one in waveforms]))
             fitted = dict(self._scales)
@@ -200,7 +205,8 @@ class ScopeSensor:
                 if waveform.clipped:
                     once_clipped.add(number)
                 if waveform.clipped or number not in once_clipped:
-                    fitted[number] = self._scales[number].fitted(waveform, noise)
+                    wanted = max(_fitted(self._scales[number], waveform, noise), scpi.FINEST)
+                    fitted[number] = min(wanted, self._coarsest[number])
             if fitted == self._scales:
                 break
             self._scales = fitted
@@ -228,6 +234,20 @@ class ScopeSensor:
                 clipped = f"{waveform.clipped} of {len(waveform.volts)} samples are clipped"
                 loudest = f"by more than {microphone.loudest:g} Pa: raise `loudest`"
                 raise SensorError(f"input {microphone.input}: {clipped}, {loudest}")
+
+
+def _fitted(scale: float, waveform: Waveform, noise: float) -> float:
+    """Return the scale for the next waveform, from one on a `scale` [V/division] with noise of an rms [V].
+
+    The scale is not made finer if the noise exceeds a step of the converter: rounding then adds at most 1/12
+    to its variance, and no bias.
+    """
+    if waveform.clipped:
+        return scale * _COARSER
+    peak = float(waveform.volts.abs().max()) + waveform.resolution
+    if peak < _KEPT * _DIVISIONS * scale and noise < waveform.resolution:
+        return peak / (_TARGET * _DIVISIONS)
+    return scale
 
 
 def open_scope(

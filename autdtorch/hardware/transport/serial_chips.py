@@ -20,12 +20,12 @@ RESET, FLOW_CONTROL, BAUD_RATE, DATA_FORMAT, STATUS, LATENCY = 0x00, 0x02, 0x03,
 #: wValue of RESET. The names of the purges in ftdi_sio, RX and TX, are from the chip's side (libftdi 1.5).
 RESET_CHIP, PURGE_OUTPUT, PURGE_INPUT = 0, 1, 2
 EIGHT_N_ONE = 0x0008  # wValue of DATA_FORMAT: 8 bits, no parity, 1 stop bit
-STATUS_BYTES = 2  # of modem and line, with which every IN packet of FTDI begins
 _LATENCY_MS = 2
 _TRANSMITTER_EMPTY = 0x40  # of the second status byte
 _FLUSH_SECONDS = 1.0
 _EIGHTHS = (0, 3, 2, 4, 1, 5, 6, 7)  # code of the fraction 0/8 ... 7/8 of a baud divisor
 
+_VENDOR_QUESTION = 0xC0  # bmRequestType: vendor's own, from the device
 _CDC_REQUEST, _CDC_LINE_CODING = 0x21, 0x20  # to the interface, of its class
 _READ_MS = 50
 
@@ -49,16 +49,15 @@ class FtdiUart(FtdiFifo):
     def flush(self) -> None:
         """Wait until the chip reports that its transmitter is empty, for at most a second."""
         deadline = time.monotonic() + _FLUSH_SECONDS
-        while not self._line_status() & _TRANSMITTER_EMPTY:
+        while True:
+            # By request, as in ftdi_sio: an IN packet may have waited since before the last bytes.
+            status = self._ask("be asked", _VENDOR_QUESTION, STATUS, 2)  # of modem and line
+            if len(status) < 2:
+                raise LinkError("the adapter gives no line status; is it an FT232R?")
+            if status[1] & _TRANSMITTER_EMPTY:
+                return
             if time.monotonic() > deadline:
                 raise LinkError("the adapter does not send its bytes; is another program on its line?")
-
-    def _line_status(self) -> int:
-        # By request, as in ftdi_sio: an IN packet may have waited in the chip since before the last bytes.
-        status = self._ask(STATUS, STATUS_BYTES)
-        if len(status) < STATUS_BYTES:
-            raise LinkError("the adapter gives no line status; is it an FT232R?")
-        return status[1]
 
     def _set_up(self) -> None:
         super()._set_up()

@@ -13,10 +13,9 @@ from autdtorch.utils.validation import require_kind
 
 #: Rules that let users write to the devices on Linux; to be copied to /etc/udev/rules.d.
 UDEV_RULES = Path(__file__).with_name("70-autdtorch.rules")
-#: bmRequestType: vendor's own, recipient device; to the device, and from it.
-VENDOR_REQUEST, VENDOR_QUESTION = 0x40, 0xC0
+#: bmRequestType: vendor's own, recipient device; to the device.
+VENDOR_REQUEST = 0x40
 
-_TIMEOUT_MS = 1000
 _DIRECTION, _TRANSFER_TYPE, _BULK = 0x80, 0x03, 0x02
 
 
@@ -53,8 +52,10 @@ def find_device(chips: Collection[tuple[int, int]], serial: str | None = None, b
 class UsbPort(Port):
     """A chip with a bulk endpoint each way, taken from the kernel's drivers.
 
-    Methods raise `LinkError` if the chip refuses, is gone, or takes nothing for a second.
+    Methods raise `LinkError` if the chip refuses, is gone, or takes nothing within a time.
     """
+
+    _timeout_ms = 1000
 
     def __init__(self, device: Any, baud: int = 0) -> None:
         """Take a chip (`usb.core.Device`) and set it up; if that fails it is given back.
@@ -72,7 +73,7 @@ class UsbPort(Port):
         """Send all of `data`."""
         sent = 0
         while sent < len(data):
-            taken = self._call("be written to", self._out.write, data[sent:], _TIMEOUT_MS)
+            taken = self._call("be written to", self._out.write, data[sent:], self._timeout_ms)
             if taken == 0:
                 raise LinkError(f"{_described(self._device)} took {sent} of {len(data)} bytes")
             sent += taken
@@ -123,7 +124,14 @@ class UsbPort(Port):
     def _request(
         self, request: int, value: int, index: int = 0, data: bytes = b"", kind: int = VENDOR_REQUEST
     ) -> None:
-        self._call("be set up", self._device.ctrl_transfer, kind, request, value, index, data, _TIMEOUT_MS)
+        self._call(
+            "be set up", self._device.ctrl_transfer, kind, request, value, index, data, self._timeout_ms
+        )
+
+    def _ask(self, what: str, kind: int, request: int, length: int, index: int = 0) -> bytes:
+        """Return the answer of at most `length` bytes to a request."""
+        transfer = self._device.ctrl_transfer
+        return bytes(self._call(what, transfer, kind, request, 0, index, length, self._timeout_ms))
 
     def _receive(self, wait_ms: int) -> bytes:
         """Return a packet; empty if none comes within the time [ms]."""
@@ -135,10 +143,6 @@ class UsbPort(Port):
             return b""
 
         return bytes(self._call("be read", read))
-
-    def _ask(self, request: int, length: int) -> bytes:
-        transfer = self._device.ctrl_transfer
-        return bytes(self._call("be asked", transfer, VENDOR_QUESTION, request, 0, 0, length, _TIMEOUT_MS))
 
     def _call(self, what: str, call: Callable[..., Any], *arguments: object) -> Any:
         from usb.core import USBError

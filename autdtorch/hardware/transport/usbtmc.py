@@ -22,7 +22,6 @@ IN_WAITS = 1  # bmClear of a pending clear: the rest of an answer must be read f
 
 _HEADER = struct.Struct("<BBBxLB3x")
 _MOST = 2**16  # bytes of an answer in one transfer
-_TIMEOUT_MS = 3000
 _CHECKS = 100
 
 
@@ -68,6 +67,8 @@ class UsbtmcPort(UsbPort):
 
     Methods raise `LinkError` if it does not take the text, or does not answer with text, or with a block.
     """
+
+    _timeout_ms = 3000
 
     def __init__(self, device: Any) -> None:
         """Take the instrument (`usb.core.Device`), and clear unread answers."""
@@ -129,7 +130,7 @@ class UsbtmcPort(UsbPort):
         return data, ended
 
     def _piece(self, question: str, size: int) -> bytes:
-        return bytes(self._call(f"answer {question}", self._in.read, size, _TIMEOUT_MS))
+        return bytes(self._call(f"answer {question}", self._in.read, size, self._timeout_ms))
 
     def _number(self) -> int:
         for interface in self._device[0]:
@@ -142,19 +143,14 @@ class UsbtmcPort(UsbPort):
         return self._tag
 
     def _clear(self) -> None:
-        status, *_ = self._class_request(INITIATE_CLEAR, 1)
+        status, *_ = self._ask("be cleared", CLASS_REQUEST, INITIATE_CLEAR, 1, self._interface)
         for _ in range(_CHECKS):
-            status, waits = self._class_request(CHECK_CLEAR_STATUS, 2)
+            status, waits = self._ask("be cleared", CLASS_REQUEST, CHECK_CLEAR_STATUS, 2, self._interface)
             if status != PENDING:
                 break
             if waits & IN_WAITS:
-                self._call("be cleared", self._in.read, _MOST, _TIMEOUT_MS)
+                self._call("be cleared", self._in.read, _MOST, self._timeout_ms)
             time.sleep(0.01)
         if status != SUCCESS:
             raise LinkError(f"USBTMC: the instrument does not clear its answers: status {status:#04x}")
         self._call("be cleared", self._out.clear_halt)
-
-    def _class_request(self, request: int, length: int) -> bytes:
-        """Return the answer of the interface, its status first."""
-        arguments = (CLASS_REQUEST, request, 0, self._interface, length, _TIMEOUT_MS)
-        return bytes(self._call("be cleared", self._device.ctrl_transfer, *arguments))
