@@ -15,8 +15,7 @@ from autdtorch.hardware.devices.autd3 import AUTD3
 from autdtorch.hardware.devices.device import Device
 from autdtorch.hardware.played import Wiring
 from autdtorch.hardware.transport.autd3_network import Autd3Port
-from autdtorch.hardware.transport.port import LinkError, Port, SharedPort, closed_on_error
-from autdtorch.hardware.transport.serial_port import SerialPort
+from autdtorch.hardware.transport.port import LinkError, Port, SerialPort, SharedPort, closed_on_error
 from autdtorch.hardware.transport.usb import find_device
 from autdtorch.utils.validation import invalid, not_negative, require_callable, require_kind
 
@@ -35,11 +34,7 @@ class Link(contextlib.AbstractContextManager["Link"]):
     Use it as a context manager. The outputs are switched off when it is opened, as some devices start with
     all transducers on, and however the block ends; at the latest when Python exits. Threads may share it.
     Methods raise `LinkError` if the device does not take the bytes; `off` and `close` then raise `OffError`.
-
-    Attributes:
-        device: the device at the port.
-        transducers: the device's transducers that play the drive (M,), int64.
-        settle: time that a drive plays before `play` returns [s].
+    Attributes are `device`, `transducers` (M,), int64, and `settle` [s].
     """
 
     def __init__(
@@ -54,7 +49,7 @@ class Link(contextlib.AbstractContextManager["Link"]):
 
         Args:
             device: the device at the port.
-            port: takes its bytes.
+            port: takes the bytes for the device.
             transducers: the device's transducer for each of the scene's (M,); others stay off. By default
                 the scene has all, in the order of the device.
             settle: time that `play` waits, after the frame has gone over the wire, for steady sound [s].
@@ -172,7 +167,7 @@ def open_link(
         device: the device to find.
         transducers: the device's transducer for each of the scene's (M,); by default all in order.
         serial: serial number of the USB chip, where several such devices are plugged in.
-        backend: of pyusb; by default libusb. An emulated bench has its own, on which waiting takes no time.
+        backend: of pyusb; by default libusb. On that of an emulated bench waiting takes no time.
         settle: time that a drive plays before its pressure is read [s], without the frame's own time.
         port: name of a serial port of the system, such as "COM3" or "/dev/ttyUSB0"; by default the chips of
             the device are looked for over pyusb.

@@ -53,7 +53,7 @@ class EvaluationLog:
     evaluation in flight. The log is locked until `end`, or until this object is released.
 
     Attributes:
-        path: path of the file.
+        path: of the file.
         origin: settings of the trial, by name.
         goes_on: true if the file has existed before.
         seconds_on: total time that the outputs were on, by its lines [s].
@@ -122,10 +122,8 @@ class EvaluationLog:
     def append(self, drive: torch.Tensor, pressure: torch.Tensor, seconds_on: float) -> Evaluation:
         """Add an evaluation under the first number that the log lacks, and return it with its time.
 
-        Args:
-            drive: (M,), as requested.
-            pressure: (P,) [Pa], as read.
-            seconds_on: total time that the outputs were on so far [s].
+        It has a requested `drive` (M,), the `pressure` (P,) [Pa] as read, and the total time that the outputs
+        were on so far, `seconds_on` [s].
 
         Raises:
             LogError: the file has changed meanwhile.
@@ -135,9 +133,9 @@ class EvaluationLog:
             self._lacking += 1
         number = self._lacking
         evaluation = Evaluation(_now(), drive, pressure, seconds_on)
-        read = {"pressure": pressure.tolist(), "seconds_on": seconds_on}
-        asked = {"time": evaluation.time, "drive": torch.view_as_real(drive).tolist()}
-        self._append({_NUMBER: number, **asked, **read})
+        asked, read = torch.view_as_real(drive).tolist(), pressure.tolist()
+        row = {"time": evaluation.time, "drive": asked, "pressure": read, "seconds_on": seconds_on}
+        self._append({_NUMBER: number, **row})
         self._keep(number, evaluation)
         self.seconds_on = seconds_on
         return evaluation

@@ -111,12 +111,7 @@ class HardwareObjective:
         return self.log.count
 
     def recorded(self, number: int, drive: torch.Tensor) -> torch.Tensor | None:
-        """Return the pressures (P,) [Pa] of an evaluation in the log, or None; see `EvaluationLog.recorded`.
-
-        Args:
-            number: number of the evaluation in the trial, from 0.
-            drive: (M,), as requested.
-        """
+        """Return the pressures (P,) [Pa] of an evaluation in the log, or None; see `EvaluationLog.recorded`."""
         evaluation = self.log.recorded(number, drive)
         if evaluation is None:
             return None
@@ -127,8 +122,7 @@ class HardwareObjective:
     def quantised(self, drive: torch.Tensor) -> torch.Tensor:
         """Return the device's nearest drives to drives (..., M); |q| = 1 is the highest level in the limit.
 
-        Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+        `ValueError` for another shape, not finite complex numbers, or an amplitude above 1.
         """
         return self._link.quantised(drive)
 

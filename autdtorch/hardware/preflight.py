@@ -91,8 +91,7 @@ def check_transducers(
 def hears_silence(sensor: Sensor, check: Preflight, points: int, readings: int = 4) -> bool:
     """Return True if a sensor of P points reads no more than at the `check` before, with the outputs off.
 
-    Raises:
-        ValueError: the sensor does not give P finite magnitudes, or fewer than 1 readings.
+    `ValueError` if the sensor does not give P finite magnitudes, or for fewer than 1 readings.
     """
     require_kind("sensor", sensor, Sensor)
     require_kind("check", check, Preflight)

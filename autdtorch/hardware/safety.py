@@ -126,11 +126,7 @@ class LimitedLink:
     """
 
     def __init__(self, link: Link, limits: Limits) -> None:
-        """Limit a link.
-
-        Raises:
-            ValueError: no link or no limits, or the device has no amplitude up to the limit except 0.
-        """
+        """Limit a link; `ValueError` if its device has no amplitude up to the limit except 0."""
         require_kind("link", link, Link)
         require_kind("limits", limits, Limits)
         self.link, self.limits = link, limits
@@ -191,11 +187,7 @@ class LimitedLink:
         return self._scale.quantised(drive)
 
     def require_on(self) -> None:
-        """Require that the outputs are on since `play`: otherwise the readings meanwhile are void.
-
-        Raises:
-            LimitError: they went off at the end of the time.
-        """
+        """Raise `LimitError` if the outputs went off since `play`, and the readings meanwhile are void."""
         self._raise_failure()
         if self._on_since is None:
             self._seconds_left()

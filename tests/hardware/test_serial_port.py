@@ -53,7 +53,7 @@ def test_a_device_at_a_named_port_plays_and_is_off_in_the_end(line, device, monk
 
 
 def test_a_line_that_takes_nothing_is_an_error_and_no_hang(line, monkeypatch):
-    monkeypatch.setattr("autdtorch.hardware.transport.serial_port._TIMEOUT", 0.02)
+    monkeypatch.setattr("autdtorch.hardware.transport.port._TIMEOUT", 0.02)
     _, name = line
     link = open_link(SONICSURFACE, port=name, settle=0)
     with pytest.raises(LinkError, match=rf"{name} cannot be written to: .*[Tt]imeout"):

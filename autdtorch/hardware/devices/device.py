@@ -17,10 +17,7 @@ _BITS = 10  # of a byte on a serial line: start, 8, stop
 
 
 class Firmware(Protocol):
-    """The emulated firmware of a device; written from its sources, not from the frames that it checks.
-
-    Its serial line has `baud` [bits/s]; None for a FIFO.
-    """
+    """The emulated firmware of a device, written from its sources; its serial line has `baud` [bits/s]."""
 
     baud: ClassVar[int | None]
 
@@ -82,8 +79,7 @@ class Device(ABC):
     def levels(self, drive: ArrayLike) -> tuple[torch.Tensor, ...]:
         """Return the levels nearest to a drive (..., M), |q| <= 1: int64 (..., M) for each of `columns`.
 
-        Raises:
-            ValueError: not finite complex numbers, no axis, or an amplitude above 1.
+        `ValueError` for not finite complex numbers, no axis, or an amplitude above 1.
         """
         tensor = drive if isinstance(drive, torch.Tensor) else complex_tensor("drive", drive)
         checked = validate_drive(tensor, tensor.shape[-1] if tensor.ndim else 0)
@@ -92,8 +88,7 @@ class Device(ABC):
     def drive(self, *levels: ArrayLike) -> torch.Tensor:
         """Return the drive (..., M), complex128, that the device emits for levels as of `levels`.
 
-        Raises:
-            ValueError: another number of levels, other shapes, or not integers of their range.
+        `ValueError` for another number of levels, other shapes, or not integers of their range.
         """
         most = self.phase_levels.phases - 1, self.phase_levels.amplitudes or 0
         return self.phase_levels.drive(*self._checked(levels, most))
@@ -105,8 +100,7 @@ class Device(ABC):
     def frame(self, drive: ArrayLike) -> bytes:
         """Return the bytes for a drive (N,) on the nearest levels; zeros switch all outputs off.
 
-        Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1.
+        `ValueError` for another shape, not finite complex numbers, or an amplitude above 1.
         """
         levels = self.levels(drive)
         if levels[0].shape != (self.transducers,):

@@ -78,14 +78,14 @@ class EmulatedBus(IBackend):  # type: ignore[misc]  # pyusb has no types
         )  # fmt: skip
 
     def get_configuration_descriptor(self, dev: int, config: int) -> SimpleNamespace:
-        _require(config == 0)
         return SimpleNamespace(
             bLength=9, bDescriptorType=2, wTotalLength=32, bNumInterfaces=len(self.chips[dev].interfaces),
             bConfigurationValue=1, iConfiguration=0, bmAttributes=0x80, bMaxPower=45, extra_descriptors=[],
         )  # fmt: skip
 
     def get_interface_descriptor(self, dev: int, intf: int, alt: int, config: int) -> SimpleNamespace:
-        _require(config == alt == 0)
+        if alt:
+            raise IndexError  # the end of pyusb's enumeration
         (kind, subclass, protocol), endpoints = self.chips[dev].interfaces[intf]
         return SimpleNamespace(
             bLength=9, bDescriptorType=4, bInterfaceNumber=intf, bAlternateSetting=0,
@@ -176,8 +176,3 @@ def _fill(buffer: array[int], data: bytes) -> int:
 def _string_descriptor(strings: Sequence[str], index: int) -> bytes:
     text = _ENGLISH.to_bytes(2, "little") if index == 0 else strings[index].encode("utf-16-le")
     return bytes([len(text) + 2, _STRING]) + text
-
-
-def _require(there: bool) -> None:
-    if not there:
-        raise IndexError  # the end of pyusb's enumeration

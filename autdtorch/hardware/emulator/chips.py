@@ -17,10 +17,7 @@ _BAUD_TOLERANCE = 0.03  # beyond it a UART loses the last of its ten bits
 
 
 class EmulatedChip(EmulatedDevice):
-    """A USB chip with a serial port in front of a firmware.
-
-    It is set to `baud` [bits/s]; `eight_n_one` is true for 8 bits, no parity, 1 stop bit.
-    """
+    """A USB chip with a serial port, at `baud` [bits/s] and perhaps `eight_n_one`, in front of a firmware."""
 
     def __init__(self, vendor: int, product: int, serial: str, firmware: Firmware) -> None:
         """Plug the chip in, with settings of an earlier user."""

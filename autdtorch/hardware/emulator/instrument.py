@@ -24,9 +24,8 @@ class Instrument(Protocol):
 class EmulatedInstrument(EmulatedDevice):
     """The USB interface of an instrument: USB488, without its interrupt endpoint.
 
-    A message longer than `longest` bytes comes in several transfers.
-    If `sends_empty_packets`, an empty packet follows a transfer of whole packets, as USB demands; some
-    instruments send none.
+    A message longer than `longest` bytes comes in several transfers. If `sends_empty_packets`, one follows a
+    transfer of whole packets, as USB demands; some instruments send none.
     """
 
     interfaces = (((0xFE, 0x03, 0x01), (0x82, 0x01)),)

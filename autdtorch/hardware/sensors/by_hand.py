@@ -34,8 +34,7 @@ class ManualSensor:
     def __init__(self, control_points: ArrayLike, ask: Callable[[str], str] = typed) -> None:
         """Set the control points (P, 3) [m], and the function that shows a question and returns the answer.
 
-        Raises:
-            ValueError: other control points, or `ask` is no function.
+        `ValueError` for other control points, or if `ask` is no function.
         """
         require_callable("ask", ask)
         self._points = points_tensor("control_points", control_points)
@@ -44,8 +43,7 @@ class ManualSensor:
     def read(self) -> torch.Tensor:
         """Return magnitudes (P,) [Pa]; asks again for a point until the answer is a number >= 0.
 
-        Raises:
-            SensorError: the input has ended.
+        `SensorError` if the input has ended.
         """
         places = (_place(number, self._points) for number in range(len(self._points)))
         readings = [self._answer(f"Pressure at {place} [Pa]: ") for place in places]
@@ -65,15 +63,10 @@ class MovedMicrophone:
     """A sensor with one microphone that a person moves between control points while the drive plays."""
 
     def __init__(self, sensor: Sensor, control_points: ArrayLike, ask: Callable[[str], str] = typed) -> None:
-        """Set the points.
+        """Set a sensor of one point, the control points (P, 3) [m], and a function.
 
-        Args:
-            sensor: reads one point, where the microphone is.
-            control_points: (P, 3) [m].
-            ask: shows the next place of the microphone, and returns once it is there.
-
-        Raises:
-            ValueError: no sensor, other control points, or `ask` is no function.
+        `ask` shows the next place of the microphone, and returns once it is there. `ValueError` for no
+        sensor, other control points, or if `ask` is no function.
         """
         require_kind("sensor", sensor, Sensor)
         require_callable("ask", ask)
@@ -83,9 +76,7 @@ class MovedMicrophone:
     def read(self) -> torch.Tensor:
         """Return magnitudes (P,) [Pa].
 
-        Raises:
-            SensorError: the input has ended, or the sensor has no reading.
-            ValueError: the sensor reads another number of points than one.
+        `SensorError` if the input has ended, `ValueError` if the sensor reads more than one point.
         """
         readings = []
         for number in range(len(self._points)):

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import torch
 
-from autdtorch.utils.validation import integer_at_least, invalid, positive
+from autdtorch.utils.validation import invalid
 
 
 class Fit(NamedTuple):
@@ -24,9 +24,8 @@ class LockIn:
     harmonics, which disturb a plain fit where that number is not whole. White noise causes an error sqrt(3/2)
     times the lowest bound of unbiased estimates (Rife and Boorstyn 1974, doi:10.1109/TIT.1974.1055282).
 
-    Attributes:
-        noise_gain: white noise of variance s^2 in every sample puts an error of E|e|^2 = noise_gain s^2 on
-            the phasor: 6 over the number of samples, if they hold many periods.
+    White noise of variance s^2 in every sample puts an error of E|e|^2 = `noise_gain` s^2 on the phasor: 6
+    over the number of samples, if they hold many periods.
     """
 
     def __init__(self, frequency: float, step: float, samples: int) -> None:
@@ -34,8 +33,7 @@ class LockIn:
 
         `ValueError` for less than two periods, or two samples a period or fewer.
         """
-        cycles = positive("frequency", frequency, "Hz") * positive("step", step, "s")
-        samples = integer_at_least("samples", samples, 4)
+        cycles = frequency * step
         if cycles >= 0.5:
             raise invalid("step", step, f"must be < {0.5 / frequency:g}, half a period", "s")
         if cycles * samples < 2:

@@ -73,11 +73,7 @@ class Oscilloscope(contextlib.AbstractContextManager["Oscilloscope"]):
     """
 
     def __init__(self, port: UsbtmcPort, dialect: Dialect = KEYSIGHT) -> None:
-        """Ask the oscilloscope at a `port` for its identity; `dialect` has the commands of its maker.
-
-        Raises:
-            ValueError: no port or dialect.
-        """
+        """Ask the oscilloscope at a `port` for its identity; `dialect` has the commands of its maker."""
         require_kind("port", port, UsbtmcPort)
         require_kind("dialect", dialect, Dialect)
         self._port, self._dialect = port, dialect

@@ -40,8 +40,7 @@ class FileSensor:
     def read(self) -> torch.Tensor:
         """Return the magnitudes (P,) [Pa], once the file has changed.
 
-        Raises:
-            SensorError: it does not change in time, or then holds anything but P numbers >= 0.
+        `SensorError` if it does not change in time, or then holds anything but P numbers >= 0.
         """
         time.sleep(self._settle)
         before, deadline = self._stamp(), time.monotonic() + self._timeout

@@ -12,12 +12,9 @@ import numpy as np
 
 from autdtorch.hardware.transport.port import LinkError, Port, closed_on_error
 
-#: Time that the kit waits for an answer [ms]; its own 10 ms run out on a busy computer.
-_ANSWER_MS = 100
-#: Time limit for a command [s]; the kit asks boards that do not answer 8 times more before it gives up.
-_TIMEOUT = 5.0
-#: Time limit for opening [s]: the kit takes up to 10 s to find the boards and 30 s to synchronise them.
-_OPENING_TIMEOUT = 60.0
+_ANSWER_MS = 100  # wait of the kit for an answer; its own 10 ms run out on a busy computer
+_TIMEOUT = 5.0  # of a command [s]; the kit asks boards that do not answer 8 times more before it gives up
+_OPENING_TIMEOUT = 60.0  # [s]; the kit takes up to 10 s to find the boards and 30 s to synchronise them
 
 _Command = Callable[[], Coroutine[Any, Any, None]]
 _Asked = tuple[_Command, SimpleQueue[BaseException | None]]  # with the queue that its end goes into
@@ -35,9 +32,7 @@ def autd3_kit() -> Any:
 
 
 class Autd3Port(Port):
-    """Boards of AUTD3 on the network; each write waits for the answer of all boards.
-
-    Methods raise `LinkError` if a board is not there or does not answer, `ImportError` without the kit.
+    """Boards of AUTD3 on the network; `LinkError` if one does not answer, `ImportError` without the kit.
 
     The kit's event loop runs in a thread of its own, and signals are handled in the main thread. A signal
     in asyncio's own code would lose the command's wake-up, and closing the loop would wait for it for ever.

@@ -1,13 +1,19 @@
-"""The port of a device: bytes out, and what goes wrong with them."""
+"""The port of a device: bytes out, and what goes wrong with them; a serial port of the operating system."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
+
+from autdtorch.utils.validation import require_kind
 
 #: Hint for a missing package of the transports.
 INSTALL_HINT = "pip install 'autdtorch[hardware]' brings what is needed"
+
+_TIMEOUT = 1.0  # [s]
 
 
 class LinkError(OSError):
@@ -48,40 +54,93 @@ class Port(Protocol):
         return
 
 
+@dataclass
 class SharedPort:
     """The ports of several boards, which share written bytes evenly.
 
     If a board fails, the others are still served; then the first error is raised.
     """
 
-    def __init__(self, ports: Sequence[Port]) -> None:
-        """Take the `ports`, in the order of the boards."""
-        self._ports = ports
+    ports: Sequence[Port]
 
     def write(self, data: bytes) -> None:
         """Send each board its part of `data`."""
-        part = len(data) // len(self._ports)
-        parts = [data[start : start + part] for start in range(0, len(data), part)]
-        self._each(lambda port, own: port.write(own), parts)
+        part = len(data) // len(self.ports)
+        _call_all(partial(port.write, data[part * place :][:part]) for place, port in enumerate(self.ports))
 
     def flush(self) -> None:
         """Wait until all bytes have left the chips of all boards."""
-        self._each(lambda port, _: port.flush())
+        _call_all(port.flush for port in self.ports)
 
     def recover(self) -> None:
         """Recover all boards."""
-        self._each(lambda port, _: port.recover())
+        _call_all(port.recover for port in self.ports)
 
     def close(self) -> None:
         """Release all boards."""
-        self._each(lambda port, _: port.close())
+        _call_all(port.close for port in self.ports)
 
-    def _each(self, do: Callable[[Port, Any], None], parts: Sequence[Any] | None = None) -> None:
-        errors = []
-        for port, part in zip(self._ports, parts or self._ports, strict=True):
-            try:
-                do(port, part)
-            except LinkError as error:
-                errors.append(error)
-        if errors:
-            raise errors[0]
+
+def _call_all(calls: Iterable[Callable[[], None]]) -> None:
+    errors = []
+    for call in calls:
+        try:
+            call()
+        except LinkError as error:
+            errors.append(error)
+    if errors:
+        raise errors[0]
+
+
+class SerialPort:
+    """A serial port of the operating system over pyserial: 8 bits, no parity, 1 stop bit, no flow control.
+
+    Methods raise `LinkError` if the port is gone, or takes nothing for a second.
+    """
+
+    def __init__(self, name: str, baud: int) -> None:
+        """Open the port of a `name` such as "COM3" or "/dev/ttyUSB0", at `baud` bits/s."""
+        require_kind("port", name, str)
+        self._name = name
+        try:
+            import serial
+        except ImportError as error:
+            raise ImportError(f"{error}; {INSTALL_HINT}") from error
+        with self._errors("be opened", hint=True):
+            # Another program that wrote to the port would break frames.
+            self._port: Any = serial.Serial(name, baud, write_timeout=_TIMEOUT, exclusive=True)
+
+    def write(self, data: bytes) -> None:
+        """Send all of `data`, and drop all input: boards in a row echo their commands."""
+        with self._errors("be written to"):
+            self._port.reset_input_buffer()
+            self._port.write(data)
+
+    def flush(self) -> None:
+        """Wait until the driver has sent all bytes."""
+        with self._errors("be flushed"):
+            self._port.flush()
+
+    def recover(self) -> None:
+        """Drop the bytes that the driver still holds."""
+        with self._errors("be recovered"):
+            self._port.reset_output_buffer()
+
+    def close(self) -> None:
+        """Close the port."""
+        with self._errors("be closed"):
+            self._port.close()
+
+    @contextlib.contextmanager
+    def _errors(self, what: str, hint: bool = False) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:  # termios.error is no OSError
+            there = f". Ports: {_listed()}" if hint else ""
+            raise LinkError(f"{self._name} cannot {what}: {error}{there}") from error
+
+
+def _listed() -> str:
+    from serial.tools.list_ports import comports
+
+    return ", ".join(f"{port.device} ({port.description})" for port in comports()) or "none"

@@ -124,10 +124,8 @@ FT232H = Adapter(0x0403, 0x6014, FtdiFifo)
 
 
 def baud_divisor(baud: int) -> tuple[int, int]:
-    """Return value and index of the request that sets `baud` [bits/s] on an FT232R; below 1.5 Mbit/s.
-
-    The divisor of 3 MHz has 14 bits before the point and a code of three bits for its eighths.
-    """
+    """Return value and index of the request that sets `baud` [bits/s] on an FT232R; below 1.5 Mbit/s."""
+    # The divisor of 3 MHz has 14 bits before the point and a code of three bits for its eighths.
     whole, eighth = divmod(round(8 * 3_000_000 / baud), 8)
     code = _EIGHTHS[eighth]
     return whole | (code & 3) << 14, code >> 2

@@ -58,10 +58,7 @@ class UsbPort(Port):
     _timeout_ms = 1000
 
     def __init__(self, device: Any, baud: int = 0) -> None:
-        """Take a chip (`usb.core.Device`) and set it up; if that fails it is given back.
-
-        Its serial line, if it has one, gets the rate nearest to `baud` [bits/s] that the chip has.
-        """
+        """Take a chip (`usb.core.Device`) and set its serial line, if it has one, to about `baud` [bits/s]."""
         self._device, self._baud = device, baud
         self._detached: list[int] = []
         with closed_on_error(self.close):

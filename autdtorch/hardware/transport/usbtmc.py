@@ -28,8 +28,7 @@ _CHECKS = 100
 def message(kind: int, tag: int, length: int, attributes: int, data: bytes = b"") -> bytes:
     """Return a bulk transfer: a header of 12 bytes, the data, and zeros up to a multiple of 4 bytes.
 
-    The header holds `kind` (MsgID), `tag` (1 to 255), `length` (of the data, or the most that the instrument
-    may send) and `attributes` (bmTransferAttributes).
+    `kind` is its MsgID; `length` is of the data, or the most that the instrument may send.
     """
     return _HEADER.pack(kind, tag, tag ^ 0xFF, length, attributes) + data + bytes(-len(data) % 4)
 
@@ -63,10 +62,7 @@ def block(data: bytes) -> bytes:
 
 
 class UsbtmcPort(UsbPort):
-    """An instrument that takes commands and answers questions, as text.
-
-    Methods raise `LinkError` if it does not take the text, or does not answer with text, or with a block.
-    """
+    """An instrument that takes commands and answers questions; methods raise `LinkError` if it does not."""
 
     _timeout_ms = 3000
 
@@ -113,11 +109,9 @@ class UsbtmcPort(UsbPort):
         return received
 
     def _data(self, question: str, tag: int) -> tuple[bytes, bool]:
-        """Return the data of a transfer from the instrument, and true if its message ends with it.
-
-        The transfer is read to the length in its header: not all instruments send an empty packet after one
-        of whole packets. If one does, that is read before the next transfer.
-        """
+        """Return the data of a transfer from the instrument, and true if its message ends with it."""
+        # Read to the length in its header: not all instruments send an empty packet after one of whole
+        # packets. If one does, that is read before the next transfer.
         packet = self._in.wMaxPacketSize
         received = self._piece(question, packet) or self._piece(question, packet)
         length, ended = announced(received, tag)
