@@ -1,69 +1,46 @@
-from .devices import AUTD3, DEVICES, OPENMPD, SONICSURFACE, ULTRAINO
-from .devices.device import Device
-from .devices.openmpd import openmpd_boards
-from .devices.ultraino import ultraino_boards
-from .emulator.bench import EmulatedBench, EmulatedSensor
-from .emulator.emulated_scope import EmulatedScope
-from .link import Link, OffError, open_autd3, open_link
-from .log import Evaluation, EvaluationLog, LogError, lock_log
-from .objective import HardwareObjective
-from .played import Played
-from .preflight import Preflight, check_transducers, hears_silence
-from .safety import LimitedLink, LimitError, Limits, Signalled, ended_by_signals
-from .sensors.by_hand import ManualSensor, MovedMicrophone
-from .sensors.oscilloscope import Microphone, Oscilloscope, ScopeSensor, open_scope
-from .sensors.reading_file import FileSensor
-from .sensors.scpi import KEYSIGHT, RIGOL, Dialect, Waveform
-from .sensors.sensor import Sensor, SensorError
-from .transport.port import LinkError, Port
-from .transport.serial_chips import Adapter
-from .transport.usbtmc import UsbtmcPort
-
-__all__ = [
-    "AUTD3",
-    "DEVICES",
-    "KEYSIGHT",
-    "OPENMPD",
-    "RIGOL",
-    "SONICSURFACE",
-    "ULTRAINO",
-    "Adapter",
-    "Device",
-    "Dialect",
-    "EmulatedBench",
-    "EmulatedScope",
-    "EmulatedSensor",
-    "Evaluation",
-    "EvaluationLog",
-    "FileSensor",
-    "HardwareObjective",
-    "LimitError",
-    "LimitedLink",
-    "Limits",
-    "Link",
-    "LinkError",
-    "LogError",
-    "ManualSensor",
-    "Microphone",
-    "MovedMicrophone",
-    "OffError",
-    "Oscilloscope",
-    "Played",
-    "Port",
-    "Preflight",
-    "ScopeSensor",
-    "Sensor",
-    "SensorError",
-    "Signalled",
-    "UsbtmcPort",
-    "Waveform",
-    "check_transducers",
-    "ended_by_signals",
-    "hears_silence",
-    "lock_log",
-    "open_autd3",
-    "open_link",
-    "open_scope",
-    "openmpd_boards",
-    "ultraino_boards",
-]
+from .devices import AUTD3 as AUTD3
+from .devices import DEVICES as DEVICES
+from .devices import OPENMPD as OPENMPD
+from .devices import SONICSURFACE as SONICSURFACE
+from .devices import ULTRAINO as ULTRAINO
+from .devices.device import Device as Device
+from .devices.openmpd import openmpd_boards as openmpd_boards
+from .devices.ultraino import ultraino_boards as ultraino_boards
+from .emulator.bench import EmulatedBench as EmulatedBench
+from .emulator.bench import EmulatedSensor as EmulatedSensor
+from .emulator.emulated_scope import EmulatedScope as EmulatedScope
+from .link import Link as Link
+from .link import OffError as OffError
+from .link import open_autd3 as open_autd3
+from .link import open_link as open_link
+from .log import Evaluation as Evaluation
+from .log import EvaluationLog as EvaluationLog
+from .log import LogError as LogError
+from .log import lock_log as lock_log
+from .objective import HardwareObjective as HardwareObjective
+from .played import Played as Played
+from .preflight import Preflight as Preflight
+from .preflight import check_transducers as check_transducers
+from .preflight import hears_silence as hears_silence
+from .safety import LimitedLink as LimitedLink
+from .safety import LimitError as LimitError
+from .safety import Limits as Limits
+from .safety import Signalled as Signalled
+from .safety import ended_by_signals as ended_by_signals
+from .sensors.by_hand import ManualSensor as ManualSensor
+from .sensors.by_hand import MovedMicrophone as MovedMicrophone
+from .sensors.oscilloscope import Microphone as Microphone
+from .sensors.oscilloscope import Oscilloscope as Oscilloscope
+from .sensors.oscilloscope import ScopeSensor as ScopeSensor
+from .sensors.oscilloscope import open_scope as open_scope
+from .sensors.reading_file import FileSensor as FileSensor
+from .sensors.scpi import KEYSIGHT as KEYSIGHT
+from .sensors.scpi import RIGOL as RIGOL
+from .sensors.scpi import Dialect as Dialect
+from .sensors.scpi import Waveform as Waveform
+from .sensors.sensor import Sensor as Sensor
+from .sensors.sensor import SensorError as SensorError
+from .transport.port import LinkError as LinkError
+from .transport.port import Port as Port
+from .transport.serial_chips import Adapter as Adapter
+from .transport.usbtmc import UsbtmcPort as UsbtmcPort

@@ -104,8 +104,7 @@ class EvaluationLog:
         An evaluation whose line was lost is made again, and its reading may differ. A later evaluation stays
         valid if the method asks for the recorded drive, and is made again otherwise.
 
-        Raises:
-            LogError: it has another drive, and no earlier line was lost.
+        `LogError` if it has another drive, and no earlier line was lost.
         """
         evaluation = self._evaluations.get(number)
         if evaluation is None or torch.equal(evaluation.drive, drive):
@@ -123,11 +122,7 @@ class EvaluationLog:
         """Add an evaluation under the first number that the log lacks, and return it with its time.
 
         It has a requested `drive` (M,), the `pressure` (P,) [Pa] as read, and the total time that the outputs
-        were on so far, `seconds_on` [s].
-
-        Raises:
-            LogError: the file has changed meanwhile.
-            OSError: the file cannot be written.
+        were on so far, `seconds_on` [s]. `LogError` if the file has changed meanwhile.
         """
         while self._lacking in self._evaluations:
             self._lacking += 1
@@ -143,9 +138,7 @@ class EvaluationLog:
     def end(self, seconds_on: float) -> None:
         """Record the total time that the outputs were on, `seconds_on` [s], and release the log.
 
-        Raises:
-            LogError: the file has changed meanwhile.
-            OSError: the file cannot be written.
+        `LogError` if the file has changed meanwhile.
         """
         with self._held:
             self._append({"time": _now(), "seconds_on": seconds_on})
@@ -207,9 +200,7 @@ class EvaluationLog:
 def lock_log(path: str | Path) -> Iterator[None]:
     """Keep other processes from a log at `path`, which need not exist; this process may lock it again.
 
-    Raises:
-        LogError: another process has it.
-        OSError: its folder cannot be written.
+    `LogError` if another process has it.
     """
     place = Path(path).resolve()
     lock = FileLock(place.with_name(f".{place.name}.lock"), thread_local=False, is_singleton=True)

@@ -27,9 +27,7 @@ class HardwareObjective:
     To continue an interrupted trial, run the same method with the same seed again: `autdtorch.run` takes the
     evaluations in the log from there.
 
-    Attributes:
-        scene: its array plays the drives, its control points are observed.
-        log: holds the evaluations.
+    Attributes are its `scene`, and its `log` of the evaluations.
     """
 
     def __init__(
@@ -111,7 +109,7 @@ class HardwareObjective:
         return self.log.count
 
     def recorded(self, number: int, drive: torch.Tensor) -> torch.Tensor | None:
-        """Return the pressures (P,) [Pa] of an evaluation in the log, or None; see `EvaluationLog.recorded`."""
+        """Return the pressures (P,) [Pa] of a logged evaluation, or None; see `EvaluationLog.recorded`."""
         evaluation = self.log.recorded(number, drive)
         if evaluation is None:
             return None

@@ -90,10 +90,8 @@ class Played(Perturbation):
     """A device that plays the nearest of its levels, as it is calibrated, within the limit of a trial.
 
     With ``Played(SimulatedObjective(...), device)`` a method finds the same drive as with a
-    `HardwareObjective` without noise. The pressures differ by a factor.
-
-    Attributes:
-        largest: amplitude of the device that is |q| = 1 in the trial: its highest level within the limit.
+    `HardwareObjective` without noise. The pressures differ by a factor: |q| = 1 in the trial is the amplitude
+    `largest` of the device, its highest level within the limit.
     """
 
     def __init__(
@@ -111,9 +109,8 @@ class Played(Perturbation):
             transducers: the device's transducer for each of the scene's (M,); by default all in order.
             amplitude: amplitude limit of the trial, as in `Limits`.
 
-        Raises:
-            ValueError: `transducers` that the device does not have, one twice, or not as many as the scene
-                has; or an `amplitude` out of range or below the device's lowest level.
+        `ValueError` for `transducers` that the device does not have, one twice, or not as many as the scene
+        has; or an `amplitude` out of range or below the device's lowest level.
         """
         super().__init__(objective)
         wiring = Wiring(device, transducers)

@@ -22,7 +22,7 @@ class Preflight:
 
     Attributes:
         pressure: of each transducer (M,) [Pa], rms over readings and control points.
-        silence: of silence, with the outputs off [Pa].
+        silence: with the outputs off [Pa].
         threshold: pressure that a working transducer exceeds [Pa].
     """
 

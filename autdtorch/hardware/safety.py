@@ -95,8 +95,7 @@ class Limits:
         duty_cycle: share of the time that they may be on, above 0 up to 1: after a stretch of t s they rest
             for t (1 / duty_cycle - 1) s.
 
-    Raises:
-        ValueError: an attribute out of range.
+    `ValueError` for an attribute out of range.
     """
 
     amplitude: float

@@ -21,10 +21,10 @@ class _Autd3(Device):
         return torch.cat(levels).to(torch.uint8).numpy().tobytes()
 
     def firmware(self, transducers: int) -> Firmware:
-        return Autd3Firmware(transducers)
+        return _Autd3Firmware(transducers)
 
 
-class Autd3Firmware:
+class _Autd3Firmware:
     """Boards behind their software kit, which receives a frame as one pattern.
 
     The packets between kit and boards are the kit's own; `autd3_emulator` checks the levels in them.
@@ -37,7 +37,6 @@ class Autd3Firmware:
         self._playing = bytes(2 * transducers)
 
     def receive(self, data: bytes) -> None:
-        """Take a pattern."""
         self._playing = data
 
     def drive(self) -> torch.Tensor:

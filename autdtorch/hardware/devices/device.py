@@ -17,7 +17,7 @@ _BITS = 10  # of a byte on a serial line: start, 8, stop
 
 
 class Firmware(Protocol):
-    """The emulated firmware of a device, written from its sources; its serial line has `baud` [bits/s]."""
+    """The emulated firmware of a device, from its sources; `baud` [bits/s] of its line, None for a FIFO."""
 
     baud: ClassVar[int | None]
 

@@ -53,10 +53,10 @@ class _OpenMPD(Device):
         return bytes(frame)
 
     def firmware(self, transducers: int) -> Firmware:
-        return OpenMPDFirmware()
+        return _OpenMPDFirmware()
 
 
-class OpenMPDFirmware:
+class _OpenMPDFirmware:
     """A board that emits pulses, which begin at a phase and last for a duty, both in 1/128 of a period.
 
     Bit 7 begins a message where one is due; bits 7 of later bytes, which set lamp and rate, are ignored.
@@ -65,12 +65,10 @@ class OpenMPDFirmware:
     baud: ClassVar[int | None] = None
 
     def __init__(self) -> None:
-        """Switch the device on."""
         self._message = bytearray()
         self._playing = bytes(512)
 
     def receive(self, data: bytes) -> None:
-        """Take bytes, in pieces of any length."""
         for byte in data:
             if self._message or byte & 128:
                 self._message.append(byte & 127)
@@ -99,17 +97,12 @@ OPENMPD = _OpenMPD(
 
 
 def openmpd_boards(boards: Sequence[OpenMPDBoard]) -> Device:
-    """Return boards of OpenMPD as their files describe them: in the files' order, calibrated, by pin.
+    """Return `boards` of OpenMPD as their files describe them: in the files' order, calibrated, by pin.
 
-    A board is found by its name as the serial number of its chip. Boards change over one after the other, as
-    their messages arrive.
+    A board has 256 transducers, and is found by its name as the serial number of its chip. Boards change over
+    one after the other, as their messages arrive.
 
-    Args:
-        boards: one after the other, of 256 transducers each.
-
-    Raises:
-        ValueError: no board, one that is no `OpenMPDBoard`, one of another number of transducers, or two of
-            the same name.
+    `ValueError` for no board, one of another number of transducers, or two of the same name.
     """
     boards = members("boards", boards, OpenMPDBoard)
     names = tuple(board.name for board in boards)

@@ -69,9 +69,7 @@ class OpenMPDBoard:
     def load(cls, path: str | os.PathLike[str]) -> OpenMPDBoard:
         """Read a .pat file.
 
-        Raises:
-            FileNotFoundError: there is no such file.
-            ValueError: it describes no board. The message names file, line and field.
+        `ValueError` with file, line and field if it describes no board, `FileNotFoundError` if there is none.
         """
         try:
             lines = path_of("path", path).read_text(encoding="utf-8-sig").splitlines()
@@ -132,8 +130,7 @@ class OpenMPDBoard:
             source_strength: [Pa m], > 0; by default as AcousTools assumes.
             radius: of the discs [m]; None or 0 for point sources.
 
-        Raises:
-            ValueError: an argument is not finite, has the wrong shape or is out of range.
+        `ValueError` if an argument is not finite, has the wrong shape or is out of range.
         """
         places = in_plane(self.positions, center, normal, angle)
         return TransducerArray(places, normal, source_strength, radius)

@@ -38,10 +38,10 @@ class _SonicSurface(Device):
         return bytes([_START, *by_channel, _COMMIT])
 
     def firmware(self, transducers: int) -> Firmware:
-        return SonicSurfaceFirmware()
+        return _SonicSurfaceFirmware()
 
 
-class SonicSurfaceFirmware:
+class _SonicSurfaceFirmware:
     """The primary FPGA (Distribute.vhd, PhaseLine.vhd), without phase corrections.
 
     It starts with all transducers on, at phase 0. A channel has a phase that it emits and one that waits; the
@@ -53,14 +53,12 @@ class SonicSurfaceFirmware:
     _START, _COMMIT, _ENABLE, _DISABLE, _OFF = 254, 253, 192, 193, 32
 
     def __init__(self) -> None:
-        """Switch the device on."""
         self._playing = [0] * 256
         self._waiting = [0] * 256
         self._channel = 0
         self._enabled = True
 
     def receive(self, data: bytes) -> None:
-        """Take bytes, in pieces of any length."""
         for byte in data:
             if byte == self._START and self._enabled:
                 self._channel = 0

@@ -43,10 +43,10 @@ class _Ultraino(Device):
         return bytes(frame) + _END
 
     def firmware(self, transducers: int) -> Firmware:
-        return UltrainoFirmware(transducers // _BOARD)
+        return _UltrainoFirmware(transducers // _BOARD)
 
 
-class UltrainoFirmware:
+class _UltrainoFirmware:
     """Boards in a row (DriverMEGA.ino).
 
     A board starts with all pins high in the first half of the period. Bytes whose lower half is 1 are for it;
@@ -61,16 +61,14 @@ class UltrainoFirmware:
     _SWITCH, _COMMIT_DURATIONS, _DURATION, _DURATION_MASK = 0x00, 0x10, 0x30, 0x3F
 
     def __init__(self, boards: int = 1) -> None:
-        """Switch `boards` boards on."""
         size = self._PATTERNS * self._TENTHS * self._PORTS
         self._playing, self._waiting = bytearray(size), bytearray(size)
         self._playing[: self._PORTS * self._TENTHS // 2] = b"\xff" * (self._PORTS * self._TENTHS // 2)
         self._durations = self._waiting_durations = [1] + [0] * (self._PATTERNS - 1)
         self._written = self._durations_written = 0
-        self._next = UltrainoFirmware(boards - 1) if boards > 1 else None
+        self._next = _UltrainoFirmware(boards - 1) if boards > 1 else None
 
     def receive(self, data: bytes) -> None:
-        """Take bytes, in pieces of any length."""
         for byte in data:
             self._take(byte)
 

@@ -49,9 +49,8 @@ class EmulatedBench:
             transducers: the device's transducer for each of the scene's (M,); by default all in order.
             dead: failed transducers of the scene, which stay silent.
 
-        Raises:
-            ValueError: `transducers` that the device does not have, not as many as the matrix has, or `dead`
-                ones that the scene does not have.
+        `ValueError` for `transducers` that the device does not have, or not as many as the matrix has, or
+        `dead` ones that the scene does not have.
         """
         self._transducers = Wiring(device, transducers).transducers
         self.transfer_matrix = complex_tensor("transfer_matrix", transfer_matrix).to("cpu", torch.complex128)
@@ -139,8 +138,7 @@ class EmulatedSensor:
                 control points and random phases, all transducers fully on; None for no noise.
             seed: of the noise, >= 0.
 
-        Raises:
-            ValueError: an argument out of range.
+        `ValueError` for an argument out of range.
         """
         require_kind("bench", bench, EmulatedBench)
         self._bench = bench

@@ -97,8 +97,7 @@ class EmulatedScope:
             drift: the microphones' gain is e^u, u a random walk of this rms after 1000 captures.
             seed: of noise, drift and the moments of capture, >= 0.
 
-        Raises:
-            ValueError: an argument out of range.
+        `ValueError` for an argument out of range.
         """
         require_callable("pressure", pressure)
         require_one_of("maker", maker, _MAKERS)

@@ -49,8 +49,7 @@ class Microphone:
         loudest: largest amplitude that the input must take [Pa].
         gain: of the amplifier between, as a factor.
 
-    Raises:
-        ValueError: an attribute out of range.
+    `ValueError` for an attribute out of range.
     """
 
     input: int

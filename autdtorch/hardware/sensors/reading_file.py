@@ -29,8 +29,7 @@ class FileSensor:
             settle: time after a drive began in which the file may still be of the drive before [s].
             timeout: time limit for the file to change then [s].
 
-        Raises:
-            ValueError: an argument out of range.
+        `ValueError` for an argument out of range.
         """
         self._path = path_of("path", path)
         self._points = integer_at_least("points", points, 1)

@@ -71,8 +71,7 @@ class Dialect:
     def waveform(self, preamble: str, codes: bytes) -> Waveform:
         """Return the waveform of the answers to the questions for preamble and samples.
 
-        Raises:
-            LinkError: the preamble is not ten numbers, with steps above 0, or there are no samples.
+        `LinkError` if the preamble is not ten numbers, with steps above 0, or there are no samples.
         """
         try:
             numbers = [float(number) for number in preamble.split(",")]

@@ -90,15 +90,17 @@ class CdcUart(UsbPort):
             super().close()
 
     def _set_up(self) -> None:
-        one_stop_bit, no_parity, data_bits = 0, 0, 8
-        coding = self._baud.to_bytes(4, "little") + bytes([one_stop_bit, no_parity, data_bits])
+        coding = self._baud.to_bytes(4, "little") + bytes([0, 0, 8])  # one stop bit, no parity, 8 bits
         self._request(_CDC_LINE_CODING, 0, data=coding, kind=_CDC_REQUEST)
         self._reader.start()
 
     def _drop_input(self) -> None:
-        with contextlib.suppress(LinkError):  # a write reports it
+        from usb.core import USBError, USBTimeoutError
+
+        with contextlib.suppress(USBError, NotImplementedError):  # a write reports it
             while not self._closing.is_set():
-                self._receive(_READ_MS)
+                with contextlib.suppress(USBTimeoutError):
+                    self._in.read(self._in.wMaxPacketSize, _READ_MS)
 
 
 class Adapter(NamedTuple):

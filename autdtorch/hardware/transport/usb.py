@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 from collections.abc import Callable, Collection
 from pathlib import Path
@@ -58,7 +57,7 @@ class UsbPort(Port):
     _timeout_ms = 1000
 
     def __init__(self, device: Any, baud: int = 0) -> None:
-        """Take a chip (`usb.core.Device`) and set its serial line, if it has one, to about `baud` [bits/s]."""
+        """Take a chip (`usb.core.Device`), and set its serial line, if it has one, to `baud` [bits/s]."""
         self._device, self._baud = device, baud
         self._detached: list[int] = []
         with closed_on_error(self.close):
@@ -129,17 +128,6 @@ class UsbPort(Port):
         """Return the answer of at most `length` bytes to a request."""
         transfer = self._device.ctrl_transfer
         return bytes(self._call(what, transfer, kind, request, 0, index, length, self._timeout_ms))
-
-    def _receive(self, wait_ms: int) -> bytes:
-        """Return a packet; empty if none comes within the time [ms]."""
-        from usb.core import USBTimeoutError
-
-        def read() -> bytes:
-            with contextlib.suppress(USBTimeoutError):
-                return bytes(self._in.read(self._in.wMaxPacketSize, wait_ms))
-            return b""
-
-        return bytes(self._call("be read", read))
 
     def _call(self, what: str, call: Callable[..., Any], *arguments: object) -> Any:
         from usb.core import USBError
