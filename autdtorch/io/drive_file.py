@@ -70,7 +70,7 @@ def save_drive(
     if device is None:
         columns, arrays = _plain(checked, array)
     else:
-        require_one_of("device", device, tuple(DEVICES))
+        require_one_of("device", device, DEVICES)
         columns, arrays = _levelled(checked, device)
     if kind == ".csv":
         write_table(path, columns)
@@ -95,7 +95,7 @@ def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
     arrays = read_arrays(path)
     if "device" in arrays:
         name = str(arrays["device"])
-        require_one_of(f"{path}: device", name, tuple(DEVICES))
+        require_one_of(f"{path}: device", name, DEVICES)
         return _played(path, name, {f"{name} {key}": value.reshape(-1) for key, value in arrays.items()})
     if "drive" not in arrays:
         raise ValueError(f"{path}: no array 'drive'; must be written by save_drive")

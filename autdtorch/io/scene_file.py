@@ -25,12 +25,12 @@ from autdtorch.utils.validation import (
     ArrayLike,
     Vector,
     finite_vector,
-    hint,
     invalid,
     members,
     path_of,
     points_tensor,
     require_known,
+    require_one_of,
     within,
 )
 
@@ -158,8 +158,7 @@ def _build_kind(where: str, value: object, builders: Mapping[str, Builder]) -> A
     """Build a part with the builder that the key `type` names."""
     section = _mapping(where, value)
     kind = section.pop("type", None)
-    if not isinstance(kind, str) or kind not in builders:
-        raise invalid(f"{where}: type", kind, f"must be one of {', '.join(builders)}{hint(kind, builders)}")
+    require_one_of(f"{where}: type", kind, builders)
     return _build(where, section, builders[kind])
 
 

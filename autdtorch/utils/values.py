@@ -35,11 +35,6 @@ def within(place: object) -> Iterator[None]:
         raise ValueError(f"{place}: {error}") from error
 
 
-def in_unit(unit: str) -> str:
-    """Return the unit as messages name it after what they accept."""
-    return f" [{unit}]" if unit else ""
-
-
 def is_dense(value: torch.Tensor | npt.NDArray[Any] | np.generic) -> bool:
     """Check that an array has few axes and holds unmasked numbers or booleans in memory."""
     if isinstance(value, torch.Tensor):

@@ -1,0 +1,333 @@
+"""Checks made once, where a value enters the package.
+
+Every function takes the name of the field first and returns the checked value in one canonical form. A bad
+value raises a `ValueError` of one line, ``field: value unit; accepted range``.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import numbers
+import os
+import re
+from collections.abc import Collection, Iterable, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias, TypeGuard
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from autdtorch.utils.values import DEEPEST, SHOWN_ENTRIES, is_plain
+from autdtorch.utils.values import invalid as invalid
+from autdtorch.utils.values import is_dense as is_dense
+from autdtorch.utils.values import within as within
+
+ArrayLike: TypeAlias = torch.Tensor | npt.ArrayLike
+Vector: TypeAlias = tuple[float, float, float]
+
+LENGTH_TOLERANCE = 1e-9
+"""Lengths that differ by less are taken to be equal [m]: far above rounding at metre scale, and far below
+any wavelength."""
+
+_NAME = re.compile(r"(?!\.+$)[\w.+-]+")
+_LONGEST_NAME = 100  # bytes
+_LARGEST = 2**63 - 1  # largest integer that NumPy and PyTorch count with
+_DENSITIES = 1e-9, 1e9  # [kg/m^3]; far beyond all materials, and squares of their ratios do not overflow
+_SOUND_SPEEDS = 1e-3, 1e6  # [m/s]
+
+
+def require_name(field: str, name: object) -> None:
+    """Check a name that becomes part of the names of files and HDF5 groups."""
+    if not isinstance(name, str) or not _NAME.fullmatch(name) or len(name.encode()) > _LONGEST_NAME:
+        accepted = "a name must be text of letters, digits and _ . + -, not of dots alone"
+        raise invalid(field, name, f"{accepted}, with at most {_LONGEST_NAME} bytes")
+
+
+def path_of(name: str, value: object, what: str = "a file") -> Path:
+    """Return `value` as the path of `what`, which need not exist."""
+    text = os.fspath(value) if isinstance(value, str | os.PathLike) else None
+    if not isinstance(text, str) or not text or "\0" in text:
+        raise invalid(name, value, f"must be the path of {what}")
+    return Path(text)
+
+
+def require_one_of(name: str, value: object, accepted: Collection[str]) -> None:
+    """Check that `value` is one of the accepted texts."""
+    if not isinstance(value, str) or value not in accepted:
+        raise invalid(name, value, f"must be one of {', '.join(accepted)}{_hint(value, accepted)}")
+
+
+def require_known(where: str, given: Iterable[Any], allowed: Collection[str], what: str = "key") -> None:
+    """Refuse keys that are not allowed."""
+    for key in given:
+        if key not in allowed:
+            found = f"unknown {what} {key!r}{_hint(key, allowed)}"
+            raise ValueError(f"{where}: {found}; allowed {what}s: {', '.join(allowed)}")
+
+
+def _hint(given: object, allowed: Collection[str]) -> str:
+    """Return a question for messages with the allowed text most like `given`; empty if none is alike."""
+    nearest = difflib.get_close_matches(given, allowed, n=1) if isinstance(given, str) else []
+    return f" (did you mean {nearest[0]!r}?)" if nearest else ""
+
+
+def require_kind(name: str, value: object, kind: type) -> None:
+    """Check that `value` is an instance of a class or protocol."""
+    if not isinstance(value, kind):
+        article = "an" if kind.__name__[0] in "AEIOU" else "a"
+        raise invalid(name, value, f"must be {article} {kind.__name__}")
+
+
+def members(name: str, value: object, kind: type) -> tuple[Any, ...]:
+    """Return the entries of an iterable, all instances of a class, as a tuple."""
+    entries = _listed(name, value, f"must be a sequence, each entry of class {kind.__name__}")
+    for index, entry in enumerate(entries):
+        require_kind(f"{name}[{index}]", entry, kind)
+    return tuple(entries)
+
+
+def _listed(name: str, value: object, accepted: str) -> list[Any]:
+    """Return the entries of an iterable other than text; a class of the user's own may raise anything."""
+    try:
+        if not isinstance(value, str | bytes):
+            return list(value)  # type: ignore[call-overload, no-any-return]
+    except Exception as error:
+        raise invalid(name, value, accepted) from error
+    raise invalid(name, value, accepted)
+
+
+def require_callable(name: str, value: object) -> None:
+    """Check that `value` can be called."""
+    if not callable(value):
+        raise invalid(name, value, "must be a function")
+
+
+def finite_number(name: str, value: object, unit: str = "") -> float:
+    """Return `value` as a finite float; text, booleans and complex numbers are refused."""
+    if isinstance(value, torch.Tensor | np.ndarray) and value.ndim == 0 and is_plain(value):
+        value = value.item()
+    if not is_plain(value) or not isinstance(value, numbers.Real):
+        raise invalid(name, value, f"must be a real number{_in_unit(unit)}")
+    try:
+        number = float(value)
+    except OverflowError:  # an integer or a fraction, too large for a float
+        number = math.inf
+    except Exception as error:  # of a class of the user's own
+        raise invalid(name, value, f"must be a real number{_in_unit(unit)}") from error
+    if not math.isfinite(number):
+        raise invalid(name, value, "must be finite", unit)
+    return number
+
+
+def positive(name: str, value: object, unit: str = "") -> float:
+    """Return `value` as a finite float > 0."""
+    number = finite_number(name, value, unit)
+    if number <= 0:
+        raise invalid(name, value, "must be finite and > 0", unit)
+    return number
+
+
+def not_negative(name: str, value: object, unit: str = "") -> float:
+    """Return `value` as a finite float >= 0."""
+    number = finite_number(name, value, unit)
+    if number < 0:
+        raise invalid(name, value, "must be finite and >= 0", unit)
+    return number
+
+
+def number_between(name: str, value: object, least: float, most: float, unit: str = "") -> float:
+    """Return `value` as a float in `least` to `most`, ends included."""
+    number = finite_number(name, value, unit)
+    if not least <= number <= most:
+        raise invalid(name, value, f"must be in {least:g} to {most:g}", unit)
+    return number
+
+
+def fluid(kind: str, density: object, sound_speed: object) -> tuple[float, float]:
+    """Return density [kg/m^3] and sound speed [m/s] of a fluid, checked as fields of `kind`."""
+    rho = positive(f"{kind}.density", density, "kg/m^3")
+    c = positive(f"{kind}.sound_speed", sound_speed, "m/s")
+    return (
+        number_between(f"{kind}.density", rho, *_DENSITIES, "kg/m^3"),
+        number_between(f"{kind}.sound_speed", c, *_SOUND_SPEEDS, "m/s"),
+    )
+
+
+def boolean(name: str, value: object) -> bool:
+    """Return `value`, True or False, as a bool."""
+    if not isinstance(value, bool | np.bool_):
+        raise invalid(name, value, "must be true or false")
+    return bool(value)
+
+
+def integer_at_least(name: str, value: object, minimum: int) -> int:
+    """Return `value` as an int >= `minimum`; whole floats are refused too."""
+    number = int(value) if is_plain(value) and isinstance(value, numbers.Integral) else minimum - 1
+    if not minimum <= number <= _LARGEST:
+        most = " and < 2^63" if number > _LARGEST else ""
+        raise invalid(name, value, f"must be an integer >= {minimum}{most}")
+    return number
+
+
+def integers(name: str, value: object, minimum: int, accepted: str) -> list[int]:
+    """Return `value`, a sequence or an array with one axis, as integers >= `minimum`."""
+    if isinstance(value, torch.Tensor | np.ndarray) and is_dense(value):  # entries need not be Integral
+        value = value.tolist()
+    if not isinstance(value, Sequence):
+        raise invalid(name, value, accepted)
+    entries = _listed(name, value, accepted)
+    return [integer_at_least(f"{name}[{place}]", entry, minimum) for place, entry in enumerate(entries)]
+
+
+def positive_integers(name: str, value: object, count: int) -> tuple[int, ...]:
+    """Return `value` as `count` integers >= 1."""
+    accepted = f"must be {count} integers >= 1"
+    entries = integers(name, value, 1, accepted)
+    if len(entries) != count:
+        raise invalid(name, entries, accepted)
+    return tuple(entries)
+
+
+def indices(name: str, value: object, count: int) -> list[int]:
+    """Return `value` as indices from 0 to `count` - 1: at least one, without repetition."""
+    chosen = integers(name, value, 0, f"must be indices from 0 to {count - 1}")
+    if not chosen or len(set(chosen)) < len(chosen) or max(chosen) >= count:
+        raise invalid(name, chosen, f"must be indices from 0 to {count - 1}, each once")
+    return chosen
+
+
+def finite_vector(name: str, value: object, unit: str = "m") -> Vector:
+    """Return `value` as three finite floats."""
+    x, y, z = _entries(name, value, 3, unit)
+    return x, y, z
+
+
+def positive_entries(name: str, value: object, count: int, unit: str = "m") -> tuple[float, ...]:
+    """Return `value` as `count` finite floats > 0."""
+    entries = _entries(name, value, count, unit)
+    if min(entries) <= 0:
+        raise invalid(name, value, "every entry must be finite and > 0", unit)
+    return entries
+
+
+def unit_vector(name: str, value: object) -> Vector:
+    """Return `value`, three finite floats, scaled to length 1."""
+    vector = finite_vector(name, value, unit="")
+    length = math.hypot(*vector)
+    # A shorter vector may be the rounding error of a difference of metres, whose direction is noise.
+    if not LENGTH_TOLERANCE < length < math.inf:
+        raise invalid(name, value, f"must be a vector of finite length > {LENGTH_TOLERANCE:g}")
+    x, y, z = (entry / length for entry in vector)
+    return x, y, z
+
+
+def real_tensor(name: str, value: object, unit: str = "") -> torch.Tensor:
+    """Return `value` as a finite float64 tensor of any shape; a tensor keeps its device and its gradient."""
+    accepted = f"must be an array of real numbers{_in_unit(unit)}"
+    tensor = _tensor(name, value, accepted)
+    if tensor.is_complex():
+        raise invalid(name, value, accepted)
+    tensor = tensor.to(torch.float64)
+    _require_finite(name, tensor, unit)
+    return tensor
+
+
+def complex_tensor(name: str, value: object) -> torch.Tensor:
+    """Return `value` as a finite complex128 tensor of any shape; a tensor keeps its device and its gradient.
+
+    A lazy conjugate is resolved, because not every PyTorch function takes one.
+    """
+    accepted = "must be an array of complex numbers"
+    tensor = _tensor(name, value, accepted)
+    if not tensor.is_complex():
+        raise invalid(name, value, accepted)
+    tensor = tensor.to(torch.complex128).resolve_conj()
+    _require_finite(name, tensor)
+    return tensor
+
+
+def magnitude_tensor(name: str, value: object, unit: str = "") -> torch.Tensor:
+    """Return |value| as a float64 tensor of any shape; complex numbers, NaN and infinity are accepted."""
+    tensor = _tensor(name, value, f"must be an array of numbers{_in_unit(unit)}")
+    return tensor.to(torch.complex128 if tensor.is_complex() else torch.float64).abs()
+
+
+def points_tensor(name: str, value: object) -> torch.Tensor:
+    """Return a float64 copy of `value`, points (P, 3) [m], P >= 1, on its device and without gradient."""
+    points = real_tensor(name, value, "m")
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
+        raise ValueError(f"{name}: shape {tuple(points.shape)}; must be (P, 3) with P >= 1")
+    return points.detach().clone()
+
+
+def points_grid(name: str, value: object) -> tuple[torch.Tensor, torch.Size]:
+    """Return points on a grid (..., 3) [m] as `points_tensor` does, and the shape (...) of the grid."""
+    points = real_tensor(name, value, "m")
+    if points.ndim < 2 or points.shape[-1] != 3 or points.numel() == 0:
+        raise ValueError(f"{name}: shape {tuple(points.shape)}; must be (P, 3) or (..., P, 3) with P >= 1")
+    return points_tensor(name, points.reshape(-1, 3)), points.shape[:-1]
+
+
+def _in_unit(unit: str) -> str:
+    """Return the unit as messages name it after what they accept."""
+    return f" [{unit}]" if unit else ""
+
+
+def _entries(name: str, value: object, count: int, unit: str) -> tuple[float, ...]:
+    tensor = real_tensor(name, value, unit)
+    if tensor.shape != (count,):
+        raise invalid(name, value, f"must be {count} real numbers{_in_unit(unit)}")
+    return tuple(float(entry) for entry in tensor.detach())
+
+
+def _tensor(name: str, value: object, accepted: str) -> torch.Tensor:
+    try:
+        numeric = _holds_numbers(value)
+        if numeric and isinstance(value, torch.Tensor):
+            return value.as_subclass(torch.Tensor)  # a subclass may override functions
+        array = np.asarray(value if numeric else None)
+    except Exception as error:  # a class of the user's own may raise anything
+        raise invalid(name, value, accepted) from error
+    if array.dtype.kind not in "iufc":
+        raise invalid(name, value, accepted)
+    # A copy: the caller's array may be read-only, or may change later.
+    with np.errstate(over="ignore"):  # an overflow becomes infinite, which is refused
+        array = array.astype(np.complex128 if array.dtype.kind == "c" else np.float64)
+    return torch.from_numpy(array)
+
+
+def _holds_numbers(value: object) -> bool:
+    """Check nested lists before NumPy converts them.
+
+    NumPy takes a boolean among numbers as 0 or 1, drops masks, and never ends on a list that contains itself
+    twice.
+    """
+    entries = [value]
+    for _ in range(DEEPEST):
+        if not all(map(is_plain, entries)):
+            return False
+        lists = {id(entry): entry for entry in entries if _is_list(entry)}
+        if not lists:
+            return True
+        entries = [entry for one in lists.values() for entry in one]
+    return False
+
+
+def _is_list(value: object) -> TypeGuard[Iterable[Any]]:
+    """Check that NumPy would iterate over `value`; it does so for any class with length and index."""
+    kind = type(value)
+    if issubclass(kind, str | bytes | memoryview) or hasattr(kind, "__array__"):
+        return False
+    return hasattr(kind, "__getitem__") and hasattr(kind, "__len__")
+
+
+def _require_finite(name: str, tensor: torch.Tensor, unit: str = "") -> None:
+    bad = ~torch.isfinite(tensor.detach())
+    if not bad.any():
+        return
+    if tensor.numel() <= SHOWN_ENTRIES:
+        raise invalid(name, tensor, "every entry must be finite", unit)
+    index = torch.nonzero(bad)[0].tolist()
+    raise invalid(f"{name}{index}", tensor[tuple(index)].item(), "every entry must be finite", unit)
