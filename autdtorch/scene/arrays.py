@@ -11,7 +11,7 @@ import torch
 
 from autdtorch.scene.geometry import Coordinates, in_plane, plane_basis
 from autdtorch.utils.memory import require_memory
-from autdtorch.utils.neighbours import nearest_other, require_distinct
+from autdtorch.utils.neighbours import closest_pair, require_distinct
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
@@ -264,8 +264,8 @@ def _disc_rule() -> tuple[torch.Tensor, torch.Tensor]:
 def _disc_radius(given: float | None, positions: torch.Tensor) -> float:
     name = "TransducerArray.radius"
     radius = 0.0 if given is None else not_negative(name, given, "m")
-    if radius > 0 and len(positions) > 1:
-        most = float(nearest_other(positions)[0].min()) / 2
+    if radius > 0:
+        most = closest_pair(positions)[0] / 2
         if radius > most + LENGTH_TOLERANCE:
             raise invalid(name, radius, f"must be at most {most:.6g} m, half the distance of neighbours", "m")
     return radius

@@ -21,24 +21,23 @@ def nearest(points: torch.Tensor, others: torch.Tensor) -> tuple[torch.Tensor, t
     return torch.from_numpy(apart), torch.from_numpy(index)
 
 
-def nearest_other(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the distance (P,) [m] of P >= 2 points (P, 3) to their nearest others, and the indices (P,)."""
+def closest_pair(points: torch.Tensor) -> tuple[float, int, int]:
+    """Return the least distance [m] between two of the points (P, 3), inf for one, and their indices."""
     from scipy.spatial import KDTree
 
     places = points.numpy(force=True)
-    apart, index = (torch.from_numpy(found) for found in KDTree(places).query(places, k=2))
-    itself = index[:, 0] == torch.arange(len(points), device="cpu")  # a coincident point may come first
-    return apart[:, 1], torch.where(itself, index[:, 1], index[:, 0])
+    apart, index = KDTree(places).query(places, k=2)
+    first = int(apart[:, 1].argmin())
+    one, other = index[first].tolist()
+    return float(apart[first, 1]), first, other if one == first else one  # a coincident point may come first
 
 
 def require_distinct(name: str, points: torch.Tensor) -> None:
     """Check that no two of the `points` (P, 3) [m] coincide."""
-    if len(points) < 2:
-        return
-    apart, other = nearest_other(points)
-    first = int(apart.argmin())
-    if apart[first] < LENGTH_TOLERANCE:
+    apart, first, other = closest_pair(points)
+    if apart < LENGTH_TOLERANCE:
+        place = tuple(points[first].tolist())
         raise ValueError(
-            f"{name}: points {first} and {int(other[first])} coincide at {tuple(points[first].tolist())} m; "
+            f"{name}: points {first} and {other} coincide at {place} m; "
             f"they must be at least {LENGTH_TOLERANCE:g} m apart"
         )

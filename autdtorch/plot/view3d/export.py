@@ -16,10 +16,15 @@ if TYPE_CHECKING:
 
 _SUFFIXES = (".png", ".html", ".gltf")
 
-_LEGEND = "position: fixed; z-index: 1; left: 16px; top: 16px; display: flex; gap: 32px; "
-_LEGEND += "font: 14px sans-serif"
-_BAR = "width: 200px; height: 14px"
-_ENDS = "display: flex; justify-content: space-between"
+# The viewer takes the element of class "content"; without one it would empty the whole page.
+_LEGEND = """<div class="content"></div>
+<div style="position: fixed; z-index: 1; left: 16px; top: 16px; display: flex; gap: 32px;
+ font: 14px sans-serif">{bars}<div>{caption}</div></div>
+</body>"""
+_BAR = """<div>{title}<div
+ style="width: 200px; height: 14px; background: linear-gradient(to right, {colours})"></div><div
+ style="display: flex; justify-content: space-between"><span>{low:g}</span><span>{high:g}</span></div>
+</div>"""
 _EVERY = 8  # every 8th colour of a table makes the gradient
 
 
@@ -68,21 +73,17 @@ def _write_gltf(plotter: pyvista.Plotter, path: Path) -> None:
 def _write_html(plotter: pyvista.Plotter, path: Path, caption: Sequence[str]) -> None:
     """Write HTML with separate colour bars: the viewer in the page would draw all of them in one place."""
     bars = plotter.scalar_bars
-    legend = "".join(_html_bar(title.strip(), bar.lookup_table) for title, bar in bars.items())
+    drawn = "".join(_html_bar(title.strip(), bar.lookup_table) for title, bar in bars.items())
     for bar in bars.values():
         bar.SetVisibility(False)
     page: str = plotter.trame.export_html(None).getvalue()
     for bar in bars.values():
         bar.SetVisibility(True)
-    lines = "<br>".join(caption)
-    # The viewer takes the element of class "content"; without one it would empty the whole page.
-    legend = f'<div class="content"></div><div style="{_LEGEND}">{legend}<div>{lines}</div></div>'
-    path.write_text(page.replace("</body>", f"{legend}\n</body>"), encoding="utf-8")
+    legend = _LEGEND.format(bars=drawn, caption="<br>".join(caption))
+    path.write_text(page.replace("</body>", legend), encoding="utf-8")
 
 
 def _html_bar(title: str, table: pyvista.LookupTable) -> str:
     low, high = table.scalar_range
     colours = ", ".join("rgb({}, {}, {})".format(*rgba[:3]) for rgba in table.values[::_EVERY])
-    bar = f'<div style="{_BAR}; background: linear-gradient(to right, {colours})"></div>'
-    ends = f'<div style="{_ENDS}"><span>{low:g}</span><span>{high:g}</span></div>'
-    return f"<div>{title}{bar}{ends}</div>"
+    return _BAR.format(title=title, colours=colours, low=low, high=high)

@@ -32,7 +32,10 @@ def rendering_problem() -> str | None:
     else:
         if child.returncode == 0:
             return None
-        cause = _cause_of_death(child)
+        lines = child.stderr.strip().splitlines() or [f"exit status {child.returncode}"]
+        cause = f"a trial rendering failed with {lines[-1].strip()!r}"
+        if child.returncode < 0:
+            cause = f"a trial rendering was killed by {signal.Signals(-child.returncode).name}"
     return (
         f"3D rendering is not available: {cause}. It needs pip install 'autdtorch[viz]' and an OpenGL "
         "driver, on Debian the packages libegl1 libgl1-mesa-dri libosmesa6"
@@ -49,10 +52,3 @@ def require_rendering() -> None:
         raise RuntimeError(problem)
     if importlib.util.find_spec("triton") is not None:
         importlib.import_module("triton")
-
-
-def _cause_of_death(child: subprocess.CompletedProcess[str]) -> str:
-    if child.returncode < 0:
-        return f"a trial rendering was killed by {signal.Signals(-child.returncode).name}"
-    lines = child.stderr.strip().splitlines() or [f"exit status {child.returncode}"]
-    return f"a trial rendering failed with {lines[-1].strip()!r}"
