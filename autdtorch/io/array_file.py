@@ -9,15 +9,14 @@ import numpy as np
 
 from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
 from autdtorch.io.csv_table import read_table
-from autdtorch.scene.arrays import PAPER_SOURCE_STRENGTH, TransducerArray
+from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import device_axes, in_plane
 from autdtorch.utils.numpy_file import read_arrays
-from autdtorch.utils.validation import ArrayLike, invalid, path_of, points_tensor, real_tensor, within
+from autdtorch.utils.validation import ArrayLike, invalid, path_of, within
 
+# Columns of a CSV file with the positions of transducers and the directions of emission, and their units.
 PLACE_COLUMNS = {"x": "m", "y": "m", "z": "m"}
-"""Columns of a CSV file with the positions of transducers, and their units."""
 NORMAL_COLUMNS = {"nx": "", "ny": "", "nz": ""}
-"""Columns with the directions of emission."""
 _IGNORED = {"transducer": "", "phase": "rad", "amplitude": ""}
 
 
@@ -53,14 +52,14 @@ def load_array(
             where it has lines.
     """
     kind = path_of("path", path).suffix.lower()
+    if kind not in (".csv", ".npz", ".pat"):
+        raise invalid("path", str(path), "must end in .csv, .npz or .pat")
     if kind == ".pat":
         file = OpenMPDBoard.load(path).array()
-    elif kind == ".csv":
-        file = _from_csv(path)
-    elif kind == ".npz":
-        file = _from_npz(path)
     else:
-        raise invalid("path", str(path), "must end in .csv, .npz or .pat")
+        parts = _from_csv(path) if kind == ".csv" else _from_npz(path)
+        with within(path):
+            file = TransducerArray(**parts)
     return TransducerArray(
         in_plane(file.positions, center, normal, angle),
         file.normals @ device_axes(normal, angle),
@@ -69,36 +68,19 @@ def load_array(
     )
 
 
-def _from_csv(path: str | os.PathLike[str]) -> TransducerArray:
+def _from_csv(path: str | os.PathLike[str]) -> dict[str, Any]:
     table = read_table(path, PLACE_COLUMNS | NORMAL_COLUMNS | _IGNORED)
-    for wanted in (PLACE_COLUMNS, NORMAL_COLUMNS):
-        missing = [name for name in wanted if name not in table]
-        if missing and (wanted is PLACE_COLUMNS or len(missing) < 3):
-            raise ValueError(f"{path}: no column {', '.join(missing)}; must have {', '.join(wanted)}")
-    positions = np.stack([table[name] for name in PLACE_COLUMNS], axis=1)
-    normals: Any = (0.0, 0.0, 1.0)
-    if "nx" in table:
-        normals = np.stack([table[name] for name in NORMAL_COLUMNS], axis=1)
-    return _built(path, positions, normals)
+    wanted = PLACE_COLUMNS | (NORMAL_COLUMNS if NORMAL_COLUMNS.keys() & table.keys() else {})
+    if missing := [name for name in wanted if name not in table]:
+        raise ValueError(f"{path}: no column {', '.join(missing)}; must have {', '.join(wanted)}")
+    values = np.stack([table[name] for name in wanted], axis=1)
+    return {"positions": values[:, :3], "normals": values[:, 3:] if len(wanted) > 3 else (0.0, 0.0, 1.0)}
 
 
-def _from_npz(path: str | os.PathLike[str]) -> TransducerArray:
+def _from_npz(path: str | os.PathLike[str]) -> dict[str, Any]:
     arrays = read_arrays(path)
     for name in ("positions", "normals"):
         if name not in arrays:
             raise ValueError(f"{path}: no array {name!r}; must have positions and normals")
-    strength = arrays.get("source_strength", np.array(PAPER_SOURCE_STRENGTH))
-    radius = arrays.get("radius", np.array(0.0))
-    return _built(path, arrays["positions"], arrays["normals"], strength, radius)
-
-
-def _built(
-    path: str | os.PathLike[str],
-    positions: ArrayLike,
-    normals: ArrayLike,
-    source_strength: Any = PAPER_SOURCE_STRENGTH,
-    radius: Any = None,
-) -> TransducerArray:
-    with within(path):
-        places, directions = points_tensor("positions", positions), real_tensor("normals", normals)
-        return TransducerArray(places, directions, source_strength, radius)
+    names = ("positions", "normals", "source_strength", "radius")
+    return {name: arrays[name] for name in names if name in arrays}

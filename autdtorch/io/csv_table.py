@@ -8,25 +8,21 @@ import os
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
+from autdtorch.utils.array_types import AnyArray, Array
 from autdtorch.utils.files import replacing
 from autdtorch.utils.validation import require_known
 
-Column: TypeAlias = npt.NDArray[np.float64]
-
-_UNITS: dict[str, dict[str, float]] = {
+_UNITS: dict[str, dict[str, float]] = {  # factors to SI of the accepted units, by SI unit
     "": {"": 1.0},
     "m": {"m": 1.0, "mm": 1e-3},
     "rad": {"rad": 1.0, "deg": math.pi / 180},
 }
-"""Factors to SI of the accepted units, by SI unit."""
 
 
-def read_table(path: str | os.PathLike[str], columns: Mapping[str, str]) -> dict[str, Column]:
+def read_table(path: str | os.PathLike[str], columns: Mapping[str, str]) -> dict[str, Array]:
     """Return the columns (R,) of a table in SI units, by name; empty lines and # comments are skipped.
 
     `columns` has the SI unit of each name that may occur: "m" (or mm in the file), "rad" (or deg), "".
@@ -40,13 +36,19 @@ def read_table(path: str | os.PathLike[str], columns: Mapping[str, str]) -> dict
     names = [name for name, _ in known]
     if len(set(names)) < len(names):
         raise ValueError(f"{path}, line {line}: columns {', '.join(names)}; every name must occur once")
-    table = [_values(f"{path}, line {line}", cells, known) for line, cells in rows]
+    table = []
+    for line, cells in rows:
+        where = f"{path}, line {line}"
+        if len(cells) != len(known):
+            raise ValueError(f"{where}: {len(cells)} cells; must be {len(known)} as in the header")
+        pairs = zip(known, cells, strict=True)
+        table.append([factor * _number(f"{where}, {name}", cell) for (name, factor), cell in pairs])
     if not table:
         raise ValueError(f"{path}: no row under the header; must have at least one")
     return dict(zip(names, np.array(table).T, strict=True))
 
 
-def write_table(path: str | os.PathLike[str], columns: Mapping[str, npt.NDArray[np.generic]]) -> None:
+def write_table(path: str | os.PathLike[str], columns: Mapping[str, AnyArray]) -> None:
     """Write columns (R,) by header, floats with full precision."""
     with replacing(Path(path)) as partial, partial.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -77,14 +79,6 @@ def _column(where: str, cell: str, columns: Mapping[str, str]) -> tuple[str, flo
         accepted = " or ".join(f"{name} [{unit}]" if unit else name for unit in units)
         raise ValueError(f"{where}: column {cell!r}; must be {accepted}")
     return name, units[unit]
-
-
-def _values(where: str, cells: list[str], known: list[tuple[str, float]]) -> list[float]:
-    if len(cells) != len(known):
-        raise ValueError(f"{where}: {len(cells)} cells; must be {len(known)} as in the header")
-    return [
-        factor * _number(f"{where}, {name}", cell) for (name, factor), cell in zip(known, cells, strict=True)
-    ]
 
 
 def _number(where: str, cell: str) -> float:

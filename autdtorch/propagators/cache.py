@@ -16,9 +16,8 @@ import torch
 
 from autdtorch.propagators.plan import Plan
 from autdtorch.utils.array_types import AnyArray, ComplexArray
-from autdtorch.utils.digest import digest_of
+from autdtorch.utils.digest import digest_of, package_versions, source_digest
 from autdtorch.utils.files import replace_file
-from autdtorch.utils.versions import package_versions, source_digest
 
 logger = logging.getLogger(__name__)
 

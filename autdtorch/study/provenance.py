@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import autdtorch
-from autdtorch.utils.digest import digest_of
+from autdtorch.utils.digest import digest_of, package_versions, source_digest
 from autdtorch.utils.files import replace_file
 from autdtorch.utils.json_lines import line_of, row_of
-from autdtorch.utils.versions import package_versions, source_digest
 
 PROVENANCE_FILE = "provenance.json"
 

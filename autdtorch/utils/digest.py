@@ -1,17 +1,22 @@
-"""Digests of values, to name the results computed from them."""
+"""Digests of values, of the package's source and the versions of others: what a result was computed from."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import hashlib
+import importlib.metadata
 import inspect
 import sys
 import uuid
 from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+_PACKAGES = ("torch", "numpy", "scipy", "libigl", "numba", "triton")  # triton is optional
 
 
 def digest_of(*parts: object) -> str:
@@ -24,6 +29,26 @@ def digest_of(*parts: object) -> str:
     for part in parts:
         _add(digest, part)
     return digest.hexdigest()
+
+
+@lru_cache(maxsize=1)
+def source_digest() -> str:
+    """Return the SHA-256 of the package's source, which changes with any edit."""
+    package = Path(__file__).parents[1]
+    digest = hashlib.sha256()
+    for source in sorted(package.rglob("*.py")):
+        digest.update(f"{source.relative_to(package).as_posix()}\n".encode())
+        digest.update(source.read_bytes())
+    return digest.hexdigest()
+
+
+def package_versions() -> dict[str, str]:
+    """Return the versions of the numerical packages that are installed."""
+    versions = {}
+    for package in _PACKAGES:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            versions[package] = importlib.metadata.version(package)
+    return versions
 
 
 def _add(digest: Any, part: Any) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import time
 import uuid
 from collections.abc import Iterator
@@ -12,13 +11,10 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-PARTIAL = ".partial"
-"""Suffix of a file that is being written."""
-
-ABANDONED = 3600.0
-"""Age [s] after which the partial file of a killed writer is removed; writing takes seconds."""
-
-_PARTIAL_NAME = re.compile(rf".+\.[0-9a-f]{{32}}{re.escape(PARTIAL)}")
+PARTIAL = ".partial"  # suffix of a file that is being written
+ABANDONED = (
+    3600.0  # age [s] after which a killed writer's partial file is removed; writing takes seconds
+)
 
 
 @contextlib.contextmanager
@@ -59,11 +55,10 @@ def replace_file(path: Path, content: bytes) -> None:
 
 
 def _remove_abandoned(folder: Path) -> None:
-    for path in folder.glob(f"*{PARTIAL}"):
-        if _PARTIAL_NAME.fullmatch(path.name):
-            with contextlib.suppress(OSError):  # another process removes it too, or another user owns it
-                if time.time() - path.lstat().st_mtime > ABANDONED:
-                    path.unlink()
+    for path in folder.glob(f"?*.{'[0-9a-f]' * 32}{PARTIAL}"):
+        with contextlib.suppress(OSError):  # another process removes it too, or another user owns it
+            if time.time() - path.lstat().st_mtime > ABANDONED:
+                path.unlink()
 
 
 @contextlib.contextmanager

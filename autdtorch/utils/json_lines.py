@@ -34,7 +34,8 @@ def row_of(line: bytes, key: str = "") -> dict[str, Any]:
     """Return the row of a line made by `line_of`; nothing is parsed before the checksum is verified."""
     if not _is_whole(line, key):
         raise ValueError(_WRONG_CHECKSUM)
-    return _row(line)
+    row: dict[str, Any] = json.loads(line[:-_END] + b"}")
+    return row
 
 
 class JsonLines:
@@ -60,13 +61,14 @@ class JsonLines:
         good: list[bytes] = []
         self._refused: list[tuple[int, bytes, str]] = []
         for number, line in enumerate(lines, first):
-            reason = _WRONG_CHECKSUM if number < first + len(lines) - 1 else _BROKE_OFF
-            for whole, part in _parts(line, key):
-                refusal = _refusal(use, part) if whole else reason
-                if refusal is None:
+            for part in _parts(line, key):
+                try:
+                    use(row_of(part, key))
                     good.append(part)
-                else:
-                    self._refused.append((number, part, refusal))
+                except _DAMAGE as error:
+                    reason = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+                    broke_off = reason == _WRONG_CHECKSUM and number == first + len(lines) - 1
+                    self._refused.append((number, part, _BROKE_OFF if broke_off else reason))
         self.used = len(good)
         self._path, self._key = path, key
         mended = head + b"".join(line + b"\n" for line in good)
@@ -112,31 +114,15 @@ class JsonLines:
         logger.warning("%s, line %d%s: set aside in %s: %s", self._path, numbers[0], more, path, reasons)
 
 
-def _parts(line: bytes, key: str) -> Iterator[tuple[bool, bytes]]:
-    """Yield whole rows (True) and the text between them (False) of a line in which newlines were lost."""
+def _parts(line: bytes, key: str) -> Iterator[bytes]:
+    """Yield whole rows and the text between them of a line in which newlines were lost."""
     if _is_whole(line, key):
-        yield True, line
+        yield line
         return
     pieces = filter(None, _SEAM.split(line))
     for are_whole, alike in itertools.groupby(pieces, lambda piece: _is_whole(piece, key)):
         for part in alike if are_whole else (b"".join(alike),):
-            yield are_whole, part
-
-
-def _refusal(use: Callable[[dict[str, Any]], None], whole: bytes) -> str | None:
-    """Pass a row to its reader; return the reason of a refusal, or None."""
-    try:
-        use(_row(whole))
-    except KeyError as error:
-        return f"it has no {error}"
-    except _DAMAGE as error:
-        return str(error)
-    return None
-
-
-def _row(whole: bytes) -> dict[str, Any]:
-    row: dict[str, Any] = json.loads(whole[:-_END] + b"}")
-    return row
+            yield part
 
 
 def _is_whole(line: bytes, key: str) -> bool:

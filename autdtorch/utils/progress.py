@@ -44,23 +44,20 @@ class Progress:
     def advance(self, steps: int) -> None:
         """Count finished steps; any thread may call it."""
         with self._lock:
-            self._advance(steps)
-
-    def _advance(self, steps: int) -> None:
-        self._done += steps
-        if self._bar is not None:
-            self._bar.total = max(self._bar.total, self._done)
-            self._bar.update(steps)
-            return
-        now = time.monotonic()
-        if self._first is None:  # the time before may include compiling kernels
-            self._first = now, self._done
-        begun, done = self._first
-        spent = now - self._begun
-        if spent >= self._next and done < self._done < self._steps:
-            left = (now - begun) * (self._steps - self._done) / (self._done - done)
-            logger.info("%s: %.0f s so far, about %.0f s left", self._what, spent, left)
-            self._next = 4 * spent  # ever fewer lines
+            self._done += steps
+            if self._bar is not None:
+                self._bar.total = max(self._bar.total, self._done)
+                self._bar.update(steps)
+                return
+            now = time.monotonic()
+            if self._first is None:  # the time before may include compiling kernels
+                self._first = now, self._done
+            begun, done = self._first
+            spent = now - self._begun
+            if spent >= self._next and done < self._done < self._steps:
+                left = (now - begun) * (self._steps - self._done) / (self._done - done)
+                logger.info("%s: %.0f s so far, about %.0f s left", self._what, spent, left)
+                self._next = 4 * spent  # ever fewer lines
 
 
 @contextlib.contextmanager

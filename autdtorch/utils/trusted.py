@@ -10,7 +10,7 @@ import importlib
 import os
 import sys
 from collections.abc import Callable, Collection
-from types import FunctionType, ModuleType
+from types import FunctionType
 from typing import Any
 
 TARGET = "_target_"
@@ -28,18 +28,14 @@ def load_trusted(where: str, target: object, modules: Collection[Any], ours: str
         raise ValueError(f"{where}: {target!r}; must be {f'one of {ours}, or ' if ours else ''}{accepted}")
     if not all(map(str.isidentifier, [*module.split("."), name])):
         raise ValueError(f"{where}: {target!r}; must be a module and a name in it, as in package.module.name")
-    found = getattr(_imported(where, target, module), name, None)
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # searched for the user's modules, after the installed packages
+    try:
+        found = getattr(importlib.import_module(module), name, None)
+    except (Exception, SystemExit) as error:  # the user's module may raise anything
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise ValueError(f"{where}: {target!r}; {module} cannot be imported ({reason})") from error
     # What the module merely imports is not trusted.
     if not isinstance(found, FunctionType | type) or not f"{found.__module__}.".startswith(f"{module}."):
         raise ValueError(f"{where}: {target!r}; must be a function or class that {module} defines")
     return found
-
-
-def _imported(where: str, target: object, module: str) -> ModuleType:
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())  # searched for the user's modules, after the installed packages
-    try:
-        return importlib.import_module(module)
-    except (Exception, SystemExit) as error:  # the user's module may raise anything
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        raise ValueError(f"{where}: {target!r}; {module} cannot be imported ({reason})") from error
