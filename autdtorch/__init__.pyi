@@ -20,9 +20,8 @@ from .objectives.metrics import FocusMetrics, focus_metrics
 from .objectives.objective import Objective, weakest_focus
 from .objectives.perturbations import Drift, FailedTransducers, Noise, Quantised, true_pressure
 from .objectives.simulated import SimulatedObjective
-from .plot.pareto import plot_pareto
+from .plot.costs import plot_pareto, plot_scaling
 from .plot.pressure_maps import plot_plane, plot_planes
-from .plot.scaling import plot_scaling
 from .plot.scene_figure import plot_scene
 from .plot.trials import plot_convergence, plot_trials
 from .plot.view3d import animate3d, view3d

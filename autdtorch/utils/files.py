@@ -12,9 +12,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 PARTIAL = ".partial"  # suffix of a file that is being written
-ABANDONED = (
-    3600.0  # age [s] after which a killed writer's partial file is removed; writing takes seconds
-)
+ABANDONED = 3600.0  # age [s] after which a killed writer's partial file is removed; writing takes seconds
 
 
 @contextlib.contextmanager

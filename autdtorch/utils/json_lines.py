@@ -121,8 +121,10 @@ def _parts(line: bytes, key: str) -> Iterator[bytes]:
         return
     pieces = filter(None, _SEAM.split(line))
     for are_whole, alike in itertools.groupby(pieces, lambda piece: _is_whole(piece, key)):
-        for part in alike if are_whole else (b"".join(alike),):
-            yield part
+        if are_whole:
+            yield from alike
+        else:
+            yield b"".join(alike)
 
 
 def _is_whole(line: bytes, key: str) -> bool:

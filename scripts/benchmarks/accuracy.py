@@ -28,7 +28,7 @@ from shared.document import command_line, fill_in, measured, percent, table
 from shared.scenes import relative_error
 
 import autdtorch as at
-from autdtorch.plot.pareto import plot_pareto
+from autdtorch.plot.costs import plot_pareto
 from autdtorch.plot.style import TICK_SIZE, readable
 
 DOCUMENT = "benchmarks.md"

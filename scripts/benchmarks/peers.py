@@ -33,7 +33,7 @@ from shared.cases import Case, cube_case, free_space_case, simulate, sphere_case
 from shared.document import command_line, fill_in, measured, percent, table
 from shared.scenes import relative_error
 
-from autdtorch.plot.pareto import plot_pareto
+from autdtorch.plot.costs import plot_pareto
 from autdtorch.plot.style import TICK_SIZE
 
 DOCUMENT = "peers.md"

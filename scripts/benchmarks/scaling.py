@@ -23,7 +23,7 @@ from shared.processes import in_new_process, peak_memory
 from shared.scenes import MIDDLE, autd3_array, paper_scene, uncached, with_array
 
 import autdtorch as at
-from autdtorch.plot.scaling import FEWEST, fit_power, plot_scaling
+from autdtorch.plot.costs import FEWEST, fit_power, plot_scaling
 from autdtorch.plot.style import TICK_SIZE
 
 DOCUMENT = "performance.md"

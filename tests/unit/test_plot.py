@@ -17,9 +17,8 @@ from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from small_scenes import scene_of_all_kinds, small_scene
 
 import autdtorch as at
-from autdtorch.plot.pareto import plot_pareto
+from autdtorch.plot.costs import plot_pareto, plot_scaling
 from autdtorch.plot.pressure_maps import plot_plane, plot_planes
-from autdtorch.plot.scaling import plot_scaling
 from autdtorch.plot.scene_figure import clipped, plot_scene
 from autdtorch.plot.style import looks_of
 from autdtorch.plot.trials import plot_convergence, plot_trials

@@ -5,7 +5,7 @@ import torch
 from benchmarks.scaling import foci
 from shared.scenes import autd3_array, with_array
 
-from autdtorch.plot.scaling import fit_power
+from autdtorch.plot.costs import fit_power
 
 SIZES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from autdtorch.methods.catalogue import label_of
-from autdtorch.plot.pareto import plot_pareto
+from autdtorch.plot.costs import plot_pareto
 from autdtorch.plot.pressure_maps import plot_planes
 from autdtorch.plot.scene_figure import plot_scene
 from autdtorch.plot.trials import plot_convergence, plot_trials
