@@ -1,17 +1,18 @@
-"""The bench of a hardware trial, from the section `hardware` of a config: device and sensor."""
+"""The bench of a hardware trial, from the section `hardware` of a config: device, sensor and limits."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from autdtorch import hardware
+from autdtorch.cli.settings import section_of
 from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
-from autdtorch.hardware.played import Wiring
 from autdtorch.hardware.sensors.by_hand import typed
 from autdtorch.objectives.perturbations import random_rms
 from autdtorch.objectives.simulated import SimulatedObjective
@@ -20,6 +21,7 @@ from autdtorch.utils.digest import digest_of
 from autdtorch.utils.validation import (
     boolean,
     finite_number,
+    indices,
     integer_at_least,
     invalid,
     require_known,
@@ -28,7 +30,6 @@ from autdtorch.utils.validation import (
 
 _MAKERS = {"keysight": hardware.KEYSIGHT, "rigol": hardware.RIGOL}
 _EMULATED_SCOPE = "2a8d:1770"
-_MOST_TRANSDUCERS = 100_000  # in a range; a slip of the finger must not fill the memory
 
 _SENSORS = {
     "emulated": ("kind", "snr"),
@@ -52,27 +53,39 @@ class Bench:
 
     def __init__(self, section: Mapping[str, Any], scene: Scene, seed: int) -> None:
         """Check the section `hardware` of a config; `seed` is the seed of emulated noise."""
-        require_known("hardware", section, _KEYS)
+        _require_keys("hardware", section, _KEYS)
         require_one_of("hardware.device", section["device"], hardware.DEVICES)
         self._section, self._scene, self._seed = section, scene, seed
+        limits = section_of(section, "limits")
+        _require_keys("hardware.limits", limits, [field.name for field in fields(hardware.Limits)])
+        self.limits = hardware.Limits(**limits)
+        self.is_dry = boolean("hardware.dry_run", section["dry_run"])  # frames are printed, nothing is opened
         self._emulated = boolean("hardware.emulated", section["emulated"]) or self.is_dry
-        self._sensor = _sensor_section(section["sensor"], self._emulated, self.is_dry)
+        self._sensor: dict[str, Any] = (
+            {"kind": "emulated", "snr": None} if self.is_dry else section_of(section, "sensor")
+        )
+        _require_sensor(self._sensor, self._emulated)
         _require_fit(section, self._emulated)
         self._boards = _openmpd_boards(section)
-        self.device = self._device()
+        self.device = hardware.openmpd_boards(self._boards) if self._boards else _device(section)
         self.transducers = self._wired(len(scene.array))
-        self._failed = indices_of("hardware.failed", section["failed"] or [])
-        if max(self._failed, default=0) >= len(scene.array):
-            accepted = f"must be 0 to {len(scene.array) - 1}, as the scene has them"
-            raise invalid("hardware.failed", max(self._failed), accepted)
+        failed = section["failed"]
+        self._failed = indices_of("hardware.failed", failed, len(scene.array)) if failed else []
         self.by_hand = self._sensor["kind"] == "manual" or bool(self._sensor.get("moved"))
-        self.settings = self._settings()
         self._bench: hardware.EmulatedBench | None = None
 
     @property
-    def is_dry(self) -> bool:
-        """True when frames are printed and no device is opened."""
-        return boolean("hardware.dry_run", self._section["dry_run"])
+    def settings(self) -> dict[str, Any]:
+        """Settings that identify the trial beside its device."""
+        settings: dict[str, Any] = {"sensor": self._sensor["kind"]}
+        if self._sensor["kind"] == "scope":
+            settings["sensitivity [V/Pa]"] = self._sensor["sensitivity"]
+            settings["captures"] = self._sensor["captures"]
+        if self._emulated:
+            settings |= {"emulated": True, "snr [dB]": self._sensor.get("snr"), "failed": self._failed}
+        if self._boards:
+            settings["boards"] = [f"{board.name} {digest_of(board)[:16]}" for board in self._boards]
+        return settings
 
     def emulate(self, simulated: SimulatedObjective) -> None:
         """Make the emulated bench, if there is one, with the transfer matrix of a simulated objective."""
@@ -83,18 +96,17 @@ class Bench:
     def link(self) -> hardware.Link:
         """Open the link to the device or its emulator."""
         section, settle, bench = self._section, self._section["settle"], self._bench
-        on_network = section["device"] == "autd3"
+        boards, on_network = self.device.boards, section["device"] == "autd3"
+        if bench is None and on_network:
+            return hardware.open_autd3(boards, self.transducers, _network(section["network"]), settle)
         if bench is None:
-            if on_network:
-                network = _network(section["network"])
-                return hardware.open_autd3(self._board_count(), self.transducers, network, settle)
             serial, port = (None if section[key] is None else str(section[key]) for key in ("serial", "port"))
             return hardware.open_link(self.device, self.transducers, serial, settle=settle, port=port)
         if not (self.is_dry or on_network):
             return hardware.open_link(self.device, self.transducers, backend=bench.bus, settle=settle)
         from autdtorch.hardware.emulator.bench import DryPort, EmulatedAutd3Port  # needs pyusb
 
-        opened = DryPort(bench, print) if self.is_dry else EmulatedAutd3Port(self._board_count(), bench)
+        opened = DryPort(bench, print) if self.is_dry else EmulatedAutd3Port(boards, bench)
         return hardware.Link(self.device, opened, self.transducers, settle, bench.bus.sleep)
 
     @contextlib.contextmanager
@@ -116,47 +128,26 @@ class Bench:
                     sensor = hardware.ScopeSensor(scope, self._scene.frequency, heads, given["captures"])
                     yield hardware.MovedMicrophone(sensor, points, _ask) if given["moved"] else sensor
 
-    def _settings(self) -> dict[str, Any]:
-        settings: dict[str, Any] = {"sensor": self._sensor["kind"]}
-        if self._sensor["kind"] == "scope":
-            settings["sensitivity [V/Pa]"] = self._sensor["sensitivity"]
-            settings["captures"] = self._sensor["captures"]
-        if self._emulated:
-            settings |= {"emulated": True, "snr [dB]": self._sensor.get("snr"), "failed": self._failed}
-        if self._boards:
-            settings["boards"] = [f"{board.name} {digest_of(board)[:16]}" for board in self._boards]
-        return settings
-
-    def _device(self) -> hardware.Device:
-        if self._boards:
-            return hardware.openmpd_boards(self._boards)
-        return hardware.DEVICES[self._section["device"]].with_boards(self._board_count())
-
-    def _board_count(self) -> int:
-        boards = self._section["boards"]
-        if self._boards:
-            return len(self._boards)
-        return 1 if boards is None else integer_at_least("hardware.boards", boards, 1)
-
     def _wired(self, count: int) -> list[int]:
         """Return the device's transducers for the scene's `count`."""
-        field, given = "hardware.transducers", self._section["transducers"]
-        if count > self.device.transducers:
-            accepted = f"must be at most {self.device.transducers}, as {self.device.name} has"
+        field, given, most = "hardware.transducers", self._section["transducers"], self.device.transducers
+        if count > most:
+            accepted = f"must be at most {most}, as {self.device.name} has"
             raise invalid("scene", f"{count} transducers", accepted)
-        if given is None and not self._section["emulated"] and count != self.device.transducers:
-            most = f"{self.device.transducers} transducers of {self.device.name}"
-            raise invalid(field, None, f"must say which {count} of the {most} the scene's are")
-        chosen = list(range(count)) if given is None else indices_of(field, given)
+        if given is None and not self._section["emulated"] and count != most:
+            accepted = (
+                f"must say which {count} of the {most} transducers of {self.device.name} the scene's are"
+            )
+            raise invalid(field, None, accepted)
+        chosen = list(range(count)) if given is None else indices_of(field, given, most)
         if len(chosen) != count:
             raise invalid(field, f"{len(chosen)} transducers", f"must be {count}, as many as the scene has")
-        wired: list[int] = Wiring(self.device, chosen).transducers.tolist()
-        return wired
+        return chosen
 
     def _scope(self) -> hardware.Oscilloscope:
         given = self._sensor
         dialect = _MAKERS[given["maker"]]
-        chip = chip_of("hardware.sensor.chip", given["chip"] or _EMULATED_SCOPE)
+        chip = _chip(given["chip"] or _EMULATED_SCOPE)
         if self._bench is None:
             return hardware.open_scope(chip, dialect)
         snr = given["snr"]
@@ -174,60 +165,48 @@ class Bench:
         return hardware.open_scope(chip, dialect, backend=self._bench.bus)
 
 
-def indices_of(field: str, value: object) -> list[int]:
-    """Return indices from a list, or from text such as "3,7-9"."""
-    if isinstance(value, list | tuple):
-        return [integer_at_least(f"{field}[{place}]", entry, 0) for place, entry in enumerate(value)]
-    try:
-        parts = [part.partition("-") for part in str(value).split(",")]
-        ranges = [range(int(low), int(high or low) + 1) for low, _, high in parts]
-    except ValueError:
-        ranges = []
-    if not ranges or not all(ranges) or sum(map(len, ranges)) > _MOST_TRANSDUCERS:
-        accepted = f"must be at most {_MOST_TRANSDUCERS} numbers, and ranges that go up, as 3,7-9"
-        raise invalid(field, value, accepted)
-    return [one for some in ranges for one in some]
+def indices_of(field: str, value: object, count: int) -> list[int]:
+    """Return indices below `count`, each once, from a list or from text such as "3,7-9"."""
+    if not isinstance(value, list):
+        try:
+            parts = [part.partition("-") for part in str(value).split(",")]
+            ranges = [range(int(low), int(high or low) + 1) for low, _, high in parts]
+        except ValueError:
+            ranges = []
+        if not ranges or not all(ranges) or sum(map(len, ranges)) > count:
+            accepted = f"must be numbers from 0 to {count - 1}, each once, and ranges that go up, as 3,7-9"
+            raise invalid(field, value, accepted)
+        value = [one for some in ranges for one in some]
+    return indices(field, value, count)
 
 
-def chip_of(field: str, text: object) -> tuple[int, int]:
-    """Return idVendor and idProduct of text such as "2a8d:1770", as lsusb shows them."""
-    try:
-        vendor, product = (int(part, 16) for part in str(text).split(":"))
-    except ValueError as error:
-        raise invalid(field, text, "must be VID:PID, as 2a8d:1770") from error
-    if not (0 <= vendor < 2**16 and 0 <= product < 2**16):
-        raise invalid(field, text, "must be VID:PID with four digits each, as 2a8d:1770")
-    return vendor, product
+def _require_keys(where: str, section: Mapping[str, Any], keys: Collection[str]) -> None:
+    require_known(where, section, keys)
+    if missing := [key for key in keys if key not in section]:
+        accepted = "must be there, as by `defaults: [base, sensor: scope, _self_]`"
+        raise ValueError(f"{where}: no {', '.join(missing)}; {accepted}")
 
 
-def _sensor_section(section: object, emulated: bool, dry: bool) -> Mapping[str, Any]:
-    """Check and return the section of the sensor; a dry run has an emulated one."""
-    if dry:
-        return {"kind": "emulated", "snr": None}
-    if not isinstance(section, Mapping):
-        raise invalid("hardware.sensor", section, f"must be one of {', '.join(_SENSORS)}")
+def _require_sensor(section: Mapping[str, Any], emulated: bool) -> None:
     kind = section.get("kind")
     require_one_of("hardware.sensor.kind", kind, _SENSORS)
-    require_known("hardware.sensor", section, _SENSORS[str(kind)])
+    _require_keys("hardware.sensor", section, _SENSORS[str(kind)])
     if kind == "emulated" and not emulated:
         raise invalid("hardware.sensor", kind, "must be scope, file or manual on a real device")
     if section.get("snr") is not None:
         if not emulated:
             raise invalid("hardware.sensor.snr", section["snr"], "must be null: it is for an emulated device")
         finite_number("hardware.sensor.snr", section["snr"])
-    if kind == "file" and section.get("path") is None:
+    if kind == "file" and section["path"] is None:
         raise invalid("hardware.sensor.path", None, "must be the file that holds the readings")
     if kind == "scope":
         require_one_of("hardware.sensor.maker", section["maker"], _MAKERS)
         boolean("hardware.sensor.moved", section["moved"])
         if not emulated and section["chip"] is None:
-            accepted = (
-                "must be the oscilloscope's VID:PID, as lsusb shows it; or hardware/sensor=file or manual"
-            )
-            raise invalid("hardware.sensor.chip", None, accepted)
+            accepted = "the oscilloscope's VID:PID, as lsusb shows it; or hardware/sensor=file or manual"
+            raise invalid("hardware.sensor.chip", None, f"must be {accepted}")
         if emulated and section["moved"]:
             raise invalid("hardware.sensor.moved", True, "must be false: it is for a real device")
-    return section
 
 
 def _require_fit(section: Mapping[str, Any], emulated: bool) -> None:
@@ -243,6 +222,11 @@ def _require_fit(section: Mapping[str, Any], emulated: bool) -> None:
     for key, (fit, bench) in fits.items():
         if section[key] not in (None, []) and not fit:
             raise invalid(f"hardware.{key}", section[key], f"must be null: it is for {bench}")
+
+
+def _device(section: Mapping[str, Any]) -> hardware.Device:
+    boards = 1 if section["boards"] is None else section["boards"]
+    return hardware.DEVICES[section["device"]].with_boards(integer_at_least("hardware.boards", boards, 1))
 
 
 def _openmpd_boards(section: Mapping[str, Any]) -> list[OpenMPDBoard]:
@@ -271,6 +255,18 @@ def _deviating(
     pins = [each * number + pin for number, board in enumerate(boards) for pin in board.pins]
     places = torch.tensor(pins, dtype=torch.int64, device="cpu")[wired]
     return torch.where(corrections == 0, 0, matrix / corrections), places
+
+
+def _chip(text: object) -> tuple[int, int]:
+    """Return idVendor and idProduct of text such as "2a8d:1770", as lsusb shows them."""
+    try:
+        vendor, product = (int(part, 16) for part in str(text).split(":"))
+    except ValueError:
+        vendor = product = -1
+    if not (0 <= vendor < 2**16 and 0 <= product < 2**16):
+        accepted = "must be VID:PID with four digits each, as 2a8d:1770"
+        raise invalid("hardware.sensor.chip", text, accepted)
+    return vendor, product
 
 
 def _network(network: object) -> Any:

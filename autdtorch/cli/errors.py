@@ -12,6 +12,8 @@ from typing import NoReturn
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf.errors import OmegaConfBaseException
 
+from autdtorch import hardware
+
 FULL_ERROR = "HYDRA_FULL_ERROR"
 """Environment variable that asks for tracebacks."""
 
@@ -40,7 +42,7 @@ def stop(error: BaseException) -> NoReturn:
     print(f"autdtorch: {in_one_line(error)}", file=sys.stderr)
     if isinstance(error, KeyboardInterrupt):
         sys.exit(128 + getattr(error, "number", signal.SIGINT))  # as a shell reports it
-    sys.exit(_LIMITED if _is_limit(error) else _REFUSED if _is_refusal(error) else _FAILED)
+    sys.exit(_REFUSED if _is_refusal(error) else _LIMITED if _is_limit(error) else _FAILED)
 
 
 def in_one_line(error: BaseException) -> str:
@@ -49,7 +51,7 @@ def in_one_line(error: BaseException) -> str:
 
 
 def _is_limit(error: BaseException) -> bool:
-    return type(error).__name__ == "LimitError"  # of the hardware, which a study does not import
+    return isinstance(error, hardware.LimitError)  # imported when it is asked for
 
 
 def _is_refusal(error: BaseException) -> bool:

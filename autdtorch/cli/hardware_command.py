@@ -8,7 +8,6 @@ import shlex
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -17,8 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 
 from autdtorch import hardware
 from autdtorch.cli.bench_config import Bench
-from autdtorch.cli.method_section import load_method
-from autdtorch.cli.settings import folder_of, is_given, scene_of, section_of, solver_of
+from autdtorch.cli.settings import folder_of, is_given, load_method, scene_of, section_of, solver_of
 from autdtorch.hardware.sensors.sensor import checked_reading
 from autdtorch.io.drive_file import save_drive
 from autdtorch.methods.solution import Solution
@@ -27,7 +25,6 @@ from autdtorch.propagators import make_propagator
 from autdtorch.study.report.hardware_report import write_hardware_report
 from autdtorch.study.run import name_of, solve
 from autdtorch.utils.progress import Progress, show_progress
-from autdtorch.utils.validation import require_known
 
 logger = logging.getLogger(__name__)
 
@@ -72,13 +69,9 @@ class _Trial:
         if "scenes" in settings:
             raise ValueError("hardware: given beside an experiment; must be one scene and one method")
         seed = settings.get("seed", 0)
-        section = section_of(settings, "hardware")
         self._scene = scene_of("scene", section_of(settings, "scene"), modules)
         self._method = load_method("method", section_of(settings, "method"), modules)
-        limits = section_of(section, "limits")
-        require_known("hardware.limits", limits, [field.name for field in fields(hardware.Limits)])
-        self._limits = hardware.Limits(**limits)
-        self._bench = Bench(section, self._scene, seed)
+        self._bench = bench = Bench(section_of(settings, "hardware"), self._scene, seed)
         self._seed = seed
         choices = HydraConfig.get().runtime.choices
         usual = Path("outputs") / f"hardware_{choices['scene']}_{choices['method']}"
@@ -87,13 +80,12 @@ class _Trial:
             "method": name_of(self._method),
             "method settings": settings["method"],
             "seed": seed,
-            **self._bench.settings,
+            **bench.settings,
         }
         self.begun = False
         simulated = SimulatedObjective(self._scene, make_propagator(self._scene, **solver_of(settings)))
-        self._bench.emulate(simulated)
-        bench = self._bench
-        self._simulated = hardware.Played(simulated, bench.device, bench.transducers, self._limits.amplitude)
+        bench.emulate(simulated)
+        self._simulated = hardware.Played(simulated, bench.device, bench.transducers, bench.limits.amplitude)
         self._settings["largest amplitude"] = round(self._simulated.largest, 4)
         self._expected = solve(self._method, self._simulated, [0], seed)
 
@@ -125,7 +117,7 @@ class _Trial:
             show_progress(self._expected.history.shape[1]) as progress,
             contextlib.ExitStack() as at_the_end,
         ):
-            limited = hardware.LimitedLink(link, self._limits)
+            limited = hardware.LimitedLink(link, bench.limits)
             objective = hardware.HardwareObjective(
                 self._scene, limited, sensor, log, self._settings, _watcher(progress)
             )
