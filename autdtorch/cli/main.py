@@ -22,11 +22,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 import autdtorch
-from autdtorch.cli.collect_command import collect
 from autdtorch.cli.config_files import CONFIGS, register
 from autdtorch.cli.errors import AGAIN, FULL_ERROR, FailedJob, in_one_line, stop
-from autdtorch.cli.settings import settings_of
-from autdtorch.cli.study_command import study
 
 logger = logging.getLogger(__name__)
 
@@ -60,6 +57,8 @@ def main() -> None:
     error: BaseException
     try:
         if sys.argv[1:2] == ["collect"]:
+            from autdtorch.cli.study_command import collect
+
             collect(sys.argv[2:])
         elif sys.argv[1:] == ["--version"]:
             print(f"autdtorch {autdtorch.__version__}")
@@ -105,8 +104,12 @@ def _run(config: DictConfig) -> None:
 
 def _job(config: DictConfig, sweep: Path | None) -> None:
     """Run a study, or a hardware trial if there is a section `hardware`."""
+    from autdtorch.cli.settings import settings_of
+
     settings, modules, output = settings_of(config)
     if settings.get("hardware") is None:
+        from autdtorch.cli.study_command import study
+
         settings.pop("hardware", None)
         study(settings, modules, output, sweep)
         return

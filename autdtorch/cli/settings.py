@@ -1,24 +1,30 @@
-"""The settings of a job as Hydra composed them: sections, scenes, solver, folders."""
+"""The settings of a job as Hydra composed them: sections, scene, method, solver, folders."""
 
 from __future__ import annotations
 
+import functools
+import inspect
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from autdtorch.io.scene_file import load_scene
 from autdtorch.io.yaml_file import plain
-from autdtorch.utils.trusted import TARGET
+from autdtorch.methods.base import Method
+from autdtorch.methods.catalogue import METHODS
+from autdtorch.propagators import make_propagator
+from autdtorch.scene.scene import Scene
+from autdtorch.study.run import StudyMethod, require_method
+from autdtorch.utils.trusted import TARGET, load_trusted
 from autdtorch.utils.validation import require_known
-
-if TYPE_CHECKING:
-    from autdtorch.scene.scene import Scene
 
 _SETTINGS = ("scene", "method", "scenes", "methods", "hardware", "solver", "trials", "seed", "plane_spacing")
 _PLACES = ("modules", "output")  # settings that change no result
+_NOT_OF_METHODS = ("objective", "trials", "seed", "score")  # the first three are the study's to give
 _CALLS = (TARGET, "_args_", "_convert_", "_partial_", "_recursive_")  # keys by which Hydra calls functions
 _TARGETS = re.compile(rf"(method|methods\.[^.]+|(scene|scenes\.[^.]+)\.obstacles\.\d+)\.{TARGET}")
 
@@ -44,21 +50,54 @@ def section_of(settings: Mapping[str, Any], key: str) -> dict[str, Any]:
 
 def scene_of(where: str, section: Mapping[str, Any], modules: list[Any]) -> Scene:
     """Build the scene of a section named `where`; `modules` may define obstacles of one's own."""
-    from autdtorch.io.scene_file import load_scene
-
     try:
         return load_scene(section, modules)
     except ValueError as error:
         raise ValueError(f"{where}: {str(error).removeprefix('scene mapping: ')}") from error
 
 
+def load_method(where: str, section: Mapping[str, Any], modules: Collection[Any]) -> StudyMethod:
+    """Make the method that a section names by `_target_`, with the section's settings.
+
+    A config file may have written the section. It can name the methods of autdtorch, and the functions and
+    subclasses of `Method` of the trusted `modules`.
+    """
+    if TARGET not in section:
+        raise ValueError(f"{where}: no _target_; must name a method such as autdtorch.gabs")
+    target = _target(f"{where}.{TARGET}", section[TARGET], modules)
+    settings = {key: value for key, value in section.items() if key != TARGET}
+    require_known(where, settings, _parameters(target, but=_NOT_OF_METHODS))
+    if not isinstance(target, type):
+        method = functools.partial(target, **settings)
+        require_method(where, method, section[TARGET])
+        return method
+    try:
+        made: Method = target(**settings)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{where}: {error}") from error
+    return made
+
+
+def _target(where: str, target: object, modules: Collection[Any]) -> Callable[..., Any]:
+    """Return the class of a method, or a function of one's own."""
+    module, _, name = str(target).rpartition(".")
+    ours = METHODS | {method.__name__: method for method in METHODS.values()}
+    if module == "autdtorch" and name in ours:
+        return ours[name]
+    found = load_trusted(where, target, modules, ", ".join(f"autdtorch.{method}" for method in METHODS))
+    if isinstance(found, type) and not issubclass(found, Method):
+        raise ValueError(f"{where}: {target!r}; must be a function or a subclass of autdtorch.Method")
+    return found
+
+
+def _parameters(function: Callable[..., Any], but: tuple[str, ...]) -> list[str]:
+    return [name for name in inspect.signature(function).parameters if name not in but]
+
+
 def solver_of(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments of `make_propagator`."""
-    from autdtorch.cli.method_section import parameters
-    from autdtorch.propagators import make_propagator
-
     solver = section_of(settings, "solver")
-    require_known("solver", solver, parameters(make_propagator, but=("scene",)))
+    require_known("solver", solver, _parameters(make_propagator, but=("scene",)))
     if isinstance(cache := solver.get("cache"), str):
         solver["cache"] = folder_of("solver.cache", cache)
     return solver

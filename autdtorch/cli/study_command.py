@@ -1,35 +1,34 @@
-"""A study, or one run of it: settings in, results in a folder, a table on stdout."""
+"""Studies: one run or an experiment, with a table on stdout, and `collect`, which merges several."""
 
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import shlex
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
-from autdtorch.cli.settings import folder_of, is_given, scene_of, section_of, solver_of
+from autdtorch.cli.settings import folder_of, is_given, load_method, scene_of, section_of, solver_of
+from autdtorch.propagators import CACHE_VARIABLE
+from autdtorch.scene.scene import Scene
+from autdtorch.study.results import StudyResult, summary_rows
+from autdtorch.study.run import StudyMethod, name_of, run_study
 
-if TYPE_CHECKING:
-    from autdtorch.scene.scene import Scene
-    from autdtorch.study.results import StudyResult
-    from autdtorch.study.run import StudyMethod
+_HELP = """autdtorch collect FOLDER [modules=NAME]
 
-    _Parts: TypeAlias = tuple[dict[str, Scene], dict[str, StudyMethod]]
-
-PLANE_FILE = "plane.png"
+Merges the finished studies in a folder and below it, such as those of a sweep in multirun, into one table
+(summary.csv) and one report (report.md, report.html), which are written there. modules=NAME allows obstacles
+of one's own, which the module NAME defines."""
 
 
 def study(settings: dict[str, Any], modules: list[Any], output: Any, sweep: Path | None) -> None:
     """Run a study; `sweep` is the folder of the sweep that the job belongs to, if any."""
-    from autdtorch.propagators import CACHE_VARIABLE
-    from autdtorch.study.run import run_study
-
     solver = solver_of(settings)
     if sweep is None:
         folder = folder_of("output", output)
@@ -40,8 +39,7 @@ def study(settings: dict[str, Any], modules: list[Any], output: Any, sweep: Path
         if solver.get("cache") is None and CACHE_VARIABLE not in os.environ:
             solver["cache"] = sweep / "matrices"  # jobs in the same scene share them
     settings["solver"] = {key: value for key, value in solver.items() if key != "cache"}  # changes no result
-    single = "scenes" not in settings
-    scenes, methods = (_single if single else _experiment)(settings, modules)
+    scenes, methods = _parts(settings, modules)
     results = run_study(
         scenes,
         methods,
@@ -50,35 +48,48 @@ def study(settings: dict[str, Any], modules: list[Any], output: Any, sweep: Path
         folder=folder,
         config=_as_text(settings, scenes),
     )
-    _show(results, scenes, folder, single)
+    shown = Path(os.path.relpath(folder))  # shorter, and equal on every machine
+    if "scenes" not in settings:
+        _draw_plane(results, scenes, folder)
+        _print_table(results, f"The results are in {shown}")
+    else:
+        from autdtorch.study.report.study_report import write_report
+
+        report = write_report(results, scenes, folder, shlex.join(["autdtorch", *sys.argv[1:]]))
+        _print_table(results, f"The report is {shown / report.name}")
 
 
-def print_table(results: StudyResult, *more: str) -> None:
-    """Print the table of results and further lines."""
-    from autdtorch.study.results import summary_rows
+def collect(arguments: list[str]) -> None:
+    """Merge the studies of the folder that the arguments name."""
+    from autdtorch.study.report.study_report import write_report
+    from autdtorch.study.report.tables import SUMMARY_FILE, save_summary
+    from autdtorch.study.sweeps import collect_results
 
-    rows = summary_rows(results)
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
-    # At once, so that lines of other jobs of a sweep do not come between.
-    sys.stdout.write("".join(f"{line}\n" for line in (*lines, *more)))
-    sys.stdout.flush()
+    if {"-h", "--help"} & set(arguments):
+        print(_HELP)
+        return
+    modules = [word.removeprefix("modules=") for word in arguments if word.startswith("modules=")]
+    folders = [word for word in arguments if not word.startswith("modules=")]
+    if len(folders) != 1 or folders[0].startswith("-"):
+        raise ValueError(f"collect: {shlex.join(arguments)!r}; must be one folder, such as multirun")
+    logging.basicConfig(format="%(message)s")
+    folder = Path(folders[0])
+    sweep = collect_results(folder, modules)
+    save_summary(sweep, folder / SUMMARY_FILE)
+    command = shlex.join(["autdtorch", "collect", *arguments])
+    report = write_report(sweep.results, sweep.scenes, folder, command, sweep.seeds)
+    count = "1 study" if sweep.studies == 1 else f"{sweep.studies} studies"
+    _print_table(sweep.results, f"{count}: the table is {folder / SUMMARY_FILE}, the report {report}")
 
 
-def _single(settings: Mapping[str, Any], modules: list[Any]) -> _Parts:
-    """Return the one scene and the one method, each by its name."""
-    from autdtorch.cli.method_section import load_method
-    from autdtorch.study.run import name_of
-
-    scene = scene_of("scene", section_of(settings, "scene"), modules)
-    method = load_method("method", section_of(settings, "method"), modules)
-    return {HydraConfig.get().runtime.choices["scene"]: scene}, {name_of(method): method}
-
-
-def _experiment(settings: Mapping[str, Any], modules: list[Any]) -> _Parts:
-    """Return the scenes and the methods of an experiment, by name."""
-    from autdtorch.cli.method_section import load_method
-
+def _parts(
+    settings: Mapping[str, Any], modules: list[Any]
+) -> tuple[dict[str, Scene], dict[str, StudyMethod]]:
+    """Return scenes and methods by name: the one of each, or those of an experiment."""
+    if "scenes" not in settings:
+        scene = scene_of("scene", section_of(settings, "scene"), modules)
+        method = load_method("method", section_of(settings, "method"), modules)
+        return {HydraConfig.get().runtime.choices["scene"]: scene}, {name_of(method): method}
     for key in ("scene", "method"):
         if key in settings:
             names = ", ".join(section_of(settings, f"{key}s"))
@@ -91,34 +102,34 @@ def _experiment(settings: Mapping[str, Any], modules: list[Any]) -> _Parts:
 
 
 def _as_text(settings: Mapping[str, Any], scenes: Mapping[str, Scene]) -> str:
-    """Return the settings as YAML, with digests of the files that they name."""
+    """Return the settings as YAML, with digests of the files of arrays and obstacles that scenes name."""
     sections = settings["scenes"] if "scenes" in settings else dict.fromkeys(scenes, settings["scene"])
-    files = {name: digests for name, section in sections.items() if (digests := list(_file_digests(section)))}
+    files = {}
+    for name, section in sections.items():
+        parts = (section["array"], *(section.get("obstacles") or ()))
+        paths = [Path(part["path"]) for part in parts if part.get("path") is not None]
+        if paths:
+            files[name] = [hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in paths]
     return OmegaConf.to_yaml(OmegaConf.create({**settings, **({"files": files} if files else {})}))
 
 
-def _file_digests(section: Mapping[str, Any]) -> Iterator[str]:
-    """Yield digests of the files of the array and of the obstacles of a scene."""
-    for part in (section["array"], *(section.get("obstacles") or ())):
-        if part.get("path") is not None:
-            yield hashlib.sha256(Path(part["path"]).read_bytes()).hexdigest()[:16]
-
-
-def _show(results: StudyResult, scenes: Mapping[str, Scene], folder: Path, single: bool) -> None:
-    """Print the table of results; draw the plane of a single run, write the report of an experiment."""
+def _draw_plane(results: StudyResult, scenes: Mapping[str, Scene], folder: Path) -> None:
+    """Draw the observation plane of a single run."""
     from autdtorch.plot.pressure_maps import plot_plane
-    from autdtorch.study.report.study_report import write_report
 
-    # A relative path is shorter, and the same on every machine.
-    shown = Path(os.path.relpath(folder))
-    if not single:
-        report = write_report(results, scenes, folder, shlex.join(["autdtorch", *sys.argv[1:]]))
-        print_table(results, f"The report is {shown / report.name}")
-        return
     (scene,) = scenes.values()
     (result,) = results.scenes.values()
     (method,) = result.methods.values()
     if method.plane_pressure is not None and scene.observation_plane is not None:
         seen = scene.observation_plane, scene.control_points, scene.obstacles
-        plot_plane(method.plane_pressure, *seen).savefig(folder / PLANE_FILE)
-    print_table(results, f"The results are in {shown}")
+        plot_plane(method.plane_pressure, *seen).savefig(folder / "plane.png")
+
+
+def _print_table(results: StudyResult, end: str) -> None:
+    """Print the table of results and a last line."""
+    rows = summary_rows(results)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+    # At once, so that lines of other jobs of a sweep do not come between.
+    sys.stdout.write("".join(f"{line}\n" for line in (*lines, end)))
+    sys.stdout.flush()

@@ -126,7 +126,7 @@ def _check_kinds(scenes: object, methods: object, solver: object, config: object
             if field == "scenes":
                 require_kind(f"scenes.{name}", entry, Scene)
             else:
-                _require_method(f"methods.{name}", entry)
+                require_method(f"methods.{name}", entry)
     if solver is not None:
         if not isinstance(solver, Mapping):
             raise invalid("solver", solver, "must be a mapping of arguments of make_propagator")
@@ -136,17 +136,19 @@ def _check_kinds(scenes: object, methods: object, solver: object, config: object
         raise invalid("config", config, "must be text")
 
 
-def _require_method(where: str, method: object) -> None:
+def require_method(where: str, method: object, shown: object = None) -> None:
+    """Check that a study can run a method, which messages show as itself or as `shown`."""
     if isinstance(method, Method):
         return
+    shown = method if shown is None else shown
     accepted = "must be a Method or a function of an objective, and of trials and seed if it is random"
     if not callable(method) or isinstance(method, type):
-        raise invalid(where, method, accepted)
+        raise invalid(where, shown, accepted)
     try:
         signature = inspect.signature(method)
         signature.bind("objective", **{key: None for key in _GIVEN if key in signature.parameters})
     except (TypeError, ValueError) as error:
-        raise invalid(where, method, f"{accepted} ({error})") from error
+        raise invalid(where, shown, f"{accepted} ({error})") from error
 
 
 def _is_random(method: StudyMethod) -> bool:

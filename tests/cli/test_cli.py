@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 
 import autdtorch.study.run
 from autdtorch.cli.config_files import CONFIGS
-from autdtorch.cli.method_section import load_method
+from autdtorch.cli.settings import load_method
 from autdtorch.hardware import DEVICES, Limits
 from autdtorch.io.scene_file import load_scene
 from autdtorch.methods.base import Method
@@ -152,7 +152,7 @@ def broken(objective): return objective.missing
 def empty(objective): ...
 """
 BAD_METHODS = {
-    "greedy": (2, "autdtorch: method: 'own.greedy'; missing a required argument: 'steps'; must take an obj"),
+    "greedy": (2, r"autdtorch: method: 'own\.greedy'; must be a .*missing a required argument: 'steps'"),
     "broken": (1, r"autdtorch: AttributeError: .* 'missing' \(own.py, line 3, in broken\); HYDRA_FULL_ERROR"),
     "empty": (2, "autdtorch: method empty: None; must return a Solution"),
 }

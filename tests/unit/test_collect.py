@@ -10,7 +10,7 @@ import yaml
 from autdtorch.io.scene_file import load_scene
 from autdtorch.methods.gabs import gabs
 from autdtorch.methods.lssg import lssg
-from autdtorch.study.report.summary_table import save_summary
+from autdtorch.study.report.tables import save_summary
 from autdtorch.study.results import MethodResult
 from autdtorch.study.results_file import RESULTS_FILE
 from autdtorch.study.run import run_study
@@ -93,7 +93,7 @@ def test_names_that_would_be_equal_get_a_digest(study: Study, tmp_path: Path) ->
     first, second = names(sweep := collect_results(tmp_path))
     assert first != second
     assert first.startswith("air-")
-    save_summary(sweep.results, sweep.swept, tmp_path / "summary.csv")
+    save_summary(sweep, tmp_path / "summary.csv")
     assert "['11']" in (tmp_path / "summary.csv").read_text(encoding="utf-8")
 
 

@@ -15,7 +15,7 @@ from autdtorch.io.scene_file import load_scene
 from autdtorch.methods.gabs import gabs
 from autdtorch.study.report.document import as_page, code, fenced, table
 from autdtorch.study.report.study_report import write_report
-from autdtorch.study.report.summary_table import SUMMARY_FILE, save_summary
+from autdtorch.study.report.tables import SUMMARY_FILE, save_summary
 from autdtorch.study.results import StudyResult
 from autdtorch.study.results_file import load_results, save_results
 from autdtorch.study.run import run_study
@@ -82,7 +82,7 @@ def left(folder: Path, *studies: StudyResult) -> Path:
 def collect(sweep: Path) -> str:
     """Do what `autdtorch collect` does; return the page."""
     found = collect_results(sweep)
-    save_summary(found.results, found.swept, sweep / SUMMARY_FILE)
+    save_summary(found, sweep / SUMMARY_FILE)
     page = write_report(found.results, found.scenes, sweep, "autdtorch collect", found.seeds)
     return page.read_text(encoding="utf-8")
 

@@ -1,9 +1,11 @@
-"""Tables of the report of a study, as rows of cells, header first."""
+"""Tables of a study: those of its report as rows of cells, header first, and ``summary.csv``."""
 
 from __future__ import annotations
 
+import csv
 import math
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,10 +14,12 @@ from autdtorch.methods.catalogue import label_of
 from autdtorch.study.report.claims import Claim, Verdict
 from autdtorch.study.results import MethodResult, SceneResult, StudyResult
 from autdtorch.study.statistics import NEAR_BOUND, bound_gap
+from autdtorch.study.sweeps import Sweep
+from autdtorch.utils.files import replacing
 
+SUMMARY_FILE = "summary.csv"
 BASELINE = "gradient_ascent"  # not a competitor: it knows the transfer matrix
 NEAR = f"{100 * NEAR_BOUND:.0f} %"
-_NO_NUMBER = "-"
 
 
 def is_baseline(method: str) -> bool:
@@ -39,7 +43,7 @@ def gap_rows(results: StudyResult) -> list[list[str]]:
     head = ["scene", "method", "score [Pa]", "gap to the bound [%]", "evaluations"]
     rows = [[*head, f"to {NEAR} of the bound", "s per trial"]]
     for scene_name, scene in results.scenes.items():
-        rows.append([scene_name, "*bound*", f"{scene.bound:.3g}", "0", *[_NO_NUMBER] * 3])
+        rows.append([scene_name, "*bound*", f"{scene.bound:.3g}", "0", "-", "-", "-"])
         for name, method in scene.methods.items():
             rows.append([scene_name, label_of(name), *_gap_cells(name, method, scene.bound)])
     return rows
@@ -51,14 +55,14 @@ def _gap_cells(name: str, method: MethodResult, bound: float) -> list[str]:
     evaluations = f"{method.solution.evaluations.double().mean():.0f}"
     near = _median_of_reached(found.evaluations)
     if is_baseline(name):
-        evaluations = near = _NO_NUMBER
+        evaluations = near = "-"
     return [str(found.score), gap, evaluations, near, f"{method.seconds.median():.2g}"]
 
 
 def _median_of_reached(evaluations: torch.Tensor) -> str:
     """Return the median, and the number of trials that got there if not all did (inf otherwise)."""
     median, reached = float(np.median(evaluations.numpy())), int(evaluations.isfinite().sum())
-    shown = f"{median:g}" if math.isfinite(median) else _NO_NUMBER
+    shown = f"{median:g}" if math.isfinite(median) else "-"
     return shown if len(evaluations) in (1, reached) else f"{shown} ({reached} of {len(evaluations)})"
 
 
@@ -88,3 +92,37 @@ def extent(counts: Sequence[int]) -> str:
     """Return "3", or "3 to 5" if the counts differ."""
     low, high = min(counts), max(counts)
     return str(low) if low == high else f"{low} to {high}"
+
+
+def save_summary(sweep: Sweep, path: Path) -> None:
+    """Write a CSV table, one line for each method in each scene.
+
+    The swept settings are columns and are left out of the names.
+    """
+    keys = sorted({key for settings in sweep.swept.values() for key in settings})
+    rows = []
+    for (name, method), settings in sweep.swept.items():
+        scene = sweep.results.scenes[name]
+        row: dict[str, object] = {"scene": name.partition(",")[0], "method": method.partition(",")[0]}
+        row |= {key: settings.get(key) for key in keys} | _numbers(scene.methods[method], scene.bound)
+        rows.append(row)
+    with replacing(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+        lines = csv.DictWriter(file, list(rows[0]))
+        lines.writeheader()
+        lines.writerows(rows)
+
+
+def _numbers(method: MethodResult, bound: float) -> dict[str, object]:
+    found, metrics = bound_gap(method, bound), method.metrics
+    return {
+        "trials": method.trials,
+        "median score [Pa]": found.score.value,
+        "best score [Pa]": float(method.solution.score.max()),
+        "bound [Pa]": bound,
+        "gap to the bound": found.gap.value,
+        "mean of the foci [Pa]": float(metrics.mean.mean()),
+        "std among the foci [Pa]": float(metrics.std.mean()),
+        "area a focus [m^2]": None if metrics.area is None else float(metrics.area.mean()),
+        "evaluations": float(method.solution.evaluations.double().mean()),
+        "median seconds a trial": float(method.seconds.median()),
+    }
