@@ -19,7 +19,6 @@ FULL_ERROR = "HYDRA_FULL_ERROR"
 
 AGAIN = "the same command repeats what is not finished"
 
-_FAILED, _REFUSED, _LIMITED = 1, 2, 3
 _REFUSALS = (ValueError, OSError, ImportError, HydraException, OmegaConfBaseException)
 
 _NO_SLURM = 'Could not detect "srun"'  # submitit, on a machine without Slurm
@@ -42,16 +41,14 @@ def stop(error: BaseException) -> NoReturn:
     print(f"autdtorch: {in_one_line(error)}", file=sys.stderr)
     if isinstance(error, KeyboardInterrupt):
         sys.exit(128 + getattr(error, "number", signal.SIGINT))  # as a shell reports it
-    sys.exit(_REFUSED if _is_refusal(error) else _LIMITED if _is_limit(error) else _FAILED)
+    if _is_refusal(error):
+        sys.exit(2)
+    sys.exit(3 if isinstance(error, hardware.LimitError) else 1)  # which is imported when it is asked for
 
 
 def in_one_line(error: BaseException) -> str:
     """Return the message of an error, with its notes, in one line."""
     return "; ".join([_message(error), *getattr(error, "__notes__", [])])
-
-
-def _is_limit(error: BaseException) -> bool:
-    return isinstance(error, hardware.LimitError)  # imported when it is asked for
 
 
 def _is_refusal(error: BaseException) -> bool:
@@ -65,7 +62,7 @@ def _message(error: BaseException) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     text = str(error)
-    if not (_is_refusal(error) or _is_limit(error)):
+    if not (_is_refusal(error) or isinstance(error, hardware.LimitError)):
         where = traceback.extract_tb(error.__traceback__)[-1]
         place = f"{os.path.relpath(where.filename)}, line {where.lineno}, in {where.name}"
         text = f"{type(error).__name__}: {text} ({place}); {FULL_ERROR}=1 shows the traceback"

@@ -60,7 +60,16 @@ class QueueWatcher(SlurmInfoWatcher):
         try:
             answer = subprocess.run(command, capture_output=True, text=True, check=True)
         except (OSError, subprocess.CalledProcessError) as error:
-            self._failed(getattr(error, "stderr", None) or str(error))
+            reason = " ".join((getattr(error, "stderr", None) or str(error)).split())
+            self._failures += 1
+            if self._failures >= _MOST_FAILURES:
+                stay = f"the jobs {', '.join(sorted(self._numbers))} may still run"
+                again = (
+                    "when squeue answers and they have ended, the same command repeats what is not finished"
+                )
+                failed = f"squeue: {reason}, {self._failures} times in a row"
+                raise ChildProcessError(f"{failed}; {stay}; {again}") from error
+            self._tell(f"squeue: {reason}; asking again")
             return
         self._failures = 0
         jobs = [line.split("|", maxsplit=2) for line in answer.stdout.splitlines()]
@@ -69,16 +78,6 @@ class QueueWatcher(SlurmInfoWatcher):
         reasons = {reason for state, reason in ours if state == "PENDING"} - {"None", ""}
         if reasons:
             self._tell(f"jobs wait in the queue: {', '.join(sorted(reasons))}")
-
-    def _failed(self, reason: str) -> None:
-        """Ask again, but not for ever."""
-        reason = " ".join(reason.split())
-        self._failures += 1
-        if self._failures >= _MOST_FAILURES:
-            stay = f"the jobs {', '.join(sorted(self._numbers))} may still run"
-            again = "when squeue answers and they have ended, the same command repeats what is not finished"
-            raise ChildProcessError(f"squeue: {reason}, {self._failures} times in a row; {stay}; {again}")
-        self._tell(f"squeue: {reason}; asking again")
 
     def _tell(self, line: str) -> None:
         """Log a line, unless it is the last one again."""

@@ -8,7 +8,6 @@ import logging
 import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TypeVar
 
 from filelock import FileLock
 
@@ -25,10 +24,9 @@ MATRICES_FOLDER = "matrices"
 PREVIOUS = "previous-"
 """Start of the names of the folders that keep files of earlier studies, and damaged ones."""
 
+_FILES = (RESULTS_FILE, TRIALS_FILE, PROVENANCE_FILE)
 _LOCK_FILE = ".lock"
 _ANOTHER = "of another study (other settings, source or packages)"
-
-_Stored = TypeVar("_Stored", Provenance, StudyResult)
 
 
 class StudyFolder:
@@ -48,7 +46,7 @@ class StudyFolder:
         self.provenance = provenance
         self.scenes: dict[str, SceneResult] = {}
         self._shapes = {name: (len(scene.array), len(scene.control_points)) for name, scene in scenes.items()}
-        self._not_used = dict.fromkeys((RESULTS_FILE, TRIALS_FILE, PROVENANCE_FILE), _ANOTHER)
+        self._not_used = dict.fromkeys(_FILES, _ANOTHER)
         self.trials = self._trial_file(None)
         if path is not None and reuse:
             self._take_up(path)
@@ -69,45 +67,37 @@ class StudyFolder:
             logger.info("re-using %d trials from %s", len(self.trials), self.path)
 
     def _take_up(self, path: Path) -> None:
-        stored = self._stored(PROVENANCE_FILE, load_provenance, path)
-        results = self._stored(RESULTS_FILE, load_results, path)
-        if results is not None:
-            self.provenance, self.scenes = results.provenance, dict(results.scenes)
+        """Use the files of this study; note why others are not used."""
+        loaders: dict[str, Callable[[Path], StudyResult | Provenance]]
+        loaders = {RESULTS_FILE: load_results, PROVENANCE_FILE: load_provenance}
+        for name, load in loaders.items():
+            try:
+                stored = load(path)
+            except FileNotFoundError:
+                continue
+            except ValueError as error:
+                self._not_used[name] = str(error)
+                continue
+            scenes = stored.scenes if isinstance(stored, StudyResult) else {}
+            provenance = stored.provenance if isinstance(stored, StudyResult) else stored
+            if provenance.same_origin(self.provenance):
+                del self._not_used[name]
+                self.provenance = provenance
+                self.scenes |= scenes
+        if self.scenes:
             logger.info("re-using %s from %s, same settings and same source", ", ".join(self.scenes), path)
-        if stored is not None:
-            self.provenance = stored
         self.trials = self._trial_file(path)
-        if stored is not None or results is not None or len(self.trials):
+        if len(self._not_used) < len(_FILES) or len(self.trials):
             del self._not_used[TRIALS_FILE]  # its lines are checked one by one
-
-    def _stored(self, name: str, load: Callable[[Path], _Stored], path: Path) -> _Stored | None:
-        """Return the content of a file of this study; otherwise note why it is not used."""
-        try:
-            stored = load(path)
-        except FileNotFoundError:
-            return None
-        except ValueError as error:
-            self._not_used[name] = str(error)
-            return None
-        origin = stored if isinstance(stored, Provenance) else stored.provenance
-        if not origin.same_origin(self.provenance):
-            return None
-        del self._not_used[name]
-        return stored
 
     def _trial_file(self, path: Path | None) -> TrialFile:
         file = None if path is None else path / TRIALS_FILE
         return TrialFile(file, self.provenance.origin, self.provenance.seed, self._shapes)
 
-    @property
-    def matrices(self) -> Path | None:
-        """Folder of the transfer matrices, or None."""
-        return None if self.path is None else self.path / MATRICES_FOLDER
-
-    def save(self, name: str, scene: SceneResult, order: Mapping[str, object]) -> None:
-        """Save a finished scene; `order` holds the names of all scenes in their order."""
+    def save(self, name: str, scene: SceneResult) -> None:
+        """Save a finished scene."""
         self.scenes[name] = scene
-        self.scenes = {other: self.scenes[other] for other in order if other in self.scenes}
+        self.scenes = {other: self.scenes[other] for other in self._shapes if other in self.scenes}
         if self.path is not None:
             save_results(StudyResult(self.provenance, self.scenes), self.path)
 

@@ -7,7 +7,7 @@ import inspect
 import math
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import torch
@@ -21,7 +21,7 @@ from autdtorch.objectives.objective import Objective
 from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.propagators import CACHE_VARIABLE, Propagator, SimulatedPropagator, make_propagator
 from autdtorch.scene.scene import Scene
-from autdtorch.study.folder import StudyFolder, open_folder
+from autdtorch.study.folder import MATRICES_FOLDER, StudyFolder, open_folder
 from autdtorch.study.provenance import provenance_now
 from autdtorch.study.results import MethodResult, SceneResult, Simulation, StudyResult, median_trial
 from autdtorch.study.trial_file import TrialFile
@@ -37,6 +37,7 @@ from autdtorch.utils.validation import (
     require_kind,
     require_known,
     require_name,
+    within,
 )
 
 StudyMethod: TypeAlias = Method | Callable[..., Solution]
@@ -90,16 +91,19 @@ def run_study(
     """
     _check_kinds(scenes, methods, solver, config)
     folder = None if folder is None else path_of("folder", folder, "a folder")
-    counts = _check(methods, trials, seed)
+    counts = _counts(methods, trials, seed)
     plane_spacing = positive("plane_spacing", plane_spacing, "m")
     for name, method in methods.items():
         for scene in scenes.values():
-            _check_method(name, method, scene, counts[name])
+            if isinstance(method, Method):
+                problem = Problem(len(scene.array), len(scene.control_points), scene=scene)
+                with within(f"method {name}"):
+                    method.require_fit(problem, min(counts[name], BLOCK))
     planes = {name: _plane_points(scene, plane_spacing) for name, scene in scenes.items()}
     # The digest of our source does not cover methods and obstacles of the user's own.
-    obstacles = [type(obstacle) for scene in scenes.values() for obstacle in scene.obstacles]
-    code: list[Any] = [*methods.values(), *obstacles]
-    ours = all(_package(one) == "autdtorch" for one in code)
+    code = [*map(_code_of, methods.values())]
+    code += [type(obstacle) for scene in scenes.values() for obstacle in scene.obstacles]
+    ours = all(str(getattr(one, "__module__", "")).partition(".")[0] == "autdtorch" for one in code)
     provenance = provenance_now(config, seed)
     with open_folder(folder, provenance, scenes, reuse=bool(config) and ours) as kept:
         missing = {name: scene for name, scene in scenes.items() if name not in kept.scenes}
@@ -110,30 +114,29 @@ def run_study(
                 finished = _run_scene(
                     name, propagators.pop(name), methods, counts, seed, planes[name], kept.trials, progress
                 )
-                kept.save(name, finished, scenes)
+                kept.save(name, finished)
         return StudyResult(kept.provenance, {name: kept.scenes[name] for name in scenes})
 
 
-def _check_kinds(scenes: object, methods: object, solver: object, config: object) -> None:
+def _check_kinds(
+    scenes: Mapping[str, Scene], methods: Mapping[str, StudyMethod], solver: object, config: object
+) -> None:
     """Check that names are names, and what they name, scenes and methods; and the settings' kinds."""
     for field, named in (("scenes", scenes), ("methods", methods)):
-        if not isinstance(named, Mapping):
-            raise invalid(field, named, f"must be a mapping of names to {field}")
-        if not named:
-            raise ValueError(f"{field}: empty; must have at least one")
-        for name, entry in named.items():
+        if not isinstance(named, Mapping) or not named:
+            raise invalid(field, named, f"must be a mapping of names to {field}, at least one")
+        for name in named:
             require_name(field, name)
-            if field == "scenes":
-                require_kind(f"scenes.{name}", entry, Scene)
-            else:
-                require_method(f"methods.{name}", entry)
+    for name, scene in scenes.items():
+        require_kind(f"scenes.{name}", scene, Scene)
+    for name, method in methods.items():
+        require_method(f"methods.{name}", method)
     if solver is not None:
         if not isinstance(solver, Mapping):
             raise invalid("solver", solver, "must be a mapping of arguments of make_propagator")
         _, *allowed = inspect.signature(make_propagator).parameters  # all but the scene
         require_known("solver", solver, allowed)
-    if not isinstance(config, str):
-        raise invalid("config", config, "must be text")
+    require_kind("config", config, str)
 
 
 def require_method(where: str, method: object, shown: object = None) -> None:
@@ -151,24 +154,14 @@ def require_method(where: str, method: object, shown: object = None) -> None:
         raise invalid(where, shown, f"{accepted} ({error})") from error
 
 
-def _is_random(method: StudyMethod) -> bool:
-    if isinstance(method, Method):
-        return method.random
-    return "trials" in inspect.signature(method).parameters
-
-
-def _check(methods: Mapping[str, StudyMethod], trials: int | Mapping[str, int], seed: int) -> dict[str, int]:
-    """Check seed and counts; returns the number of trials of each method."""
+def _counts(methods: Mapping[str, StudyMethod], trials: int | Mapping[str, int], seed: int) -> dict[str, int]:
+    """Check the seed, and return the number of trials of each method."""
     if integer_at_least("seed", seed, 0) > _LARGEST_SEED:
         raise invalid("seed", seed, f"must be an integer from 0 to {_LARGEST_SEED}")
     random = [name for name, method in methods.items() if _is_random(method)]
     if not isinstance(trials, Mapping):
-        count = integer_at_least("trials", trials, 1)
-        trials = dict.fromkeys(random, count)
-    for name in trials:
-        if name not in random:
-            accepted = f"must be a method with random choices: {', '.join(random) or 'none'}"
-            raise invalid("trials", name, accepted)
+        trials = dict.fromkeys(random, integer_at_least("trials", trials, 1))
+    require_known("trials", trials, random, "random method")
     if absent := [name for name in random if name not in trials]:
         raise invalid("trials", dict(trials), f"must also give the number for {', '.join(absent)}")
     counts = {name: integer_at_least(f"trials.{name}", trials.get(name, 1), 1) for name in methods}
@@ -177,39 +170,28 @@ def _check(methods: Mapping[str, StudyMethod], trials: int | Mapping[str, int], 
     return counts
 
 
+def _is_random(method: StudyMethod) -> bool:
+    return method.random if isinstance(method, Method) else "trials" in inspect.signature(method).parameters
+
+
 def _propagator(scene: Scene, solver: Mapping[str, Any], kept: StudyFolder) -> Propagator:
     cache = solver.get("cache")
-    if cache is None and CACHE_VARIABLE not in os.environ and kept.matrices is not None:
-        cache = kept.matrices  # a study that goes on needs its matrices again
-    try:
+    if cache is None and CACHE_VARIABLE not in os.environ and kept.path is not None:
+        cache = kept.path / MATRICES_FOLDER  # a study that goes on needs its matrices again
+    with within("solver"):
         return make_propagator(scene, **{**solver, "cache": cache})
-    except ValueError as error:
-        raise ValueError(f"solver: {error}") from error
-
-
-def _check_method(name: str, method: StudyMethod, scene: Scene, trials: int) -> None:
-    """Check a method's settings against a scene now, not after minutes of simulation."""
-    if not isinstance(method, Method):
-        return
-    problem = Problem(len(scene.array), len(scene.control_points), scene=scene)
-    try:
-        method.require_fit(problem, min(trials, BLOCK))
-    except ValueError as error:
-        raise ValueError(f"method {name}: {error}") from error
 
 
 def name_of(method: StudyMethod) -> str:
     """Return the name of a method, or of the function that it is."""
-    while isinstance(method, functools.partial):
-        method = method.func
-    return method.name if isinstance(method, Method) else str(getattr(method, "__name__", "method"))
+    return method.name if isinstance(method, Method) else str(getattr(_code_of(method), "__name__", "method"))
 
 
-def _package(code: Method | Callable[..., Any]) -> str:
-    while isinstance(code, functools.partial):
-        code = code.func
-    own = type(code) if isinstance(code, Method) else code
-    return str(getattr(own, "__module__", "")).partition(".")[0]
+def _code_of(method: StudyMethod) -> Any:
+    """Return the class of a method, or the function behind it."""
+    if isinstance(method, Method):
+        return type(method)
+    return method.func if isinstance(method, functools.partial) else method
 
 
 def solve(method: StudyMethod, objective: Objective, trials: Trials, seed: int) -> Solution:
@@ -245,14 +227,17 @@ def _run_scene(
     found = {method_name: trials.found(name, method_name, count) for method_name, count in counts.items()}
     progress.begin(f"{name}: observation plane")
     begin = time.perf_counter()
-    solutions = {method_name: solution for method_name, (solution, _) in found.items()}
-    planes, cell_area = _plane_pressures(propagator, solutions, plane)
+    planes, cell_area = _plane_pressures(
+        propagator, [solution.drive for solution, _ in found.values()], plane
+    )
     plane_seconds = time.perf_counter() - begin
     progress.advance(1)
-    results = {
-        method_name: _method_result(solution, planes.get(method_name), cell_area, seconds)
-        for method_name, (solution, seconds) in found.items()
-    }
+    results = {}
+    for (method_name, (solution, seconds)), pressure in zip(found.items(), planes, strict=True):
+        metrics = focus_metrics(solution.pressure, None if pressure is None else pressure.abs(), cell_area)
+        shown = median_trial(solution.score)
+        shown_plane = None if pressure is None else pressure[shown].clone()
+        results[method_name] = MethodResult(solution, metrics, seconds, shown, shown_plane)
     simulation = _simulation(propagator, matrix_seconds, plane_seconds)
     bound = focus_bound(transfer_matrix)
     return SceneResult(len(scene.obstacles), transfer_matrix, bound, simulation, results)
@@ -304,25 +289,16 @@ def _plane_points(scene: Scene, spacing: float) -> torch.Tensor | None:
 
 
 def _plane_pressures(
-    propagator: Propagator, solutions: Mapping[str, Solution], points: torch.Tensor | None
-) -> tuple[dict[str, torch.Tensor], float | None]:
+    propagator: Propagator, drives: list[torch.Tensor], points: torch.Tensor | None
+) -> tuple[Sequence[torch.Tensor | None], float | None]:
     """Pressure (T, Nu, Nv) [Pa] on the observation plane by method, and the area of a cell [m^2]."""
     plane = propagator.scene.observation_plane
     if plane is None or points is None:
-        return {}, None
+        return [None] * len(drives), None
     # All drives in one call: the propagator then needs no more than one simulation a transducer.
-    drives = torch.cat([solution.drive for solution in solutions.values()])
-    pressure = propagator.field(drives, points).cpu()
-    parts = torch.split(pressure, [len(solution.drive) for solution in solutions.values()])
-    return dict(zip(solutions, parts, strict=True)), plane.size[0] * plane.size[1] / points[..., 0].numel()
-
-
-def _method_result(
-    solution: Solution, plane: torch.Tensor | None, cell_area: float | None, seconds: torch.Tensor
-) -> MethodResult:
-    metrics = focus_metrics(solution.pressure, None if plane is None else plane.abs(), cell_area)
-    shown = median_trial(solution.score)
-    return MethodResult(solution, metrics, seconds, shown, None if plane is None else plane[shown].clone())
+    pressure = propagator.field(torch.cat(drives), points).cpu()
+    area = plane.size[0] * plane.size[1] / points[..., 0].numel()
+    return torch.split(pressure, [len(drive) for drive in drives]), area
 
 
 def _simulation(propagator: Propagator, matrix_seconds: float, plane_seconds: float) -> Simulation:

@@ -34,8 +34,7 @@ class Interval:
         """Return "1.23 [1.10, 1.35]", or the number alone if it is exact or its interval unknown."""
         if self.low == self.high and self.value.is_integer():
             return f"{self:.0f}"
-        shown = (self.value, self.low, self.high) if self._has_ends else (self.value,)
-        largest = max(abs(number) for number in shown)
+        largest = max(abs(number) for number in (self.value, self.low, self.high) if math.isfinite(number))
         digits = max(0, 2 - math.floor(math.log10(largest))) if largest else 0
         return f"{self:.{digits}f}"
 
@@ -44,11 +43,7 @@ class Interval:
         if not form:
             return str(self)
         value, low, high = (format(number, form) for number in (self.value, self.low, self.high))
-        return f"{value} [{low}, {high}]" if self._has_ends else value
-
-    @property
-    def _has_ends(self) -> bool:
-        return self.low < self.high < math.inf
+        return f"{value} [{low}, {high}]" if self.low < self.high < math.inf else value
 
     @classmethod
     def exact(cls, value: float) -> Interval:

@@ -125,21 +125,20 @@ def _parts(path: Path, study: StudyResult) -> list[_Part]:
     try:
         if missing := [name for name in settings.get("scenes", ()) if name not in study.scenes]:
             logger.warning("%s: unfinished scenes are left out: %s", path, ", ".join(missing))
-        return list(_parts_by(settings, study))
+        common = {key: settings[key] for key in ("solver", "plane_spacing") if key in settings}
+        parts = []
+        for name, found in study.scenes.items():
+            section = settings["scenes"][name] if "scenes" in settings else settings["scene"]
+            files = settings.get(_FILES, {}).get(name)
+            of_scene = dict(_flat({"scene": section, _FILES: files, **common}))
+            for method in found.methods:
+                chosen = settings["methods"][method] if "methods" in settings else settings["method"]
+                of_method = dict(_flat({"method": chosen}))
+                seed = study.provenance.seed
+                parts.append(_Part(name, method, section, of_scene, of_method, seed, found))
+        return parts
     except (KeyError, TypeError, AttributeError) as error:
-        accepted = "must come from the command line"
-        raise ValueError(f"{file}: no settings of a study in it; {accepted}") from error
-
-
-def _parts_by(settings: Any, study: StudyResult) -> Iterator[_Part]:
-    common = {key: settings[key] for key in ("solver", "plane_spacing") if key in settings}
-    for name, found in study.scenes.items():
-        section = settings["scenes"][name] if "scenes" in settings else settings["scene"]
-        of_scene = dict(_flat({"scene": section, _FILES: settings.get(_FILES, {}).get(name), **common}))
-        for method in found.methods:
-            chosen = settings["methods"][method] if "methods" in settings else settings["method"]
-            of_method = dict(_flat({"method": chosen}))
-            yield _Part(name, method, section, of_scene, of_method, study.provenance.seed, found)
+        raise ValueError(f"{file}: no settings of a study; must come from the command line") from error
 
 
 def _flat(value: object, key: str = "") -> Iterator[tuple[str, Any]]:
@@ -161,13 +160,12 @@ def _groups(parts: Sequence[_Part]) -> tuple[_Groups, dict[tuple[str, str], Sett
     """Group parts of equal settings by new names of scene and method; return also the swept settings."""
     scenes = _swept([(part.scene, part.scene_settings) for part in parts])
     methods = _swept([(part.method, part.method_settings) for part in parts])
-    order = list(METHODS)
+    order = {method: place for place, method in enumerate(METHODS)}
 
     def rank(index: int) -> tuple[object, ...]:
         """Sort by scene, then by our order of methods, each by its swept settings."""
         (scene, of_scene), (method, of_method) = scenes[index], methods[index]
-        place = order.index(method) if method in order else len(order)
-        return scene, _order(of_scene), place, method, _order(of_method)
+        return scene, _order(of_scene), order.get(method, len(order)), method, _order(of_method)
 
     groups: _Groups = {}
     swept: dict[tuple[str, str], Settings] = {}
@@ -241,8 +239,8 @@ def _merged_trials(parts: Sequence[_Part]) -> MethodResult:
     solution = joined([result.solution for result in kept])
     # A study keeps the observation plane of one trial. The one nearest to the joint median is shown.
     median = float(solution.score[median_trial(solution.score)])
-    away = [abs(float(result.solution.score[result.shown_trial]) - median) for result in kept]
-    nearest = away.index(min(away))
+    shown = [float(result.solution.score[result.shown_trial]) for result in kept]
+    nearest = min(range(len(kept)), key=lambda place: abs(shown[place] - median))
     return MethodResult(
         solution,
         _joined_metrics([result.metrics for result in kept]),

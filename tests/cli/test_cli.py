@@ -258,7 +258,7 @@ def test_ones_own_scene_file(run, write, tmp_path):
 
 
 def test_an_experiment_ends_with_its_report(run, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("autdtorch.study.report.figures.rendering_problem", lambda: "not tried")
+    monkeypatch.setattr("autdtorch.study.report.study_report.rendering_problem", lambda: "not tried")
     command = (
         "experiment=paper",
         "~methods.bayes_opt",

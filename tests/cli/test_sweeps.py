@@ -106,7 +106,7 @@ def test_a_method_of_ones_own_is_found_in_the_working_directory(run, write, tmp_
 
 
 def test_collected_seeds_are_trials_and_other_settings_make_names(run, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("autdtorch.study.report.figures.rendering_problem", lambda: "not tried")
+    monkeypatch.setattr("autdtorch.study.report.study_report.rendering_problem", lambda: "not tried")
     assert run("-m", *QUICK, "method=gabs", "method.levels=4,8", "seed=0,1", "trials=2") == 0
     assert run("-m", *QUICK, "method=lssg", "seed=0,1") == 0
     alone = load_results(

@@ -34,7 +34,7 @@ HOSTILE = f"{HTML}\n{MARKDOWN}\n\n</details>\n```\n{HTML}\n[x]: https://evil.exa
 
 @pytest.fixture(autouse=True)
 def without_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("autdtorch.study.report.figures.rendering_problem", lambda: "not tried")
+    monkeypatch.setattr("autdtorch.study.report.study_report.rendering_problem", lambda: "not tried")
 
 
 def study(solver: dict[str, object] | None = None, seed: int = 0) -> StudyResult:

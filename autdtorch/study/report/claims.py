@@ -61,19 +61,23 @@ class Claim:
 
     def judge(self, results: StudyResult) -> Verdict | None:
         """Return the verdict of the results, or None if they lack methods or scenes of the claim."""
-        wanted = set(self.methods)
-        usable = {name: scene for name, scene in results.scenes.items() if wanted <= scene.methods.keys()}
+        usable = {
+            name: scene for name, scene in results.scenes.items() if set(self.methods) <= scene.methods.keys()
+        }
         empty = [scene for scene in usable.values() if scene.obstacles == 0]
-        chosen = {name: scene for name, scene in usable.items() if self._is_about(name, scene)}
-        if not chosen or (self.needs_empty and not empty):
+        found = {
+            name: self.compare(scene, (empty or [scene])[0])
+            for name, scene in usable.items()
+            if self._is_about(name, scene) and (empty or not self.needs_empty)
+        }
+        if not found:
             return None
-        found = {name: self.compare(scene, (empty or [scene])[0]) for name, scene in chosen.items()}
         margins = [margin for _, one in found.values() for margin in one]
         holds = all(margin.value > 0 for margin in margins)
         surely_holds = all(margin.low > 0 for margin in margins)
         clear = surely_holds if holds else any(margin.high <= 0 for margin in margins)
-        lines = [f"{name}: {text}" for name, (text, _) in found.items()]
-        return Verdict(holds, clear, tuple([self.heading, *lines] if self.heading else lines))
+        heading = [self.heading] if self.heading else []
+        return Verdict(holds, clear, (*heading, *(f"{name}: {text}" for name, (text, _) in found.items())))
 
     def _is_about(self, name: str, scene: SceneResult) -> bool:
         with_area = all(method.metrics.area is not None for method in scene.methods.values())

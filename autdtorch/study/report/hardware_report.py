@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import json
-import os
 import statistics
-from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 
 import autdtorch
-from autdtorch.hardware.log import Evaluation, EvaluationLog
+from autdtorch.hardware.log import EvaluationLog
 from autdtorch.hardware.preflight import Preflight
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.objective import Objective
@@ -25,11 +22,9 @@ from autdtorch.utils.files import naming, replace_file
 
 REPORT_FILE = "report.md"
 _FIGURE = "convergence.png"
-_TIME = "%Y-%m-%d %H:%M:%S"
 
 
-@dataclass(frozen=True)
-class Comparison:
+class Comparison(NamedTuple):
     """A least-squares fit of simulated to measured pressures."""
 
     scale: float  # factor from simulated to measured pressures
@@ -43,12 +38,8 @@ def compare(measured: torch.Tensor, simulated: torch.Tensor) -> Comparison:
     return Comparison(float(scale), float(misfit))
 
 
-def _percent(share: float) -> str:
-    return f"{round(100 * share, 6):.2g}"  # smaller digits are rounding
-
-
 def write_hardware_report(
-    folder: str | os.PathLike[str],
+    folder: Path,
     log: EvaluationLog,
     found: Solution,
     again: torch.Tensor,
@@ -57,57 +48,42 @@ def write_hardware_report(
     preflight: Preflight,
     command: str,
 ) -> Path:
-    """Write `report.md` and its figure into a folder, which is made if it does not exist; return its path.
+    """Write `report.md` and its figure into a folder; return its path.
 
-    Args:
-        folder: folder for both.
-        log: evaluation log of the trial.
-        found: solution of the search on the bench, one trial.
-        again: readings (R, P) [Pa] of that drive after the search.
-        simulated: objective without noise, at the phase levels of the device.
-        expected: solution of the same method on `simulated`.
-        preflight: check before the trial.
-        command: command line that repeats the trial.
+    The search on the bench `found` a drive, which was read `again` (R, P) [Pa]. `expected` is the solution of
+    the same method on the `simulated` objective, without noise and with the phase levels of the device.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    evaluations = log.evaluations
-    begin, end = (datetime.fromisoformat(evaluations[place].time) for place in (0, -1))
-    drives = torch.stack([evaluation.drive for evaluation in evaluations])
-    scene = simulated.scene
+    evaluations, scene = log.evaluations, simulated.scene
     working = torch.ones(len(scene.array), dtype=torch.float64, device="cpu")
     working[preflight.dead] = 0
-    measured, predicted = torch.stack([one.pressure for one in evaluations]), simulated(working * drives)
+    measured = torch.stack([one.pressure for one in evaluations])
+    predicted = simulated(working * torch.stack([one.drive for one in evaluations]))
     fit = compare(measured, predicted)
     histories = {"bench": found.history, "simulation": fit.scale * expected.history}
     with naming(folder / _FIGURE):
         plot_convergence({scene.name: histories}).savefig(folder / _FIGURE)
-    mean = again.mean(dim=0)
-    pressures = found.pressure[0], mean, fit.scale * simulated(working * found.drive)[0]
-    alone = preflight.pressure[preflight.pressure > preflight.threshold]
+    again_mean = again.mean(dim=0)
+    pressures = found.pressure[0], again_mean, fit.scale * simulated(working * found.drive)[0]
+    times = [datetime.fromisoformat(one.time) for one in evaluations]
+    gaps = [(later - earlier).total_seconds() for earlier, later in itertools.pairwise(times)]
     text = rendered(
         "hardware.md",
-        method=log.origin.get("method", "a method"),
-        device=log.origin["device"],
-        emulated=bool(log.origin.get("emulated")),
+        log=log,
+        origin=log.origin,
         scene=scene.name,
         command=command,
         version=autdtorch.__version__,
-        begin=format(begin, _TIME),
-        end=format(end, _TIME),
-        evaluations=len(evaluations),
-        interval=f"{1e3 * _interval(evaluations):.3g}",
-        seconds_on=log.seconds_on,
-        again=float(mean.min()),
-        found=float(found.pressure.min()),
+        times=times,
+        interval=statistics.median_low(gaps) if gaps else 0.0,  # an interruption does not change it
+        found=found,
+        again=again_mean,
         readings=len(again),
         same=int(torch.isclose(found.drive, expected.drive, rtol=0, atol=1e-9).sum()),
-        transducers=found.drive.numel(),
         points=_points(scene.control_points, *pressures),
         fits=_fits(scene.control_points, measured, predicted),
         scale=fit.scale,
         misfit=_percent(fit.misfit),
-        alone=alone,
+        alone=preflight.pressure[preflight.pressure > preflight.threshold],
         preflight=preflight,
         settings=[["setting", "value"], *([name, code(_value(own))] for name, own in log.origin.items())],
     )
@@ -116,18 +92,16 @@ def write_hardware_report(
     return path
 
 
+def _percent(share: float) -> str:
+    return f"{round(100 * share, 6):.2g}"  # smaller digits are rounding
+
+
 def _value(own: Any) -> str:
     """Return a setting as JSON, consecutive integers as a range."""
     integers = isinstance(own, list) and len(own) > 2 and all(isinstance(one, int) for one in own)
     if integers and own == list(range(own[0], own[-1] + 1)):
         return f"{own[0]} to {own[-1]}"
     return json.dumps(own, ensure_ascii=False)
-
-
-def _interval(evaluations: Sequence[Evaluation]) -> float:
-    """Return the median interval [s] between evaluations, which an interruption does not change."""
-    times = [datetime.fromisoformat(evaluation.time).timestamp() for evaluation in evaluations]
-    return statistics.median_low(np.diff(times).tolist()) if len(times) > 1 else 0.0
 
 
 def _points(places: torch.Tensor, *pressures: torch.Tensor) -> list[list[str]]:
@@ -141,8 +115,8 @@ def _points(places: torch.Tensor, *pressures: torch.Tensor) -> list[list[str]]:
 
 def _fits(places: torch.Tensor, measured: torch.Tensor, simulated: torch.Tensor) -> list[list[str]]:
     rows = [["control point [mm]", "factor", "differs by [%]"]]
-    for name, here, there in zip(_names(places), measured.T, simulated.T, strict=True):
-        fit = compare(here, there)
+    for name, *pressures in zip(_names(places), measured.T, simulated.T, strict=True):
+        fit = compare(*pressures)
         rows.append([name, f"{fit.scale:#.4g}", _percent(fit.misfit)])
     return rows
 

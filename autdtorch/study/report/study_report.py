@@ -2,59 +2,50 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+import torch
+
 from autdtorch.methods.catalogue import label_of
+from autdtorch.plot.costs import plot_pareto
+from autdtorch.plot.pressure_maps import plot_planes
+from autdtorch.plot.scene_figure import plot_scene
+from autdtorch.plot.trials import plot_convergence, plot_trials
+from autdtorch.plot.view3d import rendering_problem, view3d
 from autdtorch.scene.scene import Scene
 from autdtorch.study.report import tables
 from autdtorch.study.report.claims import BO, GABS, judge_claims
 from autdtorch.study.report.document import as_page, rendered
-from autdtorch.study.report.figures import draw_figures
-from autdtorch.study.results import StudyResult, summary_rows
+from autdtorch.study.results import MethodResult, SceneResult, StudyResult, summary_rows
 from autdtorch.study.results_file import RESULTS_FILE
-from autdtorch.study.statistics import FEWEST_TRIALS
+from autdtorch.study.statistics import FEWEST_TRIALS, NEAR_BOUND, bound_gap
 from autdtorch.study.trial_file import TRIALS_FILE
 
 REPORT_FILE = "report.md"
 HTML_FILE = "report.html"
 
 _FEW_TRIALS = 20  # with fewer, the spread of a method is not well known
+_PLANES_A_FIGURE = 4
 
 
 def write_report(
-    results: StudyResult,
-    scenes: Mapping[str, Scene],
-    folder: str | os.PathLike[str],
-    command: str,
-    seeds: Sequence[int] = (),
+    results: StudyResult, scenes: Mapping[str, Scene], folder: Path, command: str, seeds: Sequence[int] = ()
 ) -> Path:
     """Write `report.md` and its figures, and both as one file `report.html`, whose path is returned.
 
-    Args:
-        results: results to report.
-        scenes: the scenes of `results`, by the same names.
-        folder: folder for the report and its figures; made if it does not exist.
-        command: command line that repeats the study.
-        seeds: seeds of the studies that `results` were merged from; empty for a single study in `folder`.
-
-    Raises:
-        OSError: the folder cannot be made or written.
-        ValueError: a scene of `results` is missing in `scenes`.
+    `scenes` are those of the results, by name. `seeds` are those of the studies that the results were merged
+    from; there are none for a single study in `folder`.
     """
-    if missing := results.scenes.keys() - scenes.keys():
-        raise ValueError(f"scenes: none for {sorted(missing)}; must have every scene of the results")
-    folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    scenes = {name: scenes[name] for name in results.scenes}
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".report-") as new:
-        text = _markdown(results, scenes, Path(new), command, seeds)
-        (Path(new) / REPORT_FILE).write_text(text, encoding="utf-8")
-        (Path(new) / HTML_FILE).write_text(as_page(text, Path(new)), encoding="utf-8")
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".report-") as name:
+        new = Path(name)
+        text = _markdown(results, scenes, new, command, seeds)
+        (new / REPORT_FILE).write_text(text, encoding="utf-8")
+        (new / HTML_FILE).write_text(as_page(text, new), encoding="utf-8")
         # A file replaces an older one, or a link: nothing is written through a link.
-        for file in Path(new).iterdir():
+        for file in new.iterdir():
             file.replace(folder / file.name)
     return folder / HTML_FILE
 
@@ -62,6 +53,9 @@ def write_report(
 def _markdown(
     results: StudyResult, scenes: Mapping[str, Scene], folder: Path, command: str, seeds: Sequence[int]
 ) -> str:
+    """Draw the figures into a folder; return the text of the report."""
+    _draw_convergence(results, folder)
+    _draw_costs(results, folder)
     counts: dict[str, list[int]] = {}
     for scene in results.scenes.values():
         for name, method in scene.methods.items():
@@ -77,7 +71,10 @@ def _markdown(
         trials=", ".join(f"{label_of(name)} {tables.extent(numbers)}" for name, numbers in counts.items()),
         few=[label_of(name) for name in (BO, GABS) if max(counts.get(name, [_FEW_TRIALS])) < _FEW_TRIALS],
         fewest_trials=FEWEST_TRIALS,
-        figures=draw_figures(results, scenes, folder),
+        rendering_problem=_draw_scenes(scenes, folder),
+        scenes=[(name, f"![{name}](fig1_{name}.png)") for name in scenes],
+        planes=_draw_planes(results, scenes, folder),
+        quantities=_draw_trials(results, folder),
         summary=summary_rows(results),
         claims=tables.claim_rows(judged),
         claims_in_all=len(judged),
@@ -90,3 +87,88 @@ def _markdown(
         results_file=RESULTS_FILE,
         trials_file=TRIALS_FILE,
     )
+
+
+def _draw_scenes(scenes: Mapping[str, Scene], folder: Path) -> str | None:
+    """Return why the scenes are not rendered in 3D, or None."""
+    problem = rendering_problem()
+    for name, scene in scenes.items():
+        if problem is None:
+            view3d(scene, save=folder / f"fig1_{name}.png").close()
+        else:
+            plot_scene(scene).savefig(folder / f"fig1_{name}.png")
+    return problem
+
+
+def _draw_planes(results: StudyResult, scenes: Mapping[str, Scene], folder: Path) -> list[str]:
+    """Return the names of the files."""
+    pressure = _by_method(results, lambda result: result.plane_pressure)
+    planes = {name: plane for name in pressure if (plane := scenes[name].observation_plane) is not None}
+    names = list(planes)
+    files: list[str] = []
+    for start in range(0, len(names), _PLANES_A_FIGURE):
+        part = names[start : start + _PLANES_A_FIGURE]
+        files.append(f"fig2_{len(files) + 1}.png" if files else "fig2.png")
+        points = {name: scenes[name].control_points for name in part}
+        obstacles = {name: scenes[name].obstacles for name in part}
+        figure = plot_planes({name: pressure[name] for name in part}, planes, points, obstacles)
+        figure.savefig(folder / files[-1])
+    return files
+
+
+def _draw_trials(results: StudyResult, folder: Path) -> list[str]:
+    """Return the labels of the quantities."""
+    areas = _by_method(
+        results, lambda result: None if result.metrics.area is None else 1e6 * result.metrics.area
+    )
+    quantities = {
+        "mean pressure of the foci [Pa]": _by_method(results, lambda result: result.metrics.mean),
+        **({"area per focus [mm²]": areas} if areas else {}),
+        "std among the foci [Pa]": _by_method(results, lambda result: result.metrics.std),
+    }
+    plot_trials(quantities).savefig(folder / "fig3abc.png")
+    return list(quantities)
+
+
+def _by_method(
+    results: StudyResult, quantity: Callable[[MethodResult], torch.Tensor | None]
+) -> dict[str, dict[str, torch.Tensor]]:
+    """Return a quantity by scene and method, without methods and scenes that lack it."""
+    found: dict[str, dict[str, torch.Tensor]] = {}
+    for scene, result in results.scenes.items():
+        for name, method in result.methods.items():
+            if (value := quantity(method)) is not None:
+                found.setdefault(scene, {})[name] = value
+    return found
+
+
+def _draw_convergence(results: StudyResult, folder: Path) -> None:
+    history, levels = {}, {}
+    for scene, found in results.scenes.items():
+        competitors = _competitors(found)
+        history[scene] = {name: method.solution.history for name, method in competitors.items()}
+        levels[scene] = {"bound": found.bound, f"{tables.NEAR} of the bound": NEAR_BOUND * found.bound}
+        levels[scene] |= {
+            label_of(name): float(method.solution.score.median())
+            for name, method in found.methods.items()
+            if name not in competitors
+        }
+    plot_convergence(history, levels).savefig(folder / "fig3d.png")
+
+
+def _draw_costs(results: StudyResult, folder: Path) -> None:
+    points = {
+        scene: {
+            name: [(float(method.seconds.median()), 100 * (1 - bound_gap(method, found.bound).gap.value))]
+            for name, method in _competitors(found).items()
+        }
+        for scene, found in results.scenes.items()
+    }
+    time, score = "median time of the search [s per trial]", "score / bound [%]"
+    plot_pareto(points, time, score, higher_is_better=True).savefig(folder / "fig4.png")
+
+
+def _competitors(scene: SceneResult) -> Mapping[str, MethodResult]:
+    """Return all methods except the baseline, which stays if it is the only one."""
+    methods = {name: method for name, method in scene.methods.items() if not tables.is_baseline(name)}
+    return methods or scene.methods

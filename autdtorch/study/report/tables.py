@@ -11,8 +11,9 @@ import numpy as np
 import torch
 
 from autdtorch.methods.catalogue import label_of
+from autdtorch.propagators import Run
 from autdtorch.study.report.claims import Claim, Verdict
-from autdtorch.study.results import MethodResult, SceneResult, StudyResult
+from autdtorch.study.results import MethodResult, StudyResult
 from autdtorch.study.statistics import NEAR_BOUND, bound_gap
 from autdtorch.study.sweeps import Sweep
 from autdtorch.utils.files import replacing
@@ -45,18 +46,13 @@ def gap_rows(results: StudyResult) -> list[list[str]]:
     for scene_name, scene in results.scenes.items():
         rows.append([scene_name, "*bound*", f"{scene.bound:.3g}", "0", "-", "-", "-"])
         for name, method in scene.methods.items():
-            rows.append([scene_name, label_of(name), *_gap_cells(name, method, scene.bound)])
+            found = bound_gap(method, scene.bound)
+            gap = f"{found.gap.mapped(lambda share: 100 * share):.1f}"
+            evaluations = f"{method.solution.evaluations.double().mean():.0f}"
+            counts = ["-", "-"] if is_baseline(name) else [evaluations, _median_of_reached(found.evaluations)]
+            seconds = f"{method.seconds.median():.2g}"
+            rows.append([scene_name, label_of(name), str(found.score), gap, *counts, seconds])
     return rows
-
-
-def _gap_cells(name: str, method: MethodResult, bound: float) -> list[str]:
-    found = bound_gap(method, bound)
-    gap = f"{found.gap.mapped(lambda share: 100 * share):.1f}"
-    evaluations = f"{method.solution.evaluations.double().mean():.0f}"
-    near = _median_of_reached(found.evaluations)
-    if is_baseline(name):
-        evaluations = near = "-"
-    return [str(found.score), gap, evaluations, near, f"{method.seconds.median():.2g}"]
 
 
 def _median_of_reached(evaluations: torch.Tensor) -> str:
@@ -70,22 +66,24 @@ def simulation_rows(results: StudyResult) -> list[list[str]]:
     """Return the simulation of every scene."""
     head = ["scene", "method", "spacing [mm]", "cells per wavelength", "runs", "periods", "to steady state"]
     rows = [[*head, "reached", "matrix [s]", "plane [s]"]]
-    return rows + [[name, *_simulation_cells(scene)] for name, scene in results.scenes.items()]
+    for name, scene in results.scenes.items():
+        simulation, runs = scene.simulation, scene.simulation.runs
+        if simulation.spacing is None:
+            cells = [f"{simulation.method} (exact)", *["-"] * 6]
+        else:
+            a_wavelength = simulation.wavelength / simulation.spacing
+            cells = [simulation.method, f"{1e3 * simulation.spacing:g}", f"{a_wavelength:.1f}"]
+            cells += _run_cells(runs) if runs else ["0, kept on disk", "-", "-", "-"]
+        seconds = (simulation.matrix_seconds, simulation.plane_seconds)
+        rows.append([name, *cells, *(f"{one:.1f}" for one in seconds)])
+    return rows
 
 
-def _simulation_cells(scene: SceneResult) -> list[str]:
-    simulation, runs = scene.simulation, scene.simulation.runs
-    seconds = [f"{simulation.matrix_seconds:.1f}", f"{simulation.plane_seconds:.1f}"]
-    if simulation.spacing is None:
-        return [f"{simulation.method} (exact)", *["-"] * 6, *seconds]
-    cells = simulation.wavelength / simulation.spacing
-    head = [simulation.method, f"{1e3 * simulation.spacing:g}", f"{cells:.1f}"]
-    if not runs:
-        return [*head, "0, kept on disk", *["-"] * 3, *seconds]
+def _run_cells(runs: Sequence[Run]) -> list[str]:
     missed = sum(not run.reached for run in runs)
     reached = f"not in {missed} runs" if missed else "yes"
     remaining = f"{max(run.remaining for run in runs):.1e}"
-    return [*head, str(len(runs)), extent([run.periods for run in runs]), remaining, reached, *seconds]
+    return [str(len(runs)), extent([run.periods for run in runs]), remaining, reached]
 
 
 def extent(counts: Sequence[int]) -> str:
