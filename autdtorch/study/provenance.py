@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -61,21 +60,20 @@ class Provenance:
 
 def provenance_now(config: str, seed: int) -> Provenance:
     """Return the provenance of a study that starts now, with the source and packages of this process."""
-    versions = {"autdtorch": autdtorch.__version__, "python": platform.python_version()}
-    versions |= package_versions()
+    versions = {"autdtorch": autdtorch.__version__, "python": platform.python_version(), **package_versions()}
     versions["platform"] = platform.platform()
     date = datetime.now(UTC).isoformat(timespec="seconds")
     return Provenance(config, seed, versions, source_digest(), date)
 
 
-def save_provenance(provenance: Provenance, folder: str | os.PathLike[str]) -> None:
+def save_provenance(provenance: Provenance, folder: Path) -> None:
     """Write the provenance of a study into its folder, with a checksum."""
-    replace_file(Path(folder) / PROVENANCE_FILE, line_of(asdict(provenance)) + b"\n")
+    replace_file(folder / PROVENANCE_FILE, line_of(asdict(provenance)) + b"\n")
 
 
-def load_provenance(folder: str | os.PathLike[str]) -> Provenance:
+def load_provenance(folder: Path) -> Provenance:
     """Read the provenance that `save_provenance` wrote; refuse a damaged file or one of another version."""
-    path = Path(folder) / PROVENANCE_FILE
+    path = folder / PROVENANCE_FILE
     content = path.read_bytes()
     try:
         return Provenance.from_fields(row_of(content.removesuffix(b"\n")))

@@ -52,9 +52,8 @@ _USER_BLOCK = 512  # bytes, the fewest that HDF5 allows
 _DAMAGE = (OSError, KeyError, ValueError, TypeError, AttributeError, OverflowError, RuntimeError)  # of h5py
 
 
-def save_results(results: StudyResult, folder: str | os.PathLike[str]) -> None:
+def save_results(results: StudyResult, folder: Path) -> None:
     """Write the results of a study into a folder, which is made if it does not exist."""
-    folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     content = io.BytesIO()  # on a full disk, HDF5 would raise no OSError but fail when it closes the file
     with h5py.File(content, "w", userblock_size=_USER_BLOCK) as file:
@@ -83,8 +82,6 @@ def load_results(path: str | os.PathLike[str]) -> StudyResult:
     path = path_of("path", path)
     if path.is_dir():
         path = path / RESULTS_FILE
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: there is no such results file")
     content = path.read_bytes()
     try:
         if content[:_USER_BLOCK] != _user_block(content[_USER_BLOCK:]):
@@ -171,9 +168,8 @@ def _read_method(group: Any, points: int, transducers: int) -> MethodResult:
     shown = integer_at_least("shown_trial", group.attrs["shown_trial"], 0)
     if shown >= trials:
         raise invalid("shown_trial", shown, f"must be in 0 to {trials - 1}, one of the trials")
-    mean, least, std, uniformity = (_magnitudes(group, key, trials) for key in _METRICS[:-1])
     area = _magnitudes(group, "area", trials) if "area" in group else None
-    metrics = FocusMetrics(mean, least, std, uniformity, area)
+    metrics = FocusMetrics(**{key: _magnitudes(group, key, trials) for key in _METRICS[:-1]}, area=area)
     plane = _complex_matrix(group, "plane_pressure") if "plane_pressure" in group else None
     return MethodResult(solution, metrics, _magnitudes(group, "seconds", trials), shown, plane)
 

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from scipy import stats
 
-from autdtorch.methods.solution import Solution
 from autdtorch.study.results import MethodResult
 
 CONFIDENCE = 0.95
@@ -116,14 +115,6 @@ def bound_gap(method: MethodResult, bound: float) -> BoundGap:
     """Return the gap of a method to the upper bound on the score [Pa], >= 0."""
     score = bootstrap(method.solution.score, average=np.median)
     gap = score.mapped(lambda value: 1 - value / bound if bound > 0 else 0.0)
-    return BoundGap(score, gap, evaluations_to(method.solution, NEAR_BOUND * bound))
-
-
-def evaluations_to(solution: Solution, score: float) -> torch.Tensor:
-    """Return the evaluations until each trial's best score reached `score` (T,), float64; inf if it did not.
-
-    The median over the trials is right if more than half of them reached the score.
-    """
-    reached = solution.history >= score
-    first = reached.int().argmax(dim=1).double() + 1
-    return torch.where(reached.any(dim=1), first, torch.inf)
+    near = method.solution.history >= NEAR_BOUND * bound
+    first = near.int().argmax(dim=1).double() + 1
+    return BoundGap(score, gap, torch.where(near.any(dim=1), first, torch.inf))

@@ -1,7 +1,6 @@
-"""The finished trials of a study, appended to a file as they end.
+"""The finished trials of a study, appended to a file as they end: a line of JSON with all that a trial found.
 
-A line a trial, as JSON, with all that the trial found: what is there survives the end of the process, at
-whatever moment it comes, and a study that is begun again goes on after it.
+Lines survive the end of the process at any moment, and a study that is begun again goes on after them.
 """
 
 from __future__ import annotations
@@ -62,9 +61,8 @@ class TrialFile:
         """
         share = seconds / len(trials)
         added = [trial for trial in trials if (scene, method, trial) not in self._trials]
-        for place, trial in enumerate(trials):
-            if trial in added:
-                self._trials[scene, method, trial] = _alone(found, place), share
+        for trial in added:
+            self._trials[scene, method, trial] = _alone(found, trials.index(trial)), share
         if self._lines is not None:
             self._lines.append(*(self._row(scene, method, trial) for trial in added))
 

@@ -83,12 +83,11 @@ def method_result(history: list[list[float]]) -> MethodResult:
     return MethodResult(solution, metrics, torch.ones(trials, dtype=torch.float64), 0, None)
 
 
-def test_evaluations_are_counted_to_the_first_that_reaches_a_score() -> None:
+def test_evaluations_are_counted_to_the_first_near_the_bound() -> None:
     ended_early = [2.0, 9.5, 9.5, 9.5]
     history = [[1.0, 2.0, 9.0, 9.5], [9.0] * 4, [1.0, 1.0, 1.0, 8.9], ended_early]
-    solution = method_result(history).solution
-    for score, wanted in ((9.0, [3, 1, math.inf, 2]), (9.6, [math.inf] * 4), (0.5, [1] * 4)):
-        assert statistics.evaluations_to(solution, score).tolist() == wanted
+    for bound, wanted in ((10.0, [3, 1, math.inf, 2]), (11.0, [math.inf] * 4), (0.5, [1] * 4)):
+        assert bound_gap(method_result(history), bound).evaluations.tolist() == wanted
 
 
 def test_the_gap_is_that_of_the_median_score() -> None:

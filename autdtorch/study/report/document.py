@@ -62,11 +62,7 @@ def rendered(template: str, **values: object) -> str:
 def as_page(text: str, folder: Path) -> str:
     """Return a report in Markdown without links as one HTML file; its first line is the title.
 
-    HTML is shown as text, except for the tags of the report itself. Images are PNG files in `folder`.
-
-    Raises:
-        OSError: an image cannot be read.
-        ValueError: an image is not in the folder.
+    HTML is shown as text, except for the tags of the report itself. Images must be PNG files in `folder`.
     """
     markdown = MarkdownIt("commonmark", {"html": True}).enable("table")
     markdown.disable(["link", "autolink", "reference"])
