@@ -8,10 +8,9 @@ import torch
 
 from autdtorch.fdtd.adjoint import recorded
 from autdtorch.fdtd.grid import make_grid, require_fine, warn_if_coarse
-from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources
 from autdtorch.fdtd.material_gradients import cells_of_maps, cells_of_obstacles, domain_cells
 from autdtorch.fdtd.steady_state import block_of, fewest_periods
-from autdtorch.fdtd.stepping import Assembly, drive_dft, drive_signal
+from autdtorch.fdtd.stepping import drive_dft, drive_signal
 from autdtorch.propagators.plan import available_kernel, make_kernel, precision_of
 from autdtorch.propagators.scene_region import region_of, warn_of_ending_walls
 from autdtorch.scene.drive import validate_drive
@@ -93,11 +92,14 @@ def differentiable_field(
     cells = (cells_of_maps if by_maps else cells_of_obstacles)(region, grid, *given)
     assembly = cells.assembly(grid, region, precision, time_step)
     receivers, nodes, stepper = assembly.receivers(targets), scene.array.nodes, make_kernel(kernel)
+    steps, block = block_of(assembly.steps_per_period)
+    signal = drive_signal(assembly.steps_per_period, 0, steps * math.ceil(periods / block)).to(precision)
     fields = [torch.zeros((0, len(targets)), dtype=torch.complex128, device="cpu")]
     for row in drive.reshape(-1, drive.shape[-1]):
         strength = scene.array.source_strength * row.cpu()
         sources = cells.driven(assembly.sources(nodes.positions, strength, nodes.weights))
-        fields.append(_phasors(stepper, assembly, sources, receivers, periods)[None])
+        record = recorded(stepper, assembly, sources, receivers, signal)
+        fields.append(drive_dft(record[-steps:], block)[None])  # the last block
     return torch.cat(fields).reshape(*drive.shape[:-1], len(targets))
 
 
@@ -130,13 +132,3 @@ def _material(name: str, given: ArrayLike | None, scene: Scene) -> torch.Tensor 
     if values.numel() and values.detach().min() <= 0:
         raise invalid(name, float(values.detach().min()), "every entry must be > 0")
     return values
-
-
-def _phasors(
-    kernel: Kernel, assembly: Assembly, sources: Sources, receivers: Receivers, periods: int
-) -> torch.Tensor:
-    """Return the phasors (P,) of the last block of a run of at least `periods`."""
-    steps, block = block_of(assembly.steps_per_period)
-    count = steps * math.ceil(periods / block)
-    signal = drive_signal(assembly.steps_per_period, 0, count).to(assembly.dtype)
-    return drive_dft(recorded(kernel, assembly, sources, receivers, signal)[-steps:], block)
