@@ -46,17 +46,9 @@ class FreeSpacePropagator:
     def transfer_matrix(
         self, points: ArrayLike | None = None, return_error: bool = False
     ) -> torch.Tensor | tuple[torch.Tensor, float]:
-        """Return the transfer matrix G (Eq. 2).
+        """Return the transfer matrix G (Eq. 2); see `SimulatedPropagator.transfer_matrix`.
 
-        Args:
-            points: (P, 3) [m]; by default the scene's control points.
-            return_error: also return the estimated relative error: 0, or infinite if obstacles are ignored.
-
-        Returns:
-            complex128 (P, M) [Pa], and the error if asked for.
-
-        Raises:
-            ValueError: `points` are not finite, have another shape, or lie on a transducer.
+        The error is 0, or infinite if obstacles are ignored. Points on a transducer raise `ValueError`.
         """
         points = self.scene.control_points if points is None else points
         matrix = free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber)
@@ -64,18 +56,7 @@ class FreeSpacePropagator:
         return (matrix, error) if boolean("return_error", return_error) else matrix
 
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
-        """Return the pressure of drives at points.
-
-        Args:
-            drive: (..., M) complex, |q| <= 1.
-            points: (P, 3) or a grid such as (Nu, Nv, 3) [m].
-
-        Returns:
-            complex128 (..., P) or (..., Nu, Nv) [Pa]; differentiable by the drive.
-
-        Raises:
-            ValueError: drive or points of another shape or out of range.
-        """
+        """Return the pressure of drives at points; see `SimulatedPropagator.field`."""
         drive = validate_drive(drive, len(self.scene.array))
         points, grid = points_grid("points", points)
         return (drive @ self.transfer_matrix(points).mT).reshape(*drive.shape[:-1], *grid)
