@@ -275,9 +275,7 @@ def _unit_normals(normals: ArrayLike, count: int) -> torch.Tensor:
     name = "TransducerArray.normals"
     rows = real_tensor(name, normals).detach().cpu()
     if rows.shape == (3,):
-        return torch.tensor(unit_vector(name, rows), dtype=torch.float64, device="cpu").repeat(count, 1)
+        return rows.new_tensor(unit_vector(name, rows)).repeat(count, 1)
     if rows.shape != (count, 3):
         raise ValueError(f"{name}: shape {tuple(rows.shape)}; must be (3,) or ({count}, 3) as positions")
-    return torch.tensor(
-        [unit_vector(f"{name}[{m}]", row) for m, row in enumerate(rows)], dtype=torch.float64, device="cpu"
-    )
+    return rows.new_tensor([unit_vector(f"{name}[{m}]", row) for m, row in enumerate(rows)])

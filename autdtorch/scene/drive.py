@@ -90,11 +90,8 @@ def focus_phases(positions: ArrayLike, focus: ArrayLike, wavenumber: float) -> t
     return wavenumber * distances(points_tensor("focus", foci).to(sources.device), sources)
 
 
-def normalise(drive: ArrayLike) -> torch.Tensor:
+def normalise(drive: torch.Tensor) -> torch.Tensor:
     """Scale a `drive` (..., M) to a largest amplitude of 1 over the last axis (Eq. 6)."""
-    drive = complex_tensor("drive", drive)
-    if drive.ndim == 0 or drive.shape[-1] == 0:
-        raise ValueError(f"drive: shape {tuple(drive.shape)}; must be (..., M) with M >= 1")
     largest = drive.abs().amax(dim=-1, keepdim=True)
     if not (largest > 0).all():
         raise ValueError("drive: 0 for every transducer; at least one amplitude must be > 0")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from operator import attrgetter
 
@@ -14,7 +14,6 @@ import torch
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import Coordinates, Plane
 from autdtorch.scene.medium import Medium as Medium
-from autdtorch.scene.obstacles import Box as Box
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.html import html_facts
 from autdtorch.utils.neighbours import nearest, require_distinct
@@ -118,7 +117,8 @@ class Scene:
         object.__setattr__(self, "obstacles", members("Scene.obstacles", obstacles, Obstacle))
         object.__setattr__(self, "observation_plane", observation_plane)
         object.__setattr__(self, "name", name)
-        _require_near(self)
+        for field, places in _everything(self):
+            _require_within(field, places)
         object.__setattr__(self, "domain", self._bounds() if domain is None else _corners(domain))
         most = _MOST_ABSORPTION / self.wavelength
         if medium.absorption > most:
@@ -181,7 +181,7 @@ class Scene:
         return " x ".join(f"{(high - low) / unit:.{digits}g}" for low, high in zip(lower, upper, strict=True))
 
     def _bounds(self) -> tuple[Vector, Vector]:
-        points = torch.cat([points for _, points in (*_contents(self), *_obstacle_corners(self))])
+        points = torch.cat([points for _, points in _everything(self)])
         margin = _DEFAULT_MARGIN * self.wavelength
         return _corners(torch.stack([points.amin(dim=0) - margin, points.amax(dim=0) + margin]))
 
@@ -207,31 +207,27 @@ def _corners(domain: ArrayLike) -> tuple[Vector, Vector]:
     return lower, upper
 
 
-def _points(scene: Scene) -> dict[str, torch.Tensor]:
-    return {"Scene.array.positions": scene.array.positions, "Scene.control_points": scene.control_points}
-
-
 def _contents(scene: Scene) -> list[tuple[str, torch.Tensor]]:
     """Return names and points (N, 3) [m] of everything that must be inside the domain."""
-    contents = list(_points(scene).items())
     positions, reach = scene.array.positions, scene.array.half_extents
-    contents += [("Scene.array disc's lower edge", positions - reach)]
-    contents += [("Scene.array disc's upper edge", positions + reach)]
+    contents = [
+        ("Scene.array.positions", positions),
+        ("Scene.control_points", scene.control_points),
+        ("Scene.array disc's lower edge", positions - reach),
+        ("Scene.array disc's upper edge", positions + reach),
+    ]
     if scene.observation_plane is not None:
         contents.append(("Scene.observation_plane corner", scene.observation_plane.corners))
     return contents
 
 
-def _obstacle_corners(scene: Scene) -> Iterator[tuple[str, torch.Tensor]]:
-    for index, body in enumerate(scene.obstacles):
-        corners = torch.tensor([body.lower, body.upper], dtype=torch.float64, device="cpu")
-        yield f"Scene.obstacles[{index}] corner", corners
-
-
-def _require_near(scene: Scene) -> None:
-    """Refuse coordinates so large that cells could not be counted."""
-    for name, points in (*_contents(scene), *_obstacle_corners(scene)):
-        _require_within(name, points)
+def _everything(scene: Scene) -> list[tuple[str, torch.Tensor]]:
+    """Return names and points (N, 3) [m] of the contents and of the obstacles' bounding boxes."""
+    bounds = [
+        (f"Scene.obstacles[{index}] corner", scene.control_points.new_tensor([body.lower, body.upper]))
+        for index, body in enumerate(scene.obstacles)
+    ]
+    return _contents(scene) + bounds
 
 
 def _require_within(name: str, points: torch.Tensor) -> None:
@@ -244,25 +240,25 @@ def _require_within(name: str, points: torch.Tensor) -> None:
 def _require_separate_points(scene: Scene) -> None:
     """Refuse coincident points and points in or on an obstacle; on it, rounding would choose the side."""
     require_distinct("Scene.control_points", scene.control_points)
-    nodes = scene.array.nodes.positions
-    gap, node = nearest(scene.control_points, nodes.reshape(-1, 3))
+    points, nodes = scene.control_points, scene.array.nodes.positions
+    gap, node = nearest(points, nodes.reshape(-1, 3))
     if gap.min() < LENGTH_TOLERANCE:
         point = int(gap.argmin())
         transducer = int(node[point]) // nodes.shape[1]
         accepted = f"lies on transducer {transducer}, must be at least {LENGTH_TOLERANCE:g} m away"
-        raise invalid(f"Scene.control_points[{point}]", scene.control_points[point], accepted, "m")
-    for name, group in (_points(scene) | {"Scene.array.nodes": nodes}).items():
+        raise invalid(f"Scene.control_points[{point}]", points[point], accepted, "m")
+    groups = {"array.positions": scene.array.positions, "control_points": points, "array.nodes": nodes}
+    for name, group in groups.items():
         for index, obstacle in enumerate(scene.obstacles):
             inside = obstacle.contains(group, margin=LENGTH_TOLERANCE)
             if inside.any():
                 first = tuple(inside.nonzero()[0].tolist())
-                extent = _extent(obstacle.lower, obstacle.upper)
-                accepted = f"lies in or on obstacle {index}, {extent}, must be outside it"
-                raise invalid(f"{name}{list(first)}", group[first], accepted, "m")
+                accepted = f"lies in or on obstacle {index}, {_extent(obstacle)}, must be outside it"
+                raise invalid(f"Scene.{name}{list(first)}", group[first], accepted, "m")
 
 
 def _warn_of_units(scene: Scene) -> None:
-    points = torch.cat(list(_points(scene).values()))
+    points = torch.cat([scene.array.positions, scene.control_points])
     extent = float((points.amax(dim=0) - points.amin(dim=0)).norm())
     least, most = (bound * scene.wavelength for bound in _USUAL_EXTENT)
     if not least <= extent <= most:
@@ -307,9 +303,10 @@ def _shared(
     return (lower, upper) if (upper - lower).min() > LENGTH_TOLERANCE else None
 
 
-def _extent(lower: Vector, upper: Vector) -> str:
-    """Return the corners of a bounding box as text, without rounding errors."""
-    low, high = (tuple(float(f"{entry:.9g}") for entry in corner) for corner in (lower, upper))
+def _extent(obstacle: Obstacle) -> str:
+    """Return the corners of the bounding box as text, without rounding errors."""
+    bounds = obstacle.lower, obstacle.upper
+    low, high = (tuple(float(f"{entry:.9g}") for entry in corner) for corner in bounds)
     return f"{low} to {high} m"
 
 
@@ -327,7 +324,6 @@ def _require_in_domain(scene: Scene) -> None:
     for name, points in _contents(scene):
         require_inside(scene.domain, name, points)
     for index, obstacle in enumerate(scene.obstacles):
-        bounds = (obstacle.lower, obstacle.upper)
-        if _shared(bounds, scene.domain) is None:
+        if _shared((obstacle.lower, obstacle.upper), scene.domain) is None:
             accepted = f"must be at least partly inside the domain, {scene.domain[0]} to {scene.domain[1]} m"
-            raise ValueError(f"Scene.obstacles[{index}]: {_extent(*bounds)}; {accepted}")
+            raise ValueError(f"Scene.obstacles[{index}]: {_extent(obstacle)}; {accepted}")

@@ -16,7 +16,7 @@ from autdtorch.fdtd.kernels.cpu import CpuKernel, _cuts
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import Assembly, assemble, drive_signal
 from autdtorch.propagators.scene_region import region_of
-from autdtorch.scene.scene import Box
+from autdtorch.scene.obstacles import Box
 
 RIGID = Box(center=(15e-3, 4e-3, 9e-3), size=(4e-3, 6e-3, 7e-3), rigid=True)
 FAST = Box(center=(14e-3, 20e-3, 14e-3), size=(6e-3, 5e-3, 5e-3), density=3.0, sound_speed=700.0)

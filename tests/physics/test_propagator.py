@@ -12,7 +12,8 @@ from autdtorch.propagators import FreeSpacePropagator, make_propagator
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.drive import drive_from_phases
 from autdtorch.scene.geometry import plane_basis
-from autdtorch.scene.scene import Box, Scene
+from autdtorch.scene.obstacles import Box
+from autdtorch.scene.scene import Scene
 
 
 def full(scene, spacing=1e-3, **settings):

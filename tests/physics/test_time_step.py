@@ -18,7 +18,7 @@ from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.stepping import Assembly, assemble, drive_dft, drive_signal
 from autdtorch.propagators import make_propagator
 from autdtorch.propagators.scene_region import region_of
-from autdtorch.scene.scene import Box
+from autdtorch.scene.obstacles import Box
 
 
 def cube(density: float, sound_speed: float = 340.0) -> tuple[Box, ...]:

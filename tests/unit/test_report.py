@@ -17,7 +17,8 @@ from autdtorch.methods.bound import focus_bound
 from autdtorch.methods.gabs import gabs
 from autdtorch.methods.lssg import lssg
 from autdtorch.scene.geometry import Plane
-from autdtorch.scene.scene import Box, Scene
+from autdtorch.scene.obstacles import Box
+from autdtorch.scene.scene import Scene
 from autdtorch.study.report.study_report import HTML_FILE, write_report
 from autdtorch.study.report.tables import gap_rows, simulation_rows
 from autdtorch.study.results import StudyResult, summary_rows

@@ -26,13 +26,6 @@ class _MeshPath(str):
     vertices: Array
     faces: Index
 
-    @classmethod
-    def read(cls, given: object) -> _MeshPath:
-        """Check and read a file."""
-        path = cls(_checked_path(given))
-        path.vertices, path.faces = _read(str(path))
-        return path
-
 
 @dataclass(frozen=True)
 class Mesh(Obstacle):
@@ -69,7 +62,7 @@ class Mesh(Obstacle):
         object.__setattr__(self, "scale", positive("Mesh.scale", self.scale))
         object.__setattr__(self, "offset", finite_vector("Mesh.offset", self.offset))
         object.__setattr__(self, "rotation", finite_vector("Mesh.rotation", self.rotation, "rad"))
-        path = self.path if isinstance(self.path, _MeshPath) else _MeshPath.read(self.path)
+        path = self.path if isinstance(self.path, _MeshPath) else _read_path(self.path)
         object.__setattr__(self, "path", path)
         vertices = self.scale * torch.from_numpy(path.vertices) @ rotation_matrix(self.rotation).T
         vertices = vertices + vertices.new_tensor(self.offset)
@@ -105,13 +98,16 @@ class Mesh(Obstacle):
         return torch.from_numpy(distance).to(points)
 
 
-def _checked_path(given: object) -> str:
+def _read_path(given: object) -> _MeshPath:
+    """Check the path of a mesh file and read it."""
     path = path_of("Mesh.path", given)
     if path.suffix.lower() not in _FORMATS:
         raise invalid("Mesh.path", str(path), f"must end in one of {', '.join(_FORMATS)}")
     if not path.is_file():
         raise invalid("Mesh.path", str(path), "must be an existing file")
-    return str(path)
+    mesh = _MeshPath(path)
+    mesh.vertices, mesh.faces = _read(str(path))
+    return mesh
 
 
 def _read(path: str) -> tuple[Array, Index]:
