@@ -93,15 +93,3 @@ def test_infeasible_simulations_are_estimated_too():
     cost = at.estimate(small_scene((CUBE,), extent=0.1), 1.8e-5, method="full")
     assert cost.memory > 50e9
     assert cost.seconds > 3600
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        *({"spacing": 0.0}, {"spacing": 5e-3, "method": "full"}, {"spacing": 1e-9, "method": "full"}),
-        *({"tolerance": 1.0}, {"method": "fem"}, {"kernel": "tpu"}, {"dtype": "float16"}),
-    ],
-)
-def test_bad_input_is_refused_by_name(arguments):
-    with pytest.raises(ValueError, match=f"^{next(iter(arguments))}: "):
-        at.estimate(small_scene(), **arguments)
