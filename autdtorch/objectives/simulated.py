@@ -12,6 +12,8 @@ from autdtorch.scene.scene import Scene
 from autdtorch.utils.threads import one_torch_thread
 from autdtorch.utils.validation import invalid, require_kind, require_one_of
 
+_PRODUCTS = 2**16  # of transfer matrix and drives, that are computed at once
+
 
 class SimulatedObjective:
     """An objective whose observations are simulated.
@@ -71,7 +73,9 @@ class SimulatedObjective:
             # One by one: a propagator may use the transfer matrix for many drives at once.
             rows = [self._propagator.field(row, self.scene.control_points) for row in drive]
             return torch.stack(rows).abs().cpu()
-        return _magnitudes(self.transfer_matrix, drive)
+        # In parts, as large temporary arrays take most of the time
+        parts = torch.split(drive, max(1, _PRODUCTS // self.transfer_matrix.numel()))
+        return torch.cat([_magnitudes(self.transfer_matrix, part) for part in parts])
 
 
 def _magnitudes(matrix: torch.Tensor, drive: torch.Tensor) -> torch.Tensor:
@@ -80,7 +84,7 @@ def _magnitudes(matrix: torch.Tensor, drive: torch.Tensor) -> torch.Tensor:
     A search through thousands of choices amplifies differences of rounding. BLAS rounds by the number of
     rows, and complex products by their place in a vector register; single real operations always round alike.
     """
-    drive = drive.contiguous()[:, None]
-    real = (matrix.real * drive.real - matrix.imag * drive.imag).sum(dim=-1)
-    imaginary = (matrix.real * drive.imag + matrix.imag * drive.real).sum(dim=-1)
+    a, b = matrix.real.contiguous(), matrix.imag.contiguous()
+    c, d = drive.real.contiguous()[:, None], drive.imag.contiguous()[:, None]
+    real, imaginary = (a * c - b * d).sum(dim=-1), (a * d + b * c).sum(dim=-1)
     return (real.square() + imaginary.square()).sqrt()
