@@ -16,8 +16,7 @@ Search = Mapping[str, torch.Tensor]
 """The state of the ascent of L trials over N weights:
 
 - ``weights`` (L, N), complex128: e^{-i phi}, or 0 for what is off; ``before``: as they were before this pass.
-- ``order`` (L, K): indices of the weights to go through in a pass; ``place``: of the next one in the order.
-- ``passes``: number of passes left, this one included.
+- ``order`` (L, K): indices of the weights to go through in a pass.
 """
 
 
@@ -44,45 +43,38 @@ def indices_of(order: str | Sequence[int], count: int) -> torch.Tensor:
     return torch.tensor(range(count) if isinstance(order, str) else order, dtype=torch.int64, device="cpu")
 
 
-def begin_ascent(weights: torch.Tensor, order: torch.Tensor, passes: int, place: int = 0) -> Search:
-    """Return the state of an ascent from weights (L, N), at a place of the first pass."""
-    return {
-        "weights": weights,
-        "before": weights,
-        "order": order,
-        "place": torch.tensor(place, dtype=torch.int64, device="cpu"),
-        "passes": torch.tensor(passes, dtype=torch.int64, device="cpu"),
-    }
+def begin_ascent(weights: torch.Tensor, order: torch.Tensor) -> Search:
+    """Return the state of an ascent from weights (L, N)."""
+    return {"weights": weights, "before": weights, "order": order}
 
 
-def candidates(search: Search, levels: int) -> torch.Tensor:
-    """Return the weights (L, levels, N) to compare: all phases of the next weight.
+def candidates(search: Search, levels: int, step: int) -> torch.Tensor:
+    """Return the weights (L, levels, N) to compare in a step: all phases of its weight.
 
     The present phase is among them, so that a choice is made among observations of one time: a lucky reading,
     or the drift since, does not hold a phase for ever.
     """
-    found = search["weights"][:, None].repeat(1, levels, 1)
-    rows = torch.arange(len(found), device="cpu")
-    found[rows, :, search["order"][:, int(search["place"])]] = _phases(levels)
-    return found
+    weights, order = search["weights"][:, None], search["order"]
+    index = order[:, step % order.shape[1], None, None].expand(-1, levels, 1)
+    phases = _phases(levels)[:, None].expand(len(order), -1, 1)
+    return weights.expand(-1, levels, -1).scatter(2, index, phases)
 
 
-def ascend(search: Search, levels: int, score: torch.Tensor) -> tuple[Search, torch.Tensor]:
-    """Take the best of the `candidates` by their scores (L, levels); of near ties the first.
+def ascend(search: Search, step: int, score: torch.Tensor) -> tuple[Search, torch.Tensor | None]:
+    """Take the best of the `candidates` of a step by their scores (L, levels); of near ties the first.
 
     Returns:
-        The state, and which of the L trials go on (L,). A trial ends after its last pass, or after a pass
-        that changed none of its weights.
+        The state, and which of the L trials go on (L,), None for all. A trial ends after a pass that changed
+        none of its weights.
     """
-    rows = torch.arange(len(score), device="cpu")
-    place, passes = int(search["place"]) + 1, int(search["passes"])
-    weights = search["weights"].clone()
-    weights[rows, search["order"][:, place - 1]] = _phases(levels)[first_of_best(score)]
-    if place < search["order"].shape[1]:
-        following = torch.tensor(place, dtype=torch.int64, device="cpu")
-        return {**search, "weights": weights, "place": following}, rows >= 0
-    goes_on = (weights != search["before"]).any(dim=1) & (passes > 1)
-    return begin_ascent(weights[goes_on], search["order"][goes_on], passes - 1), goes_on
+    order = search["order"]
+    index = order[:, step % order.shape[1], None]
+    phases = _phases(score.shape[1])[first_of_best(score)]
+    weights = search["weights"].scatter(1, index, phases[:, None])
+    if (step + 1) % order.shape[1]:
+        return {**search, "weights": weights}, None
+    goes_on = (weights != search["before"]).any(dim=1)
+    return {**search, **begin_ascent(weights[goes_on], order[goes_on])}, goes_on
 
 
 @functools.lru_cache(maxsize=8)

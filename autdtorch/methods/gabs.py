@@ -75,37 +75,36 @@ class GABS(Method):
 
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
         """Observe the first transducer alone, or each alone where their strengths decide the order."""
-        alone = torch.eye(problem.transducers, dtype=torch.complex128, device="cpu")
+        count = problem.transducers
         if self.order == "strength":
+            alone = torch.eye(count, dtype=torch.complex128, device="cpu")
             return Step(alone.expand(len(seeds), -1, -1), {})
-        orders = coordinates.indices_of(self.order, problem.transducers).expand(len(seeds), -1)
+        orders = coordinates.indices_of(self.order, count).expand(len(seeds), -1)
         if self.order == "random":
-            count = problem.transducers
             shuffled = [torch.randperm(count, generator=own, device="cpu") for own in generators_of(seeds)]
             orders = torch.stack(shuffled)
-        orders = self._first_before(orders)
-        return Step(alone[orders[:, :1]], {"orders": orders})
+        search = self._first_on(orders)
+        return Step(search["weights"][:, None], search)
 
     def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
         """Compare the phases of the next transducer."""
-        if "weights" in state.search:
-            search, goes_on = coordinates.ascend(state.search, self.levels, score)
-            return Step(coordinates.candidates(search, self.levels), search, goes_on)
-        orders = state.search["orders"] if state.search else self._first_before(best_first(score))
-        alone = torch.eye(state.problem.transducers, dtype=torch.complex128, device="cpu")
-        search = coordinates.begin_ascent(alone[orders[:, 0]], orders, self.passes, place=1)
-        if state.problem.transducers > 1:
-            return Step(coordinates.candidates(search, self.levels), search)
-        goes_on = torch.full((len(orders),), self.passes > 1, dtype=torch.bool, device="cpu")
-        search = coordinates.begin_ascent(alone[orders[goes_on, 0]], orders[goes_on], self.passes - 1)
-        return Step(coordinates.candidates(search, self.levels), search, goes_on)
+        search, goes_on = state.search or self._first_on(best_first(score)), None
+        transducers = state.problem.transducers
+        alone = transducers if self.order == "strength" else 1
+        step = (state.best.history.shape[1] - alone) // self.levels
+        if step > 0:
+            search, goes_on = coordinates.ascend(search, step, score)
+        if step + 1 == self.passes * transducers:
+            return Step(state.drives[:, :0], search)
+        return Step(coordinates.candidates(search, self.levels, step + 1), search, goes_on)
 
-    def _first_before(self, orders: torch.Tensor) -> torch.Tensor:
-        """Return `orders` (T, M) with the transducer `first` moved to the front."""
-        if self.first is None:
-            return orders
-        others = orders[orders != self.first].reshape(len(orders), -1)
-        return torch.cat([orders.new_full((len(orders), 1), self.first), others], dim=1)
+    def _first_on(self, orders: torch.Tensor) -> coordinates.Search:
+        """Return the state of an ascent in `orders` (T, M), after `first`, with one transducer on."""
+        if self.first is not None:
+            others = orders[orders != self.first].reshape(len(orders), -1)
+            orders = torch.cat([orders.new_full((len(orders), 1), self.first), others], dim=1)
+        alone = torch.eye(orders.shape[1], dtype=torch.complex128, device="cpu")
+        return coordinates.begin_ascent(alone[orders[:, 0]], orders)
 
 
 def gabs(

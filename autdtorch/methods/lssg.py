@@ -33,17 +33,9 @@ class LSS(Method):
         """Check that the problem has a scene."""
         _scene(problem)
 
-    def most_evaluations(self, problem: Problem) -> int:
-        """Return 1."""
-        return 1
-
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
         """Observe the superposition."""
         return Step(normalise(_focus_drives(problem).sum(dim=0))[None, None], {})
-
-    def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
-        """End."""
-        return Step(state.drives[:, :0], {})
 
 
 @dataclass(frozen=True)
@@ -97,17 +89,18 @@ class LSSG(Method):
         """Compare the offsets of the first focus."""
         foci = _focus_drives(problem)
         start = torch.ones(1, problem.foci, dtype=torch.complex128, device="cpu")
-        search = coordinates.begin_ascent(
-            start, coordinates.indices_of(self.order, problem.foci)[None], self.passes
-        )
-        return Step(normalise(coordinates.candidates(search, self.levels) @ foci), {**search, "foci": foci})
+        order = coordinates.indices_of(self.order, problem.foci)[None]
+        search = {**coordinates.begin_ascent(start, order), "foci": foci}
+        return Step(normalise(coordinates.candidates(search, self.levels, 0) @ foci), search)
 
     def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
         """Compare the offsets of the next focus."""
-        foci = state.search["foci"]
-        search, goes_on = coordinates.ascend(state.search, self.levels, score)
-        drives = normalise(coordinates.candidates(search, self.levels) @ foci)
-        return Step(drives, {**search, "foci": foci}, goes_on)
+        step = state.best.history.shape[1] // self.levels
+        search, goes_on = coordinates.ascend(state.search, step - 1, score)
+        if step == self.passes * state.problem.foci:
+            return Step(state.drives[:, :0], search)
+        weights = coordinates.candidates(search, self.levels, step)
+        return Step(normalise(weights @ search["foci"]), search, goes_on)
 
 
 def lss(objective: Objective, score: Score = weakest_focus) -> Solution:
