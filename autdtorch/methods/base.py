@@ -135,8 +135,8 @@ class State:
 class Method(ABC):
     """Base of all methods: a frozen dataclass of settings that are checked when it is made.
 
-    A method of one's own adds its settings as fields and implements `most_evaluations`, `begin` and
-    `advance`; ``docs/extending.md`` has an example.
+    A method of one's own adds its settings as fields and implements `begin`, `advance` and
+    `most_evaluations`; ``docs/extending.md`` has an example.
 
     Attributes:
         name: of the method in results and files.
@@ -153,23 +153,23 @@ class Method(ABC):
         cls.name = cls.__dict__.get("name", cls.__name__)
         cls.label = cls.__dict__.get("label", cls.name)
 
-    @abstractmethod
     def most_evaluations(self, problem: Problem) -> int:
-        """Return the largest number of evaluations that a trial can take."""
+        """Return the most evaluations that a trial can take: the setting `evaluations`, or 1."""
+        return int(getattr(self, "evaluations", 1))
 
     @abstractmethod
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
         """Return the first step of the trials, one for each seed."""
 
-    @abstractmethod
     def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
-        """Return the next step.
+        """Return the next step; the end by default.
 
         Args:
             state: with the drives (L, B, M) that were observed.
             pressure: magnitudes (L, B, P) [Pa], float64.
             score: scores (L, B), float64.
         """
+        return Step(state.drives[:, :0], {})
 
     def check(self, problem: Problem) -> None:  # noqa: B027 - most methods have nothing to check
         """Check the settings against the problem; `ValueError` where one does not fit."""
@@ -282,7 +282,7 @@ def restored(states: torch.Tensor) -> list[torch.Generator]:
     """Return generators in the states (T, N), uint8."""
     generators = [torch.Generator("cpu") for _ in states]
     for generator, state in zip(generators, states, strict=True):
-        generator.set_state(state.clone())
+        generator.set_state(state.clone())  # it would read a row from the beginning of the whole tensor
     return generators
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import torch
 
@@ -14,15 +13,6 @@ from autdtorch.methods.state_file import load_state, save_state
 from autdtorch.objectives.objective import Objective, Score, weakest_focus
 from autdtorch.utils.progress import show_progress
 from autdtorch.utils.validation import invalid, path_of, require_callable, require_kind
-
-
-@runtime_checkable
-class Logged(Protocol):
-    """An objective that keeps a log of its evaluations, as a `HardwareObjective` does."""
-
-    def recorded(self, number: int, drive: torch.Tensor) -> torch.Tensor | None:
-        """Return the pressures (P,) [Pa] of an evaluation of this drive (M,) that the log holds, or None."""
-        ...
 
 
 def run(
@@ -83,15 +73,13 @@ def run(
 
 
 def observed(objective: Objective, drives: torch.Tensor, number: int) -> torch.Tensor:
-    """Return pressures (B, P) [Pa] of drives (B, M): recorded ones where the objective has a log with them.
-
-    The run made `number` evaluations before.
-    """
-    if not isinstance(objective, Logged):
+    """Return pressures (B, P) [Pa] of drives (B, M), evaluations from `number` on, recorded or observed."""
+    recorded = getattr(objective, "recorded", None)  # of a `HardwareObjective`
+    if recorded is None:
         return objective(drives)
-    recorded = [objective.recorded(number + row, drive) for row, drive in enumerate(drives)]
-    found = {row: pressure for row, pressure in enumerate(recorded) if pressure is not None}
-    missing = [row for row in range(len(drives)) if row not in found]
+    pressures = [recorded(number + row, drive) for row, drive in enumerate(drives)]
+    missing = [row for row, pressure in enumerate(pressures) if pressure is None]
     if missing:
-        found |= dict(zip(missing, objective(drives[missing]), strict=True))
-    return torch.stack([found[row] for row in range(len(drives))])
+        for row, pressure in zip(missing, objective(drives[missing]), strict=True):
+            pressures[row] = pressure
+    return torch.stack(pressures)

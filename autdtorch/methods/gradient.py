@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import torch
 
-from autdtorch.methods.base import Method, Problem, State, Step, Trials, generators_of
+from autdtorch.methods.base import Method, Problem, Step, Trials, generators_of
 from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.objective import Objective, weakest_focus
@@ -50,10 +50,6 @@ class GradientAscent(Method):
         object.__setattr__(self, "starts", integer_at_least("starts", self.starts, 1))
         object.__setattr__(self, "steps", integer_at_least("steps", self.steps, 2))
 
-    def most_evaluations(self, problem: Problem) -> int:
-        """Return 1."""
-        return 1
-
     def numbers_kept(self, problem: Problem) -> float:
         """Return the numbers of all climbs."""
         return self.steps + 2.0 * self.starts * (4 * problem.transducers + 2 * problem.foci)
@@ -67,10 +63,6 @@ class GradientAscent(Method):
         starts = [random_drives(self.starts, problem.transducers, own) for own in generators_of(seeds)]
         highest = [climb(matrix, start, self.steps) for start in starts]
         return Step(torch.stack(highest)[:, None], {})
-
-    def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
-        """End."""
-        return Step(state.drives[:, :0], {})
 
 
 def gradient_ascent(

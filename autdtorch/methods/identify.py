@@ -58,10 +58,6 @@ class Identify(Method):
             accepted = f"must be an integer >= {least}, to identify {problem.transducers} transducers"
             raise invalid("evaluations", self.evaluations, accepted)
 
-    def most_evaluations(self, problem: Problem) -> int:
-        """Return `evaluations`."""
-        return self.evaluations
-
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
         """Observe random phases."""
         generators = generators_of(seeds)
@@ -103,13 +99,10 @@ class Identify(Method):
 
     def _near(self, problem: Problem, observed: int) -> int:
         """Return how many drives the next round observes after so many; 0 when all rounds are over."""
-        left, done = self.evaluations - self._first(problem) - 1, self._first(problem)
-        for rounds in range(_ROUNDS, 0, -1):
-            count = left // rounds
-            if count and done == observed:
-                return count
-            left, done = left - count, done + count
-        return 0
+        first = self._first(problem)
+        left = self.evaluations - first - 1
+        ends = [first + left * rounds // _ROUNDS for rounds in range(1, _ROUNDS + 1)]
+        return next((end - observed for end in ends if end > observed), 0)
 
 
 def identify(objective: Objective, evaluations: int = 64, trials: Trials = 1, seed: int = 0) -> Solution:

@@ -13,7 +13,6 @@ from autdtorch.methods.base import Method, Problem, State, Step, Trials, generat
 from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.objective import Objective, Score, weakest_focus
-from autdtorch.scene.drive import drive_from_phases
 from autdtorch.utils.validation import integer_at_least
 
 _AT_ONCE = 64  # evaluations of a trial in one step, which bounds the memory of a step
@@ -40,10 +39,6 @@ class RandomSearch(Method):
         if self.levels is not None:
             object.__setattr__(self, "levels", integer_at_least("levels", self.levels, 2))
 
-    def most_evaluations(self, problem: Problem) -> int:
-        """Return `evaluations`."""
-        return self.evaluations
-
     def most_at_once(self, problem: Problem) -> int:
         """Return the size of a step."""
         return min(self.evaluations, _AT_ONCE)
@@ -55,6 +50,8 @@ class RandomSearch(Method):
     def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
         """Draw more phases."""
         done = state.best.history.shape[1]
+        if done == self.evaluations:
+            return Step(state.drives[:, :0], {})
         return self._drawn(restored(state.search["generators"]), state.problem.transducers, done)
 
     def _drawn(self, generators: Sequence[torch.Generator], transducers: int, done: int) -> Step:
@@ -63,7 +60,8 @@ class RandomSearch(Method):
         turns = torch.stack(drawn)
         if self.levels is not None:
             turns = (self.levels * turns).floor() / self.levels
-        return Step(drive_from_phases(2 * math.pi * turns), {"generators": states_of(generators)})
+        drives = torch.polar(torch.ones_like(turns), -2 * math.pi * turns)
+        return Step(drives, {"generators": states_of(generators)})
 
 
 def random_search(

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -34,15 +33,6 @@ SNRS = (-1000.0, 1000.0)
 """Range of signal-to-noise ratios [dB]; far beyond it their powers overflow."""
 
 _PER = 1000  # Evaluations over which the rms of a drift is stated.
-
-
-@runtime_checkable
-class Quantiser(Protocol):
-    """An objective that knows the phase levels of its device, such as a `HardwareObjective`."""
-
-    def quantised(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return the drives (..., M) that the device plays for drives (..., M)."""
-        ...
 
 
 class Perturbation:
@@ -236,7 +226,8 @@ def quantised(objective: Objective, drive: torch.Tensor) -> torch.Tensor:
     while isinstance(objective, Perturbation):
         drive = objective.quantised(drive)
         objective = objective.inner
-    return objective.quantised(drive) if isinstance(objective, Quantiser) else drive
+    known = getattr(objective, "quantised", None)  # of a `HardwareObjective`
+    return drive if known is None else known(drive)
 
 
 def random_rms(matrix: torch.Tensor) -> float:
