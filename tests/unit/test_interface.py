@@ -10,8 +10,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from autdtorch.fdtd.assembly.constants import FAR
 from autdtorch.fdtd.assembly.element import (
+    FAR,
     LATTICE,
     VERTICES,
     InterfaceElements,

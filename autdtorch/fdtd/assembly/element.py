@@ -13,10 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.assembly.constants import SUBCELLS
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
 
+SUBCELLS = 4  # Sub-cells along each edge of an interface element, for the volume quadrature
+FAR = 1e3  # Signed distance of a body that is too far from an element to matter
 # Offsets of the eight vertices of an element [cells]
 VERTICES = np.array(list(itertools.product((0, 1), repeat=3)))
 PAIRS = np.array(list(itertools.combinations(range(8), 2)))  # The 28 pairs of vertices that are coupled

@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.assembly.constants import CONTACT_GAP, FAR, HALF_DIAGONAL, SOUND_HARD_DENSITY
-from autdtorch.fdtd.assembly.element import LATTICE, InterfaceElements, Materials
+from autdtorch.fdtd.assembly.element import FAR, LATTICE, InterfaceElements, Materials
 from autdtorch.fdtd.assembly.interface import interface_elements
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Fluid, Region, Shape
@@ -19,6 +18,12 @@ from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.progress import show_progress
 
+# Density with which sound-hard bodies are assembled. Cells that stay almost uncoupled become sound-hard.
+_SOUND_HARD_DENSITY = 1e5
+# Distance by which bodies are grown, so that touching bodies leave no film of air between them
+_CONTACT_GAP = 1e-9
+# Half the diagonal of an element: a surface farther from its centre does not intersect it
+_HALF_DIAGONAL = 0.87
 _CHUNK = 4096  # Interface elements assembled at a time
 
 
@@ -55,7 +60,7 @@ class _Union:
         """Return the signed distance [cells] of positions (..., 3) in cells."""
         places = np.array(grid.origin) + grid.spacing * (grid.clip(cell) if self.continued else cell)
         each = [shape.signed_distance(torch.from_numpy(places)) for shape in self.shapes]
-        distance = torch.stack(each).amin(dim=0).numpy() / grid.spacing - CONTACT_GAP
+        distance = torch.stack(each).amin(dim=0).numpy() / grid.spacing - _CONTACT_GAP
         if self.continued:
             return np.asarray(distance)
         beyond = np.maximum(np.array(grid.first) - cell, cell - np.array(grid.last) + 1).max(axis=-1) + 0.5
@@ -86,7 +91,7 @@ def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
     for body in bodies:
         for window, distance in _windows(body, grid):
             material[window][distance < 0] = body.material
-            cut[window] = (cut[window] | (distance < HALF_DIAGONAL)) & (distance > -HALF_DIAGONAL)
+            cut[window] = (cut[window] | (distance < _HALF_DIAGONAL)) & (distance > -_HALF_DIAGONAL)
     index = np.flatnonzero(cut)
     return Elements(materials, material, index, _interface(bodies, index, grid, materials, stencil))
 
@@ -104,7 +109,7 @@ def _unions(region: Region, stencil: Stencil) -> tuple[list[_Union], Materials]:
             unions[-1] = _Union((*unions[-1].shapes, body.shape), *kind)
         else:
             unions.append(_Union((body.shape,), *kind))
-    density = np.full(len(known), SOUND_HARD_DENSITY)
+    density = np.full(len(known), _SOUND_HARD_DENSITY)
     factor = np.ones(len(known))
     for number, fluid in enumerate(known):
         if fluid is not None:

@@ -16,15 +16,18 @@ In an element of one material both are those of the tuned stencil. An interface 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.assembly import constants, moments
 from autdtorch.fdtd.assembly.element import (
     CORNERS,
     EDGES_BETWEEN,
+    FAR,
     LATTICE,
     PAIRS,
+    SUBCELLS,
     VERTICES,
     InterfaceElements,
     Materials,
@@ -35,6 +38,15 @@ from autdtorch.fdtd.assembly.element import (
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
 
+_ABSENT_SHARE = 1e-4  # Share of an element's volume below which a material counts as absent
+# Smallest mean gradient of a signed distance with one normal. The two faces of a thin plate cancel.
+_LEAST_GRADIENT = 0.5
+_PLANE_VARIATION = 1e-6  # Largest variation of a signed distance along an axis-aligned face: rounding
+# Largest curvature [1/cells] of a surface that the local solutions follow. Edges have none.
+_LARGEST_CURVATURE = 0.5
+# Diagonal coupling that an element full of the heavier material supplies, relative to its own need. The
+# element behind has a sixth to spare, and half of that is used.
+_DIAGONAL_SHARE = 6.0
 # Axes of the second derivatives in a quadratic fit
 _SECOND = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
@@ -46,9 +58,13 @@ def _quadratic(x: Array) -> Array:
 
 
 _FIT = np.linalg.pinv(_quadratic(LATTICE - 0.5))
-_SUBCENTRES = (np.array(list(np.ndindex((constants.SUBCELLS,) * 3))) + 0.5) / constants.SUBCELLS
+_SUBCENTRES = (np.array(list(np.ndindex((SUBCELLS,) * 3))) + 0.5) / SUBCELLS
 # Trilinear shape functions of the vertices at the centres of the sub-cells (64, 8)
 _HATS = np.prod(np.where(VERTICES == 1, _SUBCENTRES[:, None], 1 - _SUBCENTRES[:, None]), axis=2)
+_FROM, _TO = VERTICES[PAIRS[:, 0], None], VERTICES[PAIRS[:, 1], None]
+_ALONG = SUBCELLS * _FROM + np.arange(SUBCELLS + 1)[:, None] * (_TO - _FROM)
+# Indices in the lattice of the points along the line between each pair of vertices (28, 5)
+_LINES = np.ravel_multi_index(tuple(np.moveaxis(_ALONG, -1, 0)), (SUBCELLS + 1,) * 3)
 
 
 def interface_elements(
@@ -60,31 +76,31 @@ def interface_elements(
     """
     count = len(materials.density)
     # bodies that do not intersect an element must not enter its shares
-    distance = np.where((distance > 0).all(axis=2, keepdims=True), constants.FAR, distance)
-    distance = np.where((distance < 0).all(axis=2, keepdims=True), -constants.FAR, distance)
-    volumes = moments.shares(moments.volume_coverage, distance, material, count)
-    lines = moments.shares(moments.line_coverage, distance, material, count)
-    coupling = series_coupling(lines, materials, stencil)
-    vertex = vertex_materials(distance, material)
+    distance = np.where((distance > 0).all(axis=2, keepdims=True), FAR, distance)
+    distance = np.where((distance < 0).all(axis=2, keepdims=True), -FAR, distance)
+    volumes = _shares(_volume_coverage, distance, material, count)
+    lines = _shares(_line_coverage, distance, material, count)
+    coupling = _series_coupling(lines, materials, stencil)
+    vertex = _vertex_materials(distance, material)
     layered = _layered_axis(distance)
     for axis in range(3):
         own = layered == axis
         coupling[own] = _layered_coupling(axis, vertex[own], volumes[own], materials, stencil)
     held = (vertex[:, :, None] == np.arange(count)).any(axis=1)
-    present = volumes.mean(axis=1) > constants.ABSENT_SHARE
+    present = volumes.mean(axis=1) > _ABSENT_SHARE
     two = (held.sum(axis=1) == 2) & (present <= held).all(axis=1)
     chosen = np.flatnonzero(two & (layered < 0))
     if len(chosen):
         inner = count - 1 - held[chosen, ::-1].argmax(axis=1)
         outer = held[chosen].argmax(axis=1)
-        level = moments.distance_to_material(distance[:, chosen], material, inner)
+        level = _distance_to_material(distance[:, chosen], material, inner)
         sides = materials.density[np.stack((outer, inner), axis=1)]
         flat, correction = _correction(level, sides, volumes[chosen], materials, coupling[chosen])
         coupling[chosen[flat]] += correction
     return InterfaceElements(coupling, _lumped_mass(vertex, volumes, materials), vertex)
 
 
-def vertex_materials(distance: Array, material: Index) -> Index:
+def _vertex_materials(distance: Array, material: Index) -> Index:
     """Return the material at each vertex (n, 8), from distances at the lattice (K, n, 125)."""
     vertex = np.zeros((distance.shape[1], 8), np.int64)
     for far, own in zip(distance, material, strict=True):
@@ -92,19 +108,19 @@ def vertex_materials(distance: Array, material: Index) -> Index:
     return vertex
 
 
-def series_coupling(lines: Array, materials: Materials, stencil: Stencil) -> Array:
+def _series_coupling(lines: Array, materials: Materials, stencil: Stencil) -> Array:
     """Return coupling coefficients (n, 28) with the density averaged along each line (n, 112, m)."""
-    density = (lines @ materials.density).reshape(-1, len(PAIRS), constants.SUBCELLS).mean(axis=2)
+    density = (lines @ materials.density).reshape(-1, len(PAIRS), SUBCELLS).mean(axis=2)
     return np.asarray(uniform_coupling(stencil) / density)
 
 
 def _layered_axis(distance: Array) -> Index:
     """Return the only axis (n,) along which signed distances (K, n, 125) vary, or -1."""
-    cube = distance.reshape(*distance.shape[:2], *(constants.SUBCELLS + 1,) * 3)
+    cube = distance.reshape(*distance.shape[:2], *(SUBCELLS + 1,) * 3)
     found = np.full(distance.shape[1], -1)
     for axis in range(3):
         others = tuple(other + 2 for other in range(3) if other != axis)
-        found[np.ptp(cube, axis=others).max(axis=(0, 2), initial=0) < constants.PLANE_VARIATION] = axis
+        found[np.ptp(cube, axis=others).max(axis=(0, 2), initial=0) < _PLANE_VARIATION] = axis
     return found
 
 
@@ -133,7 +149,7 @@ def _layered_coupling(
     sides = materials.density[vertex]
     lightest, heaviest = sides.min(axis=1), sides.max(axis=1)
     heavy = np.where(materials.density >= heaviest[:, None], share, 0).sum(axis=1)
-    allowed = (lightest / heaviest + 1) / 2 + constants.DIAGONAL_SHARE * heavy
+    allowed = (lightest / heaviest + 1) / 2 + _DIAGONAL_SHARE * heavy
     kept = np.minimum(1, allowed * density / heaviest)[:, None]
     even = np.where(straight, uniform[across].sum() / 4, 0)
     link = np.where(across, kept * uniform + (1 - kept) * even, -kept * beside) / density[:, None]
@@ -150,7 +166,7 @@ def _correction(
     """
     fit = level @ _FIT.T
     steep = np.linalg.norm(fit[:, 1:4], axis=1)
-    flat = steep > constants.LEAST_GRADIENT
+    flat = steep > _LEAST_GRADIENT
     level, sides, volumes, coupling, fit, steep = (
         p[flat] for p in (level, sides, volumes, coupling, fit, steep)
     )
@@ -166,9 +182,9 @@ def _correction(
     fields = np.concatenate((along, kinked[:, :, None]), axis=2)
 
     # Exact energies of the first two by quadrature over the sub-cells; the third keeps its own.
-    depth = moments.subcell_means(level)
+    depth = _subcell_means(level)
     stretch = np.eye(2) - depth[:, :, None, None] * bend[:, None]
-    mobility = (volumes @ (1 / materials.density)) / constants.SUBCELLS**3
+    mobility = (volumes @ (1 / materials.density)) / SUBCELLS**3
     energy = np.zeros((len(level), 3, 3))
     energy[:, :2, :2] = np.einsum("nq,nqab,nqcb->nac", mobility, stretch, stretch)
     flow = stiffness_matrix(coupling) @ fields
@@ -193,7 +209,7 @@ def _curvature(fit: Array, tangents: Array) -> Array:
     for column, (a, b) in enumerate(_SECOND, start=4):
         hessian[:, a, b] = hessian[:, b, a] = fit[:, column]
     bend = tangents @ hessian @ tangents.transpose(0, 2, 1)
-    bend[np.abs(np.linalg.eigvalsh(bend)).max(axis=1) > constants.LARGEST_CURVATURE] = 0
+    bend[np.abs(np.linalg.eigvalsh(bend)).max(axis=1) > _LARGEST_CURVATURE] = 0
     return bend
 
 
@@ -201,9 +217,68 @@ def _lumped_mass(vertex: Index, volumes: Array, materials: Materials) -> Array:
     """Return masses at the vertices (n, 8): each material's at the vertices in it, if there are any."""
     total = np.zeros(vertex.shape)
     for own, mass in enumerate(materials.mass):
-        volume = volumes[:, :, own] @ _HATS / constants.SUBCELLS**3
+        volume = volumes[:, :, own] @ _HATS / SUBCELLS**3
         kept = volume * (vertex == own)
         whole, held = volume.sum(axis=1, keepdims=True), kept.sum(axis=1, keepdims=True)
-        has = held > constants.ABSENT_SHARE * whole
+        has = held > _ABSENT_SHARE * whole
         total += mass * np.where(has, kept * whole / np.where(has, held, 1), volume)
     return total
+
+
+def _distance_to_material(distance: Array, material: Index, inner: Index) -> Array:
+    """Return the signed distance (n, 125) to the region of material `inner` (n,), cut by later bodies."""
+    level = np.full(distance.shape[1:], FAR)
+    for far, number in zip(distance, material, strict=True):
+        same = (inner == number)[:, None]
+        level = np.where(same, np.minimum(level, far), np.maximum(level, -far))
+    return level
+
+
+def _subcell_means(values: Array) -> Array:
+    """Return the means (n, 64) of lattice values (n, 125) over the corners of each sub-cell."""
+    cube = values.reshape(-1, *(SUBCELLS + 1,) * 3)
+    return _over_subcells(cube, None).reshape(len(values), SUBCELLS**3)
+
+
+def _volume_coverage(distance: Array) -> Array:
+    """Return the share of each sub-cell (..., 64) inside a body: exact for axis-aligned faces."""
+    cube = distance.reshape(*distance.shape[:-1], *(SUBCELLS + 1,) * 3)
+    mean, *slopes = (_over_subcells(cube, along) for along in (None, -3, -2, -1))
+    width = np.abs(slopes).sum(axis=0)
+    share = np.clip(0.5 - mean / np.maximum(width, 1e-12), 0, 1)
+    return np.asarray(share.reshape(*distance.shape[:-1], SUBCELLS**3))
+
+
+def _over_subcells(cube: Array, along: int | None) -> Array:
+    """Return the mean over the corners of each sub-cell, of values or of differences along an axis."""
+    for axis in (-3, -2, -1):
+        low, high = (np.take(cube, np.arange(SUBCELLS) + end, axis) for end in (0, 1))
+        cube = high - low if axis == along else (low + high) / 2
+    return cube
+
+
+def _line_coverage(distance: Array) -> Array:
+    """Return the share inside a body of each quarter of the lines between vertices (..., 112)."""
+    ends = distance[..., _LINES]
+    low = np.minimum(ends[..., :-1], ends[..., 1:])
+    high = np.maximum(ends[..., :-1], ends[..., 1:])
+    share = np.clip(-low / np.maximum(high - low, 1e-12), 0, 1)
+    return np.asarray(share.reshape(*distance.shape[:-1], -1))
+
+
+def _shares(coverage: Callable[[Array], Array], distance: Array, material: Index, count: int) -> Array:
+    """Return the share of each material (n, q, count) in the q parts that `coverage` divides an element into.
+
+    Touching bodies, with distances (K, n, 125) [cells], leave no air between them: their union decides its
+    share.
+    """
+    covered = coverage(distance)
+    share = np.zeros((*covered.shape[1:], count))
+    for cover, number in zip(covered, material, strict=True):
+        share *= 1 - cover[..., None]
+        share[..., number] += cover
+    solid = share.sum(axis=2)
+    union = coverage(distance.min(axis=0))
+    share *= np.divide(union, solid, out=np.zeros_like(solid), where=solid > 0)[..., None]
+    share[..., 0] += 1 - union
+    return share
