@@ -20,7 +20,6 @@ from autdtorch.fdtd.interpolation import Interpolation
 from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
-from autdtorch.fdtd.superposition import superposition
 from autdtorch.utils.array_types import Index
 
 # Distance [cells] from the rim of the interior within which points are not read from the grid. Interpolation
@@ -123,6 +122,8 @@ class ScatteredField:
         return self.positions(index), cells, csr_array((value, (row, place)), (len(index), len(cells)))
 
     def _sum(self, points: Tensor, sources: Tensor, amplitude: Tensor, nearest: float) -> Tensor:
+        from autdtorch.fdtd.kernels.cpu_waves import superposition  # loads numba
+
         return superposition(points, sources, amplitude, self.wavenumber, nearest, self.assembly.dtype)
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from autdtorch.analytic.green import green
-from autdtorch.fdtd.superposition import superposition
+from autdtorch.fdtd.kernels.cpu_waves import superposition
 
 
 def places(points, sources):

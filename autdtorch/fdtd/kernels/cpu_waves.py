@@ -1,4 +1,4 @@
-"""Sums of spherical waves on one core: sum_s amplitude_s e^{i k r} / r for several fields.
+"""The fields of many point sources in free space: sum_s amplitude_s e^{i k r} / r for several fields.
 
 Waves between one place and a block of others are vectorised. The others are the points or the sources,
 whichever are more. Distances and whole turns of the phase are in double precision, the rest in the
@@ -8,25 +8,27 @@ precision of the amplitudes. The order of all sums is fixed.
 from __future__ import annotations
 
 import math
+from itertools import pairwise
+from typing import Literal
 
 import numpy as np
+import torch
 from numba import njit
-from numpy.typing import NDArray
+from torch import Tensor
 
 from autdtorch.fdtd.kernels.compiled import INNER, entry
+from autdtorch.utils.array_types import AnyArray
+from autdtorch.utils.threads import spread
+from autdtorch.utils.validation import LENGTH_TOLERANCE
 
-LANES = 64  # Places in a block; their waves stay in the first-level cache
+_PAIRS = 100_000  # Pairs of a point and a source in a task: less than a millisecond
+_LANES = 64  # Places in a block; their waves stay in the first-level cache
 _TERMS = 13  # Terms of the Taylor series; the next one is below 1e-16 for arguments up to pi / 2
 _SHIFT = 1.5 * 2.0**52  # Constant that rounds to the nearest integer when added and subtracted
-_BLOCK, _X, _Y, _Z = np.uint64(LANES), np.uint64(0), np.uint64(1), np.uint64(2)  # unsigned, see cpu_sweep.py
+_BLOCK, _X, _Y, _Z = np.uint64(_LANES), np.uint64(0), np.uint64(1), np.uint64(2)  # unsigned, see cpu_sweep.py
 
 
-def wave_of(wavenumber: complex, nearest: float) -> tuple[float, float, float]:
-    """Return turns and halvings of a wave per metre, and the lower limit of the distance [m]."""
-    return wavenumber.real / (2 * math.pi), wavenumber.imag / math.log(2), nearest
-
-
-def room_for(dtype: type) -> tuple[NDArray[np.generic], ...]:
+def _room(dtype: type) -> tuple[AnyArray, ...]:
     """Return Taylor coefficients and workspace for `_waves`.
 
     The series are those of sin(2 pi u) / u and cos(2 pi u) in u^2, and of 2^-u in u.
@@ -35,8 +37,8 @@ def room_for(dtype: type) -> tuple[NDArray[np.generic], ...]:
     sine = [(-1) ** n * turn ** (2 * n + 1) / math.factorial(2 * n + 1) for n in range(_TERMS)]
     cosine = [(-1) ** n * turn ** (2 * n) / math.factorial(2 * n) for n in range(_TERMS)]
     power = [(-log) ** n / math.factorial(n) for n in range(_TERMS)]
-    bits = np.zeros(LANES, np.int32 if dtype is np.float32 else np.int64)
-    return *np.array((sine, cosine, power), dtype), *np.zeros((5, LANES), dtype), bits, bits.view(dtype)
+    bits = np.zeros(_LANES, np.int32 if dtype is np.float32 else np.int64)
+    return *np.array((sine, cosine, power), dtype), *np.zeros((5, _LANES), dtype), bits, bits.view(dtype)
 
 
 @njit(**INNER)
@@ -86,19 +88,19 @@ def _add_waves(total, r, a, b, real, imaginary):  # type: ignore[no-untyped-def]
 
 
 @entry()
-def sum_at_points(points, first, last, sources, amplitude, wave, room, fields):  # type: ignore[no-untyped-def]
-    """Write the parts of fields (2, R, P / LANES, LANES) at the blocks `first` to `last` of points.
+def _sum_at_points(points, first, last, sources, amplitude, wave, room, fields):  # type: ignore[no-untyped-def]
+    """Write the parts of fields (2, R, P / _LANES, _LANES) at the blocks `first` to `last` of points.
 
     The points are (3, P), the sources (3, N), the parts of their amplitudes (2, R, N).
     """
     runs, count = amplitude.shape[1:]
-    total = np.zeros((2, runs, LANES), amplitude.dtype)
+    total = np.zeros((2, runs, _LANES), amplitude.dtype)
     for block in range(first, last):
         for s in range(count):
             real, imaginary = _waves((sources[0, s], sources[1, s], sources[2, s]), points, block, wave, room)
             for r in range(runs):
                 _add_waves(total, r, amplitude[0, r, s], amplitude[1, r, s], real, imaginary)
-            if (s + 1) % LANES == 0 or s + 1 == count:  # limits rounding
+            if (s + 1) % _LANES == 0 or s + 1 == count:  # limits rounding
                 fields[:, :, block] += total
                 total[:] = 0
 
@@ -111,15 +113,15 @@ def _add_products(total, amplitude, r, waves):  # type: ignore[no-untyped-def]
 
 
 @entry()
-def sum_over_sources(points, first, last, sources, amplitude, wave, room, fields):  # type: ignore[no-untyped-def]
+def _sum_over_sources(points, first, last, sources, amplitude, wave, room, fields):  # type: ignore[no-untyped-def]
     """Write the parts of fields (2, R, P) at the points `first` to `last`.
 
-    The points are (3, P), the sources (3, N), the parts of their amplitudes (2, R, N / LANES, LANES).
+    The points are (3, P), the sources (3, N), the parts of their amplitudes (2, R, N / _LANES, _LANES).
     """
     runs, blocks = amplitude.shape[1:3]
     # separate arrays, which the compiler knows not to overlap and can vectorise
-    real, imaginary = np.empty((blocks, LANES), amplitude.dtype), np.empty((blocks, LANES), amplitude.dtype)
-    total, less = np.empty(LANES, amplitude.dtype), np.empty(LANES, amplitude.dtype)
+    real, imaginary = np.empty((blocks, _LANES), amplitude.dtype), np.empty((blocks, _LANES), amplitude.dtype)
+    total, less = np.empty(_LANES, amplitude.dtype), np.empty(_LANES, amplitude.dtype)
     for p in range(first, last):
         for block in range(blocks):
             place = points[0, p], points[1, p], points[2, p]
@@ -135,3 +137,45 @@ def sum_over_sources(points, first, last, sources, amplitude, wave, room, fields
             _add_products(total, amplitude[1], r, real)
             for k in range(_BLOCK):
                 fields[1, r, p] += total[k]
+
+
+def superposition(
+    points: Tensor,
+    sources: Tensor,
+    amplitude: Tensor,
+    wavenumber: complex,
+    nearest: float = 0.0,
+    dtype: torch.dtype = torch.float64,
+) -> Tensor:
+    """Return R fields (P, R) complex128 [Pa] of N point sources: sums of amplitude e^{i k r} / r.
+
+    Amplitudes are complex (N, R) [Pa m], `wavenumber` is k + i alpha [rad/m] and `nearest` the lower limit of
+    the distance [m]. float32 takes half the time at an error of 3e-7 per wave. Threads do not change the
+    result.
+    """
+    number = np.float32 if dtype == torch.float32 else np.float64
+    wavenumber = complex(wavenumber)
+    # turns and halvings of a wave per metre
+    wave = wavenumber.real / (2 * math.pi), wavenumber.imag / math.log(2), max(nearest, LENGTH_TOLERANCE)
+    parts = (amplitude.real, amplitude.imag)
+    strength = np.stack([np.ascontiguousarray(part.numpy().astype(number).T) for part in parts])
+    runs, count = strength.shape[1], len(points)
+    places, origins = (np.ascontiguousarray(each.numpy().T) for each in (points, sources))
+    if count >= len(sources):
+        places = _filled(places, "edge")
+        add, fields = _sum_at_points, np.zeros((2, runs, places.shape[1] // _LANES, _LANES))
+    else:
+        origins = _filled(origins, "edge")
+        add, fields = _sum_over_sources, np.zeros((2, runs, count))
+        strength = _filled(strength, "constant").reshape(2, runs, -1, _LANES)
+    units = fields.shape[2]
+    pieces = max(1, min(units, 1 + count * len(sources) // _PAIRS))
+    cuts = [units * piece // pieces for piece in range(pieces + 1)]
+    spread(lambda ends: add(places, *ends, origins, strength, wave, _room(number), fields), pairwise(cuts))
+    real, imaginary = fields.reshape(2, runs, -1)[:, :, :count]
+    return torch.from_numpy((real + 1j * imaginary).T)
+
+
+def _filled(rows: AnyArray, mode: Literal["edge", "constant"]) -> AnyArray:
+    """Pad rows (..., N) to whole blocks by their last entry or by zeros."""
+    return np.pad(rows, (*((0, 0),) * (rows.ndim - 1), (0, -rows.shape[-1] % _LANES)), mode)
