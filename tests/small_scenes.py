@@ -66,8 +66,7 @@ def assembled_parts(scene: Scene, spacing: float, dtype: torch.dtype) -> tuple[A
 
 def all_tensors(state: State, recorded: torch.Tensor) -> list[torch.Tensor]:
     """All results of a run: pressure, record, and the memory of layers and columns."""
-    memory = (*state.layers, state.columns, state.crossed)
-    return [state.now, state.before, recorded, *(part for layer in memory for part in layer)]
+    return [state.now, state.before, recorded, *(part for layer in state.memory for part in layer)]
 
 
 def relative_error(value: torch.Tensor, reference: torch.Tensor) -> float:

@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from autdtorch.fdtd.interpolation import Interpolation
-from autdtorch.fdtd.kernels.contract import Kernel, Layer, Receivers, Sources, State
+from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources, State
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.utils.threads import spread
@@ -42,12 +42,9 @@ def recorded(
     """Step from silence, once per row of `signal` (steps, S), and return the record (steps, R).
 
     Differentiable, once, by `sources.force` and by `heterogeneous_weight`; derivatives by rows in the
-    boundary layers are zero. Sources and receivers must be outside of the layers, where reciprocity does not
-    hold.
+    boundary layers are zero. Sources and receivers, as those of `assembly`, must be outside of the layers,
+    where reciprocity does not hold.
     """
-    for name, index in (("sources", sources.index), ("receivers", receivers.index)):
-        if not assembly.grid.inside(index.numpy()).all():
-            raise ValueError(f"{name}: cells in the boundary layers; must be inside of them")
     weight = assembly.coefficients.heterogeneous_weight
     coefficients = replace(assembly.coefficients, heterogeneous_weight=weight.detach())
     run = _Run(kernel, replace(assembly, coefficients=coefficients), sources.index, receivers, signal)
@@ -199,11 +196,8 @@ class _Recorded(torch.autograd.Function):
 
 def _cuts(steps: int, state: State, cells: int) -> list[int]:
     """Return the ends of segments. Their record and the states kept take least memory at a root's length."""
-    memory: tuple[Layer, ...] = (*state.layers, state.columns, state.crossed)
-    numbers = 2 * state.now.numel() + sum(part.numel() for layer in memory for part in layer)
-    fitting, least = (
-        _SEGMENT_BYTES / (cells * state.now.element_size()),
-        math.sqrt(steps * numbers / (2 * cells)),
-    )
+    numbers = 2 * state.now.numel() + sum(part.numel() for layer in state.memory for part in layer)
+    fitting = _SEGMENT_BYTES / (cells * state.now.element_size())
+    least = math.sqrt(steps * numbers / (2 * cells))
     count = math.ceil(steps / max(fitting, least))
     return [steps * number // count for number in range(count + 1)]

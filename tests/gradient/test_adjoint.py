@@ -86,7 +86,7 @@ def test_segments_do_not_change_the_gradients(monkeypatch: pytest.MonkeyPatch) -
 
 def test_cuts_bound_the_memory() -> None:
     """At 100^3 heterogeneous cells the states kept and the record of a segment stay below 1 GiB."""
-    state = State(torch.zeros((118,) * 3), torch.zeros(0), (), (torch.zeros(0),) * 2, (torch.zeros(0),) * 2)
+    state = State(torch.zeros((118,) * 3), torch.zeros(0), ())
     cells = 102**3
     for steps in (10, 1000, 10_000):
         cuts = adjoint._cuts(steps, state, cells)
@@ -118,10 +118,3 @@ def test_a_constant_loss_has_no_gradient() -> None:
     (0 * record).sum().backward()
     assert not sources.force.grad.any()
     assert not assembly.coefficients.heterogeneous_weight.grad.any()
-
-
-def test_receivers_in_the_layers_are_refused() -> None:
-    assembly, sources, _, signal = parts(torch.float64, HEAVY)
-    corner = Receivers(torch.tensor([[40]]), torch.ones((1, 1), dtype=torch.float64))
-    with pytest.raises(ValueError, match="receivers: cells in the boundary layers"):
-        recorded(CpuKernel(), assembly, sources, corner, signal)

@@ -14,16 +14,10 @@ from numba.core import event
 
 logger = logging.getLogger(__name__)
 
-INNER: dict[str, Any] = {
-    "error_model": "numpy",
-    "nogil": True,
-    "no_cpython_wrapper": True,
-    "no_cfunc_wrapper": True,
-}
-"""Options of functions that compiled functions call: no wrappers for Python, no checks of division by zero.
-
-`fastmath` must stay off. It lets the compiler reorder sums, in a different way wherever a call is inlined; a
-kernel loaded from disk then rounds differently from the one just compiled."""
+# Options of functions that compiled functions call: no wrappers for Python, no checks of division by zero.
+# `fastmath` must stay off. It lets the compiler reorder sums, in a different way wherever a call is inlined:
+# a kernel loaded from disk then rounds differently from the one just compiled.
+INNER: Any = {"error_model": "numpy", "nogil": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 _HERE = Path(__file__).parent
 _entries: set[Any] = set()
@@ -32,17 +26,13 @@ _entries: set[Any] = set()
 class _CompilationLog(event.Listener):
     """Logs that a kernel is compiled, which takes seconds; loading one from disk takes none."""
 
-    def __init__(self) -> None:
-        self._inside = 0
-
     def on_start(self, event: Any) -> None:
         function = event.data["dispatcher"]
-        if function in _entries and not self._inside:
+        if function in _entries:
             logger.info("compiling %s (once per machine)", function.__name__)
-        self._inside += 1
 
     def on_end(self, event: Any) -> None:
-        self._inside -= 1
+        pass
 
 
 event.register("numba:compile", _CompilationLog())  # type: ignore[no-untyped-call]

@@ -6,8 +6,7 @@ A step takes the pressures `now` and `before` at two successive times to the nex
    neighbours;
 2. in heterogeneous cells instead new = (1 + keep) now - keep before + sum_j weight_j (now_j - now);
 3. the boundary layers add the stretching of the two neighbours' sum along each axis (`boundary.py`), as in
-   air, times `layer_scale` in heterogeneous cells, and by column the difference at interfaces
-   (`layer_columns.py`);
+   air, times `layer_scale` in heterogeneous cells, and by column the difference at interfaces;
 4. the sources are added: new += sum_s signal_s force_s, of the S signals that they share;
 5. the outermost ring and the sound-hard cells stay zero.
 """
@@ -15,14 +14,28 @@ A step takes the pressures `now` and `before` at two successive times to the nex
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
-# Memory of the two boundary layers of an axis, (2, nx, ny, nz) low and high: psi with L + 1 half cells and
-# zeta with L cells along that axis, counted inwards on both sides
-Layer = tuple[Tensor, Tensor]
+
+class Layer(NamedTuple):
+    """Memory of the low and the high layer of an axis (2, nx, ny, nz), counted inwards, or of m columns."""
+
+    psi: Tensor  # L + 1 half cells along the axis; (L + 1, m)
+    zeta: Tensor  # L cells; (L, m)
+
+
+class Memory(NamedTuple):
+    """Memory of the boundary layers: of E_x, E_y and E_z, of E_y acting on E_z p, and of columns."""
+
+    x: Layer
+    y: Layer
+    z: Layer
+    yz: Layer  # 2 L cells along z: those of the low and of the high layer, counted inwards
+    columns: Layer
+    crossed: Layer
 
 
 @dataclass(frozen=True)
@@ -71,18 +84,11 @@ class Coefficients:
 
 @dataclass
 class State:
-    """Two pressure fields (nx, ny, nz) and the memory of the boundary layers.
-
-    `layers` belong to E_x, E_y and E_z, and to E_y acting on E_z p. The last has 2 L cells along z: those of
-    the low and of the high layer, counted inwards. `columns` have psi (L + 1, m) and zeta (L, m), and so have
-    `crossed`.
-    """
+    """Two pressure fields (nx, ny, nz) and the memory of the boundary layers."""
 
     now: Tensor
     before: Tensor
-    layers: tuple[Layer, ...]
-    columns: Layer
-    crossed: Layer
+    memory: Memory
 
 
 def uniform_state(shape: tuple[int, int, int], coefficients: Coefficients, pressure: float) -> State:
@@ -91,14 +97,14 @@ def uniform_state(shape: tuple[int, int, int], coefficients: Coefficients, press
 
     def silent(*size: int, axis: int) -> Layer:
         psi, zeta = ((*size[:axis], along, *size[axis + 1 :]) for along in (cells + 1, cells))
-        return c.layer_decay.new_zeros(psi), c.layer_decay.new_zeros(zeta)
+        return Layer(c.layer_decay.new_zeros(psi), c.layer_decay.new_zeros(zeta))
 
     sizes = (shape, shape, shape, (*shape[:2], 2 * cells))
     layers = (silent(2, *size, axis=axis + 1) for axis, size in zip((0, 1, 2, 1), sizes, strict=True))
     core = c.layer_decay.new_full([length - 2 for length in shape], pressure)
     now = torch.nn.functional.pad(core, (1,) * 6)
-    columns, crossed = (silent(0, len(each.index), axis=0) for each in (c.columns, c.crossed))
-    return State(now, now.clone(), tuple(layers), columns, crossed)
+    columns = (silent(0, len(each.index), axis=0) for each in (c.columns, c.crossed))
+    return State(now, now.clone(), Memory(*layers, *columns))
 
 
 @dataclass(frozen=True)

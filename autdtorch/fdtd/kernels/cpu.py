@@ -19,16 +19,10 @@ from numpy.typing import NDArray
 
 from autdtorch.fdtd.kernels.compiled import INNER, entry
 from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Receivers, Sources, State
-from autdtorch.fdtd.kernels.cpu_layout import Memory, plane_profiles, rows_profile
+from autdtorch.fdtd.kernels.cpu_layout import FlatMemory, plane_profiles, rows_profile
 from autdtorch.fdtd.kernels.cpu_sweep import stretch, sweep_planes
-from autdtorch.fdtd.kernels.cpu_workers import (
-    claim,
-    finish,
-    new_counters,
-    share_of_processors,
-    wait_for,
-    yield_address,
-)
+from autdtorch.fdtd.kernels.cpu_workers import COUNTERS, claim, finish, share_of_processors, wait_for
+from autdtorch.fdtd.stencil import OFFSETS, flat_offsets
 from autdtorch.utils.array_types import AnyArray
 from autdtorch.utils.threads import thread_count
 
@@ -126,7 +120,7 @@ def _finish_columns(p, q, columns, memory):  # type: ignore[no-untyped-def]
 @entry()
 def _advance(  # type: ignore[no-untyped-def]
     p, q, medium, layers, cells, room, columns, memory, sound_hard, sources, receivers, signal, recorded,
-    counters, give_way,
+    counters,
 ):  # fmt: skip
     """Do tasks until none is left; each worker calls this with the same arguments.
 
@@ -139,7 +133,7 @@ def _advance(  # type: ignore[no-untyped-def]
         phase, c = task // chunks, task % chunks
         if phase > 3 * steps:
             break
-        wait_for(counters, phase * chunks, give_way)
+        wait_for(counters, phase * chunks)
         step, kind = phase // 3, phase % 3
         now, new = (p, q) if step % 2 == 0 else (q, p)
         if kind == 0:
@@ -180,15 +174,14 @@ def _columns(c: Coefficients, columns: Columns) -> tuple[AnyArray, ...]:
     return columns.index.numpy(), columns.offset.numpy(), columns.weight.numpy(), *rows_profile(c, count)
 
 
-def _heterogeneous_cells(c: Coefficients, strides: NDArray[np.int64]) -> tuple[AnyArray, ...]:
+def _heterogeneous_cells(c: Coefficients, shape: torch.Size) -> tuple[AnyArray, ...]:
     """Return indices, weights, offsets, layer scale, weights of air, and workspace."""
-    offsets = np.indices((3, 3, 3)).reshape(3, -1).T - 1
-    air = np.array((c.center, c.face, c.edge, c.corner))[np.abs(offsets).sum(axis=1)]
+    air = np.array((c.center, c.face, c.edge, c.corner))[np.abs(OFFSETS).sum(axis=1)]
     index, weight = c.heterogeneous_index.numpy(), c.heterogeneous_weight.numpy()
     scale = np.zeros_like(weight, shape=len(index))
     scale[np.searchsorted(index, c.layer_index.numpy())] = c.layer_scale.numpy()
     new, swept = np.empty_like(scale), np.empty_like(scale)
-    return index, weight.ravel(), offsets @ strides, scale, air.astype(scale.dtype), new, swept
+    return index, weight.ravel(), flat_offsets(shape), scale, air.astype(scale.dtype), new, swept
 
 
 class CpuKernel:
@@ -220,29 +213,28 @@ class CpuKernel:
             c.layer_gain.numpy(),
             *plane_profiles(c, shape),
         )
-        memory = Memory(state.layers)
+        memory = FlatMemory(state.memory)
         arguments = (
             state.now.numpy().reshape(-1),
             state.before.numpy().reshape(-1),
             medium,
             tuple(part.reshape(-1) for part in memory.arrays),
-            _heterogeneous_cells(c, np.array(state.now.stride())),
+            _heterogeneous_cells(c, shape),
             _room(len(cuts) - 1, shape, c.layer_cells, dtype),
             (_columns(c, c.columns), _columns(c, c.crossed), c.crossing.numpy()),
-            tuple((psi.numpy(), zeta.numpy()) for psi, zeta in (state.columns, state.crossed)),
+            tuple((psi.numpy(), zeta.numpy()) for psi, zeta in state.memory[4:]),
             c.sound_hard_index.numpy(),
             # numba compiles again for arrays with gaps, and crashed when it loaded that from disk
             (sources.index.contiguous().numpy(), sources.force.contiguous().numpy()),
             (receivers.index.contiguous().numpy(), receivers.weight.contiguous().numpy()),
             signal.contiguous().numpy(),
             recorded.numpy(),
-            new_counters(),
-            yield_address(),
+            np.zeros(COUNTERS, np.int64),
         )
         self._work(lambda: _advance(*arguments), len(cuts) - 1)
         memory.give_back()
         now, before = (state.now, state.before) if len(signal) % 2 == 0 else (state.before, state.now)
-        return State(now, before, state.layers, state.columns, state.crossed), recorded
+        return State(now, before, state.memory), recorded
 
     def _work(self, advance: Callable[[], object], chunks: int) -> None:
         """Step on as many threads as chunks and free processors; workers that wait are slower than one."""

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from autdtorch.fdtd.kernels.contract import Coefficients, Layer
+from autdtorch.fdtd.kernels.contract import Coefficients, Memory
 from autdtorch.utils.array_types import AnyArray
 
 # b and a of the half cells, then b and a of the cells, repeated as `stretch` reads them
@@ -49,12 +49,12 @@ def _both_rows(c: Coefficients, row: int) -> Profile:
     return b_half, a_half, b_cell, a_cell
 
 
-class Memory:
+class FlatMemory:
     """Memory of the layers, copied from a state: psi and zeta of x, y, ends of rows, and y for these."""
 
-    def __init__(self, layers: tuple[Layer, ...]) -> None:
+    def __init__(self, memory: Memory) -> None:
         """Copy the memory of a state, except the x layers, which are used in place."""
-        self._layers = [[part.numpy() for part in layer] for layer in layers]
+        self._layers = [[part.numpy() for part in layer] for layer in memory[:4]]
         x, (psi_y, zeta_y), (psi_z, _), (psi_yz, zeta_yz) = self._layers
         nx, ny, layer_cells = len(psi_z[0]), psi_z.shape[2], psi_z.shape[3] - 1
         lanes = 2 * (layer_cells + 2)

@@ -12,32 +12,19 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-from llvmlite import ir
+import llvmlite.binding
 from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
-from numpy.typing import NDArray
 
 from autdtorch.fdtd.kernels.compiled import INNER
 from autdtorch.utils.threads import spread
 
-_CLAIMED, _FINISHED = 0, 16  # Places of the two counters, on separate cache lines
+COUNTERS = 32  # Numbers that hold the two counters, 0 at first
+_CLAIMED, _FINISHED = 0, 16  # Their places, on separate cache lines
 _TICKS = 10  # Fewest ticks of the thread clock for a meaningful time
 # Polls of the counter before a waiting worker yields: a few microseconds, less than waking costs
 _LOOKS = 2000
-
-
-def new_counters() -> NDArray[np.int64]:
-    """Return the counters of tasks, all 0."""
-    return np.zeros(32, np.int64)
-
-
-def yield_address() -> int:
-    """Return the address of the system's function that yields to other threads."""
-    windows = os.name == "nt"
-    function = ctypes.CDLL("kernel32").SwitchToThread if windows else ctypes.CDLL(None).sched_yield
-    return int(ctypes.cast(function, ctypes.c_void_p).value or 0)
 
 
 def share_of_processors(work: Callable[[], object], workers: int) -> float:
@@ -79,19 +66,12 @@ def _read_atomically(typing_context: Any, counters: Any, place: Any) -> Any:
     return types.int64(counters, types.int64), generate
 
 
-def _call(typing_context: Any, address: Any) -> Any:
-    """Call the function without arguments at an address."""
-
-    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        function = ir.FunctionType(ir.IntType(32), [])
-        return builder.call(builder.inttoptr(given[0], function.as_pointer()), [])
-
-    return types.int32(types.int64), generate
-
-
 _add: Any = intrinsic(_add_atomically)
 _read: Any = intrinsic(_read_atomically)
-_give_way: Any = intrinsic(_call)
+# The system's function that yields to other threads, by a name that kernels loaded from disk find
+_SYSTEM = ctypes.CDLL("kernel32").SwitchToThread if os.name == "nt" else ctypes.CDLL(None).sched_yield
+llvmlite.binding.add_symbol("autdtorch_give_way", ctypes.cast(_SYSTEM, ctypes.c_void_p).value)
+_give_way = types.ExternalFunction("autdtorch_give_way", types.int32())
 
 
 @njit(**INNER)
@@ -107,10 +87,10 @@ def finish(counters):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def wait_for(counters, tasks, give_way):  # type: ignore[no-untyped-def]
-    """Wait until so many tasks are finished; `give_way` is `yield_address()`."""
+def wait_for(counters, tasks):  # type: ignore[no-untyped-def]
+    """Wait until so many tasks are finished."""
     looks = 0
     while _read(counters, _FINISHED) < tasks:
         looks += 1
         if looks > _LOOKS:
-            _give_way(give_way)
+            _give_way()

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from autdtorch.fdtd.kernels import cuda_steps
 from autdtorch.fdtd.kernels import cuda_tables as tables
-from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, State
+from autdtorch.fdtd.kernels.contract import Coefficients, Layer, Memory, Receivers, Sources, State
 from autdtorch.utils.validation import invalid
 
 _GRAPH_STEPS = 16  # Steps of a captured graph; even, so that both fields return to their places
@@ -58,7 +58,9 @@ class DeviceMedium:
         self.dtype = c.layer_decay.dtype
         weights = c.center, c.face, c.edge, c.corner, c.keep
         self.weights = torch.tensor(weights, dtype=self.dtype, device=device)
-        self.profile = tables.profile_table(c, self.depths, device)
+        padding = 0, 2 * self.depths + 1 - len(c.layer_decay)
+        profile = (torch.nn.functional.pad(each, padding) for each in (c.layer_decay, c.layer_gain))
+        self.profile = tables.Profile(*(each.to(device) for each in profile))
         self.heterogeneous = tables.heterogeneous_table(c, device)
         self.columns = tables.column_table(c.columns, c.crossing, device)
         self.crossed = tables.column_table(c.crossed, c.crossing[:0], device)
@@ -82,9 +84,8 @@ class DeviceRun:
         self.medium, self.state, self.sources, self.receivers = medium, state, sources, receivers
         dtype, device = medium.dtype, medium.device
         self._fields = tuple(field.to(device).contiguous() for field in (state.now, state.before))
-        memory = tables.memories(state, device)
-        fresh = tables.Memories(*(tables.Memory(*map(torch.zeros_like, each)) for each in memory))
-        self._memories = memory, fresh
+        memory = Memory(*(Layer(*(part.to(device).contiguous() for part in each)) for each in state.memory))
+        self._memories = memory, Memory(*(Layer(*map(torch.zeros_like, each)) for each in memory))
         self._driven = tables.driven_table(sources, medium.settled, dtype, device)
         self._received = tables.receiver_table(receivers, steps, dtype, device)
         self.signal = torch.zeros((steps, sources.force.shape[1]), dtype=dtype, device=device)
@@ -92,32 +93,22 @@ class DeviceRun:
         self._turn = 0
         self._graphs: dict[int, torch.cuda.CUDAGraph] = {}
 
-    def goes_on(self, state: State, sources: Sources, receivers: Receivers, steps: int) -> bool:
-        """Return whether this is the last call's state, with its sources and receivers."""
-        same = self.state is state and self.sources is sources and self.receivers is receivers
-        return same and len(self.signal) == steps
-
     def advance(self, signal: Tensor) -> Tensor:
         """Step once per row of the signal; return the record of the receivers."""
         self.signal.copy_(signal)
         self._first.zero_()
-        steps = len(signal)
-        done = self._replay(steps) if self._captures(steps) else 0
+        steps, small = len(signal), self._fields[0].numel() <= _MOST_CAPTURED
+        captured = self.medium.device.type == "cuda" and steps > _GRAPH_STEPS and small
+        done = self._replay(steps) if captured else 0
         for offset in range(steps - done):
             self._step(self._turn + offset, offset)
         self._turn = (self._turn + steps) % 2
         received, block = self._received, self.medium.depths * self.medium.blocks.lanes
         grid = (triton.cdiv(received.size, block),)
         cuda_steps.read_last[grid](self._fields[self._turn], received, steps - 1, LANES=block)
-        memory = self._memories[self._turn]
-        layers = tuple((each.psi, each.zeta) for each in memory)
         now, before = self._fields[self._turn], self._fields[1 - self._turn]
-        self.state = State(now, before, layers[:4], *layers[4:])
+        self.state = State(now, before, self._memories[self._turn])
         return received.recorded.clone()
-
-    def _captures(self, steps: int) -> bool:
-        cells = self._fields[0].numel()
-        return self.medium.device.type == "cuda" and steps > _GRAPH_STEPS and cells <= _MOST_CAPTURED
 
     def _replay(self, steps: int) -> int:
         """Step by replays of a captured graph; return the number of steps done."""
@@ -187,7 +178,10 @@ class CudaKernel:
         if medium is None or medium.coefficients is not c or medium.shape != shape:
             self._run = run = None
             self._medium = medium = DeviceMedium(c, shape, self._blocks, self._device)
-        if run is None or not run.goes_on(state, sources, receivers, len(signal)):
+        if (
+            run is None or run.state is not state or run.sources is not sources
+            or run.receivers is not receivers or len(run.signal) != len(signal)
+        ):  # fmt: skip
             self._run = run = None  # frees its memory first
             self._run = run = DeviceRun(medium, state, sources, receivers, len(signal))
         recorded = run.advance(signal)

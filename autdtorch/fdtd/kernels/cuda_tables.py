@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Layer, Receivers, Sources, State
+from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Receivers, Sources
 
 
 class Shape(NamedTuple):
@@ -23,24 +23,6 @@ class Profile(NamedTuple):
 
     decay: Tensor
     gain: Tensor
-
-
-class Memory(NamedTuple):
-    """Memory of the two layers of an axis or of columns, as in `contract.State`."""
-
-    psi: Tensor
-    zeta: Tensor
-
-
-class Memories(NamedTuple):
-    """All memory of a state."""
-
-    x: Memory
-    y: Memory
-    z: Memory
-    yz: Memory
-    columns: Memory
-    crossed: Memory
 
 
 class Terms(NamedTuple):
@@ -101,20 +83,11 @@ class ReceiverTable(NamedTuple):
     recorded: Tensor  # record (steps, R)
 
 
-def profile_table(c: Coefficients, depths: int, device: torch.device) -> Profile:
-    """Return the layers' profile for blocks of `depths` cells."""
-    missing = 2 * depths + 1 - len(c.layer_decay)
-    decay, gain = (torch.nn.functional.pad(each, (0, missing)) for each in (c.layer_decay, c.layer_gain))
-    return Profile(decay.to(device), gain.to(device))
-
-
 def heterogeneous_table(c: Coefficients, device: torch.device) -> Heterogeneous:
     """Return the heterogeneous cells, with the scale of the layers' term in those in layers."""
     index, count = c.heterogeneous_index.to(device), len(c.heterogeneous_index)
-    order = torch.argsort(index)
     scale = torch.zeros(count, dtype=c.heterogeneous_weight.dtype, device=device)
-    place = order[torch.searchsorted(index[order], c.layer_index.to(device))]
-    scale[place] = c.layer_scale.to(device)
+    scale[torch.searchsorted(index, c.layer_index.to(device))] = c.layer_scale.to(device)
     weight = c.heterogeneous_weight.to(device).T.contiguous()
     return Heterogeneous(count, index.contiguous(), weight, scale, torch.zeros_like(scale))
 
@@ -174,13 +147,3 @@ def no_terms(shape: Shape, c: Coefficients, device: torch.device) -> Terms:
     columns, crossed = ((cells * len(each.index) + 1,) for each in (c.columns, c.crossed))
     sizes = ((nx, 2 * cells, nz), (nx, ny, 2 * cells), (nx, 2 * cells, 2 * cells), columns, crossed)
     return Terms(*(torch.zeros(size, dtype=c.layer_decay.dtype, device=device) for size in sizes))
-
-
-def memories(state: State, device: torch.device) -> Memories:
-    """Return a state's memory on the device; shared if it is there already."""
-
-    def moved(layer: Layer) -> Memory:
-        psi, zeta = layer
-        return Memory(psi.to(device).contiguous(), zeta.to(device).contiguous())
-
-    return Memories(*map(moved, (*state.layers, state.columns, state.crossed)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Layer, Receivers, Sources, State
+from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Layer, Memory, Receivers, Sources, State
 from autdtorch.fdtd.stencil import flat_offsets
 
 
@@ -44,17 +44,18 @@ class ReferenceKernel:
         change = (c.heterogeneous_weight * (flat_now[around] - own[:, None])).sum(-1)
         kept = own + c.keep * (own - before)
         new = new.reshape(-1).index_copy(0, c.heterogeneous_index, kept + change).reshape(state.now.shape)
-        layers, term = _absorb(state.now, state.layers, c)
+        memory, term = _absorb(state.now, state.memory, c)
         term = term.reshape(-1)
         term = term.index_copy(0, c.layer_index, c.layer_scale * term[c.layer_index]).reshape(new.shape)
         nothing = torch.zeros(c.crossed.index.T[1:].shape, dtype=flat_now.dtype, device="cpu")
-        crossed, beside = _absorb_columns(flat_now, c.crossed, nothing, state.crossed, c)
+        crossed, beside = _absorb_columns(flat_now, c.crossed, nothing, state.memory.crossed, c)
         beside = torch.nn.functional.pad(beside.reshape(-1), (0, 1))[c.crossing.T[1:]]
-        columns, shares = _absorb_columns(flat_now, c.columns, beside, state.columns, c)
+        columns, shares = _absorb_columns(flat_now, c.columns, beside, state.memory.columns, c)
         inside = c.columns.index.T[1:-1].reshape(-1)
         new = (new + term).reshape(-1).index_add(0, inside, shares.reshape(-1))
         new = new.index_add(0, driven, force).index_fill(0, c.sound_hard_index, 0)
-        return State(new.reshape(state.now.shape), state.now, layers, columns, crossed)
+        memory = memory._replace(columns=columns, crossed=crossed)
+        return State(new.reshape(state.now.shape), state.now, memory)
 
 
 def _core(field: Tensor) -> Tensor:
@@ -82,9 +83,9 @@ def _between(field: Tensor, axis: int, before: int, after: int) -> Tensor:
     return torch.nn.functional.pad(field, width)
 
 
-def _absorb(p: Tensor, layers: tuple[Layer, ...], c: Coefficients) -> tuple[tuple[Layer, ...], Tensor]:
+def _absorb(p: Tensor, memory: Memory, c: Coefficients) -> tuple[Memory, Tensor]:
     """Advance the layers' memory; return it and the term that replacing all T_a by T_a + E_a adds."""
-    x, y, z, yz = layers
+    x, y, z, yz, *_ = memory
     cells, size = c.layer_cells, p.shape
 
     def smooth(field: Tensor, first: int, second: int) -> Tensor:
@@ -106,7 +107,7 @@ def _absorb(p: Tensor, layers: tuple[Layer, ...], c: Coefficients) -> tuple[tupl
     x, faces = _stretch(torch.nn.functional.pad(_core(across), (1,) * 6), x, c, 0)
     term = placed(faces, axis=0) + smooth(e_y, 0, 2) + smooth(e_z, 0, 1)
     term = term + c.edge * e_yz + c.corner * _around(e_yz, 0)
-    return (x, y, z, yz), torch.nn.functional.pad(_core(term), (1,) * 6)
+    return memory._replace(x=x, y=y, z=z, yz=yz), torch.nn.functional.pad(_core(term), (1,) * 6)
 
 
 def _absorb_columns(
@@ -115,27 +116,25 @@ def _absorb_columns(
     """Advance the memory of columns, with summands `beside` (L + 1, m); return it and the terms (L, m)."""
     cells = columns.index.T[1:, :, None] + columns.offset
     across = torch.nn.functional.pad((columns.weight * flat[cells]).sum(-1) + beside, (0, 0, 1, 0))
-    decay, gain = c.layer_decay[:, None], c.layer_gain[:, None]
-    difference = torch.diff(across, dim=0)
-    psi = decay[0::2] * memory[0] + gain[0::2] * difference
-    slope = torch.diff(psi, dim=0)
-    zeta = decay[1::2] * memory[1] + gain[1::2] * (torch.diff(difference, dim=0) + slope)
-    return (psi, zeta), slope + zeta
+    return _advanced(across, memory, c, 0)
 
 
 def _stretch(field: Tensor, layer: Layer, c: Coefficients, axis: int) -> tuple[Layer, tuple[Tensor, Tensor]]:
     """Advance the memory of an axis; return it and E_a of the field in the low and the high layer."""
-    cells, shape = c.layer_cells, [1, 1, 1]
+    slabs = (each.narrow(axis, 0, c.layer_cells + 2) for each in (field, torch.flip(field, (axis,))))
+    sides = [_advanced(slab, Layer(*own), c, axis) for slab, *own in zip(slabs, *layer, strict=True)]
+    (low, low_term), (high, high_term) = sides
+    return Layer(*map(torch.stack, zip(low, high, strict=True))), (low_term, high_term)
+
+
+def _advanced(across: Tensor, layer: Layer, c: Coefficients, axis: int) -> tuple[Layer, Tensor]:
+    """Advance the memory of L cells from the L + 2 `across` them and their neighbours; return it and E_a."""
+    shape = [1] * across.ndim
     shape[axis] = -1
     b_half, b_cell = c.layer_decay[0::2].reshape(shape), c.layer_decay[1::2].reshape(shape)
     a_half, a_cell = c.layer_gain[0::2].reshape(shape), c.layer_gain[1::2].reshape(shape)
-    advanced, terms = [], []
-    for slab, psi, zeta in zip((field, torch.flip(field, (axis,))), *layer, strict=True):
-        difference = torch.diff(slab.narrow(axis, 0, cells + 2), dim=axis)
-        psi = b_half * psi + a_half * difference
-        slope = torch.diff(psi, dim=axis)
-        zeta = b_cell * zeta + a_cell * (torch.diff(difference, dim=axis) + slope)
-        advanced.append((psi, zeta))
-        terms.append(slope + zeta)
-    (low_psi, low_zeta), (high_psi, high_zeta) = advanced
-    return (torch.stack((low_psi, high_psi)), torch.stack((low_zeta, high_zeta))), (terms[0], terms[1])
+    difference = torch.diff(across, dim=axis)
+    psi = b_half * layer.psi + a_half * difference
+    slope = torch.diff(psi, dim=axis)
+    zeta = b_cell * layer.zeta + a_cell * (torch.diff(difference, dim=axis) + slope)
+    return Layer(psi, zeta), slope + zeta
