@@ -18,8 +18,7 @@ from autdtorch.utils.validation import (
     positive,
 )
 
-PAIR_BYTES = 80.0
-"""Memory for each entry of a transfer matrix while it is computed [bytes]."""
+PAIR_BYTES = 80.0  # Memory for each entry of a transfer matrix while it is computed [bytes]
 
 
 def green(points: ArrayLike, sources: ArrayLike, wavenumber: complex) -> torch.Tensor:

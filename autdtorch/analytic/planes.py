@@ -8,8 +8,7 @@ import numpy as np
 import torch
 
 from autdtorch.analytic.green import green
-from autdtorch.analytic.layers import Layering, vertical_wavenumber
-from autdtorch.analytic.sommerfeld import sommerfeld_integral
+from autdtorch.analytic.layers import Layering, sommerfeld_integral, vertical_wavenumber
 from autdtorch.utils.array_types import ComplexArray
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,

@@ -29,15 +29,14 @@ from autdtorch.utils.validation import (
     positive,
 )
 
+# Condition slope * dp/d(kr) + pressure * p = 0: from N to (slope, pressure) of the orders 0 to N
 Boundary: TypeAlias = Callable[[int], tuple[torch.Tensor | float, torch.Tensor | float]]
-"""Condition slope * dp/d(kr) + pressure * p = 0: from N to (slope, pressure) of the orders 0 to N."""
+# Radial functions: from k r (P,) and N to the orders 0 to N, complex (N + 1, P)
 Radial: TypeAlias = Callable[[torch.Tensor, int], torch.Tensor]
-"""Radial functions: from k r (P,) and N to the orders 0 to N, complex (N + 1, P)."""
 
 _BLOCK = 256  # points summed at a time, to limit memory
 _NEGLIGIBLE = 1e-17  # fraction of the largest term at which a series ends
-_MOST_ORDERS = 2**16
-"""Largest number of orders; enough for a point on the surface and a source 6e-4 radii off it."""
+_MOST_ORDERS = 2**16  # enough for a point on the surface and a source 6e-4 radii off it
 _CENTER = 1e-100  # replacement for k r = 0, where the field has a limit but its factors do not
 
 
