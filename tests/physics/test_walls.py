@@ -39,19 +39,11 @@ def slab(normal: int = 0, begin: float = FACE, thickness: float = 5e-3, density:
 @pytest.mark.parametrize(
     ("shift", "thickness", "exact", "bound"),
     [
-        (
-            0.0,
-            1.0,
-            analytic.rigid_plane,
-            1.5e-3,
-        ),  # the grid's own error in air is 3e-4, and the run ends 1e-3 from steady
+        # the grid's own error in air is 3e-4, and the run ends 1e-3 from steady
+        (0.0, 1.0, analytic.rigid_plane, 1.5e-3),
         (0.0, 1.0, analytic.fluid_half_space, 2e-3),
-        (
-            0.0,
-            5e-3,
-            analytic.fluid_slab,
-            2e-3,
-        ),  # required: 1 %. Faces half-way between cell centres are exact head on
+        # required: 1 %. Faces half-way between cell centres are exact head on
+        (0.0, 5e-3, analytic.fluid_slab, 2e-3),
         (0.37e-3, 5e-3, analytic.fluid_slab, 2e-3),
     ],
 )
@@ -131,10 +123,8 @@ def test_an_obstacle_at_a_wall_does_not_change_its_rows_in_the_layers() -> None:
     assembly = assemble(region_of(layered_scene((slab(), post), FRONT)), 1e-3, torch.float64)
     columns = assembly.coefficients.columns
     inwards = columns.index[:, 1] - columns.index[:, 0] == 1  # along z, from its lower end
-    weight, x = (
-        columns.weight[inwards].numpy(),
-        columns.index[inwards, 0] // math.prod(assembly.grid.shape[1:]),
-    )
+    weight = columns.weight[inwards].numpy()
+    x = columns.index[inwards, 0] // math.prod(assembly.grid.shape[1:])
     for place in x.unique():
         along = weight[(x == place).numpy()]
         assert len(along) == assembly.grid.shape[1] - 2

@@ -67,13 +67,6 @@ def test_only_axis_aligned_faces_move_the_grid() -> None:
     assert grid_offset(region_of(scene()), SPACING, *CORNERS) == (0.0, 0.0, 0.0)
 
 
-def test_a_grid_far_finer_than_the_wavelength_is_refused() -> None:
-    with pytest.raises(
-        ValueError, match=r"spacing: 1e-05 m; must be at least 1\.\d+e-05 m, 500 cells per wave"
-    ):
-        make_grid(region_of(scene()), 1e-5)
-
-
 def test_the_grid_covers_the_domain_wherever_it_lies() -> None:
     grid = make_grid(region_of(scene(box((5.3, 6.7, 7.9), (8, 9, 10)))), SPACING)
     margin = interpolation_width(grid.kappa) // 2 - 1  # cells that points beside the rim of the domain need

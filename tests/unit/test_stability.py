@@ -26,13 +26,10 @@ def random_weights(seed: int, contrast: float, negative: float) -> tuple[np.ndar
     for column, offset in enumerate(OFFSETS[14:], start=14):
         for cell, other in zip(index, index + strides @ offset, strict=True):
             if inside.flat[other]:
-                coupling = (
-                    weight[cell, column] * rng.uniform(-negative, 1) * math.sqrt(mass[cell] * mass[other])
-                )
-                weight[cell, column], weight[other, 26 - column] = (
-                    coupling / mass[cell],
-                    coupling / mass[other],
-                )
+                coupling = weight[cell, column] * rng.uniform(-negative, 1)
+                coupling *= math.sqrt(mass[cell] * mass[other])
+                weight[cell, column] = coupling / mass[cell]
+                weight[other, 26 - column] = coupling / mass[other]
             else:
                 weight[cell, column] /= mass[cell]
         for cell, other in zip(index, index - strides @ offset, strict=True):
