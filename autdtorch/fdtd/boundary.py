@@ -12,19 +12,31 @@ With E_a u the term that the layer adds to d2 u, T_a + E_a replaces every sum T_
 axis a in the 27-point sum, in products too: the exact complex stretching of the *discrete* equation, edges
 and corners of the grid included. A wave at angle t behaves as in one dimension with the wavenumber k cos t.
 The reflection is a small linear system for each angle, and the profile minimises it for all angles at once.
+
+A layer repeats the cells that it touches, so the stencil row of a cell is constant along the layer's normal.
+The kernels stretch rows as in air, scaled to the sum of the cell's own weights: exact inside an obstacle. The
+difference of a row at an interface from that is stretched here, by column, with a memory of its own. Where
+two layers meet, the difference has a part in the product of both stretchings: columns of one layer cross
+those of the other and add to their sums. Without it, waves along interfaces grow.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from autdtorch.utils.array_types import Array
+from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells
+from autdtorch.fdtd.grid import Grid
+from autdtorch.fdtd.kernels.contract import Columns
+from autdtorch.fdtd.stencil import OFFSETS, Stencil, flat_strides
+from autdtorch.utils.array_types import Array, Index
 
 # Angles of incidence at which the profile is fitted [rad]
 TUNED_ANGLES = np.radians((0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 55.0, 60.0, 65.0, 70.0, 75.0, 80.0))
@@ -36,19 +48,18 @@ _STARTS = ((10.0, 1.5), (20.0, 2.5))
 _SHIFT = 0.1
 _DIFFERENCE = 1e-7  # Step of the logarithms of the damping, for numerical derivatives
 _BOUNDS = (-14.0, 6.0)  # Range of the logarithms of the damping over w: from none to opaque
+_ROUNDING = 1e-6  # Differences from scaled air below this, relative to a face's weight, are rounding
+# The boundary layers: their axis, and 1 for the one at its upper end
+_LAYERS = tuple(itertools.product(range(3), (0, 1)))
+# Columns of one layer: cells in the ring (m,), step inwards, weights (m, w) and offsets (w,)
+_Part = tuple[Index, int, Array, Index]
 
 
-@dataclass(frozen=True)
-class LayerProfile:
+class LayerProfile(NamedTuple):
     """Recursion coefficients of a layer of n cells, from its outer end inwards."""
 
     decay: Array  # b at the half cells 0 .. n and at the cells 1 .. n, interleaved (..., 2 n + 1)
     gain: Array  # a, likewise
-
-    @property
-    def cells(self) -> int:
-        """Thickness of the layer."""
-        return int(self.decay.shape[-1]) // 2
 
 
 def reflection(profile: LayerProfile, along: Array, turn: Array) -> NDArray[np.complex128]:
@@ -62,7 +73,7 @@ def reflection(profile: LayerProfile, along: Array, turn: Array) -> NDArray[np.c
     half, full = stretch[..., 0::2], stretch[..., 1::2]
     # Unknowns: pressure in cells 1 .. L of the layer and in the first cell of air, and the amplitude r. In
     # air cell j the pressure is e^{-i along j} + r e^{i along j}.
-    cells = profile.cells
+    cells = full.shape[-1]
     matrix = np.zeros((*stretch.shape[:-1], cells + 2, cells + 2), complex)
     rows = np.arange(cells)
     matrix[..., rows, rows] = (2 - 2 * np.cos(along))[:, None] - full * (half[..., :-1] + half[..., 1:])
@@ -110,3 +121,67 @@ def tuned_profile(kappa: float, steps_per_period: float, cells: int) -> LayerPro
         start = np.log(strength / (kappa * cells) * depth**order)
         fits.append(least_squares(residual, start, slopes, bounds=_BOUNDS, max_nfev=60))
     return profile(min(fits, key=lambda fit: float(fit.cost)).x)
+
+
+def row_scale(weight: Array, stencil: Stencil) -> Array:
+    """Return the sums of stencil rows (n, 27), relative to air."""
+    return np.asarray(weight.sum(axis=1) / stencil.total)
+
+
+def layer_columns(
+    cells: HeterogeneousCells, stencil: Stencil, grid: Grid, factor: float, dtype: torch.dtype
+) -> tuple[Columns, Columns, torch.Tensor]:
+    """Return the columns, the crossed ones and the places of their terms; see `Coefficients`."""
+    outside = ~grid.inside(cells.index)
+    index, weight = cells.index[outside], cells.weight[outside]
+    rows = weight - row_scale(weight, stencil)[:, None] * stencil.weights
+    places = np.stack(np.unravel_index(index, grid.shape), axis=-1)
+    strides = flat_strides(grid.shape)
+    ahead = np.array(OFFSETS) == 1
+    middle, inside = 1 + grid.layer_cells // 2, np.arange(1, grid.layer_cells + 2)
+    parts, crossed, crossings, count = [], [], [], 0
+    for axis, side in _LAYERS:
+        used = np.abs(rows[:, ahead[:, axis]]).max(axis=1, initial=0) > _ROUNDING * stencil.face
+        here = np.flatnonzero(used & (_depth(places, axis, side, grid) == middle))
+        stride = (1 - 2 * side) * strides[axis]
+        foot = index[here] - middle * stride
+        parts.append(_columns(foot, stride, rows[here], ahead[:, axis], strides))
+        crossing = np.full((2, len(here), grid.layer_cells + 2), -1)
+        for other, end in _LAYERS[2 * axis + 2 :]:
+            depth, sideways = _depth(places[here], other, end, grid), (1 - 2 * end) * strides[other]
+            across = places[here, 3 - axis - other]
+            base = np.flatnonzero(depth == middle)
+            feet = (foot[base] - middle * sideways)[:, None] + inside * stride
+            both = np.repeat(rows[here[base]], len(inside), axis=0)
+            crossed.append(_columns(feet.ravel(), sideways, both, ahead[:, axis] & ahead[:, other], strides))
+            first = np.full(grid.shape[3 - axis - other], -1)
+            first[across[base]] = count + len(inside) * np.arange(len(base))
+            met = (depth >= 1) & (depth <= grid.layer_cells) & (first[across] >= 0)
+            crossing[0, met] = depth[met, None] - 1
+            crossing[1, met, 1:] = first[across[met], None] + inside - 1
+            count += len(inside) * len(base)
+        crossings.append(crossing)
+    depth, column = np.concatenate(crossings, axis=1)
+    crossing = np.where(column < 0, grid.layer_cells * count, depth * count + column)
+    columns, crossing_columns = (_joined(each, factor, grid, dtype) for each in (parts, crossed))
+    return columns, crossing_columns, torch.from_numpy(crossing)
+
+
+def _depth(places: Index, axis: int, side: int, grid: Grid) -> Index:
+    """Return the number of cells (n,) from the ring at one end of an axis inwards."""
+    return np.asarray(grid.shape[axis] - 1 - places[:, axis] if side else places[:, axis])
+
+
+def _columns(foot: Index, stride: int, rows: Array, ahead: NDArray[np.bool_], strides: Index) -> _Part:
+    """Return columns from `foot` (m,) on: the weights `ahead` of `rows` (m, 27), moved beside the cell."""
+    offsets = np.array(OFFSETS)[ahead]
+    beside = np.where((offsets == 1).all(axis=0), 0, offsets)
+    return foot, stride, rows[:, ahead], np.asarray(beside @ strides)
+
+
+def _joined(parts: list[_Part], factor: float, grid: Grid, dtype: torch.dtype) -> Columns:
+    depth = np.arange(grid.layer_cells + 2)
+    index = np.concatenate([foot[:, None] + stride * depth for foot, stride, _, _ in parts])
+    offset = np.concatenate([np.broadcast_to(offset, weight.shape) for _, _, weight, offset in parts])
+    weight = torch.from_numpy(factor * np.concatenate([weight for _, _, weight, _ in parts])).to(dtype)
+    return Columns(torch.from_numpy(index), torch.from_numpy(offset), weight)

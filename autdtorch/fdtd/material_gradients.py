@@ -40,10 +40,9 @@ class DifferentiableCells:
 
     def assembly(self, grid: Grid, region: Region, dtype: torch.dtype, time_step: float | None) -> Assembly:
         """Return an assembly that is differentiable by its stencil rows; see `assembly_of`."""
-        stencil = air_stencil(grid, region)
-        assembly = assembly_of(grid, stencil, self.heterogeneous, region.frequency, dtype, time_step)
+        assembly = assembly_of(grid, region, self.heterogeneous, dtype, time_step)
         coefficients = assembly.coefficients
-        weight = (coefficients.face / stencil.face * self.weight).to(dtype)
+        weight = (coefficients.face / assembly.stencil.face * self.weight).to(dtype)
         return replace(assembly, coefficients=replace(coefficients, heterogeneous_weight=weight))
 
     def driven(self, sources: Sources) -> Sources:

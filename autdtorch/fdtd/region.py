@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
+from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import Vector
 
 
@@ -38,6 +39,12 @@ class Shape(Protocol):
         """Return vertices (V, 3) [m] and triangles (F, 3), counter-clockwise as seen from outside."""
 
 
+def bounds(shapes: Sequence[Shape]) -> tuple[Array, Array]:
+    """Return the lower and upper corner (3,) [m] of the bounding box of shapes."""
+    lower = np.array([shape.lower for shape in shapes], np.float64).min(axis=0)
+    return lower, np.array([shape.upper for shape in shapes], np.float64).max(axis=0)
+
+
 @dataclass(frozen=True)
 class Body:
     """A shape of one material."""
@@ -58,7 +65,7 @@ class Region:
     # corners (lower, upper) [m] of the space that a grid of the whole domain covers
     domain: tuple[Vector, Vector]
     # positions of the transducers (M, 3) [m]; a grid stays symmetric where they are
-    sources: NDArray[np.float64]
+    sources: Array
 
     @property
     def wavenumber(self) -> float:

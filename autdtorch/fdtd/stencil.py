@@ -72,10 +72,6 @@ class Stencil:
         corners = np.array([(x, y, z) for x in (0, np.pi) for y in (0, np.pi) for z in (0, np.pi)])
         return float((_basis(corners) @ (self.face, self.edge, self.corner)).max())
 
-    def symbol_at(self, kappa: NDArray[Any]) -> NDArray[Any]:
-        """Return the symbol (...) of real or complex wave vectors times spacing (..., 3)."""
-        return np.asarray(_basis(kappa) @ (self.face, self.edge, self.corner))
-
     def isotropic_symbol(self, kappa: float) -> float:
         """Return the mean real part of the symbol of another sound speed; the loss per wavelength is kept."""
         loss = self.eta / self.kappa

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells
-from autdtorch.fdtd.assembly.layer_columns import layer_columns, row_scale
-from autdtorch.fdtd.boundary import tuned_profile
+from autdtorch.fdtd.boundary import layer_columns, row_scale, tuned_profile
 from autdtorch.fdtd.grid import Grid, make_grid
 from autdtorch.fdtd.interpolation import Interpolation, average_nodes, exclude_cells, interpolate_points
 from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, State, uniform_state
@@ -103,7 +102,7 @@ def assemble_on(grid: Grid, region: Region, dtype: torch.dtype, time_step: float
     """Assemble a region on a grid, with at most a time step of `time_step` [s], by default the largest."""
     stencil = air_stencil(grid, region)
     cells = heterogeneous_cells(elements_of(region, grid, stencil), stencil)
-    return assembly_of(grid, stencil, cells, region.frequency, dtype, time_step)
+    return assembly_of(grid, region, cells, dtype, time_step)
 
 
 def air_stencil(grid: Grid, region: Region) -> Stencil:
@@ -112,14 +111,10 @@ def air_stencil(grid: Grid, region: Region) -> Stencil:
 
 
 def assembly_of(
-    grid: Grid,
-    stencil: Stencil,
-    cells: HeterogeneousCells,
-    frequency: float,
-    dtype: torch.dtype,
-    time_step: float | None,
+    grid: Grid, region: Region, cells: HeterogeneousCells, dtype: torch.dtype, time_step: float | None
 ) -> Assembly:
     """Return the assembly of a grid with known heterogeneous cells; see `assemble_on`."""
+    stencil, frequency = air_stencil(grid, region), region.frequency
     largest = largest_eigenvalue(cells.index, cells.weight, stencil, grid.shape)
     fewest = fewest_steps(stencil, largest)
     steps_per_period = whole_steps(_wanted_steps(fewest, time_step, frequency))

@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from autdtorch.fdtd.grid import domain_extent
+from autdtorch.fdtd.grid import domain_extent, pilot_spacing
 from autdtorch.fdtd.region import Fluid, Region
-from autdtorch.fdtd.spacing import pilot_spacing
 from autdtorch.fdtd.stepping import assemble, drive_signal
 from autdtorch.propagators.grids import grid_cost
 from autdtorch.propagators.plan import make_kernel, plan

@@ -9,8 +9,7 @@ from typing import Literal
 
 import torch
 
-from autdtorch.fdtd.grid import warn_if_coarse
-from autdtorch.fdtd.spacing import coarsest_spacing, spacing_for
+from autdtorch.fdtd.grid import coarsest_spacing, spacing_for, warn_if_coarse
 from autdtorch.propagators.cache import DiskCache
 from autdtorch.propagators.free_space import FreeSpacePropagator
 from autdtorch.propagators.plan import Plan, plan

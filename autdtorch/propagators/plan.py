@@ -13,11 +13,10 @@ import numpy as np
 import torch
 
 from autdtorch.analytic.green import PAIR_BYTES
-from autdtorch.fdtd.grid import MAX_CELLS, layer_cells, require_spacing
+from autdtorch.fdtd.grid import MAX_CELLS, layer_cells, pilot_spacing, require_spacing, second_spacing
 from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.region import Region
-from autdtorch.fdtd.spacing import pilot_spacing, second_spacing
 from autdtorch.fdtd.steady_state import phasors_kept
 from autdtorch.propagators.grids import USUAL_PERIODS, Grouping, choose_grids
 from autdtorch.propagators.scene_region import region_of

@@ -12,7 +12,7 @@ from typing import Literal, Protocol, overload, runtime_checkable
 import torch
 
 from autdtorch.analytic.green import PAIR_BYTES
-from autdtorch.fdtd.spacing import grid_error
+from autdtorch.fdtd.grid import grid_error
 from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.cache import DiskCache, cache_key
 from autdtorch.propagators.full import DomainSimulation

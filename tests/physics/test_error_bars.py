@@ -8,7 +8,7 @@ from small_scenes import AIR, relative_error, small_scene
 
 from autdtorch import analytic
 from autdtorch.analytic.green import free_space_matrix
-from autdtorch.fdtd.spacing import RATIO, coarsest_spacing, grid_error, second_spacing, spacing_for
+from autdtorch.fdtd.grid import RATIO, coarsest_spacing, grid_error, second_spacing, spacing_for
 from autdtorch.propagators import FreeSpacePropagator, make_propagator
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.obstacles import Sphere

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autdtorch.fdtd.stencil import tuned_stencil
+from autdtorch.fdtd.stencil import OFFSETS, Stencil, tuned_stencil
 
 KAPPAS = st.floats(0.1, 2 * math.pi / 3)
 
@@ -15,11 +15,16 @@ def directions(count: int) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
+def symbol_at(stencil: Stencil, kappa: np.ndarray) -> np.ndarray:
+    """The symbol (...) of real or complex wave vectors times spacing (..., 3)."""
+    return (stencil.weights * (1 - np.cos(kappa @ np.array(OFFSETS).T))).sum(-1)
+
+
 @pytest.mark.parametrize(("cells", "bound"), [(17.0, 1e-8), (8.5, 1e-6), (4.25, 1e-4), (3.0, 1e-3)])
 def test_symbol_is_the_same_in_every_direction(cells: float, bound: float) -> None:
     # relative error of the frequency, half the symbol's: 4e-7 at 8.5 and 3e-5 at 4.25 cells per wavelength
     stencil = tuned_stencil(2 * math.pi / cells)
-    symbol = stencil.symbol_at(stencil.kappa * directions(2000))
+    symbol = symbol_at(stencil, stencil.kappa * directions(2000))
     assert np.abs(symbol / stencil.symbol - 1).max() / 2 < bound
 
 
@@ -29,7 +34,7 @@ def test_plane_wave_at_the_drive_frequency_turns_by_one_period_in_whole_steps(
 ) -> None:
     stencil = tuned_stencil(kappa)
     # Exact up to the anisotropy that is left, 1e-3 at the coarsest.
-    cosine = 1 - stencil.time_factor(steps) * stencil.symbol_at(kappa * directions(20)) / 2
+    cosine = 1 - stencil.time_factor(steps) * symbol_at(stencil, kappa * directions(20)) / 2
     assert np.allclose(cosine, math.cos(2 * math.pi / steps), atol=2e-3)
 
 
@@ -40,7 +45,7 @@ def test_plane_wave_falls_by_its_attenuation(cells: float, bound: float) -> None
     eta = 5e-3 * kappa
     stencil = tuned_stencil(kappa, eta)
     damping, turn = stencil.damping(steps), 2 * math.pi / steps
-    symbol = stencil.symbol_at((kappa + 1j * eta) * directions(200))
+    symbol = symbol_at(stencil, (kappa + 1j * eta) * directions(200))
     left = 2 * math.cos(turn) - 2j * damping * math.sin(turn) - 2 + stencil.time_factor(steps) * symbol
     # divided by the slope of the symbol it is an error of the wavenumber
     error = left / (stencil.time_factor(steps) * stencil.slope)
@@ -56,15 +61,11 @@ def test_no_loss_no_damping(kappa: float) -> None:
 
 
 @given(KAPPAS)
-def test_weights_are_those_of_the_symbol(kappa: float) -> None:
+def test_long_waves_see_the_laplacian(kappa: float) -> None:
     stencil = tuned_stencil(kappa)
-    offsets = np.indices((3, 3, 3)).reshape(3, -1).T - 1
-    wave = kappa * directions(5)
-    summed = (stencil.weights * (1 - np.cos(wave @ offsets.T))).sum(1)
-    assert np.allclose(summed, stencil.symbol_at(wave), rtol=1e-12)
     assert stencil.weights.sum() == pytest.approx(stencil.total)
-    # long waves see the Laplacian; the next term of the expansion is of relative size 1e-6
-    assert np.allclose(stencil.symbol_at(1e-3 * directions(20)), 1e-6, rtol=1e-5)
+    # the next term of the expansion is of relative size 1e-6
+    assert np.allclose(symbol_at(stencil, 1e-3 * directions(20)), 1e-6, rtol=1e-5)
 
 
 @given(KAPPAS)
@@ -72,7 +73,7 @@ def test_largest_symbol_bounds_every_wave_and_is_reached(kappa: float) -> None:
     stencil = tuned_stencil(kappa)
     axis = np.linspace(0, math.pi, 9)
     waves = np.stack(np.meshgrid(axis, axis, axis), axis=-1)
-    assert stencil.symbol_at(waves).max() == pytest.approx(stencil.largest_symbol, rel=1e-12)
+    assert symbol_at(stencil, waves).max() == pytest.approx(stencil.largest_symbol, rel=1e-12)
 
 
 def test_source_factor_tends_to_that_of_the_continuum_on_fine_grids() -> None:

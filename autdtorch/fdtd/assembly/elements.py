@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from autdtorch.fdtd.assembly.element import FAR, LATTICE, InterfaceElements, Materials
 from autdtorch.fdtd.assembly.interface import interface_elements
 from autdtorch.fdtd.grid import Grid
-from autdtorch.fdtd.region import Fluid, Region, Shape
+from autdtorch.fdtd.region import Fluid, Region, Shape, bounds
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.progress import show_progress
@@ -45,16 +45,6 @@ class _Union:
     shapes: tuple[Shape, ...]
     material: int
     continued: bool  # whether they continue through the boundary layers, unchanged from the interior
-
-    @property
-    def lower(self) -> Array:
-        """Lower corner of the bounding box (3,) [m]."""
-        return np.asarray(np.array([shape.lower for shape in self.shapes]).min(axis=0))
-
-    @property
-    def upper(self) -> Array:
-        """Upper corner of the bounding box (3,) [m]."""
-        return np.asarray(np.array([shape.upper for shape in self.shapes]).max(axis=0))
 
     def distance(self, cell: Array, grid: Grid) -> Array:
         """Return the signed distance [cells] of positions (..., 3) in cells."""
@@ -123,8 +113,9 @@ def _unions(region: Region, stencil: Stencil) -> tuple[list[_Union], Materials]:
 def _windows(body: _Union, grid: Grid) -> Iterator[tuple[tuple[slice, ...], Array]]:
     """Yield slabs of elements around a body with the signed distances [cells] of their centres."""
     middle = [np.arange(cells - 1) + 0.5 for cells in grid.shape]
+    lower, upper = bounds(body.shapes)
     ranges = []
-    for axis, low, high in zip(range(3), body.lower - grid.spacing, body.upper + grid.spacing, strict=True):
+    for axis, low, high in zip(range(3), lower - grid.spacing, upper + grid.spacing, strict=True):
         inside = middle[axis].clip(grid.first[axis], grid.last[axis] - 1)
         ranges.append(np.searchsorted(grid.origin[axis] + grid.spacing * inside, (low, high)))
     for x in range(ranges[0][0], ranges[0][1]):
@@ -139,8 +130,8 @@ def _distances(bodies: list[_Union], first: Index, grid: Grid) -> Array:
     center = np.array(grid.origin) + grid.spacing * grid.clip(np.asarray(first + 0.5))
     distance = np.full((len(bodies), *cell.shape[:2]), FAR)
     for far, body in zip(distance, bodies, strict=True):
-        low, high = body.lower - 2 * grid.spacing, body.upper + 2 * grid.spacing
-        near = ((center > low) & (center < high)).all(axis=1)
+        lower, upper = bounds(body.shapes)
+        near = ((center > lower - 2 * grid.spacing) & (center < upper + 2 * grid.spacing)).all(axis=1)
         if near.any():
             far[near] = body.distance(cell[near], grid)
     return distance
