@@ -26,9 +26,8 @@ from autdtorch.propagators.grids import MOST_PASSES, one_box
 from autdtorch.propagators.plan import MOST_JUDGED
 from autdtorch.propagators.simulation import Run, Simulation, Stepped
 from autdtorch.scene.arrays import Nodes
-from autdtorch.utils.neighbours import nearest
+from autdtorch.scene.scene import require_clear
 from autdtorch.utils.threads import one_torch_thread, spread
-from autdtorch.utils.validation import LENGTH_TOLERANCE, ArrayLike, invalid, points_tensor
 
 logger = logging.getLogger(__name__)
 
@@ -75,19 +74,12 @@ class BoxSimulation(Simulation):
         plan = self.plan
         return BoxSimulation(replace(plan, grouping=one_box(plan.region, plan.spacing)))
 
-    def checked(self, points: ArrayLike) -> torch.Tensor:
-        """Return points (P, 3) after checking that none is on a transducer."""
-        points = points_tensor("points", points).cpu()
-        gap, _ = nearest(points, self.plan.scene.array.nodes.positions.reshape(-1, 3))
-        if gap.min() < LENGTH_TOLERANCE:
-            index = int(gap.argmin())
-            accepted = f"lies on a transducer, must be at least {LENGTH_TOLERANCE:g} m away"
-            raise invalid(f"points[{index}]", points[index], accepted, "m")
-        return points
-
     def near_obstacle(self, points: torch.Tensor) -> bool:
         """Return whether the interpolation kernel of any point (N, 3) has heterogeneous cells."""
         return any(box.assembly.touches_heterogeneous(points[box.inside(points)]) for box in self.boxes)
+
+    def _check(self, points: torch.Tensor) -> None:
+        require_clear(self.plan.scene.array, "points", points)
 
     @torch.no_grad()
     def _simulate(

@@ -17,7 +17,6 @@ from autdtorch.propagators.simulation import Run, Simulation, Stepped
 from autdtorch.scene.arrays import Nodes
 from autdtorch.scene.scene import require_inside
 from autdtorch.utils.threads import one_torch_thread
-from autdtorch.utils.validation import ArrayLike, points_tensor
 
 
 class DomainSimulation(Simulation):
@@ -31,15 +30,12 @@ class DomainSimulation(Simulation):
         plan.require_feasible()
         return (assemble(plan.region, plan.spacing, plan.dtype, plan.time_step),)
 
-    def checked(self, points: ArrayLike) -> torch.Tensor:
-        """Return points (P, 3) after checking that they are in the domain."""
-        points = points_tensor("points", points).cpu()
-        require_inside(self.plan.scene.domain, "points", points)
-        return points
-
     def near_obstacle(self, points: torch.Tensor) -> bool:
         """Return whether the interpolation kernel of any point (N, 3) has heterogeneous cells."""
         return self.assemblies[0].touches_heterogeneous(points)
+
+    def _check(self, points: torch.Tensor) -> None:
+        require_inside(self.plan.scene.domain, "points", points)
 
     @torch.no_grad()
     def _simulate(

@@ -24,7 +24,7 @@ from autdtorch.propagators.symmetry import (
 )
 from autdtorch.scene.arrays import Nodes
 from autdtorch.utils.progress import show_progress
-from autdtorch.utils.validation import ArrayLike
+from autdtorch.utils.validation import ArrayLike, points_tensor
 
 logger = logging.getLogger(__name__)
 
@@ -83,18 +83,24 @@ class Simulation(ABC):
         """The assembled grids."""
 
     @abstractmethod
-    def checked(self, points: ArrayLike) -> torch.Tensor:
-        """Return points (P, 3) after checking them; a `ValueError` names one that cannot be computed."""
-
-    @abstractmethod
     def near_obstacle(self, points: torch.Tensor) -> bool:
         """Return whether the interpolation kernel of any point (N, 3) has heterogeneous cells."""
+
+    @abstractmethod
+    def _check(self, points: torch.Tensor) -> None:
+        """Refuse points (P, 3) whose pressure cannot be computed."""
 
     @abstractmethod
     def _simulate(
         self, sources: Sequence[Nodes], strength: torch.Tensor, receivers: Nodes, stepped: Stepped
     ) -> tuple[torch.Tensor, list[Run]]:
         """Do the work of `run`; `stepped` is called with numbers of periods."""
+
+    def checked(self, points: ArrayLike) -> torch.Tensor:
+        """Return points (P, 3) after checking them; a `ValueError` names one that cannot be computed."""
+        points = points_tensor("points", points).cpu()
+        self._check(points)
+        return points
 
     @cached_property
     def symmetries(self) -> list[Symmetry]:

@@ -240,14 +240,9 @@ def _require_within(name: str, points: torch.Tensor) -> None:
 def _require_separate_points(scene: Scene) -> None:
     """Refuse coincident points and points in or on an obstacle; on it, rounding would choose the side."""
     require_distinct("Scene.control_points", scene.control_points)
-    points, nodes = scene.control_points, scene.array.nodes.positions
-    gap, node = nearest(points, nodes.reshape(-1, 3))
-    if gap.min() < LENGTH_TOLERANCE:
-        point = int(gap.argmin())
-        transducer = int(node[point]) // nodes.shape[1]
-        accepted = f"lies on transducer {transducer}, must be at least {LENGTH_TOLERANCE:g} m away"
-        raise invalid(f"Scene.control_points[{point}]", points[point], accepted, "m")
-    groups = {"array.positions": scene.array.positions, "control_points": points, "array.nodes": nodes}
+    array, points = scene.array, scene.control_points
+    require_clear(array, "Scene.control_points", points)
+    groups = {"array.positions": array.positions, "control_points": points, "array.nodes": array.nodes[0]}
     for name, group in groups.items():
         for index, obstacle in enumerate(scene.obstacles):
             inside = obstacle.contains(group, margin=LENGTH_TOLERANCE)
@@ -308,6 +303,17 @@ def _extent(obstacle: Obstacle) -> str:
     bounds = obstacle.lower, obstacle.upper
     low, high = (tuple(float(f"{entry:.9g}") for entry in corner) for corner in bounds)
     return f"{low} to {high} m"
+
+
+def require_clear(array: TransducerArray, name: str, points: torch.Tensor) -> None:
+    """Refuse points (N, 3) [m] on a transducer."""
+    nodes = array.nodes.positions
+    gap, node = nearest(points, nodes.reshape(-1, 3))
+    if gap.min() < LENGTH_TOLERANCE:
+        point = int(gap.argmin())
+        transducer = int(node[point]) // nodes.shape[1]
+        accepted = f"lies on transducer {transducer}, must be at least {LENGTH_TOLERANCE:g} m away"
+        raise invalid(f"{name}[{point}]", points[point], accepted, "m")
 
 
 def require_inside(domain: tuple[Vector, Vector], name: str, points: torch.Tensor) -> None:

@@ -196,7 +196,7 @@ def test_bad_arguments_are_named(arguments, message):
 
 @pytest.mark.parametrize(
     ("method", "message"),
-    [("full", "must be inside the domain"), ("box", "lies on a transducer, must be at")],
+    [("full", "must be inside the domain"), ("box", "lies on transducer 2, must be at")],
 )
 def test_points_outside_the_domain_or_on_a_transducer_are_refused(method, message):
     scene = small_scene((CUBE,))
