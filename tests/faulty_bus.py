@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Sequence
-from typing import Literal, TypeAlias
 
 from autdtorch.hardware import EmulatedBench, EmulatedSensor
 from autdtorch.hardware.emulator.bus import EmulatedBus, EmulatedDevice, stall, time_out, unplugged
@@ -12,14 +11,13 @@ from autdtorch.hardware.emulator.bus import EmulatedBus, EmulatedDevice, stall, 
 #: "time-out" and "short write": a transfer ends in mid-frame, with an error or without, and the chip takes
 #: nothing until it is reset; "stall": the endpoint refuses until its halt is cleared; "unplug": the chip is
 #: gone.
-Fault: TypeAlias = Literal["time-out", "stall", "short write", "unplug"]
-FAULTS: tuple[Fault, ...] = ("time-out", "stall", "short write", "unplug")
+FAULTS = ("time-out", "stall", "short write", "unplug")
 
 
 class FaultyBus(EmulatedBus):
     """A bus with one fault, which strikes once, after a number of bytes."""
 
-    def __init__(self, chips: Sequence[EmulatedDevice], fault: Fault, after: int) -> None:
+    def __init__(self, chips: Sequence[EmulatedDevice], fault: str, after: int) -> None:
         super().__init__(chips)
         self.struck = False
         self._fault = fault

@@ -1,11 +1,9 @@
 """Faults during a trial: outputs off, an error of one line, a log that loads, and a trial that continues."""
 
 import signal
-import subprocess
 import sys
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 import pytest
 import torch
@@ -254,28 +252,6 @@ def test_a_signal_that_is_ignored_as_by_nohup_stays_so():
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)
-
-
-KILLED = f"""
-import os, signal, sys
-sys.path[:0] = {[str(folder) for folder in Path(__file__).parents[:2]]!r}
-from pathlib import Path
-from conftest import Trial, a_scene
-from faulty_bus import Disturbed
-from test_faults import SURVIVED, measure
-def kill(readings):
-    if readings > SURVIVED:
-        os.kill(os.getpid(), signal.SIGKILL)
-trial = Trial(*a_scene(), Path(sys.argv[1]))
-bench = trial.bench()
-measure(trial, bench, Disturbed(bench, kill))
-"""
-
-
-def test_sigkill_costs_the_evaluation_in_flight_alone(trial):
-    killed = subprocess.run([sys.executable, "-c", KILLED, trial.log], check=False)
-    assert killed.returncode == -signal.SIGKILL
-    require_that_it_goes_on(trial)
 
 
 @pytest.mark.parametrize("lost", [2, 200])

@@ -26,23 +26,6 @@ def objective_on(trial, link: hw.LimitedLink, sensor) -> hw.HardwareObjective:
     return hw.HardwareObjective(trial.scene, link, sensor, trial.log)
 
 
-@pytest.mark.parametrize("limit", [1.0, 0.9, 0.5, 0.03])
-def test_no_transducer_is_driven_above_the_limit(trial, limit: float):
-    bench = trial.bench(hw.OPENMPD)
-    with trial.link(bench, hw.OPENMPD) as link:
-        hw.LimitedLink(link, hw.Limits(amplitude=limit)).play(FULL)
-        amplitudes = bench.drive().abs()
-        assert amplitudes.max() <= limit * (1 + 1e-9)
-        # A step of the duty is at most pi / 128 of the amplitude, and one of the candidates 1 / 256.
-        assert amplitudes.min() >= limit - 0.03
-
-
-def test_a_device_without_amplitude_plays_in_full_or_not_at_all(trial):
-    refused = pytest.raises(ValueError, match=r"amplitude: 0\.9; must be >= 1, .* SonicSurface")
-    with trial.link(trial.bench()) as link, refused:
-        hw.LimitedLink(link, hw.Limits(amplitude=0.9))
-
-
 def test_an_invalid_drive_is_not_scaled_into_a_valid_one_and_starts_no_clock(trial):
     bench = trial.bench(hw.OPENMPD)
     with trial.link(bench, hw.OPENMPD) as link:

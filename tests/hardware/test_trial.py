@@ -11,7 +11,7 @@ from autdtorch import hardware as hw
 from autdtorch.methods.gabs import gabs
 from autdtorch.methods.identify import identify
 from autdtorch.methods.lssg import lssg
-from autdtorch.objectives.perturbations import Quantised, random_rms
+from autdtorch.objectives.perturbations import random_rms
 from autdtorch.scene.drive import drive_from_phases
 
 
@@ -49,16 +49,6 @@ def test_without_noise_a_method_finds_the_same_drive_as_in_simulation(trial, dev
     asked = torch.view_as_complex(torch.tensor([line["drive"] for line in lines], dtype=torch.float64))
     pressure = torch.tensor([line["pressure"] for line in lines], dtype=torch.float64)
     torch.testing.assert_close(full * played(asked), pressure, rtol=1e-12, atol=1e-12)
-
-
-def test_a_drive_between_the_levels_is_played_on_the_nearest(trial):
-    bench = trial.bench()
-    drive = drive_from_phases(torch.linspace(0, 3, 16, dtype=torch.float64), torch.linspace(0, 1, 16))
-    with trial.link(bench) as link:
-        link.play(drive)
-        played = Quantised(trial.simulated, levels=32, on_off=True).emitted(drive)  # by another way
-        torch.testing.assert_close(bench.drive(), played, rtol=0, atol=1e-15)
-        torch.testing.assert_close(trial.played().emitted(drive[None])[0], played, rtol=0, atol=1e-15)
 
 
 def test_a_drive_in_any_guise_is_measured_and_comes_back_from_the_log(trial):
