@@ -20,7 +20,7 @@ from small_scenes import AIR, CUBE, small_scene
 import autdtorch as at
 from autdtorch import hardware, propagators
 from autdtorch.hardware.emulator.bus import EmulatedBus
-from autdtorch.hardware.emulator.instrument import EmulatedInstrument
+from autdtorch.hardware.emulator.emulated_scope import EmulatedInstrument
 
 PLANE = at.Plane(center=(20e-3, 12e-3, 12e-3), normal=(1, 0, 0), size=(8e-3, 8e-3))
 AIR_ALONE = small_scene()

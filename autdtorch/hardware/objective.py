@@ -58,8 +58,8 @@ class HardwareObjective:
         """
         require_kind("scene", scene, Scene)
         require_kind("sensor", sensor, Sensor)
-        if watch is not None:
-            require_callable("watch", watch)
+        watch = (lambda _: None) if watch is None else watch
+        require_callable("watch", watch)
         if not isinstance(link, LimitedLink):
             raise invalid("link", link, "must be a LimitedLink: no trial without an amplitude limit")
         transducers = link.link.transducers.tolist()
@@ -113,8 +113,7 @@ class HardwareObjective:
         evaluation = self.log.recorded(number, drive)
         if evaluation is None:
             return None
-        if self._watch is not None:
-            self._watch(evaluation)
+        self._watch(evaluation)
         return evaluation.pressure
 
     def quantised(self, drive: torch.Tensor) -> torch.Tensor:
@@ -132,6 +131,5 @@ class HardwareObjective:
         pressure = checked_reading(self._sensor, len(self.scene.control_points))
         self._link.require_on()
         evaluation = self.log.append(drive, pressure, self._link.seconds_on)
-        if self._watch is not None:
-            self._watch(evaluation)
+        self._watch(evaluation)
         return pressure

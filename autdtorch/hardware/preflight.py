@@ -65,19 +65,18 @@ def check_transducers(
     """
     require_kind("link", link, LimitedLink)
     require_kind("sensor", sensor, Sensor)
-    if watch is not None:
-        require_callable("watch", watch)
+    watch = (lambda _: None) if watch is None else watch
+    require_callable("watch", watch)
     points = integer_at_least("points", points, 1)
     readings = integer_at_least("readings", readings, 1)
     background = integer_at_least("background", background, 1)
-    tell = watch or (lambda _: None)
-    tell("silence, outputs off")
+    watch("silence, outputs off")
     silence = _power(sensor, points, background)
     count = len(link.link.transducers)
     powers = []
     try:
         for number, alone in enumerate(torch.eye(count, dtype=torch.complex128, device="cpu"), start=1):
-            tell(f"transducer {number} of {count}")
+            watch(f"transducer {number} of {count}")
             link.play(alone)
             powers.append(_power(sensor, points, readings))
             link.require_on()

@@ -116,12 +116,8 @@ class Limits:
 class LimitedLink:
     """A link that plays within the `limits` of a trial, and switches off by itself when the time is up.
 
-    Methods raise `LinkError` if the device does not take the bytes.
-
-    Attributes:
-        link: the link.
-        limits: limits of the trial.
-        logs: files of the trials that it plays for; the time on before each is counted.
+    Methods raise `LinkError` if the device does not take the bytes. Attributes are the `link`, the `limits`,
+    and `logs`, the files of the trials that it plays for; the time on before each is counted.
     """
 
     def __init__(self, link: Link, limits: Limits) -> None:

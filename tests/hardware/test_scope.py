@@ -11,7 +11,7 @@ import torch
 
 from autdtorch import hardware as hw
 from autdtorch.hardware.emulator.bus import EmulatedBus, stall, time_out
-from autdtorch.hardware.emulator.instrument import EmulatedInstrument
+from autdtorch.hardware.emulator.emulated_scope import EmulatedInstrument
 from autdtorch.hardware.sensors.scpi import Dialect
 from autdtorch.methods.gabs import gabs
 from autdtorch.objectives.perturbations import random_rms

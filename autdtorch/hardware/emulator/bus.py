@@ -6,7 +6,7 @@ import errno
 from array import array
 from collections.abc import Sequence
 from types import SimpleNamespace
-from typing import ClassVar, TypeAlias
+from typing import ClassVar
 
 from autdtorch.hardware.transport.port import INSTALL_HINT
 
@@ -20,14 +20,12 @@ _GET_DESCRIPTOR, _STRING, _ENGLISH = 0x06, 0x03, 0x0409
 _FROM_DEVICE, _STANDARD_FROM_DEVICE = 0x80, 0x80
 _PACKET = 64
 
-#: Class, subclass and protocol of each interface, and its bulk endpoints.
-Interfaces: TypeAlias = tuple[tuple[tuple[int, int, int], tuple[int, ...]], ...]
-
 
 class EmulatedDevice:
     """An emulated USB device; `present` while it is plugged in."""
 
-    interfaces: ClassVar[Interfaces]
+    #: Class, subclass and protocol of each interface, and its bulk endpoints.
+    interfaces: ClassVar[tuple[tuple[tuple[int, int, int], tuple[int, ...]], ...]]
 
     def __init__(self, vendor: int, product: int, serial: str) -> None:
         """Plug the device in, with idVendor, idProduct and serial number."""
