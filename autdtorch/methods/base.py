@@ -11,7 +11,6 @@ from typing import Any, ClassVar, NamedTuple, TypeAlias
 import numpy as np
 import torch
 
-from autdtorch.methods.ranking import NEAR_TIE, first_of_best
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.objective import Objective, Score, require_objective, weakest_focus
 from autdtorch.objectives.perturbations import quantised
@@ -33,8 +32,9 @@ Trials: TypeAlias = int | Sequence[int]
 TRIAL_BYTES = 6_000.0
 """Memory of a trial [bytes]; most of it is the state of its random generator."""
 
-_SCORE_NUMBERS = 4.0
-"""Numbers kept for each evaluation: its score, and the history made of the scores."""
+NEAR_TIE = 1e-5
+"""Relative difference below which scores count as equal. Symmetric scenes have many equal scores, and the
+rounding of the simulation, which differs between machines, must not decide between them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +181,8 @@ class Method(ABC):
     def numbers_kept(self, problem: Problem) -> float:
         """Return about how many float64 numbers a trial keeps, to refuse settings that need too many."""
         drive = 4.0 * problem.transducers + 2.0 * problem.foci
-        return _SCORE_NUMBERS * self.most_evaluations(problem) + drive * self.most_at_once(problem)
+        # Besides the drives of a step: the score of each evaluation, and the history made of the scores
+        return 4.0 * self.most_evaluations(problem) + drive * self.most_at_once(problem)
 
     def require_fit(self, problem: Problem, trials: int) -> None:
         """Check settings and memory against a problem; `ValueError` where they do not fit."""
@@ -266,6 +267,12 @@ def _improved(state: State, pressure: torch.Tensor, score: torch.Tensor) -> Solu
     }
     scores = score.new_full((len(best.score), score.shape[1]), -torch.inf).index_copy(0, trials, score)
     return Solution(history=torch.cat([best.history, scores], dim=1), **columns)
+
+
+def first_of_best(score: torch.Tensor) -> torch.Tensor:
+    """Return the index (T,) of the first of scores (T, B) within `NEAR_TIE` of the best."""
+    best = score.amax(dim=1, keepdim=True)
+    return (score >= best - NEAR_TIE * best.abs()).byte().argmax(dim=1)
 
 
 def generators_of(seeds: Sequence[int]) -> list[torch.Generator]:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import torch
 
-from autdtorch.methods.ranking import first_of_best
+from autdtorch.methods.base import first_of_best
 from autdtorch.scene.drive import drive_from_phases
 from autdtorch.utils.validation import integers, invalid
 

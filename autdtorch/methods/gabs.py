@@ -9,9 +9,8 @@ from typing import ClassVar, Literal
 import torch
 
 from autdtorch.methods import coordinates
-from autdtorch.methods.base import Method, Problem, State, Step, Trials, generators_of
+from autdtorch.methods.base import NEAR_TIE, Method, Problem, State, Step, Trials, generators_of
 from autdtorch.methods.driver import run
-from autdtorch.methods.ranking import best_first
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.objective import Objective, Score, weakest_focus
 from autdtorch.utils.validation import integer_at_least, invalid
@@ -49,9 +48,8 @@ class GABS(Method):
     def __post_init__(self) -> None:
         """Check the settings."""
         object.__setattr__(self, "levels", integer_at_least("levels", self.levels, 2))
-        object.__setattr__(
-            self, "order", coordinates.order_setting(self.order, ("random", "given", "strength"))
-        )
+        order = coordinates.order_setting(self.order, ("random", "given", "strength"))
+        object.__setattr__(self, "order", order)
         object.__setattr__(self, "passes", integer_at_least("passes", self.passes, 1))
         if self.first is not None:
             object.__setattr__(self, "first", integer_at_least("first", self.first, 0))
@@ -60,18 +58,15 @@ class GABS(Method):
         """Check order and first transducer against the number of transducers."""
         coordinates.require_all(self.order, problem.transducers)
         if self.first is not None and self.first >= problem.transducers:
-            accepted = f"must be an integer from 0 to {problem.transducers - 1}"
-            raise invalid("first", self.first, accepted)
+            raise invalid("first", self.first, f"must be an integer from 0 to {problem.transducers - 1}")
 
     def most_evaluations(self, problem: Problem) -> int:
         """Return the evaluations of all passes."""
-        transducers = problem.transducers
-        alone = transducers if self.order == "strength" else 1
-        return alone + (self.passes * transducers - 1) * self.levels
+        return self._alone(problem) + (self.passes * problem.transducers - 1) * self.levels
 
     def most_at_once(self, problem: Problem) -> int:
         """Return the number of levels, or of transducers observed alone."""
-        return max(self.levels, problem.transducers if self.order == "strength" else 1)
+        return max(self.levels, self._alone(problem))
 
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
         """Observe the first transducer alone, or each alone where their strengths decide the order."""
@@ -88,15 +83,17 @@ class GABS(Method):
 
     def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
         """Compare the phases of the next transducer."""
-        search, goes_on = state.search or self._first_on(best_first(score)), None
-        transducers = state.problem.transducers
-        alone = transducers if self.order == "strength" else 1
-        step = (state.best.history.shape[1] - alone) // self.levels
+        search, goes_on = state.search or self._first_on(_best_first(score)), None
+        step = (state.best.history.shape[1] - self._alone(state.problem)) // self.levels
         if step > 0:
             search, goes_on = coordinates.ascend(search, step, score)
-        if step + 1 == self.passes * transducers:
+        if step + 1 == self.passes * state.problem.transducers:
             return Step(state.drives[:, :0], search)
         return Step(coordinates.candidates(search, self.levels, step + 1), search, goes_on)
+
+    def _alone(self, problem: Problem) -> int:
+        """Return the number of transducers observed alone."""
+        return problem.transducers if self.order == "strength" else 1
 
     def _first_on(self, orders: torch.Tensor) -> coordinates.Search:
         """Return the state of an ascent in `orders` (T, M), after `first`, with one transducer on."""
@@ -119,3 +116,12 @@ def gabs(
 ) -> Solution:
     """Run `GABS` with these settings on an objective; see `GABS` and `run`."""
     return run(GABS(levels, order, first, passes), objective, trials, seed, score=score)
+
+
+def _best_first(score: torch.Tensor) -> torch.Tensor:
+    """Return the indices (T, B) of scores (T, B) in descending order, near ties in ascending order."""
+    order = score.argsort(dim=1, descending=True, stable=True)
+    ranked = score.gather(1, order)
+    apart = ranked[:, :-1] - ranked[:, 1:] > NEAR_TIE * ranked[:, :-1].abs()
+    group = torch.nn.functional.pad(apart.cumsum(dim=1), (1, 0))
+    return order.gather(1, (group * score.shape[1] + order).argsort(dim=1))

@@ -14,7 +14,6 @@ from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.objective import Objective, Score, weakest_focus
 from autdtorch.scene.drive import drive_from_phases, focus_phases, normalise
-from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import integer_at_least, invalid
 
 
@@ -29,10 +28,6 @@ class LSS(Method):
     label: ClassVar[str] = "LSS"
     random: ClassVar[bool] = False
 
-    def check(self, problem: Problem) -> None:
-        """Check that the problem has a scene."""
-        _scene(problem)
-
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
         """Observe the superposition."""
         return Step(normalise(_focus_drives(problem).sum(dim=0))[None, None], {})
@@ -43,12 +38,8 @@ class LSSG(Method):
     """Superpose the free-space drives of the single foci, with the best offset for each (Eq. 4, 5 and 6).
 
     The search starts from `LSS`, all offsets 0, and goes through the foci in order: each tries `levels`
-    offsets while the others stay, and keeps the best. Since 0 is among them, LSSG is never worse than LSS.
-    The paper gives only the number of evaluations of its search, which is this one's: P * levels, 64 with 4
-    foci. A search that adds one focus after the other, as GABS adds transducers, would take `levels` fewer,
-    but would score foci at which no drive aims yet.
-
-    Further passes go through the foci again, for P * levels evaluations each. The search ends early with a
+    offsets while the others stay, and keeps the best. Since 0 is among them, LSSG is never worse than LSS. A
+    pass takes P * levels evaluations, as many as the paper's: 64 with 4 foci. The search ends early with a
     pass that changes nothing. Obstacles enter through the observed scores, not through the phases. The
     amplitudes are in [0, 1], not all 1.
 
@@ -73,8 +64,7 @@ class LSSG(Method):
         object.__setattr__(self, "passes", integer_at_least("passes", self.passes, 1))
 
     def check(self, problem: Problem) -> None:
-        """Check that the problem has a scene, and the order against the number of foci."""
-        _scene(problem)
+        """Check the order against the number of foci."""
         coordinates.require_all(self.order, problem.foci)
 
     def most_evaluations(self, problem: Problem) -> int:
@@ -119,13 +109,9 @@ def lssg(
     return run(LSSG(levels, order, passes), objective, score=score)
 
 
-def _scene(problem: Problem) -> Scene:
-    if problem.scene is None:
-        raise invalid("problem.scene", None, "must be a scene: the phases of the foci need its geometry")
-    return problem.scene
-
-
 def _focus_drives(problem: Problem) -> torch.Tensor:
     """Return the drives that aim at each focus in free space (P, M)."""
-    scene = _scene(problem)
+    scene = problem.scene
+    if scene is None:
+        raise invalid("problem.scene", None, "must be a scene: the phases of the foci need its geometry")
     return drive_from_phases(focus_phases(scene.array.positions, scene.control_points, scene.wavenumber))

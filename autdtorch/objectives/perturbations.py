@@ -18,7 +18,6 @@ from autdtorch.objectives.objective import Objective, require_objective, validat
 from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.scene.drive import drive_from_phases, validate_drive
 from autdtorch.scene.phase_levels import PhaseLevels
-from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import (
     boolean,
     indices,
@@ -43,10 +42,6 @@ class Perturbation:
         scene: its scene.
         evaluations: number of observations so far through this wrapper.
     """
-
-    inner: Objective
-    scene: Scene
-    evaluations: int
 
     def __init__(self, objective: Objective) -> None:
         """Wrap an objective."""

@@ -24,10 +24,6 @@ class SimulatedObjective:
         transfer_matrix: G (P, M) [Pa], complex128; None in mode "replay". Black-box methods do not use it.
     """
 
-    scene: Scene
-    evaluations: int
-    transfer_matrix: torch.Tensor | None
-
     def __init__(
         self, scene: Scene, propagator: Propagator, mode: Literal["transfer", "replay"] = "transfer"
     ) -> None:
@@ -47,7 +43,7 @@ class SimulatedObjective:
         self.scene = scene
         self.evaluations = 0
         self._propagator = propagator
-        self.transfer_matrix = None
+        self.transfer_matrix: torch.Tensor | None = None
         if mode == "transfer":
             self.transfer_matrix = propagator.transfer_matrix().to("cpu", torch.complex128)
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from autdtorch.methods.base import NEAR_TIE
 from autdtorch.methods.catalogue import label_of
-from autdtorch.methods.ranking import NEAR_TIE
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.metrics import FocusMetrics
 from autdtorch.objectives.objective import validate_drives

@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import autdtorch as at
-from autdtorch.methods.base import Step, trial_seed
-from autdtorch.methods.ranking import NEAR_TIE
+from autdtorch.methods.base import NEAR_TIE, Step, trial_seed
 from autdtorch.objectives.perturbations import Quantised
 
 BLACK_BOX = [

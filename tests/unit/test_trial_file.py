@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from autdtorch.methods.ranking import NEAR_TIE
+from autdtorch.methods.base import NEAR_TIE
 from autdtorch.methods.solution import Solution
 from autdtorch.study.trial_file import TRIALS_FILE, TrialFile
 from autdtorch.utils.json_lines import SET_ASIDE, line_of, row_of
