@@ -83,7 +83,10 @@ def test_a_trial_ends_where_no_single_transducer_can_improve(make_objective, ran
     assert (solution.evaluations < 1 + 4 * levels + 29 * 5 * levels).all()
     assert len(set(solution.evaluations.tolist())) > 1  # they end for themselves
     assert objective.evaluations == solution.evaluations.sum()
+    assert solution.history.shape == (6, 1 + 4 * levels + 29 * 5 * levels)
     for trial in range(6):
+        end = int(solution.evaluations[trial])
+        assert (solution.history[trial, end - 1 :] == solution.score[trial]).all()
         drive = solution.drive[trial].tolist()
         for transducer in range(5):
             for level in range(levels):
@@ -100,15 +103,6 @@ def test_further_passes_start_where_one_pass_ends(make_objective, random_matrix)
     assert (three.score > one.score).any()
 
 
-def test_a_trial_that_ends_early_keeps_its_last_score(make_objective, random_matrix):
-    objective = make_objective(random_matrix(2, 4, 5))
-    solution = gabs(objective, levels=4, passes=9, trials=8)
-    assert solution.history.shape == (8, 1 + 3 * 4 + 8 * 4 * 4)
-    for trial in range(8):
-        end = int(solution.evaluations[trial])
-        assert (solution.history[trial, end - 1 :] == solution.score[trial]).all()
-
-
 @pytest.mark.parametrize("levels", [3, 16])
 def test_single_point_gets_all_but_what_the_levels_cost(make_objective, random_matrix, levels):
     matrix = random_matrix(1, 8, 3)
@@ -119,9 +113,10 @@ def test_single_point_gets_all_but_what_the_levels_cost(make_objective, random_m
     assert (score <= matrix.abs().sum() * (1 + 1e-12)).all()
 
 
-def test_one_transducer_alone_needs_one_evaluation(make_objective, random_matrix):
-    solution = gabs(make_objective(random_matrix(2, 1, 0)))
-    assert solution.evaluations.tolist() == [1]
+@pytest.mark.parametrize(("passes", "evaluations"), [(1, 1), (4, 1 + 16)])
+def test_one_transducer_alone_needs_one_evaluation(make_objective, random_matrix, passes, evaluations):
+    solution = gabs(make_objective(random_matrix(2, 1, 0)), passes=passes)
+    assert solution.evaluations.tolist() == [evaluations]  # the second pass changes nothing
     assert solution.drive.tolist() == [[1 + 0j]]
 
 

@@ -4,7 +4,6 @@ import scipy.optimize
 import torch
 
 from autdtorch.methods.gradient import gradient_ascent
-from autdtorch.objectives.simulated import SimulatedObjective
 
 
 def polished(matrix, starts):
@@ -51,10 +50,3 @@ def test_every_trial_ends_at_the_best_of_the_paper_scene(paper_objective):
 def test_what_nothing_reaches_is_no_reason_to_fail(make_objective):
     solution = gradient_ascent(make_objective(torch.zeros(2, 3, dtype=torch.complex128)))
     assert solution.score.tolist() == [0.0]
-
-
-def test_needs_a_transfer_matrix(make_objective, random_matrix):
-    objective = make_objective(random_matrix(2, 3, 0))
-    replay = SimulatedObjective(objective.scene, objective._propagator, mode="replay")
-    with pytest.raises(ValueError, match=r"objective: .*; must have a transfer matrix"):
-        gradient_ascent(replay)
