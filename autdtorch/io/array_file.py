@@ -12,7 +12,7 @@ from autdtorch.io.csv_table import read_table
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import device_axes, in_plane
 from autdtorch.utils.numpy_file import read_arrays
-from autdtorch.utils.validation import ArrayLike, invalid, path_of, within
+from autdtorch.utils.validation import ArrayLike, path_of, within
 
 # Columns of a CSV file with the positions of transducers and the directions of emission, and their units.
 PLACE_COLUMNS = {"x": "m", "y": "m", "z": "m"}
@@ -51,9 +51,7 @@ def load_array(
         ValueError: another suffix, bad content, or a bad argument. The message names the file, and the line
             where it has lines.
     """
-    kind = path_of("path", path).suffix.lower()
-    if kind not in (".csv", ".npz", ".pat"):
-        raise invalid("path", str(path), "must end in .csv, .npz or .pat")
+    kind = path_of("path", path, suffixes=(".csv", ".npz", ".pat")).suffix.lower()
     if kind == ".pat":
         file = OpenMPDBoard.load(path).array()
     else:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,13 +25,14 @@ from autdtorch.utils.files import replacing
 from autdtorch.utils.numpy_file import read_arrays
 from autdtorch.utils.validation import (
     ArrayLike,
-    invalid,
     path_of,
     real_tensor,
     require_kind,
     require_one_of,
     within,
 )
+
+_FORMATS = (".csv", ".npz")
 
 _LEVEL_COLUMNS = {f"{name} {column}": "" for name, device in DEVICES.items() for column in device.columns}
 _PLAIN_COLUMNS = {"phase": "rad", "amplitude": ""}
@@ -64,7 +64,7 @@ def save_drive(
         ValueError: another suffix or device, not a drive of the array, or an M that is not a multiple of the
             transducers of a unit.
     """
-    kind = _kind(path)
+    path = path_of("path", path, suffixes=_FORMATS)
     require_kind("array", array, TransducerArray)
     checked = validate_single_drive(drive, len(array)).detach().cpu()
     if device is None:
@@ -72,10 +72,10 @@ def save_drive(
     else:
         require_one_of("device", device, DEVICES)
         columns, arrays = _levelled(checked, device)
-    if kind == ".csv":
+    if path.suffix.lower() == ".csv":
         write_table(path, columns)
     else:
-        with replacing(Path(path)) as partial, partial.open("wb") as file:  # to a path, NumPy would add .npz
+        with replacing(path) as partial, partial.open("wb") as file:  # to a path, NumPy would add .npz
             np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
@@ -90,7 +90,8 @@ def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
         ValueError: another suffix, or a file without a drive. The message names the file, and the line where
             it has lines.
     """
-    if _kind(path) == ".csv":
+    path = path_of("path", path, suffixes=_FORMATS)
+    if path.suffix.lower() == ".csv":
         return _from_columns(path, read_table(path, _COLUMNS))
     arrays = read_arrays(path)
     if "device" in arrays:
@@ -102,13 +103,6 @@ def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
     drive = arrays["drive"]
     with within(path):
         return validate_drive(drive.reshape(-1), drive.size)
-
-
-def _kind(path: str | os.PathLike[str]) -> str:
-    kind = path_of("path", path).suffix.lower()
-    if kind not in (".csv", ".npz"):
-        raise invalid("path", str(path), "must end in .csv or .npz")
-    return kind
 
 
 def _plain(drive: torch.Tensor, array: TransducerArray) -> tuple[dict[str, Any], dict[str, Any]]:

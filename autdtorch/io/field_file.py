@@ -21,13 +21,10 @@ from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
     complex_tensor,
-    invalid,
     path_of,
     positive,
     real_tensor,
 )
-
-_HDF5 = (".h5", ".hdf5")
 
 
 class _Grid(NamedTuple):
@@ -60,9 +57,7 @@ def save_field(
         ValueError: another suffix, shapes that do not agree, or points that are not a regular right-angled
             grid with at least two points along two axes.
     """
-    kind = path_of("path", path).suffix.lower()
-    if kind not in (".vti", *_HDF5):
-        raise invalid("path", str(path), "must end in .vti, .h5 or .hdf5")
+    path = path_of("path", path, suffixes=(".vti", ".h5", ".hdf5"))
     places = real_tensor("points", points, "m").detach().cpu().numpy()
     if places.ndim not in (3, 4) or places.shape[-1] != 3:
         raise ValueError(f"points: shape {places.shape}; must be (Nx, Ny, Nz, 3) or (Nu, Nv, 3)")
@@ -71,8 +66,8 @@ def save_field(
         raise ValueError(f"pressure: shape {tuple(values.shape)}; must be {places.shape[:-1]} as the points")
     frequency = positive("frequency", frequency, "Hz")
     grid = _grid(places)
-    write = _write_vti if kind == ".vti" else _write_hdf5
-    with replacing(Path(path)) as partial:
+    write = _write_vti if path.suffix.lower() == ".vti" else _write_hdf5
+    with replacing(path) as partial:
         write(partial, values, grid, frequency)
 
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, NullLocator
 
-from autdtorch.plot.data import ByMethod, by_scene, labelled, methods_of, numbers, require_each
+from autdtorch.plot.data import ByMethod, by_scene, labelled, methods_of, require_each
 from autdtorch.plot.style import (
     TICK_SIZE,
     Look,
@@ -24,7 +24,7 @@ from autdtorch.plot.style import (
     styled,
 )
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.validation import ArrayLike, boolean, invalid, members, require_kind
+from autdtorch.utils.validation import boolean, invalid, members, require_kind
 
 _FRONT: dict[str, Any] = {"color": "0.8", "linewidth": 4.0, "solid_joinstyle": "miter", "zorder": 1.0}
 _PANEL = 2.6  # inch
@@ -69,7 +69,7 @@ def plot_pareto(
         for method, values in drawn.items():
             _draw_points(ax, values, looks[method], higher_is_better)
         everything = np.concatenate(list(drawn.values()))
-        best = pareto_front(everything, higher_is_better)
+        best = _pareto_front(everything, higher_is_better)
         if names is not None:
             texts = _texts(f"names[{scene!r}]", names[scene], drawn)
             for index in best:  # on the side of the front that has no points
@@ -91,9 +91,9 @@ def plot_pareto(
     return figure
 
 
-def pareto_front(points: ArrayLike, higher_is_better: bool = False) -> list[int]:
+def _pareto_front(points: Array, higher_is_better: bool) -> list[int]:
     """Return the indices of the Pareto-optimal points (N, 2), by rising cost; of equal points the first."""
-    costs, results = numbers("points", points, "points", "2").T
+    costs, results = points.T
     worse = -results if higher_is_better else results
     kept: list[int] = []
     for index in np.lexsort((worse, costs)):
@@ -116,7 +116,7 @@ def _texts(name: str, given: Mapping[str, Sequence[str]], drawn: Mapping[str, Ar
 
 def _draw_points(ax: Axes, points: Array, look: Look, higher_is_better: bool) -> None:
     colour, marker, _ = look
-    front = pareto_front(points, higher_is_better)
+    front = _pareto_front(points, higher_is_better)
     beaten = np.delete(points, front, axis=0)
     ax.plot(*beaten.T, color=colour, marker=marker, markersize=2.5, linewidth=0, alpha=0.35)
     ax.plot(*points[front].T, color=colour, marker=marker, markersize=5, linewidth=1.2, clip_on=False)

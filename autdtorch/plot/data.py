@@ -48,26 +48,25 @@ def labelled(
 
 
 def by_scene(name: str, given: Mapping[str, ByMethod], *axes: str, positive: int = 0) -> Checked:
-    """Return the numbers by scene and method, after checking them; `positive` leading columns must be > 0."""
+    """Return the finite numbers by scene and method, after checking them.
+
+    Of the `axes`, "2" states a length, other texts are names. The first `positive` columns must be > 0.
+    """
     require_scenes(name, given)
     checked: Checked = {}
     for scene, methods in given.items():
         for method, own in methods.items():
             where = f"{name}[{scene!r}][{method!r}]"
-            values = numbers(where, own, *axes)
+            values: Array = real_tensor(where, own).detach().cpu().numpy()
+            sizes = zip(axes, values.shape, strict=False)
+            lengths = [int(axis) if axis.isdigit() else size for axis, size in sizes]
+            if values.ndim != len(axes) or list(values.shape) != lengths or values.size == 0:
+                accepted = f"must be ({', '.join(axes)}), none of them 0"
+                raise ValueError(f"{where}: shape {values.shape}; {accepted}")
             if positive and (least := values[:, :positive].min()) <= 0:
                 raise ValueError(f"{where}: {least:g}; must be > 0 on a logarithmic axis")
             checked.setdefault(scene, {})[method] = values
     return checked
-
-
-def numbers(name: str, given: ArrayLike, *axes: str) -> Array:
-    """Return finite numbers, after checking their `axes`: "2" states a length, other texts are names."""
-    values: Array = real_tensor(name, given).detach().cpu().numpy()
-    lengths = [int(axis) if axis.isdigit() else own for axis, own in zip(axes, values.shape, strict=False)]
-    if values.ndim != len(axes) or list(values.shape) != lengths or values.size == 0:
-        raise ValueError(f"{name}: shape {values.shape}; must be ({', '.join(axes)}), none of them 0")
-    return values
 
 
 def methods_of(scenes: Iterable[Mapping[str, object]]) -> list[str]:

@@ -125,15 +125,11 @@ def plot_planes(
         column[0].set_title(wrapped(readable(scene), 2.0), weight="bold")
         _add_colour_bar(figure, mesh, list(column), "horizontal", "|p| [Pa]")
     for ax, method in zip(axes[:, 0], methods, strict=True):
-        _name_row(ax, wrapped(label_of(method), 2.0))
+        # Left of the axes, even if they are empty.
+        style: Any = {"rotation": 90, "ha": "right", "va": "center", "ma": "center", "weight": "bold"}
+        where: Any = {"xy": (0, 0.5), "xycoords": "axes fraction", "textcoords": "offset points"}
+        ax.annotate(wrapped(label_of(method), 2.0), xytext=(-40, 0), **where, **style)
     return figure
-
-
-def _name_row(ax: Axes, name: str) -> None:
-    """Write a name left of the axes, even if they are empty."""
-    style: Any = {"rotation": 90, "ha": "right", "va": "center", "ma": "center", "weight": "bold"}
-    where: Any = {"xy": (0, 0.5), "xycoords": "axes fraction", "textcoords": "offset points"}
-    ax.annotate(name, xytext=(-40, 0), **where, **style)
 
 
 def _draw_plane(

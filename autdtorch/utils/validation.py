@@ -45,12 +45,15 @@ def require_name(field: str, name: object) -> None:
         raise invalid(field, name, f"{accepted}, with at most {_LONGEST_NAME} bytes")
 
 
-def path_of(name: str, value: object, what: str = "a file") -> Path:
-    """Return `value` as the path of `what`, which need not exist."""
+def path_of(name: str, value: object, what: str = "a file", suffixes: Collection[str] = ()) -> Path:
+    """Return `value` as the path of `what`, with one of the `suffixes` if given; it need not exist."""
     text = os.fspath(value) if isinstance(value, str | os.PathLike) else None
     if not isinstance(text, str) or not text or "\0" in text:
         raise invalid(name, value, f"must be the path of {what}")
-    return Path(text)
+    path = Path(text)
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise invalid(name, text, f"must end in one of {', '.join(suffixes)}")
+    return path
 
 
 def require_one_of(name: str, value: object, accepted: Collection[str]) -> None:

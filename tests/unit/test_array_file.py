@@ -128,7 +128,7 @@ def test_npz_needs_positions_and_normals_alone(tmp_path):
         ("a.csv", "", r"a.csv: empty"),
         ("a.csv", "x [m],y [m],z [m]\n0,0,0\n0,0,0\n", r"a.csv: TransducerArray.positions: points 0 and 1"),
         ("a.npz", "text", r"a.npz: .*; must hold plain NumPy arrays"),
-        ("a.txt", "", r"path: .*a.txt'; must end in .csv, .npz or .pat"),
+        ("a.txt", "", r"path: .*a.txt'; must end in one of .csv, .npz, .pat"),
     ],
 )
 def test_what_is_wrong_with_a_file_is_said_with_its_line(tmp_path, name, text, message):

@@ -122,7 +122,7 @@ def test_a_write_that_breaks_off_leaves_the_file_that_was_there(tmp_path, monkey
     [
         ({"device": "autd3"}, r"16 transducers; must be a multiple of 249 for autd3"),
         ({"device": "autd"}, r"device: 'autd'; must be one of autd3, openmpd, sonicsurface, u"),
-        ({"path": "d.txt"}, r"path: .*; must end in .csv or .npz"),
+        ({"path": "d.txt"}, r"path: .*; must end in one of .csv, .npz"),
         ({"drive": torch.ones(1, 16) + 0j}, r"drive: shape \(1, 16\); must be \(16,\), a single drive"),
     ],
 )

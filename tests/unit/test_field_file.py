@@ -90,7 +90,7 @@ def bent(points):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"path": "field.vtk"}, r"path: .*field.vtk'; must end in .vti, .h5 or .hdf5"),
+        ({"path": "field.vtk"}, r"path: .*field.vtk'; must end in one of .vti, .h5, .hdf5"),
         ({"points": bent(box_points())}, r"points: must be a regular grid with right angles"),
         ({"points": box_points() @ SHEAR}, "right angles"),
         ({"points": 0 * box_points()}, r"points: two coincide"),

@@ -8,13 +8,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from PIL import Image
+
 from autdtorch.plot.data import MM
 from autdtorch.utils.validation import path_of
 
 if TYPE_CHECKING:
     import pyvista
-
-_SUFFIXES = (".png", ".html", ".gltf")
 
 # The viewer takes the element of class "content"; without one it would empty the whole page.
 _LEGEND = """<div class="content"></div>
@@ -28,21 +28,19 @@ _BAR = """<div>{title}<div
 _EVERY = 8  # every 8th colour of a table makes the gradient
 
 
-def require_suffix(name: str, path: str | Path, suffixes: tuple[str, ...] = _SUFFIXES) -> Path:
-    """Return the path after checking its suffix."""
-    path = path_of(name, path)
-    if path.suffix not in suffixes:
-        raise ValueError(f"{name}: {str(path)!r}; its suffix must be one of {', '.join(suffixes)}")
-    if path.suffix == ".html" and importlib.util.find_spec("trame_pyvista") is None:
+def export_path(name: str, value: str | Path) -> Path:
+    """Return the path of a file that can be written."""
+    path = path_of(name, value, suffixes=(".png", ".html", ".gltf"))
+    if path.suffix.lower() == ".html" and importlib.util.find_spec("trame_pyvista") is None:
         raise RuntimeError(f"{name}: {str(path)!r} needs trame-pyvista: pip install 'autdtorch[notebook]'")
     return path
 
 
 def write(plotter: pyvista.Plotter, path: Path, caption: Sequence[str]) -> None:
     """Write the view in the format of the path's suffix."""
-    if path.suffix == ".png":
-        plotter.screenshot(str(path))
-    elif path.suffix == ".gltf":
+    if path.suffix.lower() == ".png":
+        Image.fromarray(plotter.screenshot(return_img=True)).save(path)
+    elif path.suffix.lower() == ".gltf":
         _write_gltf(plotter, path)
     else:
         _write_html(plotter, path, caption)

@@ -13,7 +13,7 @@ from PIL import Image, ImageColor
 from autdtorch.plot.colours import FLOOR, WAVE_MAP
 from autdtorch.plot.data import in_decibels
 from autdtorch.plot.view3d import meshes
-from autdtorch.plot.view3d.export import require_suffix, write
+from autdtorch.plot.view3d.export import export_path, write
 from autdtorch.plot.view3d.opengl import require_rendering
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import (
@@ -22,6 +22,7 @@ from autdtorch.utils.validation import (
     complex_tensor,
     integer_at_least,
     number_between,
+    path_of,
     require_kind,
 )
 
@@ -76,7 +77,7 @@ def view3d(
     in_domain = None if volume is None else meshes.volume_magnitude(volume)
     height = number_between("isosurface", isosurface, FLOOR, 0.0, "dB")
     zero = meshes.zero_level(reference, on_plane, in_domain)
-    path = None if save is None else require_suffix("save", save)
+    path = None if save is None else export_path("save", save)
     require_rendering()
     plotter = meshes.new_plotter(scene, off_screen)
     meshes.add_transducers(plotter, scene, phases)
@@ -117,7 +118,7 @@ def animate3d(
     plane, _ = meshes.plane_pressure(scene, field)
     pressure = complex_tensor("field", field).detach().cpu().numpy()
     frames = integer_at_least("frames", frames, 2)
-    path = require_suffix("path", path, (".gif",))
+    path = path_of("path", path, suffixes=(".gif",))
     require_rendering()
     plotter = meshes.new_plotter(scene, off_screen=True)
     discs = meshes.add_transducers(plotter, scene, phases)

@@ -119,9 +119,7 @@ class Mesh(Obstacle):
 
 def _read_path(given: object) -> _MeshPath:
     """Check the path of a mesh file and read it."""
-    path = path_of("Mesh.path", given)
-    if path.suffix.lower() not in _FORMATS:
-        raise invalid("Mesh.path", str(path), f"must end in one of {', '.join(_FORMATS)}")
+    path = path_of("Mesh.path", given, suffixes=_FORMATS)
     if not path.is_file():
         raise invalid("Mesh.path", str(path), "must be an existing file")
     mesh = _MeshPath(path)
