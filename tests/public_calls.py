@@ -358,7 +358,7 @@ def public_calls() -> dict[str, Call]:
     found = [
         call
         for module in (at, at.analytic, hardware, propagators)
-        for name in module.__all__
+        for name in getattr(module, "__all__", dir(module))
         if callable(thing := getattr(module, name))
         for call in (_calls_of(thing) if inspect.isclass(thing) else [Call(name, thing)])
     ]
