@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from autdtorch.hardware.devices import DEVICES
@@ -21,6 +21,7 @@ from autdtorch.scene.drive import (
     validate_drive,
     validate_single_drive,
 )
+from autdtorch.utils.array_types import AnyArray
 from autdtorch.utils.files import replacing
 from autdtorch.utils.numpy_file import read_arrays
 from autdtorch.utils.validation import (
@@ -33,7 +34,6 @@ from autdtorch.utils.validation import (
 )
 
 _FORMATS = (".csv", ".npz")
-
 _LEVEL_COLUMNS = {f"{name} {column}": "" for name, device in DEVICES.items() for column in device.columns}
 _PLAIN_COLUMNS = {"phase": "rad", "amplitude": ""}
 _NUMBERING = {"unit": "", "transducer": ""}
@@ -92,7 +92,15 @@ def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
     """
     path = path_of("path", path, suffixes=_FORMATS)
     if path.suffix.lower() == ".csv":
-        return _from_columns(path, read_table(path, _COLUMNS))
+        table = read_table(path, _COLUMNS)
+        for name, device in DEVICES.items():
+            if any(f"{name} {column}" in table for column in device.columns):
+                return _played(path, name, table)
+        if missing := [column for column in _PLAIN_COLUMNS if column not in table]:
+            accepted = "must have phase and amplitude, or a device's"
+            raise ValueError(f"{path}: no column {', '.join(missing)}; {accepted}")
+        with within(path):
+            return drive_from_phases(table["phase"], table["amplitude"])
     arrays = read_arrays(path)
     if "device" in arrays:
         name = str(arrays["device"])
@@ -122,34 +130,20 @@ def _levelled(drive: torch.Tensor, name: str) -> tuple[dict[str, Any], dict[str,
     units, rest = divmod(len(drive), device.board)
     if rest:
         raise ValueError(f"drive: {len(drive)} transducers; must be a multiple of {device.board} for {name}")
-    levels = [level.numpy().astype(np.uint8) for level in device.levels(drive)]
+    levels = dict(zip(device.columns, (level.numpy() for level in device.levels(drive)), strict=True))
     unit, transducer = np.divmod(np.arange(len(drive)), device.board)
     columns = {"unit": unit, "transducer": transducer}
-    columns |= {f"{name} {key}": level for key, level in zip(device.columns, levels, strict=True)}
-    arrays = {key: level.reshape(units, -1) for key, level in zip(device.columns, levels, strict=True)}
+    columns |= {f"{name} {key}": level for key, level in levels.items()}
+    arrays = {key: level.astype(np.uint8).reshape(units, -1) for key, level in levels.items()}
     return columns, arrays | {"device": name}
 
 
-def _from_columns(path: str | os.PathLike[str], table: Mapping[str, npt.NDArray[np.float64]]) -> torch.Tensor:
-    for name, device in DEVICES.items():
-        if any(f"{name} {column}" in table for column in device.columns):
-            return _played(path, name, table)
-    missing = [column for column in _PLAIN_COLUMNS if column not in table]
-    if missing:
-        accepted = "must have phase and amplitude, or a device's"
-        raise ValueError(f"{path}: no column {', '.join(missing)}; {accepted}")
-    with within(path):
-        return drive_from_phases(table["phase"], table["amplitude"])
-
-
-def _played(path: str | os.PathLike[str], name: str, stored: Mapping[str, npt.NDArray[Any]]) -> torch.Tensor:
+def _played(path: Path, name: str, stored: Mapping[str, AnyArray]) -> torch.Tensor:
     """Return the drive of a device for levels stored by names such as "autd3 phase"."""
     device = DEVICES[name]
     wanted = [f"{name} {column}" for column in device.columns]
-    missing = [column for column in wanted if column not in stored]
-    if missing:
+    if missing := [column for column in wanted if column not in stored]:
         raise ValueError(f"{path}: no {', '.join(missing)}; must have {', '.join(wanted)}")
-
     with within(path):
         levels = [real_tensor(column, stored[column]) for column in wanted]
         # The device refuses fractions, which stay floats.

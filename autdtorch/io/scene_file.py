@@ -12,8 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from autdtorch.io.array_file import load_array
 from autdtorch.io.yaml_file import load_yaml, plain, unresolved
 from autdtorch.scene.arrays import TransducerArray
@@ -22,8 +20,6 @@ from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
 from autdtorch.scene.scene import Medium, Scene
 from autdtorch.utils.trusted import TARGET, load_trusted
 from autdtorch.utils.validation import (
-    ArrayLike,
-    Vector,
     finite_vector,
     invalid,
     members,
@@ -36,20 +32,30 @@ from autdtorch.utils.validation import (
 
 Builder = Callable[..., Any]
 
-_ARRAYS: dict[str, Builder] = {
-    "grid": TransducerArray.grid,
-    "positions": TransducerArray,
-    "autd3": TransducerArray.autd3,
-    "sonicsurface": TransducerArray.sonicsurface,
-    "openmpd": TransducerArray.openmpd,
-    "file": load_array,
+_KINDS: dict[str, dict[str, Builder]] = {  # what the key `type` of a section names
+    "array": {
+        "grid": TransducerArray.grid,
+        "positions": TransducerArray,
+        "autd3": TransducerArray.autd3,
+        "sonicsurface": TransducerArray.sonicsurface,
+        "openmpd": TransducerArray.openmpd,
+        "file": load_array,
+    },
+    "control_points": {
+        "circle": circle_points,
+        "points": lambda positions: points_tensor("positions", positions),
+    },
+    "obstacle": {
+        "box": Box,
+        "sphere": Sphere,
+        "cylinder": Cylinder,
+        "mesh": Mesh,
+        "voxel_mask": VoxelMask.load,
+    },
 }
-_OBSTACLES: dict[str, Builder] = {
-    "box": Box,
-    "sphere": Sphere,
-    "cylinder": Cylinder,
-    "mesh": Mesh,
-    "voxel_mask": VoxelMask.load,
+_BUILDERS: dict[str, Builder] = {  # of sections without `type`
+    "observation_plane": Plane,
+    "domain": lambda lower, upper: (finite_vector("lower", lower), finite_vector("upper", upper)),
 }
 
 
@@ -110,56 +116,27 @@ def _part(
     where: str, key: str, value: object, air: Builder, folder: Path, modules: tuple[str, ...]
 ) -> object:
     """Build one argument of `Scene`; `air` makes a medium of air, and paths start from `folder`."""
-    match key:
-        case "medium":
-            section = _mapping(where, value)
-            return _build(where, section, air if section.keys() & _parameters(air).keys() else Medium)
-        case "array":
-            return _build_kind(where, _with_path(where, value, folder), _ARRAYS)
-        case "obstacles":
-            if not isinstance(value, list):
-                raise invalid(where, value, "must be a list of obstacles")
-            places = [(f"{where}[{index}]", entry) for index, entry in enumerate(value)]
-            return [_obstacle(place, _with_path(place, entry, folder), modules) for place, entry in places]
-        case "control_points":
-            return _build_kind(where, value, {"circle": circle_points, "points": _points})
-        case "observation_plane":
-            return _build(where, _mapping(where, value), Plane)
-        case "domain":
-            return _build(where, _mapping(where, value), _domain)
-        case _:
-            return value
-
-
-def _obstacle(where: str, section: dict[str, Any], modules: tuple[str, ...]) -> Any:
-    if TARGET not in section:
-        return _build_kind(where, section, _OBSTACLES)
-    builder = load_trusted(f"{where}.{TARGET}", section.pop(TARGET), modules)
-    return _build(where, section, builder)
-
-
-def _with_path(where: str, value: object, folder: Path) -> dict[str, Any]:
-    """Return the section, with a `path` that starts from `folder`."""
+    if key == "obstacles":
+        if not isinstance(value, list):
+            raise invalid(where, value, "must be a list of obstacles")
+        places = [(f"{where}[{index}]", entry) for index, entry in enumerate(value)]
+        return [_part(place, "obstacle", entry, air, folder, modules) for place, entry in places]
+    if key not in ("medium", *_KINDS, *_BUILDERS):
+        return value
     section = _mapping(where, value)
     if isinstance(path := section.get("path"), str):
         section["path"] = str(folder / path)
-    return section
-
-
-def _points(positions: ArrayLike) -> torch.Tensor:
-    return points_tensor("positions", positions)
-
-
-def _domain(lower: ArrayLike, upper: ArrayLike) -> tuple[Vector, Vector]:
-    return finite_vector("lower", lower), finite_vector("upper", upper)
-
-
-def _build_kind(where: str, value: object, builders: Mapping[str, Builder]) -> Any:
-    """Build a part with the builder that the key `type` names."""
-    section = _mapping(where, value)
-    kind = section.pop("type", None)
-    require_one_of(f"{where}: type", kind, builders)
-    return _build(where, section, builders[kind])
+    if key == "medium":
+        builder = air if section.keys() & _parameters(air).keys() else Medium
+    elif key in _BUILDERS:
+        builder = _BUILDERS[key]
+    elif key == "obstacle" and TARGET in section:
+        builder = load_trusted(f"{where}.{TARGET}", section.pop(TARGET), modules)
+    else:
+        kind = section.pop("type", None)
+        require_one_of(f"{where}: type", kind, _KINDS[key])
+        builder = _KINDS[key][kind]
+    return _build(where, section, builder)
 
 
 def _build(where: str, section: dict[str, Any], builder: Builder) -> Any:
