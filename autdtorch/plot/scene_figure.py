@@ -85,28 +85,21 @@ def _add_obstacle(ax: Axes3D, obstacle: Obstacle, domain: tuple[Vector, Vector])
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
     front = normals @ _TO_VIEWER > 0
-    if (vertices < domain[0]).any() or (vertices > domain[1]).any():
-        _add_faces(ax, corners[~front], normals[~front], domain)
-    _add_faces(ax, corners[front], normals[front], domain)
+    leaves = (vertices < domain[0]).any() or (vertices > domain[1]).any()
+    for side in (~front, front) if leaves else (front,):
+        light = 0.7 + 0.3 * normals[side] @ _LIGHT
+        shades = np.clip(light[:, None] * to_rgb(colours.OBSTACLE_COLOUR), 0, 1)
+        polygons = [clipped(triangle, *domain) for triangle in corners[side]]
+        if inside := [index for index, polygon in enumerate(polygons) if len(polygon)]:
+            # Edges in the colours of the faces close the seams between them.
+            style: Any = {"facecolor": shades[inside], "edgecolor": shades[inside], "lw": 0.3, "zorder": 2}
+            ax.add_collection3d(Poly3DCollection([MM * polygons[index] for index in inside], **style))
     edges = vertices[_sharp_edges(faces, normals, front)]
     if len(edges) > colours.MOST_EDGES:
         return
     lines = [clipped(edge, *domain) for edge in edges[~_hidden(obstacle, edges.mean(axis=1))]]
     if lines := [MM * line for line in lines if len(line)]:  # Matplotlib refuses a collection of none
         ax.add_collection3d(Line3DCollection(lines, colors=colours.EDGE_COLOUR, lw=0.8, zorder=2))
-
-
-def _add_faces(ax: Axes3D, corners: Array, normals: Array, domain: tuple[Vector, Vector]) -> None:
-    """Draw triangles (F, 3, 3) [m] with unit normals (F, 3), clipped to the domain."""
-    light = 0.7 + 0.3 * normals @ _LIGHT
-    shades = np.clip(light[:, None] * to_rgb(colours.OBSTACLE_COLOUR), 0, 1)
-    polygons = [clipped(triangle, *domain) for triangle in corners]
-    left = [index for index, polygon in enumerate(polygons) if len(polygon)]
-    if not left:
-        return
-    # Edges in the colours of the faces close the seams between them.
-    style: Any = {"facecolor": shades[left], "edgecolor": shades[left], "lw": 0.3, "zorder": 2}
-    ax.add_collection3d(Poly3DCollection([MM * polygons[index] for index in left], **style))
 
 
 def _hidden(obstacle: Obstacle, points: Array) -> NDArray[np.bool_]:

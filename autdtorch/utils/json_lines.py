@@ -79,8 +79,16 @@ class JsonLines:
         """Move damaged and refused lines to another file, and restore newlines and a missing head."""
         if self._mended is None:
             return
+        path = self._path.with_name(self._path.name + SET_ASIDE)
         if self._refused:
-            self._set_aside()
+            with naming(path), path.open("ab") as file:
+                file.writelines(line + b"\n" for _, line, _ in self._refused)
+                file.flush()
+                os.fsync(file.fileno())
+            numbers = list(dict.fromkeys(number for number, _, _ in self._refused))
+            more = f" and {len(numbers) - 1} more" if len(numbers) > 1 else ""
+            reasons = "; ".join(dict.fromkeys((self._refused[0][2], self._refused[-1][2])))
+            logger.warning("%s, line %d%s: set aside in %s: %s", self._path, numbers[0], more, path, reasons)
         elif self._was_there:
             logger.warning("%s: the first line or an end of line was damaged: restored", self._path)
         replace_file(self._path, self._mended)
@@ -101,17 +109,6 @@ class JsonLines:
             except BaseException:
                 file.truncate(self._size)
                 raise
-
-    def _set_aside(self) -> None:
-        path = self._path.with_name(self._path.name + SET_ASIDE)
-        with naming(path), path.open("ab") as file:
-            file.writelines(line + b"\n" for _, line, _ in self._refused)
-            file.flush()
-            os.fsync(file.fileno())
-        numbers = list(dict.fromkeys(number for number, _, _ in self._refused))
-        more = f" and {len(numbers) - 1} more" if len(numbers) > 1 else ""
-        reasons = "; ".join(dict.fromkeys((self._refused[0][2], self._refused[-1][2])))
-        logger.warning("%s, line %d%s: set aside in %s: %s", self._path, numbers[0], more, path, reasons)
 
 
 def _parts(line: bytes, key: str) -> Iterator[bytes]:

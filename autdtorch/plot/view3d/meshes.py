@@ -49,8 +49,21 @@ def new_plotter(scene: Scene, off_screen: bool) -> pyvista.Plotter:
     plotter.set_background("white")
     for obstacle in scene.obstacles:
         _add_obstacle(plotter, obstacle, scene.domain)
-    _add_control_points(plotter, scene)
-    _add_axes(plotter, scene)
+    sphere = pyvista.Sphere(radius=MM * scene.wavelength / 5)
+    points = pyvista.PolyData(MM * scene.control_points.numpy())
+    plotter.add_mesh(points.glyph(orient=False, scale=False, geom=sphere), color=POINT_COLOUR, ambient=0.3)
+    lower, upper = scene.domain
+    bounds = [MM * corner[axis] for axis in range(3) for corner in (lower, upper)]
+    titles = {f"{name}title": f"{name} [mm]" for name in "xyz"}
+    style = {"grid": "back", "location": "outer", "fmt": "%.0f", "color": "black", "font_size": 15}
+    axes = plotter.show_bounds(bounds=bounds, **titles, **style)
+    for axis in range(3):
+        axes.SetAxisLabels(axis, None)  # PyVista's are not round numbers, VTK's are
+    plotter.view_vector(_CAMERA, viewup=(0.0, 0.0, 1.0))
+    plotter.enable_parallel_projection()
+    plotter.reset_camera()
+    plotter.camera.zoom(1.05)
+    plotter.enable_anti_aliasing("ssaa")
     return plotter
 
 
@@ -140,29 +153,6 @@ def _add_obstacle(plotter: pyvista.Plotter, obstacle: Obstacle, domain: tuple[Ve
     edges = surface.extract_feature_edges(sharp)
     if 0 < edges.n_cells <= colours.MOST_EDGES:
         plotter.add_mesh(edges, color=colours.EDGE_COLOUR, line_width=2, lighting=False)
-
-
-def _add_control_points(plotter: pyvista.Plotter, scene: Scene) -> None:
-    import pyvista
-
-    sphere = pyvista.Sphere(radius=MM * scene.wavelength / 5)
-    points = pyvista.PolyData(MM * scene.control_points.numpy())
-    plotter.add_mesh(points.glyph(orient=False, scale=False, geom=sphere), color=POINT_COLOUR, ambient=0.3)
-
-
-def _add_axes(plotter: pyvista.Plotter, scene: Scene) -> None:
-    lower, upper = scene.domain
-    bounds = [MM * corner[axis] for axis in range(3) for corner in (lower, upper)]
-    titles = {f"{name}title": f"{name} [mm]" for name in "xyz"}
-    style = {"grid": "back", "location": "outer", "fmt": "%.0f", "color": "black", "font_size": 15}
-    axes = plotter.show_bounds(bounds=bounds, **titles, **style)
-    for axis in range(3):
-        axes.SetAxisLabels(axis, None)  # PyVista's are not round numbers, VTK's are
-    plotter.view_vector(_CAMERA, viewup=(0.0, 0.0, 1.0))
-    plotter.enable_parallel_projection()
-    plotter.reset_camera()
-    plotter.camera.zoom(1.05)
-    plotter.enable_anti_aliasing("ssaa")
 
 
 def add_plane(plotter: pyvista.Plotter, plane: Plane, level: Array | None) -> None:

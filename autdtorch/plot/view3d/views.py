@@ -123,7 +123,9 @@ def animate3d(
     plotter = meshes.new_plotter(scene, off_screen=True)
     discs = meshes.add_transducers(plotter, scene, phases)
     sheet = meshes.plane_mesh(plane, pressure.real)
-    limit = _round_up(float(np.abs(pressure).max()))
+    peak = float(np.abs(pressure).max())
+    digit = 10.0 ** math.floor(math.log10(peak)) if peak else 1.0
+    limit = digit * max(1, math.ceil(peak / digit))  # of one digit, for round numbers on the colour bar
     actor = meshes.add_sheet(plotter, sheet, WAVE_MAP, (-limit, limit))
     meshes.add_bar(plotter, actor, "p(t) [Pa]", position=meshes.FIELD_BAR, labels=5, fmt="%.3g")
     meshes.add_caption(plotter, f"one period: {1e6 / scene.frequency:.3g} µs")
@@ -140,12 +142,6 @@ def animate3d(
     palette.putpalette(colours.tobytes())
     first, *others = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures)
     first.save(path, save_all=True, append_images=others, duration=_FRAME_TIME, loop=0)
-
-
-def _round_up(pressure: float) -> float:
-    """Round up to one digit, for round numbers on the colour bar."""
-    digit = 10.0 ** math.floor(math.log10(pressure)) if pressure else 1.0
-    return digit * max(1, math.ceil(pressure / digit))
 
 
 def _colours(plotter: pyvista.Plotter) -> NDArray[np.uint8]:
