@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from small_scenes import AIR, CUBE, small_scene
+from small_scenes import AIR, CORNER, CUBE, small_scene
 
 import autdtorch as at
 from autdtorch import hardware, propagators
@@ -86,8 +86,7 @@ def drive_file(folder: Path) -> Path:
 
 
 def mesh_file(folder: Path) -> Path:
-    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
-    return written(folder, "corner.obj", f"{corners}f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    return written(folder, "corner.obj", CORNER)
 
 
 def board_file(folder: Path) -> Path:
@@ -149,13 +148,19 @@ def scope_bus() -> EmulatedBus:
 
 #: By name of the parameter; others have the default value.
 ARGUMENTS: dict[str, Any] = {
-    **dict.fromkeys(("background", "boards", "captures", "input", "readings"), 1),
-    "reads": 1,
+    **dict.fromkeys(("background", "boards", "captures", "input", "readings", "reads"), 1),
+    **dict.fromkeys(("frames", "starts"), 2),
+    **dict.fromkeys(("count", "foci", "initial", "max_periods", "steps"), 3),
+    **dict.fromkeys(("levels", "periods"), 4),
+    **dict.fromkeys(("pitch", "sensitivity", "thickness"), 0.01),
+    **dict.fromkeys(("spacing", "tolerance"), 2e-3),
     "settle": 0.0,
     **dict.fromkeys(("amplitude", "gain", "loudest"), 1.0),
     **dict.fromkeys(("center", "focus", "offset", "origin"), (12e-3, 11e-3, 13e-3)),
     **dict.fromkeys(("axis", "normal", "normals"), (1.0, 0.1, 0.2)),
     **dict.fromkeys(("xlabel", "ylabel"), "text"),
+    **dict.fromkeys(("observation_plane", "plane"), PLANE),
+    **dict.fromkeys(("G", "transfer_matrix"), MATRIX),
     "fixed_transducer": 0,
     "amplitudes": [1.0, 0.5, 1.0, 1.0],
     "angle": 0.3,
@@ -168,7 +173,6 @@ ARGUMENTS: dict[str, Any] = {
     "chip": CHIP,
     "control_points": SCENE.control_points,
     "costs": {"time [s]": {"size": {"gabs": [[1.0, 1.0], [2.0, 3.0]]}}},
-    "count": 3,
     "dead": [1],
     "density": 100.0,
     "density_ratio": 2.0,
@@ -178,34 +182,24 @@ ARGUMENTS: dict[str, Any] = {
     "drive": DRIVE,
     "evaluations": 11,
     "field": torch.ones(4, 4, dtype=torch.complex128),
-    "foci": 3,
     "folder": Made(lambda folder: folder),
-    "frames": 2,
     "frequency": 40e3,
-    "G": MATRIX,
     "height": 5e-3,
     "history": {"scene": {"gabs": [[1.0, 2.0]]}},
-    "initial": 3,
     "isosurface": -3.0,
-    "levels": 4,
     "limits": hardware.Limits(1.0),
     "link": Made(lambda _: limited_link()),
     "log": Made(lambda folder: folder / "log.jsonl"),
     "mask": np.ones((2, 2, 2), bool),
-    "max_periods": 3,
     "medium": AIR,
     "method": "box",
     "microphones": [hardware.Microphone(1, 0.01, 1.0)],
     "names": {"scene": {"gabs": ["a", "b"]}},
     "objective": Made(lambda _: objective()),
-    "observation_plane": PLANE,
     "obstacles": (CUBE,),
     "off_screen": True,
     "path": Made(lambda folder: folder / "file.npz"),
-    "periods": 4,
     "phases": [0.0, 1.0, 2.0, 3.0],
-    "pitch": 0.01,
-    "plane": PLANE,
     "plane_pressure": [[1.0, 2.0], [1.0, 2.0]],
     "planes": {"scene": PLANE},
     "points": [[22e-3, 7e-3, 14e-3], [20e-3, 16e-3, 12e-3]],
@@ -222,7 +216,6 @@ ARGUMENTS: dict[str, Any] = {
     "scope": Made(lambda _: scope()),
     "seconds": 10.0,
     "seconds_in_a_row": 5.0,
-    "sensitivity": 0.01,
     "sensor": Silent(),
     "settings": {"a": 1},
     "shape": (2, 2),
@@ -232,16 +225,10 @@ ARGUMENTS: dict[str, Any] = {
     "sound_speed": 340.0,
     "source": Made(lambda folder: written(folder, "scene.yaml", SCENE_FILE)),
     "sources": [[0.1, 0.02, 0.03], [0.2, 0.0, 0.0]],
-    "spacing": 2e-3,
     "speed_ratio": 1.5,
-    "starts": 2,
-    "steps": 3,
-    "thickness": 0.01,
     "timeout": 0.1,
     "stop": lambda state: True,
-    "tolerance": 2e-3,
     "transducers": [3, 1, 7, 5],
-    "transfer_matrix": MATRIX,
     "volume": torch.ones(3, 3, 3, dtype=torch.complex128),
     "wavenumber": 7.0,
 }

@@ -17,6 +17,7 @@ from autdtorch.scene.scene import Medium, Scene
 
 AIR = Medium(density=1.293, sound_speed=340.0)
 CUBE = Box(center=(12e-3, 12e-3, 12e-3), size=(6e-3, 8e-3, 4e-3), density=100.0, sound_speed=340.0)
+CORNER = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"  # a mesh
 NO_SOURCES = Sources(torch.zeros(0, dtype=torch.int64), torch.zeros((0, 2), dtype=torch.float64))
 NO_RECEIVERS = Receivers(torch.zeros((0, 1), dtype=torch.int64), torch.zeros((0, 1), dtype=torch.float64))
 
@@ -36,9 +37,7 @@ def small_scene(obstacles=(), extent=0.024, absorption=0.0, radius=0.0):
 def scene_of_all_kinds(folder: Path) -> Scene:
     """One obstacle of every kind, with an observation plane; the mesh is written to `folder`."""
     path = folder / "corner.obj"
-    path.write_text(
-        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n", encoding="utf-8"
-    )
+    path.write_text(CORNER, encoding="utf-8")
     obstacles = (
         Box((40e-3, 20e-3, 20e-3), (10e-3, 14e-3, 8e-3), rotation=(0.3, 0.2, 0.5), rigid=True),
         Sphere((40e-3, 50e-3, 50e-3), 8e-3, rigid=True),

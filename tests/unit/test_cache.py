@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from small_scenes import AIR, CUBE, small_scene
+from small_scenes import AIR, CORNER, CUBE, small_scene
 
 from autdtorch.propagators import SteadyStateWarning, make_propagator
 from autdtorch.propagators.cache import SUFFIX, DiskCache, _with_checksum, cache_key
@@ -22,7 +22,6 @@ from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import ABANDONED, PARTIAL
 
 SPACING = 2.5e-3
-CORNER = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 
 WRITER = """
 import sys, time, numpy as np

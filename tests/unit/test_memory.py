@@ -112,10 +112,13 @@ def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_the_tightest_of_nested_groups_counts(groups: Path) -> None:
+    assert memory.available_memory() > 10_000_000  # without groups, the machine's
     (groups / "cgroup").write_text("0::/job/step\n", encoding="utf-8")
     group(groups / "fs/job", most=5_000_000, used=4_000_000, inactive=500_000)
     group(groups / "fs/job/step", most="max", used=1_000_000, inactive=0)
     assert memory.available_memory() == 1_500_000  # what is cached of files can be dropped
+    group(groups / "fs/job", most=1_000_000, used=2_000_000, inactive=0)
+    assert memory.available_memory() == 0
 
 
 def test_groups_of_the_first_version_count(groups: Path) -> None:
@@ -126,13 +129,3 @@ def test_groups_of_the_first_version_count(groups: Path) -> None:
     (own / "memory.usage_in_bytes").write_text("2000000\n", encoding="ascii")
     (own / "memory.stat").write_text("cache 7\ntotal_inactive_file 0\n", encoding="ascii")
     assert memory.available_memory() == 1_000_000
-
-
-def test_nothing_is_left_of_a_group_that_is_full(groups: Path) -> None:
-    (groups / "cgroup").write_text("0::/\n", encoding="utf-8")
-    group(groups / "fs", most=1_000_000, used=2_000_000, inactive=0)
-    assert memory.available_memory() == 0
-
-
-def test_without_groups_the_machine_counts(groups: Path) -> None:
-    assert memory.available_memory() > 10_000_000

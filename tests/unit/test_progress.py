@@ -13,12 +13,13 @@ from autdtorch.utils import progress
 
 
 class Clock:
-    """A clock that the test moves."""
+    """A clock that the test moves, or that moves by itself at each reading."""
 
-    def __init__(self) -> None:
-        self.now = 100.0
+    def __init__(self, step: float = 0.0) -> None:
+        self.now, self.step = 100.0, step
 
     def monotonic(self) -> float:
+        self.now += self.step
         return self.now
 
 
@@ -54,16 +55,8 @@ def test_short_work_says_nothing_and_long_work_ever_less(clock, caplog):
     assert 3 <= len(lines_of(clock, caplog, 3600, [(1, 1)] * 3599)) <= 7
 
 
-class SlowClock(Clock):
-    """A clock that moves by two seconds at each reading."""
-
-    def monotonic(self) -> float:
-        self.now += 2.0
-        return self.now
-
-
 def test_a_single_simulation_has_a_forecast(monkeypatch, caplog):
     caplog.set_level(logging.INFO)
-    monkeypatch.setattr(progress, "time", SlowClock())
+    monkeypatch.setattr(progress, "time", Clock(step=2.0))
     at.make_propagator(small_scene(), "full", 2e-3, cache=False).transfer_matrix()
     assert re.fullmatch("simulating scene: .* s left", told(caplog)[0])

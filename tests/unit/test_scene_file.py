@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
+from small_scenes import CORNER
 
 from autdtorch.io.scene_file import load_scene
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
@@ -57,7 +58,7 @@ def test_every_scene_of_the_repository_loads():
 
 def test_positions_points_and_defaults(tmp_path):
     path = tmp_path / "small.yaml"
-    path.write_text(SMALL)
+    path.write_text(SMALL + "obstacles:\nobservation_plane: null\n")  # keys without a value count as left out
     scene = load_scene(path)
     assert scene.array.positions.tolist() == [[0.0, 0.0, 0.0], [0.0, 10e-3, 0.0]]
     assert (scene.array.source_strength, scene.array.radius, scene.medium.absorption) == (2.0, 5e-3, 1.3)
@@ -84,18 +85,11 @@ def test_interpolation_reaches_out_of_the_scene_in_a_larger_config():
     assert load_scene(config.scene).frequency == 25e3
 
 
-def test_key_without_a_value_counts_as_left_out(tmp_path):
-    path = tmp_path / "small.yaml"
-    path.write_text(SMALL + "obstacles:\nobservation_plane: null\n")
-    assert load_scene(path).obstacles == ()
-
-
 def test_obstacles_of_every_type_with_files_beside_the_scene(tmp_path):
     mask = np.ones((2, 3, 4), bool)
     np.save(tmp_path / "mask.npy", mask)
     (tmp_path / "shapes").mkdir()
-    tetrahedron = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
-    (tmp_path / "shapes" / "corner.obj").write_text(tetrahedron)
+    (tmp_path / "shapes" / "corner.obj").write_text(CORNER)
     path = tmp_path / "scene.yaml"
     path.write_text(
         SMALL
