@@ -8,10 +8,8 @@ import torch
 from small_scenes import AIR, relative_error
 
 from autdtorch.analytic.green import free_space_matrix
-from autdtorch.fdtd.grid import bodies_extent
 from autdtorch.propagators import SimulatedPropagator, make_propagator
-from autdtorch.propagators.box import BoxSimulation
-from autdtorch.propagators.grids import Grouping, cheapest_boxes, grid_cost, one_box
+from autdtorch.propagators.grids import cheapest_boxes, one_box
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
@@ -122,36 +120,9 @@ def cubes(edge, gap):
     return Scene(array, AIR, 40e3, [(second[0] + edge + 10e-3, 35e-3, 37e-3)], obstacles)
 
 
-def box_each(scene, spacing):
-    """Its two obstacles, a box each."""
-    grids = tuple(grid_cost(region_of(scene), bodies_extent([one]), spacing) for one in scene.obstacles)
-    return Grouping(((0,), (1,)), grids, passes=3)
-
-
-def test_boxes_that_need_many_passes_are_joined():
-    scene, spacing = cubes(8e-3, 48e-3), 2e-3
-    one, two = boxes(scene, spacing), boxes(scene, spacing, box_each(scene, spacing))
-    for propagator in (one, two):
-        propagator.transfer_matrix()
-    assert [len(cells(each)) for each in (one, two)] == [1, 2]
-    # one pass would cost 0.8 of one box, all of them cost 2.7
-    assert cells(two)[0] * two.runs[0].periods > 2 * cells(one)[0] * one.runs[0].periods
-
-
 def test_large_boxes_whose_coupling_costs_more_than_the_air_between_are_joined():
     """Steps alone would favour two boxes, 0.8 to 1; the sums between them take as long once more."""
     assert [len(cheapest(cubes(36e-3, gap), 2e-3).groups) for gap in (180e-3, 360e-3)] == [1, 2]
-
-
-@pytest.mark.parametrize("edge", [16e-3, 36e-3])
-def test_coupled_pairs_are_counted_from_the_geometry(edge):
-    scene, spacing = cubes(edge, 60e-3), 2e-3
-    apart = box_each(scene, spacing)
-    planned = dataclasses.replace(plan(scene, "box", spacing), grouping=apart)
-    one, other = BoxSimulation(planned).boxes
-    pairs = sum(len(driven.driven) * len(box._surface[0]) for driven, box in ((one, other), (other, one)))
-    # measured: 1.5 and 0.8 times, as the grid's place is not known
-    assert 0.5 < pairs / apart.coupled_pairs < 2
 
 
 def test_plates_that_face_each_other_share_a_box():
