@@ -28,9 +28,6 @@ from autdtorch.utils.validation import integer_at_least, invalid, positive, requ
 
 logger = logging.getLogger(__name__)
 
-METHODS = ("auto", "free_space", "box", "full")
-KERNELS = ("auto", "cpu", "cuda", "reference")
-
 MOST_JUDGED = 64
 """Receivers whose pressure decides when a run has converged."""
 
@@ -223,7 +220,7 @@ def plan(
         raise invalid("tolerance", tolerance, "must be in (0, 1)")
     max_periods = integer_at_least("max_periods", max_periods, 1)
     time_step = None if time_step is None else positive("time_step", time_step, "s")
-    require_one_of("method", method, METHODS)
+    require_one_of("method", method, ("auto", "free_space", "box", "full"))
     if method == "box" and not scene.obstacles:
         raise invalid("method", method, "needs a scene with obstacles; take free_space")
     runs, grouping = min(len(scene.control_points), len(scene.array)), Grouping((), (), 0)
@@ -240,7 +237,7 @@ def plan(
 
 def available_kernel(name: str) -> str:
     """Return the checked name of a kernel, the fastest available for "auto"."""
-    require_one_of("kernel", name, KERNELS)
+    require_one_of("kernel", name, ("auto", "cpu", "cuda", "reference"))
     has_triton = find_spec("triton") is not None
     if name == "auto":
         has_cuda = torch.cuda.is_available()
