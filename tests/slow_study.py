@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 import time
+from pathlib import Path
 
 from small_scenes import CUBE, small_scene
 
@@ -31,7 +32,7 @@ def main():
         "cube": dataclasses.replace(small_scene((CUBE,)), observation_plane=PLANE),
     }
     print("ready", flush=True)
-    settings = {"trials": 6, "plane_spacing": 4e-3, "folder": sys.argv[1], "config": "a"}
+    settings = {"trials": 6, "plane_spacing": 4e-3, "folder": Path(sys.argv[1]), "config": "a"}
     autdtorch.study.run.run_study(scenes, {"gabs": slow_gabs}, solver=SOLVER, **settings)
 
 

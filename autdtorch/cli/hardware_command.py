@@ -30,8 +30,7 @@ logger = logging.getLogger(__name__)
 
 _Measured: TypeAlias = tuple[Solution, torch.Tensor, hardware.Preflight, hardware.EvaluationLog]
 
-_LOG_FILE, _DRIVE_FILE = "trial.jsonl", "drive.npz"
-_GOES_ON = "the same command goes on where the log ends"
+_LOG_FILE = "trial.jsonl"
 
 
 def hardware_trial(settings: dict[str, Any], modules: list[Any], output: Any) -> None:
@@ -49,7 +48,9 @@ def hardware_trial(settings: dict[str, Any], modules: list[Any], output: Any) ->
             if left_on is not error:
                 error.add_note(str(left_on))
         elif trial is not None and trial.begun:
-            then = "a higher limit goes on from here" if isinstance(error, hardware.LimitError) else _GOES_ON
+            then = "the same command goes on where the log ends"
+            if isinstance(error, hardware.LimitError):
+                then = "a higher limit goes on from here"
             error.add_note(f"the outputs are off, and {then}")
         raise
 
@@ -98,7 +99,7 @@ class _Trial:
         folder = self._folder
         folder.mkdir(parents=True, exist_ok=True)
         found, again, preflight, log = self._measure(folder / _LOG_FILE)
-        save_drive(folder / _DRIVE_FILE, found.drive[0], self._scene.array)
+        save_drive(folder / "drive.npz", found.drive[0], self._scene.array)
         command = shlex.join(["autdtorch", *sys.argv[1:]])
         report = write_hardware_report(
             folder, log, found, again, self._simulated, self._expected, preflight, command

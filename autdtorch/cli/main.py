@@ -31,11 +31,7 @@ _LONGEST_NAME = 150  # of a job's folder; file systems allow 255 bytes
 
 
 class _Carrier(BaseException):
-    """Carries an exception past Hydra, which would print a line of its own about any `Exception`."""
-
-    def __init__(self, cause: Exception) -> None:
-        super().__init__(cause)
-        self.cause = cause
+    """Carries its cause past Hydra, which would print a line of its own about any `Exception`."""
 
 
 class SlurmCallback(Callback):
@@ -68,7 +64,7 @@ def main() -> None:
             if {"-m", "--multirun"} & set(sys.argv[1:]):
                 print("autdtorch collect merges the results of a sweep into one table and one report")
     except _Carrier as carrier:
-        error = carrier.cause
+        error = carrier.__cause__ or carrier
     except (Exception, KeyboardInterrupt) as raised:
         error = raised
     else:
@@ -95,7 +91,7 @@ def _run(config: DictConfig) -> None:
             _job(config, Path(job.sweep.dir) if swept else None)
     except Exception as error:
         if not swept:
-            raise _Carrier(error) from error
+            raise _Carrier from error
         # The other jobs go on.
         failure = f"job {job.job.num} failed: {in_one_line(error)}"
         logger.error(failure)

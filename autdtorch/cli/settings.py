@@ -18,7 +18,7 @@ from autdtorch.methods.base import Method
 from autdtorch.methods.catalogue import METHODS
 from autdtorch.propagators import make_propagator
 from autdtorch.scene.scene import Scene
-from autdtorch.study.run import StudyMethod, require_method
+from autdtorch.study.run import StudyMethod
 from autdtorch.utils.trusted import TARGET, load_trusted
 from autdtorch.utils.validation import require_known
 
@@ -69,7 +69,13 @@ def load_method(where: str, section: Mapping[str, Any], modules: Collection[Any]
     require_known(where, settings, _parameters(target, but=_NOT_OF_METHODS))
     if not isinstance(target, type):
         method = functools.partial(target, **settings)
-        require_method(where, method, section[TARGET])
+        signature = inspect.signature(method)
+        given = [key for key in ("trials", "seed") if key in signature.parameters]
+        try:
+            signature.bind("objective", **dict.fromkeys(given))
+        except TypeError as error:
+            accepted = "must take an objective, its settings, and trials and seed if it has random choices"
+            raise ValueError(f"{where}: {section[TARGET]!r}; {error}; {accepted}") from error
         return method
     try:
         made: Method = target(**settings)

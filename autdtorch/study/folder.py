@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import logging
-import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
@@ -58,7 +57,15 @@ class StudyFolder:
         """
         if self.path is None:
             return
-        _set_aside(self.path, self._not_used)
+        aside = {name: reason for name, reason in self._not_used.items() if (self.path / name).exists()}
+        if aside:
+            places = (self.path / f"{PREVIOUS}{number}" for number in itertools.count(1))
+            kept = next(place for place in places if not place.exists())
+            kept.mkdir()
+            for name in aside:
+                (self.path / name).replace(kept / name)
+            why = "; ".join(dict.fromkeys(aside.values()))
+            logger.warning("%s of %s kept in %s: %s", ", ".join(aside), self.path, kept, why)
         save_provenance(self.provenance, self.path)
         if TRIALS_FILE in self._not_used:
             self.trials = self._trial_file(self.path)
@@ -104,30 +111,16 @@ class StudyFolder:
 
 @contextlib.contextmanager
 def open_folder(
-    folder: str | os.PathLike[str] | None, provenance: Provenance, scenes: Mapping[str, Scene], reuse: bool
+    path: Path | None, provenance: Provenance, scenes: Mapping[str, Scene], reuse: bool
 ) -> Iterator[StudyFolder]:
     """Lock the folder of a study, which is made if it is missing; None keeps the study in memory alone.
 
     With `reuse`, files of the same origin are used again.
     """
-    if folder is None:
+    if path is None:
         yield StudyFolder(None, provenance, scenes, reuse)
         return
-    path = Path(folder)
     path.mkdir(parents=True, exist_ok=True)
     accepted = "another process writes there; wait until it ends, or give another folder"
     with held(FileLock(path / _LOCK_FILE), ValueError(f"output: {path}; {accepted}")):
         yield StudyFolder(path, provenance, scenes, reuse)
-
-
-def _set_aside(path: Path, not_used: Mapping[str, str]) -> None:
-    """Move files, by name with the reason, so that the study does not overwrite them."""
-    reasons = {name: reason for name, reason in not_used.items() if (path / name).exists()}
-    if not reasons:
-        return
-    kept = next(place for n in itertools.count(1) if not (place := path / f"{PREVIOUS}{n}").exists())
-    kept.mkdir()
-    for name in reasons:
-        (path / name).replace(kept / name)
-    why = "; ".join(dict.fromkeys(reasons.values()))
-    logger.warning("%s of %s kept in %s: %s", ", ".join(reasons), path, kept, why)

@@ -8,6 +8,8 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import torch
@@ -32,9 +34,7 @@ from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     integer_at_least,
     invalid,
-    path_of,
     positive,
-    require_kind,
     require_known,
     require_name,
     within,
@@ -49,7 +49,6 @@ _GIVEN = ("trials", "seed")  # parameters of a method that the study gives, if i
 BLOCK = 10
 """Trials that are run and saved together. The end of the process costs the block in work at most."""
 
-_LARGEST_SEED = 2**63 - 1  # the largest integer that a results file holds
 _MOST_SAMPLES = 10**6  # of an observation plane: 16 complex columns of them are 256 MB
 
 
@@ -61,10 +60,10 @@ def run_study(
     trials: int | Mapping[str, int] = 1,
     seed: int = 0,
     plane_spacing: float = 1e-3,
-    folder: str | os.PathLike[str] | None = None,
+    folder: Path | None = None,
     config: str = "",
 ) -> StudyResult:
-    """Run every method in every scene.
+    """Run every method in every scene; return the results of all scenes.
 
     A scene is simulated twice, whatever the number of methods and trials: its transfer matrix, on which the
     methods work, and then the observation plane under the drives they found. All settings are checked before.
@@ -81,16 +80,16 @@ def run_study(
             and packages, is taken from there. Without text, or with methods or obstacles that are not
             autdtorch's own, everything is computed.
 
-    Returns:
-        The results of all scenes.
-
     Raises:
-        ValueError: an argument of another kind or out of range, a solver's and a method's included, or
-            another process writes into the folder.
+        ValueError: an argument out of range, a solver's and a method's included, or another process writes
+            into the folder.
         OSError: the folder cannot be written.
     """
-    _check_kinds(scenes, methods, solver, config)
-    folder = None if folder is None else path_of("folder", folder, "a folder")
+    for field, named in (("scenes", scenes), ("methods", methods)):
+        if not named:
+            raise ValueError(f"{field}: empty; must have at least one")
+        for name in named:
+            require_name(field, name)
     counts = _counts(methods, trials, seed)
     plane_spacing = positive("plane_spacing", plane_spacing, "m")
     for name, method in methods.items():
@@ -103,7 +102,7 @@ def run_study(
     # The digest of our source does not cover methods and obstacles of the user's own.
     code = [*map(_code_of, methods.values())]
     code += [type(obstacle) for scene in scenes.values() for obstacle in scene.obstacles]
-    ours = all(str(getattr(one, "__module__", "")).partition(".")[0] == "autdtorch" for one in code)
+    ours = all(one.__module__.partition(".")[0] == "autdtorch" for one in code)
     provenance = provenance_now(config, seed)
     with open_folder(folder, provenance, scenes, reuse=bool(config) and ours) as kept:
         missing = {name: scene for name, scene in scenes.items() if name not in kept.scenes}
@@ -118,46 +117,9 @@ def run_study(
         return StudyResult(kept.provenance, {name: kept.scenes[name] for name in scenes})
 
 
-def _check_kinds(
-    scenes: Mapping[str, Scene], methods: Mapping[str, StudyMethod], solver: object, config: object
-) -> None:
-    """Check that names are names, and what they name, scenes and methods; and the settings' kinds."""
-    for field, named in (("scenes", scenes), ("methods", methods)):
-        if not isinstance(named, Mapping) or not named:
-            raise invalid(field, named, f"must be a mapping of names to {field}, at least one")
-        for name in named:
-            require_name(field, name)
-    for name, scene in scenes.items():
-        require_kind(f"scenes.{name}", scene, Scene)
-    for name, method in methods.items():
-        require_method(f"methods.{name}", method)
-    if solver is not None:
-        if not isinstance(solver, Mapping):
-            raise invalid("solver", solver, "must be a mapping of arguments of make_propagator")
-        _, *allowed = inspect.signature(make_propagator).parameters  # all but the scene
-        require_known("solver", solver, allowed)
-    require_kind("config", config, str)
-
-
-def require_method(where: str, method: object, shown: object = None) -> None:
-    """Check that a study can run a method, which messages show as itself or as `shown`."""
-    if isinstance(method, Method):
-        return
-    shown = method if shown is None else shown
-    accepted = "must be a Method or a function of an objective, and of trials and seed if it is random"
-    if not callable(method) or isinstance(method, type):
-        raise invalid(where, shown, accepted)
-    try:
-        signature = inspect.signature(method)
-        signature.bind("objective", **{key: None for key in _GIVEN if key in signature.parameters})
-    except (TypeError, ValueError) as error:
-        raise invalid(where, shown, f"{accepted} ({error})") from error
-
-
 def _counts(methods: Mapping[str, StudyMethod], trials: int | Mapping[str, int], seed: int) -> dict[str, int]:
     """Check the seed, and return the number of trials of each method."""
-    if integer_at_least("seed", seed, 0) > _LARGEST_SEED:
-        raise invalid("seed", seed, f"must be an integer from 0 to {_LARGEST_SEED}")
+    integer_at_least("seed", seed, 0)
     random = [name for name, method in methods.items() if _is_random(method)]
     if not isinstance(trials, Mapping):
         trials = dict.fromkeys(random, integer_at_least("trials", trials, 1))
@@ -184,7 +146,7 @@ def _propagator(scene: Scene, solver: Mapping[str, Any], kept: StudyFolder) -> P
 
 def name_of(method: StudyMethod) -> str:
     """Return the name of a method, or of the function that it is."""
-    return method.name if isinstance(method, Method) else str(getattr(_code_of(method), "__name__", "method"))
+    return method.name if isinstance(method, Method) else str(_code_of(method).__name__)
 
 
 def _code_of(method: StudyMethod) -> Any:
@@ -238,7 +200,10 @@ def _run_scene(
         shown = median_trial(solution.score)
         shown_plane = None if pressure is None else pressure[shown].clone()
         results[method_name] = MethodResult(solution, metrics, seconds, shown, shown_plane)
-    simulation = _simulation(propagator, matrix_seconds, plane_seconds)
+    simulation = Simulation("free_space", scene.wavelength, None, None, (), matrix_seconds, plane_seconds)
+    if isinstance(propagator, SimulatedPropagator):
+        grid = {"spacing": propagator.spacing, "tolerance": propagator.tolerance}
+        simulation = replace(simulation, method=propagator.method, **grid, runs=tuple(propagator.runs))
     bound = focus_bound(transfer_matrix)
     return SceneResult(len(scene.obstacles), transfer_matrix, bound, simulation, results)
 
@@ -299,12 +264,3 @@ def _plane_pressures(
     pressure = propagator.field(torch.cat(drives), points).cpu()
     area = plane.size[0] * plane.size[1] / points[..., 0].numel()
     return torch.split(pressure, [len(drive) for drive in drives]), area
-
-
-def _simulation(propagator: Propagator, matrix_seconds: float, plane_seconds: float) -> Simulation:
-    wavelength = propagator.scene.wavelength
-    seconds = matrix_seconds, plane_seconds
-    if not isinstance(propagator, SimulatedPropagator):
-        return Simulation("free_space", wavelength, None, None, (), *seconds)
-    settings = propagator.spacing, propagator.tolerance
-    return Simulation(propagator.method, wavelength, *settings, tuple(propagator.runs), *seconds)

@@ -72,9 +72,6 @@ class _Part:
         return self.found.methods[self.method]
 
 
-_Groups: TypeAlias = dict[str, dict[str, list[_Part]]]
-
-
 def collect_results(folder: str | os.PathLike[str], modules: Collection[str] = ()) -> Sweep:
     """Merge the studies in a folder and its subfolders, such as those of a sweep.
 
@@ -156,7 +153,9 @@ def _whole(value: object) -> object:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def _groups(parts: Sequence[_Part]) -> tuple[_Groups, dict[tuple[str, str], Settings]]:
+def _groups(
+    parts: Sequence[_Part],
+) -> tuple[dict[str, dict[str, list[_Part]]], dict[tuple[str, str], Settings]]:
     """Group parts of equal settings by new names of scene and method; return also the swept settings."""
     scenes = _swept([(part.scene, part.scene_settings) for part in parts])
     methods = _swept([(part.method, part.method_settings) for part in parts])
@@ -167,7 +166,7 @@ def _groups(parts: Sequence[_Part]) -> tuple[_Groups, dict[tuple[str, str], Sett
         (scene, of_scene), (method, of_method) = scenes[index], methods[index]
         return scene, _order(of_scene), order.get(method, len(order)), method, _order(of_method)
 
-    groups: _Groups = {}
+    groups: dict[str, dict[str, list[_Part]]] = {}
     swept: dict[tuple[str, str], Settings] = {}
     scene_names, method_names = _names(scenes), _names(methods)
     for index in sorted(range(len(parts)), key=rank):

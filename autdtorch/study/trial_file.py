@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import torch
 
@@ -19,26 +19,21 @@ from autdtorch.utils.validation import integer_at_least, invalid, not_negative, 
 
 TRIALS_FILE = "trials.jsonl"
 
-Trial: TypeAlias = tuple[Solution, float]
-"""The solution of one trial, and the seconds it took."""
-
-Shapes: TypeAlias = Mapping[str, tuple[int, int]]
-"""Numbers of transducers M and of control points P, by name of the scene."""
-
-_METRICS = ("mean", "min", "std", "uniformity")
-
 
 class TrialFile:
     """The finished trials by scene, method and number, in memory and in a file."""
 
-    def __init__(self, path: Path | None, origin: str, seed: int, shapes: Shapes) -> None:
+    def __init__(
+        self, path: Path | None, origin: str, seed: int, shapes: Mapping[str, tuple[int, int]]
+    ) -> None:
         """Read the trials of the study from the file, which is not changed before `mend`.
 
         Without a path the trials are kept in memory alone. The origin is part of the checksum of the lines.
+        The `shapes` are the numbers of transducers and of control points by name of the scene.
         """
         self._seed = seed
         self._shapes = shapes
-        self._trials: dict[tuple[str, str, int], Trial] = {}
+        self._trials: dict[tuple[str, str, int], tuple[Solution, float]] = {}  # and its seconds
         self._lines = None if path is None else JsonLines(path, origin, self._use)
 
     def __len__(self) -> int:
@@ -74,14 +69,14 @@ class TrialFile:
 
     def _row(self, scene: str, method: str, trial: int) -> dict[str, Any]:
         solution, seconds = self._trials[scene, method, trial]
-        metrics = focus_metrics(solution.pressure)
+        metrics = vars(focus_metrics(solution.pressure)).items()
         return {
             "scene": scene,
             "method": method,
             "trial": trial,
             "seed": self._seed,
             "score": float(solution.score),
-            **{name: float(getattr(metrics, name)) for name in _METRICS},
+            **{name: float(value) for name, value in metrics if value is not None},
             "evaluations": int(solution.evaluations),
             "seconds": seconds,
             "pressure": solution.pressure[0].tolist(),

@@ -152,7 +152,7 @@ def broken(objective): return objective.missing
 def empty(objective): ...
 """
 BAD_METHODS = {
-    "greedy": (2, r"autdtorch: method: 'own\.greedy'; must be a .*missing a required argument: 'steps'"),
+    "greedy": (2, "autdtorch: method: 'own.greedy'; missing a required argument: 'steps'; must take an obj"),
     "broken": (1, r"autdtorch: AttributeError: .* 'missing' \(own.py, line 3, in broken\); HYDRA_FULL_ERROR"),
     "empty": (2, "autdtorch: method empty: None; must return a Solution"),
 }

@@ -130,19 +130,6 @@ def _ordered(smaller: str, larger: tuple[str, ...], quantity: str) -> Compare:
     return compare
 
 
-def _share_of_empty(methods: tuple[str, ...], margin: Margin) -> Compare:
-    """Compare the mean pressure with that without obstacles; `margin` is `_above` or `_below`."""
-
-    def compare(scene: SceneResult, empty: SceneResult) -> Comparison:
-        shares = {}
-        for method in methods:
-            both = (_values(one, method, "mean") for one in (scene, empty))
-            shares[label_of(method)] = bootstrap(*both, combine=operator.truediv)
-        return _listed(shares), [margin(share, MUCH_WEAKER) for share in shares.values()]
-
-    return compare
-
-
 def _listed(numbers: dict[str, Interval]) -> str:
     return ", ".join(f"{label} {number}" for label, number in numbers.items())
 
@@ -174,12 +161,19 @@ def _foci_form(scene: SceneResult, _: SceneResult) -> Comparison:
 
 
 def _compared_with_empty(
-    text: str, reading: str, margin: Margin, methods: tuple[str, ...], scene: str = ""
+    text: str, reading: str, margin: Margin, methods: tuple[str, ...], name: str = ""
 ) -> Claim:
-    """Return a claim on shares of the pressure without obstacles."""
+    """Return a claim on shares of the mean pressure without obstacles, in all scenes or the one of a name."""
+
+    def compare(scene: SceneResult, empty: SceneResult) -> Comparison:
+        shares = {}
+        for method in methods:
+            both = (_values(one, method, "mean") for one in (scene, empty))
+            shares[label_of(method)] = bootstrap(*both, combine=operator.truediv)
+        return _listed(shares), [margin(share, MUCH_WEAKER) for share in shares.values()]
+
     heading = "share of the pressure without obstacles"
-    compare = _share_of_empty(methods, margin)
-    return Claim(text, reading, compare, methods, True, scene, needs_empty=True, heading=heading)
+    return Claim(text, reading, compare, methods, True, name, needs_empty=True, heading=heading)
 
 
 CLAIMS = (
