@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 
 import pytest
 from hydra import compose, initialize_config_dir
@@ -15,8 +14,6 @@ from one_node_slurm import missing_programs, one_node_slurm
 
 from autdtorch.cli.main import CONFIGS
 from autdtorch.study.results_file import load_results
-
-Run = Callable[..., int]
 
 TRIALS = 20
 SWEEP = ("scene=sphere", "solver.spacing=2.8e-3", "solver.tolerance=0.1", "plane_spacing=0.02", "seed=0,1")

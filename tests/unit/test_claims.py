@@ -1,7 +1,6 @@
 """Verdicts on the paper's claims follow the data."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -31,7 +30,7 @@ AS_CLAIMED = {
 }
 
 
-def method_result(trials: int, spread: float, values: dict[str, float]) -> MethodResult:
+def method_result(trials, spread, values):
     """Return trials evenly spread from 1 - spread to 1 + spread times the values."""
     around = 1 + spread * torch.linspace(-1, 1, trials + 2, dtype=torch.float64)[1:-1]
     mean = values["mean"] * around
@@ -46,9 +45,7 @@ def method_result(trials: int, spread: float, values: dict[str, float]) -> Metho
     return MethodResult(solution, metrics, torch.ones(trials, dtype=torch.float64), 0, None)
 
 
-def study(
-    changes: dict[tuple[str, str], dict[str, float]] | None = None, trials: int = 7, spread: float = 0.001
-) -> StudyResult:
+def study(changes=None, trials=7, spread=0.001):
     """Return data as claimed, with changes by scene and method."""
     scenes = {}
     for scene, methods in AS_CLAIMED.items():
@@ -61,7 +58,7 @@ def study(
     return StudyResult(Provenance("", 0, {}, "", ""), scenes)
 
 
-def test_every_claim_holds_for_data_as_claimed() -> None:
+def test_every_claim_holds_for_data_as_claimed():
     judged = judge_claims(study())
     assert len(judged) == len(CLAIMS)
     assert all(verdict.holds and verdict.clear for _, verdict in judged)
@@ -86,15 +83,13 @@ def test_every_claim_holds_for_data_as_claimed() -> None:
         ([11], "three_cubes", "gabs", {"weakest": 0.4}),
     ],
 )
-def test_a_claim_fails_on_contrary_data(
-    broken: list[int], scene: str, method: str, change: dict[str, float]
-) -> None:
+def test_a_claim_fails_on_contrary_data(broken, scene, method, change):
     verdicts = [verdict for _, verdict in judge_claims(study({(scene, method): change}))]
     assert [number for number, verdict in enumerate(verdicts, start=1) if not verdict.holds] == broken
     assert all(verdict.clear for verdict in verdicts)
 
 
-def test_a_difference_has_an_interval_and_is_clear_where_it_excludes_zero() -> None:
+def test_a_difference_has_an_interval_and_is_clear_where_it_excludes_zero():
     _, verdict = judge_claims(study(spread=0.3, trials=15))[4]
     line = verdict.evidence[2]
     start = "two_cubes: BO 6.00, GABS 7.00 Pa; GABS - BO 1.00 ["
@@ -109,35 +104,35 @@ def test_a_difference_has_an_interval_and_is_clear_where_it_excludes_zero() -> N
         assert (verdict.holds, verdict.clear) == (True, clear)
 
 
-def test_a_few_trials_of_random_methods_show_nothing_clearly_but_their_evaluations() -> None:
+def test_a_few_trials_of_random_methods_show_nothing_clearly_but_their_evaluations():
     judged = judge_claims(study(trials=FEWEST_TRIALS - 1))
     clear = [number for number, (_, verdict) in enumerate(judged, start=1) if verdict.clear]
     # Of LSSG, which has no randomness, and of numbers of evaluations; shares need no resampling.
     assert clear == [2, 3, 9, 10]
 
 
-def changed(change: Callable[[MethodResult], MethodResult]) -> StudyResult:
+def changed(change):
     results = study()
     for scene in results.scenes.values():
         scene.methods.update({name: change(method) for name, method in scene.methods.items()})
     return results
 
 
-def padded(method: MethodResult) -> MethodResult:
+def padded(method):
     history = method.solution.history
     history = torch.cat([history, history[:, -1:].repeat(1, 300)], dim=1)
     return replace(method, solution=replace(method.solution, history=history))
 
 
-def test_what_pads_a_history_is_no_convergence() -> None:
+def test_what_pads_a_history_is_no_convergence():
     assert judge_claims(changed(padded))[8][1] == judge_claims(study())[8][1]
 
 
-def undecided(results: StudyResult) -> list[int]:
+def undecided(results):
     return [number for number, (_, verdict) in enumerate(judge_claims(results), start=1) if verdict is None]
 
 
-def test_claims_without_data_have_no_verdict() -> None:
+def test_claims_without_data_have_no_verdict():
     results = study()
     del results.scenes["homogeneous"]
     assert undecided(results) == [2, 3, 4, 6]

@@ -4,7 +4,6 @@ import base64
 import functools
 import re
 from dataclasses import replace
-from pathlib import Path
 from unittest.mock import Mock
 from urllib.parse import unquote
 
@@ -17,11 +16,10 @@ from autdtorch.methods.bound import focus_bound
 from autdtorch.methods.gabs import gabs
 from autdtorch.methods.lssg import lssg
 from autdtorch.scene.geometry import Plane
-from autdtorch.scene.obstacles import Box
 from autdtorch.scene.scene import Scene
 from autdtorch.study.report.study_report import HTML_FILE, write_report
 from autdtorch.study.report.tables import gap_rows, simulation_rows
-from autdtorch.study.results import StudyResult, summary_rows
+from autdtorch.study.results import summary_rows
 from autdtorch.study.run import run_study
 
 PLANE = Plane(center=(20e-3, 12e-3, 12e-3), normal=(1, 0, 0), size=(20e-3, 20e-3))
@@ -33,33 +31,33 @@ METHODS = {
 }
 
 
-def scene(plane: Plane | None = PLANE, obstacles: tuple[Box, ...] = ()) -> Scene:
+def scene(plane=PLANE, obstacles=()):
     plain = small_scene()
     return Scene(plain.array, AIR, 40e3, plain.control_points, obstacles, plane, plain.domain)
 
 
 @pytest.fixture(autouse=True)
-def without_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
+def without_renderer(monkeypatch):
     """Skip 3D pictures, which take seconds and have tests of their own."""
     monkeypatch.setattr(autdtorch.study.report.study_report, "rendering_problem", lambda: "no driver")
 
 
-def studied(scenes: dict[str, Scene], **settings: object) -> StudyResult:
+def studied(scenes, **settings):
     return run_study(scenes, METHODS, solver={"method": "free_space"}, plane_spacing=2e-3, **settings)
 
 
-def reported(scenes: dict[str, Scene], folder: Path, **settings: object) -> tuple[StudyResult, str]:
+def reported(scenes, folder, **settings):
     results = studied(scenes, **settings)
     path = write_report(results, scenes, folder, "autdtorch experiment=paper trials=3")
     assert path == folder / "report.html"
     return results, (folder / "report.md").read_text(encoding="utf-8")
 
 
-def figures(report: str) -> list[str]:
+def figures(report):
     return re.findall(r"!\[[^]]*\]\(([^)]+)\)", report)
 
 
-def tables(report: str) -> list[list[list[str]]]:
+def tables(report):
     blocks = re.findall(r"(?:^\|.*\|$\n?)+", report, flags=re.MULTILINE)
     return [[line[2:-2].split(" | ") for line in block.strip().splitlines()] for block in blocks]
 
@@ -67,7 +65,7 @@ def tables(report: str) -> list[list[list[str]]]:
 BOTH = {"homogeneous": scene(), "three_cubes": scene(obstacles=(CUBE,))}
 
 
-def test_all_figures_and_tables_are_there_and_no_number_is_missing(tmp_path: Path) -> None:
+def test_all_figures_and_tables_are_there_and_no_number_is_missing(tmp_path):
     results, report = reported(BOTH, tmp_path / "new", trials=3, config="trials: 3\n")
     shown = figures(report)
     scenes = ["fig1_homogeneous.png", "fig1_three_cubes.png"]
@@ -99,7 +97,7 @@ def test_all_figures_and_tables_are_there_and_no_number_is_missing(tmp_path: Pat
     assert all(text in report for text in texts)
 
 
-def test_the_table_gives_the_mean_over_the_trials() -> None:
+def test_the_table_gives_the_mean_over_the_trials():
     results = studied({"a": scene()}, trials=3)
     head, lssg_row, _, gabs_row = summary_rows(results)
     metrics = results.scenes["a"].methods["gabs"].metrics
@@ -111,12 +109,12 @@ def test_the_table_gives_the_mean_over_the_trials() -> None:
     assert lssg_row[3] == f"{results.scenes['a'].methods['lssg'].metrics.mean[0]:.2f}"
 
 
-def with_bound(results: StudyResult, bound: float) -> StudyResult:
+def with_bound(results, bound):
     scenes = {name: replace(result, bound=bound) for name, result in results.scenes.items()}
     return replace(results, scenes=scenes)
 
 
-def test_every_method_has_a_gap_to_the_bound() -> None:
+def test_every_method_has_a_gap_to_the_bound():
     results = studied({"a": scene()}, trials=7)
     bound = focus_bound(results.scenes["a"].transfer_matrix)
     assert gap_rows(results)[1][:3] == ["a", "*bound*", f"{bound:.3g}"]
@@ -128,7 +126,7 @@ def test_every_method_has_a_gap_to_the_bound() -> None:
     assert lssg_row[5] == "-"
 
 
-def test_a_median_of_evaluations_is_given_if_more_than_half_of_the_trials_got_there() -> None:
+def test_a_median_of_evaluations_is_given_if_more_than_half_of_the_trials_got_there():
     results = studied({"a": scene()}, trials=7)
     method = results.scenes["a"].methods["gabs"]
     for reaching, text in ((7, "3"), (5, "3 (5 of 7)"), (3, "- (3 of 7)")):
@@ -139,7 +137,7 @@ def test_a_median_of_evaluations_is_given_if_more_than_half_of_the_trials_got_th
         assert gap_rows(with_bound(results, 10.0))[-1][5] == text
 
 
-def test_the_gradient_is_a_baseline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_gradient_is_a_baseline(tmp_path, monkeypatch):
     results = studied({"a": scene()}, trials=2)
     methods = results.scenes["a"].methods
     methods["gradient_ascent"] = methods.pop("lssg")
@@ -155,13 +153,13 @@ def test_the_gradient_is_a_baseline(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert levels["a"] == {"bound": 2 * score, "90 % of the bound": near, "gradient ascent": score}
 
 
-def test_a_scene_without_observation_plane_is_left_out_of_the_pictures_that_need_one(tmp_path: Path) -> None:
+def test_a_scene_without_observation_plane_is_left_out_of_the_pictures_that_need_one(tmp_path):
     _, report = reported({"plain": scene(plane=None)}, tmp_path)
     assert figures(report) == ["fig1_plain.png", "fig3abc.png", "fig3d.png", "fig4.png"]
     assert not re.search(r"\bnan\b|\binf\b|None", report)
 
 
-def test_the_page_holds_the_same_and_needs_no_other_file(tmp_path: Path) -> None:
+def test_the_page_holds_the_same_and_needs_no_other_file(tmp_path):
     _, report = reported({"my_lab": scene()}, tmp_path, config="trials: 1\n")
     page = (tmp_path / HTML_FILE).read_text(encoding="utf-8")
     sources = re.findall(r'src="([^"]*)"', page)
@@ -177,7 +175,7 @@ def test_the_page_holds_the_same_and_needs_no_other_file(tmp_path: Path) -> None
     assert "trials: 1" in page
 
 
-def test_methods_may_differ_between_scenes_and_claims_without_data_are_no_table(tmp_path: Path) -> None:
+def test_methods_may_differ_between_scenes_and_claims_without_data_are_no_table(tmp_path):
     scenes = {"lab": scene(obstacles=(CUBE,)), "other": scene(None), "third": scene()}
     results = studied(scenes, trials=2)
     lab, other, _ = (found.methods for found in results.scenes.values())
@@ -193,7 +191,7 @@ def test_methods_may_differ_between_scenes_and_claims_without_data_are_no_table(
     assert not re.search(r"\bnan\b|\binf\b|None", report)
 
 
-def test_matrices_that_were_kept_are_no_runs_and_not_exact(tmp_path: Path) -> None:
+def test_matrices_that_were_kept_are_no_runs_and_not_exact(tmp_path):
     solver = {"method": "full", "spacing": 2.8e-3, "tolerance": 0.05, "cache": tmp_path / "kept"}
     for runs in ("4", "0, kept on disk"):
         results = run_study({"cube": scene(None, (CUBE,))}, {"gabs": METHODS["gabs"]}, solver=solver)

@@ -4,7 +4,6 @@ import dataclasses
 import errno
 import hashlib
 import os
-from collections.abc import Callable
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -27,7 +26,7 @@ RUN_PAIR = (Run(183, 1.9e-3, True, 4.5), Run(600, 3e-2, False, 9.0))
 FULL = Simulation("full", 8.5e-3, 1e-3, 2e-3, RUN_PAIR, 20.0, 80.0)
 
 
-def method_result(trials: int, plane: bool, seed: int) -> MethodResult:
+def method_result(trials, plane, seed):
     generator = torch.Generator().manual_seed(seed)
     drive = torch.randn(trials, 3, dtype=torch.complex128, generator=generator).sgn()
     pressure = torch.rand(trials, 2, dtype=torch.float64, generator=generator)
@@ -40,7 +39,7 @@ def method_result(trials: int, plane: bool, seed: int) -> MethodResult:
 
 
 @pytest.fixture
-def results() -> StudyResult:
+def results():
     versions = {"autdtorch": "0", "torch": "2"}
     provenance = Provenance("seed: 3\ntext: |\n  °µ\n", 3, versions, "abc", "2026-01-01T00:00:00")
     matrix = torch.randn(2, 3, dtype=torch.complex128, generator=torch.Generator().manual_seed(0))
@@ -53,7 +52,7 @@ def results() -> StudyResult:
     return StudyResult(provenance, scenes)
 
 
-def assert_same(first: object, second: object) -> None:
+def assert_same(first, second):
     assert type(first) is type(second)
     if isinstance(first, torch.Tensor):
         assert (first.dtype, first.tolist()) == (second.dtype, second.tolist())
@@ -67,9 +66,7 @@ def assert_same(first: object, second: object) -> None:
         assert first == second
 
 
-def test_results_are_loaded_as_saved_and_saving_again_replaces_them(
-    results: StudyResult, tmp_path: Path
-) -> None:
+def test_results_are_loaded_as_saved_and_saving_again_replaces_them(results, tmp_path):
     folder = tmp_path / "new" / "folder"
     save_results(results, folder)
     assert_same(load_results(folder), results)
@@ -83,12 +80,12 @@ def test_results_are_loaded_as_saved_and_saving_again_replaces_them(
 
 
 def test_a_file_is_on_disk_before_it_is_renamed_and_a_full_disk_keeps_the_old_one(
-    results: StudyResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    results, tmp_path, monkeypatch
+):
     synced: list[int] = []
     replace = Path.replace
 
-    def check(self: Path, target: Path) -> Path:
+    def check(self, target):
         assert synced == [self.stat().st_size]
         return replace(self, target)
 
@@ -103,9 +100,7 @@ def test_a_file_is_on_disk_before_it_is_renamed_and_a_full_disk_keeps_the_old_on
 
 
 @pytest.mark.parametrize(("name", "load"), [(RESULTS_FILE, load_results), (PROVENANCE_FILE, load_provenance)])
-def test_missing_incomplete_and_damaged_files_are_refused_by_name(
-    results: StudyResult, tmp_path: Path, name: str, load: Callable[[Path], object]
-) -> None:
+def test_missing_incomplete_and_damaged_files_are_refused_by_name(results, tmp_path, name, load):
     with pytest.raises(FileNotFoundError, match=name):
         load(tmp_path)
     save_results(results, tmp_path)
@@ -126,9 +121,7 @@ def test_missing_incomplete_and_damaged_files_are_refused_by_name(
     "change",
     [{}, {"config": 3}, {"seed": "3"}, {"seed": True}, {"versions": []}, {"date": None}, {"more": 1}],
 )
-def test_a_provenance_of_other_fields_or_types_is_refused(
-    results: StudyResult, tmp_path: Path, change: dict[str, object]
-) -> None:
+def test_a_provenance_of_other_fields_or_types_is_refused(results, tmp_path, change):
     origins.save_provenance(results.provenance, tmp_path)
     assert load_provenance(tmp_path) == results.provenance
     row = dataclasses.asdict(results.provenance) | change if change else {"config": "a"}
@@ -137,12 +130,12 @@ def test_a_provenance_of_other_fields_or_types_is_refused(
         load_provenance(tmp_path)
 
 
-def saved(results: StudyResult, folder: Path) -> tuple[Path, bytes]:
+def saved(results, folder):
     save_results(results, folder)
     return folder / RESULTS_FILE, (folder / RESULTS_FILE).read_bytes()
 
 
-def refused(path: Path, content: bytes, change: Callable[[h5py.File], object]) -> str:
+def refused(path, content, change):
     """Write content with a change and a new checksum; return the message of the refusal."""
     path.write_bytes(content)
     with h5py.File(path, "r+") as file:
@@ -154,7 +147,7 @@ def refused(path: Path, content: bytes, change: Callable[[h5py.File], object]) -
     return str(error.value)
 
 
-def put(file: h5py.File, place: str, value: object) -> None:
+def put(file, place, value):
     """Replace a dataset "name" or an attribute "group@name"; None removes it."""
     group, _, attribute = place.partition("@")
     holder, name = (file[group or "/"].attrs, attribute) if attribute else (file, group)
@@ -164,9 +157,7 @@ def put(file: h5py.File, place: str, value: object) -> None:
 
 
 @pytest.mark.parametrize("link", [False, True])
-def test_any_dataset_that_is_missing_or_a_link_is_refused(
-    results: StudyResult, tmp_path: Path, link: bool
-) -> None:
+def test_any_dataset_that_is_missing_or_a_link_is_refused(results, tmp_path, link):
     path, content = saved(results, tmp_path)
     names: list[str] = []
     with h5py.File(path) as file:
@@ -216,9 +207,7 @@ OTHER = {name: h5py.SoftLink(f"/scenes/two_cubes{name}") for name in ("", "/meth
         (f"{LSSG}/plane_pressure", [np.ones(2, complex), [[np.nan + 0j]]]),
     ],
 )
-def test_other_content_is_refused(
-    results: StudyResult, tmp_path: Path, place: str, values: list[object]
-) -> None:
+def test_other_content_is_refused(results, tmp_path, place, values):
     path, content = saved(results, tmp_path)
     for value in values:
         refused(path, content, lambda file, value=value: put(file, place, value))
@@ -226,14 +215,14 @@ def test_other_content_is_refused(
 
 @pytest.mark.parametrize("side", [10**6, 10**3])
 def test_data_that_the_file_cannot_hold_or_that_are_elsewhere_are_refused_before_they_are_read(
-    results: StudyResult, tmp_path: Path, side: int
-) -> None:
-    def change(file: h5py.File) -> None:
+    results, tmp_path, side
+):
+    def change(file):
         for name in (MATRIX, "scenes/empty/runs/seconds", f"{METHOD}/score"):
             del file[name]
             file.create_dataset(name, (side, side), "c16", chunks=(100, 100))
 
-    def elsewhere(file: h5py.File) -> None:
+    def elsewhere(file):
         del file[MATRIX]
         file.create_dataset(MATRIX, (2, 3), "c16", external=[(__file__, 0, 96)])
 
@@ -242,7 +231,7 @@ def test_data_that_the_file_cannot_hold_or_that_are_elsewhere_are_refused_before
     assert "another file" in refused(path, content, elsewhere)
 
 
-def test_the_provenance_of_now_names_the_numerical_packages() -> None:
+def test_the_provenance_of_now_names_the_numerical_packages():
     provenance = origins.provenance_now("a: 1\n", 5)
     packages = {"torch", "numpy", "scipy", "libigl", "numba"}
     extras = {"triton"}  # if installed

@@ -1,7 +1,6 @@
 """The watcher of a sweep's jobs reads the answers of `squeue`, and notices failures."""
 
 import logging
-from collections.abc import Callable
 
 import pytest
 
@@ -9,8 +8,6 @@ pytest.importorskip("submitit")
 
 from autdtorch.cli import slurm
 from autdtorch.cli.slurm import QueueWatcher
-
-Squeue = Callable[[str], None]
 
 
 @pytest.fixture

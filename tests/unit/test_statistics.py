@@ -20,7 +20,7 @@ LEAST, MOST = (int(stats.binom.ppf(tail, DRAWS, CONFIDENCE)) for tail in (1e-3, 
 
 
 @pytest.mark.parametrize("trials", [FEWEST_TRIALS, 30])
-def test_intervals_cover_the_truth_as_often_as_they_say(trials: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_intervals_cover_the_truth_as_often_as_they_say(trials, monkeypatch):
     monkeypatch.setattr("autdtorch.study.statistics._RESAMPLES", 999)  # enough, and quick
     generator = torch.Generator().manual_seed(3)
     covered = np.zeros(4, int)
@@ -34,7 +34,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say(trials: int, monkeypatch
     assert ((covered >= LEAST) & (covered <= MOST)).all(), covered
 
 
-def test_exact_numbers_add_no_uncertainty_and_equal_data_give_equal_intervals() -> None:
+def test_exact_numbers_add_no_uncertainty_and_equal_data_give_equal_intervals():
     values = torch.rand(20, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     assert bootstrap(values) == bootstrap(values)
     assert bootstrap(2.0, 3.0, combine=operator.sub) == Interval.exact(-1.0)
@@ -44,14 +44,14 @@ def test_exact_numbers_add_no_uncertainty_and_equal_data_give_equal_intervals() 
     assert bootstrap(torch.full((20,), 3.0)) == Interval.exact(3.0)
 
 
-def test_too_few_trials_have_no_interval() -> None:
+def test_too_few_trials_have_no_interval():
     many, few = torch.arange(20.0), torch.arange(FEWEST_TRIALS - 1.0)
     assert (bootstrap(few).low, bootstrap(few).high) == (-math.inf, math.inf)
     assert bootstrap(many, few, combine=operator.sub).high == math.inf
     assert math.isfinite(bootstrap(torch.arange(float(FEWEST_TRIALS))).high)
 
 
-def test_a_share_of_all_trials_is_not_certain() -> None:
+def test_a_share_of_all_trials_is_not_certain():
     # Wilson's interval of n of n is [n / (n + z^2), 1].
     every = statistics.share_interval(torch.ones(50, dtype=torch.bool))
     assert (every.value, every.low, every.high) == pytest.approx((1.0, 50 / (50 + 1.96**2), 1.0), rel=1e-4)
@@ -70,11 +70,11 @@ def test_a_share_of_all_trials_is_not_certain() -> None:
         (Interval.exact(0.0), "0"),
     ],
 )
-def test_numbers_have_three_digits(interval: Interval, text: str) -> None:
+def test_numbers_have_three_digits(interval, text):
     assert str(interval) == text
 
 
-def method_result(history: list[list[float]]) -> MethodResult:
+def method_result(history):
     best = torch.tensor(history, dtype=torch.float64)
     trials, evaluations = best.shape
     drive = torch.ones(trials, 1, dtype=torch.complex128)
@@ -83,14 +83,14 @@ def method_result(history: list[list[float]]) -> MethodResult:
     return MethodResult(solution, metrics, torch.ones(trials, dtype=torch.float64), 0, None)
 
 
-def test_evaluations_are_counted_to_the_first_near_the_bound() -> None:
+def test_evaluations_are_counted_to_the_first_near_the_bound():
     ended_early = [2.0, 9.5, 9.5, 9.5]
     history = [[1.0, 2.0, 9.0, 9.5], [9.0] * 4, [1.0, 1.0, 1.0, 8.9], ended_early]
     for bound, wanted in ((10.0, [3, 1, math.inf, 2]), (11.0, [math.inf] * 4), (0.5, [1] * 4)):
         assert bound_gap(method_result(history), bound).evaluations.tolist() == wanted
 
 
-def test_the_gap_is_that_of_the_median_score() -> None:
+def test_the_gap_is_that_of_the_median_score():
     # Scores 1 to 9 have the median 5: the gap to 10 is a half, its ends are mirrored.
     finding = bound_gap(method_result([[float(score)] for score in range(1, 10)]), 10.0)
     assert finding.score.value == 5.0

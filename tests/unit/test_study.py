@@ -1,7 +1,6 @@
 """A study is repeatable, checks its settings first, and does not compute again what it finds finished."""
 
 import functools
-import itertools
 import logging
 import math
 
@@ -17,7 +16,7 @@ from autdtorch.propagators import FreeSpacePropagator, Run, SteadyStateWarning
 from autdtorch.propagators.full import DomainSimulation
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.scene import Scene
-from autdtorch.study.results_file import RESULTS_FILE, load_results
+from autdtorch.study.results_file import load_results
 from autdtorch.study.run import run_study
 from autdtorch.study.trial_file import TRIALS_FILE
 
@@ -149,24 +148,6 @@ def test_a_study_goes_on_after_the_scenes_that_were_finished(scenes, count_runs,
     assert count_runs == ["second", "first", "first"]
     assert list(results.scenes) == ["second", "first"]
     assert list(load_results(tmp_path).scenes) == ["second", "first"]
-
-
-def test_killed_while_writing_the_last_complete_file_stays(study, tmp_path, monkeypatch):
-    write_scene = autdtorch.study.results_file._write_scene
-    complete = []
-    calls = itertools.count(1)
-
-    def killed(group, scene):
-        if next(calls) == 3:  # the second scene, when the file is written for the second time
-            complete.append((tmp_path / RESULTS_FILE).read_bytes())
-            raise KeyboardInterrupt
-        write_scene(group, scene)
-
-    monkeypatch.setattr("autdtorch.study.results_file._write_scene", killed)
-    with pytest.raises(KeyboardInterrupt):
-        study(config="a: 1")
-    assert [(tmp_path / RESULTS_FILE).read_bytes()] == complete
-    assert list(load_results(tmp_path).scenes) == ["second"]
 
 
 @pytest.mark.parametrize(

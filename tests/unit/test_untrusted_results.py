@@ -3,7 +3,6 @@
 import functools
 from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
 
 import pytest
 import yaml
@@ -16,7 +15,6 @@ from autdtorch.methods.gabs import gabs
 from autdtorch.study.report.document import as_page, code, fenced, table
 from autdtorch.study.report.study_report import write_report
 from autdtorch.study.report.tables import SUMMARY_FILE, save_summary
-from autdtorch.study.results import StudyResult
 from autdtorch.study.results_file import load_results, save_results
 from autdtorch.study.run import run_study
 from autdtorch.study.sweeps import collect_results
@@ -33,11 +31,11 @@ HOSTILE = f"{HTML}\n{MARKDOWN}\n\n</details>\n```\n{HTML}\n[x]: https://evil.exa
 
 
 @pytest.fixture(autouse=True)
-def without_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
+def without_renderer(monkeypatch):
     monkeypatch.setattr("autdtorch.study.report.study_report.rendering_problem", lambda: "not tried")
 
 
-def study(solver: dict[str, object] | None = None, seed: int = 0) -> StudyResult:
+def study(solver=None, seed=0):
     settings = {"scene": SCENE, "method": {"_target_": "autdtorch.gabs"}, "solver": solver or {}}
     methods = {"gabs": functools.partial(gabs, levels=2)}
     return run_study({"air": load_scene(SCENE)}, methods, seed=seed, config=yaml.safe_dump(settings))
@@ -48,7 +46,7 @@ NAMES = ["", ".", "a/b", "a\0b", "..", "...", "..\\a", "a\nb", "a b", "x" * 101,
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_study_refuses_a_name_that_is_no_part_of_a_file_name(name: str) -> None:
+def test_a_study_refuses_a_name_that_is_no_part_of_a_file_name(name):
     scene, method = load_scene(SCENE), functools.partial(gabs, levels=2)
     with pytest.raises(ValueError, match=r"^scenes: "):
         run_study({name: scene}, {"gabs": method})
@@ -58,7 +56,7 @@ def test_a_study_refuses_a_name_that_is_no_part_of_a_file_name(name: str) -> Non
 
 @pytest.mark.parametrize("name", NAMES[4:])
 @pytest.mark.parametrize("field", ["scenes", "methods"])
-def test_results_with_such_a_name_are_refused(tmp_path: Path, name: str, field: str) -> None:
+def test_results_with_such_a_name_are_refused(tmp_path, name, field):
     results = study()
     (scene,) = results.scenes.values()
     other = {"air": replace(scene, methods={name: scene.methods["gabs"]})}
@@ -67,11 +65,11 @@ def test_results_with_such_a_name_are_refused(tmp_path: Path, name: str, field: 
         load_results(tmp_path)
 
 
-def with_origin(results: StudyResult, **changes: object) -> StudyResult:
+def with_origin(results, **changes):
     return replace(results, provenance=replace(results.provenance, **changes))
 
 
-def left(folder: Path, *studies: StudyResult) -> Path:
+def left(folder, *studies):
     """Save a sweep of these studies in a subfolder."""
     sweep = folder / "sweep"
     for number, results in enumerate(studies):
@@ -79,7 +77,7 @@ def left(folder: Path, *studies: StudyResult) -> Path:
     return sweep
 
 
-def collect(sweep: Path) -> str:
+def collect(sweep):
     """Do what `autdtorch collect` does; return the page."""
     found = collect_results(sweep)
     save_summary(found, sweep / SUMMARY_FILE)
@@ -87,7 +85,7 @@ def collect(sweep: Path) -> str:
     return page.read_text(encoding="utf-8")
 
 
-def test_the_names_of_what_was_swept_stay_in_the_folder(tmp_path: Path) -> None:
+def test_the_names_of_what_was_swept_stay_in_the_folder(tmp_path):
     solvers = ({"../../elsewhere": 1, "<b>": 1}, {"../../elsewhere": "../<b>", "語" * 300: "a\0b"})
     page = collect(left(tmp_path, *map(study, solvers)))
     assert [path.name for path in tmp_path.iterdir()] == ["sweep"]
@@ -95,14 +93,14 @@ def test_the_names_of_what_was_swept_stay_in_the_folder(tmp_path: Path) -> None:
     assert "<b>" not in page
 
 
-def test_settings_that_expand_are_refused(tmp_path: Path) -> None:
+def test_settings_that_expand_are_refused(tmp_path):
     tens = (f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 11))
     config = "scene: &a0 [lol, lol]\n" + "".join(tens)
     with pytest.raises(ValueError, match=r"results\.h5.*line"):
         collect_results(left(tmp_path, with_origin(study(), config=config)))
 
 
-def test_the_scene_of_results_reads_no_variable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_scene_of_results_reads_no_variable(tmp_path, monkeypatch):
     monkeypatch.setenv("SECRET", "hunter2")
     config = yaml.safe_dump({"scene": {**SCENE, "name": "${oc.env:SECRET}"}, "method": {}})
     with pytest.raises(ValueError, match=r"name: '\$\{oc\.env:SECRET\}'"):
@@ -110,7 +108,7 @@ def test_the_scene_of_results_reads_no_variable(tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.parametrize("end", ["", ".partial"])
-def test_a_report_is_not_written_through_a_link(tmp_path: Path, end: str) -> None:
+def test_a_report_is_not_written_through_a_link(tmp_path, end):
     sweep = left(tmp_path, study())
     mine = tmp_path / "mine"
     mine.write_text("mine", encoding="utf-8")
@@ -124,12 +122,12 @@ def test_a_report_is_not_written_through_a_link(tmp_path: Path, end: str) -> Non
 class Tags(HTMLParser):
     """Tags and attributes of a page."""
 
-    def __init__(self, page: str) -> None:
+    def __init__(self, page):
         super().__init__()
         self.found: list[tuple[str, str, str]] = []
         self.feed(page)
 
-    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attributes):
         self.found += [(tag, "", ""), *((tag, name, value or "") for name, value in attributes)]
 
 
@@ -138,7 +136,7 @@ OURS |= {"pre", "img", "div", "table", "thead", "tbody", "tr", "th", "td", "ul",
 ATTRIBUTES = {"lang", "charset", "name", "content", "class", "src", "alt"}
 
 
-def test_a_report_shows_hostile_texts_as_texts(tmp_path: Path) -> None:
+def test_a_report_shows_hostile_texts_as_texts(tmp_path):
     versions = {"autdtorch": HOSTILE, HOSTILE: "1"}
     texts = dict.fromkeys(("config", "source_digest", "date"), HOSTILE)
     hostile = with_origin(study(), versions=versions, **texts)
@@ -159,12 +157,12 @@ def test_a_report_shows_hostile_texts_as_texts(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", [HTML, MARKDOWN[1:], "&lt;b&gt; <!-- c --> <?d?> <![CDATA[e]]>"])
-def test_a_page_has_no_html_and_no_links_but_its_own(tmp_path: Path, text: str) -> None:
+def test_a_page_has_no_html_and_no_links_but_its_own(tmp_path, text):
     assert {tag for tag, _, _ in Tags(as_page(f"# {text}\n\n{text}\n", tmp_path)).found} <= OURS
 
 
 @pytest.mark.parametrize("source", ["../secret.png", "/etc/passwd", "https://a.example", "%2e%2e/secret.png"])
-def test_a_page_takes_images_of_its_folder_alone(tmp_path: Path, source: str) -> None:
+def test_a_page_takes_images_of_its_folder_alone(tmp_path, source):
     (tmp_path / "page").mkdir()
     (tmp_path / "secret.png").write_bytes(b"secret")
     with pytest.raises(ValueError, match=r"^image: "):
@@ -172,7 +170,7 @@ def test_a_page_takes_images_of_its_folder_alone(tmp_path: Path, source: str) ->
 
 
 @given(st.text() | st.text("`|\\<b>![a](c)\n\r "))
-def test_code_is_code_whatever_the_text(text: str) -> None:
+def test_code_is_code_whatever_the_text(text):
     parse = MarkdownIt("commonmark").enable("table").parse
     (block,) = parse(fenced(text))
     assert block.type == "fence"
