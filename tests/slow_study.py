@@ -32,8 +32,9 @@ def main():
         "cube": dataclasses.replace(small_scene((CUBE,)), observation_plane=PLANE),
     }
     print("ready", flush=True)
+    solver = SOLVER | {"cache": Path(sys.argv[1]) / "matrices"}
     settings = {"trials": 6, "plane_spacing": 4e-3, "folder": Path(sys.argv[1]), "config": "a"}
-    autdtorch.study.run.run_study(scenes, {"gabs": slow_gabs}, solver=SOLVER, **settings)
+    autdtorch.study.run.run_study(scenes, {"gabs": slow_gabs}, solver=solver, **settings)
 
 
 if __name__ == "__main__":

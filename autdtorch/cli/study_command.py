@@ -36,8 +36,9 @@ def study(settings: dict[str, Any], modules: list[Any], output: Any, sweep: Path
         folder = Path(HydraConfig.get().runtime.output_dir)
         if is_given("output"):
             raise ValueError(f"output: {output}; a sweep has a folder for each job in hydra.sweep.dir")
-        if solver.get("cache") is None and CACHE_VARIABLE not in os.environ:
-            solver["cache"] = sweep / "matrices"  # jobs in the same scene share them
+    if solver.get("cache") is None and CACHE_VARIABLE not in os.environ:
+        # A study that goes on needs them again, and jobs in one scene share them.
+        solver["cache"] = (sweep or folder) / "matrices"
     settings["solver"] = {key: value for key, value in solver.items() if key != "cache"}  # changes no result
     scenes, methods = _parts(settings, modules)
     results = run_study(

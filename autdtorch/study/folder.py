@@ -19,7 +19,6 @@ from autdtorch.utils.files import held
 
 logger = logging.getLogger(__name__)
 
-MATRICES_FOLDER = "matrices"
 PREVIOUS = "previous-"
 """Start of the names of the folders that keep files of earlier studies, and damaged ones."""
 

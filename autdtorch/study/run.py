@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import inspect
 import math
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -21,9 +20,9 @@ from autdtorch.methods.solution import Solution
 from autdtorch.objectives.metrics import focus_metrics
 from autdtorch.objectives.objective import Objective
 from autdtorch.objectives.simulated import SimulatedObjective
-from autdtorch.propagators import CACHE_VARIABLE, Propagator, SimulatedPropagator, make_propagator
+from autdtorch.propagators import Propagator, SimulatedPropagator, make_propagator
 from autdtorch.scene.scene import Scene
-from autdtorch.study.folder import MATRICES_FOLDER, StudyFolder, open_folder
+from autdtorch.study.folder import open_folder
 from autdtorch.study.provenance import provenance_now
 from autdtorch.study.results import MethodResult, SceneResult, Simulation, StudyResult, median_trial
 from autdtorch.study.trial_file import TrialFile
@@ -106,7 +105,8 @@ def run_study(
     provenance = provenance_now(config, seed)
     with open_folder(folder, provenance, scenes, reuse=bool(config) and ours) as kept:
         missing = {name: scene for name, scene in scenes.items() if name not in kept.scenes}
-        propagators = {name: _propagator(scene, solver or {}, kept) for name, scene in missing.items()}
+        with within("solver"):
+            propagators = {name: make_propagator(scene, **(solver or {})) for name, scene in missing.items()}
         kept.begin()
         with show_progress(len(missing) * (sum(counts.values()) + 2)) as progress:
             for name in missing:
@@ -134,14 +134,6 @@ def _counts(methods: Mapping[str, StudyMethod], trials: int | Mapping[str, int],
 
 def _is_random(method: StudyMethod) -> bool:
     return method.random if isinstance(method, Method) else "trials" in inspect.signature(method).parameters
-
-
-def _propagator(scene: Scene, solver: Mapping[str, Any], kept: StudyFolder) -> Propagator:
-    cache = solver.get("cache")
-    if cache is None and CACHE_VARIABLE not in os.environ and kept.path is not None:
-        cache = kept.path / MATRICES_FOLDER  # a study that goes on needs its matrices again
-    with within("solver"):
-        return make_propagator(scene, **{**solver, "cache": cache})
 
 
 def name_of(method: StudyMethod) -> str:

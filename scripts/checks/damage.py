@@ -58,7 +58,7 @@ def study(folder: Path, seed: int = 0) -> list[torch.Tensor]:
     results = run_study(
         {"empty": _scene(), "cube": _scene(replace(CUBE, density=100.0 + seed))},
         METHODS,
-        solver=SOLVER,
+        solver={**SOLVER, "cache": folder / "matrices"},
         trials={"gabs": 5, "identify": 2},
         seed=seed,
         folder=folder,

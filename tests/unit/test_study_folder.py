@@ -10,7 +10,7 @@ from small_scenes import CUBE, small_scene
 from autdtorch.methods.gabs import gabs
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.scene import Scene
-from autdtorch.study.folder import MATRICES_FOLDER, PREVIOUS
+from autdtorch.study.folder import PREVIOUS
 from autdtorch.study.provenance import PROVENANCE_FILE, load_provenance
 from autdtorch.study.results_file import RESULTS_FILE, load_results
 from autdtorch.study.run import run_study
@@ -139,17 +139,19 @@ def test_a_study_that_is_kept_in_memory_leaves_nothing(tmp_path, monkeypatch):
 
 
 def test_a_damaged_matrix_is_computed_again(tmp_path, warnings):
-    simulated = functools.partial(study, tmp_path, scenes={"cube": small_scene((CUBE,))}, solver=SIMULATED)
+    cache = tmp_path / "matrices"
+    solver = SIMULATED | {"cache": cache}
+    simulated = functools.partial(study, tmp_path, scenes={"cube": small_scene((CUBE,))}, solver=solver)
     undisturbed = simulated()
-    matrices = contents(tmp_path / MATRICES_FOLDER)
+    matrices = contents(cache)
     for name, content in matrices.items():
-        (tmp_path / MATRICES_FOLDER / name).write_bytes(content[:-1] + b"\1")
+        (cache / name).write_bytes(content[:-1] + b"\1")
     (tmp_path / RESULTS_FILE).unlink()
     again = simulated()
     for name, scene in again.scenes.items():
         assert torch.equal(scene.transfer_matrix, undisturbed.scenes[name].transfer_matrix)
     assert len(warnings()) == len(matrices) > 0
-    assert contents(tmp_path / MATRICES_FOLDER) == matrices
+    assert contents(cache) == matrices
 
 
 def test_trials_of_other_shapes_do_not_count_though_the_settings_are_called_the_same(tmp_path):
