@@ -30,12 +30,13 @@ _ANOTHER = "of another study (other settings, source or packages)"
 class StudyFolder:
     """The files of a study on disk; see `open_folder`.
 
-    `provenance` has the date when the study was first begun; `scenes` are the finished ones, by name.
+    `provenance` has the date when the study was first begun; `scenes` are the finished ones, by name. `begin`
+    opens the file of `trials`.
     """
 
-    def __init__(
-        self, path: Path | None, provenance: Provenance, scenes: Mapping[str, Scene], reuse: bool
-    ) -> None:
+    trials: TrialFile
+
+    def __init__(self, path: Path, provenance: Provenance, scenes: Mapping[str, Scene], reuse: bool) -> None:
         """Read the files of the study with this provenance; the folder must be locked.
 
         Each file holds its own provenance, so that a damaged one does not spoil the others.
@@ -45,17 +46,14 @@ class StudyFolder:
         self.scenes: dict[str, SceneResult] = {}
         self._shapes = {name: (len(scene.array), len(scene.control_points)) for name, scene in scenes.items()}
         self._not_used = dict.fromkeys(_FILES, _ANOTHER)
-        self.trials = self._trial_file(None)
-        if path is not None and reuse:
-            self._take_up(path)
+        if reuse:
+            self._take_up()
 
     def begin(self) -> None:
         """Set aside damaged files and those of another study, and open the file of trials.
 
         Nothing is written before: a study that is refused leaves the folder as it was.
         """
-        if self.path is None:
-            return
         aside = {name: reason for name, reason in self._not_used.items() if (self.path / name).exists()}
         if aside:
             places = (self.path / f"{PREVIOUS}{number}" for number in itertools.count(1))
@@ -67,18 +65,18 @@ class StudyFolder:
             logger.warning("%s of %s kept in %s: %s", ", ".join(aside), self.path, kept, why)
         save_provenance(self.provenance, self.path)
         if TRIALS_FILE in self._not_used:
-            self.trials = self._trial_file(self.path)
+            self.trials = self._trial_file()
         self.trials.mend()
         if len(self.trials):
             logger.info("re-using %d trials from %s", len(self.trials), self.path)
 
-    def _take_up(self, path: Path) -> None:
+    def _take_up(self) -> None:
         """Use the files of this study; note why others are not used."""
         loaders: dict[str, Callable[[Path], StudyResult | Provenance]]
         loaders = {RESULTS_FILE: load_results, PROVENANCE_FILE: load_provenance}
         for name, load in loaders.items():
             try:
-                stored = load(path)
+                stored = load(self.path)
             except FileNotFoundError:
                 continue
             except ValueError as error:
@@ -91,34 +89,27 @@ class StudyFolder:
                 self.provenance = provenance
                 self.scenes |= scenes
         if self.scenes:
-            logger.info("re-using %s from %s, same settings and same source", ", ".join(self.scenes), path)
-        self.trials = self._trial_file(path)
+            names = ", ".join(self.scenes)
+            logger.info("re-using %s from %s, same settings and same source", names, self.path)
+        self.trials = self._trial_file()
         if len(self._not_used) < len(_FILES) or len(self.trials):
             del self._not_used[TRIALS_FILE]  # its lines are checked one by one
 
-    def _trial_file(self, path: Path | None) -> TrialFile:
-        file = None if path is None else path / TRIALS_FILE
-        return TrialFile(file, self.provenance.origin, self.provenance.seed, self._shapes)
+    def _trial_file(self) -> TrialFile:
+        return TrialFile(self.path / TRIALS_FILE, self.provenance.origin, self.provenance.seed, self._shapes)
 
     def save(self, name: str, scene: SceneResult) -> None:
         """Save a finished scene."""
         self.scenes[name] = scene
         self.scenes = {other: self.scenes[other] for other in self._shapes if other in self.scenes}
-        if self.path is not None:
-            save_results(StudyResult(self.provenance, self.scenes), self.path)
+        save_results(StudyResult(self.provenance, self.scenes), self.path)
 
 
 @contextlib.contextmanager
 def open_folder(
-    path: Path | None, provenance: Provenance, scenes: Mapping[str, Scene], reuse: bool
+    path: Path, provenance: Provenance, scenes: Mapping[str, Scene], reuse: bool
 ) -> Iterator[StudyFolder]:
-    """Lock the folder of a study, which is made if it is missing; None keeps the study in memory alone.
-
-    With `reuse`, files of the same origin are used again.
-    """
-    if path is None:
-        yield StudyFolder(None, provenance, scenes, reuse)
-        return
+    """Lock the folder of a study, made if it is missing; `reuse` takes files of its origin from it."""
     path.mkdir(parents=True, exist_ok=True)
     accepted = "another process writes there; wait until it ends, or give another folder"
     with held(FileLock(path / _LOCK_FILE), ValueError(f"output: {path}; {accepted}")):

@@ -54,12 +54,12 @@ _MOST_SAMPLES = 10**6  # of an observation plane: 16 complex columns of them are
 def run_study(
     scenes: Mapping[str, Scene],
     methods: Mapping[str, StudyMethod],
+    folder: Path,
     *,
     solver: Mapping[str, Any] | None = None,
     trials: int | Mapping[str, int] = 1,
     seed: int = 0,
     plane_spacing: float = 1e-3,
-    folder: Path | None = None,
     config: str = "",
 ) -> StudyResult:
     """Run every method in every scene; return the results of all scenes.
@@ -70,11 +70,11 @@ def run_study(
     Args:
         scenes: by name.
         methods: by name, such as ``GABS(levels=16)``.
+        folder: where trials are saved as they end, and scenes when they are finished.
         solver: arguments of `make_propagator`.
         trials: of every method that has random choices, or by method name.
         seed: of the random choices, >= 0; the same in every scene.
         plane_spacing: edge of a cell of the observation plane [m].
-        folder: where trials are saved as they end, scenes when they are finished; None to save nothing.
         config: all of the above as text. What the folder holds for the same text, made with the same source
             and packages, is taken from there. Without text, or with methods or obstacles that are not
             autdtorch's own, everything is computed.

@@ -23,18 +23,16 @@ TRIALS_FILE = "trials.jsonl"
 class TrialFile:
     """The finished trials by scene, method and number, in memory and in a file."""
 
-    def __init__(
-        self, path: Path | None, origin: str, seed: int, shapes: Mapping[str, tuple[int, int]]
-    ) -> None:
+    def __init__(self, path: Path, origin: str, seed: int, shapes: Mapping[str, tuple[int, int]]) -> None:
         """Read the trials of the study from the file, which is not changed before `mend`.
 
-        Without a path the trials are kept in memory alone. The origin is part of the checksum of the lines.
-        The `shapes` are the numbers of transducers and of control points by name of the scene.
+        The origin is part of the checksum of the lines. The `shapes` are the numbers of transducers and of
+        control points by name of the scene.
         """
         self._seed = seed
         self._shapes = shapes
         self._trials: dict[tuple[str, str, int], tuple[Solution, float]] = {}  # and its seconds
-        self._lines = None if path is None else JsonLines(path, origin, self._use)
+        self._lines = JsonLines(path, origin, self._use)
 
     def __len__(self) -> int:
         """Return the number of trials."""
@@ -42,8 +40,7 @@ class TrialFile:
 
     def mend(self) -> None:
         """Set aside lines that are damaged or of another study; call it before the first `append`."""
-        if self._lines is not None:
-            self._lines.mend()
+        self._lines.mend()
 
     def missing(self, scene: str, method: str, trials: int) -> list[int]:
         """Return which of the first `trials` trials are not there."""
@@ -58,8 +55,7 @@ class TrialFile:
         added = [trial for trial in trials if (scene, method, trial) not in self._trials]
         for trial in added:
             self._trials[scene, method, trial] = _alone(found, trials.index(trial)), share
-        if self._lines is not None:
-            self._lines.append(*(self._row(scene, method, trial) for trial in added))
+        self._lines.append(*(self._row(scene, method, trial) for trial in added))
 
     def found(self, scene: str, method: str, trials: int) -> tuple[Solution, torch.Tensor]:
         """Return the joined solution of the first `trials` trials, and seconds (T,) of each."""

@@ -41,7 +41,7 @@ HUGE: dict[str, tuple[str, Callable[[], object]]] = {
     "starts": ("starts", lambda: at.gradient_ascent(OBJECTIVE, starts=10**11)),
     "steps": ("steps", lambda: at.gradient_ascent(OBJECTIVE, steps=10**12)),
     "numbers of trials": ("trials", lambda: at.gabs(OBJECTIVE, trials=range(10**11))),
-    "study": ("trials.gabs", lambda: run_study({"a": AIR}, {"gabs": at.gabs}, trials=10**11)),
+    "study": ("trials.gabs", lambda: run_study({"a": AIR}, {"gabs": at.gabs}, Path(), trials=10**11)),
 }
 
 
@@ -77,12 +77,14 @@ def test_the_first_evaluations_by_strength_count(monkeypatch: pytest.MonkeyPatch
         at.gabs(objective, levels=2, order="strength", trials=20)
 
 
-def test_a_study_needs_the_memory_of_a_block_of_its_trials(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_study_needs_the_memory_of_a_block_of_its_trials(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(memory, "available_memory", lambda: 20_000_000)
     with pytest.raises(ValueError, match=r"^evaluations: 3000; needs about"):
         at.random_search(OBJECTIVE, evaluations=3000, trials=300)
     method = functools.partial(at.random_search, evaluations=3000)
-    study = run_study({"a": AIR}, {"random": method}, trials=300)
+    study = run_study({"a": AIR}, {"random": method}, tmp_path, trials=300)
     assert len(study.scenes["a"].methods["random"].solution.score) == 300
 
 

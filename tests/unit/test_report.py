@@ -3,7 +3,9 @@
 import base64
 import functools
 import re
+import tempfile
 from dataclasses import replace
+from pathlib import Path
 from unittest.mock import Mock
 from urllib.parse import unquote
 
@@ -43,7 +45,9 @@ def without_renderer(monkeypatch):
 
 
 def studied(scenes, **settings):
-    return run_study(scenes, METHODS, solver={"method": "free_space"}, plane_spacing=2e-3, **settings)
+    solver = {"method": "free_space"}
+    with tempfile.TemporaryDirectory() as folder:
+        return run_study(scenes, METHODS, Path(folder), solver=solver, plane_spacing=2e-3, **settings)
 
 
 def reported(scenes, folder, **settings):
@@ -194,5 +198,6 @@ def test_methods_may_differ_between_scenes_and_claims_without_data_are_no_table(
 def test_matrices_that_were_kept_are_no_runs_and_not_exact(tmp_path):
     solver = {"method": "full", "spacing": 2.8e-3, "tolerance": 0.05, "cache": tmp_path / "kept"}
     for runs in ("4", "0, kept on disk"):
-        results = run_study({"cube": scene(None, (CUBE,))}, {"gabs": METHODS["gabs"]}, solver=solver)
+        scenes = {"cube": scene(None, (CUBE,))}
+        results = run_study(scenes, {"gabs": METHODS["gabs"]}, tmp_path / runs, solver=solver)
         assert simulation_rows(results)[1][4] == runs

@@ -76,15 +76,16 @@ def test_every_trial_of_every_method_has_its_figures(scenes, tmp_path):
     assert len((tmp_path / TRIALS_FILE).read_text(encoding="utf-8").splitlines()) == 2 * 4
 
 
-def test_a_scene_without_observation_plane_has_no_areas():
-    result = run_study({"a": scene(None, obstacles=(CUBE,))}, METHODS, solver=FREE_SPACE).scenes["a"]
+def test_a_scene_without_observation_plane_has_no_areas(tmp_path):
+    scenes = {"a": scene(None, obstacles=(CUBE,))}
+    result = run_study(scenes, METHODS, tmp_path, solver=FREE_SPACE).scenes["a"]
     assert result.obstacles == 1
     for method in result.methods.values():
         assert method.metrics.area is None
         assert method.plane_pressure is None
 
 
-def test_the_runs_of_a_simulation_are_recorded(monkeypatch):
+def test_the_runs_of_a_simulation_are_recorded(tmp_path, monkeypatch):
     def simulate(self, sources, strength, receivers, stepped):
         rows, places = [], receivers.positions[:, 0]
         for nodes, own in zip(sources, strength, strict=True):
@@ -94,7 +95,7 @@ def test_the_runs_of_a_simulation_are_recorded(monkeypatch):
     monkeypatch.setattr(DomainSimulation, "_simulate", simulate)
     solver = {"method": "full", "spacing": 2e-3, "tolerance": 0.2, "kernel": "reference"}
     with pytest.warns(SteadyStateWarning):
-        result = run_study({"a": scene()}, METHODS, solver=solver).scenes["a"]
+        result = run_study({"a": scene()}, METHODS, tmp_path, solver=solver).scenes["a"]
     simulation = result.simulation
     assert (simulation.method, simulation.spacing, simulation.tolerance) == ("full", 2e-3, 0.2)
     # The transfer matrix of 3 control points, and the plane: one simulation for four equivalent transducers.
@@ -168,10 +169,10 @@ def test_a_study_goes_on_after_the_scenes_that_were_finished(scenes, count_runs,
         ({"methods": {"gabs": GABS(first=16)}}, "method gabs: first: 16; must be an integer from 0 to"),
     ],
 )
-def test_settings_are_checked_before_anything_is_simulated(changes, message, monkeypatch):
+def test_settings_are_checked_before_anything_is_simulated(changes, message, tmp_path, monkeypatch):
     monkeypatch.setattr(autdtorch.study.run, "_run_scene", lambda *_: pytest.fail("simulated too early"))
     with pytest.raises(ValueError, match=message) as caught:
-        run_study(**{"scenes": {"a": scene()}, "methods": METHODS} | changes)
+        run_study(**{"scenes": {"a": scene()}, "methods": METHODS, "folder": tmp_path} | changes)
     assert "\n" not in str(caught.value)
 
 
@@ -185,9 +186,9 @@ def test_another_study_is_kept_and_a_refused_one_moves_nothing(study, tmp_path):
 
 
 @pytest.mark.parametrize("returned", [1, 3])
-def test_a_method_returns_the_trials_it_is_asked_for(returned):
+def test_a_method_returns_the_trials_it_is_asked_for(returned, tmp_path):
     def method(objective, trials, seed):
         return gabs(objective, levels=4, trials=returned, seed=seed)
 
     with pytest.raises(ValueError, match=rf"method own: {returned} trials; must be the trials \[0, 1\]"):
-        run_study({"a": scene(None)}, {"own": method}, solver=FREE_SPACE, trials=2)
+        run_study({"a": scene(None)}, {"own": method}, tmp_path, solver=FREE_SPACE, trials=2)

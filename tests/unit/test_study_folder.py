@@ -132,12 +132,6 @@ def test_trials_alone_are_used_and_a_damaged_one_is_run_again(tmp_path, warnings
     assert again[:-1] == [lines[0], *lines[2:]]
 
 
-def test_a_study_that_is_kept_in_memory_leaves_nothing(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert torch.equal(numbers(study(None)), numbers(study(tmp_path / "kept")))
-    assert [path.name for path in tmp_path.iterdir()] == ["kept"]
-
-
 def test_a_damaged_matrix_is_computed_again(tmp_path, warnings):
     cache = tmp_path / "matrices"
     solver = SIMULATED | {"cache": cache}

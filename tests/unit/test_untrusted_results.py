@@ -1,8 +1,10 @@
 """Results from others: names are safe as file names, and texts stay texts in a report."""
 
 import functools
+import tempfile
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 
 import pytest
 import yaml
@@ -38,7 +40,9 @@ def without_renderer(monkeypatch):
 def study(solver=None, seed=0):
     settings = {"scene": SCENE, "method": {"_target_": "autdtorch.gabs"}, "solver": solver or {}}
     methods = {"gabs": functools.partial(gabs, levels=2)}
-    return run_study({"air": load_scene(SCENE)}, methods, seed=seed, config=yaml.safe_dump(settings))
+    with tempfile.TemporaryDirectory() as folder:
+        scenes, text = {"air": load_scene(SCENE)}, yaml.safe_dump(settings)
+        return run_study(scenes, methods, Path(folder), seed=seed, config=text)
 
 
 #: HDF5 itself has no groups of the first four names.
@@ -46,12 +50,12 @@ NAMES = ["", ".", "a/b", "a\0b", "..", "...", "..\\a", "a\nb", "a b", "x" * 101,
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_study_refuses_a_name_that_is_no_part_of_a_file_name(name):
+def test_a_study_refuses_a_name_that_is_no_part_of_a_file_name(tmp_path, name):
     scene, method = load_scene(SCENE), functools.partial(gabs, levels=2)
     with pytest.raises(ValueError, match=r"^scenes: "):
-        run_study({name: scene}, {"gabs": method})
+        run_study({name: scene}, {"gabs": method}, tmp_path)
     with pytest.raises(ValueError, match=r"^methods: "):
-        run_study({"air": scene}, {name: method})
+        run_study({"air": scene}, {name: method}, tmp_path)
 
 
 @pytest.mark.parametrize("name", NAMES[4:])
