@@ -52,11 +52,8 @@ class EvaluationLog:
     A line is on disk before the next evaluation begins: a process that ends at any moment loses at most the
     evaluation in flight. The log is locked until `end`, or until this object is released.
 
-    Attributes:
-        path: of the file.
-        origin: settings of the trial, by name.
-        goes_on: true if the file has existed before.
-        seconds_on: total time that the outputs were on, by its lines [s].
+    Attributes are its `path`, the `origin`, `goes_on`, true if the file has existed before, and `seconds_on`,
+    the total time that the outputs were on, by its lines [s].
     """
 
     def __init__(self, path: str | Path, origin: Mapping[str, Any], transducers: int, points: int) -> None:
@@ -66,7 +63,7 @@ class EvaluationLog:
         trial is overwritten if it holds no evaluation.
 
         Args:
-            path: path of the file.
+            path: of the file.
             origin: settings of the trial by name, values of JSON; the first that differs is reported.
             transducers: number of transducers M.
             points: number of control points P.

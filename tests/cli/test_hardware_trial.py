@@ -103,7 +103,6 @@ OPENMPD = ("hardware=openmpd", "hardware.limits.amplitude=1", "hardware.transduc
     [
         (("hardware=emulated",), "hardware.limits.amplitude: none; must be given"),
         ((*GABS, "hardware.limits.amplitude=0.5"), "amplitude: 0.5; must be >= 1"),
-        ((*GABS, "hardware.limits.amplitude=0"), "amplitude: 0"),
         ((*GABS, "+hardware.limits.loudness=3"), "loudness"),
         ((*GABS, "+hardware.colour=red"), "hardware: unknown key 'colour'"),
         ((*OPENMPD, "hardware/sensor=emulated"), "hardware.sensor: 'emulated'; must be scope, file or"),

@@ -95,7 +95,6 @@ def nobody(question: str) -> str:
         (lambda: [1.0, float("nan")], "pressure of the sensor"),
         (lambda: ["noise", 1.0], "pressure of the sensor"),
         (lambda: [1.0], "pressure of the sensor"),
-        (lambda: [1.0, -1.0], "pressure of the sensor"),
         (hw.ManualSensor([(0, 0, 0), (1, 0, 0)], nobody).read, "nobody answers"),
         (hw.FileSensor("no/such/file", 2, timeout=0.01).read, "did not change"),
     ],

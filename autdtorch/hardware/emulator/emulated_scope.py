@@ -180,8 +180,8 @@ class EmulatedScope:
 class EmulatedInstrument(EmulatedDevice):
     """The USB interface of an instrument: USB488, without its interrupt endpoint.
 
-    A message longer than `longest` bytes comes in several transfers. If `sends_empty_packets`, one follows a
-    transfer of whole packets, as USB demands; some instruments send none.
+    A message longer than `longest` bytes comes in several transfers. An empty packet follows a transfer of
+    whole packets, as USB demands, if `sends_empty_packets`; some instruments send none.
     """
 
     interfaces = (((0xFE, 0x03, 0x01), (0x82, 0x01)),)
@@ -212,7 +212,10 @@ class EmulatedInstrument(EmulatedDevice):
         if kind == 2 and len(data) == 12:
             self._asked = tag, length
         elif kind == 1 and len(data) == 12 + length + -length % 4:
-            self._take(data[12 : 12 + length], ends=bool(data[8] & 1))
+            self._received += data[12 : 12 + length]
+            if data[8] & 1:  # the message ends
+                line, self._received = self._received.decode("ascii").strip(), b""
+                self._answer = self._instrument.execute(line) or b""
         else:
             raise stall()
 
@@ -237,12 +240,6 @@ class EmulatedInstrument(EmulatedDevice):
         data, self._answer = self._answer[:size], self._answer[size:]
         header = bytes([2, tag, 255 - tag, 0, *len(data).to_bytes(4, "little"), not self._answer, 0, 0, 0])
         return header + data + bytes(-len(data) % 4)
-
-    def _take(self, data: bytes, ends: bool) -> None:
-        self._received += data
-        if ends:
-            line, self._received = self._received.decode("ascii").strip(), b""
-            self._answer = self._instrument.execute(line) or b""
 
 
 def _short(header: str) -> str:
