@@ -25,13 +25,7 @@ from .plot.pressure_maps import plot_plane, plot_planes
 from .plot.scene_figure import plot_scene
 from .plot.trials import plot_convergence, plot_trials
 from .plot.view3d import animate3d, view3d
-from .propagators import (
-    SteadyStateWarning,
-    cell_centers,
-    differentiable_field,
-    make_propagator,
-    volume_field,
-)
+from .propagators import SteadyStateWarning, cell_centers, differentiable_field, make_propagator, volume_field
 from .propagators.estimate import Estimate, estimate
 from .scene.arrays import PAPER_SOURCE_STRENGTH, TransducerArray
 from .scene.drive import amplitudes_of, drive_from_phases, focus_phases, phases_of

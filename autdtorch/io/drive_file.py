@@ -24,14 +24,7 @@ from autdtorch.scene.drive import (
 from autdtorch.utils.array_types import AnyArray
 from autdtorch.utils.files import replacing
 from autdtorch.utils.numpy_file import read_arrays
-from autdtorch.utils.validation import (
-    ArrayLike,
-    path_of,
-    real_tensor,
-    require_kind,
-    require_one_of,
-    within,
-)
+from autdtorch.utils.validation import ArrayLike, path_of, real_tensor, require_kind, require_one_of, within
 
 _FORMATS = (".csv", ".npz")
 _LEVEL_COLUMNS = {f"{name} {column}": "" for name, device in DEVICES.items() for column in device.columns}

@@ -11,18 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, NullLocator
 
+from autdtorch.plot import style
 from autdtorch.plot.data import ByMethod, by_scene, labelled, methods_of, require_each
-from autdtorch.plot.style import (
-    TICK_SIZE,
-    Look,
-    add_legend,
-    label_of,
-    log_axes,
-    looks_of,
-    new_figure,
-    new_panels,
-    styled,
-)
+from autdtorch.plot.style import TICK_SIZE, Look, add_legend, label_of, log_axes, looks_of, styled
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import boolean, invalid, members, require_kind
 
@@ -64,7 +55,7 @@ def plot_pareto(
     if names is not None:
         require_each("names", names, data)
     looks = looks_of(methods_of(data.values()))
-    figure, panels = new_panels(data, _PANEL, _PANEL, xlabel, ylabel, sharey=higher_is_better)
+    figure, panels = style.new_panels(data, _PANEL, _PANEL, xlabel, ylabel, sharey=higher_is_better)
     for ax, (scene, drawn) in zip(panels, data.items(), strict=True):
         for method, values in drawn.items():
             _draw_points(ax, values, looks[method], higher_is_better)
@@ -156,7 +147,7 @@ def plot_scaling(costs: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
     data = labelled("costs", costs, "points", "2", positive=2)
     growths = methods_of(data.values())
     looks = looks_of(methods_of(series for by_size in data.values() for series in by_size.values()))
-    figure = new_figure(0.6 + 2.5 * len(growths), 0.2 + 2.7 * len(data))
+    figure = style.new_figure(0.6 + 2.5 * len(growths), 0.2 + 2.7 * len(data))
     panels = figure.subplots(len(data), len(growths), squeeze=False, sharex="col", sharey="row")
     for line, (label, by_size) in zip(panels, data.items(), strict=True):
         for ax, growth in zip(line, growths, strict=True):
@@ -183,8 +174,8 @@ def _draw_series(ax: Axes, name: str, values: Array, look: Look) -> None:
         name += f", slope {fit.exponent:.1f}".replace("-", "\N{MINUS SIGN}")
     elif len(values) >= FEWEST:
         name += f", within a factor {costs.max() / costs.min():.2g}"
-    style: Any = {"color": look.colour, "marker": look.marker, "linestyle": look.dashes, "label": name}
-    ax.plot(sizes, costs, ms=4, lw=1.2, **style)
+    line: Any = {"color": look.colour, "marker": look.marker, "linestyle": look.dashes, "label": name}
+    ax.plot(sizes, costs, ms=4, lw=1.2, **line)
 
 
 def _mark_sizes(ax: Axes, sizes: Array) -> None:

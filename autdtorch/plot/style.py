@@ -52,9 +52,7 @@ _STYLE: Any = {  # Any: Matplotlib types every key by itself
     "axes.spines.top": False,
     "axes.spines.right": False,
 }
-styled = mpl.rc_context(_STYLE)
-"""Decorator for functions that make a figure."""
-
+styled = mpl.rc_context(_STYLE)  # decorator for functions that make a figure
 TICK_SIZE = 8.0  # not in the style, which is no longer set when the figure is drawn and its ticks are made
 
 _DPI = 150

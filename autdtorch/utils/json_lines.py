@@ -16,9 +16,7 @@ from autdtorch.utils.files import naming, replace_file
 
 logger = logging.getLogger(__name__)
 
-SET_ASIDE = ".damaged"
-"""Suffix of the file, next to the first, that keeps the lines that cannot be used."""
-
+SET_ASIDE = ".damaged"  # suffix of the file, next to the first, that keeps the lines that cannot be used
 _SEAM = re.compile(rb'(?=\{")|(?<="\})')  # possible start or end of a row without nested objects
 _WRONG_CHECKSUM = "its checksum is wrong"
 _BROKE_OFF = "the last line broke off"

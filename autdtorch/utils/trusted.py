@@ -1,8 +1,4 @@
-"""Functions and classes that config files name by `_target_`, from modules that the user trusts.
-
-A config file may come from others, so it never decides what runs: the user names the modules, on the command
-line or as an argument.
-"""
+"""Functions and classes that config files name by `_target_`, from modules that the user, no file, names."""
 
 from __future__ import annotations
 
@@ -13,8 +9,7 @@ from collections.abc import Callable, Collection
 from types import FunctionType
 from typing import Any
 
-TARGET = "_target_"
-"""Key that names the function or class."""
+TARGET = "_target_"  # key that names the function or class
 
 
 def load_trusted(where: str, target: object, modules: Collection[Any], ours: str = "") -> Callable[..., Any]:

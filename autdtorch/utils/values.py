@@ -12,9 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-DEEPEST = 16
-"""Largest number of axes of an array, or of nested lists; some functions of PyTorch take at most 25."""
-
+DEEPEST = 16  # most axes of an array, or levels of nested lists; some functions of PyTorch take at most 25
 SHOWN_ENTRIES = 9
 _SHOWN_CHARACTERS = 120
 _SHOWN_BITS = 128  # of an integer; Python refuses to write out very large ones
