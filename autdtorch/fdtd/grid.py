@@ -79,14 +79,10 @@ class Grid:
         return x, y, z
 
     @property
-    def wavelength(self) -> float:
-        """Wavelength in air [m]."""
-        return 2 * math.pi * self.spacing / self.kappa
-
-    @property
-    def diagonal(self) -> float:
-        """Longest path through the interior [m]."""
-        return self.spacing * math.hypot(*self.interior)
+    def crossing(self) -> float:
+        """Time of sound in air along the longest path through the interior [periods]."""
+        wavelength = 2 * math.pi * self.spacing / self.kappa
+        return self.spacing * math.hypot(*self.interior) / wavelength
 
     @cached_property
     def centers(self) -> tuple[Array, Array, Array]:

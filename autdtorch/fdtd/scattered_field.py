@@ -51,12 +51,18 @@ class ScatteredField:
         both = torch.view_as_real(torch.from_numpy(force)).to(assembly.dtype)
         return Sources(torch.from_numpy(assembly.heterogeneous.index), both)
 
+    def waves(self, points: Tensor, sources: Tensor, amplitude: Tensor, nearest: float = 0.0) -> Tensor:
+        """Return fields (P, R) at points (P, 3) [m] of sources (N, 3) [m], amplitudes (N, R) [Pa m]."""
+        from autdtorch.fdtd.kernels.cpu_waves import superposition  # loads numba
+
+        return superposition(points, sources, amplitude, self.wavenumber, nearest, self.assembly.dtype)
+
     def incident(
         self, points: Tensor, nodes: Tensor, weights: Tensor, strength: Tensor, nearest: float = 0.0
     ) -> Tensor:
         """Return the incident field (P,) at points (P, 3) [m] of sources with nodes (N, n, 3) [m]."""
         amplitude = strength.repeat_interleave(len(weights)) * weights.repeat(len(strength))
-        return self._sum(points, nodes.reshape(-1, 3), amplitude[:, None], nearest)[:, 0]
+        return self.waves(points, nodes.reshape(-1, 3), amplitude[:, None], nearest)[:, 0]
 
     def driving(self, nodes: Tensor, weights: Tensor, strength: Tensor) -> Tensor:
         """Return the incident field (n,) at the `driven` positions; see `incident`."""
@@ -64,7 +70,7 @@ class ScatteredField:
 
     def near_to_far(self, nodes: Tensor, weights: Tensor) -> NearToFar:
         """Return the transform to P targets: means with `weights` (n,) over nodes (P, n, 3) [m]."""
-        _, surface, outward = self._surface
+        _, surface, outward = self.surface
         within = self.inside(nodes)
         inner = self.assembly.interpolation(nodes[within])
         cells = np.unique(np.concatenate((surface, inner.index.ravel())))
@@ -73,11 +79,7 @@ class ScatteredField:
 
     def radiated(self, amplitude: Tensor, points: Tensor) -> Tensor:
         """Return fields (P, R) at points (P, 3) [m] of the Huygens surface with amplitudes (n, R) [Pa m]."""
-        return self._sum(points, self._surface[0], amplitude, 0.0)
-
-    def at_surface(self, sources: Tensor, amplitude: Tensor) -> Tensor:
-        """Return fields (n, R) at the Huygens surface of sources (N, 3) [m], amplitudes (N, R) [Pa m]."""
-        return self._sum(self._surface[0], sources, amplitude, 0.0)
+        return self.waves(points, self.surface[0], amplitude)
 
     def inside(self, points: Tensor) -> Tensor:
         """Return which points (..., 3) are read from the grid; others are clear of the Huygens surface."""
@@ -100,7 +102,7 @@ class ScatteredField:
         return cells, place.reshape(around.shape)
 
     @cached_property
-    def _surface(self) -> tuple[Tensor, Index, csr_array]:
+    def surface(self) -> tuple[Tensor, Index, csr_array]:
         """Positions (n, 3) of the Huygens surface, the cells (m,) it reads, and their weights (n, m)."""
         assembly = self.assembly
         grid, stencil = assembly.grid, assembly.stencil
@@ -120,11 +122,6 @@ class ScatteredField:
         value = factor / assembly.stencil.source_factor(float(assembly.steps_per_period))
         value = value * stencil.weights[column] * step[row, column]
         return self.positions(index), cells, csr_array((value, (row, place)), (len(index), len(cells)))
-
-    def _sum(self, points: Tensor, sources: Tensor, amplitude: Tensor, nearest: float) -> Tensor:
-        from autdtorch.fdtd.kernels.cpu_waves import superposition  # loads numba
-
-        return superposition(points, sources, amplitude, self.wavenumber, nearest, self.assembly.dtype)
 
 
 @dataclass(frozen=True)
@@ -157,7 +154,7 @@ class NearToFar:
         outside = self.nodes[::every][~within]
         amplitude = torch.zeros((len(outside), len(within)), dtype=torch.complex128, device="cpu")
         amplitude[torch.arange(len(outside), device="cpu"), target[~within]] = share[~within] + 0j
-        received = self.box.at_surface(outside, amplitude)  # reciprocity of Green's function
+        received = self.box.waves(self.box.surface[0], outside, amplitude)  # reciprocity of Green's function
         number = torch.zeros(self.within.shape, dtype=torch.int64, device="cpu")
         number[self.within] = torch.arange(int(self.within.sum()), device="cpu")
         place = target[within].numpy(), number[::every][within].numpy()

@@ -62,7 +62,7 @@ def run_to_steady_state(
     `observe` maps the phasors of `cells` (k,) to the quantity that must converge, once sound has crossed the
     grid twice. `stepped` is called with the number of periods after each block.
     """
-    earliest = fewest_periods(assembly.grid.diagonal / assembly.grid.wavelength)
+    earliest = fewest_periods(assembly.grid.crossing)
     sequence = Extrapolation(phasors_kept(len(cells)))
     values: deque[Tensor] = deque(maxlen=3)
     ramp = math.ceil(RAMP_PERIODS * assembly.steps_per_period)

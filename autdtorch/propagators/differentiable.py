@@ -85,7 +85,7 @@ def differentiable_field(
     warn_if_coarse(speeds, scene.frequency, spacing)
     warn_of_ending_walls(scene)
     if periods is None:
-        periods = fewest_periods(grid.diagonal / grid.wavelength)
+        periods = fewest_periods(grid.crossing)
     periods = integer_at_least("periods", periods, 1)
     time_step = None if time_step is None else positive("time_step", time_step, "s")
     by_maps = any(one is not None and one.ndim == 3 for one in given)
