@@ -157,32 +157,30 @@ def _scaled_cosine_and_sine(inner: ComplexArray, length: float) -> tuple[Complex
     return np.asarray((1 + np.exp(phase)) / 2, np.complex128), np.asarray(sine, np.complex128)
 
 
-def sommerfeld_integral(
-    spectrum: Callable[[ComplexArray], ComplexArray],
-    wavenumbers: tuple[float, float],
-    offset: float,
-    height: float,
-    reverberation: float,
-) -> complex:
-    """Return i / 4 pi times the integral of F(kappa) J_0(kappa offset) kappa / gamma, kappa = 0 to infinity.
+def source_response(layering: Layering, offset: float, height: float, source_height: float) -> complex:
+    """Return the field at a horizontal `offset` and a `height` [m] of a point source at `source_height` [m].
 
-    F is the `spectrum` of a point source between plane waves of the `wavenumbers` [rad/m] outside and in the
-    layer; F = e^{i gamma height} gives `green` (Brekhovskikh & Godin, Acoustics of Layered Media II, 1992,
-    chapter 1). Its singularities lie between 0 and the larger wavenumber: branch points and poles of guided
-    waves on the real axis, poles of leaky waves above it. The contour passes below all of them. Beyond, where
-    F is real for real kappa and decays like e^{-kappa height}, both halves of J_0 follow their paths of
-    steepest descent. `offset` and `height` [m] are the horizontal and vertical distance, not both zero.
-    `reverberation` is the path back and forth in the layer [m], which makes F oscillate faster.
+    It is the reflected wave for `height` >= 0, else the total field: i / 4 pi times the integral of
+    F(kappa) J_0(kappa offset) kappa / gamma from kappa = 0 to infinity (Brekhovskikh & Godin, Acoustics of
+    Layered Media II, 1992, chapter 1). F = e^{i gamma height} gives `green`. Singularities of F lie between
+    0 and the larger wavenumber: branch points and poles of guided waves on the real axis, poles of leaky
+    waves above it. The contour passes below all of them. Beyond, where F is real for real kappa and decays
+    like e^{-kappa height}, both halves of J_0 follow their paths of steepest descent.
     """
-    wavenumber = wavenumbers[0]
+    wavenumbers = (layering.wavenumber, layering.inner_wavenumber)
+    vertical, end = source_height + abs(height), 1.5 * max(wavenumbers)
 
     def integrand(kappa: ComplexArray) -> ComplexArray:
-        return spectrum(kappa) * kappa / vertical_wavenumber(wavenumber, kappa)
+        gamma = vertical_wavenumber(layering.wavenumber, kappa)
+        if height >= 0:
+            spectrum = layering.reflected(kappa) * np.exp(1j * gamma * vertical)
+        else:
+            spectrum = layering.transmitted(kappa, -height) * np.exp(1j * gamma * source_height)
+        return spectrum * kappa / gamma
 
-    end = 1.5 * max(wavenumbers)
-    kappa, weights = _contour(wavenumbers, end, offset, height + reverberation)
+    kappa, weights = _contour(wavenumbers, end, offset, vertical + 2 * layering.depth)
     total = np.sum(weights * integrand(kappa) * jv(0, kappa * offset))
-    return complex(0.25j / np.pi * (total + _tail(integrand, end, offset, height)))
+    return complex(0.25j / np.pi * (total + _tail(integrand, end, offset, vertical)))
 
 
 def _contour(

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import torch
 
 from autdtorch.analytic.green import green
-from autdtorch.analytic.layers import Layering, sommerfeld_integral, vertical_wavenumber
-from autdtorch.utils.array_types import ComplexArray
+from autdtorch.analytic.layers import Layering, source_response
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
@@ -137,7 +135,7 @@ def _layered_field(
     between = targets[:, None] - origins
     offsets = (between - (between @ axis)[..., None] * axis).norm(dim=-1)
     rows = [
-        [_response(layering, offset, height, source) for offset, source in zip(row, above, strict=True)]
+        [source_response(layering, offset, height, source) for offset, source in zip(row, above, strict=True)]
         for row, height in zip(offsets.tolist(), heights.tolist(), strict=True)
     ]
     field = torch.tensor(rows, dtype=torch.complex128, device=targets.device)
@@ -147,19 +145,6 @@ def _layered_field(
         sign = -1 if scattered else 1
         field[incident] += sign * green(targets[incident], origins, layering.wavenumber)
     return field
-
-
-def _response(layering: Layering, offset: float, height: float, source_height: float) -> complex:
-    """Return the reflected wave for `height` >= 0 [m], the total field below."""
-
-    def spectrum(kappa: ComplexArray) -> ComplexArray:
-        gamma = vertical_wavenumber(layering.wavenumber, kappa)
-        if height >= 0:
-            return layering.reflected(kappa) * np.exp(1j * gamma * (source_height + height))
-        return layering.transmitted(kappa, -height) * np.exp(1j * gamma * source_height)
-
-    wavenumbers = (layering.wavenumber, layering.inner_wavenumber)
-    return sommerfeld_integral(spectrum, wavenumbers, offset, source_height + abs(height), 2 * layering.depth)
 
 
 def _heights(
