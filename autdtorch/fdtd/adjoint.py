@@ -1,15 +1,13 @@
-"""Gradients of receiver records, by an adjoint run of any kernel.
+"""Gradients of receiver records, by an adjoint run of any kernel (`docs/decisions/gradients.md`).
 
-Multiplied by the masses of its cells the scheme is symmetric, boundary layers included. A force on cell j
-moves cell i as a force on cell i moves cell j, times m_j / m_i. The derivatives lambda of a loss by all
-forces come from a run of the same kernel, driven in the receivers' cells by the loss's derivatives over the
-masses, last step first, and read times the masses:
+The derivatives lambda of a loss by all forces come from a run of the same kernel, driven in the receivers'
+cells by the loss's derivatives over the masses, last step first, and read times the masses:
 
     dL / d force_is  = sum_t lambda_i(t) signal_s(t)
     dL / d weight_ij = sum_t lambda_i(t) (p_j(t) - p_i(t)).
 
 The second sum needs the run itself in reverse. Its state is kept at the beginning of segments, which are
-stepped again with the heterogeneous cells and their neighbours as receivers (`docs/decisions/gradients.md`).
+stepped again with the heterogeneous cells and their neighbours as receivers.
 """
 
 from __future__ import annotations

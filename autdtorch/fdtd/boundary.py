@@ -10,8 +10,7 @@ g = 1 / (1 + sigma / (alpha - i w)). In time this takes two memory variables (CP
 
 With E_a u the term that the layer adds to d2 u, T_a + E_a replaces every sum T_a of the two neighbours along
 axis a in the 27-point sum, in products too: the exact complex stretching of the *discrete* equation, edges
-and corners of the grid included. A wave at angle t behaves as in one dimension with the wavenumber k cos t.
-The reflection is a small linear system for each angle, and the profile minimises it for all angles at once.
+and corners of the grid included (`docs/decisions/boundary-layer.md`).
 
 A layer repeats the cells that it touches, so the stencil row of a cell is constant along the layer's normal.
 The kernels stretch rows as in air, scaled to the sum of the cell's own weights: exact inside an obstacle. The
@@ -95,7 +94,7 @@ def tuned_profile(kappa: float, steps_per_period: float, cells: int) -> LayerPro
     """Return the profile of `cells` cells with the least reflection at the drive frequency, at all angles.
 
     Every value of the damping is free. The complex reflection at `TUNED_ANGLES` is fitted, as its magnitude
-    is not smooth. Angles up to 60 degrees weigh ten times as much as others.
+    is not smooth; angles up to 60 degrees weigh ten times as much as others.
     """
     frequency = 2 * math.pi / steps_per_period
     along, turn = kappa * np.cos(TUNED_ANGLES), np.full_like(TUNED_ANGLES, frequency)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -33,14 +32,6 @@ _WORTHWHILE = 0.9  # Error of an asymmetric placement, relative to the symmetric
 _ALLOWANCE = 0.07
 
 
-class _Faces(NamedTuple):
-    """F axis-aligned faces."""
-
-    place: Array  # distance from one end of the extent (F,) [m]
-    first: Array  # 1 where the lighter side comes first, -1 where the heavier does (F,)
-    area: Array  # area (F,) [m^2]
-
-
 def grid_offset(
     region: Region, spacing: float, lower: Sequence[float], upper: Sequence[float]
 ) -> tuple[float, float, float]:
@@ -60,8 +51,11 @@ def _triangles(shape: Shape) -> tuple[Array, Array]:
     return first, np.cross(second - first, third - first)
 
 
-def _faces(region: Region, surfaces: list[tuple[Array, Array]], axis: int, origin: float) -> _Faces:
-    """Return the faces across an axis within the domain."""
+def _faces(region: Region, surfaces: list[tuple[Array, Array]], axis: int, origin: float) -> Array:
+    """Return the faces across an axis within the domain (3, F): distance from `origin` [m], side, area [m^2].
+
+    The side is 1 where the lighter material comes first, and -1 where the heavier does.
+    """
     low, high = (corner[axis] for corner in region.domain)
     parts = [np.zeros((3, 0))]
     for body, (corner, normal) in zip(region.bodies, surfaces, strict=True):
@@ -74,10 +68,10 @@ def _faces(region: Region, surfaces: list[tuple[Array, Array]], axis: int, origi
         parts.append(np.stack((place - origin, first, double[aligned] / 2))[:, inside])
     place, first, area = np.concatenate(parts, axis=1)
     faces, own = np.unique(np.stack((place.round(9), first)), axis=1, return_inverse=True)
-    return _Faces(faces[0], faces[1], np.bincount(own.ravel(), area, faces.shape[1]).astype(np.float64))
+    return np.vstack((faces, np.bincount(own.ravel(), area, faces.shape[1])))
 
 
-def _axis_offset(faces: _Faces, transducers: Array, length: float, spacing: float) -> float:
+def _axis_offset(faces: Array, transducers: Array, length: float, spacing: float) -> float:
     """Return the offset [cells] with a small mean square error of the faces, if possible a symmetric one."""
     place, first, area = faces
     cells, whole = place / spacing, length / spacing
