@@ -16,7 +16,7 @@ from public_calls import Call, public_calls
 from wrong_values import WRONG, Wrong, spoiled
 
 import autdtorch as at
-from autdtorch.plot.view3d import animation, view
+from autdtorch.plot.view3d import views
 from autdtorch.scene.drive import normalise, validate_drive
 from autdtorch.scene.geometry import plane_basis
 
@@ -45,8 +45,7 @@ def nothing_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
     def stop() -> None:
         raise Accepted
 
-    monkeypatch.setattr(animation, "require_rendering", stop)
-    monkeypatch.setattr(view, "require_rendering", stop)
+    monkeypatch.setattr(views, "require_rendering", stop)
 
 
 def refusal(function: Callable[..., Any], arguments: dict[str, Any]) -> Exception | None:
