@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 
-from autdtorch.scene.geometry import plane_basis
+from autdtorch.scene.geometry import circle_points
 from autdtorch.utils.validation import Vector
 
 SEGMENTS = 48
@@ -27,9 +25,7 @@ def revolved(profile: torch.Tensor, center: Vector, axis: Vector) -> tuple[torch
         axis: unit vector (3,).
     """
     rings, count = len(profile) - 2, SEGMENTS
-    u, v = plane_basis(axis)
-    angles = 2 * math.pi * torch.arange(count, dtype=torch.float64, device="cpu") / count
-    circle = angles.cos()[:, None] * u + angles.sin()[:, None] * v
+    circle = circle_points((0.0, 0.0, 0.0), 1.0, count, axis)
     upwards = torch.tensor(axis, dtype=torch.float64, device="cpu")
     bottom, top = (profile[end, 1] * upwards for end in (0, -1))
     sides = profile[1:-1, :1, None] * circle + profile[1:-1, 1:, None] * upwards

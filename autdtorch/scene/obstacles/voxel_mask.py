@@ -88,8 +88,7 @@ class VoxelMask(Obstacle):
     def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the faces between voxels of body and air; see `Obstacle.surface`."""
         mask = np.pad(self.mask, 1)
-        signs = np.array([0, 1])
-        corners = np.stack(np.meshgrid(signs, signs, signs, indexing="ij"), axis=-1).reshape(8, 3)
+        corners = np.indices((2, 2, 2)).reshape(3, 8).T
         quads = []
         for side, triangles in enumerate(BOX_TRIANGLES.reshape(6, 2, 3).numpy()):
             axis, step = side // 2, 2 * (side % 2) - 1
