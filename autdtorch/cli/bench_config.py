@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -66,8 +67,7 @@ class Bench:
         )
         _require_sensor(self._sensor, self._emulated)
         _require_fit(section, self._emulated)
-        self._boards = _openmpd_boards(section)
-        self.device = hardware.openmpd_boards(self._boards) if self._boards else _device(section)
+        self.device, self._boards = _device(section)
         self.transducers = self._wired(len(scene.array))
         failed = section["failed"]
         self._failed = indices_of("hardware.failed", failed, len(scene.array)) if failed else []
@@ -224,22 +224,19 @@ def _require_fit(section: Mapping[str, Any], emulated: bool) -> None:
             raise invalid(f"hardware.{key}", section[key], f"must be null: it is for {bench}")
 
 
-def _device(section: Mapping[str, Any]) -> hardware.Device:
-    boards = 1 if section["boards"] is None else section["boards"]
-    return hardware.DEVICES[section["device"]].with_boards(integer_at_least("hardware.boards", boards, 1))
-
-
-def _openmpd_boards(section: Mapping[str, Any]) -> list[OpenMPDBoard]:
-    """Return the boards of OpenMPD from their .pat files, if there are any."""
-    boards = section["boards"]
-    if section["device"] != "openmpd" or boards is None:
-        return []
-    if not isinstance(boards, list) or not boards:
-        raise invalid("hardware.boards", boards, "must be a list of the boards' .pat files")
-    for name in boards:
+def _device(section: Mapping[str, Any]) -> tuple[hardware.Device, list[OpenMPDBoard]]:
+    """Return the device, and the boards of OpenMPD from their .pat files, if there are any."""
+    given = section["boards"]
+    if section["device"] != "openmpd" or given is None:
+        count = integer_at_least("hardware.boards", 1 if given is None else given, 1)
+        return hardware.DEVICES[section["device"]].with_boards(count), []
+    if not isinstance(given, list) or not given:
+        raise invalid("hardware.boards", given, "must be a list of the boards' .pat files")
+    for name in given:
         if not Path(str(name)).is_file():
             raise invalid("hardware.boards", name, "no such file; must be the .pat files of the boards")
-    return [OpenMPDBoard.load(str(name)) for name in boards]
+    boards = [OpenMPDBoard.load(str(name)) for name in given]
+    return hardware.openmpd_boards(boards), boards
 
 
 def _deviating(
@@ -259,14 +256,11 @@ def _deviating(
 
 def _chip(text: object) -> tuple[int, int]:
     """Return idVendor and idProduct of text such as "2a8d:1770", as lsusb shows them."""
-    try:
-        vendor, product = (int(part, 16) for part in str(text).split(":"))
-    except ValueError:
-        vendor = product = -1
-    if not (0 <= vendor < 2**16 and 0 <= product < 2**16):
+    found = re.fullmatch(r"(?:0x)?([0-9a-f]{1,4}):(?:0x)?([0-9a-f]{1,4})", str(text), re.IGNORECASE)
+    if found is None:
         accepted = "must be VID:PID with four digits each, as 2a8d:1770"
         raise invalid("hardware.sensor.chip", text, accepted)
-    return vendor, product
+    return int(found[1], 16), int(found[2], 16)
 
 
 def _network(network: object) -> Any:

@@ -43,8 +43,6 @@ StudyMethod: TypeAlias = Method | Callable[..., Solution]
 """A `Method`, or a function of an objective with its settings bound. A function that has parameters `trials`
 and `seed` is given the numbers of the trials to run, as many as it is to return, and the study's seed."""
 
-_GIVEN = ("trials", "seed")  # parameters of a method that the study gives, if it has them
-
 BLOCK = 10
 """Trials that are run and saved together. The end of the process costs the block in work at most."""
 
@@ -153,8 +151,8 @@ def solve(method: StudyMethod, objective: Objective, trials: Trials, seed: int) 
     if isinstance(method, Method):
         return run(method, objective, trials, seed)
     taken = inspect.signature(method).parameters
-    given = zip(_GIVEN, (trials, seed), strict=True)
-    return method(objective, **{key: value for key, value in given if key in taken})
+    given = {"trials": trials, "seed": seed}
+    return method(objective, **{key: value for key, value in given.items() if key in taken})
 
 
 def _run_scene(

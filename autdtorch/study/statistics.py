@@ -23,11 +23,11 @@ _SEED = 0
 
 @dataclass(frozen=True)
 class Interval:
-    """A number with its confidence interval; the ends are infinite if the interval is unknown."""
+    """A number with its confidence interval, infinite if it is unknown and empty if the number is exact."""
 
     value: float
-    low: float
-    high: float
+    low: float = -math.inf
+    high: float = math.inf
 
     def __str__(self) -> str:
         """Return "1.23 [1.10, 1.35]", or the number alone if it is exact or its interval unknown."""
@@ -43,16 +43,6 @@ class Interval:
             return str(self)
         value, low, high = (format(number, form) for number in (self.value, self.low, self.high))
         return f"{value} [{low}, {high}]" if self.low < self.high < math.inf else value
-
-    @classmethod
-    def exact(cls, value: float) -> Interval:
-        """Return a number without uncertainty."""
-        return cls(value, value, value)
-
-    @classmethod
-    def unknown(cls, value: float) -> Interval:
-        """Return a number of unknown uncertainty."""
-        return cls(value, -math.inf, math.inf)
 
     def mapped(self, function: Callable[[float], float]) -> Interval:
         """Return the interval of a monotone function of the number."""
@@ -84,10 +74,10 @@ def bootstrap(
 
     value = float(statistic(*drawn))
     if not drawn:
-        return Interval.exact(value)
+        return Interval(value, value, value)
     trials = min(len(values) for values in drawn)
     if trials < FEWEST_TRIALS:
-        return Interval.unknown(value)
+        return Interval(value)
     student = stats.t.ppf((1 + CONFIDENCE) / 2, trials - 1)
     expanded = 1 - 2 * stats.norm.sf(math.sqrt(trials / (trials - 1)) * student)
     settings: Any = {"n_resamples": _RESAMPLES, "vectorized": True, "method": "percentile"}

@@ -102,8 +102,8 @@ def _values(scene: SceneResult, method: str, quantity: str) -> torch.Tensor | fl
 def _means(scene: SceneResult, methods: Iterable[str], quantity: str) -> str:
     parts = []
     for method in methods:
-        values = _values(scene, method, quantity)
-        mean = Interval.exact(values) if isinstance(values, float) else Interval.unknown(float(values.mean()))
+        own = _values(scene, method, quantity)
+        mean = Interval(own, own, own) if isinstance(own, float) else Interval(float(own.mean()))
         parts.append(f"{label_of(method)} {mean}")
     return f"{', '.join(parts)} {_UNITS[quantity][0]}".rstrip()
 

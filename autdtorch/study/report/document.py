@@ -72,17 +72,15 @@ def as_page(text: str, folder: Path) -> str:
     for token in tokens:
         for part in token.children or ():
             if part.type == "image":
-                part.attrSet("src", _embedded(folder, unquote(str(part.attrGet("src")))))
+                name = unquote(str(part.attrGet("src")))
+                if Path(name).name != name:
+                    raise ValueError(f"image: {name!r}; must be a file in the folder of the report")
+                image = base64.b64encode((folder / name).read_bytes()).decode("ascii")
+                part.attrSet("src", f"data:image/png;base64,{image}")
     body = markdown.renderer.render(tokens, markdown.options, {})
     # A wide table scrolls by itself. All other HTML of this name has been escaped.
     body = body.replace("<table>", '<div class="table"><table>').replace("</table>", "</table></div>")
     return rendered("page.html", title=text.partition("\n")[0].lstrip("# "), body=body)
-
-
-def _embedded(folder: Path, name: str) -> str:
-    if Path(name).name != name:
-        raise ValueError(f"image: {name!r}; must be a file in the folder of the report")
-    return f"data:image/png;base64,{base64.b64encode((folder / name).read_bytes()).decode('ascii')}"
 
 
 def _html(_: object, tokens: Sequence[Token], index: int, *__: object) -> str:
