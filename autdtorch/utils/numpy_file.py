@@ -38,14 +38,13 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, AnyArray]:
             members = archive.infolist()
             if (size := sum(member.file_size for member in members)) > _LARGEST:
                 raise ValueError(f"{size} bytes, more than {_LARGEST}")
-            return {member.filename.removesuffix(".npy"): _member(archive, member) for member in members}
+            arrays = {}
+            for member in members:
+                with archive.open(member) as file:
+                    arrays[member.filename.removesuffix(".npy")] = _read(file, member.file_size)
+            return arrays
     except (*_DAMAGE, *_ARCHIVE_DAMAGE) as error:
         raise ValueError(f"{os.fspath(path)}: {error}; must hold plain NumPy arrays") from error
-
-
-def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> AnyArray:
-    with archive.open(member) as file:
-        return _read(file, member.file_size)
 
 
 def _read(file: Any, size: int) -> AnyArray:

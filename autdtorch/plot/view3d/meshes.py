@@ -109,13 +109,9 @@ def add_bar(
     plotter: pyvista.Plotter, mesh: pyvista.Actor, title: str, *, position: float, labels: int, fmt: str
 ) -> None:
     """Draw the colour bar of a mesh; `position` is its left edge, as a share of the window."""
+    title += "\n"  # VTK sets the title tight against the bar
     bar = plotter.add_scalar_bar(
-        title + "\n",  # VTK sets the title tight against the bar
-        mapper=mesh.mapper,
-        n_labels=labels,
-        fmt=fmt,
-        position_x=position,
-        **_BAR,
+        title, mapper=mesh.mapper, n_labels=labels, fmt=fmt, position_x=position, **_BAR
     )
     _use_font(bar.GetTitleTextProperty(), bar.GetLabelTextProperty())
 
