@@ -5,7 +5,7 @@ from __future__ import annotations
 import numbers
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
@@ -187,8 +187,7 @@ class Method(ABC):
     def require_fit(self, problem: Problem, trials: int) -> None:
         """Check settings and memory against a problem; `ValueError` where they do not fit."""
         self.check(problem)
-        counts = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        whole = {name: value for name, value in counts.items() if isinstance(value, int)}
+        whole = {name: value for name, value in vars(self).items() if isinstance(value, int)}
         if whole:
             largest = max(whole, key=whole.__getitem__)
             require_memory(largest, whole[largest], 8 * trials * self.numbers_kept(problem))
@@ -208,9 +207,9 @@ class Method(ABC):
         seeds = trial_seeds(seed, trials)
         if not self.random and len(seeds) > 1:
             raise invalid("trials", trials, f"must be 1: {self.label} has no random choices")
-        self.require_fit(problem, len(seeds))
-        step = self.begin(problem, seeds)
         count = len(seeds)
+        self.require_fit(problem, count)
+        step = self.begin(problem, seeds)
         empty = Solution(
             torch.zeros(count, problem.transducers, dtype=torch.complex128, device="cpu"),
             torch.zeros(count, problem.foci, dtype=torch.float64, device="cpu"),
@@ -255,18 +254,18 @@ class Method(ABC):
 def _improved(state: State, pressure: torch.Tensor, score: torch.Tensor) -> Solution:
     """Return the best drives after another observation, pressures (L, B, P) and scores (L, B)."""
     best, trials = state.best, state.trials
-    index = first_of_best(score)
-    highest = score.gather(1, index[:, None])[:, 0]
+    index = first_of_best(score)[:, None]
+    highest = score.gather(1, index)[:, 0]
     row = torch.nonzero(highest - NEAR_TIE * highest.abs() > best.score[trials])[:, 0]
-    better = trials[row]
-    columns = {
-        "score": best.score.index_copy(0, better, highest[row]),
-        "drive": best.drive.index_copy(0, better, state.drives[row, index[row]]),
-        "pressure": best.pressure.index_copy(0, better, pressure[row, index[row]]),
-        "evaluations": best.evaluations.index_add(0, trials, torch.full_like(trials, score.shape[1])),
-    }
+    better, index = trials[row], index[row, 0]
     scores = score.new_full((len(best.score), score.shape[1]), -torch.inf).index_copy(0, trials, score)
-    return Solution(history=torch.cat([best.history, scores], dim=1), **columns)
+    return Solution(
+        drive=best.drive.index_copy(0, better, state.drives[row, index]),
+        pressure=best.pressure.index_copy(0, better, pressure[row, index]),
+        score=best.score.index_copy(0, better, highest[row]),
+        evaluations=best.evaluations.index_add(0, trials, torch.full_like(trials, score.shape[1])),
+        history=torch.cat([best.history, scores], dim=1),
+    )
 
 
 def first_of_best(score: torch.Tensor) -> torch.Tensor:

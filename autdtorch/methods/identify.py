@@ -1,7 +1,6 @@
 """Identification: fit the transfer matrix to observed magnitudes, then maximise on the matrix.
 
-The pressure of a control point is linear in the drive. Enough magnitudes therefore determine its row of the
-transfer matrix, up to a phase that no magnitude shows (docs/decisions/identify.md).
+Enough magnitudes determine each row of the matrix up to a phase (docs/decisions/identify.md).
 """
 
 from __future__ import annotations
@@ -34,9 +33,8 @@ class Identify(Method):
     """Fit the transfer matrix to observed magnitudes, and maximise the weakest focus on the matrix.
 
     The first max(3 M - 2, evaluations / 2) drives have random phases. The others lie around the best drive of
-    the matrix fitted so far, where noise must average out: a few rounds, each after a new fit. The last drive
-    is the best one of the last fit; it is the solution, since the highest of many noisy readings is a lucky
-    one.
+    the matrix fitted so far, in a few rounds, each after a new fit, so that noise averages out there. The
+    solution is the best drive of the last fit, since the highest of many noisy readings is a lucky one.
 
     Attributes:
         evaluations: number of evaluations of a trial, >= 3 M - 1. More of them average noise.
@@ -78,7 +76,9 @@ class Identify(Method):
         else:
             drives, observed = state.drives, pressure
             fits = [_search(*seen) for seen in zip(drives, observed, generators, strict=True)]
-        best = torch.stack([_strongest(rows, own) for rows, own in zip(fits, generators, strict=True)])
+        starts = [random_drives(_STARTS, state.problem.transducers, own) for own in generators]
+        climbs = zip(fits, starts, strict=True)
+        best = torch.stack([climb(rows.T, start, _CLIMB_STEPS) for rows, start in climbs])
         search |= {"drives": drives, "observed": observed, "rows": torch.stack(fits)}
         count = self._near(state.problem, drives.shape[1])
         if count == 0:
@@ -139,11 +139,6 @@ def _fit(drives: torch.Tensor, observed: torch.Tensor, rows: torch.Tensor) -> to
     for _ in range(_FIT_STEPS):
         rows = inverse @ (observed * (drives @ rows).sgn())
     return rows
-
-
-def _strongest(rows: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-    """Return the drive (M,) of the strongest weakest focus, by fitted rows (M, P)."""
-    return climb(rows.T, random_drives(_STARTS, len(rows), generator), _CLIMB_STEPS)
 
 
 def _nearby(drive: torch.Tensor, generator: torch.Generator, count: int) -> torch.Tensor:
