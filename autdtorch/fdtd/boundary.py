@@ -31,7 +31,6 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.kernels.contract import Columns
 from autdtorch.fdtd.stencil import OFFSETS, Stencil, flat_strides
@@ -122,18 +121,13 @@ def tuned_profile(kappa: float, steps_per_period: float, cells: int) -> LayerPro
     return profile(min(fits, key=lambda fit: float(fit.cost)).x)
 
 
-def row_scale(weight: Array, stencil: Stencil) -> Array:
-    """Return the sums of stencil rows (n, 27), relative to air."""
-    return np.asarray(weight.sum(axis=1) / stencil.total)
-
-
 def layer_columns(
-    cells: HeterogeneousCells, stencil: Stencil, grid: Grid, factor: float, dtype: torch.dtype
+    index: Index, rows: Array, stencil: Stencil, grid: Grid, factor: float, dtype: torch.dtype
 ) -> tuple[Columns, Columns, torch.Tensor]:
-    """Return the columns, the crossed ones and the places of their terms; see `Coefficients`."""
-    outside = ~grid.inside(cells.index)
-    index, weight = cells.index[outside], cells.weight[outside]
-    rows = weight - row_scale(weight, stencil)[:, None] * stencil.weights
+    """Return the columns, the crossed ones and the places of their terms; see `Coefficients`.
+
+    `rows` (n, 27) are the differences of the cells `index` (n,) in the layers from scaled air.
+    """
     places = np.stack(np.unravel_index(index, grid.shape), axis=-1)
     strides = flat_strides(grid.shape)
     ahead = np.array(OFFSETS) == 1

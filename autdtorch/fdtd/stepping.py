@@ -13,7 +13,7 @@ from torch import Tensor
 
 from autdtorch.fdtd.assembly.elements import elements_of
 from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells
-from autdtorch.fdtd.boundary import layer_columns, row_scale, tuned_profile
+from autdtorch.fdtd.boundary import layer_columns, tuned_profile
 from autdtorch.fdtd.grid import Grid, make_grid
 from autdtorch.fdtd.interpolation import Interpolation, average_nodes, exclude_cells, interpolate_points
 from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, State, uniform_state
@@ -124,7 +124,10 @@ def assembly_of(
     keep = (1 - damping) / (1 + damping)
     profile = tuned_profile(grid.kappa, steps, grid.layer_cells)
     in_layers = ~grid.inside(cells.index)
-    columns, crossed, crossing = layer_columns(cells, stencil, grid, factor, dtype)
+    index, weight = cells.index[in_layers], cells.weight[in_layers]
+    scale = weight.sum(axis=1) / stencil.total
+    rows = weight - scale[:, None] * stencil.weights
+    columns, crossed, crossing = layer_columns(index, rows, stencil, grid, factor, dtype)
     coefficients = Coefficients(
         center=1 + keep - factor * stencil.total,
         face=factor * stencil.face,
@@ -136,8 +139,8 @@ def assembly_of(
         sound_hard_index=torch.from_numpy(cells.shell),
         layer_decay=torch.from_numpy(profile.decay).to(dtype),
         layer_gain=torch.from_numpy(profile.gain).to(dtype),
-        layer_index=torch.from_numpy(cells.index[in_layers]),
-        layer_scale=torch.from_numpy(row_scale(cells.weight[in_layers], stencil)).to(dtype),
+        layer_index=torch.from_numpy(index),
+        layer_scale=torch.from_numpy(scale).to(dtype),
         columns=columns,
         crossed=crossed,
         crossing=crossing,
