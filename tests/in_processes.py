@@ -1,4 +1,4 @@
-"""Simulate and search in this process, then in two others of one kind, and count what differs; a program."""
+"""Simulate and search in this process, then in two others of each kind; print what differs. A program."""
 
 from __future__ import annotations
 
@@ -41,4 +41,5 @@ if __name__ == "__main__":
     torch.set_num_threads(4)  # on any machine
     torch.randn(1500, 1500).matmul(torch.randn(1500, 1500))  # starts PyTorch's threads
     expected = [found(0), found(1)]
-    print(sum(one != other for one, other in zip(in_processes(sys.argv[1]), expected, strict=True)))
+    for kind in sys.argv[1:]:
+        print(kind, sum(one != other for one, other in zip(in_processes(kind), expected, strict=True)))

@@ -327,10 +327,11 @@ def _is_list(value: object) -> TypeGuard[Iterable[Any]]:
 
 
 def _require_finite(name: str, tensor: torch.Tensor, unit: str = "") -> None:
-    bad = ~torch.isfinite(tensor.detach())
-    if not bad.any():
+    values = tensor.detach()
+    # Of complex numbers, `isfinite` takes three times as long.
+    if torch.isfinite(torch.view_as_real(values) if values.is_complex() else values).all():
         return
     if tensor.numel() <= SHOWN_ENTRIES:
         raise invalid(name, tensor, "every entry must be finite", unit)
-    index = torch.nonzero(bad)[0].tolist()
+    index = torch.nonzero(~torch.isfinite(values))[0].tolist()
     raise invalid(f"{name}{index}", tensor[tuple(index)].item(), "every entry must be finite", unit)
