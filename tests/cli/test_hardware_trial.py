@@ -5,16 +5,18 @@ import io
 import math
 import re
 import signal
-import sys
 from pathlib import Path
+from unittest import mock
 
 import pytest
 import torch
+import yaml
 from filelock import FileLock
 
 import autdtorch.cli.hardware_command
-from autdtorch.cli.bench_config import indices_of
-from autdtorch.hardware import LinkError, OffError
+from autdtorch.cli.bench_config import Bench, indices_of
+from autdtorch.cli.main import CONFIGS
+from autdtorch.hardware import LinkError, MovedMicrophone, OffError, Oscilloscope, ScopeSensor
 from autdtorch.io.drive_file import load_drive
 from autdtorch.io.scene_file import load_scene
 from autdtorch.scene.arrays import TransducerArray
@@ -176,6 +178,56 @@ def test_devices_of_boards_find_the_drive_of_the_simulation(trial, tmp_path, dev
         assert (status, "of another trial, whose boards is ['left " in log) == (2, True)
 
 
+REAL = ("hardware.limits.amplitude=1", "hardware.transducers='0-8'")
+
+
+@pytest.mark.parametrize(
+    ("words", "opener", "given"),
+    [
+        (("hardware=sonicsurface", "hardware.port=COM3"), "open_link", {"port": "COM3", "settle": 0.005}),
+        (("hardware=ultraino", "hardware.boards=2", "hardware.settle=0.1"), "open_link", {"settle": 0.1}),
+        (("hardware=autd3",), "open_autd3", {}),
+    ],
+)
+def test_the_settings_of_a_real_bench_reach_its_device(trial, monkeypatch, words, opener, given):
+    calls = []
+
+    def nothing_there(*arguments, **named):
+        calls.append((arguments, named))
+        raise LinkError("nothing there")
+
+    monkeypatch.setattr(f"autdtorch.hardware.{opener}", nothing_there)
+    status, _, log = trial(*REAL, *words, "hardware/sensor=file", "hardware.sensor.path=readings.csv")
+    assert (status, log.splitlines()[-1]) == (2, "autdtorch: nothing there")
+    ((arguments, named),) = calls
+    assert list(range(9)) in arguments
+    assert given.items() <= named.items()
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_the_settings_of_an_oscilloscope_reach_it(write, tmp_path, monkeypatch, moved):
+    write("two.yaml", SCENE)
+    base, scope = (CONFIGS / "hardware" / name for name in ("base.yaml", "sensor/scope.yaml"))
+    section = yaml.safe_load(base.read_text()) | {"device": "sonicsurface", "transducers": "0-8"}
+    section["limits"]["amplitude"] = 1.0
+    section["sensor"] = yaml.safe_load(scope.read_text()) | {"chip": "0x2a8d:1770", "moved": moved}
+    instrument = mock.MagicMock(spec=Oscilloscope)
+    instrument.__enter__.return_value = instrument
+    opened = mock.Mock(return_value=instrument)
+    monkeypatch.setattr("autdtorch.hardware.open_scope", opened)
+    with Bench(section, load_scene(tmp_path / "two.yaml"), 0).sensor() as found:
+        assert isinstance(found, MovedMicrophone if moved else ScopeSensor)
+    assert opened.call_args.args[0] == (0x2A8D, 0x1770)
+    inputs, _ = instrument.set_up.call_args.args
+    assert list(inputs) == ([1] if moved else [1, 2])
+
+
+@pytest.mark.parametrize("network", ["server:0", "server:http"])
+def test_a_network_without_a_port_is_refused(trial, network):
+    status, _, log = trial(*REAL, "hardware=autd3", f"hardware.network='{network}'", "hardware/sensor=manual")
+    assert (status, "must be server:PORT with a port from 1 to 65535" in log) == (2, True)
+
+
 def write_board(folder, name, gain=1.0):
     path = folder / f"{name}.pat"
     positions = "\n".join(f"({0.0105 * (n % 16)}, {0.0105 * (n // 16)}, 0)" for n in range(256))
@@ -223,16 +275,6 @@ def test_an_error_in_mid_trial_says_whether_the_outputs_are_off(trial, fail_at, 
     status, _, log = trial(*GABS)
     then = "; they may still be on" if left_on else OFF
     assert (status, log.splitlines()[-1]) == (2, f"autdtorch: there.jsonl: No space left on device{then}")
-
-
-@pytest.mark.parametrize("words", [(), ("hardware.dry_run=true",)])
-def test_without_pyusb_an_emulated_trial_ends_with_the_hint(trial, monkeypatch, words):
-    for name in [name for name in sys.modules if name.startswith("autdtorch.hardware.emulator.")]:
-        monkeypatch.delitem(sys.modules, name)
-    for name in ("usb", "usb.core", "usb.backend"):
-        monkeypatch.setitem(sys.modules, name, None)
-    status, _, log = trial(*GABS, *words)
-    assert (status, "pip install 'autdtorch[hardware]'" in log) == (2, True)
 
 
 def test_a_person_reads_each_transducer_and_the_silence_once(trial, monkeypatch):
