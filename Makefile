@@ -1,4 +1,4 @@
-# Needs python3 (3.11 or later) with pip and venv. The first target installs everything else into .venv.
+# Needs python3 (3.11 or later) with pip and venv. Every target installs what it needs into .venv.
 
 PYTHON ?= python3
 ARGS ?=
@@ -6,6 +6,7 @@ ARGS ?=
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet -c constraints.txt -e
 
 # "make paper trials=50" passes trials=50 to Hydra, and so every variable of the command line except PYTHON and ARGS.
 OVERRIDES = $(strip $(foreach name,$(filter-out PYTHON ARGS,$(.VARIABLES)),$(if \
@@ -26,21 +27,25 @@ help:
 $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "autdtorch needs Python 3.11 or later")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --disable-pip-version-check --quiet -c constraints.txt -e '.[viz,dev]'
+	$(INSTALL) .
+	@touch $@
+
+$(INSTALLED)-%: $(INSTALLED)
+	$(INSTALL) '.[$*]'
 	@touch $@
 
 paper: $(INSTALLED)
 	$(BIN)/autdtorch experiment=paper $(OVERRIDES)
 
-test: $(INSTALLED)
+test: $(INSTALLED)-dev
 	$(BIN)/python -m pytest -n auto --maxprocesses 8 --dist worksteal $(ARGS)
 
-lint: $(INSTALLED)
+lint: $(INSTALLED)-dev
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-docs: $(INSTALLED)
+docs: $(INSTALLED)-docs
 	$(BIN)/python -m sphinx -W --keep-going -d outputs/.doctrees docs outputs/docs
 
 clean:

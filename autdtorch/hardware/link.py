@@ -174,7 +174,6 @@ def open_link(
 
     Raises:
         LinkError: none or several such devices, or it does not take the bytes.
-        ImportError: pyusb, libusb-package or pyserial is missing.
         ValueError: no `Device`; `transducers` that it does not have, or one twice; a negative `settle`; a
             `serial` for a device of several boards; or a `port` for one without a serial line.
     """

@@ -8,13 +8,8 @@ from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import ClassVar
 
-from autdtorch.hardware.transport.port import INSTALL_HINT
-
-try:
-    from usb.backend import IBackend
-    from usb.core import USBError, USBTimeoutError
-except ImportError as error:
-    raise ImportError(f"{error}; {INSTALL_HINT}") from error
+from usb.backend import IBackend
+from usb.core import USBError, USBTimeoutError
 
 _GET_DESCRIPTOR, _STRING, _ENGLISH = 0x06, 0x03, 0x0409
 _FROM_DEVICE, _STANDARD_FROM_DEVICE = 0x80, 0x80

@@ -259,7 +259,6 @@ def open_scope(
     Raises:
         ValueError: `chip` is not two numbers.
         LinkError: none or several such devices, or it does not answer.
-        ImportError: pyusb or libusb-package is missing.
     """
     vendor, product = positive_integers("chip", chip, 2)
     port = UsbtmcPort(find_device([(vendor, product)], serial, backend))

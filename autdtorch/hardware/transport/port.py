@@ -10,9 +10,6 @@ from typing import Any, Protocol, runtime_checkable
 
 from autdtorch.utils.validation import require_kind
 
-#: Hint for a missing package of the transports.
-INSTALL_HINT = "pip install 'autdtorch[hardware]' brings what is needed"
-
 _TIMEOUT = 1.0  # [s]
 
 
@@ -101,11 +98,9 @@ class SerialPort:
     def __init__(self, name: str, baud: int) -> None:
         """Open the port of a `name` such as "COM3" or "/dev/ttyUSB0", at `baud` bits/s."""
         require_kind("port", name, str)
+        import serial
+
         self._name = name
-        try:
-            import serial
-        except ImportError as error:
-            raise ImportError(f"{error}; {INSTALL_HINT}") from error
         with self._errors("be opened", hint=True):
             # Another program that wrote to the port would break frames.
             self._port: Any = serial.Serial(name, baud, write_timeout=_TIMEOUT, exclusive=True)

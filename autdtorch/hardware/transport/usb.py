@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
-from autdtorch.hardware.transport.port import INSTALL_HINT, LinkError, Port, closed_on_error
+from autdtorch.hardware.transport.port import LinkError, Port, closed_on_error
 from autdtorch.utils.validation import require_kind
 
 #: Rules that let users write to the devices on Linux; to be copied to /etc/udev/rules.d.
@@ -21,17 +21,13 @@ _DIRECTION, _TRANSFER_TYPE, _BULK = 0x80, 0x03, 0x02
 def find_device(chips: Collection[tuple[int, int]], serial: str | None = None, backend: Any = None) -> Any:
     """Return the one USB device (`usb.core.Device`) whose idVendor and idProduct are in `chips`.
 
-    `LinkError` if none or several have them and the `serial` number, or without libusb; `ImportError` without
-    pyusb or libusb-package.
+    `LinkError` if none or several have them and the `serial` number, or without libusb.
     """
     if serial is not None:
         require_kind("serial", serial, str)
-    try:
-        import usb.core
+    import usb.core
 
-        backend = _libusb() if backend is None else backend
-    except ImportError as error:
-        raise ImportError(f"{error}; {INSTALL_HINT}") from error
+    backend = _libusb() if backend is None else backend
     present = list(usb.core.find(find_all=True, backend=backend))
     fitting = [device for device in present if (device.idVendor, device.idProduct) in chips]
     matching = [device for device in fitting if serial is None or _serial_of(device) == serial]

@@ -37,8 +37,8 @@ def rendering_problem() -> str | None:
         if child.returncode < 0:
             cause = f"a trial rendering was killed by {signal.Signals(-child.returncode).name}"
     return (
-        f"3D rendering is not available: {cause}. It needs pip install 'autdtorch[viz]' and an OpenGL "
-        "driver, on Debian the packages libegl1 libgl1-mesa-dri libosmesa6"
+        f"3D rendering is not available: {cause}. It needs an OpenGL driver, on Debian the packages libegl1 "
+        "libgl1-mesa-dri libosmesa6"
     )
 
 
