@@ -7,6 +7,8 @@ from .io.field_file import save_field
 from .io.scene_file import load_scene
 from .methods.base import Method, Problem, State
 from .methods.bayes.bayes import BayesOpt, bayes_opt
+from .methods.bayes.focus_problem import FocusProblem
+from .methods.bayes.kernels import PhasorKernel
 from .methods.bound import focus_bound
 from .methods.driver import run
 from .methods.gabs import GABS, gabs
@@ -48,6 +50,7 @@ __all__ = [
     "Estimate",
     "FailedTransducers",
     "FocusMetrics",
+    "FocusProblem",
     "GradientAscent",
     "Identify",
     "Medium",
@@ -58,6 +61,7 @@ __all__ = [
     "Obstacle",
     "OpenMPDBoard",
     "OverlapWarning",
+    "PhasorKernel",
     "Plane",
     "Problem",
     "Quantised",

@@ -50,7 +50,7 @@ NOT_CALLED_BY_USERS = {
 
 #: Methods that the driver calls, and that authors of methods implement.
 INSIDE_METHODS = {"advance", "begin", "check", "most_at_once", "most_evaluations", "numbers_kept"}
-INSIDE_METHODS |= {"recorded", "require_fit"}
+INSIDE_METHODS |= {"forward", "recorded", "require_fit"}
 
 
 class Made(NamedTuple):
@@ -202,6 +202,7 @@ ARGUMENTS: dict[str, Any] = {
     "phases": [0.0, 1.0, 2.0, 3.0],
     "plane_pressure": [[1.0, 2.0], [1.0, 2.0]],
     "planes": {"scene": PLANE},
+    "X": torch.full((2, 3), 0.5, dtype=torch.float64),
     "points": [[22e-3, 7e-3, 14e-3], [20e-3, 16e-3, 12e-3]],
     "port": Silent(),
     "positions": [[0.0, 0.0, 0.0], [0.0, 0.01, 0.0]],
@@ -364,5 +365,7 @@ def _calls_of(kind: type) -> Iterator[Call]:
         member = inspect.getattr_static(kind, name)
         if isinstance(member, classmethod) and name[0] != "_":
             yield Call(f"{kind.__name__}.{name}", getattr(kind, name))
-        elif inspect.isfunction(member) and name not in inner and (name == "__call__" or name[0] != "_"):
+        elif not inspect.isfunction(member) or not member.__module__.startswith("autdtorch"):
+            continue  # such as a method that comes from GPyTorch
+        elif name not in inner and (name == "__call__" or name[0] != "_"):
             yield Call(f"{kind.__name__}.{name}", member, kind)

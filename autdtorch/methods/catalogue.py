@@ -17,9 +17,12 @@ METHODS: dict[str, type[Method]] = {
 }
 """Methods by name, in the order of reports. A method of one's own needs no entry: configs name its class."""
 
+_VARIANTS = {"bo_foci": "BO, each focus", "bo_circle": "BO, circle"}
+"""Labels of configs that are settings of a method."""
+
 
 def label_of(name: str) -> str:
     """Return the label of a method: the paper's, or its name, and after a comma the settings of a sweep."""
     method, comma, settings = name.partition(",")
-    label = METHODS[method].label if method in METHODS else method.replace("_", " ")
+    label = METHODS[method].label if method in METHODS else _VARIANTS.get(method, method.replace("_", " "))
     return label + re.sub(r",(?=\S)", ", ", comma + settings)

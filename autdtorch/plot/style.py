@@ -29,6 +29,7 @@ class Look(NamedTuple):
 _LOOKS = {  # colours of Okabe and Ito
     "lssg": Look("#0072B2", "o", (0, ())),
     "bayes_opt": Look("#D55E00", "s", (0, (5, 1.5))),
+    "bo_foci": Look("#882255", "P", (0, (6, 2, 2, 2))),
     "gabs": Look("#009E73", "D", (0, (5, 1.5, 1, 1.5))),
     "lss": Look("#E69F00", "^", (0, (8, 1.5))),
     "identify": Look("#CC79A7", "v", (0, (1, 1))),
@@ -36,7 +37,7 @@ _LOOKS = {  # colours of Okabe and Ito
     "gradient_ascent": Look("#000000", "*", (0, (2, 2))),
 }
 _SPARE_LOOKS = (  # colours of Tol's muted scheme
-    Look("#882255", "P", (0, (6, 2, 2, 2))),
+    Look("#44AA99", "p", (0, (1, 3))),
     Look("#999933", "h", (0, (4, 1))),
     Look("#332288", "<", (0, (2, 1, 6, 1))),
     Look("#999999", ">", (0, (3, 3))),

@@ -43,7 +43,7 @@ StudyMethod: TypeAlias = Method | Callable[..., Solution]
 """A `Method`, or a function of an objective with its settings bound. A function that has parameters `trials`
 and `seed` is given the numbers of the trials to run, as many as it is to return, and the study's seed."""
 
-BLOCK = 10
+BLOCK = 25
 """Trials that are run and saved together. The end of the process costs the block in work at most."""
 
 _MOST_SAMPLES = 10**6  # of an observation plane: 16 complex columns of them are 256 MB

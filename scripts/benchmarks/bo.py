@@ -1,9 +1,11 @@
-"""Bayesian optimisation: against BoTorch one trial after the other, and by options.
+"""Bayesian optimisation: against one trial after the other, by options, and with a process for each focus.
 
 Prints Markdown tables. Times are processor times on one thread, so that other processes matter little.
 
-    python scripts/benchmark.py bo sequential --sequential-trials 10     15 minutes on an idle core
-    python scripts/benchmark.py bo options                               10 minutes
+    python scripts/benchmark.py bo sequential --sequential-trials 10     20 minutes on an idle core
+    python scripts/benchmark.py bo options                               30 minutes
+    python scripts/benchmark.py bo foci                                  3 minutes
+    python scripts/benchmark.py bo noise                                 15 minutes
 """
 
 from __future__ import annotations
@@ -25,22 +27,26 @@ from autdtorch.methods.bayes.bayes import NOISE, drives_at
 from autdtorch.objectives.objective import weakest_focus
 
 EVALUATIONS, INITIAL, FIXED = 256, 16, 6
-REFIT_GROWTH, CANDIDATES, STARTS, CLIMB_STEPS = 1.1, 128, 2, 20
+REFIT_GROWTH, CANDIDATES, STARTS, CLIMB_STEPS = 1.2, 128, 2, 20
 """Schedule and search effort of the sequential loop: those of `bayes_opt`."""
 VARIANTS: dict[str, dict[str, Any]] = {
     "as in the paper": {},
     "log_ei": {"acquisition": "log_ei"},
     "random initial points": {"initial_points": "random"},
     "inferred noise": {"noise": "inferred"},
-    "circle": {"embedding": "circle"},
-    "circle, log_ei": {"embedding": "circle", "acquisition": "log_ei"},
-    "circle, log_ei, inferred noise": {"embedding": "circle", "acquisition": "log_ei", "noise": "inferred"},
+    "circle": {"kernel": "circle"},
+    "circle, log_ei": {"kernel": "circle", "acquisition": "log_ei"},
+    "circle, log_ei, inferred noise": {"kernel": "circle", "acquisition": "log_ei", "noise": "inferred"},
 }
+
+BUDGETS = (32, 48, 64, 96)
+NOISY_BUDGETS = (64, 128, 256)
+FOCI: dict[str, Any] = {"model": "foci", "kernel": "phasor", "noise": "inferred"}
 
 Objectives = Mapping[str, at.SimulatedObjective]
 
 OPTIONS = {
-    "what": {"nargs": "+", "choices": ["sequential", "options"], "help": "tables to print"},
+    "what": {"nargs": "+", "choices": ["sequential", "options", "foci", "noise"], "help": "tables to print"},
     "--scenes": {"nargs": "+", "default": PAPER, "help": "names of scenes"},
     "--trials": {"type": int, "default": 50, "help": "trials at once"},
     "--sequential-trials": {"type": int, "default": 5, "help": "trials with BoTorch"},
@@ -55,7 +61,6 @@ def main(given: argparse.Namespace) -> None:
     objectives = {
         name: at.SimulatedObjective(scene, at.make_propagator(scene)) for name, scene in scenes.items()
     }
-    at.bayes_opt(objectives[given.scenes[0]], evaluations=18)  # compiles
     if "sequential" in given.what:
         times = [f"{given.trials} trials at once", "a trial", "a BoTorch trial", "ratio"]
         first = given.sequential_trials
@@ -63,6 +68,11 @@ def main(given: argparse.Namespace) -> None:
         show(["scene", *times, *scores], sequential_rows(objectives, given.trials, first))
     if "options" in given.what:
         show(["options", *objectives, "time"], option_rows(objectives, given.trials))
+    if "foci" in given.what:
+        show(["scene", *map(str, BUDGETS), "time of a trial"], foci_rows(objectives, given.trials))
+    if "noise" in given.what:
+        columns = [f"{name}, {count}" for count in NOISY_BUDGETS for name in ("bo_foci", "identify")]
+        show(["scene, 20 dB", *columns], noise_rows(objectives, given.trials))
 
 
 def show(header: list[str], rows: Iterator[list[str]]) -> None:
@@ -95,6 +105,27 @@ def option_rows(objectives: Objectives, trials: int) -> Iterator[list[str]]:
         yield [name, *(quartiles(solution.score) for solution in solutions), f"{seconds:.0f} s"]
 
 
+def foci_rows(objectives: Objectives, trials: int) -> Iterator[list[str]]:
+    """Compare a process for each focus with gradient ascent after numbers of evaluations."""
+    for name, objective in objectives.items():
+        best = at.gradient_ascent(objective).score
+        solution, seconds = timed(lambda o=objective: at.bayes_opt(o, max(BUDGETS), 4, trials=trials, **FOCI))
+        shares = [quartiles(solution.history[:, count - 1] / best) for count in BUDGETS]
+        yield [name, *shares, f"{seconds / trials:.2f} s"]
+
+
+def noise_rows(objectives: Objectives, trials: int) -> Iterator[list[str]]:
+    """Compare true pressures of the answers with those of `identify`, as shares of gradient ascent."""
+    for name, objective in objectives.items():
+        best = at.gradient_ascent(objective).score
+        row = [name]
+        for count in NOISY_BUDGETS:
+            for method in (at.BayesOpt(count, 4, **FOCI), at.Identify(count)):
+                drive = at.run(method, at.Noise(objective, 20.0), trials).drive
+                row.append(quartiles(at.true_pressure(objective, drive).amin(dim=1) / best))
+        yield row
+
+
 def timed(run: Callable[[], Any]) -> tuple[Any, float]:
     """Return the result and the processor time [s]."""
     begin = time.process_time()
@@ -103,9 +134,10 @@ def timed(run: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def quartiles(score: torch.Tensor) -> str:
-    """Format median and quartiles [Pa]."""
+    """Format median and quartiles."""
     low, middle, high = score.quantile(torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64)).tolist()
-    return f"{middle:.2f} ({low:.2f} to {high:.2f})"
+    digits = 3 if high < 1.5 else 2  # shares, or pressures
+    return f"{middle:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
 
 def botorch_trial(objective: at.SimulatedObjective, trial: int) -> torch.Tensor:

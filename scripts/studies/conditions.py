@@ -65,7 +65,7 @@ METHODS = {
     "gabs": Method("gabs"),
     "gabs_2_passes": Method("gabs", {"passes": 2}),
     "bayes_opt": Method("bayes_opt", together=True),
-    "bayes_opt_circle": Method("bayes_opt", {"embedding": "circle"}, together=True),
+    "bayes_opt_circle": Method("bayes_opt", {"kernel": "circle"}, together=True),
     "identify": Method("identify"),
     "identify_256": Method("identify", {"evaluations": 256}),
 }

@@ -33,7 +33,7 @@ METHODS: tuple[tuple[str, Method], ...] = (
     ("LSSG, 5 passes", partial(at.lssg, passes=5)),
     ("GABS, 4 levels", partial(at.gabs, levels=4)),
     ("BO", partial(at.bayes_opt, evaluations=1000)),
-    ("BO on the circle", partial(at.bayes_opt, evaluations=1000, embedding="circle")),
+    ("BO on the circle", partial(at.bayes_opt, evaluations=1000, kernel="circle")),
     ("identify", partial(at.identify, evaluations=1000)),
     ("random search", partial(at.random_search, evaluations=4000)),
     ("GABS, 16 levels", at.gabs),

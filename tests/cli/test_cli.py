@@ -60,7 +60,7 @@ def test_the_papers_experiment(composed):
     assert all(load_scene(scene) for scene in config["scenes"].values())
     assert all(load_method(name, method, ()) for name, method in config["methods"].items())
     assert list(config["scenes"]) == ["homogeneous", "three_cubes", "two_cubes"]
-    assert list(config["methods"]) == ["lssg", "bayes_opt", "gabs", "identify", "gradient_ascent"]
+    assert list(config["methods"]) == ["lssg", "bayes_opt", "bo_foci", "gabs", "identify", "gradient_ascent"]
     assert config["methods"]["gabs"] == {
         "_target_": "autdtorch.gabs", "levels": 16, "order": "random", "first": None, "passes": 1
     }  # fmt: skip
@@ -250,6 +250,7 @@ def test_an_experiment_ends_with_its_report(run, tmp_path, capsys, monkeypatch):
     command = (
         "experiment=paper",
         "~methods.bayes_opt",
+        "~methods.bo_foci",
         "~scenes.two_cubes",
         "plane_spacing=5e-3",
         "trials=2",

@@ -2,12 +2,17 @@ import math
 
 import pytest
 import torch
+from botorch.acquisition.analytic import ExpectedImprovement, LogExpectedImprovement
 
-from autdtorch.methods.bayes.bayes import bayes_opt
+import autdtorch as at
+from autdtorch.methods.bayes.acquisition import ScoreAcquisition
+from autdtorch.methods.bayes.kernels import PhasorKernel, on_circle, phasors
+from autdtorch.methods.bayes.processes import Fit, Processes, fitted
 from autdtorch.objectives.objective import weakest_focus
 from autdtorch.scene.drive import drive_from_phases
 
 SMALL = {"evaluations": 30, "initial": 6, "fixed_transducer": 2}
+FOCI = {"model": "foci", "kernel": "phasor", "noise": "inferred"}
 
 
 @pytest.fixture(scope="module")
@@ -15,15 +20,24 @@ def matrix(random_matrix):
     return random_matrix(2, 4, 11)
 
 
-@pytest.fixture(scope="module")
-def solution(make_objective, matrix):
+@pytest.fixture(scope="module", params=[{}, {"kernel": "circle", "acquisition": "log_ei"}, FOCI])
+def solution(request, make_objective, matrix):
     """Two trials of 30 evaluations on a small problem."""
-    return bayes_opt(make_objective(matrix), trials=2, seed=5, **SMALL)
+    return at.bayes_opt(make_objective(matrix), trials=2, seed=5, **SMALL, **request.param)
+
+
+def uniform(*shape, seed=0):
+    return torch.rand(shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def fit_of(trials, outputs, length_scale, noise):
+    return Fit(
+        *(torch.full((trials, outputs), value, dtype=torch.float64) for value in (length_scale, noise))
+    )
 
 
 def test_beats_random_search(make_objective, matrix, solution):
-    generator = torch.Generator().manual_seed(0)
-    phases = 2 * math.pi * torch.rand(200, 30, 4, dtype=torch.float64, generator=generator)
+    phases = 2 * math.pi * uniform(200, 30, 4)
     scores = weakest_focus(make_objective(matrix)(drive_from_phases(phases).flatten(0, 1)))
     searches = scores.unflatten(0, (200, 30)).max(dim=1).values
     assert (solution.score > searches.median()).all()
@@ -35,9 +49,149 @@ def test_fixed_transducer_stays_at_phase_zero_and_all_are_fully_on(solution):
     torch.testing.assert_close(solution.amplitudes, torch.ones(2, 4).double(), rtol=1e-15, atol=0)
 
 
-def test_score_that_never_changes_is_no_error(make_objective, matrix):
+@pytest.mark.parametrize("options", [{}, FOCI])
+def test_score_that_never_changes_is_no_error(make_objective, matrix, options):
     objective = make_objective(matrix)
-    solution = bayes_opt(
-        objective, evaluations=6, initial=3, fixed_transducer=0, score=lambda p: torch.ones(p.shape[:-1])
+    solution = at.bayes_opt(
+        objective,
+        evaluations=6,
+        initial=3,
+        fixed_transducer=0,
+        score=lambda p: 1 + 0 * p[..., 0],
+        **options,
     )
     assert solution.score.tolist() == [1.0]
+
+
+def test_goal_without_a_derivative_is_refused_for_the_foci(make_objective, matrix):
+    with pytest.raises(ValueError, match=r"score: .*; must be differentiable"):
+        at.bayes_opt(make_objective(matrix), score=lambda p: torch.ones_like(p[..., 0]), **SMALL, **FOCI)
+
+
+def test_foci_find_the_maximum(make_objective, random_matrix):
+    objective = make_objective(random_matrix(3, 6, 4))
+    best = at.gradient_ascent(objective).score
+    found = at.bayes_opt(objective, evaluations=40, initial=6, fixed_transducer=0, trials=4, **FOCI)
+    # Amplitudes below 1, which gradient ascent may use, and other local maxima are within a few per cent.
+    assert (found.score > 0.9 * best).all()
+
+
+def test_goal_of_ones_own_is_reached_by_the_foci(make_objective, random_matrix):
+    """A goal is improved by its samples, without the smooth minimum: the pressure at the first focus."""
+    matrix = random_matrix(2, 4, 3)
+    highest = matrix[0].abs().sum()
+    options = dict(evaluations=40, initial=6, fixed_transducer=0, score=lambda p: p[..., 0], **FOCI)
+    found = at.bayes_opt(make_objective(matrix), **options)
+    assert 0.98 * highest < found.score.item() <= highest * (1 + 1e-6)
+
+
+class TestPhasorKernel:
+    def drives(self, count, transducers):
+        parts = uniform(2, count, transducers, seed=3)
+        return torch.polar(parts[0], 2 * math.pi * parts[1])
+
+    def test_is_the_covariance_of_intensities(self):
+        # 400,000 samples of fourth moments scatter by about 1 %.
+        drives, generator = self.drives(4, 3), torch.Generator().manual_seed(1)
+        rows = torch.randn(400_000, 3, dtype=torch.complex128, generator=generator) / math.sqrt(3)
+        intensity = (rows @ drives.T).abs().square()
+        inputs = torch.cat([drives.real, drives.imag], dim=-1)
+        expected = PhasorKernel("drives")(inputs).to_dense()
+        torch.testing.assert_close(intensity.T.cov(), expected, rtol=0.05, atol=0.005)
+
+    def test_phases_are_drives_that_are_fully_on(self):
+        points, others = uniform(5, 3), uniform(4, 3, seed=1)
+        for kernel in (PhasorKernel(), PhasorKernel("drives")):
+            inputs = (points, others) if kernel.inputs == "phases" else (phasors(points), phasors(others))
+            values = kernel(*inputs).to_dense()
+            # Kernels are written once, so that both agree to rounding.
+            torch.testing.assert_close(
+                values, PhasorKernel()(points, others).to_dense(), rtol=1e-12, atol=1e-14
+            )
+            assert torch.allclose(kernel(inputs[0], diag=True), torch.ones(5, dtype=torch.float64))
+
+    def test_is_positive_semidefinite(self):
+        matrix = PhasorKernel()(uniform(60, 3)).to_dense()
+        assert torch.linalg.eigvalsh(matrix).min() > -1e-12 * len(matrix)
+
+    def test_refuses_other_inputs(self):
+        with pytest.raises(ValueError, match="inputs: 'turns'; must be one of phases, drives"):
+            PhasorKernel("turns")
+
+
+class TestProcesses:
+    def test_posterior_meets_the_observations(self):
+        points, values = uniform(2, 7, 3), 1 + uniform(2, 7, 2, seed=1)
+        for kernel, observed in (("circle", values[..., :1]), ("phasor", values)):
+            fit = fit_of(2, observed.shape[2], 0.5, 1e-6)
+            mean, deviation = Processes(kernel, points, observed, fit).at(points)
+            modelled = observed.square() if kernel == "phasor" else observed
+            # The noise and the jitter, 1e-5 variances, leave about their square root of a deviation.
+            assert (deviation < 0.02).all()
+            torch.testing.assert_close(mean, modelled, rtol=0.02, atol=0)
+
+    def test_posterior_written_out_is_that_of_the_model(self):
+        points, values, at_points = uniform(2, 9, 3), 1 + uniform(2, 9, 2, seed=1), uniform(2, 4, 3, seed=2)
+        for kernel, observed, feature in (
+            ("circle", values[..., :1], on_circle),
+            ("phasor", values, phasors),
+        ):
+            processes = Processes(kernel, points, observed, fit_of(2, observed.shape[2], 0.5, 1e-3))
+            mean, deviation = processes.at(at_points)
+            expected = processes.model.posterior(feature(at_points))
+            torch.testing.assert_close(mean, processes.mean + processes.scale * expected.mean)
+            torch.testing.assert_close(
+                deviation, processes.scale * expected.variance.sqrt(), rtol=1e-5, atol=0
+            )
+
+    def test_noise_of_readings_is_inferred(self, random_matrix):
+        """Readings with complex noise of a hundredth of the mean intensity, as at 20 dB."""
+        generator, matrix = torch.Generator().manual_seed(2), random_matrix(4, 6, 1)
+        points = uniform(3, 80, 5)
+        features = phasors(points)
+        pressure = torch.complex(features[..., :6], features[..., 6:]) @ matrix.T
+        sigma = 0.1 * pressure.abs().square().mean().sqrt()
+        noise = torch.randn(pressure.shape, dtype=torch.complex128, generator=generator)
+        seen = (pressure + sigma * noise).abs()
+        found = fitted("phasor", points, seen, "inferred").noise
+        expected = sigma.square() / pressure.abs().square().mean(dim=1)
+        assert (found < 2 * expected).all()
+        assert (found > expected / 2).all()
+        quiet = fitted("phasor", points, pressure.abs(), "inferred").noise
+        assert (quiet < 1e-4).all()
+
+
+@pytest.mark.filterwarnings("ignore:ExpectedImprovement has known numerical issues")
+@pytest.mark.parametrize("log", [False, True])
+def test_improvement_is_that_of_botorch(log):
+    points, score = uniform(1, 8, 3), uniform(1, 8, 1, seed=1)
+    fit = fit_of(1, 1, 0.7, 1e-4)
+    processes = Processes("phases", points, score, fit)
+    ours = ScoreAcquisition(processes, points, score, log).value(uniform(1, 20, 3, seed=2))
+    highest = ((score.max() - processes.mean) / processes.scale).item()
+    theirs = (LogExpectedImprovement if log else ExpectedImprovement)(processes.model, highest)
+    expected = theirs(uniform(20, 1, 1, 3, seed=2)[:, 0])
+    unit = processes.scale.item()
+    expected = expected + math.log(unit) if log else expected * unit
+    torch.testing.assert_close(ours[0], expected.flatten(), rtol=1e-6, atol=1e-12)
+
+
+class TestFocusProblem:
+    def test_scores_are_those_of_the_objective(self, make_objective, matrix):
+        objective = make_objective(matrix)
+        problem = at.FocusProblem(objective, fixed_transducer=1)
+        points = uniform(2, 5, 3)
+        turns = torch.cat(
+            [points[..., :1], torch.zeros(2, 5, 1, dtype=torch.float64), points[..., 1:]], dim=-1
+        )
+        pressure = objective(drive_from_phases(2 * math.pi * turns).flatten(0, 1)).unflatten(0, (2, 5))
+        torch.testing.assert_close(problem.pressures(points), pressure)
+        torch.testing.assert_close(problem(points), pressure.amin(dim=-1))
+        assert problem.bounds.tolist() == [[0, 0, 0], [1, 1, 1]]
+
+    def test_is_maximised_unless_negated(self, make_objective, matrix):
+        problem, negated = (
+            at.FocusProblem(make_objective(matrix), negate=negate) for negate in (False, True)
+        )
+        assert not problem.is_minimization_problem
+        torch.testing.assert_close(negated(uniform(4, 3)), -problem(uniform(4, 3)))

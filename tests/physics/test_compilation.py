@@ -24,7 +24,7 @@ propagator = at.make_propagator(scene, "box", 2e-3, cache=False)
 objective = at.SimulatedObjective(scene, propagator)
 found = [propagator.transfer_matrix()]
 for solution in (
-    at.gabs(objective, trials=3), at.identify(objective), at.bayes_opt(objective, 30, fixed_transducer=0)
+    at.gabs(objective, trials=3), at.identify(objective), at.bayes_opt(objective, 20, fixed_transducer=0)
 ):
     found += [solution.drive, solution.pressure, solution.history]
 print(hashlib.sha256(b"".join(one.numpy().tobytes() for one in found)).hexdigest())
@@ -49,8 +49,8 @@ def test_cold_and_warm_caches_give_the_same_results(tmp_path: Path) -> None:
     assert compiled_again == 0
     assert warm == cold
     kept = [path.name for path in tmp_path.rglob("*.nbi")]
-    folders = Path(at.__file__).parent / "fdtd" / "kernels", Path(at.__file__).parent / "methods" / "bayes"
-    assert all(any(compiled._digest(folder) in name for folder in folders) for name in kept)
+    digest = compiled._digest(Path(at.__file__).parent / "fdtd" / "kernels")
+    assert all(digest in name for name in kept)
     assert kept
 
 

@@ -183,7 +183,7 @@ def test_levels_are_drawn_across_their_scene() -> None:
     assert labels == ["GABS", "bound", "90 %"]
 
 
-METHODS = ("lssg", "bayes_opt", "gabs", "lss", "random_search", "identify", "gradient_ascent")
+METHODS = ("lssg", "bayes_opt", "bo_foci", "gabs", "lss", "random_search", "identify", "gradient_ascent")
 
 
 def test_methods_differ_in_colour_in_marker_and_in_dashes() -> None:

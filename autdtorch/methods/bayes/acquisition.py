@@ -1,203 +1,127 @@
-"""Acquisition functions of a Gaussian process, and the point where one is largest."""
+"""Acquisition functions of all trials, and the points where they are largest."""
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
+from typing import Protocol
 
-import numpy as np
+import torch
+from botorch.acquisition.analytic import _ei_helper, _log_ei_helper
+from botorch.utils.safe_math import fatmin, log_fatplus, logmeanexp
 
-from autdtorch.methods.bayes.process import (
-    Posterior,
-    Vector,
-    add_rows,
-    compiled,
-    covariances,
-    features_of,
-    matern,
-    whiten,
-)
+from autdtorch.methods.bayes.climb import Effort, candidates, highest
+from autdtorch.methods.bayes.processes import Processes
+from autdtorch.objectives.objective import Score, weakest_focus
+from autdtorch.utils.validation import invalid
 
-_STARTS = 2  # The best candidates are climbed from,
-_CLIMB_EVALUATIONS = 20  # with so many evaluations of the acquisition function each.
-_BLOCK = 64
-"""Candidates whose covariances are kept at a time: so many that they stay in the cache."""
+_SCORE_EFFORT = Effort(candidates=128, starts=2, steps=20)
+_FOCUS_EFFORT = Effort(candidates=128, starts=4, steps=40)
+_SAMPLES = 32  # of the foci, over which the improvement of a goal is averaged
+_SMOOTH_MINIMUM = 1e-2  # temperature of the smooth minimum, and
+_SMOOTH_IMPROVEMENT = 1e-3  # of the smooth improvement, both in rms pressures of the strongest focus
+_LEAST_INTENSITY = 1e-6  # in such pressures, squared
 
 
-def largest(process: Posterior, log: bool, candidates: Vector, lower: Vector, upper: Vector) -> Vector:
-    """The point (D,) between `lower` and `upper` (D,) with the largest (log) expected improvement.
+class Acquisition(Protocol):
+    """What is observed next, and what is best so far.
 
-    Args:
-        process: the process.
-        log: whether the logarithm is compared and climbed.
-        candidates: (C, D); compared first, then climbed from the best of them.
-        lower: in turns; -inf on the circle.
-        upper: in turns.
+    Attributes:
+        best: index of the best point of each trial (T,).
     """
-    mean, deviation = posterior(process, candidates)
-    values = _expected_improvements(mean, deviation, process.best, log)
-    starts = candidates[np.argsort(-values, kind="stable")[:_STARTS]]
-    climbed = [_climb(process, log, start, lower, upper) for start in starts]
-    return np.asarray(max(climbed, key=lambda found: found[1])[0])
+
+    best: torch.Tensor
+
+    def next_points(self, generators: Sequence[torch.Generator], last: bool) -> torch.Tensor:
+        """Return the points (T, D) to observe next; `last` if nothing is observed after them."""
+        ...
 
 
-@compiled
-def posterior(process, points):  # type: ignore[no-untyped-def]
-    """Mean (C,) and standard deviation (C,) of the process, without noise, at points (C, D)."""
-    total, count = len(points), process.size
-    mean, deviation = np.empty(total), np.empty(total)
-    scale = 1 / process.length_scale**2
-    kernel, white = np.empty((count, _BLOCK)), np.empty(_BLOCK)
-    at, square = np.zeros((len(process.features), _BLOCK)), np.empty(_BLOCK)
-    for first in range(0, total, _BLOCK):
-        width = min(_BLOCK, total - first)
-        for c in range(width):
-            at[:, c] = features_of(points[first + c], process.circle)
-        block_mean, explained = np.zeros(_BLOCK), np.zeros(_BLOCK)
-        for n in range(count):
-            square[:] = 0.0
-            for f in range(len(at)):
-                for c in range(_BLOCK):
-                    square[c] += (process.features[f, n] - at[f, c]) ** 2
-            for c in range(_BLOCK):
-                kernel[n, c], _ = matern(square[c] * scale)
-                block_mean[c] += process.weights[n] * kernel[n, c]
-        for i in range(count):
-            white[:] = 0.0
-            add_rows(white, 0, _BLOCK, process.factor[i], kernel, 0, i + 1)
-            for c in range(_BLOCK):
-                explained[c] += white[c] * white[c]
-        for c in range(width):
-            mean[first + c] = block_mean[c]
-            deviation[first + c] = process.scale * _deviation(1 - explained[c])
-    return mean, deviation
+class ScoreAcquisition:
+    """The (log) expected improvement of a score that one process models.
 
-
-@compiled
-def _deviation(variance):  # type: ignore[no-untyped-def]
-    # Rounding may leave a variance below 0 at a point that is process.
-    return math.sqrt(max(variance, 1e-12))
-
-
-@compiled
-def expected_improvement(mean, deviation, best):  # type: ignore[no-untyped-def]
-    """E[max(f - best, 0)], and its derivatives by mean and deviation."""
-    u = (mean - best) / deviation
-    density, share = _normal(u)
-    return deviation * (density + u * share), share, density
-
-
-@compiled
-def log_expected_improvement(mean, deviation, best):  # type: ignore[no-untyped-def]
-    """Logarithm of the expected improvement, precise where that rounds to 0; its derivatives.
-
-    At u = -t, with the ratio m = (1 - Phi(t)) / phi(t) of Mills: phi + u Phi = phi (1 - t m). Both m and
-    1 - t m = m (1/m - t) follow from Laplace's continued fraction 1/m = t + 1/(t + 2/(t + ...)), in which
-    nothing cancels.
+    The formulas are those of BoTorch's `ExpectedImprovement` and `LogExpectedImprovement`, which take points
+    one by one.
     """
-    u = (mean - best) / deviation
-    if u > -10:
-        density, share = _normal(u)
-        gain = density + u * share
-        return math.log(deviation * gain), share / (deviation * gain), density / (deviation * gain)
-    rest = -u
-    for term in range(20, 1, -1):
-        rest = -u + term / rest
-    rest = 1 / rest  # 1/m - t
-    ratio = 1 / (rest - u)
-    gain = ratio * rest  # (phi + u Phi) / phi
-    value = math.log(deviation * gain) - 0.5 * u * u - 0.5 * math.log(2 * math.pi)
-    return value, ratio / (deviation * gain), 1 / (deviation * gain)
+
+    def __init__(self, processes: Processes, points: torch.Tensor, score: torch.Tensor, log: bool) -> None:
+        """Compare with the best of the scores (T, N, 1) at points (T, N, D)."""
+        self.best = score[..., 0].argmax(dim=1)
+        self._highest = score[..., 0].amax(dim=1, keepdim=True)
+        self._processes, self._points, self._log = processes, points, log
+
+    def next_points(self, generators: Sequence[torch.Generator], last: bool) -> torch.Tensor:
+        """Return the points (T, D) of the largest expected improvement."""
+        start = candidates(_chosen(self._points, self.best), generators, _SCORE_EFFORT.candidates)
+        return highest(self.value, start, _SCORE_EFFORT, self._processes.reach, self._processes.periodic)
+
+    def value(self, points: torch.Tensor) -> torch.Tensor:
+        """Return the improvement (T, C) at points (T, C, D)."""
+        mean, deviation = (of[..., 0] for of in self._processes.at(points))
+        scaled = (mean - self._highest) / deviation
+        if self._log:
+            return _log_ei_helper(scaled) + deviation.log()
+        gain: torch.Tensor = deviation * _ei_helper(scaled)
+        return gain
 
 
-@compiled
-def _normal(u):  # type: ignore[no-untyped-def]
-    """Density and distribution function of the standard normal distribution."""
-    return math.exp(-0.5 * u * u) / math.sqrt(2 * math.pi), 0.5 * math.erfc(-u / math.sqrt(2))
+class FocusAcquisition:
+    """The log expected improvement of a goal over processes of the intensities of the foci.
+
+    The foci are sampled independently. As in BoTorch's `qLogExpectedImprovement`, minimum and improvement are
+    smooth, so that the logarithm has a slope everywhere.
+    """
+
+    def __init__(self, processes: Processes, points: torch.Tensor, goal: Score) -> None:
+        """Compare with the highest posterior mean at the points (T, N, D)."""
+        self._processes, self._points, self._goal = processes, points, goal
+        self._unit = processes.scale.amax(dim=-1, keepdim=True).sqrt()
+        self._normal = _normal_samples(processes.scale.shape[-1])
+        with torch.no_grad():
+            expected = self.expected(points)
+        self.best = expected.argmax(dim=1)
+        self._highest = expected.amax(dim=1)[:, None, None]
+
+    def next_points(self, generators: Sequence[torch.Generator], last: bool) -> torch.Tensor:
+        """Return the points (T, D) of the largest expected improvement, or of the largest mean at last."""
+        best = _chosen(self._points, self.best)
+        start = candidates(best, generators, _FOCUS_EFFORT.candidates)
+        value = self.value
+        if last:
+            start, value = torch.cat([best[:, None], start], dim=1), self.expected
+        return highest(value, start, _FOCUS_EFFORT, self._processes.reach, self._processes.periodic)
+
+    def expected(self, points: torch.Tensor) -> torch.Tensor:
+        """Return the goal (T, C) of the mean intensities at points (T, C, D)."""
+        return self._scored(self._processes.at(points).mean)
+
+    def value(self, points: torch.Tensor) -> torch.Tensor:
+        """Return the log improvement (T, C) at points (T, C, D)."""
+        mean, deviation = self._processes.at(points)
+        samples = mean[..., None, :] + deviation[..., None, :] * self._normal
+        gain = log_fatplus(self._scored(samples) - self._highest, tau=_SMOOTH_IMPROVEMENT)
+        mean_gain: torch.Tensor = logmeanexp(gain, dim=-1)
+        return mean_gain
+
+    def _scored(self, intensity: torch.Tensor) -> torch.Tensor:
+        """Return the goal (T, ...) of intensities (T, ..., P), in units of pressure."""
+        unit = self._unit.reshape(-1, *(1,) * (intensity.ndim - 1))
+        pressure = (intensity / unit.square()).clamp_min(_LEAST_INTENSITY).sqrt()
+        if self._goal is weakest_focus:
+            minimum: torch.Tensor = fatmin(pressure, dim=-1, tau=_SMOOTH_MINIMUM)
+            return minimum
+        score = self._goal(unit * pressure) / unit[..., 0]
+        if intensity.requires_grad and not score.requires_grad:
+            raise invalid("score", self._goal, 'must be differentiable by PyTorch, for the model "foci"')
+        return score
 
 
-@compiled
-def _improvement(mean, deviation, best, log):  # type: ignore[no-untyped-def]
-    if log:
-        return log_expected_improvement(mean, deviation, best)
-    return expected_improvement(mean, deviation, best)
+def _chosen(points: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
+    return points[torch.arange(len(points), device="cpu"), index]
 
 
-@compiled
-def _expected_improvements(mean, deviation, best, log):  # type: ignore[no-untyped-def]
-    values = np.empty(len(mean))
-    for c in range(len(mean)):
-        values[c] = _improvement(mean[c], deviation[c], best, log)[0]
-    return values
-
-
-@compiled
-def _value(process, log, point, gradient, room):  # type: ignore[no-untyped-def]
-    """Acquisition function at a point (D,), its gradient written to `gradient` (D,)."""
-    count, dimensions = process.size, len(point)
-    kernel, slope, white, pull = room
-    at = features_of(point, process.circle)
-    covariances(process.features, count, at, process.length_scale, kernel, slope)
-    whiten(process.factor, count, kernel, white)
-    mean, explained = 0.0, 0.0
-    for n in range(count):
-        mean += process.weights[n] * kernel[n]
-        explained += white[n] * white[n]
-    deviation = process.scale * _deviation(1 - explained)
-    value, by_mean, by_deviation = _improvement(mean, deviation, process.best, log)
-    pull[:count] = 0.0
-    for i in range(count):
-        for j in range(i + 1):
-            pull[j] += white[i] * process.factor[i, j]
-    for n in range(count):
-        by_kernel = by_mean * process.weights[n] - by_deviation * process.scale**2 / deviation * pull[n]
-        pull[n] = 2 * slope[n] * by_kernel
-    for f in range(len(at)):
-        total = 0.0
-        for n in range(count):
-            total += pull[n] * (at[f] - process.features[f, n])
-        if not process.circle:
-            gradient[f] = total
-        elif f < dimensions:
-            gradient[f] = -2 * math.pi * at[dimensions + f] * total
-        else:
-            gradient[f - dimensions] += 2 * math.pi * at[f - dimensions] * total
-    return value
-
-
-@compiled
-def _climb(process, log, start, lower, upper):  # type: ignore[no-untyped-def]
-    """Spectral projected gradient (Birgin, Martinez and Raydan 2000): the best point (D,), and its value."""
-    dimensions = len(start)
-    room = (np.empty(process.size), np.empty(process.size), np.empty(process.size), np.empty(process.size))
-    point, gradient = start.copy(), np.empty(dimensions)
-    value = _value(process, log, point, gradient, room)
-    norm = math.sqrt(np.sum(gradient * gradient))
-    if norm == 0:
-        return point, value
-    reach = process.length_scale / (2 * math.pi) if process.circle else process.length_scale
-    rate = 0.1 * reach / norm
-    there, steeper, move = np.empty(dimensions), np.empty(dimensions), np.empty(dimensions)
-    share = 0.0
-    for _ in range(_CLIMB_EVALUATIONS):
-        if share == 0:
-            rise = 0.0
-            for d in range(dimensions):
-                move[d] = min(max(point[d] + rate * gradient[d], lower[d]), upper[d]) - point[d]
-                rise += move[d] * gradient[d]
-            if rise <= 0:
-                break
-            share = 1.0
-        for d in range(dimensions):
-            there[d] = point[d] + share * move[d]
-        found = _value(process, log, there, steeper, room)
-        if found < value + 1e-4 * share * rise:
-            # The top of the parabola through what is known of the line.
-            share *= min(max(-0.5 * share * rise / (found - value - share * rise), 0.1), 0.5)
-            continue
-        length, bend = 0.0, 0.0
-        for d in range(dimensions):
-            length += (share * move[d]) ** 2
-            bend -= share * move[d] * (steeper[d] - gradient[d])
-        rate = length / bend if bend > 0 else 4 * rate
-        point[:], gradient[:], value, share = there, steeper, found, 0.0
-    return point, value
+def _normal_samples(foci: int) -> torch.Tensor:
+    """Return samples (S, P) of the standard normal distribution, spread evenly by a Sobol sequence."""
+    sequence = torch.quasirandom.SobolEngine(foci, scramble=True, seed=0)  # type: ignore[no-untyped-call]
+    uniform = sequence.draw(_SAMPLES, dtype=torch.float64)
+    normal: torch.Tensor = torch.special.ndtri(uniform.clamp(1e-6, 1 - 1e-6))
+    return normal

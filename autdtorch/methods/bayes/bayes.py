@@ -1,50 +1,71 @@
-"""Bayesian optimisation of the phases (Algorithm 1), many trials at once."""
+"""Bayesian optimisation of the phases (Algorithm 1) with BoTorch, many trials at once."""
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import torch
 
-from autdtorch.methods.base import Method, Problem, State, Step, Trials
+from autdtorch.methods.base import Method, Problem, State, Step, Trials, generators_of, restored, states_of
 from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.objective import Objective, Score, weakest_focus
 from autdtorch.scene.drive import drive_from_phases
-from autdtorch.utils.threads import spread
-from autdtorch.utils.validation import integer_at_least, invalid, number_between, require_kind, require_one_of
+from autdtorch.utils.threads import one_torch_thread
+from autdtorch.utils.validation import integer_at_least, invalid, number_between, require_one_of
 
 if TYPE_CHECKING:
-    from autdtorch.methods.bayes.trial import BayesTrial
+    from autdtorch.methods.bayes.acquisition import Acquisition
 
 NOISE = 1e-4
-"""Variance of the observation noise that the Gaussian process assumes, in its own variances. A fitted one
+"""Variance of the observation noise that the process of the score assumes, in its own variances. A fitted one
 would take the kinks of the minimum over the foci for noise, and the search would end lower."""
+
+_REFIT_GROWTH = 1.2  # growth of the number of observations after which the hyperparameters are fitted again
+
+
+@contextlib.contextmanager
+def _defaults_of_processes() -> Iterator[None]:
+    """Set PyTorch's global state as GPyTorch needs it, whatever it is outside."""
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        with torch.inference_mode(False), torch.enable_grad(), torch.device("cpu"):
+            yield
+    finally:
+        torch.set_default_dtype(before)
 
 
 @dataclass(frozen=True)
 class BayesOpt(Method):
     """Maximise the score over the phases by Bayesian optimisation (Algorithm 1), all amplitudes being 1.
 
-    A Gaussian process with zero mean and an isotropic Matern 5/2 kernel is fitted to the standardised scores;
-    the next phases maximise the expected improvement (Eq. 7). As in the paper, the process does not know by
-    default that phases are periodic. Trials search for their next phases side by side, on as many threads as
-    PyTorch has.
+    The next phases maximise the expected improvement (Eq. 7) by Gaussian processes, BoTorch's `SingleTaskGP`.
+    The trials of a block are in the batch shape of one model: another block rounds otherwise, and the search
+    amplifies that, so that numbers repeat for equal blocks only.
 
     Attributes:
         evaluations: number of evaluations of a trial, > `initial`.
         initial: number of them, >= 2, that are spread over all phases before the search.
         fixed_transducer: index of the transducer whose phase stays 0, since a common offset of all phases
             changes no magnitude; 6 is the paper's 7th.
-        acquisition: "ei", the expected improvement, or "log_ei", its logarithm (Ament et al. 2023), which has
-            a slope also where the improvement itself rounds to 0.
-        embedding: space in which the kernel measures distances: the "phases" as numbers from 0 to 2 pi, or
-            their points (cos, sin) on the "circle", which makes the process periodic.
+        model: "weakest": one process models the score, as in the paper. "foci": each focus has a process, and
+            the improvement of the score is averaged over samples of all. The score must then be
+            differentiable by PyTorch.
+        kernel: of the model "weakest": "phases", as in the paper, measures distances between phases from 0 to
+            2 pi; "circle" between their points (cos, sin), which makes the process periodic; both are Matern
+            5/2. Of the model "foci": "phasor", the covariance of intensities |g . q|^2; see `PhasorKernel`.
+        acquisition: of the model "weakest": "ei", the expected improvement, or "log_ei", its logarithm (Ament
+            et al. 2023), which has a slope also where the improvement itself rounds to 0.
         initial_points: a scrambled "sobol" sequence, or independent "random" points.
-        noise: variance of the observations, in variances of the process, from 1e-6 to 1; "inferred" fits it.
+        noise: variance of the noise, from 1e-6 to 1: of scores in variances of the process, or of a reading
+            in mean intensities of its focus (model "foci"). "inferred" fits it. The model "foci" then
+            spends the last evaluation at the maximum of the posterior mean, and returns the drive where the
+            posterior mean is highest.
 
     Raises:
         ValueError: a setting out of range.
@@ -56,8 +77,9 @@ class BayesOpt(Method):
     evaluations: int = 256
     initial: int = 16
     fixed_transducer: int = 6
+    model: Literal["weakest", "foci"] = "weakest"
+    kernel: Literal["phases", "circle", "phasor"] = "phases"
     acquisition: Literal["ei", "log_ei"] = "ei"
-    embedding: Literal["phases", "circle"] = "phases"
     initial_points: Literal["sobol", "random"] = "sobol"
     noise: float | Literal["inferred"] = NOISE
 
@@ -68,8 +90,11 @@ class BayesOpt(Method):
         object.__setattr__(self, "evaluations", evaluations)
         fixed = integer_at_least("fixed_transducer", self.fixed_transducer, 0)
         object.__setattr__(self, "fixed_transducer", fixed)
+        require_one_of("model", self.model, ("weakest", "foci"))
+        require_one_of("kernel", self.kernel, ("phases", "circle", "phasor"))
+        if (self.kernel == "phasor") != (self.model == "foci"):
+            raise invalid("kernel", self.kernel, 'must be "phasor" with the model "foci", and only there')
         require_one_of("acquisition", self.acquisition, ("ei", "log_ei"))
-        require_one_of("embedding", self.embedding, ("phases", "circle"))
         require_one_of("initial_points", self.initial_points, ("sobol", "random"))
         if isinstance(self.noise, str):
             require_one_of("noise", self.noise, ("inferred",))
@@ -78,77 +103,86 @@ class BayesOpt(Method):
 
     def check(self, problem: Problem) -> None:
         """Check the number of transducers."""
-        transducers = integer_at_least("transducers of the objective's array", problem.transducers, 2)
-        if self.fixed_transducer >= transducers:
-            accepted = f"must be an integer from 0 to {transducers - 1}"
-            raise invalid("fixed_transducer", self.fixed_transducer, accepted)
+        require_transducer(self.fixed_transducer, problem.transducers)
 
     def most_evaluations(self, problem: Problem) -> int:
         """Return `evaluations`."""
         return self.evaluations
 
     def numbers_kept(self, problem: Problem) -> float:
-        """Return the numbers of the process: a matrix of all pairs of evaluations."""
-        return 2.0 * self.evaluations**2
+        """Return the numbers of the processes: a few matrices of all pairs of evaluations."""
+        return 4.0 * self._outputs(problem) * self.evaluations**2
 
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
         """Observe the initial points."""
-        trials = self._trials(problem, seeds)
-        points = torch.stack([trial.initial_points() for trial in trials])
+        generators = generators_of(seeds)
+        dimensions = problem.transducers - 1
+        if self.initial_points == "sobol":
+            points = torch.stack([_sobol(self.initial, dimensions, seed) for seed in seeds])
+        else:
+            points = torch.stack([_uniform(own, self.initial, dimensions) for own in generators])
         search = {
-            "points": points[:, :0],
-            "scores": points[:, :0, 0],
-            "next": points,
+            "points": points,
+            "values": torch.empty(len(seeds), 0, self._outputs(problem), dtype=torch.float64, device="cpu"),
+            "generators": states_of(generators),
         }
         return Step(drives_at(points, self.fixed_transducer), search)
 
-    def tell(self, state: State, pressure: torch.Tensor) -> State:
-        """Return the state after an observation; its processes are kept in `scratch`."""
-        require_kind("state", state, State)
-        count = state.search["points"].shape[1]
-        if state.scratch is None or any(trial.count != count for trial in state.scratch):
-            state = replace(state, scratch=self._rebuilt(state))
-        return super().tell(state, pressure)
-
+    @one_torch_thread()
+    @_defaults_of_processes()
     def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
-        """Fit the processes, and observe the points of the largest expected improvement."""
-        told = state.search["next"]
+        """Observe the points of the largest expected improvement."""
+        values = score[..., None] if self.model == "weakest" else pressure
         search = {
-            **state.search,
-            "points": torch.cat([state.search["points"], told], dim=1),
-            "scores": torch.cat([state.search["scores"], score], dim=1),
-        }
-        if search["scores"].shape[1] >= self.evaluations:
+            name: tensor.clone() for name, tensor in state.search.items()
+        }  # inference mode's are read-only
+        search["values"] = torch.cat([search["values"], values.clone()], dim=1)
+        count = search["values"].shape[1]
+        if self.model == "weakest" and count == self.evaluations:
             return Step(state.drives[:, :0], search)
-        observed = zip(state.scratch, told, score, strict=True)
-        points = torch.stack(spread(lambda one: one[0].next_point(*one[1:]), observed))[:, None]
-        return Step(drives_at(points, self.fixed_transducer), {**search, "next": points})
+        search |= self._fitted(search)
+        acquisition = self._acquisition(state.problem, search)
+        if count == self.evaluations:
+            return Step(state.drives[:, :0], {**search, "answer": acquisition.best})
+        generators = restored(search["generators"])
+        point = acquisition.next_points(generators, last=count == self.evaluations - 1)[:, None]
+        search |= {"points": torch.cat([search["points"], point], dim=1), "generators": states_of(generators)}
+        return Step(drives_at(point, self.fixed_transducer), search)
 
-    def _trials(self, problem: Problem, seeds: Sequence[int]) -> list[BayesTrial]:
-        from autdtorch.methods.bayes.trial import BayesTrial, Settings  # loads Numba
+    def best(self, state: State) -> Solution:
+        """Return the best drive observed, or that of the highest posterior mean (model "foci")."""
+        found = super().best(state)
+        if not state.done or self.model == "weakest":
+            return found
+        chosen = torch.arange(len(found.score), device="cpu"), state.search["answer"]
+        drive = state.problem.quantise(drives_at(state.search["points"][chosen], self.fixed_transducer))
+        pressure = state.search["values"][chosen]
+        return replace(found, drive=drive, pressure=pressure, score=state.problem.goal(pressure))
 
-        settings = Settings(
-            dimensions=problem.transducers - 1,
-            evaluations=self.evaluations,
-            initial=self.initial,
-            log=self.acquisition == "log_ei",
-            circle=self.embedding == "circle",
-            sobol=self.initial_points == "sobol",
-            noise=None if isinstance(self.noise, str) else self.noise,
-        )
-        return [BayesTrial(settings, seed) for seed in seeds]
+    def _outputs(self, problem: Problem) -> int:
+        return 1 if self.model == "weakest" else problem.foci
 
-    def _rebuilt(self, state: State) -> list[BayesTrial]:
-        """Return the trials after the observations so far, as their search left them."""
-        points, scores = state.search["points"], state.search["scores"]
-        trials = self._trials(state.problem, state.seeds)
-        for trial in trials:
-            trial.initial_points()  # draws from the generator
-        ends = [self.initial, *range(self.initial + 1, points.shape[1] + 1)] if points.shape[1] else []
-        for begin, end in zip([0, *ends], ends, strict=False):
-            for trial, own_points, own_scores in zip(trials, points, scores, strict=True):
-                trial.next_point(own_points[begin:end], own_scores[begin:end])
-        return trials
+    def _fitted(self, search: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Return the hyperparameters, fitted again where the observations grew by a fifth."""
+        count = search["values"].shape[1]
+        if "fitted" in search and count < _REFIT_GROWTH * int(search["fitted"]):
+            return {}
+        from autdtorch.methods.bayes.processes import fitted
+
+        fit = fitted(self.kernel, search["points"], search["values"], self.noise)
+        return {**fit._asdict(), "fitted": torch.tensor(count, dtype=torch.int64, device="cpu")}
+
+    def _acquisition(self, problem: Problem, search: Mapping[str, torch.Tensor]) -> Acquisition:
+        from autdtorch.methods.bayes.acquisition import FocusAcquisition, ScoreAcquisition
+        from autdtorch.methods.bayes.processes import Fit, Processes
+
+        fit = Fit(search["length_scale"], search["noise"])
+        processes = Processes(self.kernel, search["points"], search["values"], fit)
+        if self.model == "weakest":
+            return ScoreAcquisition(
+                processes, search["points"], search["values"], self.acquisition == "log_ei"
+            )
+        return FocusAcquisition(processes, search["points"], problem.goal)
 
 
 def bayes_opt(
@@ -160,35 +194,24 @@ def bayes_opt(
     fixed_transducer: int = 6,
     score: Score = weakest_focus,
     *,
+    model: Literal["weakest", "foci"] = "weakest",
+    kernel: Literal["phases", "circle", "phasor"] = "phases",
     acquisition: Literal["ei", "log_ei"] = "ei",
-    embedding: Literal["phases", "circle"] = "phases",
     initial_points: Literal["sobol", "random"] = "sobol",
     noise: float | Literal["inferred"] = NOISE,
 ) -> Solution:
-    """Run `BayesOpt` on an objective.
-
-    Args:
-        objective: what is evaluated.
-        evaluations: number of evaluations of a trial, > `initial`.
-        initial: number of evaluations, >= 2, before the search.
-        trials: number of trials T, >= 1, or their numbers.
-        seed: of the random choices, >= 0.
-        fixed_transducer: index of the transducer whose phase stays 0.
-        score: function that is maximised.
-        acquisition: "ei" or "log_ei".
-        embedding: "phases" or "circle".
-        initial_points: "sobol" or "random".
-        noise: variance of the observations, from 1e-6 to 1, or "inferred".
-
-    Returns:
-        The best drive observed in each trial.
-
-    Raises:
-        ValueError: an argument out of range, an array of one transducer, or pressures or scores that are not
-            finite.
-    """
-    method = BayesOpt(evaluations, initial, fixed_transducer, acquisition, embedding, initial_points, noise)
+    """Run `BayesOpt` with these settings on an objective; see `BayesOpt` and `run`."""
+    method = BayesOpt(
+        evaluations, initial, fixed_transducer, model, kernel, acquisition, initial_points, noise
+    )
     return run(method, objective, trials, seed, score=score)
+
+
+def require_transducer(fixed_transducer: int, transducers: int) -> None:
+    """Check that an array has at least two transducers, and the one whose phase is fixed."""
+    integer_at_least("transducers of the objective's array", transducers, 2)
+    if not 0 <= fixed_transducer < transducers:
+        raise invalid("fixed_transducer", fixed_transducer, f"must be an integer from 0 to {transducers - 1}")
 
 
 def drives_at(points: torch.Tensor, fixed_transducer: int) -> torch.Tensor:
@@ -197,3 +220,15 @@ def drives_at(points: torch.Tensor, fixed_transducer: int) -> torch.Tensor:
     return drive_from_phases(
         2 * math.pi * torch.cat([before, torch.zeros_like(points[..., :1]), after], dim=-1)
     )
+
+
+def _sobol(count: int, dimensions: int, seed: int) -> torch.Tensor:
+    sequence = torch.quasirandom.SobolEngine(dimensions, scramble=True, seed=seed)  # type: ignore[no-untyped-call]
+    points = sequence.draw(count, dtype=torch.float64)
+    points[0] = sequence.shift.double() / 2**sequence.MAXBIT  # the engine rounds it to PyTorch's default
+    return points
+
+
+def _uniform(generator: torch.Generator, *shape: int) -> torch.Tensor:
+    """Return random numbers in [0, 1)."""
+    return torch.rand(shape, dtype=torch.float64, generator=generator, device="cpu")

@@ -1,0 +1,194 @@
+"""Gaussian processes over drives: those of all trials, and of all foci, in the batch shape of one model."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal, NamedTuple, TypeAlias
+
+import torch
+from botorch.fit import fit_gpytorch_mll
+from botorch.models import SingleTaskGP
+from gpytorch.kernels import MaternKernel
+from gpytorch.means import ZeroMean
+from gpytorch.mlls import ExactMarginalLogLikelihood
+
+from autdtorch.methods.bayes.kernels import PhasorKernel, on_circle, phasors
+
+KernelName: TypeAlias = Literal["phases", "circle", "phasor"]
+"""The space in which a process measures phases: as numbers, on the circle, or by the phasors they make."""
+
+_FEATURES = {"phases": lambda points: points, "circle": on_circle, "phasor": phasors}
+_LEAST_VARIANCE = 1e-12
+"""Smallest variance of a posterior: rounding may leave one below 0 at an observed point."""
+
+_JITTER = 1e-5
+"""Variance added to intensities, in variances of the process, so that their covariance can be inverted."""
+
+_PHASOR_REACH = 0.2  # [turns]
+
+_NOISES = 10.0 ** torch.linspace(-6, 0, 25, dtype=torch.float64, device="cpu")
+"""Candidates for the variance of a reading's noise, in mean intensities."""
+
+
+class Fit(NamedTuple):
+    """The fitted hyperparameters of the processes of T trials, with K outputs each.
+
+    Attributes:
+        length_scale: of the Matern kernel (T, K); ones for the phasor kernel, which has none.
+        noise: variance of the noise (T, K): of values in variances of the process, or, for the phasor
+            kernel, of a reading in mean intensities.
+    """
+
+    length_scale: torch.Tensor
+    noise: torch.Tensor
+
+
+class Posterior(NamedTuple):
+    """Mean and standard deviation at points, both (T, C, K)."""
+
+    mean: torch.Tensor
+    deviation: torch.Tensor
+
+
+class Processes:
+    """Gaussian processes of T trials with K outputs each, in the batch shape of one `SingleTaskGP`.
+
+    With the kernels "phases" and "circle" (Matern 5/2) the process models the values, standardised. With the
+    kernel "phasor" it models the intensities of pressures, in units of their mean.
+
+    Attributes:
+        periodic: whether phases have their period.
+        reach: length over which a process varies (T,) [turns].
+        mean: of the processes before the observations (T, 1, K).
+        scale: standard deviation, likewise.
+    """
+
+    def __init__(self, kernel: KernelName, points: torch.Tensor, values: torch.Tensor, fit: Fit) -> None:
+        """Condition the processes on observations.
+
+        Args:
+            kernel: space in which phases are measured.
+            points: phases in turns (T, N, D).
+            values: scores or pressures (T, N, K).
+            fit: hyperparameters.
+        """
+        self._features = _FEATURES[kernel]
+        self._observed = self._features(points)
+        self.periodic = kernel != "phases"
+        self.reach = _reach(kernel, fit)
+        standard, self.mean, self.scale = standardised(kernel, values, fit.noise)
+        self.model = _model(kernel, self._observed, standard, fit).eval().requires_grad_(False)
+        self.model.posterior(self._observed[:, :1])  # makes GPyTorch's caches
+        cached: Any = self.model.prediction_strategy
+        shape = *values.shape[::2], -1
+        self._weights = cached.mean_cache.reshape(shape).mT
+        factor = cached.lik_train_train_covar.cholesky().to_dense().reshape(*shape, points.shape[1])
+        one = torch.eye(points.shape[1], dtype=factor.dtype, device="cpu")
+        self._whitening = torch.linalg.solve_triangular(factor, one, upper=False).mT
+
+    def at(self, points: torch.Tensor) -> Posterior:
+        """Return the posterior at points (T, C, D), in the units of scores, or of intensities.
+
+        It is that of the model, written out from the model's caches: outputs share the covariances, and no
+        covariance between points is needed.
+        """
+        covariance = self.model.covar_module(self._features(points), self._observed).to_dense()
+        explained = (covariance[:, None] @ self._whitening).square().sum(dim=-1).mT
+        deviation = (1 - explained).clamp_min(_LEAST_VARIANCE).sqrt()
+        return Posterior(self.mean + self.scale * (covariance @ self._weights), self.scale * deviation)
+
+
+def standardised(
+    kernel: KernelName, values: torch.Tensor, noise: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return what a process models of values (T, N, K), with its mean and its unit (T, 1, K)."""
+    if kernel != "phasor":
+        mean, unit = values.mean(dim=1, keepdim=True), values.std(dim=1, keepdim=True)
+        unit = unit.clamp_min(1e-6 * mean.abs()).clamp_min(_LEAST_VARIANCE)  # values that never change
+        return (values - mean) / unit, mean, unit
+    # A reading is |p + n|, n circular Gaussian noise: its square is above |p|^2 by the noise's variance.
+    intensity = values.square()
+    unit = intensity.mean(dim=1, keepdim=True) / (1 + noise[:, None])
+    return intensity / unit - noise[:, None] - 1, unit, unit
+
+
+def fitted(
+    kernel: KernelName, points: torch.Tensor, values: torch.Tensor, noise: float | Literal["inferred"]
+) -> Fit:
+    """Return the hyperparameters of the largest marginal likelihood.
+
+    Args:
+        kernel: space in which phases are measured.
+        points: phases in turns (T, N, D).
+        values: scores or pressures (T, N, K).
+        noise: as in `Fit`; "inferred" to fit it, too.
+    """
+    shape = values.shape[0], values.shape[2]
+    given = torch.full(shape, 0.0 if isinstance(noise, str) else noise, dtype=torch.float64, device="cpu")
+    if kernel == "phasor":
+        ones = torch.ones_like(given)
+        return Fit(ones, _likeliest_noise(points, values) if isinstance(noise, str) else given)
+    standard = standardised(kernel, values, given)[0]
+    fits = [
+        [_fit_alone(kernel, own, column[:, None], noise) for column in columns.T]
+        for own, columns in zip(points, standard, strict=True)
+    ]
+    length_scale, variance = torch.tensor(fits, dtype=torch.float64, device="cpu").unbind(dim=-1)
+    return Fit(length_scale, variance)
+
+
+def _fit_alone(
+    kernel: KernelName, points: torch.Tensor, standard: torch.Tensor, noise: float | Literal["inferred"]
+) -> tuple[float, float]:
+    """Return length scale and noise of one process; a joint fit of many would couple them (L-BFGS)."""
+    known = None if isinstance(noise, str) else torch.full_like(standard, noise)
+    model = SingleTaskGP(
+        _FEATURES[kernel](points), standard, known,
+        covar_module=MaternKernel(2.5), mean_module=ZeroMean(), outcome_transform=None,
+    )  # fmt: skip
+    fit_gpytorch_mll(ExactMarginalLogLikelihood(model.likelihood, model))
+    variance = model.likelihood.noise.mean()
+    return model.covar_module.lengthscale.item(), variance.item()
+
+
+def _likeliest_noise(points: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    """Return the variance of a reading's noise (T, P), in mean intensities, equal in pascals for all foci."""
+    features, intensity = phasors(points), values.square()
+    mean = intensity.mean(dim=1)
+    share, vectors = torch.linalg.eigh(PhasorKernel("drives").forward(features, features))
+    seen = (vectors.mT @ (intensity / mean[:, None] - 1)).square()
+    variance = _NOISES[:, None, None] * mean.mean(dim=-1, keepdim=True)
+    noise = variance / (mean - variance).clamp_min(0.1 * mean)
+    unit = 1 + noise
+    spread = share.clamp_min(0)[..., None] + _intensity_variance(noise)[:, :, None]
+    fit = len(seen[0]) * unit.log() - 0.5 * (spread.log() + unit[:, :, None].square() * seen / spread).sum(
+        dim=2
+    )
+    return noise[fit.sum(dim=-1).argmax(dim=0), torch.arange(len(mean), device="cpu")]
+
+
+def _intensity_variance(noise: torch.Tensor) -> torch.Tensor:
+    # |p + n|^2 has the variance 2 |p|^2 s^2 + s^4; |p|^2 is 1 in the mean.
+    return noise * (2 + noise) + _JITTER
+
+
+def _model(kernel: KernelName, features: torch.Tensor, standard: torch.Tensor, fit: Fit) -> SingleTaskGP:
+    if kernel == "phasor":
+        covariance = PhasorKernel("drives")
+        variance = _intensity_variance(fit.noise)
+    else:
+        outputs = fit.length_scale.shape[1:] if fit.length_scale.shape[1] > 1 else ()
+        covariance = MaternKernel(2.5, batch_shape=torch.Size([len(features), *outputs]))
+        covariance.lengthscale = fit.length_scale.reshape(*covariance.batch_shape, 1, 1)
+        variance = fit.noise
+    return SingleTaskGP(
+        features, standard, variance[:, None].expand_as(standard).contiguous(),
+        covar_module=covariance, mean_module=ZeroMean(), outcome_transform=None,
+    )  # fmt: skip
+
+
+def _reach(kernel: KernelName, fit: Fit) -> torch.Tensor:
+    if kernel == "phasor":
+        return torch.full(fit.noise.shape[:1], _PHASOR_REACH, dtype=torch.float64, device="cpu")
+    shortest = fit.length_scale.amin(dim=-1)
+    return shortest / (2 * math.pi) if kernel == "circle" else shortest
