@@ -22,7 +22,6 @@ def found(seed: int) -> list[float]:
     )
     assert objective.transfer_matrix is not None
     scores = [at.gabs(objective, trials=40, seed=seed), at.identify(objective, seed=seed)]
-    scores += [at.bayes_opt(objective, 20, trials=2, fixed_transducer=0, seed=seed)]
     return [objective.transfer_matrix.abs().sum().item(), *(each.score.sum().item() for each in scores)]
 
 

@@ -14,8 +14,9 @@ from submitit.slurm.slurm import SlurmInfoWatcher, SlurmJob
 
 logger = logging.getLogger(__name__)
 
-_PAUSE = 10.0  # [s] between questions to the queue; clusters want few
-_MOST_FAILURES = 30  # failures of squeue in a row, 5 min; a controller that restarts is back before
+_PAUSE = 1.0, 10.0  # [s] between the first questions to the queue, and at most; clusters want few
+_LONGER = 1.2  # growth of the pause
+_MOST_FAILURES = 30  # failures of squeue in a row, some 4 min; a controller that restarts is back before
 
 
 class QueueWatcher(SlurmInfoWatcher):
@@ -27,7 +28,7 @@ class QueueWatcher(SlurmInfoWatcher):
         self._logs = logs
         self._numbers: set[str] = set()
         self._queued = True
-        self._next_question = 0.0
+        self._next_question, self._pause = 0.0, _PAUSE[0]
         self._told = ""
         self._failures = 0
 
@@ -47,7 +48,8 @@ class QueueWatcher(SlurmInfoWatcher):
         killed is therefore not done before the others.
         """
         if time.monotonic() >= self._next_question:
-            self._next_question = time.monotonic() + _PAUSE
+            self._next_question = time.monotonic() + self._pause
+            self._pause = min(_LONGER * self._pause, _PAUSE[1])
             self._ask()
         return not self._queued
 

@@ -142,11 +142,13 @@ class Method(ABC):
         name: of the method in results and files.
         label: name of the method in figures and tables.
         random: whether trials differ by random choices. A method without has one trial.
+        block: number of trials that a study runs and saves together.
     """
 
     name: ClassVar[str]
     label: ClassVar[str]
     random: ClassVar[bool] = True
+    block: ClassVar[int] = 10
 
     def __init_subclass__(cls) -> None:
         """Name a method without a name after its class."""

@@ -43,7 +43,7 @@ StudyMethod: TypeAlias = Method | Callable[..., Solution]
 """A `Method`, or a function of an objective with its settings bound. A function that has parameters `trials`
 and `seed` is given the numbers of the trials to run, as many as it is to return, and the study's seed."""
 
-BLOCK = 25
+BLOCK = Method.block
 """Trials that are run and saved together. The end of the process costs the block in work at most."""
 
 _MOST_SAMPLES = 10**6  # of an observation plane: 16 complex columns of them are 256 MB
@@ -94,7 +94,7 @@ def run_study(
             if isinstance(method, Method):
                 problem = Problem(len(scene.array), len(scene.control_points), scene=scene)
                 with within(f"method {name}"):
-                    method.require_fit(problem, min(counts[name], BLOCK))
+                    method.require_fit(problem, min(counts[name], method.block))
     planes = {name: _plane_points(scene, plane_spacing) for name, scene in scenes.items()}
     # The digest of our source does not cover methods and obstacles of the user's own.
     code = [*map(_code_of, methods.values())]
@@ -175,7 +175,8 @@ def _run_scene(
     for method_name, method in methods.items():
         where = name, method_name, counts[method_name]
         progress.advance(where[2] - len(trials.missing(*where)))
-        _run_trials(where, functools.partial(solve, method, objective, seed=seed), trials, progress)
+        size = method.block if isinstance(method, Method) else BLOCK
+        _run_trials(where, size, functools.partial(solve, method, objective, seed=seed), trials, progress)
     found = {method_name: trials.found(name, method_name, count) for method_name, count in counts.items()}
     progress.begin(f"{name}: observation plane")
     begin = time.perf_counter()
@@ -199,12 +200,16 @@ def _run_scene(
 
 
 def _run_trials(
-    where: tuple[str, str, int], solve: Callable[..., Solution], trials: TrialFile, progress: Progress
+    where: tuple[str, str, int],
+    size: int,
+    solve: Callable[..., Solution],
+    trials: TrialFile,
+    progress: Progress,
 ) -> None:
-    """Run the blocks of trials of which one is missing; `where` is scene, method and number of trials."""
+    """Run the blocks of `size` trials of which one is missing; `where` is scene, method and their number."""
     scene, method, count = where
     missing = set(trials.missing(*where))
-    for block in (range(first, min(first + BLOCK, count)) for first in range(0, count, BLOCK)):
+    for block in (range(first, min(first + size, count)) for first in range(0, count, size)):
         if missing.isdisjoint(block):
             continue
         first, last = block[0] + 1, block[-1] + 1

@@ -34,6 +34,10 @@ METHODS: tuple[tuple[str, Method], ...] = (
     ("GABS, 4 levels", partial(at.gabs, levels=4)),
     ("BO", partial(at.bayes_opt, evaluations=1000)),
     ("BO on the circle", partial(at.bayes_opt, evaluations=1000, kernel="circle")),
+    (
+        "BO, each focus",
+        partial(at.bayes_opt, evaluations=600, initial=4, model="foci", kernel="phasor", noise="inferred"),
+    ),
     ("identify", partial(at.identify, evaluations=1000)),
     ("random search", partial(at.random_search, evaluations=4000)),
     ("GABS, 16 levels", at.gabs),

@@ -15,7 +15,7 @@ from one_node_slurm import missing_programs, one_node_slurm
 from autdtorch.cli.main import CONFIGS
 from autdtorch.study.results_file import load_results
 
-TRIALS = 40
+TRIALS = 20
 SWEEP = ("scene=sphere", "solver.spacing=2.8e-3", "solver.tolerance=0.1", "plane_spacing=0.02", "seed=0,1")
 SWEEP += ("method=identify", f"trials={TRIALS}")
 # With a limit below ten minutes, submitit takes every signal for the one that Slurm sends before the limit.

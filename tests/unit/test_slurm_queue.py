@@ -14,7 +14,7 @@ from autdtorch.cli.slurm import QueueWatcher
 def squeue(tmp_path, monkeypatch):
     """Puts a shell script in the place of `squeue`; there is none before."""
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr(slurm, "_PAUSE", 0.0)
+    monkeypatch.setattr(slurm, "_PAUSE", (0.0, 0.0))
 
     def install(script):
         (tmp_path / "squeue").write_text(f"#!/bin/sh\n{script}\n", encoding="utf-8")
