@@ -17,7 +17,7 @@ METHODS: dict[str, type[Method]] = {
 }
 """Methods by name, in the order of reports. A method of one's own needs no entry: configs name its class."""
 
-_VARIANTS = {"bo_foci": "BO, each focus", "bo_circle": "BO, circle"}
+_VARIANTS = {"bo_foci": "BO per focus", "bo_circle": "BO on the circle"}
 """Labels of configs that are settings of a method."""
 
 

@@ -35,7 +35,7 @@ METHODS: tuple[tuple[str, Method], ...] = (
     ("BO", partial(at.bayes_opt, evaluations=1000)),
     ("BO on the circle", partial(at.bayes_opt, evaluations=1000, kernel="circle")),
     (
-        "BO, each focus",
+        "BO per focus",
         partial(at.bayes_opt, evaluations=600, initial=4, model="foci", kernel="phasor", noise="inferred"),
     ),
     ("identify", partial(at.identify, evaluations=1000)),
