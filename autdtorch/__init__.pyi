@@ -15,6 +15,7 @@ from .methods.gabs import GABS, gabs
 from .methods.gradient import GradientAscent, gradient_ascent
 from .methods.identify import Identify, identify
 from .methods.lssg import LSS, LSSG, lss, lssg
+from .methods.prior import Prior
 from .methods.random_search import RandomSearch, random_search
 from .methods.solution import Solution
 from .methods.state_file import load_state, save_state
@@ -63,6 +64,7 @@ __all__ = [
     "OverlapWarning",
     "PhasorKernel",
     "Plane",
+    "Prior",
     "Problem",
     "Quantised",
     "RandomSearch",

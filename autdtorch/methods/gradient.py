@@ -80,10 +80,17 @@ def random_drives(count: int, transducers: int, generator: torch.Generator) -> t
 
 @one_torch_thread()
 def climb(matrix: torch.Tensor, drive: torch.Tensor, steps: int) -> torch.Tensor:
-    """Return the highest drive (M,) of projected gradient ascents with momentum from drives (S, M).
+    """Return the highest drive (M,) of the climbs from drives (S, M), on one matrix (P, M)."""
+    drive = climbed(matrix, drive, steps)
+    return drive[weakest_focus(_pressure(matrix, drive).abs()).argmax()]
 
-    The ascent maximises a smooth minimum over the foci of `matrix` (P, M), -T log sum_p exp(-|p_p| / T). Its
-    temperature T falls until it is the minimum.
+
+@one_torch_thread()
+def climbed(matrix: torch.Tensor, drive: torch.Tensor, steps: int) -> torch.Tensor:
+    """Return drives (S, M) after projected gradient ascents with momentum from drives (S, M).
+
+    Each ascent maximises a smooth minimum over the foci, -T log sum_p exp(-|p_p| / T), of one matrix (P, M)
+    or of its own (S, P, M). The temperature T falls until it is the minimum.
     """
     velocity = torch.zeros_like(drive)
     for progress in torch.linspace(0, 1, steps, dtype=torch.float64, device="cpu").tolist():
@@ -97,7 +104,7 @@ def climb(matrix: torch.Tensor, drive: torch.Tensor, steps: int) -> torch.Tensor
         velocity = _MOMENTUM * velocity + (1 - _MOMENTUM) * slope
         drive = drive + step * velocity
         drive = drive / drive.abs().clamp_min(1)
-    return drive[weakest_focus(_pressure(matrix, drive).abs()).argmax()]
+    return drive
 
 
 def _pressure(matrix: torch.Tensor, drive: torch.Tensor) -> torch.Tensor:

@@ -7,7 +7,8 @@ import torch
 
 from autdtorch.methods.bound import focus_bound
 from autdtorch.methods.gradient import gradient_ascent, random_drives
-from autdtorch.methods.identify import _fit, identify
+from autdtorch.methods.identify import identify
+from autdtorch.methods.phase_retrieval import _fit
 from autdtorch.objectives.perturbations import Noise, Quantised
 
 

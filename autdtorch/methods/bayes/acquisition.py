@@ -16,6 +16,7 @@ from autdtorch.utils.validation import invalid
 
 _SCORE_EFFORT = Effort(candidates=128, starts=2, steps=20)
 _FOCUS_EFFORT = Effort(candidates=128, starts=4, steps=40)
+_NEAR_EFFORT = Effort(candidates=16, starts=2, steps=10)  # where a good start is known
 _SAMPLES = 32  # of the foci, over which the improvement of a goal is averaged
 _SMOOTH_MINIMUM = 1e-2  # temperature of the smooth minimum, and
 _SMOOTH_IMPROVEMENT = 1e-3  # of the smooth improvement, both in rms pressures of the strongest focus
@@ -71,8 +72,11 @@ class FocusAcquisition:
     smooth, so that the logarithm has a slope everywhere.
     """
 
-    def __init__(self, processes: Processes, points: torch.Tensor, goal: Score) -> None:
-        """Compare with the highest posterior mean at the points (T, N, D)."""
+    def __init__(
+        self, processes: Processes, points: torch.Tensor, goal: Score, start: torch.Tensor | None = None
+    ) -> None:
+        """Compare with the highest posterior mean at the points (T, N, D); `start` (T, D) may be better."""
+        self._start = start
         self._processes, self._points, self._goal = processes, points, goal
         self._unit = processes.scale.amax(dim=-1, keepdim=True).sqrt()
         self._normal = _normal_samples(processes.scale.shape[-1])
@@ -84,11 +88,11 @@ class FocusAcquisition:
     def next_points(self, generators: Sequence[torch.Generator], last: bool) -> torch.Tensor:
         """Return the points (T, D) of the largest expected improvement, or of the largest mean at last."""
         best = _chosen(self._points, self.best)
-        start = candidates(best, generators, _FOCUS_EFFORT.candidates)
-        value = self.value
-        if last:
-            start, value = torch.cat([best[:, None], start], dim=1), self.expected
-        return highest(value, start, _FOCUS_EFFORT, self._processes.reach, self._processes.periodic)
+        effort = _FOCUS_EFFORT if self._start is None else _NEAR_EFFORT
+        known = [best] if self._start is None else [best, self._start]
+        start = torch.cat([torch.stack(known, dim=1), candidates(best, generators, effort.candidates)], dim=1)
+        value = self.expected if last else self.value
+        return highest(value, start, effort, self._processes.reach, self._processes.periodic)
 
     def expected(self, points: torch.Tensor) -> torch.Tensor:
         """Return the goal (T, C) of the mean intensities at points (T, C, D)."""

@@ -12,18 +12,25 @@ import torch
 
 from autdtorch.methods.base import Method, Problem, State, Step, Trials, generators_of, restored, states_of
 from autdtorch.methods.driver import run
+from autdtorch.methods.gradient import climb, climbed, random_drives
+from autdtorch.methods.matrix_posterior import kept, posteriors
+from autdtorch.methods.prior import Prior
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.objective import Objective, Score, weakest_focus
-from autdtorch.scene.drive import drive_from_phases
+from autdtorch.scene.drive import drive_from_phases, phases_of
 from autdtorch.utils.threads import one_torch_thread
 from autdtorch.utils.validation import integer_at_least, invalid, number_between, require_one_of
 
 if TYPE_CHECKING:
     from autdtorch.methods.bayes.acquisition import Acquisition
+    from autdtorch.methods.bayes.processes import Fit, Rows
 
 NOISE = 1e-4
 """Variance of the observation noise that the process of the score assumes, in its own variances. A fitted one
 would take the kinks of the minimum over the foci for noise, and the search would end lower."""
+
+_STARTS, _CLIMB_STEPS = 16, 300  # of the climbs to the best drive of a simulation
+_SAMPLE_STEPS = 60  # of the climb on a sample of the matrix, from the best drive
 
 _REFIT_GROWTH = 1.2  # growth of the number of observations after which the hyperparameters are fitted again
 
@@ -34,7 +41,11 @@ def _defaults_of_processes() -> Iterator[None]:
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
     try:
-        with torch.inference_mode(False), torch.enable_grad(), torch.device("cpu"):
+        with contextlib.ExitStack() as changed:
+            changed.enter_context(torch.inference_mode(False))
+            changed.enter_context(torch.enable_grad())
+            if torch.get_default_device().type != "cpu":  # it slows every operation by a microsecond or two
+                changed.enter_context(torch.device("cpu"))
             yield
     finally:
         torch.set_default_dtype(before)
@@ -50,12 +61,14 @@ class BayesOpt(Method):
 
     Attributes:
         evaluations: number of evaluations of a trial, > `initial`.
-        initial: number of them, >= 2, that are spread over all phases before the search.
+        initial: number of them, >= 2, that are spread over all phases before the search. With a prior, the
+            search begins at the best drive of the simulation instead.
         fixed_transducer: index of the transducer whose phase stays 0, since a common offset of all phases
             changes no magnitude; 6 is the paper's 7th.
         model: "weakest": one process models the score, as in the paper. "foci": each focus has a process, and
             the improvement of the score is averaged over samples of all. The score must then be
-            differentiable by PyTorch.
+            differentiable by PyTorch. From 3 M - 1 evaluations on, or with a prior, the processes begin at a
+            sample of the transfer matrix that `MatrixPosterior` fits to all readings.
         kernel: of the model "weakest": "phases", as in the paper, measures distances between phases from 0 to
             2 pi; "circle" between their points (cos, sin), which makes the process periodic; both are Matern
             5/2. Of the model "foci": "phasor", the covariance of intensities |g . q|^2; see `PhasorKernel`.
@@ -66,6 +79,7 @@ class BayesOpt(Method):
             in mean intensities of its focus (model "foci"). "inferred" fits it. The model "foci" then
             spends the last evaluation at the maximum of the posterior mean, and returns the drive where the
             posterior mean is highest.
+        prior: what a simulation says of the transfer matrix, for the model "foci".
 
     Raises:
         ValueError: a setting out of range.
@@ -83,6 +97,7 @@ class BayesOpt(Method):
     acquisition: Literal["ei", "log_ei"] = "ei"
     initial_points: Literal["sobol", "random"] = "sobol"
     noise: float | Literal["inferred"] = NOISE
+    prior: Prior | None = None
 
     def __post_init__(self) -> None:
         """Check the settings."""
@@ -101,10 +116,15 @@ class BayesOpt(Method):
             require_one_of("noise", self.noise, ("inferred",))
         else:
             object.__setattr__(self, "noise", number_between("noise", self.noise, 1e-6, 1))
+        object.__setattr__(self, "prior", Prior.of("prior", self.prior))
+        if self.prior is not None and self.model != "foci":
+            raise invalid("prior", self.prior, 'must be None without the model "foci"')
 
     def check(self, problem: Problem) -> None:
-        """Check the number of transducers."""
+        """Check the number of transducers, and the prior."""
         require_transducer(self.fixed_transducer, problem.transducers)
+        if self.prior is not None:
+            self.prior.simulated(problem)
 
     def most_evaluations(self, problem: Problem) -> int:
         """Return `evaluations`."""
@@ -112,13 +132,21 @@ class BayesOpt(Method):
 
     def numbers_kept(self, problem: Problem) -> float:
         """Return the numbers of the processes: a few matrices of all pairs of evaluations."""
-        return 4.0 * self._outputs(problem) * self.evaluations**2
+        outputs = self._outputs(problem)
+        coupled = outputs if self.prior is not None else 1
+        return 4.0 * outputs * coupled * self.evaluations**2
 
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
         """Observe the initial points."""
         generators = generators_of(seeds)
         dimensions = problem.transducers - 1
-        if self.initial_points == "sobol":
+        if self.prior is not None:
+            matrix = self.prior.simulated(problem)
+            starts = [random_drives(_STARTS, problem.transducers, own) for own in generators]
+            points = self._points(torch.stack([climb(matrix, start, _CLIMB_STEPS) for start in starts]))[
+                :, None
+            ]
+        elif self.initial_points == "sobol":
             points = torch.stack([_sobol(self.initial, dimensions, seed) for seed in seeds])
         else:
             points = torch.stack([_uniform(own, self.initial, dimensions) for own in generators])
@@ -134,18 +162,17 @@ class BayesOpt(Method):
     def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
         """Observe the points of the largest expected improvement."""
         values = score[..., None] if self.model == "weakest" else pressure
-        search = {
-            name: tensor.clone() for name, tensor in state.search.items()
-        }  # inference mode's are read-only
+        # Tensors of inference mode are read-only.
+        search = {name: tensor.clone() for name, tensor in state.search.items()}
         search["values"] = torch.cat([search["values"], values.clone()], dim=1)
         count = search["values"].shape[1]
         if self.model == "weakest" and count == self.evaluations:
             return Step(state.drives[:, :0], search)
-        search |= self._fitted(search)
-        acquisition = self._acquisition(state.problem, search)
+        generators = restored(search["generators"])
+        fit, rows = self._fitted(state.problem, search, generators)
+        acquisition = self._acquisition(state.problem, search, fit, rows)
         if count == self.evaluations:
             return Step(state.drives[:, :0], {**search, "answer": acquisition.best})
-        generators = restored(search["generators"])
         point = acquisition.next_points(generators, last=count == self.evaluations - 1)[:, None]
         search |= {"points": torch.cat([search["points"], point], dim=1), "generators": states_of(generators)}
         return Step(drives_at(point, self.fixed_transducer), search)
@@ -163,27 +190,67 @@ class BayesOpt(Method):
     def _outputs(self, problem: Problem) -> int:
         return 1 if self.model == "weakest" else problem.foci
 
-    def _fitted(self, search: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Return the hyperparameters, fitted again where the observations grew by a fifth."""
+    def _points(self, drives: torch.Tensor) -> torch.Tensor:
+        """Return points (..., M - 1) in turns with the phases of drives (..., M)."""
+        phases = phases_of(drives)
+        points = (phases - phases[..., [self.fixed_transducer]]) / (2 * math.pi) % 1
+        return points[..., self._others(drives.shape[-1])[:-1]]
+
+    def _others(self, transducers: int) -> list[int]:
+        """Return the indices of all transducers, the fixed one at the end."""
+        others = [index for index in range(transducers) if index != self.fixed_transducer]
+        return [*others, self.fixed_transducer]
+
+    def _fitted(
+        self, problem: Problem, search: dict[str, torch.Tensor], generators: Sequence[torch.Generator]
+    ) -> tuple[Fit, Rows | None]:
+        """Return hyperparameters and rows; `search` keeps what the next fit begins with."""
+        from autdtorch.methods.bayes.processes import Fit, fitted
+
         count = search["values"].shape[1]
-        if "fitted" in search and count < _REFIT_GROWTH * int(search["fitted"]):
-            return {}
-        from autdtorch.methods.bayes.processes import fitted
+        if self.model == "foci" and (self.prior is not None or count >= 3 * problem.transducers - 1):
+            return self._with_rows(problem, search, generators)
+        # The hyperparameters are fitted again where the observations grew by a fifth.
+        if "fitted" not in search or count >= _REFIT_GROWTH * int(search["fitted"]):
+            search |= fitted(self.kernel, search["points"], search["values"], self.noise)._asdict()
+            search["fitted"] = torch.tensor(count, dtype=torch.int64, device="cpu")
+        return Fit(search["length_scale"], search["noise"]), None
 
-        fit = fitted(self.kernel, search["points"], search["values"], self.noise)
-        return {**fit._asdict(), "fitted": torch.tensor(count, dtype=torch.int64, device="cpu")}
+    def _with_rows(
+        self, problem: Problem, search: dict[str, torch.Tensor], generators: Sequence[torch.Generator]
+    ) -> tuple[Fit, Rows]:
+        """Return the noise, and rows of the matrix that is fitted to all readings, or of a sample of it."""
+        from autdtorch.methods.bayes.processes import Fit, Rows
 
-    def _acquisition(self, problem: Problem, search: Mapping[str, torch.Tensor]) -> Acquisition:
+        observed = search["values"]
+        drives = problem.quantise(drives_at(search["points"], self.fixed_transducer))
+        power = observed.square().mean(dim=1)
+        variance = None if isinstance(self.noise, str) else 0.5 * self.noise * power
+        prior = None if self.prior is None else self.prior.of_matrix(problem)
+        fits = posteriors(prior, search, drives, observed, generators, variance)
+        search |= kept(fits)
+        mean = torch.stack([fit.matrix for fit in fits])
+        sampled = torch.stack([fit.sample(*of) for fit, *of in zip(fits, drives, generators, strict=True)])
+        spread = (sampled - mean).abs().square().mean(dim=-1)
+        # The search explores what a sample makes likely; the answer, and the last drive, follow the mean.
+        rows = mean if observed.shape[1] >= self.evaluations - 1 else sampled
+        share = (2 * search["variance"] / power).clamp_max(0.5)
+        fit = Fit(torch.ones_like(share), share / (1 - share))
+        seen = weakest_focus((drives @ rows.mT).abs()).argmax(dim=1)
+        best = climbed(rows, drives[torch.arange(len(seen), device="cpu"), seen], _SAMPLE_STEPS)
+        return fit, Rows(rows[..., self._others(problem.transducers)], spread, self._points(best))
+
+    def _acquisition(
+        self, problem: Problem, search: Mapping[str, torch.Tensor], fit: Fit, rows: Rows | None
+    ) -> Acquisition:
         from autdtorch.methods.bayes.acquisition import FocusAcquisition, ScoreAcquisition
-        from autdtorch.methods.bayes.processes import Fit, Processes
+        from autdtorch.methods.bayes.processes import Processes
 
-        fit = Fit(search["length_scale"], search["noise"])
-        processes = Processes(self.kernel, search["points"], search["values"], fit)
+        points, values = search["points"], search["values"]
+        processes = Processes(self.kernel, points, values, fit, rows)
         if self.model == "weakest":
-            return ScoreAcquisition(
-                processes, search["points"], search["values"], self.acquisition == "log_ei"
-            )
-        return FocusAcquisition(processes, search["points"], problem.goal)
+            return ScoreAcquisition(processes, points, values, self.acquisition == "log_ei")
+        return FocusAcquisition(processes, points, problem.goal, None if rows is None else rows.best)
 
 
 def bayes_opt(
@@ -200,10 +267,11 @@ def bayes_opt(
     acquisition: Literal["ei", "log_ei"] = "ei",
     initial_points: Literal["sobol", "random"] = "sobol",
     noise: float | Literal["inferred"] = NOISE,
+    prior: Prior | None = None,
 ) -> Solution:
     """Run `BayesOpt` with these settings on an objective; see `BayesOpt` and `run`."""
     method = BayesOpt(
-        evaluations, initial, fixed_transducer, model, kernel, acquisition, initial_points, noise
+        evaluations, initial, fixed_transducer, model, kernel, acquisition, initial_points, noise, prior
     )
     return run(method, objective, trials, seed, score=score)
 

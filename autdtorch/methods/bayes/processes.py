@@ -43,6 +43,20 @@ class Fit(NamedTuple):
     noise: torch.Tensor
 
 
+class Rows(NamedTuple):
+    """The rows of the transfer matrix as they are known before the observations.
+
+    Attributes:
+        mean: (T, K, M) [Pa], complex; the transducer whose phase stays 0 is the last.
+        variance: of an entry (T, K) [Pa^2].
+        best: phases in turns (T, D) of a drive that focuses best by the mean.
+    """
+
+    mean: torch.Tensor
+    variance: torch.Tensor
+    best: torch.Tensor
+
+
 class Posterior(NamedTuple):
     """Mean and standard deviation at points, both (T, C, K)."""
 
@@ -63,7 +77,14 @@ class Processes:
         scale: standard deviation, likewise.
     """
 
-    def __init__(self, kernel: KernelName, points: torch.Tensor, values: torch.Tensor, fit: Fit) -> None:
+    def __init__(
+        self,
+        kernel: KernelName,
+        points: torch.Tensor,
+        values: torch.Tensor,
+        fit: Fit,
+        rows: Rows | None = None,
+    ) -> None:
         """Condition the processes on observations.
 
         Args:
@@ -71,17 +92,28 @@ class Processes:
             points: phases in turns (T, N, D).
             values: scores or pressures (T, N, K).
             fit: hyperparameters.
+            rows: for the kernel "phasor". Without them, each output has the same covariances.
         """
         self._features = _FEATURES[kernel]
-        self._observed = self._features(points)
+        observed = self._features(points)
         self.periodic = kernel != "phases"
         self.reach = _reach(kernel, fit)
         standard, self.mean, self.scale = standardised(kernel, values, fit.noise)
-        self.model = _model(kernel, self._observed, standard, fit).eval().requires_grad_(False)
-        self.model.posterior(self._observed[:, :1])  # makes GPyTorch's caches
+        self._shared = rows is None
+        self._kernel = _kernel(kernel, fit, rows, self.scale[:, 0])
+        excess = self._excess(observed)
+        variance = fit.noise[:, None]
+        if kernel == "phasor":
+            variance = _intensity_variance(variance, 1 + excess)
+        self.model = SingleTaskGP(
+            observed, standard - excess, variance.expand_as(standard).contiguous(),
+            covar_module=self._kernel, mean_module=ZeroMean(), outcome_transform=None,
+        ).eval().requires_grad_(False)  # fmt: skip
+        self.model.posterior(observed[:, :1])  # makes GPyTorch's caches
         cached: Any = self.model.prediction_strategy
         shape = *values.shape[::2], -1
-        self._weights = cached.mean_cache.reshape(shape).mT
+        self._observed = self._by_output(observed)
+        self._weights = cached.mean_cache.reshape(*shape, 1)
         factor = cached.lik_train_train_covar.cholesky().to_dense().reshape(*shape, points.shape[1])
         one = torch.eye(points.shape[1], dtype=factor.dtype, device="cpu")
         self._whitening = torch.linalg.solve_triangular(factor, one, upper=False).mT
@@ -89,13 +121,28 @@ class Processes:
     def at(self, points: torch.Tensor) -> Posterior:
         """Return the posterior at points (T, C, D), in the units of scores, or of intensities.
 
-        It is that of the model, written out from the model's caches: outputs share the covariances, and no
-        covariance between points is needed.
+        It is that of the model, written out from the model's caches: no covariance between points is needed.
         """
-        covariance = self.model.covar_module(self._features(points), self._observed).to_dense()
-        explained = (covariance[:, None] @ self._whitening).square().sum(dim=-1).mT
-        deviation = (1 - explained).clamp_min(_LEAST_VARIANCE).sqrt()
-        return Posterior(self.mean + self.scale * (covariance @ self._weights), self.scale * deviation)
+        features = self._features(points)
+        there = self._by_output(features)
+        covariance = self._kernel.forward(there, self._observed)  # as the model calls it, without its checks
+        variance: torch.Tensor | float = 1.0
+        if self._shared:
+            covariance = covariance[:, None]
+        else:
+            variance = self._kernel.forward(there, there, diag=True)
+        mean = self._excess(features) + (covariance @ self._weights)[..., 0].mT
+        unexplained = (variance - (covariance @ self._whitening).square().sum(dim=-1)).mT
+        deviation = unexplained.clamp_min(_LEAST_VARIANCE).sqrt()
+        return Posterior(self.mean + self.scale * mean, self.scale * deviation)
+
+    def _by_output(self, features: torch.Tensor) -> torch.Tensor:
+        """Return features (T, N, F) for the covariances of all outputs, or of each output."""
+        return features if self._shared else features[:, None]
+
+    def _excess(self, features: torch.Tensor) -> torch.Tensor | float:
+        """Return the means before the observations (T, C, K), less `mean`, in units of `scale`."""
+        return 0.0 if self._shared else self._kernel.mean(features[:, None]).mT - 1
 
 
 def standardised(
@@ -167,24 +214,20 @@ def _likeliest_noise(points: torch.Tensor, values: torch.Tensor) -> torch.Tensor
     return noise[fit.sum(dim=-1).argmax(dim=0), torch.arange(len(mean), device="cpu")]
 
 
-def _intensity_variance(noise: torch.Tensor) -> torch.Tensor:
-    # |p + n|^2 has the variance 2 |p|^2 s^2 + s^4; |p|^2 is 1 in the mean.
-    return noise * (2 + noise) + _JITTER
+def _intensity_variance(noise: torch.Tensor, expected: torch.Tensor | float = 1.0) -> torch.Tensor:
+    # |p + n|^2 has the variance 2 |p|^2 s^2 + s^4.
+    return noise * (2 * expected + noise) + _JITTER
 
 
-def _model(kernel: KernelName, features: torch.Tensor, standard: torch.Tensor, fit: Fit) -> SingleTaskGP:
-    if kernel == "phasor":
-        covariance = PhasorKernel("drives")
-        variance = _intensity_variance(fit.noise)
-    else:
-        outputs = fit.length_scale.shape[1:] if fit.length_scale.shape[1] > 1 else ()
-        covariance = MaternKernel(2.5, batch_shape=torch.Size([len(features), *outputs]))
-        covariance.lengthscale = fit.length_scale.reshape(*covariance.batch_shape, 1, 1)
-        variance = fit.noise
-    return SingleTaskGP(
-        features, standard, variance[:, None].expand_as(standard).contiguous(),
-        covar_module=covariance, mean_module=ZeroMean(), outcome_transform=None,
-    )  # fmt: skip
+def _kernel(kernel: KernelName, fit: Fit, rows: Rows | None, unit: torch.Tensor) -> Any:
+    """Return the covariance of what is modelled; `unit` of intensities (T, K)."""
+    if kernel != "phasor":
+        matern = MaternKernel(2.5, batch_shape=fit.length_scale.shape[:1])
+        matern.lengthscale = fit.length_scale[..., None]
+        return matern
+    if rows is None:
+        return PhasorKernel("drives")
+    return PhasorKernel("drives", rows.mean / unit[..., None].sqrt(), rows.variance / unit)
 
 
 def _reach(kernel: KernelName, fit: Fit) -> torch.Tensor:

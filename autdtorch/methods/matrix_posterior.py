@@ -1,0 +1,261 @@
+"""The posterior of a transfer matrix, given the magnitudes that drives made and a Gaussian prior."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+
+from autdtorch.methods.phase_retrieval import retrieve
+from autdtorch.utils.threads import one_torch_thread
+
+_KEPT = ("factors", "entries", "variance")
+_STEPS = 10  # of Gauss and Newton
+_HALVINGS = 6  # of a step that misfits more
+_ENOUGH = 1e-3  # relative gain of a step below which the fit ends
+_NOISE_ROUNDS = 4  # of estimates of the noise; a factor below which the maximum is not sought again:
+_NOISE_FACTOR = 1.5
+_USUAL_NOISE = 0.03  # in rms pressures at random phases, assumed before readings
+_WEIGHT = 4.0  # of this assumption, in readings
+
+
+@dataclass(frozen=True, eq=False)
+class MatrixPrior:
+    """A Gaussian prior of the transfer matrix: G_pm = e^(s + a_m + i b_m) R_pm + d_p e_pm.
+
+    All foci share the factors of the transducers. The entries e_pm are circular, of variance 1.
+
+    Attributes:
+        rows: R (P, M) [Pa].
+        spread: d_p (P,) [Pa].
+        widths: standard deviations (2 M + 1,) of a_m, of b_m [rad] and of s; empty without factors.
+    """
+
+    rows: torch.Tensor
+    spread: torch.Tensor
+    widths: torch.Tensor
+
+    @property
+    def usual_variance(self) -> torch.Tensor:
+        """Variance of the noise that is assumed before readings [Pa^2]."""
+        power = (self.rows.abs().square() + self.spread[:, None].square()).sum(dim=1).mean()
+        return 0.5 * _USUAL_NOISE**2 * power
+
+    @classmethod
+    def unknown(cls, observed: torch.Tensor, transducers: int) -> MatrixPrior:
+        """Return the prior of a matrix of which only magnitudes (N, P) of full drives are known."""
+        rows = torch.zeros(observed.shape[1], transducers, dtype=torch.complex128, device="cpu")
+        return cls(rows, observed.square().mean(dim=0).div(transducers).sqrt(), observed.new_empty(0))
+
+
+@dataclass(frozen=True, eq=False)
+class MatrixPosterior:
+    """The posterior of a transfer matrix around its maximum, where the magnitudes are linearised.
+
+    Attributes:
+        prior: of the matrix.
+        factors: a_m, b_m and s at the maximum, as `MatrixPrior.widths`.
+        entries: e_pm at the maximum (P, M).
+        variance: of the magnitudes' noise, for each focus (P,) [Pa^2].
+    """
+
+    prior: MatrixPrior
+    factors: torch.Tensor
+    entries: torch.Tensor
+    variance: torch.Tensor
+
+    @classmethod
+    def start(cls, prior: MatrixPrior) -> MatrixPosterior:
+        """Return the maximum of the prior."""
+        variance = prior.usual_variance.expand_as(prior.spread)
+        return cls(prior, torch.zeros_like(prior.widths), torch.zeros_like(prior.rows), variance)
+
+    @property
+    def matrix(self) -> torch.Tensor:
+        """The transfer matrix (P, M) [Pa] at the maximum."""
+        return self._scaled() + self.prior.spread[:, None] * self.entries
+
+    @one_torch_thread()
+    def fitted(
+        self, drives: torch.Tensor, observed: torch.Tensor, infer_noise: bool = True
+    ) -> MatrixPosterior:
+        """Return the posterior given magnitudes (N, P) that drives (N, M) made.
+
+        The maximum is sought from this one. Steps are solved for the readings, of which there may be far
+        fewer than unknowns. The noise follows by MacKay's rule (1992): the misfit over the number of
+        readings that no unknown explains.
+        """
+        now, line = self._maximum(_Linearised.at(self, drives), drives, observed)
+        for _ in range(_NOISE_ROUNDS if infer_noise else 0):
+            before, now = now.variance[0], now._with_noise(line, observed)
+            if not 1 / _NOISE_FACTOR < now.variance[0] / before < _NOISE_FACTOR:
+                now, line = now._maximum(line, drives, observed)
+        return now
+
+    def _maximum(
+        self, line: _Linearised, drives: torch.Tensor, observed: torch.Tensor
+    ) -> tuple[MatrixPosterior, _Linearised]:
+        """Return the maximum that damped steps of Gauss and Newton find, linearised."""
+        now = self
+        for _ in range(_STEPS):
+            target, misfit = now._solved(line, observed), now._misfit(line, observed)
+            for halving in range(_HALVINGS):
+                there = now._towards(target, 0.5**halving)
+                new_line = _Linearised.at(there, drives)
+                better = there._misfit(new_line, observed)
+                if better < misfit:
+                    break
+            else:
+                break
+            now, line = there, new_line
+            if misfit - better < _ENOUGH * misfit:
+                break
+        return now, line
+
+    def _with_noise(self, line: _Linearised, observed: torch.Tensor) -> MatrixPosterior:
+        left = (observed - line.magnitudes).square().sum() + _WEIGHT * self.prior.usual_variance
+        free = self.variance[0] * torch.cholesky_inverse(line.factor(self)).diagonal(dim1=1, dim2=2).sum()
+        return replace(self, variance=(left / (free + _WEIGHT)).expand_as(self.variance))
+
+    @one_torch_thread()
+    def sample(self, drives: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Return a sample (P, M) [Pa] of the matrix, given readings of drives (N, M) that were fitted.
+
+        A sample of the prior is corrected by the readings that it would give (Matheron's rule).
+        """
+        line = _Linearised.at(self, drives)
+        factors = self.prior.widths * _normal(generator, *self.factors.shape)
+        entries = _circular(generator, *self.entries.shape)
+        noise = self.variance.sqrt() * _normal(generator, *line.magnitudes.shape)
+        given = line.change(factors, entries) + noise
+        correction = line.explained(self, given)
+        drawn = replace(
+            self,
+            factors=self.factors + factors - correction[0],
+            entries=self.entries + entries - correction[1],
+        )
+        return drawn.matrix
+
+    def _scaled(self) -> torch.Tensor:
+        """Return the rows of the prior (P, M), by the factors."""
+        if not len(self.factors):
+            return self.prior.rows
+        gain, phase = self.factors[:-1].chunk(2)
+        return torch.polar((gain + self.factors[-1]).exp(), phase) * self.prior.rows
+
+    def _solved(self, line: _Linearised, observed: torch.Tensor) -> MatrixPosterior:
+        left = observed - line.magnitudes + line.change(self.factors, self.entries)
+        factors, entries = line.explained(self, left)
+        return replace(self, factors=factors, entries=entries)
+
+    def _towards(self, other: MatrixPosterior, share: float) -> MatrixPosterior:
+        return replace(
+            self,
+            factors=torch.lerp(self.factors, other.factors, share),
+            entries=self.entries + share * (other.entries - self.entries),
+        )
+
+    def _misfit(self, line: _Linearised, observed: torch.Tensor) -> torch.Tensor:
+        """Return twice the negative logarithm of the posterior, but for a constant."""
+        readings = ((observed - line.magnitudes).square() / self.variance).sum()
+        factors = (self.factors / self.prior.widths).square().sum()
+        return readings + factors + 2 * self.entries.abs().square().sum()
+
+
+def posteriors(
+    prior: MatrixPrior | None,
+    search: Mapping[str, torch.Tensor],
+    drives: torch.Tensor,
+    observed: torch.Tensor,
+    generators: Sequence[torch.Generator],
+    variance: torch.Tensor | None = None,
+) -> list[MatrixPosterior]:
+    """Return the posteriors of T trials, given all their readings.
+
+    Args:
+        prior: of the matrix; None if nothing is known, for at least 3 M - 2 readings.
+        search: what `kept` returned after fewer readings, if there were any.
+        drives: (T, N, M).
+        observed: magnitudes (T, N, P).
+        generators: of the trials, for the first search without a prior.
+        variance: of the magnitudes' noise (T, P) [Pa^2]; None to infer it.
+    """
+    found = []
+    for trial, (own, seen, generator) in enumerate(zip(drives, observed, generators, strict=True)):
+        given = MatrixPrior.unknown(seen, own.shape[1]) if prior is None else prior
+        if "entries" in search:
+            given = replace(given, spread=search["spread"][trial])
+            start = MatrixPosterior(given, *(search[name][trial] for name in _KEPT))
+        else:
+            start = MatrixPosterior.start(given)
+            if prior is None:
+                rows = retrieve(own, seen, generator).T
+                start = replace(start, entries=rows / given.spread[:, None])
+        if variance is not None:
+            start = replace(start, variance=variance[trial])
+        found.append(start.fitted(own, seen, infer_noise=variance is None))
+    return found
+
+
+def kept(found: Sequence[MatrixPosterior]) -> dict[str, torch.Tensor]:
+    """Return tensors from which `posteriors` goes on."""
+    tensors = {name: torch.stack([getattr(one, name) for one in found]) for name in _KEPT}
+    return {**tensors, "spread": torch.stack([one.prior.spread for one in found])}
+
+
+@dataclass(frozen=True, eq=False)
+class _Linearised:
+    """Magnitudes (N, P), and their derivatives by factors (N, P, K) and entries (N, P, M)."""
+
+    magnitudes: torch.Tensor
+    by_factors: torch.Tensor
+    by_entries: torch.Tensor
+
+    @classmethod
+    def at(cls, posterior: MatrixPosterior, drives: torch.Tensor) -> _Linearised:
+        pressure = drives @ posterior.matrix.T
+        turned = pressure.sgn().conj()[..., None] * drives[:, None]
+        by_factors = pressure.real.new_empty(*pressure.shape, 0)
+        if len(posterior.factors):
+            parts = turned * posterior._scaled()
+            by_factors = torch.cat([parts.real, -parts.imag, parts.real.sum(dim=-1, keepdim=True)], dim=-1)
+        return cls(pressure.abs(), by_factors, turned * posterior.prior.spread[:, None])
+
+    def change(self, factors: torch.Tensor, entries: torch.Tensor) -> torch.Tensor:
+        """Return the change of the magnitudes (N, P) with factors and entries."""
+        return self.by_factors @ factors + (self.by_entries * entries).sum(dim=-1).real
+
+    def explained(self, posterior: MatrixPosterior, left: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the likeliest factors and entries that change the magnitudes by (N, P)."""
+        factor = self.factor(posterior)
+        weights = torch.cholesky_solve(left.T.reshape(len(factor), -1, 1), factor).reshape(left.T.shape).T
+        factors = posterior.prior.widths.square() * (weights[..., None] * self.by_factors).sum(dim=(0, 1))
+        return factors, 0.5 * (weights[..., None] * self.by_entries.conj()).sum(dim=0)
+
+    def factor(self, posterior: MatrixPosterior) -> torch.Tensor:
+        """Return the Cholesky factor of the readings' covariance, (P, N, N); with factors (1, P N, P N)."""
+        by_focus = self.by_entries.transpose(0, 1)
+        covariance = 0.5 * (by_focus @ by_focus.mH).real
+        covariance.diagonal(dim1=1, dim2=2).add_(posterior.variance[:, None])
+        if self.by_factors.shape[-1]:
+            shared = (self.by_factors * posterior.prior.widths).transpose(0, 1).flatten(0, 1)
+            covariance = (_block_diagonal(covariance) + shared @ shared.T)[None]
+        factor: torch.Tensor = torch.linalg.cholesky(covariance)
+        return factor
+
+
+def _block_diagonal(blocks: torch.Tensor) -> torch.Tensor:
+    """Return the matrix (B N, B N) of blocks (B, N, N)."""
+    whole = blocks.new_zeros(len(blocks), blocks.shape[1], len(blocks), blocks.shape[1])
+    every = torch.arange(len(blocks), device="cpu")
+    whole[every, :, every] = blocks
+    return whole.flatten(2).flatten(0, 1)
+
+
+def _normal(generator: torch.Generator, *shape: int) -> torch.Tensor:
+    return torch.randn(shape, dtype=torch.float64, generator=generator, device="cpu")
+
+
+def _circular(generator: torch.Generator, *shape: int) -> torch.Tensor:
+    return torch.randn(shape, dtype=torch.complex128, generator=generator, device="cpu")
