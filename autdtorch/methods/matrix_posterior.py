@@ -16,6 +16,8 @@ _HALVINGS = 6  # of a step that misfits more
 _ENOUGH = 1e-3  # relative gain of a step below which the fit ends
 _NOISE_ROUNDS = 4  # of estimates of the noise; a factor below which the maximum is not sought again:
 _NOISE_FACTOR = 1.5
+_DARK = 1e-6  # smallest entries that a row is expected to have, in those of the strongest row, and
+_TINY = 1e-150  # in pascals: their squares must not be 0
 _USUAL_NOISE = 0.03  # in rms pressures at random phases, assumed before readings
 _WEIGHT = 4.0  # of this assumption, in readings
 
@@ -46,7 +48,10 @@ class MatrixPrior:
     def unknown(cls, observed: torch.Tensor, transducers: int) -> MatrixPrior:
         """Return the prior of a matrix of which only magnitudes (N, P) of full drives are known."""
         rows = torch.zeros(observed.shape[1], transducers, dtype=torch.complex128, device="cpu")
-        return cls(rows, observed.square().mean(dim=0).div(transducers).sqrt(), observed.new_empty(0))
+        spread = observed.square().mean(dim=0).div(transducers).sqrt()
+        # A focus that nothing reaches has an unknown row, too.
+        spread = spread.clamp_min(_DARK * float(spread.max())).clamp_min(_TINY)
+        return cls(rows, spread, observed.new_empty(0))
 
 
 @dataclass(frozen=True, eq=False)
