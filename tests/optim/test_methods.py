@@ -23,8 +23,8 @@ BLACK_BOX = [
     at.GABS(levels=3, order="strength"),
     at.RandomSearch(evaluations=130),
     at.Identify(evaluations=30),
-    at.BayesOpt(evaluations=12, initial=5, fixed_transducer=1),
-    at.BayesOpt(14, 5, 1, model="foci", kernel="phasor", noise="inferred"),
+    at.BayesOpt(evaluations=9, initial=5, fixed_transducer=1),
+    at.BayesOpt(10, 5, 1, model="foci", kernel="phasor", noise="inferred"),
 ]
 METHODS = [*BLACK_BOX, at.GradientAscent(steps=20)]
 RANDOM = [method for method in METHODS if method.random]
