@@ -7,7 +7,7 @@ soon as it is public; add a parameter with a new name or another meaning here, u
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -316,14 +316,16 @@ class Call(NamedTuple):
 
     def argument(self, parameter: str, folder: Path) -> Any:
         """A value that it accepts for a parameter."""
-        default = inspect.signature(self.function).parameters[parameter].default
+        default = _parameters(self.function)[parameter].default
         value = OTHERS.get(f"{self.name}.{parameter}", ARGUMENTS.get(parameter, default))
         assert value is not inspect.Parameter.empty, f"add {self.name}.{parameter} to public_calls.py"
         return value.make(folder) if isinstance(value, Made) else value
 
-    def arguments(self, folder: Path) -> dict[str, Any]:
-        """Values that it accepts, by parameter."""
-        return {name: self.argument(name, folder) for name in self.parameters}
+    def arguments(self, folder: Path, /, **given: Any) -> dict[str, Any]:
+        """Values that it accepts, by parameter, those given among them."""
+        return {
+            name: given[name] if name in given else self.argument(name, folder) for name in self.parameters
+        }
 
     def bound(self, folder: Path) -> Callable[..., Any]:
         """The function, of an instance if it needs one."""
@@ -336,8 +338,13 @@ class Call(NamedTuple):
 
 
 @cache
+def _parameters(function: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
+    return inspect.signature(function).parameters
+
+
+@cache
 def _annotations(function: Callable[..., Any]) -> dict[str, str]:
-    given = inspect.signature(function).parameters.values()
+    given = _parameters(function).values()
     return {one.name: str(one.annotation) for one in given if one.name != "self"}
 
 

@@ -151,7 +151,7 @@ def test_what_hydra_is_made_of_is_not_taken_from_a_folder_of_configs(run, send, 
 
 
 def test_a_launcher_of_ones_own_comes_from_a_folder_that_is_trusted(run, send):
-    send({"hydra/launcher/mine.yaml": "defaults: [joblib]\nn_jobs: 2\n"})
+    send({"hydra/launcher/mine.yaml": "defaults: [basic]\n"})
     command = ("-m", "hydra/launcher=mine", "method=lssg", "plane_spacing=0.02")
     assert run("--config-dir", "sent", *command) == 2
     assert run(*command, "hydra.searchpath=[sent]") == 0

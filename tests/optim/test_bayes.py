@@ -71,7 +71,7 @@ def test_goal_without_a_derivative_is_refused_for_the_foci(make_objective, matri
 def test_foci_find_the_maximum(make_objective, random_matrix):
     objective = make_objective(random_matrix(3, 6, 4))
     best = at.gradient_ascent(objective).score
-    found = at.bayes_opt(objective, evaluations=40, initial=6, fixed_transducer=0, trials=4, **FOCI)
+    found = at.bayes_opt(objective, evaluations=30, initial=6, fixed_transducer=0, trials=2, **FOCI)
     # Amplitudes below 1, which gradient ascent may use, and other local maxima are within a few per cent.
     assert (found.score > 0.9 * best).all()
 
@@ -80,7 +80,7 @@ def test_goal_of_ones_own_is_reached_by_the_foci(make_objective, random_matrix):
     """A goal is improved by its samples, without the smooth minimum: the pressure at the first focus."""
     matrix = random_matrix(2, 4, 3)
     highest = matrix[0].abs().sum()
-    options = dict(evaluations=40, initial=6, fixed_transducer=0, score=lambda p: p[..., 0], **FOCI)
+    options = dict(evaluations=24, initial=6, fixed_transducer=0, score=lambda p: p[..., 0], **FOCI)
     found = at.bayes_opt(make_objective(matrix), **options)
     assert 0.98 * highest < found.score.item() <= highest * (1 + 1e-6)
 

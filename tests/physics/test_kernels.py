@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,6 +26,7 @@ PLATE = Box((12e-3, 12e-3, 21.7e-3), (30e-3, 40e-3, 1.7e-3), density=5.0, sound_
 """Runs through the boundary layers of x and y."""
 
 
+@functools.cache  # no kernel changes them
 def scene_parts(dtype: torch.dtype, absorption: float = 0.0) -> tuple[Assembly, Sources, Receivers]:
     return assembled_parts(small_scene((CUBE, RIGID, FAST, PLATE), absorption=absorption), 1e-3, dtype)
 

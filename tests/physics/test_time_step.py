@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import replace
 from fractions import Fraction
@@ -49,8 +50,16 @@ def advance(c: Coefficients, state: State, steps: int) -> State:
     return CpuKernel().advance(state, c, NO_SOURCES, NO_RECEIVERS, silence)[0]
 
 
-def true_eigenvalue(assembly: Assembly) -> float:
+@functools.cache  # several tests take the same scene
+def assembled(name: str) -> Assembly:
+    obstacles, spacing = SCENES[name]
+    return assemble(region_of(small_scene(obstacles)), spacing, torch.float64)
+
+
+@functools.cache
+def true_eigenvalue(name: str) -> float:
     """Largest eigenvalue of a step on the whole grid without its layers, by Arnoldi."""
+    assembly = assembled(name)
     c = assembly.coefficients
     open_ended = replace(c, layer_gain=torch.zeros_like(c.layer_gain))
     factor = assembly.stencil.time_factor(float(assembly.steps_per_period))
@@ -71,18 +80,16 @@ def true_eigenvalue(assembly: Assembly) -> float:
 
 @pytest.mark.parametrize("name", SCENES)
 def test_time_step_is_just_below_the_limit(name: str) -> None:
-    obstacles, spacing = SCENES[name]
-    assembly = assemble(region_of(small_scene(obstacles)), spacing, torch.float64)
-    limit = fewest_steps(assembly.stencil, true_eigenvalue(assembly))
+    assembly = assembled(name)
+    limit = fewest_steps(assembly.stencil, true_eigenvalue(name))
     assert 0.95 <= limit / float(assembly.steps_per_period) <= 1
 
 
 @pytest.mark.parametrize("name", ["paper", "light"])
 def test_a_run_is_bounded_at_the_chosen_time_step_and_blows_up_above_the_limit(name: str) -> None:
-    obstacles, spacing = SCENES[name]
-    assembly = assemble(region_of(small_scene(obstacles)), spacing, torch.float64)
+    assembly = assembled(name)
     stencil, c = assembly.stencil, assembly.coefficients
-    limit = fewest_steps(stencil, true_eigenvalue(assembly))
+    limit = fewest_steps(stencil, true_eigenvalue(name))
     ratio = stencil.time_factor(limit / 1.05) / stencil.time_factor(float(assembly.steps_per_period))
 
     def growth(coefficients: Coefficients, steps: int) -> float:

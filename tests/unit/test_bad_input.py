@@ -89,7 +89,7 @@ def test_a_value_of_a_wrong_kind_is_refused_in_a_line_that_names_the_field(call,
         for wrong in (*WRONG, *spoiled(valid)):
             if annotation == "Any" or (callable(valid) and callable(wrong.value)):
                 continue  # errors of a function show where it is called
-            error = refusal(function, call.arguments(tmp_path) | {parameter: wrong.value})
+            error = refusal(function, call.arguments(tmp_path, **{parameter: wrong.value}))
             found = complaint(call, parameter, wrong, error)
             if found and (call.name, parameter, wrong.name) not in EXPECTED:
                 complaints.append(f"{parameter} = {wrong.name}: {found}")

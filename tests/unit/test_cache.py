@@ -192,8 +192,8 @@ def test_a_folder_that_cannot_be_used_costs_no_result(tmp_path):
 
 
 def test_writers_that_run_together_and_are_killed(tmp_path):
-    """Three processes write one matrix over and over, each with values of its own, until they are killed."""
-    folder, ready = tmp_path / "cache", [tmp_path / f"ready{number}" for number in range(3)]
+    """Two processes write one matrix over and over, each with values of its own, until they are killed."""
+    folder, ready = tmp_path / "cache", [tmp_path / f"ready{number}" for number in range(2)]
     writers = [
         subprocess.Popen([sys.executable, "-c", WRITER, str(folder), str(number), str(flag)])
         for number, flag in enumerate(ready)
@@ -202,11 +202,11 @@ def test_writers_that_run_together_and_are_killed(tmp_path):
         wait_for(lambda: all(flag.exists() for flag in ready) and files(folder))
         cache, seen = DiskCache(folder), set()
         end = time.monotonic() + 60
-        while len(seen) < 3 and time.monotonic() < end:
+        while len(seen) < 2 and time.monotonic() < end:
             matrix, number = cache.load("shared", (200_000,))
             assert (matrix == number).all()
             seen.add(number)
-        assert len(seen) == 3
+        assert len(seen) == 2
     finally:
         for writer in writers:
             writer.kill()

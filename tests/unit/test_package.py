@@ -29,6 +29,7 @@ for name in autdtorch.__all__:
 for name in autdtorch.hardware.__all__:
     if not name.startswith("Emulated"):
         getattr(autdtorch.hardware, name)
+import autdtorch.methods.catalogue
 after_names = sorted(heavy & sys.modules.keys())
 for name in plots:
     getattr(autdtorch, name)

@@ -53,21 +53,22 @@ def numbers(folder: Path) -> dict[str, torch.Tensor]:
     found: dict[str, torch.Tensor] = {}
     ball = at.Sphere((12e-3, 20e-3, 5e-3), 3e-3, density=0.2, sound_speed=900.0)
     scene = small_scene((CUBE, ball), radius=1e-3, absorption=2.0)
+    propagators = {}
     for method in ("box", "full", "free_space"):
-        propagator = at.make_propagator(scene, method, 2e-3, cache=False)
-        matrix, error = propagator.transfer_matrix(return_error=True)
-        found[method] = matrix
-        found[f"{method} error"] = torch.tensor(error, dtype=torch.float64, device="cpu")
+        propagators[method] = propagator = at.make_propagator(scene, method, 2e-3, 0.1, cache=False)
+        found[method] = propagator.transfer_matrix()
         drive = at.drive_from_phases(torch.arange(4, dtype=torch.float64, device="cpu"))
         found[f"{method} field"] = propagator.field(drive, scene.control_points + 1e-4)
-    objective = at.SimulatedObjective(scene, at.make_propagator(scene, "box", 2e-3, cache=False))
+    _, error = propagators["box"].transfer_matrix(return_error=True)
+    found["error"] = torch.tensor(error, dtype=torch.float64, device="cpu")
+    objective = at.SimulatedObjective(scene, propagators["box"])
     noisy = at.Noise(at.Quantised(at.Drift(at.FailedTransducers(objective, [1]), 0.1, 5), 16), 30.0)
     for name, solution in {
         "lss": at.lss(objective),
         "lssg": at.lssg(objective, passes=2),
         "gabs": at.gabs(objective, order="strength", trials=3),
         "random": at.random_search(objective, levels=7, trials=2),
-        "bo": at.bayes_opt(objective, 20, trials=2, fixed_transducer=0),
+        "bo": at.bayes_opt(objective, 18, trials=2, fixed_transducer=0),
         "identify": at.identify(objective, trials=2),
         "gradient": at.gradient_ascent(objective, starts=3, steps=20),
         "noisy": at.gabs(noisy, trials=2),
@@ -82,7 +83,7 @@ def numbers(folder: Path) -> dict[str, torch.Tensor]:
     at.save_drive(folder / "drive.csv", found["gabs drive"][0], scene.array)
     found["saved"] = at.load_drive(folder / "drive.csv")
     found["gradient of the drive"] = at.differentiable_field(scene, drive, spacing=2e-3)
-    found["volume"] = at.volume_field(propagator, drive).nan_to_num()
+    found["volume"] = at.volume_field(propagators["free_space"], drive).nan_to_num()
     return found
 
 
