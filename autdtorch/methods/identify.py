@@ -96,15 +96,14 @@ class Identify(Method):
         generators = restored(search["generators"])
         prior = None if self.prior is None else self.prior.of_matrix(state.problem)
         fits = posteriors(prior, search, drives, observed, generators)
-        best = torch.stack([_highest(*of) for of in zip(fits, drives, generators, strict=True)])
+        apart = [own.clone() for own in drives]  # their products must not round by the place in memory
+        best = torch.stack([_highest(*of) for of in zip(fits, apart, generators, strict=True)])
         search |= {"drives": drives, "observed": observed, **kept(fits)}
         left = self.most_evaluations(state.problem) - drives.shape[1] - 1
         if left == 0:
             return Step(best[:, None], {**search, "last": best})
         count = min(left, max(1, drives.shape[1] // _GROWTH))
-        chosen = torch.stack(
-            [_sampled(*of, count) for of in zip(fits, drives, best, generators, strict=True)]
-        )
+        chosen = torch.stack([_sampled(*of, count) for of in zip(fits, apart, best, generators, strict=True)])
         return Step(state.problem.quantise(chosen), {**search, "generators": states_of(generators)})
 
     def best(self, state: State) -> Solution:

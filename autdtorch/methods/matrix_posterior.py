@@ -187,11 +187,13 @@ def posteriors(
         variance: of the magnitudes' noise (T, P) [Pa^2]; None to infer it.
     """
     found = []
-    for trial, (own, seen, generator) in enumerate(zip(drives, observed, generators, strict=True)):
+    for trial, generator in enumerate(generators):
+        # Copies: products of a part of a tensor may round by its place in memory.
+        own, seen = drives[trial].clone(), observed[trial].clone()
         given = MatrixPrior.unknown(seen, own.shape[1]) if prior is None else prior
         if "entries" in search:
-            given = replace(given, spread=search["spread"][trial])
-            start = MatrixPosterior(given, *(search[name][trial] for name in _KEPT))
+            given = replace(given, spread=search["spread"][trial].clone())
+            start = MatrixPosterior(given, *(search[name][trial].clone() for name in _KEPT))
         else:
             start = MatrixPosterior.start(given)
             if prior is None:

@@ -13,6 +13,7 @@ import torch
 
 from autdtorch.methods.base import Method, Problem, State
 from autdtorch.methods.solution import Solution
+from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import replace_file
 from autdtorch.utils.numpy_file import read_arrays
 from autdtorch.utils.validation import path_of, require_kind
@@ -78,9 +79,9 @@ def load_state(path: str | os.PathLike[str], method: Method, problem: Problem) -
 
 
 def _origin(method: Method, problem: Problem) -> str:
-    """Return the method, its settings and the size of the problem as JSON."""
+    """Return the method, its settings and the size of the problem as JSON; of a tensor, its digest."""
     settings = dataclasses.asdict(method)
-    return json.dumps([method.name, settings, problem.transducers, problem.foci])
+    return json.dumps([method.name, settings, problem.transducers, problem.foci], default=digest_of)
 
 
 def _require_consistent(state: State) -> None:

@@ -266,8 +266,12 @@ def test_an_experiment_ends_with_its_report(run, tmp_path, capsys, monkeypatch):
 
 
 def test_ctrl_c_ends_with_one_line_and_its_status(run, capsys, monkeypatch):
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
     monkeypatch.setattr(autdtorch.study.run, "_run_scene", lambda *_: signal.raise_signal(signal.SIGINT))
-    assert run("solver.method=free_space") == 130
+    try:
+        assert run("solver.method=free_space") == 130
+    finally:
+        signal.signal(signal.SIGINT, before)
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("autdtorch: interrupted; ")
 

@@ -7,7 +7,7 @@ from botorch.acquisition.analytic import ExpectedImprovement, LogExpectedImprove
 import autdtorch as at
 from autdtorch.methods.bayes.acquisition import ScoreAcquisition
 from autdtorch.methods.bayes.kernels import PhasorKernel, on_circle, phasors
-from autdtorch.methods.bayes.processes import Fit, Processes, fitted
+from autdtorch.methods.bayes.processes import Fit, Processes, Rows, fitted
 from autdtorch.objectives.objective import weakest_focus
 from autdtorch.scene.drive import drive_from_phases
 
@@ -99,6 +99,22 @@ class TestPhasorKernel:
         expected = PhasorKernel("drives")(inputs).to_dense()
         torch.testing.assert_close(intensity.T.cov(), expected, rtol=0.05, atol=0.005)
 
+    def test_rows_that_are_expected_shift_intensities_and_couple_them(self):
+        drives, generator = self.drives(4, 3), torch.Generator().manual_seed(1)
+        mean = torch.randn(2, 3, dtype=torch.complex128, generator=generator)
+        variance = torch.tensor([0.5, 2.0], dtype=torch.float64)
+        parts = torch.randn(2, 400_000, 3, dtype=torch.complex128, generator=generator)
+        rows = mean[:, None] + variance.sqrt()[:, None, None] * parts
+        intensity = (rows @ drives.T).abs().square()
+        kernel, inputs = PhasorKernel("drives", mean, variance), torch.cat([drives.real, drives.imag], dim=-1)
+        # 400,000 samples of fourth moments scatter by about 1 %.
+        for found, expected in zip(intensity, kernel(inputs).to_dense(), strict=True):
+            torch.testing.assert_close(found.T.cov(), expected, rtol=0.05, atol=0.05)
+        torch.testing.assert_close(intensity.mean(dim=1), kernel.mean(inputs), rtol=0.02, atol=0)
+        torch.testing.assert_close(
+            kernel(inputs, diag=True), kernel(inputs).to_dense().diagonal(dim1=1, dim2=2)
+        )
+
     def test_phases_are_drives_that_are_fully_on(self):
         points, others = uniform(5, 3), uniform(4, 3, seed=1)
         for kernel in (PhasorKernel(), PhasorKernel("drives")):
@@ -143,6 +159,20 @@ class TestProcesses:
             torch.testing.assert_close(
                 deviation, processes.scale * expected.variance.sqrt(), rtol=1e-5, atol=0
             )
+
+    def test_posterior_with_rows_is_that_of_the_model(self, random_matrix):
+        points, values, there = uniform(2, 9, 3), 1 + uniform(2, 9, 2, seed=1), uniform(2, 4, 3, seed=2)
+        mean = random_matrix(4, 4, 0).reshape(2, 2, 4)
+        rows = Rows(mean, torch.full((2, 2), 0.3, dtype=torch.float64), points[:, 0])
+        processes = Processes("phasor", points, values, fit_of(2, 2, 1.0, 1e-3), rows)
+        found, model = processes.at(there), processes.model.posterior(phasors(there))
+        features = phasors(there)
+        expected = torch.complex(features[..., :4], features[..., 4:]) @ mean.mT
+        intensity = expected.abs().square() + 0.3 * 4
+        torch.testing.assert_close(found.mean, intensity + processes.scale * model.mean)
+        torch.testing.assert_close(
+            found.deviation, processes.scale * model.variance.sqrt(), rtol=1e-5, atol=0
+        )
 
     def test_noise_of_readings_is_inferred(self, random_matrix):
         """Readings with complex noise of a hundredth of the mean intensity, as at 20 dB."""

@@ -1,0 +1,138 @@
+import math
+from functools import partial
+
+import pytest
+import torch
+
+import autdtorch as at
+from autdtorch.methods.gradient import random_drives
+from autdtorch.methods.matrix_posterior import MatrixPosterior, MatrixPrior, _Linearised
+from autdtorch.objectives.perturbations import Noise
+
+FOCI = {"model": "foci", "kernel": "phasor", "noise": "inferred"}
+
+
+def generator(seed):
+    return torch.Generator().manual_seed(seed)
+
+
+def deviating(matrix, seed, gain=0.1, phase=0.5):
+    """The matrix (P, M) of transducers whose gains and phases deviate."""
+    draws = torch.randn(2, matrix.shape[1], dtype=torch.float64, generator=generator(seed))
+    return matrix * torch.polar((gain * draws[0]).exp(), phase * draws[1])
+
+
+@pytest.fixture
+def prior(random_matrix):
+    rows = random_matrix(2, 4, 0)
+    widths = torch.tensor([0.1] * 4 + [0.5] * 4 + [1.0], dtype=torch.float64)
+    return MatrixPrior(rows, torch.tensor([0.1, 0.2], dtype=torch.float64), widths)
+
+
+def somewhere(prior, seed):
+    """A posterior whose factors and entries are not 0."""
+    factors = 0.3 * torch.randn(len(prior.widths), dtype=torch.float64, generator=generator(seed))
+    entries = torch.randn(prior.rows.shape, dtype=torch.complex128, generator=generator(seed + 1))
+    return MatrixPosterior(prior, factors, entries, torch.full((2,), 1e-4, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("with_factors", [False, True])
+def test_derivatives_are_those_of_the_magnitudes(prior, with_factors):
+    if not with_factors:
+        prior = MatrixPrior(prior.rows, prior.spread, prior.widths[:0])
+    here, drives = somewhere(prior, 1), random_drives(6, 4, generator(3))
+    factors = here.factors.clone().requires_grad_(True)
+    entries = here.entries.clone().requires_grad_(True)
+    there = MatrixPosterior(prior, factors, entries, here.variance)
+    magnitudes = (drives @ there.matrix.T).abs()
+    line = _Linearised.at(here, drives)
+    for index in range(magnitudes.numel()):
+        by = torch.autograd.grad(
+            magnitudes.flatten()[index], (factors, entries), retain_graph=True, allow_unused=True
+        )
+        own = tuple(divmod(index, 2))
+        if with_factors:
+            torch.testing.assert_close(line.by_factors[own], by[0])
+        # PyTorch's gradient of a real function is the conjugate of the derivative by the entry.
+        torch.testing.assert_close(line.by_entries[own], by[1][own[1]].conj())
+
+
+def slopes(posterior, drives):
+    """Derivatives (N P, K) of magnitudes by factors, and by real and imaginary parts of all entries."""
+    line = _Linearised.at(posterior, drives)
+    by_parts = torch.zeros(*line.magnitudes.shape, *posterior.entries.shape, 2, dtype=torch.float64)
+    for focus in range(len(posterior.entries)):
+        entry = line.by_entries[:, focus]
+        by_parts[:, focus, focus] = torch.stack([entry.real, -entry.imag], dim=-1)
+    return torch.cat([line.by_factors, by_parts.flatten(2)], dim=-1).flatten(0, 1)
+
+
+def test_samples_have_the_covariance_that_readings_leave(prior):
+    # A thousandth of the widths, so that magnitudes are linear.
+    small = MatrixPrior(prior.rows, 1e-3 * prior.spread, 1e-3 * prior.widths)
+    here = MatrixPosterior(
+        small, 0 * small.widths, 0 * small.rows, torch.full((2,), 1e-6, dtype=torch.float64)
+    )
+    read, others = random_drives(3, 4, generator(3)), random_drives(2, 4, generator(4))
+    variance = torch.cat([small.widths.square(), torch.full((16,), 0.5, dtype=torch.float64)])
+    known, wanted = slopes(here, read), slopes(here, others)
+    explained = wanted * variance @ known.T
+    of_readings = known * variance @ known.T + 1e-6 * torch.eye(6, dtype=torch.float64)
+    expected = wanted * variance @ wanted.T - explained @ torch.linalg.solve(of_readings, explained.T)
+    draws = generator(5)
+    samples = torch.stack([here.sample(read, draws) for _ in range(3000)])
+    found = (others @ samples.mT).abs().flatten(1).T.cov()
+    # Of 3000 samples, the standard error of an entry is at most 0.03 of the largest variance.
+    assert (found - expected).abs().max() < 0.13 * expected.diagonal().max()
+    # Readings leave little of some directions, and most of others.
+    assert expected.diagonal().max() < 0.9 * (wanted * variance @ wanted.T).diagonal().max()
+
+
+def test_a_simulation_is_corrected_by_few_readings(make_objective, random_matrix):
+    """Fewer readings than unknowns of one row, which without a prior would determine nothing."""
+    simulated = random_matrix(3, 12, 2)
+    shares = []
+    for seed in range(3):
+        objective = make_objective(deviating(simulated, seed))
+        best = at.gradient_ascent(objective).score
+        begin = objective(at.gradient_ascent(make_objective(simulated)).drive).amin(dim=1)
+        options = {"evaluations": 20, "prior": at.Prior(simulated), "seed": seed}
+        found = at.identify(Noise(objective, 30, seed=seed), **options)
+        foci = at.bayes_opt(Noise(objective, 30, seed=seed), **options, **FOCI)
+        shares.append([begin / best, *(objective(one.drive).amin(dim=1) / best for one in (found, foci))])
+    begin, found, foci = torch.tensor(shares).median(dim=0).values
+    # Measured: 0.81, 0.994 and 0.994.
+    assert begin < 0.88
+    assert found > 0.95
+    assert foci > 0.95
+
+
+def test_the_scale_of_readings_is_fitted(make_objective, random_matrix):
+    """A sensor in other units than the simulation's costs nothing."""
+    simulated = random_matrix(3, 8, 2)
+    objective = make_objective(3 * deviating(simulated, 1))
+    best = at.gradient_ascent(objective).score
+    assert at.identify(objective, 20, prior=at.Prior(simulated)).score > 0.97 * best
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"gain": 0}, "gain: 0; must be .* > 0"),
+        ({"phase": math.nan}, "phase: nan"),
+        ({"rest": -1}, "rest: -1; must be .* > 0"),
+        ({"transfer_matrix": torch.ones(3, dtype=torch.complex128)}, r"transfer_matrix: shape \(3,\)"),
+    ],
+)
+def test_a_prior_out_of_range_is_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        at.Prior(**settings)
+
+
+@pytest.mark.parametrize("method", [at.identify, partial(at.bayes_opt, fixed_transducer=0, **FOCI)])
+def test_a_prior_of_another_problem_is_refused(make_objective, random_matrix, method):
+    objective = make_objective(random_matrix(3, 5, 0))
+    with pytest.raises(ValueError, match=r"prior.transfer_matrix: shape \(3, 4\); must be \(3, 5\)"):
+        method(objective, prior=at.Prior(random_matrix(3, 4, 0)))
+    with pytest.raises(ValueError, match="prior: 'simulated'; must be a Prior"):
+        method(objective, prior="simulated")
