@@ -24,19 +24,22 @@ _WEIGHT = 4.0  # of this assumption, in readings
 
 @dataclass(frozen=True, eq=False)
 class MatrixPrior:
-    """A Gaussian prior of the transfer matrix: G_pm = e^(s + a_m + i b_m) R_pm + d_p e_pm.
+    """A Gaussian prior of the transfer matrix: G = e^(s + a_m + i b_m) (R + sum_k t_k V_k) + d_p e.
 
-    All foci share the factors of the transducers. The entries e_pm are circular, of variance 1.
+    All foci share the factors a_m and b_m of transducer m, the scale s and the amounts t_k. The entries e of
+    row p and column m are circular, of variance 1.
 
     Attributes:
         rows: R (P, M) [Pa].
         spread: d_p (P,) [Pa].
-        widths: standard deviations (2 M + 1,) of a_m, of b_m [rad] and of s; empty without factors.
+        widths: standard deviations (2 M + 1 + K,) of a_m, b_m [rad], s and t_k; empty without factors.
+        changes: V (K, P, M) [Pa].
     """
 
     rows: torch.Tensor
     spread: torch.Tensor
     widths: torch.Tensor
+    changes: torch.Tensor
 
     @property
     def usual_variance(self) -> torch.Tensor:
@@ -51,7 +54,7 @@ class MatrixPrior:
         spread = observed.square().mean(dim=0).div(transducers).sqrt()
         # A focus that nothing reaches has an unknown row, too.
         spread = spread.clamp_min(_DARK * float(spread.max())).clamp_min(_TINY)
-        return cls(rows, spread, observed.new_empty(0))
+        return cls(rows, spread, observed.new_empty(0), rows.new_empty(0, *rows.shape))
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +63,7 @@ class MatrixPosterior:
 
     Attributes:
         prior: of the matrix.
-        factors: a_m, b_m and s at the maximum, as `MatrixPrior.widths`.
+        factors: a_m, b_m, s and t_k at the maximum, as `MatrixPrior.widths`.
         entries: e_pm at the maximum (P, M).
         variance: of the magnitudes' noise, for each focus (P,) [Pa^2].
     """
@@ -79,7 +82,7 @@ class MatrixPosterior:
     @property
     def matrix(self) -> torch.Tensor:
         """The transfer matrix (P, M) [Pa] at the maximum."""
-        return self._scaled() + self.prior.spread[:, None] * self.entries
+        return self._scaled()[0] + self.prior.spread[:, None] * self.entries
 
     @one_torch_thread()
     def fitted(
@@ -87,9 +90,8 @@ class MatrixPosterior:
     ) -> MatrixPosterior:
         """Return the posterior given magnitudes (N, P) that drives (N, M) made.
 
-        The maximum is sought from this one. Steps are solved for the readings, of which there may be far
-        fewer than unknowns. The noise follows by MacKay's rule (1992): the misfit over the number of
-        readings that no unknown explains.
+        The maximum is sought from this one. The noise follows by MacKay's rule (1992): the misfit over the
+        number of readings that no unknown explains.
         """
         now, line = self._maximum(_Linearised.at(self, drives), drives, observed)
         for _ in range(_NOISE_ROUNDS if infer_noise else 0):
@@ -120,8 +122,8 @@ class MatrixPosterior:
 
     def _with_noise(self, line: _Linearised, observed: torch.Tensor) -> MatrixPosterior:
         left = (observed - line.magnitudes).square().sum() + _WEIGHT * self.prior.usual_variance
-        free = self.variance[0] * torch.cholesky_inverse(line.factor(self)).diagonal(dim1=1, dim2=2).sum()
-        return replace(self, variance=(left / (free + _WEIGHT)).expand_as(self.variance))
+        variance = left / (line.unexplained(self) + _WEIGHT)
+        return replace(self, variance=variance.expand_as(self.variance))
 
     @one_torch_thread()
     def sample(self, drives: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
@@ -142,12 +144,15 @@ class MatrixPosterior:
         )
         return drawn.matrix
 
-    def _scaled(self) -> torch.Tensor:
-        """Return the rows of the prior (P, M), by the factors."""
+    def _scaled(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return rows (P, M) and changes (K, P, M) of the prior, by the factors."""
+        rows, changes = self.prior.rows, self.prior.changes
         if not len(self.factors):
-            return self.prior.rows
-        gain, phase = self.factors[:-1].chunk(2)
-        return torch.polar((gain + self.factors[-1]).exp(), phase) * self.prior.rows
+            return rows, changes
+        transducers = rows.shape[1]
+        gain, phase, scale, amounts = torch.split(self.factors, [transducers, transducers, 1, len(changes)])
+        factor = torch.polar((gain + scale).exp(), phase)
+        return factor * (rows + (amounts[:, None, None] * changes).sum(dim=0)), factor * changes
 
     def _solved(self, line: _Linearised, observed: torch.Tensor) -> MatrixPosterior:
         left = observed - line.magnitudes + line.change(self.factors, self.entries)
@@ -225,8 +230,11 @@ class _Linearised:
         turned = pressure.sgn().conj()[..., None] * drives[:, None]
         by_factors = pressure.real.new_empty(*pressure.shape, 0)
         if len(posterior.factors):
-            parts = turned * posterior._scaled()
-            by_factors = torch.cat([parts.real, -parts.imag, parts.real.sum(dim=-1, keepdim=True)], dim=-1)
+            rows, changes = posterior._scaled()
+            parts = turned * rows
+            by_amounts = torch.einsum("npm,kpm->npk", turned, changes).real
+            by_scale = parts.real.sum(dim=-1, keepdim=True)
+            by_factors = torch.cat([parts.real, -parts.imag, by_scale, by_amounts], dim=-1)
         return cls(pressure.abs(), by_factors, turned * posterior.prior.spread[:, None])
 
     def change(self, factors: torch.Tensor, entries: torch.Tensor) -> torch.Tensor:
@@ -235,29 +243,48 @@ class _Linearised:
 
     def explained(self, posterior: MatrixPosterior, left: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the likeliest factors and entries that change the magnitudes by (N, P)."""
-        factor = self.factor(posterior)
-        weights = torch.cholesky_solve(left.T.reshape(len(factor), -1, 1), factor).reshape(left.T.shape).T
+        if not len(posterior.factors):
+            slope, factor = self._of_rows(posterior)
+            by_readings = slope.mT @ (left.T / posterior.variance[:, None])[..., None]
+            parts = torch.cholesky_solve(by_readings, factor)[..., 0]
+            return posterior.factors, torch.complex(*parts.chunk(2, dim=1))
+        weights = (
+            torch.cholesky_solve(left.T.reshape(-1, 1), self._of_readings(posterior)).reshape(left.T.shape).T
+        )
         factors = posterior.prior.widths.square() * (weights[..., None] * self.by_factors).sum(dim=(0, 1))
         return factors, 0.5 * (weights[..., None] * self.by_entries.conj()).sum(dim=0)
 
-    def factor(self, posterior: MatrixPosterior) -> torch.Tensor:
-        """Return the Cholesky factor of the readings' covariance, (P, N, N); with factors (1, P N, P N)."""
+    def unexplained(self, posterior: MatrixPosterior) -> torch.Tensor:
+        """Return the number of readings that no unknown explains."""
+        if not len(posterior.factors):
+            slope, factor = self._of_rows(posterior)
+            unknown = 2 * torch.cholesky_inverse(factor).diagonal(dim1=1, dim2=2).sum()
+            return self.magnitudes.numel() - slope.shape[0] * slope.shape[2] + unknown
+        inverse = torch.cholesky_inverse(self._of_readings(posterior))
+        return (inverse.diagonal().reshape(self.magnitudes.T.shape).T * posterior.variance).sum()
+
+    def _of_rows(self, posterior: MatrixPosterior) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return derivatives (P, N, 2 M), and the Cholesky factor of the inverse covariance of the entries.
+
+        For many readings of each row, which has its own unknowns.
+        """
         by_focus = self.by_entries.transpose(0, 1)
-        covariance = 0.5 * (by_focus @ by_focus.mH).real
-        covariance.diagonal(dim1=1, dim2=2).add_(posterior.variance[:, None])
-        if self.by_factors.shape[-1]:
-            shared = (self.by_factors * posterior.prior.widths).transpose(0, 1).flatten(0, 1)
-            covariance = (_block_diagonal(covariance) + shared @ shared.T)[None]
-        factor: torch.Tensor = torch.linalg.cholesky(covariance)
+        slope = torch.cat([by_focus.real, -by_focus.imag], dim=-1)
+        inverse = slope.mT @ slope / posterior.variance[:, None, None]
+        inverse.diagonal(dim1=1, dim2=2).add_(2)  # parts of entries have the variance 1/2
+        return slope, torch.linalg.cholesky(inverse)
+
+    def _of_readings(self, posterior: MatrixPosterior) -> torch.Tensor:
+        """Return the Cholesky factor (P N, P N) of the readings' covariance, of which there are few."""
+        by_focus = self.by_entries.transpose(0, 1)
+        own = 0.5 * (by_focus @ by_focus.mH).real
+        own.diagonal(dim1=1, dim2=2).add_(posterior.variance[:, None])
+        shared = (self.by_factors * posterior.prior.widths).transpose(0, 1).flatten(0, 1)
+        covariance = (shared @ shared.T).reshape(len(own), own.shape[1], len(own), own.shape[1])
+        for focus, block in enumerate(own):
+            covariance[focus, :, focus] += block
+        factor: torch.Tensor = torch.linalg.cholesky(covariance.reshape(len(shared), -1))
         return factor
-
-
-def _block_diagonal(blocks: torch.Tensor) -> torch.Tensor:
-    """Return the matrix (B N, B N) of blocks (B, N, N)."""
-    whole = blocks.new_zeros(len(blocks), blocks.shape[1], len(blocks), blocks.shape[1])
-    every = torch.arange(len(blocks), device="cpu")
-    whole[every, :, every] = blocks
-    return whole.flatten(2).flatten(0, 1)
 
 
 def _normal(generator: torch.Generator, *shape: int) -> torch.Tensor:

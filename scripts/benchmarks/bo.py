@@ -2,7 +2,7 @@
 
 Prints Markdown tables. Times are processor times on one thread, so that other processes matter little.
 
-    python scripts/benchmark.py bo sequential --sequential-trials 10     20 minutes on an idle core
+    python scripts/benchmark.py bo sequential --scenes homogeneous       20 minutes on an idle core
     python scripts/benchmark.py bo options                               30 minutes
     python scripts/benchmark.py bo foci                                  3 minutes
     python scripts/benchmark.py bo noise                                 15 minutes
@@ -49,7 +49,7 @@ OPTIONS = {
     "what": {"nargs": "+", "choices": ["sequential", "options", "foci", "noise"], "help": "tables to print"},
     "--scenes": {"nargs": "+", "default": PAPER, "help": "names of scenes"},
     "--trials": {"type": int, "default": 50, "help": "trials at once"},
-    "--sequential-trials": {"type": int, "default": 5, "help": "trials with BoTorch"},
+    "--sequential-trials": {"type": int, "default": 50, "help": "trials with BoTorch"},
     "--threads": {"type": int, "default": 1, "help": "threads of PyTorch"},
 }
 
@@ -64,7 +64,7 @@ def main(given: argparse.Namespace) -> None:
     if "sequential" in given.what:
         times = [f"{given.trials} trials at once", "a trial", "a BoTorch trial", "ratio"]
         first = given.sequential_trials
-        scores = [f"score [Pa] of {given.trials}", f"of the first {first}", "of BoTorch's"]
+        scores = [f"score [Pa] of {given.trials}", f"of {first} by BoTorch", "difference of means"]
         show(["scene", *times, *scores], sequential_rows(objectives, given.trials, first))
     if "options" in given.what:
         show(["options", *objectives, "time"], option_rows(objectives, given.trials))
@@ -93,7 +93,10 @@ def sequential_rows(objectives: Objectives, trials: int, sequential_trials: int)
         )
         each, alone_each = seconds / trials, alone_seconds / sequential_trials
         times = [f"{seconds:.1f} s", f"{each:.2f} s", f"{alone_each:.1f} s", f"{alone_each / each:.0f}"]
-        yield [name, *times, quartiles(batch), quartiles(batch[:sequential_trials]), quartiles(alone)]
+        # 95 % of the differences that chance makes, by Welch's standard error
+        chance = 1.96 * math.sqrt(batch.var() / trials + alone.var() / sequential_trials)
+        difference = f"{batch.mean() - alone.mean():+.2f} (chance: {chance:.2f})"
+        yield [name, *times, quartiles(batch), quartiles(alone), difference]
 
 
 def option_rows(objectives: Objectives, trials: int) -> Iterator[list[str]]:

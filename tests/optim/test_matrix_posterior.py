@@ -25,8 +25,9 @@ def deviating(matrix, seed, gain=0.1, phase=0.5):
 @pytest.fixture
 def prior(random_matrix):
     rows = random_matrix(2, 4, 0)
-    widths = torch.tensor([0.1] * 4 + [0.5] * 4 + [1.0], dtype=torch.float64)
-    return MatrixPrior(rows, torch.tensor([0.1, 0.2], dtype=torch.float64), widths)
+    widths = torch.tensor([0.1] * 4 + [0.5] * 4 + [1.0, 1.0], dtype=torch.float64)
+    changes = 0.1 * random_matrix(2, 4, 1)[None]
+    return MatrixPrior(rows, torch.tensor([0.1, 0.2], dtype=torch.float64), widths, changes)
 
 
 def somewhere(prior, seed):
@@ -39,7 +40,7 @@ def somewhere(prior, seed):
 @pytest.mark.parametrize("with_factors", [False, True])
 def test_derivatives_are_those_of_the_magnitudes(prior, with_factors):
     if not with_factors:
-        prior = MatrixPrior(prior.rows, prior.spread, prior.widths[:0])
+        prior = MatrixPrior(prior.rows, prior.spread, prior.widths[:0], prior.changes[:0])
     here, drives = somewhere(prior, 1), random_drives(6, 4, generator(3))
     factors = here.factors.clone().requires_grad_(True)
     entries = here.entries.clone().requires_grad_(True)
@@ -69,7 +70,7 @@ def slopes(posterior, drives):
 
 def test_samples_have_the_covariance_that_readings_leave(prior):
     # A thousandth of the widths, so that magnitudes are linear.
-    small = MatrixPrior(prior.rows, 1e-3 * prior.spread, 1e-3 * prior.widths)
+    small = MatrixPrior(prior.rows, 1e-3 * prior.spread, 1e-3 * prior.widths, prior.changes)
     here = MatrixPosterior(
         small, 0 * small.widths, 0 * small.rows, torch.full((2,), 1e-6, dtype=torch.float64)
     )
@@ -107,6 +108,19 @@ def test_a_simulation_is_corrected_by_few_readings(make_objective, random_matrix
     assert foci > 0.95
 
 
+def test_what_a_variant_changes_is_found(make_objective, random_matrix):
+    """One unknown, the amount of the change, explains what would be errors of all entries."""
+    simulated, variant = random_matrix(2, 10, 2), random_matrix(2, 10, 3)
+    objective = make_objective(simulated - 0.7 * (variant - simulated))
+    best = at.gradient_ascent(objective).score
+    plain, knowing = (
+        at.identify(objective, 8, prior=at.Prior(simulated, variants, gain=1e-3, phase=1e-3, rest=0.01)).score
+        for variants in (None, variant[None])
+    )
+    assert plain < 0.9 * best
+    assert knowing > 0.99 * best
+
+
 def test_the_scale_of_readings_is_fitted(make_objective, random_matrix):
     """A sensor in other units than the simulation's costs nothing."""
     simulated = random_matrix(3, 8, 2)
@@ -134,5 +148,7 @@ def test_a_prior_of_another_problem_is_refused(make_objective, random_matrix, me
     objective = make_objective(random_matrix(3, 5, 0))
     with pytest.raises(ValueError, match=r"prior.transfer_matrix: shape \(3, 4\); must be \(3, 5\)"):
         method(objective, prior=at.Prior(random_matrix(3, 4, 0)))
+    with pytest.raises(ValueError, match=r"prior.variants: shape \(3, 5\); must be \(K, 3, 5\)"):
+        method(objective, prior=at.Prior(random_matrix(3, 5, 0), random_matrix(3, 5, 1)))
     with pytest.raises(ValueError, match="prior: 'simulated'; must be a Prior"):
         method(objective, prior="simulated")

@@ -60,7 +60,7 @@ class BayesOpt(Method):
     amplifies that, so that numbers repeat for equal blocks only.
 
     Attributes:
-        evaluations: number of evaluations of a trial, > `initial`.
+        evaluations: number of evaluations of a trial, > `initial`; >= 2 with a prior.
         initial: number of them, >= 2, that are spread over all phases before the search. With a prior, the
             search begins at the best drive of the simulation instead.
         fixed_transducer: index of the transducer whose phase stays 0, since a common offset of all phases
@@ -102,7 +102,9 @@ class BayesOpt(Method):
     def __post_init__(self) -> None:
         """Check the settings."""
         object.__setattr__(self, "initial", integer_at_least("initial", self.initial, 2))
-        evaluations = integer_at_least("evaluations", self.evaluations, self.initial + 1)
+        object.__setattr__(self, "prior", Prior.of("prior", self.prior))
+        least = self.initial + 1 if self.prior is None else 2
+        evaluations = integer_at_least("evaluations", self.evaluations, least)
         object.__setattr__(self, "evaluations", evaluations)
         fixed = integer_at_least("fixed_transducer", self.fixed_transducer, 0)
         object.__setattr__(self, "fixed_transducer", fixed)
@@ -116,7 +118,6 @@ class BayesOpt(Method):
             require_one_of("noise", self.noise, ("inferred",))
         else:
             object.__setattr__(self, "noise", number_between("noise", self.noise, 1e-6, 1))
-        object.__setattr__(self, "prior", Prior.of("prior", self.prior))
         if self.prior is not None and self.model != "foci":
             raise invalid("prior", self.prior, 'must be None without the model "foci"')
 
