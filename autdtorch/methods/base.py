@@ -6,7 +6,7 @@ import numbers
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, NamedTuple, TypeAlias
+from typing import ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
@@ -109,7 +109,6 @@ class State:
         drives: B drives for each of them to observe next (L, B, M), complex128.
         search: what the method needs to go on: tensors by name.
         best: the best drive of each trial so far, with its history.
-        scratch: objects that a method can rebuild from `search`; not saved.
     """
 
     problem: Problem
@@ -118,7 +117,6 @@ class State:
     drives: torch.Tensor
     search: Mapping[str, torch.Tensor]
     best: Solution
-    scratch: Any = None
 
     @property
     def done(self) -> bool:

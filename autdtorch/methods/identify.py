@@ -71,6 +71,12 @@ class Identify(Method):
             return self.evaluations
         return _LEAST if self.prior is not None else max(_LEAST, 4 * problem.transducers)
 
+    def numbers_kept(self, problem: Problem) -> float:
+        """Return the numbers of the fit, too: derivatives, and with a prior all pairs of readings."""
+        readings = float(self.most_evaluations(problem) * problem.foci)
+        pairs = 3 * readings**2 if self.prior is not None else 0.0
+        return super().numbers_kept(problem) + 6 * readings * problem.transducers + pairs
+
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
         """Observe random phases, or the best drive of the prior."""
         generators = generators_of(seeds)

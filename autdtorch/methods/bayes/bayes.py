@@ -134,7 +134,7 @@ class BayesOpt(Method):
     def numbers_kept(self, problem: Problem) -> float:
         """Return the numbers of the processes: a few matrices of all pairs of evaluations."""
         outputs = self._outputs(problem)
-        coupled = outputs if self.prior is not None else 1
+        coupled = outputs if self.prior is not None else 1  # a fit from a prior couples the foci
         return 4.0 * outputs * coupled * self.evaluations**2
 
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
