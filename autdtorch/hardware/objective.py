@@ -12,7 +12,7 @@ import torch
 from autdtorch.hardware.log import Evaluation, EvaluationLog
 from autdtorch.hardware.safety import LimitedLink, LimitError
 from autdtorch.hardware.sensors.sensor import Sensor, checked_reading
-from autdtorch.objectives.objective import validate_drives
+from autdtorch.objectives.objective import observe_drives
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.validation import invalid, path_of, require_callable, require_kind
@@ -85,23 +85,19 @@ class HardwareObjective:
         link.logs.add(place)
 
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
-        """Play drives (B, M), |q| <= 1, one by one; return magnitudes (B, P) [Pa], float64.
+        """Play drives (..., M), |q| <= 1, one by one; return magnitudes (..., P) [Pa], float64.
 
         The outputs are off afterwards, also after an error.
 
         Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1; or a sensor that
-                does not give a finite magnitude for each control point.
+            ValueError: no drive, another shape, not finite complex numbers, or an amplitude above 1; or a
+                sensor that does not give a finite magnitude for each control point.
             LogError: the log is of other drives, or has changed meanwhile.
             LimitError: a limit of the trial is reached.
             LinkError: the device does not take the bytes.
             OSError: the log cannot be written.
         """
-        drives = validate_drives(drive, len(self.scene.array))
-        try:
-            return torch.stack([self._measure(row) for row in drives])
-        finally:
-            self._link.off()
+        return observe_drives(self._observe, drive, len(self.scene.array))
 
     @property
     def evaluations(self) -> int:
@@ -122,6 +118,12 @@ class HardwareObjective:
         `ValueError` for another shape, not finite complex numbers, or an amplitude above 1.
         """
         return self._link.quantised(drive)
+
+    def _observe(self, drive: torch.Tensor) -> torch.Tensor:
+        try:
+            return torch.stack([self._measure(row) for row in drive])
+        finally:
+            self._link.off()
 
     def _measure(self, drive: torch.Tensor) -> torch.Tensor:
         most = self._link.limits.evaluations

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from autdtorch.objectives.objective import Objective, require_objective, validate_drives
+from autdtorch.objectives.objective import Objective, observe_drives, require_objective, validate_drives
 from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.scene.drive import drive_from_phases, validate_drive
 from autdtorch.scene.phase_levels import PhaseLevels
@@ -55,10 +55,9 @@ class Perturbation:
         return f"{type(self).__name__}({self.inner!r}, {self.evaluations} evaluations)"
 
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
-        """Observe drives (B, M), perturbed: pressure magnitudes (B, P) [Pa]."""
-        drive = validate_drives(drive, len(self.scene.array))
-        pressure = self._observe(drive)
-        self.evaluations += len(drive)
+        """Observe drives (..., M), perturbed: pressure magnitudes (..., P) [Pa]."""
+        pressure = observe_drives(self._observe, drive, len(self.scene.array))
+        self.evaluations += math.prod(pressure.shape[:-1])
         return pressure
 
     def quantised(self, drive: torch.Tensor) -> torch.Tensor:
@@ -66,7 +65,7 @@ class Perturbation:
         return validate_drive(drive, len(self.scene.array))
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return the drives (B, M) that `inner` is given for drives (B, M), at present."""
+        """Return the drives (..., M) that `inner` is given for drives (..., M), at present."""
         return self.quantised(drive)
 
     def _observe(self, drive: torch.Tensor) -> torch.Tensor:
@@ -114,7 +113,7 @@ class FailedTransducers(Perturbation):
         self._alive[indices("transducers", transducers, count)] = 0
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return `drive` (B, M) without the failed transducers."""
+        """Return `drive` (..., M) without the failed transducers."""
         return super().emitted(drive) * self._alive
 
 
@@ -146,7 +145,7 @@ class Drift(Perturbation):
         self._walk = torch.zeros_like(self._steps)
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return `drive` (B, M) with the drift after the evaluations so far."""
+        """Return `drive` (..., M) with the drift after the evaluations so far."""
         return super().emitted(drive) * self._factors(self._walk)[0]
 
     def _observe(self, drive: torch.Tensor) -> torch.Tensor:
@@ -203,7 +202,7 @@ class Noise(Perturbation):
 
 
 def true_pressure(objective: Objective, drive: torch.Tensor) -> torch.Tensor:
-    """Return the pressures (B, P) [Pa] that the array at present makes for drives (B, M).
+    """Return the pressures (..., P) [Pa] that the array at present makes for drives (..., M).
 
     Perturbations of the drive remain: quantisation, failed transducers, the drift so far. Those of the sensor
     are left out: noise and its drift. Only the innermost objective counts the evaluations.
@@ -213,7 +212,7 @@ def true_pressure(objective: Objective, drive: torch.Tensor) -> torch.Tensor:
     while isinstance(objective, Perturbation):
         drive = objective.emitted(drive)
         objective = objective.inner
-    return objective(drive)
+    return observe_drives(objective, drive, drive.shape[-1])
 
 
 def quantised(objective: Objective, drive: torch.Tensor) -> torch.Tensor:
