@@ -13,7 +13,7 @@ import torch
 
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.validation import invalid, real_tensor, require_kind
+from autdtorch.utils.validation import complex_tensor, invalid, real_tensor, require_kind
 
 Score: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
 """A goal: function of pressures (..., P) [Pa] that gives the scores (...) to maximise."""
@@ -75,6 +75,14 @@ def validate_magnitudes(name: str, value: object, points: int) -> torch.Tensor:
     if pressure.shape != (points,) or pressure.min() < 0:
         raise invalid(name, value, f"must be {points} numbers >= 0", "Pa")
     return pressure
+
+
+def validate_matrix(name: str, value: object, points: int, transducers: int) -> torch.Tensor:
+    """Return a transfer matrix (P, M) [Pa] as complex128 on the CPU, without gradient, after checking it."""
+    matrix = complex_tensor(name, value).detach().cpu()
+    if matrix.shape != (points, transducers):
+        raise ValueError(f"{name}: shape {tuple(matrix.shape)}; must be ({points}, {transducers})")
+    return matrix
 
 
 def weakest_focus(pressure: torch.Tensor) -> torch.Tensor:

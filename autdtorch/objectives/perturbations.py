@@ -15,7 +15,6 @@ import numpy as np
 import torch
 
 from autdtorch.objectives.objective import Objective, observe_drives, require_objective, validate_drives
-from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.scene.drive import drive_from_phases, validate_drive
 from autdtorch.scene.phase_levels import PhaseLevels
 from autdtorch.utils.validation import (
@@ -183,8 +182,8 @@ class Noise(Perturbation):
                 evaluation, here and of `objective`, and drifts go on; a `Solution` counts drives.
             seed: of the noise, >= 0.
             reference: [Pa], > 0; by default the rms pressure over control points and random phases, all
-                transducers fully on: sqrt(mean_p sum_m |G_pm|^2) of the innermost objective, which must be
-                simulated from a transfer matrix.
+                transducers fully on: sqrt(mean_p sum_m |G_pm|^2) of the innermost objective, which must have
+                a transfer matrix G.
         """
         super().__init__(objective)
         level = number_between("snr", snr, *SNRS, "dB")
@@ -224,15 +223,20 @@ def quantised(objective: Objective, drive: torch.Tensor) -> torch.Tensor:
     return drive if known is None else known(drive)
 
 
+def simulated_matrix(objective: Objective) -> torch.Tensor | None:
+    """Return the transfer matrix (P, M) [Pa] of the innermost objective, or None where it has none."""
+    while isinstance(objective, Perturbation):
+        objective = objective.inner
+    return getattr(objective, "transfer_matrix", None)
+
+
 def random_rms(matrix: torch.Tensor) -> float:
     """Return the rms pressure [Pa] over the points of a matrix (P, M) and random phases at full drive."""
     return math.sqrt(float(matrix.abs().square().sum(dim=1).mean()))
 
 
 def _innermost_rms(objective: Objective) -> float:
-    while isinstance(objective, Perturbation):
-        objective = objective.inner
-    matrix = objective.transfer_matrix if isinstance(objective, SimulatedObjective) else None
+    matrix = simulated_matrix(objective)
     if matrix is None:
         raise invalid("reference", None, "must be given where the objective has no transfer matrix", "Pa")
     return random_rms(matrix)

@@ -21,7 +21,8 @@ class SimulatedObjective:
     Attributes:
         scene: its array plays the drives, and its control points are observed.
         evaluations: number of observations so far.
-        transfer_matrix: G (P, M) [Pa], complex128; None in mode "replay". Black-box methods do not use it.
+        transfer_matrix: G (P, M) [Pa], complex128; None in mode "replay". Only `GradientAscent` and methods
+            with a `Prior` use it.
     """
 
     def __init__(

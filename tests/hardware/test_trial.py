@@ -143,6 +143,11 @@ def test_a_scene_of_other_transducers_is_refused(trial):
         trial.objective(link, hw.EmulatedSensor(bench))
     with trial.link(bench) as link, pytest.raises(ValueError, match="no trial without an amplitude limit"):
         hw.HardwareObjective(trial.scene, link, hw.EmulatedSensor(bench), trial.log)
+    with trial.link(bench) as link:
+        limited, matrix = hw.LimitedLink(link, hw.Limits(1.0)), trial.simulated.transfer_matrix.T
+        rest = hw.EmulatedSensor(bench), trial.log
+        with pytest.raises(ValueError, match=r"transfer_matrix: shape \(16, 2\); must be \(2, 16\)"):
+            hw.HardwareObjective(trial.scene, limited, *rest, transfer_matrix=matrix)
     for settings in ({1}, {"gain": torch.ones(1)}):
         with trial.link(bench) as link:
             limited = hw.LimitedLink(link, hw.Limits(1.0))

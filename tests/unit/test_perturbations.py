@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.stats import kstest, rice
 from small_scenes import small_scene
 
+from autdtorch.methods.base import Problem
 from autdtorch.methods.gabs import gabs
 from autdtorch.objectives.perturbations import (
     Drift,
@@ -136,7 +137,9 @@ NESTED = {
     "drift": lambda inner: Drift(inner, phase=0.3, loss=0.2, sensor=0.1, seed=5),
     "quantised": lambda inner: Quantised(inner, 8),
     "failed": lambda inner: FailedTransducers(inner, [2]),
-    "all": lambda inner: Noise(Quantised(Drift(FailedTransducers(inner, [2]), phase=0.3, seed=5), 8), 20),
+    "all": lambda inner: Noise(
+        Quantised(Drift(FailedTransducers(inner, [2]), phase=0.3, seed=5), 8), 20, reference=1.0
+    ),
 }
 
 
@@ -150,6 +153,12 @@ def test_drives_of_any_leading_dimensions_are_those_in_a_row(make, leading):
         expected = observe(flat, drives).reshape(*leading, 3)
         assert torch.equal(observe(shaped, drives.reshape(*leading, 4)), expected)
     assert shaped.evaluations == flat.evaluations
+
+
+@pytest.mark.parametrize("make", NESTED.values(), ids=NESTED)
+def test_a_problem_has_the_matrix_of_the_simulation_inside(make, simulated):
+    assert torch.equal(Problem.of(make(simulated)).transfer_matrix, simulated.transfer_matrix)
+    assert Problem.of(make(Recorder())).transfer_matrix is None
 
 
 def test_an_objective_of_ones_own_is_given_batches():
