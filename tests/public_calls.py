@@ -276,23 +276,15 @@ OTHERS: dict[str, Any] = {
     "save_field.path": Made(lambda folder: folder / "field.vti"),
     "save_field.points": GRID,
     "save_field.pressure": torch.ones(2, 3, 4, dtype=torch.complex128),
-    "true_pressure.drive": DRIVE[None],
     "weakest_focus.pressure": torch.ones(2, 3),
     **{f"{kind}.device": hardware.SONICSURFACE for kind in ("EmulatedBench", "Link", "Played", "open_link")},
     **{f"{kind}_sphere.center": (0.0, 0.0, 0.0) for kind in ("fluid", "rigid", "soft")},
-    **{
-        f"{kind}.{method}.drive": DRIVE[None]
-        for kind in ("FailedTransducers", "Drift", "Noise", "Played", "Quantised")
-        for method in ("__call__", "emitted")
-    },
     **{
         f"{name}.{call}.state": Made(lambda _, name=name: state(name))
         for name in METHODS
         for call in ("ask", "best", "tell")
     },
     **{f"{name}.tell.pressure": Made(lambda _, name=name: observed(state(name))) for name in METHODS},
-    "HardwareObjective.__call__.drive": DRIVE[None],
-    "SimulatedObjective.__call__.drive": DRIVE[None],
 }
 
 #: Of classes that users do not make themselves.

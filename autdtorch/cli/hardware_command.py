@@ -20,6 +20,7 @@ from autdtorch.cli.settings import folder_of, is_given, load_method, scene_of, s
 from autdtorch.hardware.sensors.sensor import checked_reading
 from autdtorch.io.drive_file import save_drive
 from autdtorch.methods.solution import Solution
+from autdtorch.objectives.perturbations import simulated_matrix
 from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.propagators import make_propagator
 from autdtorch.study.report.hardware_report import write_hardware_report
@@ -120,7 +121,13 @@ class _Trial:
         ):
             limited = hardware.LimitedLink(link, bench.limits)
             objective = hardware.HardwareObjective(
-                self._scene, limited, sensor, log, self._settings, _watcher(progress)
+                self._scene,
+                limited,
+                sensor,
+                log,
+                self._settings,
+                _watcher(progress),
+                simulated_matrix(self._simulated),
             )
             self.begun = not bench.is_dry
             at_the_end.callback(lambda: objective.log.end(limited.seconds_on))

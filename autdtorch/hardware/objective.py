@@ -12,7 +12,7 @@ import torch
 from autdtorch.hardware.log import Evaluation, EvaluationLog
 from autdtorch.hardware.safety import LimitedLink, LimitError
 from autdtorch.hardware.sensors.sensor import Sensor, checked_reading
-from autdtorch.objectives.objective import validate_drives
+from autdtorch.objectives.objective import observe_drives, validate_matrix
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.validation import invalid, path_of, require_callable, require_kind
@@ -27,7 +27,10 @@ class HardwareObjective:
     To continue an interrupted trial, run the same method with the same seed again: `autdtorch.run` takes the
     evaluations in the log from there.
 
-    Attributes are its `scene`, and its `log` of the evaluations.
+    Attributes:
+        scene: the scene on the bench.
+        log: of the evaluations.
+        transfer_matrix: simulated G (P, M) [Pa]; None where none was given.
     """
 
     def __init__(
@@ -38,6 +41,7 @@ class HardwareObjective:
         log: str | Path,
         settings: Mapping[str, Any] | None = None,
         watch: Callable[[Evaluation], None] | None = None,
+        transfer_matrix: torch.Tensor | None = None,
     ) -> None:
         """Prepare the observations.
 
@@ -49,10 +53,12 @@ class HardwareObjective:
             settings: further settings that identify the trial, values of JSON: method, seed, sensor. A log
                 of other settings, or of another scene, device or amplitude, is refused.
             watch: function that is called with every evaluation, those from the log included.
+            transfer_matrix: G (P, M) [Pa] of a simulation of the scene, for a `Prior` and `GradientAscent`. A
+                common factor does not matter to them, such as that of the amplitude limit.
 
         Raises:
             ValueError: no scene or sensor; the link is not limited, or plays another number of transducers
-                than the scene has; or `settings` that JSON cannot hold.
+                than the scene has; a transfer matrix of another shape; or `settings` that JSON cannot hold.
             LogError: the log is of another trial, none, or open in another process.
             OSError: the log cannot be read or written.
         """
@@ -63,13 +69,17 @@ class HardwareObjective:
         if not isinstance(link, LimitedLink):
             raise invalid("link", link, "must be a LimitedLink: no trial without an amplitude limit")
         transducers = link.link.transducers.tolist()
-        if len(transducers) != len(scene.array):
-            accepted = f"must be {len(scene.array)}, as many as the scene has"
+        points, count = len(scene.control_points), len(scene.array)
+        if len(transducers) != count:
+            accepted = f"must be {count}, as many as the scene has"
             raise invalid("link.transducers", len(transducers), accepted)
         try:
             json.dumps(named := {} if settings is None else {**settings})
         except (TypeError, ValueError) as error:
             raise invalid("settings", settings, "must be a mapping of what JSON can hold") from error
+        self.transfer_matrix = transfer_matrix
+        if transfer_matrix is not None:
+            self.transfer_matrix = validate_matrix("transfer_matrix", transfer_matrix, points, count)
         self.scene, self._link, self._sensor, self._watch = scene, link, sensor, watch
         origin = {
             "scene": f"{scene.name} {digest_of(scene)[:16]}",
@@ -78,30 +88,26 @@ class HardwareObjective:
             "amplitude limit": link.limits.amplitude,
             **named,
         }
-        self.log = EvaluationLog(path_of("log", log), origin, len(scene.array), len(scene.control_points))
+        self.log = EvaluationLog(path_of("log", log), origin, count, points)
         place = self.log.path.resolve()
         if self.log.goes_on and place not in link.logs:
             link.go_on(self.log.seconds_on)
         link.logs.add(place)
 
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
-        """Play drives (B, M), |q| <= 1, one by one; return magnitudes (B, P) [Pa], float64.
+        """Play drives (..., M), |q| <= 1, one by one; return magnitudes (..., P) [Pa], float64.
 
         The outputs are off afterwards, also after an error.
 
         Raises:
-            ValueError: another shape, not finite complex numbers, or an amplitude above 1; or a sensor that
-                does not give a finite magnitude for each control point.
+            ValueError: no drive, another shape, not finite complex numbers, or an amplitude above 1; or a
+                sensor that does not give a finite magnitude for each control point.
             LogError: the log is of other drives, or has changed meanwhile.
             LimitError: a limit of the trial is reached.
             LinkError: the device does not take the bytes.
             OSError: the log cannot be written.
         """
-        drives = validate_drives(drive, len(self.scene.array))
-        try:
-            return torch.stack([self._measure(row) for row in drives])
-        finally:
-            self._link.off()
+        return observe_drives(self._observe, drive, len(self.scene.array))
 
     @property
     def evaluations(self) -> int:
@@ -122,6 +128,12 @@ class HardwareObjective:
         `ValueError` for another shape, not finite complex numbers, or an amplitude above 1.
         """
         return self._link.quantised(drive)
+
+    def _observe(self, drive: torch.Tensor) -> torch.Tensor:
+        try:
+            return torch.stack([self._measure(row) for row in drive])
+        finally:
+            self._link.off()
 
     def _measure(self, drive: torch.Tensor) -> torch.Tensor:
         most = self._link.limits.evaluations

@@ -12,12 +12,17 @@ import numpy as np
 import torch
 
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.objective import Objective, Score, require_objective, weakest_focus
-from autdtorch.objectives.perturbations import quantised
+from autdtorch.objectives.objective import (
+    Objective,
+    Score,
+    require_objective,
+    validate_matrix,
+    weakest_focus,
+)
+from autdtorch.objectives.perturbations import quantised, simulated_matrix
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.validation import (
-    complex_tensor,
     integer_at_least,
     integers,
     invalid,
@@ -48,7 +53,7 @@ class Problem:
         foci: number P of control points.
         goal: function of pressures (..., P) [Pa] that gives the scores (...) to maximise.
         scene: geometry, for methods that start from free-space phases (`LSS`, `LSSG`).
-        transfer_matrix: G (P, M) [Pa], for methods that climb the model (`GradientAscent`).
+        transfer_matrix: simulated G (P, M) [Pa], for `GradientAscent` and as a `Prior` of what is measured.
         quantise: function of drives (..., M) that gives the drives which the device plays.
     """
 
@@ -68,18 +73,14 @@ class Problem:
         if self.scene is not None:
             require_kind("scene", self.scene, Scene)
         if self.transfer_matrix is not None:
-            matrix = complex_tensor("transfer_matrix", self.transfer_matrix)
-            if matrix.shape != (self.foci, self.transducers):
-                accepted = f"must be ({self.foci}, {self.transducers})"
-                raise ValueError(f"transfer_matrix: shape {tuple(matrix.shape)}; {accepted}")
+            matrix = validate_matrix("transfer_matrix", self.transfer_matrix, self.foci, self.transducers)
             object.__setattr__(self, "transfer_matrix", matrix)
 
     @classmethod
     def of(cls, objective: Objective, goal: Score = weakest_focus) -> Problem:
-        """Return the problem that an objective poses."""
+        """Return the problem that an objective poses, with the transfer matrix that it has inside, if any."""
         require_objective(objective)
-        scene = objective.scene
-        matrix = getattr(objective, "transfer_matrix", None)
+        scene, matrix = objective.scene, simulated_matrix(objective)
         counts = len(scene.array), len(scene.control_points)
         return cls(*counts, goal, scene, matrix, lambda drive: quantised(objective, drive))
 

@@ -34,6 +34,9 @@ class GradientAscent(Method):
     A trial climbs from `starts` drives of random phases and observes the highest: one evaluation. With 16
     transducers that is nearly always the global maximum, to 1e-4; a few hundred need more `steps`.
 
+    The matrix is the simulated one. Under perturbations, and on a bench, the drive is the best of the
+    simulation, not of what is observed.
+
     Attributes:
         starts: number of drives that a trial starts from, >= 1.
         steps: of each climb, >= 2.

@@ -24,8 +24,8 @@ class Prior:
     all readings share, for steps towards variants of the scene, and for errors of single entries.
 
     Attributes:
-        transfer_matrix: G (P, M) [Pa] of the simulation; None for the one that the objective has. A hardware
-            trial gives its own.
+        transfer_matrix: G (P, M) [Pa] of the simulation; None for the one that the objective has: a
+            `SimulatedObjective`, also within perturbations, or a `HardwareObjective` to which it was given.
         variants: transfer matrices (K, P, M) [Pa] of the scene as it may also be, each simulated with one
             change of the size that is to be expected: an obstacle 2 mm aside, the air 5 K warmer.
         gain: standard deviation of the logarithm of a transducer's gain, > 0.

@@ -13,7 +13,7 @@ import torch
 
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.validation import invalid, real_tensor, require_kind
+from autdtorch.utils.validation import complex_tensor, invalid, real_tensor, require_kind
 
 Score: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
 """A goal: function of pressures (..., P) [Pa] that gives the scores (...) to maximise."""
@@ -36,7 +36,10 @@ class Objective(Protocol):
         ...
 
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
-        """Observe drives (B, M), complex, |q| <= 1: pressure magnitudes (B, P) [Pa], one evaluation each."""
+        """Observe drives (B, M), complex, |q| <= 1: pressure magnitudes (B, P) [Pa], one evaluation each.
+
+        The objectives of this package take drives (..., M), and give magnitudes (..., P).
+        """
         ...
 
 
@@ -46,11 +49,23 @@ def require_objective(objective: Objective) -> None:
     require_kind("objective.scene", objective.scene, Scene)
 
 
+def observe_drives(
+    observe: Callable[[torch.Tensor], torch.Tensor], drive: torch.Tensor, transducers: int
+) -> torch.Tensor:
+    """Return magnitudes (..., P) [Pa] of drives (..., M) from a function that takes (B, M) and gives (B, P).
+
+    `ValueError` for no drive, another M than `transducers`, not finite complex numbers, or |q| > 1.
+    """
+    drive = validate_drives(drive, transducers)
+    pressure = observe(drive.reshape(-1, transducers))
+    return pressure.reshape(*drive.shape[:-1], -1)
+
+
 def validate_drives(drive: torch.Tensor, transducers: int) -> torch.Tensor:
-    """Check drives (B, M), B >= 1, and return them as complex128 on the CPU, without gradient."""
+    """Check drives (..., M), at least one, and return them as complex128 on the CPU, without gradient."""
     drive = validate_drive(drive, transducers).detach().cpu()
-    if drive.ndim != 2 or len(drive) == 0:
-        raise ValueError(f"drive: shape {tuple(drive.shape)}; must be (B, {transducers}) with B >= 1")
+    if drive.numel() == 0:
+        raise ValueError(f"drive: shape {tuple(drive.shape)}; must be (..., {transducers}), not empty")
     return drive
 
 
@@ -60,6 +75,14 @@ def validate_magnitudes(name: str, value: object, points: int) -> torch.Tensor:
     if pressure.shape != (points,) or pressure.min() < 0:
         raise invalid(name, value, f"must be {points} numbers >= 0", "Pa")
     return pressure
+
+
+def validate_matrix(name: str, value: object, points: int, transducers: int) -> torch.Tensor:
+    """Return a transfer matrix (P, M) [Pa] as complex128 on the CPU, without gradient, after checking it."""
+    matrix = complex_tensor(name, value).detach().cpu()
+    if matrix.shape != (points, transducers):
+        raise ValueError(f"{name}: shape {tuple(matrix.shape)}; must be ({points}, {transducers})")
+    return matrix
 
 
 def weakest_focus(pressure: torch.Tensor) -> torch.Tensor:

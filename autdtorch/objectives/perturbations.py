@@ -14,8 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from autdtorch.objectives.objective import Objective, require_objective, validate_drives
-from autdtorch.objectives.simulated import SimulatedObjective
+from autdtorch.objectives.objective import Objective, observe_drives, require_objective, validate_drives
 from autdtorch.scene.drive import drive_from_phases, validate_drive
 from autdtorch.scene.phase_levels import PhaseLevels
 from autdtorch.utils.validation import (
@@ -55,10 +54,9 @@ class Perturbation:
         return f"{type(self).__name__}({self.inner!r}, {self.evaluations} evaluations)"
 
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
-        """Observe drives (B, M), perturbed: pressure magnitudes (B, P) [Pa]."""
-        drive = validate_drives(drive, len(self.scene.array))
-        pressure = self._observe(drive)
-        self.evaluations += len(drive)
+        """Observe drives (..., M), perturbed: pressure magnitudes (..., P) [Pa]."""
+        pressure = observe_drives(self._observe, drive, len(self.scene.array))
+        self.evaluations += math.prod(pressure.shape[:-1])
         return pressure
 
     def quantised(self, drive: torch.Tensor) -> torch.Tensor:
@@ -66,7 +64,7 @@ class Perturbation:
         return validate_drive(drive, len(self.scene.array))
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return the drives (B, M) that `inner` is given for drives (B, M), at present."""
+        """Return the drives (..., M) that `inner` is given for drives (..., M), at present."""
         return self.quantised(drive)
 
     def _observe(self, drive: torch.Tensor) -> torch.Tensor:
@@ -114,7 +112,7 @@ class FailedTransducers(Perturbation):
         self._alive[indices("transducers", transducers, count)] = 0
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return `drive` (B, M) without the failed transducers."""
+        """Return `drive` (..., M) without the failed transducers."""
         return super().emitted(drive) * self._alive
 
 
@@ -146,7 +144,7 @@ class Drift(Perturbation):
         self._walk = torch.zeros_like(self._steps)
 
     def emitted(self, drive: torch.Tensor) -> torch.Tensor:
-        """Return `drive` (B, M) with the drift after the evaluations so far."""
+        """Return `drive` (..., M) with the drift after the evaluations so far."""
         return super().emitted(drive) * self._factors(self._walk)[0]
 
     def _observe(self, drive: torch.Tensor) -> torch.Tensor:
@@ -184,8 +182,8 @@ class Noise(Perturbation):
                 evaluation, here and of `objective`, and drifts go on; a `Solution` counts drives.
             seed: of the noise, >= 0.
             reference: [Pa], > 0; by default the rms pressure over control points and random phases, all
-                transducers fully on: sqrt(mean_p sum_m |G_pm|^2) of the innermost objective, which must be
-                simulated from a transfer matrix.
+                transducers fully on: sqrt(mean_p sum_m |G_pm|^2) of the innermost objective, which must have
+                a transfer matrix G.
         """
         super().__init__(objective)
         level = number_between("snr", snr, *SNRS, "dB")
@@ -203,7 +201,7 @@ class Noise(Perturbation):
 
 
 def true_pressure(objective: Objective, drive: torch.Tensor) -> torch.Tensor:
-    """Return the pressures (B, P) [Pa] that the array at present makes for drives (B, M).
+    """Return the pressures (..., P) [Pa] that the array at present makes for drives (..., M).
 
     Perturbations of the drive remain: quantisation, failed transducers, the drift so far. Those of the sensor
     are left out: noise and its drift. Only the innermost objective counts the evaluations.
@@ -213,7 +211,7 @@ def true_pressure(objective: Objective, drive: torch.Tensor) -> torch.Tensor:
     while isinstance(objective, Perturbation):
         drive = objective.emitted(drive)
         objective = objective.inner
-    return objective(drive)
+    return observe_drives(objective, drive, drive.shape[-1])
 
 
 def quantised(objective: Objective, drive: torch.Tensor) -> torch.Tensor:
@@ -225,15 +223,20 @@ def quantised(objective: Objective, drive: torch.Tensor) -> torch.Tensor:
     return drive if known is None else known(drive)
 
 
+def simulated_matrix(objective: Objective) -> torch.Tensor | None:
+    """Return the transfer matrix (P, M) [Pa] of the innermost objective, or None where it has none."""
+    while isinstance(objective, Perturbation):
+        objective = objective.inner
+    return getattr(objective, "transfer_matrix", None)
+
+
 def random_rms(matrix: torch.Tensor) -> float:
     """Return the rms pressure [Pa] over the points of a matrix (P, M) and random phases at full drive."""
     return math.sqrt(float(matrix.abs().square().sum(dim=1).mean()))
 
 
 def _innermost_rms(objective: Objective) -> float:
-    while isinstance(objective, Perturbation):
-        objective = objective.inner
-    matrix = objective.transfer_matrix if isinstance(objective, SimulatedObjective) else None
+    matrix = simulated_matrix(objective)
     if matrix is None:
         raise invalid("reference", None, "must be given where the objective has no transfer matrix", "Pa")
     return random_rms(matrix)

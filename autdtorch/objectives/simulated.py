@@ -6,7 +6,7 @@ from typing import Literal
 
 import torch
 
-from autdtorch.objectives.objective import validate_drives
+from autdtorch.objectives.objective import observe_drives
 from autdtorch.propagators import Propagator
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.threads import one_torch_thread
@@ -21,7 +21,8 @@ class SimulatedObjective:
     Attributes:
         scene: its array plays the drives, and its control points are observed.
         evaluations: number of observations so far.
-        transfer_matrix: G (P, M) [Pa], complex128; None in mode "replay". Black-box methods do not use it.
+        transfer_matrix: G (P, M) [Pa], complex128; None in mode "replay". Only `GradientAscent` and methods
+            with a `Prior` use it.
     """
 
     def __init__(
@@ -57,13 +58,18 @@ class SimulatedObjective:
         """Observe the control points under each of several drives.
 
         Args:
-            drive: (B, M) complex, |q| <= 1.
+            drive: (..., M) complex, |q| <= 1; each drive is an evaluation.
 
         Returns:
-            Pressure magnitudes (B, P) [Pa], float64, on the CPU, without gradient. In mode "transfer" a row
+            Pressure magnitudes (..., P) [Pa], float64, on the CPU, without gradient. In mode "transfer" a row
             is rounded alike, whatever the other rows and the number of threads.
+
+        Raises:
+            ValueError: no drive, another shape, not finite complex numbers, or an amplitude above 1.
         """
-        drive = validate_drives(drive, len(self.scene.array))
+        return observe_drives(self._observe, drive, len(self.scene.array))
+
+    def _observe(self, drive: torch.Tensor) -> torch.Tensor:
         self.evaluations += len(drive)
         if self.transfer_matrix is None:
             # One by one: a propagator may use the transfer matrix for many drives at once.

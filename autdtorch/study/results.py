@@ -135,6 +135,8 @@ def stored_solution(fields: Mapping[str, Any], transducers: int, points: int) ->
         ValueError: another shape or type, or numbers out of range; the message names the field.
     """
     drive = validate_drives(fields["drive"], transducers)
+    if drive.ndim != 2:
+        raise ValueError(f"drive: shape {tuple(drive.shape)}; must be (T, {transducers})")
     trials = len(drive)
     evaluations = np.asarray(fields["evaluations"])
     if evaluations.shape != (trials,) or evaluations.dtype != np.int64 or evaluations.min() < 1:

@@ -92,7 +92,10 @@ def run_study(
     for name, method in methods.items():
         for scene in scenes.values():
             if isinstance(method, Method):
-                problem = Problem(len(scene.array), len(scene.control_points), scene=scene)
+                points, transducers = len(scene.control_points), len(scene.array)
+                # In place of the matrix that the simulation will give: a prior needs one, of this shape.
+                blank = torch.zeros(points, transducers, dtype=torch.complex128, device="cpu")
+                problem = Problem(transducers, points, scene=scene, transfer_matrix=blank)
                 with within(f"method {name}"):
                     method.require_fit(problem, min(counts[name], method.block))
     planes = {name: _plane_points(scene, plane_spacing) for name, scene in scenes.items()}

@@ -160,8 +160,8 @@ def outcome(method: Method, objective: at.Objective, wrap: Wrap, trials: int) ->
     else:
         solutions = [solve(method, own, [trial]) for trial, own in enumerate(objectives)]
     drives = torch.cat([solution.drive for solution in solutions])
-    true = [at.true_pressure(own, drive[None]) for own, drive in zip(objectives, drives, strict=True)]
-    return Outcome(at.weakest_focus(torch.cat(true)), torch.cat([found.score for found in solutions]))
+    true = [at.true_pressure(own, drive) for own, drive in zip(objectives, drives, strict=True)]
+    return Outcome(at.weakest_focus(torch.stack(true)), torch.cat([found.score for found in solutions]))
 
 
 def keys(outcomes: Outcomes, place: int) -> list[str]:

@@ -135,6 +135,30 @@ def test_a_trial_that_may_not_be_made_ends_with_one_line(trial, words, message):
     assert (status, message in log) == (2, True)
 
 
+@pytest.mark.parametrize(
+    "method", [("method=identify",), ("method=bo_foci", "method.initial=2", "method.fixed_transducer=0")]
+)
+def test_with_a_prior_few_evaluations_find_how_the_transducers_deviate(trial, monkeypatch, method):
+    generator = torch.Generator().manual_seed(0)
+    gain, phase = torch.randn(2, 9, dtype=torch.float64, generator=generator)
+    deviation = torch.polar((0.1 * gain).exp(), 0.7 * phase)
+    emulate = autdtorch.hardware.EmulatedBench
+
+    def deviating(device, matrix, *rest, **named):
+        return emulate(device, matrix * deviation, *rest, **named)
+
+    def measured(*words):
+        status, printed, _ = trial(*EMULATED, *words)
+        assert status == 0
+        return float(re.search(r"weakest focus (\S+) Pa", printed)[1])
+
+    monkeypatch.setattr("autdtorch.hardware.EmulatedBench", deviating)
+    simulated = measured("method=gradient", "output=simulated")
+    few = 12  # of the 3 M - 1 = 26 that a trial without a prior needs
+    found = measured(*method, f"method.evaluations={few}", "method.prior={gain: 0.1, phase: 0.7}")
+    assert found > 1.2 * simulated
+
+
 def test_a_limit_ends_a_trial_with_a_status_of_its_own(trial):
     status, _, log = trial(*GABS, "hardware.limits.evaluations=5")
     assert (status, "5 evaluations are made, the limit; the outputs are off" in log) == (3, True)

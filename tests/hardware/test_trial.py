@@ -58,11 +58,27 @@ def test_a_drive_in_any_guise_is_measured_and_comes_back_from_the_log(trial):
     bench = trial.bench()
     with trial.link(bench) as link:
         objective = trial.objective(link, hw.EmulatedSensor(bench))
-        measured = torch.cat([objective(one[None]) for one in guises])
+        measured = torch.stack([objective(one) for one in guises])
         again = trial.objective(link, hw.EmulatedSensor(bench))
-        assert torch.equal(torch.cat([again(one[None]) for one in guises]), measured)
+        assert torch.equal(torch.stack([again(one) for one in guises]), measured)
     expected = trial.played()(torch.stack([drive, drive.conj(), drive, drive]))
     torch.testing.assert_close(measured, expected, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("leading", [(), (1,), (2, 3)])
+def test_drives_of_any_leading_dimensions_are_played_in_a_row(trial, leading):
+    phases = 7 * torch.rand(*leading, 16, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    drives = drive_from_phases(phases)
+    bench = trial.bench()
+    with trial.link(bench) as link:
+        objective = trial.objective(link, hw.EmulatedSensor(bench))
+        measured = objective(drives)
+        asked = torch.stack([evaluation.drive for evaluation in objective.log.evaluations])
+        assert torch.equal(asked, drives.reshape(-1, 16))
+        assert objective.evaluations == len(asked)
+    played = trial.played()
+    torch.testing.assert_close(measured, played(drives), rtol=1e-12, atol=0)
+    assert played.evaluations == len(asked)
 
 
 def test_an_evaluation_is_logged_before_the_next_is_played(trial):
@@ -127,6 +143,11 @@ def test_a_scene_of_other_transducers_is_refused(trial):
         trial.objective(link, hw.EmulatedSensor(bench))
     with trial.link(bench) as link, pytest.raises(ValueError, match="no trial without an amplitude limit"):
         hw.HardwareObjective(trial.scene, link, hw.EmulatedSensor(bench), trial.log)
+    with trial.link(bench) as link:
+        limited, matrix = hw.LimitedLink(link, hw.Limits(1.0)), trial.simulated.transfer_matrix.T
+        rest = hw.EmulatedSensor(bench), trial.log
+        with pytest.raises(ValueError, match=r"transfer_matrix: shape \(16, 2\); must be \(2, 16\)"):
+            hw.HardwareObjective(trial.scene, limited, *rest, transfer_matrix=matrix)
     for settings in ({1}, {"gain": torch.ones(1)}):
         with trial.link(bench) as link:
             limited = hw.LimitedLink(link, hw.Limits(1.0))

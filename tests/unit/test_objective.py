@@ -1,3 +1,4 @@
+import math
 from unittest.mock import Mock
 
 import pytest
@@ -51,6 +52,16 @@ def test_a_row_does_not_depend_on_the_rows_beside_it(scene, drive):
     assert torch.equal(together[:7], objective(drive.T.contiguous().T))
 
 
+@pytest.mark.parametrize("mode", ["transfer", "replay"])
+@pytest.mark.parametrize("leading", [(), (1,), (6,), (2, 3), (1, 3, 2)])
+def test_leading_dimensions_are_those_of_the_drives(scene, drive, mode, leading):
+    objective = SimulatedObjective(scene, make_propagator(scene, "free_space"), mode)
+    count = math.prod(leading)
+    pressure = objective(drive[:count].reshape(*leading, 4))
+    assert objective.evaluations == count
+    assert torch.equal(pressure, objective(drive[:count]).reshape(*leading, 3))
+
+
 def test_a_row_does_not_depend_on_the_number_of_threads():
     # 340204 products: wherever a thread begins it is in the middle of a row.
     array = TransducerArray.grid((17, 1), pitch=10e-3, center=(0, 0, 0))
@@ -75,12 +86,12 @@ def test_a_row_does_not_depend_on_the_number_of_threads():
     [
         (lambda drive: 1.1 * drive / drive.abs().max(), r"amplitude 1\.1"),
         (lambda drive: drive[:, :3], r"\(7, 3\)"),
-        (lambda drive: drive[0], r"\(4,\)"),
+        (lambda drive: drive[0, 0], r"\(\)"),
         (lambda drive: drive[:0], r"\(0, 4\)"),
         (lambda drive: drive.real, "complex"),
         (lambda drive: drive * torch.nan, "finite"),
     ],
-    ids=["too loud", "transducer missing", "no batch", "no row", "real", "nan"],
+    ids=["too loud", "transducer missing", "no array", "no drive", "real", "nan"],
 )
 def test_drive_that_no_array_can_play_is_refused_and_not_counted(scene, drive, change, message):
     objective = SimulatedObjective(scene, make_propagator(scene, "free_space"))

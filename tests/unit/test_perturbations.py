@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.stats import kstest, rice
 from small_scenes import small_scene
 
+from autdtorch.methods.base import Problem
 from autdtorch.methods.gabs import gabs
 from autdtorch.objectives.perturbations import (
     Drift,
@@ -131,6 +132,43 @@ def test_randomness_follows_from_the_seed_however_the_rows_are_divided(make, sim
     assert not torch.allclose(make(simulated, 6)(drive), together)
 
 
+NESTED = {
+    "noise": lambda inner: Noise(inner, 20, reads=2, seed=5, reference=1.0),
+    "drift": lambda inner: Drift(inner, phase=0.3, loss=0.2, sensor=0.1, seed=5),
+    "quantised": lambda inner: Quantised(inner, 8),
+    "failed": lambda inner: FailedTransducers(inner, [2]),
+    "all": lambda inner: Noise(
+        Quantised(Drift(FailedTransducers(inner, [2]), phase=0.3, seed=5), 8), 20, reference=1.0
+    ),
+}
+
+
+@pytest.mark.parametrize("make", NESTED.values(), ids=NESTED)
+@given(leading=st.lists(st.integers(1, 3), max_size=3))
+def test_drives_of_any_leading_dimensions_are_those_in_a_row(make, leading):
+    simulated = SimulatedObjective(SCENE, FreeSpacePropagator(SCENE))
+    flat, shaped = make(simulated), make(simulated)
+    drives = random_drive(math.prod(leading))
+    for observe in (lambda one, drive: one(drive), true_pressure, lambda one, drive: one(drive)):
+        expected = observe(flat, drives).reshape(*leading, 3)
+        assert torch.equal(observe(shaped, drives.reshape(*leading, 4)), expected)
+    assert shaped.evaluations == flat.evaluations
+
+
+@pytest.mark.parametrize("make", NESTED.values(), ids=NESTED)
+def test_a_problem_has_the_matrix_of_the_simulation_inside(make, simulated):
+    assert torch.equal(Problem.of(make(simulated)).transfer_matrix, simulated.transfer_matrix)
+    assert Problem.of(make(Recorder())).transfer_matrix is None
+
+
+def test_an_objective_of_ones_own_is_given_batches():
+    recorder = Recorder()
+    wrapped = Noise(FailedTransducers(recorder, [2]), 20, reference=1.0)
+    assert wrapped(random_drive(1)[0]).shape == true_pressure(wrapped, random_drive(1)[0]).shape == (3,)
+    assert wrapped(random_drive(6).reshape(2, 3, 4)).shape == (2, 3, 3)
+    assert [tuple(drives.shape) for drives in recorder.drives] == [(1, 4), (1, 4), (6, 4)]
+
+
 def test_noise_and_drift_of_one_seed_are_unrelated():
     recorder = Recorder()
     Drift(recorder, phase=1.0, seed=4)(fully_on(3000))
@@ -216,7 +254,7 @@ def test_true_pressure_keeps_the_device_and_drops_the_sensor(simulated):
 )
 def test_a_drive_that_no_array_can_play_is_refused_and_not_counted(make, simulated):
     objective = make(simulated)
-    for wrong in (random_drive(2)[:, :3], random_drive(2)[0], 2 * random_drive(2), random_drive(2).real):
+    for wrong in (random_drive(2)[:, :3], random_drive(0), 2 * random_drive(2), random_drive(2).real):
         with pytest.raises(ValueError, match="drive"):
             objective(wrong)
         with pytest.raises(ValueError, match="drive"):

@@ -11,7 +11,10 @@ from small_scenes import AIR, CUBE, small_scene
 import autdtorch.study.run
 from autdtorch.analytic.green import green
 from autdtorch.methods.gabs import GABS, gabs
+from autdtorch.methods.gradient import GradientAscent
+from autdtorch.methods.identify import Identify
 from autdtorch.methods.lssg import LSSG, lssg
+from autdtorch.methods.prior import Prior
 from autdtorch.propagators import FreeSpacePropagator, Run, SteadyStateWarning
 from autdtorch.propagators.full import DomainSimulation
 from autdtorch.scene.geometry import Plane
@@ -183,6 +186,13 @@ def test_another_study_is_kept_and_a_refused_one_moves_nothing(study, tmp_path):
             study(solver=FREE_SPACE | {"dtype": "int"}, config="a: 4")
     kept = [tmp_path / folder for folder in ("previous-1", "previous-2", ".")]
     assert [load_results(folder).provenance.config for folder in kept] == ["a: 1", "a: 2", "a: 3"]
+
+
+def test_the_matrix_of_the_study_is_a_prior(tmp_path):
+    methods = {"identify": Identify(evaluations=3, prior=Prior()), "climb": GradientAscent()}
+    found = run_study({"a": scene(None)}, methods, tmp_path, solver=FREE_SPACE).scenes["a"].methods
+    # 1e-4 is what either climb leaves.
+    assert found["identify"].solution.score > 0.999 * found["climb"].solution.score
 
 
 @pytest.mark.parametrize("returned", [1, 3])

@@ -6,7 +6,13 @@ import torch
 from botorch.test_functions.base import BaseTestProblem
 
 from autdtorch.methods.bayes.bayes import drives_at, require_transducer
-from autdtorch.objectives.objective import Objective, Score, require_objective, weakest_focus
+from autdtorch.objectives.objective import (
+    Objective,
+    Score,
+    observe_drives,
+    require_objective,
+    weakest_focus,
+)
 from autdtorch.utils.validation import boolean, integer_at_least, not_negative, real_tensor, require_callable
 
 
@@ -64,8 +70,7 @@ class FocusProblem(BaseTestProblem):
         X = real_tensor("X", X, "turns").detach()
         if X.ndim == 0 or X.shape[-1] != self.dim or X.numel() == 0:
             raise ValueError(f"X: shape {tuple(X.shape)}; must be (..., {self.dim}), not empty")
-        drives = drives_at(X, self.fixed_transducer).reshape(-1, self.dim + 1)
-        return self.objective(drives).reshape(*X.shape[:-1], -1)
+        return observe_drives(self.objective, drives_at(X, self.fixed_transducer), self.dim + 1)
 
     def _evaluate_true(self, X: torch.Tensor) -> torch.Tensor:
         return self.score(self.pressures(X)).to(X)
