@@ -248,6 +248,7 @@ OTHERS: dict[str, Any] = {
     "Medium.air.pressure": 1e5,
     "Mesh.path": Made(mesh_file),
     "OpenMPDBoard.load.path": Made(board_file),
+    "PhasorKernel.mean.x": torch.ones(3, 2, dtype=torch.float64),
     "Problem.transducers": 4,
     "Oscilloscope.port": Made(lambda _: scope()._port),
     "Plane.size": (0.1, 0.1),

@@ -189,9 +189,9 @@ class Method(ABC):
         """Check settings and memory against a problem; `ValueError` where they do not fit."""
         self.check(problem)
         whole = {name: value for name, value in vars(self).items() if isinstance(value, int)}
-        if whole:
-            largest = max(whole, key=whole.__getitem__)
-            require_memory(largest, whole[largest], 8 * trials * self.numbers_kept(problem))
+        whole = whole or {"evaluations": self.most_evaluations(problem)}
+        largest = max(whole, key=whole.__getitem__)
+        require_memory(largest, whole[largest], 8 * trials * self.numbers_kept(problem))
 
     def start(self, problem: Problem, seed: int = 0, trials: Trials = 1) -> State:
         """Begin T trials.

@@ -15,7 +15,7 @@ from autdtorch.methods.base import Method, Problem, State, Step, Trials, generat
 from autdtorch.methods.driver import run
 from autdtorch.methods.gradient import climb, climbed, random_drives
 from autdtorch.methods.matrix_posterior import MatrixPosterior, kept, posteriors
-from autdtorch.methods.prior import Prior
+from autdtorch.methods.prior import Prior, best_simulated_drives, matrix_prior, prior_mean, prior_of
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.objective import Objective, weakest_focus
 from autdtorch.utils.threads import one_torch_thread
@@ -53,12 +53,12 @@ class Identify(Method):
         """Check the settings."""
         if self.evaluations is not None:
             object.__setattr__(self, "evaluations", integer_at_least("evaluations", self.evaluations, 2))
-        object.__setattr__(self, "prior", Prior.of("prior", self.prior))
+        object.__setattr__(self, "prior", prior_of("prior", self.prior))
 
     def check(self, problem: Problem) -> None:
         """Check that there are enough evaluations for the number of transducers, or that the prior fits."""
         if self.prior is not None:
-            self.prior.simulated(problem)
+            prior_mean(self.prior, problem)
             return
         least = 3 * problem.transducers - 1
         if self.most_evaluations(problem) < least:
@@ -84,9 +84,7 @@ class Identify(Method):
             count = max(3 * problem.transducers - 2, self.most_evaluations(problem) // 2)
             drives = torch.stack([random_drives(count, problem.transducers, own) for own in generators])
         else:
-            matrix = self.prior.simulated(problem)
-            starts = [random_drives(_STARTS, problem.transducers, own) for own in generators]
-            drives = torch.stack([climb(matrix, start, _CLIMB_STEPS) for start in starts])[:, None]
+            drives = best_simulated_drives(self.prior, problem, generators)[:, None]
         return Step(problem.quantise(drives), {"generators": states_of(generators)})
 
     @one_torch_thread()
@@ -100,7 +98,7 @@ class Identify(Method):
             drives = torch.cat([search["drives"], drives], dim=1)
             observed = torch.cat([search["observed"], observed], dim=1)
         generators = restored(search["generators"])
-        prior = None if self.prior is None else self.prior.of_matrix(state.problem)
+        prior = None if self.prior is None else matrix_prior(self.prior, state.problem)
         fits = posteriors(prior, search, drives, observed, generators)
         apart = [own.clone() for own in drives]  # their products must not round by the place in memory
         best = torch.stack([_highest(*of) for of in zip(fits, apart, generators, strict=True)])

@@ -14,12 +14,12 @@ _KEPT = ("factors", "entries", "variance")
 _STEPS = 10  # of Gauss and Newton
 _HALVINGS = 6  # of a step that misfits more
 _ENOUGH = 1e-3  # relative gain of a step below which the fit ends
-_NOISE_ROUNDS = 4  # of estimates of the noise; a factor below which the maximum is not sought again:
-_NOISE_FACTOR = 1.5
+_NOISE_ROUNDS = 4  # of estimates of the noise
+_NOISE_FACTOR = 1.5  # change of the variance above which the maximum is sought again
 _DARK = 1e-6  # smallest entries that a row is expected to have, in those of the strongest row, and
 _TINY = 1e-150  # in pascals: their squares must not be 0
 _USUAL_NOISE = 0.03  # in rms pressures at random phases, assumed before readings
-_WEIGHT = 4.0  # of this assumption, in readings
+_WEIGHT = 4.0  # of this assumption beside readings: so many of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +46,13 @@ class MatrixPrior:
         """Variance of the noise that is assumed before readings [Pa^2]."""
         power = (self.rows.abs().square() + self.spread[:, None].square()).sum(dim=1).mean()
         return 0.5 * _USUAL_NOISE**2 * power
+
+    def in_units_of(self, drive: torch.Tensor, observed: torch.Tensor) -> MatrixPrior:
+        """Return the prior in the units of a first reading: magnitudes (P,) that a drive (M,) made."""
+        expected = (self.rows @ drive).abs().norm()
+        factor = observed.norm() / expected if observed.any() and expected > 0 else 1.0
+        parts = {name: factor * getattr(self, name) for name in ("rows", "spread", "changes")}
+        return replace(self, **parts)
 
     @classmethod
     def unknown(cls, observed: torch.Tensor, transducers: int) -> MatrixPrior:
@@ -91,7 +98,7 @@ class MatrixPosterior:
         """Return the posterior given magnitudes (N, P) that drives (N, M) made.
 
         The maximum is sought from this one. The noise follows by MacKay's rule (1992): the misfit over the
-        number of readings that no unknown explains.
+        number of readings that no unknown explains, beside a few readings of the usual noise.
         """
         now, line = self._maximum(_Linearised.at(self, drives), drives, observed)
         for _ in range(_NOISE_ROUNDS if infer_noise else 0):
@@ -142,7 +149,11 @@ class MatrixPosterior:
             factors=self.factors + factors - correction[0],
             entries=self.entries + entries - correction[1],
         )
-        return drawn.matrix
+        if len(self.factors):
+            return drawn.matrix
+        # No reading shows the common phase of a row. Drawn as a straight step, it would make the row longer.
+        turn = (drawn.matrix * self.matrix.conj()).sum(dim=1).imag / self.matrix.abs().square().sum(dim=1)
+        return drawn.matrix - 1j * turn.nan_to_num()[:, None] * self.matrix
 
     def _scaled(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return rows (P, M) and changes (K, P, M) of the prior, by the factors."""
@@ -195,7 +206,10 @@ def posteriors(
     for trial, generator in enumerate(generators):
         # Copies: products of a part of a tensor may round by its place in memory.
         own, seen = drives[trial].clone(), observed[trial].clone()
-        given = MatrixPrior.unknown(seen, own.shape[1]) if prior is None else prior
+        if prior is None:
+            given = MatrixPrior.unknown(seen, own.shape[1])
+        else:
+            given = prior.in_units_of(own[0], seen[0])
         if "entries" in search:
             given = replace(given, spread=search["spread"][trial].clone())
             start = MatrixPosterior(given, *(search[name][trial].clone() for name in _KEPT))

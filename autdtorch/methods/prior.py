@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 
 import torch
 
 from autdtorch.methods.base import Problem
+from autdtorch.methods.gradient import climb, random_drives
 from autdtorch.methods.matrix_posterior import MatrixPrior
-from autdtorch.utils.validation import complex_tensor, invalid, positive, require_known
+from autdtorch.utils.validation import complex_tensor, invalid, number_between, require_known, within
 
-_SCALE = 1.0
-"""Standard deviation of the logarithm of the scale between readings and simulation. A sensor may be wrong by
-a factor of three; the first reading fixes it."""
+_STARTS, _CLIMB_STEPS = 16, 300  # of the climbs to the best drive of a simulation
+
+_LEAST_WIDTH = 1e-6  # of gain, phase and rest
+_DARK = 1e-2  # rms entry that a row has at least, in those of the strongest row: simulated shadows are deep
+
+_SCALE = 0.3
+"""Standard deviation of the logarithm of the scale between readings and simulation, once the first reading
+has given their units."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,16 +35,16 @@ class Prior:
             `SimulatedObjective`, also within perturbations, or a `HardwareObjective` to which it was given.
         variants: transfer matrices (K, P, M) [Pa] of the scene as it may also be, each simulated with one
             change of the size that is to be expected: an obstacle 2 mm aside, the air 5 K warmer.
-        gain: standard deviation of the logarithm of a transducer's gain, > 0.
-        phase: of a transducer's phase [rad], > 0.
-        rest: of an entry, > 0, in rms entries of its row.
+        gain: standard deviation of the logarithm of a transducer's gain, 1e-6 to 3.
+        phase: of a transducer's phase [rad], 1e-6 to 2 pi.
+        rest: of an entry, in rms entries of its row, 1e-6 to 10.
 
     Raises:
         ValueError: a value out of range.
     """
 
-    transfer_matrix: torch.Tensor | None = None
-    variants: torch.Tensor | None = None
+    transfer_matrix: torch.Tensor | None = field(default=None, repr=False)
+    variants: torch.Tensor | None = field(default=None, repr=False)
     gain: float = 0.1
     phase: float = 0.5
     rest: float = 0.15
@@ -50,41 +57,57 @@ class Prior:
                 raise ValueError(f"transfer_matrix: shape {tuple(matrix.shape)}; must be (P, M)")
             object.__setattr__(self, "transfer_matrix", matrix)
         if self.variants is not None:
-            object.__setattr__(self, "variants", complex_tensor("variants", self.variants).detach().cpu())
-        object.__setattr__(self, "gain", positive("gain", self.gain))
-        object.__setattr__(self, "phase", positive("phase", self.phase, "rad"))
-        object.__setattr__(self, "rest", positive("rest", self.rest))
+            variants = complex_tensor("variants", self.variants).detach().cpu()
+            if variants.ndim != 3:
+                raise ValueError(f"variants: shape {tuple(variants.shape)}; must be (K, P, M)")
+            object.__setattr__(self, "variants", variants)
+        for name, most, unit in (("gain", 3.0, ""), ("phase", 2 * math.pi, "rad"), ("rest", 10.0, "")):
+            value = number_between(name, getattr(self, name), _LEAST_WIDTH, most, unit)
+            object.__setattr__(self, name, value)
 
-    @classmethod
-    def of(cls, name: str, value: object) -> Prior | None:
-        """Return a prior, or None, of what a setting holds; a mapping has the settings of a prior."""
-        if value is None or isinstance(value, Prior):
-            return value
-        if isinstance(value, Mapping):
-            require_known(name, value, [field.name for field in fields(cls)])
-            return cls(**value)
-        accepted = "must be a Prior, a mapping of its settings, or None"
-        raise invalid(name, value, accepted)
 
-    def of_matrix(self, problem: Problem) -> MatrixPrior:
-        """Return the prior of the transfer matrix of a problem."""
-        matrix = self.simulated(problem)
-        each = torch.ones(problem.transducers, dtype=torch.float64, device="cpu")
-        changes = matrix.new_empty(0, *matrix.shape) if self.variants is None else self.variants - matrix
-        widths = torch.cat(
-            [self.gain * each, self.phase * each, _SCALE * each[:1], each.new_ones(len(changes))]
-        )
-        return MatrixPrior(matrix, self.rest * matrix.abs().square().mean(dim=1).sqrt(), widths, changes)
+def prior_of(name: str, value: object) -> Prior | None:
+    """Return a prior, or None, of a setting; a mapping, as in a config, has the settings of a prior."""
+    if value is None or isinstance(value, Prior):
+        return value
+    if isinstance(value, Mapping):
+        require_known(name, value, [setting.name for setting in fields(Prior)])
+        with within(name):
+            return Prior(**value)
+    raise invalid(name, value, "must be a Prior, a mapping of its settings, or None")
 
-    def simulated(self, problem: Problem) -> torch.Tensor:
-        """Return the simulated matrix (P, M) for a problem."""
-        matrix = problem.transfer_matrix if self.transfer_matrix is None else self.transfer_matrix
-        if matrix is None:
-            raise invalid("prior.transfer_matrix", None, "must be given where the objective has none")
-        shape = problem.foci, problem.transducers
-        if matrix.shape != shape:
-            raise ValueError(f"prior.transfer_matrix: shape {tuple(matrix.shape)}; must be {shape}")
-        if self.variants is not None and (self.variants.ndim != 3 or self.variants.shape[1:] != shape):
-            accepted = f"must be (K, {shape[0]}, {shape[1]})"
-            raise ValueError(f"prior.variants: shape {tuple(self.variants.shape)}; {accepted}")
-        return matrix
+
+def prior_mean(prior: Prior, problem: Problem) -> torch.Tensor:
+    """Return the simulated matrix (P, M) [Pa], after comparing shapes with those of the problem."""
+    matrix = problem.transfer_matrix if prior.transfer_matrix is None else prior.transfer_matrix
+    if matrix is None:
+        raise invalid("prior.transfer_matrix", None, "must be given where the objective has none")
+    shape = problem.foci, problem.transducers
+    if matrix.shape != shape:
+        raise ValueError(f"prior.transfer_matrix: shape {tuple(matrix.shape)}; must be {shape}")
+    if prior.variants is not None and (prior.variants.shape[1:] != shape):
+        accepted = f"must be (K, {shape[0]}, {shape[1]})"
+        raise ValueError(f"prior.variants: shape {tuple(prior.variants.shape)}; {accepted}")
+    return matrix
+
+
+def matrix_prior(prior: Prior, problem: Problem) -> MatrixPrior:
+    """Return the Gaussian prior of the transfer matrix of a problem."""
+    matrix = prior_mean(prior, problem)
+    each = torch.ones(problem.transducers, dtype=torch.float64, device="cpu")
+    changes = matrix.new_empty(0, *matrix.shape) if prior.variants is None else prior.variants - matrix
+    widths = [prior.gain * each, prior.phase * each, _SCALE * each[:1], each.new_ones(len(changes))]
+    entries = matrix.abs().square().mean(dim=1).sqrt()
+    if not entries.any():
+        raise invalid("prior.transfer_matrix", 0, "must not be 0 throughout")
+    spread = prior.rest * entries.clamp_min(_DARK * float(entries.max()))
+    return MatrixPrior(matrix, spread, torch.cat(widths), changes)
+
+
+def best_simulated_drives(
+    prior: Prior, problem: Problem, generators: Sequence[torch.Generator]
+) -> torch.Tensor:
+    """Return drives (T, M) that focus best in the simulation, one for each generator of random starts."""
+    matrix = prior_mean(prior, problem)
+    starts = [random_drives(_STARTS, problem.transducers, own) for own in generators]
+    return torch.stack([climb(matrix, start, _CLIMB_STEPS) for start in starts])

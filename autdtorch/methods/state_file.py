@@ -81,6 +81,9 @@ def load_state(path: str | os.PathLike[str], method: Method, problem: Problem) -
 def _origin(method: Method, problem: Problem) -> str:
     """Return the method, its settings and the size of the problem as JSON; of a tensor, its digest."""
     settings = dataclasses.asdict(method)
+    prior = settings.get("prior")
+    if prior is not None and prior["transfer_matrix"] is None:  # then it is that of the problem
+        prior["transfer_matrix"] = problem.transfer_matrix
     return json.dumps([method.name, settings, problem.transducers, problem.foci], default=digest_of)
 
 

@@ -60,8 +60,8 @@ class Provenance:
 
 def provenance_now(config: str, seed: int) -> Provenance:
     """Return the provenance of a study that starts now, with the source and packages of this process."""
-    versions = {"autdtorch": autdtorch.__version__, "python": platform.python_version(), **package_versions()}
-    versions["platform"] = platform.platform()
+    versions = {"autdtorch": autdtorch.__version__, "python": platform.python_version()}
+    versions |= package_versions("botorch", "gpytorch") | {"platform": platform.platform()}
     date = datetime.now(UTC).isoformat(timespec="seconds")
     return Provenance(config, seed, versions, source_digest(), date)
 

@@ -42,10 +42,10 @@ def source_digest() -> str:
     return digest.hexdigest()
 
 
-def package_versions() -> dict[str, str]:
-    """Return the versions of the numerical packages that are installed."""
+def package_versions(*more: str) -> dict[str, str]:
+    """Return the versions of the numerical packages that are installed, and of others by name."""
     versions = {}
-    for package in _PACKAGES:
+    for package in (*_PACKAGES, *more):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             versions[package] = importlib.metadata.version(package)
     return versions

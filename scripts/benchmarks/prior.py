@@ -53,7 +53,7 @@ class Measured:
 def moved(scene: at.Scene, shift: torch.Tensor) -> at.Scene:
     """Move the obstacles by a vector [m]."""
     obstacles = [
-        dataclasses.replace(one, center=(torch.tensor(one.center) + shift).tolist())
+        dataclasses.replace(one, center=(torch.tensor(one.center, dtype=torch.float64) + shift).tolist())
         for one in scene.obstacles
     ]
     return dataclasses.replace(scene, obstacles=tuple(obstacles))

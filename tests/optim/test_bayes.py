@@ -68,6 +68,17 @@ def test_goal_without_a_derivative_is_refused_for_the_foci(make_objective, matri
         at.bayes_opt(make_objective(matrix), score=lambda p: torch.ones_like(p[..., 0]), **SMALL, **FOCI)
 
 
+@pytest.mark.parametrize("dark", [1, slice(None)])
+@pytest.mark.parametrize("with_prior", [False, True])
+def test_foci_that_nothing_reaches(make_objective, random_matrix, dark, with_prior):
+    simulated = random_matrix(3, 5, 0)
+    matrix = simulated.clone()
+    matrix[dark] = 0
+    prior = at.Prior(simulated) if with_prior else None
+    found = at.bayes_opt(make_objective(matrix), 16, 4, fixed_transducer=0, prior=prior, **FOCI)
+    assert found.score.tolist() == [0.0]
+
+
 def test_foci_find_the_maximum(make_objective, random_matrix):
     objective = make_objective(random_matrix(3, 6, 4))
     best = at.gradient_ascent(objective).score
@@ -125,6 +136,13 @@ class TestPhasorKernel:
                 values, PhasorKernel()(points, others).to_dense(), rtol=1e-12, atol=1e-14
             )
             assert torch.allclose(kernel(inputs[0], diag=True), torch.ones(5, dtype=torch.float64))
+
+    def test_part_of_a_batch(self, random_matrix):
+        kernel = PhasorKernel("phases", random_matrix(2, 4, 0), torch.tensor([0.5, 1.0]).double())
+        points = uniform(6, 3)
+        torch.testing.assert_close(kernel[1](points).to_dense(), kernel(points).to_dense()[1])
+        with pytest.raises(ValueError, match="variance: None; must be given with rows"):
+            PhasorKernel("phases", random_matrix(2, 4, 0))
 
     def test_is_positive_semidefinite(self):
         matrix = PhasorKernel()(uniform(60, 3)).to_dense()

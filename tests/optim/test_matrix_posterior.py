@@ -6,7 +6,7 @@ import torch
 
 import autdtorch as at
 from autdtorch.methods.gradient import random_drives
-from autdtorch.methods.matrix_posterior import MatrixPosterior, MatrixPrior, _Linearised
+from autdtorch.methods.matrix_posterior import MatrixPosterior, MatrixPrior, _Linearised, posteriors
 from autdtorch.objectives.perturbations import Noise
 
 FOCI = {"model": "foci", "kernel": "phasor", "noise": "inferred"}
@@ -89,6 +89,16 @@ def test_samples_have_the_covariance_that_readings_leave(prior):
     assert expected.diagonal().max() < 0.9 * (wanted * variance @ wanted.T).diagonal().max()
 
 
+def test_samples_have_the_magnitudes_of_readings_that_determine_a_row(random_matrix):
+    """Also where the common phase of a row, which no reading shows, is drawn at random."""
+    matrix, drives = random_matrix(2, 5, 0), random_drives(60, 5, generator(1))
+    observed = (drives @ matrix.T).abs()
+    (fit,) = posteriors(None, {}, drives[None], observed[None], [generator(2)])
+    sample = fit.sample(drives, generator(3))
+    # The noise, assumed from few readings, is half a per cent.
+    torch.testing.assert_close((drives @ sample.T).abs(), observed, rtol=0.02, atol=0.03)
+
+
 def test_a_simulation_is_corrected_by_few_readings(make_objective, random_matrix):
     """Fewer readings than unknowns of one row, which without a prior would determine nothing."""
     simulated = random_matrix(3, 12, 2)
@@ -121,20 +131,23 @@ def test_what_a_variant_changes_is_found(make_objective, random_matrix):
     assert knowing > 0.99 * best
 
 
-def test_the_scale_of_readings_is_fitted(make_objective, random_matrix):
-    """A sensor in other units than the simulation's costs nothing."""
+@pytest.mark.parametrize("factor", [1e-4, 3.0, 1e4])
+@pytest.mark.parametrize("method", [at.identify, partial(at.bayes_opt, fixed_transducer=0, **FOCI)])
+def test_a_sensor_in_other_units_costs_nothing(make_objective, random_matrix, method, factor):
     simulated = random_matrix(3, 8, 2)
-    objective = make_objective(3 * deviating(simulated, 1))
+    objective = make_objective(factor * deviating(simulated, 1))
     best = at.gradient_ascent(objective).score
-    assert at.identify(objective, 20, prior=at.Prior(simulated)).score > 0.97 * best
+    assert method(objective, evaluations=20, prior=at.Prior(simulated)).score > 0.97 * best
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"gain": 0}, "gain: 0; must be .* > 0"),
+        ({"gain": 0}, "gain: 0; must be"),
+        ({"gain": 1e6}, "gain: 1e\\+06|gain: 1000000"),
         ({"phase": math.nan}, "phase: nan"),
-        ({"rest": -1}, "rest: -1; must be .* > 0"),
+        ({"rest": -1}, "rest: -1; must be"),
+        ({"variants": torch.ones(3, dtype=torch.complex128)}, r"variants: shape \(3,\)"),
         ({"transfer_matrix": torch.ones(3, dtype=torch.complex128)}, r"transfer_matrix: shape \(3,\)"),
     ],
 )
@@ -148,7 +161,9 @@ def test_a_prior_of_another_problem_is_refused(make_objective, random_matrix, me
     objective = make_objective(random_matrix(3, 5, 0))
     with pytest.raises(ValueError, match=r"prior.transfer_matrix: shape \(3, 4\); must be \(3, 5\)"):
         method(objective, prior=at.Prior(random_matrix(3, 4, 0)))
-    with pytest.raises(ValueError, match=r"prior.variants: shape \(3, 5\); must be \(K, 3, 5\)"):
-        method(objective, prior=at.Prior(random_matrix(3, 5, 0), random_matrix(3, 5, 1)))
+    with pytest.raises(ValueError, match=r"prior.variants: shape \(1, 3, 4\); must be \(K, 3, 5\)"):
+        method(objective, prior=at.Prior(random_matrix(3, 5, 0), random_matrix(3, 4, 1)[None]))
+    with pytest.raises(ValueError, match=r"prior\.transfer_matrix: 0; must not be 0 throughout"):
+        method(objective, prior=at.Prior(0 * random_matrix(3, 5, 0)))
     with pytest.raises(ValueError, match="prior: 'simulated'; must be a Prior"):
         method(objective, prior="simulated")

@@ -15,7 +15,7 @@ from autdtorch.objectives.objective import Score, weakest_focus
 from autdtorch.utils.validation import invalid
 
 _SCORE_EFFORT = Effort(candidates=128, starts=2, steps=20)
-_FOCUS_EFFORT = Effort(candidates=128, starts=4, steps=40)
+_FOCUS_EFFORT = Effort(candidates=256, starts=8, steps=60)
 _NEAR_EFFORT = Effort(candidates=16, starts=2, steps=10)  # where a good start is known
 _SAMPLES = 32  # of the foci, over which the improvement of a goal is averaged
 _SMOOTH_MINIMUM = 1e-2  # temperature of the smooth minimum, and

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
@@ -12,9 +12,9 @@ import torch
 
 from autdtorch.methods.base import Method, Problem, State, Step, Trials, generators_of, restored, states_of
 from autdtorch.methods.driver import run
-from autdtorch.methods.gradient import climb, climbed, random_drives
+from autdtorch.methods.gradient import climbed
 from autdtorch.methods.matrix_posterior import kept, posteriors
-from autdtorch.methods.prior import Prior
+from autdtorch.methods.prior import Prior, best_simulated_drives, matrix_prior, prior_mean, prior_of
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.objective import Objective, Score, weakest_focus
 from autdtorch.scene.drive import drive_from_phases, phases_of
@@ -29,7 +29,6 @@ NOISE = 1e-4
 """Variance of the observation noise that the process of the score assumes, in its own variances. A fitted one
 would take the kinks of the minimum over the foci for noise, and the search would end lower."""
 
-_STARTS, _CLIMB_STEPS = 16, 300  # of the climbs to the best drive of a simulation
 _SAMPLE_STEPS = 60  # of the climb on a sample of the matrix, from the best drive
 
 _REFIT_GROWTH = 1.2  # growth of the number of observations after which the hyperparameters are fitted again
@@ -62,7 +61,7 @@ class BayesOpt(Method):
     Attributes:
         evaluations: number of evaluations of a trial, > `initial`; >= 2 with a prior.
         initial: number of them, >= 2, that are spread over all phases before the search. With a prior, the
-            search begins at the best drive of the simulation instead.
+            search begins at the drive whose weakest focus is best in the simulation.
         fixed_transducer: index of the transducer whose phase stays 0, since a common offset of all phases
             changes no magnitude; 6 is the paper's 7th.
         model: "weakest": one process models the score, as in the paper. "foci": each focus has a process, and
@@ -76,9 +75,9 @@ class BayesOpt(Method):
             et al. 2023), which has a slope also where the improvement itself rounds to 0.
         initial_points: a scrambled "sobol" sequence, or independent "random" points.
         noise: variance of the noise, from 1e-6 to 1: of scores in variances of the process, or of a reading
-            in mean intensities of its focus (model "foci"). "inferred" fits it. The model "foci" then
-            spends the last evaluation at the maximum of the posterior mean, and returns the drive where the
-            posterior mean is highest.
+            in mean intensities of its focus (model "foci"). "inferred" fits it. The model "foci"
+            spends the last evaluation at the maximum of the posterior mean, and returns the observed drive
+            where the posterior mean is highest.
         prior: what a simulation says of the transfer matrix, for the model "foci".
 
     Raises:
@@ -102,7 +101,7 @@ class BayesOpt(Method):
     def __post_init__(self) -> None:
         """Check the settings."""
         object.__setattr__(self, "initial", integer_at_least("initial", self.initial, 2))
-        object.__setattr__(self, "prior", Prior.of("prior", self.prior))
+        object.__setattr__(self, "prior", prior_of("prior", self.prior))
         least = self.initial + 1 if self.prior is None else 2
         evaluations = integer_at_least("evaluations", self.evaluations, least)
         object.__setattr__(self, "evaluations", evaluations)
@@ -125,7 +124,7 @@ class BayesOpt(Method):
         """Check the number of transducers, and the prior."""
         require_transducer(self.fixed_transducer, problem.transducers)
         if self.prior is not None:
-            self.prior.simulated(problem)
+            prior_mean(self.prior, problem)
 
     def most_evaluations(self, problem: Problem) -> int:
         """Return `evaluations`."""
@@ -142,11 +141,7 @@ class BayesOpt(Method):
         generators = generators_of(seeds)
         dimensions = problem.transducers - 1
         if self.prior is not None:
-            matrix = self.prior.simulated(problem)
-            starts = [random_drives(_STARTS, problem.transducers, own) for own in generators]
-            points = self._points(torch.stack([climb(matrix, start, _CLIMB_STEPS) for start in starts]))[
-                :, None
-            ]
+            points = self._points(best_simulated_drives(self.prior, problem, generators))[:, None]
         elif self.initial_points == "sobol":
             points = torch.stack([_sobol(self.initial, dimensions, seed) for seed in seeds])
         else:
@@ -170,8 +165,11 @@ class BayesOpt(Method):
         if self.model == "weakest" and count == self.evaluations:
             return Step(state.drives[:, :0], search)
         generators = restored(search["generators"])
-        fit, rows = self._fitted(state.problem, search, generators)
-        acquisition = self._acquisition(state.problem, search, fit, rows)
+        points = search["points"]
+        if self.model == "foci":  # processes of the points that were played
+            points = self._points(state.problem.quantise(drives_at(points, self.fixed_transducer)))
+        fit, rows = self._fitted(state.problem, search, points, generators)
+        acquisition = self._acquisition(state.problem.goal, search["values"], points, fit, rows)
         if count == self.evaluations:
             return Step(state.drives[:, :0], {**search, "answer": acquisition.best})
         point = acquisition.next_points(generators, last=count == self.evaluations - 1)[:, None]
@@ -203,7 +201,11 @@ class BayesOpt(Method):
         return [*others, self.fixed_transducer]
 
     def _fitted(
-        self, problem: Problem, search: dict[str, torch.Tensor], generators: Sequence[torch.Generator]
+        self,
+        problem: Problem,
+        search: dict[str, torch.Tensor],
+        points: torch.Tensor,
+        generators: Sequence[torch.Generator],
     ) -> tuple[Fit, Rows | None]:
         """Return hyperparameters and rows; `search` keeps what the next fit begins with."""
         from autdtorch.methods.bayes.processes import Fit, fitted
@@ -213,7 +215,7 @@ class BayesOpt(Method):
             return self._with_rows(problem, search, generators)
         # The hyperparameters are fitted again where the observations grew by a fifth.
         if "fitted" not in search or count >= _REFIT_GROWTH * int(search["fitted"]):
-            search |= fitted(self.kernel, search["points"], search["values"], self.noise)._asdict()
+            search |= fitted(self.kernel, points, search["values"], self.noise)._asdict()
             search["fitted"] = torch.tensor(count, dtype=torch.int64, device="cpu")
         return Fit(search["length_scale"], search["noise"]), None
 
@@ -221,13 +223,13 @@ class BayesOpt(Method):
         self, problem: Problem, search: dict[str, torch.Tensor], generators: Sequence[torch.Generator]
     ) -> tuple[Fit, Rows]:
         """Return the noise, and rows of the matrix that is fitted to all readings, or of a sample of it."""
-        from autdtorch.methods.bayes.processes import Fit, Rows
+        from autdtorch.methods.bayes.processes import Fit, Rows, mean_intensity
 
         observed = search["values"]
         drives = problem.quantise(drives_at(search["points"], self.fixed_transducer))
-        power = observed.square().mean(dim=1)
-        variance = None if isinstance(self.noise, str) else 0.5 * self.noise * power
-        prior = None if self.prior is None else self.prior.of_matrix(problem)
+        power = mean_intensity(observed)
+        variance = None if isinstance(self.noise, str) else 0.5 * self.noise / (1 + self.noise) * power
+        prior = None if self.prior is None else matrix_prior(self.prior, problem)
         fits = posteriors(prior, search, drives, observed, generators, variance)
         search |= kept(fits)
         mean = torch.stack([fit.matrix for fit in fits])
@@ -242,16 +244,15 @@ class BayesOpt(Method):
         return fit, Rows(rows[..., self._others(problem.transducers)], spread, self._points(best))
 
     def _acquisition(
-        self, problem: Problem, search: Mapping[str, torch.Tensor], fit: Fit, rows: Rows | None
+        self, goal: Score, values: torch.Tensor, points: torch.Tensor, fit: Fit, rows: Rows | None
     ) -> Acquisition:
         from autdtorch.methods.bayes.acquisition import FocusAcquisition, ScoreAcquisition
         from autdtorch.methods.bayes.processes import Processes
 
-        points, values = search["points"], search["values"]
         processes = Processes(self.kernel, points, values, fit, rows)
         if self.model == "weakest":
             return ScoreAcquisition(processes, points, values, self.acquisition == "log_ei")
-        return FocusAcquisition(processes, points, problem.goal, None if rows is None else rows.best)
+        return FocusAcquisition(processes, points, goal, None if rows is None else rows.best)
 
 
 def bayes_opt(

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from gpytorch.kernels import Kernel
 
-from autdtorch.utils.validation import require_one_of
+from autdtorch.utils.validation import complex_tensor, invalid, real_tensor, require_one_of
 
 
 class PhasorKernel(Kernel):  # type: ignore[misc]
@@ -37,17 +37,38 @@ class PhasorKernel(Kernel):  # type: ignore[misc]
                 transducer, whichever it is, keeps phase 0, and is the last of a row. "drives": inputs
                 (..., 2 M) are the real parts of drives, then their imaginary parts.
             rows: g0 (..., M), complex; the dimensions before are those of a batch. 0 by default.
-            variance: s^2 (...); 1 / M by default: intensities are in units of their mean at full drive.
+            variance: s^2 (...), > 0, given with `rows`. Without them 1 / M: intensities are in units of their
+                mean at full drive.
             settings: of `gpytorch.kernels.Kernel`.
 
         Raises:
-            ValueError: unknown inputs.
+            ValueError: unknown inputs; rows or a variance that are no finite numbers, one without the other,
+                or of shapes that do not fit.
         """
         require_one_of("inputs", inputs, ("phases", "drives"))
-        if rows is not None:
+        if (rows is None) != (variance is None):
+            raise invalid("variance", variance, "must be given with rows, and only then")
+        if rows is not None and variance is not None:
+            rows, variance = complex_tensor("rows", rows), real_tensor("variance", variance)
+            if rows.ndim == 0 or variance.shape != rows.shape[:-1] or not bool((variance > 0).all()):
+                raise invalid("variance", variance, f"must be > 0, of shape {tuple(rows.shape[:-1])}")
             settings.setdefault("batch_shape", rows.shape[:-1])
         super().__init__(**settings)
-        self.inputs, self.rows, self.variance = inputs, rows, variance
+        self.inputs = inputs
+        # As real numbers: PyTorch's `Module.to` would drop imaginary parts.
+        self.register_buffer("_rows", None if rows is None else torch.view_as_real(rows.resolve_conj()))
+        self.register_buffer("variance", variance)
+
+    @property
+    def rows(self) -> torch.Tensor | None:
+        """The rows (..., M), complex, or None."""
+        return None if self._rows is None else torch.view_as_complex(self._rows)
+
+    def __getitem__(self, index: Any) -> PhasorKernel:
+        """Return the kernel of a part of the batch."""
+        if self.rows is None:
+            return super().__getitem__(index)  # type: ignore[no-any-return]
+        return PhasorKernel(self.inputs, self.rows[index], self.variance[index])
 
     def forward(self, x1: torch.Tensor, x2: torch.Tensor, diag: bool = False, **_: Any) -> torch.Tensor:
         """Return covariances (..., N1, N2) of inputs (..., N1, D) and (..., N2, D); (..., N) with `diag`."""
@@ -62,7 +83,10 @@ class PhasorKernel(Kernel):  # type: ignore[misc]
         return covariance + 2 * variance * (of_means[0] * real + of_means[1] * imaginary)
 
     def mean(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the mean intensities (..., N) of inputs (..., N, D)."""
+        """Return the mean intensities (..., N) of inputs (..., N, D); `ValueError` for other shapes."""
+        x = real_tensor("x", x)
+        if x.ndim < 2:
+            raise ValueError(f"x: shape {tuple(x.shape)}; must be (..., N, D)")
         if self.inputs == "phases":
             x = phasors(x)
         mean = self._variance(x) * x.square().sum(dim=-1)

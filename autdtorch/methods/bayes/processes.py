@@ -24,6 +24,8 @@ _LEAST_VARIANCE = 1e-12
 _JITTER = 1e-5
 """Variance added to intensities, in variances of the process, so that their covariance can be inverted."""
 
+_DARK = 1e-12  # least mean intensity of a focus, in those of the strongest
+_TINY = 1e-30  # and where all are dark [Pa^2]
 _PHASOR_REACH = 0.2  # [turns]
 
 _NOISES = 10.0 ** torch.linspace(-6, 0, 25, dtype=torch.float64, device="cpu")
@@ -155,7 +157,7 @@ def standardised(
         return (values - mean) / unit, mean, unit
     # A reading is |p + n|, n circular Gaussian noise: its square is above |p|^2 by the noise's variance.
     intensity = values.square()
-    unit = intensity.mean(dim=1, keepdim=True) / (1 + noise[:, None])
+    unit = mean_intensity(values)[:, None] / (1 + noise[:, None])
     return intensity / unit - noise[:, None] - 1, unit, unit
 
 
@@ -201,7 +203,7 @@ def _fit_alone(
 def _likeliest_noise(points: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
     """Return the variance of a reading's noise (T, P), in mean intensities, equal in pascals for all foci."""
     features, intensity = phasors(points), values.square()
-    mean = intensity.mean(dim=1)
+    mean = mean_intensity(values)
     share, vectors = torch.linalg.eigh(PhasorKernel("drives").forward(features, features))
     seen = (vectors.mT @ (intensity / mean[:, None] - 1)).square()
     variance = _NOISES[:, None, None] * mean.mean(dim=-1, keepdim=True)
@@ -212,6 +214,12 @@ def _likeliest_noise(points: torch.Tensor, values: torch.Tensor) -> torch.Tensor
         dim=2
     )
     return noise[fit.sum(dim=-1).argmax(dim=0), torch.arange(len(mean), device="cpu")]
+
+
+def mean_intensity(pressure: torch.Tensor) -> torch.Tensor:
+    """Return the mean squares (T, K) of pressures (T, N, K); of a focus that nothing reaches, not quite 0."""
+    mean = pressure.square().mean(dim=1)
+    return mean.clamp_min(_DARK * mean.amax(dim=1, keepdim=True)).clamp_min(_TINY)
 
 
 def _intensity_variance(noise: torch.Tensor, expected: torch.Tensor | float = 1.0) -> torch.Tensor:
