@@ -85,8 +85,8 @@ class PhasorKernel(Kernel):  # type: ignore[misc]
     def mean(self, x: torch.Tensor) -> torch.Tensor:
         """Return the mean intensities (..., N) of inputs (..., N, D); `ValueError` for other shapes."""
         x = real_tensor("x", x)
-        if x.ndim < 2:
-            raise ValueError(f"x: shape {tuple(x.shape)}; must be (..., N, D)")
+        if x.ndim < 2 or x.numel() == 0:
+            raise ValueError(f"x: shape {tuple(x.shape)}; must be (..., N, D), not empty")
         if self.inputs == "phases":
             x = phasors(x)
         mean = self._variance(x) * x.square().sum(dim=-1)
