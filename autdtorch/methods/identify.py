@@ -5,6 +5,7 @@ Enough magnitudes determine each row of the matrix up to a phase (docs/decisions
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -22,6 +23,7 @@ from autdtorch.utils.threads import one_torch_thread
 from autdtorch.utils.validation import integer_at_least, invalid
 
 _LEAST = 64  # evaluations without the setting; more where transducers need them
+_LEAST_READINGS = 2.3  # for each transducer, to find a row by its magnitudes
 _STARTS = 16  # drives from which the fitted matrix is climbed
 _CLIMB_STEPS = 300
 _SAMPLE_STEPS = 60  # of the climb on a sample of the matrix, from the best drive
@@ -32,14 +34,15 @@ _GROWTH = 24  # a round observes one drive for so many that were observed
 class Identify(Method):
     """Fit the transfer matrix to observed magnitudes, and maximise the weakest focus on the matrix.
 
-    Without a prior, the first max(3 M - 2, evaluations / 2) drives have random phases. With one, the first is
-    the best drive of the simulation. Each of the others is the best drive of a sample of the matrix, from its
-    posterior (Thompson 1933). The last one is the best drive of the likeliest matrix. It is the solution,
-    since the highest of many noisy readings is a lucky one.
+    Without a prior, the first max(3 M - 2, evaluations / 2) drives, or all but the last, have random phases.
+    With one, the first is the best drive of the simulation. Each of the others is the best drive of a sample
+    of the matrix, from its posterior (Thompson 1933). The last one is the best drive of the likeliest matrix.
+    It is the solution, since the highest of many noisy readings is a lucky one.
 
     Attributes:
-        evaluations: number of evaluations of a trial, >= 3 M - 1, or >= 2 with a prior. None: 64 with a
-            prior, or else the larger of 64 and 4 M. More of them average noise.
+        evaluations: number of evaluations of a trial, > 2.3 M, or >= 2 with a prior. With fewer than 3 M - 1
+            the search takes long, and noise harms more. None: 64 with a prior, or else the larger of 64 and
+            4 M. More of them average noise.
         prior: what a simulation says of the transfer matrix.
     """
 
@@ -60,7 +63,8 @@ class Identify(Method):
         if self.prior is not None:
             prior_mean(self.prior, problem)
             return
-        least = 3 * problem.transducers - 1
+        transducers = problem.transducers
+        least = min(3 * transducers - 1, math.ceil(_LEAST_READINGS * transducers) + 1)
         if self.most_evaluations(problem) < least:
             accepted = f"must be an integer >= {least}, to identify {problem.transducers} transducers"
             raise invalid("evaluations", self.evaluations, accepted)
@@ -81,7 +85,8 @@ class Identify(Method):
         """Observe random phases, or the best drive of the prior."""
         generators = generators_of(seeds)
         if self.prior is None:
-            count = max(3 * problem.transducers - 2, self.most_evaluations(problem) // 2)
+            most = self.most_evaluations(problem)
+            count = min(max(3 * problem.transducers - 2, most // 2), most - 1)
             drives = torch.stack([random_drives(count, problem.transducers, own) for own in generators])
         else:
             drives = best_simulated_drives(self.prior, problem, generators)[:, None]

@@ -38,6 +38,7 @@ METHODS: tuple[tuple[str, Method], ...] = (
         "BO per focus",
         partial(at.bayes_opt, evaluations=600, initial=4, model="foci", kernel="phasor", noise="inferred"),
     ),
+    ("identify", partial(at.identify, evaluations=600)),
     ("identify", partial(at.identify, evaluations=1000)),
     ("random search", partial(at.random_search, evaluations=4000)),
     ("GABS, 16 levels", at.gabs),

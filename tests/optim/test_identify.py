@@ -99,6 +99,12 @@ def test_from_the_fewest_evaluations(make_objective, random_matrix, points, tran
     assert solution.score.max() <= focus_bound(objective.transfer_matrix)
 
 
+def test_fewer_readings_than_three_for_each_transducer(make_objective, random_matrix):
+    """Magnitudes determine a row from about two readings a transducer on; then the search takes longer."""
+    objective = make_objective(random_matrix(2, 20, 0))
+    assert identify(objective, evaluations=47).score > 0.98 * gradient_ascent(objective).score
+
+
 def test_a_large_array(make_objective, random_matrix):
     objective = make_objective(random_matrix(2, 64, 0))
     score = identify(objective, evaluations=256).score

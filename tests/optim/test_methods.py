@@ -265,7 +265,7 @@ def test_phases_at_the_control_points_are_never_seen(make_objective, random_matr
         (at.random_search, {"levels": 1}, "levels: 1; must be an integer >= 2"),
         (at.gradient_ascent, {"starts": 0}, "starts: 0; must be an integer >= 1"),
         (at.gradient_ascent, {"steps": 1}, "steps: 1; must be an integer >= 2"),
-        (at.identify, {"evaluations": 13}, "evaluations: 13; must be an integer >= 14"),
+        (at.identify, {"evaluations": 12}, "evaluations: 12; must be an integer >= 13"),
         (at.bayes_opt, {"initial": 1}, "initial: 1; must be an integer >= 2"),
         (at.bayes_opt, {"evaluations": 16}, "evaluations: 16; must be an integer >= 17"),
         (at.bayes_opt, {"fixed_transducer": 5}, "fixed_transducer: 5; must be an integer from 0 to 4"),
