@@ -233,7 +233,7 @@ def test_data_that_the_file_cannot_hold_or_that_are_elsewhere_are_refused_before
 
 def test_the_provenance_of_now_names_the_numerical_packages():
     provenance = origins.provenance_now("a: 1\n", 5)
-    packages = {"torch", "numpy", "scipy", "libigl", "numba"}
+    packages = {"torch", "numpy", "scipy", "libigl", "numba", "botorch", "gpytorch"}
     extras = {"triton"}  # if installed
     assert set(provenance.versions) - extras == {"autdtorch", "python", "platform"} | packages
     assert provenance.same_origin(origins.provenance_now("a: 1\n", 5))
