@@ -34,3 +34,5 @@ def nothing_from_disk(monkeypatch: pytest.MonkeyPatch) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         item.add_marker(item.path.relative_to(TESTS).parts[0])
+    # the documentation takes longest to build: started last, it would leave the other processes idle
+    items.sort(key=lambda item: "docs" not in item.keywords)
