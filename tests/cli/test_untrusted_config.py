@@ -157,11 +157,11 @@ def test_a_launcher_of_ones_own_comes_from_a_folder_that_is_trusted(run, send):
     assert run(*command, "hydra.searchpath=[sent]") == 0
 
 
-@pytest.mark.parametrize("target", ["climbing.load", "climbing.torch", "climbing.no", "climbing.torch.load"])
+@pytest.mark.parametrize("target", ["reaching.load", "reaching.torch", "reaching.no", "reaching.torch.load"])
 def test_of_a_trusted_module_only_its_own_functions_are_methods(target, refused, send, write, tmp_path):
-    write("here/climbing.py", "import torch\nfrom torch import load\n")
+    write("here/reaching.py", "import torch\nfrom torch import load\n")
     send({"method/x.yaml": LINES.replace("torch.load", target)})
-    line = refused("--config-dir", "sent", "method=x", "modules=[climbing, evil]")
+    line = refused("--config-dir", "sent", "method=x", "modules=[reaching, evil]")
     assert f"method._target_: '{target}'" in line
     assert not list(tmp_path.rglob("canary"))  # nor is a module imported that no method needs
 

@@ -23,7 +23,7 @@ scene = small_scene((CUBE,))
 propagator = at.make_propagator(scene, "box", 2e-3, cache=False)
 objective = at.SimulatedObjective(scene, propagator)
 found = [propagator.transfer_matrix()]
-for solution in (at.gabs(objective, trials=3), at.identify(objective)):
+for solution in (at.gabs(objective, trials=3), at.identify(objective, 20)):
     found += [solution.drive, solution.pressure, solution.history]
 print(hashlib.sha256(b"".join(one.numpy().tobytes() for one in found)).hexdigest())
 print(sum(sum(one.stats.cache_misses.values()) for one in _entries))
