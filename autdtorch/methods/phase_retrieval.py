@@ -7,50 +7,78 @@ import torch
 from autdtorch.utils.threads import one_torch_thread
 
 _GUESSES = 16  # rows from which the search for each row begins
+_APART = 0.5  # random part of these rows, relative to the common part
+_STEP = 0.7  # relaxation of the splitting; 1 takes half as many steps again
 _SEARCH_STEPS = 300
 _LONG_SEARCH_STEPS = 10_000  # with fewer than 3 M - 2 readings, unless all rows are found
-_CHECKED = 500  # steps of a long search after which the rows are compared with the readings
+_CHECKED = 100  # steps of a long search after which the rows are compared with the readings
 _FOUND = 1e-3  # relative error of the readings, rms, of a row that is found
 _FIT_STEPS = 100
+_FAINT = 0.02  # intensity, relative to the mean, below which readings have the weight of this one
 
 
 @one_torch_thread()
 def retrieve(drives: torch.Tensor, observed: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
     """Return rows of the transfer matrix (M, P) that explain magnitudes (N, P) observed for `drives` (N, M).
 
-    Douglas-Rachford splitting seeks phasors that have the observed magnitudes and that some row produces. It
-    leaves the local minima that trap a fit, after many steps where readings are few. The rows are then
-    fitted, and the best fit is taken.
+    Relaxed Douglas-Rachford splitting (Elser, SIAM J. Appl. Algebra Geometry 2 (2018) 150) seeks phasors that
+    have the observed magnitudes and that some row produces, from spectral estimates of the rows. The rows are
+    then fitted, and the best fit is taken.
     """
-    transducers, foci = drives.shape[1], observed.shape[1]
-    size = transducers, foci * _GUESSES
-    guesses = torch.randn(size, dtype=torch.complex128, generator=generator, device="cpu")
-    magnitudes = observed.repeat_interleave(_GUESSES, dim=1)
     inverse = torch.linalg.pinv(drives)
-    phasors = drives @ guesses
-    steps = _SEARCH_STEPS if len(drives) >= 3 * transducers - 2 else _LONG_SEARCH_STEPS
-    for step in range(1, steps + 1):
-        right = magnitudes * phasors.sgn()
-        phasors = phasors + drives @ (inverse @ (2 * right - phasors)) - right
-        if step % _CHECKED == 0:
-            left = _misfit(drives, magnitudes, inverse @ phasors).reshape(foci, -1).amin(dim=1)
-            if (left <= _FOUND**2 * observed.square().sum(dim=0)).all():
-                break
-    rows = _fit(drives, magnitudes, inverse @ phasors)
-    misfit = _misfit(drives, magnitudes, rows).reshape(foci, _GUESSES)
-    every = torch.arange(foci, device="cpu")
-    return rows.reshape(transducers, foci, _GUESSES)[:, every, misfit.argmin(dim=1)]
+    short = len(drives) < 3 * drives.shape[1] - 2
+    found = []
+    for magnitude in observed.mT[:, :, None]:
+        rows = _searched(drives, inverse, magnitude, short, generator)
+        rows = _fit(drives, inverse, magnitude, rows)
+        found.append(rows[:, _misfit(drives, magnitude, rows).argmin()])
+    return torch.stack(found, dim=1)
 
 
-@one_torch_thread()
-def _fit(drives: torch.Tensor, observed: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
-    """Return the least-squares fit of rows (M, K) to magnitudes (N, K): phases and rows in turn."""
-    inverse = torch.linalg.pinv(drives)
+def _searched(
+    drives: torch.Tensor,
+    inverse: torch.Tensor,
+    observed: torch.Tensor,
+    short: bool,
+    generator: torch.Generator,
+) -> torch.Tensor:
+    """Return candidates (M, K) for a row that explains magnitudes (N, 1), after a long search if `short`."""
+    start = _spectral(drives, observed)[:, None]
+    guesses = torch.randn((len(start), _GUESSES), dtype=torch.complex128, generator=generator, device="cpu")
+    phasors = drives @ (start + _APART * start.norm() / guesses.norm(dim=0) * guesses)
+    enough = _FOUND**2 * observed.square().sum()
+    for step in range(_LONG_SEARCH_STEPS if short else _SEARCH_STEPS):
+        right = observed * phasors.sgn()
+        phasors = phasors + _STEP * (drives @ (inverse @ (2 * right - phasors)) - right)
+        if step % _CHECKED == 0 and (_misfit(drives, observed, inverse @ phasors) <= enough).any():
+            break
+    rows: torch.Tensor = inverse @ phasors
+    return rows
+
+
+def _spectral(drives: torch.Tensor, observed: torch.Tensor) -> torch.Tensor:
+    """Return the estimate (M,) of a row from magnitudes (N, 1): the main direction of loud drives.
+
+    The weights 1 - 1 / intensity find a direction from the fewest readings (Mondelli and Montanari, Found.
+    Comput. Math. 19 (2019) 703).
+    """
+    intensity, least = observed[:, 0].square(), torch.finfo(observed.dtype).tiny
+    relative = intensity / intensity.mean().clamp(min=least)
+    weight = 1 - 1 / relative.clamp(min=_FAINT)
+    direction: torch.Tensor = torch.linalg.eigh((drives.mH * weight) @ drives).eigenvectors[:, -1]
+    row: torch.Tensor = direction * (observed.norm() / (drives @ direction).norm().clamp(min=least))
+    return row
+
+
+def _fit(
+    drives: torch.Tensor, inverse: torch.Tensor, observed: torch.Tensor, rows: torch.Tensor
+) -> torch.Tensor:
+    """Return least-squares fits (M, K) of rows to magnitudes (N, 1): phases and rows in turn."""
     for _ in range(_FIT_STEPS):
         rows = inverse @ (observed * (drives @ rows).sgn())
     return rows
 
 
-def _misfit(drives: torch.Tensor, magnitudes: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
-    """Return the sum of squares (K,) of what rows (M, K) leave of magnitudes (N, K)."""
-    return ((drives @ rows).abs() - magnitudes).square().sum(dim=0)
+def _misfit(drives: torch.Tensor, observed: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+    """Return the sum of squares (K,) of what rows (M, K) leave of magnitudes (N, 1)."""
+    return ((drives @ rows).abs() - observed).square().sum(dim=0)
