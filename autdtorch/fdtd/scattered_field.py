@@ -20,7 +20,7 @@ from autdtorch.fdtd.interpolation import Interpolation
 from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
-from autdtorch.utils.array_types import Index
+from autdtorch.utils.array_types import Array, Index
 
 # Distance [cells] from the rim of the interior within which points are not read from the grid. Interpolation
 # is poor there, and the Huygens surface, two cells from the rim, is farther than half a cell from such a
@@ -35,6 +35,7 @@ class ScatteredField:
 
     assembly: Assembly
     wavenumber: complex  # complex wavenumber in air [rad/m]
+    axes: Array  # axes of the grid, one a row (3, 3)
 
     @property
     def driven(self) -> Tensor:
@@ -72,7 +73,7 @@ class ScatteredField:
         """Return the transform to P targets: means with `weights` (n,) over nodes (P, n, 3) [m]."""
         _, surface, outward = self.surface
         within = self.inside(nodes)
-        inner = self.assembly.interpolation(nodes[within])
+        inner = self.assembly.interpolation(self._on_axes(nodes[within]))
         cells = np.unique(np.concatenate((surface, inner.index.ravel())))
         picked = Interpolation(surface[:, None], np.ones((len(surface), 1))).matrix(cells)
         return NearToFar(self, nodes, weights, within, cells, outward @ picked, inner.matrix(cells))
@@ -84,15 +85,23 @@ class ScatteredField:
     def inside(self, points: Tensor) -> Tensor:
         """Return which points (..., 3) are read from the grid; others are clear of the Huygens surface."""
         grid = self.assembly.grid
-        cells = torch.from_numpy(grid.to_cells(points))
+        cells = torch.from_numpy(grid.to_cells(self._on_axes(points)))
         first, last = torch.tensor([grid.first, grid.last], dtype=torch.int64, device="cpu").unbind()
         return ((cells > first + _BESIDE) & (cells < last - 1 - _BESIDE)).all(dim=-1)
+
+    def near_obstacle(self, points: Tensor) -> bool:
+        """Return whether the interpolation kernel of any point (N, 3) in the box has heterogeneous cells."""
+        return self.assembly.touches_heterogeneous(self._on_axes(points[self.inside(points)]))
 
     def positions(self, cells: Index) -> Tensor:
         """Return the centres (n, 3) [m] of cells."""
         grid = self.assembly.grid
         places = np.stack(np.unravel_index(cells, grid.shape), axis=-1)
-        return torch.from_numpy(np.array(grid.origin) + grid.spacing * places)
+        return torch.from_numpy((np.array(grid.origin) + grid.spacing * places) @ self.axes)
+
+    def _on_axes(self, points: Tensor) -> Tensor:
+        """Return points (..., 3) [m] in the coordinates of the grid."""
+        return points @ torch.from_numpy(self.axes.T)
 
     @cached_property
     def _driven(self) -> tuple[Index, Index]:

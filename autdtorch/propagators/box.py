@@ -22,11 +22,13 @@ from autdtorch.fdtd.grid import make_box
 from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
 from autdtorch.fdtd.steady_state import Extrapolation, SteadyState, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble_on
+from autdtorch.fdtd.turning import turned
 from autdtorch.propagators.grids import MOST_PASSES, one_box
 from autdtorch.propagators.plan import MOST_JUDGED
 from autdtorch.propagators.simulation import Run, Simulation, Stepped
 from autdtorch.scene.arrays import Nodes
 from autdtorch.scene.scene import require_clear
+from autdtorch.utils.array_types import Array
 from autdtorch.utils.threads import one_torch_thread, spread
 
 logger = logging.getLogger(__name__)
@@ -58,11 +60,19 @@ class BoxSimulation(Simulation):
         plan = self.plan
         plan.require_feasible()
         boxes = []
-        for group in plan.grouping.groups:
+        for group, axes in zip(plan.grouping.groups, plan.grouping.axes, strict=True):
             part = replace(plan.region, bodies=tuple(plan.region.bodies[one] for one in group))
+            part = turned(part, axes)
+            if (axes != np.eye(3)).any():
+                logger.info("the grid around obstacles %s is turned along their faces", list(group))
             assembly = assemble_on(make_box(part, plan.spacing), part, plan.dtype, plan.time_step)
-            boxes.append(ScatteredField(assembly, plan.scene.complex_wavenumber))
+            boxes.append(ScatteredField(assembly, plan.scene.complex_wavenumber, axes))
         return boxes
+
+    @property
+    def axes(self) -> Array:
+        """Axes of the first grid, one a row (3, 3)."""
+        return self.plan.grouping.axes[0]
 
     @property
     def assemblies(self) -> Sequence[Assembly]:
@@ -76,7 +86,7 @@ class BoxSimulation(Simulation):
 
     def near_obstacle(self, points: torch.Tensor) -> bool:
         """Return whether the interpolation kernel of any point (N, 3) has heterogeneous cells."""
-        return any(box.assembly.touches_heterogeneous(points[box.inside(points)]) for box in self.boxes)
+        return any(box.near_obstacle(points) for box in self.boxes)
 
     def _check(self, points: torch.Tensor) -> None:
         require_clear(self.plan.scene.array, "points", points)

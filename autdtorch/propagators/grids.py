@@ -9,7 +9,7 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import permutations
+from itertools import combinations, permutations
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.steady_state import fewest_periods
 from autdtorch.fdtd.stencil import tuned_stencil
+from autdtorch.fdtd.turning import FlatFaces, along, axes_along, flat_faces
 from autdtorch.utils.array_types import Array
 
 logger = logging.getLogger(__name__)
@@ -95,9 +96,13 @@ def grid_cost(region: Region, extent: Extent, spacing: float) -> GridCost:
 
 @dataclass(frozen=True)
 class Grouping:
-    """Grids with the ascending indices of the obstacles on each, and the expected passes between boxes."""
+    """Grids with the ascending indices of the obstacles on each, their axes, and the expected passes.
+
+    Axes are rows of matrices (3, 3). Passes are those of the iteration between boxes.
+    """
 
     groups: tuple[tuple[int, ...], ...]
+    axes: tuple[Array, ...]
     grids: tuple[GridCost, ...]
     passes: int
 
@@ -118,7 +123,8 @@ def choose_grids(
     """Return "box" or "full" and its grids; for "auto" the cheapest that is accurate for the region."""
     if method == "box":
         return method, cheapest_boxes(region, spacing, tolerance, runs)
-    domain = _one_grid(region, domain_extent(region, spacing), spacing)
+    everything = _Box(tuple(range(len(region.bodies))), np.eye(3), domain_extent(region, spacing))
+    domain = _boxes(region, [everything], spacing, 1)
     if method == "full":
         return method, domain
     boxes = cheapest_boxes(region, spacing, tolerance, runs)
@@ -126,17 +132,19 @@ def choose_grids(
     walls = any(body.continued for body in region.bodies)
     first, last = region.domain
     outside = any((np.less(one.lower, first) | np.greater(one.upper, last)).any() for one in region.shapes)
-    method, grouping = ("full", domain) if walls or not (outside or gain > 1) else ("box", boxes)
+    tilted = any((axes != np.eye(3)).any() for axes in boxes.axes)
+    method, grouping = ("full", domain) if walls or not (outside or tilted or gain > 1) else ("box", boxes)
     logger.debug(
         "method auto: %s; full would take %.2g times as long as box (walls through the boundary layer: %s,"
-        " obstacles that leave the domain: %s)", method, gain, walls, outside,
+        " obstacles that leave the domain: %s, tilted obstacles: %s)", method, gain, walls, outside, tilted,
     )  # fmt: skip
     return method, grouping
 
 
 def one_box(region: Region, spacing: float) -> Grouping:
     """Return one box of `spacing` [m] for all obstacles."""
-    return _one_grid(region, bodies_extent(region.shapes), spacing)
+    group = range(len(region.bodies))
+    return _boxes(region, [_Box.around(region, group, list(map(flat_faces, region.shapes)))], spacing, 1)
 
 
 def cheapest_boxes(region: Region, spacing: float, tolerance: float, runs: int) -> Grouping:
@@ -144,40 +152,67 @@ def cheapest_boxes(region: Region, spacing: float, tolerance: float, runs: int) 
 
     The interiors of boxes, with the air around their obstacles, do not overlap.
     """
-    best, shapes = one_box(region, spacing), region.shapes
-    if len(shapes) > _MOST_OBSTACLES:
+    best, surfaces = one_box(region, spacing), list(map(flat_faces, region.shapes))
+    if len(region.bodies) > _MOST_OBSTACLES:
         return best
-    groups: list[tuple[int, ...]] = [(index,) for index in range(len(shapes))]
-    while len(groups) > 1:
-        extents = [bodies_extent([shapes[index] for index in group]) for group in groups]
-        gaps = _gaps(extents, spacing)
-        if gaps.min() > 0 and (passes := _expected_passes(extents, tolerance)) <= MOST_PASSES:
-            grids = tuple(grid_cost(region, extent, spacing) for extent in extents)
-            best = min(best, Grouping(tuple(groups), grids, passes), key=lambda found: found.box_cost(runs))
+    boxes = [_Box.around(region, [index], surfaces) for index in range(len(region.bodies))]
+    while len(boxes) > 1:
+        gaps = _gaps(boxes, spacing)
+        if gaps.min() > 0 and (passes := _expected_passes(boxes, tolerance)) <= MOST_PASSES:
+            best = min(best, _boxes(region, boxes, spacing, passes), key=lambda found: found.box_cost(runs))
         first, second = sorted(map(int, np.unravel_index(gaps.argmin(), gaps.shape)))
-        groups[first] = tuple(sorted((*groups[first], *groups.pop(second))))
+        both = sorted((*boxes[first].group, *boxes.pop(second).group))
+        boxes[first] = _Box.around(region, both, surfaces)
     return best
 
 
-def _one_grid(region: Region, extent: Extent, spacing: float) -> Grouping:
-    return Grouping((tuple(range(len(region.bodies))),), (grid_cost(region, extent, spacing),), 1)
+@dataclass(frozen=True)
+class _Box:
+    """The obstacles of a box, its axes, one a row (3, 3), and its extent along them."""
+
+    group: tuple[int, ...]
+    axes: Array
+    extent: Extent
+
+    @classmethod
+    def around(cls, region: Region, group: Sequence[int], surfaces: Sequence[FlatFaces]) -> _Box:
+        axes = axes_along([surfaces[index] for index in group])
+        shapes = [along(region.bodies[index].shape, axes) for index in group]
+        return cls(tuple(group), axes, bodies_extent(shapes))
+
+    @property
+    def middle(self) -> Array:
+        """Its centre (3,) [m], in the coordinates of the scene."""
+        return np.asarray((np.array(self.extent.lower) + self.extent.upper) / 2 @ self.axes)
+
+    @property
+    def half(self) -> Array:
+        """Half of the lengths of its edges (3,) [m]."""
+        return np.asarray(np.subtract(self.extent.upper, self.extent.lower) / 2)
 
 
-def _gaps(extents: Sequence[Extent], spacing: float) -> Array:
+def _boxes(region: Region, boxes: Sequence[_Box], spacing: float, passes: int) -> Grouping:
+    grids = tuple(grid_cost(region, box.extent, spacing) for box in boxes)
+    return Grouping(tuple(box.group for box in boxes), tuple(box.axes for box in boxes), grids, passes)
+
+
+def _gaps(boxes: Sequence[_Box], spacing: float) -> Array:
     """Distances (B, B) [m] of boxes' interiors, along the axis where it is largest; infinite to itself."""
-    margin = np.array([(extent.margin + 1) * spacing for extent in extents])  # one: for the grid's offset
-    lower = np.array([extent.lower for extent in extents]) - margin[:, None]
-    upper = np.array([extent.upper for extent in extents]) + margin[:, None]
-    above = lower[:, None] - upper[None]
-    gaps: Array = np.maximum(above, above.transpose(1, 0, 2)).max(axis=-1)
-    np.fill_diagonal(gaps, math.inf)
+    gaps = np.full((len(boxes), len(boxes)), math.inf)
+    for (i, one), (j, other) in combinations(enumerate(boxes), 2):
+        axes = np.concatenate((one.axes, other.axes))
+        reach = sum(
+            np.abs(axes @ box.axes.T) @ (box.half + (box.extent.margin + 1) * spacing)  # one: for the offset
+            for box in (one, other)
+        )
+        gaps[i, j] = gaps[j, i] = (np.abs(axes @ (one.middle - other.middle)) - reach).max()
     return gaps
 
 
-def _expected_passes(extents: Sequence[Extent], tolerance: float) -> int:
+def _expected_passes(boxes: Sequence[_Box], tolerance: float) -> int:
     """Expected passes: a large body of radius a scatters a / 2d of an incident field to a distance d."""
-    lower, upper = (np.array([getattr(extent, end) for extent in extents]) for end in ("lower", "upper"))
-    middle, radius = (lower + upper) / 2, np.linalg.norm(upper - lower, axis=1) / 2
+    middle = np.array([box.middle for box in boxes])
+    radius = np.array([np.linalg.norm(box.half) for box in boxes])
     apart = np.linalg.norm(middle[:, None] - middle, axis=-1)
     np.fill_diagonal(apart, math.inf)
     share = float((radius / (2 * apart)).sum(axis=1).max())

@@ -34,9 +34,9 @@ _NONE = -1
 
 @dataclass(frozen=True, eq=False)
 class Symmetry:
-    """A symmetry: a signed permutation (3, 3), its fixed point (3,) [m] and the transducers' images (M,)."""
+    """A symmetry: an orthogonal matrix (3, 3), its fixed point (3,) [m] and the transducers' images (M,)."""
 
-    matrix: Index
+    matrix: Array
     center: Array
     transducers: Index
 
@@ -95,23 +95,27 @@ def _representatives(images: Index) -> tuple[Index, Index]:
     return known.min(axis=0), known.argmin(axis=0)
 
 
-def symmetries(assemblies: Sequence[Assembly], transducers: Nodes) -> list[Symmetry]:
-    """Return all symmetries of a scene on its grid, the identity first; only that on several grids."""
+def symmetries(assemblies: Sequence[Assembly], along: Array, transducers: Nodes) -> list[Symmetry]:
+    """Return all symmetries of a scene on its grid, the identity first; only that on several grids.
+
+    `along` holds the axes of the grid, one a row (3, 3).
+    """
     assembly = assemblies[0]
     grid, cells = assembly.grid, assembly.heterogeneous
-    center = np.array(grid.origin) + grid.spacing * (np.array(grid.shape) - 1) / 2
+    center = (np.array(grid.origin) + grid.spacing * (np.array(grid.shape) - 1) / 2) @ along
     positions, weights = transducers.positions.numpy(), transducers.weights.numpy()
-    found = [Symmetry(np.eye(3, dtype=np.int64), center, np.arange(len(positions)))]
+    found = [Symmetry(np.eye(3), center, np.arange(len(positions)))]
     turns = itertools.product(itertools.permutations(range(3)), itertools.product((1, -1), repeat=3))
     for axes, signs in itertools.islice(turns, 1, None if len(assemblies) == 1 else 1):
-        matrix = np.diag(signs) @ np.eye(3, dtype=np.int64)[list(axes)]
+        turn = np.diag(signs) @ np.eye(3, dtype=np.int64)[list(axes)]
+        matrix = along.T @ turn @ along
         images = _matched(positions, weights, matrix, center)
-        if (images != _NONE).all() and _maps_cells(cells, grid, matrix, _ROUNDING * assembly.stencil.face):
+        if (images != _NONE).all() and _maps_cells(cells, grid, turn, _ROUNDING * assembly.stencil.face):
             found.append(Symmetry(matrix, center, images))
     return found
 
 
-def _matched(groups: Array, weights: Array, matrix: Index, center: Array) -> Index:
+def _matched(groups: Array, weights: Array, matrix: Array, center: Array) -> Index:
     """Map groups of places (N, n, 3) [m] with weights (n,); return the group (N,) of each image, or -1."""
     count = len(weights)
     places = (groups - center).reshape(-1, 3)

@@ -10,11 +10,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from autdtorch.fdtd.assembly.edges import edges_of, reductions
 from autdtorch.fdtd.assembly.element import FAR, LATTICE, InterfaceElements, Materials
-from autdtorch.fdtd.assembly.interface import interface_elements
+from autdtorch.fdtd.assembly.interface import Bodies, interface_elements
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Fluid, Region, Shape, bounds
 from autdtorch.fdtd.stencil import Stencil
+from autdtorch.fdtd.turning import flat_faces
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.progress import show_progress
 
@@ -45,6 +47,7 @@ class _Union:
     shapes: tuple[Shape, ...]
     material: int
     continued: bool  # whether they continue through the boundary layers, unchanged from the interior
+    finite: bool  # whether finite elements represent its surface: tilted or curved, and sound-hard
 
     def distance(self, cell: Array, grid: Grid) -> Array:
         """Return the signed distance [cells] of positions (..., 3) in cells."""
@@ -94,8 +97,9 @@ def _unions(region: Region, stencil: Stencil) -> tuple[list[_Union], Materials]:
     for body in region.bodies:
         if body.fluid not in known:
             known.append(body.fluid)
-        kind = known.index(body.fluid), body.continued
-        if unions and kind == (unions[-1].material, unions[-1].continued):
+        tilted = flat_faces(body.shape).aligned_share(np.eye(3)) < 1
+        kind = known.index(body.fluid), body.continued, tilted and body.fluid is None
+        if unions and kind == (unions[-1].material, unions[-1].continued, unions[-1].finite):
             unions[-1] = _Union((*unions[-1].shapes, body.shape), *kind)
         else:
             unions.append(_Union((body.shape,), *kind))
@@ -142,10 +146,15 @@ def _interface(
 ) -> InterfaceElements:
     parts = [InterfaceElements(np.zeros((0, 28)), np.zeros((0, 8)), np.zeros((0, 8), np.int64))]
     numbers = np.array([body.material for body in bodies], np.int64)
+    finite = np.array([body.finite for body in bodies], bool)
+    edges = [edge for body in bodies if body.finite for shape in body.shapes for edge in edges_of(shape)]
     shape = tuple(cells - 1 for cells in grid.shape)
     with show_progress(len(index), "measuring surfaces") as progress:
         for start in range(0, len(index), _CHUNK):
             first = np.stack(np.unravel_index(index[start : start + _CHUNK], shape), axis=-1)
-            parts.append(interface_elements(_distances(bodies, first, grid), numbers, materials, stencil))
+            centers = np.array(grid.origin) + grid.spacing * (first + 0.5)
+            less = reductions(edges, centers, grid.spacing)
+            near = Bodies(_distances(bodies, first, grid), numbers, finite, less)
+            parts.append(interface_elements(near, materials, stencil))
             progress.advance(len(first))
     return InterfaceElements(*(np.concatenate(each) for each in zip(*parts, strict=True)))

@@ -29,7 +29,7 @@ logger = logging.getLogger(__name__)
 Shape = tuple[int, int, int]
 # Sum of coupling coefficients, relative to air, up to which a cell in a sound-hard body is sound-hard. Cells
 # at a surface have 0.3 or more, all others 0.03 or less.
-_SOUND_HARD_COUPLING = 0.1
+_SOUND_HARD_COUPLING = 1e-3
 # Eigenvalues below this share of the largest are rounding in a condensed stiffness matrix. A higher value
 # would remove energy from nearly constant pressures.
 _NULL_EIGENVALUE = 1e-10

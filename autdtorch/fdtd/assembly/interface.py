@@ -17,6 +17,7 @@ In an element of one material both are those of the tuned stencil. An interface 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,7 @@ from autdtorch.fdtd.assembly.element import (
     stiffness_matrix,
     uniform_coupling,
 )
+from autdtorch.fdtd.assembly.sound_hard import HATS, added_thickness, cut_coupling, cut_mass
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
 
@@ -58,23 +60,24 @@ def _quadratic(x: Array) -> Array:
 
 
 _FIT = np.linalg.pinv(_quadratic(LATTICE - 0.5))
-_SUBCENTRES = (np.array(list(np.ndindex((SUBCELLS,) * 3))) + 0.5) / SUBCELLS
-# Trilinear shape functions of the vertices at the centres of the sub-cells (64, 8)
-_HATS = np.prod(np.where(VERTICES == 1, _SUBCENTRES[:, None], 1 - _SUBCENTRES[:, None]), axis=2)
 _FROM, _TO = VERTICES[PAIRS[:, 0], None], VERTICES[PAIRS[:, 1], None]
 _ALONG = SUBCELLS * _FROM + np.arange(SUBCELLS + 1)[:, None] * (_TO - _FROM)
 # Indices in the lattice of the points along the line between each pair of vertices (28, 5)
 _LINES = np.ravel_multi_index(tuple(np.moveaxis(_ALONG, -1, 0)), (SUBCELLS + 1,) * 3)
 
 
-def interface_elements(
-    distance: Array, material: Index, materials: Materials, stencil: Stencil
-) -> InterfaceElements:
-    """Return the stiffness and mass of n elements that surfaces of K bodies intersect.
+class Bodies(NamedTuple):
+    """Bodies near n elements; later ones take precedence."""
 
-    `distance` (K, n, 125) is `FAR` for bodies that are not near. Later bodies take precedence.
-    """
-    count = len(materials.density)
+    distance: Array  # signed distances of K bodies (K, n, 125) [cells]; `FAR` for those that are not near
+    material: Index  # number of the material of each body (K,)
+    finite: NDArray[np.bool_]  # whether finite elements represent its surface (K,): tilted, sound-hard faces
+    reductions: Array  # share of the stiffness that is taken away near edges of such bodies (n, 3, 3)
+
+
+def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -> InterfaceElements:
+    """Return the stiffness and mass of n elements that surfaces of K bodies intersect."""
+    count, (distance, material, finite, reductions) = len(materials.density), bodies
     # bodies that do not intersect an element must not enter its shares
     distance = np.where((distance > 0).all(axis=2, keepdims=True), FAR, distance)
     distance = np.where((distance < 0).all(axis=2, keepdims=True), -FAR, distance)
@@ -83,13 +86,14 @@ def interface_elements(
     coupling = _series_coupling(lines, materials, stencil)
     vertex = _vertex_materials(distance, material)
     layered = _layered_axis(distance)
+    grown = ((np.abs(distance) < FAR).any(axis=2) & finite[:, None]).any(axis=0) & (layered < 0)
     for axis in range(3):
         own = layered == axis
         coupling[own] = _layered_coupling(axis, vertex[own], volumes[own], materials, stencil)
     held = (vertex[:, :, None] == np.arange(count)).any(axis=1)
     present = volumes.mean(axis=1) > _ABSENT_SHARE
     two = (held.sum(axis=1) == 2) & (present <= held).all(axis=1)
-    chosen = np.flatnonzero(two & (layered < 0))
+    chosen = np.flatnonzero(two & (layered < 0) & ~grown)
     if len(chosen):
         inner = count - 1 - held[chosen, ::-1].argmax(axis=1)
         outer = held[chosen].argmax(axis=1)
@@ -97,7 +101,13 @@ def interface_elements(
         sides = materials.density[np.stack((outer, inner), axis=1)]
         flat, correction = _correction(level, sides, volumes[chosen], materials, coupling[chosen])
         coupling[chosen[flat]] += correction
-    return InterfaceElements(coupling, _lumped_mass(vertex, volumes, materials), vertex)
+    mass = _lumped_mass(vertex, volumes, materials)
+    if grown.any():
+        thickness = np.where(finite, added_thickness(stencil.kappa), 0)[:, None, None]
+        shares = _shares(_volume_coverage, distance[:, grown] - thickness, material, count)
+        coupling[grown] = cut_coupling(shares, materials, reductions[grown], stencil)
+        mass[grown] = cut_mass(shares, materials)
+    return InterfaceElements(coupling, mass, vertex)
 
 
 def _vertex_materials(distance: Array, material: Index) -> Index:
@@ -217,7 +227,7 @@ def _lumped_mass(vertex: Index, volumes: Array, materials: Materials) -> Array:
     """Return masses at the vertices (n, 8): each material's at the vertices in it, if there are any."""
     total = np.zeros(vertex.shape)
     for own, mass in enumerate(materials.mass):
-        volume = volumes[:, :, own] @ _HATS / SUBCELLS**3
+        volume = volumes[:, :, own] @ HATS / SUBCELLS**3
         kept = volume * (vertex == own)
         whole, held = volume.sum(axis=1, keepdims=True), kept.sum(axis=1, keepdims=True)
         has = held > _ABSENT_SHARE * whole

@@ -1,0 +1,124 @@
+"""Turning of the grid: the axes of a box follow the flat faces of the bodies in it.
+
+The field around a box is exact, so that its grid may have any direction. A tilted cuboid is then as accurate
+as one aligned with the axes of the scene.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from autdtorch.fdtd.region import Region, Shape
+from autdtorch.utils.array_types import Array
+from autdtorch.utils.validation import Vector
+
+_ALIGNED = 1 - 1e-9  # Smallest cosine between the normal of a face and an axis that is parallel to it
+_WORTHWHILE = (
+    0.4  # Share of all surfaces that must become aligned before a grid is turned and loses symmetries
+)
+_DECIMALS = 9  # Normals that agree to so many decimals are equal
+_SAGITTA = 1.5  # Growth of a bounding box, relative to the distance of triangles from a curved surface
+
+
+@dataclass(frozen=True, eq=False)
+class Turned:
+    """A shape in the coordinates of other axes."""
+
+    shape: Shape
+    axes: Array  # the axes, one a row, in the coordinates of the shape (3, 3)
+
+    @property
+    def lower(self) -> Vector:
+        """Corner of the bounding box with the smallest coordinates (3,) [m]."""
+        return self._bounds[0]
+
+    @property
+    def upper(self) -> Vector:
+        """Corner of the bounding box with the largest coordinates (3,) [m]."""
+        return self._bounds[1]
+
+    def signed_distance(self, points: Tensor, /) -> Tensor:
+        """Return the distance (...) [m] of points (..., 3) to the surface, negative inside."""
+        return self.shape.signed_distance(points @ torch.from_numpy(self.axes))
+
+    def surface(self) -> tuple[Tensor, Tensor]:
+        """Return vertices (V, 3) [m] and triangles (F, 3), counter-clockwise as seen from outside."""
+        vertices, triangles = self.shape.surface()
+        return vertices @ torch.from_numpy(self.axes.T), triangles
+
+    @cached_property
+    def _bounds(self) -> tuple[Vector, Vector]:
+        vertices, triangles = self.surface()
+        middle = self.signed_distance(vertices[triangles].mean(dim=1))
+        beyond = _SAGITTA * float(middle.abs().max())
+        x, y, z = (vertices.amin(dim=0) - beyond).tolist()
+        u, v, w = (vertices.amax(dim=0) + beyond).tolist()
+        return (x, y, z), (u, v, w)
+
+
+def along(shape: Shape, axes: Array) -> Shape:
+    """Return a shape in the coordinates of other axes, one a row (3, 3)."""
+    return shape if (axes == np.eye(3)).all() else Turned(shape, axes)
+
+
+def turned(region: Region, axes: Array) -> Region:
+    """Return a region in the coordinates of other axes, one a row (3, 3), without a domain of its own."""
+    if (axes == np.eye(3)).all():
+        return region
+    bodies = tuple(replace(body, shape=along(body.shape, axes)) for body in region.bodies)
+    everywhere = (-np.inf,) * 3, (np.inf,) * 3
+    return replace(region, bodies=bodies, domain=everywhere, sources=region.sources @ axes.T)
+
+
+class FlatFaces(NamedTuple):
+    """The flat faces of a surface."""
+
+    normals: Array  # outward unit vectors (n, 3)
+    areas: Array  # areas (n,) [m^2]
+
+    def aligned_share(self, axes: Array) -> float:
+        """Return the share of their area that is normal to one of the axes, one a row (3, 3)."""
+        aligned = (np.abs(self.normals @ axes.T) > _ALIGNED).any(axis=1)
+        return 1.0 if aligned.all() else float(self.areas[aligned].sum() / self.areas.sum())
+
+
+def axes_along(surfaces: Sequence[FlatFaces]) -> Array:
+    """Return the axes, one a row (3, 3), that are normal to the largest area of surfaces."""
+    together = FlatFaces(*(np.concatenate(parts) for parts in zip(*surfaces, strict=True)))
+    own = np.eye(3)
+    best = max((_own_axes(*faces) for faces in surfaces), key=together.aligned_share)
+    return best if together.aligned_share(best) > together.aligned_share(own) + _WORTHWHILE else own
+
+
+def flat_faces(shape: Shape) -> FlatFaces:
+    """Return the flat faces of a shape; triangles of a curved surface are faces, too."""
+    vertices, triangles = (part.numpy() for part in shape.surface())
+    first, second, third = np.moveaxis(vertices[triangles], 1, 0)
+    normal = np.cross(second - first, third - first)
+    double = np.linalg.norm(normal, axis=1)
+    normal, double = normal[double > 0], double[double > 0]
+    rounded = (normal / double[:, None]).round(_DECIMALS)
+    normals, place = np.unique(rounded, axis=0, return_inverse=True)
+    return FlatFaces(normals, np.bincount(place.ravel(), double, len(normals)) / 2)
+
+
+def _own_axes(normals: Array, areas: Array) -> Array:
+    """Return the axes (3, 3) of the largest face and of the largest perpendicular one, in the usual order."""
+    first = normals[areas.argmax()]
+    beside = np.abs(normals @ first) < 1 - _ALIGNED
+    helper = np.eye(3)[np.abs(first).argmin()]
+    second = normals[beside][areas[beside].argmax()] if beside.any() else helper - (helper @ first) * first
+    second = second - (second @ first) * first
+    first, second = first / np.linalg.norm(first), second / np.linalg.norm(second)
+    axes = np.stack((first, second, np.cross(first, second)))
+    orders = [axes[list(order)] for order in itertools.permutations(range(3))]
+    usual = max(orders, key=lambda each: np.abs(np.diag(each)).sum())
+    return usual * np.where(np.diag(usual) < 0, -1.0, 1.0)[:, None]
