@@ -19,7 +19,7 @@ from autdtorch.fdtd.assembly.element import (
     stiffness_matrix,
     uniform_coupling,
 )
-from autdtorch.fdtd.assembly.interface import interface_elements
+from autdtorch.fdtd.assembly.interface import Bodies, interface_elements
 from autdtorch.fdtd.stencil import tuned_stencil
 
 STENCIL = tuned_stencil(2 * math.pi / 8.5)
@@ -46,7 +46,18 @@ def element(
     """One element, obstacle k of which is of material k + 1; masses are 1/density by default."""
     masses = np.array(mass or [1 / d for d in density], float)
     materials = Materials(np.array(density, float), masses, np.zeros(len(density), bool))
-    return interface_elements(np.stack(distance)[:, None], np.arange(len(distance)) + 1, materials, STENCIL)
+    count = len(distance)
+    near = Bodies(
+        np.stack(distance)[:, None], np.arange(count) + 1, np.zeros(count, bool), np.zeros((1, 3, 3))
+    )
+    return interface_elements(near, materials, STENCIL)
+
+
+def rigid_element(distance: np.ndarray, reduction: np.ndarray | float = 0.0) -> InterfaceElements:
+    """One element that a tilted rigid surface cuts."""
+    materials = Materials(np.array([1, 1e5]), np.array([1, 1e-5]), np.array([False, True]))
+    reductions = np.broadcast_to(reduction, (1, 3, 3))
+    return interface_elements(Bodies(distance[None, None], ONE, ONE > 0, reductions), materials, STENCIL)
 
 
 def energy(cut: InterfaceElements, field: np.ndarray) -> float:
@@ -99,6 +110,29 @@ def test_a_field_along_a_plane_surface_has_its_exact_energy(
     along /= np.linalg.norm(along)
     # 1/density averaged over the element, which is what its masses sum to; rounding as above
     assert energy(cut, VERTICES @ along) == pytest.approx(cut.mass.sum(), rel=1e-9)
+
+
+TILTED = NORMALS.filter(lambda n: np.count_nonzero(np.abs(n) > 0.01) > 1)
+
+
+@settings(max_examples=60)
+@given(TILTED, OFFSETS, st.floats(0, 0.45))
+def test_a_tilted_rigid_surface_leaves_the_energy_of_the_air(
+    normal: np.ndarray, offset: float, reduction: float
+) -> None:
+    cut = rigid_element(plane(normal, offset))
+    air = float(cut.mass.sum())
+    for direction in np.eye(3):
+        assert energy(cut, VERTICES @ direction) == pytest.approx(air, rel=1e-9)  # rounding
+    middle = cut.mass[0] @ VERTICES / air
+    assert ((middle > 0) & (middle < 1)).all()
+    edge = normal / np.linalg.norm(normal)
+    softer = rigid_element(plane(normal, offset), reduction * (np.eye(3) - np.outer(edge, edge)))
+    assert energy(softer, VERTICES @ edge) == pytest.approx(air, rel=1e-9)
+    across = np.cross(edge, np.eye(3)[np.abs(edge).argmin()])
+    across /= np.linalg.norm(across)
+    assert energy(softer, VERTICES @ across) == pytest.approx((1 - reduction) * air, rel=1e-9)
+    assert np.linalg.eigvalsh(stiffness_matrix(softer.coupling)[0]).min() > -1e-12
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
