@@ -42,9 +42,10 @@ def make_propagator(
         method: "free_space": exact, without obstacles. "full": FDTD on the whole domain. "box": FDTD of the
             scattered field in a box around the obstacles, exact elsewhere, also outside the domain. Distant
             obstacles get boxes of their own, coupled by a multiple-scattering iteration, where that is
-            cheaper. Obstacles are simulated as a whole, including parts outside the domain. "auto": free
-            space without obstacles, full where a wall continues through the boundary layer, box where other
-            obstacles leave the domain, otherwise the cheaper of box and full. The propagator's `method` is
+            cheaper. Obstacles are simulated as a whole, including parts outside the domain. The grid of a
+            box turns with tilted flat faces. "auto": free space without obstacles, full where a wall
+            continues through the boundary layer, box where other obstacles leave the domain or are tilted,
+            otherwise the cheaper of box and full. The propagator's `method` is
             the one chosen; the reason is logged at level DEBUG.
         spacing: edge of a cell [m], at most a third of the wavelength. The error falls with it
             (docs/numerics.md). None: the spacing is chosen from simulations on two coarse grids so that the

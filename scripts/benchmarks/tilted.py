@@ -59,7 +59,7 @@ def cube_scene(rotation: tuple[float, float, float], material: Mapping[str, obje
 
 
 def matrix(scene: at.Scene, spacing: float, held: bool) -> tuple[torch.Tensor, float]:
-    """Return the transfer matrix at a spacing [mm] and its run time [s]; `held` keeps the grid from turning."""
+    """Return the matrix at a spacing [mm] and its run time [s]; `held` keeps the grid from turning."""
     begin = time.perf_counter()
     planned = plan(scene, "box", spacing * 1e-3, 1e-3)
     if held:

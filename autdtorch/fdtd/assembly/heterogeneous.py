@@ -28,7 +28,7 @@ logger = logging.getLogger(__name__)
 
 Shape = tuple[int, int, int]
 # Sum of coupling coefficients, relative to air, up to which a cell in a sound-hard body is sound-hard. Cells
-# at a surface have 0.3 or more, all others 0.03 or less.
+# in such bodies have 1e-5, from their density, unless a finite element reaches them.
 _SOUND_HARD_COUPLING = 1e-3
 # Eigenvalues below this share of the largest are rounding in a condensed stiffness matrix. A higher value
 # would remove energy from nearly constant pressures.
