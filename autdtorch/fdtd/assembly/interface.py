@@ -4,11 +4,11 @@ In an element of one material both are those of the tuned stencil. An interface 
 
 - coupling in series: density averaged along the line between vertices, exact for a flow across the surface;
 - for axis-aligned faces, a product of the direction across the faces and the two others;
-- for other surfaces of fluids, a correction that gives two fields along the surface their exact energy. A third field
-  crosses the surface with continuous pressure and flow, and keeps its energy in series. With L the stiffness
-  in series, N the fields at the vertices and A their exact energies, the correction is C^T (A - N^T L N) C
-  with the projection C = (N^T L N)^-1 N^T L. This is the consistency term of virtual element methods (Beirao
-  da Veiga et al. 2013) for the local solutions of immersed finite elements (Li 1998);
+- for other surfaces of fluids, a correction that gives two fields along the surface their exact energy. A
+  third field crosses the surface with continuous pressure and flow, and keeps its energy in series. With L
+  the stiffness in series, N the fields at the vertices and A their exact energies, the correction is
+  C^T (A - N^T L N) C with the projection C = (N^T L N)^-1 N^T L. This is the consistency term of virtual
+  element methods (Beirao da Veiga et al. 2013) for the local solutions of immersed finite elements (Li 1998);
 - masses on their side of the surface: a sliver of air gives its mass to the vertices in air;
 - at other surfaces of sound-hard bodies, the finite elements of `sound_hard.py` instead.
 
