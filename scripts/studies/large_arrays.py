@@ -32,17 +32,13 @@ METHODS: tuple[tuple[str, Method], ...] = (
     ("random search", partial(at.random_search, evaluations=1000)),
     ("LSSG, 5 passes", partial(at.lssg, passes=5)),
     ("GABS, 4 levels", partial(at.gabs, levels=4)),
-    ("BO", partial(at.bayes_opt, evaluations=1000)),
-    ("BO on the circle", partial(at.bayes_opt, evaluations=1000, kernel="circle")),
+    ("GABS, 16 levels", at.gabs),
+    ("BO", at.bayes_opt),
     (
         "BO per focus",
         partial(at.bayes_opt, evaluations=600, initial=4, model="foci", kernel="phasor", noise="inferred"),
     ),
     ("identify", partial(at.identify, evaluations=600)),
-    ("identify", partial(at.identify, evaluations=1000)),
-    ("random search", partial(at.random_search, evaluations=4000)),
-    ("GABS, 16 levels", at.gabs),
-    ("GABS, 4 levels, 4 passes", partial(at.gabs, levels=4, passes=4)),
     ("gradient ascent", at.gradient_ascent),
 )
 
