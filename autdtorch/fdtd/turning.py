@@ -21,10 +21,11 @@ from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import Vector
 
 _ALIGNED = 1 - 1e-9  # Smallest cosine between the normal of a face and an axis that is parallel to it
+_PERPENDICULAR = 4e-5  # Largest cosine between perpendicular normals; the same angle
 _WORTHWHILE = (
     0.4  # Share of all surfaces that must become aligned before a grid is turned and loses symmetries
 )
-_DECIMALS = 9  # Normals that agree to so many decimals are equal
+_DECIMALS = 6  # Normals that agree to so many decimals are equal: files hold single precision
 _SAGITTA = 1.5  # Growth of a bounding box, relative to the distance of triangles from a curved surface
 
 
@@ -106,14 +107,16 @@ def flat_faces(shape: Shape) -> FlatFaces:
     double = np.linalg.norm(normal, axis=1)
     normal, double = normal[double > 0], double[double > 0]
     rounded = (normal / double[:, None]).round(_DECIMALS)
-    normals, place = np.unique(rounded, axis=0, return_inverse=True)
-    return FlatFaces(normals, np.bincount(place.ravel(), double, len(normals)) / 2)
+    _, place = np.unique(rounded, axis=0, return_inverse=True)
+    total = np.stack([np.bincount(place.ravel(), component) for component in normal.T], axis=1)
+    areas = np.linalg.norm(total, axis=1)
+    return FlatFaces(total / areas[:, None], areas / 2)
 
 
 def _own_axes(normals: Array, areas: Array) -> Array:
     """Return the axes (3, 3) of the largest face and of the largest perpendicular one, in the usual order."""
     first = normals[areas.argmax()]
-    beside = np.abs(normals @ first) < 1 - _ALIGNED
+    beside = np.abs(normals @ first) < _PERPENDICULAR
     helper = np.eye(3)[np.abs(first).argmin()]
     second = normals[beside][areas[beside].argmax()] if beside.any() else helper - (helper @ first) * first
     second = second - (second @ first) * first

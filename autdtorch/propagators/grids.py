@@ -94,7 +94,7 @@ def grid_cost(region: Region, extent: Extent, spacing: float) -> GridCost:
     return GridCost(interior, shape, math.ceil(periods * steps_per_period), steps_per_period)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Grouping:
     """Grids with the ascending indices of the obstacles on each, their axes, and the expected passes.
 

@@ -54,7 +54,7 @@ adds to that."""
 _RUN_STEPS, _SCENE_STEPS = 4e7, 1e8
 """Further time of a run and of a scene."""
 
-_BESIDE_RIGID, _BESIDE_FLUID, _SHARE_INSIDE = 1.5, 2.0, 0.5
+_BESIDE, _SHARE_INSIDE = 2.0, 0.5
 """Heterogeneous cells for each area of a cell of a rigid or fluid surface; their share of the cuboid around
 an obstacle of another sound speed."""
 
@@ -153,7 +153,7 @@ class Plan:
             # a plane of normal n cuts |nx| + |ny| + |nz| elements for each area of a cell
             cut += float(np.abs(doubled).sum()) / 2 / spacing**2
             columns += (float(np.linalg.norm(continued, axis=1).sum()) / 2 - area) / spacing**2
-            beside = (_BESIDE_FLUID if body.fluid else _BESIDE_RIGID) * area / spacing**2
+            beside = _BESIDE * area / spacing**2
             cells += beside
             meshed += beside if isinstance(body.shape, Mesh) else 0.0
             if body.fluid and body.fluid.sound_speed != region.fluid.sound_speed:

@@ -11,14 +11,19 @@ import torch
 from bloch_chain import reflection
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from small_scenes import AIR, relative_error
 
 from autdtorch.fdtd.assembly.edges import edges_of
+from autdtorch.fdtd.stencil import flat_offsets
+from autdtorch.fdtd.stepping import assemble
 from autdtorch.fdtd.turning import axes_along, flat_faces
 from autdtorch.propagators import make_propagator
+from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import rotation_matrix
-from autdtorch.scene.obstacles import Box, Cylinder, Sphere
+from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere
 from autdtorch.scene.scene import Scene
 
 TILTS = [(0.3, 0.0, 0.0), (math.pi / 4, 0.0, 0.0), (0.5, 0.4, 0.3)]
@@ -115,6 +120,48 @@ def test_axes_follow_flat_faces_only(rotation):
         Cylinder((0, 0, 0), 1e-2, 2e-2, (1, 1, 1), rigid=True),
     ):
         assert (axes_along([flat_faces(curved)]) == np.eye(3)).all()
+
+
+@pytest.mark.parametrize("rotation", TILTS)
+def test_a_mesh_in_single_precision_turns_the_grid(rotation, tmp_path):
+    vertices, triangles = Box((0, 0, 0), (1e-2, 2e-2, 3e-2), rotation, rigid=True).surface()
+    lines = [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in vertices.float().tolist()]
+    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in triangles.tolist()]
+    (tmp_path / "box.obj").write_text("\n".join(lines), encoding="utf-8")
+    axes = axes_along([flat_faces(Mesh(tmp_path / "box.obj", rigid=True))])
+    turned = np.abs(axes @ rotation_matrix(rotation).numpy())
+    assert np.abs(turned - turned.round()).max() < 1e-6
+
+
+@pytest.mark.parametrize("rotation", TILTS)
+@pytest.mark.parametrize("thickness", [1e-3, 1.3e-3, 2e-3, 3e-3, 4e-3])
+def test_no_cell_of_a_tilted_plate_belongs_to_the_air_on_both_sides(thickness, rotation):
+    plate = Box((0, 0, 0), (0.1, 0.1, thickness), rotation, rigid=True)
+    array = TransducerArray([[0, 0, -12e-3]], (0, 0, 1))
+    scene = Scene(array, AIR, 40e3, [(0, 0, 12e-3)], [plate], domain=((-14e-3,) * 3, (14e-3,) * 3))
+    assembly = assemble(region_of(scene), 1e-3, torch.float64)
+    cells, grid = assembly.heterogeneous, assembly.grid
+    row, column = np.nonzero(np.abs(cells.weight * cells.mass[:, None]) > 1e-3 * assembly.stencil.face)
+    first, second = cells.index[row], cells.index[row] + flat_offsets(grid.shape)[column]
+    middle = np.array(grid.shape) // 2
+    near = [
+        (np.abs(np.stack(np.unravel_index(each, grid.shape), 1) - middle) < 7).all(axis=1)
+        for each in (first, second)
+    ]
+    joined = near[0] & near[1]
+    graph = coo_array(
+        (np.ones(joined.sum()), (first[joined], second[joined])), shape=(math.prod(grid.shape),) * 2
+    )
+    _, part = connected_components(graph, directed=False)
+    used = np.unique(first[joined])
+    assert len(np.unique(part[used])) == 2
+
+
+def test_edges_between_touching_bodies_are_none():
+    half = {axis: Box((x, 0, 0), (1e-2,) * 3, rigid=True) for axis, x in (("left", -5e-3), ("right", 5e-3))}
+    edges = edges_of(half["left"], [half["right"]])
+    assert len(edges) == 8
+    assert all(edge.end[0] < -1e-6 or edge.begin[0] < -1e-6 for edge in edges)
 
 
 def test_edges_are_those_of_the_shape():

@@ -231,7 +231,9 @@ def _duct_modes(a: float, b: float, z1: float, z2: float) -> np.ndarray:
 def test_condensation_keeps_the_energy_positive(exponents: list[float], gone: int) -> None:
     """Coupling of all sizes, as where three materials meet."""
     coupling = 10.0 ** np.array(exponents)[None]
-    interface = InterfaceElements(coupling, np.full((1, 8), 0.1), np.zeros((1, 8), np.int64))
+    interface = InterfaceElements(
+        coupling, np.full((1, 8), 0.1), np.zeros((1, 8), np.int64), np.zeros(1, bool)
+    )
     out = np.array([gone >> vertex & 1 for vertex in range(8)], bool)
     matrix = stiffness_matrix(condensed(interface, out[None]).coupling)[0]
     # rounding of the elimination

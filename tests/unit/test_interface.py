@@ -48,7 +48,7 @@ def element(
     materials = Materials(np.array(density, float), masses, np.zeros(len(density), bool))
     count = len(distance)
     near = Bodies(
-        np.stack(distance)[:, None], np.arange(count) + 1, np.zeros(count, bool), np.zeros((1, 3, 3))
+        np.stack(distance)[:, None], np.arange(count) + 1, np.zeros((count, 1), bool), np.zeros((1, 3, 3))
     )
     return interface_elements(near, materials, STENCIL)
 
@@ -57,7 +57,9 @@ def rigid_element(distance: np.ndarray, reduction: np.ndarray | float = 0.0) -> 
     """One element that a tilted rigid surface cuts."""
     materials = Materials(np.array([1, 1e5]), np.array([1, 1e-5]), np.array([False, True]))
     reductions = np.broadcast_to(reduction, (1, 3, 3))
-    return interface_elements(Bodies(distance[None, None], ONE, ONE > 0, reductions), materials, STENCIL)
+    return interface_elements(
+        Bodies(distance[None, None], ONE, ONE[None] > 0, reductions), materials, STENCIL
+    )
 
 
 def energy(cut: InterfaceElements, field: np.ndarray) -> float:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -23,6 +24,7 @@ _REACH = 1.2  # Distance from an edge within which the stiffness is reduced [cel
 # errors of up to 1.6, 1.5 and 2.1 % at 1 mm and 0.7, 0.5 and 0.3 % at 0.5 mm.
 _REDUCTION = 0.3
 _FEWEST_SIDES = 16  # Fewest sides of a polygon that stands for a circle
+_OUTSIDE = 1e-6  # Distance of such a point from its face [m]
 _ROUND = 1e-6  # Largest relative deviation of its corners from the circle
 
 
@@ -80,8 +82,11 @@ def reductions(edges: Sequence[Segment | Circle], centers: Array, spacing: float
     """
     total, weights = np.zeros((len(centers), 3, 3)), np.zeros(len(centers))
     reach = _REACH * spacing
+    lowest, highest = centers.min(axis=0) - reach, centers.max(axis=0) + reach
     for edge in edges:
         lower, upper = edge.bounds
+        if (lower > highest).any() or (upper < lowest).any():
+            continue
         near = np.flatnonzero(((centers > lower - reach) & (centers < upper + reach)).all(axis=1))
         distance, along = edge.nearest(centers[near])
         weight = np.maximum(0, 1 - (distance / reach) ** 2)
@@ -91,10 +96,14 @@ def reductions(edges: Sequence[Segment | Circle], centers: Array, spacing: float
     return total / np.where(weights > 0, weights, 1)[:, None, None]
 
 
-def edges_of(shape: Shape) -> list[Segment | Circle]:
-    """Return the convex edges of a shape."""
+def edges_of(shape: Shape, others: Sequence[Shape] = ()) -> list[Segment | Circle]:
+    """Return the convex edges of a shape that `others` do not cover."""
     vertices, triangles = (part.numpy() for part in shape.surface())
-    ends, angles = _sharp_sides(vertices, triangles)
+    ends, angles, beside = _sharp_sides(vertices, triangles)
+    covered = np.zeros(len(ends), bool)
+    for other in others:
+        covered |= (other.signed_distance(torch.from_numpy(beside)) < 0).any(dim=1).numpy()
+    ends, angles = ends[~covered], angles[~covered]
     places, number = np.unique(ends.reshape(-1, 3).round(9), axis=0, return_inverse=True)
     first, second = number.reshape(-1, 2).T
     graph = coo_array((np.ones(len(ends)), (first, second)), shape=(len(places),) * 2)
@@ -127,10 +136,11 @@ def _circle(corners: Array, reduction: float, sides: int) -> Circle | None:
     return Circle(center, axes[2], radius, reduction) if flat else None
 
 
-def _sharp_sides(vertices: Array, triangles: Index) -> tuple[Array, Array]:
-    """Return the ends (n, 2, 3) [m] of the sides at convex edges of a surface, and their angles (n,) [rad].
+def _sharp_sides(vertices: Array, triangles: Index) -> tuple[Array, Array, Array]:
+    """Return the ends (n, 2, 3) [m] of the sides at convex edges of a surface.
 
-    The angle is that between the normals of the two faces.
+    Also returned are the angle (n,) [rad] between the normals of the two faces, and a point just outside each
+    of them (n, 2, 3) [m], next to the middle of the edge.
     """
     _, number = np.unique(vertices.round(9), axis=0, return_inverse=True)  # corners may be there twice
     corners, place = vertices[triangles], number.ravel()[triangles]
@@ -147,4 +157,6 @@ def _sharp_sides(vertices: Array, triangles: Index) -> tuple[Array, Array]:
     towards = corners[other].mean(axis=1) - corners[one].mean(axis=1)
     convex = np.einsum("ij,ij->i", normal[one], towards) < 0
     chosen = convex & (angle > _SHARP) & (double[one] > 0) & (double[other] > 0)
-    return ends[order[pairs[chosen]]], angle[chosen]
+    ends, first, second = ends[order[pairs[chosen]]], normal[one[chosen]], normal[other[chosen]]
+    outside = np.stack((first - 2 * second, second - 2 * first), axis=1)
+    return ends, angle[chosen], ends.mean(axis=1)[:, None] + _OUTSIDE * outside

@@ -49,6 +49,7 @@ class InterfaceElements(NamedTuple):
     coupling: Array  # coupling coefficients of the `PAIRS` (n, 28)
     mass: Array  # lumped mass at the vertices (n, 8)
     material: Index  # number of the material at each vertex (n, 8)
+    finite: NDArray[np.bool_]  # whether it is a finite element, whose sound-hard vertices stay cells (n,)
 
 
 def coupling_by_edges(stencil: Stencil) -> Array:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from autdtorch.fdtd.assembly.edges import edges_of, reductions
 from autdtorch.fdtd.assembly.element import FAR, LATTICE, InterfaceElements, Materials
-from autdtorch.fdtd.assembly.interface import Bodies, interface_elements
+from autdtorch.fdtd.assembly.interface import Bodies, interface_elements, mean_gradient
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Fluid, Region, Shape, bounds
 from autdtorch.fdtd.stencil import Stencil
@@ -27,6 +27,11 @@ _CONTACT_GAP = 1e-9
 # Half the diagonal of an element: a surface farther from its centre does not intersect it
 _HALF_DIAGONAL = 0.87
 _CHUNK = 4096  # Interface elements assembled at a time
+_ALL = 1 - 1e-6  # Share of a surface that is aligned if it all is: slivers do not count
+# Depths below its surface at which a body must be there to be thick [cells]. Sound would pass through thinner
+# walls of finite elements, whose vertices can belong to both sides.
+_DEPTHS = np.array([1.2, 2.3, 3.5])
+_LEAST_GRADIENT = 0.3  # Least mean gradient of a signed distance in an element with one surface
 
 
 @dataclass(frozen=True)
@@ -97,7 +102,7 @@ def _unions(region: Region, stencil: Stencil) -> tuple[list[_Union], Materials]:
     for body in region.bodies:
         if body.fluid not in known:
             known.append(body.fluid)
-        tilted = flat_faces(body.shape).aligned_share(np.eye(3)) < 1
+        tilted = flat_faces(body.shape).aligned_share(np.eye(3)) < _ALL
         kind = known.index(body.fluid), body.continued, tilted and body.fluid is None
         if unions and kind == (unions[-1].material, unions[-1].continued, unions[-1].finite):
             unions[-1] = _Union((*unions[-1].shapes, body.shape), *kind)
@@ -141,20 +146,40 @@ def _distances(bodies: list[_Union], first: Index, grid: Grid) -> Array:
     return distance
 
 
+def _finite(body: _Union, distance: Array, first: Index, grid: Grid) -> NDArray[np.bool_]:
+    """Return whether finite elements represent a body in elements (n,): where it is thick enough."""
+    finite = np.full(len(first), body.finite)
+    near = np.flatnonzero(finite & (np.abs(distance) < FAR).any(axis=1))
+    if len(near):
+        gradient, middle = mean_gradient(distance[near]), distance[near].mean(axis=1)
+        steep = np.linalg.norm(gradient, axis=1)  # small where the two faces of a plate cancel
+        normal = gradient / np.maximum(steep, _LEAST_GRADIENT)[:, None]
+        below = (middle[:, None] + _DEPTHS)[:, :, None] * normal[:, None]
+        inside = body.distance(first[near, None] + 0.5 - below, grid) < 0
+        finite[near] = inside.all(axis=1) & (steep > _LEAST_GRADIENT)
+    return finite
+
+
 def _interface(
     bodies: list[_Union], index: Index, grid: Grid, materials: Materials, stencil: Stencil
 ) -> InterfaceElements:
-    parts = [InterfaceElements(np.zeros((0, 28)), np.zeros((0, 8)), np.zeros((0, 8), np.int64))]
+    none = np.zeros((0, 28)), np.zeros((0, 8)), np.zeros((0, 8), np.int64), np.zeros(0, bool)
+    parts = [InterfaceElements(*none)]
     numbers = np.array([body.material for body in bodies], np.int64)
-    finite = np.array([body.finite for body in bodies], bool)
-    edges = [edge for body in bodies if body.finite for shape in body.shapes for edge in edges_of(shape)]
+    shapes = [shape for body in bodies for shape in body.shapes]
+    own = [shape for body in bodies if body.finite for shape in body.shapes]
+    edges = [
+        edge for shape in own for edge in edges_of(shape, [each for each in shapes if each is not shape])
+    ]
     shape = tuple(cells - 1 for cells in grid.shape)
     with show_progress(len(index), "measuring surfaces") as progress:
         for start in range(0, len(index), _CHUNK):
             first = np.stack(np.unravel_index(index[start : start + _CHUNK], shape), axis=-1)
             centers = np.array(grid.origin) + grid.spacing * (first + 0.5)
             less = reductions(edges, centers, grid.spacing)
-            near = Bodies(_distances(bodies, first, grid), numbers, finite, less)
+            distance = _distances(bodies, first, grid)
+            finite = np.stack([_finite(*pair, first, grid) for pair in zip(bodies, distance, strict=True)])
+            near = Bodies(distance, numbers, finite, less)
             parts.append(interface_elements(near, materials, stencil))
             progress.advance(len(first))
     return InterfaceElements(*(np.concatenate(each) for each in zip(*parts, strict=True)))

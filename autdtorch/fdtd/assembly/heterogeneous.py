@@ -28,8 +28,10 @@ logger = logging.getLogger(__name__)
 
 Shape = tuple[int, int, int]
 # Sum of coupling coefficients, relative to air, up to which a cell in a sound-hard body is sound-hard. Cells
-# in such bodies have 1e-5, from their density, unless a finite element reaches them.
-_SOUND_HARD_COUPLING = 1e-3
+# at a surface have 0.3 or more, all others 0.03 or less. Vertices of finite elements stay cells in all but
+# slivers: the least sum is relative to the densest fluid, and above the 1e-5 that the body's density leaves.
+_SOUND_HARD_COUPLING = 0.1
+_SLIVER_COUPLING, _LEAST_COUPLING = 1e-3, 3e-5
 # Eigenvalues below this share of the largest are rounding in a condensed stiffness matrix. A higher value
 # would remove energy from nearly constant pressures.
 _NULL_EIGENVALUE = 1e-10
@@ -112,11 +114,14 @@ def _without_sound_hard(
     hard = elements.materials.sound_hard[_cell_material(elements)]
     hard[vertices] = elements.materials.sound_hard[interface.material]
     inside, known = hard[touched], -1
+    densest = elements.materials.density[~elements.materials.sound_hard].max()
+    least = np.full(len(hard), _SOUND_HARD_COUPLING * stencil.total)
+    least[vertices[interface.finite]] = max(_SLIVER_COUPLING / densest, _LEAST_COUPLING) * stencil.total
     hard[touched] = False
     while True:
         coupling, mass = _assembled(elements, interface, touched, shape, stencil)
         coupling *= ~(hard[touched, None] | hard[_neighbours(touched, shape)])
-        hard[touched] |= inside & (np.abs(coupling).sum(axis=1) <= _SOUND_HARD_COUPLING * stencil.total)
+        hard[touched] |= inside & (np.abs(coupling).sum(axis=1) <= least[touched])
         if hard.sum() == known or not inside.any():
             return coupling, mass, hard
         known = hard.sum()
@@ -138,7 +143,7 @@ def condensed(interface: InterfaceElements, out: NDArray[np.bool_]) -> Interface
     matrix[gone[:, :, None] | gone[:, None, :]] = 0
     coupling = interface.coupling.copy()
     coupling[some] = -matrix[:, PAIRS[:, 0], PAIRS[:, 1]]
-    return InterfaceElements(coupling, np.where(out, 0, interface.mass), interface.material)
+    return interface._replace(coupling=coupling, mass=np.where(out, 0, interface.mass))
 
 
 def _assembled(

@@ -72,7 +72,7 @@ class Bodies(NamedTuple):
 
     distance: Array  # signed distances of K bodies (K, n, 125) [cells]; `FAR` for those that are not near
     material: Index  # number of the material of each body (K,)
-    finite: NDArray[np.bool_]  # whether finite elements represent its surface (K,): tilted, sound-hard faces
+    finite: NDArray[np.bool_]  # whether finite elements represent it in an element (K, n)
     reductions: Array  # share of the stiffness that is taken away near edges of such bodies (n, 3, 3)
 
 
@@ -87,7 +87,7 @@ def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -
     coupling = _series_coupling(lines, materials, stencil)
     vertex = _vertex_materials(distance, material)
     layered = _layered_axis(distance)
-    grown = ((np.abs(distance) < FAR).any(axis=2) & finite[:, None]).any(axis=0) & (layered < 0)
+    grown = ((np.abs(distance) < FAR).any(axis=2) & finite).any(axis=0) & (layered < 0)
     for axis in range(3):
         own = layered == axis
         coupling[own] = _layered_coupling(axis, vertex[own], volumes[own], materials, stencil)
@@ -104,11 +104,11 @@ def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -
         coupling[chosen[flat]] += correction
     mass = _lumped_mass(vertex, volumes, materials)
     if grown.any():
-        thickness = np.where(finite, added_thickness(stencil.kappa), 0)[:, None, None]
+        thickness = added_thickness(stencil.kappa) * finite[:, grown, None]
         shares = _shares(_volume_coverage, distance[:, grown] - thickness, material, count)
         coupling[grown] = cut_coupling(shares, materials, reductions[grown], stencil)
         mass[grown] = cut_mass(shares, materials)
-    return InterfaceElements(coupling, mass, vertex)
+    return InterfaceElements(coupling, mass, vertex, grown)
 
 
 def _vertex_materials(distance: Array, material: Index) -> Index:
@@ -204,6 +204,11 @@ def _correction(
     projection = np.linalg.solve(own, flow.transpose(0, 2, 1))
     added = projection.transpose(0, 2, 1) @ (energy - own) @ projection
     return flat, -added[:, PAIRS[:, 0], PAIRS[:, 1]]
+
+
+def mean_gradient(level: Array) -> Array:
+    """Return the mean gradient (..., 3) of signed distances at the lattice (..., 125)."""
+    return np.asarray(level @ _FIT[1:4].T)
 
 
 def _tangents(normal: Array) -> Array:
