@@ -29,7 +29,7 @@ from autdtorch.scene.scene import Scene
 TILTS = [(0.3, 0.0, 0.0), (math.pi / 4, 0.0, 0.0), (0.5, 0.4, 0.3)]
 
 
-@settings(max_examples=25)
+@settings(max_examples=12)
 @given(
     normal=st.tuples(*[st.integers(-4, 4)] * 3).filter(
         lambda n: np.count_nonzero(n) > 1 and math.gcd(*n) == 1
