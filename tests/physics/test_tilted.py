@@ -134,7 +134,7 @@ def test_a_mesh_in_single_precision_turns_the_grid(rotation, tmp_path):
 
 
 @pytest.mark.parametrize("rotation", TILTS)
-@pytest.mark.parametrize("thickness", [1e-3, 1.3e-3, 2e-3, 3e-3, 4e-3])
+@pytest.mark.parametrize("thickness", [1e-3, 2e-3, 4e-3])
 def test_no_cell_of_a_tilted_plate_belongs_to_the_air_on_both_sides(thickness, rotation):
     plate = Box((0, 0, 0), (0.1, 0.1, thickness), rotation, rigid=True)
     array = TransducerArray([[0, 0, -12e-3]], (0, 0, 1))
