@@ -14,11 +14,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from autdtorch.fdtd.region import Region, Shape
+from autdtorch.fdtd.region import Region, Shape, doubled_normals
+from autdtorch.fdtd.turning import ALIGNED
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
-_ALIGNED = 1 - 1e-9  # Smallest cosine between the normal of an axis-aligned face and the axis
 # Distance of a face from a cell centre [cells] up to which the centre lies on it, and so in the obstacle
 _TOUCHING = 1e-6
 _ROUNDING = 1e-6  # Excess over whole cells [cells] that needs no further cell
@@ -47,8 +47,8 @@ def grid_offset(
 def _triangles(shape: Shape) -> tuple[Array, Array]:
     """Return the first corners (n, 3) [m] of triangles, and their outward normals of twice their area."""
     vertices, triangles = (part.numpy() for part in shape.surface())
-    first, second, third = np.moveaxis(vertices[triangles], 1, 0)
-    return first, np.cross(second - first, third - first)
+    corners = vertices[triangles]
+    return corners[:, 0], doubled_normals(corners)
 
 
 def _faces(region: Region, surfaces: list[tuple[Array, Array]], axis: int, origin: float) -> Array:
@@ -60,7 +60,7 @@ def _faces(region: Region, surfaces: list[tuple[Array, Array]], axis: int, origi
     parts = [np.zeros((3, 0))]
     for body, (corner, normal) in zip(region.bodies, surfaces, strict=True):
         double = np.linalg.norm(normal, axis=1)
-        aligned = np.abs(normal[:, axis]) > _ALIGNED * double
+        aligned = np.abs(normal[:, axis]) > ALIGNED * double
         place, outward = corner[aligned, axis], np.sign(normal[aligned, axis])
         heavier = body.fluid is None or body.fluid.density >= region.fluid.density
         inside = (place > low) & (place < high)

@@ -16,15 +16,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from autdtorch.fdtd.region import Region, Shape
+from autdtorch.fdtd.region import Region, Shape, doubled_normals
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import Vector
 
-_ALIGNED = 1 - 1e-9  # Smallest cosine between the normal of a face and an axis that is parallel to it
+ALIGNED = 1 - 1e-9  # Smallest cosine between the normal of a face and an axis that is parallel to it
 _PERPENDICULAR = 4e-5  # Largest cosine between perpendicular normals; the same angle
-_WORTHWHILE = (
-    0.4  # Share of all surfaces that must become aligned before a grid is turned and loses symmetries
-)
+# Share of all surfaces that must become aligned before a grid is turned, which may cost symmetries
+_WORTHWHILE = 0.4
 _DECIMALS = 6  # Normals that agree to so many decimals are equal: files hold single precision
 _SAGITTA = 1.5  # Growth of a bounding box, relative to the distance of triangles from a curved surface
 
@@ -65,16 +64,21 @@ class Turned:
         return (x, y, z), (u, v, w)
 
 
-def along(shape: Shape, axes: Array) -> Shape:
+def is_turned(axes: Array) -> bool:
+    """Return whether axes, one a row (3, 3), differ from those of the scene."""
+    return bool((axes != np.eye(3)).any())
+
+
+def turned_shape(shape: Shape, axes: Array) -> Shape:
     """Return a shape in the coordinates of other axes, one a row (3, 3)."""
-    return shape if (axes == np.eye(3)).all() else Turned(shape, axes)
+    return Turned(shape, axes) if is_turned(axes) else shape
 
 
 def turned(region: Region, axes: Array) -> Region:
     """Return a region in the coordinates of other axes, one a row (3, 3), without a domain of its own."""
-    if (axes == np.eye(3)).all():
+    if not is_turned(axes):
         return region
-    bodies = tuple(replace(body, shape=along(body.shape, axes)) for body in region.bodies)
+    bodies = tuple(replace(body, shape=turned_shape(body.shape, axes)) for body in region.bodies)
     everywhere = (-np.inf,) * 3, (np.inf,) * 3
     return replace(region, bodies=bodies, domain=everywhere, sources=region.sources @ axes.T)
 
@@ -87,7 +91,7 @@ class FlatFaces(NamedTuple):
 
     def aligned_share(self, axes: Array) -> float:
         """Return the share of their area that is normal to one of the axes, one a row (3, 3)."""
-        aligned = (np.abs(self.normals @ axes.T) > _ALIGNED).any(axis=1)
+        aligned = (np.abs(self.normals @ axes.T) > ALIGNED).any(axis=1)
         return 1.0 if aligned.all() else float(self.areas[aligned].sum() / self.areas.sum())
 
 
@@ -102,8 +106,7 @@ def axes_along(surfaces: Sequence[FlatFaces]) -> Array:
 def flat_faces(shape: Shape) -> FlatFaces:
     """Return the flat faces of a shape; triangles of a curved surface are faces, too."""
     vertices, triangles = (part.numpy() for part in shape.surface())
-    first, second, third = np.moveaxis(vertices[triangles], 1, 0)
-    normal = np.cross(second - first, third - first)
+    normal = doubled_normals(vertices[triangles])
     double = np.linalg.norm(normal, axis=1)
     normal, double = normal[double > 0], double[double > 0]
     rounded = (normal / double[:, None]).round(_DECIMALS)

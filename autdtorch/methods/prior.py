@@ -11,6 +11,7 @@ import torch
 from autdtorch.methods.base import Problem
 from autdtorch.methods.gradient import climb, random_drives
 from autdtorch.methods.matrix_posterior import MatrixPrior
+from autdtorch.objectives.objective import validate_matrix
 from autdtorch.utils.validation import complex_tensor, invalid, number_between, require_known, within
 
 _STARTS, _CLIMB_STEPS = 16, 300  # of the climbs to the best drive of a simulation
@@ -83,8 +84,7 @@ def prior_mean(prior: Prior, problem: Problem) -> torch.Tensor:
     if matrix is None:
         raise invalid("prior.transfer_matrix", None, "must be given where the objective has none")
     shape = problem.foci, problem.transducers
-    if matrix.shape != shape:
-        raise ValueError(f"prior.transfer_matrix: shape {tuple(matrix.shape)}; must be {shape}")
+    matrix = validate_matrix("prior.transfer_matrix", matrix, *shape)
     if prior.variants is not None and (prior.variants.shape[1:] != shape):
         accepted = f"must be (K, {shape[0]}, {shape[1]})"
         raise ValueError(f"prior.variants: shape {tuple(prior.variants.shape)}; {accepted}")

@@ -22,13 +22,12 @@ from autdtorch.fdtd.grid import make_box
 from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
 from autdtorch.fdtd.steady_state import Extrapolation, SteadyState, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble_on
-from autdtorch.fdtd.turning import turned
+from autdtorch.fdtd.turning import is_turned, turned
 from autdtorch.propagators.grids import MOST_PASSES, one_box
 from autdtorch.propagators.plan import MOST_JUDGED
 from autdtorch.propagators.simulation import Run, Simulation, Stepped
 from autdtorch.scene.arrays import Nodes
 from autdtorch.scene.scene import require_clear
-from autdtorch.utils.array_types import Array
 from autdtorch.utils.threads import one_torch_thread, spread
 
 logger = logging.getLogger(__name__)
@@ -63,16 +62,11 @@ class BoxSimulation(Simulation):
         for group, axes in zip(plan.grouping.groups, plan.grouping.axes, strict=True):
             part = replace(plan.region, bodies=tuple(plan.region.bodies[one] for one in group))
             part = turned(part, axes)
-            if (axes != np.eye(3)).any():
+            if is_turned(axes):
                 logger.info("the grid around obstacles %s is turned along their faces", list(group))
             assembly = assemble_on(make_box(part, plan.spacing), part, plan.dtype, plan.time_step)
             boxes.append(ScatteredField(assembly, plan.scene.complex_wavenumber, axes))
         return boxes
-
-    @property
-    def axes(self) -> Array:
-        """Axes of the first grid, one a row (3, 3)."""
-        return self.plan.grouping.axes[0]
 
     @property
     def assemblies(self) -> Sequence[Assembly]:

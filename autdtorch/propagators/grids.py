@@ -25,7 +25,7 @@ from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.stability import fewest_steps
 from autdtorch.fdtd.steady_state import fewest_periods
 from autdtorch.fdtd.stencil import tuned_stencil
-from autdtorch.fdtd.turning import FlatFaces, along, axes_along, flat_faces
+from autdtorch.fdtd.turning import FlatFaces, axes_along, flat_faces, is_turned, turned_shape
 from autdtorch.utils.array_types import Array
 
 logger = logging.getLogger(__name__)
@@ -132,7 +132,7 @@ def choose_grids(
     walls = any(body.continued for body in region.bodies)
     first, last = region.domain
     outside = any((np.less(one.lower, first) | np.greater(one.upper, last)).any() for one in region.shapes)
-    tilted = any((axes != np.eye(3)).any() for axes in boxes.axes)
+    tilted = any(map(is_turned, boxes.axes))
     method, grouping = ("full", domain) if walls or not (outside or tilted or gain > 1) else ("box", boxes)
     logger.debug(
         "method auto: %s; full would take %.2g times as long as box (walls through the boundary layer: %s,"
@@ -143,8 +143,7 @@ def choose_grids(
 
 def one_box(region: Region, spacing: float) -> Grouping:
     """Return one box of `spacing` [m] for all obstacles."""
-    group = range(len(region.bodies))
-    return _boxes(region, [_Box.around(region, group, list(map(flat_faces, region.shapes)))], spacing, 1)
+    return _one_box(region, spacing, list(map(flat_faces, region.shapes)))
 
 
 def cheapest_boxes(region: Region, spacing: float, tolerance: float, runs: int) -> Grouping:
@@ -152,7 +151,8 @@ def cheapest_boxes(region: Region, spacing: float, tolerance: float, runs: int) 
 
     The interiors of boxes, with the air around their obstacles, do not overlap.
     """
-    best, surfaces = one_box(region, spacing), list(map(flat_faces, region.shapes))
+    surfaces = list(map(flat_faces, region.shapes))
+    best = _one_box(region, spacing, surfaces)
     if len(region.bodies) > _MOST_OBSTACLES:
         return best
     boxes = [_Box.around(region, [index], surfaces) for index in range(len(region.bodies))]
@@ -177,7 +177,7 @@ class _Box:
     @classmethod
     def around(cls, region: Region, group: Sequence[int], surfaces: Sequence[FlatFaces]) -> _Box:
         axes = axes_along([surfaces[index] for index in group])
-        shapes = [along(region.bodies[index].shape, axes) for index in group]
+        shapes = [turned_shape(region.bodies[index].shape, axes) for index in group]
         return cls(tuple(group), axes, bodies_extent(shapes))
 
     @property
@@ -189,6 +189,10 @@ class _Box:
     def half(self) -> Array:
         """Half of the lengths of its edges (3,) [m]."""
         return np.asarray(np.subtract(self.extent.upper, self.extent.lower) / 2)
+
+
+def _one_box(region: Region, spacing: float, surfaces: Sequence[FlatFaces]) -> Grouping:
+    return _boxes(region, [_Box.around(region, range(len(surfaces)), surfaces)], spacing, 1)
 
 
 def _boxes(region: Region, boxes: Sequence[_Box], spacing: float, passes: int) -> Grouping:

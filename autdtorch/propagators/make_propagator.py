@@ -45,8 +45,8 @@ def make_propagator(
             cheaper. Obstacles are simulated as a whole, including parts outside the domain. The grid of a
             box turns with tilted flat faces. "auto": free space without obstacles, full where a wall
             continues through the boundary layer, box where other obstacles leave the domain or are tilted,
-            otherwise the cheaper of box and full. The propagator's `method` is
-            the one chosen; the reason is logged at level DEBUG.
+            otherwise the cheaper of box and full. The propagator's `method` is the one
+            chosen; the reason is logged at level DEBUG.
         spacing: edge of a cell [m], at most a third of the wavelength. The error falls with it
             (docs/numerics.md). None: the spacing is chosen from simulations on two coarse grids so that the
             estimated error of the transfer matrix is below `tolerance`.

@@ -16,13 +16,12 @@ from autdtorch.analytic.green import PAIR_BYTES
 from autdtorch.fdtd.grid import MAX_CELLS, layer_cells, pilot_spacing, require_spacing, second_spacing
 from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.kernels.contract import Kernel
-from autdtorch.fdtd.region import Region
+from autdtorch.fdtd.region import Region, doubled_normals
 from autdtorch.fdtd.steady_state import phasors_kept
 from autdtorch.propagators.grids import USUAL_PERIODS, Grouping, choose_grids
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.obstacles import Mesh
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.array_types import Array
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.validation import integer_at_least, invalid, positive, require_kind, require_one_of
 
@@ -147,8 +146,8 @@ class Plan:
         cut = cells = columns = meshed = 0.0
         for body in region.bodies:
             vertices, triangles = (part.numpy() for part in body.shape.surface())
-            doubled = _doubled_areas(np.clip(vertices, *inner)[triangles])
-            continued = _doubled_areas(np.clip(vertices, *outer)[triangles])
+            doubled = doubled_normals(np.clip(vertices, *inner)[triangles])
+            continued = doubled_normals(np.clip(vertices, *outer)[triangles])
             area = float(np.linalg.norm(doubled, axis=1).sum()) / 2
             # a plane of normal n cuts |nx| + |ny| + |nz| elements for each area of a cell
             cut += float(np.abs(doubled).sum()) / 2 / spacing**2
@@ -268,9 +267,3 @@ def precision_of(dtype: str | torch.dtype) -> torch.dtype:
     name = str(dtype).removeprefix("torch.") if isinstance(dtype, torch.dtype) else dtype
     require_one_of("dtype", name, ("float32", "float64"))
     return torch.float32 if name == "float32" else torch.float64
-
-
-def _doubled_areas(triangles: Array) -> Array:
-    """Return normals (T, 3) of triangles (T, 3, 3), twice as long as their areas."""
-    a, b, c = np.moveaxis(triangles, 1, 0)
-    return np.asarray(np.cross(b - a, c - a))

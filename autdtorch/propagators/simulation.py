@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
 import torch
 
 from autdtorch.fdtd.steady_state import SteadyState, fewest_periods
@@ -24,7 +23,6 @@ from autdtorch.propagators.symmetry import (
     symmetries,
 )
 from autdtorch.scene.arrays import Nodes
-from autdtorch.utils.array_types import Array
 from autdtorch.utils.progress import show_progress
 from autdtorch.utils.validation import ArrayLike, points_tensor
 
@@ -84,11 +82,6 @@ class Simulation(ABC):
     def assemblies(self) -> Sequence[Assembly]:
         """The assembled grids."""
 
-    @property
-    def axes(self) -> Array:
-        """Axes of the grid, one a row (3, 3)."""
-        return np.eye(3)
-
     @abstractmethod
     def near_obstacle(self, points: torch.Tensor) -> bool:
         """Return whether the interpolation kernel of any point (N, 3) has heterogeneous cells."""
@@ -112,7 +105,7 @@ class Simulation(ABC):
     @cached_property
     def symmetries(self) -> list[Symmetry]:
         """Symmetries of the scene on its grid."""
-        return symmetries(self.assemblies, self.axes, self.plan.scene.array.nodes)
+        return symmetries(self.assemblies, self.plan.grouping.axes[0], self.plan.scene.array.nodes)
 
     @property
     def time_step(self) -> float:

@@ -15,7 +15,7 @@ import torch
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from autdtorch.fdtd.region import Shape
+from autdtorch.fdtd.region import Shape, doubled_normals
 from autdtorch.utils.array_types import Array, Index
 
 _SHARP = np.radians(20)  # Smallest angle between the normals of two faces that meet in an edge
@@ -24,8 +24,8 @@ _REACH = 1.2  # Distance from an edge within which the stiffness is reduced [cel
 # errors of up to 1.6, 1.5 and 2.1 % at 1 mm and 0.7, 0.5 and 0.3 % at 0.5 mm.
 _REDUCTION = 0.3
 _FEWEST_SIDES = 16  # Fewest sides of a polygon that stands for a circle
-_OUTSIDE = 1e-6  # Distance of such a point from its face [m]
 _ROUND = 1e-6  # Largest relative deviation of its corners from the circle
+_OUTSIDE = 1e-6  # Distance from a face of the point that is looked for in other bodies [m]
 
 
 @dataclass(frozen=True)
@@ -100,6 +100,8 @@ def edges_of(shape: Shape, others: Sequence[Shape] = ()) -> list[Segment | Circl
     """Return the convex edges of a shape that `others` do not cover."""
     vertices, triangles = (part.numpy() for part in shape.surface())
     ends, angles, beside = _sharp_sides(vertices, triangles)
+    if not len(ends):
+        return []
     covered = np.zeros(len(ends), bool)
     for other in others:
         covered |= (other.signed_distance(torch.from_numpy(beside)) < 0).any(dim=1).numpy()
@@ -139,12 +141,12 @@ def _circle(corners: Array, reduction: float, sides: int) -> Circle | None:
 def _sharp_sides(vertices: Array, triangles: Index) -> tuple[Array, Array, Array]:
     """Return the ends (n, 2, 3) [m] of the sides at convex edges of a surface.
 
-    Also returned are the angle (n,) [rad] between the normals of the two faces, and a point just outside each
-    of them (n, 2, 3) [m], next to the middle of the edge.
+    Also return the angles (n,) [rad] between the normals of the two faces, and points (n, 2, 3) [m] just
+    outside each face, next to the middle of the edge.
     """
     _, number = np.unique(vertices.round(9), axis=0, return_inverse=True)  # corners may be there twice
     corners, place = vertices[triangles], number.ravel()[triangles]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = doubled_normals(corners)
     double = np.linalg.norm(normal, axis=1)
     normal = normal / np.where(double > 0, double, 1)[:, None]
     turns = ((0, 1), (1, 2), (2, 0))

@@ -102,8 +102,8 @@ def _unions(region: Region, stencil: Stencil) -> tuple[list[_Union], Materials]:
     for body in region.bodies:
         if body.fluid not in known:
             known.append(body.fluid)
-        tilted = flat_faces(body.shape).aligned_share(np.eye(3)) < _ALL
-        kind = known.index(body.fluid), body.continued, tilted and body.fluid is None
+        finite = body.fluid is None and flat_faces(body.shape).aligned_share(np.eye(3)) < _ALL
+        kind = known.index(body.fluid), body.continued, finite
         if unions and kind == (unions[-1].material, unions[-1].continued, unions[-1].finite):
             unions[-1] = _Union((*unions[-1].shapes, body.shape), *kind)
         else:
