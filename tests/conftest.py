@@ -4,6 +4,8 @@ several processes, these share the cores: threads that wait for each other on bu
 slower."""
 
 import os
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import hypothesis
@@ -29,6 +31,15 @@ if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
 def nothing_from_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tests simulate, whatever matrices the user keeps."""
     monkeypatch.delenv("AUTDTORCH_CACHE_DIR", raising=False)
+
+
+@pytest.fixture(autouse=True)
+def no_timer_left_running() -> Iterator[None]:
+    """Outputs that a test leaves on are not switched off, with a warning, in the middle of another."""
+    yield
+    for thread in threading.enumerate():
+        if isinstance(thread, threading.Timer):
+            thread.cancel()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
