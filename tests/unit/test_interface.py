@@ -20,9 +20,10 @@ from autdtorch.fdtd.assembly.element import (
     uniform_coupling,
 )
 from autdtorch.fdtd.assembly.interface import Bodies, interface_elements
-from autdtorch.fdtd.stencil import tuned_stencil
+from autdtorch.fdtd.stencil import Stencil, tuned_stencil
 
 STENCIL = tuned_stencil(2 * math.pi / 8.5)
+LONG = tuned_stencil(1e-3)  # of long waves: the terms of second order are 1e-6
 ONE = np.array([1])
 OFFSETS = st.floats(-0.4, 0.4)
 CONTRASTS = st.floats(-3, 5).map(lambda exponent: 10**exponent)
@@ -41,25 +42,28 @@ def sphere(normal: np.ndarray, offset: float, radius: float) -> np.ndarray:
 
 
 def element(
-    *distance: np.ndarray, density: tuple[float, ...] = (1, 77), mass: tuple[float, ...] | None = None
+    *distance: np.ndarray,
+    density: tuple[float, ...] = (1, 77),
+    mass: tuple[float, ...] | None = None,
+    stencil: Stencil = STENCIL,
 ) -> InterfaceElements:
     """One element, obstacle k of which is of material k + 1; masses are 1/density by default."""
     masses = np.array(mass or [1 / d for d in density], float)
-    materials = Materials(np.array(density, float), masses, np.zeros(len(density), bool))
-    count = len(distance)
-    near = Bodies(
-        np.stack(distance)[:, None], np.arange(count) + 1, np.zeros((count, 1), bool), np.zeros((1, 3, 3))
+    materials = Materials(
+        np.array(density, float), masses, np.ones(len(density)), np.zeros(len(density), bool)
     )
-    return interface_elements(near, materials, STENCIL)
+    count = len(distance)
+    numbers, none = np.arange(count) + 1, np.zeros(count, bool)
+    near = Bodies(np.stack(distance)[:, None], numbers, none, none[:, None], np.zeros((1, 3, 3)))
+    return interface_elements(near, materials, stencil)
 
 
 def rigid_element(distance: np.ndarray, reduction: np.ndarray | float = 0.0) -> InterfaceElements:
     """One element that a tilted rigid surface cuts."""
-    materials = Materials(np.array([1, 1e5]), np.array([1, 1e-5]), np.array([False, True]))
+    materials = Materials(np.array([1, 1e5]), np.array([1, 1e-5]), np.ones(2), np.array([False, True]))
     reductions = np.broadcast_to(reduction, (1, 3, 3))
-    return interface_elements(
-        Bodies(distance[None, None], ONE, ONE[None] > 0, reductions), materials, STENCIL
-    )
+    near = Bodies(distance[None, None], ONE, ONE < 0, ONE[None] > 0, reductions)
+    return interface_elements(near, materials, STENCIL)
 
 
 def energy(cut: InterfaceElements, field: np.ndarray) -> float:
@@ -105,13 +109,13 @@ def test_energy_is_never_negative_at_any_contrast(
 def test_a_field_along_a_plane_surface_has_its_exact_energy(
     normal: np.ndarray, offset: float, density: float
 ) -> None:
-    cut = element(plane(normal, offset), density=(1, density))
+    cut = element(plane(normal, offset), density=(1, density), stencil=LONG)
     volumes = element(plane(normal, offset), density=(1, density), mass=(0, 1)).mass.sum()
     assume(1e-3 < volumes < 1 - 1e-3)  # what is smaller may count as absent
     along = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     along /= np.linalg.norm(along)
-    # 1/density averaged over the element, which is what its masses sum to; rounding as above
-    assert energy(cut, VERTICES @ along) == pytest.approx(cut.mass.sum(), rel=1e-9)
+    # 1/density averaged over the element, which is what its masses sum to
+    assert energy(cut, VERTICES @ along) == pytest.approx(cut.mass.sum(), rel=1e-5)
 
 
 TILTED = NORMALS.filter(lambda n: np.count_nonzero(np.abs(n) > 0.01) > 1)
@@ -145,16 +149,16 @@ def test_a_flow_through_a_surface_along_the_grid_meets_its_exact_resistance(
     normal = np.eye(3)[axis]
     depth = VERTICES[:, axis] - 0.5 - offset
     kinked = np.where(depth < 0, density, 1.0) * depth  # of unit flow
-    cut = element(plane(normal, offset), density=(1, density))
+    cut = element(plane(normal, offset), density=(1, density), stencil=LONG)
     resistance = (0.5 + offset) * density + (0.5 - offset)
     flow = stiffness_matrix(cut.coupling)[0] @ kinked
-    # nothing flows along the surface, all of it across; rounding
-    assert flow[depth > 0].sum() == pytest.approx(1, rel=1e-9)
-    assert energy(cut, kinked) == pytest.approx(resistance, rel=1e-9)
+    # nothing flows along the surface, all of it across
+    assert flow[depth > 0].sum() == pytest.approx(1, rel=1e-5)
+    assert energy(cut, kinked) == pytest.approx(resistance, rel=1e-5)
 
 
 @settings(max_examples=40)
-@given(NORMALS, OFFSETS)
+@given(TILTED, OFFSETS)
 def test_masses_stay_on_their_side(normal: np.ndarray, offset: float) -> None:
     distance = plane(normal, offset)
     air, solid = element(distance, mass=(1, 0)), element(distance, mass=(0, 1))
@@ -166,8 +170,8 @@ def test_masses_stay_on_their_side(normal: np.ndarray, offset: float) -> None:
 
 @pytest.mark.parametrize("offset", [-0.6, -0.2, 0.1, 0.5])
 def test_volumes_of_planes(offset: float) -> None:
-    along = element(plane(np.array((0, 1, 0)), offset), mass=(0, 1))
-    assert along.mass.sum() == pytest.approx(max(0, 0.5 + offset), abs=1e-12)
+    along, share = element(plane(np.array((0, 1, 0)), offset), stencil=LONG), max(0, 0.5 + offset)
+    assert along.mass.sum() == pytest.approx(1 - share + share / 77, rel=1e-5)
     normal, points = np.array((0.8, 0.5, 0.33)), np.random.default_rng(0).random((400_000, 3))
     exact = ((points - 0.5) @ normal / np.linalg.norm(normal) < offset).mean()
     # random points are good to 8e-4; the sub-cells of a quarter to 1 % (measured)

@@ -35,6 +35,7 @@ class Materials:
 
     density: Array  # density (m,)
     mass: Array  # mass of a cell (m,)
+    slowness: Array  # wavenumber (m,), of sound-hard materials that of air
     sound_hard: NDArray[np.bool_]  # whether the material is sound-hard (m,)
 
     @property

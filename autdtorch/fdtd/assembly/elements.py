@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -52,7 +52,8 @@ class _Union:
     shapes: tuple[Shape, ...]
     material: int
     continued: bool  # whether they continue through the boundary layers, unchanged from the interior
-    finite: bool  # whether finite elements represent its surface: tilted or curved, and sound-hard
+    aligned: bool  # whether all its faces are flat and parallel to the grid
+    finite: bool  # whether finite elements represent its surface: not aligned, and sound-hard
 
     def distance(self, cell: Array, grid: Grid) -> Array:
         """Return the signed distance [cells] of positions (..., 3) in cells."""
@@ -102,21 +103,27 @@ def _unions(region: Region, stencil: Stencil) -> tuple[list[_Union], Materials]:
     for body in region.bodies:
         if body.fluid not in known:
             known.append(body.fluid)
-        finite = body.fluid is None and flat_faces(body.shape).aligned_share(np.eye(3)) < _ALL
-        kind = known.index(body.fluid), body.continued, finite
-        if unions and kind == (unions[-1].material, unions[-1].continued, unions[-1].finite):
-            unions[-1] = _Union((*unions[-1].shapes, body.shape), *kind)
+        aligned = flat_faces(body.shape).aligned_share(np.eye(3)) >= _ALL
+        own = _Union(
+            (body.shape,),
+            known.index(body.fluid),
+            body.continued,
+            aligned,
+            body.fluid is None and not aligned,
+        )
+        if unions and own == replace(unions[-1], shapes=own.shapes):
+            unions[-1] = replace(own, shapes=(*unions[-1].shapes, body.shape))
         else:
-            unions.append(_Union((body.shape,), *kind))
+            unions.append(own)
     density = np.full(len(known), _SOUND_HARD_DENSITY)
-    factor = np.ones(len(known))
+    factor, slowness = np.ones(len(known)), np.ones(len(known))
     for number, fluid in enumerate(known):
         if fluid is not None:
             ratio = fluid.sound_speed / air.sound_speed
             density[number] = fluid.density / air.density / flow_factor(stencil.kappa, ratio)
-            factor[number] = speed_factor(stencil, ratio)
+            factor[number], slowness[number] = speed_factor(stencil, ratio), 1 / ratio
     sound_hard = np.array([fluid is None for fluid in known])
-    return unions, Materials(density, 1 / (density * factor), sound_hard)
+    return unions, Materials(density, 1 / (density * factor), slowness, sound_hard)
 
 
 def _windows(body: _Union, grid: Grid) -> Iterator[tuple[tuple[slice, ...], Array]]:
@@ -166,6 +173,7 @@ def _interface(
     none = np.zeros((0, 28)), np.zeros((0, 8)), np.zeros((0, 8), np.int64), np.zeros(0, bool)
     parts = [InterfaceElements(*none)]
     numbers = np.array([body.material for body in bodies], np.int64)
+    aligned = np.array([body.aligned for body in bodies], bool)
     shapes = [shape for body in bodies for shape in body.shapes]
     own = [shape for body in bodies if body.finite for shape in body.shapes]
     edges = [
@@ -179,7 +187,7 @@ def _interface(
             less = reductions(edges, centers, grid.spacing)
             distance = _distances(bodies, first, grid)
             finite = np.stack([_finite(*pair, first, grid) for pair in zip(bodies, distance, strict=True)])
-            near = Bodies(distance, numbers, finite, less)
+            near = Bodies(distance, numbers, aligned, finite, less)
             parts.append(interface_elements(near, materials, stencil))
             progress.advance(len(first))
     return InterfaceElements(*(np.concatenate(each) for each in zip(*parts, strict=True)))

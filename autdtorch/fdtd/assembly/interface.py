@@ -23,9 +23,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from autdtorch.fdtd.assembly.aligned_edges import edge_elements
+from autdtorch.fdtd.assembly.aligned_faces import layered_axis, layered_elements
+from autdtorch.fdtd.assembly.coverage import (
+    distance_to_material,
+    line_coverage,
+    shares,
+    subcell_means,
+    volume_coverage,
+)
 from autdtorch.fdtd.assembly.element import (
     CORNERS,
-    EDGES_BETWEEN,
     FAR,
     LATTICE,
     PAIRS,
@@ -33,7 +41,6 @@ from autdtorch.fdtd.assembly.element import (
     VERTICES,
     InterfaceElements,
     Materials,
-    coupling_by_edges,
     stiffness_matrix,
     uniform_coupling,
 )
@@ -44,12 +51,8 @@ from autdtorch.utils.array_types import Array, Index
 _ABSENT_SHARE = 1e-4  # Share of an element's volume below which a material counts as absent
 # Smallest mean gradient of a signed distance with one normal. The two faces of a thin plate cancel.
 _LEAST_GRADIENT = 0.5
-_PLANE_VARIATION = 1e-6  # Largest variation of a signed distance along an axis-aligned face: rounding
 # Largest curvature [1/cells] of a surface that the local solutions follow. Edges have none.
 _LARGEST_CURVATURE = 0.5
-# Diagonal coupling that an element full of the heavier material supplies, relative to its own need. The
-# element behind has a sixth to spare, and half of that is used.
-_DIAGONAL_SHARE = 6.0
 # Axes of the second derivatives in a quadratic fit
 _SECOND = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
@@ -61,10 +64,6 @@ def _quadratic(x: Array) -> Array:
 
 
 _FIT = np.linalg.pinv(_quadratic(LATTICE - 0.5))
-_FROM, _TO = VERTICES[PAIRS[:, 0], None], VERTICES[PAIRS[:, 1], None]
-_ALONG = SUBCELLS * _FROM + np.arange(SUBCELLS + 1)[:, None] * (_TO - _FROM)
-# Indices in the lattice of the points along the line between each pair of vertices (28, 5)
-_LINES = np.ravel_multi_index(tuple(np.moveaxis(_ALONG, -1, 0)), (SUBCELLS + 1,) * 3)
 
 
 class Bodies(NamedTuple):
@@ -72,42 +71,52 @@ class Bodies(NamedTuple):
 
     distance: Array  # signed distances of K bodies (K, n, 125) [cells]; `FAR` for those that are not near
     material: Index  # number of the material of each body (K,)
+    aligned: NDArray[np.bool_]  # whether all faces of a body are parallel to the grid (K,)
     finite: NDArray[np.bool_]  # whether finite elements represent it in an element (K, n)
     reductions: Array  # share of the stiffness that is taken away near edges of such bodies (n, 3, 3)
 
 
 def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -> InterfaceElements:
     """Return the stiffness and mass of n elements that surfaces of K bodies intersect."""
-    count, (distance, material, finite, reductions) = len(materials.density), bodies
+    count, (distance, material, aligned, finite, reductions) = len(materials.density), bodies
     # bodies that do not intersect an element must not enter its shares
     distance = np.where((distance > 0).all(axis=2, keepdims=True), FAR, distance)
     distance = np.where((distance < 0).all(axis=2, keepdims=True), -FAR, distance)
-    volumes = _shares(_volume_coverage, distance, material, count)
-    lines = _shares(_line_coverage, distance, material, count)
+    volumes = shares(volume_coverage, distance, material, count)
+    lines = shares(line_coverage, distance, material, count)
     coupling = _series_coupling(lines, materials, stencil)
     vertex = _vertex_materials(distance, material)
-    layered = _layered_axis(distance)
-    grown = ((np.abs(distance) < FAR).any(axis=2) & finite).any(axis=0) & (layered < 0)
+    mass = _lumped_mass(vertex, volumes, materials)
+    layered = layered_axis(vertex, volumes, distance[~aligned])
+    near = (np.abs(distance) < FAR).any(axis=2)
+    grown = (near & finite).any(axis=0) & (layered < 0)
     for axis in range(3):
         own = layered == axis
-        coupling[own] = _layered_coupling(axis, vertex[own], volumes[own], materials, stencil)
+        share = volumes[own].mean(axis=1)
+        coupling[own], mass[own] = layered_elements(axis, vertex[own], share, mass[own], materials, stencil)
     held = (vertex[:, :, None] == np.arange(count)).any(axis=1)
     present = volumes.mean(axis=1) > _ABSENT_SHARE
     two = (held.sum(axis=1) == 2) & (present <= held).all(axis=1)
+    straight = np.flatnonzero((aligned[:, None] | ~near).all(axis=0) & (layered < 0))
+    edged, *found = edge_elements(
+        distance[:, straight], material, vertex[straight], volumes[straight], materials, stencil
+    )
+    edged = straight[edged]
+    coupling[edged], mass[edged] = found
+    two[edged] = False
     chosen = np.flatnonzero(two & (layered < 0) & ~grown)
     if len(chosen):
         inner = count - 1 - held[chosen, ::-1].argmax(axis=1)
         outer = held[chosen].argmax(axis=1)
-        level = _distance_to_material(distance[:, chosen], material, inner)
+        level = distance_to_material(distance[:, chosen], material, inner)
         sides = materials.density[np.stack((outer, inner), axis=1)]
         flat, correction = _correction(level, sides, volumes[chosen], materials, coupling[chosen])
         coupling[chosen[flat]] += correction
-    mass = _lumped_mass(vertex, volumes, materials)
     if grown.any():
         thickness = added_thickness(stencil.kappa) * finite[:, grown, None]
-        shares = _shares(_volume_coverage, distance[:, grown] - thickness, material, count)
-        coupling[grown] = cut_coupling(shares, materials, reductions[grown], stencil)
-        mass[grown] = cut_mass(shares, materials)
+        part = shares(volume_coverage, distance[:, grown] - thickness, material, count)
+        coupling[grown] = cut_coupling(part, materials, reductions[grown], stencil)
+        mass[grown] = cut_mass(part, materials)
     return InterfaceElements(coupling, mass, vertex, grown)
 
 
@@ -123,48 +132,6 @@ def _series_coupling(lines: Array, materials: Materials, stencil: Stencil) -> Ar
     """Return coupling coefficients (n, 28) with the density averaged along each line (n, 112, m)."""
     density = (lines @ materials.density).reshape(-1, len(PAIRS), SUBCELLS).mean(axis=2)
     return np.asarray(uniform_coupling(stencil) / density)
-
-
-def _layered_axis(distance: Array) -> Index:
-    """Return the only axis (n,) along which signed distances (K, n, 125) vary, or -1."""
-    cube = distance.reshape(*distance.shape[:2], *(SUBCELLS + 1,) * 3)
-    found = np.full(distance.shape[1], -1)
-    for axis in range(3):
-        others = tuple(other + 2 for other in range(3) if other != axis)
-        found[np.ptp(cube, axis=others).max(axis=(0, 2), initial=0) < _PLANE_VARIATION] = axis
-    return found
-
-
-def _layered_coupling(
-    axis: int, vertex: Index, volumes: Array, materials: Materials, stencil: Stencil
-) -> Array:
-    """Return coupling coefficients (n, 28) of elements with faces across an axis, in product form.
-
-    With p0 and p1 the pressures in the two planes of vertices, the energy is g (p1 - p0)^T W (p1 - p0), g
-    being the series mobility. Each plane has the energy of air times a mobility t; a material counts for the
-    plane that holds its vertices, or half for each. The energy of each direction by itself must be positive,
-    or waves grow in a boundary layer that the faces enter. Off-diagonal coupling in W reduces it, and is
-    limited by t of the heavier side; the rest is moved to the diagonal.
-    """
-    across = EDGES_BETWEEN[:, axis] == 1
-    straight = across & (EDGES_BETWEEN.sum(axis=1) == 1)
-    uniform = uniform_coupling(stencil)
-    beside = np.where(across, 0, coupling_by_edges(stencil)[np.minimum(EDGES_BETWEEN.sum(axis=1) + 1, 3)])
-    share = volumes.mean(axis=1)
-    density = share @ materials.density
-    side = VERTICES[:, axis]
-    held = [(vertex[:, side == plane, None] == np.arange(share.shape[1])).any(axis=1) for plane in (0, 1)]
-    part = np.stack((1.0 + held[0] - held[1], 1.0 + held[1] - held[0]))
-    mobility = (part * share) @ (1 / materials.density)
-    along = mobility[side[PAIRS[:, 0]]].T
-    sides = materials.density[vertex]
-    lightest, heaviest = sides.min(axis=1), sides.max(axis=1)
-    heavy = np.where(materials.density >= heaviest[:, None], share, 0).sum(axis=1)
-    allowed = (lightest / heaviest + 1) / 2 + _DIAGONAL_SHARE * heavy
-    kept = np.minimum(1, allowed * density / heaviest)[:, None]
-    even = np.where(straight, uniform[across].sum() / 4, 0)
-    link = np.where(across, kept * uniform + (1 - kept) * even, -kept * beside) / density[:, None]
-    return np.asarray(np.where(across, 0, along * (uniform + beside)) + link)
 
 
 def _correction(
@@ -193,7 +160,7 @@ def _correction(
     fields = np.concatenate((along, kinked[:, :, None]), axis=2)
 
     # Exact energies of the first two by quadrature over the sub-cells; the third keeps its own.
-    depth = _subcell_means(level)
+    depth = subcell_means(level)
     stretch = np.eye(2) - depth[:, :, None, None] * bend[:, None]
     mobility = (volumes @ (1 / materials.density)) / SUBCELLS**3
     energy = np.zeros((len(level), 3, 3))
@@ -239,62 +206,3 @@ def _lumped_mass(vertex: Index, volumes: Array, materials: Materials) -> Array:
         has = held > _ABSENT_SHARE * whole
         total += mass * np.where(has, kept * whole / np.where(has, held, 1), volume)
     return total
-
-
-def _distance_to_material(distance: Array, material: Index, inner: Index) -> Array:
-    """Return the signed distance (n, 125) to the region of material `inner` (n,), cut by later bodies."""
-    level = np.full(distance.shape[1:], FAR)
-    for far, number in zip(distance, material, strict=True):
-        same = (inner == number)[:, None]
-        level = np.where(same, np.minimum(level, far), np.maximum(level, -far))
-    return level
-
-
-def _subcell_means(values: Array) -> Array:
-    """Return the means (n, 64) of lattice values (n, 125) over the corners of each sub-cell."""
-    cube = values.reshape(-1, *(SUBCELLS + 1,) * 3)
-    return _over_subcells(cube, None).reshape(len(values), SUBCELLS**3)
-
-
-def _volume_coverage(distance: Array) -> Array:
-    """Return the share of each sub-cell (..., 64) inside a body: exact for axis-aligned faces."""
-    cube = distance.reshape(*distance.shape[:-1], *(SUBCELLS + 1,) * 3)
-    mean, *slopes = (_over_subcells(cube, along) for along in (None, -3, -2, -1))
-    width = np.abs(slopes).sum(axis=0)
-    share = np.clip(0.5 - mean / np.maximum(width, 1e-12), 0, 1)
-    return np.asarray(share.reshape(*distance.shape[:-1], SUBCELLS**3))
-
-
-def _over_subcells(cube: Array, along: int | None) -> Array:
-    """Return the mean over the corners of each sub-cell, of values or of differences along an axis."""
-    for axis in (-3, -2, -1):
-        low, high = (np.take(cube, np.arange(SUBCELLS) + end, axis) for end in (0, 1))
-        cube = high - low if axis == along else (low + high) / 2
-    return cube
-
-
-def _line_coverage(distance: Array) -> Array:
-    """Return the share inside a body of each quarter of the lines between vertices (..., 112)."""
-    ends = distance[..., _LINES]
-    low = np.minimum(ends[..., :-1], ends[..., 1:])
-    high = np.maximum(ends[..., :-1], ends[..., 1:])
-    share = np.clip(-low / np.maximum(high - low, 1e-12), 0, 1)
-    return np.asarray(share.reshape(*distance.shape[:-1], -1))
-
-
-def _shares(coverage: Callable[[Array], Array], distance: Array, material: Index, count: int) -> Array:
-    """Return the share of each material (n, q, count) in the q parts that `coverage` divides an element into.
-
-    Touching bodies, with distances (K, n, 125) [cells], leave no air between them: their union decides its
-    share.
-    """
-    covered = coverage(distance)
-    share = np.zeros((*covered.shape[1:], count))
-    for cover, number in zip(covered, material, strict=True):
-        share *= 1 - cover[..., None]
-        share[..., number] += cover
-    solid = share.sum(axis=2)
-    union = coverage(distance.min(axis=0))
-    share *= np.divide(union, solid, out=np.zeros_like(solid), where=solid > 0)[..., None]
-    share[..., 0] += 1 - union
-    return share
