@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from autdtorch.fdtd.grid import domain_extent, pilot_spacing
+from autdtorch.fdtd.grid import domain_extent, coarsest_spacing
 from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.stepping import assemble, drive_signal
 from autdtorch.propagators.grids import grid_cost
@@ -86,7 +86,7 @@ def estimate(
         nodes = len(scene.array) * len(scene.control_points) * len(scene.array.nodes.weights)
         return Estimate("free_space", None, 0, 0, planned.memory, _NODE_SECONDS * nodes)
     # a multiple of the spacing: a scene that is symmetric on one grid mostly is on the other
-    factor = max(1, math.floor(pilot_spacing(planned.region) / spacing))
+    factor = max(1, math.floor(coarsest_spacing(planned.region) / spacing))
     pilot = planned.at(spacing * factor, planned.tolerance)
     if pilot.memory < available_memory():
         planned = replace(planned, runs=SimulatedPropagator(pilot).planned_runs)

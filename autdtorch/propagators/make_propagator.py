@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import logging
-import math
 import os
 from typing import Literal
 
 import torch
 
-from autdtorch.fdtd.grid import coarsest_spacing, spacing_for, warn_if_coarse
+from autdtorch.fdtd.grid import warn_if_coarse
 from autdtorch.propagators.cache import DiskCache
 from autdtorch.propagators.free_space import FreeSpacePropagator
-from autdtorch.propagators.plan import Plan, plan
+from autdtorch.propagators.plan import plan
+from autdtorch.propagators.refinement import Budget, refined
 from autdtorch.propagators.scene_region import warn_of_ending_walls
-from autdtorch.propagators.simulated import SimulatedPropagator, execute
+from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.validation import invalid, path_of
+from autdtorch.utils.validation import invalid, path_of, positive
 
 logger = logging.getLogger(__name__)
 
@@ -33,6 +33,8 @@ def make_propagator(
     dtype: str | torch.dtype = "float32",
     max_periods: int = 600,
     time_step: float | None = None,
+    seconds: float | None = None,
+    memory: float | None = None,
     cache: str | os.PathLike[str] | Literal[False] | None = None,
 ) -> FreeSpacePropagator | SimulatedPropagator:
     """Make the propagator of a scene. Nothing is simulated before its first use.
@@ -47,11 +49,11 @@ def make_propagator(
             continues through the boundary layer, box where other obstacles leave the domain or are tilted,
             otherwise the cheaper of box and full. The propagator's `method` is the one
             chosen; the reason is logged at level DEBUG.
-        spacing: edge of a cell [m], at most a third of the wavelength. The error falls with it
-            (docs/numerics.md). None: the spacing is chosen from simulations on two coarse grids so that the
-            estimated error of the transfer matrix is below `tolerance`.
-        tolerance: relative error, in (0, 1): the distance to the steady state at which a simulation ends;
-            half of it where the spacing is chosen, as the other half is left to the grid.
+        spacing: edge of a cell [m], at most a third of the wavelength. The error falls with its square
+            (docs/numerics.md). None: the scene is simulated on finer and finer grids, until the estimated
+            error of the transfer matrix is within `tolerance`.
+        tolerance: relative error, in (0, 1): the distance to the steady state at which a simulation ends,
+            or the estimated error where the spacing is chosen.
         kernel: "cpu" (numba), "cuda" (Triton, on an NVIDIA GPU), "reference" (torch, slow, readable), or
             "auto" for the fastest available.
         dtype: precision of the fields, float32 or float64.
@@ -59,6 +61,8 @@ def make_propagator(
             `SteadyStateWarning`. Periods are stepped in blocks of a few; the last block is completed.
         time_step: upper limit of the time step [s]; the step used is within 3 % of it. By default the
             largest stable one.
+        seconds: time for the choice of a spacing [s], about; the finest grid that fits is taken.
+        memory: most memory for it [bytes].
         cache: folder for simulated transfer matrices, which are used again for the same scene, points,
             settings and version of this package. By default the environment variable AUTDTORCH_CACHE_DIR,
             or no cache if it is not set; False: no cache. Several processes may share the folder.
@@ -70,12 +74,21 @@ def make_propagator(
         ValueError: an argument is out of range, the kernel needs a package that is not installed, or the
             simulation needs more memory than available.
     """
+    budget = Budget(
+        *(
+            None if value is None else positive(name, value, unit)
+            for name, value, unit in (("seconds", seconds, "s"), ("memory", memory, "bytes"))
+        )
+    )
+    if spacing is not None and (seconds, memory) != (None, None):
+        raise invalid("spacing", spacing, "must be None where seconds or memory limit its choice", "m")
     planned = plan(scene, method, spacing, tolerance, kernel, dtype, max_periods, time_step)
     disk_cache = _disk_cache(cache)
     if planned.method == "free_space":
         return FreeSpacePropagator(scene)
     if spacing is None:
-        planned = _at_chosen_spacing(planned, disk_cache)
+        warn_of_ending_walls(scene)
+        return refined(planned, budget, disk_cache)
     planned.require_feasible()
     propagator = SimulatedPropagator(planned, disk_cache)
     if time_step is not None:
@@ -83,21 +96,6 @@ def make_propagator(
     warn_if_coarse(planned.region.sound_speeds, scene.frequency, planned.spacing)
     warn_of_ending_walls(scene)
     return propagator
-
-
-def _at_chosen_spacing(pilot: Plan, cache: DiskCache | None) -> Plan:
-    """Return the plan whose grid error should be half the tolerance, from simulations on two coarse grids."""
-    tolerance = pilot.tolerance / 2
-    error = execute(pilot.at(pilot.spacing, max(tolerance, 1e-3)), cache).error
-    if not math.isfinite(error):
-        accepted = f"too few to choose a spacing: at {pilot.spacing:.3g} m no run came near its steady state"
-        raise invalid("max_periods", pilot.max_periods, accepted)
-    spacing = min(spacing_for(tolerance, error, pilot.spacing), coarsest_spacing(pilot.region))
-    chosen = pilot.at(spacing, tolerance, pilot.time_step)
-    chosen.require_feasible("tolerance", pilot.tolerance)
-    shown = 1e3 * spacing, 1e3 * pilot.spacing, error
-    logger.info("spacing %.3g mm: the error at %.3g mm is about %.2g", *shown)
-    return chosen
 
 
 def _disk_cache(folder: str | os.PathLike[str] | Literal[False] | None) -> DiskCache | None:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from autdtorch.analytic.green import PAIR_BYTES
-from autdtorch.fdtd.grid import MAX_CELLS, layer_cells, pilot_spacing, require_spacing, second_spacing
+from autdtorch.fdtd.grid import MAX_CELLS, coarsest_spacing, layer_cells, require_spacing, second_spacing
 from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.region import Region, doubled_normals
@@ -210,10 +210,10 @@ def plan(
     max_periods: int = 600,
     time_step: float | None = None,
 ) -> Plan:
-    """Plan a simulation, with the arguments of `make_propagator`; no spacing gives the first coarse grid."""
+    """Plan a simulation, with the arguments of `make_propagator`; no spacing gives the coarsest."""
     require_kind("scene", scene, Scene)
     region, kernel, precision = region_of(scene), available_kernel(kernel), precision_of(dtype)
-    spacing = pilot_spacing(region) if spacing is None else positive("spacing", spacing, "m")
+    spacing = coarsest_spacing(region) if spacing is None else positive("spacing", spacing, "m")
     tolerance = positive("tolerance", tolerance)
     if tolerance >= 1:
         raise invalid("tolerance", tolerance, "must be in (0, 1)")

@@ -12,7 +12,7 @@ from typing import Literal, Protocol, overload, runtime_checkable
 import torch
 
 from autdtorch.analytic.green import PAIR_BYTES
-from autdtorch.fdtd.grid import grid_error
+from autdtorch.fdtd.grid import grid_errors
 from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.cache import DiskCache, cache_key
 from autdtorch.propagators.full import DomainSimulation
@@ -25,6 +25,8 @@ from autdtorch.utils.threads import one_torch_thread
 from autdtorch.utils.validation import ArrayLike, boolean, points_grid
 
 logger = logging.getLogger(__name__)
+
+_TINY = torch.finfo(torch.float64).tiny
 
 
 class SteadyStateWarning(UserWarning):
@@ -63,12 +65,17 @@ class SimulatedPropagator:
             matrices take none.
     """
 
-    def __init__(self, plan: Plan, cache: DiskCache | None = None) -> None:
-        """Use `make_propagator`, which checks its arguments. Nothing is computed here."""
+    def __init__(
+        self, plan: Plan, cache: DiskCache | None = None, second: SimulatedPropagator | None = None
+    ) -> None:
+        """Use `make_propagator`, which checks its arguments. Nothing is computed here.
+
+        A `second` propagator of the scene, on another grid, serves error estimates.
+        """
         self.scene, self.method, self.spacing = plan.scene, plan.method, plan.spacing
         self.tolerance, self.max_periods = plan.tolerance, plan.max_periods
         self.runs: list[Run] = []
-        self._plan, self._cache = plan, cache
+        self._plan, self._cache, self._given_second = plan, cache, second
         self._simulation = DomainSimulation(plan) if plan.method == "full" else BoxSimulation(plan)
         self._control: TransferMatrix | None = None
         self._near_logged = False
@@ -91,7 +98,7 @@ class SimulatedPropagator:
     @cached_property
     def _second(self) -> SimulatedPropagator:
         """A simulation on another grid, for the error estimate."""
-        return SimulatedPropagator(self._plan.second, self._cache)
+        return self._given_second or SimulatedPropagator(self._plan.second, self._cache)
 
     @overload
     def transfer_matrix(
@@ -112,9 +119,9 @@ class SimulatedPropagator:
 
         Args:
             points: (P, 3) [m]; by default the scene's control points.
-            return_error: also return the estimated relative error (L2 of the whole matrix): the difference
-                to a second grid, which takes a fifth of the time where it is coarser, and the distance to
-                the steady state.
+            return_error: also return the estimated relative error (L2 of the whole matrix), from a second
+                grid, which takes a fifth of the time where it is coarser, and the distance to the steady
+                state. `point_errors` has that of each point.
 
         Returns:
             complex128 (P, M) [Pa], and the error if asked for.
@@ -130,6 +137,17 @@ class SimulatedPropagator:
         result = self._with_error(places) if with_error else self._result(places)
         self._report(result.runs, self.scene.control_points if places is None else places)
         return (result.matrix, result.error) if with_error else result.matrix
+
+    @one_torch_thread()
+    def point_errors(self, points: ArrayLike | None = None) -> torch.Tensor:
+        """Return the estimated relative error of each point's row of the transfer matrix, float64 (P,).
+
+        Points and errors are those of `transfer_matrix`.
+        """
+        places = None if points is None else self._simulation.checked(points)
+        result, second = self._result(places), self._second._result(places)
+        rows = grid_errors(result.matrix, second.matrix, self._second.spacing / self.spacing)
+        return rows + result.error * result.matrix.norm() / result.matrix.norm(dim=1).clamp(min=_TINY)
 
     @one_torch_thread()
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
@@ -191,8 +209,13 @@ class SimulatedPropagator:
     def _with_error(self, points: torch.Tensor | None) -> TransferMatrix:
         """Return the matrix of points with its error, estimated from a second grid."""
         first, second = self._result(points), self._second._result(points)
-        difference = grid_error(first.matrix, second.matrix, coarser=self._second.spacing > self.spacing)
+        whole = first.matrix.reshape(1, -1), second.matrix.reshape(1, -1)
+        difference = float(grid_errors(*whole, self._second.spacing / self.spacing))
         return TransferMatrix(first.matrix, first.error + difference, first.runs + second.runs)
+
+    def control_error(self) -> float:
+        """Return the estimated relative error of the matrix of the control points."""
+        return self._with_error(None).error
 
     def _report(self, runs: Sequence[Run], points: torch.Tensor | None) -> None:
         """Warn of new runs that did not converge; log once if a source is next to an obstacle.
@@ -214,8 +237,3 @@ class SimulatedPropagator:
                 f"relative error up to {error:.1e}, tolerance {self.tolerance:g}; raise max_periods or "
                 "tolerance", SteadyStateWarning, stacklevel=4,  # the caller of the public, decorated method
             )  # fmt: skip
-
-
-def execute(plan: Plan, cache: DiskCache | None = None) -> TransferMatrix:
-    """Return the transfer matrix of the control points with its error, estimated from a second grid."""
-    return SimulatedPropagator(plan, cache)._with_error(None)

@@ -71,5 +71,5 @@ def test_the_coupling_at_an_edge(depth: tuple[float, float], density: float) -> 
 
 @pytest.mark.parametrize("depth", [(0.2, 0.7), (0.5, 0.5), (0.9, 0.1)])
 def test_an_edge_of_air_in_air_is_none(depth: tuple[float, float]) -> None:
-    """The tuned stencil differs from that of long waves by the fourth order, 0.24 here, times a small factor."""
+    """The stencil is tuned to other waves than the long ones of the fit: the limit is half of kappa^4."""
     assert edge_coupling(depth, (1.0, 1.0), tuned_stencil(0.3)) == pytest.approx(np.ones(6), abs=5e-3)

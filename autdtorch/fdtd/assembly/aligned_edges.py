@@ -1,9 +1,9 @@
 """Elements at edges between two faces parallel to the grid.
 
-The field at an edge is singular: in a plane across it, long waves are sums of r^v cos(v phi) and r^v sin(v phi)
-with exponents v that the densities decide (2/3 at a sound-hard edge). The coupling of the element at the edge
-is fitted so that the scheme reproduces the first of them on the cells around it. Without this, the error of a
-cuboid depends on where its faces fall, and is up to twenty times as large.
+The field at an edge is singular: in a plane across it, long waves are sums of r^v cos(v phi) and of
+r^v sin(v phi) with exponents v that the densities decide (2/3 at a sound-hard edge). The coupling of the element
+at the edge is fitted so that the scheme reproduces the first of them on the cells around it. Without this, the
+error of a cuboid depends on where its faces fall, and is up to twenty times as large.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from scipy.optimize import least_squares
 from autdtorch.fdtd.assembly.aligned_faces import constant_along, matched
 from autdtorch.fdtd.assembly.coverage import distance_to_material
 from autdtorch.fdtd.assembly.element import (
-    CORNERS,
     LATTICE,
     PAIRS,
     SUBCELLS,
@@ -40,6 +39,8 @@ _ROUNDING = 1e-9
 _PRIOR = 1e-4
 _EXACT = 1e-12  # Relative tolerance of the fit: symmetric scenes stay so
 _CORNERS = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])  # Columns of an element, from the one at the edge
+# Columns within the material of one edge, and of two that touch along it
+_CORNER, _DIAGONAL = np.array((True, False, False, False)), np.array((True, False, False, True))
 _COLUMN_PAIRS = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
 _MIRRORED = [1, 0, 2, 3, 5, 4]  # The pairs after both axes are exchanged
 _SIDES = np.abs(_CORNERS[_COLUMN_PAIRS[:, 0]] - _CORNERS[_COLUMN_PAIRS[:, 1]]).sum(axis=1)
@@ -61,20 +62,21 @@ def edge_elements(
     found = [(np.zeros(0, np.int64), np.zeros((0, 28)), np.zeros((0, 8)))]
     for axis in range(3):
         along = constant_along(volumes, (axis,))
-        for first in _CORNERS:
+        for first, inside in itertools.product(_CORNERS, (_CORNER, _DIAGONAL)):
             columns = _columns(axis, first)
             held = vertex[:, columns]
             pair = held[:, :2, 0]
-            edge = (held[:, 0] == pair[:, :1]).all(axis=1) & (held[:, 1:] == pair[:, 1:, None]).all(
-                axis=(1, 2)
-            )
-            rows = np.flatnonzero(along & edge & (pair[:, 0] != pair[:, 1]))
+            edge = (held == np.where(inside[:, None], pair[:, None, :1], pair[:, None, 1:])).all(axis=(1, 2))
+            # of two diagonals, that of the heavier material
+            denser = materials.density[pair[:, 0]] > materials.density[pair[:, 1]]
+            edge &= denser if inside is _DIAGONAL else pair[:, 0] != pair[:, 1]
+            rows = np.flatnonzero(along & edge)
             level = distance_to_material(distance[:, rows], material, pair[rows, 0])
             share = np.take_along_axis(volumes[rows], pair[rows, :1, None], axis=2)[:, :, 0]
-            depth, good = _depths(level, share, axis, first)
+            depth, good = _depths(level, share, axis, first, inside)
             rows, depth = rows[good], depth[good]
             if len(rows):
-                found.append((rows, *_assembled(depth, pair[rows], columns, materials, stencil)))
+                found.append((rows, *_assembled(depth, pair[rows], inside, columns, materials, stencil)))
     index, coupling, mass = (np.concatenate(part) for part in zip(*found, strict=True))
     return index, coupling, mass
 
@@ -85,10 +87,12 @@ def _columns(axis: int, first: Array) -> Index:
     return np.stack([np.flatnonzero((places == np.abs(first - corner)).all(axis=1)) for corner in _CORNERS])
 
 
-def _depths(level: Array, share: Array, axis: int, first: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the distance [cells] of the other columns (k, 2) from the faces of a quadrant around the first.
+def _depths(
+    level: Array, share: Array, axis: int, first: Array, inside: NDArray[np.bool_]
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the distance [cells] of the next columns (k, 2) from the faces between them and the first.
 
-    Also return where there is one. `level` (k, 125) is the signed distance to the material there,
+    Also return where such faces fill the quadrants of the columns `inside` (4,). `level` (k, 125) is the signed distance to the material there,
     `share` (k, 64) its share of the sub-cells. A signed distance may be too small near other faces, inside or
     outside: of both sides of a face, those distances are taken that fit the shares best.
     """
@@ -106,17 +110,30 @@ def _depths(level: Array, share: Array, axis: int, first: Array) -> tuple[Array,
     square = np.moveaxis(share.reshape(-1, *(SUBCELLS,) * 3), axis + 1, 3).mean(axis=3)
     square = square[:, :: 1 - 2 * first[0], :: 1 - 2 * first[1]]
     pairs = np.stack([np.stack(pair, axis=1) for pair in itertools.product(*sides)])
-    covered = np.clip(SUBCELLS * pairs[..., None] - np.arange(SUBCELLS), 0, 1)
-    product = covered[:, :, 0, :, None] * covered[:, :, 1, None]
-    missed = np.abs(product - square).mean(axis=(2, 3))
+    missed = np.abs(_areas(pairs, inside, SUBCELLS) - square).mean(axis=(2, 3))
     best = missed.min(axis=0)
     # the mean of those that fit alike: mirrored surfaces have mirrored depths
     alike = (missed <= best + _SAME)[..., None]
     return 1 - (alike * pairs).sum(axis=0) / alike.sum(axis=0), best < _FITS
 
 
+def _areas(faces: Array, inside: NDArray[np.bool_], squares: int) -> Array:
+    """Return the shares (..., s, s) of squares that lie in the quadrants `inside` (4,) beside `faces` (..., 2)."""
+    below = np.clip(squares * faces[..., None] - np.arange(squares), 0, 1)
+    sides = np.stack((below, 1 - below), axis=-2)  # (..., axis, side, square)
+    parts = [
+        sides[..., 0, x, :, None] * sides[..., 1, y, None, :] for x, y in _CORNERS[np.flatnonzero(inside)]
+    ]
+    return np.asarray(sum(parts))
+
+
 def _assembled(
-    depth: Array, pair: Index, columns: Index, materials: Materials, stencil: Stencil
+    depth: Array,
+    pair: Index,
+    inside: NDArray[np.bool_],
+    columns: Index,
+    materials: Materials,
+    stencil: Stencil,
 ) -> tuple[Array, Array]:
     """Return coupling (k, 28) and mass (k, 8) of elements by their depths and materials (k, 2)."""
     keys = np.column_stack((pair, (depth / _SAME).round())).astype(np.int64)
@@ -125,26 +142,25 @@ def _assembled(
     for row, (inner, outer, *places) in enumerate(keys):
         faces, own = (places[0] * _SAME, places[1] * _SAME), [inner, outer]
         density, light = materials.density[own], materials.mass[own]
-        flat = edge_coupling(faces, (float(density[0]), float(density[1])), stencil)
-        shares = _lumped(faces, density)
+        flat = edge_coupling(faces, (float(density[0]), float(density[1])), stencil, bool(inside[3]))
+        shares = _lumped(faces, density, inside)
         coupling[row] = _extruded(flat, (1 / density) @ shares, columns, stencil)
         mass[row, columns] = (light @ shares / 2)[:, None]
     return coupling[number.ravel()], mass[number.ravel()]
 
 
-def _lumped(depth: tuple[float, float], density: Array) -> Array:
+def _lumped(depth: tuple[float, float], density: Array, inside: NDArray[np.bool_]) -> Array:
     """Return the volumes (2, 4) of both materials that count for each column.
 
     A column takes less from the other material, by the share of the flow from there that reaches it.
     """
-    first, second = (np.clip((1 - each) * _SQUARES - np.arange(_SQUARES), 0, 1) for each in depth)
-    inside = first[:, None] * second
+    within = _areas(1 - np.array(depth), inside, _SQUARES)
     x, y = np.meshgrid(*((np.arange(_SQUARES) + 0.5) / _SQUARES,) * 2, indexing="ij")
     hats = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y])
     across = np.minimum(1, density / density.mean())
     shares = []
-    for own, area in enumerate((inside, 1 - inside)):
-        part = hats * np.where((np.arange(4) > 0) == own, 1, across[own])[:, None, None]
+    for own, area, columns in ((0, within, inside), (1, 1 - within, ~inside)):
+        part = hats * np.where(columns, 1, across[own])[:, None, None]
         shares.append((area * part / part.sum(axis=0)).mean(axis=(1, 2)))
     return np.stack(shares)
 
@@ -165,34 +181,38 @@ def _extruded(flat: Array, mobility: Array, columns: Index, stencil: Stencil) ->
     return np.asarray((matrix + matrix.T)[PAIRS[:, 0], PAIRS[:, 1]])
 
 
-def edge_coupling(depth: tuple[float, float], density: tuple[float, float], stencil: Stencil) -> Array:
+def edge_coupling(
+    depth: tuple[float, float], density: tuple[float, float], stencil: Stencil, diagonal: bool = False
+) -> Array:
     """Return the coupling (6,) of pairs of columns at an edge, relative to air.
 
-    `depth` is the distance [cells] of the other columns from the faces of the first column's material,
-    `density` of that material and of the other. Mirrored edges have mirrored coupling to the last bit, so that
-    symmetric scenes stay symmetric.
+    `depth` is the distance [cells] of the next columns from the faces of the first column's material, `density`
+    of that material and of the other. `diagonal`: two such edges touch. Mirrored edges have mirrored coupling
+    to the last bit: symmetric scenes stay symmetric.
     """
     first, second = depth
     if first > second:
-        return _edge_coupling((second, first), density, stencil)[_MIRRORED]
-    found = _edge_coupling(depth, density, stencil)
+        return _edge_coupling((second, first), density, stencil, diagonal)[_MIRRORED]
+    found = _edge_coupling(depth, density, stencil, diagonal)
     return found if first < second else (found + found[_MIRRORED]) / 2
 
 
 @lru_cache(maxsize=4096)
-def _edge_coupling(depth: tuple[float, float], density: tuple[float, float], stencil: Stencil) -> Array:
+def _edge_coupling(
+    depth: tuple[float, float], density: tuple[float, float], stencil: Stencil, diagonal: bool
+) -> Array:
     """Fit the element at the edge in a plane across it, among elements of one material or with one face."""
     by_edges, side = coupling_by_edges(stencil), np.arange(-_RADIUS, _RADIUS + 2)
     uniform = 2 * by_edges[_SIDES] + 2 * by_edges[_SIDES + 1]
     places = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
     out = np.abs(places - 0.5).max(axis=1)
     given, judged = out > _RADIUS, out > 1
-    fields = _singular_fields(places - 1 + np.array(depth), density)
+    fields = (_diagonal_fields if diagonal else _corner_fields)(places - 1 + np.array(depth), density)
     fields /= np.abs(fields[given]).max(axis=0)
     matrix = np.zeros((len(places),) * 2)
     for x, y in itertools.product(side[:-1], side[:-1]):
         if x or y:
-            _add(matrix, (x, y), _beside((x, y), depth, density, uniform))
+            _add(matrix, (x, y), _beside((x, y), depth, density, uniform, diagonal))
     inner, outer = density
     own = np.array(
         (1 - depth[0], 1 - depth[1], 1 - max(depth), 0, 0, 0)
@@ -235,14 +255,22 @@ def _add(matrix: Array, first: tuple[int, int], coupling: Array) -> None:
 
 
 def _beside(
-    place: tuple[int, int], depth: tuple[float, float], density: tuple[float, float], uniform: Array
+    place: tuple[int, int],
+    depth: tuple[float, float],
+    density: tuple[float, float],
+    uniform: Array,
+    diagonal: bool,
 ) -> Array:
     """Return the coupling (6,) of an element that is not at the edge."""
-    if 0 not in place or max(place) > 0:
-        return uniform / density[0 if max(place) < 0 else 1]
+    x, y = place
+    if x and y:
+        return uniform / density[0 if max(place) < 0 or (diagonal and min(place) > 0) else 1]
+    if max(place) > 0 and not diagonal:
+        return uniform / density[1]
     axis = place.index(0)  # across the face
+    order = [0, 1] if max(place) == 0 else [1, 0]
     planes = np.array([[1 - depth[axis], depth[axis]]])
-    link, mobility, _ = matched(planes, np.array([density]), np.full((1, 2), _LONG))
+    link, mobility, _ = matched(planes, np.array(density)[None, order], np.full((1, 2), _LONG))
     one, other = _CORNERS[_COLUMN_PAIRS.T, axis]
     along = mobility[0, one] * (uniform[0] + uniform[2]) - link[0] * uniform[2]
     return np.where(one != other, uniform * link[0], along)
@@ -258,7 +286,35 @@ def _semidefinite(coupling: Array) -> Array:
     return -((vectors * values.clip(min=0)) @ vectors.T)[tuple(_COLUMN_PAIRS.T)]
 
 
-def _singular_fields(places: Array, density: tuple[float, float]) -> Array:
+def _diagonal_fields(places: Array, density: tuple[float, float]) -> Array:
+    """Return six fields (n, 6) of long waves at places (n, 2) [cells] around two edges that touch.
+
+    They are even or odd about both planes that bisect the edges. If odd about one of them, tan^2(pi v / 4) is the
+    ratio of the densities; otherwise v is 2.
+    """
+    steep = 4 / np.pi * np.arctan(np.sqrt(density[0] / density[1]))
+    radius = np.hypot(*places.T)
+    turn = np.arctan2(places[:, 1], places[:, 0]) + 3 * np.pi / 4  # from the middle of the first quadrant
+    quarter = np.round(turn / (np.pi / 2))
+    angle, filled = turn - quarter * np.pi / 2, quarter % 2 == 0
+    half = np.where(quarter % 4 < 2, 1, -1)  # of the first of two opposite quadrants
+    columns = []
+    for v in (steep, 4 - steep):  # even about the first plane
+        ratio = -np.cos(v * np.pi / 4) / np.sin(v * np.pi / 4)
+        columns.append(
+            np.where(filled, half * np.cos(v * angle), ratio * half * np.sin(v * angle)) * radius**v
+        )
+    for v in (2 - steep, 2 + steep):  # odd about it
+        ratio = np.sin(v * np.pi / 4) / np.cos(v * np.pi / 4)
+        columns.append(
+            np.where(filled, half * np.sin(v * angle), ratio * half * np.cos(v * angle)) * radius**v
+        )
+    even = np.where(filled, 1, -density[1] / density[0]) * np.cos(2 * angle)
+    odd = np.where(filled, 1, -1) * np.sin(2 * angle)
+    return np.column_stack((*columns, radius**2 * even, radius**2 * odd))
+
+
+def _corner_fields(places: Array, density: tuple[float, float]) -> Array:
     """Return six fields (n, 6) of long waves at places (n, 2) [cells] around an edge.
 
     They are even or odd about the plane that bisects the edge. With q = (i - o) / 2 (i + o), i being the

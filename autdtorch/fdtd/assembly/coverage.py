@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from autdtorch.fdtd.assembly.element import FAR, LATTICE, PAIRS, SUBCELLS, VERTICES
+from autdtorch.fdtd.assembly.element import FAR, PAIRS, SUBCELLS, VERTICES
 from autdtorch.utils.array_types import Array, Index
 
 _FROM, _TO = VERTICES[PAIRS[:, 0], None], VERTICES[PAIRS[:, 1], None]

@@ -17,7 +17,6 @@ In an element of one material both are those of the tuned stencil. An interface 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np

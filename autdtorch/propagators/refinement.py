@@ -1,0 +1,77 @@
+"""The choice of a spacing by tolerance: from a coarse grid to finer ones, until the estimated error is met."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from dataclasses import dataclass, field
+
+from autdtorch.fdtd.grid import coarsest_spacing
+from autdtorch.propagators.cache import DiskCache
+from autdtorch.propagators.plan import Plan
+from autdtorch.propagators.simulated import SimulatedPropagator
+from autdtorch.utils.validation import invalid
+
+logger = logging.getLogger(__name__)
+
+_FIRST_STEP, _SMALLEST_STEP, _LARGEST_STEP = 1.45, 1.25, 2.5
+"""Ratios of a spacing and the next: the first, the smallest that tells two errors apart, and the largest over
+which an error is trusted to fall with the square of the spacing."""
+
+_AIM = 0.8
+"""Error for which a spacing is chosen, relative to the tolerance."""
+
+_SETTLED = 0.1
+"""Distance to the steady state at which runs end, relative to the tolerance."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The time [s] and the memory [bytes] that a choice may take; None is no limit."""
+
+    seconds: float | None = None
+    memory: float | None = None
+    begin: float = field(default_factory=time.perf_counter)
+
+    def fits(self, plan: Plan, last: Plan, taken: float) -> bool:
+        """Return whether a plan is expected to fit, after the `last` one took `taken` [s]."""
+        spent = time.perf_counter() - self.begin
+        in_time = self.seconds is None or spent + taken * plan.work / last.work <= self.seconds
+        return in_time and (self.memory is None or plan.memory <= self.memory)
+
+
+def refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPropagator:
+    """Return a propagator whose estimated error is within the tolerance of a plan.
+
+    Where the budget does not suffice, it is the finest that fits, and a warning says which error it has.
+    """
+    tolerance, second = pilot.tolerance, None
+    plan = pilot.at(coarsest_spacing(pilot.region), _SETTLED * pilot.tolerance, pilot.time_step)
+    while True:
+        plan.require_feasible("tolerance", tolerance)
+        begin = time.perf_counter()
+        found = SimulatedPropagator(plan, cache, second)
+        found.transfer_matrix()
+        error = found.control_error() if second else math.inf  # unknown
+        taken = time.perf_counter() - begin
+        if second and not math.isfinite(error):
+            accepted = (
+                f"too few to choose a spacing: at {plan.spacing:.3g} m no run came near its steady state"
+            )
+            raise invalid("max_periods", pilot.max_periods, accepted)
+        logger.info("spacing %.3g mm: estimated error %.2g", 1e3 * plan.spacing, error)
+        if second and error <= tolerance:
+            return found
+        step = _FIRST_STEP
+        if second:
+            step = min(max(math.sqrt(error / (_AIM * tolerance)), _SMALLEST_STEP), _LARGEST_STEP)
+        for ratio in (step, _SMALLEST_STEP):
+            finer = plan.at(plan.spacing / ratio, plan.tolerance, pilot.time_step)
+            if budget.fits(finer, plan, taken):
+                break
+        else:
+            shown = 1e3 * plan.spacing, error, tolerance
+            logger.warning("the budget ends at %.3g mm: estimated error %.2g, tolerance %g", *shown)
+            return found
+        plan, second = finer, found

@@ -1,0 +1,153 @@
+"""Error and time of matrices that were asked for by tolerance.
+
+Fills in a block of benchmarks.md. Each scene is simulated for each tolerance with `spacing=None`, and on ten
+grids. Required: true errors within the tolerance in 95 % of the cases, estimates within a factor of three of
+the true errors in 90 %, and a time of at most three times that of the coarsest grid that would have done.
+
+    python scripts/benchmark.py tolerance           about 40 minutes on 2 idle cores
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyvista
+import torch
+from shared.document import fill_in, measured, percent, table
+from shared.scenes import relative_error, uncached
+
+import autdtorch as at
+from autdtorch import analytic
+
+DOCUMENT = "benchmarks.md"
+
+TOLERANCES = (0.05, 0.02, 0.01, 0.005)
+SPACINGS = (2.4, 2.0, 1.65, 1.35, 1.1, 0.9, 0.75, 0.6, 0.5, 0.4)  # [mm]
+REFERENCE = 0.3  # [mm], where there is no exact solution
+FACTOR = 3.0
+"""Largest ratio of an estimate and the true error, and of a time and that of the coarsest grid that does."""
+
+AIR = at.Medium(1.2, 343.0)
+ARRAY = at.TransducerArray.grid((4, 4), 10.5e-3, (0, 0, -40e-3), (0, 0, 1))
+POINTS = np.array([[0, 0, 30], [12, 0, 30], [-10, 8, 25], [4, -14, 35]]) * 1e-3
+
+MATERIALS: Mapping[str, Mapping[str, object]] = {
+    "rigid": {"rigid": True},
+    "ratio 77": {"density": 77 * AIR.density, "sound_speed": 900.0},
+    "ratio 77, sound speed of air": {"density": 77 * AIR.density, "sound_speed": AIR.sound_speed},
+    "ratio 8": {"density": 8 * AIR.density, "sound_speed": 1.5 * AIR.sound_speed},
+    "ratio 3": {"density": 3 * AIR.density, "sound_speed": 1.5 * AIR.sound_speed},
+    "helium": {"density": 0.14 * AIR.density, "sound_speed": 2.7 * AIR.sound_speed},
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene, and its exact matrix (P, M) [Pa] if there is a solution."""
+
+    name: str
+    scene: at.Scene
+    exact: torch.Tensor | None = None
+    method: str = "auto"
+
+
+def scene(*obstacles: at.Obstacle) -> at.Scene:
+    """Return obstacles between 16 transducers and four points."""
+    return at.Scene(ARRAY, AIR, 40e3, POINTS, obstacles, domain=((-0.1,) * 3, (0.1,) * 3))
+
+
+def sphere_case(material: str, radius: float) -> Case:
+    """Return a sphere off the middle, with the exact series."""
+    given, center = MATERIALS[material], (0.7e-3, -0.4e-3, 0.3e-3)
+    found = scene(at.Sphere(center, radius, **given))
+    where = (found.control_points, ARRAY.positions, found.wavenumber, center, radius)
+    if "rigid" in given:
+        field = analytic.rigid_sphere(*where)
+    else:
+        ratios = float(given["density"]) / AIR.density, float(given["sound_speed"]) / AIR.sound_speed
+        field = analytic.fluid_sphere(*where, *ratios)
+    return Case(
+        f"sphere of {1e3 * radius:g} mm, {material}", found, 4 * math.pi * ARRAY.source_strength * field
+    )
+
+
+def slab_case(thickness: float, density: float, speed: float) -> Case:
+    """Return a point source before a slab, with points on both sides."""
+    face = 20.3e-3
+    slab = at.Box(
+        (face + thickness / 2, 20e-3, 20e-3), (thickness, 1.0, 1.0),
+        density=density * AIR.density, sound_speed=speed * AIR.sound_speed,
+    )  # fmt: skip
+    array = at.TransducerArray([(8.3e-3, 19.1e-3, 20.7e-3)], (1, 0, 0))
+    points = torch.tensor(
+        [(x, y, z) for x in (14.1e-3, 34.6e-3) for y in (9.4e-3, 21e-3) for z in (11.7e-3, 32.2e-3)],
+        dtype=torch.float64,
+    )
+    found = at.Scene(array, AIR, 40e3, points, (slab,), domain=((0, 0, 0), (40e-3,) * 3))
+    where = (points, array.positions, found.wavenumber, (face, 0, 0), (-1, 0, 0), thickness, density, speed)
+    exact = 4 * math.pi * array.source_strength * analytic.fluid_slab(*where)
+    return Case(f"slab of {1e3 * thickness:g} mm, ratio {density:g}", found, exact)
+
+
+def cases() -> list[Case]:
+    """Return the scenes of all kinds."""
+    random = np.random.default_rng(19)
+    found = [sphere_case(name, radius) for name in MATERIALS for radius in (3.3e-3, 4.6e-3, 6.5e-3, 8e-3)]
+    found += [slab_case(*each) for each in ((5e-3, 3.0, 1.5), (3.2e-3, 77.0, 2.6), (4.1e-3, 8.0, 1.5))]
+    names = list(MATERIALS)
+    for number in range(18):
+        name, size = names[number % 6], random.uniform(5e-3, 16e-3, 3).tolist()
+        center = random.uniform(-3e-3, 3e-3, 3).tolist()
+        found.append(Case(f"cuboid {number}, {name}", scene(at.Box(center, size, **MATERIALS[name]))))
+    for number in range(14):
+        name, size = names[number % 6], random.uniform(5e-3, 14e-3, 3).tolist()
+        turn = random.uniform(-0.8, 0.8, 3).tolist()
+        box = at.Box(random.uniform(-3e-3, 3e-3, 3).tolist(), size, turn, **MATERIALS[name])
+        found.append(Case(f"turned cuboid {number}, {name}", scene(box)))
+    for number in range(8):
+        pair = [names[number % 6], names[(number + 1) % 6]]
+        places = ((-8e-3, 1e-3, -2e-3), (7e-3, -1e-3, 3e-3))
+        spheres = [
+            at.Sphere(place, random.uniform(3e-3, 6e-3), **MATERIALS[name])
+            for place, name in zip(places, pair, strict=True)
+        ]
+        found.append(Case(f"two spheres {number}, {' and '.join(pair)}", scene(*spheres)))
+    for number in range(6):
+        boxes = [
+            at.Box(place, (8e-3,) * 3, random.uniform(-0.7, 0.7, 3).tolist(), rigid=True)
+            for place in ((-8e-3, 1e-3, -2e-3), (8e-3, -1e-3, 3e-3))
+        ]
+        found.append(Case(f"two turned cubes {number}, rigid", scene(*boxes)))
+    for number in range(4):
+        boxes = [
+            at.Box(random.uniform(-12e-3, 12e-3, 3).tolist(), (6e-3,) * 3, **MATERIALS[names[number]])
+            for _ in range(3)
+        ]
+        found.append(Case(f"three cubes {number}, {names[number]}", scene(*boxes)))
+    return found + [ellipsoid_case(name, number) for number, name in enumerate(names)]
+
+
+def ellipsoid_case(material: str, number: int) -> Case:
+    """Return an ellipsoid as a mesh of 5120 triangles."""
+    path = results() / "ellipsoid.stl"
+    if not path.exists():
+        pyvista.ParametricEllipsoid(7.0, 5.0, 4.0, u_res=100, v_res=60, w_res=5).triangulate().clean().save(
+            path
+        )
+    turn = 0.2 * number, 0.3, 0.1 * number
+    mesh = at.Mesh(str(path), scale=1e-3, rotation=turn, **MATERIALS[material])
+    return Case(f"ellipsoid, {material}", scene(mesh))
+
+
+def results() -> Path:
+    """Return the folder of references."""
+    folder = Path(__file__).parents[2] / "results" / "tolerance"
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
