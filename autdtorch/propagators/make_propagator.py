@@ -13,7 +13,7 @@ from autdtorch.fdtd.grid import coarsest_spacing, spacing_for, warn_if_coarse
 from autdtorch.propagators.cache import DiskCache
 from autdtorch.propagators.free_space import FreeSpacePropagator
 from autdtorch.propagators.plan import Plan, plan
-from autdtorch.propagators.scene_region import warn_of_ending_walls
+from autdtorch.propagators.scene_region import warn_of_ending_walls, warn_of_near_points
 from autdtorch.propagators.simulated import SimulatedPropagator, execute
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import invalid, path_of
@@ -82,6 +82,8 @@ def make_propagator(
         logger.debug("time step %.4g us", 1e6 * propagator.time_step)  # refuses one that is not stable
     warn_if_coarse(planned.region.sound_speeds, scene.frequency, planned.spacing)
     warn_of_ending_walls(scene)
+    warn_of_near_points(scene, "array.positions", scene.array.positions, planned.spacing)
+    warn_of_near_points(scene, "control_points", scene.control_points, planned.spacing)
     return propagator
 
 

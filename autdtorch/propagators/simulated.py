@@ -17,6 +17,7 @@ from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.cache import DiskCache, cache_key
 from autdtorch.propagators.full import DomainSimulation
 from autdtorch.propagators.plan import Plan
+from autdtorch.propagators.scene_region import warn_of_near_points
 from autdtorch.propagators.simulation import Run, TransferMatrix, single_nodes
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
@@ -71,7 +72,7 @@ class SimulatedPropagator:
         self._plan, self._cache = plan, cache
         self._simulation = DomainSimulation(plan) if plan.method == "full" else BoxSimulation(plan)
         self._control: TransferMatrix | None = None
-        self._near_logged = False
+        self._near_logged = self._near_points_logged = False
 
     def __repr__(self) -> str:
         """Scene, settings and number of runs."""
@@ -128,6 +129,8 @@ class SimulatedPropagator:
         if places is not None:
             require_memory("points", (len(places), 3), PAIR_BYTES * len(self.scene.array) * len(places))
         result = self._with_error(places) if with_error else self._result(places)
+        if places is not None:
+            self._report_near(places)
         self._report(result.runs, self.scene.control_points if places is None else places)
         return (result.matrix, result.error) if with_error else result.matrix
 
@@ -148,6 +151,8 @@ class SimulatedPropagator:
         drive = validate_drive(drive, len(self.scene.array))
         points, grid = points_grid("points", points)
         points = self._simulation.checked(points)
+        if len(grid) == 1:  # others are pictures, which may cross obstacles
+            self._report_near(points)
         flat = drive.reshape(-1, drive.shape[-1])
         by_matrix = drive.requires_grad or len(flat) > self._simulation.orbits(points).runs
         rows = len(self.scene.array) if by_matrix else len(flat)
@@ -193,6 +198,11 @@ class SimulatedPropagator:
         first, second = self._result(points), self._second._result(points)
         difference = grid_error(first.matrix, second.matrix, coarser=self._second.spacing > self.spacing)
         return TransferMatrix(first.matrix, first.error + difference, first.runs + second.runs)
+
+    def _report_near(self, points: torch.Tensor) -> None:
+        """Log once, of the points of any call, which are next to a surface."""
+        if not self._near_points_logged:
+            self._near_points_logged = warn_of_near_points(self.scene, "points", points, self.spacing)
 
     def _report(self, runs: Sequence[Run], points: torch.Tensor | None) -> None:
         """Warn of new runs that did not converge; log once if a source is next to an obstacle.
