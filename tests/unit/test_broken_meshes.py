@@ -6,6 +6,7 @@ import pytest
 import pyvista as pv
 import torch
 
+from autdtorch.fdtd.assembly.edges import edges_of
 from autdtorch.scene.obstacles import Box, Mesh, Sphere, VoxelMask
 
 
@@ -168,6 +169,7 @@ REFUSED = {  # vertices and triangles, the reason, the place
     "a vertex too far away": ((1e60 * CUBE[0], CUBE[1]), "1e+50", "vertex 1 at (0, 0, 1e+60)"),
     "an index too large": ((CUBE[0], [*CUBE[1], [0, 1, 8]]), "8 vertices", "triangle 12 of vertices 0, 1, 8"),
     "an index below 0": ((CUBE[0], [*CUBE[1], [0, 1, -1]]), "8 vertices", "triangle 12 of vertices 0, 1, -1"),
+    "an index beyond all": ((CUBE[0], [*CUBE[1], [0, 1, 1e300]]), "8 vertices", "triangle 12 of vertices"),
     "an index between two": ((CUBE[0], CUBE[1] + 0.5), "whole numbers", "Mesh.surface"),
     "two sides of a sheet": (
         (SHEET, [[0, 1, 2], [0, 2, 1]]), "must enclose a volume", "(0, 0, 0) to (1, 1, 0)",
@@ -251,6 +253,12 @@ def test_merged_spheres_have_the_surface_of_their_union():
     vertices = mesh.vertices
     inside = torch.stack([Sphere(tuple(c), radius, rigid=True).signed_distance(vertices) for c in centers])
     assert inside.amin(dim=0).min() > -3e-3  # no triangle of one sphere within the other
+
+
+def test_the_edges_of_overlapping_parts_are_those_of_their_union():
+    for surface, length in ((merged(CUBE, box(*FLUSH)), 14.0), (merged(CUBE, CUBE), 12.0), (CUBE, 12.0)):
+        edges = edges_of(Mesh.from_surface(surface, rigid=True))
+        assert sum(np.linalg.norm(edge.end - edge.begin) for edge in edges) == pytest.approx(length)
 
 
 def test_parts_that_touch_at_edges_keep_their_insides():

@@ -16,6 +16,8 @@ from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.validation import Vector, finite_vector, invalid, positive, real_tensor, within
 
+_MOST = 2**53  # largest whole number that is exact in double precision
+
 
 class _Source(str):
     """The path of a mesh file and its triangles; `dataclasses.replace` passes both on, so it is read once."""
@@ -146,4 +148,4 @@ def _triangles(surface: Any) -> Triangles:
     )
     if (triangles != np.trunc(triangles)).any():
         raise ValueError("triangles that are not whole numbers; must be indices of vertices, counted from 0")
-    return vertices, triangles.astype(np.int64)
+    return vertices, triangles.clip(-1, _MOST).astype(np.int64)  # an index beyond is refused
