@@ -123,6 +123,7 @@ RIGHT = {  # vertices and triangles, the boxes that they stand for, and their vo
     "a triangle of two points": (with_faces(CUBE, lambda faces: [*faces, [3, 4, 3]]), [ONE], 1.0),
     "a triangle of collinear points": (split_edge(close=True), [ONE], 1.0),
     "a fin of two sides": (fin(double=True), [ONE], 1.0),
+    "a fin outside": ((np.vstack([CUBE[0], [[2.0, 0, 0]]]), [*CUBE[1], [0, 1, 8], [0, 8, 1]]), [ONE], 1.0),
     "every triangle twice": ((CUBE[0], np.repeat(CUBE[1], 2, axis=0)), [ONE], 1.0),
     "a part twice": (merged(CUBE, CUBE), [ONE], 1.0),
     "parts apart": (merged(CUBE, FAR), [ONE, ((3, 0, 0), (4, 1, 1))], 2.0),

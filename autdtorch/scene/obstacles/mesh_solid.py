@@ -61,26 +61,25 @@ def solid_of(corners: Array, triangles: Index) -> Triangles:
         raise ValueError(f"{_box(_bounds(vertices))} has no volume; must enclose a volume")
     label = _labels(vertices, faces)
     if _part(vertices, faces).volume < 0:
-        faces = np.ascontiguousarray(faces[:, ::-1])
+        faces = faces[:, ::-1]
+    whole = _part(vertices, faces)
     parts = [_part(vertices, own) for own in _split(faces, label)]
     for part in parts:
         _require_simple(part)
     solids = [part for part in parts if abs(part.volume) > _EMPTY * part.area * _extent(part.vertices)]
     if not solids:
-        raise ValueError(f"{_box(_bounds(vertices))} has no volume; must enclose a volume")
+        raise ValueError(f"{_box(whole.bounds)} has no volume; must enclose a volume")
     if any(map(_touches_itself, parts)):  # manifold3d may join other sheets at an edge than the parts do
-        whole = _part(vertices, faces)
         _require_simple(whole)
         _require_air_beside(whole)
-        return vertices, faces
+        return whole.vertices, whole.faces
     slivers = any(map(_has_sliver, parts))
     if len(parts) == 1 and not slivers:
-        return vertices, faces
-    _require_few_crossings(_part(vertices, faces))
+        return whole.vertices, whole.faces
+    _require_few_crossings(whole)
     joined = _union(solids)
-    if slivers or not _agree(joined, parts):
-        return joined.vertices, joined.faces
-    return vertices, faces
+    chosen = joined if slivers or not _agree(joined, parts) else whole
+    return chosen.vertices, chosen.faces
 
 
 def winding_number(vertices: Array, faces: Index, points: Array) -> Array:
