@@ -246,6 +246,7 @@ OTHERS: dict[str, Any] = {
     "LimitedLink.link": Made(lambda _: link()),
     "LimitedLink.go_on.seconds": 0.1,
     "Medium.air.pressure": 1e5,
+    "Mesh.from_surface.surface": Made(lambda _: CUBE.surface()),
     "Mesh.path": Made(mesh_file),
     "OpenMPDBoard.load.path": Made(board_file),
     "PhasorKernel.mean.x": torch.ones(3, 2, dtype=torch.float64),

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from autdtorch.fdtd.interpolation import interpolation_width
@@ -208,9 +208,9 @@ def second_spacing(region: Region, spacing: float) -> float:
 def grid_errors(matrix: Tensor, second: Tensor, ratio: float) -> Tensor:
     """Return the estimated relative error (P,) of each row of a matrix (P, M), given a second one.
 
-    `ratio` is that of the second spacing to the first. Errors fall with the square of the spacing. Where both
-    have the same cause, the difference is their difference; where they are independent, the root of the sum of
-    their squares. The mean of both is within a factor of two of either for ratios from 1.25 on.
+    `ratio` is that of the second spacing to the first. Errors fall with the square of the spacing. Two with
+    the same cause differ by their difference, independent ones by the root of the sum of their squares. The
+    geometric mean of both is within a factor of two of either for ratios from 1.25 on.
     """
     alike, independent = 1 / abs(ratio**2 - 1), 1 / math.sqrt(1 + ratio**4)
     size = matrix.norm(dim=1).clamp(min=torch.finfo(torch.float64).tiny)

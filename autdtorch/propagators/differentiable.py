@@ -12,7 +12,7 @@ from autdtorch.fdtd.material_gradients import cells_of_maps, cells_of_obstacles,
 from autdtorch.fdtd.steady_state import block_of, fewest_periods
 from autdtorch.fdtd.stepping import drive_dft, drive_signal
 from autdtorch.propagators.plan import available_kernel, make_kernel, precision_of
-from autdtorch.propagators.scene_region import region_of, warn_of_ending_walls
+from autdtorch.propagators.scene_region import region_of, warn_of_ending_walls, warn_of_near_points
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene, require_inside
 from autdtorch.utils.validation import (
@@ -84,6 +84,7 @@ def differentiable_field(
     require_fine(speeds, scene.frequency, spacing)
     warn_if_coarse(speeds, scene.frequency, spacing)
     warn_of_ending_walls(scene)
+    warn_of_near_points(scene, "points", targets, grid.spacing)
     if periods is None:
         periods = fewest_periods(grid.crossing)
     periods = integer_at_least("periods", periods, 1)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from autdtorch.fdtd.grid import domain_extent, coarsest_spacing
+from autdtorch.fdtd.grid import coarsest_spacing, domain_extent
 from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.stepping import assemble, drive_signal
 from autdtorch.propagators.grids import grid_cost

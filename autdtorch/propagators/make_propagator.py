@@ -13,7 +13,7 @@ from autdtorch.propagators.cache import DiskCache
 from autdtorch.propagators.free_space import FreeSpacePropagator
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.refinement import Budget, refined
-from autdtorch.propagators.scene_region import warn_of_ending_walls
+from autdtorch.propagators.scene_region import warn_of_ending_walls, warn_of_near_points
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import invalid, path_of, positive
@@ -87,14 +87,16 @@ def make_propagator(
     if planned.method == "free_space":
         return FreeSpacePropagator(scene)
     if spacing is None:
-        warn_of_ending_walls(scene)
-        return refined(planned, budget, disk_cache)
-    planned.require_feasible()
-    propagator = SimulatedPropagator(planned, disk_cache)
+        propagator = refined(planned, budget, disk_cache)
+    else:
+        planned.require_feasible()
+        propagator = SimulatedPropagator(planned, disk_cache)
     if time_step is not None:
         logger.debug("time step %.4g us", 1e6 * propagator.time_step)  # refuses one that is not stable
-    warn_if_coarse(planned.region.sound_speeds, scene.frequency, planned.spacing)
+    warn_if_coarse(planned.region.sound_speeds, scene.frequency, propagator.spacing)
     warn_of_ending_walls(scene)
+    warn_of_near_points(scene, "array.positions", scene.array.positions, propagator.spacing)
+    warn_of_near_points(scene, "control_points", scene.control_points, propagator.spacing)
     return propagator
 
 

@@ -1,4 +1,4 @@
-"""The choice of a spacing by tolerance: from a coarse grid to finer ones, until the estimated error is met."""
+"""The choice of a spacing by tolerance: grids become finer until the estimated error is small enough."""
 
 from __future__ import annotations
 

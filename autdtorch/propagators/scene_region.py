@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 
 import numpy as np
+import torch
 
 from autdtorch.fdtd.region import Body, Fluid, Region
 from autdtorch.scene.obstacles import Box
@@ -33,6 +34,25 @@ def warn_of_ending_walls(scene: Scene) -> None:
             "obstacle %s crosses the domain in another direction than a wall before: it ends where the"
             " boundary layer begins, and its end reflects", ", ".join(ending),
         )  # fmt: skip
+
+
+def warn_of_near_points(scene: Scene, name: str, points: torch.Tensor, spacing: float) -> bool:
+    """Log which points (P, 3) [m] are less than a cell from a surface, on either side; return whether any."""
+    found = False
+    for index, obstacle in enumerate(scene.obstacles):
+        lower, upper = points.new_tensor([obstacle.lower, obstacle.upper])
+        around = ((points > lower - spacing) & (points < upper + spacing)).all(dim=-1).nonzero()[:, 0]
+        gap = obstacle.signed_distance(points[around]) if len(around) else points.new_zeros(0)
+        if count := int((gap.abs() < spacing).sum()):
+            found, nearest = True, int(gap.abs().argmin())
+            point = int(around[nearest])
+            logger.warning(
+                "%s[%d] at %s mm is %.2g mm %s obstacle %d%s: less accurate within a cell, %.2g mm, of a"
+                " surface", name, point, tuple(round(1e3 * entry, 3) for entry in points[point].tolist()),
+                1e3 * abs(float(gap[nearest])), "inside" if gap[nearest] < 0 else "from", index,
+                f", and {count - 1} more are near it" if count > 1 else "", 1e3 * spacing,
+            )  # fmt: skip
+    return found
 
 
 def _walls(scene: Scene) -> list[tuple[bool, bool]]:

@@ -17,6 +17,7 @@ from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.cache import DiskCache, cache_key
 from autdtorch.propagators.full import DomainSimulation
 from autdtorch.propagators.plan import Plan
+from autdtorch.propagators.scene_region import warn_of_near_points
 from autdtorch.propagators.simulation import Run, TransferMatrix, single_nodes
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
@@ -78,7 +79,7 @@ class SimulatedPropagator:
         self._plan, self._cache, self._given_second = plan, cache, second
         self._simulation = DomainSimulation(plan) if plan.method == "full" else BoxSimulation(plan)
         self._control: TransferMatrix | None = None
-        self._near_logged = False
+        self._near_logged = self._near_points_logged = False
 
     def __repr__(self) -> str:
         """Scene, settings and number of runs."""
@@ -135,6 +136,8 @@ class SimulatedPropagator:
         if places is not None:
             require_memory("points", (len(places), 3), PAIR_BYTES * len(self.scene.array) * len(places))
         result = self._with_error(places) if with_error else self._result(places)
+        if places is not None:
+            self._report_near(places)
         self._report(result.runs, self.scene.control_points if places is None else places)
         return (result.matrix, result.error) if with_error else result.matrix
 
@@ -166,6 +169,8 @@ class SimulatedPropagator:
         drive = validate_drive(drive, len(self.scene.array))
         points, grid = points_grid("points", points)
         points = self._simulation.checked(points)
+        if len(grid) == 1:  # others are pictures, which may cross obstacles
+            self._report_near(points)
         flat = drive.reshape(-1, drive.shape[-1])
         by_matrix = drive.requires_grad or len(flat) > self._simulation.orbits(points).runs
         rows = len(self.scene.array) if by_matrix else len(flat)
@@ -216,6 +221,11 @@ class SimulatedPropagator:
     def control_error(self) -> float:
         """Return the estimated relative error of the matrix of the control points."""
         return self._with_error(None).error
+
+    def _report_near(self, points: torch.Tensor) -> None:
+        """Log once, of the points of any call, which are next to a surface."""
+        if not self._near_points_logged:
+            self._near_points_logged = warn_of_near_points(self.scene, "points", points, self.spacing)
 
     def _report(self, runs: Sequence[Run], points: torch.Tensor | None) -> None:
         """Warn of new runs that did not converge; log once if a source is next to an obstacle.

@@ -14,7 +14,7 @@ import torch
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import Coordinates, Plane
 from autdtorch.scene.medium import Medium as Medium
-from autdtorch.scene.obstacles import Obstacle
+from autdtorch.scene.obstacles import Mesh, Obstacle
 from autdtorch.utils.html import html_facts
 from autdtorch.utils.neighbours import nearest, require_distinct
 from autdtorch.utils.validation import (
@@ -37,6 +37,7 @@ _FARTHEST = 1e6  # [m] along an axis; far beyond any simulation, and volumes do 
 _FREQUENCIES = 1e-3, 1e12  # [Hz]
 _DECIBELS = 20 / math.log(10)  # in a neper
 _USUAL_EXTENT = 0.1, 2000.0  # [wavelengths] across array and control points
+_USUAL_MESH = 20.0  # [extents of array and control points] across a mesh whose file is in metres
 _MOST_ABSORPTION = 3.0  # [dB per wavelength]: the model assumes a small imaginary part of the wavenumber
 
 
@@ -99,7 +100,7 @@ class Scene:
 
         Warns:
             OverlapWarning: two obstacles of different materials overlap.
-            ScaleWarning: lengths seem to be in mm, or the frequency in kHz.
+            ScaleWarning: lengths, or the file of a mesh, seem to be in mm, or the frequency in kHz.
         """
         require_kind("Scene.array", array, TransducerArray)
         require_kind("Scene.medium", medium, Medium)
@@ -249,17 +250,34 @@ def _require_separate_points(scene: Scene) -> None:
             if inside.any():
                 first = tuple(inside.nonzero()[0].tolist())
                 accepted = f"lies in or on obstacle {index}, {_extent(obstacle)}, must be outside it"
+                accepted += _unit_hint(scene, obstacle)
                 raise invalid(f"Scene.{name}{list(first)}", group[first], accepted, "m")
 
 
 def _warn_of_units(scene: Scene) -> None:
-    points = torch.cat([scene.array.positions, scene.control_points])
-    extent = float((points.amax(dim=0) - points.amin(dim=0)).norm())
+    extent = _observed_extent(scene)
     least, most = (bound * scene.wavelength for bound in _USUAL_EXTENT)
     if not least <= extent <= most:
         found = f"{extent:.4g} m from end to end of array and control points, but a wavelength of"
         text = f"Scene: {found} {scene.wavelength:.4g} m; are lengths in m and the frequency in Hz?"
         warnings.warn(text, ScaleWarning, stacklevel=3)
+    for index, obstacle in enumerate(scene.obstacles):
+        if hint := _unit_hint(scene, obstacle):
+            text = f"Scene.obstacles[{index}]: a mesh of {_extent(obstacle)}{hint}"
+            warnings.warn(text, ScaleWarning, stacklevel=3)
+
+
+def _unit_hint(scene: Scene, obstacle: Obstacle) -> str:
+    """Return what to do about a mesh far larger than the array and the control points; else nothing."""
+    size = math.dist(obstacle.lower, obstacle.upper)
+    too_large = isinstance(obstacle, Mesh) and size > _USUAL_MESH * _observed_extent(scene)
+    return "; take scale=1e-3 for a file in millimetres" if too_large else ""
+
+
+def _observed_extent(scene: Scene) -> float:
+    """Return the diagonal [m] of the bounding box of array and control points."""
+    points = torch.cat([scene.array.positions, scene.control_points])
+    return float((points.amax(dim=0) - points.amin(dim=0)).norm())
 
 
 def _warn_of_overlaps(obstacles: tuple[Obstacle, ...]) -> None:
@@ -332,4 +350,5 @@ def _require_in_domain(scene: Scene) -> None:
     for index, obstacle in enumerate(scene.obstacles):
         if _shared((obstacle.lower, obstacle.upper), scene.domain) is None:
             accepted = f"must be at least partly inside the domain, {scene.domain[0]} to {scene.domain[1]} m"
+            accepted += _unit_hint(scene, obstacle)
             raise ValueError(f"Scene.obstacles[{index}]: {_extent(obstacle)}; {accepted}")

@@ -82,6 +82,38 @@ def test_a_source_beside_an_obstacle_is_logged_once(method, caplog):
     assert len(messages(caplog, "of an obstacle")) == 1
 
 
+@pytest.mark.parametrize("method", ["box", "full"])
+def test_points_closer_to_a_surface_than_a_cell_are_logged_on_both_sides(method, caplog):
+    scene = small_scene((CUBE,))  # its faces across x are at 9 and 15 mm
+    propagator = simulated(scene, method, 1.4e-3, tolerance=0.5)
+    assert not messages(caplog, "of a surface")
+    points = torch.tensor([[20e-3, 12e-3, 12e-3], [15.3e-3, 12e-3, 12e-3]], dtype=torch.float64)
+    propagator.field(DRIVE, points.expand(2, 2, 3))  # a picture
+    assert not messages(caplog, "of a surface")
+    for _ in range(2):
+        propagator.field(DRIVE, points)
+    (message,) = messages(caplog, "of a surface")
+    assert "points[1] at (15.3, 12.0, 12.0) mm is 0.3 mm from obstacle 0" in message
+    caplog.clear()
+    within = torch.tensor([[14.6e-3, 12e-3, 12e-3], [12e-3, 12e-3, 12e-3]], dtype=torch.float64)
+    simulated(scene, method, 1.4e-3, tolerance=0.5).transfer_matrix(within)
+    (message,) = messages(caplog, "of a surface")
+    assert "points[0] at (14.6, 12.0, 12.0) mm is 0.4 mm inside obstacle 0" in message
+
+
+def test_control_points_and_transducers_next_to_a_surface_are_logged(caplog):
+    plate = Box(center=(4e-3, 12e-3, 12e-3), size=(4e-3, 14e-3, 14e-3), rigid=True)  # 0.8 mm from the array
+    scene = dataclasses.replace(small_scene((plate,)), control_points=[(6.2e-3, 12e-3, 12e-3)])
+    simulated(scene, "full", 1.4e-3)
+    array, point = messages(caplog, "of a surface")
+    assert "array.positions[0]" in array
+    assert "3 more" in array
+    assert "control_points[0]" in point
+    caplog.clear()
+    differentiable_field(scene, DRIVE, spacing=1.4e-3, periods=2)
+    assert len(messages(caplog, "of a surface")) == 1
+
+
 def test_runs_that_do_not_converge_give_one_warning():
     propagator = simulated(small_scene((CUBE,)), "full", 1.4e-3, tolerance=1e-6, max_periods=8)
     drives, points = torch.stack((DRIVE, 1j * DRIVE)), propagator.scene.control_points

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from autdtorch.scene.obstacles.mesh import read_obj, read_ply
+from autdtorch.scene.obstacles.mesh_file import read_obj, read_ply
 
 CORNERS = [(0.0, 0.0, 0.0), (1.5, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -2.0)]
 FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]

@@ -9,7 +9,7 @@ import torch
 
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import Plane, circle_points
-from autdtorch.scene.obstacles import Box, Sphere
+from autdtorch.scene.obstacles import Box, Mesh, Sphere
 from autdtorch.scene.scene import Medium, OverlapWarning, ScaleWarning, Scene
 
 AIR = Medium(density=1.293, sound_speed=340.0)
@@ -90,6 +90,17 @@ def test_a_scene_that_seems_to_be_in_other_units_is_told(changes):
     with pytest.warns(ScaleWarning, match="are lengths in m and the frequency in Hz") as caught:
         paper_scene(**changes)
     assert caught[0].filename == __file__
+
+
+def test_a_mesh_in_millimetres_is_told_how_to_scale_it():
+    surface = Sphere((50.0, 50.0, 50.0), 8.0, rigid=True).surface()
+    assert paper_scene(obstacles=[Mesh.from_surface(surface, 1e-3, rigid=True)])
+    with pytest.warns(ScaleWarning, match=r"^Scene\.obstacles\[0\]: .*scale=1e-3") as caught:
+        paper_scene(obstacles=[Mesh.from_surface(surface, rigid=True)])
+    assert caught[0].filename == __file__
+    for offset, domain in (((-50.0,) * 3, None), ((0.0,) * 3, ((0, 0, 0), (0.1, 0.1, 0.1)))):
+        with pytest.raises(ValueError, match=r"^Scene\..*scale=1e-3"):
+            paper_scene(obstacles=[Mesh.from_surface(surface, 1.0, offset, rigid=True)], domain=domain)
 
 
 def test_obstacles_of_one_material_may_overlap_and_those_of_two_may_touch():

@@ -1,9 +1,9 @@
 """Elements at edges between two faces parallel to the grid.
 
 The field at an edge is singular: in a plane across it, long waves are sums of r^v cos(v phi) and of
-r^v sin(v phi) with exponents v that the densities decide (2/3 at a sound-hard edge). The coupling of the element
-at the edge is fitted so that the scheme reproduces the first of them on the cells around it. Without this, the
-error of a cuboid depends on where its faces fall, and is up to twenty times as large.
+r^v sin(v phi) with exponents v that the densities decide (2/3 at a sound-hard edge). The coupling of the
+element at the edge is fitted so that the scheme reproduces the first of them on the cells around it. Without
+this, the error of a cuboid depends on where its faces fall, and is up to twenty times as large.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ _CORNERS = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])  # Columns of an element, 
 _CORNER, _DIAGONAL = np.array((True, False, False, False)), np.array((True, False, False, True))
 _COLUMN_PAIRS = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
 _MIRRORED = [1, 0, 2, 3, 5, 4]  # The pairs after both axes are exchanged
+_TURNED = [4, 5, 2, 3, 0, 1]  # The pairs after the first and the last column are exchanged, too
 _SIDES = np.abs(_CORNERS[_COLUMN_PAIRS[:, 0]] - _CORNERS[_COLUMN_PAIRS[:, 1]]).sum(axis=1)
 
 
@@ -92,9 +93,9 @@ def _depths(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Return the distance [cells] of the next columns (k, 2) from the faces between them and the first.
 
-    Also return where such faces fill the quadrants of the columns `inside` (4,). `level` (k, 125) is the signed distance to the material there,
-    `share` (k, 64) its share of the sub-cells. A signed distance may be too small near other faces, inside or
-    outside: of both sides of a face, those distances are taken that fit the shares best.
+    Also return where the material fills the quadrants of the columns `inside` (4,). `level` (k, 125) is the
+    signed distance to it, `share` (k, 64) its share of the sub-cells. A signed distance may be too small near
+    other faces, inside or outside: of both sides of a face, those are taken that fit the shares best.
     """
     places = [
         np.abs(LATTICE[:, other] - begin)
@@ -118,7 +119,7 @@ def _depths(
 
 
 def _areas(faces: Array, inside: NDArray[np.bool_], squares: int) -> Array:
-    """Return the shares (..., s, s) of squares that lie in the quadrants `inside` (4,) beside `faces` (..., 2)."""
+    """Return the shares (..., s, s) of squares in the quadrants `inside` (4,) beside `faces` (..., 2)."""
     below = np.clip(squares * faces[..., None] - np.arange(squares), 0, 1)
     sides = np.stack((below, 1 - below), axis=-2)  # (..., axis, side, square)
     parts = [
@@ -186,15 +187,15 @@ def edge_coupling(
 ) -> Array:
     """Return the coupling (6,) of pairs of columns at an edge, relative to air.
 
-    `depth` is the distance [cells] of the next columns from the faces of the first column's material, `density`
-    of that material and of the other. `diagonal`: two such edges touch. Mirrored edges have mirrored coupling
-    to the last bit: symmetric scenes stay symmetric.
+    `depth` is the distance [cells] of the next columns from the faces of the first column's material,
+    `density` that of this material and of the other. `diagonal`: two such edges touch. The mean over the
+    images of an edge keeps symmetric scenes symmetric.
     """
-    first, second = depth
-    if first > second:
-        return _edge_coupling((second, first), density, stencil, diagonal)[_MIRRORED]
-    found = _edge_coupling(depth, density, stencil, diagonal)
-    return found if first < second else (found + found[_MIRRORED]) / 2
+    turned = (1 - depth[1], 1 - depth[0])  # each of two edges in the place of the other
+    images = [(depth, [0, 1, 2, 3, 4, 5])] + ([(turned, _TURNED)] if diagonal else [])
+    images += [(place[::-1], [order[one] for one in _MIRRORED]) for place, order in images]
+    fits = [_edge_coupling(place, density, stencil, diagonal)[order] for place, order in images]
+    return np.asarray(sum(fits) / len(fits))
 
 
 @lru_cache(maxsize=4096)
@@ -214,9 +215,8 @@ def _edge_coupling(
         if x or y:
             _add(matrix, (x, y), _beside((x, y), depth, density, uniform, diagonal))
     inner, outer = density
-    own = np.array(
-        (1 - depth[0], 1 - depth[1], 1 - max(depth), 0, 0, 0)
-    )  # share of the lines within the edge
+    # share of the lines within the edge
+    own = np.array((1 - depth[0], 1 - depth[1], 1 - max(depth), 0, 0, 0))
     series = uniform / (own * inner + (1 - own) * outer)
 
     parts = np.zeros((6, *matrix.shape))
@@ -289,8 +289,8 @@ def _semidefinite(coupling: Array) -> Array:
 def _diagonal_fields(places: Array, density: tuple[float, float]) -> Array:
     """Return six fields (n, 6) of long waves at places (n, 2) [cells] around two edges that touch.
 
-    They are even or odd about both planes that bisect the edges. If odd about one of them, tan^2(pi v / 4) is the
-    ratio of the densities; otherwise v is 2.
+    They are even or odd about both planes that bisect the edges. If odd about one of them, tan^2(pi v / 4)
+    is the ratio of the densities; otherwise v is 2.
     """
     steep = 4 / np.pi * np.arctan(np.sqrt(density[0] / density[1]))
     radius = np.hypot(*places.T)
