@@ -36,6 +36,9 @@ AROUND = 5
 # degrees is below -68 dB (-82 dB from 8.5 cells per wavelength on); of coarser grids -66 dB at 4.25 cells and
 # -32 dB at 3.
 FINE_LAYER_CELLS, COARSE_LAYER_CELLS = 6, 8
+# Difference of two matrices from which the order is three, and safety factor of an estimate: over 80 scenes
+# (docs/benchmarks.md) they bring most estimates to within a factor of three
+_LARGE, _CAUTION = 0.06, 1.15
 RATIO = 1.5  # Ratio of the spacings of the two grids: the coarser costs a fifth of the finer
 
 
@@ -208,10 +211,10 @@ def second_spacing(region: Region, spacing: float) -> float:
 def grid_errors(matrix: Tensor, second: Tensor, ratio: float) -> Tensor:
     """Return the estimated relative error (P,) of each row of a matrix (P, M), given a second one.
 
-    `ratio` is that of the second spacing to the first. Errors fall with the square of the spacing. Two with
-    the same cause differ by their difference, independent ones by the root of the sum of their squares. The
-    geometric mean of both is within a factor of two of either for ratios from 1.25 on.
+    `ratio` is that of the second spacing to the first. Errors fall with the square of the spacing; large
+    ones, of grids that hardly resolve the wave, with up to the third power.
     """
-    alike, independent = 1 / abs(ratio**2 - 1), 1 / math.sqrt(1 + ratio**4)
     size = matrix.norm(dim=1).clamp(min=torch.finfo(torch.float64).tiny)
-    return math.sqrt(alike * independent) * (matrix - second).norm(dim=1) / size
+    difference = (matrix - second).norm(dim=1) / size
+    order = 2 + (difference / _LARGE).clamp(max=1)
+    return _CAUTION * difference / (ratio**order - 1).abs()

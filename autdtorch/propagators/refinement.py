@@ -15,11 +15,14 @@ from autdtorch.utils.validation import invalid
 
 logger = logging.getLogger(__name__)
 
-_FIRST_STEP, _SMALLEST_STEP, _LARGEST_STEP = 1.45, 1.25, 2.5
+_FIRST_SPACING = 1.9
+"""First spacing for a tolerance of 1, in wavelengths; it falls with the root of the tolerance."""
+
+_FIRST_STEP, _SMALLEST_STEP, _LARGEST_STEP = 1.4, 1.25, 2.5
 """Ratios of a spacing and the next: the first, the smallest that tells two errors apart, and the largest over
 which an error is trusted to fall with the square of the spacing."""
 
-_AIM = 0.8
+_AIM = 0.6
 """Error for which a spacing is chosen, relative to the tolerance."""
 
 _SETTLED = 0.1
@@ -46,26 +49,22 @@ def refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPr
 
     Where the budget does not suffice, it is the finest that fits, and a warning says which error it has.
     """
-    tolerance, second = pilot.tolerance, None
-    plan = pilot.at(coarsest_spacing(pilot.region), _SETTLED * pilot.tolerance, pilot.time_step)
+    tolerance, others, region = pilot.tolerance, [], pilot.region
+    spacing = min(_FIRST_SPACING * region.wavelength * math.sqrt(tolerance), coarsest_spacing(region))
+    plan = pilot.at(spacing, _SETTLED * tolerance, pilot.time_step)
     while True:
         plan.require_feasible("tolerance", tolerance)
-        begin = time.perf_counter()
-        found = SimulatedPropagator(plan, cache, second)
-        found.transfer_matrix()
-        error = found.control_error() if second else math.inf  # unknown
+        begin, found = time.perf_counter(), SimulatedPropagator(plan, cache, others)
+        error, step = found.known_error(), _FIRST_STEP
         taken = time.perf_counter() - begin
-        if second and not math.isfinite(error):
-            accepted = (
-                f"too few to choose a spacing: at {plan.spacing:.3g} m no run came near its steady state"
-            )
-            raise invalid("max_periods", pilot.max_periods, accepted)
-        logger.info("spacing %.3g mm: estimated error %.2g", 1e3 * plan.spacing, error)
-        if second and error <= tolerance:
-            return found
-        step = _FIRST_STEP
-        if second:
+        if others:
+            if not math.isfinite(error):
+                accepted = f"too few: at a spacing of {plan.spacing:.3g} m no run came near its steady state"
+                raise invalid("max_periods", pilot.max_periods, accepted)
             step = min(max(math.sqrt(error / (_AIM * tolerance)), _SMALLEST_STEP), _LARGEST_STEP)
+        logger.info("spacing %.3g mm: estimated error %.2g", 1e3 * plan.spacing, error)
+        if error <= tolerance:
+            return found
         for ratio in (step, _SMALLEST_STEP):
             finer = plan.at(plan.spacing / ratio, plan.tolerance, pilot.time_step)
             if budget.fits(finer, plan, taken):
@@ -74,4 +73,4 @@ def refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPr
             shown = 1e3 * plan.spacing, error, tolerance
             logger.warning("the budget ends at %.3g mm: estimated error %.2g, tolerance %g", *shown)
             return found
-        plan, second = finer, found
+        plan, others = finer, [*others, found]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -67,16 +68,17 @@ class SimulatedPropagator:
     """
 
     def __init__(
-        self, plan: Plan, cache: DiskCache | None = None, second: SimulatedPropagator | None = None
+        self, plan: Plan, cache: DiskCache | None = None, others: Sequence[SimulatedPropagator] = ()
     ) -> None:
         """Use `make_propagator`, which checks its arguments. Nothing is computed here.
 
-        A `second` propagator of the scene, on another grid, serves error estimates.
+        `others` are propagators of the scene on other grids, for error estimates; by default one is made.
         """
         self.scene, self.method, self.spacing = plan.scene, plan.method, plan.spacing
         self.tolerance, self.max_periods = plan.tolerance, plan.max_periods
         self.runs: list[Run] = []
-        self._plan, self._cache, self._given_second = plan, cache, second
+        self._reported = 0
+        self._plan, self._cache, self._given = plan, cache, tuple(others)
         self._simulation = DomainSimulation(plan) if plan.method == "full" else BoxSimulation(plan)
         self._control: TransferMatrix | None = None
         self._near_logged = self._near_points_logged = False
@@ -97,9 +99,9 @@ class SimulatedPropagator:
         return self._simulation.orbits(self.scene.control_points).runs
 
     @cached_property
-    def _second(self) -> SimulatedPropagator:
-        """A simulation on another grid, for the error estimate."""
-        return self._given_second or SimulatedPropagator(self._plan.second, self._cache)
+    def _others(self) -> tuple[SimulatedPropagator, ...]:
+        """Simulations on other grids, for the error estimate."""
+        return self._given or (SimulatedPropagator(self._plan.second, self._cache),)
 
     @overload
     def transfer_matrix(
@@ -138,7 +140,7 @@ class SimulatedPropagator:
         result = self._with_error(places) if with_error else self._result(places)
         if places is not None:
             self._report_near(places)
-        self._report(result.runs, self.scene.control_points if places is None else places)
+        self._report(self.scene.control_points if places is None else places)
         return (result.matrix, result.error) if with_error else result.matrix
 
     @one_torch_thread()
@@ -148,9 +150,20 @@ class SimulatedPropagator:
         Points and errors are those of `transfer_matrix`.
         """
         places = None if points is None else self._simulation.checked(points)
-        result, second = self._result(places), self._second._result(places)
-        rows = grid_errors(result.matrix, second.matrix, self._second.spacing / self.spacing)
-        return rows + result.error * result.matrix.norm() / result.matrix.norm(dim=1).clamp(min=_TINY)
+        result = self._result(places)
+        settling = result.error * result.matrix.norm() / result.matrix.norm(dim=1).clamp(min=_TINY)
+        others = [other._result(places).matrix for other in self._others]
+        return self._grid_errors(result.matrix, others) + settling
+
+    def _grid_errors(self, matrix: torch.Tensor, others: Sequence[torch.Tensor]) -> torch.Tensor:
+        """Return the errors (P,) of the rows of a matrix, given those on the other grids; the least counts.
+
+        A grid that is too coarse for the scene makes the error seem larger.
+        """
+        ratios = (other.spacing / self.spacing for other in self._others)
+        return torch.stack(
+            [grid_errors(matrix, second, ratio) for second, ratio in zip(others, ratios, strict=True)]
+        ).amin(dim=0)
 
     @one_torch_thread()
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
@@ -177,7 +190,7 @@ class SimulatedPropagator:
         require_memory("points", (*grid, 3), PAIR_BYTES * rows * len(points))
         if by_matrix:
             result = self._executed(points)
-            self._report(result.runs, points)
+            self._report(points)
             return (drive @ result.matrix.mT).reshape(*drive.shape[:-1], *grid)
         field = torch.zeros((len(flat), len(points)), dtype=torch.complex128, device="cpu")
         if (loud := flat.any(dim=1)).any():
@@ -185,16 +198,15 @@ class SimulatedPropagator:
             nodes = [self.scene.array.nodes] * len(strength)
             field[loud], runs = self._simulation.run(nodes, strength, single_nodes(points))
             self.runs += runs
-            self._report(runs, None)
+            self._report(None)
         return field.reshape(*drive.shape[:-1], *grid)
 
     def _result(self, points: torch.Tensor | None) -> TransferMatrix:
-        """Return the matrix of points, by default of the control points, and the runs of this call."""
+        """Return the matrix of points, by default of the control points, which is kept."""
         if points is not None:
             return self._executed(points)
-        kept = self._control
-        result = self._control = kept or self._executed(self.scene.control_points)
-        return replace(result, matrix=result.matrix.clone(), runs=() if kept else result.runs)
+        kept = self._control = self._control or self._executed(self.scene.control_points)
+        return replace(kept, matrix=kept.matrix.clone())
 
     def _executed(self, points: torch.Tensor) -> TransferMatrix:
         """Return the matrix of points, simulated or from the cache. One that has converged is added to it."""
@@ -213,26 +225,37 @@ class SimulatedPropagator:
     @one_torch_thread()
     def _with_error(self, points: torch.Tensor | None) -> TransferMatrix:
         """Return the matrix of points with its error, estimated from a second grid."""
-        first, second = self._result(points), self._second._result(points)
-        whole = first.matrix.reshape(1, -1), second.matrix.reshape(1, -1)
-        difference = float(grid_errors(*whole, self._second.spacing / self.spacing))
-        return TransferMatrix(first.matrix, first.error + difference, first.runs + second.runs)
+        own, others = self._result(points), [other._result(points) for other in self._others]
+        whole = self._grid_errors(own.matrix.reshape(1, -1), [one.matrix.reshape(1, -1) for one in others])
+        runs = own.runs + tuple(run for one in others for run in one.runs)
+        return TransferMatrix(own.matrix, own.error + float(whole), runs)
 
-    def control_error(self) -> float:
-        """Return the estimated relative error of the matrix of the control points."""
-        return self._with_error(None).error
+    @one_torch_thread()
+    def known_error(self) -> float:
+        """Simulate the control points; return the error by the grids given, infinite without any."""
+        if self._given:
+            return self._with_error(None).error
+        self._result(None)
+        return math.inf
 
     def _report_near(self, points: torch.Tensor) -> None:
         """Log once, of the points of any call, which are next to a surface."""
         if not self._near_points_logged:
             self._near_points_logged = warn_of_near_points(self.scene, "points", points, self.spacing)
 
-    def _report(self, runs: Sequence[Run], points: torch.Tensor | None) -> None:
+    def _unreported(self) -> list[Run]:
+        """Return the runs since the last call."""
+        runs, self._reported = self.runs[self._reported :], len(self.runs)
+        return runs
+
+    def _report(self, points: torch.Tensor | None) -> None:
         """Warn of new runs that did not converge; log once if a source is next to an obstacle.
 
-        Without `points`, all transducers were sources.
+        Without `points`, all transducers were sources. Coarse grids on the way to a tolerance do not matter.
         """
-        simulation = self._simulation
+        simulation, runs = self._simulation, self._unreported()
+        if not self._given and "_others" in vars(self):
+            runs += [run for other in self._others for run in other._unreported()]
         if runs and not self._near_logged and (points is None or not simulation.orbits(points).from_points):
             self._near_logged = True
             if any(map(simulation.near_obstacle, self.scene.array.nodes.positions)):

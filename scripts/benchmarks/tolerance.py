@@ -15,7 +15,6 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pyvista
@@ -50,12 +49,12 @@ MATERIALS: Mapping[str, Mapping[str, object]] = {
 
 @dataclass(frozen=True)
 class Case:
-    """A scene, and its exact matrix (P, M) [Pa] if there is a solution."""
+    """A scene, the kind of scenes it belongs to, and its exact matrix (P, M) [Pa] if there is a solution."""
 
+    kind: str
     name: str
     scene: at.Scene
     exact: torch.Tensor | None = None
-    method: str = "auto"
 
 
 def scene(*obstacles: at.Obstacle) -> at.Scene:
@@ -73,9 +72,8 @@ def sphere_case(material: str, radius: float) -> Case:
     else:
         ratios = float(given["density"]) / AIR.density, float(given["sound_speed"]) / AIR.sound_speed
         field = analytic.fluid_sphere(*where, *ratios)
-    return Case(
-        f"sphere of {1e3 * radius:g} mm, {material}", found, 4 * math.pi * ARRAY.source_strength * field
-    )
+    name = f"sphere of {1e3 * radius:g} mm, {material}"
+    return Case("spheres", name, found, 4 * math.pi * ARRAY.source_strength * field)
 
 
 def slab_case(thickness: float, density: float, speed: float) -> Case:
@@ -93,7 +91,7 @@ def slab_case(thickness: float, density: float, speed: float) -> Case:
     found = at.Scene(array, AIR, 40e3, points, (slab,), domain=((0, 0, 0), (40e-3,) * 3))
     where = (points, array.positions, found.wavenumber, (face, 0, 0), (-1, 0, 0), thickness, density, speed)
     exact = 4 * math.pi * array.source_strength * analytic.fluid_slab(*where)
-    return Case(f"slab of {1e3 * thickness:g} mm, ratio {density:g}", found, exact)
+    return Case("slabs", f"slab of {1e3 * thickness:g} mm, ratio {density:g}", found, exact)
 
 
 def cases() -> list[Case]:
@@ -105,12 +103,14 @@ def cases() -> list[Case]:
     for number in range(18):
         name, size = names[number % 6], random.uniform(5e-3, 16e-3, 3).tolist()
         center = random.uniform(-3e-3, 3e-3, 3).tolist()
-        found.append(Case(f"cuboid {number}, {name}", scene(at.Box(center, size, **MATERIALS[name]))))
+        found.append(
+            Case("cuboids", f"cuboid {number}, {name}", scene(at.Box(center, size, **MATERIALS[name])))
+        )
     for number in range(14):
         name, size = names[number % 6], random.uniform(5e-3, 14e-3, 3).tolist()
         turn = random.uniform(-0.8, 0.8, 3).tolist()
         box = at.Box(random.uniform(-3e-3, 3e-3, 3).tolist(), size, turn, **MATERIALS[name])
-        found.append(Case(f"turned cuboid {number}, {name}", scene(box)))
+        found.append(Case("turned cuboids", f"turned cuboid {number}, {name}", scene(box)))
     for number in range(8):
         pair = [names[number % 6], names[(number + 1) % 6]]
         places = ((-8e-3, 1e-3, -2e-3), (7e-3, -1e-3, 3e-3))
@@ -118,36 +118,134 @@ def cases() -> list[Case]:
             at.Sphere(place, random.uniform(3e-3, 6e-3), **MATERIALS[name])
             for place, name in zip(places, pair, strict=True)
         ]
-        found.append(Case(f"two spheres {number}, {' and '.join(pair)}", scene(*spheres)))
+        found.append(Case("two spheres", f"two spheres {number}, {' and '.join(pair)}", scene(*spheres)))
     for number in range(6):
         boxes = [
             at.Box(place, (8e-3,) * 3, random.uniform(-0.7, 0.7, 3).tolist(), rigid=True)
             for place in ((-8e-3, 1e-3, -2e-3), (8e-3, -1e-3, 3e-3))
         ]
-        found.append(Case(f"two turned cubes {number}, rigid", scene(*boxes)))
+        found.append(Case("two turned cubes", f"two turned cubes {number}, rigid", scene(*boxes)))
     for number in range(4):
         boxes = [
             at.Box(random.uniform(-12e-3, 12e-3, 3).tolist(), (6e-3,) * 3, **MATERIALS[names[number]])
             for _ in range(3)
         ]
-        found.append(Case(f"three cubes {number}, {names[number]}", scene(*boxes)))
+        found.append(Case("three cubes", f"three cubes {number}, {names[number]}", scene(*boxes)))
     return found + [ellipsoid_case(name, number) for number, name in enumerate(names)]
 
 
 def ellipsoid_case(material: str, number: int) -> Case:
     """Return an ellipsoid as a mesh of 5120 triangles."""
-    path = results() / "ellipsoid.stl"
-    if not path.exists():
-        pyvista.ParametricEllipsoid(7.0, 5.0, 4.0, u_res=100, v_res=60, w_res=5).triangulate().clean().save(
-            path
-        )
+    ball = pyvista.Icosphere(radius=1.0, nsub=4).scale((7.0, 5.0, 4.0))
     turn = 0.2 * number, 0.3, 0.1 * number
-    mesh = at.Mesh(str(path), scale=1e-3, rotation=turn, **MATERIALS[material])
-    return Case(f"ellipsoid, {material}", scene(mesh))
+    mesh = at.Mesh.from_surface(ball, scale=1e-3, rotation=turn, **MATERIALS[material])
+    return Case("ellipsoids (meshes)", f"ellipsoid, {material}", scene(mesh))
 
 
-def results() -> Path:
-    """Return the folder of references."""
-    folder = Path(__file__).parents[2] / "results" / "tolerance"
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
+@dataclass(frozen=True)
+class Result:
+    """The error and the time of a matrix of a case.
+
+    Attributes:
+        kind: of the case.
+        asked: spacing [mm] or tolerance.
+        error: true relative error.
+        claimed: estimated error; None where none was asked for.
+        seconds: run time.
+        spacing: [mm].
+    """
+
+    kind: str
+    asked: float
+    error: float
+    claimed: float | None
+    seconds: float
+    spacing: float
+
+
+def on_grids(case: Case) -> tuple[list[Result], torch.Tensor]:
+    """Return the results by spacing that the scene allows, and the reference."""
+    matrices: dict[float, tuple[torch.Tensor, float]] = {}
+    for spacing in (*SPACINGS, *(() if case.exact is not None else (REFERENCE,))):
+        begin = time.perf_counter()
+        try:
+            matrix = uncached(case.scene, "auto", spacing).transfer_matrix()
+        except ValueError as error:  # too coarse for a slow medium
+            print(f"{case.name}: {error}", flush=True)
+            continue
+        matrices[spacing] = matrix, time.perf_counter() - begin
+    reference = matrices.pop(REFERENCE)[0] if case.exact is None else case.exact
+    found = [
+        Result(case.kind, h, relative_error(matrix, reference), None, seconds, h)
+        for h, (matrix, seconds) in matrices.items()
+    ]
+    return found, reference
+
+
+def by_tolerance(case: Case, tolerance: float, reference: torch.Tensor) -> Result:
+    """Return the result of a tolerance; its time includes the choice of the spacing."""
+    begin = time.perf_counter()
+    propagator = at.make_propagator(case.scene, spacing=None, tolerance=tolerance, cache=False)
+    matrix, claimed = propagator.transfer_matrix(return_error=True)
+    seconds, error = time.perf_counter() - begin, relative_error(matrix, reference)
+    return Result(case.kind, tolerance, error, claimed, seconds, 1e3 * propagator.spacing)
+
+
+def summary(found: list[Result], ratios: list[float]) -> list[str]:
+    """Return a row of shares over the results of a tolerance."""
+    met = np.mean([one.error <= one.asked for one in found])
+    claims = np.array([one.claimed / one.error for one in found])
+    near = np.mean((claims <= FACTOR) & (claims >= 1 / FACTOR))
+    quick = np.mean(np.array(ratios) <= FACTOR)
+    spacing, error = (np.median([getattr(one, name) for one in found]) for name in ("spacing", "error"))
+    return [
+        percent(found[0].asked), str(len(found)), f"{met:.0%}", f"{near:.0%}", f"{np.median(claims):.2g}",
+        f"{quick:.0%}", f"{np.median(ratios):.2g}", f"{spacing:.2g} mm", percent(float(error)),
+    ]  # fmt: skip
+
+
+def by_kind(found: list[Result], asked: tuple[float, ...], shown: Callable[[float], str]) -> str:
+    """Return a table with the median error (and the largest), and the median time, of each kind of scene."""
+    lines = []
+    for kind in dict.fromkeys(one.kind for one in found):
+        cells = []
+        for each in asked:
+            own = [one for one in found if (one.kind, one.asked) == (kind, each)]
+            errors = [one.error for one in own]
+            seconds = float(np.median([one.seconds for one in own]))
+            cells.append(f"{percent(float(np.median(errors)))} ({percent(max(errors))}), {seconds:.2g} s")
+        lines.append([kind, *cells])
+    return table(["scenes", *map(shown, asked)], lines)
+
+
+def main(given: argparse.Namespace) -> None:
+    """Measure all cases and write the tables."""
+    warnings.simplefilter("ignore", at.SteadyStateWarning)
+    grids: list[Result] = []
+    asked: dict[float, list[Result]] = {tolerance: [] for tolerance in TOLERANCES}
+    ratios: dict[float, list[float]] = {tolerance: [] for tolerance in TOLERANCES}
+    uncached(cases()[0].scene, "auto", 2.0).transfer_matrix()  # compiles the kernel
+    for case in cases():
+        own, reference = on_grids(case)
+        grids += own
+        for tolerance in TOLERANCES:
+            found = by_tolerance(case, tolerance, reference)
+            asked[tolerance].append(found)
+            enough = [one for one in own if one.error <= tolerance]
+            if enough:
+                ratios[tolerance].append(found.seconds / max(enough, key=lambda one: one.spacing).seconds)
+            print(f"{case.name}, {tolerance:g}: {found}", flush=True)
+    header = ["tolerance", "scenes", "met", "estimate within 3", "estimate / error", "time within 3"]
+    header += ["time ratio", "spacing", "error"]
+    rows = [summary(asked[tolerance], ratios[tolerance]) for tolerance in TOLERANCES]
+    caption = (
+        "Shares of the scenes whose true error is within the tolerance, whose estimate is within a factor of"
+        " three of it, and whose time is within that of the coarsest sufficient one of ten grids; medians."
+    )
+    every = [one for found in asked.values() for one in found]
+    parts = [
+        measured(), caption, table(header, rows), "By tolerance: median error (largest), and median time.",
+        by_kind(every, TOLERANCES, percent), "By spacing:",
+        by_kind(grids, (2.0, 1.1, 0.5), lambda spacing: f"{spacing:g} mm"),
+    ]  # fmt: skip
+    fill_in(DOCUMENT, "benchmark.py tolerance", parts, given.output)

@@ -40,8 +40,8 @@ def of_two_speeds(extent):
 def test_a_coarse_spacing_is_logged_once_for_all_obstacles(method, extent, caplog):
     propagator = simulated(of_two_speeds(extent), method, 2.5e-3)
     assert len(propagator._simulation.assemblies) == (2 if method == "box" else 1)
-    assert propagator._second.spacing < propagator.spacing
-    assert propagator._second.planned_runs
+    assert propagator._others[0].spacing < propagator.spacing
+    assert propagator._others[0].planned_runs
     (message,) = messages(caplog, "coarse")
     assert "2.5 mm" in message
     assert all(where in message for where in ("the medium", "obstacle 1", "obstacle 2"))
@@ -132,6 +132,6 @@ def test_walls_that_end_are_logged_once(caplog):
         *(Box((12e-3, y, 12e-3), (1.0, 1e-3, 1.0), density=2.0, sound_speed=340.0) for y in (1e-3, 23e-3)),
     ]
     scene = dataclasses.replace(small_scene(), control_points=[(10e-3, 12e-3, 11e-3)], obstacles=walls)
-    assert simulated(scene, "full", 2e-3)._second
+    assert simulated(scene, "full", 2e-3)._others
     (message,) = messages(caplog, "another direction")
     assert "obstacle 1, 2 " in message

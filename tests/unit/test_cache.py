@@ -61,7 +61,7 @@ def test_what_was_simulated_is_not_simulated_again(tmp_path):
     assert torch.equal(kept, matrix)
     assert kept_error == error
     assert not again.runs
-    assert not again._second.runs
+    assert not again._others[0].runs
     drives = torch.ones((5, 4), dtype=torch.complex128)
     assert torch.allclose(again.field(drives, scene.control_points), matrix.sum(dim=1))
     assert not again.runs
