@@ -137,7 +137,8 @@ def cells_of_maps(
     air = torch.ones(shape, dtype=torch.float64, device="cpu")
     relative = air if density is None else density / region.fluid.density
     speed = air if sound_speed is None else sound_speed / region.fluid.sound_speed
-    half, own = stencil.kappa / 2, stencil.kappa / 2 / speed  # `elements.flow_factor`
+    # the impedance of a face half-way between two cells is off by tan(k / 2) / (k / 2)
+    half, own = stencil.kappa / 2, stencil.kappa / 2 / speed
     relative = relative / (math.tan(half) / half * own / torch.tan(own))
     fluidity = relative * _speed_factor(stencil, speed)
     weight, mass = _rows(stencil, relative, fluidity)

@@ -27,8 +27,8 @@ _STEPS = 20
 _SYMMETRIC = 0, _STEPS // 2  # Symmetric candidates: a cell or a face between cells in the middle
 _WORTHWHILE = 0.9  # Error of an asymmetric placement, relative to the symmetric one, below which it is taken
 # Additional distance from the best place [cells, rms] allowed to a symmetric grid if the faces are symmetric:
-# a quarter of the largest. `docs/decisions/runs.md` has the errors.
-_ALLOWANCE = 0.14
+# a fifth of the largest. `docs/decisions/runs.md` has the errors.
+_ALLOWANCE = 0.1
 _BEST = 0.45  # Best distance of a face behind the last centre [cells]
 
 

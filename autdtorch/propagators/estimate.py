@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from autdtorch.fdtd.grid import coarsest_spacing, domain_extent
+from autdtorch.fdtd.grid import domain_extent
 from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.stepping import assemble, drive_signal
 from autdtorch.propagators.grids import grid_cost
@@ -22,6 +22,9 @@ from autdtorch.utils.validation import positive
 _MEASURED_STEPS, _MEASURED_CELLS = 80, (300_000, 1_000_000)
 _AIR_SPACING, _AIR_RIM = 1e-3, 28
 """Timed steps on a small and a large grid of so many cells; their spacing [m] and cells beside the domain."""
+
+_PILOT_CELLS = 6
+"""Cells per wavelength of the coarse grid that symmetries are found on."""
 
 _NODE_SECONDS = 4e-8
 """Time [s] of a pair of a point and a node of a transducer in free space."""
@@ -86,7 +89,7 @@ def estimate(
         nodes = len(scene.array) * len(scene.control_points) * len(scene.array.nodes.weights)
         return Estimate("free_space", None, 0, 0, planned.memory, _NODE_SECONDS * nodes)
     # a multiple of the spacing: a scene that is symmetric on one grid mostly is on the other
-    factor = max(1, math.floor(coarsest_spacing(planned.region) / spacing))
+    factor = max(1, math.floor(planned.region.wavelength / _PILOT_CELLS / spacing))
     pilot = planned.at(spacing * factor, planned.tolerance)
     if pilot.memory < available_memory():
         planned = replace(planned, runs=SimulatedPropagator(pilot).planned_runs)

@@ -74,6 +74,7 @@ def make_propagator(
         ValueError: an argument is out of range, the kernel needs a package that is not installed, or the
             simulation needs more memory than available.
     """
+    planned = plan(scene, method, spacing, tolerance, kernel, dtype, max_periods, time_step)
     budget = Budget(
         *(
             None if value is None else positive(name, value, unit)
@@ -82,7 +83,6 @@ def make_propagator(
     )
     if spacing is not None and (seconds, memory) != (None, None):
         raise invalid("spacing", spacing, "must be None where seconds or memory limit its choice", "m")
-    planned = plan(scene, method, spacing, tolerance, kernel, dtype, max_periods, time_step)
     disk_cache = _disk_cache(cache)
     if planned.method == "free_space":
         return FreeSpacePropagator(scene)

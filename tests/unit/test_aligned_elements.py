@@ -20,10 +20,10 @@ def reflection(kappa: float, density: float, slowness: float, place: float) -> t
     """Return the reflection of a chain of cells, and the exact one.
 
     The last cell of air lies `place` before the face. The density of the other material is assembled so that
-    its impedance is right half-way between cells.
+    waves keep their flow at the face.
     """
     near, beyond = kappa, kappa * slowness
-    assembled = density * (math.tan(beyond / 2) / beyond) / (math.tan(near / 2) / near)
+    assembled = density * (math.sin(beyond) / beyond) / (math.sin(near) / near)
     depths, densities = np.array([[place, 1 - place]]), np.array([[1.0, assembled]])
     link, _, thickness = matched(depths, densities, np.array([[near, beyond]]))
     mass = (thickness[0] + 0.5) * 4 * np.sin(np.array([near, beyond]) / 2) ** 2 / densities[0]

@@ -110,24 +110,21 @@ def matched(depth: Array, density: Array, wavenumber: Array) -> tuple[Array, Arr
 
 def _least(depth: Array, density: Array, link: Array, ratio: Array) -> Array:
     """Return the thickness (n, 2) for long waves, given the squared ratio (n, 2) of the wavenumbers."""
-    moved = depth**2 - 1 / 4
+    moved = depth**2
     return depth - density * link[:, None] / 2 * (moved - moved[:, ::-1] * ratio)
 
 
 def _exact(depth: Array, density: Array, wavenumber: Array) -> tuple[Array, Array]:
     """Return the coupling (n,) and the thickness (n, 2) with which a wave across the face is exact.
 
-    The discrete flow of a wave is cos^2(k / 2) of its own: the pressure in one of the materials is scaled.
+    Densities are assembled so that the discrete flow is that of the wave (`elements.flow_factor`).
     """
-    half = wavenumber / 2
-    true = density * half / np.tan(half)
-    here, flow = np.cos(wavenumber * depth), np.cos(half)
+    true = density * wavenumber / np.sin(wavenumber)
+    here, half = np.cos(wavenumber * depth), wavenumber / 2
     slope = true / wavenumber * np.sin(wavenumber * depth)
-    link = flow.prod(axis=1) / (here * slope[:, ::-1]).sum(axis=1)
+    link = 1 / (here * slope[:, ::-1]).sum(axis=1)
     # differences of cosines without their rounding: 1 - cos(x) is 2 sin^2(x / 2)
-    bend, own = np.sin(half * depth) ** 2, np.sin(half / 2) ** 2
-    other, its = bend[:, ::-1], own[:, ::-1]
-    jump = 4 * (other * own - bend * its) - 2 * (other + own - bend - its)
-    force = density * link[:, None] * jump / flow[:, ::-1]
+    bend = 2 * np.sin(half * depth) ** 2
+    force = density * link[:, None] * (bend - bend[:, ::-1])
     force -= 2 * np.sin(wavenumber * (depth + 0.5)) * np.sin(half)
     return link, -force / (4 * np.sin(half) ** 2) / here - 0.5

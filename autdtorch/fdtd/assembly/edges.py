@@ -105,7 +105,6 @@ def edges_of(shape: Shape, others: Sequence[Shape] = ()) -> list[Segment | Circl
     covered = np.zeros(len(ends), bool)
     for other in others:
         covered |= (other.signed_distance(torch.from_numpy(beside)) < 0).any(dim=1).numpy()
-    ends, angles = ends[~covered], angles[~covered]
     places, number = np.unique(ends.reshape(-1, 3).round(9), axis=0, return_inverse=True)
     first, second = number.reshape(-1, 2).T
     graph = coo_array((np.ones(len(ends)), (first, second)), shape=(len(places),) * 2)
@@ -115,13 +114,14 @@ def edges_of(shape: Shape, others: Sequence[Shape] = ()) -> list[Segment | Circl
     shares = _REDUCTION * 3 * angles / (np.pi + angles)
     for own in range(part.max(initial=-1) + 1):
         chosen = part[first] == own
+        free = chosen & ~covered
         circle = _circle(places[part == own], float(shares[chosen].mean()), int(chosen.sum()))
-        if circle:
+        if circle and free.any():  # whole: sides of a polygon would depend on its corners
             edges.append(circle)
-        else:
+        elif not circle:
             edges += [
                 Segment(side[0], side[1], float(share))
-                for side, share in zip(ends[chosen], shares[chosen], strict=True)
+                for side, share in zip(ends[free], shares[free], strict=True)
             ]
     return edges
 

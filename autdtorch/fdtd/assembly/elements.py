@@ -72,14 +72,13 @@ def speed_factor(stencil: Stencil, speed_ratio: float) -> float:
 
 
 def flow_factor(kappa: float, speed_ratio: float) -> float:
-    """Return the factor on a material's coupling and mass that corrects its impedance next to air.
+    """Return the factor on a material's coupling and mass with which waves keep their flow at its surface.
 
-    Half-way between two cells a wave's slope is their difference over 2 sin(k / 2) / k, and its value their
-    mean over cos(k / 2), with the material's own k. The grid's impedance is off by tan(k / 2) / (k / 2). At
-    oblique incidence the two normal k differ, but the ratio of these factors is unchanged to second order.
+    Where a wave of unit pressure and flow passes a grid, the discrete flow is sin(k) / k, with the material's
+    own k. At oblique incidence the two normal k differ, but the ratio is unchanged to second order.
     """
-    air, own = kappa / 2, kappa / speed_ratio / 2
-    return (math.tan(air) / air) / (math.tan(own) / own)
+    own = kappa / speed_ratio
+    return math.sin(kappa) / kappa / (math.sin(own) / own)
 
 
 def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:

@@ -9,7 +9,7 @@ In an element of one material both are those of the tuned stencil. An interface 
   the stiffness in series, N the fields at the vertices and A their exact energies, the correction is
   C^T (A - N^T L N) C with the projection C = (N^T L N)^-1 N^T L. This is the consistency term of virtual
   element methods (Beirao da Veiga et al. 2013) for the local solutions of immersed finite elements (Li 1998);
-- masses on their side of the surface: a sliver of air gives its mass to the vertices in air;
+- masses on their side of the surface, but for the share of a flow through it that reaches the other side;
 - at other surfaces of sound-hard bodies, the finite elements of `sound_hard.py` instead.
 
 `docs/decisions/surfaces.md` compares this treatment with others.
@@ -196,12 +196,22 @@ def _curvature(fit: Array, tangents: Array) -> Array:
 
 
 def _lumped_mass(vertex: Index, volumes: Array, materials: Materials) -> Array:
-    """Return masses at the vertices (n, 8): each material's at the vertices in it, if there are any."""
+    """Return masses at the vertices (n, 8).
+
+    Vertices in a material take its mass, but for the share of a flow through the surface that reaches those
+    of other fluids. With one face across the line between two vertices, both standing waves are then exact.
+    """
     total = np.zeros(vertex.shape)
+    mean = volumes.mean(axis=1) @ materials.density
     for own, mass in enumerate(materials.mass):
-        volume = volumes[:, :, own] @ HATS / SUBCELLS**3
-        kept = volume * (vertex == own)
-        whole, held = volume.sum(axis=1, keepdims=True), kept.sum(axis=1, keepdims=True)
-        has = held > _ABSENT_SHARE * whole
-        total += mass * np.where(has, kept * whole / np.where(has, held, 1), volume)
+        inside = vertex == own
+        beside = ~inside & ~materials.sound_hard[vertex]
+        beside[~inside.any(axis=1)] = True
+        near, far = inside @ HATS.T, beside @ HATS.T
+        passed = np.minimum(1, (materials.density[own] / mean)[:, None] * far)
+        passed[~inside.any(axis=1)] = 1
+        volume = volumes[:, :, own] / SUBCELLS**3
+        here = (volume * np.divide(1 - passed, near, out=np.zeros_like(near), where=near > 0)) @ HATS
+        there = (volume * np.divide(passed, far, out=np.zeros_like(far), where=far > 0)) @ HATS
+        total += mass * (np.where(inside, here, 0) + np.where(beside, there, 0))
     return total
