@@ -217,4 +217,5 @@ def grid_errors(matrix: Tensor, second: Tensor, ratio: float) -> Tensor:
     size = matrix.norm(dim=1).clamp(min=torch.finfo(torch.float64).tiny)
     difference = (matrix - second).norm(dim=1) / size
     order = 2 + (difference / _LARGE).clamp(max=1)
-    return _CAUTION * difference / (ratio**order - 1).abs()
+    error: Tensor = _CAUTION * difference / (ratio**order - 1).abs()
+    return error

@@ -3,7 +3,8 @@
 For obstacles the derivatives are central differences of the whole assembly. Maps are differentiated by
 autograd. On a map the coupling of two cells has both densities in series, 2 / (rho_i + rho_j), and a cell the
 mass 1 / (rho_i f_i), with density and speed factor f as in `assembly/elements.py`. Uniform maps give the
-stencil rows of an obstacle of that material; surfaces are staircases half-way between two cells.
+stencil rows of an obstacle of that material; surfaces are staircases half-way between two cells, and
+densities are scaled for these.
 """
 
 from __future__ import annotations

@@ -75,19 +75,15 @@ def make_propagator(
             simulation needs more memory than available.
     """
     planned = plan(scene, method, spacing, tolerance, kernel, dtype, max_periods, time_step)
-    budget = Budget(
-        *(
-            None if value is None else positive(name, value, unit)
-            for name, value, unit in (("seconds", seconds, "s"), ("memory", memory, "bytes"))
-        )
-    )
+    seconds = None if seconds is None else positive("seconds", seconds, "s")
+    memory = None if memory is None else positive("memory", memory, "bytes")
     if spacing is not None and (seconds, memory) != (None, None):
         raise invalid("spacing", spacing, "must be None where seconds or memory limit its choice", "m")
     disk_cache = _disk_cache(cache)
     if planned.method == "free_space":
         return FreeSpacePropagator(scene)
     if spacing is None:
-        propagator = refined(planned, budget, disk_cache)
+        propagator = refined(planned, Budget(seconds, memory), disk_cache)
     else:
         planned.require_feasible()
         propagator = SimulatedPropagator(planned, disk_cache)

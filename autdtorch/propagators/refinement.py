@@ -49,7 +49,8 @@ def refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPr
 
     Where the budget does not suffice, it is the finest that fits, and a warning says which error it has.
     """
-    tolerance, others, region = pilot.tolerance, [], pilot.region
+    tolerance, region = pilot.tolerance, pilot.region
+    others: list[SimulatedPropagator] = []
     spacing = min(_FIRST_SPACING * region.wavelength * math.sqrt(tolerance), coarsest_spacing(region))
     plan = pilot.at(spacing, _SETTLED * tolerance, pilot.time_step)
     while True:

@@ -153,7 +153,8 @@ class SimulatedPropagator:
         result = self._result(places)
         settling = result.error * result.matrix.norm() / result.matrix.norm(dim=1).clamp(min=_TINY)
         others = [other._result(places).matrix for other in self._others]
-        return self._grid_errors(result.matrix, others) + settling
+        errors: torch.Tensor = self._grid_errors(result.matrix, others) + settling
+        return errors
 
     def _grid_errors(self, matrix: torch.Tensor, others: Sequence[torch.Tensor]) -> torch.Tensor:
         """Return the errors (P,) of the rows of a matrix, given those on the other grids; the least counts.

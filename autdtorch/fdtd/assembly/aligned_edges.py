@@ -242,7 +242,7 @@ def _edge_coupling(
         return np.concatenate((moved[:, chosen].reshape(6, -1).T, _PRIOR * np.eye(6)))
 
     found = least_squares(missed, np.ones(6), slopes, xtol=_EXACT, ftol=_EXACT, gtol=_EXACT).x
-    return _semidefinite(found * series) / uniform
+    return np.asarray(_semidefinite(found * series) / uniform)
 
 
 def _add(matrix: Array, first: tuple[int, int], coupling: Array) -> None:
@@ -273,7 +273,7 @@ def _beside(
     link, mobility, _ = matched(planes, np.array(density)[None, order], np.full((1, 2), _LONG))
     one, other = _CORNERS[_COLUMN_PAIRS.T, axis]
     along = mobility[0, one] * (uniform[0] + uniform[2]) - link[0] * uniform[2]
-    return np.where(one != other, uniform * link[0], along)
+    return np.asarray(np.where(one != other, uniform * link[0], along))
 
 
 def _semidefinite(coupling: Array) -> Array:
@@ -283,7 +283,8 @@ def _semidefinite(coupling: Array) -> Array:
     matrix += matrix.T
     matrix[range(4), range(4)] = -matrix.sum(axis=1)
     values, vectors = np.linalg.eigh(matrix)
-    return -((vectors * values.clip(min=0)) @ vectors.T)[tuple(_COLUMN_PAIRS.T)]
+    kept = (vectors * values.clip(min=0)) @ vectors.T
+    return np.asarray(-kept[tuple(_COLUMN_PAIRS.T)])
 
 
 def _diagonal_fields(places: Array, density: tuple[float, float]) -> Array:

@@ -26,6 +26,7 @@ _VARIATION = 1e-6  # Largest variation of a share or distance along an axis-alig
 _WHOLE = 1e-9  # Share of an element up to which a third material is rounding
 # Wavenumber, relative to the wave's, at which second derivatives by it are evaluated
 _SMALL = 0.1
+_PLACES, _STILL = 40, 1e-3  # Places of a face between two cells; long waves, relative to the drive's
 # Ratio of the second-order terms of mobility and thickness. With s = sin^2 of the angle of incidence, the
 # exact term is (1 - s)^2 = 1 - 2 s + s^2; the scheme has 1 - 1.25 s, nearest to it over s of 0 to 1.
 _OBLIQUE = 1.25
@@ -106,6 +107,21 @@ def matched(depth: Array, density: Array, wavenumber: Array) -> tuple[Array, Arr
     change = (near[1] - thickness) / _SMALL**2
     link = link + (near[0] - link) / _SMALL**2
     return link, 2 * (along + _OBLIQUE * change) / density, thickness + change
+
+
+def mean_thickness(materials: Materials, stencil: Stencil) -> Array:
+    """Return the mean second-order thickness [cells] of air before each material (m,), over all places.
+
+    A wave on the grid is reflected so far behind other surfaces of fluids. Sound-hard ones have finite elements.
+    """
+    depth = (np.arange(_PLACES) + 0.5) / _PLACES
+    depths, found = np.stack((depth, 1 - depth), axis=1), np.zeros(len(materials.density))
+    for number in np.flatnonzero(~materials.sound_hard)[1:]:
+        density, slowness = materials.density[[0, number]], materials.slowness[[0, number]]
+        own = np.broadcast_to(density, depths.shape), np.broadcast_to(slowness, depths.shape)
+        waves, still = (matched(depths, own[0], scale * stencil.kappa * own[1])[2] for scale in (1, _STILL))
+        found[number] = (waves - still)[:, 0].mean()
+    return found
 
 
 def _least(depth: Array, density: Array, link: Array, ratio: Array) -> Array:

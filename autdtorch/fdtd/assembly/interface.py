@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from autdtorch.fdtd.assembly.aligned_edges import edge_elements
-from autdtorch.fdtd.assembly.aligned_faces import layered_axis, layered_elements
+from autdtorch.fdtd.assembly.aligned_faces import layered_axis, layered_elements, mean_thickness
 from autdtorch.fdtd.assembly.coverage import (
     distance_to_material,
     line_coverage,
@@ -85,22 +85,25 @@ def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -
     lines = shares(line_coverage, distance, material, count)
     coupling = _series_coupling(lines, materials, stencil)
     vertex = _vertex_materials(distance, material)
-    mass = _lumped_mass(vertex, volumes, materials)
     layered = layered_axis(vertex, volumes, distance[~aligned])
     near = (np.abs(distance) < FAR).any(axis=2)
+    straight = (aligned[:, None] | ~near).all(axis=0) | (layered >= 0)
+    grow = mean_thickness(materials, stencil)[material, None, None] * ~straight[:, None]
+    volumes = shares(volume_coverage, distance - grow, material, count)
+    mass = _lumped_mass(vertex, volumes, materials)
     grown = (near & finite).any(axis=0) & (layered < 0)
     for axis in range(3):
-        own = layered == axis
+        own = np.flatnonzero(layered == axis)
         share = volumes[own].mean(axis=1)
         coupling[own], mass[own] = layered_elements(axis, vertex[own], share, mass[own], materials, stencil)
     held = (vertex[:, :, None] == np.arange(count)).any(axis=1)
     present = volumes.mean(axis=1) > _ABSENT_SHARE
     two = (held.sum(axis=1) == 2) & (present <= held).all(axis=1)
-    straight = np.flatnonzero((aligned[:, None] | ~near).all(axis=0) & (layered < 0))
+    cornered = np.flatnonzero(straight & (layered < 0))
     edged, *found = edge_elements(
-        distance[:, straight], material, vertex[straight], volumes[straight], materials, stencil
+        distance[:, cornered], material, vertex[cornered], volumes[cornered], materials, stencil
     )
-    edged = straight[edged]
+    edged = cornered[edged]
     coupling[edged], mass[edged] = found
     two[edged] = False
     chosen = np.flatnonzero(two & (layered < 0) & ~grown)
