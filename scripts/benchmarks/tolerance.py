@@ -5,6 +5,7 @@ grids. Required: true errors within the tolerance in 95 % of the cases, estimate
 the true errors in 90 %, and a time of at most three times that of the coarsest grid that would have done.
 
     python scripts/benchmark.py tolerance           about 40 minutes on 2 idle cores
+    python scripts/benchmark.py tolerance --every 4
 """
 
 from __future__ import annotations
@@ -218,14 +219,17 @@ def by_kind(found: list[Result], asked: tuple[float, ...], shown: Callable[[floa
     return table(["scenes", *map(shown, asked)], lines)
 
 
+OPTIONS = {"--every": {"type": int, "default": 1, "help": "measure each n-th scene"}}
+
+
 def main(given: argparse.Namespace) -> None:
-    """Measure all cases and write the tables."""
+    """Measure the cases and write the tables."""
     warnings.simplefilter("ignore", at.SteadyStateWarning)
     grids: list[Result] = []
     asked: dict[float, list[Result]] = {tolerance: [] for tolerance in TOLERANCES}
     ratios: dict[float, list[float]] = {tolerance: [] for tolerance in TOLERANCES}
     uncached(cases()[0].scene, "auto", 2.0).transfer_matrix()  # compiles the kernel
-    for case in cases():
+    for case in cases()[:: given.every]:
         own, reference = on_grids(case)
         grids += own
         for tolerance in TOLERANCES:

@@ -110,9 +110,9 @@ def matched(depth: Array, density: Array, wavenumber: Array) -> tuple[Array, Arr
 
 
 def mean_thickness(materials: Materials, stencil: Stencil) -> Array:
-    """Return the mean second-order thickness [cells] of air before each material (m,), over all places.
+    """Return the second-order thickness [cells] of air before each material (m,), averaged over places.
 
-    A wave on the grid is reflected so far behind other surfaces of fluids. Sound-hard ones have finite elements.
+    A wave on the grid is reflected so far behind other surfaces of fluids. Sound-hard ones need none.
     """
     depth = (np.arange(_PLACES) + 0.5) / _PLACES
     depths, found = np.stack((depth, 1 - depth), axis=1), np.zeros(len(materials.density))
