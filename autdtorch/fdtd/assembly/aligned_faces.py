@@ -105,8 +105,14 @@ def matched(depth: Array, density: Array, wavenumber: Array) -> tuple[Array, Arr
     along = _least(depth, density, link, np.ones_like(ratio))
     near = _exact(depth, density, _SMALL * wavenumber)
     change = (near[1] - thickness) / _SMALL**2
-    link = link + (near[0] - link) / _SMALL**2
-    return link, 2 * (along + _OBLIQUE * change) / density, thickness + change
+    mobility = along + _bounded(_OBLIQUE * change, along)
+    link = link + _bounded((near[0] - link) / _SMALL**2, link)
+    return link, 2 * mobility / density, thickness + _bounded(change, thickness)
+
+
+def _bounded(change: Array, value: Array) -> Array:
+    """Return a change that leaves at least half of a value: coarse grids of slow materials stay stable."""
+    return np.asarray(np.clip(change, -value / 2, value))
 
 
 def mean_thickness(materials: Materials, stencil: Stencil) -> Array:
