@@ -13,9 +13,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from autdtorch.fdtd.region import Region, Shape, doubled_normals
+from autdtorch.fdtd.region import Region, Shape
 from autdtorch.fdtd.turning import ALIGNED
 from autdtorch.utils.array_types import Array
+from autdtorch.utils.triangles import doubled_normals
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
 # Distance of a face from a cell centre [cells] up to which the centre lies on it, and so in the obstacle

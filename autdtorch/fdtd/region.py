@@ -45,12 +45,6 @@ def bounds(shapes: Sequence[Shape]) -> tuple[Array, Array]:
     return lower, np.array([shape.upper for shape in shapes], np.float64).max(axis=0)
 
 
-def doubled_normals(corners: Array) -> Array:
-    """Return the outward normals (T, 3) of triangles with `corners` (T, 3, 3), of twice their area."""
-    first, second, third = np.moveaxis(corners, 1, 0)
-    return np.asarray(np.cross(second - first, third - first))
-
-
 @dataclass(frozen=True)
 class Body:
     """A shape of one material."""

@@ -19,6 +19,7 @@ from autdtorch.plot.style import TICK_SIZE, new_figure, styled
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import Array
+from autdtorch.utils.triangles import doubled_normals
 from autdtorch.utils.validation import ArrayLike, Vector, require_kind
 
 _TICKS = 5  # along the longest side; on a short side as many would overlap
@@ -82,7 +83,7 @@ def _add_obstacle(ax: Axes3D, obstacle: Obstacle, domain: tuple[Vector, Vector])
     """
     vertices, faces = (part.numpy() for part in obstacle.surface())
     corners = vertices[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = doubled_normals(corners)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
     front = normals @ _TO_VIEWER > 0
     leaves = (vertices < domain[0]).any() or (vertices > domain[1]).any()

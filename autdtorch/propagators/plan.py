@@ -16,13 +16,14 @@ from autdtorch.analytic.green import PAIR_BYTES
 from autdtorch.fdtd.grid import MAX_CELLS, coarsest_spacing, layer_cells, require_spacing, second_spacing
 from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.kernels.contract import Kernel
-from autdtorch.fdtd.region import Region, doubled_normals
+from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import phasors_kept
 from autdtorch.propagators.grids import USUAL_PERIODS, Grouping, choose_grids
 from autdtorch.propagators.scene_region import region_of
 from autdtorch.scene.obstacles import Mesh
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.memory import require_memory
+from autdtorch.utils.triangles import doubled_normals
 from autdtorch.utils.validation import integer_at_least, invalid, positive, require_kind, require_one_of
 
 logger = logging.getLogger(__name__)

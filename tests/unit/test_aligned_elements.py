@@ -47,7 +47,7 @@ def reflection(kappa: float, density: float, slowness: float, place: float) -> t
 def test_a_wave_is_reflected_exactly_wherever_the_face_falls(
     density: float, slowness: float, place: float
 ) -> None:
-    """The error is of fourth order; its largest coefficient found was 0.12, with margin for rare cases."""
+    """The error is of fourth order; its largest coefficient in 20,000 random cases was 0.11."""
     for kappa in (0.1, 0.3, 0.7):
         found, exact = reflection(kappa, density, slowness, place)
         assert abs(found - exact) < 0.3 * kappa**4
@@ -71,5 +71,5 @@ def test_the_coupling_at_an_edge(depth: tuple[float, float], density: float) -> 
 
 @pytest.mark.parametrize("depth", [(0.2, 0.7), (0.5, 0.5), (0.9, 0.1)])
 def test_an_edge_of_air_in_air_is_none(depth: tuple[float, float]) -> None:
-    """The stencil is tuned to other waves than the long ones of the fit: the limit is half of kappa^4."""
-    assert edge_coupling(depth, (1.0, 1.0), tuned_stencil(0.3)) == pytest.approx(np.ones(6), abs=5e-3)
+    """The fit ends where it starts, up to rounding."""
+    assert edge_coupling(depth, (1.0, 1.0), tuned_stencil(0.3)) == pytest.approx(np.ones(6), abs=1e-9)

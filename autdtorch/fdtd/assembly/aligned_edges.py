@@ -34,7 +34,7 @@ _SAME = 1e-9  # Difference of depths [cells] up to which edges share their coupl
 _RADIUS = 3  # Elements on each side of the edge in the plane of the fit
 _SQUARES = 64  # Squares along each side of an element, for the areas beside an edge
 _LONG = 1e-3  # Wavenumber of a long wave [rad/cell]
-_ROUNDING = 1e-9
+_ROUNDING = 1e-9  # Angle [rad], or value of a sine, up to which it is zero
 # Weight of the coupling in series, for what the fields do not determine
 _PRIOR = 1e-4
 _EXACT = 1e-12  # Relative tolerance of the fit: symmetric scenes stay so

@@ -70,17 +70,15 @@ def layered_elements(
     uniform = uniform_coupling(stencil)
     beside = np.where(across, 0, coupling_by_edges(stencil)[np.minimum(EDGES_BETWEEN.sum(axis=1) + 1, 3)])
     side = VERTICES[:, axis]
-    link, mobility, mass = 1 / (share @ materials.density), _mobility(side, vertex, share, materials), mass
+    link, mobility = 1 / (share @ materials.density), _mobility(side, vertex, share, materials)
     planes = np.stack([vertex[:, side == plane][:, 0] for plane in (0, 1)], axis=1)
     depth = np.take_along_axis(share, planes, axis=1)
     one = np.flatnonzero((planes[:, 0] != planes[:, 1]) & (depth.sum(axis=1) > 1 - _WHOLE))
-    if len(one):
-        own = planes[one]
-        link[one], mobility[one], thickness = matched(
-            depth[one], materials.density[own], stencil.kappa * materials.slowness[own]
-        )
-        mass = mass.copy()
-        mass[one] = (thickness * materials.mass[own] / 4)[:, side]
+    own, mass = planes[one], mass.copy()
+    link[one], mobility[one], thickness = matched(
+        depth[one], materials.density[own], stencil.kappa * materials.slowness[own]
+    )
+    mass[one] = (thickness * materials.mass[own] / 4)[:, side]
     along = mobility[:, side[PAIRS[:, 0]]]
     link = np.where(across, uniform, -beside) * link[:, None]
     return np.where(across, 0, along * (uniform + beside)) + link, mass
@@ -132,8 +130,7 @@ def mean_thickness(materials: Materials, stencil: Stencil) -> Array:
 
 def _least(depth: Array, density: Array, link: Array, ratio: Array) -> Array:
     """Return the thickness (n, 2) for long waves, given the squared ratio (n, 2) of the wavenumbers."""
-    moved = depth**2
-    return depth - density * link[:, None] / 2 * (moved - moved[:, ::-1] * ratio)
+    return depth - density * link[:, None] / 2 * (depth**2 - depth[:, ::-1] ** 2 * ratio)
 
 
 def _exact(depth: Array, density: Array, wavenumber: Array) -> tuple[Array, Array]:

@@ -88,8 +88,9 @@ def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -
     layered = layered_axis(vertex, volumes, distance[~aligned])
     near = (np.abs(distance) < FAR).any(axis=2)
     straight = (aligned[:, None] | ~near).all(axis=0) | (layered >= 0)
-    grow = mean_thickness(materials, stencil)[material, None, None] * ~straight[:, None]
-    volumes = shares(volume_coverage, distance - grow, material, count)
+    moved = np.flatnonzero(~straight)
+    grow = mean_thickness(materials, stencil)[material, None, None]
+    volumes[moved] = shares(volume_coverage, distance[:, moved] - grow, material, count)
     mass = _lumped_mass(vertex, volumes, materials)
     grown = (near & finite).any(axis=0) & (layered < 0)
     for axis in range(3):

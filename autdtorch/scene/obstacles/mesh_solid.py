@@ -14,6 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.triangles import doubled_normals
 
 Triangles: TypeAlias = tuple[Array, Index]
 """Vertices (V, 3) and the indices of each triangle's vertices (F, 3)."""
@@ -127,7 +128,7 @@ def _labels(vertices: Array, faces: Index) -> Index:
     Every side of a triangle meets one of the opposite direction. Of several on an edge, the first ones of
     each direction meet, because files list one part after the other.
     """
-    sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    sides = _sides(faces)
     upwards = sides[:, 0] < sides[:, 1]
     edges, edge = np.unique(sides.min(axis=1) * len(vertices) + sides.max(axis=1), return_inverse=True)
     up, down = (np.bincount(edge[chosen], minlength=len(edges)) for chosen in (upwards, ~upwards))
@@ -184,7 +185,7 @@ def _edges(part: _Part) -> tuple[Any, Array, Array]:
 
     tree = igl.AABB()
     tree.init(part.vertices, part.faces)
-    sides = np.concatenate([part.faces[:, [0, 1]], part.faces[:, [1, 2]], part.faces[:, [2, 0]]])
+    sides = _sides(part.faces)
     first, last = np.moveaxis(part.vertices[sides[sides[:, 0] < sides[:, 1]]], 1, 0)
     return tree, first + _END * (last - first), (1 - 2 * _END) * (last - first)
 
@@ -192,7 +193,7 @@ def _edges(part: _Part) -> tuple[Any, Array, Array]:
 def _require_air_beside(whole: _Part) -> None:
     """Check that each triangle has air on one side only; triangles may lie on each other."""
     corners = whole.vertices[whole.faces]
-    middle, normal = corners.mean(axis=1), _doubled(corners)
+    middle, normal = corners.mean(axis=1), doubled_normals(corners)
     length = np.linalg.norm(normal, axis=1)
     step = _BESIDE * _extent(whole.vertices) * normal / np.where(length > 0, length, 1)[:, None]
     outside, inside = (
@@ -283,15 +284,14 @@ def _agree(joined: _Part, parts: Sequence[_Part]) -> bool:
     )
 
 
-def _doubled(corners: Array) -> Array:
-    """Return the normals (F, 3) of triangles (F, 3, 3), of twice their area."""
-    first, second, third = np.moveaxis(corners, 1, 0)
-    return np.asarray(np.cross(second - first, third - first))
+def _sides(faces: Index) -> Index:
+    """Return the vertices of the sides (3 F, 2) of triangles: the first side of each, then the others."""
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def _areas(corners: Array) -> Array:
     """Return the areas (F,) of triangles (F, 3, 3)."""
-    return np.asarray(np.linalg.norm(_doubled(corners), axis=1) / 2)
+    return np.asarray(np.linalg.norm(doubled_normals(corners), axis=1) / 2)
 
 
 def _bounds(vertices: Array) -> Array:
