@@ -68,7 +68,7 @@ def edge_elements(
             held = vertex[:, columns]
             pair = held[:, :2, 0]
             edge = (held == np.where(inside[:, None], pair[:, None, :1], pair[:, None, 1:])).all(axis=(1, 2))
-            # of two diagonals, that of the heavier material
+            # two edges that touch are those of the heavier material
             denser = materials.density[pair[:, 0]] > materials.density[pair[:, 1]]
             edge &= denser if inside is _DIAGONAL else pair[:, 0] != pair[:, 1]
             rows = np.flatnonzero(along & edge)
@@ -169,7 +169,7 @@ def _lumped(depth: tuple[float, float], density: Array, inside: NDArray[np.bool_
 def _extruded(flat: Array, mobility: Array, columns: Index, stencil: Stencil) -> Array:
     """Return coupling (28,) from that across the edge (6,) and the mobility of each column (4,) along it.
 
-    The energy is the mean over both ends of the one across the edge, and that of each column along it.
+    The energy across the edge is averaged over both ends of the columns; each column adds its own along it.
     """
     by_edges, matrix = coupling_by_edges(stencil), np.zeros((8, 8))
     along = mobility.copy()
@@ -188,8 +188,8 @@ def edge_coupling(
     """Return the coupling (6,) of pairs of columns at an edge, relative to air.
 
     `depth` is the distance [cells] of the next columns from the faces of the first column's material,
-    `density` that of this material and of the other. `diagonal`: two such edges touch. The mean over the
-    images of an edge keeps symmetric scenes symmetric.
+    `density` holds the densities of this material and of the other. `diagonal`: two such edges touch. The
+    mean over the images of an edge keeps symmetric scenes symmetric.
     """
     turned = (1 - depth[1], 1 - depth[0])  # each of two edges in the place of the other
     images = [(depth, [0, 1, 2, 3, 4, 5])] + ([(turned, _TURNED)] if diagonal else [])
@@ -318,13 +318,13 @@ def _diagonal_fields(places: Array, density: tuple[float, float]) -> Array:
 def _corner_fields(places: Array, density: tuple[float, float]) -> Array:
     """Return six fields (n, 6) of long waves at places (n, 2) [cells] around an edge.
 
-    They are even or odd about the plane that bisects the edge. With q = (i - o) / 2 (i + o), i being the
-    density within the edge and o that around it, cos(pi v / 2) is q for odd and -q for even ones; or v is 2.
+    They are even or odd about the plane that bisects the edge. The densities i within the edge and o around
+    it give q = (i - o) / 2 (i + o). Then cos(pi v / 2) is q for odd and -q for even fields; or v is 2.
     """
     inner, outer = density
     lowest = 2 / np.pi * np.arccos((inner - outer) / (2 * (inner + outer)))
     radius = np.hypot(*places.T)
-    # from the middle of the material within the edge, and from that of the other
+    # zero in the middle of the material within the edge; `back` is zero in the middle of the other
     angle = (np.arctan2(places[:, 1], places[:, 0]) + 7 * np.pi / 4) % (2 * np.pi) - np.pi
     inside, back = np.abs(angle) <= np.pi / 4 + _ROUNDING, np.pi - np.abs(angle)
     columns = []
