@@ -19,7 +19,7 @@ from autdtorch.plot.style import TICK_SIZE, new_figure, styled
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.triangles import doubled_normals
+from autdtorch.utils.triangles import doubled_normals, sides_of
 from autdtorch.utils.validation import ArrayLike, Vector, require_kind
 
 _TICKS = 5  # along the longest side; on a short side as many would overlap
@@ -112,7 +112,7 @@ def _hidden(obstacle: Obstacle, points: Array) -> NDArray[np.bool_]:
 
 def _sharp_edges(faces: NDArray[np.int64], normals: Array, front: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return the vertices (E, 2) of edges between faces at over `SHARP_ANGLE`, one of them in `front`."""
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    ends = sides_of(faces)
     face = np.tile(np.arange(len(faces)), 3)
     pairs = np.sort(ends, axis=1)
     # On a closed surface, sorting brings the two faces of an edge together.

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from autdtorch.utils.array_types import Array
+from autdtorch.utils.array_types import Array, Index
 
 
 def doubled_normals(corners: Array) -> Array:
     """Return the outward normals (T, 3) of triangles with `corners` (T, 3, 3), of twice their area."""
     first, second, third = np.moveaxis(corners, 1, 0)
     return np.asarray(np.cross(second - first, third - first))
+
+
+def sides_of(triangles: Index) -> Index:
+    """Return the vertices (3 T, 2) of the sides of triangles (T, 3): the first of each, then the others."""
+    return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])

@@ -215,9 +215,9 @@ def by_kind(found: list[Result], columns: tuple[tuple[float, str], ...]) -> str:
         cells = []
         for asked, _ in columns:
             own = [one for one in found if (one.kind, one.asked) == (kind, asked)]
-            middle, most = (percent(float(of([one.error for one in own]))) for of in (np.median, max))
+            errors = [100 * one.error for one in own]
             seconds = float(np.median([one.seconds for one in own]))
-            cells.append(f"{middle.removesuffix(' %')} ({most.removesuffix(' %')}) %, {seconds:.2g} s")
+            cells.append(f"{np.median(errors):.3g} ({max(errors):.3g}) %, {seconds:.2g} s")
         lines.append([kind, *cells])
     return table(["scenes", *(shown for _, shown in columns)], lines)
 

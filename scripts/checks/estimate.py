@@ -25,6 +25,7 @@ from shared.processes import in_new_process
 from shared.scenes import paper_scene
 
 import autdtorch as at
+from autdtorch.utils.triangles import doubled_normals
 
 
 class Cost(NamedTuple):
@@ -62,8 +63,8 @@ def head() -> at.Mesh:
     flat = np.sqrt(1 - height**2)
     vertices = np.column_stack((12 * flat * np.cos(turn), 9 * flat * np.sin(turn), 15 * height))
     faces = ConvexHull(vertices).simplices
-    first, second, third = vertices[faces].transpose(1, 0, 2)
-    inward = (np.cross(second - first, third - first) * first).sum(axis=1) < 0
+    corners = vertices[faces]
+    inward = (doubled_normals(corners) * corners[:, 0]).sum(axis=1) < 0
     faces[inward] = faces[inward, ::-1]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "head.obj"

@@ -43,8 +43,8 @@ def layered_axis(vertex: Index, volumes: Array, distance: Array) -> Index:
     """Return an axis (n,) along which alone elements vary, or -1.
 
     Arguments are materials at the vertices (n, 8), shares in the sub-cells (n, 64, m), and signed distances
-    (K, n, 125) of bodies with other faces. That of an aligned body also varies along a face, where another
-    face is as near.
+    (K, n, 125) of bodies with other faces. The signed distance of an aligned body is not needed: it also
+    varies along a face, where another face is as near.
     """
     found = np.full(len(volumes), -1)
     corners, cube = vertex.reshape(-1, 2, 2, 2), distance.reshape(*distance.shape[:2], *(SUBCELLS + 1,) * 3)
@@ -61,10 +61,11 @@ def layered_elements(
 ) -> tuple[Array, Array]:
     """Return coupling (n, 28) and mass (n, 8) of elements with faces across an axis.
 
-    `vertex` (n, 8) is the material at the vertices, `share` (n, m) that of each material in the volume, and
-    `mass` (n, 8) the mass of elements with several faces. With p0 and p1 the pressures in the two planes, the
-    energy is g (p1 - p0)^T W (p1 - p0), W being the averages along a plane in air, and for each plane that of
-    air times a mobility. Each part is positive: waves would grow in a boundary layer otherwise.
+    `vertex` (n, 8) holds the material at the vertices, `share` (n, m) the share of each material in the
+    volume, and `mass` (n, 8) the mass of elements with several faces. With p0 and p1 the pressures in the
+    two planes, the energy is g (p1 - p0)^T W (p1 - p0), W being the averages along a plane in air, and for
+    each plane that of air times a mobility. Each part is positive: waves would grow in a boundary layer
+    otherwise.
     """
     across = EDGES_BETWEEN[:, axis] == 1
     uniform = uniform_coupling(stencil)
@@ -136,7 +137,7 @@ def _least(depth: Array, density: Array, link: Array, ratio: Array) -> Array:
 def _exact(depth: Array, density: Array, wavenumber: Array) -> tuple[Array, Array]:
     """Return the coupling (n,) and the thickness (n, 2) with which a wave across the face is exact.
 
-    Densities are assembled so that the discrete flow is that of the wave (`elements.flow_factor`).
+    Assembled densities give the wave its exact flow on the grid (`elements.flow_factor`).
     """
     true = density * wavenumber / np.sin(wavenumber)
     here, half = np.cos(wavenumber * depth), wavenumber / 2

@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from autdtorch.fdtd.region import Shape
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.triangles import doubled_normals
+from autdtorch.utils.triangles import doubled_normals, sides_of
 
 _SHARP = np.radians(20)  # Smallest angle between the normals of two faces that meet in an edge
 _REACH = 1.2  # Distance from an edge within which the stiffness is reduced [cells]
@@ -150,9 +150,7 @@ def _sharp_sides(vertices: Array, triangles: Index) -> tuple[Array, Array, Array
     normal = doubled_normals(corners)
     double = np.linalg.norm(normal, axis=1)
     normal = normal / np.where(double > 0, double, 1)[:, None]
-    turns = ((0, 1), (1, 2), (2, 0))
-    sides = np.concatenate([np.sort(place[:, list(turn)], axis=1) for turn in turns])
-    ends = np.concatenate([corners[:, list(turn)] for turn in turns])
+    sides, ends = np.sort(sides_of(place), axis=1), vertices[sides_of(triangles)]
     order = np.lexsort(sides.T)
     pairs = np.flatnonzero((sides[order][1:] == sides[order][:-1]).all(axis=1))  # of two triangles each
     one, other = order[pairs] % len(triangles), order[pairs + 1] % len(triangles)

@@ -14,7 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.triangles import doubled_normals
+from autdtorch.utils.triangles import doubled_normals, sides_of
 
 Triangles: TypeAlias = tuple[Array, Index]
 """Vertices (V, 3) and the indices of each triangle's vertices (F, 3)."""
@@ -128,15 +128,15 @@ def _labels(vertices: Array, faces: Index) -> Index:
     Every side of a triangle meets one of the opposite direction. Of several on an edge, the first ones of
     each direction meet, because files list one part after the other.
     """
-    sides = _sides(faces)
-    upwards = sides[:, 0] < sides[:, 1]
-    edges, edge = np.unique(sides.min(axis=1) * len(vertices) + sides.max(axis=1), return_inverse=True)
+    ends = sides_of(faces)
+    upwards = ends[:, 0] < ends[:, 1]
+    edges, edge = np.unique(ends.min(axis=1) * len(vertices) + ends.max(axis=1), return_inverse=True)
     up, down = (np.bincount(edge[chosen], minlength=len(edges)) for chosen in (upwards, ~upwards))
     if len(wrong := np.flatnonzero(up != down)):
         first = wrong[0]
-        ends = " to ".join(map(_place, vertices[list(divmod(edges[first], len(vertices)))]))
+        place = " to ".join(map(_place, vertices[list(divmod(edges[first], len(vertices)))]))
         found = f"{len(wrong)} of its {len(edges)} edges do not join two triangles of one orientation"
-        where = f"the first, {ends}, has {up[first]} of one and {down[first]} of the other"
+        where = f"the first, {place}, has {up[first]} of one and {down[first]} of the other"
         raise ValueError(f"{found} ({where}); must be watertight")
     owner = np.tile(np.arange(len(faces)), 3)
     one, other = (owner[chosen][np.lexsort((owner[chosen], edge[chosen]))] for chosen in (upwards, ~upwards))
@@ -185,8 +185,8 @@ def _edges(part: _Part) -> tuple[Any, Array, Array]:
 
     tree = igl.AABB()
     tree.init(part.vertices, part.faces)
-    sides = _sides(part.faces)
-    first, last = np.moveaxis(part.vertices[sides[sides[:, 0] < sides[:, 1]]], 1, 0)
+    ends = sides_of(part.faces)
+    first, last = np.moveaxis(part.vertices[ends[ends[:, 0] < ends[:, 1]]], 1, 0)
     return tree, first + _END * (last - first), (1 - 2 * _END) * (last - first)
 
 
@@ -282,11 +282,6 @@ def _agree(joined: _Part, parts: Sequence[_Part]) -> bool:
         abs(total - each.sum()) <= _EQUAL * np.abs(each).sum()
         for total, each in ((joined.volume, volumes), (joined.area, areas))
     )
-
-
-def _sides(faces: Index) -> Index:
-    """Return the vertices of the sides (3 F, 2) of triangles: the first side of each, then the others."""
-    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def _areas(corners: Array) -> Array:
