@@ -26,6 +26,7 @@ _PERPENDICULAR = 4e-5  # Largest cosine between perpendicular normals; the same 
 # Share of all surfaces that must become aligned before a grid is turned, which may cost symmetries
 _WORTHWHILE = 0.4
 _DECIMALS = 6  # Normals that agree to so many decimals are equal: files hold single precision
+_ALL = 1 - 1e-6  # Share of a surface that is aligned if it all is: slivers do not count
 _SAGITTA = 1.5  # Growth of a bounding box, relative to the distance of triangles from a curved surface
 
 
@@ -94,6 +95,10 @@ class FlatFaces(NamedTuple):
         """Return the share of their area that is normal to one of the axes, one a row (3, 3)."""
         aligned = (np.abs(self.normals @ axes.T) > ALIGNED).any(axis=1)
         return 1.0 if aligned.all() else float(self.areas[aligned].sum() / self.areas.sum())
+
+    def all_aligned(self, axes: Array) -> bool:
+        """Return whether all of them are normal to one of the axes, one a row (3, 3)."""
+        return self.aligned_share(axes) >= _ALL
 
 
 def axes_along(surfaces: Sequence[FlatFaces]) -> Array:

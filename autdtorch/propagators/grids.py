@@ -98,13 +98,15 @@ def grid_cost(region: Region, extent: Extent, spacing: float) -> GridCost:
 class Grouping:
     """Grids with the ascending indices of the obstacles on each, their axes, and the expected passes.
 
-    Axes are rows of matrices (3, 3). Passes are those of the iteration between boxes.
+    Axes are rows of matrices (3, 3). Passes are those of the iteration between boxes. Grids are aligned if
+    every face is parallel to the axes of its grid.
     """
 
     groups: tuple[tuple[int, ...], ...]
     axes: tuple[Array, ...]
     grids: tuple[GridCost, ...]
     passes: int
+    aligned: bool = True
 
     @property
     def coupled_pairs(self) -> int:
@@ -123,8 +125,9 @@ def choose_grids(
     """Return "box" or "full" and its grids; for "auto" the cheapest that is accurate for the region."""
     if method == "box":
         return method, cheapest_boxes(region, spacing, tolerance, runs)
-    everything = _Box(tuple(range(len(region.bodies))), np.eye(3), domain_extent(region, spacing))
-    domain = _boxes(region, [everything], spacing, 1)
+    own, extent = np.eye(3), domain_extent(region, spacing)
+    aligned = all(flat_faces(shape).all_aligned(own) for shape in region.shapes)
+    domain = _boxes(region, [_Box(tuple(range(len(region.bodies))), own, extent, aligned)], spacing, 1)
     if method == "full":
         return method, domain
     boxes = cheapest_boxes(region, spacing, tolerance, runs)
@@ -168,17 +171,23 @@ def cheapest_boxes(region: Region, spacing: float, tolerance: float, runs: int) 
 
 @dataclass(frozen=True)
 class _Box:
-    """The obstacles of a box, its axes, one a row (3, 3), and its extent along them."""
+    """The obstacles of a box, its axes, one a row (3, 3), and its extent along them.
+
+    It is aligned if every face of its obstacles is parallel to them.
+    """
 
     group: tuple[int, ...]
     axes: Array
     extent: Extent
+    aligned: bool
 
     @classmethod
     def around(cls, region: Region, group: Sequence[int], surfaces: Sequence[FlatFaces]) -> _Box:
-        axes = axes_along([surfaces[index] for index in group])
+        faces = [surfaces[index] for index in group]
+        axes = axes_along(faces)
         shapes = [turned_shape(region.bodies[index].shape, axes) for index in group]
-        return cls(tuple(group), axes, bodies_extent(shapes))
+        aligned = all(each.all_aligned(axes) for each in faces)
+        return cls(tuple(group), axes, bodies_extent(shapes), aligned)
 
     @property
     def middle(self) -> Array:
@@ -197,7 +206,8 @@ def _one_box(region: Region, spacing: float, surfaces: Sequence[FlatFaces]) -> G
 
 def _boxes(region: Region, boxes: Sequence[_Box], spacing: float, passes: int) -> Grouping:
     grids = tuple(grid_cost(region, box.extent, spacing) for box in boxes)
-    return Grouping(tuple(box.group for box in boxes), tuple(box.axes for box in boxes), grids, passes)
+    groups, axes = tuple(box.group for box in boxes), tuple(box.axes for box in boxes)
+    return Grouping(groups, axes, grids, passes, all(box.aligned for box in boxes))
 
 
 def _gaps(boxes: Sequence[_Box], spacing: float) -> Array:

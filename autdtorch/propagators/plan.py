@@ -13,7 +13,15 @@ import numpy as np
 import torch
 
 from autdtorch.analytic.green import PAIR_BYTES
-from autdtorch.fdtd.grid import MAX_CELLS, coarsest_spacing, layer_cells, require_spacing, second_spacing
+from autdtorch.fdtd.grid import (
+    ALIGNED_ORDER,
+    MAX_CELLS,
+    ORDER,
+    coarsest_spacing,
+    layer_cells,
+    require_spacing,
+    second_spacing,
+)
 from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.region import Region
@@ -102,6 +110,11 @@ class Plan:
         return self.at(second_spacing(self.region, self.spacing), self.tolerance)
 
     @property
+    def order(self) -> float:
+        """The power of the spacing with which errors fall."""
+        return ALIGNED_ORDER if self.grouping.aligned else ORDER
+
+    @property
     def cells(self) -> int:
         """Cells of all grids, boundary layers included."""
         return sum(grid.cells for grid in self.grouping.grids)
@@ -187,6 +200,14 @@ class Plan:
         """Runs side by side; coupled boxes run one after the other."""
         grids = self.grouping.grids
         return make_kernel(self.kernel).at_once(grids[0].shape) if len(grids) == 1 else 1
+
+    def is_feasible(self) -> bool:
+        """Return whether the machine can hold it."""
+        try:
+            self.require_feasible()
+        except ValueError:
+            return False
+        return True
 
     def require_feasible(self, field: str = "spacing", value: float | None = None) -> None:
         """Refuse too much memory or too many cells, and name the field and the value to blame."""

@@ -16,13 +16,13 @@ from autdtorch.utils.validation import invalid
 logger = logging.getLogger(__name__)
 
 _FIRST_SPACING = 1.9
-"""First spacing for a tolerance of 1, in wavelengths; it falls with the root of the tolerance."""
+"""First spacing for a tolerance of 1, in wavelengths; it falls as the error does."""
 
-_FIRST_STEP, _SMALLEST_STEP, _LARGEST_STEP = 1.4, 1.25, 2.5
+_FIRST_STEP, _SMALLEST_STEP, _LARGEST_STEP = 1.7, 1.25, 2.5
 """Ratios of a spacing and the next: the first, the smallest that tells two errors apart, and the largest over
-which an error is trusted to fall with the square of the spacing."""
+which an error is trusted to fall with a power of the spacing."""
 
-_AIM = 0.6
+_AIM = 0.7
 """Error for which a spacing is chosen, relative to the tolerance."""
 
 _SETTLED = 0.1
@@ -38,10 +38,15 @@ class Budget:
     begin: float = field(default_factory=time.perf_counter)
 
     def fits(self, plan: Plan, last: Plan, taken: float) -> bool:
-        """Return whether a plan is expected to fit, after the `last` one took `taken` [s]."""
+        """Return whether a plan is expected to fit, after the `last` one took `taken` [s].
+
+        Without limits every plan does: one that the machine cannot hold is refused.
+        """
+        if self.seconds is None and self.memory is None:
+            return True
         spent = time.perf_counter() - self.begin
         in_time = self.seconds is None or spent + taken * plan.work / last.work <= self.seconds
-        return in_time and (self.memory is None or plan.memory <= self.memory)
+        return in_time and (self.memory is None or plan.memory <= self.memory) and plan.is_feasible()
 
 
 def refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPropagator:
@@ -49,9 +54,9 @@ def refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPr
 
     Where the budget does not suffice, it is the finest that fits, and a warning says which error it has.
     """
-    tolerance, region = pilot.tolerance, pilot.region
+    tolerance, region, order = pilot.tolerance, pilot.region, pilot.order
     others: list[SimulatedPropagator] = []
-    spacing = min(_FIRST_SPACING * region.wavelength * math.sqrt(tolerance), coarsest_spacing(region))
+    spacing = min(_FIRST_SPACING * region.wavelength * tolerance ** (1 / order), coarsest_spacing(region))
     plan = pilot.at(spacing, _SETTLED * tolerance, pilot.time_step)
     while True:
         plan.require_feasible("tolerance", tolerance)
@@ -62,7 +67,7 @@ def refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPr
             if not math.isfinite(error):
                 accepted = f"too few: at a spacing of {plan.spacing:.3g} m no run came near its steady state"
                 raise invalid("max_periods", pilot.max_periods, accepted)
-            step = min(max(math.sqrt(error / (_AIM * tolerance)), _SMALLEST_STEP), _LARGEST_STEP)
+            step = min(max((error / (_AIM * tolerance)) ** (1 / order), _SMALLEST_STEP), _LARGEST_STEP)
         logger.info("spacing %.3g mm: estimated error %.2g", 1e3 * plan.spacing, error)
         if error <= tolerance:
             return found

@@ -162,8 +162,9 @@ class SimulatedPropagator:
         A grid that is too coarse for the scene makes the error seem larger.
         """
         ratios = (other.spacing / self.spacing for other in self._others)
+        order = self._plan.order
         return torch.stack(
-            [grid_errors(matrix, second, ratio) for second, ratio in zip(others, ratios, strict=True)]
+            [grid_errors(matrix, second, ratio, order) for second, ratio in zip(others, ratios, strict=True)]
         ).amin(dim=0)
 
     @one_torch_thread()

@@ -14,7 +14,7 @@ from autdtorch.fdtd.grid import RATIO, coarsest_spacing, grid_errors, second_spa
 from autdtorch.propagators import FreeSpacePropagator, make_propagator
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.scene_region import region_of
-from autdtorch.scene.obstacles import Sphere
+from autdtorch.scene.obstacles import Box, Sphere
 
 CENTER, RADIUS = (12.2e-3, 11.9e-3, 12.1e-3), 3.3e-3
 RIGID = Sphere(CENTER, RADIUS, rigid=True)
@@ -97,16 +97,25 @@ def test_without_an_estimate_no_spacing_is_chosen():
         make_propagator(small_scene((RIGID,)), "box", None, tolerance=0.1, max_periods=1)
 
 
-@given(st.floats(1.25, 3.0), st.floats(1e-5, 1e-2))
-def test_errors_of_the_second_order_are_known_from_either_grid(ratio, error):
+@given(st.floats(1.25, 3.0), st.floats(1e-5, 5e-3), st.sampled_from([2, 3.3]))
+def test_errors_are_known_from_either_grid(ratio, error, order):
     one = torch.ones(2, 3, dtype=torch.complex128)
-    fine, coarse = one * (1 + error), one * (1 + error * ratio**2)
-    # within the safety factor and the third order of large differences
-    assert (grid_errors(fine, coarse, ratio) / error).numpy() == pytest.approx(1, abs=0.7)
-    assert (grid_errors(coarse, fine, 1 / ratio) / error / ratio**2).numpy() == pytest.approx(1, abs=0.7)
+    fine, coarse = one * (1 + error), one * (1 + error * ratio**order)
+    known = grid_errors(fine, coarse, ratio, order), grid_errors(coarse, fine, 1 / ratio, order)
+    # large differences are taken for third order
+    assert (known[0] / error).numpy() == pytest.approx(1, abs=0.7)
+    assert (known[1] / error / ratio**order).numpy() == pytest.approx(1, abs=0.7)
 
 
 def test_the_second_grid_is_coarser_where_fair():
     region = region_of(EMPTY)
     assert second_spacing(region, 1e-3) == RATIO * 1e-3
     assert second_spacing(region, 2e-3) == 2e-3 / RATIO
+
+
+@pytest.mark.parametrize("rotation", [(0, 0, 0), (0.5, 0.4, 0.3)])
+def test_errors_fall_faster_where_all_faces_follow_the_grid(rotation):
+    flat, curved = Box(CENTER, (5e-3,) * 3, rotation, rigid=True), Sphere((5e-3,) * 3, 2e-3, rigid=True)
+    assert plan(small_scene((flat,)), "box").order > 2
+    assert plan(small_scene((flat,)), "full").order > 2 or any(rotation)
+    assert plan(small_scene((flat, curved)), "box").order == 2

@@ -91,9 +91,11 @@ def test_a_study_needs_the_memory_of_a_block_of_its_trials(
 def test_a_chosen_spacing_is_refused_by_the_tolerance(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = small_scene((CUBE,))
     coarse = at.estimate(scene, 2e-3, method="box").memory
-    monkeypatch.setattr(memory, "available_memory", lambda: int(3 * coarse))
+    monkeypatch.setattr(memory, "available_memory", lambda: int(6 * coarse))
     with pytest.raises(ValueError, match=r"^tolerance: 0\.0001; needs about"):
         at.make_propagator(scene, "box", spacing=None, tolerance=1e-4)
+    reached = at.make_propagator(scene, "box", spacing=None, tolerance=1e-4, seconds=1e3)
+    assert at.estimate(scene, reached.spacing, method="box").memory < 6 * coarse
 
 
 def group(folder: Path, most: object, used: int, inactive: int) -> None:

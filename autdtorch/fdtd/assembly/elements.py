@@ -27,7 +27,6 @@ _CONTACT_GAP = 1e-9
 # Half the diagonal of an element: a surface farther from its centre does not intersect it
 _HALF_DIAGONAL = 0.87
 _CHUNK = 4096  # Interface elements assembled at a time
-_ALL = 1 - 1e-6  # Share of a surface that is aligned if it all is: slivers do not count
 # Depths below its surface at which a body must be there to be thick [cells]. Sound would pass through thinner
 # walls of finite elements, whose vertices can belong to both sides.
 _DEPTHS = np.array([1.2, 2.3, 3.5])
@@ -102,7 +101,7 @@ def _unions(region: Region, stencil: Stencil) -> tuple[list[_Union], Materials]:
     for body in region.bodies:
         if body.fluid not in known:
             known.append(body.fluid)
-        aligned = flat_faces(body.shape).aligned_share(np.eye(3)) >= _ALL
+        aligned = flat_faces(body.shape).all_aligned(np.eye(3))
         own = _Union(
             (body.shape,),
             known.index(body.fluid),
