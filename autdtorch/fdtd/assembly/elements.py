@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from autdtorch.fdtd.assembly.distances import HALF_DIAGONAL, lattice_distances, located
 from autdtorch.fdtd.assembly.edges import edges_of, reductions
 from autdtorch.fdtd.assembly.element import FAR, LATTICE, InterfaceElements, Materials
 from autdtorch.fdtd.assembly.interface import Bodies, interface_elements, mean_gradient
@@ -24,8 +25,6 @@ from autdtorch.utils.progress import show_progress
 _SOUND_HARD_DENSITY = 1e5
 # Distance by which bodies are grown, so that touching bodies leave no film of air between them
 _CONTACT_GAP = 1e-9
-# Half the diagonal of an element: a surface farther from its centre does not intersect it
-_HALF_DIAGONAL = 0.87
 _CHUNK = 4096  # Interface elements assembled at a time
 # Depths below its surface at which a body must be there to be thick [cells]. Sound would pass through thinner
 # walls of finite elements, whose vertices can belong to both sides.
@@ -86,9 +85,11 @@ def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
     material = np.zeros([cells - 1 for cells in grid.shape], np.int16)
     cut = np.zeros(material.shape, bool)
     for body in bodies:
-        for window, distance in _windows(body, grid):
-            material[window][distance < 0] = body.material
-            cut[window] = (cut[window] | (distance < _HALF_DIAGONAL)) & (distance > -_HALF_DIAGONAL)
+        near, distance, inside = located(partial(body.distance, grid=grid), *_range(body, grid))
+        own = tuple(near.T)
+        material[tuple(near[distance < 0].T)] = material[tuple(inside.T)] = body.material
+        cut[own] = (cut[own] | (distance < HALF_DIAGONAL)) & (distance > -HALF_DIAGONAL)
+        cut[tuple(inside.T)] = False
     index = np.flatnonzero(cut)
     return Elements(materials, material, index, _interface(bodies, index, grid, materials, stencil))
 
@@ -124,30 +125,26 @@ def _unions(region: Region, stencil: Stencil) -> tuple[list[_Union], Materials]:
     return unions, Materials(density, 1 / (density * factor), slowness, sound_hard)
 
 
-def _windows(body: _Union, grid: Grid) -> Iterator[tuple[tuple[slice, ...], Array]]:
-    """Yield slabs of elements around a body with the signed distances [cells] of their centres."""
+def _range(body: _Union, grid: Grid) -> Index:
+    """Return the first element around a body along each axis, and one past the last (2, 3)."""
     middle = [np.arange(cells - 1) + 0.5 for cells in grid.shape]
     lower, upper = bounds(body.shapes)
     ranges = []
     for axis, low, high in zip(range(3), lower - grid.spacing, upper + grid.spacing, strict=True):
         inside = middle[axis].clip(grid.first[axis], grid.last[axis] - 1)
         ranges.append(np.searchsorted(grid.origin[axis] + grid.spacing * inside, (low, high)))
-    for x in range(ranges[0][0], ranges[0][1]):
-        window = (slice(x, x + 1), slice(*ranges[1]), slice(*ranges[2]))
-        axes = (m[part] for m, part in zip(middle, window, strict=True))
-        yield window, body.distance(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1), grid)
+    return np.array(ranges, np.int64).T
 
 
 def _distances(bodies: list[_Union], first: Index, grid: Grid) -> Array:
     """Return distances (K, n, L) of bodies from the lattices of elements, by their first cells (n, 3)."""
-    cell = first[:, None] + LATTICE
     center = np.array(grid.origin) + grid.spacing * grid.clip(np.asarray(first + 0.5))
-    distance = np.full((len(bodies), *cell.shape[:2]), FAR)
+    distance = np.full((len(bodies), len(first), len(LATTICE)), FAR)
     for far, body in zip(distance, bodies, strict=True):
         lower, upper = bounds(body.shapes)
         near = ((center > lower - 2 * grid.spacing) & (center < upper + 2 * grid.spacing)).all(axis=1)
         if near.any():
-            far[near] = body.distance(cell[near], grid)
+            far[near] = lattice_distances(partial(body.distance, grid=grid), first[near])
     return distance
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,9 @@ import torch
 
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.base import Obstacle
+from autdtorch.scene.obstacles.mesh_distance import MeshDistance
 from autdtorch.scene.obstacles.mesh_file import read_mesh
-from autdtorch.scene.obstacles.mesh_solid import Triangles, solid_of, winding_number
+from autdtorch.scene.obstacles.mesh_solid import Triangles, solid_of
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.validation import Vector, finite_vector, invalid, positive, real_tensor, within
@@ -24,6 +26,15 @@ class _Source(str):
 
     vertices: Array
     faces: Index
+
+    @cached_property
+    def distance(self) -> MeshDistance:
+        """The distance to the triangles, in units of the file."""
+        return MeshDistance(self.vertices, self.faces)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the search structures, which are built again."""
+        return {name: value for name, value in vars(self).items() if name != "distance"}
 
 
 @dataclass(frozen=True)
@@ -112,16 +123,15 @@ class Mesh(Obstacle):
         return self.vertices.clone(), self.faces.clone()
 
     def _distance(self, points: torch.Tensor) -> torch.Tensor:
-        """Measure to the nearest triangle, with the sign of the winding number."""
-        if len(points) == 0:
-            return points.new_zeros(0)
-        import igl
+        """Measure in the coordinates of the file, whose search structures serve every place of the mesh."""
+        moved = points.detach().cpu() - points.new_tensor(self.offset).cpu()
+        own = moved @ rotation_matrix(self.rotation) / self.scale
+        return torch.from_numpy(self.scale * self._source.distance(own.numpy())).to(points)
 
-        queries = np.ascontiguousarray(points.detach().cpu().numpy())
-        vertices, faces = self.vertices.numpy(), self.faces.numpy()
-        distance = np.sqrt(igl.point_mesh_squared_distance(queries, vertices, faces)[0])
-        inside = winding_number(vertices, faces, queries) > 0.5
-        return torch.from_numpy(np.where(inside, -distance, distance)).to(points)
+    @property
+    def _source(self) -> _Source:
+        assert isinstance(self.path, _Source)
+        return self.path
 
 
 def _read(given: object) -> _Source:
