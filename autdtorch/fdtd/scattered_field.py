@@ -20,6 +20,7 @@ from autdtorch.fdtd.interpolation import Interpolation
 from autdtorch.fdtd.kernels.contract import Sources
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
+from autdtorch.utils.apertures import Apertures, Discs
 from autdtorch.utils.array_types import Array, Index
 
 # Distance [cells] from the rim of the interior within which points are not read from the grid. Interpolation
@@ -52,33 +53,40 @@ class ScatteredField:
         both = torch.view_as_real(torch.from_numpy(force)).to(assembly.dtype)
         return Sources(torch.from_numpy(assembly.heterogeneous.index), both)
 
-    def waves(self, points: Tensor, sources: Tensor, amplitude: Tensor, nearest: float = 0.0) -> Tensor:
+    def waves(
+        self, points: Tensor | Discs, sources: Tensor | Discs, amplitude: Tensor, nearest: float = 0.0
+    ) -> Tensor:
         """Return fields (P, R) at points (P, 3) [m] of sources (N, 3) [m], amplitudes (N, R) [Pa m]."""
         from autdtorch.fdtd.kernels.cpu_waves import superposition  # loads numba
 
         return superposition(points, sources, amplitude, self.wavenumber, nearest, self.assembly.dtype)
 
-    def incident(
-        self, points: Tensor, nodes: Tensor, weights: Tensor, strength: Tensor, nearest: float = 0.0
-    ) -> Tensor:
-        """Return the incident field (P,) at points (P, 3) [m] of sources with nodes (N, n, 3) [m]."""
-        amplitude = strength.repeat_interleave(len(weights)) * weights.repeat(len(strength))
-        return self.waves(points, nodes.reshape(-1, 3), amplitude[:, None], nearest)[:, 0]
+    def incident(self, points: Tensor, sources: Apertures, strength: Tensor, nearest: float = 0.0) -> Tensor:
+        """Return the incident field (P,) at points (P, 3) [m] of sources with strengths (N,) [Pa m]."""
+        far = sources.far_from(points, self.wavenumber)
+        near, own = sources.chosen(~far), strength[~far]
+        amplitude = own.repeat_interleave(len(near.weights)) * near.weights.repeat(len(own))
+        field = self.waves(points, near.positions.reshape(-1, 3), amplitude[:, None], nearest)[:, 0]
+        if far.any():
+            field = field + self.waves(points, sources.chosen(far).discs, strength[far, None])[:, 0]
+        return field
 
-    def driving(self, nodes: Tensor, weights: Tensor, strength: Tensor) -> Tensor:
+    def driving(self, sources: Apertures, strength: Tensor) -> Tensor:
         """Return the incident field (n,) at the `driven` positions; see `incident`."""
-        return self.incident(self.driven, nodes, weights, strength, _NEAREST * self.assembly.grid.spacing)
+        return self.incident(self.driven, sources, strength, _NEAREST * self.assembly.grid.spacing)
 
-    def near_to_far(self, nodes: Tensor, weights: Tensor) -> NearToFar:
-        """Return the transform to P targets: means with `weights` (n,) over nodes (P, n, 3) [m]."""
-        _, surface, outward = self.surface
+    def near_to_far(self, targets: Apertures) -> NearToFar:
+        """Return the transform to P targets, which take the mean over their nodes or discs."""
+        positions, surface, outward = self.surface
+        far = targets.far_from(positions, self.wavenumber)
+        nodes = targets.positions[~far]
         within = self.inside(nodes)
         inner = self.assembly.interpolation(self._on_axes(nodes[within]))
         cells = np.unique(np.concatenate((surface, inner.index.ravel())))
         picked = Interpolation(surface[:, None], np.ones((len(surface), 1))).matrix(cells)
-        return NearToFar(self, nodes, weights, within, cells, outward @ picked, inner.matrix(cells))
+        return NearToFar(self, targets, far, within, cells, outward @ picked, inner.matrix(cells))
 
-    def radiated(self, amplitude: Tensor, points: Tensor) -> Tensor:
+    def radiated(self, amplitude: Tensor, points: Tensor | Discs) -> Tensor:
         """Return fields (P, R) at points (P, 3) [m] of the Huygens surface with amplitudes (n, R) [Pa m]."""
         return self.waves(points, self.surface[0], amplitude)
 
@@ -138,19 +146,24 @@ class NearToFar:
     """Near-to-far-field transform from phasors of a box's cells to the scattered field at P targets."""
 
     box: ScatteredField
-    nodes: Tensor  # nodes of the targets (P, n, 3) [m]
-    weights: Tensor  # weights of a target's nodes (n,)
-    within: Tensor  # mask of the nodes in the box, where its cells are read (P, n)
+    targets: Apertures
+    far: Tensor  # which targets are discs far from the box (P,)
+    within: Tensor  # mask of the nodes of the others in the box, where its cells are read (Q, n)
     cells: Index  # flat indices (k,) of the cells whose phasors are needed
     outward: csr_array  # amplitudes of the Huygens surface from those phasors
     inward: csr_array  # field at the nodes in the box from those phasors
 
     def field(self, phasors: Tensor) -> Tensor:
         """Return scattered fields (P, R) at the targets, from the cells' phasors (k, R) in R runs."""
+        amplitude, near = self.amplitudes(phasors), self.targets.chosen(~self.far)
         field = torch.zeros((*self.within.shape, phasors.shape[1]), dtype=torch.complex128, device="cpu")
         field[self.within] = torch.from_numpy(self.inward @ phasors.numpy())
-        field[~self.within] = self.box.radiated(self.amplitudes(phasors), self.nodes[~self.within])
-        return torch.einsum("pnr,n->pr", field, self.weights.to(field.dtype))
+        field[~self.within] = self.box.radiated(amplitude, near.positions[~self.within])
+        mean = torch.zeros((len(self.far), phasors.shape[1]), dtype=torch.complex128, device="cpu")
+        mean[~self.far] = torch.einsum("pnr,n->pr", field, near.weights.to(field.dtype))
+        if self.far.any():
+            mean[self.far] = self.box.radiated(amplitude, self.targets.chosen(self.far).discs)
+        return mean
 
     def amplitudes(self, phasors: Tensor) -> Tensor:
         """Return amplitudes (n, R) [Pa m] of the Huygens surface, from the cells' phasors (k, R)."""
@@ -158,14 +171,24 @@ class NearToFar:
 
     def matrix(self, every: int) -> Tensor:
         """Return the matrix from phasors (k,) to the scattered field at each `every`-th target."""
-        within, share = self.within[::every], self.weights.expand(self.within[::every].shape)
-        target = torch.arange(len(within), device="cpu")[:, None].expand(within.shape)
-        outside = self.nodes[::every][~within]
-        amplitude = torch.zeros((len(outside), len(within)), dtype=torch.complex128, device="cpu")
-        amplitude[torch.arange(len(outside), device="cpu"), target[~within]] = share[~within] + 0j
-        received = self.box.waves(self.box.surface[0], outside, amplitude)  # reciprocity of Green's function
-        number = torch.zeros(self.within.shape, dtype=torch.int64, device="cpu")
-        number[self.within] = torch.arange(int(self.within.sum()), device="cpu")
-        place = target[within].numpy(), number[::every][within].numpy()
-        picked = csr_array((share[within].numpy(), place), (len(within), self.inward.shape[0]))
-        return torch.from_numpy((self.outward.T @ received.numpy()).T + (picked @ self.inward).toarray())
+        chosen = range(0, len(self.far), every)
+        place = torch.cumsum((~self.far).long(), 0) - 1  # among those that are not far
+        rows = [self._row(target, None if self.far[target] else int(place[target])) for target in chosen]
+        return torch.from_numpy(np.stack(rows))
+
+    def _row(self, target: int, near: int | None) -> Array:
+        """Return the row (k,) of a target, which is a far disc or the number `near` of the others."""
+        positions, weights = self.box.surface[0], self.targets.weights.to(torch.complex128)
+        if near is None:
+            disc = self.targets.chosen(slice(target, target + 1)).discs
+            received = self.box.waves(positions, disc, weights.sum()[None, None])
+            return np.asarray((self.outward.T @ received.numpy())[:, 0])
+        within = self.within[near]
+        first = int(self.within[:near].sum())
+        outside = self.targets.positions[target][~within]
+        # reciprocity of Green's function
+        received = self.box.waves(positions, outside, weights[~within, None])
+        inner = self.inward[first : first + int(within.sum())]
+        return np.asarray(
+            (self.outward.T @ received.numpy())[:, 0] + self.targets.weights[within].numpy() @ inner
+        )

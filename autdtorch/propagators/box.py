@@ -26,8 +26,8 @@ from autdtorch.fdtd.turning import is_turned, turned
 from autdtorch.propagators.grids import MOST_PASSES, one_box
 from autdtorch.propagators.plan import MOST_JUDGED
 from autdtorch.propagators.simulation import Run, Simulation, Stepped
-from autdtorch.scene.arrays import Nodes
 from autdtorch.scene.scene import require_clear
+from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.threads import one_torch_thread, spread
 
 logger = logging.getLogger(__name__)
@@ -87,14 +87,14 @@ class BoxSimulation(Simulation):
 
     @torch.no_grad()
     def _simulate(
-        self, sources: Sequence[Nodes], strength: torch.Tensor, receivers: Nodes, stepped: Stepped
+        self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures, stepped: Stepped
     ) -> tuple[torch.Tensor, list[Run]]:
         boxes, plan, points = self.boxes, self.plan, receivers.positions
         drives = list(zip(sources, strength, strict=True))
         weights = receivers.weights.to(torch.complex128)
-        fields = [boxes[0].incident(points.reshape(-1, 3), *nodes, own) for nodes, own in drives]
+        fields = [boxes[0].incident(points.reshape(-1, 3), nodes, own) for nodes, own in drives]
         incident = torch.stack([field.reshape(points.shape[:-1]) @ weights for field in fields], dim=1)
-        transforms = [box.near_to_far(*receivers) for box in boxes]
+        transforms = [box.near_to_far(receivers) for box in boxes]
         every = math.ceil(len(points) / MOST_JUDGED)
         matrix = torch.cat([transform.matrix(every) for transform in transforms], dim=1)
 
@@ -111,14 +111,14 @@ class BoxSimulation(Simulation):
         @torch.no_grad()  # holds in one thread only
         def alone(run: int) -> tuple[SteadyState, float]:
             begin, (nodes, own), direct = time.perf_counter(), drives[run], incident[::every, run]
-            field = boxes[0].driving(*nodes, own)
+            field = boxes[0].driving(nodes, own)
             steady = simulate(0, field, plan.tolerance, lambda part: direct + matrix @ part)
             return steady, time.perf_counter() - begin
 
         if len(boxes) == 1:
             found = spread(alone, range(len(drives)), self._kernel.at_once(boxes[0].assembly.grid.shape))
         else:
-            pairs = [[box.driving(*nodes, own) for nodes, own in drives] for box in boxes]
+            pairs = [[box.driving(nodes, own) for nodes, own in drives] for box in boxes]
             driving = [torch.stack(fields, dim=1) for fields in pairs]
             found = _coupled(
                 boxes, transforms, driving, lambda part: incident[::every] + matrix @ part, simulate,

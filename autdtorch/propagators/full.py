@@ -14,8 +14,8 @@ from autdtorch.fdtd.steady_state import run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble
 from autdtorch.propagators.plan import MOST_JUDGED
 from autdtorch.propagators.simulation import Run, Simulation, Stepped
-from autdtorch.scene.arrays import Nodes
 from autdtorch.scene.scene import require_inside
+from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.threads import one_torch_thread
 
 
@@ -39,7 +39,7 @@ class DomainSimulation(Simulation):
 
     @torch.no_grad()
     def _simulate(
-        self, sources: Sequence[Nodes], strength: torch.Tensor, receivers: Nodes, stepped: Stepped
+        self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures, stepped: Stepped
     ) -> tuple[torch.Tensor, list[Run]]:
         (assembly,), plan = self.assemblies, self.plan
         points = assembly.interpolation(receivers.positions, receivers.weights)

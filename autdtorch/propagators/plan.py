@@ -145,8 +145,7 @@ class Plan:
         ringing = USUAL_PERIODS if filled.cells and passes == 1 else 1.0
         run = _RUN_STEPS + ringing * passes * stepping
         assembly = _SCENE_STEPS + _ASSEMBLY_STEPS * filled.cells + _MESH_STEPS * filled.meshed
-        radiating = sum(grid.radiating for grid in grids) if self.method == "box" else 0
-        pairs = radiating * self._receivers
+        pairs = sum(grid.radiating for grid in grids) * self._terms if self.method == "box" else 0
         return assembly + _PAIR_STEPS * pairs + math.ceil(self.runs / self._at_once) * run
 
     @cached_property
@@ -177,6 +176,17 @@ class Plan:
     @property
     def _receivers(self) -> int:
         return max(len(self.scene.control_points), self.scene.array.nodes.positions[..., 0].numel())
+
+    @property
+    def _terms(self) -> int:
+        """Terms of the sums over radiating cells for each: nodes of the transducers, two for a far disc."""
+        transducers = self.scene.array.apertures
+        around = np.array(
+            [shape.lower for shape in self.region.shapes] + [s.upper for s in self.region.shapes]
+        )
+        far = transducers.far_from(torch.from_numpy(around), self.region.wavenumber)
+        count = np.where(far, 2, len(transducers.weights)).sum()
+        return max(len(self.scene.control_points), int(count))
 
     @property
     def _kept(self) -> int:

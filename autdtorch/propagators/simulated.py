@@ -19,9 +19,10 @@ from autdtorch.propagators.cache import DiskCache, cache_key
 from autdtorch.propagators.full import DomainSimulation
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.scene_region import warn_of_near_points
-from autdtorch.propagators.simulation import Run, TransferMatrix, single_nodes
+from autdtorch.propagators.simulation import Run, TransferMatrix
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.threads import one_torch_thread
 from autdtorch.utils.validation import ArrayLike, boolean, points_grid
@@ -197,8 +198,8 @@ class SimulatedPropagator:
         field = torch.zeros((len(flat), len(points)), dtype=torch.complex128, device="cpu")
         if (loud := flat.any(dim=1)).any():
             strength = self.scene.array.source_strength * flat[loud]
-            nodes = [self.scene.array.nodes] * len(strength)
-            field[loud], runs = self._simulation.run(nodes, strength, single_nodes(points))
+            apertures = [self.scene.array.apertures] * len(strength)
+            field[loud], runs = self._simulation.run(apertures, strength, Apertures.of_points(points))
             self.runs += runs
             self._report(None)
         return field.reshape(*drive.shape[:-1], *grid)

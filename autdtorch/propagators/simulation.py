@@ -22,7 +22,7 @@ from autdtorch.propagators.symmetry import (
     orbits_of_transducers,
     symmetries,
 )
-from autdtorch.scene.arrays import Nodes
+from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.progress import show_progress
 from autdtorch.utils.validation import ArrayLike, points_tensor
 
@@ -92,7 +92,7 @@ class Simulation(ABC):
 
     @abstractmethod
     def _simulate(
-        self, sources: Sequence[Nodes], strength: torch.Tensor, receivers: Nodes, stepped: Stepped
+        self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures, stepped: Stepped
     ) -> tuple[torch.Tensor, list[Run]]:
         """Do the work of `run`; `stepped` is called with numbers of periods."""
 
@@ -105,7 +105,7 @@ class Simulation(ABC):
     @cached_property
     def symmetries(self) -> list[Symmetry]:
         """Symmetries of the scene on its grid."""
-        return symmetries(self.assemblies, self.plan.grouping.axes[0], self.plan.scene.array.nodes)
+        return symmetries(self.assemblies, self.plan.grouping.axes[0], self.plan.scene.array.apertures)
 
     @property
     def time_step(self) -> float:
@@ -124,18 +124,18 @@ class Simulation(ABC):
 
     def transfer_matrix(self, points: torch.Tensor) -> TransferMatrix:
         """Simulate the transfer matrix of points (P, 3)."""
-        array, targets, orbits = self.plan.scene.array, single_nodes(points), self.orbits(points)
-        sources, receivers = (targets, array.nodes) if orbits.from_points else (array.nodes, targets)
+        array, targets, orbits = self.plan.scene.array, Apertures.of_points(points), self.orbits(points)
+        sources, receivers = (targets, array.apertures) if orbits.from_points else (array.apertures, targets)
         begins = "points" if orbits.from_points else "transducers"
         logger.debug("transfer matrix: %d runs serve %d %s", orbits.runs, len(orbits.representative), begins)
         strength = torch.full((orbits.runs, 1), array.source_strength, dtype=torch.complex128, device="cpu")
-        alone = [Nodes(sources.positions[own : own + 1], sources.weights) for own in orbits.representatives]
+        alone = [sources.chosen(slice(own, own + 1)) for own in orbits.representatives]
         found, runs = self.run(alone, strength, receivers)
         rows, remaining = orbits.expand(found), max(run.remaining for run in runs)
         return TransferMatrix(rows if orbits.from_points else rows.mT.contiguous(), remaining, tuple(runs))
 
     def run(
-        self, sources: Sequence[Nodes], strength: torch.Tensor, receivers: Nodes
+        self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures
     ) -> tuple[torch.Tensor, list[Run]]:
         """Return the pressure (R, P) [Pa] at P receivers of R runs with N sources each, and the runs.
 
@@ -149,8 +149,3 @@ class Simulation(ABC):
         periods = math.ceil(len(sources) * USUAL_PERIODS * fewest_periods(crossing))
         with show_progress(periods, what) as progress:
             return self._simulate(sources, strength, receivers, progress.advance)
-
-
-def single_nodes(points: torch.Tensor) -> Nodes:
-    """Return points (P, 3) as sources or receivers of one node each."""
-    return Nodes(points[:, None], torch.ones(1, dtype=torch.float64, device="cpu"))

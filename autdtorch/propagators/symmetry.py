@@ -20,7 +20,7 @@ from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.stencil import OFFSETS
 from autdtorch.fdtd.stepping import Assembly
-from autdtorch.scene.arrays import Nodes
+from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
@@ -95,7 +95,7 @@ def _representatives(images: Index) -> tuple[Index, Index]:
     return known.min(axis=0), known.argmin(axis=0)
 
 
-def symmetries(assemblies: Sequence[Assembly], along: Array, transducers: Nodes) -> list[Symmetry]:
+def symmetries(assemblies: Sequence[Assembly], along: Array, transducers: Apertures) -> list[Symmetry]:
     """Return all symmetries of a scene on its grid, the identity first; only that on several grids.
 
     `along` holds the axes of the grid, one a row (3, 3).

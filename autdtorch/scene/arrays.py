@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from autdtorch.scene.geometry import Coordinates, in_plane, plane_basis
+from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.neighbours import closest_pair, require_distinct
 from autdtorch.utils.validation import (
@@ -204,11 +205,17 @@ class TransducerArray:
         step against the next (Peirce, J. SIAM 5 (1957) 66-73). For k a <= 6 the error in the far field is
         1e-6 at all angles. At a distance of a/2 from the disc it is 1e-4 of the largest pressure.
         """
+        return Nodes(*self.apertures[:2])
+
+    @property
+    def apertures(self) -> Apertures:
+        """The transducers as sources or receivers: `nodes`, and what their far field needs."""
         if self.radius == 0:
-            return Nodes(self.positions[:, None], torch.ones(1, dtype=torch.float64, device="cpu"))
+            return Apertures.of_points(self.positions)
         disc, weights = _disc_rule()
         axes = torch.stack([torch.stack(plane_basis(normal)) for normal in self.normals])
-        return Nodes(self.positions[:, None] + self.radius * disc @ axes, weights)
+        positions = self.positions[:, None] + self.radius * disc @ axes
+        return Apertures(positions, weights, self.normals, self.radius)
 
     @property
     def half_extents(self) -> torch.Tensor:

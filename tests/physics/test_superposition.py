@@ -4,9 +4,12 @@ import math
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from autdtorch.analytic.green import green
 from autdtorch.fdtd.kernels.cpu_waves import superposition
+from autdtorch.scene.arrays import TransducerArray
 
 
 def places(points, sources):
@@ -54,3 +57,33 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch):
     for one, other in (sums[2:4], sums[4:]):
         assert torch.equal(one, sums[0])
         assert torch.equal(other, sums[1])
+
+
+@given(
+    wavenumber=st.sampled_from([200.0, 733.0, complex(733.0, 0.15), complex(1100.0, 5.0)]),
+    normal=st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda n: math.hypot(*n) > 0.1),
+    distance=st.floats(0.01, 0.5),
+    seed=st.integers(0, 1000),
+)
+def test_a_far_disc_is_the_sum_of_its_nodes(wavenumber, normal, distance, seed):
+    array = TransducerArray([(0.01, -0.02, 0.03)], normal, radius=4.5e-3)
+    nodes, generator = array.apertures, torch.Generator().manual_seed(seed)
+    way = torch.randn((70, 3), generator=generator, dtype=torch.float64)
+    points = array.positions + distance * way / way.norm(dim=1, keepdim=True)
+    if not nodes.far_from(points[:1], wavenumber).all():
+        return
+    one = torch.ones((1, 1), dtype=torch.complex128)
+    summed = superposition(points, nodes.positions[0], nodes.weights[:, None] + 0j, wavenumber)
+    expanded = superposition(points, nodes.discs, one, wavenumber)
+    largest = math.exp(-complex(wavenumber).imag * distance) / distance
+    assert (expanded - summed).abs().max() < 6e-5 * largest  # measured 2.8e-5, where it begins to be far
+    received = torch.cat([superposition(nodes.discs, point[None], one, wavenumber) for point in points])
+    assert (received - expanded).abs().max() < 1e-12 * largest  # reciprocity
+
+
+def test_large_or_near_discs_are_sums_of_nodes():
+    nodes = TransducerArray([(0, 0, 0), (0.1, 0, 0)], (0, 0, 1), radius=5e-3).apertures
+    points = torch.tensor([[0.0, 0.0, 0.03], [0.0, 0.02, 0.04]], dtype=torch.float64)
+    assert nodes.far_from(points, 733.0).tolist() == [False, True]
+    assert nodes.far_from(points, 1500.0).tolist() == [False, False]
+    assert not TransducerArray([(0, 0, 0)], (0, 0, 1)).apertures.far_from(points, 733.0).any()

@@ -1,8 +1,9 @@
-"""The fields of many point sources in free space: sum_s amplitude_s e^{i k r} / r for several fields.
+"""The fields of many sources in free space: sum_s amplitude_s e^{i k r} / r for several fields.
 
 Waves between one place and a block of others are vectorised. The others are the points or the sources,
-whichever are more. Distances and whole turns of the phase are in double precision, the rest in the
-precision of the amplitudes. The order of all sums is fixed.
+whichever are more. Discs are always the places, and their waves have a factor. Distances and whole turns
+of the phase are in double precision, the rest in the precision of the amplitudes. The order of all sums is
+fixed.
 """
 
 from __future__ import annotations
@@ -17,13 +18,14 @@ from numba import njit
 from torch import Tensor
 
 from autdtorch.fdtd.kernels.compiled import INNER, entry
+from autdtorch.utils.apertures import PATTERN_TERMS, Discs
 from autdtorch.utils.array_types import AnyArray
 from autdtorch.utils.threads import spread
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
 _PAIRS = 100_000  # Pairs of a point and a source in a task: less than a millisecond
 _LANES = 64  # Places in a block; their waves stay in the first-level cache
-_TERMS = 13  # Terms of the Taylor series; the next one is below 1e-16 for arguments up to pi / 2
+_TERMS = PATTERN_TERMS  # Terms of the Taylor series; the next one is below 1e-16 for arguments up to pi / 2
 _SHIFT = 1.5 * 2.0**52  # Constant that rounds to the nearest integer when added and subtracted
 _BLOCK, _X, _Y, _Z = np.uint64(_LANES), np.uint64(0), np.uint64(1), np.uint64(2)  # unsigned, see cpu_sweep.py
 
@@ -48,11 +50,29 @@ def _series(c, y):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _waves(place, others, block, wave, room):  # type: ignore[no-untyped-def]
-    """Return the parts of e^{i k r} / r, from a place to those of a block of `others` (3, N)."""
+def _directed(place, others, first, pattern, real, imaginary, distance):  # type: ignore[no-untyped-def]
+    """Multiply waves by the pattern (orders, 2, terms) of a disc at a place with a normal (6,)."""
+    x, y, z = place[0], place[1], place[2]
+    along_x, along_y, along_z = place[3], place[4], place[5]
+    last = pattern.shape[0] - 1
+    for k in range(_BLOCK):
+        dx, dy, dz = others[_X, first + k] - x, others[_Y, first + k] - y, others[_Z, first + k] - z
+        nearness = 1 / distance[k]
+        cosine = (dx * along_x + dy * along_y + dz * along_z) * nearness
+        sine_squared = pattern.dtype.type(1 - cosine * cosine)
+        a, b = _series(pattern[last, 0], sine_squared), _series(pattern[last, 1], sine_squared)
+        for order in range(last - 1, -1, -1):
+            a = a * nearness + _series(pattern[order, 0], sine_squared)
+            b = b * nearness + _series(pattern[order, 1], sine_squared)
+        real[k], imaginary[k] = a * real[k] - b * imaginary[k], a * imaginary[k] + b * real[k]
+
+
+@njit(**INNER)
+def _waves(place, others, block, wave, pattern, room):  # type: ignore[no-untyped-def]
+    """Return the parts of e^{i k r} / r, from a place (6,) to those of a block of `others` (3, N)."""
     sine, cosine, power, real, imaginary, side, quarter, distance, bits, halves = room
     turns_per_metre, halvings_per_metre, nearest = wave
-    x, y, z = place
+    x, y, z = place[0], place[1], place[2]
     first = np.uint64(block) * _BLOCK
     for k in range(_BLOCK):
         dx, dy, dz = others[_X, first + k] - x, others[_Y, first + k] - y, others[_Z, first + k] - z
@@ -65,18 +85,19 @@ def _waves(place, others, block, wave, room):  # type: ignore[no-untyped-def]
         square = quarter[k] * quarter[k]
         real[k] = -quarter[k] * _series(sine, square) / distance[k]
         imaginary[k] = np.copysign(_series(cosine, square), side[k]) / distance[k]
-    if halvings_per_metre == 0:
-        return real, imaginary
-    digits, lowest = (23, 126) if real.itemsize == 4 else (52, 1022)
-    for k in range(_BLOCK):
-        halvings = min(distance[k] * halvings_per_metre, float(lowest))
-        whole = (halvings + _SHIFT) - _SHIFT
-        bits[k] = (lowest + 1 - int(whole)) << digits  # 2^-whole, read as a float
-        quarter[k] = halvings - whole
-    for k in range(_BLOCK):
-        size = halves[k] * _series(power, quarter[k])
-        real[k] *= size
-        imaginary[k] *= size
+    if halvings_per_metre > 0:
+        digits, lowest = (23, 126) if real.itemsize == 4 else (52, 1022)
+        for k in range(_BLOCK):
+            halvings = min(distance[k] * halvings_per_metre, float(lowest))
+            whole = (halvings + _SHIFT) - _SHIFT
+            bits[k] = (lowest + 1 - int(whole)) << digits  # 2^-whole, read as a float
+            quarter[k] = halvings - whole
+        for k in range(_BLOCK):
+            size = halves[k] * _series(power, quarter[k])
+            real[k] *= size
+            imaginary[k] *= size
+    if len(pattern):
+        _directed(place, others, first, pattern, real, imaginary, distance)
     return real, imaginary
 
 
@@ -88,16 +109,16 @@ def _add_waves(total, r, a, b, real, imaginary):  # type: ignore[no-untyped-def]
 
 
 @entry()
-def _sum_at_points(points, first, last, sources, amplitude, wave, room, fields):  # type: ignore[no-untyped-def]
+def _sum_at_points(points, first, last, sources, amplitude, wave, pattern, room, fields):  # type: ignore[no-untyped-def]
     """Write the parts of fields (2, R, P / _LANES, _LANES) at the blocks `first` to `last` of points.
 
-    The points are (3, P), the sources (3, N), the parts of their amplitudes (2, R, N).
+    The points are (3, P), the sources with normals (N, 6), the parts of their amplitudes (2, R, N).
     """
     runs, count = amplitude.shape[1:]
     total = np.zeros((2, runs, _LANES), amplitude.dtype)
     for block in range(first, last):
         for s in range(count):
-            real, imaginary = _waves((sources[0, s], sources[1, s], sources[2, s]), points, block, wave, room)
+            real, imaginary = _waves(sources[s], points, block, wave, pattern, room)
             for r in range(runs):
                 _add_waves(total, r, amplitude[0, r, s], amplitude[1, r, s], real, imaginary)
             if (s + 1) % _LANES == 0 or s + 1 == count:  # limits rounding
@@ -113,10 +134,11 @@ def _add_products(total, amplitude, r, waves):  # type: ignore[no-untyped-def]
 
 
 @entry()
-def _sum_over_sources(points, first, last, sources, amplitude, wave, room, fields):  # type: ignore[no-untyped-def]
+def _sum_over_sources(points, first, last, sources, amplitude, wave, pattern, room, fields):  # type: ignore[no-untyped-def]
     """Write the parts of fields (2, R, P) at the points `first` to `last`.
 
-    The points are (3, P), the sources (3, N), the parts of their amplitudes (2, R, N / _LANES, _LANES).
+    The points with normals are (P, 6), the sources (3, N), the parts of their amplitudes
+    (2, R, N / _LANES, _LANES).
     """
     runs, blocks = amplitude.shape[1:3]
     # separate arrays, which the compiler knows not to overlap and can vectorise
@@ -124,8 +146,7 @@ def _sum_over_sources(points, first, last, sources, amplitude, wave, room, field
     total, less = np.empty(_LANES, amplitude.dtype), np.empty(_LANES, amplitude.dtype)
     for p in range(first, last):
         for block in range(blocks):
-            place = points[0, p], points[1, p], points[2, p]
-            real[block], imaginary[block] = _waves(place, sources, block, wave, room)
+            real[block], imaginary[block] = _waves(points[p], sources, block, wave, pattern, room)
         for r in range(runs):
             total[:], less[:] = 0, 0
             _add_products(total, amplitude[0], r, real)
@@ -140,18 +161,19 @@ def _sum_over_sources(points, first, last, sources, amplitude, wave, room, field
 
 
 def superposition(
-    points: Tensor,
-    sources: Tensor,
+    points: Tensor | Discs,
+    sources: Tensor | Discs,
     amplitude: Tensor,
     wavenumber: complex,
     nearest: float = 0.0,
     dtype: torch.dtype = torch.float64,
 ) -> Tensor:
-    """Return R fields (P, R) complex128 [Pa] of N point sources: sums of amplitude e^{i k r} / r.
+    """Return R fields (P, R) complex128 [Pa] of N sources: sums of amplitude e^{i k r} / r.
 
     Amplitudes are complex (N, R) [Pa m], `wavenumber` is k + i alpha [rad/m] and `nearest` the lower limit of
-    the distance [m]. float32 takes half the time at an error of 3e-7 per wave. Threads do not change the
-    result.
+    the distance [m]. Either points or sources may be discs, far from the others: the mean pressure over a
+    disc, or the field of one. float32 takes half the time at an error of 3e-7 per wave. Threads do not change
+    the result.
     """
     number = np.float32 if dtype == torch.float32 else np.float64
     wavenumber = complex(wavenumber)
@@ -159,21 +181,37 @@ def superposition(
     wave = wavenumber.real / (2 * math.pi), wavenumber.imag / math.log(2), max(nearest, LENGTH_TOLERANCE)
     parts = (amplitude.real, amplitude.imag)
     strength = np.stack([np.ascontiguousarray(part.numpy().astype(number).T) for part in parts])
-    runs, count = strength.shape[1], len(points)
-    places, origins = (np.ascontiguousarray(each.numpy().T) for each in (points, sources))
-    if count >= len(sources):
-        places = _filled(places, "edge")
-        add, fields = _sum_at_points, np.zeros((2, runs, places.shape[1] // _LANES, _LANES))
+    (places, receiving), (origins, radiating) = (_rows(each, wavenumber) for each in (points, sources))
+    pattern = np.concatenate((receiving, radiating)).astype(number)
+    runs, count = strength.shape[1], len(places)
+    if len(radiating) or (count >= len(origins) and not len(receiving)):
+        columns, add = _filled(places[:, :3].T, "edge"), _sum_at_points
+        fields = np.zeros((2, runs, columns.shape[1] // _LANES, _LANES))
+        both = columns, origins
     else:
-        origins = _filled(origins, "edge")
-        add, fields = _sum_over_sources, np.zeros((2, runs, count))
+        columns, add, fields = (
+            _filled(origins[:, :3].T, "edge"),
+            _sum_over_sources,
+            np.zeros((2, runs, count)),
+        )
         strength = _filled(strength, "constant").reshape(2, runs, -1, _LANES)
+        both = places, columns
     units = fields.shape[2]
-    pieces = max(1, min(units, 1 + count * len(sources) // _PAIRS))
+    pieces = max(1, min(units, 1 + count * len(origins) // _PAIRS))
     cuts = [units * piece // pieces for piece in range(pieces + 1)]
-    spread(lambda ends: add(places, *ends, origins, strength, wave, _room(number), fields), pairwise(cuts))
+    spread(
+        lambda ends: add(both[0], *ends, both[1], strength, wave, pattern, _room(number), fields),
+        pairwise(cuts),
+    )
     real, imaginary = fields.reshape(2, runs, -1)[:, :, :count]
     return torch.from_numpy((real + 1j * imaginary).T)
+
+
+def _rows(given: Tensor | Discs, wavenumber: complex) -> tuple[AnyArray, AnyArray]:
+    """Return positions and normals (N, 6), and the pattern of discs; points have none."""
+    if isinstance(given, Discs):
+        return torch.cat((given.centers, given.normals), dim=1).numpy(), given.pattern(wavenumber)
+    return np.pad(given.numpy(), ((0, 0), (0, 3))), np.zeros((0, 2, PATTERN_TERMS))
 
 
 def _filled(rows: AnyArray, mode: Literal["edge", "constant"]) -> AnyArray:

@@ -1,0 +1,81 @@
+"""Points and discs that radiate or receive: the monopoles that stand for them, and the far field of discs."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Self
+
+import numpy as np
+import torch
+
+from autdtorch.utils.array_types import AnyArray, Array
+
+PATTERN_TERMS = 13
+"""Powers of the square of the sine of an angle in a far-field pattern."""
+
+_ORDERS = 4  # of the expansion in 1 / r
+_LARGEST = 6.0  # k a of the largest discs: the first power that is left out is below 1e-7 of the axis
+# A disc is far at so many radii and where k a^2 / 2r is at most this: the orders that are left out are below
+# 3e-5 of the pressure on the axis
+_FAR_RADII, _FAR_PHASE = 10.0, 0.14
+
+
+class Apertures(NamedTuple):
+    """N sources or receivers of equal shape, with n monopoles each, in float64."""
+
+    positions: torch.Tensor  # of the monopoles (N, n, 3) [m]
+    weights: torch.Tensor  # (n,), with the sum 1
+    normals: torch.Tensor | None = None  # of discs (N, 3)
+    radius: float = 0.0  # of discs [m]
+
+    @classmethod
+    def of_points(cls, points: torch.Tensor) -> Self:
+        """Return points (P, 3) as sources or receivers."""
+        return cls(points[:, None], torch.ones(1, dtype=torch.float64, device="cpu"))
+
+    def chosen(self, index: slice | torch.Tensor) -> Self:
+        """Return some of the sources or receivers."""
+        normals = None if self.normals is None else self.normals[index]
+        return self._replace(positions=self.positions[index], normals=normals)
+
+    @property
+    def discs(self) -> Discs:
+        """The discs that the monopoles stand for."""
+        assert self.normals is not None
+        return Discs(self.positions.mean(dim=1), self.normals, self.radius)
+
+    def far_from(self, points: torch.Tensor, wavenumber: complex) -> torch.Tensor:
+        """Return which of them (N,) are discs so far from all points (P, 3) that `Discs.pattern` holds."""
+        count = len(self.positions)
+        if self.normals is None or abs(wavenumber) * self.radius > _LARGEST:
+            return torch.zeros(count, dtype=torch.bool, device="cpu")
+        center = self.positions.mean(dim=1)
+        beyond = torch.maximum(points.amin(dim=0) - center, center - points.amax(dim=0)).clamp(min=0)
+        least = self.radius * max(_FAR_RADII, abs(wavenumber) * self.radius / (2 * _FAR_PHASE))
+        return torch.gt(beyond.norm(dim=1), least)
+
+
+class Discs(NamedTuple):
+    """Discs with a constant velocity, or that receive the mean pressure."""
+
+    centers: torch.Tensor  # (N, 3) [m]
+    normals: torch.Tensor  # (N, 3)
+    radius: float  # [m]
+
+    def pattern(self, wavenumber: complex) -> Array:
+        """Return the factor on e^{i k r} / r far from a disc, real and imaginary part (orders, 2, terms).
+
+        It is a polynomial in 1 / r and in u, the square of the sine of the angle from the normal. The order
+        zero is 2 J1(v) / v with v^2 = (k a)^2 u; order n follows from the one before by the recursion of
+        Atkinson (1949) and Wilcox (1956), 2 i k n F_n = n (n - 1) F_(n-1) + B F_(n-1) with the Laplacian B on
+        the sphere.
+        """
+        power = np.arange(PATTERN_TERMS, dtype=np.float64)
+        factor = -((wavenumber * self.radius) ** 2) / 4
+        orders: list[AnyArray] = [
+            np.cumprod(np.concatenate(([1.0 + 0j], factor / (power[1:] * (power[1:] + 1)))))
+        ]
+        for order in range(1, _ORDERS):
+            laplacian = -2 * power * (2 * power + 1) * orders[-1]
+            laplacian[:-1] += 4 * power[1:] ** 2 * orders[-1][1:]
+            orders.append((order * (order - 1) * orders[-1] + laplacian) / (2j * wavenumber * order))
+        return np.stack((np.real(orders), np.imag(orders)), axis=1)
