@@ -28,6 +28,7 @@ from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import phasors_kept
 from autdtorch.propagators.grids import USUAL_PERIODS, Grouping, choose_grids
 from autdtorch.propagators.scene_region import region_of
+from autdtorch.scene.arrays import apertures_of
 from autdtorch.scene.obstacles import Mesh
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.memory import require_memory
@@ -180,7 +181,7 @@ class Plan:
     @property
     def _terms(self) -> int:
         """Terms of the sums over radiating cells for each: nodes of the transducers, two for a far disc."""
-        transducers = self.scene.array.apertures
+        transducers = apertures_of(self.scene.array)
         around = np.array(
             [shape.lower for shape in self.region.shapes] + [s.upper for s in self.region.shapes]
         )

@@ -20,6 +20,7 @@ from autdtorch.propagators.full import DomainSimulation
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.scene_region import warn_of_near_points
 from autdtorch.propagators.simulation import Run, TransferMatrix
+from autdtorch.scene.arrays import apertures_of
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.apertures import Apertures
@@ -198,7 +199,7 @@ class SimulatedPropagator:
         field = torch.zeros((len(flat), len(points)), dtype=torch.complex128, device="cpu")
         if (loud := flat.any(dim=1)).any():
             strength = self.scene.array.source_strength * flat[loud]
-            apertures = [self.scene.array.apertures] * len(strength)
+            apertures = [apertures_of(self.scene.array)] * len(strength)
             field[loud], runs = self._simulation.run(apertures, strength, Apertures.of_points(points))
             self.runs += runs
             self._report(None)

@@ -22,6 +22,7 @@ from autdtorch.propagators.symmetry import (
     orbits_of_transducers,
     symmetries,
 )
+from autdtorch.scene.arrays import apertures_of
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.progress import show_progress
 from autdtorch.utils.validation import ArrayLike, points_tensor
@@ -105,7 +106,7 @@ class Simulation(ABC):
     @cached_property
     def symmetries(self) -> list[Symmetry]:
         """Symmetries of the scene on its grid."""
-        return symmetries(self.assemblies, self.plan.grouping.axes[0], self.plan.scene.array.apertures)
+        return symmetries(self.assemblies, self.plan.grouping.axes[0], apertures_of(self.plan.scene.array))
 
     @property
     def time_step(self) -> float:
@@ -125,7 +126,9 @@ class Simulation(ABC):
     def transfer_matrix(self, points: torch.Tensor) -> TransferMatrix:
         """Simulate the transfer matrix of points (P, 3)."""
         array, targets, orbits = self.plan.scene.array, Apertures.of_points(points), self.orbits(points)
-        sources, receivers = (targets, array.apertures) if orbits.from_points else (array.apertures, targets)
+        sources, receivers = (
+            (targets, apertures_of(array)) if orbits.from_points else (apertures_of(array), targets)
+        )
         begins = "points" if orbits.from_points else "transducers"
         logger.debug("transfer matrix: %d runs serve %d %s", orbits.runs, len(orbits.representative), begins)
         strength = torch.full((orbits.runs, 1), array.source_strength, dtype=torch.complex128, device="cpu")

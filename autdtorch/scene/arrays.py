@@ -205,17 +205,7 @@ class TransducerArray:
         step against the next (Peirce, J. SIAM 5 (1957) 66-73). For k a <= 6 the error in the far field is
         1e-6 at all angles. At a distance of a/2 from the disc it is 1e-4 of the largest pressure.
         """
-        return Nodes(*self.apertures[:2])
-
-    @property
-    def apertures(self) -> Apertures:
-        """The transducers as sources or receivers: `nodes`, and what their far field needs."""
-        if self.radius == 0:
-            return Apertures.of_points(self.positions)
-        disc, weights = _disc_rule()
-        axes = torch.stack([torch.stack(plane_basis(normal)) for normal in self.normals])
-        positions = self.positions[:, None] + self.radius * disc @ axes
-        return Apertures(positions, weights, self.normals, self.radius)
+        return Nodes(*apertures_of(self)[:2])
 
     @property
     def half_extents(self) -> torch.Tensor:
@@ -234,6 +224,16 @@ class TransducerArray:
             f"TransducerArray({len(self)} transducers around ({x:.4g}, {y:.4g}, {z:.4g}) mm, "
             f"{size}source strength {self.source_strength:.4g} Pa m)"
         )
+
+
+def apertures_of(array: TransducerArray) -> Apertures:
+    """Return the transducers as sources or receivers: their nodes, and what their far field needs."""
+    if array.radius == 0:
+        return Apertures.of_points(array.positions)
+    disc, weights = _disc_rule()
+    axes = torch.stack([torch.stack(plane_basis(normal)) for normal in array.normals])
+    positions = array.positions[:, None] + array.radius * disc @ axes
+    return Apertures(positions, weights, array.normals, array.radius)
 
 
 def _autd3_places(count_x: int, count_y: int) -> torch.Tensor:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from autdtorch.analytic.green import green
 from autdtorch.fdtd.kernels.cpu_waves import superposition
-from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.arrays import TransducerArray, apertures_of
 
 
 def places(points, sources):
@@ -67,7 +67,7 @@ def test_the_number_of_threads_changes_no_bit(monkeypatch):
 )
 def test_a_far_disc_is_the_sum_of_its_nodes(wavenumber, normal, distance, seed):
     array = TransducerArray([(0.01, -0.02, 0.03)], normal, radius=4.5e-3)
-    nodes, generator = array.apertures, torch.Generator().manual_seed(seed)
+    nodes, generator = apertures_of(array), torch.Generator().manual_seed(seed)
     way = torch.randn((70, 3), generator=generator, dtype=torch.float64)
     points = array.positions + distance * way / way.norm(dim=1, keepdim=True)
     if not nodes.far_from(points[:1], wavenumber).all():
@@ -82,8 +82,8 @@ def test_a_far_disc_is_the_sum_of_its_nodes(wavenumber, normal, distance, seed):
 
 
 def test_large_or_near_discs_are_sums_of_nodes():
-    nodes = TransducerArray([(0, 0, 0), (0.1, 0, 0)], (0, 0, 1), radius=5e-3).apertures
+    nodes = apertures_of(TransducerArray([(0, 0, 0), (0.1, 0, 0)], (0, 0, 1), radius=5e-3))
     points = torch.tensor([[0.0, 0.0, 0.03], [0.0, 0.02, 0.04]], dtype=torch.float64)
     assert nodes.far_from(points, 733.0).tolist() == [False, True]
     assert nodes.far_from(points, 1500.0).tolist() == [False, False]
-    assert not TransducerArray([(0, 0, 0)], (0, 0, 1)).apertures.far_from(points, 733.0).any()
+    assert not apertures_of(TransducerArray([(0, 0, 0)], (0, 0, 1))).far_from(points, 733.0).any()

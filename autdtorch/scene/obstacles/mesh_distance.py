@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
+from weakref import WeakSet
+
 import numpy as np
 
 from autdtorch.utils.array_types import Array, Index
@@ -9,6 +12,16 @@ from autdtorch.utils.triangles import doubled_normals
 
 _ON_SIDE = 1e-9  # barycentric coordinate of a nearest point that lies on a side of its triangle
 _FINE = 2.0  # accuracy of winding numbers as libigl counts it: errors are below 0.05
+
+
+_known: WeakSet[MeshDistance] = WeakSet()
+
+
+@atexit.register
+def _drop_all() -> None:
+    """Drop the search structures: libigl warns of any that outlive the interpreter."""
+    for each in tuple(_known):
+        vars(each).clear()
 
 
 class MeshDistance:
@@ -24,6 +37,7 @@ class MeshDistance:
         """Build the structures for vertices (V, 3) and outward triangles (F, 3)."""
         import igl
 
+        _known.add(self)
         self._vertices, self._faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces)
         self._tree = igl.AABB()
         self._tree.init(self._vertices, self._faces)
