@@ -132,8 +132,10 @@ class BoxSimulation(Simulation):
         parts = torch.split(phasors, [len(transform.cells) for transform in transforms])
         scattered = [transform.field(part) for transform, part in zip(transforms, parts, strict=True)]
         silent = torch.zeros(len(points), dtype=torch.bool, device="cpu")
-        for obstacle in plan.scene.obstacles:  # the later obstacle wins
-            silent = torch.where(obstacle.contains(points).any(dim=1), obstacle.rigid, silent)
+        for obstacle, body in zip(
+            plan.scene.obstacles, plan.region.bodies, strict=True
+        ):  # the later one wins
+            silent = torch.where(obstacle.contains(points).any(dim=1), body.fluid is None, silent)
         total = incident + sum(scattered)
         return total.mT.masked_fill(silent, 0), list(map(Run.of, steady, seconds))
 

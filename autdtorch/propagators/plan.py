@@ -27,7 +27,7 @@ from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import phasors_kept
 from autdtorch.propagators.grids import USUAL_PERIODS, Grouping, choose_grids
-from autdtorch.propagators.scene_region import region_of
+from autdtorch.propagators.scene_region import hardened, region_of
 from autdtorch.scene.arrays import apertures_of
 from autdtorch.scene.obstacles import Mesh
 from autdtorch.scene.scene import Scene
@@ -250,6 +250,7 @@ def plan(
     tolerance = positive("tolerance", tolerance)
     if tolerance >= 1:
         raise invalid("tolerance", tolerance, "must be in (0, 1)")
+    region = hardened(region, tolerance)
     max_periods = integer_at_least("max_periods", max_periods, 1)
     time_step = None if time_step is None else positive("time_step", time_step, "s")
     require_one_of("method", method, ("auto", "free_space", "box", "full"))

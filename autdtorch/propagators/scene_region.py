@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -10,8 +12,14 @@ import torch
 from autdtorch.fdtd.region import Body, Fluid, Region
 from autdtorch.scene.obstacles import Box
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.triangles import doubled_normals
 
 logger = logging.getLogger(__name__)
+
+_STIFF = (
+    2.0  # ratio of sound speeds from which heavy bodies have no sharp resonances at the drive's frequency
+)
+_HARDNESS = 1.4  # largest relative difference of a sphere from a rigid one, times its density ratio
 
 
 def region_of(scene: Scene) -> Region:
@@ -24,6 +32,38 @@ def region_of(scene: Scene) -> Region:
     medium, positions = scene.medium, np.asarray(scene.array.positions.numpy())
     air = Fluid(medium.density, medium.sound_speed)
     return Region(air, scene.attenuation, scene.frequency, tuple(bodies), scene.domain, positions)
+
+
+def hardened(region: Region, tolerance: float) -> Region:
+    """Return a region whose hard bodies are rigid: those whose field differs by less than a tolerance."""
+    bodies, hard = [], []
+    for index, body in enumerate(region.bodies):
+        if body.fluid is not None and difference_from_rigid(body, region) <= tolerance:
+            hard.append(str(index))
+            body = replace(body, fluid=None)
+        bodies.append(body)
+    if hard:
+        logger.info("obstacle %s is taken as rigid: the difference is below the tolerance", ", ".join(hard))
+    return replace(region, bodies=tuple(bodies)) if hard else region
+
+
+def difference_from_rigid(body: Body, region: Region) -> float:
+    """Return how much the field of a fluid body differs from that of a rigid one, at most, relative to it.
+
+    For a density ratio m and an impedance ratio z, a body moves in proportion to 1 / m and yields in
+    proportion to 1 / z. Through a wall of thickness d, 1 / (m k d) passes (mass law).
+    """
+    assert body.fluid is not None
+    heavier = body.fluid.density / region.fluid.density
+    stiffer = body.fluid.sound_speed / region.fluid.sound_speed
+    if heavier <= 1 or stiffer < _STIFF:
+        return math.inf
+    vertices, triangles = (part.numpy() for part in body.shape.surface())
+    corners = vertices[triangles] - vertices.mean(axis=0)
+    area = np.linalg.norm(doubled_normals(corners), axis=1).sum() / 2
+    thickness = 2 * abs(np.linalg.det(corners).sum() / 6) / area
+    moved = 1 + 1 / (region.wavenumber * thickness)
+    return float(_HARDNESS * (moved + 1 / stiffer) / heavier)
 
 
 def warn_of_ending_walls(scene: Scene) -> None:

@@ -1,0 +1,59 @@
+"""Hard obstacles, which are simulated as rigid ones."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from small_scenes import AIR, relative_error, small_scene
+
+from autdtorch import analytic
+from autdtorch.propagators import make_propagator
+from autdtorch.propagators.plan import plan
+from autdtorch.propagators.scene_region import difference_from_rigid, region_of
+from autdtorch.scene.obstacles import Box, Sphere
+
+CENTER = (12.2e-3, 11.9e-3, 12.1e-3)
+STEEL = {"density": 7800.0, "sound_speed": 5900.0}
+
+
+@given(
+    radius=st.floats(1e-3, 10e-3),
+    heavier=st.floats(100, 1e5),
+    stiffer=st.floats(2.5, 20),
+    seed=st.integers(0, 1000),
+)
+def test_the_difference_from_a_rigid_sphere_is_known(radius, heavier, stiffer, seed):
+    way = torch.randn((12, 3), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    around = torch.tensor(CENTER, dtype=torch.float64) + 3 * radius * way / way.norm(dim=1, keepdim=True)
+    where = around[:8], around[8:], EMPTY.wavenumber, CENTER, radius
+    rigid, fluid = analytic.rigid_sphere(*where), analytic.fluid_sphere(*where, heavier, stiffer)
+    sphere = Sphere(CENTER, radius, density=heavier * AIR.density, sound_speed=stiffer * AIR.sound_speed)
+    region = region_of(small_scene((sphere,), extent=60e-3))
+    # resonances of stiff and heavy spheres are narrow; none has exceeded the bound by a half
+    assert relative_error(rigid, fluid) < 1.5 * difference_from_rigid(region.bodies[0], region)
+
+
+EMPTY = small_scene()
+
+
+def test_steel_is_rigid():
+    steel, rigid = (Box(CENTER, (5e-3,) * 3, **each) for each in (STEEL, {"rigid": True}))
+    inside = torch.tensor([CENTER], dtype=torch.float64)
+    found, expected = (make_propagator(small_scene((box,)), "box", 1.3e-3) for box in (steel, rigid))
+    assert torch.equal(found.transfer_matrix(), expected.transfer_matrix())
+    assert found.time_step == expected.time_step
+    assert found.transfer_matrix(inside).abs().max() == 0
+
+
+@pytest.mark.parametrize(
+    ("body", "tolerance"),
+    [
+        (Sphere(CENTER, 4e-3, **STEEL), 1e-4),  # 3e-4 by its density
+        (Box(CENTER, (5e-3, 5e-3, 20e-6), **STEEL), 2e-3),  # 1.4 % of the pressure passes a foil
+        (Sphere(CENTER, 4e-3, density=1e4, sound_speed=AIR.sound_speed), 2e-3),  # it may resonate
+        (Sphere(CENTER, 4e-3, density=0.1 * AIR.density, sound_speed=1e4), 2e-3),
+    ],
+    ids=["strict", "foil", "slow", "light"],
+)
+def test_others_keep_their_material(body, tolerance):
+    assert plan(small_scene((body,)), "box", 0.5e-3, tolerance).region.bodies[0].fluid is not None
