@@ -6,6 +6,7 @@ multiplies them by known phases, which leaves one unknown for each value of n . 
 
 from __future__ import annotations
 
+import cmath
 import itertools
 import math
 from dataclasses import dataclass
@@ -44,8 +45,8 @@ class HalfSpace:
         return torch.from_numpy(corners), torch.tensor([[0, 1, 2]])
 
 
-def reflection(normal, offset, spacing, incidence, azimuth=0.0):
-    """The reflection coefficient of a sound-hard half-space, 1 in theory.
+def reflection(normal, offset, spacing, incidence, azimuth=0.0, fluid=None):
+    """The reflection coefficient of a half-space, sound-hard (1 in theory) or of a fluid.
 
     The surface is `offset` cells from a cell centre. The wave comes at an angle `incidence` [rad] from the
     normal.
@@ -55,32 +56,50 @@ def reflection(normal, offset, spacing, incidence, azimuth=0.0):
     length, middle = float(np.linalg.norm(normal)), np.array(grid.shape) // 2
     unit = np.array(normal) / length
     shape = HalfSpace(unit, spacing * float(unit @ middle + offset))
-    region = Region(AIR, 0.0, FREQUENCY, (Body(shape, None),), ((0.0,) * 3, (1.0,) * 3), np.zeros((1, 3)))
+    region = Region(AIR, 0.0, FREQUENCY, (Body(shape, fluid),), ((0.0,) * 3, (1.0,) * 3), np.zeros((1, 3)))
     cells = heterogeneous_cells(elements_of(region, grid, stencil), stencil)
 
     tangent = np.cross(unit, (math.cos(azimuth), math.sin(azimuth), 0.4))
-    across = kappa * math.cos(incidence)
+    across, inner = kappa * math.cos(incidence), kappa * _inner_wavenumber(incidence, fluid)
     along = kappa * math.sin(incidence) * tangent / np.linalg.norm(tangent)
     rows = _rows(cells, stencil, grid, middle, np.array(normal))
-    top = max(rows) - int(np.abs(normal).sum())
-    unknown = {place: number for number, place in enumerate(sorted(rows)) if place < top}
-    matrix, right = np.zeros((len(unknown) + 1,) * 2, complex), np.zeros(len(unknown) + 1, complex)
+    reach = int(np.abs(normal).sum())
+    top, bottom = max(rows) - reach, min(rows) + reach if fluid else -math.inf
+    unknown = {place: number for number, place in enumerate(sorted(p for p in rows if bottom < p < top))}
+    size = len(unknown) + (2 if fluid else 1)
+    matrix, right = np.zeros((size, size), complex), np.zeros(size, complex)
 
     def add(equation, place, value):
-        if place < top:
-            matrix[equation, unknown[place]] += value
-        else:  # far from the surface: the incident wave and the reflected one
-            phase = np.exp(1j * across * (place / length - offset))
+        distance = place / length - offset
+        if place >= top:  # far from the surface: the incident wave and the reflected one
+            phase = np.exp(1j * across * distance)
             matrix[equation, -1] += value * phase
             right[equation] -= value / phase
+        elif place <= bottom:  # the transmitted one
+            matrix[equation, -2] += value * np.exp(-1j * inner * distance)
+        else:
+            matrix[equation, unknown[place]] += value
 
-    for equation, place in enumerate([*unknown, top]):
+    for equation, place in enumerate([*unknown, bottom, top] if fluid else [*unknown, top]):
         add(equation, place, stencil.symbol)
         for step, weight in zip(np.array(OFFSETS), rows[place], strict=True):
             if weight:
                 add(equation, place + int(step @ normal), weight * np.exp(1j * along @ step))
                 add(equation, place, -weight)
     return complex(np.linalg.solve(matrix, right)[-1])
+
+
+def _inner_wavenumber(incidence, fluid):
+    """The wavenumber across the surface inside a fluid, relative to that of air."""
+    speed = fluid.sound_speed / AIR.sound_speed if fluid else 1.0
+    return cmath.sqrt(1 / speed**2 - math.sin(incidence) ** 2)
+
+
+def exact_reflection(incidence, fluid):
+    """The reflection coefficient of a half-space of a fluid."""
+    inner = fluid.density / AIR.density * math.cos(incidence)
+    outer = _inner_wavenumber(incidence, fluid)
+    return (inner - outer) / (inner + outer)
 
 
 def _rows(cells, stencil, grid, middle, normal):

@@ -79,7 +79,13 @@ def edge_elements(
             if len(rows):
                 found.append((rows, *_assembled(depth, pair[rows], inside, columns, materials, stencil)))
     index, coupling, mass = (np.concatenate(part) for part in zip(*found, strict=True))
-    return index, coupling, mass
+    # two edges that touch are found from either: with a gap between them, their mean keeps the symmetry
+    index, place, count = np.unique(index, return_inverse=True, return_counts=True)
+    totals = np.zeros((len(index), 28)), np.zeros((len(index), 8))
+    for total, part in zip(totals, (coupling, mass), strict=True):
+        np.add.at(total, place.ravel(), part)
+        total /= count[:, None]
+    return index, *totals
 
 
 def _columns(axis: int, first: Array) -> Index:

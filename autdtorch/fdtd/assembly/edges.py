@@ -106,7 +106,9 @@ def edges_of(shape: Shape, others: Sequence[Shape] = ()) -> list[Segment | Circl
     covered = np.zeros(len(ends), bool)
     for other in others:
         covered |= (other.signed_distance(torch.from_numpy(beside)) < 0).any(dim=1).numpy()
-    places, number = np.unique(ends.reshape(-1, 3).round(9), axis=0, return_inverse=True)
+    corners = ends.reshape(-1, 3)
+    _, known, number = np.unique(corners.round(9), axis=0, return_index=True, return_inverse=True)
+    places = corners[known]
     first, second = number.reshape(-1, 2).T
     graph = coo_array((np.ones(len(ends)), (first, second)), shape=(len(places),) * 2)
     _, part = connected_components(graph, directed=False)

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from autdtorch.fdtd.assembly.distances import HALF_DIAGONAL, lattice_distances, located
 from autdtorch.fdtd.assembly.edges import edges_of, reductions
 from autdtorch.fdtd.assembly.element import FAR, LATTICE, InterfaceElements, Materials
-from autdtorch.fdtd.assembly.interface import Bodies, interface_elements, mean_gradient
+from autdtorch.fdtd.assembly.interface import Bodies, interface_elements
+from autdtorch.fdtd.assembly.smooth_faces import mean_gradient, roughness
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Fluid, Region, Shape, bounds
 from autdtorch.fdtd.stencil import Stencil
@@ -29,6 +30,11 @@ _CHUNK = 4096  # Interface elements assembled at a time
 # Depths below its surface at which a body must be there to be thick [cells]. Sound would pass through thinner
 # walls of finite elements, whose vertices can belong to both sides.
 _DEPTHS = np.array([1.2, 2.3, 3.5])
+# Deviation [cells] of a signed distance from a quadratic one at which a second face is near
+_ROUGH = 0.01
+# Share of a rigid edge's reduction that edges of fluids have. With 0.15 and 0.3, tilted cubes of ratio
+# 77 have errors of up to 2.4 and 2.7 % (15 mm) and 2.8 and 2.1 % (8 mm) at 1 mm.
+_FLUID_REDUCTION = 0.3
 _LEAST_GRADIENT = 0.3  # Least mean gradient of a signed distance in an element with one surface
 
 
@@ -51,7 +57,8 @@ class _Union:
     material: int
     continued: bool  # whether they continue through the boundary layers, unchanged from the interior
     aligned: bool  # whether all its faces are flat and parallel to the grid
-    finite: bool  # whether finite elements represent its surface: not aligned, and sound-hard
+    sound_hard: bool
+    finite: bool  # whether finite elements represent its surface, or that of a fluid near edges
 
     def distance(self, cell: Array, grid: Grid) -> Array:
         """Return the signed distance [cells] of positions (..., 3) in cells."""
@@ -108,7 +115,8 @@ def _unions(region: Region, stencil: Stencil) -> tuple[list[_Union], Materials]:
             known.index(body.fluid),
             body.continued,
             aligned,
-            body.fluid is None and not aligned,
+            body.fluid is None,
+            not aligned and (body.fluid is None or body.fluid.density > air.density),
         )
         if unions and own == replace(unions[-1], shapes=own.shapes):
             unions[-1] = replace(own, shapes=(*unions[-1].shapes, body.shape))
@@ -148,8 +156,17 @@ def _distances(bodies: list[_Union], first: Index, grid: Grid) -> Array:
     return distance
 
 
-def _finite(body: _Union, distance: Array, first: Index, grid: Grid) -> NDArray[np.bool_]:
-    """Return whether finite elements represent a body in elements (n,): where it is thick enough."""
+def _finite(
+    body: _Union, distance: Array, first: Index, near_edge: NDArray[np.bool_], grid: Grid
+) -> NDArray[np.bool_]:
+    """Return whether finite elements represent a body in elements (n,).
+
+    They do where a sound-hard body is thick enough, and where a fluid has more than one face.
+    """
+    if not body.sound_hard:
+        own = near_edge & (np.abs(distance) < FAR).any(axis=1) & body.finite
+        own[own] = roughness(distance[own]) > _ROUGH
+        return own
     finite = np.full(len(first), body.finite)
     near = np.flatnonzero(finite & (np.abs(distance) < FAR).any(axis=1))
     if len(near):
@@ -170,9 +187,12 @@ def _interface(
     numbers = np.array([body.material for body in bodies], np.int64)
     aligned = np.array([body.aligned for body in bodies], bool)
     shapes = [shape for body in bodies for shape in body.shapes]
-    own = [shape for body in bodies if body.finite for shape in body.shapes]
     edges = [
-        edge for shape in own for edge in edges_of(shape, [each for each in shapes if each is not shape])
+        replace(edge, reduction=edge.reduction * (1 if body.sound_hard else _FLUID_REDUCTION))
+        for body in bodies
+        if body.finite
+        for shape in body.shapes
+        for edge in edges_of(shape, [each for each in shapes if each is not shape])
     ]
     shape = tuple(cells - 1 for cells in grid.shape)
     with show_progress(len(index), "measuring surfaces") as progress:
@@ -181,7 +201,10 @@ def _interface(
             centers = np.array(grid.origin) + grid.spacing * (first + 0.5)
             less = reductions(edges, centers, grid.spacing)
             distance = _distances(bodies, first, grid)
-            finite = np.stack([_finite(*pair, first, grid) for pair in zip(bodies, distance, strict=True)])
+            edged = np.asarray(less.any(axis=(1, 2)))
+            finite = np.stack(
+                [_finite(*pair, first, edged, grid) for pair in zip(bodies, distance, strict=True)]
+            )
             near = Bodies(distance, numbers, aligned, finite, less)
             parts.append(interface_elements(near, materials, stencil))
             progress.advance(len(first))

@@ -40,6 +40,7 @@ _ROW_ROUNDING = 1e-9  # Stencil rows within this of air's are those of air
 # Gershgorin's bound exceeds the largest eigenvalue of air by more. For the paper's cubes 1.1 costs 3 % of the
 # time step and 1.2 would cost 8 %; a slab of density ratio 3 keeps its mass.
 _ROW_SUM_MARGIN = 1.1
+_NEED_ITERATIONS = 3  # of the mass that a cell needs, as its neighbours' masses decide it
 _MASS_TRANSFERS = 6  # Largest number of mass transfers to light cells; one is nearly always enough
 
 
@@ -180,8 +181,8 @@ def _transferred_mass(coupling: Array, mass: Array, touched: Index, shape: Shape
     takes mass from the cells it is coupled to; their sum is unchanged. Gershgorin's circles then bound the
     operator at any contrast.
     """
-    mass, need = mass.copy(), np.abs(coupling).sum(axis=1) / largest
-    asked = mass.sum()
+    need = _needed_mass(coupling, mass, touched, shape, largest)
+    mass, asked = mass.copy(), mass.sum()
     for _ in range(_MASS_TRANSFERS):
         light = np.flatnonzero(need > mass)
         if len(light) == 0:
@@ -200,6 +201,25 @@ def _transferred_mass(coupling: Array, mass: Array, touched: Index, shape: Shape
     if mass.sum() > asked * (1 + 1e-6):
         logger.debug("light cells found too little mass around them: added %.2g", mass.sum() - asked)
     return np.where(mass > 0, mass, 1.0)
+
+
+def _needed_mass(coupling: Array, mass: Array, touched: Index, shape: Shape, largest: float) -> Array:
+    """Return the masses (n,) at which Gershgorin's circles of the symmetric operator end at twice `largest`.
+
+    With the sum D_i of a row, that is D_i + sum_j |K_ij| sqrt(m_i / m_j) = 2 largest m_i. The root counts up
+    to 1: a uniform material, next to a lighter one, needs no more than its own mass.
+    """
+    neighbour, size = _neighbours(touched, shape), np.abs(coupling)
+    place = np.searchsorted(touched, neighbour).clip(max=len(touched) - 1)
+    beside, row = touched[place] != neighbour, coupling.sum(axis=1)
+    need = size.sum(axis=1) / largest
+    for _ in range(_NEED_ITERATIONS):
+        own = np.maximum(mass, need)
+        around = np.where(beside, 1, own[place])
+        ratio = np.divide(own[:, None], around, out=np.ones_like(size), where=around > 0)
+        lighter = np.sqrt(ratio).clip(max=1)
+        need = (np.maximum(row, 0) + (size * lighter).sum(axis=1)) / (2 * largest)
+    return np.asarray(need)
 
 
 def _uniform_cells(

@@ -1,0 +1,306 @@
+"""Elements that one smooth surface between two fluids cuts: local fields and the forces they cause.
+
+The local fields are two coordinates along the surface, and a kinked one, continuous in pressure and flow.
+What flows through a face of the element is distributed to its vertices by what the face alone shows, so that
+two elements sharing it get opposite forces: fields like these cause no net force at any vertex.
+
+With the fields N and their forces G at the vertices, the energies are A = N^T G, and the stiffness is
+G A^-1 G^T + (I - N P)^T S (I - N P), with P = A^-1 G^T and the stiffness in series S. Where the surface bends
+too much, local fields get their energies A alone, with S + C^T (A - N^T S N) C and the projection
+C = (N^T S N)^-1 N^T S. Both are virtual elements (Beirao da Veiga et al. 2013) with the local solutions
+of immersed finite elements (Li 1998).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from autdtorch.fdtd.assembly.coverage import subcell_means
+from autdtorch.fdtd.assembly.element import CORNERS, LATTICE, PAIRS, SUBCELLS, VERTICES, stiffness_matrix
+from autdtorch.utils.array_types import Array, Index
+
+# Smallest mean gradient of a signed distance with one normal. The two faces of a thin plate cancel.
+_LEAST_GRADIENT = 0.5
+# Axes of the second derivatives in a quadratic fit
+_SECOND = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+# Curvature [1/cells] that local solutions follow if only their energies are prescribed
+_LARGEST_CURVATURE = 0.5
+# Forces are those of flat surfaces. Up to this curvature [1/cells], times the square root of the ratio of
+# densities, they are better than energies; 5 % on either side both are blended.
+_WEAK_CURVATURE, _BLEND = 0.0156, 0.05
+# Between these ratios of densities forces give way to energies: four vertices of a face cannot have all
+# moments, and the energy of the forces would not be positive.
+_LARGE_RATIO, _TOO_LARGE = 80.0, 160.0
+_LEAST_ENERGY = 0.01  # Smallest energy of a sum of fields, relative to theirs, that is safely positive
+_MIDDLE = len(LATTICE) // 2  # The centre of an element in the lattice
+# Weight of a vertex for the flow on the other side of a surface: this power of the ratio of densities
+_BESIDE = 0.33
+_SINGULAR = 1e-10  # Relative size of eigenvalues that are rounding
+
+
+def _quadratic(x: Array) -> Array:
+    """Return monomials up to degree two at points (n, 3): value, gradient, second derivatives."""
+    second = [x[:, a] * x[:, b] / (2 if a == b else 1) for a, b in _SECOND]
+    return np.column_stack((np.ones(len(x)), x, *second))
+
+
+_MONOMIALS = _quadratic(LATTICE - 0.5)
+_FIT = np.linalg.pinv(_MONOMIALS)
+
+
+def _face_geometry() -> tuple[Index, Index]:
+    """Return the vertices (6, 4) of the faces, and the lattice's points (6, 64, 3) of their triangles.
+
+    Squares are cut along both diagonals, so that a mirrored surface has mirrored forces.
+    """
+    square = np.array([(0, 0), (1, 0), (0, 1), (1, 1)])
+    corners = [square[list(each)] for each in ((0, 1, 2), (3, 1, 2), (1, 0, 3), (2, 0, 3))]
+    vertices, triangles = [], []
+    for axis in range(3):
+        for end in (0, 1):
+            vertices.append(np.flatnonzero(VERTICES[:, axis] == end))
+            own = np.array([each + c for each in np.ndindex((SUBCELLS,) * 2) for c in corners])
+            points = np.insert(own, axis, end * SUBCELLS, axis=2)
+            triangles.append(points @ ((SUBCELLS + 1) ** 2, SUBCELLS + 1, 1))
+    return np.array(vertices), np.array(triangles)
+
+
+_FACE_VERTICES, _TRIANGLES = _face_geometry()
+_AXIS, _OUTWARD = np.repeat(np.arange(3), 2), np.tile((-1.0, 1.0), 3)
+
+
+class Surface(NamedTuple):
+    """A surface in n elements, from the signed distances at their lattices."""
+
+    level: Array  # signed distance at the lattice (n, 125), negative in the inner material
+    normal: Array  # unit vector (n, 3)
+    tangents: Array  # unit vectors (n, 2, 3)
+    bend: Array  # curvature (n, 2, 2) [1/cells]
+    density: Array  # of the outer and the inner material (n, 2)
+
+    def chosen(self, some: Index | NDArray[np.bool_]) -> Surface:
+        """Return the surface in some of the elements."""
+        return Surface(*(part[some] for part in self))
+
+
+def mean_gradient(level: Array) -> Array:
+    """Return the mean gradient (..., 3) of signed distances at the lattice (..., 125)."""
+    return np.asarray(level @ _FIT[1:4].T)
+
+
+def roughness(level: Array) -> Array:
+    """Return the largest deviation (n,) of signed distances (n, 125) from a quadratic function."""
+    return np.asarray(np.abs(level - level @ _FIT.T @ _MONOMIALS.T).max(axis=1))
+
+
+def surfaces(level: Array, density: Array) -> tuple[NDArray[np.bool_], Surface]:
+    """Return which elements (n,) have a surface with one normal, and the surface in these."""
+    fit = level @ _FIT.T
+    steep = np.linalg.norm(fit[:, 1:4], axis=1)
+    flat = steep > _LEAST_GRADIENT
+    normal = fit[flat, 1:4] / steep[flat, None]
+    tangents = _tangents(normal)
+    return flat, Surface(level[flat], normal, tangents, _curvature(fit[flat], tangents), density[flat])
+
+
+def _tangents(normal: Array) -> Array:
+    """Return two unit vectors (n, 2, 3) orthogonal to unit vectors (n, 3)."""
+    helper = np.where(np.abs(normal[:, :1]) < 0.7, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    first = np.cross(normal, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack((first, np.cross(normal, first)), axis=1)
+
+
+def _curvature(fit: Array, tangents: Array) -> Array:
+    """Return the curvature (n, 2, 2) [1/cells]."""
+    hessian = np.zeros((len(fit), 3, 3))
+    for column, (a, b) in enumerate(_SECOND, start=4):
+        hessian[:, a, b] = hessian[:, b, a] = fit[:, column]
+    return np.asarray(tangents @ hessian @ tangents.transpose(0, 2, 1))
+
+
+def fields(surface: Surface) -> Array:
+    """Return the local fields (n, 8, 3) at the vertices."""
+    depth = surface.level[:, CORNERS]
+    return local_fields(surface, VERTICES - 0.5, depth, np.where(depth < 0, 1, 0))
+
+
+def local_fields(surface: Surface, places: Array, depth: Array, side: Index) -> Array:
+    """Return the fields (n, q, 3): coordinates of the foot of a place along the surface, and the kinked one.
+
+    `places` ((n,) q, 3) are relative to the centre, `depth` (n, q) are their signed distances, and `side`
+    ((n,) q) is 1 in the inner material.
+    """
+    along = places @ surface.tangents.transpose(0, 2, 1)
+    along = along - depth[:, :, None] * (along @ surface.bend)
+    kinked = np.where(side == 1, surface.density[:, 1:], surface.density[:, :1]) * depth
+    return np.concatenate((along, kinked[:, :, None]), axis=2)
+
+
+def weight_of_forces(surface: Surface) -> Array:
+    """Return the share (n,) of the forces in the stiffness, the rest being that of energies."""
+    depth = surface.level[:, _MIDDLE, None]
+    curvature = np.linalg.eigvalsh(surface.bend)
+    curvature = np.abs(curvature / np.maximum(1 - depth * curvature, 0.1)).max(axis=1)  # at the surface
+    ratio = surface.density.max(axis=1) / surface.density.min(axis=1)
+    bent = curvature / (_WEAK_CURVATURE * np.sqrt(ratio))
+    weight = np.clip((1 + _BLEND - bent) / (2 * _BLEND), 0, 1)
+    return np.asarray(weight * np.clip((_TOO_LARGE - ratio) / (_TOO_LARGE - _LARGE_RATIO), 0, 1))
+
+
+def smooth_stiffness(
+    surface: Surface, tilted: NDArray[np.bool_], mobility: Array, coupling: Array, uniform: Array
+) -> tuple[Array, Array]:
+    """Return the coupling (n, 28) of elements with a smooth surface, and the share (n,) of forces in it.
+
+    `tilted` (n,) are those that have forces, `mobility` (n, 64) is that of the sub-cells, `coupling` (n, 28)
+    is in series, and `uniform` (28,) in air.
+    """
+    weight = np.where(tilted, weight_of_forces(surface), 0)
+    total = np.zeros((len(weight), 8, 8))
+    some = np.flatnonzero(weight)
+    # a line in a sliver of a light fluid would be much stiffer than the element
+    series = stiffness_matrix(np.minimum(coupling, mobility.sum(axis=1)[:, None] * uniform)[some])
+    total[some], positive = _with_forces(surface.chosen(some), series)
+    weight[some[~positive]] = 0
+    some = np.flatnonzero(weight < 1)
+    energies = _with_energies(surface.chosen(some), mobility[some], stiffness_matrix(coupling[some]))
+    share = weight[some, None, None]
+    total[some] = share * total[some] + (1 - share) * energies
+    return np.asarray(-total[:, PAIRS[:, 0], PAIRS[:, 1]]), weight
+
+
+def _with_energies(surface: Surface, mobility: Array, series: Array) -> Array:
+    """Return the stiffness (n, 8, 8) with which the two fields along the surface have their exact energy.
+
+    The third keeps its energy in series.
+    """
+    sharp = np.abs(np.linalg.eigvalsh(surface.bend)).max(axis=1) > _LARGEST_CURVATURE  # edges
+    surface = surface._replace(bend=np.where(sharp[:, None, None], 0, surface.bend))
+    local, depth = fields(surface), subcell_means(surface.level)
+    stretch = np.eye(2) - depth[:, :, None, None] * surface.bend[:, None]
+    energy = np.zeros((len(depth), 3, 3))
+    energy[:, :2, :2] = np.einsum("nq,nqab,nqcb->nac", mobility, stretch, stretch)
+    flow = series @ local
+    own = local.transpose(0, 2, 1) @ flow
+    energy[:, 2, 2] = own[:, 2, 2]
+    projection = np.linalg.solve(own, flow.transpose(0, 2, 1))
+    return np.asarray(series + projection.transpose(0, 2, 1) @ (energy - own) @ projection)
+
+
+def _with_forces(surface: Surface, series: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the stiffness (n, 8, 8) with the forces of the local fields, and whether these have an energy.
+
+    All other fields keep their energy in series.
+    """
+    local, force = fields(surface), forces(surface)
+    force = force - force.mean(axis=1, keepdims=True)  # zero but for the curvature
+    energy = local.transpose(0, 2, 1) @ force
+    energy = (energy + energy.transpose(0, 2, 1)) / 2
+    size = np.sqrt(np.maximum(energy[:, range(3), range(3)], 1e-12))
+    least = np.linalg.eigvalsh(energy / size[:, :, None] / size[:, None])[:, 0]
+    positive = (least > _LEAST_ENERGY) & (energy[:, range(3), range(3)] > 0).all(axis=1)
+    energy[~positive] = np.eye(3)
+    projection = np.linalg.solve(energy, force.transpose(0, 2, 1))
+    rest = np.eye(8) - local @ projection
+    return force @ projection + rest.transpose(0, 2, 1) @ series @ rest, positive
+
+
+def forces(surface: Surface) -> Array:
+    """Return the forces (n, 8, 3) of the local fields at the vertices: their flow out of the element."""
+    total = np.zeros((len(surface.level), 8, 3))
+    for face in range(6):
+        total[:, _FACE_VERTICES[face]] += face_forces(surface, face)
+    return total
+
+
+def face_forces(surface: Surface, face: int) -> Array:
+    """Return the forces (n, 4, 3) of the fields' flow through a face at its vertices."""
+    vertices, axis = _FACE_VERTICES[face], _AXIS[face]
+    area, place, depth = _parts(surface.level, _TRIANGLES[face])
+    side = np.repeat((0, 1), area.shape[1] // 2)
+    flow = area[:, :, None] * _OUTWARD[face] * _flow(surface, axis, place, depth, side)
+    corners = fields(surface)[:, vertices]
+    middle = corners.mean(axis=1, keepdims=True)
+    local = local_fields(surface, place, depth, side) - middle
+
+    light, dense = surface.density.min(axis=1), surface.density.max(axis=1)
+    inner = surface.level[:, CORNERS[vertices]] < 0
+    hats = np.where(VERTICES[vertices] == 1, 0.5 + place[:, :, None], 0.5 - place[:, :, None])
+    beside = inner[:, None] != (side == 1)[:, None]
+    near = np.delete(hats, axis, axis=3).prod(axis=3)
+    near *= np.where(beside, ((light / dense) ** _BESIDE)[:, None, None], 1)
+    near /= near.sum(axis=2, keepdims=True)
+
+    # in units in which the three fields have similar energies
+    share = area[:, side == 1].sum(axis=1)
+    shares = np.stack((1 - share, share), axis=1)
+    mobility, density = (shares / surface.density).sum(axis=1), (shares * surface.density).sum(axis=1)
+    scale = np.sqrt(np.stack((mobility, mobility, density), axis=1))[:, None]
+    weight = np.where(inner, surface.density[:, 1:], surface.density[:, :1]) / light[:, None]
+    flow, local = flow / scale, local / scale
+    moments = local.transpose(0, 2, 1) @ flow
+    near = near.transpose(0, 2, 1) @ flow
+    return np.asarray(
+        scale * _distributed(near, moments, flow.sum(axis=1), (corners - middle) / scale, weight)
+    )
+
+
+def _parts(level: Array, triangles: Index) -> tuple[Array, Array, Array]:
+    """Return area (n, 128), place (n, 128, 3) and depth (n, 128) of the two parts of triangles (64, 3).
+
+    The first half are outside the inner material. Places are relative to the element's centre.
+    """
+    depth = level[:, triangles]
+    count = (depth < 0).sum(axis=2, keepdims=True)
+    cut = count % 3 != 0
+    lone = cut & ((depth < 0) == (count == 1))  # the vertex that is alone on its side
+    gap = np.where(lone, depth, 0).sum(axis=2, keepdims=True)
+    share = np.where(lone | ~cut, 1, gap / np.where(gap != depth, gap - depth, 1))
+    area = np.where(cut, share.prod(axis=2, keepdims=True), 0)
+    tip = np.where(lone, 1 - np.where(lone, 0, share / 3).sum(axis=2, keepdims=True), share / 3)
+    rest = (1 / 3 - area * tip) / np.maximum(1 - area, 1e-12)
+    outer = np.where(count == 1, 1 - area, np.where(count == 3, 0, np.where(cut, area, 1)))[:, :, 0]
+    centers = np.where(count == 2, tip, rest), np.where(count == 2, rest, tip)
+    place = LATTICE[triangles] - 0.5
+    areas = np.concatenate((outer, 1 - outer), axis=1) / len(triangles)
+    places = np.concatenate([np.einsum("nqv,qvx->nqx", each, place) for each in centers], axis=1)
+    return areas, places, np.concatenate([(each * depth).sum(axis=2) for each in centers], axis=1)
+
+
+def _flow(surface: Surface, axis: int, place: Array, depth: Array, side: Index) -> Array:
+    """Return the flow (n, q, 3) of the fields along an axis: mobility times gradient."""
+    tangents = surface.tangents[:, :, axis]
+    turn = place @ surface.tangents.transpose(0, 2, 1) @ surface.bend  # of the normal
+    across = surface.normal[:, None, axis] + (turn * tangents[:, None]).sum(axis=2)
+    bent = (surface.bend @ tangents[:, :, None])[:, None, :, 0]
+    along = tangents[:, None] - depth[:, :, None] * bent - turn * surface.normal[:, None, None, axis]
+    return np.concatenate((along / surface.density[:, side, None], across[:, :, None]), axis=2)
+
+
+def _distributed(near: Array, moments: Array, total: Array, local: Array, weight: Array) -> Array:
+    """Return forces (n, 4, 3) near given ones, with exact totals (n, 3) and as exact moments as possible.
+
+    `moments` (n, 3, 3) are those of the flow of each second field with each first, and `local` (n, 4, 3) the
+    fields at the vertices. Four forces cannot have all moments where the values of two fields are the same
+    at the vertices. The rest of the moments is symmetric, so that forces remain those of an energy.
+    """
+    square = local @ local.transpose(0, 2, 1)
+    square[:, range(4), range(4)] += weight
+    inverse = np.linalg.inv(square)
+    found = inverse @ (weight[:, :, None] * near + local @ moments)
+    rules, goal = np.zeros((len(near), 6, 4, 3)), np.zeros((len(near), 6))
+    rules[:, range(3), :, range(3)] = 1
+    goal[:, :3] = total
+    for number, (one, other) in enumerate(((0, 1), (0, 2), (1, 2)), start=3):
+        rules[:, number, :, other] = local[:, :, one]
+        rules[:, number, :, one] = -local[:, :, other]
+        goal[:, number] = moments[:, one, other] - moments[:, other, one]
+    gap = goal - np.einsum("nril,nil->nr", rules, found)
+    moved = np.einsum("nij,nrjl->nril", inverse, rules)
+    gram = np.einsum("nril,nsil->nrs", rules, moved, optimize=True)
+    factors = np.linalg.pinv(gram, rcond=_SINGULAR, hermitian=True) @ gap[:, :, None]
+    return np.asarray(found + np.einsum("nril,nr->nil", moved, factors[:, :, 0]))
