@@ -20,13 +20,11 @@ import vedo
 from acoustools.BEM import compute_E
 from acoustools.Mesh import calculate_features, get_CHIEF_points
 from shared.cases import (
-    CUBE_ORDER,
     SPHERE_RADIUS,
     Case,
     Simulation,
     close_scene,
-    extrapolate,
-    limit_case,
+    cubes_with,
     simulate,
     sphere_case,
 )
@@ -41,8 +39,8 @@ PACKAGES = ("acoustools", "vedo")
 SPHERE_SUBDIVISIONS, CUBE_SUBDIVISIONS = (2, 3, 4), (3, 4)
 SPACINGS = (1.0, 0.5)
 """Spacings of our grids [mm]."""
-LIMIT_SPACINGS = (0.5, 1 / 3, 0.25)
-"""Spacings for the limit of the cubes [mm]; all have the faces between cells."""
+FINEST = 0.25
+"""Spacing of the reference of the cubes [mm]."""
 
 CHIEF_POINTS, CHIEF_DEPTH = 30, 3e-3
 """Approximate number of inner points with zero field, and their depth [m]."""
@@ -55,16 +53,15 @@ PLANE_SPACING = 1e-3
 """Spacing of the points behind the obstacles [m]."""
 
 
-def rigid_cubes(count: int, spacings: Sequence[float] = LIMIT_SPACINGS) -> Case:
-    """Return the paper's three cubes, rigid, or the middle one, with the limit of our grids [mm]."""
+def rigid_cubes(count: int, spacing: float = FINEST) -> Case:
+    """Return the paper's three cubes, rigid, or the middle one, as a grid of `spacing` [mm] has them."""
     scene = close_scene("three_cubes")
     kept = scene.obstacles if count == 3 else scene.obstacles[1:2]
     cubes = tuple(at.Box(one.center, one.size, rigid=True) for one in kept)
     scene = dataclasses.replace(scene, obstacles=cubes)
     name = "three rigid cubes" if count == 3 else "rigid cube"
-    empty = limit_case(name, scene, torch.zeros(()))
-    exact = extrapolate(spacings, [simulate(empty, h).matrix for h in spacings], CUBE_ORDER)
-    return limit_case(name, scene, exact)
+    empty = cubes_with(name, scene, torch.zeros(()))
+    return cubes_with(name, scene, simulate(empty, spacing).matrix)
 
 
 def sphere_mesh(scene: at.Scene, subdivisions: int) -> vedo.Mesh:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import product
 
-import numpy as np
 import torch
 from shared.document import DOCS
 from shared.scenes import paper_scene, relative_error, uncached
@@ -35,11 +34,6 @@ FACE = 22.2e-3
 
 CUBES = ("three_cubes", "two_cubes")
 
-SMOOTH_ORDER = 2.0
-CUBE_ORDER = 4 / 3
-"""Orders of the error in the spacing h, for smooth surfaces and for edges. At an edge of a rigid cube the
-velocity is singular as r^(-1/3), and the energy that a grid misses goes as h^(4/3) (Grisvard 1985)."""
-
 
 @dataclass(frozen=True)
 class Case:
@@ -51,7 +45,6 @@ class Case:
         points: where the pressure is compared (P, 3) [m].
         exact: transfer matrix (P, M) [Pa].
         scattered: norm of its scattered part; None without obstacles.
-        order: of the error in the spacing, for extrapolation.
         method: of the propagator.
     """
 
@@ -60,7 +53,6 @@ class Case:
     points: torch.Tensor
     exact: torch.Tensor
     scattered: float | None
-    order: float
     method: str = "box"
 
 
@@ -82,13 +74,6 @@ def simulate(case: Case, spacing: float, tolerance: float = TOLERANCE) -> Simula
         matrix = propagator.transfer_matrix(case.points)
     seconds = time.perf_counter() - begin
     return Simulation(matrix, seconds, all(run.reached for run in propagator.runs))
-
-
-def extrapolate(spacings: Sequence[float], matrices: Sequence[torch.Tensor], order: float) -> torch.Tensor:
-    """Return G_0 of the least-squares fit G(h) = G_0 + C h^order (Richardson's for two spacings)."""
-    powers = np.array(spacings) ** order
-    weights = np.linalg.pinv(np.column_stack((np.ones(len(powers)), powers)))[0]
-    return sum((w * g for w, g in zip(weights.tolist(), matrices, strict=True)), start=torch.zeros(()))
 
 
 def close_scene(name: str, obstacles: Sequence[at.Obstacle] | None = None) -> at.Scene:
@@ -114,7 +99,7 @@ def free_space_case() -> Case:
     """Return the paper's scene without obstacles."""
     scene = close_scene("homogeneous")
     exact = free_space_matrix(scene.control_points, scene.array, scene.wavenumber)
-    return Case("free space", scene, scene.control_points, exact, None, SMOOTH_ORDER, "full")
+    return Case("free space", scene, scene.control_points, exact, None, "full")
 
 
 def sphere_case(name: str, shift: Sequence[float] = (0.0, 0.0, 0.0)) -> Case:
@@ -134,25 +119,21 @@ def sphere_case(name: str, shift: Sequence[float] = (0.0, 0.0, 0.0)) -> Case:
         both = [analytic.fluid_sphere(*where, *ratios, scattered=scattered) for scattered in (False, True)]
     exact, scattered = (4 * math.pi * empty.array.source_strength * part for part in both)
     scene = close_scene("homogeneous", [sphere])
-    return Case(name, scene, points, exact, float(scattered.norm()), SMOOTH_ORDER)
+    return Case(name, scene, points, exact, float(scattered.norm()))
 
 
 def cube_case(name: str) -> Case:
-    """Return a scene of cubes, with the limit of the stored fine grids as its transfer matrix."""
+    """Return a scene of cubes, with the stored transfer matrix of the finest grid."""
     scene = close_scene(name)
     stored = json.loads(CUBE_MATRICES.read_text(encoding="utf-8"))["scenes"][name]
-    matrices = [
-        torch.complex(*(torch.tensor(m[part], dtype=torch.float64) for part in ("real", "imag")))
-        for m in stored
-    ]
-    exact = extrapolate([m["spacing"] for m in stored], matrices, CUBE_ORDER)
-    return limit_case(name, scene, exact)
+    parts = (torch.tensor(stored[-1][part], dtype=torch.float64) for part in ("real", "imag"))
+    return cubes_with(name, scene, torch.complex(*parts))
 
 
-def limit_case(name: str, scene: at.Scene, exact: torch.Tensor) -> Case:
+def cubes_with(name: str, scene: at.Scene, exact: torch.Tensor) -> Case:
     """Return a case of cubes with a known transfer matrix."""
     scattered = exact - free_space_matrix(scene.control_points, scene.array, scene.wavenumber)
-    return Case(name, scene, scene.control_points, exact, float(scattered.norm()), CUBE_ORDER)
+    return Case(name, scene, scene.control_points, exact, float(scattered.norm()))
 
 
 def slab_case() -> Case:
@@ -185,7 +166,7 @@ def _layered_case(
     where = (points, array.positions, scene.wavenumber, (FACE, 0, 0), (-1, 0, 0))
     strength = 4 * math.pi * array.source_strength
     total, scattered = (strength * exact(*where, scattered=part) for part in (False, True))
-    return Case(name, scene, points, total, float(scattered.norm()), SMOOTH_ORDER, "full")
+    return Case(name, scene, points, total, float(scattered.norm()), "full")
 
 
 def piston_case() -> Case:
@@ -200,7 +181,7 @@ def piston_case() -> Case:
     scene = at.Scene(array, AIR, 40e3, points, domain=domain)
     field = analytic.piston_field(points, array.positions, scene.wavenumber, 5e-3, tilt)
     exact = 4 * math.pi * array.source_strength * field
-    return Case("piston", scene, points, exact, None, SMOOTH_ORDER, "full")
+    return Case("piston", scene, points, exact, None, "full")
 
 
 def worst_point_error(case: Case, matrix: torch.Tensor) -> float:

@@ -6,20 +6,15 @@ import pytest
 import torch
 from benchmarks.accuracy import Row, compare, make_reference, observed_order, worst_point, write_report
 from shared import cases, document
-from shared.cases import cube_case, extrapolate, piston_case, simulate, slab_case, sphere_case, wall_case
+from shared.cases import cube_case, piston_case, simulate, slab_case, sphere_case, wall_case
 
 import autdtorch as at
 from autdtorch.analytic.green import free_space_matrix
 
 
 @pytest.mark.parametrize("spacings", [(1.0, 0.7), (1.0, 0.7, 0.5)])
-def test_the_order_of_a_power_law_is_its_power_and_extrapolation_removes_it(
-    spacings: tuple[float, ...],
-) -> None:
+def test_the_order_of_a_power_law_is_its_power(spacings: tuple[float, ...]) -> None:
     assert observed_order(spacings, [0.3 * h**1.7 for h in spacings]) == pytest.approx(1.7, rel=1e-12)
-    limit, slope = torch.randn(2, 3, dtype=torch.complex128, generator=torch.Generator().manual_seed(0))
-    found = extrapolate(spacings, [limit + slope * h**1.5 for h in spacings], 1.5)
-    assert torch.allclose(found, limit, rtol=1e-12)
 
 
 def test_scattered_error_is_that_of_the_scattered_field() -> None:
@@ -38,14 +33,14 @@ def test_cases_are_normalised_as_free_space(make) -> None:
     assert 0.3 < float(case.exact.norm() / free.norm()) < 2
 
 
-def test_cubes_reference_is_the_limit_of_the_stored_matrices(
+def test_cubes_reference_is_the_finest_of_the_stored_matrices(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class PowerLaw:
-        """Transfer matrices that differ from free space by a power of the spacing."""
+        """Transfer matrices of free space times a function of the spacing."""
 
         def __init__(self, scene: at.Scene, _: str, spacing: float, tolerance: float, cache: bool) -> None:
-            self.scene, self.factor = scene, 1 + (10 * spacing) ** cases.CUBE_ORDER
+            self.scene, self.factor = scene, 1 + 1e3 * spacing
 
         def transfer_matrix(self, points: torch.Tensor) -> torch.Tensor:
             return self.factor * free_space_matrix(points, self.scene.array, self.scene.wavenumber)
@@ -55,7 +50,7 @@ def test_cubes_reference_is_the_limit_of_the_stored_matrices(
     make_reference()
     case = cube_case("two_cubes")
     free = free_space_matrix(case.scene.control_points[:1], case.scene.array, case.scene.wavenumber)
-    assert torch.allclose(case.exact, free, rtol=1e-10)
+    assert torch.allclose(case.exact, 1.2 * free, rtol=1e-10)
 
 
 def test_errors_are_measured() -> None:
