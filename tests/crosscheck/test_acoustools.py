@@ -31,7 +31,7 @@ def test_both_come_to_the_series_of_a_rigid_sphere() -> None:
 
 
 def test_both_agree_on_a_rigid_cube() -> None:
-    case = rigid_cubes(1, (1.0, 0.5))
+    case = rigid_cubes(1, 0.5)
     # 0.55 % with 768 panels of 1.2 mm, most of it AcousTools': four times as many leave half of it.
     theirs = boundary_elements(case, cube_mesh(case.scene, 3))
     assert relative_error(theirs, case.exact) < 0.01

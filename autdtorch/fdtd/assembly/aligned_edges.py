@@ -28,8 +28,9 @@ from autdtorch.fdtd.assembly.element import (
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
 
-# Share of an element by which its materials may differ from a quadrant: shares are inexact near an edge
-_FITS = 0.1
+# Share of an element by which its materials may differ from quadrants. Shares are inexact near edges, by
+# 0.125 where two touch.
+_FITS = 0.15
 _SAME = 1e-9  # Difference of depths [cells] up to which edges share their coupling
 _RADIUS = 3  # Elements on each side of the edge in the plane of the fit
 _SQUARES = 64  # Squares along each side of an element, for the areas beside an edge
@@ -44,6 +45,9 @@ _CORNER, _DIAGONAL = np.array((True, False, False, False)), np.array((True, Fals
 _COLUMN_PAIRS = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
 _MIRRORED = [1, 0, 2, 3, 5, 4]  # The pairs after both axes are exchanged
 _TURNED = [4, 5, 2, 3, 0, 1]  # The pairs after the first and the last column are exchanged, too
+# Three orthogonal differences of the columns, and the places of a triangular matrix
+_DIFFERENCES = np.array([(1, 0, 1), (-1, 0, 1), (0, 1, -1), (0, -1, -1)]) / np.sqrt((2, 2, 4))
+_LOWER = np.tril_indices(3)
 _SIDES = np.abs(_CORNERS[_COLUMN_PAIRS[:, 0]] - _CORNERS[_COLUMN_PAIRS[:, 1]]).sum(axis=1)
 
 
@@ -226,29 +230,51 @@ def _edge_coupling(
     series = uniform / (own * inner + (1 - own) * outer)
 
     parts = np.zeros((6, *matrix.shape))
-    for part, own_coupling in zip(parts, np.diag(series), strict=True):
-        _add(part, (0, 0), own_coupling)
+    for part, unit in zip(parts, np.eye(6), strict=True):
+        _add(part, (0, 0), unit)
     free, chosen = ~given, judged[~given]
     solution = fields.copy()
 
-    def solved(factor: Array) -> Array:
+    def solved(coupling: Array) -> Array:
         """Return the inverse for the cells between; their pressures are left in `solution`."""
-        whole = (matrix + np.tensordot(factor, parts, axes=1))[free]
+        whole = (matrix + np.tensordot(coupling, parts, axes=1))[free]
         inverse = np.linalg.inv(whole[:, free])
         solution[free] = -inverse @ whole[:, given] @ fields[given]
         return np.asarray(inverse)
 
-    def missed(factor: Array) -> Array:
-        solved(factor)
+    def missed(root: Array) -> Array:
+        coupling = _coupling_of(root, root)
+        solved(coupling)
         wrong = (solution - fields)[free][chosen]
-        return np.concatenate((wrong.ravel(), _PRIOR * (factor - 1)))
+        return np.concatenate((wrong.ravel(), _PRIOR * (coupling / series - 1)))
 
-    def slopes(factor: Array) -> Array:
-        moved = -solved(factor) @ (parts @ solution)[:, free]
-        return np.concatenate((moved[:, chosen].reshape(6, -1).T, _PRIOR * np.eye(6)))
+    def slopes(root: Array) -> Array:
+        moved = -solved(_coupling_of(root, root)) @ (parts @ solution)[:, free]
+        by_coupling = np.concatenate((moved[:, chosen].reshape(6, -1).T, _PRIOR * np.diag(1 / series)))
+        return 2 * by_coupling @ np.stack([_coupling_of(root, unit) for unit in np.eye(6)], axis=1)
 
-    found = least_squares(missed, np.ones(6), slopes, xtol=_EXACT, ftol=_EXACT, gtol=_EXACT).x
-    return np.asarray(_semidefinite(found * series) / uniform)
+    root = least_squares(missed, _root_of(series), slopes, xtol=_EXACT, ftol=_EXACT, gtol=_EXACT).x
+    return np.asarray(_coupling_of(root, root) / uniform)
+
+
+def _coupling_of(root: Array, other: Array) -> Array:
+    """Return the coupling (6,) of the symmetric part of B R S^T B^T, with R and S triangular from (6,) each.
+
+    B spans the differences of the columns. With R = S no energy is negative.
+    """
+    first, second = np.zeros((2, 3, 3))
+    first[_LOWER], second[_LOWER] = root, other
+    half = _DIFFERENCES @ first @ (_DIFFERENCES @ second).T
+    return np.asarray(-(half + half.T)[tuple(_COLUMN_PAIRS.T)] / 2)
+
+
+def _root_of(coupling: Array) -> Array:
+    """Return the triangular matrix (6,) that has a coupling (6,) of positive energy."""
+    matrix = np.zeros((4, 4))
+    matrix[tuple(_COLUMN_PAIRS.T)] = -coupling
+    matrix += matrix.T
+    matrix[range(4), range(4)] = -matrix.sum(axis=1)
+    return np.asarray(np.linalg.cholesky(_DIFFERENCES.T @ matrix @ _DIFFERENCES)[_LOWER])
 
 
 def _add(matrix: Array, first: tuple[int, int], coupling: Array) -> None:
@@ -280,17 +306,6 @@ def _beside(
     one, other = _CORNERS[_COLUMN_PAIRS.T, axis]
     along = mobility[0, one] * (uniform[0] + uniform[2]) - link[0] * uniform[2]
     return np.asarray(np.where(one != other, uniform * link[0], along))
-
-
-def _semidefinite(coupling: Array) -> Array:
-    """Return coupling (6,) of a non-negative energy, by dropping what is negative of it."""
-    matrix = np.zeros((4, 4))
-    matrix[tuple(_COLUMN_PAIRS.T)] = -coupling
-    matrix += matrix.T
-    matrix[range(4), range(4)] = -matrix.sum(axis=1)
-    values, vectors = np.linalg.eigh(matrix)
-    kept = (vectors * values.clip(min=0)) @ vectors.T
-    return np.asarray(-kept[tuple(_COLUMN_PAIRS.T)])
 
 
 def _diagonal_fields(places: Array, density: tuple[float, float]) -> Array:
