@@ -38,6 +38,7 @@ _LEAST_ENERGY = 0.01  # Smallest energy of a sum of fields, relative to theirs, 
 _MIDDLE = len(LATTICE) // 2  # The centre of an element in the lattice
 # Weight of a vertex for the flow on the other side of a surface: this power of the ratio of densities
 _BESIDE = 0.33
+_SQUARES = 2  # Squares along each side of a face, each of four triangles on which distances are linear
 _SINGULAR = 1e-10  # Relative size of eigenvalues that are rounding
 
 
@@ -52,7 +53,7 @@ _FIT = np.linalg.pinv(_MONOMIALS)
 
 
 def _face_geometry() -> tuple[Index, Index]:
-    """Return the vertices (6, 4) of the faces, and the lattice's points (6, 64, 3) of their triangles.
+    """Return the vertices (6, 4) of the faces, and the lattice's points (6, 16, 3) of their triangles.
 
     Squares are cut along both diagonals, so that a mirrored surface has mirrored forces.
     """
@@ -62,7 +63,8 @@ def _face_geometry() -> tuple[Index, Index]:
     for axis in range(3):
         for end in (0, 1):
             vertices.append(np.flatnonzero(VERTICES[:, axis] == end))
-            own = np.array([each + c for each in np.ndindex((SUBCELLS,) * 2) for c in corners])
+            own = np.array([each + c for each in np.ndindex((_SQUARES,) * 2) for c in corners])
+            own *= SUBCELLS // _SQUARES
             points = np.insert(own, axis, end * SUBCELLS, axis=2)
             triangles.append(points @ ((SUBCELLS + 1) ** 2, SUBCELLS + 1, 1))
     return np.array(vertices), np.array(triangles)
@@ -250,7 +252,7 @@ def face_forces(surface: Surface, face: int) -> Array:
 
 
 def _parts(level: Array, triangles: Index) -> tuple[Array, Array, Array]:
-    """Return area (n, 128), place (n, 128, 3) and depth (n, 128) of the two parts of triangles (64, 3).
+    """Return area (n, 32), place (n, 32, 3) and depth (n, 32) of the two parts of triangles (16, 3).
 
     The first half are outside the inner material. Places are relative to the element's centre.
     """
