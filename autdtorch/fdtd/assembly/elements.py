@@ -35,6 +35,7 @@ _ROUGH = 0.01
 # Share of a rigid edge's reduction that edges of fluids have. With 0.15 and 0.3, tilted cubes of ratio
 # 77 have errors of up to 2.4 and 2.7 % (15 mm) and 2.8 and 2.1 % (8 mm) at 1 mm.
 _FLUID_REDUCTION = 0.3
+_SAME = 1e-9  # Difference of distances [cells] up to which elements are alike
 _LEAST_GRADIENT = 0.3  # Least mean gradient of a signed distance in an element with one surface
 
 
@@ -179,6 +180,22 @@ def _finite(
     return finite
 
 
+def _distinct(distance: Array, finite: NDArray[np.bool_], less: Array) -> tuple[Index, Index]:
+    """Return the first of the elements (n,) that are alike, and the place of each (n,) among these.
+
+    Along flat faces parallel to the grid, nearly all are alike.
+    """
+    count = len(less)
+    parts = (np.moveaxis(distance, 1, 0) / _SAME, finite.T, less / _SAME)
+    keys = np.concatenate([part.reshape(count, -1).round().astype(np.int64) for part in parts], axis=1)
+    # sums modulo 2^64: keys that differ have the same sum once in 10^19
+    sums = keys.view(np.uint64) @ np.random.default_rng(0).integers(
+        2**64, size=keys.shape[1], dtype=np.uint64
+    )
+    _, first, place = np.unique(sums, return_index=True, return_inverse=True)
+    return first, place
+
+
 def _interface(
     bodies: list[_Union], index: Index, grid: Grid, materials: Materials, stencil: Stencil
 ) -> InterfaceElements:
@@ -205,7 +222,9 @@ def _interface(
             finite = np.stack(
                 [_finite(*pair, first, edged, grid) for pair in zip(bodies, distance, strict=True)]
             )
-            near = Bodies(distance, numbers, aligned, finite, less)
-            parts.append(interface_elements(near, materials, stencil))
+            own, place = _distinct(distance, finite, less)
+            near = Bodies(distance[:, own], numbers, aligned, finite[:, own], less[own])
+            found = interface_elements(near, materials, stencil)
+            parts.append(InterfaceElements(*(part[place] for part in found)))
             progress.advance(len(first))
     return InterfaceElements(*(np.concatenate(each) for each in zip(*parts, strict=True)))
