@@ -52,6 +52,10 @@ class InterfaceElements(NamedTuple):
     material: Index  # number of the material at each vertex (n, 8)
     finite: NDArray[np.bool_]  # whether it is a finite element, whose sound-hard vertices stay cells (n,)
 
+    def chosen(self, some: Index) -> InterfaceElements:
+        """Return some of the elements."""
+        return InterfaceElements(self.coupling[some], self.mass[some], self.material[some], self.finite[some])
+
 
 def coupling_by_edges(stencil: Stencil) -> Array:
     """Return the coupling (4,) in air by edges between vertices; 4 elements share a face, 2 an edge."""

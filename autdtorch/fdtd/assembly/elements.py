@@ -225,6 +225,6 @@ def _interface(
             own, place = _distinct(distance, finite, less)
             near = Bodies(distance[:, own], numbers, aligned, finite[:, own], less[own])
             found = interface_elements(near, materials, stencil)
-            parts.append(InterfaceElements(*(part[place] for part in found)))
+            parts.append(found.chosen(place))
             progress.advance(len(first))
     return InterfaceElements(*(np.concatenate(each) for each in zip(*parts, strict=True)))

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from autdtorch.fdtd.kernels.compiled import INNER, entry
 from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Receivers, Sources, State
 from autdtorch.fdtd.kernels.cpu_layout import FlatMemory, plane_profiles, rows_profile
+from autdtorch.fdtd.kernels.cpu_rows import row_offsets, rows_of
 from autdtorch.fdtd.kernels.cpu_sweep import stretch, sweep_planes
 from autdtorch.fdtd.kernels.cpu_workers import COUNTERS, claim, finish, share_of_processors, wait_for
-from autdtorch.fdtd.stencil import OFFSETS, flat_offsets
+from autdtorch.fdtd.stencil import OFFSETS
 from autdtorch.utils.array_types import AnyArray
 from autdtorch.utils.threads import thread_count
 
@@ -175,13 +176,13 @@ def _columns(c: Coefficients, columns: Columns) -> tuple[AnyArray, ...]:
 
 
 def _heterogeneous_cells(c: Coefficients, shape: torch.Size) -> tuple[AnyArray, ...]:
-    """Return indices, weights, offsets, layer scale, weights of air, and workspace."""
-    air = np.array((c.center, c.face, c.edge, c.corner))[np.abs(OFFSETS).sum(axis=1)]
+    """Return indices, weights, offsets of rows, layer scale, weights of air, and workspace."""
     index, weight = c.heterogeneous_index.numpy(), c.heterogeneous_weight.numpy()
+    air = np.array((c.center, c.face, c.edge, c.corner), weight.dtype)[np.abs(OFFSETS).sum(axis=1)]
     scale = np.zeros_like(weight, shape=len(index))
     scale[np.searchsorted(index, c.layer_index.numpy())] = c.layer_scale.numpy()
     new, swept = np.empty_like(scale), np.empty_like(scale)
-    return index, weight.ravel(), flat_offsets(shape), scale, air.astype(scale.dtype), new, swept
+    return index, rows_of(weight), row_offsets(shape), scale, rows_of(air[None]), new, swept
 
 
 class CpuKernel:

@@ -22,6 +22,7 @@ import numpy as np
 from numba import njit
 
 from autdtorch.fdtd.kernels.compiled import INNER
+from autdtorch.fdtd.kernels.cpu_rows import sum_of_rows
 
 _U = np.uint64
 
@@ -49,15 +50,9 @@ def _heterogeneous(p, q, cells, first, last, keep):  # type: ignore[no-untyped-d
     for n in range(first, last):
         cell = index[n]
         own, old = p[cell], q[cell]
-        change = own - own
-        for m in range(27):
-            change += weight[n * 27 + m] * (p[cell + offset[m]] - own)
-        new[n] = own + keep * (own - old) + change
+        new[n] = own + keep * (own - old) + sum_of_rows(p, cell, offset, weight, n * len(air))
         if scale[n] != 0:
-            change = own - own
-            for m in range(27):
-                change += air[m] * p[cell + offset[m]]
-            swept[n] = change - keep * old
+            swept[n] = own + keep * (own - old) + sum_of_rows(p, cell, offset, air, 0)
 
 
 @njit(**INNER)
