@@ -19,7 +19,6 @@ from autdtorch.fdtd.grid import (
     Extent,
     bodies_extent,
     domain_extent,
-    layer_cells,
 )
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.stability import fewest_steps
@@ -85,7 +84,7 @@ def grid_cost(region: Region, extent: Extent, spacing: float) -> GridCost:
     spacing = max(finest, min(spacing, coarsest))  # others are refused later
     kappa = region.wavenumber * spacing
     interior = x, y, z = extent.interior(spacing)
-    rim = layer_cells(kappa) + 1
+    rim = extent.layer_cells(kappa) + 1
     stencil = tuned_stencil(kappa, region.attenuation * spacing)
     periods = fewest_periods(spacing * math.hypot(*interior) / region.wavelength)
     fastest = max(region.sound_speeds.values()) / region.fluid.sound_speed

@@ -18,7 +18,7 @@ from autdtorch.fdtd.grid import (
     MAX_CELLS,
     ORDER,
     coarsest_spacing,
-    layer_cells,
+    domain_extent,
     require_spacing,
     second_spacing,
 )
@@ -156,7 +156,8 @@ class Plan:
         inner = outer = np.array([[-np.inf] * 3, [np.inf] * 3])
         if self.method == "full":
             inner = np.array(region.domain)
-            outer = inner + spacing * layer_cells(region.wavenumber * spacing) * np.array([[-1.0], [1.0]])
+            layer = domain_extent(region, spacing).layer_cells(region.wavenumber * spacing)
+            outer = inner + spacing * layer * np.array([[-1.0], [1.0]])
         cut = cells = columns = meshed = 0.0
         for body in region.bodies:
             vertices, triangles = (part.numpy() for part in body.shape.surface())

