@@ -52,7 +52,7 @@ def reflection(normal, offset, spacing, incidence, azimuth=0.0, fluid=None):
     normal.
     """
     kappa = 2 * math.pi * FREQUENCY / AIR.sound_speed * spacing
-    stencil, grid = tuned_stencil(kappa), Grid(spacing, (2 * REACH,) * 3, (0.0, 0.0, 0.0), kappa, 6)
+    stencil, grid = tuned_stencil(kappa), Grid(spacing, (2 * REACH,) * 3, (0.0, 0.0, 0.0), kappa, 6, 1)
     length, middle = float(np.linalg.norm(normal)), np.array(grid.shape) // 2
     unit = np.array(normal) / length
     shape = HalfSpace(unit, spacing * float(unit @ middle + offset))

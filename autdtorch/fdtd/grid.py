@@ -55,6 +55,7 @@ class Grid:
     origin: tuple[float, float, float]  # centre of cell (0, 0, 0) [m]
     kappa: float  # wavenumber in air times spacing [rad]
     layer_cells: int  # thickness of the boundary layer
+    crossings: int  # times that sound crosses the grid before it has arrived everywhere
 
     @property
     def rim(self) -> int:
@@ -79,10 +80,10 @@ class Grid:
         return x, y, z
 
     @property
-    def crossing(self) -> float:
-        """Time of sound in air along the longest path through the interior [periods]."""
+    def arrival(self) -> float:
+        """Time after which sound has arrived everywhere, by the longest path [periods]."""
         wavelength = 2 * math.pi * self.spacing / self.kappa
-        return self.spacing * math.hypot(*self.interior) / wavelength
+        return self.crossings * self.spacing * math.hypot(*self.interior) / wavelength
 
     @cached_property
     def centers(self) -> tuple[Array, Array, Array]:
@@ -114,7 +115,10 @@ class Extent:
     lower: Sequence[float]  # corner with the smallest coordinates (3,) [m]
     upper: Sequence[float]  # corner with the largest coordinates (3,) [m]
     margin: int  # cells around that, before the boundary layer begins
-    thinner: int = 0  # cells by which the boundary layer is thinner
+    thinner: int  # cells by which the boundary layer is thinner
+    # times that sound crosses the grid before it has arrived everywhere: on a grid of the whole domain once,
+    # and again as an echo; a box is driven everywhere at once
+    crossings: int
 
     def layer_cells(self, kappa: float) -> int:
         """Return the thickness of the boundary layer at a wavenumber times spacing `kappa` [rad]."""
@@ -131,13 +135,14 @@ class Extent:
 
 def domain_extent(region: Region, spacing: float) -> Extent:
     """Return the region's domain, with the air that the interpolation of points near its faces needs."""
-    return Extent(*region.domain, interpolation_width(region.wavenumber * spacing) // 2 - 1)
+    margin = interpolation_width(region.wavenumber * spacing) // 2 - 1
+    return Extent(*region.domain, margin, thinner=0, crossings=2 if region.bodies else 1)
 
 
 def bodies_extent(shapes: Sequence[Shape]) -> Extent:
     """Return the extent of one or more shapes and the air around them in a box."""
     lower, upper = bounds(shapes)
-    return Extent(lower.tolist(), upper.tolist(), AROUND, _THINNER)
+    return Extent(lower.tolist(), upper.tolist(), AROUND, _THINNER, crossings=1)
 
 
 def make_grid(region: Region, spacing: float) -> Grid:
@@ -167,7 +172,7 @@ def _covering(region: Region, spacing: float, extent: Extent) -> Grid:
     layer = extent.layer_cells(kappa)
     rim = layer + 1 + extent.margin - 0.5
     x, y, z = (low - (rim + first) * spacing for low, first in zip(extent.lower, offset, strict=True))
-    grid = Grid(spacing, extent.interior(spacing, offset), (x, y, z), kappa, layer)
+    grid = Grid(spacing, extent.interior(spacing, offset), (x, y, z), kappa, layer, extent.crossings)
     if math.prod(grid.shape) > MAX_CELLS:
         cells = " x ".join(map(str, grid.shape))
         raise invalid("spacing", spacing, f"gives {cells} cells, must be at most {MAX_CELLS:.0e} in all", "m")

@@ -35,6 +35,8 @@ _MOST_FITTED = 2048  # Most cells whose phasors decide the means
 _ROUNDING = 1e-13  # Regularisation of the normal equations, relative to the mean square of the differences
 # Safety factor: the residual is estimated as this many times the changes over the last two blocks
 _CAUTION = 2.0
+# Ratio of the changes over successive blocks, twice, up to which the next ones are expected to fall as fast
+_FALLING = 0.1
 
 
 @dataclass(frozen=True)
@@ -59,12 +61,12 @@ def run_to_steady_state(
 ) -> SteadyState:
     """Step until the relative residual is within `tolerance`, or `max_periods` have passed.
 
-    `observe` maps the phasors of `cells` (k,) to the quantity that must converge, once sound has crossed the
-    grid twice. `stepped` is called with the number of periods after each block.
+    `observe` maps the phasors of `cells` (k,) to the quantity that must converge, once sound has arrived
+    everywhere. `stepped` is called with the number of periods after each block.
     """
-    earliest = fewest_periods(assembly.grid.crossing)
+    earliest = fewest_periods(assembly.grid.arrival)
     sequence = Extrapolation(phasors_kept(len(cells)))
-    values: deque[Tensor] = deque(maxlen=3)
+    values: deque[Tensor] = deque(maxlen=4)
     ramp = math.ceil(RAMP_PERIODS * assembly.steps_per_period)
     for count, windows in windows_of_run(assembly, kernel, sources, cells):
         stepped(block_of(assembly.steps_per_period)[1])
@@ -86,9 +88,9 @@ def block_of(steps_per_period: Fraction) -> tuple[int, int]:
     return parts * steps_per_period.numerator, parts * steps_per_period.denominator
 
 
-def fewest_periods(crossing: float) -> int:
-    """Return the periods of the shortest run on a grid that sound crosses in `crossing` periods."""
-    return RAMP_PERIODS + math.ceil(2 * crossing)
+def fewest_periods(arrival: float) -> int:
+    """Return the periods of the shortest run on a grid where sound has arrived after `arrival` periods."""
+    return RAMP_PERIODS + math.ceil(arrival)
 
 
 def phasors_kept(cells: int) -> int:
@@ -167,10 +169,14 @@ def _turned(window: Tensor, start: int, periods: int) -> Phasors:
 
 
 def _residual(values: deque[Tensor]) -> float:
-    """Return the residual of the last value, estimated from its changes over the last two blocks."""
-    last = values[-1]
-    size = float(last.norm())
+    """Return the residual of the last value, estimated from its changes over the last blocks."""
+    last, size = values[-1], float(values[-1].norm())
     if len(values) < 3 or not size:
         return math.inf
-    changes = [float((last - value).norm()) / size for value in values]
-    return _CAUTION * max(changes) if all(map(math.isfinite, changes)) else math.inf
+    changes = [float((one - before).norm()) / size for before, one in itertools.pairwise(values)]
+    if not all(map(math.isfinite, changes)):
+        return math.inf
+    falls = [one / before for before, one in itertools.pairwise(changes) if before]
+    if len(falls) == 2 and max(falls) <= _FALLING:
+        return _CAUTION * max(falls) * changes[-1]
+    return _CAUTION * max(changes[-1], float((last - values[-3]).norm()) / size)

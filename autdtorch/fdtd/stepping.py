@@ -25,9 +25,8 @@ from autdtorch.utils.validation import invalid
 logger = logging.getLogger(__name__)
 
 # Periods over which the drive is switched on. A short ramp excites the shortest waves of the grid, which
-# almost stand still and stay: at 2 mm, 3 periods left changes of 1e-3 per period after 60 periods, 8 periods
-# 5e-5.
-RAMP_PERIODS = 8
+# almost stand still and stay: at 2 mm, 3 periods left changes of 1e-3 per period after 60 periods.
+RAMP_PERIODS = 6
 # Initial uniform pressure, relative to the largest force. From exact zeros the wave's precursors would decay
 # into subnormal numbers, on which processors are slow (2.4 times, measured at 120^3 in float32).
 _BACKGROUND = 1e-20

@@ -148,7 +148,7 @@ class Simulation(ABC):
         what = f"simulating {plan.scene.name}"
         count = "1 run" if len(sources) == 1 else f"{len(sources)} runs"
         logger.info("%s: %s, cells of %.3g mm, %s", what, plan.method, 1e3 * plan.spacing, count)
-        crossing = max(grid.crossing for grid in grids)
-        periods = math.ceil(len(sources) * USUAL_PERIODS * fewest_periods(crossing))
+        arrival = max(grid.arrival for grid in grids)
+        periods = math.ceil(len(sources) * USUAL_PERIODS * fewest_periods(arrival))
         with show_progress(periods, what) as progress:
             return self._simulate(sources, strength, receivers, progress.advance)

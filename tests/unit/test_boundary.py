@@ -6,7 +6,7 @@ import pytest
 from autdtorch.fdtd.boundary import reflection, tuned_profile
 from autdtorch.fdtd.grid import FINE_LAYER_CELLS, Extent
 
-DOMAIN = Extent((0, 0, 0), (1, 1, 1), 0)
+DOMAIN = Extent((0, 0, 0), (1, 1, 1), 0, 0, 1)
 
 
 def reflected_decibels(
