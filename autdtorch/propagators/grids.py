@@ -105,7 +105,7 @@ class Grouping:
     axes: tuple[Array, ...]
     grids: tuple[GridCost, ...]
     passes: int
-    aligned: bool = True
+    aligned: bool
 
     @property
     def coupled_pairs(self) -> int:
@@ -125,7 +125,7 @@ def choose_grids(
     if method == "box":
         return method, cheapest_boxes(region, spacing, tolerance, runs)
     own, extent = np.eye(3), domain_extent(region, spacing)
-    aligned = all(flat_faces(shape).all_aligned(own) for shape in region.shapes)
+    aligned = bool(region.bodies) and all(flat_faces(shape).all_aligned(own) for shape in region.shapes)
     domain = _boxes(region, [_Box(tuple(range(len(region.bodies))), own, extent, aligned)], spacing, 1)
     if method == "full":
         return method, domain

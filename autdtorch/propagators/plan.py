@@ -257,7 +257,7 @@ def plan(
     require_one_of("method", method, ("auto", "free_space", "box", "full"))
     if method == "box" and not scene.obstacles:
         raise invalid("method", method, "needs a scene with obstacles; take free_space")
-    runs, grouping = min(len(scene.control_points), len(scene.array)), Grouping((), (), (), 0)
+    runs, grouping = min(len(scene.control_points), len(scene.array)), Grouping((), (), (), 0, aligned=False)
     if method == "auto" and not scene.obstacles:
         logger.debug("method auto: free_space (no obstacles)")
         method = "free_space"

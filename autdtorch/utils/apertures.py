@@ -44,9 +44,9 @@ class Apertures(NamedTuple):
         return Discs(self.positions.mean(dim=1), self.normals, self.radius)
 
     def far_from(self, points: torch.Tensor, wavenumber: complex) -> torch.Tensor:
-        """Return which of them (N,) are discs so far from all points (P, 3) that `Discs.pattern` holds."""
+        """Return which of them (N,) are discs far enough from all points (P, 3) for `Discs.pattern`."""
         count = len(self.positions)
-        if self.normals is None or abs(wavenumber) * self.radius > _LARGEST:
+        if self.normals is None or len(points) == 0 or abs(wavenumber) * self.radius > _LARGEST:
             return torch.zeros(count, dtype=torch.bool, device="cpu")
         center = self.positions.mean(dim=1)
         beyond = torch.maximum(points.amin(dim=0) - center, center - points.amax(dim=0)).clamp(min=0)

@@ -100,3 +100,10 @@ def test_runs_side_by_side_are_those_one_after_the_other(monkeypatch):
         monkeypatch.setattr(CpuKernel, "at_once", lambda self, shape, count=count: count)
         runs.append((propagator.transfer_matrix().tolist(), [run.periods for run in propagator.runs]))
     assert runs[0] == runs[1]
+
+
+def test_discs_among_obstacles_of_air():
+    air = Box(CUBE.center, CUBE.size, density=AIR.density, sound_speed=AIR.sound_speed)
+    with_air, without = (small_scene(each, radius=1e-3) for each in ((air,), ()))
+    found = make_propagator(with_air, "box", 1e-3).transfer_matrix()
+    assert relative_error(found, make_propagator(without, "free_space").transfer_matrix()) < 1e-6

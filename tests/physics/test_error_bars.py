@@ -102,9 +102,10 @@ def test_errors_are_known_from_either_grid(ratio, error, order):
     one = torch.ones(2, 3, dtype=torch.complex128)
     fine, coarse = one * (1 + error), one * (1 + error * ratio**order)
     known = grid_errors(fine, coarse, ratio, order), grid_errors(coarse, fine, 1 / ratio, order)
-    # large differences are taken for third order
-    assert (known[0] / error).numpy() == pytest.approx(1, abs=0.7)
-    assert (known[1] / error / ratio**order).numpy() == pytest.approx(1, abs=0.7)
+    # large differences of second order are taken for third order; errors are relative to a matrix that has one
+    most = 0.7 if order == 2 else 0.2
+    assert (known[0] / error).numpy() == pytest.approx(1, abs=most)
+    assert (known[1] / error / ratio**order).numpy() == pytest.approx(1, abs=most)
 
 
 def test_the_second_grid_is_coarser_where_fair():
@@ -117,5 +118,6 @@ def test_the_second_grid_is_coarser_where_fair():
 def test_errors_fall_faster_where_all_faces_follow_the_grid(rotation):
     flat, curved = Box(CENTER, (5e-3,) * 3, rotation, rigid=True), Sphere((5e-3,) * 3, 2e-3, rigid=True)
     assert plan(small_scene((flat,)), "box").order > 2
-    assert plan(small_scene((flat,)), "full").order > 2 or any(rotation)
+    assert (plan(small_scene((flat,)), "full").order > 2) == (not any(rotation))
+    assert plan(EMPTY, "full").order == 2  # that of waves in air
     assert plan(small_scene((flat, curved)), "box").order == 2

@@ -216,3 +216,17 @@ def test_edges_are_those_of_the_shape():
     rims = edges_of(Cylinder((0, 0, 0), 1e-2, 2e-2, (1, 2, 3), rigid=True))
     assert [round(rim.radius, 9) for rim in rims] == [1e-2, 1e-2]
     assert edges_of(Sphere((0, 0, 0), 1e-2, rigid=True)) == []
+
+
+def test_an_edge_of_a_fluid_leaves_a_thin_rigid_plate_whole():
+    """Finite elements at the edge must not join the air on both sides of the plate."""
+    plate = Box((0, 0, -9.5e-3), (24e-3, 24e-3, 1e-3), rigid=True)
+    above = -9e-3 + 0.1e-3 + math.sqrt(2) * 5e-3
+    cube = Box((0, 0, above), (10e-3,) * 3, (math.pi / 4, 0, 0), **DENSE)
+    array = TransducerArray([(0, 0, -18e-3)], (0, 0, 1))
+    scenes = (
+        Scene(array, AIR, 40e3, [[0, 0, 18e-3]], bodies, domain=((-20e-3,) * 3, (20e-3,) * 3))
+        for bodies in ((plate,), (plate, cube))
+    )
+    alone, both = (len(assemble(region_of(scene), 1e-3).heterogeneous.sound_hard) for scene in scenes)
+    assert alone == both > 0

@@ -158,26 +158,34 @@ def _distances(bodies: list[_Union], first: Index, grid: Grid) -> Array:
 
 
 def _finite(
-    body: _Union, distance: Array, first: Index, near_edge: NDArray[np.bool_], grid: Grid
+    bodies: list[_Union], distance: Array, first: Index, near_edge: NDArray[np.bool_], grid: Grid
 ) -> NDArray[np.bool_]:
-    """Return whether finite elements represent a body in elements (n,).
+    """Return whether finite elements represent bodies in elements (K, n).
 
-    They do where a sound-hard body is thick enough, and where a fluid has more than one face.
+    They do where a sound-hard body is thick enough, and at edges of a fluid without a thin sound-hard body.
     """
-    if not body.sound_hard:
-        own = near_edge & (np.abs(distance) < FAR).any(axis=1) & body.finite
-        own[own] = roughness(distance[own]) > _ROUGH
-        return own
-    finite = np.full(len(first), body.finite)
-    near = np.flatnonzero(finite & (np.abs(distance) < FAR).any(axis=1))
-    if len(near):
-        gradient, middle = mean_gradient(distance[near]), distance[near].mean(axis=1)
-        steep = np.linalg.norm(gradient, axis=1)  # small where the two faces of a plate cancel
-        normal = gradient / np.maximum(steep, _LEAST_GRADIENT)[:, None]
-        below = (middle[:, None] + _DEPTHS)[:, :, None] * normal[:, None]
-        inside = body.distance(first[near, None] + 0.5 - below, grid) < 0
-        finite[near] = inside.all(axis=1) & (steep > _LEAST_GRADIENT)
-    return finite
+    near = np.asarray((np.abs(distance) < FAR).any(axis=2))
+    finite, thin = near.copy(), np.zeros(len(first), bool)
+    for body, own, level, here in zip(bodies, finite, distance, near, strict=True):
+        own &= body.finite
+        if body.sound_hard:
+            own[own] = _thick(body, level[own], first[own], grid)
+            thin |= here & ~own
+        else:
+            own &= near_edge
+            own[own] = roughness(level[own]) > _ROUGH
+    hard = np.array([body.sound_hard for body in bodies])
+    return np.asarray(finite & (hard[:, None] | ~thin))
+
+
+def _thick(body: _Union, distance: Array, first: Index, grid: Grid) -> NDArray[np.bool_]:
+    """Return whether a sound-hard body has one face in elements (n,), with enough of the body behind it."""
+    gradient, middle = mean_gradient(distance), distance.mean(axis=1)
+    steep = np.linalg.norm(gradient, axis=1)  # small where the two faces of a plate cancel
+    normal = gradient / np.maximum(steep, _LEAST_GRADIENT)[:, None]
+    below = (middle[:, None] + _DEPTHS)[:, :, None] * normal[:, None]
+    inside = body.distance(first[:, None] + 0.5 - below, grid) < 0
+    return np.asarray(inside.all(axis=1) & (steep > _LEAST_GRADIENT))
 
 
 def _distinct(distance: Array, finite: NDArray[np.bool_], less: Array) -> tuple[Index, Index]:
@@ -219,9 +227,7 @@ def _interface(
             less = reductions(edges, centers, grid.spacing)
             distance = _distances(bodies, first, grid)
             edged = np.asarray(less.any(axis=(1, 2)))
-            finite = np.stack(
-                [_finite(*pair, first, edged, grid) for pair in zip(bodies, distance, strict=True)]
-            )
+            finite = _finite(bodies, distance, first, edged, grid)
             own, place = _distinct(distance, finite, less)
             near = Bodies(distance[:, own], numbers, aligned, finite[:, own], less[own])
             found = interface_elements(near, materials, stencil)

@@ -36,9 +36,9 @@ _SLIVER_COUPLING, _LEAST_COUPLING = 1e-3, 3e-5
 # would remove energy from nearly constant pressures.
 _NULL_EIGENVALUE = 1e-10
 _ROW_ROUNDING = 1e-9  # Stencil rows within this of air's are those of air
-# Largest sum of a stencil row at a surface, relative to a uniform material, before the cell receives mass.
-# Gershgorin's bound exceeds the largest eigenvalue of air by more. For the paper's cubes 1.1 costs 3 % of the
-# time step and 1.2 would cost 8 %; a slab of density ratio 3 keeps its mass.
+# End of a cell's Gershgorin circle, relative to a uniform material, from which the cell receives mass. For
+# the paper's cubes 1.1 costs 3 % of the time step and 1.2 would cost 8 %; a slab of density ratio 3 keeps its
+# mass.
 _ROW_SUM_MARGIN = 1.1
 _NEED_ITERATIONS = 3  # of the mass that a cell needs, as its neighbours' masses decide it
 _MASS_TRANSFERS = 6  # Largest number of mass transfers to light cells; one is nearly always enough
@@ -71,7 +71,7 @@ def heterogeneous_cells(elements: Elements, stencil: Stencil) -> HeterogeneousCe
     touched = touched[_inner(touched, shape)]
     coupling, mass, hard = _without_sound_hard(elements, touched, shape, stencil)
     largest = _ROW_SUM_MARGIN * stencil.total * float(elements.materials.speed.max())
-    mass = _transferred_mass(coupling, mass, touched, shape, largest)
+    mass = _transferred_mass(coupling, mass, elements, touched, shape, largest)
     weight = coupling / mass[:, None]
     changed = (np.abs(weight - stencil.weights) > _ROW_ROUNDING).any(axis=1) | (mass != 1)
     changed &= ~hard[touched]
@@ -174,14 +174,16 @@ def _assembled(
     return coupling, mass
 
 
-def _transferred_mass(coupling: Array, mass: Array, touched: Index, shape: Shape, largest: float) -> Array:
-    """Return masses (n,) with which no stencil row sums to more than `largest` and shortens the time step.
+def _transferred_mass(
+    coupling: Array, mass: Array, elements: Elements, touched: Index, shape: Shape, largest: float
+) -> Array:
+    """Return masses (n,) with which few stencil rows shorten the time step.
 
     A light cell with strong coupling, in a heavy obstacle just below its surface, moves with the air. It
-    takes mass from the cells it is coupled to; their sum is unchanged. Gershgorin's circles then bound the
-    operator at any contrast.
+    takes mass from the cells it is coupled to; their sum is unchanged. The largest eigenvalue, which decides
+    the time step, then depends little on the contrast.
     """
-    need = _needed_mass(coupling, mass, touched, shape, largest)
+    need = _needed_mass(coupling, mass, elements, touched, shape, largest)
     mass, asked = mass.copy(), mass.sum()
     for _ in range(_MASS_TRANSFERS):
         light = np.flatnonzero(need > mass)
@@ -203,7 +205,9 @@ def _transferred_mass(coupling: Array, mass: Array, touched: Index, shape: Shape
     return np.where(mass > 0, mass, 1.0)
 
 
-def _needed_mass(coupling: Array, mass: Array, touched: Index, shape: Shape, largest: float) -> Array:
+def _needed_mass(
+    coupling: Array, mass: Array, elements: Elements, touched: Index, shape: Shape, largest: float
+) -> Array:
     """Return the masses (n,) at which Gershgorin's circles of the symmetric operator end at twice `largest`.
 
     With the sum D_i of a row, that is D_i + sum_j |K_ij| sqrt(m_i / m_j) = 2 largest m_i. The root counts up
@@ -212,10 +216,11 @@ def _needed_mass(coupling: Array, mass: Array, touched: Index, shape: Shape, lar
     neighbour, size = _neighbours(touched, shape), np.abs(coupling)
     place = np.searchsorted(touched, neighbour).clip(max=len(touched) - 1)
     beside, row = touched[place] != neighbour, coupling.sum(axis=1)
+    uniform = elements.materials.mass[_cell_material(elements)[neighbour]]
     need = size.sum(axis=1) / largest
     for _ in range(_NEED_ITERATIONS):
         own = np.maximum(mass, need)
-        around = np.where(beside, 1, own[place])
+        around = np.where(beside, uniform, own[place])
         ratio = np.divide(own[:, None], around, out=np.ones_like(size), where=around > 0)
         lighter = np.sqrt(ratio).clip(max=1)
         need = (np.maximum(row, 0) + (size * lighter).sum(axis=1)) / (2 * largest)
