@@ -49,11 +49,12 @@ def make_propagator(
             continues through the boundary layer, box where other obstacles leave the domain or are tilted,
             otherwise the cheaper of box and full. The propagator's `method` is the one
             chosen; the reason is logged at level DEBUG.
-        spacing: edge of a cell [m], at most a third of the wavelength. The error falls with its square
-            (docs/numerics.md). None: the scene is simulated on finer and finer grids, until the estimated
+        spacing: edge of a cell [m], at most a third of the wavelength. The error falls with its square, or
+            faster along the grid (docs/decisions/error-bars.md). None: the scene is simulated on finer and finer grids, until the estimated
             error of the transfer matrix is within `tolerance`.
         tolerance: relative error, in (0, 1): the distance to the steady state at which a simulation ends,
-            or the estimated error where the spacing is chosen.
+            or the estimated error where the spacing is chosen. Hard obstacles are simulated as rigid where
+            the difference is smaller.
         kernel: "cpu" (numba), "cuda" (Triton, on an NVIDIA GPU), "reference" (torch, slow, readable), or
             "auto" for the fastest available.
         dtype: precision of the fields, float32 or float64.

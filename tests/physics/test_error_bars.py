@@ -102,7 +102,7 @@ def test_errors_are_known_from_either_grid(ratio, error, order):
     one = torch.ones(2, 3, dtype=torch.complex128)
     fine, coarse = one * (1 + error), one * (1 + error * ratio**order)
     known = grid_errors(fine, coarse, ratio, order), grid_errors(coarse, fine, 1 / ratio, order)
-    # large differences of second order are taken for third order; errors are relative to a matrix that has one
+    # large differences of second order are taken for third order; errors are relative to one of the matrices
     most = 0.7 if order == 2 else 0.2
     assert (known[0] / error).numpy() == pytest.approx(1, abs=most)
     assert (known[1] / error / ratio**order).numpy() == pytest.approx(1, abs=most)

@@ -1,4 +1,4 @@
-"""Elements that a tilted or curved surface of a sound-hard body cuts.
+"""Elements that a tilted or curved surface of a sound-hard body cuts, or a tilted edge of a dense fluid.
 
 Their stiffness and mass are those of finite elements with trilinear functions, integrated over the part that
 is no such body (a cut finite element method, Burman et al. 2015, doi:10.1002/nme.4823). Vertices in the body

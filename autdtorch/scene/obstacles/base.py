@@ -83,7 +83,7 @@ class Obstacle(ABC):
 
     @abstractmethod
     def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return vertices (V, 3) [m], float64, and triangles of their indices (F, 3), int64, for drawing.
+        """Return vertices (V, 3) [m], float64, and triangles of their indices (F, 3), int64.
 
         Triangles are counter-clockwise as seen from outside.
         """
