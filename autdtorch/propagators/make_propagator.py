@@ -50,8 +50,8 @@ def make_propagator(
             otherwise the cheaper of box and full. The propagator's `method` is the one
             chosen; the reason is logged at level DEBUG.
         spacing: edge of a cell [m], at most a third of the wavelength. The error falls with its square, or
-            faster along the grid (docs/decisions/error-bars.md). None: the scene is simulated on finer and finer grids, until the estimated
-            error of the transfer matrix is within `tolerance`.
+            faster along the grid (docs/decisions/error-bars.md). None: the scene is simulated on finer and
+            finer grids, until the estimated error of the transfer matrix is within `tolerance`.
         tolerance: relative error, in (0, 1): the distance to the steady state at which a simulation ends,
             or the estimated error where the spacing is chosen. Hard obstacles are simulated as rigid where
             the difference is smaller.

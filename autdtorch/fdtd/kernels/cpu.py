@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from autdtorch.fdtd.kernels.compiled import INNER, entry
 from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Receivers, Sources, State
 from autdtorch.fdtd.kernels.cpu_layout import FlatMemory, plane_profiles, rows_profile
-from autdtorch.fdtd.kernels.cpu_rows import row_offsets, rows_of
+from autdtorch.fdtd.kernels.cpu_rows import row_offsets
 from autdtorch.fdtd.kernels.cpu_sweep import stretch, sweep_planes
 from autdtorch.fdtd.kernels.cpu_workers import COUNTERS, claim, finish, share_of_processors, wait_for
 from autdtorch.fdtd.stencil import OFFSETS
@@ -182,7 +182,7 @@ def _heterogeneous_cells(c: Coefficients, shape: torch.Size) -> tuple[AnyArray, 
     scale = np.zeros_like(weight, shape=len(index))
     scale[np.searchsorted(index, c.layer_index.numpy())] = c.layer_scale.numpy()
     new, swept = np.empty_like(scale), np.empty_like(scale)
-    return index, rows_of(weight), row_offsets(shape), scale, rows_of(air[None]), new, swept
+    return index, weight.reshape(-1), row_offsets(shape), scale, air, new, swept
 
 
 class CpuKernel:

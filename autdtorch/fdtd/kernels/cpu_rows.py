@@ -14,34 +14,25 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from autdtorch.fdtd.stencil import flat_offsets
-from autdtorch.utils.array_types import AnyArray, Index
+from autdtorch.utils.array_types import Index
 
-_WIDTH = 4  # Cells of a row that are read: the three neighbours, and one whose weight is zero
-
-
-def rows_of(weight: AnyArray) -> AnyArray:
-    """Return weights (n, 27) as `sum_of_rows` reads them (n * 36,).
-
-    The cell of weight zero is the last of a row, and the first of the last row: no read leaves the grid.
-    """
-    rows = np.zeros((len(weight), 9, _WIDTH), weight.dtype)
-    rows[:, :8, :3] = weight.reshape(-1, 9, 3)[:, :8]
-    rows[:, 8, 1:] = weight[:, 24:]
-    return rows.reshape(-1)
+_WIDTH = 4  # Cells of a row that are read: the three neighbours and one more, whose weight is not its own
+# Neighbours read first in each row, and the one more in these four: no read leaves the grid or the weights
+_FIRST, _MORE = (*range(0, 24, 3), 23), (*8 * (3,), 0)
 
 
 def row_offsets(shape: tuple[int, ...]) -> Index:
-    """Return the flat offsets (9,) from a cell to the first cells of the rows."""
+    """Return the flat offsets (9,) from a cell to the first cells read of the nine rows around it."""
     first = np.array(flat_offsets(shape)[::3])
     first[8] -= 1
     return first
 
 
 def _sum_of_rows(typing_context: Any, p: Any, cell: Any, offset: Any, weight: Any, at: Any) -> Any:
-    """Return the sum of weight[at + 4 r + j] * (p[cell + offset[r] + j] - p[cell])."""
+    """Return the sum of weight[at + j] * (p[neighbour j] - p[cell]) over the 27 neighbours j."""
 
     def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-        kinds = signature.args
+        kinds, long = signature.args, ir.IntType(64)
         number = context.get_data_type(p.dtype)
         row = ir.VectorType(number, _WIDTH)
         size = context.get_abi_sizeof(number)
@@ -57,12 +48,13 @@ def _sum_of_rows(typing_context: Any, p: Any, cell: Any, offset: Any, weight: An
         for j in range(_WIDTH):
             own = builder.insert_element(own, here, ir.Constant(ir.IntType(32), j))
         total = ir.Constant(row, None)
-        for r in range(9):
-            long = ir.IntType(64)
+        for r, (first, more) in enumerate(zip(_FIRST, _MORE, strict=True)):
             step = builder.load(pointer(2, ir.Constant(long, r)))
-            around = load(0, builder.add(given[1], step))
-            weights = load(3, builder.add(given[4], ir.Constant(long, _WIDTH * r)))
-            total = builder.fadd(total, builder.fmul(weights, builder.fsub(around, own)))
+            rise = builder.fsub(load(0, builder.add(given[1], step)), own)
+            weights = load(3, builder.add(given[4], ir.Constant(long, first)))
+            zero = ir.Constant(number, 0.0)
+            weights = builder.insert_element(weights, zero, ir.Constant(ir.IntType(32), more))
+            total = builder.fadd(total, builder.fmul(weights, rise))
         parts = [builder.extract_element(total, ir.Constant(ir.IntType(32), j)) for j in range(_WIDTH)]
         return builder.fadd(builder.fadd(parts[0], parts[2]), builder.fadd(parts[1], parts[3]))
 
