@@ -21,6 +21,7 @@ from autdtorch.fdtd.stencil import Stencil
 from autdtorch.fdtd.turning import flat_faces
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.progress import show_progress
+from autdtorch.utils.threads import spread
 
 # Density with which sound-hard bodies are assembled. Cells that stay almost uncoupled become sound-hard.
 _SOUND_HARD_DENSITY = 1e5
@@ -208,7 +209,6 @@ def _interface(
     bodies: list[_Union], index: Index, grid: Grid, materials: Materials, stencil: Stencil
 ) -> InterfaceElements:
     none = np.zeros((0, 28)), np.zeros((0, 8)), np.zeros((0, 8), np.int64), np.zeros(0, bool)
-    parts = [InterfaceElements(*none)]
     numbers = np.array([body.material for body in bodies], np.int64)
     aligned = np.array([body.aligned for body in bodies], bool)
     shapes = [shape for body in bodies for shape in body.shapes]
@@ -220,17 +220,20 @@ def _interface(
         for edge in edges_of(shape, [each for each in shapes if each is not shape])
     ]
     shape = tuple(cells - 1 for cells in grid.shape)
+
+    def chunk(begin: int) -> InterfaceElements:
+        first = np.stack(np.unravel_index(index[begin : begin + _CHUNK], shape), axis=-1)
+        centers = np.array(grid.origin) + grid.spacing * (first + 0.5)
+        less = reductions(edges, centers, grid.spacing)
+        distance = _distances(bodies, first, grid)
+        edged = np.asarray(less.any(axis=(1, 2)))
+        finite = _finite(bodies, distance, first, edged, grid)
+        own, place = _distinct(distance, finite, less)
+        near = Bodies(distance[:, own], numbers, aligned, finite[:, own], less[own])
+        found = interface_elements(near, materials, stencil)
+        progress.advance(len(first))
+        return found.chosen(place)
+
     with show_progress(len(index), "measuring surfaces") as progress:
-        for start in range(0, len(index), _CHUNK):
-            first = np.stack(np.unravel_index(index[start : start + _CHUNK], shape), axis=-1)
-            centers = np.array(grid.origin) + grid.spacing * (first + 0.5)
-            less = reductions(edges, centers, grid.spacing)
-            distance = _distances(bodies, first, grid)
-            edged = np.asarray(less.any(axis=(1, 2)))
-            finite = _finite(bodies, distance, first, edged, grid)
-            own, place = _distinct(distance, finite, less)
-            near = Bodies(distance[:, own], numbers, aligned, finite[:, own], less[own])
-            found = interface_elements(near, materials, stencil)
-            parts.append(found.chosen(place))
-            progress.advance(len(first))
+        parts = [InterfaceElements(*none), *spread(chunk, range(0, len(index), _CHUNK))]
     return InterfaceElements(*(np.concatenate(each) for each in zip(*parts, strict=True)))
