@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from autdtorch.fdtd.kernels.contract import Kernel, Receivers, Sources
-from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, drive_dft, drive_signal
+from autdtorch.fdtd.stepping import RAMP_PERIODS, Assembly, drive_basis, drive_signal, fourier_sum
 from autdtorch.utils.array_types import Index
 
 Phasors = NDArray[np.complex128]
@@ -147,25 +147,30 @@ def windows_of_run(
     shift = max(1, steps // _PARTS)
     ones = torch.ones((len(cells), 1), dtype=assembly.dtype, device="cpu")
     receivers = Receivers(torch.from_numpy(cells[:, None]), ones)
-    state = assembly.silence(sources)
-    both = None  # record of the last two blocks (2 * steps, k)
+    state, basis = assembly.silence(sources), drive_basis(steps, periods)
+    total = silence = torch.zeros(len(cells), dtype=torch.complex128, device="cpu")
+    sums: dict[int, Tensor] = {}  # Fourier sums from the beginning to where windows begin and end
     for block in itertools.count():
         first = block * steps
         signal = drive_signal(steps_per_period, first, steps).to(assembly.dtype)
         state, recorded = kernel.advance(state, assembly.coefficients, sources, receivers, signal)
-        if both is None:
-            both = recorded.new_zeros((2 * steps, len(cells)), dtype=torch.float64)
-        both[:steps] = both[steps:]
-        both[steps:] = recorded
+        sums = {time: value for time, value in sums.items() if time > first - steps}
+        inside = (time for time in range(first + 1, first + steps) if _is_needed(time, steps, shift))
+        for begin, end in itertools.pairwise((first, *inside, first + steps)):
+            part = slice(begin - first, end - first)
+            total = total + fourier_sum(basis[:, part], recorded[part]).cpu()
+            sums[end] = total
         starts = range(-(-(first + 1) // shift) * shift - steps, first + 1, shift)
-        windows = ((start, both[start - first + steps :][:steps]) for start in starts)
-        yield (block + 1) * periods, [(start, _turned(window, start, periods)) for start, window in windows]
+        windows = []
+        for start in starts:
+            before = sums[start] if start > 0 else silence
+            windows.append((start, (sums[start + steps] - before).numpy()))
+        yield (block + 1) * periods, windows
 
 
-def _turned(window: Tensor, start: int, periods: int) -> Phasors:
-    """Return phasors (k,) of a window of `periods`, recorded (steps, k) after each step from `start` on."""
-    turn = 2 * math.pi * (start * periods % len(window)) / len(window)
-    return np.asarray(drive_dft(window, periods).cpu().numpy() * complex(math.cos(turn), math.sin(turn)))
+def _is_needed(time: int, steps: int, shift: int) -> bool:
+    """Return whether a window ends or begins after `time` steps; ends are `shift` apart."""
+    return time % shift == 0 or (time + steps) % shift == 0
 
 
 def _residual(values: deque[Tensor]) -> float:

@@ -174,11 +174,19 @@ def drive_signal(steps_per_period: Fraction, first: int, count: int) -> Tensor:
     return torch.stack((envelope * torch.cos(phase), envelope * torch.sin(phase)), dim=1)
 
 
-def drive_dft(recorded: Tensor, periods: int) -> Tensor:
-    """Return phasors (R,) at the drive frequency of a record (steps, R) of `periods`."""
-    steps = len(recorded)
+def drive_basis(steps: int, periods: int) -> Tensor:
+    """Return the weights (2, steps) of the real and imaginary part of a phasor, for records of `periods`."""
     turn = 2 * math.pi * periods / steps * torch.arange(1, steps + 1, dtype=torch.float64, device="cpu")
-    basis = 2 / steps * torch.stack((torch.cos(turn), torch.sin(turn)))
+    return 2 / steps * torch.stack((torch.cos(turn), torch.sin(turn)))
+
+
+def fourier_sum(basis: Tensor, recorded: Tensor) -> Tensor:
+    """Return the sum (R,) of a record (steps, R) with the weights (2, steps) of a phasor."""
     # in single precision PyTorch may take products of a few bits (torch.set_float32_matmul_precision)
     cosine, sine = basis.to(recorded.device) @ recorded.double()
     return torch.complex(cosine, sine)
+
+
+def drive_dft(recorded: Tensor, periods: int) -> Tensor:
+    """Return phasors (R,) at the drive frequency of a record (steps, R) of `periods`."""
+    return fourier_sum(drive_basis(len(recorded), periods), recorded)
