@@ -131,13 +131,15 @@ class BoxSimulation(Simulation):
         phasors = torch.stack([each.pressure for each in steady], dim=1)
         parts = torch.split(phasors, [len(transform.cells) for transform in transforms])
         scattered = [transform.field(part) for transform, part in zip(transforms, parts, strict=True)]
-        silent = torch.zeros(len(points), dtype=torch.bool, device="cpu")
-        for obstacle, body in zip(
-            plan.scene.obstacles, plan.region.bodies, strict=True
-        ):  # the later one wins
-            silent = torch.where(obstacle.contains(points).any(dim=1), body.fluid is None, silent)
         total = incident + sum(scattered)
-        return total.mT.masked_fill(silent, 0), list(map(Run.of, steady, seconds))
+        return total.mT.masked_fill(self._silent(points), 0), list(map(Run.of, steady, seconds))
+
+    def _silent(self, points: torch.Tensor) -> torch.Tensor:
+        """Return which points (P, n, 3) [m] are in a rigid obstacle; of overlapping ones the later counts."""
+        silent = torch.zeros(len(points), dtype=torch.bool, device="cpu")
+        for obstacle, body in zip(self.plan.scene.obstacles, self.plan.region.bodies, strict=True):
+            silent = torch.where(obstacle.contains(points).any(dim=1), body.fluid is None, silent)
+        return silent
 
 
 def _coupled(

@@ -59,59 +59,92 @@ class Bodies(NamedTuple):
 
 def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -> InterfaceElements:
     """Return the stiffness and mass of n elements that surfaces of K bodies intersect."""
-    count, (distance, material, aligned, finite, reductions) = len(materials.density), bodies
+    count, distance, material = len(materials.density), bodies.distance, bodies.material
     # bodies that do not intersect an element must not enter its shares
     distance = np.where((distance > 0).all(axis=2, keepdims=True), FAR, distance)
     distance = np.where((distance < 0).all(axis=2, keepdims=True), -FAR, distance)
+    bodies = bodies._replace(distance=distance)
     volumes = shares(volume_coverage, distance, material, count)
     lines = shares(line_coverage, distance, material, count)
     coupling = _series_coupling(lines, materials, stencil)
     vertex = _vertex_materials(distance, material)
-    layered = layered_axis(vertex, volumes, distance[~aligned])
+    layered = layered_axis(vertex, volumes, distance[~bodies.aligned])
     near = (np.abs(distance) < FAR).any(axis=2)
-    straight = (aligned[:, None] | ~near).all(axis=0) | (layered >= 0)
+    straight = (bodies.aligned[:, None] | ~near).all(axis=0) | (layered >= 0)
     moved = np.flatnonzero(~straight)
     grow = mean_thickness(materials, stencil)[material, None, None]
     volumes[moved] = shares(volume_coverage, distance[:, moved] - grow, material, count)
     mass = lumped_mass(vertex, volumes, materials)
-    grown = (near & finite).any(axis=0) & (layered < 0)
+    cut = _Cut(vertex, volumes, coupling, mass)
+
+    finite = (near & bodies.finite).any(axis=0) & (layered < 0)
     for axis in range(3):
         own = np.flatnonzero(layered == axis)
         share = volumes[own].mean(axis=1)
         coupling[own], mass[own] = layered_elements(axis, vertex[own], share, mass[own], materials, stencil)
-    held = (vertex[:, :, None] == np.arange(count)).any(axis=1)
-    present = volumes.mean(axis=1) > _ABSENT_SHARE
-    two = (held.sum(axis=1) == 2) & (present <= held).all(axis=1)
     cornered = np.flatnonzero(straight & (layered < 0))
     edged, *found = edge_elements(
         distance[:, cornered], material, vertex[cornered], volumes[cornered], materials, stencil
     )
     edged = cornered[edged]
     coupling[edged], mass[edged] = found
+    held = (vertex[:, :, None] == np.arange(count)).any(axis=1)
+    present = volumes.mean(axis=1) > _ABSENT_SHARE
+    two = (held.sum(axis=1) == 2) & (present <= held).all(axis=1) & (layered < 0) & ~finite
     two[edged] = False
-    chosen = np.flatnonzero(two & (layered < 0) & ~grown)
-    if len(chosen):
-        inner = count - 1 - held[chosen, ::-1].argmax(axis=1)
-        outer = held[chosen].argmax(axis=1)
-        level = distance_to_material(distance[:, chosen], material, inner)
-        sides = np.stack((outer, inner), axis=1)
-        flat, surface = surfaces(level, materials.density[sides])
-        own, pair = chosen[flat], sides[flat]
-        mobility = volumes[own] @ (1 / materials.density) / SUBCELLS**3
-        tilted, uniform = ~straight[own], uniform_coupling(stencil)  # corners along the grid have no forces
-        coupling[own], weight = smooth_stiffness(surface, tilted, mobility, coupling[own], uniform)
-        some = weight > 0
-        own, pair, surface, weight = own[some], pair[some], surface.chosen(some), weight[some, None]
-        part = _moved_shares(surface, pair, added_thickness(stencil.kappa), count)
-        balanced = balanced_mass(surface, materials.mass[pair], lumped_mass(vertex[own], part, materials))
-        mass[own] += weight * (balanced - mass[own])
-    if grown.any():
-        contrast = np.where(materials.sound_hard, 1, (materials.density - 1) / (materials.density + 1))
-        thickness = added_thickness(stencil.kappa) * contrast[material, None, None] * finite[:, grown, None]
-        part = shares(volume_coverage, distance[:, grown] - thickness, material, count)
-        coupling[grown] = cut_coupling(part, materials, reductions[grown], stencil)
-        mass[grown] = cut_mass(part, materials)
-    return InterfaceElements(coupling, mass, vertex, grown)
+    _smooth_elements(cut, bodies, held, np.flatnonzero(two), straight, materials, stencil)
+    if finite.any():
+        _finite_elements(cut, bodies, np.flatnonzero(finite), materials, stencil)
+    return InterfaceElements(coupling, mass, vertex, finite)
+
+
+class _Cut(NamedTuple):
+    """Elements that surfaces intersect, whose coupling and mass are set in place."""
+
+    vertex: Index  # material at the vertices (n, 8)
+    volumes: Array  # shares of the materials in the sub-cells (n, 64, m)
+    coupling: Array  # (n, 28)
+    mass: Array  # (n, 8)
+
+
+def _smooth_elements(
+    cut: _Cut,
+    bodies: Bodies,
+    held: NDArray[np.bool_],
+    chosen: Index,
+    straight: NDArray[np.bool_],
+    materials: Materials,
+    stencil: Stencil,
+) -> None:
+    """Set the `chosen` elements of two materials in which the surface between them has one normal.
+
+    `held` (n, m) are the materials at the vertices. Elements `straight` (n,) along the grid have no forces.
+    """
+    count = len(materials.density)
+    inner = count - 1 - held[chosen, ::-1].argmax(axis=1)
+    level = distance_to_material(bodies.distance[:, chosen], bodies.material, inner)
+    sides = np.stack((held[chosen].argmax(axis=1), inner), axis=1)
+    flat, surface = surfaces(level, materials.density[sides])
+    own, pair = chosen[flat], sides[flat]
+    mobility = cut.volumes[own] @ (1 / materials.density) / SUBCELLS**3
+    cut.coupling[own], weight = smooth_stiffness(
+        surface, ~straight[own], mobility, cut.coupling[own], uniform_coupling(stencil)
+    )
+    some = weight > 0
+    own, pair, surface, weight = own[some], pair[some], surface.chosen(some), weight[some, None]
+    part = _moved_shares(surface, pair, added_thickness(stencil.kappa), count)
+    lumped = lumped_mass(cut.vertex[own], part, materials)
+    cut.mass[own] += weight * (balanced_mass(surface, materials.mass[pair], lumped) - cut.mass[own])
+
+
+def _finite_elements(cut: _Cut, bodies: Bodies, own: Index, materials: Materials, stencil: Stencil) -> None:
+    """Set the elements `own` to finite elements, their bodies grown by the added thickness."""
+    contrast = np.where(materials.sound_hard, 1, (materials.density - 1) / (materials.density + 1))
+    contrast = contrast[bodies.material, None, None] * bodies.finite[:, own, None]
+    grown = bodies.distance[:, own] - added_thickness(stencil.kappa) * contrast
+    part = shares(volume_coverage, grown, bodies.material, len(materials.density))
+    cut.coupling[own] = cut_coupling(part, materials, bodies.reductions[own], stencil)
+    cut.mass[own] = cut_mass(part, materials)
 
 
 def _vertex_materials(distance: Array, material: Index) -> Index:
