@@ -32,6 +32,7 @@ from autdtorch.scene.arrays import apertures_of
 from autdtorch.scene.obstacles import Mesh
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.memory import require_memory
+from autdtorch.utils.threads import thread_count
 from autdtorch.utils.triangles import doubled_normals
 from autdtorch.utils.validation import integer_at_least, invalid, positive, require_kind, require_one_of
 
@@ -49,14 +50,21 @@ _CELL_MEMORY, _ELEMENT_BYTES, _COLUMN_BYTES = 2_000.0, 20_500.0, 8_000.0
 """Memory [bytes] of a heterogeneous cell, of an element while its surface is assembled, and of an element
 that a surface cuts in a boundary layer."""
 
-_ELEMENTS, _MOST_ELEMENTS = 1.4, 4096
-"""Elements assembled for each that a surface cuts, as some are only near it; the most at once."""
+_ALIKE, _FORCES = 0.25, 5.0
+"""Memory and time of assembling elements along the grid, nearly all of which are alike, and time of those
+with forces, at tilted surfaces of fluids; relative to tilted surfaces of rigid bodies."""
 
-_CELL_STEPS, _COLUMN_STEPS = 35.0, 250.0
+_ELEMENTS, _MOST_ELEMENTS = 1.4, 4096
+"""Elements assembled for each that a surface cuts, as some are only near it; the most at once by a thread."""
+
+_RECORDED = 32
+"""Memory [bytes] of a recorded number, and of what is made of it for the Fourier sums."""
+
+_CELL_STEPS, _COLUMN_STEPS = 15.0, 150.0
 """Time of a step of a heterogeneous cell, and of one that a surface cuts in a boundary layer. This and the
 following times are in steps of a cell of air."""
 
-_PAIR_STEPS, _ASSEMBLY_STEPS, _MESH_STEPS = 11.0, 60_000.0, 200_000.0
+_PAIR_STEPS, _ASSEMBLY_STEPS, _MESH_STEPS = 11.0, 60_000.0, 60_000.0
 """Time of one term of a sum over radiating cells, of the assembly of a heterogeneous cell, and of what a mesh
 adds to that."""
 
@@ -74,7 +82,8 @@ class Heterogeneity(NamedTuple):
     cut: float  # elements that surfaces cut
     cells: float  # heterogeneous cells: beside surfaces, and inside another medium
     columns: float  # elements that surfaces cut in the boundary layers
-    meshed: float  # heterogeneous cells at meshes
+    meshed: float  # those at meshes
+    assembled: float  # those beside surfaces, by the time of assembling them
 
 
 @dataclass(frozen=True)
@@ -128,11 +137,12 @@ class Plan:
         grids, filled, kept = self.grouping.grids, self._heterogeneity, self._kept
         block = 3 * max(grid.steps_per_period for grid in grids)
         run = _FIELD_NUMBERS * self.dtype.itemsize * self.cells
-        run += kept * (16 * phasors_kept(kept) + 48 * block)
+        run += kept * (16 * phasors_kept(kept) + _RECORDED * block)
         receivers = max(len(self.scene.control_points), len(self.scene.array))
         judged = min(MOST_JUDGED, receivers) if self.method == "box" else 0
         lasting = _CELL_BYTES * self.cells + _CELL_MEMORY * filled.cells + _COLUMN_BYTES * filled.columns
-        assembled = min(_ELEMENTS * filled.cut / len(grids), _MOST_ELEMENTS)
+        assembled = min(_ELEMENTS * filled.cut / len(grids), _MOST_ELEMENTS * thread_count())
+        assembled *= _ALIKE if self.grouping.aligned else 1
         running = 24 * judged * kept + min(self.runs, self._at_once) * run
         return lasting + max(_ELEMENT_BYTES * assembled, running)
 
@@ -143,9 +153,9 @@ class Plan:
         single = _CELL_STEPS * filled.cells + _COLUMN_STEPS * filled.columns
         stepping = sum(grid.work for grid in grids) + max(grid.steps for grid in grids) * single
         # coupled boxes are stepped to looser tolerances, and empty grids have no resonances
-        ringing = USUAL_PERIODS if filled.cells and passes == 1 else 1.0
+        ringing = USUAL_PERIODS if filled.cells and passes == 1 and self.method == "box" else 1.0
         run = _RUN_STEPS + ringing * passes * stepping
-        assembly = _SCENE_STEPS + _ASSEMBLY_STEPS * filled.cells + _MESH_STEPS * filled.meshed
+        assembly = _SCENE_STEPS + _ASSEMBLY_STEPS * filled.assembled + _MESH_STEPS * filled.meshed
         pairs = sum(grid.radiating for grid in grids) * self._terms if self.method == "box" else 0
         return assembly + _PAIR_STEPS * pairs + math.ceil(self.runs / self._at_once) * run
 
@@ -158,7 +168,7 @@ class Plan:
             inner = np.array(region.domain)
             layer = domain_extent(region, spacing).layer_cells(region.wavenumber * spacing)
             outer = inner + spacing * layer * np.array([[-1.0], [1.0]])
-        cut = cells = columns = meshed = 0.0
+        cut = cells = columns = meshed = assembled = 0.0
         for body in region.bodies:
             vertices, triangles = (part.numpy() for part in body.shape.surface())
             doubled = doubled_normals(np.clip(vertices, *inner)[triangles])
@@ -170,10 +180,11 @@ class Plan:
             beside = _BESIDE * area / spacing**2
             cells += beside
             meshed += beside if isinstance(body.shape, Mesh) else 0.0
+            assembled += beside * (_ALIKE if self.grouping.aligned else _FORCES if body.fluid else 1)
             if body.fluid and body.fluid.sound_speed != region.fluid.sound_speed:
                 box = np.clip([body.shape.lower, body.shape.upper], *inner)
                 cells += _SHARE_INSIDE * float(np.prod(box[1] - box[0])) / spacing**3
-        return Heterogeneity(cut, cells, columns, meshed)
+        return Heterogeneity(cut, cells, columns, meshed, assembled)
 
     @property
     def _receivers(self) -> int:
