@@ -46,18 +46,18 @@ MOST_JUDGED = 64
 _CELL_BYTES, _FIELD_NUMBERS = 3.0, 2.5
 """Memory of a cell: of the assembly [bytes], and numbers in each run."""
 
-_CELL_MEMORY, _ELEMENT_BYTES, _COLUMN_BYTES = 2_000.0, 20_500.0, 8_000.0
+_CELL_MEMORY, _ELEMENT_BYTES, _COLUMN_BYTES = 2_000.0, 14_000.0, 12_000.0
 """Memory [bytes] of a heterogeneous cell, of an element while its surface is assembled, and of an element
 that a surface cuts in a boundary layer."""
 
-_ALIKE, _FORCES = 0.25, 5.0
+_ALIKE, _FORCES = 0.25, 3.0
 """Memory and time of assembling elements along the grid, nearly all of which are alike, and time of those
 with forces, at tilted surfaces of fluids; relative to tilted surfaces of rigid bodies."""
 
 _ELEMENTS, _MOST_ELEMENTS = 1.4, 4096
 """Elements assembled for each that a surface cuts, as some are only near it; the most at once by a thread."""
 
-_RECORDED = 32
+_RECORDED = 44
 """Memory [bytes] of a recorded number, and of what is made of it for the Fourier sums."""
 
 _CELL_STEPS, _COLUMN_STEPS = 15.0, 150.0
