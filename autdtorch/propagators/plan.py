@@ -46,7 +46,7 @@ MOST_JUDGED = 64
 _CELL_BYTES, _FIELD_NUMBERS = 3.0, 2.5
 """Memory of a cell: of the assembly [bytes], and numbers in each run."""
 
-_CELL_MEMORY, _ELEMENT_BYTES, _COLUMN_BYTES = 2_000.0, 14_000.0, 12_000.0
+_CELL_MEMORY, _ELEMENT_BYTES, _COLUMN_BYTES = 2_000.0, 14_000.0, 18_000.0
 """Memory [bytes] of a heterogeneous cell, of an element while its surface is assembled, and of an element
 that a surface cuts in a boundary layer."""
 
