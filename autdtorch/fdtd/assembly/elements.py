@@ -229,7 +229,7 @@ def _interface(
         edged = np.asarray(less.any(axis=(1, 2)))
         finite = _finite(bodies, distance, first, edged, grid)
         own, place = _distinct(distance, finite, less)
-        near = Bodies(distance[:, own], numbers, aligned, finite[:, own], less[own])
+        near = Bodies(distance, numbers, aligned, finite, less).chosen(own)
         found = interface_elements(near, materials, stencil)
         progress.advance(len(first))
         return found.chosen(place)

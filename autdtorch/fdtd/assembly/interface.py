@@ -56,45 +56,32 @@ class Bodies(NamedTuple):
     finite: NDArray[np.bool_]  # whether finite elements represent it in an element (K, n)
     reductions: Array  # share of the stiffness that is taken away near edges of such bodies (n, 3, 3)
 
+    def chosen(self, some: Index | NDArray[np.bool_]) -> Bodies:
+        """Return the bodies near some of the elements."""
+        return self._replace(
+            distance=self.distance[:, some], finite=self.finite[:, some], reductions=self.reductions[some]
+        )
+
 
 def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -> InterfaceElements:
     """Return the stiffness and mass of n elements that surfaces of K bodies intersect."""
-    count, distance, material = len(materials.density), bodies.distance, bodies.material
+    distance, material = bodies.distance, bodies.material
     # bodies that do not intersect an element must not enter its shares
     distance = np.where((distance > 0).all(axis=2, keepdims=True), FAR, distance)
     distance = np.where((distance < 0).all(axis=2, keepdims=True), -FAR, distance)
     bodies = bodies._replace(distance=distance)
-    volumes = shares(volume_coverage, distance, material, count)
-    lines = shares(line_coverage, distance, material, count)
-    coupling = _series_coupling(lines, materials, stencil)
+    volumes = shares(volume_coverage, distance, material, len(materials.density))
     vertex = _vertex_materials(distance, material)
     layered = layered_axis(vertex, volumes, distance[~bodies.aligned])
     near = (np.abs(distance) < FAR).any(axis=2)
-    straight = (bodies.aligned[:, None] | ~near).all(axis=0) | (layered >= 0)
-    moved = np.flatnonzero(~straight)
-    grow = mean_thickness(materials, stencil)[material, None, None]
-    volumes[moved] = shares(volume_coverage, distance[:, moved] - grow, material, count)
-    mass = lumped_mass(vertex, volumes, materials)
-    cut = _Cut(vertex, volumes, coupling, mass)
-
     finite = (near & bodies.finite).any(axis=0) & (layered < 0)
-    for axis in range(3):
-        own = np.flatnonzero(layered == axis)
-        share = volumes[own].mean(axis=1)
-        coupling[own], mass[own] = layered_elements(axis, vertex[own], share, mass[own], materials, stencil)
-    cornered = np.flatnonzero(straight & (layered < 0))
-    edged, *found = edge_elements(
-        distance[:, cornered], material, vertex[cornered], volumes[cornered], materials, stencil
-    )
-    edged = cornered[edged]
-    coupling[edged], mass[edged] = found
-    held = (vertex[:, :, None] == np.arange(count)).any(axis=1)
-    present = volumes.mean(axis=1) > _ABSENT_SHARE
-    two = (held.sum(axis=1) == 2) & (present <= held).all(axis=1) & (layered < 0) & ~finite
-    two[edged] = False
-    _smooth_elements(cut, bodies, held, np.flatnonzero(two), straight, materials, stencil)
+    coupling, mass = np.zeros((len(vertex), 28)), np.zeros(vertex.shape)
     if finite.any():
-        _finite_elements(cut, bodies, np.flatnonzero(finite), materials, stencil)
+        coupling[finite], mass[finite] = _finite_elements(bodies.chosen(finite), materials, stencil)
+    if (other := ~finite).any():
+        cut = _Cut(vertex[other], volumes[other], coupling[other], mass[other])
+        _set_others(cut, bodies.chosen(other), layered[other], materials, stencil)
+        coupling[other], mass[other] = cut.coupling, cut.mass
     return InterfaceElements(coupling, mass, vertex, finite)
 
 
@@ -107,7 +94,39 @@ class _Cut(NamedTuple):
     mass: Array  # (n, 8)
 
 
-def _smooth_elements(
+def _set_others(cut: _Cut, bodies: Bodies, layered: Index, materials: Materials, stencil: Stencil) -> None:
+    """Set elements that are no finite elements.
+
+    `layered` (n,) is the axis along which alone an element varies, or -1.
+    """
+    count, distance, material = len(materials.density), bodies.distance, bodies.material
+    vertex, volumes, coupling, mass = cut
+    near = (np.abs(distance) < FAR).any(axis=2)
+    straight = (bodies.aligned[:, None] | ~near).all(axis=0) | (layered >= 0)
+    moved = np.flatnonzero(~straight)
+    grow = mean_thickness(materials, stencil)[material, None, None]
+    volumes[moved] = shares(volume_coverage, distance[:, moved] - grow, material, count)
+    lines = shares(line_coverage, distance, material, count)
+    coupling[:] = _series_coupling(lines, materials, stencil)
+    mass[:] = lumped_mass(vertex, volumes, materials)
+    for axis in range(3):
+        own = np.flatnonzero(layered == axis)
+        share = volumes[own].mean(axis=1)
+        coupling[own], mass[own] = layered_elements(axis, vertex[own], share, mass[own], materials, stencil)
+    cornered = np.flatnonzero(straight & (layered < 0))
+    edged, *found = edge_elements(
+        distance[:, cornered], material, vertex[cornered], volumes[cornered], materials, stencil
+    )
+    edged = cornered[edged]
+    coupling[edged], mass[edged] = found
+    held = (vertex[:, :, None] == np.arange(count)).any(axis=1)
+    present = volumes.mean(axis=1) > _ABSENT_SHARE
+    two = (held.sum(axis=1) == 2) & (present <= held).all(axis=1) & (layered < 0)
+    two[edged] = False
+    _set_smooth(cut, bodies, held, np.flatnonzero(two), straight, materials, stencil)
+
+
+def _set_smooth(
     cut: _Cut,
     bodies: Bodies,
     held: NDArray[np.bool_],
@@ -137,14 +156,13 @@ def _smooth_elements(
     cut.mass[own] += weight * (balanced_mass(surface, materials.mass[pair], lumped) - cut.mass[own])
 
 
-def _finite_elements(cut: _Cut, bodies: Bodies, own: Index, materials: Materials, stencil: Stencil) -> None:
-    """Set the elements `own` to finite elements, their bodies grown by the added thickness."""
+def _finite_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -> tuple[Array, Array]:
+    """Return coupling (n, 28) and mass (n, 8) of finite elements, the bodies grown by the added thickness."""
     contrast = np.where(materials.sound_hard, 1, (materials.density - 1) / (materials.density + 1))
-    contrast = contrast[bodies.material, None, None] * bodies.finite[:, own, None]
-    grown = bodies.distance[:, own] - added_thickness(stencil.kappa) * contrast
+    contrast = contrast[bodies.material, None, None] * bodies.finite[:, :, None]
+    grown = bodies.distance - added_thickness(stencil.kappa) * contrast
     part = shares(volume_coverage, grown, bodies.material, len(materials.density))
-    cut.coupling[own] = cut_coupling(part, materials, bodies.reductions[own], stencil)
-    cut.mass[own] = cut_mass(part, materials)
+    return cut_coupling(part, materials, bodies.reductions, stencil), cut_mass(part, materials)
 
 
 def _vertex_materials(distance: Array, material: Index) -> Index:
