@@ -217,7 +217,7 @@ def second_spacing(region: Region, spacing: float) -> float:
 def grid_errors(matrix: Tensor, second: Tensor, ratio: float, order: float) -> Tensor:
     """Return the estimated relative error (P,) of each row of a matrix (P, M), given a second one.
 
-    `ratio` is that of the second spacing to the first. Errors fall with the spacing to the power of `order`;
+    `ratio` is the second spacing over the first. Errors fall with the spacing to the power of `order`;
     large ones, of grids that hardly resolve the wave, at least with up to the third power.
     """
     size = matrix.norm(dim=1).clamp(min=torch.finfo(torch.float64).tiny)

@@ -59,7 +59,7 @@ def _overlap(one: Shape, other: Shape) -> bool:
 
 
 def difference_from_rigid(body: Body, region: Region) -> float:
-    """Return about how much the field of a fluid body differs from that of a rigid one, relative to it.
+    """Return the approximate relative difference between the fields of a fluid body and of a rigid one.
 
     For a density ratio m and an impedance ratio z, a body moves in proportion to 1 / m and yields in
     proportion to 1 / z. Through a wall of thickness d, 1 / (m k d) passes (mass law); here d is the mean

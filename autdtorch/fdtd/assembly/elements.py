@@ -60,7 +60,7 @@ class _Union:
     continued: bool  # whether they continue through the boundary layers, unchanged from the interior
     aligned: bool  # whether all its faces are flat and parallel to the grid
     sound_hard: bool
-    finite: bool  # whether finite elements represent its surface, or that of a fluid near edges
+    finite: bool  # whether finite elements represent its surface; of a fluid only the edges
 
     def distance(self, cell: Array, grid: Grid) -> Array:
         """Return the signed distance [cells] of positions (..., 3) in cells."""

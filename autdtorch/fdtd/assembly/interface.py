@@ -5,7 +5,7 @@ In an element of one material both are those of the tuned stencil. An interface 
 - coupling in series: density averaged along the line between vertices, exact for a flow across the surface;
 - for axis-aligned faces, a product of the direction across the faces and the two others;
 - for other surfaces of fluids, the forces or the energies of local fields (`smooth_faces.py`);
-- masses on their side of the surface, but for the share of a flow through it that reaches the other side;
+- masses on their side of the surface, except for the share of a flow through it which reaches the other side;
 - at other surfaces of sound-hard bodies, and edges of fluids, the finite elements of `sound_hard.py` instead.
 
 `docs/decisions/surfaces.md` compares this treatment with others.

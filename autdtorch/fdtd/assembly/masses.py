@@ -16,8 +16,8 @@ _MOST_TAKEN = 0.8  # Largest share of a vertex's mass that is taken away
 def lumped_mass(vertex: Index, volumes: Array, materials: Materials) -> Array:
     """Return masses at the vertices (n, 8).
 
-    Vertices in a material take its mass, but for the share of a flow through the surface that reaches those
-    of other fluids. With one face across the line between two vertices, both standing waves are then exact.
+    Vertices in a material take its mass, except for the share of a flow through the surface which reaches
+    other fluids. With one face across the line between two vertices, both standing waves are then exact.
     """
     total = np.zeros(vertex.shape)
     mean = volumes.mean(axis=1) @ materials.density

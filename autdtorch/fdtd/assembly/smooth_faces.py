@@ -143,7 +143,7 @@ def local_fields(surface: Surface, places: Array, depth: Array, side: Index) -> 
 
 
 def weight_of_forces(surface: Surface) -> Array:
-    """Return the share (n,) of the forces in the stiffness, the rest being that of energies."""
+    """Return the share (n,) of the forces in the stiffness; energies have the rest."""
     depth = surface.level[:, _MIDDLE, None]
     curvature = np.linalg.eigvalsh(surface.bend)
     curvature = np.abs(curvature / np.maximum(1 - depth * curvature, 0.1)).max(axis=1)  # at the surface
@@ -158,8 +158,8 @@ def smooth_stiffness(
 ) -> tuple[Array, Array]:
     """Return the coupling (n, 28) of elements with a smooth surface, and the share (n,) of forces in it.
 
-    `tilted` (n,) are those that have forces, `mobility` (n, 64) is that of the sub-cells, `coupling` (n, 28)
-    is in series, and `uniform` (28,) in air.
+    Elements `tilted` (n,) may have forces. `mobility` (n, 64) belongs to the sub-cells; `coupling` (n, 28) is
+    in series, and `uniform` (28,) in air.
     """
     weight = np.where(tilted, weight_of_forces(surface), 0)
     total = np.zeros((len(weight), 8, 8))
@@ -199,7 +199,7 @@ def _with_forces(surface: Surface, series: Array) -> tuple[Array, NDArray[np.boo
     All other fields keep their energy in series.
     """
     local, force = fields(surface), forces(surface)
-    force = force - force.mean(axis=1, keepdims=True)  # zero but for the curvature
+    force = force - force.mean(axis=1, keepdims=True)  # the curvature alone leaves a sum
     energy = local.transpose(0, 2, 1) @ force
     energy = (energy + energy.transpose(0, 2, 1)) / 2
     size = np.sqrt(np.maximum(energy[:, range(3), range(3)], 1e-12))
