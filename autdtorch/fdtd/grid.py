@@ -80,10 +80,14 @@ class Grid:
         return x, y, z
 
     @property
+    def crossing(self) -> float:
+        """Time of sound in air along the longest path through the interior [periods]."""
+        return crossing_time(self.interior, self.kappa)
+
+    @property
     def arrival(self) -> float:
-        """Time after which sound has arrived everywhere, by the longest path [periods]."""
-        wavelength = 2 * math.pi * self.spacing / self.kappa
-        return self.crossings * self.spacing * math.hypot(*self.interior) / wavelength
+        """Time after which sound has arrived everywhere [periods]."""
+        return self.crossings * self.crossing
 
     @cached_property
     def centers(self) -> tuple[Array, Array, Array]:
@@ -106,6 +110,11 @@ class Grid:
     def clip(self, cells: Array) -> Array:
         """Return positions (..., 3) in cells, moved from the boundary layer to the nearest interior cell."""
         return np.clip(cells, self.first, np.array(self.last) - 1)
+
+
+def crossing_time(interior: tuple[int, int, int], kappa: float) -> float:
+    """Return the time of sound through cells from corner to corner [periods], with `kappa` as in `Grid`."""
+    return math.hypot(*interior) * kappa / (2 * math.pi)
 
 
 @dataclass(frozen=True)

@@ -86,7 +86,7 @@ def differentiable_field(
     warn_of_ending_walls(scene)
     warn_of_near_points(scene, "points", targets, grid.spacing)
     if periods is None:
-        periods = fewest_periods(2 * grid.arrival / grid.crossings)
+        periods = fewest_periods(2 * grid.crossing)
     periods = integer_at_least("periods", periods, 1)
     time_step = None if time_step is None else positive("time_step", time_step, "s")
     by_maps = any(one is not None and one.ndim == 3 for one in given)

@@ -18,6 +18,7 @@ from autdtorch.fdtd.grid import (
     MIN_CELLS_PER_WAVELENGTH,
     Extent,
     bodies_extent,
+    crossing_time,
     domain_extent,
 )
 from autdtorch.fdtd.region import Region
@@ -86,7 +87,7 @@ def grid_cost(region: Region, extent: Extent, spacing: float) -> GridCost:
     interior = x, y, z = extent.interior(spacing)
     rim = extent.layer_cells(kappa) + 1
     stencil = tuned_stencil(kappa, region.attenuation * spacing)
-    periods = fewest_periods(extent.crossings * spacing * math.hypot(*interior) / region.wavelength)
+    periods = fewest_periods(extent.crossings * crossing_time(interior, kappa))
     fastest = max(region.sound_speeds.values()) / region.fluid.sound_speed
     steps_per_period = fewest_steps(stencil, stencil.largest_symbol * fastest**2)
     shape = x + 2 * rim, y + 2 * rim, z + 2 * rim

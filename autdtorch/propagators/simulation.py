@@ -125,10 +125,9 @@ class Simulation(ABC):
 
     def transfer_matrix(self, points: torch.Tensor) -> TransferMatrix:
         """Simulate the transfer matrix of points (P, 3)."""
-        array, targets, orbits = self.plan.scene.array, Apertures.of_points(points), self.orbits(points)
-        sources, receivers = (
-            (targets, apertures_of(array)) if orbits.from_points else (apertures_of(array), targets)
-        )
+        array, orbits = self.plan.scene.array, self.orbits(points)
+        targets, transducers = Apertures.of_points(points), apertures_of(array)
+        sources, receivers = (targets, transducers) if orbits.from_points else (transducers, targets)
         begins = "points" if orbits.from_points else "transducers"
         logger.debug("transfer matrix: %d runs serve %d %s", orbits.runs, len(orbits.representative), begins)
         strength = torch.full((orbits.runs, 1), array.source_strength, dtype=torch.complex128, device="cpu")

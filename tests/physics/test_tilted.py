@@ -33,11 +33,15 @@ RIGID = {"rigid": True}
 DENSE = {"density": 77 * AIR.density, "sound_speed": 900.0}
 
 
+def tilted_normals(most):
+    """Normals of whole numbers up to `most`, none along the grid."""
+    numbers = st.tuples(*[st.integers(-most, most)] * 3)
+    return numbers.filter(lambda n: np.count_nonzero(n) > 1 and math.gcd(*n) == 1)
+
+
 @settings(max_examples=12)
 @given(
-    normal=st.tuples(*[st.integers(-4, 4)] * 3).filter(
-        lambda n: np.count_nonzero(n) > 1 and math.gcd(*n) == 1
-    ),
+    normal=tilted_normals(4),
     offset=st.floats(0, 1),
     incidence=st.floats(0, math.radians(60)),
     azimuth=st.floats(0, 6),
@@ -59,9 +63,7 @@ def test_the_place_of_a_tilted_half_space_converges():
 
 @settings(max_examples=12)
 @given(
-    normal=st.tuples(*[st.integers(-3, 3)] * 3).filter(
-        lambda n: np.count_nonzero(n) > 1 and math.gcd(*n) == 1
-    ),
+    normal=tilted_normals(3),
     offset=st.floats(0, 1),
     incidence=st.floats(0, math.radians(60)),
     material=st.sampled_from([(1.5, 1.2), (3.0, 1.5), (8.0, 1.5), (77.0, 2.6), (77.0, 1.0)]),

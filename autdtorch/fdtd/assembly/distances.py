@@ -10,6 +10,7 @@ from typing import TypeAlias
 import numpy as np
 
 from autdtorch.fdtd.assembly.element import LATTICE, SUBCELLS
+from autdtorch.fdtd.assembly.smooth_faces import quadratic
 from autdtorch.utils.array_types import Array, Index
 
 Measure: TypeAlias = Callable[[Array], Array]
@@ -86,9 +87,6 @@ _HALVES = np.array(list(itertools.product((0.0, 0.5, 1.0), repeat=3)))  # (27, 3
 _X, _Y, _Z = (_quadratic_factors(x) for x in LATTICE.T)
 # Values at the lattice (27, 125) of the product of quadratic polynomials through those at `_HALVES`
 _INTERPOLATION = np.einsum("pi,pj,pk->ijkp", _X, _Y, _Z).reshape(27, -1)
-_MONOMIALS = np.stack(
-    [np.prod(_HALVES ** np.array(power), axis=1) for power in itertools.product(range(3), repeat=3)
-     if sum(power) <= 2], axis=1,
-)  # fmt: skip
+_MONOMIALS = quadratic(_HALVES - 0.5)
 # Differences (27, 27) of values at `_HALVES` from the quadratic function that fits them best
 _BEYOND_QUADRATIC = np.eye(27) - _MONOMIALS @ np.linalg.pinv(_MONOMIALS)

@@ -42,13 +42,13 @@ _SQUARES = 2  # Squares along each side of a face, each of four triangles on whi
 _SINGULAR = 1e-10  # Relative size of eigenvalues that are rounding
 
 
-def _quadratic(x: Array) -> Array:
+def quadratic(x: Array) -> Array:
     """Return monomials up to degree two at points (n, 3): value, gradient, second derivatives."""
     second = [x[:, a] * x[:, b] / (2 if a == b else 1) for a, b in _SECOND]
     return np.column_stack((np.ones(len(x)), x, *second))
 
 
-_MONOMIALS = _quadratic(LATTICE - 0.5)
+_MONOMIALS = quadratic(LATTICE - 0.5)
 _FIT = np.linalg.pinv(_MONOMIALS)
 
 
