@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 from autdtorch.fdtd.kernels.compiled import INNER, entry
 from autdtorch.fdtd.kernels.contract import Coefficients, Columns, Receivers, Sources, State
+from autdtorch.fdtd.kernels.cpu_layers import stretch
 from autdtorch.fdtd.kernels.cpu_layout import FlatMemory, plane_profiles, rows_profile
 from autdtorch.fdtd.kernels.cpu_rows import row_offsets
-from autdtorch.fdtd.kernels.cpu_sweep import stretch, sweep_planes
+from autdtorch.fdtd.kernels.cpu_sweep import sweep_planes
 from autdtorch.fdtd.kernels.cpu_workers import COUNTERS, claim, finish, share_of_processors, wait_for
 from autdtorch.fdtd.stencil import OFFSETS
 from autdtorch.utils.array_types import AnyArray
@@ -29,6 +30,8 @@ from autdtorch.utils.threads import thread_count
 
 # Fewest cells and planes of a chunk, for which a second thread and the sums at its ends pay
 _CHUNK_CELLS, _CHUNK_PLANES = 200_000, 32
+# Cells of the layers across an axis that are computed at once
+_GROUP_CELLS = 3000
 # Shares of the processors' time that workers got: below the first a single worker continues, above the second
 # several again
 _CROWDED, _FREE = 0.75, 0.9
@@ -47,15 +50,16 @@ def _record(p, receivers, first, last, out):  # type: ignore[no-untyped-def]
 @njit(**INNER)
 def _sweep_chunk(c, p, q, medium, layers, cells, room):  # type: ignore[no-untyped-def]
     cuts, starts = medium[0], medium[1]
-    e_y, e_z, e_yz, ends, total, across, u, outermost = room
-    own = (e_y[c], e_z[c], e_yz[c]), ends[c], total[c], across[c], u[c], outermost[c]
+    y, e_y, z, e_z, yz, e_yz, a, b, across, outermost = room
+    terms = (y[c], e_y[c]), (z[c], e_z[c]), (yz[c], e_yz[c])
+    own = across[c], outermost[c], terms, (a[c], b[c])
     psi_x, zeta_x, psi_y, zeta_y, psi_z, zeta_z, psi_yz, zeta_yz = layers
     memory = (psi_y, zeta_y), (psi_z, zeta_z), (psi_yz, zeta_yz)
     first, last = np.uint64(cuts[c]), np.uint64(cuts[c + 1])
     shape, weights, profile = medium[3:6], medium[6:11], medium[11:13]
-    profiles = medium[13:17], medium[17:21], medium[21:25]
+    profiles = medium[13:16]
     sweep_planes(
-        p, q, first, last, shape, weights, (psi_x, zeta_x), memory, profile, profiles, cells, starts, own
+        p, q, first, last, shape, weights, (psi_x, zeta_x), profile, memory, profiles, cells, starts, own
     )
 
 
@@ -161,12 +165,19 @@ def _cuts(shape: tuple[int, ...]) -> NDArray[np.int64]:
     return np.linspace(1, 1 + planes, chunks + 1).astype(np.int64)
 
 
+def _group(shape: torch.Size, layer_cells: int) -> int:
+    """Return the number of planes whose layers are computed at once: as many as the cache holds."""
+    _, ny, nz = shape
+    return max(1, _GROUP_CELLS // (2 * (layer_cells + 2) * max(ny, nz)))
+
+
 def _room(chunks: int, shape: torch.Size, layer_cells: int, dtype: type) -> tuple[AnyArray, ...]:
     """Return the workspace of the chunks during a step, see `sweep_planes`."""
     _, ny, nz = shape
-    lanes = 2 * (layer_cells + 2)
-    terms = (2 * layer_cells * nz, ny * lanes, 2 * layer_cells * lanes)
-    sizes = (*(3 * size for size in terms), ny * lanes, *(planes * ny * nz for planes in (1, 1, 3, 2)))
+    lanes, group = 2 * (layer_cells + 2), _group(shape, layer_cells)
+    terms = (group * lanes * nz, group * ny * lanes, group * lanes * lanes)
+    ends = (ny * lanes, ny * lanes)
+    sizes = (*np.repeat(terms, 2), *ends, *(planes * ny * nz for planes in (3, 2)))
     return tuple(np.zeros((chunks, size), dtype) for size in sizes)
 
 
@@ -212,7 +223,7 @@ class CpuKernel:
             *(dtype(weight) for weight in (c.center, c.face, c.edge, c.corner, c.keep)),
             c.layer_decay.numpy(),
             c.layer_gain.numpy(),
-            *plane_profiles(c, shape),
+            *plane_profiles(c, shape, _group(shape, c.layer_cells)),
         )
         memory = FlatMemory(state.memory)
         arguments = (

@@ -24,29 +24,19 @@ def rows_profile(c: Coefficients, row: int) -> Profile:
     return decay[0::2].repeat(row), gain[0::2].repeat(row), decay[1::2].repeat(row), gain[1::2].repeat(row)
 
 
-def plane_profiles(c: Coefficients, shape: torch.Size) -> tuple[AnyArray, ...]:
-    """Return the profiles across y, z, and y for the lanes, of both layers each."""
+def plane_profiles(c: Coefficients, shape: torch.Size, planes: int) -> tuple[Profile, Profile, Profile]:
+    """Return the profiles across y, z, and y for the lanes, of both layers each, for some planes."""
     _, ny, nz = shape
     decay, gain = c.layer_decay.numpy(), c.layer_gain.numpy()
-    across_z = []
-    for values in (decay, gain):
-        half, cell, none = values[0::2], values[1::2], np.zeros(1, values.dtype)
-        halves = np.concatenate((half, none, half[::-1], none))
-        cells = np.concatenate((cell, none, none, cell[::-1], none, none))
-        across_z.append((np.tile(halves, ny), np.tile(cells, ny)))
-    (b_half, b_cell), (a_half, a_cell) = across_z
-    lanes = 2 * (c.layer_cells + 2)
-    return *_both_rows(c, nz), b_half, a_half, b_cell, a_cell, *_both_rows(c, lanes)
+    lanes, none = 2 * (c.layer_cells + 2), np.zeros(1, decay.dtype)
+    halves = [np.concatenate((half, none, half[::-1], none)) for half in (decay[0::2], gain[0::2])]
+    cells = [np.concatenate((cell, none, none, cell[::-1], none, none)) for cell in (decay[1::2], gain[1::2])]
 
+    def profile(row: int, times: int) -> Profile:
+        b_half, a_half, b_cell, a_cell = (np.tile(part.repeat(row), times) for part in (*halves, *cells))
+        return b_half, a_half, b_cell, a_cell
 
-def _both_rows(c: Coefficients, row: int) -> Profile:
-    """Return the profiles of a lower and an upper layer of rows, with a row of zeros after their cells."""
-    low = rows_profile(c, row)
-    none = np.zeros(row, low[0].dtype)
-    high = [part.reshape(-1, row)[::-1].ravel() for part in low]
-    b_half, a_half = (np.concatenate((low[part], high[part])) for part in (0, 1))
-    b_cell, a_cell = (np.concatenate((low[part], none, high[part], none)) for part in (2, 3))
-    return b_half, a_half, b_cell, a_cell
+    return profile(nz, planes), profile(1, planes * ny), profile(lanes, planes)
 
 
 class FlatMemory:
@@ -55,12 +45,11 @@ class FlatMemory:
     def __init__(self, memory: Memory) -> None:
         """Copy the memory of a state, except the x layers, which are used in place."""
         self._layers = [[part.numpy() for part in layer] for layer in memory[:4]]
-        x, (psi_y, zeta_y), (psi_z, _), (psi_yz, zeta_yz) = self._layers
-        nx, ny, layer_cells = len(psi_z[0]), psi_z.shape[2], psi_z.shape[3] - 1
-        lanes = 2 * (layer_cells + 2)
-        of_yz = ((*part.shape[:3], lanes) for part in (psi_yz, zeta_yz))
-        sizes = (psi_y.shape, zeta_y.shape, *2 * ((nx, ny, lanes),), *of_yz)
-        self.arrays = (*x, *(np.zeros(size, psi_y.dtype) for size in sizes))
+        x, (psi_y, _), (psi_z, _), _ = self._layers
+        _, nx, ny, cells = psi_z.shape
+        nz, lanes = psi_y.shape[-1], 2 * (cells + 1)
+        sizes = ((nx, lanes, nz), (nx, ny, lanes), (nx, lanes, lanes))
+        self.arrays = (*x, *(np.zeros(size, psi_y.dtype) for size in sizes for _ in range(2)))
         for here, there, sign in self._pairs():
             here[...] = sign * there
 
@@ -71,17 +60,15 @@ class FlatMemory:
 
     def _pairs(self) -> Iterator[tuple[AnyArray, AnyArray, int]]:
         """Yield views of the arrays and of the state; psi of upper layers changes its sign."""
-        for half, number in ((True, 2), (False, 3)):
-            y, z, yz = self.arrays[number], self.arrays[number + 2], self.arrays[number + 4]
-            _, of_y, of_z, of_yz = (layer[not half] for layer in self._layers)
+        for part in (0, 1):
+            y, z, yz = self.arrays[2 + part :: 2]
+            _, of_y, of_z, of_yz = (layer[part] for layer in self._layers)
             reach = z.shape[-1] // 2
-            cells = reach - 2
-            upper = -1 if half else 1
-            first, last = (0, reach - 1) if half else (1, reach - 1)
-            low, high = slice(first, last), slice(reach + first, reach + last)
-            yield z[..., low], of_z[0], 1
-            yield z[..., high][..., ::-1], of_z[1], upper
-            for side, sign, order in ((0, 1, slice(None)), (1, upper, slice(None, None, -1))):
-                yield y[side][:, order], of_y[side], sign
-                yield yz[side][:, order, 1 : cells + 1], of_yz[side][..., :cells], sign
-                yield yz[side][:, order, reach + 1 : -1][..., ::-1], of_yz[side][..., cells:], sign
+            upper = 1 if part else -1
+            low, high = slice(part, reach - 1), slice(reach + part, 2 * reach - 1)
+            inner, outer = slice(1, reach - 1), slice(reach + 1, 2 * reach - 1)
+            for side, along, sign, order in ((0, low, 1, 1), (1, high, upper, -1)):
+                yield y[:, along][:, ::order], of_y[side], sign
+                yield z[..., along][..., ::order], of_z[side], sign
+                yield yz[:, along, inner][:, ::order], of_yz[side][..., : reach - 2], sign
+                yield yz[:, along, outer][:, ::order, ::-1], of_yz[side][..., reach - 2 :], sign

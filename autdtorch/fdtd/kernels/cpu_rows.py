@@ -62,3 +62,28 @@ def _sum_of_rows(typing_context: Any, p: Any, cell: Any, offset: Any, weight: An
 
 
 sum_of_rows: Any = intrinsic(_sum_of_rows)
+
+
+def _add_four(typing_context: Any, u: Any, at: Any, v: Any, start: Any) -> Any:
+    """Add four cells of v from `start` on to those of u from `at` on."""
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        number = context.get_data_type(u.dtype)
+        row, size = ir.VectorType(number, 4).as_pointer(), context.get_abi_sizeof(number)
+
+        def pointer(k: int) -> Any:
+            array = context.make_array(signature.args[k])(context, builder, given[k])
+            cell = cgutils.get_item_pointer(
+                context, builder, signature.args[k], array, [given[k + 1]], wraparound=False
+            )
+            return builder.bitcast(cell, row)
+
+        here, there = pointer(0), pointer(2)
+        total = builder.fadd(builder.load(here, align=size), builder.load(there, align=size))
+        builder.store(total, here, align=size)
+        return context.get_dummy_value()
+
+    return types.void(u, types.uint64, v, types.uint64), generate
+
+
+add_four: Any = intrinsic(_add_four)

@@ -1,0 +1,167 @@
+"""The boundary layers of a chunk of planes on one core.
+
+The layers stretch the sums of neighbours along an axis: T_y p becomes T_y p + E_y p, and T_y T_z p becomes
+(T_y + E_y)(T_z + E_z) p. Each plane keeps the memory of its two layers across y as L + 2 rows from the ring
+inwards, then as many outwards; that across z likewise, as lanes: the ends of all rows; and that of E_y E_z
+as rows of lanes. The terms of several planes are computed at a time, as loops over a few hundred cells cost
+more than their cells.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from autdtorch.fdtd.kernels.compiled import INNER
+from autdtorch.fdtd.kernels.cpu_rows import add_four
+
+_U = np.uint64
+
+
+@njit(**INNER)
+def stretch(u, at, step, psi, psi_at, zeta, zeta_at, term, term_at, cells, profile, profile_at):  # type: ignore[no-untyped-def]
+    """Advance the memory of a layer and write its terms.
+
+    Along its axis cells are `step` apart. There is a half cell between each cell of u from `at` on and the
+    next. The `cells` and the terms begin with the second cell; the profile has a value for each.
+    """
+    b_half, a_half, b_cell, a_cell = profile
+    for k in range(cells + step):
+        decayed = b_half[profile_at + k] * psi[psi_at + k]
+        psi[psi_at + k] = decayed + a_half[profile_at + k] * (u[at + step + k] - u[at + k])
+    here, ahead = at + step, at + step + step
+    for k in range(cells):
+        slope = psi[psi_at + step + k] - psi[psi_at + k]
+        second = (u[ahead + k] - u[here + k]) - (u[here + k] - u[at + k])
+        moved = b_cell[profile_at + k] * zeta[zeta_at + k] + a_cell[profile_at + k] * (second + slope)
+        zeta[zeta_at + k] = moved
+        term[term_at + k] = slope + moved
+
+
+@njit(**INNER)
+def _copy_ends(p, i, planes, shape, cells, rows, lanes):  # type: ignore[no-untyped-def]
+    """Copy the rows of the layers across y, and the ends of all rows."""
+    _, ny, nz = shape
+    one, reach = _U(1), cells + _U(2)
+    to = _U(0)
+    for plane in range(i, i + planes):
+        for side in range(_U(2)):
+            start = (plane * ny + (ny - reach) * side) * nz
+            for k in range(reach * nz):
+                rows[to + k] = p[start + k]
+            to += reach * nz
+    to = _U(0)
+    for row in range(i * ny, (i + planes) * ny):
+        low, high = row * nz, (row + one) * nz - reach
+        for k in range(reach):
+            lanes[to + k] = p[low + k]
+            lanes[to + reach + k] = p[high + k]
+        to += reach + reach
+
+
+@njit(**INNER)
+def stretch_planes(p, i, planes, shape, cells, memory, terms, profiles):  # type: ignore[no-untyped-def]
+    """Compute E_y p, E_z p and E_y E_z p of some planes from i on, in the layers."""
+    _, ny, nz = shape
+    (psi_y, zeta_y), (psi_z, zeta_z), (psi_yz, zeta_yz) = memory
+    (y, e_y), (z, e_z), (yz, e_yz) = terms
+    across_y, across_z, across_yz = profiles
+    one, two, zero = _U(1), _U(2), _U(0)
+    reach = cells + two
+    lanes = two * reach
+    _copy_ends(p, i, planes, shape, cells, y, z)
+    first, size = i * lanes * nz, planes * lanes * nz - two * nz
+    stretch(y, zero, nz, psi_y, first, zeta_y, first + nz, e_y, nz, size, across_y, zero)
+    first, size = i * ny * lanes, planes * ny * lanes - two
+    stretch(z, zero, one, psi_z, first, zeta_z, first + one, e_z, one, size, across_z, zero)
+    to = zero
+    for plane in range(planes):
+        for side in range(two):
+            start = (plane * ny + (ny - reach) * side) * lanes
+            for k in range(reach * lanes):
+                yz[to + k] = e_z[start + k]
+            to += reach * lanes
+    first, size = i * lanes * lanes, planes * lanes * lanes - two * lanes
+    stretch(yz, zero, lanes, psi_yz, first, zeta_yz, first + lanes, e_yz, lanes, size, across_yz, zero)
+
+
+@njit(**INNER)
+def _add_to_ends(u, at, shape, cells, ends):  # type: ignore[no-untyped-def]
+    """Add the cells of lanes to the plane of u that begins at `at`."""
+    _, ny, nz = shape
+    one, reach, fours = _U(1), cells + _U(2), cells - cells % _U(4)
+    for j in range(one, ny - one):
+        low, high = at + j * nz + one, at + (j + one) * nz - reach + one
+        lane = j * (reach + reach) + one
+        for k in range(_U(0), fours, _U(4)):
+            add_four(u, low + k, ends, lane + k)
+            add_four(u, high + k, ends, lane + reach + k)
+        for k in range(fours, cells):
+            u[low + k] += ends[lane + k]
+            u[high + k] += ends[lane + reach + k]
+
+
+@njit(**INNER)
+def add_terms(q, at, across, here, place, shape, cells, terms, ends, weights):  # type: ignore[no-untyped-def]
+    """Add the terms of a plane to its A, in `across` from `here` on, and to its B, in q from `at` on."""
+    _, ny, nz = shape
+    (_, e_y), (_, e_z), (_, e_yz) = terms
+    a, b = ends
+    _, face, edge, corner, _ = weights
+    one, two = _U(1), _U(2)
+    reach = cells + two
+    lanes = two * reach
+    for side in range(two):
+        e = (place * lanes + side * reach) * nz
+        o = (ny - reach) * side * nz
+        for k in range(nz, (cells + one) * nz):
+            own, beside = e_y[e + k], e_y[e + k - one] + e_y[e + k + one]
+            across[here + o + k] += edge * own + corner * beside
+            q[at + o + k] += face * own + edge * beside
+    e = place * ny * lanes
+    for k in range(lanes, (ny - one) * lanes):
+        own, beside = e_z[e + k], e_z[e + k - lanes] + e_z[e + k + lanes]
+        a[k] = edge * own + corner * beside
+        b[k] = face * own + edge * beside
+    for side in range(two):
+        e = (place * lanes + side * reach) * lanes
+        o = (ny - reach) * side * lanes
+        for k in range(lanes, (cells + one) * lanes):
+            a[o + k] += corner * e_yz[e + k]
+            b[o + k] += edge * e_yz[e + k]
+    _add_to_ends(across, here, shape, cells, a)
+    _add_to_ends(q, at, shape, cells, b)
+
+
+@njit(**INNER)
+def _half_cell(psi, at, u, ahead, here, n, decay, gain):  # type: ignore[no-untyped-def]
+    for k in range(n):
+        psi[at + k] = decay * psi[at + k] + gain * (u[ahead + k] - u[here + k])
+
+
+@njit(**INNER)
+def absorb_x(q, i, shape, memory, u, profile):  # type: ignore[no-untyped-def]
+    """Add the term of the layer across x to plane i; `u` holds A of the planes around."""
+    nx, ny, nz = shape
+    psi, zeta = memory
+    decay, gain = profile
+    one, two, three = _U(1), _U(2), _U(3)
+    cells, plane = _U(len(decay) // 2), ny * nz
+    side = one if two * i > nx else _U(0)
+    depth = nx - one - i if side else i
+    here, low, high = i % three * plane, (i + two) % three * plane, (i + one) % three * plane
+    outside, inside = (high, low) if side else (low, high)
+    outer = (side * (cells + one) + depth - one) * plane
+    inner, shift, out = outer + plane, (side * cells + depth - one) * plane, i * plane
+    # Each half cell is advanced with the first of its two planes.
+    if side or depth == one:
+        _half_cell(psi, outer, u, here, outside, plane, decay[two * depth - two], gain[two * depth - two])
+    if not side or depth == cells:
+        _half_cell(psi, inner, u, inside, here, plane, decay[two * depth], gain[two * depth])
+    b, a = decay[two * depth - one], gain[two * depth - one]
+    for k in range(plane):
+        slope = psi[inner + k] - psi[outer + k]
+        second = (u[inside + k] - u[here + k]) - (u[here + k] - u[outside + k])
+        moved = b * zeta[shift + k] + a * (second + slope)
+        zeta[shift + k] = moved
+        q[out + k] += slope + moved
