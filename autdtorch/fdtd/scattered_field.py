@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, vstack
 from torch import Tensor
 
 from autdtorch.fdtd.interpolation import Interpolation
@@ -22,6 +22,7 @@ from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.utils.apertures import Apertures, Discs
 from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.threads import spread
 
 # Distance [cells] from the rim of the interior within which points are not read from the grid. Interpolation
 # is poor there, and the Huygens surface, two cells from the rim, is farther than half a cell from such a
@@ -169,26 +170,42 @@ class NearToFar:
         """Return amplitudes (n, R) [Pa m] of the Huygens surface, from the cells' phasors (k, R)."""
         return torch.from_numpy(self.outward @ phasors.numpy())
 
-    def matrix(self, every: int) -> Tensor:
-        """Return the matrix from phasors (k,) to the scattered field at each `every`-th target."""
+    def readings(self, every: int) -> Readings:
+        """Return the readings of each `every`-th target."""
         chosen = range(0, len(self.far), every)
         place = torch.cumsum((~self.far).long(), 0) - 1  # among those that are not far
-        rows = [self._row(target, None if self.far[target] else int(place[target])) for target in chosen]
-        return torch.from_numpy(np.stack(rows))
+        rows = spread(lambda one: self._row(one, None if self.far[one] else int(place[one])), chosen)
+        received, inner = zip(*rows, strict=True)
+        return Readings(self.outward, torch.cat(received, dim=1), vstack(inner, format="csr"))
 
-    def _row(self, target: int, near: int | None) -> Array:
-        """Return the row (k,) of a target, which is a far disc or the number `near` of the others."""
+    def _row(self, target: int, near: int | None) -> tuple[Tensor, csr_array]:
+        """Return waves from the Huygens surface (n, 1) to a target, and weights of cells (1, k).
+
+        The target is a far disc or the number `near` of the others.
+        """
         positions, weights = self.box.surface[0], self.targets.weights.to(torch.complex128)
         if near is None:
             disc = self.targets.chosen(slice(target, target + 1)).discs
             received = self.box.waves(positions, disc, weights.sum()[None, None])
-            return np.asarray((self.outward.T @ received.numpy())[:, 0])
+            return received, csr_array((1, len(self.cells)))
         within = self.within[near]
         first = int(self.within[:near].sum())
         outside = self.targets.positions[target][~within]
         # reciprocity of Green's function
         received = self.box.waves(positions, outside, weights[~within, None])
         inner = self.inward[first : first + int(within.sum())]
-        return np.asarray(
-            (self.outward.T @ received.numpy())[:, 0] + self.targets.weights[within].numpy() @ inner
-        )
+        return received, csr_array(self.targets.weights[within].numpy()[None] @ inner)
+
+
+@dataclass(frozen=True)
+class Readings:
+    """The scattered field at P targets, as matrices that are built once for many phasors."""
+
+    outward: csr_array  # amplitudes of the Huygens surface from phasors (n, k)
+    received: Tensor  # waves from the surface to the targets (n, P)
+    inner: csr_array  # field at the targets in the box from phasors (P, k)
+
+    def field(self, phasors: Tensor) -> Tensor:
+        """Return the scattered field (P, R) at the targets, from the cells' phasors (k, R)."""
+        amplitude = torch.from_numpy(self.outward @ phasors.numpy())
+        return self.received.mT @ amplitude + torch.from_numpy(self.inner @ phasors.numpy())

@@ -33,6 +33,7 @@ _FEWEST_PHASORS, _MOST_PHASORS = 12, 64
 _MOST_NUMBERS = 20_000_000  # Most complex numbers that the phasors kept may hold: 320 MB
 _MOST_FITTED = 2048  # Most cells whose phasors decide the means
 _ROUNDING = 1e-13  # Regularisation of the normal equations, relative to the mean square of the differences
+_JUDGED = 4  # Blocks whose changes decide whether a run has converged
 # Safety factor: the residual is estimated as this many times the changes over the last two blocks
 _CAUTION = 2.0
 # Ratio of the changes over successive blocks, twice, up to which the next ones are expected to fall as fast
@@ -64,15 +65,18 @@ def run_to_steady_state(
     `observe` maps the phasors of `cells` (k,) to the quantity that must converge, once sound has arrived
     everywhere. `stepped` is called with the number of periods after each block.
     """
-    earliest = fewest_periods(assembly.grid.arrival)
+    earliest, block = fewest_periods(assembly.grid.arrival), block_of(assembly.steps_per_period)[1]
     sequence = Extrapolation(phasors_kept(len(cells)))
-    values: deque[Tensor] = deque(maxlen=4)
+    values: deque[Tensor] = deque(maxlen=_JUDGED)
+    first_judged = min(earliest, max_periods) - (_JUDGED - 1) * block
     ramp = math.ceil(RAMP_PERIODS * assembly.steps_per_period)
     for count, windows in windows_of_run(assembly, kernel, sources, cells):
-        stepped(block_of(assembly.steps_per_period)[1])
+        stepped(block)
         for start, phasor in windows:
             if start >= ramp:
                 sequence.append(phasor)
+        if count < first_judged:
+            continue
         limit = torch.from_numpy(sequence.limit() if len(sequence) else windows[-1][1])
         values.append(observe(limit))
         residual = _residual(values)

@@ -16,7 +16,7 @@ from autdtorch.methods.base import Method, Problem, Step, Trials, generators_of
 from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.objective import Objective, weakest_focus
-from autdtorch.utils.threads import one_torch_thread
+from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import integer_at_least, invalid
 
 # First and last value, in equal ratios between: temperature of the smooth minimum, in mean pressures of the
@@ -81,14 +81,14 @@ def random_drives(count: int, transducers: int, generator: torch.Generator) -> t
     return torch.polar(torch.ones_like(turns), 2 * math.pi * turns)
 
 
-@one_torch_thread()
+@one_library_thread()
 def climb(matrix: torch.Tensor, drive: torch.Tensor, steps: int) -> torch.Tensor:
     """Return the highest drive (M,) of the climbs from drives (S, M), on one matrix (P, M)."""
     drive = climbed(matrix, drive, steps)
     return drive[weakest_focus(_pressure(matrix, drive).abs()).argmax()]
 
 
-@one_torch_thread()
+@one_library_thread()
 def climbed(matrix: torch.Tensor, drive: torch.Tensor, steps: int) -> torch.Tensor:
     """Return drives (S, M) after projected gradient ascents with momentum from drives (S, M).
 

@@ -19,7 +19,7 @@ from autdtorch.methods.matrix_posterior import MatrixPosterior, kept, posteriors
 from autdtorch.methods.prior import Prior, best_simulated_drives, matrix_prior, prior_mean, prior_of
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.objective import Objective, weakest_focus
-from autdtorch.utils.threads import one_torch_thread
+from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import integer_at_least, invalid
 
 _LEAST = 64  # evaluations without the setting; more where transducers need them
@@ -92,7 +92,7 @@ class Identify(Method):
             drives = best_simulated_drives(self.prior, problem, generators)[:, None]
         return Step(problem.quantise(drives), {"generators": states_of(generators)})
 
-    @one_torch_thread()
+    @one_library_thread()
     def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
         """Fit the matrix, and observe the best drives of samples of it; that of the fit at the end."""
         search = dict(state.search)

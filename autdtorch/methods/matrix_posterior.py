@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from autdtorch.methods.phase_retrieval import retrieve
-from autdtorch.utils.threads import one_torch_thread
+from autdtorch.utils.threads import one_library_thread
 
 _KEPT = ("factors", "entries", "variance")
 _STEPS = 10  # of Gauss and Newton
@@ -91,7 +91,7 @@ class MatrixPosterior:
         """The transfer matrix (P, M) [Pa] at the maximum."""
         return self._scaled()[0] + self.prior.spread[:, None] * self.entries
 
-    @one_torch_thread()
+    @one_library_thread()
     def fitted(
         self, drives: torch.Tensor, observed: torch.Tensor, infer_noise: bool = True
     ) -> MatrixPosterior:
@@ -132,7 +132,7 @@ class MatrixPosterior:
         variance = left / (line.unexplained(self) + _WEIGHT)
         return replace(self, variance=variance.expand_as(self.variance))
 
-    @one_torch_thread()
+    @one_library_thread()
     def sample(self, drives: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """Return a sample (P, M) [Pa] of the matrix, given readings of drives (N, M) that were fitted.
 

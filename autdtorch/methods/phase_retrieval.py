@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from autdtorch.utils.threads import one_torch_thread
+from autdtorch.utils.threads import one_library_thread
 
 _GUESSES = 16  # rows from which the search for each row begins
 _APART = 0.5  # random part of these rows, relative to the common part
@@ -17,7 +17,7 @@ _FIT_STEPS = 100
 _FAINT = 0.02  # intensity, relative to the mean, below which readings have the weight of this one
 
 
-@one_torch_thread()
+@one_library_thread()
 def retrieve(drives: torch.Tensor, observed: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
     """Return rows of the transfer matrix (M, P) that explain magnitudes (N, P) observed for `drives` (N, M).
 

@@ -9,7 +9,7 @@ import torch
 from autdtorch.objectives.objective import observe_drives
 from autdtorch.propagators import Propagator
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.threads import one_torch_thread
+from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import invalid, require_kind, require_one_of
 
 _PRODUCTS = 2**16  # of transfer matrix and drives, that are computed at once
@@ -53,7 +53,7 @@ class SimulatedObjective:
         mode = "replay" if self.transfer_matrix is None else "transfer"
         return f"SimulatedObjective(scene {self.scene.name!r}, mode {mode!r}, {self.evaluations} evaluations)"
 
-    @one_torch_thread()
+    @one_library_thread()
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
         """Observe the control points under each of several drives.
 

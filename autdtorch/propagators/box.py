@@ -28,7 +28,7 @@ from autdtorch.propagators.plan import MOST_JUDGED
 from autdtorch.propagators.simulation import Run, Simulation, Stepped
 from autdtorch.scene.scene import require_clear
 from autdtorch.utils.apertures import Apertures
-from autdtorch.utils.threads import one_torch_thread, spread
+from autdtorch.utils.threads import one_library_thread, spread
 
 logger = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ class BoxSimulation(Simulation):
     """
 
     @cached_property
-    @one_torch_thread()
+    @one_library_thread()
     def boxes(self) -> list[ScatteredField]:
         """The assembled boxes."""
         plan = self.plan
@@ -96,7 +96,12 @@ class BoxSimulation(Simulation):
         incident = torch.stack([field.reshape(points.shape[:-1]) @ weights for field in fields], dim=1)
         transforms = [box.near_to_far(receivers) for box in boxes]
         every = math.ceil(len(points) / MOST_JUDGED)
-        matrix = torch.cat([transform.matrix(every) for transform in transforms], dim=1)
+        readings = [transform.readings(every) for transform in transforms]
+        sizes = [len(transform.cells) for transform in transforms]
+
+        def pressure(phasors: torch.Tensor) -> torch.Tensor:
+            parts = zip(readings, torch.split(phasors, sizes), strict=True)
+            return incident[::every] + sum(reading.field(part) for reading, part in parts)
 
         def simulate(index: int, field: torch.Tensor, tolerance: float, observe: Observe) -> SteadyState:
             box, cells = boxes[index], transforms[index].cells
@@ -112,7 +117,9 @@ class BoxSimulation(Simulation):
         def alone(run: int) -> tuple[SteadyState, float]:
             begin, (nodes, own), direct = time.perf_counter(), drives[run], incident[::every, run]
             field = boxes[0].driving(nodes, own)
-            steady = simulate(0, field, plan.tolerance, lambda part: direct + matrix @ part)
+            steady = simulate(
+                0, field, plan.tolerance, lambda part: direct + readings[0].field(part[:, None])[:, 0]
+            )
             return steady, time.perf_counter() - begin
 
         if len(boxes) == 1:
@@ -120,16 +127,13 @@ class BoxSimulation(Simulation):
         else:
             pairs = [[box.driving(nodes, own) for nodes, own in drives] for box in boxes]
             driving = [torch.stack(fields, dim=1) for fields in pairs]
-            found = _coupled(
-                boxes, transforms, driving, lambda part: incident[::every] + matrix @ part, simulate,
-                plan.tolerance,
-            )  # fmt: skip
+            found = _coupled(boxes, transforms, driving, pressure, simulate, plan.tolerance)
             if not found:
                 logger.debug("the iteration between %d boxes does not converge: one box instead", len(boxes))
                 return self._in_one_box._simulate(sources, strength, receivers, stepped)
         steady, seconds = zip(*found, strict=True)
         phasors = torch.stack([each.pressure for each in steady], dim=1)
-        parts = torch.split(phasors, [len(transform.cells) for transform in transforms])
+        parts = torch.split(phasors, sizes)
         scattered = [transform.field(part) for transform, part in zip(transforms, parts, strict=True)]
         total = incident + sum(scattered)
         return total.mT.masked_fill(self._silent(points), 0), list(map(Run.of, steady, seconds))

@@ -16,14 +16,14 @@ from autdtorch.propagators.plan import MOST_JUDGED
 from autdtorch.propagators.simulation import Run, Simulation, Stepped
 from autdtorch.scene.scene import require_inside
 from autdtorch.utils.apertures import Apertures
-from autdtorch.utils.threads import one_torch_thread
+from autdtorch.utils.threads import one_library_thread
 
 
 class DomainSimulation(Simulation):
     """FDTD of the total field on a grid of the whole domain."""
 
     @cached_property
-    @one_torch_thread()
+    @one_library_thread()
     def assemblies(self) -> Sequence[Assembly]:
         """The assembled grid of the domain."""
         plan = self.plan

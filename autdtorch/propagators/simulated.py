@@ -25,7 +25,7 @@ from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.memory import require_memory
-from autdtorch.utils.threads import one_torch_thread
+from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import ArrayLike, boolean, points_grid
 
 logger = logging.getLogger(__name__)
@@ -113,7 +113,7 @@ class SimulatedPropagator:
     def transfer_matrix(
         self, points: ArrayLike | None = None, *, return_error: Literal[True]
     ) -> tuple[torch.Tensor, float]: ...
-    @one_torch_thread()
+    @one_library_thread()
     def transfer_matrix(
         self, points: ArrayLike | None = None, return_error: bool = False
     ) -> torch.Tensor | tuple[torch.Tensor, float]:
@@ -145,7 +145,7 @@ class SimulatedPropagator:
         self._report(self.scene.control_points if places is None else places)
         return (result.matrix, result.error) if with_error else result.matrix
 
-    @one_torch_thread()
+    @one_library_thread()
     def point_errors(self, points: ArrayLike | None = None) -> torch.Tensor:
         """Return the estimated relative error of each point's row of the transfer matrix, float64 (P,).
 
@@ -169,7 +169,7 @@ class SimulatedPropagator:
             [grid_errors(matrix, second, ratio, order) for second, ratio in zip(others, ratios, strict=True)]
         ).amin(dim=0)
 
-    @one_torch_thread()
+    @one_library_thread()
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
         """Return the pressure of drives at points, from a simulation for each drive or the transfer matrix.
 
@@ -226,7 +226,7 @@ class SimulatedPropagator:
             cache.save(key, result.matrix.numpy(), result.error)
         return result
 
-    @one_torch_thread()
+    @one_library_thread()
     def _with_error(self, points: torch.Tensor | None) -> TransferMatrix:
         """Return the matrix of points with its error, estimated from a second grid."""
         own, others = self._result(points), [other._result(points) for other in self._others]
@@ -234,7 +234,7 @@ class SimulatedPropagator:
         runs = own.runs + tuple(run for one in others for run in one.runs)
         return TransferMatrix(own.matrix, own.error + float(whole), runs)
 
-    @one_torch_thread()
+    @one_library_thread()
     def known_error(self) -> float:
         """Simulate the control points; return the error by the grids given, infinite without any."""
         if self._given:

@@ -6,6 +6,7 @@ Threads live for one call, so that none spins while it waits and none is missing
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -14,6 +15,7 @@ from contextvars import ContextVar
 from typing import TypeVar
 
 import torch
+from threadpoolctl import ThreadpoolController
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -22,11 +24,12 @@ _given: ContextVar[int | None] = ContextVar("threads", default=None)
 
 
 class _Outside:
-    """PyTorch's number of threads outside `one_torch_thread`, which several threads may enter at once."""
+    """The number of threads outside `one_library_thread`, which several threads may enter at once."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._threads = self._inside = 0
+        self._blas = contextlib.ExitStack()
 
     def threads(self) -> int:
         """Return PyTorch's number of threads before the first thread entered."""
@@ -39,6 +42,7 @@ class _Outside:
             before = torch.get_num_threads()
             if not self._inside:
                 self._threads = before
+                self._blas.enter_context(_numpy_threads().limit(limits=1))
             self._inside += 1
             torch.set_num_threads(1)
             return before
@@ -48,12 +52,19 @@ class _Outside:
         with self._lock:
             self._inside -= 1
             torch.set_num_threads(before if self._inside else self._threads)
+            if not self._inside:
+                self._blas.close()
 
     def begin_forked(self) -> None:
         """Set one thread in a forked process, also for the time after `leave`."""
         # PyTorch's threads do not survive a fork, and a forked process would wait for them forever.
         self._lock, self._threads = threading.Lock(), 1
         torch.set_num_threads(1)
+
+
+@functools.cache
+def _numpy_threads() -> ThreadpoolController:
+    return ThreadpoolController().select(user_api="blas")
 
 
 _outside = _Outside()
@@ -72,11 +83,11 @@ def thread_count() -> int:
 
 
 @contextlib.contextmanager
-def one_torch_thread() -> Iterator[None]:
-    """Restrict PyTorch to one thread, without a change to `thread_count`; also a decorator.
+def one_library_thread() -> Iterator[None]:
+    """Restrict PyTorch and NumPy to one thread, without a change to `thread_count`; also a decorator.
 
-    PyTorch's threads spin while they wait for each other. On a busy machine this slows thousands of small
-    operations down many times (docs/decisions/threads.md).
+    Their threads spin while they wait, also after their work is done. They take the processor from ours, and
+    on a busy machine slow thousands of small operations down many times (docs/decisions/threads.md).
     """
     token = _given.set(thread_count())
     before = _outside.enter()

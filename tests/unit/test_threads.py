@@ -30,10 +30,10 @@ def in_new_thread() -> int:
 
 
 def test_it_is_one_inside_and_what_it_was_outside() -> None:
-    with threads.one_torch_thread():
+    with threads.one_library_thread():
         assert torch.get_num_threads() == 1
         assert threads.thread_count() == 4
-        with threads.one_torch_thread():
+        with threads.one_library_thread():
             assert threads.thread_count() == 4
         assert torch.get_num_threads() == 1
     assert torch.get_num_threads() == in_new_thread() == 4
@@ -44,13 +44,13 @@ def test_threads_that_leave_in_the_order_they_entered_leave_nothing_behind() -> 
     seen = []
 
     def second() -> None:
-        with threads.one_torch_thread():
+        with threads.one_library_thread():
             seen.append(threads.thread_count())
             entered.set()
             left.wait(10)
 
     other = threading.Thread(target=second)
-    with threads.one_torch_thread():
+    with threads.one_library_thread():
         other.start()
         assert entered.wait(10)
     left.set()
@@ -62,7 +62,7 @@ def test_threads_that_leave_in_the_order_they_entered_leave_nothing_behind() -> 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no forks here")
 @pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning")
 def test_a_child_has_one_thread_also_after_leaving_what_its_parent_had_entered() -> None:
-    with threads.one_torch_thread():
+    with threads.one_library_thread():
         child = os.fork()
     if child == 0:
         os._exit(torch.get_num_threads())

@@ -50,9 +50,10 @@ def layered_axis(vertex: Index, volumes: Array, distance: Array) -> Index:
     corners, cube = vertex.reshape(-1, 2, 2, 2), distance.reshape(*distance.shape[:2], *(SUBCELLS + 1,) * 3)
     for axis in range(3):
         one, other = (each for each in range(3) if each != axis)
-        even = np.ptp(corners, axis=(one + 1, other + 1)).max(axis=1, initial=0) == 0
-        even &= np.ptp(cube, axis=(one + 2, other + 2)).max(axis=(0, 2), initial=0) < _VARIATION
-        found[even & constant_along(volumes, (one, other))] = axis
+        even = np.flatnonzero(np.ptp(corners, axis=(one + 1, other + 1)).max(axis=1, initial=0) == 0)
+        varied = np.ptp(cube[:, even], axis=(one + 2, other + 2)).max(axis=(0, 2), initial=0)
+        even = even[varied < _VARIATION]
+        found[even[constant_along(volumes[even], (one, other))]] = axis
     return found
 
 

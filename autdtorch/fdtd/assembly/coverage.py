@@ -26,25 +26,24 @@ def distance_to_material(distance: Array, material: Index, inner: Index) -> Arra
 
 def subcell_means(values: Array) -> Array:
     """Return the means (n, 64) of lattice values (n, 125) over the corners of each sub-cell."""
-    cube = values.reshape(-1, *(SUBCELLS + 1,) * 3)
-    return _over_subcells(cube, None).reshape(len(values), SUBCELLS**3)
+    return _over_subcells(values)[0]
 
 
 def volume_coverage(distance: Array) -> Array:
     """Return the share of each sub-cell (..., 64) inside a body: exact for axis-aligned faces."""
-    cube = distance.reshape(*distance.shape[:-1], *(SUBCELLS + 1,) * 3)
-    mean, *slopes = (_over_subcells(cube, along) for along in (None, -3, -2, -1))
+    mean, *slopes = _over_subcells(distance)
     width = np.abs(slopes).sum(axis=0)
-    share = np.clip(0.5 - mean / np.maximum(width, 1e-12), 0, 1)
-    return np.asarray(share.reshape(*distance.shape[:-1], SUBCELLS**3))
+    return np.asarray(np.clip(0.5 - mean / np.maximum(width, 1e-12), 0, 1))
 
 
-def _over_subcells(cube: Array, along: int | None) -> Array:
-    """Return the mean over the corners of each sub-cell, of values or of differences along an axis."""
+def _over_subcells(values: Array) -> Array:
+    """Return means (4, ..., 64) over the corners of each sub-cell: of lattice values (..., 125) and slopes."""
+    found = [values.reshape(*values.shape[:-1], *(SUBCELLS + 1,) * 3)]
     for axis in (-3, -2, -1):
-        low, high = (np.take(cube, np.arange(SUBCELLS) + end, axis) for end in (0, 1))
-        cube = high - low if axis == along else (low + high) / 2
-    return cube
+        ends = [np.moveaxis(each, axis, 0) for each in found]
+        means = [np.moveaxis((each[:-1] + each[1:]) / 2, 0, axis) for each in ends]
+        found = [*means, np.moveaxis(ends[0][1:] - ends[0][:-1], 0, axis)]
+    return np.stack(found).reshape(4, *values.shape[:-1], SUBCELLS**3)
 
 
 def line_coverage(distance: Array) -> Array:
@@ -68,7 +67,7 @@ def shares(coverage: Callable[[Array], Array], distance: Array, material: Index,
         share *= 1 - cover[..., None]
         share[..., number] += cover
     solid = share.sum(axis=2)
-    union = coverage(distance.min(axis=0))
+    union = covered[0] if len(covered) == 1 else coverage(distance.min(axis=0))
     share *= np.divide(union, solid, out=np.zeros_like(solid), where=solid > 0)[..., None]
     share[..., 0] += 1 - union
     return share

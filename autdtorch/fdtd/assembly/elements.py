@@ -27,7 +27,7 @@ from autdtorch.utils.threads import spread
 _SOUND_HARD_DENSITY = 1e5
 # Distance by which bodies are grown, so that touching bodies leave no film of air between them
 _CONTACT_GAP = 1e-9
-_CHUNK = 4096  # Interface elements assembled at a time
+_CHUNK = 8192  # Interface elements assembled at a time
 # Depths below its surface at which a body must be there to be thick [cells]. Sound would pass through thinner
 # walls of finite elements, whose vertices can belong to both sides.
 _DEPTHS = np.array([1.2, 2.3, 3.5])
@@ -100,7 +100,8 @@ def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
         cut[own] = (cut[own] | (distance < HALF_DIAGONAL)) & (distance > -HALF_DIAGONAL)
         cut[tuple(inside.T)] = False
     index = np.flatnonzero(cut)
-    return Elements(materials, material, index, _interface(bodies, index, grid, materials, stencil))
+    whole = np.where(cut, -1, material)
+    return Elements(materials, material, index, _interface(bodies, index, whole, grid, materials, stencil))
 
 
 def _unions(region: Region, stencil: Stencil) -> tuple[list[_Union], Materials]:
@@ -159,9 +160,14 @@ def _distances(bodies: list[_Union], first: Index, grid: Grid) -> Array:
 
 
 def _finite(
-    bodies: list[_Union], distance: Array, first: Index, near_edge: NDArray[np.bool_], grid: Grid
+    bodies: list[_Union],
+    distance: Array,
+    first: Index,
+    near_edge: NDArray[np.bool_],
+    whole: NDArray[np.int16],
+    grid: Grid,
 ) -> NDArray[np.bool_]:
-    """Return whether finite elements represent bodies in elements (K, n).
+    """Return whether finite elements represent bodies in elements (K, n); `whole` as in `_thick`.
 
     They do where a sound-hard body is thick enough, and at edges of a fluid without a thin sound-hard body.
     """
@@ -170,7 +176,7 @@ def _finite(
     for body, own, level, here in zip(bodies, finite, distance, near, strict=True):
         own &= body.finite
         if body.sound_hard:
-            own[own] = _thick(body, level[own], first[own], grid)
+            own[own] = _thick(body, level[own], first[own], whole, grid)
             thin |= here & ~own
         else:
             own &= near_edge
@@ -179,13 +185,21 @@ def _finite(
     return np.asarray(finite & (hard[:, None] | ~thin))
 
 
-def _thick(body: _Union, distance: Array, first: Index, grid: Grid) -> NDArray[np.bool_]:
-    """Return whether a sound-hard body has one face in elements (n,), with enough of the body behind it."""
+def _thick(
+    body: _Union, distance: Array, first: Index, whole: NDArray[np.int16], grid: Grid
+) -> NDArray[np.bool_]:
+    """Return whether a sound-hard body has one face in elements (n,), with enough of the body behind it.
+
+    `whole` (nx - 1, ny - 1, nz - 1) is the material of elements that no surface intersects, else -1.
+    """
     gradient, middle = mean_gradient(distance), distance.mean(axis=1)
     steep = np.linalg.norm(gradient, axis=1)  # small where the two faces of a plate cancel
     normal = gradient / np.maximum(steep, _LEAST_GRADIENT)[:, None]
     below = (middle[:, None] + _DEPTHS)[:, :, None] * normal[:, None]
-    inside = body.distance(first[:, None] + 0.5 - below, grid) < 0
+    places = first[:, None] + 0.5 - below
+    element = np.clip(places.astype(np.int64), 0, np.array(whole.shape) - 1)
+    inside = whole[tuple(np.moveaxis(element, -1, 0))] == body.material
+    inside[~inside] = body.distance(places[~inside], grid) < 0
     return np.asarray(inside.all(axis=1) & (steep > _LEAST_GRADIENT))
 
 
@@ -206,8 +220,14 @@ def _distinct(distance: Array, finite: NDArray[np.bool_], less: Array) -> tuple[
 
 
 def _interface(
-    bodies: list[_Union], index: Index, grid: Grid, materials: Materials, stencil: Stencil
+    bodies: list[_Union],
+    index: Index,
+    whole: NDArray[np.int16],
+    grid: Grid,
+    materials: Materials,
+    stencil: Stencil,
 ) -> InterfaceElements:
+    """Return the interface elements, at flat indices (n,); `whole` as in `_thick`."""
     none = np.zeros((0, 28)), np.zeros((0, 8)), np.zeros((0, 8), np.int64), np.zeros(0, bool)
     numbers = np.array([body.material for body in bodies], np.int64)
     aligned = np.array([body.aligned for body in bodies], bool)
@@ -227,7 +247,7 @@ def _interface(
         less = reductions(edges, centers, grid.spacing)
         distance = _distances(bodies, first, grid)
         edged = np.asarray(less.any(axis=(1, 2)))
-        finite = _finite(bodies, distance, first, edged, grid)
+        finite = _finite(bodies, distance, first, edged, whole, grid)
         own, place = _distinct(distance, finite, less)
         near = Bodies(distance, numbers, aligned, finite, less).chosen(own)
         found = interface_elements(near, materials, stencil)

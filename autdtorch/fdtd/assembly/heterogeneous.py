@@ -152,25 +152,23 @@ def _assembled(
 ) -> tuple[Array, Array]:
     """Return coupling (n, 27) and mass (n,) of the touched cells, summed over their elements."""
     coupling, mass = np.zeros((len(touched), 27)), np.zeros(len(touched))
+    cube = coupling.reshape(-1, 3, 3, 3)
     places = np.stack(np.unravel_index(touched, shape), axis=-1)
-    cells = tuple(cells - 1 for cells in shape)
-    cut = np.zeros(cells, bool)
-    cut.ravel()[elements.index] = True
-    pairs, air_pairs = np.zeros((8, 8, len(elements.index))), np.zeros((8, 8))
-    pairs[PAIRS[:, 0], PAIRS[:, 1]] = pairs[PAIRS[:, 1], PAIRS[:, 0]] = interface.coupling.T
-    air_pairs[PAIRS[:, 0], PAIRS[:, 1]] = air_pairs[PAIRS[:, 1], PAIRS[:, 0]] = uniform_coupling(stencil)
+    cells, kinds = tuple(cells - 1 for cells in shape), elements.materials
+    # elements by kind: of one material, then those that surfaces intersect
+    count = len(kinds.density)
+    kind = elements.material.astype(np.int64).ravel()
+    kind[elements.index] = count + np.arange(len(elements.index))
+    pairs, masses = np.zeros((count + len(elements.index), 8, 8)), np.empty((count + len(elements.index), 8))
+    pairs[:, PAIRS[:, 0], PAIRS[:, 1]] = pairs[:, PAIRS[:, 1], PAIRS[:, 0]] = np.concatenate(
+        (uniform_coupling(stencil) / kinds.density[:, None], interface.coupling)
+    )
+    masses[:count], masses[count:] = kinds.mass[:, None] / 8, interface.mass
     for own, vertex in enumerate(VERTICES):
-        element = np.ravel_multi_index(tuple((places - vertex).T), cells)
-        is_cut = cut.ravel()[element]
-        place = np.searchsorted(elements.index, element[is_cut])
-        material = elements.material.ravel()[element]
-        for other, target in enumerate(VERTICES):
-            part = air_pairs[own, other] / elements.materials.density[material]
-            part[is_cut] = pairs[own, other, place]
-            coupling[:, int((target - vertex + 1) @ (9, 3, 1))] += part
-        part = elements.materials.mass[material] / 8
-        part[is_cut] = interface.mass[place, own]
-        mass += part
+        element = kind[np.ravel_multi_index(tuple((places - vertex).T), cells)]
+        x, y, z = (slice(1 - end, 3 - end) for end in vertex)
+        cube[:, x, y, z] += pairs[element, own].reshape(-1, 2, 2, 2)
+        mass += masses[element, own]
     return coupling, mass
 
 
@@ -218,12 +216,13 @@ def _needed_mass(
     beside, row = touched[place] != neighbour, coupling.sum(axis=1)
     uniform = elements.materials.mass[_cell_material(elements)[neighbour]]
     need = size.sum(axis=1) / largest
-    for _ in range(_NEED_ITERATIONS):
-        own = np.maximum(mass, need)
-        around = np.where(beside, uniform, own[place])
-        ratio = np.divide(own[:, None], around, out=np.ones_like(size), where=around > 0)
+    most = np.flatnonzero(need > mass)  # all others count with their own mass, which is more
+    for number in range(_NEED_ITERATIONS):
+        own, some = np.maximum(mass, need), most if number + 1 < _NEED_ITERATIONS else slice(None)
+        around = np.where(beside[some], uniform[some], own[place[some]])
+        ratio = np.divide(own[some, None], around, out=np.ones_like(around), where=around > 0)
         lighter = np.sqrt(ratio).clip(max=1)
-        need = (np.maximum(row, 0) + (size * lighter).sum(axis=1)) / (2 * largest)
+        need[some] = (np.maximum(row[some], 0) + (size[some] * lighter).sum(axis=1)) / (2 * largest)
     return np.asarray(need)
 
 

@@ -39,12 +39,12 @@ _CROWDED, _FREE = 0.75, 0.9
 
 @njit(**INNER)
 def _record(p, receivers, first, last, out):  # type: ignore[no-untyped-def]
-    index, weight = receivers
-    for r in range(first, last):
-        total = p[0] - p[0]
-        for m in range(index.shape[1]):
-            total += weight[r, m] * p[index[r, m]]
-        out[r] = total
+    index, weight = receivers  # a row for each cell of a receiver
+    out[first:last] = 0
+    for m in range(len(index)):
+        own, share = index[m], weight[m]
+        for r in range(first, last):
+            out[r] += share[r] * p[own[r]]
 
 
 @njit(**INNER)
@@ -81,9 +81,10 @@ def _finish_chunk(c, q, medium, cells, outermost, sources, row):  # type: ignore
         absorbed = scale[n] * (q[index[n]] - swept[n]) if scale[n] != 0 else scale[n]
         q[index[n]] = new[n] + absorbed
     driven, force = sources
-    for n in range(driven_starts[c], driven_starts[c + 1]):
-        for s in range(len(row)):
-            q[driven[n]] += force[n, s] * row[s]
+    for s in range(len(row)):
+        own, now = force[s], row[s]
+        for n in range(driven_starts[c], driven_starts[c + 1]):
+            q[driven[n]] += own[n] * now
 
 
 @njit(**INNER)
@@ -143,7 +144,7 @@ def _advance(  # type: ignore[no-untyped-def]
         now, new = (p, q) if step % 2 == 0 else (q, p)
         if kind == 0:
             if step > 0:
-                first, last = c * read // chunks, (c + 1) * read // chunks
+                first, last = np.uint64(c * read // chunks), np.uint64((c + 1) * read // chunks)
                 _record(now, receivers, first, last, recorded[step - 1])
             if step < steps:
                 _sweep_chunk(c, now, new, medium, layers, cells, room)
@@ -196,6 +197,10 @@ def _heterogeneous_cells(c: Coefficients, shape: torch.Size) -> tuple[AnyArray, 
     return index, weight.reshape(-1), row_offsets(shape), scale, air, new, swept
 
 
+def _unsigned(index: torch.Tensor) -> AnyArray:
+    return index.contiguous().numpy().view(np.uint64)
+
+
 class CpuKernel:
     """Kernel on the CPU, which updates the state in place; see `kernels.contract`."""
 
@@ -237,8 +242,8 @@ class CpuKernel:
             tuple((psi.numpy(), zeta.numpy()) for psi, zeta in state.memory[4:]),
             c.sound_hard_index.numpy(),
             # numba compiles again for arrays with gaps, and crashed when it loaded that from disk
-            (sources.index.contiguous().numpy(), sources.force.contiguous().numpy()),
-            (receivers.index.contiguous().numpy(), receivers.weight.contiguous().numpy()),
+            (_unsigned(sources.index), sources.force.mT.contiguous().numpy()),
+            (_unsigned(receivers.index.mT), receivers.weight.mT.contiguous().numpy()),
             signal.contiguous().numpy(),
             recorded.numpy(),
             np.zeros(COUNTERS, np.int64),

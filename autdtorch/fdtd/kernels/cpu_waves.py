@@ -40,7 +40,13 @@ def _room(dtype: type) -> tuple[AnyArray, ...]:
     cosine = [(-1) ** n * turn ** (2 * n) / math.factorial(2 * n) for n in range(_TERMS)]
     power = [(-log) ** n / math.factorial(n) for n in range(_TERMS)]
     bits = np.zeros(_LANES, np.int32 if dtype is np.float32 else np.int64)
-    return *np.array((sine, cosine, power), dtype), *np.zeros((5, _LANES), dtype), bits, bits.view(dtype)
+    return *np.array((sine, cosine, power), dtype), *np.zeros((9, _LANES), dtype), bits, bits.view(dtype)
+
+
+@njit(**INNER)
+def _terms(c):  # type: ignore[no-untyped-def]
+    """Return coefficients as values: the compiler knows that a loop does not change them."""
+    return c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8], c[9], c[10], c[11], c[12]
 
 
 @njit(**INNER)
@@ -50,27 +56,31 @@ def _series(c, y):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _directed(place, others, first, pattern, real, imaginary, distance):  # type: ignore[no-untyped-def]
+def _directed(place, others, first, pattern, real, imaginary, distance, room):  # type: ignore[no-untyped-def]
     """Multiply waves by the pattern (orders, 2, terms) of a disc at a place with a normal (6,)."""
+    a, b, nearness, sine_squared = room
     x, y, z = place[0], place[1], place[2]
     along_x, along_y, along_z = place[3], place[4], place[5]
-    last = pattern.shape[0] - 1
     for k in range(_BLOCK):
         dx, dy, dz = others[_X, first + k] - x, others[_Y, first + k] - y, others[_Z, first + k] - z
-        nearness = 1 / distance[k]
-        cosine = (dx * along_x + dy * along_y + dz * along_z) * nearness
-        sine_squared = pattern.dtype.type(1 - cosine * cosine)
-        a, b = _series(pattern[last, 0], sine_squared), _series(pattern[last, 1], sine_squared)
-        for order in range(last - 1, -1, -1):
-            a = a * nearness + _series(pattern[order, 0], sine_squared)
-            b = b * nearness + _series(pattern[order, 1], sine_squared)
-        real[k], imaginary[k] = a * real[k] - b * imaginary[k], a * imaginary[k] + b * real[k]
+        near = 1 / distance[k]
+        cosine = (dx * along_x + dy * along_y + dz * along_z) * near
+        a[k], b[k], nearness[k], sine_squared[k] = 0, 0, near, 1 - cosine * cosine
+    for order in range(pattern.shape[0] - 1, -1, -1):  # outside: inner loops alone are vectorised
+        real_terms, imaginary_terms = _terms(pattern[order, 0]), _terms(pattern[order, 1])
+        for k in range(_BLOCK):
+            a[k] = a[k] * nearness[k] + _series(real_terms, sine_squared[k])
+        for k in range(_BLOCK):
+            b[k] = b[k] * nearness[k] + _series(imaginary_terms, sine_squared[k])
+    for k in range(_BLOCK):
+        own, other = real[k], imaginary[k]
+        real[k], imaginary[k] = a[k] * own - b[k] * other, a[k] * other + b[k] * own
 
 
 @njit(**INNER)
 def _waves(place, others, block, wave, pattern, room):  # type: ignore[no-untyped-def]
     """Return the parts of e^{i k r} / r, from a place (6,) to those of a block of `others` (3, N)."""
-    sine, cosine, power, real, imaginary, side, quarter, distance, bits, halves = room
+    sine, cosine, power, real, imaginary, side, quarter, distance, a, b, near, slope, bits, halves = room
     turns_per_metre, halvings_per_metre, nearest = wave
     x, y, z = place[0], place[1], place[2]
     first = np.uint64(block) * _BLOCK
@@ -81,10 +91,12 @@ def _waves(place, others, block, wave, pattern, room):  # type: ignore[no-untype
         turns -= (turns + _SHIFT) - _SHIFT
         distance[k], side[k], quarter[k] = r, turns, abs(turns) - 0.25
     # with u = |t| - 1/4 of t turns: cos(2 pi t) = -sin(2 pi u) and |sin(2 pi t)| = cos(2 pi u)
+    sine_terms, cosine_terms, power_terms = _terms(sine), _terms(cosine), _terms(power)
     for k in range(_BLOCK):
-        square = quarter[k] * quarter[k]
-        real[k] = -quarter[k] * _series(sine, square) / distance[k]
-        imaginary[k] = np.copysign(_series(cosine, square), side[k]) / distance[k]
+        real[k] = -quarter[k] * _series(sine_terms, quarter[k] * quarter[k]) / distance[k]
+    for k in range(_BLOCK):
+        size = _series(cosine_terms, quarter[k] * quarter[k])
+        imaginary[k] = np.copysign(size, side[k]) / distance[k]
     if halvings_per_metre > 0:
         digits, lowest = (23, 126) if real.itemsize == 4 else (52, 1022)
         for k in range(_BLOCK):
@@ -93,11 +105,11 @@ def _waves(place, others, block, wave, pattern, room):  # type: ignore[no-untype
             bits[k] = (lowest + 1 - int(whole)) << digits  # 2^-whole, read as a float
             quarter[k] = halvings - whole
         for k in range(_BLOCK):
-            size = halves[k] * _series(power, quarter[k])
+            size = halves[k] * _series(power_terms, quarter[k])
             real[k] *= size
             imaginary[k] *= size
     if len(pattern):
-        _directed(place, others, first, pattern, real, imaginary, distance)
+        _directed(place, others, first, pattern, real, imaginary, distance, (a, b, near, slope))
     return real, imaginary
 
 

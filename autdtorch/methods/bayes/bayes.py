@@ -18,7 +18,7 @@ from autdtorch.methods.prior import Prior, best_simulated_drives, matrix_prior, 
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.objective import Objective, Score, weakest_focus
 from autdtorch.scene.drive import drive_from_phases, phases_of
-from autdtorch.utils.threads import one_torch_thread
+from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import integer_at_least, invalid, number_between, require_one_of
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ class BayesOpt(Method):
         }
         return Step(drives_at(points, self.fixed_transducer), search)
 
-    @one_torch_thread()
+    @one_library_thread()
     @_defaults_of_processes()
     def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
         """Observe the points of the largest expected improvement."""
