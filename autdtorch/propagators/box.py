@@ -18,12 +18,12 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from autdtorch.fdtd.grid import make_box
 from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
 from autdtorch.fdtd.steady_state import Extrapolation, SteadyState, run_to_steady_state
-from autdtorch.fdtd.stepping import Assembly, assemble_on
-from autdtorch.fdtd.turning import is_turned, turned
+from autdtorch.fdtd.stepping import Assembly
+from autdtorch.fdtd.turning import is_turned
 from autdtorch.propagators.grids import MOST_PASSES, one_box
+from autdtorch.propagators.moved_boxes import assembled_box
 from autdtorch.propagators.plan import MOST_JUDGED
 from autdtorch.propagators.simulation import Run, Simulation, Stepped
 from autdtorch.scene.scene import require_clear
@@ -61,10 +61,9 @@ class BoxSimulation(Simulation):
         boxes = []
         for group, axes in zip(plan.grouping.groups, plan.grouping.axes, strict=True):
             part = replace(plan.region, bodies=tuple(plan.region.bodies[one] for one in group))
-            part = turned(part, axes)
             if is_turned(axes):
                 logger.info("the grid around obstacles %s is turned along their faces", list(group))
-            assembly = assemble_on(make_box(part, plan.spacing), part, plan.dtype, plan.time_step)
+            assembly = assembled_box(part, axes, plan.spacing, plan.dtype, plan.time_step)
             boxes.append(ScatteredField(assembly, plan.scene.complex_wavenumber, axes))
         return boxes
 

@@ -108,6 +108,8 @@ def symmetries(assemblies: Sequence[Assembly], along: Array, transducers: Apertu
     turns = itertools.product(itertools.permutations(range(3)), itertools.product((1, -1), repeat=3))
     for axes, signs in itertools.islice(turns, 1, None if len(assemblies) == 1 else 1):
         turn = np.diag(signs) @ np.eye(3, dtype=np.int64)[list(axes)]
+        if (np.abs(turn) @ grid.shape != grid.shape).any():
+            continue
         matrix = along.T @ turn @ along
         images = _matched(positions, weights, matrix, center)
         if (images != _NONE).all() and _maps_cells(cells, grid, turn, _ROUNDING * assembly.stencil.face):
@@ -129,10 +131,8 @@ def _matched(groups: Array, weights: Array, matrix: Array, center: Array) -> Ind
 
 
 def _maps_cells(cells: HeterogeneousCells, grid: Grid, matrix: Index, rounding: float) -> bool:
-    """Return whether heterogeneous cells are mapped onto cells with equal rows and mass."""
+    """Return whether a turn of the grid maps heterogeneous cells onto cells with equal rows and mass."""
     shape = np.array(grid.shape)
-    if (np.abs(matrix) @ shape != shape).any():
-        return False
 
     def image(index: Index) -> Index:
         double = 2 * np.stack(np.unravel_index(index, grid.shape), axis=-1) - (shape - 1)

@@ -1,4 +1,4 @@
-"""PyTorch's number of threads, kept to one by several threads at once and across a fork."""
+"""Threads of PyTorch and NumPy, kept to one each by several threads at once and across a fork."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 import torch
+from threadpoolctl import threadpool_info
 
 from autdtorch.utils import threads
 
@@ -37,6 +38,18 @@ def test_it_is_one_inside_and_what_it_was_outside() -> None:
             assert threads.thread_count() == 4
         assert torch.get_num_threads() == 1
     assert torch.get_num_threads() == in_new_thread() == 4
+
+
+def test_numpy_has_one_thread_inside_and_what_it_had_outside() -> None:
+    def counts() -> list[int]:
+        return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+
+    before = counts()
+    with threads.one_library_thread():
+        with threads.one_library_thread():
+            pass
+        assert all(count == 1 for count in counts())
+    assert counts() == before
 
 
 def test_threads_that_leave_in_the_order_they_entered_leave_nothing_behind() -> None:

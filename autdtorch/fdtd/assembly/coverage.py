@@ -26,7 +26,7 @@ def distance_to_material(distance: Array, material: Index, inner: Index) -> Arra
 
 def subcell_means(values: Array) -> Array:
     """Return the means (n, 64) of lattice values (n, 125) over the corners of each sub-cell."""
-    return _over_subcells(values)[0]
+    return np.asarray(_over_subcells(values)[0])
 
 
 def volume_coverage(distance: Array) -> Array:
@@ -37,7 +37,7 @@ def volume_coverage(distance: Array) -> Array:
 
 
 def _over_subcells(values: Array) -> Array:
-    """Return means (4, ..., 64) over the corners of each sub-cell: of lattice values (..., 125) and slopes."""
+    """Return means (4, ..., 64) over the corners of sub-cells: of lattice values (..., 125) and slopes."""
     found = [values.reshape(*values.shape[:-1], *(SUBCELLS + 1,) * 3)]
     for axis in (-3, -2, -1):
         ends = [np.moveaxis(each, axis, 0) for each in found]

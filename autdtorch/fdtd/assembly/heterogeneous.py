@@ -119,14 +119,16 @@ def _without_sound_hard(
     least = np.full(len(hard), _SOUND_HARD_COUPLING * stencil.total)
     least[vertices[interface.finite]] = max(_SLIVER_COUPLING / densest, _LEAST_COUPLING) * stencil.total
     hard[touched] = False
+    coupling, mass = _assembled(elements, interface, touched, shape, stencil)
     while True:
-        coupling, mass = _assembled(elements, interface, touched, shape, stencil)
         coupling *= ~(hard[touched, None] | hard[_neighbours(touched, shape)])
         hard[touched] |= inside & (np.abs(coupling).sum(axis=1) <= least[touched])
         if hard.sum() == known or not inside.any():
             return coupling, mass, hard
-        known = hard.sum()
-        interface = condensed(elements.interface, hard[vertices])
+        known, out = hard.sum(), hard[vertices]
+        interface = condensed(elements.interface, out)
+        changed = np.isin(touched, vertices[out.any(axis=1)])
+        coupling[changed], mass[changed] = _assembled(elements, interface, touched[changed], shape, stencil)
 
 
 def condensed(interface: InterfaceElements, out: NDArray[np.bool_]) -> InterfaceElements:

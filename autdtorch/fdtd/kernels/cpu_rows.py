@@ -1,6 +1,7 @@
-"""The 27-point sum around a single cell, four cells of a row at a time.
+"""Operations on four cells of a row at a time, which Numba does not vectorise.
 
-Numba does not vectorise it: heterogeneous cells are scattered, and strict sums keep their order.
+Rows around heterogeneous cells are scattered, and their strict sums keep an order; the ends of rows, with the
+cells of boundary layers, are too short.
 """
 
 from __future__ import annotations
@@ -21,6 +22,10 @@ _WIDTH = 4  # Cells of a row that are read: the three neighbours and one more, w
 _FIRST, _MORE = (*range(0, 24, 3), 23), (*8 * (3,), 0)
 
 
+def _item(context: Any, builder: Any, kind: Any, array: Any, index: Any) -> Any:
+    return cgutils.get_item_pointer(context, builder, kind, array, [index], wraparound=False)  # type: ignore[no-untyped-call]
+
+
 def row_offsets(shape: tuple[int, ...]) -> Index:
     """Return the flat offsets (9,) from a cell to the first cells read of the nine rows around it."""
     first = np.array(flat_offsets(shape)[::3])
@@ -39,7 +44,7 @@ def _sum_of_rows(typing_context: Any, p: Any, cell: Any, offset: Any, weight: An
         arrays = {k: context.make_array(kinds[k])(context, builder, given[k]) for k in (0, 2, 3)}
 
         def pointer(k: int, index: Any) -> Any:
-            return cgutils.get_item_pointer(context, builder, kinds[k], arrays[k], [index], wraparound=False)  # type: ignore[no-untyped-call]
+            return _item(context, builder, kinds[k], arrays[k], index)
 
         def load(k: int, index: Any) -> Any:
             return builder.load(builder.bitcast(pointer(k, index), row.as_pointer()), align=size)
@@ -73,9 +78,7 @@ def _add_four(typing_context: Any, u: Any, at: Any, v: Any, start: Any) -> Any:
 
         def pointer(k: int) -> Any:
             array = context.make_array(signature.args[k])(context, builder, given[k])
-            cell = cgutils.get_item_pointer(
-                context, builder, signature.args[k], array, [given[k + 1]], wraparound=False
-            )
+            cell = _item(context, builder, signature.args[k], array, given[k + 1])
             return builder.bitcast(cell, row)
 
         here, there = pointer(0), pointer(2)

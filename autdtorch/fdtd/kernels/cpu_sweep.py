@@ -5,9 +5,9 @@ pressure gives two planes,
 
     A = face p + edge (T_y + T_z) p + corner T_y T_z p,    B = center p + face (T_y + T_z) p + edge T_y T_z p,
 
-and new_i = B_i + A_(i-1) + A_(i+1) - keep before_i; the last A is added when plane i + 2 reads it. The boundary
-layers across y and z stretch T_y and T_z. `cpu_layers.py` adds what follows from this to A and B, in the cells
-of the layers, and the terms of the layers across x to new_i.
+and new_i = B_i + A_(i-1) + A_(i+1) - keep before_i; the last A is added when plane i + 2 reads it. The
+boundary layers across y and z stretch T_y and T_z. `cpu_layers.py` adds what follows from this to A and B, in
+the cells of the layers, and the terms of the layers across x to new_i.
 
 All arrays are flat with unsigned indices: array views cost numba more than a short row, and possibly negative
 indices a test. Loops run over whole planes, or all rows of a layer, as if they were one row. The values that
