@@ -9,6 +9,7 @@ import torch
 
 import autdtorch as at
 from autdtorch.propagators import SimulatedPropagator
+from autdtorch.propagators.moved_boxes import forget_assemblies
 
 ROOT = Path(__file__).parents[2]
 SCENES = ROOT / "configs" / "scene"
@@ -45,7 +46,8 @@ def with_array(scene: at.Scene, array: at.TransducerArray) -> at.Scene:
 
 
 def uncached(scene: at.Scene, method: str, spacing: float, tolerance: float = 1e-3) -> SimulatedPropagator:
-    """Return a propagator at `spacing` [mm] that reads nothing from disk."""
+    """Return a propagator at `spacing` [mm] that reads nothing from disk and reuses no assembly."""
+    forget_assemblies()
     propagator = at.make_propagator(scene, method, spacing * 1e-3, tolerance=tolerance, cache=False)
     assert isinstance(propagator, SimulatedPropagator)
     return propagator

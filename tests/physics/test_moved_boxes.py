@@ -7,6 +7,7 @@ import torch
 from small_scenes import AIR, relative_error, scene_of_all_kinds
 
 from autdtorch.propagators import make_propagator, moved_boxes
+from autdtorch.propagators.moved_boxes import forget_assemblies
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
 from autdtorch.scene.scene import Scene
@@ -20,7 +21,7 @@ SPHERE = Sphere((40e-3, 50e-3, 50e-3), 4e-3, rigid=True)
 def assembled(monkeypatch):
     """A list with an entry for every box that is assembled; none is kept before."""
     found, assemble_on = [], moved_boxes.assemble_on
-    monkeypatch.setattr(moved_boxes, "_kept", moved_boxes._Kept())
+    forget_assemblies()
     monkeypatch.setattr(moved_boxes, "assemble_on", lambda *given: found.append(0) or assemble_on(*given))
     return found
 
@@ -47,12 +48,12 @@ def test_a_scene_that_moves_as_a_whole_keeps_its_matrix_and_its_assembly(kind, t
     assert len(assembled) == 1
 
 
-def test_a_kept_assembly_changes_no_bit(assembled, monkeypatch):
+def test_a_kept_assembly_changes_no_bit(assembled):
     matrix(SPHERE)
     there = replace(SPHERE, center=by(MOVE, SPHERE.center))
     warm = matrix(there)
     assert len(assembled) == 1
-    monkeypatch.setattr(moved_boxes, "_kept", moved_boxes._Kept())
+    forget_assemblies()
     assert torch.equal(matrix(there), warm)
     assert len(assembled) == 2
 
@@ -71,8 +72,7 @@ def test_other_bodies_have_boxes_of_their_own(other, assembled):
     assert len(assembled) == 2
 
 
-def test_the_memory_of_kept_assemblies_is_limited(assembled, monkeypatch):
-    monkeypatch.setattr(moved_boxes, "_MOST_BYTES", 0)
-    matrix(SPHERE)
-    matrix(SPHERE)
+def test_large_boxes_are_not_kept(assembled, monkeypatch):
+    monkeypatch.setattr(moved_boxes, "_MOST_CELLS", 100)
+    assert torch.equal(matrix(SPHERE), matrix(SPHERE))
     assert len(assembled) == 2

@@ -1,0 +1,84 @@
+"""Run times of what users bring: a hand as a mesh, transducers as discs, a moved obstacle, steel.
+
+Fills in a block of performance.md. The hand has a palm, four fingers and a thumb of ellipsoids, 40,000
+triangles in all. Each matrix has four foci. Each time is the shortest of three, with the kernels compiled.
+
+    python scripts/benchmark.py meshes            about two minutes on 2 idle cores
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import time
+from collections.abc import Iterable
+
+import numpy as np
+import pyvista
+from shared.document import fill_in, measured, table
+
+import autdtorch as at
+from autdtorch.propagators.moved_boxes import forget_assemblies
+
+DOCUMENT = "performance.md"
+
+AIR = at.Medium(1.2, 343.0)
+PLACE = (0.0, 0.0, 0.09)
+FOCI = [(-20e-3, 10e-3, 0.13), (30e-3, 0.0, 0.14), (60e-3, 20e-3, 0.15), (0.0, -70e-3, 0.13)]
+DOMAIN = ((-0.15, -0.15, -0.01), (0.15, 0.15, 0.2))
+FINGERS = ((-32, 45, 7.5), (-11, 58, 8), (10, 55, 8), (31, 42, 7))
+"""Middle across the hand, half the length and radius [mm]."""
+REPEATS = 3
+
+
+def hand() -> at.Mesh:
+    """Return a rigid hand, its parts merged."""
+    palm = pyvista.Icosphere(radius=1.0, nsub=5).scale((50.0, 42.0, 14.0)).translate((-35.0, 0.0, 0.0))
+    finger = pyvista.Icosphere(radius=1.0, nsub=4)
+    parts = [finger.scale((length, r, r)).translate((30.0, y, 0.0)) for y, length, r in FINGERS]
+    thumb = finger.scale((40.0, 9.0, 9.0)).rotate_z(-53.0).translate((-30.0, -45.0, 0.0))
+    return at.Mesh.from_surface(
+        pyvista.merge([palm, *parts, thumb], merge_points=False), 1e-3, PLACE, rigid=True
+    )
+
+
+def seconds(obstacle: at.Obstacle, array: at.TransducerArray, spacing: float, moved: bool = False) -> float:
+    """Return the time of a transfer matrix, from the scene on; a moved obstacle was simulated before."""
+    spent = []
+    for _ in range(REPEATS):
+        if not moved:
+            forget_assemblies()
+        begin = time.perf_counter()
+        scene = at.Scene(array, AIR, 40e3, FOCI, [obstacle], domain=DOMAIN)
+        at.make_propagator(scene, "box", spacing, cache=False).transfer_matrix()
+        spent.append(time.perf_counter() - begin)
+    return min(spent)
+
+
+def rows() -> Iterable[list[str]]:
+    """Measure all cases."""
+    discs = at.TransducerArray.autd3((0.0, 0.0, 0.0))
+    points = at.TransducerArray.autd3((0.0, 0.0, 0.0), radius=None)
+    few = at.TransducerArray.grid((4, 4), 10e-3, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    mesh, rigid = hand(), at.Sphere(PLACE, 8e-3, rigid=True)
+    seconds(rigid, discs, 2e-3)  # loads the kernels
+    moved = dataclasses.replace(mesh, offset=tuple(np.add(PLACE, (5e-3, 0.0, 0.0)).tolist()))
+    steel = at.Sphere(PLACE, 8e-3, density=7800.0, sound_speed=5900.0)
+    for name, *case in (
+        ("hand, AUTD3 of discs, 1 mm", mesh, discs, 1e-3),
+        ("the same, moved by 5 mm", moved, discs, 1e-3, True),
+        ("hand, AUTD3 of points, 1 mm", mesh, points, 1e-3),
+        ("steel sphere, 16 points, 0.5 mm", steel, few, 0.5e-3),
+        ("rigid sphere, 16 points, 0.5 mm", rigid, few, 0.5e-3),
+    ):
+        yield [name, f"{seconds(*case):.2f} s"]
+
+
+def main(given: argparse.Namespace) -> None:
+    """Measure, and write the block."""
+    made = []
+    for row in rows():
+        made.append(row)
+        print(row, flush=True)
+    parts = (measured(), table(["scene", "time"], made))
+    fill_in(DOCUMENT, "benchmark.py meshes", parts, given.output)
