@@ -23,7 +23,7 @@ from autdtorch.propagators.moved_boxes import forget_assemblies
 DOCUMENT = "performance.md"
 
 AIR = at.Medium(1.2, 343.0)
-PLACE = (0.0, 0.0, 0.09)
+UP, PLACE = (0.0, 0.0, 1.0), (0.0, 0.0, 0.09)
 FOCI = [(-20e-3, 10e-3, 0.13), (30e-3, 0.0, 0.14), (60e-3, 20e-3, 0.15), (0.0, -70e-3, 0.13)]
 DOMAIN = ((-0.15, -0.15, -0.01), (0.15, 0.15, 0.2))
 FINGERS = ((-32, 45, 7.5), (-11, 58, 8), (10, 55, 8), (31, 42, 7))
@@ -57,9 +57,9 @@ def seconds(obstacle: at.Obstacle, array: at.TransducerArray, spacing: float, mo
 
 def rows() -> Iterable[list[str]]:
     """Measure all cases."""
-    discs = at.TransducerArray.autd3((0.0, 0.0, 0.0))
-    points = at.TransducerArray.autd3((0.0, 0.0, 0.0), radius=None)
-    few = at.TransducerArray.grid((4, 4), 10e-3, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    discs = at.TransducerArray.autd3((0.0, 0.0, 0.0), UP)
+    points = at.TransducerArray.autd3((0.0, 0.0, 0.0), UP, radius=None)
+    few = at.TransducerArray.grid((4, 4), 10e-3, (0.0, 0.0, 0.0), UP)
     mesh, rigid = hand(), at.Sphere(PLACE, 8e-3, rigid=True)
     seconds(rigid, discs, 2e-3)  # loads the kernels
     moved = dataclasses.replace(mesh, offset=tuple(np.add(PLACE, (5e-3, 0.0, 0.0)).tolist()))

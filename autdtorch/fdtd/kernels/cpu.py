@@ -56,18 +56,18 @@ def _sweep_chunk(c, p, q, medium, layers, cells, room):  # type: ignore[no-untyp
     psi_x, zeta_x, psi_y, zeta_y, psi_z, zeta_z, psi_yz, zeta_yz = layers
     memory = (psi_y, zeta_y), (psi_z, zeta_z), (psi_yz, zeta_yz)
     first, last = np.uint64(cuts[c]), np.uint64(cuts[c + 1])
-    shape, weights, profile = medium[3:6], medium[6:11], medium[11:13]
-    profiles = medium[13:16]
+    shape, weights, profile = medium[4:7], medium[7:12], medium[12:14]
+    profiles = medium[14:17]
     sweep_planes(
         p, q, first, last, shape, weights, (psi_x, zeta_x), profile, memory, profiles, cells, starts, own
     )
 
 
 @njit(**INNER)
-def _finish_chunk(c, q, medium, cells, outermost, sources, row):  # type: ignore[no-untyped-def]
+def _finish_chunk(c, q, medium, cells, outermost, sources, row, sound_hard):  # type: ignore[no-untyped-def]
     """Add the terms of the neighbours to the outermost planes of chunk c; then set its single cells."""
-    cuts, starts, driven_starts = medium[:3]
-    ny, nz = int(medium[4]), int(medium[5])
+    cuts, starts, driven_starts, hard_starts = medium[:4]
+    ny, nz = int(medium[5]), int(medium[6])
     plane = ny * nz
     for end in range(2):
         other = c + 2 * end - 1
@@ -85,6 +85,8 @@ def _finish_chunk(c, q, medium, cells, outermost, sources, row):  # type: ignore
         own, now = force[s], row[s]
         for n in range(driven_starts[c], driven_starts[c + 1]):
             q[driven[n]] += own[n] * now
+    for n in range(hard_starts[c], hard_starts[c + 1]):
+        q[sound_hard[n]] = 0
 
 
 @njit(**INNER)
@@ -130,17 +132,18 @@ def _advance(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Do tasks until none is left; each worker calls this with the same arguments.
 
-    A step has three phases with a task for each chunk: sweep it, finish it, set sound-hard cells to zero. The
-    first phase records the step before.
+    A step has two phases with a task for each chunk, sweep it and finish it, and a third if interfaces pass
+    through the boundary layers. The first phase records the step before.
     """
     chunks, steps, read = len(medium[0]) - 1, len(signal), recorded.shape[1]
-    for _ in range((3 * steps + 1) * chunks):
+    kinds = 3 if len(columns[0][0]) else 2
+    for _ in range((kinds * steps + 1) * chunks):
         task = claim(counters)
         phase, c = task // chunks, task % chunks
-        if phase > 3 * steps:
+        if phase > kinds * steps:
             break
         wait_for(counters, phase * chunks)
-        step, kind = phase // 3, phase % 3
+        step, kind = phase // kinds, phase % kinds
         now, new = (p, q) if step % 2 == 0 else (q, p)
         if kind == 0:
             if step > 0:
@@ -149,10 +152,9 @@ def _advance(  # type: ignore[no-untyped-def]
             if step < steps:
                 _sweep_chunk(c, now, new, medium, layers, cells, room)
         elif kind == 1:
-            _finish_chunk(c, new, medium, cells, room[-1], sources, signal[step])
+            _finish_chunk(c, new, medium, cells, room[-1], sources, signal[step], sound_hard)
         elif c == 0:
-            if len(columns[0][0]):
-                _finish_columns(now, new, columns, memory)
+            _finish_columns(now, new, columns, memory)
             for n in range(len(sound_hard)):
                 new[sound_hard[n]] = 0
         finish(counters)
@@ -224,6 +226,7 @@ class CpuKernel:
             cuts,
             np.searchsorted(c.heterogeneous_index.numpy(), plane * np.arange(shape[0] + 1)),
             np.searchsorted(sources.index.numpy(), plane * cuts),
+            np.searchsorted(c.sound_hard_index.numpy(), plane * cuts),
             *(np.uint64(cells) for cells in shape),
             *(dtype(weight) for weight in (c.center, c.face, c.edge, c.corner, c.keep)),
             c.layer_decay.numpy(),
@@ -240,7 +243,7 @@ class CpuKernel:
             _room(len(cuts) - 1, shape, c.layer_cells, dtype),
             (_columns(c, c.columns), _columns(c, c.crossed), c.crossing.numpy()),
             tuple((psi.numpy(), zeta.numpy()) for psi, zeta in state.memory[4:]),
-            c.sound_hard_index.numpy(),
+            _unsigned(c.sound_hard_index),
             # numba compiles again for arrays with gaps, and crashed when it loaded that from disk
             (_unsigned(sources.index), sources.force.mT.contiguous().numpy()),
             (_unsigned(receivers.index.mT), receivers.weight.mT.contiguous().numpy()),
