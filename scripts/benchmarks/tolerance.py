@@ -25,6 +25,7 @@ from shared.scenes import relative_error, uncached
 
 import autdtorch as at
 from autdtorch import analytic
+from autdtorch.propagators.moved_boxes import forget_assemblies
 
 DOCUMENT = "benchmarks.md"
 
@@ -188,6 +189,7 @@ def on_grids(case: Case) -> tuple[list[Result], torch.Tensor]:
 
 def by_tolerance(case: Case, tolerance: float, reference: torch.Tensor) -> Result:
     """Return the result of a tolerance; its time includes the choice of the spacing."""
+    forget_assemblies()
     begin = time.perf_counter()
     propagator = at.make_propagator(case.scene, spacing=None, tolerance=tolerance, cache=False)
     matrix, claimed = propagator.transfer_matrix(return_error=True)

@@ -25,6 +25,7 @@ from shared.processes import in_new_process
 from shared.scenes import paper_scene
 
 import autdtorch as at
+from autdtorch.propagators.moved_boxes import forget_assemblies
 from autdtorch.utils.triangles import doubled_normals
 
 
@@ -141,6 +142,7 @@ def measure(name: str) -> Cost:
     estimate = at.estimate(built, spacing, method=method, dtype=dtype)
     ctypes.CDLL("libc.so.6").malloc_trim(0)  # memory that is free already does not count
     Path("/proc/self/clear_refs").write_text("5", "ascii")  # resets the peak
+    forget_assemblies()
     before, begin = held("VmRSS"), time.perf_counter()
     propagator = at.make_propagator(built, method, spacing, dtype=dtype, cache=False)
     propagator.transfer_matrix()
