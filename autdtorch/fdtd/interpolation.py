@@ -27,6 +27,7 @@ _REGULARISATION = 1e-5  # Keeps weights small where the fit does not determine t
 _ONE_SIDED_REGULARISATION = 1e-2
 # Distance [cells] along each axis of the cells that are then fitted: larger systems take long
 _ONE_SIDED_REACH = 3
+_ABSCISSA, _QUADRATURE = np.polynomial.legendre.leggauss(24)  # of wavenumbers up to the drive's
 
 
 @dataclass(frozen=True)
@@ -45,8 +46,7 @@ class Interpolation:
 
 def axis_weights(offset: Array, nodes: Array, kappa: float) -> Array:
     """Return weights (P, n) of samples at `nodes` (P, n) for values at `offset` (P,), in cells."""
-    abscissa, quadrature = np.polynomial.legendre.leggauss(24)
-    wavenumber, scale = kappa * (abscissa + 1) / 2, np.sqrt(quadrature / 2)
+    wavenumber, scale = kappa * (_ABSCISSA + 1) / 2, np.sqrt(_QUADRATURE / 2)
     phase = wavenumber[:, None] * (nodes - offset[:, None])[:, None, :]
     system = np.concatenate((scale[:, None] * np.cos(phase), scale[:, None] * np.sin(phase)), axis=1)
     target = np.concatenate((scale, np.zeros_like(scale)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -93,6 +94,11 @@ def rotation_matrix(rotation: Vector) -> torch.Tensor:
 
     R = Rz(c) Ry(b) Rx(a), for column vectors (extrinsic Euler angles); (0, 0, pi/2) turns x into y.
     """
+    return _rotation_matrix(tuple(rotation)).clone()
+
+
+@functools.lru_cache(64)
+def _rotation_matrix(rotation: Vector) -> torch.Tensor:
     matrix = torch.eye(3, dtype=torch.float64, device="cpu")
     for axis, angle in enumerate(rotation):
         first, second = (axis + 1) % 3, (axis + 2) % 3
