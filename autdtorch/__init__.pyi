@@ -9,7 +9,6 @@ from .methods.base import Method, Problem, State
 from .methods.bayes.bayes import BayesOpt, bayes_opt
 from .methods.bayes.focus_problem import FocusProblem
 from .methods.bayes.kernels import PhasorKernel
-from .methods.bound import focus_bound
 from .methods.driver import run
 from .methods.gabs import GABS, gabs
 from .methods.gradient import GradientAscent, gradient_ascent
@@ -19,6 +18,8 @@ from .methods.prior import Prior
 from .methods.random_search import RandomSearch, random_search
 from .methods.solution import Solution
 from .methods.state_file import load_state, save_state
+from .objectives.bound import focus_bound
+from .objectives.goals import Goal, MeanPressure, QuietPoints, TargetPressures, WeakestFocus
 from .objectives.metrics import FocusMetrics, focus_metrics
 from .objectives.objective import Objective, weakest_focus
 from .objectives.perturbations import Drift, FailedTransducers, Noise, Quantised, true_pressure
@@ -52,8 +53,10 @@ __all__ = [
     "FailedTransducers",
     "FocusMetrics",
     "FocusProblem",
+    "Goal",
     "GradientAscent",
     "Identify",
+    "MeanPressure",
     "Medium",
     "Mesh",
     "Method",
@@ -67,6 +70,7 @@ __all__ = [
     "Prior",
     "Problem",
     "Quantised",
+    "QuietPoints",
     "RandomSearch",
     "ScaleWarning",
     "Scene",
@@ -76,8 +80,10 @@ __all__ = [
     "State",
     "SteadyStateWarning",
     "Sweep",
+    "TargetPressures",
     "TransducerArray",
     "VoxelMask",
+    "WeakestFocus",
     "amplitudes_of",
     "analytic",
     "animate3d",

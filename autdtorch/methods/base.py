@@ -12,12 +12,12 @@ import numpy as np
 import torch
 
 from autdtorch.methods.solution import Solution
+from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal, goal_of
 from autdtorch.objectives.objective import (
     Objective,
     Score,
     require_objective,
     validate_matrix,
-    weakest_focus,
 )
 from autdtorch.objectives.perturbations import quantised, simulated_matrix
 from autdtorch.scene.scene import Scene
@@ -51,7 +51,8 @@ class Problem:
     Attributes:
         transducers: number M of entries of a drive.
         foci: number P of control points.
-        goal: function of pressures (..., P) [Pa] that gives the scores (...) to maximise.
+        goal: such as `WeakestFocus`, or a function of pressures (..., P) [Pa] that gives the scores (...) to
+            maximise.
         scene: geometry, for methods that start from free-space phases (`LSS`, `LSSG`).
         transfer_matrix: simulated G (P, M) [Pa], for `GradientAscent` and as a `Prior` of what is measured.
         quantise: function of drives (..., M) that gives the drives which the device plays.
@@ -59,7 +60,7 @@ class Problem:
 
     transducers: int
     foci: int
-    goal: Score = weakest_focus
+    goal: Score = WEAKEST_FOCUS
     scene: Scene | None = None
     transfer_matrix: torch.Tensor | None = None
     quantise: Callable[[torch.Tensor], torch.Tensor] = field(default=lambda drive: drive)
@@ -69,6 +70,9 @@ class Problem:
         for name in ("transducers", "foci"):
             object.__setattr__(self, name, integer_at_least(name, getattr(self, name), 1))
         require_callable("goal", self.goal)
+        object.__setattr__(self, "goal", goal_of(self.goal))
+        if isinstance(self.goal, Goal):
+            self.goal.check(self.foci)
         require_callable("quantise", self.quantise)
         if self.scene is not None:
             require_kind("scene", self.scene, Scene)
@@ -77,7 +81,7 @@ class Problem:
             object.__setattr__(self, "transfer_matrix", matrix)
 
     @classmethod
-    def of(cls, objective: Objective, goal: Score = weakest_focus) -> Problem:
+    def of(cls, objective: Objective, goal: Score = WEAKEST_FOCUS) -> Problem:
         """Return the problem that an objective poses, with the transfer matrix that it has inside, if any."""
         require_objective(objective)
         scene, matrix = objective.scene, simulated_matrix(objective)

@@ -10,7 +10,8 @@ import torch
 from autdtorch.methods.base import Method, Problem, State, Trials, trial_seeds
 from autdtorch.methods.solution import Solution
 from autdtorch.methods.state_file import load_state, save_state
-from autdtorch.objectives.objective import Objective, Score, weakest_focus
+from autdtorch.objectives.goals import WEAKEST_FOCUS
+from autdtorch.objectives.objective import Objective, Score
 from autdtorch.utils.progress import show_progress
 from autdtorch.utils.validation import invalid, path_of, require_callable, require_kind
 
@@ -21,7 +22,7 @@ def run(
     trials: Trials = 1,
     seed: int = 0,
     *,
-    score: Score = weakest_focus,
+    score: Score = WEAKEST_FOCUS,
     stop: Callable[[State], bool] | None = None,
     state_file: str | Path | None = None,
 ) -> Solution:

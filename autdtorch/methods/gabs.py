@@ -12,7 +12,8 @@ from autdtorch.methods import coordinates
 from autdtorch.methods.base import NEAR_TIE, Method, Problem, State, Step, Trials, generators_of
 from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.objective import Objective, Score, weakest_focus
+from autdtorch.objectives.goals import WEAKEST_FOCUS
+from autdtorch.objectives.objective import Objective, Score
 from autdtorch.utils.validation import integer_at_least, invalid
 
 
@@ -112,7 +113,7 @@ def gabs(
     passes: int = 1,
     trials: Trials = 1,
     seed: int = 0,
-    score: Score = weakest_focus,
+    score: Score = WEAKEST_FOCUS,
 ) -> Solution:
     """Run `GABS` with these settings on an objective; see `GABS` and `run`."""
     return run(GABS(levels, order, first, passes), objective, trials, seed, score=score)

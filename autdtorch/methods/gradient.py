@@ -1,4 +1,4 @@
-"""Gradient ascent on the weakest focus, by a known transfer matrix.
+"""Gradient ascent on a goal, by a known transfer matrix.
 
 No method that sees magnitudes only can do this on a real array. It is a baseline to compare them with.
 """
@@ -15,12 +15,12 @@ import torch
 from autdtorch.methods.base import Method, Problem, Step, Trials, generators_of
 from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.objective import Objective, weakest_focus
+from autdtorch.objectives.goals import WEAKEST_FOCUS, slope_of
+from autdtorch.objectives.objective import Objective, Score
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import integer_at_least, invalid
 
-# First and last value, in equal ratios between: temperature of the smooth minimum, in mean pressures of the
-# foci, and step, in largest amplitudes.
+# First and last value, in equal ratios between: temperature of `Goal.slope`, and step in amplitudes
 _TEMPERATURE = (0.3, 1e-4)
 _STEP = (0.5, 0.005)
 _MOMENTUM = 0.9
@@ -29,7 +29,7 @@ _TINY = 1e-300
 
 @dataclass(frozen=True)
 class GradientAscent(Method):
-    """Climb the weakest focus over all drives of amplitudes <= 1, by the transfer matrix of the problem.
+    """Climb the goal over all drives of amplitudes <= 1, by the transfer matrix of the problem.
 
     A trial climbs from `starts` drives of random phases and observes the highest: one evaluation. With 16
     transducers that is nearly always the global maximum, to 1e-4; a few hundred need more `steps`.
@@ -64,15 +64,20 @@ class GradientAscent(Method):
             accepted = 'must have a transfer matrix, as SimulatedObjective has in mode "transfer"'
             raise invalid("objective", None, accepted)
         starts = [random_drives(self.starts, problem.transducers, own) for own in generators_of(seeds)]
-        highest = [climb(matrix, start, self.steps) for start in starts]
+        highest = [climb(problem.goal, matrix, start, self.steps) for start in starts]
         return Step(torch.stack(highest)[:, None], {})
 
 
 def gradient_ascent(
-    objective: Objective, starts: int = 32, steps: int = 300, trials: Trials = 1, seed: int = 0
+    objective: Objective,
+    starts: int = 32,
+    steps: int = 300,
+    trials: Trials = 1,
+    seed: int = 0,
+    score: Score = WEAKEST_FOCUS,
 ) -> Solution:
     """Run `GradientAscent` with these settings on an objective with a transfer matrix; see `run`."""
-    return run(GradientAscent(starts, steps), objective, trials, seed)
+    return run(GradientAscent(starts, steps), objective, trials, seed, score=score)
 
 
 def random_drives(count: int, transducers: int, generator: torch.Generator) -> torch.Tensor:
@@ -82,26 +87,24 @@ def random_drives(count: int, transducers: int, generator: torch.Generator) -> t
 
 
 @one_library_thread()
-def climb(matrix: torch.Tensor, drive: torch.Tensor, steps: int) -> torch.Tensor:
-    """Return the highest drive (M,) of the climbs from drives (S, M), on one matrix (P, M)."""
-    drive = climbed(matrix, drive, steps)
-    return drive[weakest_focus(_pressure(matrix, drive).abs()).argmax()]
+def climb(goal: Score, matrix: torch.Tensor, drive: torch.Tensor, steps: int) -> torch.Tensor:
+    """Return the highest drive (M,) of the climbs of a goal from drives (S, M), on one matrix (P, M)."""
+    drive = climbed(goal, matrix, drive, steps)
+    return drive[goal(_pressure(matrix, drive).abs()).argmax()]
 
 
 @one_library_thread()
-def climbed(matrix: torch.Tensor, drive: torch.Tensor, steps: int) -> torch.Tensor:
-    """Return drives (S, M) after projected gradient ascents with momentum from drives (S, M).
+def climbed(goal: Score, matrix: torch.Tensor, drive: torch.Tensor, steps: int) -> torch.Tensor:
+    """Return drives (S, M) after projected gradient ascents of a goal with momentum from drives (S, M).
 
-    Each ascent maximises a smooth minimum over the foci, -T log sum_p exp(-|p_p| / T), of one matrix (P, M)
-    or of its own (S, P, M). The temperature T falls until it is the minimum.
+    Each ascent is on one matrix (P, M) or on its own (S, P, M). The goal is smoothed over a temperature,
+    which falls.
     """
     velocity = torch.zeros_like(drive)
     for progress in torch.linspace(0, 1, steps, dtype=torch.float64, device="cpu").tolist():
         temperature, step = (first * (last / first) ** progress for first, last in (_TEMPERATURE, _STEP))
         pressure = _pressure(matrix, drive)
-        magnitude = pressure.abs()
-        hardness = 1 / (temperature * magnitude.mean(dim=-1, keepdim=True)).clamp_min(_TINY)
-        weights = torch.softmax(-magnitude * hardness, dim=-1)
+        weights = slope_of(goal, pressure.abs(), temperature)
         slope = ((weights * pressure.sgn())[..., None] * matrix.conj()).sum(dim=-2)
         slope = slope / slope.abs().mean(dim=-1, keepdim=True).clamp_min(_TINY)
         velocity = _MOMENTUM * velocity + (1 - _MOMENTUM) * slope

@@ -18,7 +18,8 @@ from autdtorch.methods.gradient import climb, climbed, random_drives
 from autdtorch.methods.matrix_posterior import MatrixPosterior, kept, posteriors
 from autdtorch.methods.prior import Prior, best_simulated_drives, matrix_prior, prior_mean, prior_of
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.objective import Objective, weakest_focus
+from autdtorch.objectives.goals import WEAKEST_FOCUS
+from autdtorch.objectives.objective import Objective, Score
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import integer_at_least, invalid
 
@@ -32,7 +33,7 @@ _GROWTH = 24  # a round observes one drive for so many that were observed
 
 @dataclass(frozen=True)
 class Identify(Method):
-    """Fit the transfer matrix to observed magnitudes, and maximise the weakest focus on the matrix.
+    """Fit the transfer matrix to observed magnitudes, and maximise the goal on the matrix.
 
     Without a prior, the first max(3 M - 2, evaluations / 2) drives, or all but the last, have random phases.
     With one, the first is the best drive of the simulation. Each of the others is the best drive of a sample
@@ -106,13 +107,15 @@ class Identify(Method):
         prior = None if self.prior is None else matrix_prior(self.prior, state.problem)
         fits = posteriors(prior, search, drives, observed, generators)
         apart = [own.clone() for own in drives]  # their products must not round by the place in memory
-        best = torch.stack([_highest(*of) for of in zip(fits, apart, generators, strict=True)])
+        goal = state.problem.goal
+        best = torch.stack([_highest(goal, *of) for of in zip(fits, apart, generators, strict=True)])
         search |= {"drives": drives, "observed": observed, **kept(fits)}
         left = self.most_evaluations(state.problem) - drives.shape[1] - 1
         if left == 0:
             return Step(best[:, None], {**search, "last": best})
         count = min(left, max(1, drives.shape[1] // _GROWTH))
-        chosen = torch.stack([_sampled(*of, count) for of in zip(fits, apart, best, generators, strict=True)])
+        each = zip(fits, apart, best, generators, strict=True)
+        chosen = torch.stack([_sampled(goal, *of, count) for of in each])
         return Step(state.problem.quantise(chosen), {**search, "generators": states_of(generators)})
 
     def best(self, state: State) -> Solution:
@@ -131,21 +134,29 @@ def identify(
     seed: int = 0,
     *,
     prior: Prior | None = None,
+    score: Score = WEAKEST_FOCUS,
 ) -> Solution:
     """Run `Identify` with these settings on an objective; see `Identify` and `run`."""
-    return run(Identify(evaluations, prior), objective, trials, seed)
+    return run(Identify(evaluations, prior), objective, trials, seed, score=score)
 
 
-def _highest(fit: MatrixPosterior, drives: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+def _highest(
+    goal: Score, fit: MatrixPosterior, drives: torch.Tensor, generator: torch.Generator
+) -> torch.Tensor:
     """Return the best drive (M,) of a fitted matrix, which was fitted to drives (N, M)."""
-    seen = drives[weakest_focus((drives @ fit.matrix.T).abs()).argmax()]
+    seen = drives[goal((drives @ fit.matrix.T).abs()).argmax()]
     starts = random_drives(_STARTS, len(seen), generator)
-    return climb(fit.matrix, torch.cat([seen[None], starts]), _CLIMB_STEPS)
+    return climb(goal, fit.matrix, torch.cat([seen[None], starts]), _CLIMB_STEPS)
 
 
 def _sampled(
-    fit: MatrixPosterior, drives: torch.Tensor, best: torch.Tensor, generator: torch.Generator, count: int
+    goal: Score,
+    fit: MatrixPosterior,
+    drives: torch.Tensor,
+    best: torch.Tensor,
+    generator: torch.Generator,
+    count: int,
 ) -> torch.Tensor:
     """Return the best drives (count, M) of samples of the matrix, near the best of the fitted one."""
     samples = torch.stack([fit.sample(drives, generator) for _ in range(count)])
-    return climbed(samples, best.expand(count, -1), _SAMPLE_STEPS)
+    return climbed(goal, samples, best.expand(count, -1), _SAMPLE_STEPS)

@@ -12,7 +12,8 @@ from autdtorch.methods import coordinates
 from autdtorch.methods.base import Method, Problem, State, Step
 from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.objective import Objective, Score, weakest_focus
+from autdtorch.objectives.goals import WEAKEST_FOCUS
+from autdtorch.objectives.objective import Objective, Score
 from autdtorch.scene.drive import drive_from_phases, focus_phases, normalise
 from autdtorch.utils.validation import integer_at_least, invalid
 
@@ -93,7 +94,7 @@ class LSSG(Method):
         return Step(normalise(weights @ search["foci"]), search, goes_on)
 
 
-def lss(objective: Objective, score: Score = weakest_focus) -> Solution:
+def lss(objective: Objective, score: Score = WEAKEST_FOCUS) -> Solution:
     """Run `LSS` on an objective, with a `score` to report; see `run`."""
     return run(LSS(), objective, score=score)
 
@@ -103,7 +104,7 @@ def lssg(
     levels: int = 16,
     order: Literal["given"] | Sequence[int] = "given",
     passes: int = 1,
-    score: Score = weakest_focus,
+    score: Score = WEAKEST_FOCUS,
 ) -> Solution:
     """Run `LSSG` with these settings on an objective: one trial; see `LSSG` and `run`."""
     return run(LSSG(levels, order, passes), objective, score=score)

@@ -110,4 +110,4 @@ def best_simulated_drives(
     """Return drives (T, M) that focus best in the simulation, one for each generator of random starts."""
     matrix = prior_mean(prior, problem)
     starts = [random_drives(_STARTS, problem.transducers, own) for own in generators]
-    return torch.stack([climb(matrix, start, _CLIMB_STEPS) for start in starts])
+    return torch.stack([climb(problem.goal, matrix, start, _CLIMB_STEPS) for start in starts])

@@ -12,7 +12,8 @@ import torch
 from autdtorch.methods.base import Method, Problem, State, Step, Trials, generators_of, restored, states_of
 from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.objective import Objective, Score, weakest_focus
+from autdtorch.objectives.goals import WEAKEST_FOCUS
+from autdtorch.objectives.objective import Objective, Score
 from autdtorch.utils.validation import integer_at_least
 
 _AT_ONCE = 64  # evaluations of a trial in one step, which bounds the memory of a step
@@ -70,7 +71,7 @@ def random_search(
     levels: int | None = None,
     trials: Trials = 1,
     seed: int = 0,
-    score: Score = weakest_focus,
+    score: Score = WEAKEST_FOCUS,
 ) -> Solution:
     """Run `RandomSearch` with these settings on an objective; see `RandomSearch` and `run`."""
     return run(RandomSearch(evaluations, levels), objective, trials, seed, score=score)

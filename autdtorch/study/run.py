@@ -14,9 +14,9 @@ from typing import Any, TypeAlias
 import torch
 
 from autdtorch.methods.base import TRIAL_BYTES, Method, Problem, Trials
-from autdtorch.methods.bound import focus_bound
 from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
+from autdtorch.objectives.bound import focus_bound
 from autdtorch.objectives.metrics import focus_metrics
 from autdtorch.objectives.objective import Objective
 from autdtorch.objectives.simulated import SimulatedObjective

@@ -6,9 +6,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from autdtorch.methods.bound import focus_bound
 from autdtorch.methods.gabs import gabs
 from autdtorch.methods.gradient import gradient_ascent, random_drives
+from autdtorch.objectives.bound import focus_bound
 
 
 @settings(max_examples=40)

@@ -5,10 +5,10 @@ import pytest
 import scipy.optimize
 import torch
 
-from autdtorch.methods.bound import focus_bound
 from autdtorch.methods.gradient import gradient_ascent, random_drives
 from autdtorch.methods.identify import identify
 from autdtorch.methods.phase_retrieval import _fit
+from autdtorch.objectives.bound import focus_bound
 from autdtorch.objectives.perturbations import Noise, Quantised
 
 

@@ -14,9 +14,9 @@ import torch
 from small_scenes import AIR, CUBE, small_scene
 
 import autdtorch.study.report.study_report
-from autdtorch.methods.bound import focus_bound
 from autdtorch.methods.gabs import gabs
 from autdtorch.methods.lssg import lssg
+from autdtorch.objectives.bound import focus_bound
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.scene import Scene
 from autdtorch.study.report.study_report import HTML_FILE, write_report

@@ -11,7 +11,8 @@ from botorch.utils.safe_math import fatmin, log_fatplus, logmeanexp
 
 from autdtorch.methods.bayes.climb import Effort, candidates, highest
 from autdtorch.methods.bayes.processes import Processes
-from autdtorch.objectives.objective import Score, weakest_focus
+from autdtorch.objectives.goals import WeakestFocus
+from autdtorch.objectives.objective import Score
 from autdtorch.utils.validation import invalid
 
 _SCORE_EFFORT = Effort(candidates=128, starts=2, steps=20)
@@ -110,8 +111,8 @@ class FocusAcquisition:
         """Return the goal (T, ...) of intensities (T, ..., P), in units of pressure."""
         unit = self._unit.reshape(-1, *(1,) * (intensity.ndim - 1))
         pressure = (intensity / unit.square()).clamp_min(_LEAST_INTENSITY).sqrt()
-        if self._goal is weakest_focus:
-            minimum: torch.Tensor = fatmin(pressure, dim=-1, tau=_SMOOTH_MINIMUM)
+        if isinstance(self._goal, WeakestFocus):
+            minimum: torch.Tensor = fatmin(self._goal.levels(pressure), dim=-1, tau=_SMOOTH_MINIMUM)
             return minimum
         score = self._goal(unit * pressure) / unit[..., 0]
         if intensity.requires_grad and not score.requires_grad:

@@ -16,7 +16,8 @@ from autdtorch.methods.gradient import climbed
 from autdtorch.methods.matrix_posterior import kept, posteriors
 from autdtorch.methods.prior import Prior, best_simulated_drives, matrix_prior, prior_mean, prior_of
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.objective import Objective, Score, weakest_focus
+from autdtorch.objectives.goals import WEAKEST_FOCUS
+from autdtorch.objectives.objective import Objective, Score
 from autdtorch.scene.drive import drive_from_phases, phases_of
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import integer_at_least, invalid, number_between, require_one_of
@@ -239,8 +240,8 @@ class BayesOpt(Method):
         rows = mean if observed.shape[1] >= self.evaluations - 1 else sampled
         share = (2 * search["variance"] / power).clamp_max(0.5)
         fit = Fit(torch.ones_like(share), share / (1 - share))
-        seen = weakest_focus((drives @ rows.mT).abs()).argmax(dim=1)
-        best = climbed(rows, drives[torch.arange(len(seen), device="cpu"), seen], _SAMPLE_STEPS)
+        seen = problem.goal((drives @ rows.mT).abs()).argmax(dim=1)
+        best = climbed(problem.goal, rows, drives[torch.arange(len(seen), device="cpu"), seen], _SAMPLE_STEPS)
         return fit, Rows(rows[..., self._others(problem.transducers)], spread, self._points(best))
 
     def _acquisition(
@@ -262,7 +263,7 @@ def bayes_opt(
     trials: Trials = 1,
     seed: int = 0,
     fixed_transducer: int = 6,
-    score: Score = weakest_focus,
+    score: Score = WEAKEST_FOCUS,
     *,
     model: Literal["weakest", "foci"] = "weakest",
     kernel: Literal["phases", "circle", "phasor"] = "phases",

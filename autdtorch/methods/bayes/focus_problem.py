@@ -6,12 +6,12 @@ import torch
 from botorch.test_functions.base import BaseTestProblem
 
 from autdtorch.methods.bayes.bayes import drives_at, require_transducer
+from autdtorch.objectives.goals import WEAKEST_FOCUS
 from autdtorch.objectives.objective import (
     Objective,
     Score,
     observe_drives,
     require_objective,
-    weakest_focus,
 )
 from autdtorch.utils.validation import boolean, integer_at_least, not_negative, real_tensor, require_callable
 
@@ -30,7 +30,7 @@ class FocusProblem(BaseTestProblem):
         self,
         objective: Objective,
         fixed_transducer: int = 0,
-        score: Score = weakest_focus,
+        score: Score = WEAKEST_FOCUS,
         noise_std: float | None = None,
         negate: bool = False,
     ) -> None:

@@ -1,0 +1,158 @@
+"""Goals: scores by their definition, slopes by finite differences, and bounds that no drive exceeds."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from autdtorch.methods.base import Problem
+from autdtorch.methods.gabs import gabs
+from autdtorch.methods.gradient import climb, random_drives
+from autdtorch.methods.identify import identify
+from autdtorch.objectives.goals import (
+    Goal,
+    MeanPressure,
+    QuietPoints,
+    TargetPressures,
+    WeakestFocus,
+    derivative,
+    goal_of,
+)
+from autdtorch.objectives.objective import weakest_focus
+
+PRESSURE = torch.tensor([[4.0, 2.0, 0.3, 1.0], [1.0, 8.0, 0.1, 4.0]], dtype=torch.float64)
+DB30 = 10 ** (-30 / 20)
+
+
+def goals_for(points: int, unit: float) -> list[Goal]:
+    weights = [1.0 + (point % 3) for point in range(points)]
+    return [
+        WeakestFocus(),
+        WeakestFocus(weights),
+        MeanPressure(),
+        TargetPressures([unit * weight for weight in weights]),
+        QuietPoints(WeakestFocus(), [points - 1], 0.1),
+        QuietPoints(WeakestFocus(weights[1:]), [0], DB30),
+        QuietPoints(MeanPressure(), [0], 0.3),
+        QuietPoints(TargetPressures([unit] * (points - 1)), [1], 0.1),
+    ]
+
+
+def test_scores_are_those_of_the_definitions():
+    # one by one: the least over its weight, the mean, and the rms of the relative deviations
+    for goal, scores in (
+        (WeakestFocus(), [0.3, 0.1]),
+        (WeakestFocus([8, 1, 0.3, 1]), [0.5, 0.125]),
+        (MeanPressure(), [1.825, 3.275]),
+        (TargetPressures([4, 2, 0.3, 2]), [-0.25, -math.sqrt((0.75**2 + 3**2 + (2 / 3) ** 2 + 1) / 4)]),
+        (QuietPoints(WeakestFocus(), [2], 0.3), [1.0, 1.0]),  # 0.3 and 0.1 of the weakest other
+        (QuietPoints(WeakestFocus(), [2], 0.15), [1 - 2 * math.log(2), 1.0]),
+        (QuietPoints(MeanPressure(), [0, 2], 4), [1.5, 6.0]),
+    ):
+        assert goal(PRESSURE).tolist() == pytest.approx(scores, rel=1e-12)
+        assert goal(PRESSURE[0]).shape == ()
+
+
+@settings(max_examples=30)
+@given(points=st.integers(2, 6), transducers=st.integers(2, 24), seed=st.integers(0, 1000))
+def test_no_drive_scores_above_the_bound(random_matrix, points, transducers, seed):
+    matrix, generator = random_matrix(points, transducers, seed), torch.Generator().manual_seed(seed)
+    drives = random_drives(50, transducers, generator)
+    for goal in goals_for(points, unit=float(matrix.abs().sum(dim=1).mean()) / 3):
+        best = torch.cat([drives, climb(goal, matrix, drives[:4], 60)[None], torch.zeros_like(drives[:1])])
+        assert goal((best @ matrix.T).abs()).max() <= goal.bound(matrix) + 1e-12
+
+
+def test_gradient_ascent_comes_near_the_bounds(random_matrix):
+    # median gaps of 1.3 to 5.7 % were measured: 16 transducers cannot always reach the relaxation
+    gaps = []
+    for seed in range(5):
+        matrix, generator = random_matrix(4, 16, seed), torch.Generator().manual_seed(seed)
+        for goal in (WeakestFocus([1, 2, 1, 1]), QuietPoints(WeakestFocus(), [3], DB30)):
+            drive = climb(goal, matrix, random_drives(16, 16, generator), 300)
+            gaps.append(1 - float(goal((matrix @ drive).abs())) / goal.bound(matrix))
+    assert sorted(gaps)[len(gaps) // 2] < 0.08
+
+
+def test_bounds_are_met_where_the_best_drive_is_known():
+    # orthogonal rows of unit entries: the drive of one focus leaves all others at 0
+    turns = torch.outer(torch.arange(8), torch.arange(8)).double()
+    matrix = torch.polar(torch.ones(8, 8).double(), 2 * math.pi * turns / 8)
+    assert QuietPoints(WeakestFocus(), range(1, 8), 1e-3).bound(matrix) == pytest.approx(8, rel=1e-5)
+    assert MeanPressure().bound(matrix) == pytest.approx(math.sqrt(8), rel=1e-5)
+    assert TargetPressures([8]).bound(matrix[:1]) == pytest.approx(0, abs=1e-9)
+    assert TargetPressures([16]).bound(matrix[:1]) == pytest.approx(-0.5, rel=1e-5)
+
+
+def test_a_quiet_point_like_its_focus_costs_all_that_the_penalty_leaves():
+    matrix = torch.polar(torch.ones(1, 5).double(), torch.arange(5).double()[None]).expand(2, -1)
+    # |p| is alike at both: the excess is 1 / ratio, and the best drive takes the penalty
+    for ratio in (0.8, 0.65):
+        expected = 5 * (1 + 2 * math.log(ratio))
+        bound = QuietPoints(WeakestFocus(), [1], ratio).bound(matrix)
+        # the search ends after eight relaxations; 0.15 is left at 0.65
+        assert expected <= bound < expected + 0.25
+
+
+@pytest.mark.parametrize("number", range(8))
+def test_slopes_are_derivatives(number):
+    goal = goals_for(4, unit=2.0)[number]
+    pressure = torch.tensor([1.3, 1.9, 2.4, 3.1], dtype=torch.float64)
+    exact = derivative(goal, pressure)
+    found = goal.slope(pressure, 1e-4)
+    if isinstance(goal, QuietPoints):  # a quadratic penalty in place of the loudest point: its sign alone
+        assert (torch.sign(found[list(goal.points)]) == torch.sign(exact[list(goal.points)])).all()
+        return
+    cosine = torch.nn.functional.cosine_similarity(found, exact, dim=0)
+    assert cosine == pytest.approx(1, abs=1e-6)
+
+
+def test_the_function_of_the_paper_is_its_goal():
+    assert goal_of(weakest_focus) == WeakestFocus()
+    assert Problem(4, 2, weakest_focus).goal == WeakestFocus()
+    assert goal_of(torch.Tensor.sum) is torch.Tensor.sum
+
+
+@pytest.mark.parametrize("method", [gabs, identify], ids=["gabs", "identify"])
+def test_methods_that_see_magnitudes_reach_targets(make_objective, random_matrix, method):
+    objective = make_objective(random_matrix(3, 12, 0))
+    goal = TargetPressures([1.0, 2.0, 1.5])  # far below what 12 transducers of about 1 Pa reach
+    solution = method(objective, score=goal)
+    assert goal.bound(objective.transfer_matrix) == 0
+    # identify fits the matrix; 16 phases of amplitude 1 leave GABS several per cent
+    assert (solution.pressure / torch.tensor(goal.targets) - 1).abs().max() < (
+        0.02 if method is identify else 0.2
+    )
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: WeakestFocus([1, 0]), "weights: .*; must be numbers > 0"),
+        (lambda: TargetPressures([]), "targets: .*; must be numbers > 0"),
+        (lambda: TargetPressures([[1.0]]), "targets: .*; must be numbers > 0"),
+        (lambda: QuietPoints(weakest_focus, [1], 0.1), "goal: .*Goal"),
+        (lambda: QuietPoints(WeakestFocus(), [], 0.1), "points: .*; must be indices of control points"),
+        (lambda: QuietPoints(WeakestFocus(), [1, 1], 0.1), "points: .*; must be indices of control points"),
+        (lambda: QuietPoints(WeakestFocus(), [1], 0), "ratio: 0; must be finite and > 0"),
+        (lambda: Problem(4, 2, WeakestFocus([1, 2, 3])), "weights: .*; must be 2 numbers"),
+        (
+            lambda: Problem(4, 2, QuietPoints(WeakestFocus(), [2], 0.1)),
+            "points: .*; must be indices from 0 to 1",
+        ),
+        (lambda: Problem(4, 2, QuietPoints(WeakestFocus(), [0, 1], 0.1)), "points: .*, and not all of them"),
+        (
+            lambda: Problem(4, 3, QuietPoints(TargetPressures([1]), [0], 0.1)),
+            "targets: .*; must be 2 numbers",
+        ),
+        (
+            lambda: TargetPressures([1.0]).bound(torch.ones(2, 3, dtype=torch.complex128)),
+            "targets: .*; must be 2",
+        ),
+    ],
+)
+def test_bad_goals_are_named(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
