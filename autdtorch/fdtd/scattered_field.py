@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from scipy.sparse import csr_array, vstack
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from autdtorch.fdtd.interpolation import Interpolation
@@ -22,12 +22,12 @@ from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.utils.apertures import Apertures, Discs
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.threads import spread
 
 # Distance [cells] from the rim of the interior within which points are not read from the grid. Interpolation
 # is poor there, and the Huygens surface, two cells from the rim, is farther than half a cell from such a
 # point.
 _BESIDE = 1.25
+_TOGETHER = 16  # Targets whose waves are computed at once
 _NEAREST = 0.5  # Distance [cells] from a source at which the singular incident field is cut off
 
 
@@ -172,29 +172,36 @@ class NearToFar:
 
     def readings(self, every: int) -> Readings:
         """Return the readings of each `every`-th target."""
-        chosen = range(0, len(self.far), every)
-        place = torch.cumsum((~self.far).long(), 0) - 1  # among those that are not far
-        rows = spread(lambda one: self._row(one, None if self.far[one] else int(place[one])), chosen)
-        received, inner = zip(*rows, strict=True)
-        return Readings(self.outward, torch.cat(received, dim=1), vstack(inner, format="csr"))
-
-    def _row(self, target: int, near: int | None) -> tuple[Tensor, csr_array]:
-        """Return waves from the Huygens surface (n, 1) to a target, and weights of cells (1, k).
-
-        The target is a far disc or the number `near` of the others.
-        """
-        positions, weights = self.box.surface[0], self.targets.weights.to(torch.complex128)
-        if near is None:
-            disc = self.targets.chosen(slice(target, target + 1)).discs
-            received = self.box.waves(positions, disc, weights.sum()[None, None])
-            return received, csr_array((1, len(self.cells)))
-        within = self.within[near]
-        first = int(self.within[:near].sum())
-        outside = self.targets.positions[target][~within]
+        chosen, weights = torch.arange(0, len(self.far), every, device="cpu"), self.targets.weights
+        far = self.far[chosen]
+        near = (torch.cumsum(~self.far, 0) - 1)[chosen[~far]]  # their numbers among all that are not far
+        within, some = self.within[near], self.targets.chosen(chosen[~far])
+        received = torch.zeros((len(self.box.surface[0]), len(far)), dtype=torch.complex128, device="cpu")
         # reciprocity of Green's function
-        received = self.box.waves(positions, outside, weights[~within, None])
-        inner = self.inward[first : first + int(within.sum())]
-        return received, csr_array(self.targets.weights[within].numpy()[None] @ inner)
+        received[:, ~far] = self._received(some, weights * ~within)
+        received[:, far] = self._received(
+            self.targets.chosen(chosen[far]), weights.sum().expand(int(far.sum()), 1)
+        )
+        read = torch.zeros_like(self.within)
+        read[near] = within
+        row, node = torch.nonzero(within, as_tuple=True)
+        place = torch.nonzero(~far)[row, 0].numpy(), np.arange(len(row))
+        mean = csr_array((weights[node].numpy(), place), (len(far), len(row)))
+        return Readings(self.outward, received, csr_array(mean @ self.inward[read[self.within].numpy()]))
+
+    def _received(self, targets: Apertures, weights: Tensor) -> Tensor:
+        """Return waves (m, P) from the Huygens surface to P targets, with weights (P, n) of their nodes.
+
+        Discs with one weight each are far.
+        """
+        discs = targets.normals is not None and weights.shape[1] == 1
+        found = [torch.zeros((len(self.box.surface[0]), 0), dtype=torch.complex128, device="cpu")]
+        for first in range(0, len(weights), _TOGETHER):
+            some, own = targets.chosen(slice(first, first + _TOGETHER)), weights[first : first + _TOGETHER]
+            amplitude = torch.block_diag(*own[:, :, None]).to(torch.complex128)
+            sources = some.discs if discs else some.positions.flatten(0, 1)
+            found.append(self.box.waves(self.box.surface[0], sources, amplitude))
+        return torch.cat(found, dim=1)
 
 
 @dataclass(frozen=True)
