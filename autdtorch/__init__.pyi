@@ -12,6 +12,7 @@ from .methods.bayes.kernels import PhasorKernel
 from .methods.driver import run
 from .methods.gabs import GABS, gabs
 from .methods.gradient import GradientAscent, gradient_ascent
+from .methods.holography import Holography, holography
 from .methods.identify import Identify, identify
 from .methods.lssg import LSS, LSSG, lss, lssg
 from .methods.prior import Prior
@@ -55,6 +56,7 @@ __all__ = [
     "FocusProblem",
     "Goal",
     "GradientAscent",
+    "Holography",
     "Identify",
     "MeanPressure",
     "Medium",
@@ -101,6 +103,7 @@ __all__ = [
     "gradient_ascent",
     "green",
     "hardware",
+    "holography",
     "identify",
     "load_array",
     "load_drive",

@@ -198,7 +198,9 @@ class NearToFar:
         found = [torch.zeros((len(self.box.surface[0]), 0), dtype=torch.complex128, device="cpu")]
         for first in range(0, len(weights), _TOGETHER):
             some, own = targets.chosen(slice(first, first + _TOGETHER)), weights[first : first + _TOGETHER]
-            amplitude = torch.block_diag(*own[:, :, None]).to(torch.complex128)
+            columns = torch.arange(len(own), device="cpu").repeat_interleave(own.shape[1])
+            amplitude = torch.zeros((own.numel(), len(own)), dtype=torch.complex128, device="cpu")
+            amplitude[torch.arange(own.numel(), device="cpu"), columns] = own.flatten().to(amplitude)
             sources = some.discs if discs else some.positions.flatten(0, 1)
             found.append(self.box.waves(self.box.surface[0], sources, amplitude))
         return torch.cat(found, dim=1)

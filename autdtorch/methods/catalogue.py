@@ -8,16 +8,25 @@ from autdtorch.methods.base import Method
 from autdtorch.methods.bayes.bayes import BayesOpt
 from autdtorch.methods.gabs import GABS
 from autdtorch.methods.gradient import GradientAscent
+from autdtorch.methods.holography import Holography
 from autdtorch.methods.identify import Identify
 from autdtorch.methods.lssg import LSS, LSSG
 from autdtorch.methods.random_search import RandomSearch
 
 METHODS: dict[str, type[Method]] = {
-    method.name: method for method in (LSS, LSSG, BayesOpt, GABS, Identify, RandomSearch, GradientAscent)
+    method.name: method
+    for method in (LSS, LSSG, BayesOpt, GABS, Identify, RandomSearch, GradientAscent, Holography)
 }
 """Methods by name, in the order of reports. A method of one's own needs no entry: configs name its class."""
 
-_VARIANTS = {"bo_foci": "BO per focus", "bo_circle": "BO on the circle"}
+_VARIANTS = {
+    "bo_foci": "BO per focus",
+    "bo_circle": "BO on the circle",
+    "gs": "GS (model-based)",
+    "wgs": "WGS (model-based)",
+    "gs_pat": "GS-PAT (model-based)",
+    "diff_pat": "Diff-PAT (model-based)",
+}
 """Labels of configs that are settings of a method."""
 
 

@@ -10,6 +10,12 @@ import torch
 pytest.importorskip("acoustools", reason="needs AcousTools: install autdtorch[crosscheck]")
 pytest.importorskip("vedo", reason="AcousTools needs it: install autdtorch[crosscheck]")
 
+from acoustools.Solvers import (
+    gspat_solver,
+    iterative_backpropagation,
+    naive_solver_batched,
+    wgs_solver_batch,
+)
 from acoustools.Utilities import forward_model_batched
 from checks.acoustools import boundary_elements, cube_mesh, rigid_cubes, sphere_mesh
 from shared.cases import simulate, sphere_case
@@ -55,3 +61,22 @@ def test_pistons_agree_where_three_terms_of_the_series_are_enough() -> None:
     # AcousTools leaves out x^6 / 9216 - x^8 / 737280 of 2 J1(x) / x: 2.3e-4 at 20 degrees, 0.056 at 60.
     assert torch.allclose(theirs[:2].to(exact), exact[:2], rtol=0, atol=5e-4)
     assert (theirs - exact)[3:].tolist() == pytest.approx([0.056, 0.118], abs=1e-3)
+
+
+@pytest.mark.parametrize("points", [1, 4, 16])
+def test_solvers_of_holography_agree_on_one_matrix(points: int) -> None:
+    generator = torch.Generator().manual_seed(points)
+    matrix = torch.randn(8, points, 249, dtype=torch.complex64, generator=generator)
+    places, ones = torch.zeros(8, 3, points), torch.ones(points, 1, dtype=torch.complex64)
+    back = matrix.conj().mT
+    theirs = {
+        "naive": naive_solver_batched(places, A=matrix)[1],
+        "gs": iterative_backpropagation(places, iterations=100, A=matrix),
+        "wgs": wgs_solver_batch(matrix, ones, 100)[2],
+        "gs_pat": gspat_solver(matrix @ back, matrix, back, ones, 100),
+    }
+    for algorithm, drive in theirs.items():
+        ours = at.holography(matrix, None, algorithm, 100)
+        found, wanted = ((matrix @ one[..., None])[..., 0].abs() for one in (ours, drive[..., 0]))
+        # both round in single precision, and a hundred iterations spread that
+        assert torch.allclose(found, wanted, rtol=1e-4, atol=1e-4 * float(wanted.max())), algorithm

@@ -1,0 +1,220 @@
+"""Holography: drives for pressures wanted at points, by a known transfer matrix G and p = G q.
+
+Model-based: unlike the methods that see magnitudes alone, these read the matrix. All take sets of points as a
+batch. With t the wanted pressures, x / |x| entry by entry, and * for a product of entries:
+
+- "naive": q = sgn(G^H t), back-propagation;
+- "gs": p = t * sgn(G q), q = sgn(G^H p) in turns (Gerchberg and Saxton 1972), iterative back-propagation of
+  Marzo and Drinkwater (2019), doi:10.1073/pnas.1813047115;
+- "wgs": b is multiplied by t / |G q| and divided by its largest entry, p = b * sgn(G q), q = sgn(G^H p)
+  (Di Leonardo, Ianni and Ruocco 2007), doi:10.1364/OE.15.001913;
+- "gs_pat": p = G G^H (t * sgn(p)) in turns, and in the end q = sgn(G^H (t^2 * p / |p|^2)) (Martinez Plasencia
+  et al. 2020), doi:10.1145/3386569.3392492;
+- "diff_pat": Adam on the phases, from those of "wgs", for the least sum of (|p| - t)^2 (Fushimi, Yamamoto and
+  Ochiai 2021), doi:10.1038/s41598-021-91880-2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal, TypeAlias, get_args
+
+import torch
+
+from autdtorch.methods.base import Method, Problem, Step
+from autdtorch.objectives.goals import QuietPoints, TargetPressures, WeakestFocus
+from autdtorch.objectives.objective import Score
+from autdtorch.utils.validation import (
+    ArrayLike,
+    boolean,
+    complex_tensor,
+    integer_at_least,
+    invalid,
+    real_tensor,
+    require_one_of,
+)
+
+Algorithm: TypeAlias = Literal["naive", "gs", "wgs", "gs_pat", "diff_pat"]
+Project: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
+
+_RATES = 0.1, 0.001  # First and last step of Adam [rad, or amplitudes]
+_MOMENTS = 0.9, 0.99  # Shares of the old means of gradients and their squares in the new ones
+_TINY = 1e-30
+
+
+@dataclass(frozen=True)
+class Holography(Method):
+    """Compute one drive from the transfer matrix of the problem, by an algorithm of holography.
+
+    The goal tells the wanted pressures: targets [Pa], weights of the weakest focus, 0 for quiet points.
+    The matrix is the simulated one, as for `GradientAscent`.
+
+    Attributes:
+        algorithm: "naive", "gs", "wgs", "gs_pat" or "diff_pat"; see `holography`.
+        iterations: of the algorithm, >= 1; "naive" has none.
+        amplitudes: whether amplitudes are free in [0, 1]; otherwise all are 1.
+    """
+
+    name: ClassVar[str] = "holography"
+    label: ClassVar[str] = "holography (model-based)"
+    random: ClassVar[bool] = False
+
+    algorithm: Algorithm = "wgs"
+    iterations: int = 200
+    amplitudes: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        require_one_of("algorithm", self.algorithm, get_args(Algorithm))
+        object.__setattr__(self, "iterations", integer_at_least("iterations", self.iterations, 1))
+        object.__setattr__(self, "amplitudes", boolean("amplitudes", self.amplitudes))
+
+    def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
+        """Compute the drive, and observe it."""
+        matrix = problem.transfer_matrix
+        if matrix is None:
+            accepted = 'must have a transfer matrix, as SimulatedObjective has in mode "transfer"'
+            raise invalid("objective", None, accepted)
+        targets, absolute = wanted_pressures(problem.goal, problem.foci)
+        if self.algorithm == "diff_pat" and not absolute:
+            # as loud as the weakest focus of "wgs" over its weight
+            loud = targets > 0
+            reached = (matrix @ holography(matrix, targets, "wgs", self.iterations, self.amplitudes)).abs()
+            targets = targets * (reached[loud] / targets[loud]).amin()
+        drive = holography(matrix, targets, self.algorithm, self.iterations, self.amplitudes)
+        return Step(drive[None, None], {})
+
+
+def holography(
+    G: ArrayLike,
+    targets: ArrayLike | None = None,
+    algorithm: Algorithm = "wgs",
+    iterations: int = 200,
+    amplitudes: bool = False,
+) -> torch.Tensor:
+    """Return drives for wanted pressures, for one transfer matrix or a batch of them.
+
+    Args:
+        G: transfer matrices (..., P, M), complex [Pa], on the CPU or a GPU.
+        targets: wanted pressures (..., P) or (P,), >= 0 and not all 0: relative to each other, and [Pa] for
+            "diff_pat" and where amplitudes are free. None for 1 everywhere.
+        algorithm: "naive", "gs" (iterative back-propagation), "wgs" (weighted), "gs_pat" or "diff_pat".
+        iterations: >= 1; "naive" has none.
+        amplitudes: whether amplitudes are free in [0, 1]; otherwise all are 1, and pressures at best in
+            proportion to the targets, except of "diff_pat".
+
+    Returns:
+        Drives (..., M), complex, |q| <= 1, in the precision and on the device of G.
+
+    Raises:
+        ValueError: not finite numbers, shapes that do not fit, negative targets, or a setting out of range.
+    """
+    require_one_of("algorithm", algorithm, get_args(Algorithm))
+    iterations = integer_at_least("iterations", iterations, 1)
+    free = boolean("amplitudes", amplitudes)
+    checked = complex_tensor("G", G).detach()
+    if checked.ndim < 2 or 0 in checked.shape:
+        raise ValueError(f"G: shape {tuple(checked.shape)}; must be (..., P, M) with P, M >= 1")
+    single = isinstance(G, torch.Tensor) and G.dtype == torch.complex64
+    matrix = checked.to(torch.complex64) if single else checked
+    wanted = _checked_targets(targets, matrix)[..., None]
+    project = _within_largest if free else torch.sgn
+    if algorithm == "diff_pat":
+        start = _weighted(matrix, wanted, iterations, project)
+        drive = _descent(matrix, wanted, _scaled(matrix, wanted, start) if free else start, iterations, free)
+    else:
+        drive = _SOLVERS[algorithm](matrix, wanted, iterations, project)
+        drive = _scaled(matrix, wanted, drive) if free else drive
+    return drive[..., 0]
+
+
+def wanted_pressures(goal: Score, points: int) -> tuple[torch.Tensor, bool]:
+    """Return the pressures (P,) that a goal wants, and whether they are absolute [Pa], not relative."""
+    if isinstance(goal, QuietPoints):
+        others, absolute = wanted_pressures(goal.goal, points - len(goal.points))
+        wanted = torch.zeros(points, dtype=torch.float64, device="cpu")
+        wanted[[point for point in range(points) if point not in goal.points]] = others
+        return wanted, absolute
+    absolute = isinstance(goal, TargetPressures)
+    values = goal.targets if isinstance(goal, TargetPressures) else getattr(goal, "weights", None)
+    if values is None or not isinstance(goal, TargetPressures | WeakestFocus):
+        values = [1.0] * points
+    return torch.tensor(values, dtype=torch.float64, device="cpu"), absolute
+
+
+def _checked_targets(targets: ArrayLike | None, matrix: torch.Tensor) -> torch.Tensor:
+    """Return targets (..., P) for matrices (..., P, M), in their precision."""
+    shape = matrix.shape[:-1]
+    given = real_tensor("targets", torch.ones(shape[-1]) if targets is None else targets, "Pa").detach()
+    if given.shape not in (shape, shape[-1:]):
+        accepted = f"must be {tuple(shape[-1:])}" + (f" or {tuple(shape)}" if len(shape) > 1 else "")
+        raise ValueError(f"targets: shape {tuple(given.shape)}; {accepted}")
+    if given.min() < 0 or not (given.amax(dim=-1) > 0).all():
+        raise invalid("targets", targets, "must be >= 0, and one of each set > 0", "Pa")
+    return given.to(matrix.device, matrix.real.dtype).expand(shape)
+
+
+def _naive(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project) -> torch.Tensor:
+    return project(matrix.mH @ wanted.to(matrix.dtype))
+
+
+def _in_turns(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project) -> torch.Tensor:
+    back, drive = matrix.mH, torch.ones_like(matrix[..., :1, :]).mT
+    for _ in range(iterations):
+        drive = project(back @ (wanted * (matrix @ drive).sgn()))
+    return drive
+
+
+def _weighted(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project) -> torch.Tensor:
+    back, drive, weights = matrix.mH, torch.ones_like(matrix[..., :1, :]).mT, torch.ones_like(wanted)
+    for _ in range(iterations):
+        pressure = matrix @ drive
+        weights = wanted * weights / pressure.abs().clamp_min(_TINY)
+        weights = weights / weights.amax(dim=-2, keepdim=True)
+        drive = project(back @ (weights * pressure.sgn()))
+    return drive
+
+
+def _at_points(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project) -> torch.Tensor:
+    both, pressure = matrix @ matrix.mH, wanted.to(matrix.dtype)
+    for _ in range(iterations):
+        pressure = both @ (wanted * pressure.sgn())
+    return project(matrix.mH @ (wanted.square() * pressure.sgn() / pressure.abs().clamp_min(_TINY)))
+
+
+_SOLVERS = {"naive": _naive, "gs": _in_turns, "wgs": _weighted, "gs_pat": _at_points}
+
+
+def _descent(
+    matrix: torch.Tensor, wanted: torch.Tensor, drive: torch.Tensor, iterations: int, free: bool
+) -> torch.Tensor:
+    """Return drives (..., M, 1) with the least sum of (|p| - t)^2 that Adam finds from drives (..., M, 1)."""
+    phase, size, back = drive.angle(), drive.abs(), matrix.mH
+    means, squares = torch.zeros_like(drive), torch.zeros_like(drive)
+    for step in range(1, iterations + 1):
+        drive = torch.polar(size, phase)
+        pressure = matrix @ drive
+        flow = (back @ ((pressure.abs() - wanted) * pressure.sgn())).conj() * drive.sgn()
+        # by the amplitude, and by the phase times the amplitude
+        slope = torch.complex(flow.real, -flow.imag * size)
+        means = _MOMENTS[0] * means + (1 - _MOMENTS[0]) * slope
+        square = torch.complex(slope.real.square(), slope.imag.square())
+        squares = _MOMENTS[1] * squares + (1 - _MOMENTS[1]) * square
+        rate = _RATES[0] * (_RATES[1] / _RATES[0]) ** (step / iterations)
+        mean, spread = means / (1 - _MOMENTS[0] ** step), squares / (1 - _MOMENTS[1] ** step)
+        phase = phase - rate * mean.imag / (spread.imag.sqrt() + _TINY)
+        if free:
+            size = (size - rate * mean.real / (spread.real.sqrt() + _TINY)).clamp(0, 1)
+    return torch.polar(size, phase)
+
+
+def _within_largest(drive: torch.Tensor) -> torch.Tensor:
+    return drive / drive.abs().amax(dim=-2, keepdim=True).clamp_min(_TINY)
+
+
+def _scaled(matrix: torch.Tensor, wanted: torch.Tensor, drive: torch.Tensor) -> torch.Tensor:
+    """Return drives whose pressures are as near to the wanted ones as one factor <= 1 allows."""
+    pressure = (matrix @ drive).abs()
+    power = pressure.square().sum(dim=-2, keepdim=True).clamp_min(_TINY)
+    return drive * ((pressure * wanted).sum(dim=-2, keepdim=True) / power).clamp_max(1)

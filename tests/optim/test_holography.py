@@ -1,0 +1,104 @@
+"""Holography: pressures that are reached, definitions from the papers, batches, and bad input."""
+
+import pytest
+import torch
+
+from autdtorch.methods.driver import run
+from autdtorch.methods.holography import Holography, holography
+from autdtorch.objectives.bound import focus_bound
+from autdtorch.objectives.goals import QuietPoints, TargetPressures, WeakestFocus
+
+ALGORITHMS = ["naive", "gs", "wgs", "gs_pat", "diff_pat"]
+
+
+def pressures(matrix, drive):
+    return (matrix @ drive[..., None])[..., 0].abs()
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_one_point_gets_all_transducers_in_phase(random_matrix, algorithm):
+    matrix = random_matrix(1, 20, 0)
+    most = matrix.abs().sum()
+    drive = holography(matrix, [float(most)], algorithm)
+    # the one drive of largest pressure; the descent ends within its last steps of 1e-3 rad
+    assert pressures(matrix, drive)[0] == pytest.approx(
+        float(most), rel=1e-12 if algorithm != "diff_pat" else 1e-5
+    )
+    assert torch.allclose(drive.abs(), torch.ones(20).double())
+
+
+def test_weighted_and_descent_reach_proportions_and_pressures(random_matrix):
+    matrix, wanted = random_matrix(4, 40, 1), torch.tensor([6.0, 9.0, 6.0, 8.0]).double()
+    share = pressures(matrix, holography(matrix, wanted, "wgs")) / wanted
+    # 200 iterations leave 1e-4; back-propagation alone leaves a third
+    assert share.std() < 1e-3 * share.mean()
+    for free in (False, True):
+        drive = holography(matrix, wanted, "diff_pat", amplitudes=free)
+        # within reach: all foci could have about twice their targets
+        assert (pressures(matrix, drive) / wanted - 1).abs().max() < 1e-2
+        assert drive.abs().max() <= 1 + 1e-12
+
+
+def test_free_amplitudes_give_the_wanted_level(random_matrix):
+    matrix, wanted = random_matrix(3, 30, 2), torch.tensor([2.0, 1.0, 3.0]).double()
+    drive = holography(matrix, wanted, "wgs", amplitudes=True)
+    assert (pressures(matrix, drive) / wanted - 1).abs().max() < 1e-3
+    assert drive.abs().max() <= 1 + 1e-12
+
+
+@pytest.mark.parametrize("algorithm", ["wgs", "diff_pat"])
+def test_points_of_no_pressure_are_quiet(random_matrix, algorithm):
+    matrix, wanted = random_matrix(5, 60, 3), torch.tensor([9.0, 9.0, 9.0, 0.0, 0.0]).double()
+    found = pressures(matrix, holography(matrix, wanted, algorithm, iterations=400))
+    if algorithm == "wgs":  # ignores points without a target
+        assert found[:3].std() < 1e-3 * found[:3].mean()
+    else:
+        assert found[3:].max() < 10 ** (-30 / 20) * found[:3].min()  # 30 dB below
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_batch_is_its_sets_one_by_one(random_matrix, algorithm):
+    matrix = torch.stack([random_matrix(3, 10, seed) for seed in range(4)]).reshape(2, 2, 3, 10)
+    wanted = torch.rand(2, 2, 3, generator=torch.Generator().manual_seed(0)).double() + 0.5
+    both = holography(matrix, wanted, algorithm, 20)
+    assert both.shape == (2, 2, 10)
+    for place in ((0, 0), (1, 0), (1, 1)):
+        # products round by the size of the batch
+        assert torch.allclose(both[place], holography(matrix[place], wanted[place], algorithm, 20), atol=1e-8)
+    assert holography(matrix.to(torch.complex64), None, algorithm, 2).dtype == torch.complex64
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_as_a_method_it_is_one_evaluation_below_the_bound(make_objective, random_matrix, algorithm):
+    objective = make_objective(random_matrix(4, 30, 0))
+    solution = run(Holography(algorithm), objective)
+    assert solution.evaluations.tolist() == [1]
+    assert 0 < solution.score[0] <= focus_bound(objective.transfer_matrix)
+
+
+def test_goals_tell_the_wanted_pressures(make_objective, random_matrix):
+    objective = make_objective(random_matrix(3, 30, 0))
+    targets = TargetPressures([4.0, 2.0, 3.0])
+    assert run(Holography("diff_pat"), objective, score=targets).score[0] > -0.01
+    weights = run(Holography("wgs"), objective, score=WeakestFocus([2, 1, 1])).pressure[0]
+    assert weights[0] == pytest.approx(2 * float(weights[1]), rel=1e-2)
+    quiet = run(Holography("diff_pat"), objective, score=QuietPoints(WeakestFocus(), [1], 0.05)).pressure[0]
+    assert quiet[1] < 0.05 * quiet[[0, 2]].min()
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"G": torch.ones(2, 3)}, "G: .*complex"),
+        ({"G": torch.ones(3, dtype=torch.complex128)}, r"G: shape \(3,\); must be \(..., P, M\)"),
+        ({"targets": [1.0]}, r"targets: shape \(1,\); must be \(2,\)"),
+        ({"targets": [1.0, -1.0]}, "targets: .*; must be >= 0"),
+        ({"targets": [0.0, 0.0]}, "targets: .*; must be >= 0, and one of each set > 0"),
+        ({"algorithm": "best"}, "algorithm: 'best'"),
+        ({"iterations": 0}, "iterations: 0"),
+        ({"amplitudes": 2}, "amplitudes: 2"),
+    ],
+)
+def test_bad_input_is_named(given, message):
+    with pytest.raises(ValueError, match=message):
+        holography(**{"G": torch.ones(2, 3, dtype=torch.complex128), **given})
