@@ -12,7 +12,7 @@ from .methods.bayes.kernels import PhasorKernel
 from .methods.driver import run
 from .methods.gabs import GABS, gabs
 from .methods.gradient import GradientAscent, gradient_ascent
-from .methods.holography import Holography, holography
+from .methods.holography.holography import Holography, holography
 from .methods.identify import Identify, identify
 from .methods.lssg import LSS, LSSG, lss, lssg
 from .methods.prior import Prior

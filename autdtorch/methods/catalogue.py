@@ -8,7 +8,7 @@ from autdtorch.methods.base import Method
 from autdtorch.methods.bayes.bayes import BayesOpt
 from autdtorch.methods.gabs import GABS
 from autdtorch.methods.gradient import GradientAscent
-from autdtorch.methods.holography import Holography
+from autdtorch.methods.holography.holography import Holography
 from autdtorch.methods.identify import Identify
 from autdtorch.methods.lssg import LSS, LSSG
 from autdtorch.methods.random_search import RandomSearch

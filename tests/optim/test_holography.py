@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from autdtorch.methods.driver import run
-from autdtorch.methods.holography import Holography, holography
+from autdtorch.methods.holography.holography import _SOLVERS, Holography, _within_largest, holography
 from autdtorch.objectives.bound import focus_bound
 from autdtorch.objectives.goals import QuietPoints, TargetPressures, WeakestFocus
 
@@ -66,6 +66,21 @@ def test_a_batch_is_its_sets_one_by_one(random_matrix, algorithm):
         # products round by the size of the batch
         assert torch.allclose(both[place], holography(matrix[place], wanted[place], algorithm, 20), atol=1e-8)
     assert holography(matrix.to(torch.complex64), None, algorithm, 2).dtype == torch.complex64
+
+
+@pytest.mark.parametrize("free", [False, True])
+@pytest.mark.parametrize("algorithm", ALGORITHMS[:-1])
+def test_kernels_on_cpus_are_the_definitions(random_matrix, algorithm, free):
+    matrix = torch.stack([random_matrix(3, 10, seed) for seed in range(21)])  # a block and a part
+    wanted = torch.rand(21, 3, 1, generator=torch.Generator().manual_seed(0)).double() + 0.5
+    exact = _SOLVERS[algorithm](matrix, wanted, 20, _within_largest if free else torch.sgn)
+    found = holography(matrix, wanted[..., 0], algorithm, 20, free)
+    # free amplitudes are scaled to the wanted level; twenty iterations spread rounding of 1e-16
+    assert torch.allclose(
+        torch.nn.functional.normalize(found, dim=-1),
+        torch.nn.functional.normalize(exact[..., 0], dim=-1),
+        atol=1e-9,
+    )
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)

@@ -118,14 +118,13 @@ def holography(
         raise ValueError(f"G: shape {tuple(checked.shape)}; must be (..., P, M) with P, M >= 1")
     single = isinstance(G, torch.Tensor) and G.dtype == torch.complex64
     matrix = checked.to(torch.complex64) if single else checked
-    wanted = _checked_targets(targets, matrix)[..., None]
-    project = _within_largest if free else torch.sgn
+    wanted = _checked_targets(targets, matrix)
+    drive = _solved(matrix, wanted, "wgs" if algorithm == "diff_pat" else algorithm, iterations, free)
+    wanted, drive = wanted[..., None], drive[..., None]
+    if free:
+        drive = _scaled(matrix, wanted, drive)
     if algorithm == "diff_pat":
-        start = _weighted(matrix, wanted, iterations, project)
-        drive = _descent(matrix, wanted, _scaled(matrix, wanted, start) if free else start, iterations, free)
-    else:
-        drive = _SOLVERS[algorithm](matrix, wanted, iterations, project)
-        drive = _scaled(matrix, wanted, drive) if free else drive
+        drive = _descent(matrix, wanted, drive, iterations, free)
     return drive[..., 0]
 
 
@@ -141,6 +140,20 @@ def wanted_pressures(goal: Score, points: int) -> tuple[torch.Tensor, bool]:
     if values is None or not isinstance(goal, TargetPressures | WeakestFocus):
         values = [1.0] * points
     return torch.tensor(values, dtype=torch.float64, device="cpu"), absolute
+
+
+def _solved(
+    matrix: torch.Tensor, wanted: torch.Tensor, algorithm: str, iterations: int, free: bool
+) -> torch.Tensor:
+    """Return drives (..., M) for matrices (..., P, M) and wanted pressures (..., P)."""
+    if matrix.device.type == "cpu":
+        from autdtorch.methods.holography.kernel import solved  # loads numba
+
+        sets = matrix.flatten(0, -3) if matrix.ndim > 2 else matrix[None]
+        drive = solved(sets, wanted.reshape(sets.shape[:-1]), algorithm, iterations, free)
+        return drive.reshape(*matrix.shape[:-2], matrix.shape[-1])
+    project = _within_largest if free else torch.sgn
+    return _SOLVERS[algorithm](matrix, wanted[..., None], iterations, project)[..., 0]
 
 
 def _checked_targets(targets: ArrayLike | None, matrix: torch.Tensor) -> torch.Tensor:
@@ -160,14 +173,18 @@ def _naive(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project:
 
 
 def _in_turns(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project) -> torch.Tensor:
-    back, drive = matrix.mH, torch.ones_like(matrix[..., :1, :]).mT
+    back, drive = matrix.mH.resolve_conj(), torch.ones_like(matrix[..., :1, :]).mT
     for _ in range(iterations):
         drive = project(back @ (wanted * (matrix @ drive).sgn()))
     return drive
 
 
 def _weighted(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project) -> torch.Tensor:
-    back, drive, weights = matrix.mH, torch.ones_like(matrix[..., :1, :]).mT, torch.ones_like(wanted)
+    back, drive, weights = (
+        matrix.mH.resolve_conj(),
+        torch.ones_like(matrix[..., :1, :]).mT,
+        torch.ones_like(wanted),
+    )
     for _ in range(iterations):
         pressure = matrix @ drive
         weights = wanted * weights / pressure.abs().clamp_min(_TINY)
@@ -190,7 +207,7 @@ def _descent(
     matrix: torch.Tensor, wanted: torch.Tensor, drive: torch.Tensor, iterations: int, free: bool
 ) -> torch.Tensor:
     """Return drives (..., M, 1) with the least sum of (|p| - t)^2 that Adam finds from drives (..., M, 1)."""
-    phase, size, back = drive.angle(), drive.abs(), matrix.mH
+    phase, size, back = drive.angle(), drive.abs(), matrix.mH.resolve_conj()
     means, squares = torch.zeros_like(drive), torch.zeros_like(drive)
     for step in range(1, iterations + 1):
         drive = torch.polar(size, phase)

@@ -1,0 +1,1 @@
+"""Holography on known transfer matrices: drives for wanted pressures."""

@@ -1,0 +1,225 @@
+"""Holography on CPUs, in numba: the algorithms of `holography.py`, for blocks of sets at once.
+
+A block packs the matrices of `_LANES` sets entry by entry, so that every operation is one on vectors, and its
+matrices stay in the cache through all iterations. Arrays are flat with unsigned indices, real and imaginary
+parts apart, and made in one function, so that the compiler knows that they do not overlap. The order of all
+sums is fixed.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+from numba import njit
+
+from autdtorch.fdtd.kernels.compiled import INNER, entry
+from autdtorch.utils.threads import spread, thread_count
+
+_LANES = np.uint64(16)  # Sets of a block
+_TASKS = 4  # Tasks a thread, so that none waits long for another
+_TINY = 1e-30
+_NAMES = ("naive", "gs", "wgs", "gs_pat")
+_HERE = Path(__file__).parent
+
+
+def solved(
+    matrix: torch.Tensor, wanted: torch.Tensor, algorithm: str, iterations: int, free: bool
+) -> torch.Tensor:
+    """Return drives (B, M) of matrices (B, P, M) and wanted pressures (B, P), on the CPU."""
+    count, _, transducers = matrix.shape
+    parts = torch.view_as_real(matrix.contiguous().resolve_conj()).numpy()
+    drive = np.empty((count, transducers, 2), parts.dtype)
+    targets, number = np.ascontiguousarray(wanted.numpy()), _NAMES.index(algorithm)
+    if algorithm == "naive":  # too quick to be packed
+        spread(lambda ends: _back_propagate(parts, targets, *ends, free, drive), _cuts(count))
+    else:
+        blocks = _cuts(-(-count // int(_LANES)))
+        spread(lambda ends: _solve(parts, targets, *ends, number, iterations, free, drive), blocks)
+    return torch.view_as_complex(torch.from_numpy(drive))
+
+
+def _cuts(count: int) -> list[tuple[int, int]]:
+    """Return the first of so many, and one past the last, of each task."""
+    tasks = min(count, _TASKS * thread_count())
+    return list(pairwise(count * task // tasks for task in range(tasks + 1)))
+
+
+@entry(_HERE)
+def _back_propagate(matrix, wanted, first, last, free, drive):  # type: ignore[no-untyped-def]
+    """Write the drives (B, M, 2) of the sets `first` to `last` of matrices (B, P, M, 2)."""
+    points, transducers = matrix.shape[1:3]
+    tiny = matrix.dtype.type(_TINY)
+    for n in range(first, last):
+        out, rows = drive[n].reshape(-1), matrix[n].reshape(points, -1)
+        out[:] = 0
+        for p in range(points):
+            own, size = rows[p], wanted[n, p]
+            for k in range(len(out)):
+                out[k] += size * own[k]
+        largest = tiny
+        for m in range(transducers if free else 0):
+            largest = max(largest, math.sqrt(out[2 * m] ** 2 + out[2 * m + 1] ** 2))
+        for m in range(transducers):
+            real, imaginary = out[2 * m], out[2 * m + 1]
+            size = largest if free else max(math.sqrt(real * real + imaginary * imaginary), tiny)
+            out[2 * m], out[2 * m + 1] = real / size, -imaginary / size
+
+
+@njit(**INNER)
+def _pack(matrix, wanted, first, a, b, t):  # type: ignore[no-untyped-def]
+    """Copy the sets from `first` on to lanes; lanes beyond the last set repeat it."""
+    last, points, transducers = len(matrix) - 1, matrix.shape[1], matrix.shape[2]
+    to = np.uint64(0)
+    for p in range(points):
+        for lane in range(16):
+            t[np.uint64(p) * _LANES + np.uint64(lane)] = wanted[min(first + lane, last), p]
+        for m in range(transducers):
+            for lane in range(16):
+                a[to] = matrix[min(first + lane, last), p, m, 0]
+                b[to] = matrix[min(first + lane, last), p, m, 1]
+                to += np.uint64(1)
+
+
+@njit(**INNER)
+def _forward(a, b, x, z, y, w, points, transducers):  # type: ignore[no-untyped-def]
+    """Set pressures y + i w (P,) = (a + i b) (x + i z), for drives (M,)."""
+    for k in range(points * _LANES):
+        y[k], w[k] = 0, 0
+    for p in range(points):
+        out = p * _LANES
+        for m in range(transducers):
+            at, of = (p * transducers + m) * _LANES, m * _LANES
+            for k in range(_LANES):
+                y[out + k] += a[at + k] * x[of + k] - b[at + k] * z[of + k]
+                w[out + k] += a[at + k] * z[of + k] + b[at + k] * x[of + k]
+
+
+@njit(**INNER)
+def _back(a, b, y, w, x, z, size, points, transducers, free):  # type: ignore[no-untyped-def]
+    """Set drives x + i z (M,) = (a + i b)^H (y + i w), of amplitude 1, or over their largest if `free`."""
+    count = transducers * _LANES
+    for k in range(count):
+        x[k], z[k] = 0, 0
+    for p in range(points):
+        of = p * _LANES
+        for m in range(transducers):
+            at, out = (p * transducers + m) * _LANES, m * _LANES
+            for k in range(_LANES):
+                x[out + k] += a[at + k] * y[of + k] + b[at + k] * w[of + k]
+                z[out + k] += a[at + k] * w[of + k] - b[at + k] * y[of + k]
+    tiny = x.dtype.type(_TINY)
+    for k in range(count):
+        size[k] = max(math.sqrt(x[k] * x[k] + z[k] * z[k]), tiny)
+    if free:
+        for m in range(np.uint64(1), transducers):
+            for k in range(_LANES):
+                size[k] = max(size[k], size[m * _LANES + k])
+        for k in range(_LANES, count):
+            size[k] = size[k % _LANES]
+    for k in range(count):
+        x[k] /= size[k]
+        z[k] /= size[k]
+
+
+@njit(**INNER)
+def _imposed(y, w, weight, count):  # type: ignore[no-untyped-def]
+    """Give pressures y + i w the sizes `weight`."""
+    tiny = y.dtype.type(_TINY)
+    for k in range(count):
+        factor = weight[k] / max(math.sqrt(y[k] * y[k] + w[k] * w[k]), tiny)
+        y[k] *= factor
+        w[k] *= factor
+
+
+@njit(**INNER)
+def _reweighted(y, w, t, weight, count):  # type: ignore[no-untyped-def]
+    """Multiply weights (P,) by wanted over present pressure, and divide them by the largest."""
+    tiny = y.dtype.type(_TINY)
+    for k in range(count):
+        weight[k] *= t[k] / max(math.sqrt(y[k] * y[k] + w[k] * w[k]), tiny)
+    for lane in range(_LANES):
+        largest = tiny
+        for k in range(lane, count, _LANES):
+            largest = max(largest, weight[k])
+        for k in range(lane, count, _LANES):
+            weight[k] /= largest
+
+
+@njit(**INNER)
+def _products(a, b, c, d, points, transducers):  # type: ignore[no-untyped-def]
+    """Set c + i d (P, P) = (a + i b) (a + i b)^H."""
+    for k in range(points * points * _LANES):
+        c[k], d[k] = 0, 0
+    for p in range(points):
+        for q in range(p + np.uint64(1)):
+            out, mirrored = (p * points + q) * _LANES, (q * points + p) * _LANES
+            for m in range(transducers):
+                at, of = (p * transducers + m) * _LANES, (q * transducers + m) * _LANES
+                for k in range(_LANES):
+                    c[out + k] += a[at + k] * a[of + k] + b[at + k] * b[of + k]
+                    d[out + k] += b[at + k] * a[of + k] - a[at + k] * b[of + k]
+            for k in range(_LANES):
+                c[mirrored + k] = c[out + k]
+                d[mirrored + k] = d[out + k] if p == q else -d[out + k]
+
+
+@entry(_HERE)
+def _solve(matrix, wanted, first, last, algorithm, iterations, free, drive):  # type: ignore[no-untyped-def]
+    """Write the drives (B, M, 2) of the blocks `first` to `last` of matrices (B, P, M, 2).
+
+    The algorithm is a place in `_NAMES`.
+    """
+    points, transducers, kind = np.uint64(matrix.shape[1]), np.uint64(matrix.shape[2]), matrix.dtype
+    count, entries = points * _LANES, points * transducers * _LANES
+    a, b = np.empty(entries, kind), np.empty(entries, kind)
+    drives, squares = transducers * _LANES, points * count if algorithm == 3 else np.uint64(1)
+    x, z, size = np.empty(drives, kind), np.empty(drives, kind), np.empty(drives, kind)
+    y, w, t, weight = (
+        np.empty(count, kind),
+        np.empty(count, kind),
+        np.empty(count, kind),
+        np.empty(count, kind),
+    )
+    c, d, v, u = (
+        np.empty(squares, kind),
+        np.empty(squares, kind),
+        np.empty(count, kind),
+        np.empty(count, kind),
+    )
+    for block in range(first, last):
+        _pack(matrix, wanted, 16 * block, a, b, t)
+        if algorithm == 3:
+            y[:] = t
+            w[:] = 0
+        else:
+            x[:], z[:] = 1, 0
+            for k in range(count):
+                weight[k] = t[k] if algorithm == 1 else kind.type(1)
+        if algorithm == 3:
+            _products(a, b, c, d, points, transducers)
+        for _ in range(iterations):
+            if algorithm == 3:
+                _imposed(y, w, t, count)
+                v[:] = y
+                u[:] = w
+                _forward(c, d, v, u, y, w, points, points)
+                continue
+            _forward(a, b, x, z, y, w, points, transducers)
+            if algorithm == 2:
+                _reweighted(y, w, t, weight, count)
+            _imposed(y, w, weight, count)
+            _back(a, b, y, w, x, z, size, points, transducers, free)
+        if algorithm == 3:
+            for k in range(count):
+                factor = t[k] * t[k] / max(y[k] * y[k] + w[k] * w[k], kind.type(_TINY))
+                y[k] *= factor
+                w[k] *= factor
+            _back(a, b, y, w, x, z, size, points, transducers, free)
+        for lane in range(min(16, len(matrix) - 16 * block)):
+            for m in range(matrix.shape[2]):
+                drive[16 * block + lane, m, 0] = x[np.uint64(16 * m + lane)]
+                drive[16 * block + lane, m, 1] = z[np.uint64(16 * m + lane)]
