@@ -106,6 +106,8 @@ def test_goals_tell_the_wanted_pressures(make_objective, random_matrix):
     [
         ({"G": torch.ones(2, 3)}, "G: .*complex"),
         ({"G": torch.ones(3, dtype=torch.complex128)}, r"G: shape \(3,\); must be \(..., P, M\)"),
+        ({"G": torch.full((2, 3), complex("nan"))}, "G: .*; every entry must be finite"),
+        ({"G": torch.full((2, 3), complex(float("inf"), 0))}, "G: .*; every entry must be finite"),
         ({"targets": [1.0]}, r"targets: shape \(1,\); must be \(2,\)"),
         ({"targets": [1.0, -1.0]}, "targets: .*; must be >= 0"),
         ({"targets": [0.0, 0.0]}, "targets: .*; must be >= 0, and one of each set > 0"),

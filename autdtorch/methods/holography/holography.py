@@ -113,11 +113,7 @@ def holography(
     require_one_of("algorithm", algorithm, get_args(Algorithm))
     iterations = integer_at_least("iterations", iterations, 1)
     free = boolean("amplitudes", amplitudes)
-    checked = complex_tensor("G", G).detach()
-    if checked.ndim < 2 or 0 in checked.shape:
-        raise ValueError(f"G: shape {tuple(checked.shape)}; must be (..., P, M) with P, M >= 1")
-    single = isinstance(G, torch.Tensor) and G.dtype == torch.complex64
-    matrix = checked.to(torch.complex64) if single else checked
+    matrix = _checked_matrix(G)
     wanted = _checked_targets(targets, matrix)
     drive = _solved(matrix, wanted, "wgs" if algorithm == "diff_pat" else algorithm, iterations, free)
     wanted, drive = wanted[..., None], drive[..., None]
@@ -125,6 +121,11 @@ def holography(
         drive = _scaled(matrix, wanted, drive)
     if algorithm == "diff_pat":
         drive = _descent(matrix, wanted, drive, iterations, free)
+    if not torch.isfinite(torch.view_as_real(drive)).all():
+        complex_tensor(
+            "G", G
+        )  # names what is not finite: a check of all matrices would take longer than "naive"
+        raise invalid("G", G, "must not overflow in products with its own entries")
     return drive[..., 0]
 
 
@@ -154,6 +155,15 @@ def _solved(
         return drive.reshape(*matrix.shape[:-2], matrix.shape[-1])
     project = _within_largest if free else torch.sgn
     return _SOLVERS[algorithm](matrix, wanted[..., None], iterations, project)[..., 0]
+
+
+def _checked_matrix(G: ArrayLike) -> torch.Tensor:
+    """Return matrices (..., P, M) in their precision, not yet known to be finite."""
+    ready = isinstance(G, torch.Tensor) and G.dtype in (torch.complex64, torch.complex128) and not G.is_sparse
+    matrix = G.detach() if isinstance(G, torch.Tensor) and ready else complex_tensor("G", G).detach()
+    if matrix.ndim < 2 or 0 in matrix.shape:
+        raise ValueError(f"G: shape {tuple(matrix.shape)}; must be (..., P, M) with P, M >= 1")
+    return matrix.resolve_conj()
 
 
 def _checked_targets(targets: ArrayLike | None, matrix: torch.Tensor) -> torch.Tensor:
