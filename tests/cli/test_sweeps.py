@@ -137,7 +137,7 @@ def test_collected_seeds_are_trials_and_other_settings_make_names(run, tmp_path,
         ("homogeneous", "gabs", "8"),
     ]
     # The summary's median is over all trials.
-    assert float(rows[2]["median score [Pa]"]) == pytest.approx(
+    assert float(rows[2]["median score"]) == pytest.approx(
         float(methods["gabs,levels=8"].solution.score.quantile(0.5)), rel=1e-12
     )
     report = (tmp_path / "multirun" / "report.md").read_text(encoding="utf-8")
