@@ -22,7 +22,7 @@ from autdtorch.hardware.sensors.sensor import checked_reading
 from autdtorch.io.drive_file import save_drive
 from autdtorch.io.goal_section import goal_section, load_goal, score_label
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.goals import Goal
+from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
 from autdtorch.objectives.perturbations import simulated_matrix
 from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.propagators import make_propagator
@@ -89,10 +89,11 @@ class _Trial:
         self._settings = {
             "method": name_of(self._method),
             "method settings": settings["method"],
-            "goal": goal_section(self._goal),
             "seed": seed,
             **bench.settings,
         }
+        if self._goal != WEAKEST_FOCUS:  # so that logs from before there were goals go on
+            self._settings["goal"] = goal_section(self._goal)
         self.begun = False
         simulated = SimulatedObjective(self._scene, make_propagator(self._scene, **solver_of(settings)))
         bench.emulate(simulated)
@@ -196,8 +197,8 @@ def _silence_expected() -> Iterator[None]:
 
 
 def _shown(goal: Goal, pressure: torch.Tensor) -> str:
-    """Return the score of pressures (P,) [Pa] as text, such as "weakest focus [Pa]: 812"."""
-    return f"{score_label(goal.name, goal.unit)}: {float(goal(pressure)):.4g}"
+    """Return the score of pressures (P,) [Pa] as text, such as "weakest focus 812 Pa"."""
+    return f"{score_label(goal.name)} {float(goal(pressure)):.4g} {goal.unit}".rstrip()
 
 
 def _watcher(progress: Progress, goal: Goal) -> Callable[[hardware.Evaluation], None]:

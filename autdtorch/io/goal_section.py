@@ -71,7 +71,7 @@ def require_score(name: object, unit: object) -> None:
         require_name("goal.unit", unit)
 
 
-def score_label(name: str, unit: str) -> str:
+def score_label(name: str, unit: str = "") -> str:
     """Return the name and unit of scores for tables and figures, such as "weakest focus [Pa]"."""
     return name.replace("_", " ") + (f" [{unit}]" if unit else "")
 

@@ -168,7 +168,7 @@ class TargetPressures(Goal):
         matrix = checked_matrix(G)
         self.check(len(matrix))
         share, _ = level_bound(matrix, np.array(self.targets))
-        return -max(0.0, 1 - share) / math.sqrt(len(matrix))
+        return min(0.0, share - 1) / math.sqrt(len(matrix))
 
     def check(self, points: int) -> None:
         """Check the number of targets."""

@@ -111,7 +111,7 @@ def test_a_trial_maximises_its_goal(trial, tmp_path, words, goal):
     assert status == 0
     lines = (tmp_path / "out" / "trial.jsonl").read_text().splitlines()[1:-1]
     pressure = torch.tensor([json.loads(line)["pressure"] for line in lines], dtype=torch.float64)
-    score = f"{float(goal(pressure).max()):#.4g}"
+    score = f"{float(goal(pressure).max()):#.4g} {goal.unit}".rstrip()
     report = (tmp_path / "out" / "report.md").read_text()
     assert f"{score}** when the drive was played again, {score} in the search" in report
     assert f"{float(goal(pressure).max()):.4g}" in printed

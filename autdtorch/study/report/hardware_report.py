@@ -83,9 +83,9 @@ def write_hardware_report(
         times=times,
         interval=statistics.median_low(gaps) if gaps else 0.0,  # an interruption does not change it
         found=found,
-        goal=score_label(goal.name, goal.unit),
+        goal=score_label(goal.name),
+        unit=goal.unit and f" {goal.unit}",
         score_again=float(goal(again_mean)),
-        scaled=bool(goal.unit),
         readings=len(again),
         same=int(torch.isclose(found.drive, expected.drive, rtol=0, atol=1e-9).sum()),
         points=_points(scene.control_points, *pressures),
