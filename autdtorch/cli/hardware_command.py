@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import shlex
 import sys
 import tempfile
@@ -19,13 +20,16 @@ from autdtorch.cli.bench_config import Bench
 from autdtorch.cli.settings import folder_of, is_given, load_method, scene_of, section_of, solver_of
 from autdtorch.hardware.sensors.sensor import checked_reading
 from autdtorch.io.drive_file import save_drive
+from autdtorch.io.goal_section import goal_section, load_goal, score_label
 from autdtorch.methods.solution import Solution
+from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
 from autdtorch.objectives.perturbations import simulated_matrix
 from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.propagators import make_propagator
 from autdtorch.study.report.hardware_report import write_hardware_report
-from autdtorch.study.run import name_of, solve
+from autdtorch.study.run import name_of, require_goal_taken, solve
 from autdtorch.utils.progress import Progress, show_progress
+from autdtorch.utils.validation import within
 
 logger = logging.getLogger(__name__)
 
@@ -73,6 +77,10 @@ class _Trial:
         seed = settings.get("seed", 0)
         self._scene = scene_of("scene", section_of(settings, "scene"), modules)
         self._method = load_method("method", section_of(settings, "method"), modules)
+        self._goal = load_goal("goal", settings.get("goal"))
+        with within("goal"):
+            self._goal.check(len(self._scene.control_points))
+        require_goal_taken(name_of(self._method), self._method, self._goal)
         self._bench = bench = Bench(section_of(settings, "hardware"), self._scene, seed)
         self._seed = seed
         choices = HydraConfig.get().runtime.choices
@@ -84,12 +92,14 @@ class _Trial:
             "seed": seed,
             **bench.settings,
         }
+        if self._goal != WEAKEST_FOCUS:  # so that logs from before there were goals go on
+            self._settings["goal"] = goal_section(self._goal)
         self.begun = False
         simulated = SimulatedObjective(self._scene, make_propagator(self._scene, **solver_of(settings)))
         bench.emulate(simulated)
         self._simulated = hardware.Played(simulated, bench.device, bench.transducers, bench.limits.amplitude)
         self._settings["largest amplitude"] = round(self._simulated.largest, 4)
-        self._expected = solve(self._method, self._simulated, [0], seed)
+        self._expected = solve(self._method, self._simulated, [0], seed, self._goal)
 
     def run(self) -> None:
         """Play and measure; leave log, drive and report, unless the run is dry."""
@@ -103,10 +113,10 @@ class _Trial:
         save_drive(folder / "drive.npz", found.drive[0], self._scene.array)
         command = shlex.join(["autdtorch", *sys.argv[1:]])
         report = write_hardware_report(
-            folder, log, found, again, self._simulated, self._expected, preflight, command
+            folder, log, found, again, self._simulated, self._expected, preflight, self._goal, command
         )
-        weakest = float(again.mean(dim=0).min())
-        print(f"weakest focus {weakest:.4g} Pa, measured once more; the report is {report}")
+        score = _shown(self._goal, again.mean(dim=0))
+        print(f"{score}, measured once more; the report is {report}")
 
     def _measure(self, log: Path) -> _Measured:
         """Check the transducers, run the method on the device, and read the drive it found again (R, P)."""
@@ -126,7 +136,7 @@ class _Trial:
                 sensor,
                 log,
                 self._settings,
-                _watcher(progress),
+                _watcher(progress, self._goal),
                 simulated_matrix(self._simulated),
             )
             self.begun = not bench.is_dry
@@ -137,7 +147,7 @@ class _Trial:
             progress.begin("checking the transducers, one by one")
             preflight = self._preflight(limited, sensor, readings, progress)
             progress.begin(f"running {name_of(self._method)} on {bench.device.name}")
-            found = solve(self._method, objective, [0], self._seed)
+            found = solve(self._method, objective, [0], self._seed, self._goal)
             progress.begin("the drive that was found, once more")
             limited.play(found.drive[0])
             again = torch.stack([checked_reading(sensor, points) for _ in range(readings)])
@@ -186,16 +196,21 @@ def _silence_expected() -> Iterator[None]:
         scope.setLevel(logging.NOTSET)
 
 
-def _watcher(progress: Progress) -> Callable[[hardware.Evaluation], None]:
+def _shown(goal: Goal, pressure: torch.Tensor) -> str:
+    """Return the score of pressures (P,) [Pa] as text, such as "weakest focus 812 Pa"."""
+    return f"{score_label(goal.name)} {float(goal(pressure)):.4g} {goal.unit}".rstrip()
+
+
+def _watcher(progress: Progress, goal: Goal) -> Callable[[hardware.Evaluation], None]:
     """Return a function that shows every evaluation, and the best so far."""
-    best = 0.0
+    best = -math.inf
 
     def watch(evaluation: hardware.Evaluation) -> None:
         nonlocal best
         progress.advance(1)
-        weakest = float(evaluation.pressure.min())
-        if weakest > best:
-            best = weakest
-            progress.describe(f"weakest focus {best:.3g} Pa")
+        score = float(goal(evaluation.pressure))
+        if score > best:
+            best = score
+            progress.describe(_shown(goal, evaluation.pressure))
 
     return watch

@@ -22,9 +22,20 @@ from autdtorch.study.run import StudyMethod
 from autdtorch.utils.trusted import TARGET, load_trusted
 from autdtorch.utils.validation import require_known
 
-_SETTINGS = ("scene", "method", "scenes", "methods", "hardware", "solver", "trials", "seed", "plane_spacing")
+_SETTINGS = (
+    "scene",
+    "method",
+    "scenes",
+    "methods",
+    "goal",
+    "hardware",
+    "solver",
+    "trials",
+    "seed",
+    "plane_spacing",
+)
 _PLACES = ("modules", "output")  # settings that change no result
-_NOT_OF_METHODS = ("objective", "trials", "seed", "score")  # the first three are the study's to give
+_NOT_OF_METHODS = ("objective", "trials", "seed", "score")  # the study's to give
 _CALLS = (TARGET, "_args_", "_convert_", "_partial_", "_recursive_")  # keys by which Hydra calls functions
 _TARGETS = re.compile(rf"(method|methods\.[^.]+|(scene|scenes\.[^.]+)\.obstacles\.\d+)\.{TARGET}")
 
@@ -70,7 +81,7 @@ def load_method(where: str, section: Mapping[str, Any], modules: Collection[Any]
     if not isinstance(target, type):
         method = functools.partial(target, **settings)
         signature = inspect.signature(method)
-        given = [key for key in ("trials", "seed") if key in signature.parameters]
+        given = [key for key in ("trials", "seed", "score") if key in signature.parameters]
         try:
             signature.bind("objective", **dict.fromkeys(given))
         except TypeError as error:

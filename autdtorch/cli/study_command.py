@@ -15,6 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from autdtorch.cli.settings import folder_of, is_given, load_method, scene_of, section_of, solver_of
+from autdtorch.io.goal_section import load_goal
 from autdtorch.propagators import CACHE_VARIABLE
 from autdtorch.scene.scene import Scene
 from autdtorch.study.results import StudyResult, summary_rows
@@ -41,12 +42,14 @@ def study(settings: dict[str, Any], modules: list[Any], output: Any, sweep: Path
         solver["cache"] = (sweep or folder) / "matrices"
     settings["solver"] = {key: value for key, value in solver.items() if key != "cache"}  # changes no result
     scenes, methods = _parts(settings, modules)
+    goal = load_goal("goal", settings.get("goal"))
     results = run_study(
         scenes,
         methods,
         solver=solver,
         **{key: settings[key] for key in ("trials", "seed", "plane_spacing") if key in settings},
         folder=folder,
+        goal=goal,
         config=_as_text(settings, scenes),
     )
     shown = Path(os.path.relpath(folder))  # shorter, and equal on every machine

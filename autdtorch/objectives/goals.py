@@ -25,16 +25,20 @@ _INTERVALS, _MOST_RELAXATIONS, _GAIN = 500, 8, 1e-3
 class Goal(ABC):
     """Base of all goals: a function of pressures (..., P) [Pa] that gives scores (...) to maximise.
 
-    A goal of one's own is a frozen dataclass with `__call__`; gradient and bound are optional. Methods and
-    reports take any function of pressures, too.
+    A goal of one's own is a frozen dataclass with `__call__`; gradient and bound are optional. Methods take
+    any function of pressures, too.
 
     Attributes:
-        name: of the goal in configs, results and figures.
+        name: of the goal in configs, results and figures; of the class where it has none.
         unit: of the scores, "" for numbers.
     """
 
     name: ClassVar[str]
     unit: ClassVar[str] = "Pa"
+
+    def __init_subclass__(cls) -> None:
+        """Name a goal without a name after its class."""
+        cls.name = cls.__dict__.get("name", cls.__name__)
 
     @abstractmethod
     def __call__(self, pressure: ArrayLike) -> torch.Tensor:
@@ -106,7 +110,7 @@ class WeakestFocus(Goal):
         _require_count("weights", self.weights, points)
 
     def levels(self, pressure: torch.Tensor) -> torch.Tensor:
-        """Return pressures (..., P) over their weights."""
+        """Return pressures (..., P) [Pa] over their weights."""
         return pressure if self.weights is None else pressure / pressure.new_tensor(self.weights)
 
 
@@ -164,7 +168,7 @@ class TargetPressures(Goal):
         matrix = checked_matrix(G)
         self.check(len(matrix))
         share, _ = level_bound(matrix, np.array(self.targets))
-        return -max(0.0, 1 - share) / math.sqrt(len(matrix))
+        return min(0.0, share - 1) / math.sqrt(len(matrix))
 
     def check(self, points: int) -> None:
         """Check the number of targets."""
@@ -229,7 +233,7 @@ class QuietPoints(Goal):
         return slope
 
     def parts(self, pressure: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the pressures of the other points (..., P - K) and of the quiet ones (..., K)."""
+        """Return the pressures [Pa] of the other points (..., P - K) and of the quiet ones (..., K)."""
         return pressure[..., self._others(pressure.shape[-1])], pressure[..., list(self.points)]
 
     def _others(self, points: int) -> list[int]:

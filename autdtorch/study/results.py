@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
 
+from autdtorch.io.goal_section import PAPERS_GOAL, score_label
 from autdtorch.methods.base import NEAR_TIE
 from autdtorch.methods.catalogue import label_of
 from autdtorch.methods.solution import Solution
@@ -86,9 +87,11 @@ class SceneResult:
     Attributes:
         obstacles: number of obstacles.
         transfer_matrix: of the control points (P, M), complex128 [Pa].
-        bound: certified upper bound on the pressure of the weakest focus [Pa].
+        bound: certified upper bound on the score; infinite if none is known.
         simulation: the simulation of the field.
         methods: results by method name, in the order of the runs.
+        goal: name and settings of the goal that the methods maximised.
+        unit: of the scores, "" for numbers.
     """
 
     obstacles: int
@@ -96,13 +99,25 @@ class SceneResult:
     bound: float
     simulation: Simulation
     methods: dict[str, MethodResult]
+    goal: Mapping[str, Any] = field(default_factory=PAPERS_GOAL.copy)
+    unit: str = "Pa"
+
+    @property
+    def score_label(self) -> str:
+        """Name and unit of the scores, such as "weakest focus [Pa]"."""
+        return score_label(self.goal["name"], self.unit)
+
+    def in_unit(self, score: object) -> str:
+        """Return a score, or its text, with its unit."""
+        return f"{score} {self.unit}".rstrip()
 
     def __repr__(self) -> str:
         """Return counts, bound and methods, with units."""
         points, transducers = self.transfer_matrix.shape
         return (
             f"SceneResult({self.obstacles} obstacles, {transducers} transducers, {points} control points, "
-            f"bound {self.bound:.4g} Pa, methods {', '.join(self.methods)})"
+            f"goal {self.goal['name']}, bound {self.in_unit(f'{self.bound:.4g}')}, "
+            f"methods {', '.join(self.methods)})"
         )
 
 
@@ -169,17 +184,22 @@ def median_trial(score: torch.Tensor) -> int:
 
 
 def summary_rows(results: StudyResult) -> list[list[str]]:
-    """Return a table of the metrics, header first: mean over the trials ± standard deviation."""
-    head = ["scene", "method", "trials", "mean [Pa]", "weakest [Pa]", "std [Pa]", "area [mm²]"]
-    rows = [[*head, "evaluations"]]
+    """Return a table of the metrics, header first: mean over the trials ± standard deviation.
+
+    The score has a column where it is not the pressure of the weakest focus, as in the paper.
+    """
+    scored = any(scene.goal != PAPERS_GOAL for scene in results.scenes.values())
+    head = ["scene", "method", "trials", *(["score"] if scored else [])]
+    rows = [[*head, "mean [Pa]", "weakest [Pa]", "std [Pa]", "area [mm²]", "evaluations"]]
     for scene_name, scene in results.scenes.items():
         for name, method in scene.methods.items():
             metrics = method.metrics
             area = "none" if metrics.area is None else _over_trials(1e6 * metrics.area, ".0f")
             pressures = (metrics.mean, metrics.min, metrics.std)
-            numbers = [str(method.trials), *(_over_trials(values, ".2f") for values in pressures), area]
+            score = [scene.in_unit(_over_trials(method.solution.score, ".3g"))] if scored else []
+            numbers = [*score, *(_over_trials(values, ".2f") for values in pressures), area]
             evaluations = f"{method.solution.evaluations.double().mean():.0f}"
-            rows.append([scene_name, label_of(name), *numbers, evaluations])
+            rows.append([scene_name, label_of(name), str(method.trials), *numbers, evaluations])
     return rows
 
 

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
+import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +19,7 @@ import h5py
 import torch
 
 import autdtorch
+from autdtorch.io.goal_section import GOALS, PAPERS_GOAL, load_goal, require_score
 from autdtorch.objectives.metrics import FocusMetrics
 from autdtorch.propagators import Run
 from autdtorch.study.provenance import Provenance
@@ -32,11 +35,13 @@ from autdtorch.utils.files import replace_file
 from autdtorch.utils.validation import (
     boolean,
     complex_tensor,
+    finite_number,
     integer_at_least,
     invalid,
     not_negative,
     path_of,
     positive,
+    require_kind,
     require_name,
     require_one_of,
 )
@@ -107,7 +112,9 @@ def _read_provenance(attributes: Any) -> Provenance:
 
 
 def _write_scene(group: Any, scene: SceneResult) -> None:
-    attributes = {"obstacles": scene.obstacles, "bound": scene.bound}
+    # A goal of one's own may have settings that JSON cannot hold.
+    attributes: dict[str, Any] = {"goal": json.dumps(scene.goal, default=str), "unit": scene.unit}
+    attributes |= {"obstacles": scene.obstacles, "bound": scene.bound}
     attributes |= {key: getattr(scene.simulation, key) for key in _SIMULATION}
     group.attrs.update({key: value for key, value in attributes.items() if value is not None})
     for key in _RUN:
@@ -121,13 +128,29 @@ def _write_scene(group: Any, scene: SceneResult) -> None:
 def _read_scene(group: Any) -> SceneResult:
     matrix = _complex_matrix(group, "transfer_matrix")
     points, transducers = matrix.shape
+    goal, unit = _read_goal(group.attrs)
+    bound = group.attrs["bound"]
     return SceneResult(
         integer_at_least("obstacles", group.attrs["obstacles"], 0),
         matrix,
-        not_negative("bound", group.attrs["bound"], "Pa"),
+        math.inf if bound == math.inf else finite_number("bound", bound, unit),
         _read_simulation(group),
         {name: _read_method(entry, points, transducers) for name, entry in _named(group, "methods")},
+        goal,
+        unit,
     )
+
+
+def _read_goal(attributes: Any) -> tuple[dict[str, Any], str]:
+    """Return the section of the goal, and the unit of its scores; files without are of the paper's goal."""
+    if "goal" not in attributes:
+        return PAPERS_GOAL.copy(), "Pa"
+    goal, unit = json.loads(attributes["goal"]), attributes["unit"]
+    require_kind("goal", goal, dict)
+    require_score(goal["name"], unit)
+    if goal["name"] in GOALS:
+        load_goal("goal", goal)
+    return goal, unit
 
 
 def _read_simulation(group: Any) -> Simulation:

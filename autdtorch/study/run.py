@@ -13,10 +13,11 @@ from typing import Any, TypeAlias
 
 import torch
 
+from autdtorch.io.goal_section import goal_section, require_score
 from autdtorch.methods.base import TRIAL_BYTES, Method, Problem, Trials
 from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.bound import focus_bound
+from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal, QuietPoints
 from autdtorch.objectives.metrics import focus_metrics
 from autdtorch.objectives.objective import Objective
 from autdtorch.objectives.simulated import SimulatedObjective
@@ -34,6 +35,7 @@ from autdtorch.utils.validation import (
     integer_at_least,
     invalid,
     positive,
+    require_kind,
     require_known,
     require_name,
     within,
@@ -41,7 +43,8 @@ from autdtorch.utils.validation import (
 
 StudyMethod: TypeAlias = Method | Callable[..., Solution]
 """A `Method`, or a function of an objective with its settings bound. A function that has parameters `trials`
-and `seed` is given the numbers of the trials to run, as many as it is to return, and the study's seed."""
+and `seed` is given the numbers of the trials to run, as many as it is to return, and the study's seed. One
+that has a parameter `score` is given the goal."""
 
 BLOCK = Method.block
 """Trials that are run and saved together. The end of the process costs the block in work at most."""
@@ -58,6 +61,7 @@ def run_study(
     trials: int | Mapping[str, int] = 1,
     seed: int = 0,
     plane_spacing: float = 1e-3,
+    goal: Goal = WEAKEST_FOCUS,
     config: str = "",
 ) -> StudyResult:
     """Run every method in every scene; return the results of all scenes.
@@ -73,8 +77,9 @@ def run_study(
         trials: of every method that has random choices, or by method name.
         seed: of the random choices, >= 0; the same in every scene.
         plane_spacing: edge of a cell of the observation plane [m].
+        goal: what the methods maximise.
         config: all of the above as text. What the folder holds for the same text, made with the same source
-            and packages, is taken from there. Without text, or with methods or obstacles that are not
+            and packages, is taken from there. Without text, or with methods, obstacles or a goal that are not
             autdtorch's own, everything is computed.
 
     Raises:
@@ -89,18 +94,19 @@ def run_study(
             require_name(field, name)
     counts = _counts(methods, trials, seed)
     plane_spacing = positive("plane_spacing", plane_spacing, "m")
+    _check_goal(goal, scenes, methods)
     for name, method in methods.items():
         for scene in scenes.values():
             if isinstance(method, Method):
                 points, transducers = len(scene.control_points), len(scene.array)
                 # In place of the matrix that the simulation will give: a prior needs one, of this shape.
                 blank = torch.zeros(points, transducers, dtype=torch.complex128, device="cpu")
-                problem = Problem(transducers, points, scene=scene, transfer_matrix=blank)
+                problem = Problem(transducers, points, goal, scene, blank)
                 with within(f"method {name}"):
                     method.require_fit(problem, min(counts[name], method.block))
     planes = {name: _plane_points(scene, plane_spacing) for name, scene in scenes.items()}
-    # The digest of our source does not cover methods and obstacles of the user's own.
-    code = [*map(_code_of, methods.values())]
+    # The digest of our source does not cover methods, obstacles and goals of the user's own.
+    code = [*map(_code_of, methods.values()), *map(type, _goals_of(goal))]
     code += [type(obstacle) for scene in scenes.values() for obstacle in scene.obstacles]
     ours = all(one.__module__.partition(".")[0] == "autdtorch" for one in code)
     provenance = provenance_now(config, seed)
@@ -111,9 +117,8 @@ def run_study(
         kept.begin()
         with show_progress(len(missing) * (sum(counts.values()) + 2)) as progress:
             for name in missing:
-                finished = _run_scene(
-                    name, propagators.pop(name), methods, counts, seed, planes[name], kept.trials, progress
-                )
+                place = name, propagators.pop(name), planes[name]
+                finished = _run_scene(*place, methods, counts, seed, goal, kept.trials, progress)
                 kept.save(name, finished)
         return StudyResult(kept.provenance, {name: kept.scenes[name] for name in scenes})
 
@@ -133,6 +138,31 @@ def _counts(methods: Mapping[str, StudyMethod], trials: int | Mapping[str, int],
     return counts
 
 
+def _check_goal(goal: Goal, scenes: Mapping[str, Scene], methods: Mapping[str, StudyMethod]) -> None:
+    """Check the goal against all scenes, and that every method can maximise it."""
+    require_kind("goal", goal, Goal)
+    require_score(goal.name, goal.unit)
+    for scene in scenes.values():
+        with within("goal"):
+            goal.check(len(scene.control_points))
+    for name, method in methods.items():
+        require_goal_taken(name, method, goal)
+
+
+def require_goal_taken(name: str, method: StudyMethod, goal: Goal) -> None:
+    """Refuse a function that maximises the weakest focus, whatever the goal."""
+    if goal == WEAKEST_FOCUS or isinstance(method, Method):
+        return
+    if "score" not in inspect.signature(method).parameters:
+        accepted = f"must have a parameter `score`, for the goal {goal.name}"
+        raise invalid(f"method {name}", name_of(method), accepted)
+
+
+def _goals_of(goal: Goal) -> list[Goal]:
+    """Return a goal, and the goals that it is made of."""
+    return [goal, *_goals_of(goal.goal)] if isinstance(goal, QuietPoints) else [goal]
+
+
 def _is_random(method: StudyMethod) -> bool:
     return method.random if isinstance(method, Method) else "trials" in inspect.signature(method).parameters
 
@@ -149,22 +179,23 @@ def _code_of(method: StudyMethod) -> Any:
     return method.func if isinstance(method, functools.partial) else method
 
 
-def solve(method: StudyMethod, objective: Objective, trials: Trials, seed: int) -> Solution:
+def solve(method: StudyMethod, objective: Objective, trials: Trials, seed: int, goal: Goal) -> Solution:
     """Run trials of a method on an objective."""
     if isinstance(method, Method):
-        return run(method, objective, trials, seed)
+        return run(method, objective, trials, seed, score=goal)
     taken = inspect.signature(method).parameters
-    given = {"trials": trials, "seed": seed}
+    given = {"trials": trials, "seed": seed, "score": goal}
     return method(objective, **{key: value for key, value in given.items() if key in taken})
 
 
 def _run_scene(
     name: str,
     propagator: Propagator,
+    plane: torch.Tensor | None,
     methods: Mapping[str, StudyMethod],
     counts: Mapping[str, int],
     seed: int,
-    plane: torch.Tensor | None,
+    goal: Goal,
     trials: TrialFile,
     progress: Progress,
 ) -> SceneResult:
@@ -179,7 +210,8 @@ def _run_scene(
         where = name, method_name, counts[method_name]
         progress.advance(where[2] - len(trials.missing(*where)))
         size = method.block if isinstance(method, Method) else BLOCK
-        _run_trials(where, size, functools.partial(solve, method, objective, seed=seed), trials, progress)
+        solved = functools.partial(solve, method, objective, seed=seed, goal=goal)
+        _run_trials(where, size, solved, trials, progress)
     found = {method_name: trials.found(name, method_name, count) for method_name, count in counts.items()}
     progress.begin(f"{name}: observation plane")
     begin = time.perf_counter()
@@ -198,8 +230,8 @@ def _run_scene(
     if isinstance(propagator, SimulatedPropagator):
         grid = {"spacing": propagator.spacing, "tolerance": propagator.tolerance}
         simulation = replace(simulation, method=propagator.method, **grid, runs=tuple(propagator.runs))
-    bound = focus_bound(transfer_matrix)
-    return SceneResult(len(scene.obstacles), transfer_matrix, bound, simulation, results)
+    known = transfer_matrix, float(goal.bound(transfer_matrix)), simulation, results
+    return SceneResult(len(scene.obstacles), *known, goal_section(goal), goal.unit)
 
 
 def _run_trials(

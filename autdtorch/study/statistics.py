@@ -96,15 +96,22 @@ def share_interval(successes: torch.Tensor) -> Interval:
 class BoundGap:
     """The distance of a method's score from the certified bound."""
 
-    score: Interval  # median over the trials [Pa]
-    gap: Interval  # 1 - score / bound
+    score: Interval  # median over the trials
+    gap: Interval  # 1 - score / bound; bound - score where scores are no shares of it
     evaluations: torch.Tensor  # of each trial until it was near the bound (T,), float64; inf if never
 
 
+def has_shares(bound: float) -> bool:
+    """Return whether scores are shares of the bound: it is known, and above 0."""
+    return 0 < bound < math.inf
+
+
 def bound_gap(method: MethodResult, bound: float) -> BoundGap:
-    """Return the gap of a method to the upper bound on the score [Pa], >= 0."""
+    """Return the gap of a method to the upper bound on the score; infinite if no bound is known."""
     score = bootstrap(method.solution.score, average=np.median)
-    gap = score.mapped(lambda value: 1 - value / bound if bound > 0 else 0.0)
-    near = method.solution.history >= NEAR_BOUND * bound
+    gap = Interval(math.inf)
+    if math.isfinite(bound):
+        gap = score.mapped(lambda value: 1 - value / bound if has_shares(bound) else bound - value)
+    near = (method.solution.history >= NEAR_BOUND * bound) & has_shares(bound)
     first = near.int().argmax(dim=1).double() + 1
     return BoundGap(score, gap, torch.where(near.any(dim=1), first, torch.inf))

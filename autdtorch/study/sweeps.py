@@ -127,7 +127,7 @@ def _parts(path: Path, study: StudyResult) -> list[_Part]:
         for name, found in study.scenes.items():
             section = settings["scenes"][name] if "scenes" in settings else settings["scene"]
             files = settings.get(_FILES, {}).get(name)
-            of_scene = dict(_flat({"scene": section, _FILES: files, **common}))
+            of_scene = dict(_flat({"scene": section, _FILES: files, **common})) | dict(_flat_goal(found.goal))
             for method in found.methods:
                 chosen = settings["methods"][method] if "methods" in settings else settings["method"]
                 of_method = dict(_flat({"method": chosen}))
@@ -146,6 +146,16 @@ def _flat(value: object, key: str = "") -> Iterator[tuple[str, Any]]:
             yield from _flat(entry, f"{key}.{name}" if key else str(name))
     else:
         yield key, [_whole(entry) for entry in value] if isinstance(value, list) else _whole(value)
+
+
+def _flat_goal(goal: Mapping[str, Any], key: str = "goal") -> Iterator[tuple[str, Any]]:
+    """Yield the name of a goal as ``goal``, and its settings as ``goal.targets``."""
+    yield key, goal["name"]
+    for name, entry in goal.items():
+        if isinstance(entry, dict):
+            yield from _flat_goal(entry, f"{key}.{name}")
+        elif name != "name":
+            yield from _flat(entry, f"{key}.{name}")
 
 
 def _whole(value: object) -> object:

@@ -18,13 +18,16 @@ import autdtorch.study.run
 from autdtorch.cli.config_files import CONFIGS
 from autdtorch.cli.settings import load_method
 from autdtorch.hardware import DEVICES, Limits
+from autdtorch.io.goal_section import GOALS, load_goal
 from autdtorch.io.scene_file import load_scene
 from autdtorch.methods.base import Method
+from autdtorch.objectives.goals import MeanPressure, QuietPoints, TargetPressures, WeakestFocus
 from autdtorch.propagators import make_propagator
 from autdtorch.study.results_file import load_results
 
 CONFIG_NAMES = {
-    group: sorted(path.stem for path in (CONFIGS / group).glob("*.yaml")) for group in ("scene", "method")
+    group: sorted(path.stem for path in (CONFIGS / group).glob("*.yaml"))
+    for group in ("scene", "method", "goal")
 }
 SINGLE_FILES = ("results.h5", "trials.jsonl", "provenance.json", ".lock", "plane.png")
 
@@ -54,8 +57,17 @@ def test_every_method_builds_with_known_settings(name, composed):
     assert isinstance(load_method("method", composed(f"method={name}")["method"], ()), Method)
 
 
+def test_every_goal_has_a_config_of_its_name_with_all_its_settings(composed):
+    assert sorted(GOALS) == CONFIG_NAMES["goal"]
+    for name, goal in GOALS.items():
+        section = composed(f"goal={name}")["goal"]
+        assert section["name"] == name
+        assert list(section)[1:] == [field.name for field in dataclasses.fields(goal)]
+
+
 def test_the_papers_experiment(composed):
     config = composed("experiment=paper")
+    assert load_goal("goal", config["goal"]) == WeakestFocus()
     assert not {"scene", "method"} & set(config)
     assert all(load_scene(scene) for scene in config["scenes"].values())
     assert all(load_method(name, method, ()) for name, method in config["methods"].items())
@@ -69,7 +81,61 @@ def test_the_papers_experiment(composed):
     assert composed("experiment=paper", "trials=7")["trials"] == 7
 
 
+@pytest.mark.parametrize(
+    ("words", "goal"),
+    [
+        ((), WeakestFocus()),
+        (("goal.weights=[1,2,1,2]",), WeakestFocus([1, 2, 1, 2])),
+        (("goal=mean_pressure",), MeanPressure()),
+        (("goal=target_pressures", "goal.targets=[4,2,4,2]"), TargetPressures([4, 2, 4, 2])),
+        (("goal=quiet_points", "goal.points=[2,3]"), QuietPoints(WeakestFocus(), [2, 3], 0.03)),
+        (
+            ("goal=quiet_points", "goal.points=[3]", "goal.ratio=0.1", "goal.goal=mean_pressure"),
+            QuietPoints(MeanPressure(), [3], 0.1),
+        ),
+        (
+            ("goal=quiet_points", "goal.points=[0]", "goal.goal={name:target_pressures,targets:[4,2,4]}"),
+            QuietPoints(TargetPressures([4, 2, 4]), [0], 0.03),
+        ),
+    ],
+)
+def test_a_run_maximises_the_goal_of_its_settings(words, goal, run, tmp_path, capsys):
+    command = ("scene=homogeneous", "method=gabs", "method.levels=4", "plane_spacing=20e-3", "output=out")
+    for reused in (False, True):
+        assert run(*command, *words) == 0
+        assert ("re-using" in capsys.readouterr().err) is reused
+    scene = load_results(tmp_path / "out").scenes["homogeneous"]
+    assert load_goal("goal", scene.goal) == goal
+    solution = scene.methods["gabs"].solution
+    assert solution.score.tolist() == goal(solution.pressure).tolist()
+    assert solution.score.max() <= scene.bound == goal.bound(scene.transfer_matrix)
+
+
+def test_results_of_another_goal_are_not_used(run, tmp_path, capsys):
+    command = ("scene=homogeneous", "method=lssg", "plane_spacing=20e-3", "output=out")
+    for words in ((), ("goal=mean_pressure",), ("goal.weights=[1,2,1,2]",), ("goal.weights=[1,2,1,3]",)):
+        assert run(*command, *words) == 0
+        assert "re-using" not in capsys.readouterr().err
+    assert len(list((tmp_path / "out").glob("previous-*"))) == 3
+
+
 WRONG = [
+    (["goal=loudest"], "goal: 'loudest'; must be one of mean_pressure, quiet_points, "),
+    (["goal.name=loudest"], r"goal\.name: 'loudest'; must be one of weakest_focus, mean_pressure, "),
+    (["goal=target_pressures"], "goal: targets: None; must be"),
+    (["goal=target_pressures", "goal.targets=[4,-2,4,2]"], "goal: targets: .*; must be numbers > 0"),
+    (["goal=target_pressures", "goal.targets=[4,2]"], r"goal: targets: \(4\.0, 2\.0\); must be 4 numbers"),
+    (["goal=quiet_points", "goal.points=[4]"], r"goal: points: \(4,\); must be indices from 0 to 3"),
+    (["goal=quiet_points", "goal.points=[3]", "goal.ratio=0"], "goal: ratio: 0.*; must be finite and > 0"),
+    (["goal=quiet_points", "goal.points=[3]", "goal.goal=gabs"], r"goal\.goal\.name: 'gabs'; must be one of"),
+    (["goal=quiet_points", "goal.points=[3]", "goal.goal=3"], r"goal\.goal: 3; must be the name of a goal"),
+    (["goal.weights=[1,0,1,1]"], "goal: weights: .*; must be numbers > 0"),
+    (["+goal.targets=[1]"], "goal: unknown key 'targets'.*; allowed keys: name, weights"),
+    (["+goal._target_=os.system"], r"goal\._target_: 'os\.system'; must not be given"),
+    (
+        ["goal=quiet_points", "goal.goal={_target_:os.system}"],
+        r"goal\.goal\._target_: 'os\.system'; must not be given",
+    ),
     (["scene=thre_cubes"], "scene: 'thre_cubes'; must be one of homogeneous, sphere"),
     (["experiment=nature"], "experiment: 'nature'; must be one of paper"),
     (["spacing=1e-3"], "spacing: unknown key"),

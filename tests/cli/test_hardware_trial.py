@@ -2,6 +2,7 @@
 
 import errno
 import io
+import json
 import math
 import re
 import signal
@@ -19,6 +20,7 @@ from autdtorch.cli.main import CONFIGS
 from autdtorch.hardware import LinkError, MovedMicrophone, OffError, Oscilloscope, ScopeSensor
 from autdtorch.io.drive_file import load_drive
 from autdtorch.io.scene_file import load_scene
+from autdtorch.objectives.goals import QuietPoints, TargetPressures, WeakestFocus
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.study.report.hardware_report import compare
 
@@ -97,6 +99,26 @@ def test_a_dry_run_shows_the_frames_and_leaves_nothing(trial, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("words", "goal"),
+    [
+        (("goal=target_pressures", "goal.targets=[2,1]"), TargetPressures([2, 1])),
+        (("goal=quiet_points", "goal.points=[1]", "goal.ratio=0.1"), QuietPoints(WeakestFocus(), [1], 0.1)),
+    ],
+)
+def test_a_trial_maximises_its_goal(trial, tmp_path, words, goal):
+    status, printed, _ = trial(*GABS, *words)
+    assert status == 0
+    lines = (tmp_path / "out" / "trial.jsonl").read_text().splitlines()[1:-1]
+    pressure = torch.tensor([json.loads(line)["pressure"] for line in lines], dtype=torch.float64)
+    score = f"{float(goal(pressure).max()):#.4g} {goal.unit}".rstrip()
+    report = (tmp_path / "out" / "report.md").read_text()
+    assert f"{score}** when the drive was played again, {score} in the search" in report
+    assert f"{float(goal(pressure).max()):.4g}" in printed
+    status, _, log = trial(*GABS, "goal=mean_pressure")
+    assert (status, "of another trial, whose goal is" in log) == (2, True)
+
+
 OPENMPD = ("hardware=openmpd", "hardware.limits.amplitude=1", "hardware.transducers='0-8'")
 
 
@@ -126,6 +148,10 @@ OPENMPD = ("hardware=openmpd", "hardware.limits.amplitude=1", "hardware.transduc
         ((*GABS, "hardware.device=autd3", "hardware.boards=two"), "hardware.boards: 'two'; must be an int"),
         ((*GABS, "hardware.failed='0-8'"), "hardware.sensor: 0 Pa from the strongest transducer; must be"),
         (("hardware=sonicsurface", "hardware/sensor=manual", GABS[1]), "transducers: None; must say which 9"),
+        (
+            (*GABS, "goal=target_pressures", "goal.targets=[1,2,3]"),
+            "goal: targets: (1.0, 2.0, 3.0); must be 2",
+        ),
         ((*GABS, "hardware=nowhere"), "hardware: 'nowhere'; must be one of autd3, base, emulated"),
         ((*GABS, "-m"), "hardware: a sweep; must be one trial at a time"),
     ],

@@ -137,12 +137,30 @@ def test_collected_seeds_are_trials_and_other_settings_make_names(run, tmp_path,
         ("homogeneous", "gabs", "8"),
     ]
     # The summary's median is over all trials.
-    assert float(rows[2]["median score [Pa]"]) == pytest.approx(
+    assert float(rows[2]["median score"]) == pytest.approx(
         float(methods["gabs,levels=8"].solution.score.quantile(0.5)), rel=1e-12
     )
     report = (tmp_path / "multirun" / "report.md").read_text(encoding="utf-8")
     assert "- seeds: 0, 1\n" in report
     assert "in the folders that the settings name: `results.h5`" in report
+
+
+def test_swept_goals_are_scenes_of_their_own(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("autdtorch.study.report.study_report.rendering_problem", lambda: "not tried")
+    assert run("-m", *QUICK, "method=lssg", "goal=weakest_focus,mean_pressure") == 0
+    targets = ("goal=target_pressures", "goal.targets=[4,2,4,2],[2,4,2,4]")
+    assert run("-m", *QUICK, "method=lssg", *targets) == 0
+    assert run("collect", "multirun") == 0
+    scenes = collect_results(tmp_path).results.scenes
+    assert [scene.goal["name"] for scene in scenes.values()] == [
+        "mean_pressure", "target_pressures", "target_pressures", "weakest_focus"
+    ]  # fmt: skip
+    assert "homogeneous,goal=target_pressures,targets=4x2x4x2" in scenes
+    with (tmp_path / "multirun" / "summary.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["goal"] for row in rows] == [scene.goal["name"] for scene in scenes.values()]
+    assert [row["unit"] for row in rows] == ["Pa", "", "", "Pa"]
+    assert [row["gap to the bound"] == "" for row in rows] == [False, True, True, False]
 
 
 def test_an_unfinished_study_is_left_out(run, tmp_path, capsys):

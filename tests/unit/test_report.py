@@ -2,6 +2,7 @@
 
 import base64
 import functools
+import math
 import re
 import tempfile
 from dataclasses import replace
@@ -17,6 +18,7 @@ import autdtorch.study.report.study_report
 from autdtorch.methods.gabs import gabs
 from autdtorch.methods.lssg import lssg
 from autdtorch.objectives.bound import focus_bound
+from autdtorch.objectives.goals import TargetPressures
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.scene import Scene
 from autdtorch.study.report.study_report import HTML_FILE, write_report
@@ -121,13 +123,46 @@ def with_bound(results, bound):
 def test_every_method_has_a_gap_to_the_bound():
     results = studied({"a": scene()}, trials=7)
     bound = focus_bound(results.scenes["a"].transfer_matrix)
-    assert gap_rows(results)[1][:3] == ["a", "*bound*", f"{bound:.3g}"]
+    assert gap_rows(results)[1][:3] == ["a", "*bound*", f"{bound:.3g} Pa"]
     median = float(results.scenes["a"].methods["gabs"].solution.score.median())  # of seven, one of them
     _, bound_row, lssg_row, _, gabs_row = gap_rows(with_bound(results, 2 * median))
-    assert bound_row[:4] == ["a", "*bound*", f"{2 * median:.3g}", "0"]
+    assert bound_row[:4] == ["a", "*bound*", f"{2 * median:.3g} Pa", "0"]
     assert gabs_row[3].startswith("50.0")
     assert gabs_row[4:6] == [str(1 + 3 * 4), "- (0 of 7)"]
     assert lssg_row[5] == "-"
+
+
+def test_a_report_of_target_pressures_has_differences_to_the_bound_and_no_verdict(tmp_path):
+    results, report = reported(BOTH, tmp_path, trials=3, goal=TargetPressures([9, 6, 9]))
+    _, _, lssg_row, *_ = gap_rows(results)
+    result = results.scenes["homogeneous"]
+    score = float(result.methods["lssg"].solution.score)
+    assert float(lssg_row[2]) == pytest.approx(score, rel=0.01)
+    assert float(lssg_row[3]) == pytest.approx(result.bound - score, rel=0.01)
+    assert lssg_row[5] == "-"
+    assert "target pressures" in report
+    assert "%" not in "".join(lssg_row)
+    assert "reproduced" not in report
+    assert not re.search(r"\bnan\b|\binf\b|None", report)
+    for name in figures(report):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_goal_without_bound_has_no_gap(tmp_path):
+    results = with_bound(studied({"a": scene()}, trials=2), math.inf)
+    write_report(results, {"a": scene()}, tmp_path, "autdtorch")
+    report = (tmp_path / "report.md").read_text(encoding="utf-8")
+    assert not re.search(r"\bnan\b|\binf\b|None", report)
+    assert {row[3] for row in gap_rows(results)[1:]} == {"-"}
+
+
+def test_scenes_of_different_goals_have_figures_of_their_own(tmp_path):
+    results = studied({"a": scene()})
+    other = studied({"b": scene()}, goal=TargetPressures([9, 6, 9]))
+    both = replace(results, scenes=results.scenes | other.scenes)
+    write_report(both, {"a": scene(), "b": scene()}, tmp_path, "autdtorch")
+    shown = figures((tmp_path / "report.md").read_text(encoding="utf-8"))
+    assert {"fig3d.png", "fig3d_2.png", "fig4.png", "fig4_2.png"} <= set(shown)
 
 
 def test_a_median_of_evaluations_is_given_if_more_than_half_of_the_trials_got_there():
@@ -150,7 +185,7 @@ def test_the_gradient_is_a_baseline(tmp_path, monkeypatch):
     monkeypatch.setattr(autdtorch.study.report.study_report, "plot_convergence", drawn)
     write_report(with_bound(results, 2 * score), {"a": scene()}, tmp_path, "autdtorch")
     row = gap_rows(with_bound(results, 2 * score))[-1]
-    assert (row[1], row[3], row[4], row[5]) == ("gradient ascent", "50.0", "-", "-")
+    assert (row[1], row[3], row[4], row[5]) == ("gradient ascent", "50.0 %", "-", "-")
     history, levels = drawn.call_args.args
     assert list(history["a"]) == ["bayes_opt", "gabs"]
     near = pytest.approx(1.8 * score)

@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 import torch
 
+from autdtorch.io.goal_section import goal_section
 from autdtorch.methods.solution import Solution
+from autdtorch.objectives.goals import WEAKEST_FOCUS, TargetPressures
 from autdtorch.objectives.metrics import focus_metrics
 from autdtorch.propagators import Run
 from autdtorch.study import provenance as origins
@@ -99,6 +101,17 @@ def test_a_file_is_on_disk_before_it_is_renamed_and_a_full_disk_keeps_the_old_on
     assert load_results(tmp_path).scenes.keys() == results.scenes.keys()
 
 
+def test_results_without_a_goal_are_of_the_papers(results, tmp_path):
+    targets = goal_section(TargetPressures([4, 2]))
+    scene = dataclasses.replace(results.scenes["empty"], goal=targets, unit="", bound=-0.5)
+    save_results(dataclasses.replace(results, scenes={"empty": scene}), tmp_path)
+    assert_same(load_results(tmp_path).scenes["empty"], scene)
+    for key in ("goal", "unit"):
+        changed(tmp_path / RESULTS_FILE, lambda file, key=key: put(file, f"scenes/empty@{key}", None))
+    older = load_results(tmp_path).scenes["empty"]
+    assert (older.goal, older.score_label) == (goal_section(WEAKEST_FOCUS), "weakest focus [Pa]")
+
+
 @pytest.mark.parametrize(("name", "load"), [(RESULTS_FILE, load_results), (PROVENANCE_FILE, load_provenance)])
 def test_missing_incomplete_and_damaged_files_are_refused_by_name(results, tmp_path, name, load):
     with pytest.raises(FileNotFoundError, match=name):
@@ -135,13 +148,18 @@ def saved(results, folder):
     return folder / RESULTS_FILE, (folder / RESULTS_FILE).read_bytes()
 
 
-def refused(path, content, change):
-    """Write content with a change and a new checksum; return the message of the refusal."""
-    path.write_bytes(content)
+def changed(path, change):
+    """Change a file, and its checksum."""
     with h5py.File(path, "r+") as file:
         change(file)
     body = path.read_bytes()[512:]
     path.write_bytes(hashlib.sha256(body).hexdigest().encode().ljust(512, b"\0") + body)
+
+
+def refused(path, content, change):
+    """Write content with a change and a new checksum; return the message of the refusal."""
+    path.write_bytes(content)
+    changed(path, change)
     with pytest.raises(ValueError, match=rf"^.*{RESULTS_FILE}: .*; must be a results file of .*$") as error:
         load_results(path)
     return str(error.value)
@@ -186,7 +204,9 @@ OTHER = {name: h5py.SoftLink(f"/scenes/two_cubes{name}") for name in ("", "/meth
         ("@date", [3, None]),
         ("@seed", ["three", 1.5, None]),
         ("scenes/empty@obstacles", [np.inf, -(10**9), 0.5, None]),
-        ("scenes/empty@bound", ["high", np.ones(2), np.nan, -1.0, None]),
+        ("scenes/empty@bound", ["high", np.ones(2), np.nan, -np.inf, None]),
+        ("scenes/empty@goal", ["loud", "[]", "{}", '{"name": "<b>"}', '{"name": "target_pressures"}', 3]),
+        ("scenes/empty@unit", ["<b>", 3, None]),
         ("scenes/empty@method", ["guess", None]),
         ("scenes/empty@wavelength", [0.0, None]),
         ("scenes/two_cubes@spacing", [np.inf]),

@@ -3,6 +3,7 @@
 import functools
 import logging
 import math
+from dataclasses import dataclass
 
 import pytest
 import torch
@@ -10,11 +11,13 @@ from small_scenes import AIR, CUBE, small_scene
 
 import autdtorch.study.run
 from autdtorch.analytic.green import green
+from autdtorch.io.goal_section import load_goal
 from autdtorch.methods.gabs import GABS, gabs
 from autdtorch.methods.gradient import GradientAscent
 from autdtorch.methods.identify import Identify
 from autdtorch.methods.lssg import LSSG, lssg
 from autdtorch.methods.prior import Prior
+from autdtorch.objectives.goals import Goal, MeanPressure, QuietPoints, TargetPressures
 from autdtorch.propagators import FreeSpacePropagator, Run, SteadyStateWarning
 from autdtorch.propagators.full import DomainSimulation
 from autdtorch.scene.geometry import Plane
@@ -169,6 +172,8 @@ def test_a_study_goes_on_after_the_scenes_that_were_finished(scenes, count_runs,
         ({"seed": -1}, "seed: -1"),
         ({"plane_spacing": float("nan")}, "plane_spacing: nan m"),
         ({"solver": {"spacing": -1.0}}, r"solver: spacing: -1\.0 m"),
+        ({"goal": "mean_pressure"}, "goal: 'mean_pressure'; must be a Goal"),
+        ({"goal": TargetPressures([3, 4])}, r"goal: targets: \(3\.0, 4\.0\); must be 3 numbers"),
         ({"methods": {"gabs": GABS(first=16)}}, "method gabs: first: 16; must be an integer from 0 to"),
     ],
 )
@@ -193,6 +198,46 @@ def test_the_matrix_of_the_study_is_a_prior(tmp_path):
     found = run_study({"a": scene(None)}, methods, tmp_path, solver=FREE_SPACE).scenes["a"].methods
     # 1e-4 is what either climb leaves.
     assert found["identify"].solution.score > 0.999 * found["climb"].solution.score
+
+
+GOALS = [MeanPressure(), TargetPressures([9, 6, 9]), QuietPoints(MeanPressure(), [1], 0.1)]
+
+
+@pytest.mark.parametrize("goal", GOALS, ids=lambda goal: goal.name)
+def test_methods_and_functions_maximise_the_goal_of_the_study(goal, tmp_path):
+    methods = {"climb": GradientAscent(), "gabs": functools.partial(gabs, levels=4)}
+    scene_result = run_study({"a": scene(None)}, methods, tmp_path, solver=FREE_SPACE, goal=goal).scenes["a"]
+    assert scene_result.bound == goal.bound(scene_result.transfer_matrix)
+    assert load_goal("goal", load_results(tmp_path).scenes["a"].goal) == goal
+    for method in scene_result.methods.values():
+        assert torch.equal(method.solution.score, goal(method.solution.pressure))
+    climbed = scene_result.methods["climb"].solution.score
+    assert scene_result.methods["gabs"].solution.score < climbed <= scene_result.bound
+
+
+@dataclass(frozen=True)
+class Loudest(Goal):
+    def __call__(self, pressure):
+        return pressure.amax(dim=-1)
+
+
+def test_a_goal_of_ones_own_has_no_bound_and_is_computed_again(study, count_runs, tmp_path):
+    for _ in range(2):
+        results = study(config="a: 1", goal=Loudest())
+    assert count_runs == ["second", "first"] * 2
+    found = results.scenes["first"]
+    assert found.bound == load_results(tmp_path).scenes["first"].bound == math.inf
+    assert found.score_label == "Loudest [Pa]"
+    solution = found.methods["gabs"].solution
+    assert torch.equal(solution.score, solution.pressure.amax(dim=1))
+
+
+def test_a_function_that_takes_no_score_is_refused_for_another_goal(tmp_path):
+    def weakest(objective):
+        return lssg(objective)
+
+    with pytest.raises(ValueError, match="method own: 'weakest'; must have a parameter `score`"):
+        run_study({"a": scene()}, {"own": weakest}, tmp_path, solver=FREE_SPACE, goal=MeanPressure())
 
 
 @pytest.mark.parametrize("returned", [1, 3])

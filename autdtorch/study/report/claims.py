@@ -14,6 +14,7 @@ from typing import TypeAlias
 
 import torch
 
+from autdtorch.io.goal_section import PAPERS_GOAL
 from autdtorch.methods.catalogue import label_of
 from autdtorch.methods.solution import Solution
 from autdtorch.study.results import SceneResult, StudyResult
@@ -60,9 +61,11 @@ class Claim:
     heading: str = ""  # first line of the evidence
 
     def judge(self, results: StudyResult) -> Verdict | None:
-        """Return the verdict of the results, or None if they lack methods or scenes of the claim."""
+        """Return the verdict of the results, or None without the methods, scenes or goal of the claim."""
         usable = {
-            name: scene for name, scene in results.scenes.items() if set(self.methods) <= scene.methods.keys()
+            name: scene
+            for name, scene in results.scenes.items()
+            if set(self.methods) <= scene.methods.keys() and scene.goal == PAPERS_GOAL
         }
         empty = [scene for scene in usable.values() if scene.obstacles == 0]
         found = {

@@ -14,7 +14,9 @@ import torch
 import autdtorch
 from autdtorch.hardware.log import EvaluationLog
 from autdtorch.hardware.preflight import Preflight
+from autdtorch.io.goal_section import score_label
 from autdtorch.methods.solution import Solution
+from autdtorch.objectives.goals import Goal
 from autdtorch.objectives.objective import Objective
 from autdtorch.plot.trials import plot_convergence
 from autdtorch.study.report.document import code, rendered
@@ -46,12 +48,14 @@ def write_hardware_report(
     simulated: Objective,
     expected: Solution,
     preflight: Preflight,
+    goal: Goal,
     command: str,
 ) -> Path:
     """Write `report.md` and its figure into a folder; return its path.
 
     The search on the bench `found` a drive, which was read `again` (R, P) [Pa]. `expected` is the solution of
-    the same method on the `simulated` objective, without noise and with the phase levels of the device.
+    the same method on the `simulated` objective, without noise and with the phase levels of the device. Both
+    maximised the `goal`.
     """
     evaluations, scene = log.evaluations, simulated.scene
     working = torch.ones(len(scene.array), dtype=torch.float64, device="cpu")
@@ -59,9 +63,12 @@ def write_hardware_report(
     measured = torch.stack([one.pressure for one in evaluations])
     predicted = simulated(working * torch.stack([one.drive for one in evaluations]))
     fit = compare(measured, predicted)
-    histories = {"bench": found.history, "simulation": fit.scale * expected.history}
+    # A pressure scales with the transducers; a score without unit does not.
+    scale = fit.scale if goal.unit else 1.0
+    histories = {"bench": found.history, "simulation": scale * expected.history}
+    label = score_label(f"{goal.name}, best so far", goal.unit)
     with naming(folder / _FIGURE):
-        plot_convergence({scene.name: histories}).savefig(folder / _FIGURE)
+        plot_convergence({scene.name: histories}, label=label).savefig(folder / _FIGURE)
     again_mean = again.mean(dim=0)
     pressures = found.pressure[0], again_mean, fit.scale * simulated(working * found.drive)[0]
     times = [datetime.fromisoformat(one.time) for one in evaluations]
@@ -76,7 +83,9 @@ def write_hardware_report(
         times=times,
         interval=statistics.median_low(gaps) if gaps else 0.0,  # an interruption does not change it
         found=found,
-        again=again_mean,
+        goal=score_label(goal.name),
+        unit=goal.unit and f" {goal.unit}",
+        score_again=float(goal(again_mean)),
         readings=len(again),
         same=int(torch.isclose(found.drive, expected.drive, rtol=0, atol=1e-9).sum()),
         points=_points(scene.control_points, *pressures),

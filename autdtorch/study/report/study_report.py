@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
 
+import numpy as np
 import torch
 
+from autdtorch.io.goal_section import score_label
 from autdtorch.methods.catalogue import label_of
 from autdtorch.plot.costs import plot_pareto
 from autdtorch.plot.pressure_maps import plot_planes
@@ -20,11 +24,13 @@ from autdtorch.study.report.claims import BO, GABS, judge_claims
 from autdtorch.study.report.document import as_page, rendered
 from autdtorch.study.results import MethodResult, SceneResult, StudyResult, summary_rows
 from autdtorch.study.results_file import RESULTS_FILE
-from autdtorch.study.statistics import FEWEST_TRIALS, NEAR_BOUND, bound_gap
+from autdtorch.study.statistics import FEWEST_TRIALS, NEAR_BOUND, has_shares
 from autdtorch.study.trial_file import TRIALS_FILE
 
 REPORT_FILE = "report.md"
 HTML_FILE = "report.html"
+
+_Key = TypeVar("_Key")
 
 _FEW_TRIALS = 20  # with fewer, the spread of a method is not well known
 _PLANES_A_FIGURE = 4
@@ -54,8 +60,6 @@ def _markdown(
     results: StudyResult, scenes: Mapping[str, Scene], folder: Path, command: str, seeds: Sequence[int]
 ) -> str:
     """Draw the figures into a folder; return the text of the report."""
-    _draw_convergence(results, folder)
-    _draw_costs(results, folder)
     counts: dict[str, list[int]] = {}
     for scene in results.scenes.values():
         for name, method in scene.methods.items():
@@ -74,6 +78,10 @@ def _markdown(
         rendering_problem=_draw_scenes(scenes, folder),
         scenes=[(name, f"![{name}](fig1_{name}.png)") for name in scenes],
         planes=_draw_planes(results, scenes, folder),
+        goals=list(dict.fromkeys(scene.score_label for scene in results.scenes.values())),
+        differences=not all(has_shares(scene.bound) for scene in results.scenes.values()),
+        convergence=_draw_convergence(results, folder),
+        costs=_draw_costs(results, folder),
         quantities=_draw_trials(results, folder),
         summary=summary_rows(results),
         claims=tables.claim_rows(judged),
@@ -108,7 +116,7 @@ def _draw_planes(results: StudyResult, scenes: Mapping[str, Scene], folder: Path
     files: list[str] = []
     for start in range(0, len(names), _PLANES_A_FIGURE):
         part = names[start : start + _PLANES_A_FIGURE]
-        files.append(f"fig2_{len(files) + 1}.png" if files else "fig2.png")
+        files.append(_numbered("fig2", files))
         points = {name: scenes[name].control_points for name in part}
         obstacles = {name: scenes[name].obstacles for name in part}
         figure = plot_planes({name: pressure[name] for name in part}, planes, points, obstacles)
@@ -142,30 +150,67 @@ def _by_method(
     return found
 
 
-def _draw_convergence(results: StudyResult, folder: Path) -> None:
-    history, levels = {}, {}
-    for scene, found in results.scenes.items():
-        competitors = _competitors(found)
-        history[scene] = {name: method.solution.history for name, method in competitors.items()}
-        levels[scene] = {"bound": found.bound, f"{tables.NEAR} of the bound": NEAR_BOUND * found.bound}
-        levels[scene] |= {
-            label_of(name): float(method.solution.score.median())
-            for name, method in found.methods.items()
-            if name not in competitors
-        }
-    plot_convergence(history, levels).savefig(folder / "fig3d.png")
+def _numbered(name: str, files: Sequence[str]) -> str:
+    """Return the name of the file of a figure after those that it has."""
+    return f"{name}_{len(files) + 1}.png" if files else f"{name}.png"
 
 
-def _draw_costs(results: StudyResult, folder: Path) -> None:
-    points = {
-        scene: {
-            name: [(float(method.seconds.median()), 100 * (1 - bound_gap(method, found.bound).gap.value))]
-            for name, method in _competitors(found).items()
+def _draw_convergence(results: StudyResult, folder: Path) -> list[str]:
+    """Return the names of the files, one for each goal and unit."""
+    files: list[str] = []
+    for (goal, unit), scenes in _grouped(results, lambda scene: (scene.goal["name"], scene.unit)).items():
+        history, levels = {}, {}
+        for name, scene in scenes.items():
+            competitors = _competitors(scene)
+            history[name] = {method: found.solution.history for method, found in competitors.items()}
+            levels[name] = _bounds(scene.bound) | {
+                label_of(method): float(found.solution.score.median())
+                for method, found in scene.methods.items()
+                if method not in competitors
+            }
+        files.append(_numbered("fig3d", files))
+        label = score_label(f"{goal}, best so far", unit)
+        plot_convergence(history, levels, label=label).savefig(folder / files[-1])
+    return files
+
+
+def _bounds(bound: float) -> dict[str, float]:
+    """Return the bound, if it is known, and a score near it, by label."""
+    near = {f"{tables.NEAR} of the bound": NEAR_BOUND * bound} if has_shares(bound) else {}
+    return {"bound": bound} | near if math.isfinite(bound) else {}
+
+
+def _draw_costs(results: StudyResult, folder: Path) -> list[str]:
+    """Return the names of the files: one for shares of the bound, and one for each other score."""
+    files: list[str] = []
+    share = "score / bound [%]"
+    groups = _grouped(results, lambda scene: share if has_shares(scene.bound) else scene.score_label)
+    for label, scenes in groups.items():
+        points = {
+            name: {
+                method: [(float(found.seconds.median()), _median_score(found, scene.bound))]
+                for method, found in _competitors(scene).items()
+            }
+            for name, scene in scenes.items()
         }
-        for scene, found in results.scenes.items()
-    }
-    time, score = "median time of the search [s per trial]", "score / bound [%]"
-    plot_pareto(points, time, score, higher_is_better=True).savefig(folder / "fig4.png")
+        files.append(_numbered("fig4", files))
+        time = "median time of the search [s per trial]"
+        plot_pareto(points, time, label, higher_is_better=True).savefig(folder / files[-1])
+    return files
+
+
+def _median_score(method: MethodResult, bound: float) -> float:
+    """Return the median score, in percent of the bound where it is a share of it."""
+    score = float(np.median(method.solution.score.numpy()))
+    return 100 * score / bound if has_shares(bound) else score
+
+
+def _grouped(results: StudyResult, key: Callable[[SceneResult], _Key]) -> dict[_Key, dict[str, SceneResult]]:
+    """Return the scenes by a key, and by name."""
+    found: dict[_Key, dict[str, SceneResult]] = {}
+    for name, scene in results.scenes.items():
+        found.setdefault(key(scene), {})[name] = scene
+    return found
 
 
 def _competitors(scene: SceneResult) -> Mapping[str, MethodResult]:

@@ -13,8 +13,8 @@ import torch
 from autdtorch.methods.catalogue import label_of
 from autdtorch.propagators import Run
 from autdtorch.study.report.claims import Claim, Verdict
-from autdtorch.study.results import MethodResult, StudyResult
-from autdtorch.study.statistics import NEAR_BOUND, bound_gap
+from autdtorch.study.results import MethodResult, SceneResult, StudyResult
+from autdtorch.study.statistics import NEAR_BOUND, Interval, bound_gap, has_shares
 from autdtorch.study.sweeps import Sweep
 from autdtorch.utils.files import replacing
 
@@ -41,18 +41,27 @@ def claim_rows(judged: Iterable[tuple[Claim, Verdict | None]]) -> list[list[str]
 
 def gap_rows(results: StudyResult) -> list[list[str]]:
     """Return score, gap to the bound and cost of every method."""
-    head = ["scene", "method", "score [Pa]", "gap to the bound [%]", "evaluations"]
+    head = ["scene", "method", "score", "gap to the bound", "evaluations"]
     rows = [[*head, f"to {NEAR} of the bound", "s per trial"]]
     for scene_name, scene in results.scenes.items():
-        rows.append([scene_name, "*bound*", f"{scene.bound:.3g}", "0", "-", "-", "-"])
+        bounded = math.isfinite(scene.bound)
+        cells = [scene.in_unit(f"{scene.bound:.3g}"), "0"] if bounded else ["no bound", "-"]
+        rows.append([scene_name, "*bound*", *cells, "-", "-", "-"])
         for name, method in scene.methods.items():
             found = bound_gap(method, scene.bound)
-            gap = f"{found.gap.mapped(lambda share: 100 * share):.1f}"
+            scores = [scene.in_unit(found.score), _gap(found.gap, scene)]
             evaluations = f"{method.solution.evaluations.double().mean():.0f}"
-            counts = ["-", "-"] if is_baseline(name) else [evaluations, _median_of_reached(found.evaluations)]
-            seconds = f"{method.seconds.median():.2g}"
-            rows.append([scene_name, label_of(name), str(found.score), gap, *counts, seconds])
+            near = _median_of_reached(found.evaluations) if has_shares(scene.bound) else "-"
+            counts = ["-", "-"] if is_baseline(name) else [evaluations, near]
+            rows.append([scene_name, label_of(name), *scores, *counts, f"{method.seconds.median():.2g}"])
     return rows
+
+
+def _gap(gap: Interval, scene: SceneResult) -> str:
+    """Return the gap to the bound in percent, or as a difference where scores are no shares of the bound."""
+    if has_shares(scene.bound):
+        return f"{gap.mapped(lambda share: 100 * share):.1f} %"
+    return scene.in_unit(gap) if math.isfinite(scene.bound) else "-"
 
 
 def _median_of_reached(evaluations: torch.Tensor) -> str:
@@ -102,7 +111,7 @@ def save_summary(sweep: Sweep, path: Path) -> None:
     for (name, method), settings in sweep.swept.items():
         scene = sweep.results.scenes[name]
         row: dict[str, object] = {"scene": name.partition(",")[0], "method": method.partition(",")[0]}
-        row |= {key: settings.get(key) for key in keys} | _numbers(scene.methods[method], scene.bound)
+        row |= {key: settings.get(key) for key in keys} | _numbers(scene.methods[method], scene)
         rows.append(row)
     with replacing(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         lines = csv.DictWriter(file, list(rows[0]))
@@ -110,14 +119,16 @@ def save_summary(sweep: Sweep, path: Path) -> None:
         lines.writerows(rows)
 
 
-def _numbers(method: MethodResult, bound: float) -> dict[str, object]:
-    found, metrics = bound_gap(method, bound), method.metrics
+def _numbers(method: MethodResult, scene: SceneResult) -> dict[str, object]:
+    found, metrics = bound_gap(method, scene.bound), method.metrics
     return {
+        "goal": scene.goal["name"],
+        "unit": scene.unit,
         "trials": method.trials,
-        "median score [Pa]": found.score.value,
-        "best score [Pa]": float(method.solution.score.max()),
-        "bound [Pa]": bound,
-        "gap to the bound": found.gap.value,
+        "median score": found.score.value,
+        "best score": float(method.solution.score.max()),
+        "bound": scene.bound if math.isfinite(scene.bound) else None,
+        "gap to the bound": found.gap.value if has_shares(scene.bound) else None,
         "mean of the foci [Pa]": float(metrics.mean.mean()),
         "std among the foci [Pa]": float(metrics.std.mean()),
         "area a focus [m^2]": None if metrics.area is None else float(metrics.area.mean()),
