@@ -36,13 +36,13 @@ frequency: 40000
 control_points: {type: points, positions: [[0.08, 0, 0]]}
 """
 
-METHODS = ("BayesOpt", "GABS", "GradientAscent", "Identify", "LSS", "LSSG", "RandomSearch")
+METHODS = ("BayesOpt", "GABS", "GradientAscent", "Holography", "Identify", "LSS", "LSSG", "RandomSearch")
 
 #: Results, parts of drivers, and calls that need a device.
 NOT_CALLED_BY_USERS = {
     *("Estimate", "Evaluation", "EvaluationLog", "FocusMetrics", "Preflight", "Run", "Solution", "Sweep"),
     *("Adapter", "Device", "Dialect", "Obstacle", "OpenMPDBoard", "SimulatedPropagator", "UsbtmcPort"),
-    *("EmulatedBench.receive", "EmulatedScope.execute", "Method", "State", "Waveform"),
+    *("EmulatedBench.receive", "EmulatedScope.execute", "Goal", "Method", "State", "Waveform"),
     *("EmulatedScope.plug_into", "Oscilloscope.capture", "Oscilloscope.set_up"),
     *("Device.pack", "lock_log", "open_autd3"),  # the one only makes a context, the other asks the network
 }
@@ -50,7 +50,7 @@ NOT_CALLED_BY_USERS = {
 
 #: Methods that the driver calls, and that authors of methods implement.
 INSIDE_METHODS = {"advance", "begin", "check", "most_at_once", "most_evaluations", "numbers_kept"}
-INSIDE_METHODS |= {"forward", "recorded", "require_fit"}
+INSIDE_METHODS |= {"forward", "levels", "parts", "recorded", "require_fit", "slope"}
 
 
 class Made(NamedTuple):
@@ -184,6 +184,7 @@ ARGUMENTS: dict[str, Any] = {
     "field": torch.ones(4, 4, dtype=torch.complex128),
     "folder": Made(lambda folder: folder),
     "frequency": 40e3,
+    "goal": at.WeakestFocus(),
     "height": 5e-3,
     "history": {"scene": {"gabs": [[1.0, 2.0]]}},
     "isosurface": -3.0,
@@ -211,6 +212,7 @@ ARGUMENTS: dict[str, Any] = {
     "propagator": Made(lambda _: at.make_propagator(AIR_ALONE)),
     "quantities": {"pressure [Pa]": {"scene": {"gabs": [1.0, 2.0]}}},
     "radius": 3e-3,
+    "ratio": 0.1,
     "rotation": (0.0, 0.0, 0.1),
     "scale": 1e-3,
     "scene": SCENE,
@@ -249,6 +251,9 @@ OTHERS: dict[str, Any] = {
     "Mesh.from_surface.surface": Made(lambda _: CUBE.surface()),
     "Mesh.path": Made(mesh_file),
     "OpenMPDBoard.load.path": Made(board_file),
+    "QuietPoints.points": [1],
+    "TargetPressures.targets": [1.0, 2.0, 3.0],
+    "TargetPressures.__call__.pressure": [1.0, 2.0, 3.0],
     "PhasorKernel.mean.x": torch.ones(3, 2, dtype=torch.float64),
     "Problem.transducers": 4,
     "Oscilloscope.port": Made(lambda _: scope()._port),

@@ -20,8 +20,8 @@ from autdtorch.objectives.objective import Objective, Score
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import integer_at_least, invalid
 
-# First and last value, in equal ratios between: temperature of `Goal.slope`, and step in amplitudes
-_TEMPERATURE = (0.3, 1e-4)
+# First and last value, in equal ratios between: smoothing of `Goal.slope`, and step in amplitudes
+_SMOOTHING = (0.3, 1e-4)
 _STEP = (0.5, 0.005)
 _MOMENTUM = 0.9
 _TINY = 1e-300
@@ -97,14 +97,13 @@ def climb(goal: Score, matrix: torch.Tensor, drive: torch.Tensor, steps: int) ->
 def climbed(goal: Score, matrix: torch.Tensor, drive: torch.Tensor, steps: int) -> torch.Tensor:
     """Return drives (S, M) after projected gradient ascents of a goal with momentum from drives (S, M).
 
-    Each ascent is on one matrix (P, M) or on its own (S, P, M). The goal is smoothed over a temperature,
-    which falls.
+    Each ascent is on one matrix (P, M) or on its own (S, P, M). The goal is smoothed less and less.
     """
     velocity = torch.zeros_like(drive)
     for progress in torch.linspace(0, 1, steps, dtype=torch.float64, device="cpu").tolist():
-        temperature, step = (first * (last / first) ** progress for first, last in (_TEMPERATURE, _STEP))
+        smoothing, step = (first * (last / first) ** progress for first, last in (_SMOOTHING, _STEP))
         pressure = _pressure(matrix, drive)
-        weights = slope_of(goal, pressure.abs(), temperature)
+        weights = slope_of(goal, pressure.abs(), smoothing)
         slope = ((weights * pressure.sgn())[..., None] * matrix.conj()).sum(dim=-2)
         slope = slope / slope.abs().mean(dim=-1, keepdim=True).clamp_min(_TINY)
         velocity = _MOMENTUM * velocity + (1 - _MOMENTUM) * slope

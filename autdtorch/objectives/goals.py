@@ -44,12 +44,12 @@ class Goal(ABC):
     def __call__(self, pressure: ArrayLike) -> torch.Tensor:
         """Return the scores (...) of pressure magnitudes (..., P) [Pa]."""
 
-    def slope(self, pressure: torch.Tensor, temperature: float) -> torch.Tensor:
+    def slope(self, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
         """Return derivatives (..., P) of the score by the magnitudes, smoothed over a share of the mean.
 
         Args:
             pressure: magnitudes (..., P) [Pa].
-            temperature: differences of pressures, relative to their mean, that are smoothed.
+            smoothing: differences of pressures, relative to their mean, over which minima are smoothed.
         """
         return derivative(self, pressure)
 
@@ -89,10 +89,10 @@ class WeakestFocus(Goal):
         """Return the smallest magnitude over weight (...) [Pa]."""
         return self.levels(checked_pressure(pressure)).amin(dim=-1)
 
-    def slope(self, pressure: torch.Tensor, temperature: float) -> torch.Tensor:
+    def slope(self, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
         """Return those of the smooth minimum -T log sum_p exp(-|p_p| / (w_p T))."""
         levels = self.levels(pressure)
-        hardness = 1 / (temperature * levels.mean(dim=-1, keepdim=True)).clamp_min(
+        hardness = 1 / (smoothing * levels.mean(dim=-1, keepdim=True)).clamp_min(
             torch.finfo(levels.dtype).tiny
         )
         return self.levels(torch.softmax(-levels * hardness, dim=-1))
@@ -124,7 +124,7 @@ class MeanPressure(Goal):
         """Return the mean magnitude (...) [Pa]."""
         return checked_pressure(pressure).mean(dim=-1)
 
-    def slope(self, pressure: torch.Tensor, temperature: float) -> torch.Tensor:
+    def slope(self, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
         """Return equal derivatives."""
         return torch.full_like(pressure, 1 / pressure.shape[-1])
 
@@ -159,7 +159,7 @@ class TargetPressures(Goal):
         """Return minus the rms deviation (...), relative to the targets."""
         return -self._deviation(checked_pressure(pressure)).square().mean(dim=-1).sqrt()
 
-    def slope(self, pressure: torch.Tensor, temperature: float) -> torch.Tensor:
+    def slope(self, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
         """Return those of minus half the sum of squares."""
         return -self._deviation(pressure) / pressure.new_tensor(self.targets)
 
@@ -221,13 +221,13 @@ class QuietPoints(Goal):
         excess = (quiet.amax(dim=-1).clamp_min(tiny) / limit.clamp_min(tiny)).log().clamp_min(0)
         return score - _PENALTY * excess * (score if self.unit else 1)
 
-    def slope(self, pressure: torch.Tensor, temperature: float) -> torch.Tensor:
+    def slope(self, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
         """Return those of the goal, less a quadratic penalty for each quiet point that grows as it cools."""
         loud, quiet = self.parts(pressure)
         limit = self.ratio * loud.amin(dim=-1, keepdim=True).clamp_min(torch.finfo(loud.dtype).tiny)
         slope = torch.zeros_like(pressure)
-        own = self.goal.slope(loud, temperature)
-        over = (quiet / limit - 1).clamp_min(0) / temperature
+        own = self.goal.slope(loud, smoothing)
+        over = (quiet / limit - 1).clamp_min(0) / smoothing
         slope[..., self._others(pressure.shape[-1])] = own
         slope[..., list(self.points)] = -own.abs().sum(dim=-1, keepdim=True) * over
         return slope
@@ -281,9 +281,9 @@ def goal_of(score: Score) -> Score:
     return WEAKEST_FOCUS if score is weakest_focus else score
 
 
-def slope_of(goal: Score, pressure: torch.Tensor, temperature: float) -> torch.Tensor:
+def slope_of(goal: Score, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
     """Return the derivatives (..., P) of a goal or of any function of magnitudes; see `Goal.slope`."""
-    return goal.slope(pressure, temperature) if isinstance(goal, Goal) else derivative(goal, pressure)
+    return goal.slope(pressure, smoothing) if isinstance(goal, Goal) else derivative(goal, pressure)
 
 
 def derivative(goal: Score, pressure: torch.Tensor) -> torch.Tensor:

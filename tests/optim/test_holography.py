@@ -33,7 +33,7 @@ def test_weighted_and_descent_reach_proportions_and_pressures(random_matrix):
     # 200 iterations leave 1e-4; back-propagation alone leaves a third
     assert share.std() < 1e-3 * share.mean()
     for free in (False, True):
-        drive = holography(matrix, wanted, "diff_pat", amplitudes=free)
+        drive = holography(matrix, wanted, "diff_pat", free_amplitudes=free)
         # within reach: all foci could have about twice their targets
         assert (pressures(matrix, drive) / wanted - 1).abs().max() < 1e-2
         assert drive.abs().max() <= 1 + 1e-12
@@ -41,7 +41,7 @@ def test_weighted_and_descent_reach_proportions_and_pressures(random_matrix):
 
 def test_free_amplitudes_give_the_wanted_level(random_matrix):
     matrix, wanted = random_matrix(3, 30, 2), torch.tensor([2.0, 1.0, 3.0]).double()
-    drive = holography(matrix, wanted, "wgs", amplitudes=True)
+    drive = holography(matrix, wanted, "wgs", free_amplitudes=True)
     assert (pressures(matrix, drive) / wanted - 1).abs().max() < 1e-3
     assert drive.abs().max() <= 1 + 1e-12
 
@@ -113,7 +113,7 @@ def test_goals_tell_the_wanted_pressures(make_objective, random_matrix):
         ({"targets": [0.0, 0.0]}, "targets: .*; must be >= 0, and one of each set > 0"),
         ({"algorithm": "best"}, "algorithm: 'best'"),
         ({"iterations": 0}, "iterations: 0"),
-        ({"amplitudes": 2}, "amplitudes: 2"),
+        ({"free_amplitudes": 2}, "free_amplitudes: 2"),
     ],
 )
 def test_bad_input_is_named(given, message):

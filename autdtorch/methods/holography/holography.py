@@ -53,7 +53,7 @@ class Holography(Method):
     Attributes:
         algorithm: "naive", "gs", "wgs", "gs_pat" or "diff_pat"; see `holography`.
         iterations: of the algorithm, >= 1; "naive" has none.
-        amplitudes: whether amplitudes are free in [0, 1]; otherwise all are 1.
+        free_amplitudes: whether amplitudes are free in [0, 1]; otherwise all are 1.
     """
 
     name: ClassVar[str] = "holography"
@@ -62,13 +62,13 @@ class Holography(Method):
 
     algorithm: Algorithm = "wgs"
     iterations: int = 200
-    amplitudes: bool = False
+    free_amplitudes: bool = False
 
     def __post_init__(self) -> None:
         """Check the settings."""
         require_one_of("algorithm", self.algorithm, get_args(Algorithm))
         object.__setattr__(self, "iterations", integer_at_least("iterations", self.iterations, 1))
-        object.__setattr__(self, "amplitudes", boolean("amplitudes", self.amplitudes))
+        object.__setattr__(self, "free_amplitudes", boolean("free_amplitudes", self.free_amplitudes))
 
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
         """Compute the drive, and observe it."""
@@ -80,9 +80,11 @@ class Holography(Method):
         if self.algorithm == "diff_pat" and not absolute:
             # as loud as the weakest focus of "wgs" over its weight
             loud = targets > 0
-            reached = (matrix @ holography(matrix, targets, "wgs", self.iterations, self.amplitudes)).abs()
+            reached = (
+                matrix @ holography(matrix, targets, "wgs", self.iterations, self.free_amplitudes)
+            ).abs()
             targets = targets * (reached[loud] / targets[loud]).amin()
-        drive = holography(matrix, targets, self.algorithm, self.iterations, self.amplitudes)
+        drive = holography(matrix, targets, self.algorithm, self.iterations, self.free_amplitudes)
         return Step(drive[None, None], {})
 
 
@@ -91,7 +93,7 @@ def holography(
     targets: ArrayLike | None = None,
     algorithm: Algorithm = "wgs",
     iterations: int = 200,
-    amplitudes: bool = False,
+    free_amplitudes: bool = False,
 ) -> torch.Tensor:
     """Return drives for wanted pressures, for one transfer matrix or a batch of them.
 
@@ -101,7 +103,7 @@ def holography(
             "diff_pat" and where amplitudes are free. None for 1 everywhere.
         algorithm: "naive", "gs" (iterative back-propagation), "wgs" (weighted), "gs_pat" or "diff_pat".
         iterations: >= 1; "naive" has none.
-        amplitudes: whether amplitudes are free in [0, 1]; otherwise all are 1, and pressures at best in
+        free_amplitudes: whether amplitudes are free in [0, 1]; otherwise all are 1, and pressures at best in
             proportion to the targets, except of "diff_pat".
 
     Returns:
@@ -112,7 +114,7 @@ def holography(
     """
     require_one_of("algorithm", algorithm, get_args(Algorithm))
     iterations = integer_at_least("iterations", iterations, 1)
-    free = boolean("amplitudes", amplitudes)
+    free = boolean("free_amplitudes", free_amplitudes)
     matrix = _checked_matrix(G)
     wanted = _checked_targets(targets, matrix)
     drive = _solved(matrix, wanted, "wgs" if algorithm == "diff_pat" else algorithm, iterations, free)
