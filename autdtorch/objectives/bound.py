@@ -31,6 +31,9 @@ _LEAST_WEIGHT = 1e-12
 #: Largest price of a quiet point: where none can be quiet the search has no end. Range of log z, likewise.
 _MOST_PRICE, _RANGE = 1e6, 30.0
 
+#: Logarithm of a bound that is 0
+_NOTHING = -700.0
+
 #: Relative margin on top of the bound; rounding of the bound and of a pressure is below 1e-13.
 _MARGIN = 1e-12
 
@@ -91,9 +94,9 @@ def level_bound(
     silent = silent / alone.min()
     silent = silent[np.abs(silent).max(axis=1) > 0]
     importance = (alone.min() / alone) ** 2  # of each focus, scaled against overflow
-    rows = np.concatenate((foci / alone[:, None], silent))[:, np.abs(foci).max(axis=0) > 0]
-    count = len(foci)
-    start = np.linalg.norm(rows[:count], axis=0)
+    rows = np.concatenate((foci / alone[:, None], silent))
+    rows, count = rows[:, np.abs(rows).max(axis=0) > 0], len(foci)
+    start = np.linalg.norm(rows, axis=0)
     weights = 1 / importance if together else np.ones(count)
     limits = list(zip(weights, weights, strict=True)) if together else [(_LEAST_WEIGHT, None)] * count
     log_z = np.log(start)
@@ -133,6 +136,8 @@ def _log_bound(x: _Reals, rows: _Complexes, importance: _Reals, order: float) ->
     signed = np.concatenate((weights * (all_prices / mean), -prices))
     left, singular, right = np.linalg.svd(columns, full_matrices=False)
     values, vectors = np.linalg.eigh((singular[:, None] * (left.conj().T * signed) @ left) * singular)
+    if values[-1] <= 0:  # no level is left
+        return _NOTHING, np.zeros_like(x)
     positive = np.maximum(values, 0)
     ratios = positive / positive[-1]
     norm = np.linalg.norm(ratios, order)

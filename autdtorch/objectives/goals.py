@@ -67,6 +67,14 @@ class Goal(ABC):
     def check(self, points: int) -> None:  # noqa: B027 - many goals take any number of points
         """Check the goal against the number of control points; `ValueError` where it does not fit."""
 
+    def checked(self, pressure: ArrayLike) -> torch.Tensor:
+        """Return pressures (..., P) [Pa] after checking them, and that the goal has as many points."""
+        found = real_tensor("pressure", pressure, "Pa")
+        if found.ndim == 0 or found.shape[-1] == 0:
+            raise ValueError(f"pressure: shape {tuple(found.shape)}; must be (..., P) with P >= 1")
+        self.check(found.shape[-1])
+        return found
+
 
 @dataclass(frozen=True)
 class WeakestFocus(Goal):
@@ -87,7 +95,7 @@ class WeakestFocus(Goal):
 
     def __call__(self, pressure: ArrayLike) -> torch.Tensor:
         """Return the smallest magnitude over weight (...) [Pa]."""
-        return self.levels(checked_pressure(pressure)).amin(dim=-1)
+        return self.levels(self.checked(pressure)).amin(dim=-1)
 
     def slope(self, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
         """Return those of the smooth minimum -T log sum_p exp(-|p_p| / (w_p T))."""
@@ -122,14 +130,14 @@ class MeanPressure(Goal):
 
     def __call__(self, pressure: ArrayLike) -> torch.Tensor:
         """Return the mean magnitude (...) [Pa]."""
-        return checked_pressure(pressure).mean(dim=-1)
+        return self.checked(pressure).mean(dim=-1)
 
     def slope(self, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
         """Return equal derivatives."""
         return torch.full_like(pressure, 1 / pressure.shape[-1])
 
     def bound(self, G: ArrayLike) -> float:
-        """Return the bound [Pa] on the root mean square; see `Goal.bound`."""
+        """Return the bound [Pa] by the root mean square of points that sound reaches; see `Goal.bound`."""
         matrix = checked_matrix(G)
         reached = matrix[np.abs(matrix).max(axis=1) > 0]
         if len(reached) == 0:
@@ -157,7 +165,9 @@ class TargetPressures(Goal):
 
     def __call__(self, pressure: ArrayLike) -> torch.Tensor:
         """Return minus the rms deviation (...), relative to the targets."""
-        return -self._deviation(checked_pressure(pressure)).square().mean(dim=-1).sqrt()
+        deviation = self._deviation(self.checked(pressure))
+        total: torch.Tensor = torch.linalg.vector_norm(deviation, dim=-1)
+        return -total / math.sqrt(len(self.targets))
 
     def slope(self, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
         """Return those of minus half the sum of squares."""
@@ -201,6 +211,8 @@ class QuietPoints(Goal):
     def __post_init__(self) -> None:
         """Check the fields."""
         require_kind("goal", self.goal, Goal)
+        if isinstance(self.goal, QuietPoints):
+            raise invalid("goal", self.goal, "must be a goal without quiet points of its own")
         accepted = "must be indices of control points, each once, at least one"
         points = tuple(integers("points", self.points, 0, accepted))
         if not points or len(set(points)) < len(points):
@@ -215,11 +227,11 @@ class QuietPoints(Goal):
 
     def __call__(self, pressure: ArrayLike) -> torch.Tensor:
         """Return the score of the loud points (...), less the penalty."""
-        loud, quiet = self.parts(checked_pressure(pressure))
+        loud, quiet = self.parts(self.checked(pressure))
         score, limit = self.goal(loud), self.ratio * loud.amin(dim=-1)
         tiny = torch.finfo(quiet.dtype).tiny
         excess = (quiet.amax(dim=-1).clamp_min(tiny) / limit.clamp_min(tiny)).log().clamp_min(0)
-        return score - _PENALTY * excess * (score if self.unit else 1)
+        return score - _PENALTY * excess * (score.abs() if self.unit else 1)
 
     def slope(self, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
         """Return those of the goal, less a quadratic penalty for each quiet point that grows as it cools."""
@@ -292,14 +304,6 @@ def derivative(goal: Score, pressure: torch.Tensor) -> torch.Tensor:
         magnitude = pressure.detach().requires_grad_()
         found = torch.autograd.grad(goal(magnitude).sum(), magnitude, allow_unused=True)[0]
     return torch.zeros_like(pressure) if found is None else found
-
-
-def checked_pressure(pressure: ArrayLike) -> torch.Tensor:
-    """Return pressures (..., P) with P >= 1, after checking them."""
-    checked = real_tensor("pressure", pressure, "Pa")
-    if checked.ndim == 0 or checked.shape[-1] == 0:
-        raise ValueError(f"pressure: shape {tuple(checked.shape)}; must be (..., P) with P >= 1")
-    return checked
 
 
 def _positive(name: str, values: object, unit: str = "") -> tuple[float, ...]:

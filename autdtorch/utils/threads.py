@@ -58,12 +58,14 @@ class _Outside:
     def begin_forked(self) -> None:
         """Set one thread in a forked process, also for the time after `leave`."""
         # PyTorch's threads do not survive a fork, and a forked process would wait for them forever.
-        self._lock, self._threads = threading.Lock(), 1
+        self._lock, self._threads, self._blas = threading.Lock(), 1, contextlib.ExitStack()
         torch.set_num_threads(1)
 
 
 @functools.cache
 def _numpy_threads() -> ThreadpoolController:
+    import scipy.linalg  # noqa: F401 - has a BLAS of its own, which must be there to be found
+
     return ThreadpoolController().select(user_api="blas")
 
 

@@ -165,7 +165,7 @@ def study_subject(folder: Path) -> Subject:
     finished, half, another = (folder / name for name in ("study", "half-study", "another-study"))
     numbers = study(finished)
     study(another, seed=1)
-    with mock.patch("autdtorch.study.run.focus_bound", side_effect=[0.0, KeyboardInterrupt]):
+    with mock.patch("autdtorch.objectives.goals.WeakestFocus.bound", side_effect=[0.0, KeyboardInterrupt]):
         try:
             study(half)
         except KeyboardInterrupt:

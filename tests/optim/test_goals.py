@@ -96,6 +96,28 @@ def test_a_quiet_point_like_its_focus_costs_all_that_the_penalty_leaves():
         assert expected <= bound < expected + 0.25
 
 
+def test_a_transducer_that_reaches_quiet_points_alone_can_cancel_them():
+    matrix = torch.tensor([[1, 0], [1, 1]], dtype=torch.complex128)
+    goal = QuietPoints(WeakestFocus(), [1], 0.1)
+    # the drive (1, -1) has the pressures 1 and 0
+    assert goal((matrix @ torch.tensor([1, -1], dtype=torch.complex128)).abs()) == 1
+    assert goal.bound(matrix) == pytest.approx(1, rel=1e-5)
+
+
+@pytest.mark.parametrize("ratio", [0.9, 0.5, 0.1])
+@pytest.mark.parametrize("transducers", [1, 2, 5])
+def test_a_focus_parallel_to_a_quiet_point_has_a_bound(random_matrix, transducers, ratio):
+    row = random_matrix(1, transducers, 0)
+    matrix, goal = torch.cat([row, 0.3 * row]), QuietPoints(WeakestFocus(), [1], ratio)
+    drives = random_drives(50, transducers, torch.Generator().manual_seed(0))
+    drives = torch.cat([drives, (row / row.abs()).conj(), 0 * row])
+    assert goal((drives @ matrix.T).abs()).max() <= goal.bound(matrix) + 1e-12
+
+
+def test_the_gradient_is_finite_where_targets_are_met():
+    assert derivative(TargetPressures([1.0, 2.0]), torch.tensor([1.0, 2.0]).double()).tolist() == [0, 0]
+
+
 @pytest.mark.parametrize("number", range(8))
 def test_slopes_are_derivatives(number):
     goal = goals_for(4, unit=2.0)[number]
@@ -134,6 +156,12 @@ def test_methods_that_see_magnitudes_reach_targets(make_objective, random_matrix
         (lambda: TargetPressures([]), "targets: .*; must be numbers > 0"),
         (lambda: TargetPressures([[1.0]]), "targets: .*; must be numbers > 0"),
         (lambda: QuietPoints(weakest_focus, [1], 0.1), "goal: .*Goal"),
+        (
+            lambda: QuietPoints(QuietPoints(WeakestFocus(), [1], 0.1), [2], 0.1),
+            "goal: .*; must be a goal without",
+        ),
+        (lambda: WeakestFocus([1, 2, 3])(torch.ones(1)), "weights: .*; must be 1 numbers"),
+        (lambda: QuietPoints(WeakestFocus(), [1], 0.1)(torch.ones(1)), "points: .*; must be indices"),
         (lambda: QuietPoints(WeakestFocus(), [], 0.1), "points: .*; must be indices of control points"),
         (lambda: QuietPoints(WeakestFocus(), [1, 1], 0.1), "points: .*; must be indices of control points"),
         (lambda: QuietPoints(WeakestFocus(), [1], 0), "ratio: 0; must be finite and > 0"),

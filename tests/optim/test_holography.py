@@ -84,6 +84,24 @@ def test_kernels_on_cpus_are_the_definitions(random_matrix, algorithm, free):
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_point_that_no_transducer_reaches_harms_no_other(random_matrix, algorithm):
+    matrix = random_matrix(4, 16, 0)
+    matrix[2] = 0
+    drive = holography(matrix, None, algorithm, 100)
+    assert torch.allclose(drive.abs(), torch.ones(16).double())
+    alone = holography(matrix[[0, 1, 3]], None, algorithm, 100)
+    # the descent also tries to reach the point, in vain
+    assert pressures(matrix, drive)[[0, 1, 3]].amin() > 0.9 * pressures(matrix[[0, 1, 3]], alone).amin()
+
+
+def test_scales_of_single_precision_do_not_matter(random_matrix):
+    matrix = random_matrix(8, 40, 0).to(torch.complex64)
+    for algorithm in ALGORITHMS[:-1]:
+        plain, large = (holography(scale * matrix, None, algorithm, 10) for scale in (1, 2.0**30))
+        assert torch.allclose(plain, large, atol=1e-5)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_as_a_method_it_is_one_evaluation_below_the_bound(make_objective, random_matrix, algorithm):
     objective = make_objective(random_matrix(4, 30, 0))
     solution = run(Holography(algorithm), objective)

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, TypeAlias, get_args
+from typing import ClassVar, Literal, TypeAlias, cast, get_args
 
 import torch
 
@@ -31,6 +31,7 @@ from autdtorch.utils.validation import (
     complex_tensor,
     integer_at_least,
     invalid,
+    is_dense,
     real_tensor,
     require_one_of,
 )
@@ -41,6 +42,7 @@ Project: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
 _RATES = 0.1, 0.001  # First and last step of Adam [rad, or amplitudes]
 _MOMENTS = 0.9, 0.99  # Shares of the old means of gradients and their squares in the new ones
 _TINY = 1e-30
+_UNREACHED = 1e-6  # Pressure over that of the loudest point, below which a point gets no more weight
 
 
 @dataclass(frozen=True)
@@ -161,17 +163,19 @@ def _solved(
 
 def _checked_matrix(G: ArrayLike) -> torch.Tensor:
     """Return matrices (..., P, M) in their precision, not yet known to be finite."""
-    ready = isinstance(G, torch.Tensor) and G.dtype in (torch.complex64, torch.complex128) and not G.is_sparse
-    matrix = G.detach() if isinstance(G, torch.Tensor) and ready else complex_tensor("G", G).detach()
+    ready = isinstance(G, torch.Tensor) and G.is_complex() and is_dense(G)
+    matrix = cast(torch.Tensor, G).detach() if ready else complex_tensor("G", G).detach()
     if matrix.ndim < 2 or 0 in matrix.shape:
-        raise ValueError(f"G: shape {tuple(matrix.shape)}; must be (..., P, M) with P, M >= 1")
-    return matrix.resolve_conj()
+        raise ValueError(f"G: shape {tuple(matrix.shape)}; must be (..., P, M), not empty")
+    return matrix.resolve_conj().to(torch.complex64 if matrix.dtype == torch.complex64 else torch.complex128)
 
 
 def _checked_targets(targets: ArrayLike | None, matrix: torch.Tensor) -> torch.Tensor:
     """Return targets (..., P) for matrices (..., P, M), in their precision."""
     shape = matrix.shape[:-1]
-    given = real_tensor("targets", torch.ones(shape[-1]) if targets is None else targets, "Pa").detach()
+    if targets is None:
+        return torch.ones(shape, dtype=matrix.real.dtype, device=matrix.device)
+    given = real_tensor("targets", targets, "Pa").detach()
     if given.shape not in (shape, shape[-1:]):
         accepted = f"must be {tuple(shape[-1:])}" + (f" or {tuple(shape)}" if len(shape) > 1 else "")
         raise ValueError(f"targets: shape {tuple(given.shape)}; {accepted}")
@@ -199,7 +203,10 @@ def _weighted(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, proje
     )
     for _ in range(iterations):
         pressure = matrix @ drive
-        weights = wanted * weights / pressure.abs().clamp_min(_TINY)
+        size = pressure.abs()
+        loudest = size.amax(dim=-2, keepdim=True).clamp_min(_TINY)
+        # the weight of a point that no transducer reaches would outgrow all others
+        weights = wanted * weights / torch.where(size > _UNREACHED * loudest, size, loudest)
         weights = weights / weights.amax(dim=-2, keepdim=True)
         drive = project(back @ (weights * pressure.sgn()))
     return drive
@@ -207,6 +214,7 @@ def _weighted(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, proje
 
 def _at_points(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project) -> torch.Tensor:
     both, pressure = matrix @ matrix.mH, wanted.to(matrix.dtype)
+    both = both / both.abs().amax(dim=(-2, -1), keepdim=True).clamp_min(_TINY)  # against overflow
     for _ in range(iterations):
         pressure = both @ (wanted * pressure.sgn())
     return project(matrix.mH @ (wanted.square() * pressure.sgn() / pressure.abs().clamp_min(_TINY)))

@@ -21,7 +21,7 @@ from autdtorch.utils.threads import spread, thread_count
 
 _LANES = np.uint64(16)  # Sets of a block
 _TASKS = 4  # Tasks a thread, so that none waits long for another
-_TINY = 1e-30
+_TINY, _UNREACHED = 1e-30, 1e-6  # as in `holography.py`
 _NAMES = ("naive", "gs", "wgs", "gs_pat")
 _HERE = Path(__file__).parent
 
@@ -138,11 +138,15 @@ def _imposed(y, w, weight, count):  # type: ignore[no-untyped-def]
 @njit(**INNER)
 def _reweighted(y, w, t, weight, count):  # type: ignore[no-untyped-def]
     """Multiply weights (P,) by wanted over present pressure, and divide them by the largest."""
-    tiny = y.dtype.type(_TINY)
-    for k in range(count):
-        weight[k] *= t[k] / max(math.sqrt(y[k] * y[k] + w[k] * w[k]), tiny)
+    tiny, share = y.dtype.type(_TINY), y.dtype.type(_UNREACHED)
     for lane in range(_LANES):
+        loudest = tiny
+        for k in range(lane, count, _LANES):
+            loudest = max(loudest, math.sqrt(y[k] * y[k] + w[k] * w[k]))
         largest = tiny
+        for k in range(lane, count, _LANES):
+            size = math.sqrt(y[k] * y[k] + w[k] * w[k])
+            weight[k] *= t[k] / (size if size > share * loudest else loudest)
         for k in range(lane, count, _LANES):
             largest = max(largest, weight[k])
         for k in range(lane, count, _LANES):
@@ -165,6 +169,13 @@ def _products(a, b, c, d, points, transducers):  # type: ignore[no-untyped-def]
             for k in range(_LANES):
                 c[mirrored + k] = c[out + k]
                 d[mirrored + k] = d[out + k] if p == q else -d[out + k]
+    for lane in range(_LANES):  # against overflow: the largest entry is on the diagonal
+        largest = c.dtype.type(_TINY)
+        for p in range(points):
+            largest = max(largest, c[(p * points + p) * _LANES + lane])
+        for k in range(lane, points * points * _LANES, _LANES):
+            c[k] /= largest
+            d[k] /= largest
 
 
 @entry(_HERE)
