@@ -1,8 +1,8 @@
 """Certified upper bounds on scores over all drives (docs/decisions/bound.md).
 
 Let foci reach at least t w_p, with w the pressures wanted relative to each other, and quiet points at most
-r t. For any a, b >= 0 of the foci and the quiet points with sum a_p w_p^2 - r^2 sum b_k = 1, any z > 0 of
-the M transducers, and all drives |q_i| <= 1,
+r t. Take any z > 0 of the M transducers, and any a, b >= 0 of the foci and the quiet points with
+sum a_p w_p^2 - r^2 sum b_k = 1. All drives |q_i| <= 1 have
 
     t^2 <= sum a_p |(G q)_p|^2 - sum b_k |(G q)_k|^2 <= lambda |z|^2,
 

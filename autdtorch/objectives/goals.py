@@ -192,14 +192,14 @@ class TargetPressures(Goal):
 class QuietPoints(Goal):
     """A goal for some control points, while others stay quiet: below a ratio of the weakest of the former.
 
-    The score is that of `goal` for the other points, less a penalty for the loudest quiet point: twice the
+    The other points are scored by `goal`. A penalty is subtracted for the loudest quiet point: twice the
     logarithm of its excess, times the score of a goal in Pa. A quiet region is points of a plane or a sphere.
 
     Attributes:
         goal: of the points that are not quiet, in their order.
         points: indices of the quiet control points.
-        ratio: largest pressure of a quiet point over that of the weakest other one, > 0; 10^(-30/20) for 30
-            dB.
+        ratio: largest pressure of a quiet point, relative to the weakest other point, > 0; 10^(-30/20) for
+            30 dB.
     """
 
     name: ClassVar[str] = "quiet_points"

@@ -1,10 +1,10 @@
 """The boundary layers of a chunk of planes on one core.
 
 The layers stretch the sums of neighbours along an axis: T_y p becomes T_y p + E_y p, and T_y T_z p becomes
-(T_y + E_y)(T_z + E_z) p. Each plane keeps the memory of its two layers across y as L + 2 rows from the ring
-inwards, then as many outwards; that across z likewise, as lanes: the ends of all rows; and that of E_y E_z
-as rows of lanes. The terms of several planes are computed at a time, as loops over a few hundred cells cost
-more than their cells.
+(T_y + E_y)(T_z + E_z) p. A plane's memory across y is stored as L + 2 rows from the ring inwards, then as
+many outwards. Its memory across z is stored as lanes, the ends of all rows, in the same order. The memory of
+E_y E_z has rows of lanes. Several planes are computed at a time, because starting a loop costs as much as a
+few hundred cells.
 """
 
 from __future__ import annotations

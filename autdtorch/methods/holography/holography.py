@@ -42,7 +42,7 @@ Project: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
 _RATES = 0.1, 0.001  # First and last step of Adam [rad, or amplitudes]
 _MOMENTS = 0.9, 0.99  # Shares of the old means of gradients and their squares in the new ones
 _TINY = 1e-30
-_UNREACHED = 1e-6  # Pressure over that of the loudest point, below which a point gets no more weight
+_UNREACHED = 1e-6  # Pressure, relative to the loudest point, below which a point gets no more weight
 
 
 @dataclass(frozen=True)
