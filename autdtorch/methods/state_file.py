@@ -13,6 +13,7 @@ import torch
 
 from autdtorch.methods.base import Method, Problem, State
 from autdtorch.methods.solution import Solution
+from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import replace_file
 from autdtorch.utils.numpy_file import read_arrays
@@ -52,7 +53,7 @@ def load_state(path: str | os.PathLike[str], method: Method, problem: Problem) -
     Args:
         path: of the file.
         method: of the same settings as when the state was saved.
-        problem: with the same numbers of transducers and foci.
+        problem: with the same numbers of transducers and foci, and the same goal.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -79,12 +80,18 @@ def load_state(path: str | os.PathLike[str], method: Method, problem: Problem) -
 
 
 def _origin(method: Method, problem: Problem) -> str:
-    """Return the method, its settings and the size of the problem as JSON; of a tensor, its digest."""
+    """Return the method, its settings, the size of the problem and its goal as JSON; of a tensor, its digest.
+
+    The paper's goal is left out: older files do not name it.
+    """
     settings = dataclasses.asdict(method)
     prior = settings.get("prior")
     if prior is not None and prior["transfer_matrix"] is None:  # then it is that of the problem
         prior["transfer_matrix"] = problem.transfer_matrix
-    return json.dumps([method.name, settings, problem.transducers, problem.foci], default=digest_of)
+    goal = problem.goal
+    named = repr(goal) if isinstance(goal, Goal) else getattr(goal, "__qualname__", type(goal).__name__)
+    goals = [] if goal == WEAKEST_FOCUS else [named]
+    return json.dumps([method.name, settings, problem.transducers, problem.foci, *goals], default=digest_of)
 
 
 def _require_consistent(state: State) -> None:

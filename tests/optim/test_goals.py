@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autdtorch.methods.base import Problem
-from autdtorch.methods.gabs import gabs
+from autdtorch.methods.gabs import GABS, gabs
 from autdtorch.methods.gradient import climb, random_drives
 from autdtorch.methods.identify import identify
+from autdtorch.methods.state_file import load_state, save_state
 from autdtorch.objectives.goals import (
     Goal,
     MeanPressure,
@@ -135,6 +136,18 @@ def test_the_function_of_the_paper_is_its_goal():
     assert goal_of(weakest_focus) == WeakestFocus()
     assert Problem(4, 2, weakest_focus).goal == WeakestFocus()
     assert goal_of(torch.Tensor.sum) is torch.Tensor.sum
+
+
+def test_a_saved_state_goes_on_under_its_own_goal_alone(tmp_path):
+    method, path = GABS(levels=4), tmp_path / "state.npz"
+    problems = [Problem(4, 2, goal) for goal in (WeakestFocus(), WeakestFocus([1, 2]), torch.Tensor.sum)]
+    for own in problems:
+        save_state(path, method, method.start(own))
+        assert load_state(path, method, own).problem is own
+        for other in problems:
+            if other is not own:
+                with pytest.raises(ValueError, match=r"state of .*; must be of"):
+                    load_state(path, method, other)
 
 
 @pytest.mark.parametrize("method", [gabs, identify], ids=["gabs", "identify"])
