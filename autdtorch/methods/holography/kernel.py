@@ -70,18 +70,20 @@ def _back_propagate(matrix, wanted, first, last, free, drive):  # type: ignore[n
 
 
 @njit(**INNER)
-def _pack(matrix, wanted, first, a, b, t):  # type: ignore[no-untyped-def]
-    """Copy the sets from `first` on to lanes; lanes beyond the last set repeat it."""
-    last, points, transducers = len(matrix) - 1, matrix.shape[1], matrix.shape[2]
-    to = np.uint64(0)
-    for p in range(points):
-        for lane in range(16):
-            t[np.uint64(p) * _LANES + np.uint64(lane)] = wanted[min(first + lane, last), p]
-        for m in range(transducers):
-            for lane in range(16):
-                a[to] = matrix[min(first + lane, last), p, m, 0]
-                b[to] = matrix[min(first + lane, last), p, m, 1]
-                to += np.uint64(1)
+def _pack(matrix, wanted, first, points, transducers, a, b, t, begin):  # type: ignore[no-untyped-def]
+    """Copy the sets from `first` on, of flat arrays, to lanes; lanes beyond the last set repeat it."""
+    one, two, entries = np.uint64(1), np.uint64(2), points * transducers
+    last = np.uint64(len(wanted)) // points - one
+    for lane in range(_LANES):
+        number = min(first + lane, last)
+        begin[lane] = two * entries * number
+        for p in range(points):
+            t[p * _LANES + lane] = wanted[number * points + p]
+    for n in range(entries):
+        to, at = n * _LANES, two * n
+        for lane in range(_LANES):
+            a[to + lane] = matrix[begin[lane] + at]
+            b[to + lane] = matrix[begin[lane] + at + one]
 
 
 @njit(**INNER)
@@ -201,8 +203,9 @@ def _solve(matrix, wanted, first, last, algorithm, iterations, free, drive):  # 
         np.empty(count, kind),
         np.empty(count, kind),
     )
+    flat, targets, begin = matrix.reshape(-1), wanted.reshape(-1), np.empty(_LANES, np.uint64)
     for block in range(first, last):
-        _pack(matrix, wanted, 16 * block, a, b, t)
+        _pack(flat, targets, np.uint64(block) * _LANES, points, transducers, a, b, t, begin)
         if algorithm == 3:
             y[:] = t
             w[:] = 0
@@ -230,7 +233,10 @@ def _solve(matrix, wanted, first, last, algorithm, iterations, free, drive):  # 
                 y[k] *= factor
                 w[k] *= factor
             _back(a, b, y, w, x, z, size, points, transducers, free)
-        for lane in range(min(16, len(matrix) - 16 * block)):
-            for m in range(matrix.shape[2]):
-                drive[16 * block + lane, m, 0] = x[np.uint64(16 * m + lane)]
-                drive[16 * block + lane, m, 1] = z[np.uint64(16 * m + lane)]
+        for lane in range(_LANES):
+            number = np.uint64(block) * _LANES + lane
+            if number < np.uint64(len(matrix)):
+                out = drive[number].reshape(-1)
+                for m in range(transducers):
+                    out[m + m] = x[m * _LANES + lane]
+                    out[m + m + np.uint64(1)] = z[m * _LANES + lane]
