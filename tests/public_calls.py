@@ -50,7 +50,8 @@ NOT_CALLED_BY_USERS = {
 
 #: Methods that the driver calls, and that authors of methods implement.
 INSIDE_METHODS = {"advance", "begin", "check", "most_at_once", "most_evaluations", "numbers_kept"}
-INSIDE_METHODS |= {"checked", "forward", "levels", "parts", "recorded", "require_fit", "slope"}
+INSIDE_METHODS |= {"checked", "forward", "levels", "others", "parts", "recorded", "require_fit", "slope"}
+INSIDE_METHODS |= {"wanted"}
 
 
 class Made(NamedTuple):

@@ -27,9 +27,8 @@ from autdtorch.objectives.perturbations import simulated_matrix
 from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.propagators import make_propagator
 from autdtorch.study.report.hardware_report import write_hardware_report
-from autdtorch.study.run import name_of, require_goal_taken, solve
+from autdtorch.study.run import check_goal, name_of, solve
 from autdtorch.utils.progress import Progress, show_progress
-from autdtorch.utils.validation import within
 
 logger = logging.getLogger(__name__)
 
@@ -78,9 +77,7 @@ class _Trial:
         self._scene = scene_of("scene", section_of(settings, "scene"), modules)
         self._method = load_method("method", section_of(settings, "method"), modules)
         self._goal = load_goal("goal", settings.get("goal"))
-        with within("goal"):
-            self._goal.check(len(self._scene.control_points))
-        require_goal_taken(name_of(self._method), self._method, self._goal)
+        check_goal(self._goal, {"scene": self._scene}, {name_of(self._method): self._method})
         self._bench = bench = Bench(section_of(settings, "hardware"), self._scene, seed)
         self._seed = seed
         choices = HydraConfig.get().runtime.choices

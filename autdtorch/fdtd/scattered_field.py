@@ -178,9 +178,9 @@ class NearToFar:
         within, some = self.within[near], self.targets.chosen(chosen[~far])
         received = torch.zeros((len(self.box.surface[0]), len(far)), dtype=torch.complex128, device="cpu")
         # reciprocity of Green's function
-        received[:, ~far] = self._received(some, weights * ~within)
+        received[:, ~far] = self._received(some, weights * ~within, far=False)
         received[:, far] = self._received(
-            self.targets.chosen(chosen[far]), weights.sum().expand(int(far.sum()), 1)
+            self.targets.chosen(chosen[far]), weights.sum().expand(int(far.sum()), 1), far=True
         )
         read = torch.zeros_like(self.within)
         read[near] = within
@@ -189,19 +189,18 @@ class NearToFar:
         mean = csr_array((weights[node].numpy(), place), (len(far), len(row)))
         return Readings(self.outward, received, csr_array(mean @ self.inward[read[self.within].numpy()]))
 
-    def _received(self, targets: Apertures, weights: Tensor) -> Tensor:
+    def _received(self, targets: Apertures, weights: Tensor, far: bool) -> Tensor:
         """Return waves (m, P) from the Huygens surface to P targets, with weights (P, n) of their nodes.
 
-        Discs with one weight each are far.
+        Targets that are `far` discs have one weight each.
         """
-        discs = targets.normals is not None and weights.shape[1] == 1
         found = [torch.zeros((len(self.box.surface[0]), 0), dtype=torch.complex128, device="cpu")]
         for first in range(0, len(weights), _TOGETHER):
             some, own = targets.chosen(slice(first, first + _TOGETHER)), weights[first : first + _TOGETHER]
             columns = torch.arange(len(own), device="cpu").repeat_interleave(own.shape[1])
             amplitude = torch.zeros((own.numel(), len(own)), dtype=torch.complex128, device="cpu")
             amplitude[torch.arange(own.numel(), device="cpu"), columns] = own.flatten().to(amplitude)
-            sources = some.discs if discs else some.positions.flatten(0, 1)
+            sources = some.discs if far else some.positions.flatten(0, 1)
             found.append(self.box.waves(self.box.surface[0], sources, amplitude))
         return torch.cat(found, dim=1)
 

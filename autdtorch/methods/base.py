@@ -89,6 +89,14 @@ class Problem:
         return cls(*counts, goal, scene, matrix, lambda drive: quantised(objective, drive))
 
 
+def known_matrix(problem: Problem) -> torch.Tensor:
+    """Return the transfer matrix (P, M) [Pa] of a problem, which must have one."""
+    if problem.transfer_matrix is None:
+        accepted = 'must have a transfer matrix, as SimulatedObjective has in mode "transfer"'
+        raise invalid("objective", None, accepted)
+    return problem.transfer_matrix
+
+
 class Step(NamedTuple):
     """The next step of a method.
 

@@ -12,13 +12,13 @@ from typing import ClassVar
 
 import torch
 
-from autdtorch.methods.base import Method, Problem, Step, Trials, generators_of
+from autdtorch.methods.base import Method, Problem, Step, Trials, generators_of, known_matrix
 from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS, slope_of
 from autdtorch.objectives.objective import Objective, Score
 from autdtorch.utils.threads import one_library_thread
-from autdtorch.utils.validation import integer_at_least, invalid
+from autdtorch.utils.validation import integer_at_least
 
 # First and last value, in equal ratios between: smoothing of `Goal.slope`, and step in amplitudes
 _SMOOTHING = (0.3, 1e-4)
@@ -59,10 +59,7 @@ class GradientAscent(Method):
 
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
         """Climb, and observe the highest drive."""
-        matrix = problem.transfer_matrix
-        if matrix is None:
-            accepted = 'must have a transfer matrix, as SimulatedObjective has in mode "transfer"'
-            raise invalid("objective", None, accepted)
+        matrix = known_matrix(problem)
         starts = [random_drives(self.starts, problem.transducers, own) for own in generators_of(seeds)]
         highest = [climb(problem.goal, matrix, start, self.steps) for start in starts]
         return Step(torch.stack(highest)[:, None], {})

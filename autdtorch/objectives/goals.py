@@ -12,7 +12,8 @@ import numpy as np
 import torch
 
 from autdtorch.objectives.bound import checked_matrix, level_bound
-from autdtorch.objectives.objective import Score, weakest_focus
+from autdtorch.objectives.objective import Score, checked_pressure, weakest_focus
+from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import ArrayLike, integers, invalid, positive, real_tensor, require_kind
 
 # Times that a score falls by its size where quiet points exceed their limit by a factor of e
@@ -69,9 +70,7 @@ class Goal(ABC):
 
     def checked(self, pressure: ArrayLike) -> torch.Tensor:
         """Return pressures (..., P) [Pa] after checking them, and that the goal has as many points."""
-        found = real_tensor("pressure", pressure, "Pa")
-        if found.ndim == 0 or found.shape[-1] == 0:
-            raise ValueError(f"pressure: shape {tuple(found.shape)}; must be (..., P) with P >= 1")
+        found = checked_pressure(pressure)
         self.check(found.shape[-1])
         return found
 
@@ -109,13 +108,15 @@ class WeakestFocus(Goal):
         """Return the bound of a semidefinite relaxation [Pa]; see `Goal.bound`."""
         matrix = checked_matrix(G)
         self.check(len(matrix))
-        return level_bound(matrix, np.ones(len(matrix)) if self.weights is None else np.array(self.weights))[
-            0
-        ]
+        return level_bound(matrix, self.wanted(len(matrix)))[0]
 
     def check(self, points: int) -> None:
         """Check the number of weights."""
         _require_count("weights", self.weights, points)
+
+    def wanted(self, points: int) -> Array:
+        """Return the pressures (P,) wanted relative to each other, 1 without weights."""
+        return np.ones(points) if self.weights is None else np.array(self.weights)
 
     def levels(self, pressure: torch.Tensor) -> torch.Tensor:
         """Return pressures (..., P) [Pa] over their weights."""
@@ -234,21 +235,22 @@ class QuietPoints(Goal):
         return score - _PENALTY * excess * (score.abs() if self.unit else 1)
 
     def slope(self, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
-        """Return those of the goal, less a quadratic penalty for each quiet point that grows as it cools."""
+        """Return those of the goal, less a quadratic penalty for quiet points: more with less smoothing."""
         loud, quiet = self.parts(pressure)
         limit = self.ratio * loud.amin(dim=-1, keepdim=True).clamp_min(torch.finfo(loud.dtype).tiny)
         slope = torch.zeros_like(pressure)
         own = self.goal.slope(loud, smoothing)
         over = (quiet / limit - 1).clamp_min(0) / smoothing
-        slope[..., self._others(pressure.shape[-1])] = own
+        slope[..., self.others(pressure.shape[-1])] = own
         slope[..., list(self.points)] = -own.abs().sum(dim=-1, keepdim=True) * over
         return slope
 
     def parts(self, pressure: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the pressures [Pa] of the other points (..., P - K) and of the quiet ones (..., K)."""
-        return pressure[..., self._others(pressure.shape[-1])], pressure[..., list(self.points)]
+        return pressure[..., self.others(pressure.shape[-1])], pressure[..., list(self.points)]
 
-    def _others(self, points: int) -> list[int]:
+    def others(self, points: int) -> list[int]:
+        """Return the indices of the points that are not quiet, of so many in all."""
         return [point for point in range(points) if point not in self.points]
 
     def bound(self, G: ArrayLike) -> float:
@@ -259,7 +261,7 @@ class QuietPoints(Goal):
         least = self.goal.bound(loud)
         if not isinstance(self.goal, WeakestFocus):
             return least
-        weights = np.ones(len(loud)) if self.goal.weights is None else np.array(self.goal.weights)
+        weights = self.goal.wanted(len(loud))
         # A drive of excess x has at most the level for the ratio times e^x, and 1 - penalty x times that is
         # its score. The first rises with x and the second falls: the ends of an interval bound both.
         excess = np.linspace(0, 1 / _PENALTY, _INTERVALS + 1)

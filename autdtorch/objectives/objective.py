@@ -13,7 +13,7 @@ import torch
 
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.validation import complex_tensor, invalid, real_tensor, require_kind
+from autdtorch.utils.validation import ArrayLike, complex_tensor, invalid, real_tensor, require_kind
 
 Score: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
 """A goal: function of pressures (..., P) [Pa] that gives the scores (...) to maximise."""
@@ -87,7 +87,12 @@ def validate_matrix(name: str, value: object, points: int, transducers: int) -> 
 
 def weakest_focus(pressure: torch.Tensor) -> torch.Tensor:
     """Return the pressure of the weakest focus (...) [Pa] of pressures (..., P): the paper's f = min(p_n)."""
-    pressure = real_tensor("pressure", pressure, "Pa")
-    if pressure.ndim == 0 or pressure.shape[-1] == 0:
-        raise ValueError(f"pressure: shape {tuple(pressure.shape)}; must be (..., P) with P >= 1")
-    return pressure.amin(dim=-1)
+    return checked_pressure(pressure).amin(dim=-1)
+
+
+def checked_pressure(pressure: ArrayLike) -> torch.Tensor:
+    """Return pressures (..., P) [Pa] with P >= 1 as float64, after checking them."""
+    checked = real_tensor("pressure", pressure, "Pa")
+    if checked.ndim == 0 or checked.shape[-1] == 0:
+        raise ValueError(f"pressure: shape {tuple(checked.shape)}; must be (..., P) with P >= 1")
+    return checked

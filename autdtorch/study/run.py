@@ -94,7 +94,7 @@ def run_study(
             require_name(field, name)
     counts = _counts(methods, trials, seed)
     plane_spacing = positive("plane_spacing", plane_spacing, "m")
-    _check_goal(goal, scenes, methods)
+    check_goal(goal, scenes, methods)
     for name, method in methods.items():
         for scene in scenes.values():
             if isinstance(method, Method):
@@ -138,7 +138,7 @@ def _counts(methods: Mapping[str, StudyMethod], trials: int | Mapping[str, int],
     return counts
 
 
-def _check_goal(goal: Goal, scenes: Mapping[str, Scene], methods: Mapping[str, StudyMethod]) -> None:
+def check_goal(goal: Goal, scenes: Mapping[str, Scene], methods: Mapping[str, StudyMethod]) -> None:
     """Check the goal against all scenes, and that every method can maximise it."""
     require_kind("goal", goal, Goal)
     require_score(goal.name, goal.unit)
@@ -146,10 +146,10 @@ def _check_goal(goal: Goal, scenes: Mapping[str, Scene], methods: Mapping[str, S
         with within("goal"):
             goal.check(len(scene.control_points))
     for name, method in methods.items():
-        require_goal_taken(name, method, goal)
+        _require_goal_taken(name, method, goal)
 
 
-def require_goal_taken(name: str, method: StudyMethod, goal: Goal) -> None:
+def _require_goal_taken(name: str, method: StudyMethod, goal: Goal) -> None:
     """Refuse a function that maximises the weakest focus, whatever the goal."""
     if goal == WEAKEST_FOCUS or isinstance(method, Method):
         return

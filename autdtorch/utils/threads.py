@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import itertools
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -117,6 +118,11 @@ def spread(function: Callable[[T], R], items: Iterable[T], most: int | None = No
 
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(alone, items))
+
+
+def even_parts(count: int, parts: int) -> list[tuple[int, int]]:
+    """Return the first of `count` things, and one past the last, of each of some nearly equal parts."""
+    return list(itertools.pairwise(count * part // parts for part in range(parts + 1)))
 
 
 def _processors() -> int:

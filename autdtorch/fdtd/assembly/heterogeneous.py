@@ -219,8 +219,9 @@ def _needed_mass(
     uniform = elements.materials.mass[_cell_material(elements)[neighbour]]
     need = size.sum(axis=1) / largest
     most = np.flatnonzero(need > mass)  # all others count with their own mass, which is more
-    for number in range(_NEED_ITERATIONS):
-        own, some = np.maximum(mass, need), most if number + 1 < _NEED_ITERATIONS else slice(None)
+    everyone = np.arange(len(need))
+    for some in (*[most] * (_NEED_ITERATIONS - 1), everyone):
+        own = np.maximum(mass, need)
         around = np.where(beside[some], uniform[some], own[place[some]])
         ratio = np.divide(own[some, None], around, out=np.ones_like(around), where=around > 0)
         lighter = np.sqrt(ratio).clip(max=1)

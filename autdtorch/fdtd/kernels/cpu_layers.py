@@ -39,23 +39,26 @@ def stretch(u, at, step, psi, psi_at, zeta, zeta_at, term, term_at, cells, profi
 
 
 @njit(**INNER)
-def _copy_ends(p, i, planes, shape, cells, rows, lanes):  # type: ignore[no-untyped-def]
-    """Copy the rows of the layers across y, and the ends of all rows."""
-    _, ny, nz = shape
-    one, reach = _U(1), cells + _U(2)
+def _copy_rows(u, first, planes, ny, row, reach, out):  # type: ignore[no-untyped-def]
+    """Copy the rows of the layers across y, from planes of ny rows."""
     to = _U(0)
-    for plane in range(i, i + planes):
+    for plane in range(first, first + planes):
         for side in range(_U(2)):
-            start = (plane * ny + (ny - reach) * side) * nz
-            for k in range(reach * nz):
-                rows[to + k] = p[start + k]
-            to += reach * nz
+            start = (plane * ny + (ny - reach) * side) * row
+            for k in range(reach * row):
+                out[to + k] = u[start + k]
+            to += reach * row
+
+
+@njit(**INNER)
+def _copy_ends(p, first, rows, nz, reach, out):  # type: ignore[no-untyped-def]
+    """Copy the ends of rows."""
     to = _U(0)
-    for row in range(i * ny, (i + planes) * ny):
-        low, high = row * nz, (row + one) * nz - reach
+    for row in range(first, first + rows):
+        low, high = row * nz, (row + _U(1)) * nz - reach
         for k in range(reach):
-            lanes[to + k] = p[low + k]
-            lanes[to + reach + k] = p[high + k]
+            out[to + k] = p[low + k]
+            out[to + reach + k] = p[high + k]
         to += reach + reach
 
 
@@ -69,18 +72,13 @@ def stretch_planes(p, i, planes, shape, cells, memory, terms, profiles):  # type
     one, two, zero = _U(1), _U(2), _U(0)
     reach = cells + two
     lanes = two * reach
-    _copy_ends(p, i, planes, shape, cells, y, z)
+    _copy_rows(p, i, planes, ny, nz, reach, y)
     first, size = i * lanes * nz, planes * lanes * nz - two * nz
     stretch(y, zero, nz, psi_y, first, zeta_y, first + nz, e_y, nz, size, across_y, zero)
+    _copy_ends(p, i * ny, planes * ny, nz, reach, z)
     first, size = i * ny * lanes, planes * ny * lanes - two
     stretch(z, zero, one, psi_z, first, zeta_z, first + one, e_z, one, size, across_z, zero)
-    to = zero
-    for plane in range(planes):
-        for side in range(two):
-            start = (plane * ny + (ny - reach) * side) * lanes
-            for k in range(reach * lanes):
-                yz[to + k] = e_z[start + k]
-            to += reach * lanes
+    _copy_rows(e_z, zero, planes, ny, lanes, reach, yz)
     first, size = i * lanes * lanes, planes * lanes * lanes - two * lanes
     stretch(yz, zero, lanes, psi_yz, first, zeta_yz, first + lanes, e_yz, lanes, size, across_yz, zero)
 

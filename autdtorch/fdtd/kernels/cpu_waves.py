@@ -9,7 +9,6 @@ fixed.
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -20,7 +19,7 @@ from torch import Tensor
 from autdtorch.fdtd.kernels.compiled import INNER, entry
 from autdtorch.utils.apertures import PATTERN_TERMS, Discs
 from autdtorch.utils.array_types import AnyArray
-from autdtorch.utils.threads import spread
+from autdtorch.utils.threads import even_parts, spread
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
 _PAIRS = 100_000  # Pairs of a point and a source in a task: less than a millisecond
@@ -210,10 +209,9 @@ def superposition(
         both = places, columns
     units = fields.shape[2]
     pieces = max(1, min(units, 1 + count * len(origins) // _PAIRS))
-    cuts = [units * piece // pieces for piece in range(pieces + 1)]
     spread(
         lambda ends: add(both[0], *ends, both[1], strength, wave, pattern, _room(number), fields),
-        pairwise(cuts),
+        even_parts(units, pieces),
     )
     real, imaginary = fields.reshape(2, runs, -1)[:, :, :count]
     return torch.from_numpy((real + 1j * imaginary).T)

@@ -22,8 +22,8 @@ from typing import ClassVar, Literal, TypeAlias, cast, get_args
 
 import torch
 
-from autdtorch.methods.base import Method, Problem, Step
-from autdtorch.objectives.goals import QuietPoints, TargetPressures, WeakestFocus
+from autdtorch.methods.base import Method, Problem, Step, known_matrix
+from autdtorch.objectives.goals import WEAKEST_FOCUS, QuietPoints, TargetPressures, WeakestFocus
 from autdtorch.objectives.objective import Score
 from autdtorch.utils.validation import (
     ArrayLike,
@@ -41,8 +41,8 @@ Project: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
 
 _RATES = 0.1, 0.001  # First and last step of Adam [rad, or amplitudes]
 _MOMENTS = 0.9, 0.99  # Shares of the old means of gradients and their squares in the new ones
-_TINY = 1e-30
-_UNREACHED = 1e-6  # Pressure, relative to the loudest point, below which a point gets no more weight
+TINY = 1e-30
+UNREACHED = 1e-6  # Pressure, relative to the loudest point, below which a point gets no more weight
 
 
 @dataclass(frozen=True)
@@ -74,18 +74,13 @@ class Holography(Method):
 
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
         """Compute the drive, and observe it."""
-        matrix = problem.transfer_matrix
-        if matrix is None:
-            accepted = 'must have a transfer matrix, as SimulatedObjective has in mode "transfer"'
-            raise invalid("objective", None, accepted)
+        matrix = known_matrix(problem)
         targets, absolute = wanted_pressures(problem.goal, problem.foci)
         if self.algorithm == "diff_pat" and not absolute:
             # as loud as the weakest focus of "wgs" over its weight
             loud = targets > 0
-            reached = (
-                matrix @ holography(matrix, targets, "wgs", self.iterations, self.free_amplitudes)
-            ).abs()
-            targets = targets * (reached[loud] / targets[loud]).amin()
+            start = holography(matrix, targets, "wgs", self.iterations, self.free_amplitudes)
+            targets = targets * ((matrix @ start).abs()[loud] / targets[loud]).amin()
         drive = holography(matrix, targets, self.algorithm, self.iterations, self.free_amplitudes)
         return Step(drive[None, None], {})
 
@@ -126,9 +121,8 @@ def holography(
     if algorithm == "diff_pat":
         drive = _descent(matrix, wanted, drive, iterations, free)
     if not torch.isfinite(torch.view_as_real(drive).sum()):
-        complex_tensor(
-            "G", G
-        )  # names what is not finite: a check of all matrices would take longer than "naive"
+        # Names what is not finite. To check all matrices before would take longer than "naive".
+        complex_tensor("G", G)
         raise invalid("G", G, "must not overflow in products with its own entries")
     return drive[..., 0]
 
@@ -138,13 +132,12 @@ def wanted_pressures(goal: Score, points: int) -> tuple[torch.Tensor, bool]:
     if isinstance(goal, QuietPoints):
         others, absolute = wanted_pressures(goal.goal, points - len(goal.points))
         wanted = torch.zeros(points, dtype=torch.float64, device="cpu")
-        wanted[[point for point in range(points) if point not in goal.points]] = others
+        wanted[goal.others(points)] = others
         return wanted, absolute
-    absolute = isinstance(goal, TargetPressures)
-    values = goal.targets if isinstance(goal, TargetPressures) else getattr(goal, "weights", None)
-    if values is None or not isinstance(goal, TargetPressures | WeakestFocus):
-        values = [1.0] * points
-    return torch.tensor(values, dtype=torch.float64, device="cpu"), absolute
+    if isinstance(goal, TargetPressures):
+        return torch.tensor(goal.targets, dtype=torch.float64, device="cpu"), True
+    weighted = goal if isinstance(goal, WeakestFocus) else WEAKEST_FOCUS
+    return torch.from_numpy(weighted.wanted(points)), False
 
 
 def _solved(
@@ -196,17 +189,14 @@ def _in_turns(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, proje
 
 
 def _weighted(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project) -> torch.Tensor:
-    back, drive, weights = (
-        matrix.mH.resolve_conj(),
-        torch.ones_like(matrix[..., :1, :]).mT,
-        torch.ones_like(wanted),
-    )
+    back, drive = matrix.mH.resolve_conj(), torch.ones_like(matrix[..., :1, :]).mT
+    weights = torch.ones_like(wanted)
     for _ in range(iterations):
         pressure = matrix @ drive
         size = pressure.abs()
-        loudest = size.amax(dim=-2, keepdim=True).clamp_min(_TINY)
+        loudest = size.amax(dim=-2, keepdim=True).clamp_min(TINY)
         # the weight of a point that no transducer reaches would outgrow all others
-        weights = wanted * weights / torch.where(size > _UNREACHED * loudest, size, loudest)
+        weights = wanted * weights / torch.where(size > UNREACHED * loudest, size, loudest)
         weights = weights / weights.amax(dim=-2, keepdim=True)
         drive = project(back @ (weights * pressure.sgn()))
     return drive
@@ -214,10 +204,10 @@ def _weighted(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, proje
 
 def _at_points(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project) -> torch.Tensor:
     both, pressure = matrix @ matrix.mH, wanted.to(matrix.dtype)
-    both = both / both.abs().amax(dim=(-2, -1), keepdim=True).clamp_min(_TINY)  # against overflow
+    both = both / both.abs().amax(dim=(-2, -1), keepdim=True).clamp_min(TINY)  # against overflow
     for _ in range(iterations):
         pressure = both @ (wanted * pressure.sgn())
-    return project(matrix.mH @ (wanted.square() * pressure.sgn() / pressure.abs().clamp_min(_TINY)))
+    return project(matrix.mH @ (wanted.square() * pressure.sgn() / pressure.abs().clamp_min(TINY)))
 
 
 _SOLVERS = {"naive": _naive, "gs": _in_turns, "wgs": _weighted, "gs_pat": _at_points}
@@ -240,18 +230,18 @@ def _descent(
         squares = _MOMENTS[1] * squares + (1 - _MOMENTS[1]) * square
         rate = _RATES[0] * (_RATES[1] / _RATES[0]) ** (step / iterations)
         mean, spread = means / (1 - _MOMENTS[0] ** step), squares / (1 - _MOMENTS[1] ** step)
-        phase = phase - rate * mean.imag / (spread.imag.sqrt() + _TINY)
+        phase = phase - rate * mean.imag / (spread.imag.sqrt() + TINY)
         if free:
-            size = (size - rate * mean.real / (spread.real.sqrt() + _TINY)).clamp(0, 1)
+            size = (size - rate * mean.real / (spread.real.sqrt() + TINY)).clamp(0, 1)
     return torch.polar(size, phase)
 
 
 def _within_largest(drive: torch.Tensor) -> torch.Tensor:
-    return drive / drive.abs().amax(dim=-2, keepdim=True).clamp_min(_TINY)
+    return drive / drive.abs().amax(dim=-2, keepdim=True).clamp_min(TINY)
 
 
 def _scaled(matrix: torch.Tensor, wanted: torch.Tensor, drive: torch.Tensor) -> torch.Tensor:
     """Return drives whose pressures are as near to the wanted ones as one factor <= 1 allows."""
     pressure = (matrix @ drive).abs()
-    power = pressure.square().sum(dim=-2, keepdim=True).clamp_min(_TINY)
+    power = pressure.square().sum(dim=-2, keepdim=True).clamp_min(TINY)
     return drive * ((pressure * wanted).sum(dim=-2, keepdim=True) / power).clamp_max(1)

@@ -9,7 +9,6 @@ sums is fixed.
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +16,13 @@ import torch
 from numba import njit
 
 from autdtorch.fdtd.kernels.compiled import INNER, entry
-from autdtorch.utils.threads import spread, thread_count
+from autdtorch.methods.holography.holography import TINY, UNREACHED
+from autdtorch.utils.threads import even_parts, spread, thread_count
 
 _LANES = np.uint64(16)  # Sets of a block
 _TASKS = 4  # Tasks a thread, so that none waits long for another
-_TINY, _UNREACHED = 1e-30, 1e-6  # as in `holography.py`
-_NAMES = ("naive", "gs", "wgs", "gs_pat")
+_NAMES = ("gs", "wgs", "gs_pat")
+_GS, _WGS, _GS_PAT = range(3)  # places in `_NAMES`
 _HERE = Path(__file__).parent
 
 
@@ -31,28 +31,24 @@ def solved(
 ) -> torch.Tensor:
     """Return drives (B, M) of matrices (B, P, M) and wanted pressures (B, P), on the CPU."""
     count, _, transducers = matrix.shape
-    parts = torch.view_as_real(matrix.contiguous().resolve_conj()).numpy()
-    drive = np.empty((count, transducers, 2), parts.dtype)
-    targets, number = np.ascontiguousarray(wanted.numpy()), _NAMES.index(algorithm)
-    if algorithm == "naive":  # too quick to be packed
-        spread(lambda ends: _back_propagate(parts, targets, *ends, free, drive), _cuts(count))
+    entries = torch.view_as_real(matrix.contiguous().resolve_conj()).numpy()
+    drive = np.empty((count, transducers, 2), entries.dtype)
+    targets, naive = np.ascontiguousarray(wanted.numpy()), algorithm == "naive"
+    units = count if naive else -(-count // int(_LANES))
+    parts = even_parts(units, min(units, _TASKS * thread_count()))
+    if naive:  # too quick to be packed
+        spread(lambda ends: _back_propagate(entries, targets, *ends, free, drive), parts)
     else:
-        blocks = _cuts(-(-count // int(_LANES)))
-        spread(lambda ends: _solve(parts, targets, *ends, number, iterations, free, drive), blocks)
+        number = _NAMES.index(algorithm)
+        spread(lambda ends: _solve(entries, targets, *ends, number, iterations, free, drive), parts)
     return torch.view_as_complex(torch.from_numpy(drive))
-
-
-def _cuts(count: int) -> list[tuple[int, int]]:
-    """Return the first of so many, and one past the last, of each task."""
-    tasks = min(count, _TASKS * thread_count())
-    return list(pairwise(count * task // tasks for task in range(tasks + 1)))
 
 
 @entry(_HERE)
 def _back_propagate(matrix, wanted, first, last, free, drive):  # type: ignore[no-untyped-def]
     """Write the drives (B, M, 2) of the sets `first` to `last` of matrices (B, P, M, 2)."""
     points, transducers = matrix.shape[1:3]
-    tiny = matrix.dtype.type(_TINY)
+    tiny = matrix.dtype.type(TINY)
     for n in range(first, last):
         out, rows = drive[n].reshape(-1), matrix[n].reshape(points, -1)
         out[:] = 0
@@ -113,7 +109,7 @@ def _back(a, b, y, w, x, z, size, points, transducers, free):  # type: ignore[no
             for k in range(_LANES):
                 x[out + k] += a[at + k] * y[of + k] + b[at + k] * w[of + k]
                 z[out + k] += a[at + k] * w[of + k] - b[at + k] * y[of + k]
-    tiny = x.dtype.type(_TINY)
+    tiny = x.dtype.type(TINY)
     for k in range(count):
         size[k] = max(math.sqrt(x[k] * x[k] + z[k] * z[k]), tiny)
     if free:
@@ -130,7 +126,7 @@ def _back(a, b, y, w, x, z, size, points, transducers, free):  # type: ignore[no
 @njit(**INNER)
 def _imposed(y, w, weight, count):  # type: ignore[no-untyped-def]
     """Give pressures y + i w the sizes `weight`."""
-    tiny = y.dtype.type(_TINY)
+    tiny = y.dtype.type(TINY)
     for k in range(count):
         factor = weight[k] / max(math.sqrt(y[k] * y[k] + w[k] * w[k]), tiny)
         y[k] *= factor
@@ -140,7 +136,7 @@ def _imposed(y, w, weight, count):  # type: ignore[no-untyped-def]
 @njit(**INNER)
 def _reweighted(y, w, t, weight, count):  # type: ignore[no-untyped-def]
     """Multiply weights (P,) by wanted over present pressure, and divide them by the largest."""
-    tiny, share = y.dtype.type(_TINY), y.dtype.type(_UNREACHED)
+    tiny, share = y.dtype.type(TINY), y.dtype.type(UNREACHED)
     for lane in range(_LANES):
         loudest = tiny
         for k in range(lane, count, _LANES):
@@ -172,7 +168,7 @@ def _products(a, b, c, d, points, transducers):  # type: ignore[no-untyped-def]
                 c[mirrored + k] = c[out + k]
                 d[mirrored + k] = d[out + k] if p == q else -d[out + k]
     for lane in range(_LANES):  # against overflow: the largest entry is on the diagonal
-        largest = c.dtype.type(_TINY)
+        largest = c.dtype.type(TINY)
         for p in range(points):
             largest = max(largest, c[(p * points + p) * _LANES + lane])
         for k in range(lane, points * points * _LANES, _LANES):
@@ -189,50 +185,38 @@ def _solve(matrix, wanted, first, last, algorithm, iterations, free, drive):  # 
     points, transducers, kind = np.uint64(matrix.shape[1]), np.uint64(matrix.shape[2]), matrix.dtype
     count, entries = points * _LANES, points * transducers * _LANES
     a, b = np.empty(entries, kind), np.empty(entries, kind)
-    drives, squares = transducers * _LANES, points * count if algorithm == 3 else np.uint64(1)
+    drives, squares = transducers * _LANES, points * count if algorithm == _GS_PAT else np.uint64(1)
     x, z, size = np.empty(drives, kind), np.empty(drives, kind), np.empty(drives, kind)
-    y, w, t, weight = (
-        np.empty(count, kind),
-        np.empty(count, kind),
-        np.empty(count, kind),
-        np.empty(count, kind),
-    )
-    c, d, v, u = (
-        np.empty(squares, kind),
-        np.empty(squares, kind),
-        np.empty(count, kind),
-        np.empty(count, kind),
-    )
+    y, w, v, u = np.empty(count, kind), np.empty(count, kind), np.empty(count, kind), np.empty(count, kind)
+    t, weight = np.empty(count, kind), np.empty(count, kind)
+    c, d = np.empty(squares, kind), np.empty(squares, kind)
     flat, targets, begin = matrix.reshape(-1), wanted.reshape(-1), np.empty(_LANES, np.uint64)
     for block in range(first, last):
         _pack(flat, targets, np.uint64(block) * _LANES, points, transducers, a, b, t, begin)
-        if algorithm == 3:
+        if algorithm == _GS_PAT:
+            _products(a, b, c, d, points, transducers)
             y[:] = t
             w[:] = 0
-        else:
-            x[:], z[:] = 1, 0
-            for k in range(count):
-                weight[k] = t[k] if algorithm == 1 else kind.type(1)
-        if algorithm == 3:
-            _products(a, b, c, d, points, transducers)
-        for _ in range(iterations):
-            if algorithm == 3:
+            for _ in range(iterations):
                 _imposed(y, w, t, count)
                 v[:] = y
                 u[:] = w
                 _forward(c, d, v, u, y, w, points, points)
-                continue
-            _forward(a, b, x, z, y, w, points, transducers)
-            if algorithm == 2:
-                _reweighted(y, w, t, weight, count)
-            _imposed(y, w, weight, count)
-            _back(a, b, y, w, x, z, size, points, transducers, free)
-        if algorithm == 3:
             for k in range(count):
-                factor = t[k] * t[k] / max(y[k] * y[k] + w[k] * w[k], kind.type(_TINY))
+                factor = t[k] * t[k] / max(y[k] * y[k] + w[k] * w[k], kind.type(TINY))
                 y[k] *= factor
                 w[k] *= factor
             _back(a, b, y, w, x, z, size, points, transducers, free)
+        else:
+            x[:], z[:] = 1, 0
+            for k in range(count):
+                weight[k] = t[k] if algorithm == _GS else kind.type(1)
+            for _ in range(iterations):
+                _forward(a, b, x, z, y, w, points, transducers)
+                if algorithm == _WGS:
+                    _reweighted(y, w, t, weight, count)
+                _imposed(y, w, weight, count)
+                _back(a, b, y, w, x, z, size, points, transducers, free)
         for lane in range(_LANES):
             number = np.uint64(block) * _LANES + lane
             if number < np.uint64(len(matrix)):
