@@ -13,6 +13,7 @@ from .methods.driver import run
 from .methods.gabs import GABS, gabs
 from .methods.gradient import GradientAscent, gradient_ascent
 from .methods.holography.holography import Holography, holography
+from .methods.holography.sequence import drive_sequence
 from .methods.identify import Identify, identify
 from .methods.lssg import LSS, LSSG, lss, lssg
 from .methods.prior import Prior
@@ -20,10 +21,11 @@ from .methods.random_search import RandomSearch, random_search
 from .methods.solution import Solution
 from .methods.state_file import load_state, save_state
 from .objectives.bound import focus_bound
-from .objectives.goals import Goal, MeanPressure, QuietPoints, TargetPressures, WeakestFocus
+from .objectives.goals import Goal, MeanPressure, TargetPressures, WeakestFocus
 from .objectives.metrics import FocusMetrics, focus_metrics
 from .objectives.objective import Objective, weakest_focus
 from .objectives.perturbations import Drift, FailedTransducers, Noise, Quantised, true_pressure
+from .objectives.quiet import Contrast, QuietPoints
 from .objectives.simulated import SimulatedObjective
 from .plot.costs import plot_pareto, plot_scaling
 from .plot.pressure_maps import plot_plane, plot_planes
@@ -34,7 +36,7 @@ from .propagators import SteadyStateWarning, cell_centers, differentiable_field,
 from .propagators.estimate import Estimate, estimate
 from .scene.arrays import PAPER_SOURCE_STRENGTH, TransducerArray
 from .scene.drive import amplitudes_of, drive_from_phases, focus_phases, phases_of
-from .scene.geometry import Plane, circle_points
+from .scene.geometry import Plane, circle_points, sphere_points
 from .scene.medium import Medium
 from .scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
 from .scene.scene import OverlapWarning, ScaleWarning, Scene
@@ -48,6 +50,7 @@ __all__ = [
     "PAPER_SOURCE_STRENGTH",
     "BayesOpt",
     "Box",
+    "Contrast",
     "Cylinder",
     "Drift",
     "Estimate",
@@ -95,6 +98,7 @@ __all__ = [
     "collect_results",
     "differentiable_field",
     "drive_from_phases",
+    "drive_sequence",
     "estimate",
     "focus_bound",
     "focus_metrics",
@@ -126,6 +130,7 @@ __all__ = [
     "save_drive",
     "save_field",
     "save_state",
+    "sphere_points",
     "true_pressure",
     "view3d",
     "volume_field",

@@ -50,7 +50,7 @@ NOT_CALLED_BY_USERS = {
 
 #: Methods that the driver calls, and that authors of methods implement.
 INSIDE_METHODS = {"advance", "begin", "check", "most_at_once", "most_evaluations", "numbers_kept"}
-INSIDE_METHODS |= {"checked", "forward", "levels", "others", "parts", "recorded", "require_fit", "slope"}
+INSIDE_METHODS |= {"checked", "forward", "levels", "recorded", "require_fit", "slope"}
 INSIDE_METHODS |= {"wanted"}
 
 
@@ -253,6 +253,7 @@ OTHERS: dict[str, Any] = {
     "Mesh.path": Made(mesh_file),
     "OpenMPDBoard.load.path": Made(board_file),
     "QuietPoints.points": [1],
+    "Contrast.points": [1],
     "TargetPressures.targets": [1.0, 2.0, 3.0],
     "TargetPressures.__call__.pressure": [1.0, 2.0, 3.0],
     "PhasorKernel.mean.x": torch.ones(3, 2, dtype=torch.float64),

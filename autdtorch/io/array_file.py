@@ -17,7 +17,7 @@ from autdtorch.utils.validation import ArrayLike, path_of, within
 # Columns of a CSV file with the positions of transducers and the directions of emission, and their units.
 PLACE_COLUMNS = {"x": "m", "y": "m", "z": "m"}
 NORMAL_COLUMNS = {"nx": "", "ny": "", "nz": ""}
-_IGNORED = {"transducer": "", "phase": "rad", "amplitude": ""}
+_IGNORED = {"frame": "", "transducer": "", "phase": "rad", "amplitude": ""}
 
 
 def load_array(
@@ -71,7 +71,8 @@ def _from_csv(path: str | os.PathLike[str]) -> dict[str, Any]:
     wanted = PLACE_COLUMNS | (NORMAL_COLUMNS if NORMAL_COLUMNS.keys() & table.keys() else {})
     if missing := [name for name in wanted if name not in table]:
         raise ValueError(f"{path}: no column {', '.join(missing)}; must have {', '.join(wanted)}")
-    values = np.stack([table[name] for name in wanted], axis=1)
+    rows = table["frame"] == 0 if "frame" in table else slice(None)  # each frame repeats the array
+    values = np.stack([table[name][rows] for name in wanted], axis=1)
     return {"positions": values[:, :3], "normals": values[:, 3:] if len(wanted) > 3 else (0.0, 0.0, 1.0)}
 
 

@@ -1,4 +1,4 @@
-"""Drives in files: with full precision and their array, or as the integer levels of a device."""
+"""Drives and sequences of them in files: with full precision and the array, or as levels of a device."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from autdtorch.scene.drive import (
     drive_from_phases,
     phases_of,
     validate_drive,
-    validate_single_drive,
 )
 from autdtorch.utils.array_types import AnyArray
 from autdtorch.utils.files import replacing
@@ -29,14 +28,14 @@ from autdtorch.utils.validation import ArrayLike, path_of, real_tensor, require_
 _FORMATS = (".csv", ".npz")
 _LEVEL_COLUMNS = {f"{name} {column}": "" for name, device in DEVICES.items() for column in device.columns}
 _PLAIN_COLUMNS = {"phase": "rad", "amplitude": ""}
-_NUMBERING = {"unit": "", "transducer": ""}
+_NUMBERING = {"frame": "", "unit": "", "transducer": ""}
 _COLUMNS = _NUMBERING | PLACE_COLUMNS | NORMAL_COLUMNS | _PLAIN_COLUMNS | _LEVEL_COLUMNS
 
 
 def save_drive(
     path: str | os.PathLike[str], drive: ArrayLike, array: TransducerArray, device: str | None = None
 ) -> None:
-    """Write a drive as `.csv` or `.npz`, with full precision or as the levels of a device.
+    """Write a drive, or the frames of a sequence, with full precision or as the levels of a device.
 
     Without `device`, `.csv` has the columns transducer, x, y, z [m], nx, ny, nz, phase [rad] and amplitude.
     `.npz` has the arrays drive (M,), positions, normals, source_strength and radius. `load_array` reads the
@@ -47,9 +46,12 @@ def save_drive(
     for example, autd3 phase and autd3 intensity. `.npz` has the name `device` and uint8 arrays (units,
     transducers per unit): phase, and for AUTD3 intensity, for OpenMPD and Ultraino duty.
 
+    A sequence has one axis more: `.csv` begins with the column frame, from 0, and arrays of `.npz` have the
+    frames first.
+
     Args:
         path: of the file, which is replaced; the suffix decides the format.
-        drive: complex (M,), |q| <= 1.
+        drive: complex (M,), or (T, M) for T frames, |q| <= 1.
         array: the M transducers.
         device: a name in `hardware.DEVICES`, such as "autd3", or None.
 
@@ -59,7 +61,10 @@ def save_drive(
     """
     path = path_of("path", path, suffixes=_FORMATS)
     require_kind("array", array, TransducerArray)
-    checked = validate_single_drive(drive, len(array)).detach().cpu()
+    checked = validate_drive(drive, len(array)).detach().cpu()
+    if checked.ndim not in (1, 2) or 0 in checked.shape:
+        accepted = f"must be ({len(array)},), or (T, {len(array)}) for T frames"
+        raise ValueError(f"drive: shape {tuple(checked.shape)}; {accepted}")
     if device is None:
         columns, arrays = _plain(checked, array)
     else:
@@ -73,7 +78,7 @@ def save_drive(
 
 
 def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
-    """Read a drive (M,), complex128, from a file of `save_drive`, levels as the device plays them.
+    """Read a drive (M,) or frames (T, M), complex128, of `save_drive`, levels as the device plays them.
 
     Args:
         path: of the file; the suffix decides the format.
@@ -88,22 +93,34 @@ def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
         table = read_table(path, _COLUMNS)
         for name, device in DEVICES.items():
             if any(f"{name} {column}" in table for column in device.columns):
-                return _played(path, name, table)
+                return _in_frames(path, _played(path, name, table), table)
         if missing := [column for column in _PLAIN_COLUMNS if column not in table]:
             accepted = "must have phase and amplitude, or a device's"
             raise ValueError(f"{path}: no column {', '.join(missing)}; {accepted}")
         with within(path):
-            return drive_from_phases(table["phase"], table["amplitude"])
+            return _in_frames(path, drive_from_phases(table["phase"], table["amplitude"]), table)
     arrays = read_arrays(path)
     if "device" in arrays:
         name = str(arrays["device"])
         require_one_of(f"{path}: device", name, DEVICES)
-        return _played(path, name, {f"{name} {key}": value.reshape(-1) for key, value in arrays.items()})
+        frames = arrays[DEVICES[name].columns[0]].shape[:-2] if DEVICES[name].columns[0] in arrays else ()
+        levels = {f"{name} {key}": value.reshape(-1) for key, value in arrays.items()}
+        return _played(path, name, levels).reshape(*frames, -1)
     if "drive" not in arrays:
         raise ValueError(f"{path}: no array 'drive'; must be written by save_drive")
     drive = arrays["drive"]
     with within(path):
-        return validate_drive(drive.reshape(-1), drive.size)
+        return validate_drive(drive, drive.shape[-1] if drive.ndim else 1)
+
+
+def _in_frames(path: Path, drive: torch.Tensor, table: Mapping[str, AnyArray]) -> torch.Tensor:
+    """Return the drive (M,) of all rows of a table, or the frames (T, M) that the table numbers."""
+    if "frame" not in table:
+        return drive
+    frames = len(np.unique(table["frame"]))
+    if not np.array_equal(table["frame"], np.repeat(np.arange(frames), len(drive) // frames)):
+        raise ValueError(f"{path}: column frame; must count from 0, with as many rows for each frame")
+    return drive.reshape(frames, -1)
 
 
 def _plain(drive: torch.Tensor, array: TransducerArray) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -112,7 +129,9 @@ def _plain(drive: torch.Tensor, array: TransducerArray) -> tuple[dict[str, Any],
     columns = {"transducer": np.arange(len(array))}
     columns |= {f"{name} [m]": positions[:, axis] for axis, name in enumerate(PLACE_COLUMNS)}
     columns |= {name: normals[:, axis] for axis, name in enumerate(NORMAL_COLUMNS)}
-    columns |= {"phase [rad]": phases_of(drive).numpy(), "amplitude": amplitudes_of(drive).numpy()}
+    columns = _numbered(columns, drive)
+    flat = drive.flatten()
+    columns |= {"phase [rad]": phases_of(flat).numpy(), "amplitude": amplitudes_of(flat).numpy()}
     arrays = {"drive": drive.numpy(), "positions": positions, "normals": normals}
     return columns, arrays | {"source_strength": array.source_strength, "radius": array.radius}
 
@@ -120,15 +139,25 @@ def _plain(drive: torch.Tensor, array: TransducerArray) -> tuple[dict[str, Any],
 def _levelled(drive: torch.Tensor, name: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return columns by header and arrays by name of the levels for a device."""
     device = DEVICES[name]
-    units, rest = divmod(len(drive), device.board)
+    count = drive.shape[-1]
+    units, rest = divmod(count, device.board)
     if rest:
-        raise ValueError(f"drive: {len(drive)} transducers; must be a multiple of {device.board} for {name}")
+        raise ValueError(f"drive: {count} transducers; must be a multiple of {device.board} for {name}")
     levels = dict(zip(device.columns, (level.numpy() for level in device.levels(drive)), strict=True))
-    unit, transducer = np.divmod(np.arange(len(drive)), device.board)
-    columns = {"unit": unit, "transducer": transducer}
-    columns |= {f"{name} {key}": level for key, level in levels.items()}
-    arrays = {key: level.astype(np.uint8).reshape(units, -1) for key, level in levels.items()}
+    unit, transducer = np.divmod(np.arange(count), device.board)
+    columns = _numbered({"unit": unit, "transducer": transducer}, drive)
+    columns |= {f"{name} {key}": level.reshape(-1) for key, level in levels.items()}
+    shape = *drive.shape[:-1], units, device.board
+    arrays = {key: level.astype(np.uint8).reshape(shape) for key, level in levels.items()}
     return columns, arrays | {"device": name}
+
+
+def _numbered(columns: dict[str, Any], drive: torch.Tensor) -> dict[str, Any]:
+    """Return columns (M,), repeated for each frame of drives (T, M) and numbered by frame."""
+    if drive.ndim == 1:
+        return columns
+    frames = {"frame": np.repeat(np.arange(len(drive)), drive.shape[1])}
+    return frames | {name: np.tile(values, len(drive)) for name, values in columns.items()}
 
 
 def _played(path: Path, name: str, stored: Mapping[str, AnyArray]) -> torch.Tensor:

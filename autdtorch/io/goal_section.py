@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,14 +11,14 @@ from autdtorch.objectives.goals import (
     WEAKEST_FOCUS,
     Goal,
     MeanPressure,
-    QuietPoints,
     TargetPressures,
     WeakestFocus,
 )
+from autdtorch.objectives.quiet import Contrast, QuietPoints
 from autdtorch.utils.validation import invalid, require_known, require_name, require_one_of
 
 GOALS: dict[str, type[Goal]] = {
-    goal.name: goal for goal in (WeakestFocus, MeanPressure, TargetPressures, QuietPoints)
+    goal.name: goal for goal in (WeakestFocus, MeanPressure, TargetPressures, QuietPoints, Contrast)
 }
 """The goals by name."""
 
@@ -28,7 +29,7 @@ def load_goal(where: str, section: object) -> Goal:
     Args:
         where: name of the section in messages.
         section: a mapping of `name` and the settings of that goal, or a name alone. A config file may have
-            written it.
+            written it. Consecutive points can be text such as "4-67".
 
     Raises:
         ValueError: an unknown name or setting, or a setting out of range.
@@ -43,6 +44,8 @@ def load_goal(where: str, section: object) -> Goal:
     fields = [field.name for field in dataclasses.fields(kind)]
     require_known(where, section, ["name", *fields])
     settings = {field: section.get(field) for field in fields}
+    if span := re.fullmatch(r"(\d+)-(\d+)", str(settings.get("points"))):
+        settings["points"] = range(int(span[1]), int(span[2]) + 1)
     if "goal" in fields:
         settings["goal"] = load_goal(f"{where}.goal", settings["goal"])
     try:

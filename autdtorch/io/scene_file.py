@@ -10,12 +10,14 @@ import os
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+
+import torch
 
 from autdtorch.io.array_file import load_array
 from autdtorch.io.yaml_file import load_yaml, plain, unresolved
 from autdtorch.scene.arrays import TransducerArray
-from autdtorch.scene.geometry import Plane, circle_points
+from autdtorch.scene.geometry import Plane, circle_points, sphere_points
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
 from autdtorch.scene.scene import Medium, Scene
 from autdtorch.utils.trusted import TARGET, load_trusted
@@ -43,6 +45,10 @@ _KINDS: dict[str, dict[str, Builder]] = {  # what the key `type` of a section na
     },
     "control_points": {
         "circle": circle_points,
+        "sphere": sphere_points,
+        "plane": lambda center, normal, size, spacing: (
+            Plane(center, normal, size).points(spacing).flatten(0, 1)
+        ),
         "points": lambda positions: points_tensor("positions", positions),
     },
     "obstacle": {
@@ -62,7 +68,8 @@ _BUILDERS: dict[str, Builder] = {  # of sections without `type`
 def load_scene(source: str | os.PathLike[str] | Mapping[str, Any], modules: Collection[str] = ()) -> Scene:
     """Read a scene from a YAML file, or from a mapping of the same layout such as Hydra's `cfg.scene`.
 
-    An obstacle has a `type`, or the `_target_` of a class of the user's own, such as `mymodule.MyObstacle`.
+    Control points are a section, or a list of sections whose points follow one another. An obstacle has a
+    `type`, or the `_target_` of a class of the user's own, such as `mymodule.MyObstacle`.
 
     Args:
         source: path of the file, or the mapping. A value may be an interpolation of another key, `${key}`;
@@ -121,6 +128,10 @@ def _part(
             raise invalid(where, value, "must be a list of obstacles")
         places = [(f"{where}[{index}]", entry) for index, entry in enumerate(value)]
         return [_part(place, "obstacle", entry, air, folder, modules) for place, entry in places]
+    if key == "control_points" and isinstance(value, list) and value:
+        groups = [(f"{where}[{index}]", entry) for index, entry in enumerate(value)]
+        parts = [_part(place, key, entry, air, folder, modules) for place, entry in groups]
+        return torch.cat(cast(list[torch.Tensor], parts))
     if key not in ("medium", *_KINDS, *_BUILDERS):
         return value
     section = _mapping(where, value)

@@ -20,6 +20,7 @@ import numpy as np
 import scipy.optimize
 from numpy.typing import NDArray
 
+from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import ArrayLike, complex_tensor
 
 #: Orders of Schatten norms that approach the largest eigenvalue, which has kinks at its minima.
@@ -34,11 +35,21 @@ _MOST_PRICE, _RANGE = 1e6, 30.0
 #: Logarithm of a bound that is 0
 _NOTHING = -700.0
 
+#: Ranges of log z to certify: where prices let some z vanish, rounding takes more than the range gains.
+_RANGES = (2 * _RANGE, 16.0, 12.0, 8.0, 6.0, 4.0, 2.0)
+
+#: Rounding of an entry of the matrix whose eigenvalues are taken, over the number of its rows
+_ROUNDING = 10 * float(np.finfo(np.float64).eps)
+
+#: Smallest singular value of a background, relative to the largest, and the margin for its rounding.
+_LEAST_SINGULAR, _SINGULAR_MARGIN = 1e-8, 1e-6
+
 #: Relative margin on top of the bound; rounding of the bound and of a pressure is below 1e-13.
 _MARGIN = 1e-12
 
 _Reals: TypeAlias = NDArray[np.float64]
-_Complexes: TypeAlias = NDArray[np.complex128]
+Complexes: TypeAlias = NDArray[np.complex128]
+"""Array of complex numbers."""
 
 
 def focus_bound(G: ArrayLike) -> float:
@@ -58,7 +69,7 @@ def focus_bound(G: ArrayLike) -> float:
     return level_bound(matrix, np.ones(len(matrix)))[0]
 
 
-def checked_matrix(G: ArrayLike) -> _Complexes:
+def checked_matrix(G: ArrayLike) -> Complexes:
     """Return a transfer matrix (P, M) after checking it."""
     matrix = complex_tensor("G", G).detach().cpu().numpy().astype(np.complex128)
     if matrix.ndim != 2 or matrix.size == 0:
@@ -66,12 +77,14 @@ def checked_matrix(G: ArrayLike) -> _Complexes:
     return matrix
 
 
+@one_library_thread()
 def level_bound(
-    foci: _Complexes,
+    foci: Complexes,
     wanted: _Reals,
-    quiet: _Complexes | None = None,
+    quiet: Complexes | None = None,
     ratio: float = 1.0,
     together: bool = False,
+    norm: bool = False,
 ) -> tuple[float, float]:
     """Return a bound on the level t of foci that reach t `wanted`, while quiet points stay below r t.
 
@@ -81,6 +94,7 @@ def level_bound(
         quiet: rows of the quiet points (K, M) [Pa].
         ratio: r > 0.
         together: whether t is the root mean square of the pressures over `wanted`, not the least.
+        norm: whether drives have the norm 1, instead of amplitudes up to 1.
 
     Returns:
         The bound, and the price r^2 sum b >= 0 of the quiet points: for another ratio r e^x, the bound is
@@ -99,8 +113,8 @@ def level_bound(
     start = np.linalg.norm(rows, axis=0)
     weights = 1 / importance if together else np.ones(count)
     limits = list(zip(weights, weights, strict=True)) if together else [(_LEAST_WEIGHT, None)] * count
-    log_z = np.log(start)
-    limits += [(0, _MOST_PRICE)] * len(silent) + [(log - _RANGE, log + _RANGE) for log in log_z]
+    log_z, wide = (np.zeros(len(start)), 0.0) if norm else (np.log(start), _RANGE)
+    limits += [(0, _MOST_PRICE)] * len(silent) + [(log - wide, log + wide) for log in log_z]
     x = np.concatenate([weights, np.full(len(silent), 1e-3), log_z])
     for order in _ORDERS:
         x = scipy.optimize.minimize(
@@ -112,11 +126,55 @@ def level_bound(
             bounds=limits,
             options={"maxcor": 40, "maxiter": 2000, "ftol": 1e-14, "gtol": 1e-10},
         ).x
-    bound = alone.min() * math.exp(_log_bound(x, rows, importance, math.inf)[0]) * (1 + _MARGIN)
+    bound = alone.min() * math.exp(_certified(x, rows, importance)) * (1 + _MARGIN)
+    if norm:  # |z|^2 is the number of transducers
+        bound /= math.sqrt(len(start))
     return bound, float(x[count : count + len(silent)].sum())
 
 
-def _log_bound(x: _Reals, rows: _Complexes, importance: _Reals, order: float) -> tuple[float, _Reals]:
+def contrast_bound(foci: Complexes, background: Complexes) -> float:
+    """Return a bound on the weakest focus over the rms pressure of the background, of any drive.
+
+    With background rows B = U S V^H, the drive q = V S^-1 x has a background of the norm |x|.
+
+    Args:
+        foci: their rows of the transfer matrix (P, M) [Pa].
+        background: rows of its points (K, M) [Pa].
+
+    Returns:
+        The bound; infinite where B has a rank below M, for drives can silence the background then.
+    """
+    _, singular, right = np.linalg.svd(background, full_matrices=False)
+    if len(background) < foci.shape[1] or singular[-1] <= _LEAST_SINGULAR * singular[0]:
+        return math.inf
+    rows = foci @ (right.conj().T / singular)
+    level, _ = level_bound(rows, np.ones(len(rows)), norm=True)
+    return level * math.sqrt(len(background)) * (1 + _SINGULAR_MARGIN)
+
+
+def _certified(x: _Reals, rows: Complexes, importance: _Reals) -> float:
+    """Return the logarithm of the bound that x certifies, whatever the rounding; see `_log_bound`."""
+    split, found = len(rows), []
+    for width in _RANGES:
+        log_z = x[split:].clip(x[split:].max() - width)
+        z, columns, signed = _dual(np.concatenate([x[:split], log_z]), rows, importance)
+        left, singular, _ = np.linalg.svd(columns, full_matrices=False)
+        largest = np.linalg.eigvalsh((singular[:, None] * (left.conj().T * signed) @ left) * singular)[-1]
+        rounding = _ROUNDING * len(rows) * np.abs(signed) @ (np.abs(columns) ** 2).sum(axis=1)
+        found.append(math.log(max(largest, 0.0) + rounding) / 2 + math.log(np.linalg.norm(z)))
+    return min(found)
+
+
+def _dual(x: _Reals, rows: Complexes, importance: _Reals) -> tuple[_Reals, Complexes, _Reals]:
+    """Return z over its largest, the rows over it, and the signed weights of all points; see `_log_bound`."""
+    weights, prices, log_z = np.split(x, [len(importance), len(rows)])
+    z = np.exp(log_z - log_z.max())
+    # with prices b, the weights are divided by their mean and multiplied by 1 + sum b
+    factor = (1 + prices.sum()) / (weights @ importance)
+    return z, rows / z, np.concatenate((weights * factor, -prices))
+
+
+def _log_bound(x: _Reals, rows: Complexes, importance: _Reals, order: float) -> tuple[float, _Reals]:
     """Return the logarithm of the bound over the least of `alone`, and its gradient.
 
     The Schatten norm of this `order`, of the positive part, replaces the largest eigenvalue.
@@ -125,15 +183,11 @@ def _log_bound(x: _Reals, rows: _Complexes, importance: _Reals, order: float) ->
         x: the weights a over `importance`, up to a factor, b, then log z (P + K + M,).
         rows: transfer matrix (P + K, M), rows of foci divided by `alone`, those of quiet points by its least.
         importance: (min(alone) / alone)^2 (P,).
-        order: >= 2; infinite for the largest eigenvalue.
+        order: >= 2.
     """
-    foci, points = len(importance), len(rows)
-    weights, prices, log_z = np.split(x, [foci, points])
-    z = np.exp(log_z - log_z.max())
-    columns = rows / z
-    # with prices b, the weights are divided by their mean and multiplied by 1 + sum b
-    mean, all_prices = weights @ importance, 1 + prices.sum()
-    signed = np.concatenate((weights * (all_prices / mean), -prices))
+    foci, (z, columns, signed) = len(importance), _dual(x, rows, importance)
+    weights, all_prices = x[:foci], 1 + x[foci : len(rows)].sum()
+    mean = weights @ importance
     left, singular, right = np.linalg.svd(columns, full_matrices=False)
     values, vectors = np.linalg.eigh((singular[:, None] * (left.conj().T * signed) @ left) * singular)
     if values[-1] <= 0:  # no level is left

@@ -14,12 +14,7 @@ import torch
 from autdtorch.objectives.bound import checked_matrix, level_bound
 from autdtorch.objectives.objective import Score, checked_pressure, weakest_focus
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.validation import ArrayLike, integers, invalid, positive, real_tensor, require_kind
-
-# Times that a score falls by its size where quiet points exceed their limit by a factor of e
-_PENALTY = 2.0
-# Bound of a goal with quiet points: intervals of the excess, relaxations for ratios, and their least gain
-_INTERVALS, _MOST_RELAXATIONS, _GAIN = 500, 8, 1e-3
+from autdtorch.utils.validation import ArrayLike, invalid, real_tensor
 
 
 @dataclass(frozen=True)
@@ -32,10 +27,12 @@ class Goal(ABC):
     Attributes:
         name: of the goal in configs, results and figures; of the class where it has none.
         unit: of the scores, "" for numbers.
+        absolute: whether `wanted` gives pressures in Pa.
     """
 
     name: ClassVar[str]
     unit: ClassVar[str] = "Pa"
+    absolute: ClassVar[bool] = False
 
     def __init_subclass__(cls) -> None:
         """Name a goal without a name after its class."""
@@ -64,6 +61,10 @@ class Goal(ABC):
             ValueError: not finite complex numbers, not (P, M), or another number of points than the goal's.
         """
         return math.inf
+
+    def wanted(self, points: int) -> Array:
+        """Return the pressures (P,) wanted, relative to each other, or in Pa if `absolute`: 1 for each."""
+        return np.ones(points)
 
     def check(self, points: int) -> None:  # noqa: B027 - many goals take any number of points
         """Check the goal against the number of control points; `ValueError` where it does not fit."""
@@ -157,6 +158,7 @@ class TargetPressures(Goal):
 
     name: ClassVar[str] = "target_pressures"
     unit: ClassVar[str] = ""
+    absolute: ClassVar[bool] = True
 
     targets: Sequence[float]
 
@@ -181,109 +183,16 @@ class TargetPressures(Goal):
         share, _ = level_bound(matrix, np.array(self.targets))
         return min(0.0, share - 1) / math.sqrt(len(matrix))
 
+    def wanted(self, points: int) -> Array:
+        """Return the targets (P,) [Pa]."""
+        return np.array(self.targets)
+
     def check(self, points: int) -> None:
         """Check the number of targets."""
         _require_count("targets", self.targets, points)
 
     def _deviation(self, pressure: torch.Tensor) -> torch.Tensor:
         return pressure / pressure.new_tensor(self.targets) - 1
-
-
-@dataclass(frozen=True)
-class QuietPoints(Goal):
-    """A goal for some control points, while others stay quiet: below a ratio of the weakest of the former.
-
-    The other points are scored by `goal`. A penalty is subtracted for the loudest quiet point: twice the
-    logarithm of its excess, times the score of a goal in Pa. A quiet region is points of a plane or a sphere.
-
-    Attributes:
-        goal: of the points that are not quiet, in their order.
-        points: indices of the quiet control points.
-        ratio: largest pressure of a quiet point, relative to the weakest other point, > 0; 10^(-30/20) for
-            30 dB.
-    """
-
-    name: ClassVar[str] = "quiet_points"
-
-    goal: Goal
-    points: Sequence[int]
-    ratio: float
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        require_kind("goal", self.goal, Goal)
-        if isinstance(self.goal, QuietPoints):
-            raise invalid("goal", self.goal, "must be a goal without quiet points of its own")
-        accepted = "must be indices of control points, each once, at least one"
-        points = tuple(integers("points", self.points, 0, accepted))
-        if not points or len(set(points)) < len(points):
-            raise invalid("points", points, accepted)
-        object.__setattr__(self, "points", points)
-        object.__setattr__(self, "ratio", positive("ratio", self.ratio))
-
-    @property
-    def unit(self) -> str:  # type: ignore[override]
-        """The unit of the goal."""
-        return self.goal.unit
-
-    def __call__(self, pressure: ArrayLike) -> torch.Tensor:
-        """Return the score of the loud points (...), less the penalty."""
-        loud, quiet = self.parts(self.checked(pressure))
-        score, limit = self.goal(loud), self.ratio * loud.amin(dim=-1)
-        tiny = torch.finfo(quiet.dtype).tiny
-        excess = (quiet.amax(dim=-1).clamp_min(tiny) / limit.clamp_min(tiny)).log().clamp_min(0)
-        return score - _PENALTY * excess * (score.abs() if self.unit else 1)
-
-    def slope(self, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
-        """Return those of the goal, less a quadratic penalty for quiet points: more with less smoothing."""
-        loud, quiet = self.parts(pressure)
-        limit = self.ratio * loud.amin(dim=-1, keepdim=True).clamp_min(torch.finfo(loud.dtype).tiny)
-        slope = torch.zeros_like(pressure)
-        own = self.goal.slope(loud, smoothing)
-        over = (quiet / limit - 1).clamp_min(0) / smoothing
-        slope[..., self.others(pressure.shape[-1])] = own
-        slope[..., list(self.points)] = -own.abs().sum(dim=-1, keepdim=True) * over
-        return slope
-
-    def parts(self, pressure: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the pressures [Pa] of the other points (..., P - K) and of the quiet ones (..., K)."""
-        return pressure[..., self.others(pressure.shape[-1])], pressure[..., list(self.points)]
-
-    def others(self, points: int) -> list[int]:
-        """Return the indices of the points that are not quiet, of so many in all."""
-        return [point for point in range(points) if point not in self.points]
-
-    def bound(self, G: ArrayLike) -> float:
-        """Return the bound from a relaxation with the quiet points; see `Goal.bound`."""
-        matrix = checked_matrix(G)
-        self.check(len(matrix))
-        loud, quiet = (part.mT.numpy() for part in self.parts(torch.from_numpy(matrix).mT))
-        least = self.goal.bound(loud)
-        if not isinstance(self.goal, WeakestFocus):
-            return least
-        weights = self.goal.wanted(len(loud))
-        # A drive of excess x has at most the level for the ratio times e^x, and 1 - penalty x times that is
-        # its score. The first rises with x and the second falls: the ends of an interval bound both.
-        excess = np.linspace(0, 1 / _PENALTY, _INTERVALS + 1)
-        levels, worst = np.full(_INTERVALS, least), 0
-        for _ in range(_MOST_RELAXATIONS):
-            before = (levels * (1 - _PENALTY * excess[:-1])).max()
-            ratio = self.ratio * weights.max() * math.exp(excess[worst])
-            level, price = level_bound(loud, weights, quiet, ratio)
-            left = 1 - price * np.expm1(2 * (excess[1:] - excess[worst]))
-            levels[left > 0] = np.minimum(levels[left > 0], level / np.sqrt(left[left > 0]))
-            scores = levels * (1 - _PENALTY * excess[:-1])
-            worst = int(scores.argmax()) + 1
-            if scores.max() > (1 - _GAIN) * before:
-                break
-        return float(scores.max())
-
-    def check(self, points: int) -> None:
-        """Check the indices, and the goal for the other points."""
-        if max(self.points) >= points or len(self.points) == points:
-            accepted = f"must be indices from 0 to {points - 1}, and not all of them"
-            raise invalid("points", self.points, accepted)
-        self.goal.check(points - len(self.points))
 
 
 WEAKEST_FOCUS = WeakestFocus()

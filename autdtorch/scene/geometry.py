@@ -1,4 +1,4 @@
-"""Bases of planes, rotations, points on circles, and the observation plane."""
+"""Bases of planes, rotations, points on circles and spheres, and the observation plane."""
 
 from __future__ import annotations
 
@@ -136,6 +136,32 @@ def circle_points(
     start = finite_number("angle", angle, "rad")
     angles = start + 2 * math.pi * torch.arange(count, dtype=torch.float64, device="cpu") / count
     return origin + radius * (angles.cos()[:, None] * u + angles.sin()[:, None] * v)
+
+
+def sphere_points(center: ArrayLike, radius: float, count: int) -> torch.Tensor:
+    """Return evenly spread points on a sphere: a Fibonacci lattice.
+
+    Each point has the area 4 pi radius^2 / count around it; their distances are about the root of it.
+
+    Args:
+        center: centre of the sphere (3,) [m].
+        radius: its radius [m], > 0.
+        count: number of points, >= 1.
+
+    Returns:
+        Points (count, 3) [m], float64.
+
+    Raises:
+        ValueError: an argument is not finite, has the wrong shape or is out of range.
+    """
+    origin = torch.tensor(finite_vector("center", center), dtype=torch.float64, device="cpu")
+    radius = positive("radius", radius, "m")
+    count = integer_at_least("count", count, 1)
+    require_memory("count", count, _POINT_BYTES * count)
+    number = torch.arange(count, dtype=torch.float64, device="cpu")
+    height = 1 - (2 * number + 1) / count
+    angle, across = math.pi * (3 - math.sqrt(5)) * number, (1 - height.square()).sqrt()
+    return origin + radius * torch.stack((across * angle.cos(), across * angle.sin(), height), dim=1)
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,10 @@ from autdtorch.io.goal_section import goal_section, require_score
 from autdtorch.methods.base import TRIAL_BYTES, Method, Problem, Trials
 from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal, QuietPoints
+from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
 from autdtorch.objectives.metrics import focus_metrics
 from autdtorch.objectives.objective import Objective
+from autdtorch.objectives.quiet import QuietPoints
 from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.propagators import Propagator, SimulatedPropagator, make_propagator
 from autdtorch.scene.scene import Scene

@@ -35,6 +35,19 @@ METHODS = {
     "GABS, 3 passes": lambda objective, seed: at.gabs(objective, passes=3, seed=seed),
     "identify": lambda objective, seed: at.identify(objective, seed=seed),
 }
+TARGETS = at.TargetPressures([6.0, 4.0, 6.0, 4.0])
+FOR_TARGETS = {
+    "GABS": lambda objective, seed: at.gabs(objective, seed=seed, score=TARGETS),
+    "GABS, 3 passes": lambda objective, seed: at.gabs(objective, passes=3, seed=seed, score=TARGETS),
+    "GABS, 5 passes": lambda objective, seed: at.gabs(objective, passes=5, seed=seed, score=TARGETS),
+    "BO": lambda objective, seed: at.bayes_opt(objective, 150, seed=seed, score=TARGETS),
+    "BO, circle": lambda objective, seed: at.bayes_opt(
+        objective, 150, kernel="circle", seed=seed, score=TARGETS
+    ),
+    "BO, foci": lambda objective, seed: at.bayes_opt(
+        objective, 80, initial=4, model="foci", kernel="phasor", noise="inferred", seed=seed, score=TARGETS
+    ),
+}
 SNR = 30.0  # dB
 
 _CHIP = (0x2A8D, 0x1770)
@@ -133,6 +146,21 @@ def with_noise(
     ]
 
 
+def with_targets(simulated: at.SimulatedObjective, device: hardware.Device, seeds: range) -> list[list[str]]:
+    """Return the rows of the table of targets: true rms deviations from the targets."""
+    on_levels, rows = hardware.Played(simulated, device, range(len(simulated.scene.array))), []
+    for name, solve in FOR_TARGETS.items():
+        found = [
+            measure(simulated, device, readings, partial(solve, seed=seed), seed).found for seed in seeds
+        ]
+        truly = torch.cat([-TARGETS(at.true_pressure(on_levels, one.drive)) for one in found])
+        cells = [f"{100 * float(value):.1f}" for value in (truly.median(), truly.max())]
+        rows.append(
+            [name, str(int(found[0].evaluations)), *cells, f"{int((truly <= 0.05).sum())} of {len(seeds)}"]
+        )
+    return rows
+
+
 def rates(simulated: at.SimulatedObjective, device: hardware.Device, seeds: range) -> str:
     """Return the evaluations per second of GABS, the median of its trials, without and with waits."""
     trials = [
@@ -164,6 +192,12 @@ def main(given: argparse.Namespace) -> None:
         "sample of an oscilloscope: true weakest focus against the simulated trial of the same seed, on\n"
         f"{DEVICES[0].name}.",
         table(["noise in", "method", "mean (95 % interval) [%]", "range [%]", "within 5 %"], noisy),
+        f"Targets of {TARGETS.targets} Pa with this noise in every reading: true rms\n"
+        "deviation from the targets.",
+        table(
+            ["method", "evaluations", "median [%]", "largest [%]", "within 5 %"],
+            with_targets(simulated, DEVICES[0], seeds),
+        ),
         "Evaluations per second of GABS, on the emulated device and with the waits of a bench (frames on\n"
         f"the line, off frames, 5 ms of settling): {'; '.join(rates(simulated, d, seeds) for d in DEVICES)}.",
     )

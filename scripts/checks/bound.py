@@ -1,7 +1,8 @@
 """Bounds on the goals: no method may exceed them.
 
 Half of the random scenes have an unstructured transfer matrix, the others one of transducers and control
-points in air; 2 to 32 transducers, 1 to 8 foci. Exits with 1 if a score is above its bound.
+points in air; 2 to 32 transducers, 1 to 8 foci. For contrast, 2 to 8 transducers and enough background points
+that it has a bound. Exits with 1 if a score is above its bound.
 
     python scripts/check.py bound --scenes 1000
 """
@@ -41,8 +42,11 @@ class MatrixPropagator:
         return drive @ self._matrix.T
 
 
-def random_objective(generator: torch.Generator) -> at.SimulatedObjective:
-    """Return an objective of 2 to 32 transducers and 1 to 8 foci, of either kind."""
+def random_objective(generator: torch.Generator, background: bool = False) -> at.SimulatedObjective:
+    """Return an objective of 2 to 32 transducers and 1 to 8 foci, of either kind.
+
+    With `background`, of 2 to 8 transducers and up to 8 more control points than transducers.
+    """
 
     def integer(low: int, high: int) -> int:
         return int(torch.randint(low, high + 1, (), generator=generator))
@@ -50,7 +54,8 @@ def random_objective(generator: torch.Generator) -> at.SimulatedObjective:
     def uniform(*shape: int) -> torch.Tensor:
         return torch.rand(shape, dtype=torch.float64, generator=generator)
 
-    transducers, foci, physical = integer(2, 32), integer(1, 8), integer(0, 1)
+    transducers, foci, physical = integer(2, 8 if background else 32), integer(1, 8), integer(0, 1)
+    foci += transducers if background else 0
     # Transducers on a 10 mm grid of 8 x 8, foci in a cube of 100 mm that begins 40 mm in front of it.
     places = torch.randperm(64, generator=generator)[:transducers]
     positions = 10e-3 * torch.stack([torch.zeros(transducers), places // 8, places % 8], dim=1).double()
@@ -119,33 +124,40 @@ def check_goals(count: int, seed: int) -> int:
     generator, above, scores = torch.Generator().manual_seed(seed), 0, 0
     gaps = defaultdict(list)
     for _ in range(count):
-        objective = random_objective(generator)
-        for goal in random_goals(objective, generator):
+        objective, wide = random_objective(generator), random_objective(generator, background=True)
+        goals = [(goal, objective) for goal in random_goals(objective, generator)]
+        goals.append((at.Contrast(range(len(wide.scene.array))), wide))
+        for goal, objective in goals:
             bound = goal.bound(objective.transfer_matrix)
             ascent, *others = (
                 solve(objective, score=goal).score.item()
                 for solve in (at.gradient_ascent, at.gabs, at.random_search)
             )
-            above += sum(not score <= bound + ROUNDING * abs(bound) for score in (ascent, *others))
-            scores += 1 + len(others)
+            if not max(ascent, *others) <= bound + ROUNDING * abs(bound):
+                print(f"above its bound {bound}: {max(ascent, *others)}, {goal}")
+                above += 1
+            scores += 1
             inner = type(goal.goal).__name__ + " and quiet points" if isinstance(goal, at.QuietPoints) else ""
             gaps[inner or type(goal).__name__].append(
                 (bound - ascent) / bound if goal.unit else bound - ascent
             )
-    print(f"{count} random scenes, seed {seed}: {above} of {scores} scores of goals above their bounds")
+    print(f"{count} random scenes, seed {seed}: {above} of {scores} best scores of goals above their bounds")
     for name, values in gaps.items():
         print(f"  {name}, gradient ascent: median {np.median(values):.2%} below the bound")
     return above
 
 
 def check_paper_scenes() -> None:
-    """Print the gaps of gradient ascent in the paper's scenes, without and with weights."""
+    """Print the gaps of gradient ascent in the paper's scenes, without weights and with 20 random sets."""
+    generator = torch.Generator().manual_seed(0)
+    weights = (1 + 2 * torch.rand(20, 4, dtype=torch.float64, generator=generator)).tolist()
     for name, objective in paper_objectives().items():
-        for goal in (at.WeakestFocus(), at.WeakestFocus([1, 2, 1, 2]), at.WeakestFocus([1, 1, 2, 3])):
-            bound = goal.bound(objective.transfer_matrix)
-            score = at.gradient_ascent(objective, score=goal).score.item()
-            gap = f"gap {1 - score / bound:.3%}"
-            print(f"{name}, weights {goal.weights}: bound {bound:.4f} Pa, gradient {score:.4f} Pa, {gap}")
+        plain, *weighted = (
+            1 - at.gradient_ascent(objective, score=goal).score.item() / goal.bound(objective.transfer_matrix)
+            for goal in (at.WeakestFocus(), *map(at.WeakestFocus, weights))
+        )
+        gaps = f"median {np.median(weighted):.3%}, most {max(weighted):.3%} with weights from 1 to 3"
+        print(f"{name}: gradient ascent is {plain:.3%} below the bound; {gaps}")
 
 
 OPTIONS = {

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from autdtorch.methods.gabs import gabs
 from autdtorch.methods.gradient import gradient_ascent, random_drives
-from autdtorch.objectives.bound import focus_bound
+from autdtorch.objectives.bound import _certified, focus_bound
 
 
 @settings(max_examples=40)
@@ -93,3 +93,15 @@ def test_paper_scene_without_obstacles_is_solved(paper_objective):
 def test_bad_matrices_are_named(matrix, message):
     with pytest.raises(ValueError, match=message):
         focus_bound(matrix)
+
+
+@pytest.mark.parametrize("least", [-1.0, -12.0, -36.0, -60.0])
+def test_rounding_takes_nothing_from_a_certificate(least):
+    # a z that vanishes leaves 1 / z^2 in the matrix, beside which rounding hides the largest eigenvalue
+    rows = np.array([[0.4, 0.4, 0.2], [0.3, -0.2, 0.5], [30, 78, 106]], dtype=np.complex128)
+    first = np.exp(2j * math.pi * np.random.default_rng(0).random((2, 1000)))
+    drives = np.stack([*first, -(rows[2, :2] @ first) / rows[2, 2]])
+    drives = drives[:, np.abs(drives[2]) <= 1]  # the third point is at 0
+    level = np.abs(rows[:2] @ drives).min(axis=0).max()
+    x = np.array([1.0, 1.0, 1e-3, 0.0, 0.0, least])
+    assert math.exp(_certified(x, rows, np.ones(2))) >= level

@@ -6,7 +6,8 @@ import torch
 from autdtorch.methods.driver import run
 from autdtorch.methods.holography.holography import _SOLVERS, Holography, _within_largest, holography
 from autdtorch.objectives.bound import focus_bound
-from autdtorch.objectives.goals import QuietPoints, TargetPressures, WeakestFocus
+from autdtorch.objectives.goals import TargetPressures, WeakestFocus
+from autdtorch.objectives.quiet import QuietPoints
 
 ALGORITHMS = ["naive", "gs", "wgs", "gs_pat", "diff_pat"]
 

@@ -65,6 +65,23 @@ def test_levels_come_back_as_the_device_plays_them(tmp_path, device, suffix):
     assert (amplitudes_of(played) - amplitudes_of(drive)).abs().max() <= amplitude_error + 1e-9
 
 
+@pytest.mark.parametrize("suffix", [".csv", ".npz"])
+@pytest.mark.parametrize("device", [None, *ARRAYS])
+@pytest.mark.parametrize("frames", [1, 3])
+def test_frames_come_back_in_their_order(tmp_path, device, suffix, frames):
+    array = ARRAYS[device or "autd3"]
+    drives = torch.stack([some_drive(len(array)).roll(frame) for frame in range(frames)])
+    path = tmp_path / f"frames{suffix}"
+    save_drive(path, drives, array, device)
+    read = load_drive(path)
+    assert read.shape == drives.shape
+    for frame in range(frames):
+        save_drive(tmp_path / f"alone{suffix}", drives[frame], array, device)
+        assert torch.equal(load_drive(tmp_path / f"alone{suffix}"), read[frame])
+    if device is None:
+        assert torch.allclose(load_array(path).positions, array.positions, rtol=0, atol=1e-15)
+
+
 def test_autd3_gets_bytes_in_the_order_of_its_units(tmp_path):
     drive = some_drive(498)
     save_drive(tmp_path / "drive.npz", drive, ARRAYS["autd3"], "autd3")
@@ -81,6 +98,8 @@ def test_autd3_gets_bytes_in_the_order_of_its_units(tmp_path):
         ("transducer,phase [rad]\n0,1\n", r"d.csv: no column amplitude; must have phase and amplitude"),
         ("phase [rad],amplitude\n0,2\n", r"d.csv: amplitudes: from 2 to 2"),
         ("unit,transducer,autd3 phase\n0,0,1\n", r"d.csv: no autd3 intensity; must have autd3 phase, "),
+        ("frame,phase [rad],amplitude\n0,1,1\n0,1,1\n1,1,1\n", r"d.csv: column frame; must count"),
+        ("frame,phase [rad],amplitude\n1,1,1\n2,1,1\n", r"d.csv: column frame; must count"),
         ("autd3 phase,autd3 intensity\n256,0\n", r"d.csv: AUTD3 phase: .*0 to 255"),
         ("autd3 phase,autd3 intensity\n1.5,0\n", r"d.csv: AUTD3 phase: .*0 to 255"),
     ],
@@ -123,7 +142,8 @@ def test_a_write_that_breaks_off_leaves_the_file_that_was_there(tmp_path, monkey
         ({"device": "autd3"}, r"16 transducers; must be a multiple of 249 for autd3"),
         ({"device": "autd"}, r"device: 'autd'; must be one of autd3, openmpd, sonicsurface, u"),
         ({"path": "d.txt"}, r"path: .*; must end in one of .csv, .npz"),
-        ({"drive": torch.ones(1, 16) + 0j}, r"drive: shape \(1, 16\); must be \(16,\), a single drive"),
+        ({"drive": torch.ones(1, 1, 16) + 0j}, r"drive: shape \(1, 1, 16\); must be \(16,\), or \(T, 16\)"),
+        ({"drive": torch.ones(0, 16) + 0j}, r"drive: shape \(0, 16\); must be \(16,\), or \(T, 16\)"),
     ],
 )
 def test_a_drive_that_is_not_the_devices_is_refused(tmp_path, changes, message):

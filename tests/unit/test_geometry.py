@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from small_scenes import small_scene
 
-from autdtorch.scene.geometry import Plane, circle_points, plane_basis
+from autdtorch.scene.geometry import Plane, circle_points, plane_basis, sphere_points
 
 # Unit vectors are products of a few roundings of numbers up to 1.
 ROUNDING = 1e-14
@@ -136,3 +136,16 @@ def stored(tensor):
 
 def test_equal_planes_are_equal():
     assert Plane([0, 0, 0], [2, 0, 0], [1, 1]) == Plane((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0))
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 200])
+def test_sphere_points_are_even_on_the_sphere(count):
+    offsets = sphere_points((1e-2, 2e-2, 3e-2), 5e-3, count) - torch.tensor(
+        [1e-2, 2e-2, 3e-2], dtype=torch.float64
+    )
+    assert offsets.norm(dim=1).tolist() == pytest.approx([5e-3] * count, rel=1e-12)
+    if count == 200:
+        # A hexagonal lattice of as many points has distances of 1.07 times the root of the area of each.
+        apart = torch.pdist(offsets).min() / (5e-3 * math.sqrt(4 * math.pi / count))
+        assert 0.8 < apart < 1.08
+        assert offsets.mean(dim=0).norm() < 0.01 * 5e-3

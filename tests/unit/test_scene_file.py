@@ -7,6 +7,7 @@ from omegaconf import OmegaConf
 from small_scenes import CORNER
 
 from autdtorch.io.scene_file import load_scene
+from autdtorch.scene.geometry import sphere_points
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
 from autdtorch.scene.scene import Medium
 
@@ -174,3 +175,18 @@ def test_an_obstacle_of_ones_own_is_named_by_target(own, tmp_path):
 def test_what_is_not_an_obstacle_of_a_trusted_module_is_refused(own, target, modules, message):
     with pytest.raises(ValueError, match=message):
         own(target, modules)
+
+
+def test_control_points_of_several_groups_follow_one_another(tmp_path):
+    path = tmp_path / "groups.yaml"
+    groups = """control_points:
+  - {type: points, positions: [[80e-3, 0, 0]]}
+  - {type: sphere, center: [60e-3, 0, 0], radius: 3e-3, count: 5}
+  - {type: plane, center: [90e-3, 0, 0], normal: [1, 0, 0], size: [4e-3, 6e-3], spacing: 2e-3}
+"""
+    path.write_text(SMALL.replace(SMALL[SMALL.index("control_points") :], groups))
+    points = load_scene(path).control_points
+    assert points.shape == (1 + 5 + 6, 3)
+    assert points[0].tolist() == [80e-3, 0, 0]
+    assert torch.equal(points[1:6], sphere_points((60e-3, 0, 0), 3e-3, 5))
+    assert points[6:, 0].tolist() == pytest.approx([90e-3] * 6)

@@ -17,7 +17,8 @@ from autdtorch.methods.gradient import GradientAscent
 from autdtorch.methods.identify import Identify
 from autdtorch.methods.lssg import LSSG, lssg
 from autdtorch.methods.prior import Prior
-from autdtorch.objectives.goals import Goal, MeanPressure, QuietPoints, TargetPressures
+from autdtorch.objectives.goals import Goal, MeanPressure, TargetPressures
+from autdtorch.objectives.quiet import QuietPoints
 from autdtorch.propagators import FreeSpacePropagator, Run, SteadyStateWarning
 from autdtorch.propagators.full import DomainSimulation
 from autdtorch.scene.geometry import Plane

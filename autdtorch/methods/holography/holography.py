@@ -23,7 +23,7 @@ from typing import ClassVar, Literal, TypeAlias, cast, get_args
 import torch
 
 from autdtorch.methods.base import Method, Problem, Step, known_matrix
-from autdtorch.objectives.goals import WEAKEST_FOCUS, QuietPoints, TargetPressures, WeakestFocus
+from autdtorch.objectives.goals import Goal
 from autdtorch.objectives.objective import Score
 from autdtorch.utils.validation import (
     ArrayLike,
@@ -129,15 +129,9 @@ def holography(
 
 def wanted_pressures(goal: Score, points: int) -> tuple[torch.Tensor, bool]:
     """Return the pressures (P,) that a goal wants, and whether they are absolute [Pa], not relative."""
-    if isinstance(goal, QuietPoints):
-        others, absolute = wanted_pressures(goal.goal, points - len(goal.points))
-        wanted = torch.zeros(points, dtype=torch.float64, device="cpu")
-        wanted[goal.others(points)] = others
-        return wanted, absolute
-    if isinstance(goal, TargetPressures):
-        return torch.tensor(goal.targets, dtype=torch.float64, device="cpu"), True
-    weighted = goal if isinstance(goal, WeakestFocus) else WEAKEST_FOCUS
-    return torch.from_numpy(weighted.wanted(points)), False
+    if not isinstance(goal, Goal):
+        return torch.ones(points, dtype=torch.float64, device="cpu"), False
+    return torch.from_numpy(goal.wanted(points)), goal.absolute
 
 
 def _solved(

@@ -1,0 +1,215 @@
+"""Goals for foci beside points that stay quiet; a quiet region is points of a plane or a sphere."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import torch
+
+from autdtorch.objectives.bound import Complexes, checked_matrix, contrast_bound, level_bound
+from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal, WeakestFocus
+from autdtorch.utils.array_types import Array
+from autdtorch.utils.validation import ArrayLike, integers, invalid, positive, require_kind
+
+# Power of the excess of quiet points by which a score in Pa is divided
+_PENALTY = 2.0
+# Bound of a goal with quiet points: largest excess and number of intervals, relaxations, and their least gain
+_MOST_EXCESS, _INTERVALS, _MOST_RELAXATIONS, _GAIN = 8.0, 16_000, 8, 1e-3
+# Least background, relative to the loudest focus: silence behind foci has no other contrast
+_LEAST = 1e-10
+
+
+@dataclass(frozen=True)
+class QuietPoints(Goal):
+    """A goal for some control points, while others stay quiet: below a ratio of the weakest of the former.
+
+    The other points are scored by `goal`. If the loudest quiet point exceeds its limit by a factor, a score
+    in Pa is divided by the square of the factor; from others, twice its logarithm is subtracted. A quiet
+    region is points of a plane or a sphere.
+
+    Attributes:
+        goal: of the points that are not quiet, in their order.
+        points: indices of the quiet control points.
+        ratio: largest pressure of a quiet point, relative to the weakest other point, > 0; 10^(-30/20) for
+            30 dB.
+    """
+
+    name: ClassVar[str] = "quiet_points"
+
+    goal: Goal
+    points: Sequence[int]
+    ratio: float
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        require_kind("goal", self.goal, Goal)
+        if isinstance(self.goal, QuietPoints | Contrast):
+            raise invalid("goal", self.goal, "must be a goal without quiet points of its own")
+        object.__setattr__(self, "points", _indices(self.points))
+        object.__setattr__(self, "ratio", positive("ratio", self.ratio))
+
+    @property
+    def unit(self) -> str:  # type: ignore[override]
+        """The unit of the goal."""
+        return self.goal.unit
+
+    @property
+    def absolute(self) -> bool:  # type: ignore[override]
+        """Whether the goal wants pressures in Pa."""
+        return self.goal.absolute
+
+    def __call__(self, pressure: ArrayLike) -> torch.Tensor:
+        """Return the score of the other points (...), lowered for the excess of quiet points."""
+        loud, quiet = _parts(self.checked(pressure), self.points)
+        score, limit = self.goal(loud), self.ratio * loud.amin(dim=-1)
+        tiny = torch.finfo(quiet.dtype).tiny
+        excess = (quiet.amax(dim=-1).clamp_min(tiny) / limit.clamp_min(tiny)).log().clamp_min(0)
+        if self.unit:  # a factor: a lower score must not make up for the excess
+            return score * (-_PENALTY * excess * score.sgn()).exp()
+        return score - _PENALTY * excess
+
+    def slope(self, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
+        """Return those of the goal, and of a penalty for the smooth maximum of the excess."""
+        loud, quiet = _parts(pressure, self.points)
+        tiny = torch.finfo(loud.dtype).tiny
+        own, weakest = self.goal.slope(loud, smoothing), WEAKEST_FOCUS.slope(loud, smoothing)
+        limit = self.ratio * loud.amin(dim=-1, keepdim=True).clamp_min(tiny)
+        excess = (quiet.clamp_min(tiny) / limit).log() / smoothing
+        weights = torch.softmax(torch.cat([torch.zeros_like(limit), excess], dim=-1), dim=-1)[..., 1:]
+        penalty = _PENALTY * (own.abs() * loud).sum(dim=-1, keepdim=True)  # of the size of the score
+        raised = penalty * weights.sum(dim=-1, keepdim=True) * weakest * self.ratio / limit
+        slope = torch.zeros_like(pressure)
+        slope[..., _others(self.points, pressure.shape[-1])] = own + raised
+        slope[..., list(self.points)] = -penalty * weights / quiet.clamp_min(tiny)
+        return slope
+
+    def bound(self, G: ArrayLike) -> float:
+        """Return the bound from a relaxation with the quiet points; see `Goal.bound`."""
+        matrix = checked_matrix(G)
+        self.check(len(matrix))
+        loud, quiet = _rows(matrix, self.points)
+        least = self.goal.bound(loud)
+        if not isinstance(self.goal, WeakestFocus):
+            return least
+        weights = self.goal.wanted(len(loud))
+        # A drive whose excess has the logarithm x has at most the level for the ratio times e^x, and
+        # e^(-penalty x) times that is its score. The first rises with x and the second falls: the ends of an
+        # interval bound both. The last interval has no end.
+        excess = np.append(np.linspace(0, _MOST_EXCESS, _INTERVALS), math.inf)
+        factor, levels, worst = np.exp(-_PENALTY * excess[:-1]), np.full(_INTERVALS, least), 0
+        for _ in range(_MOST_RELAXATIONS):
+            before = (levels * factor).max()
+            ratio = self.ratio * weights.max() * math.exp(excess[worst])
+            level, price = level_bound(loud, weights, quiet, ratio)
+            left = (
+                1 - price * np.expm1(2 * (excess[1:] - excess[worst])) if price > 0 else np.ones(_INTERVALS)
+            )
+            levels[left > 0] = np.minimum(levels[left > 0], level / np.sqrt(left[left > 0]))
+            scores = levels * factor
+            worst = min(int(scores.argmax()) + 1, _INTERVALS - 1)
+            if scores.max() > (1 - _GAIN) * before:
+                break
+        return float(scores.max())
+
+    def wanted(self, points: int) -> Array:
+        """Return 0 for quiet points, and what the goal wants for the others."""
+        return _silenced(self.points, self.goal.wanted(points - len(self.points)))
+
+    def check(self, points: int) -> None:
+        """Check the indices, and the goal for the other points."""
+        _require_others(self.points, points)
+        self.goal.check(points - len(self.points))
+
+
+@dataclass(frozen=True)
+class Contrast(Goal):
+    """The pressure of the weakest focus over the rms pressure of the background.
+
+    Attributes:
+        points: indices of the control points of the background; all others are foci.
+    """
+
+    name: ClassVar[str] = "contrast"
+    unit: ClassVar[str] = ""
+
+    points: Sequence[int]
+
+    def __post_init__(self) -> None:
+        """Check the indices."""
+        object.__setattr__(self, "points", _indices(self.points))
+
+    def __call__(self, pressure: ArrayLike) -> torch.Tensor:
+        """Return the ratios (...), at most 1e10."""
+        foci, background = _parts(self.checked(pressure), self.points)
+        rms = torch.linalg.vector_norm(background, dim=-1) / math.sqrt(len(self.points))
+        least = (_LEAST * foci.amax(dim=-1)).clamp_min(torch.finfo(foci.dtype).tiny)
+        ratio: torch.Tensor = foci.amin(dim=-1) / torch.maximum(rms, least)
+        return ratio
+
+    def slope(self, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
+        """Return those of the logarithm, with a smooth minimum."""
+        foci, background = _parts(pressure, self.points)
+        own = WEAKEST_FOCUS.slope(foci, smoothing)
+        tiny = torch.finfo(foci.dtype).tiny
+        slope = torch.zeros_like(pressure)
+        slope[..., _others(self.points, pressure.shape[-1])] = own / foci.amin(
+            dim=-1, keepdim=True
+        ).clamp_min(tiny)
+        power = background.square().sum(dim=-1, keepdim=True)
+        slope[..., list(self.points)] = -background / power.clamp_min(tiny)
+        return slope
+
+    def bound(self, G: ArrayLike) -> float:
+        """Return the bound, infinite where drives can silence the background; see `Goal.bound`."""
+        matrix = checked_matrix(G)
+        self.check(len(matrix))
+        return contrast_bound(*_rows(matrix, self.points))
+
+    def wanted(self, points: int) -> Array:
+        """Return 0 for the background, and 1 for each focus."""
+        return _silenced(self.points, np.ones(points - len(self.points)))
+
+    def check(self, points: int) -> None:
+        """Check the indices."""
+        _require_others(self.points, points)
+
+
+def _indices(points: Sequence[int]) -> tuple[int, ...]:
+    """Return indices of control points after checking them."""
+    accepted = "must be indices of control points, each once, at least one"
+    checked = tuple(integers("points", points, 0, accepted))
+    if not checked or len(set(checked)) < len(checked):
+        raise invalid("points", points, accepted)
+    return checked
+
+
+def _require_others(points: Sequence[int], count: int) -> None:
+    """Check that indices are among so many control points, and leave others."""
+    if max(points) >= count or len(points) == count:
+        raise invalid("points", points, f"must be indices from 0 to {count - 1}, and not all of them")
+
+
+def _others(points: Sequence[int], count: int) -> list[int]:
+    """Return the other indices of so many control points."""
+    return sorted(set(range(count)).difference(points))
+
+
+def _parts(pressure: torch.Tensor, points: Sequence[int]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the pressures [Pa] of the other points (..., P - K) and of these (..., K)."""
+    return pressure[..., _others(points, pressure.shape[-1])], pressure[..., list(points)]
+
+
+def _rows(matrix: Complexes, points: Sequence[int]) -> tuple[Complexes, Complexes]:
+    """Return the rows of the other points (P - K, M) and of these (K, M)."""
+    return matrix[_others(points, len(matrix))], matrix[list(points)]
+
+
+def _silenced(points: Sequence[int], others: Array) -> Array:
+    """Return `others` (P - K,) with 0 put in at `points`."""
+    wanted = np.zeros(len(others) + len(points))
+    wanted[_others(points, len(wanted))] = others
+    return wanted
