@@ -14,12 +14,12 @@ the minimum, the bound still holds.
 from __future__ import annotations
 
 import math
-from typing import TypeAlias
 
 import numpy as np
 import scipy.optimize
-from numpy.typing import NDArray
 
+from autdtorch.objectives.phase_bound import phase_bound
+from autdtorch.utils.array_types import Array, ComplexArray
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import ArrayLike, complex_tensor
 
@@ -47,10 +47,6 @@ _LEAST_SINGULAR, _SINGULAR_MARGIN = 1e-8, 1e-6
 #: Relative margin on top of the bound; rounding of the bound and of a pressure is below 1e-13.
 _MARGIN = 1e-12
 
-_Reals: TypeAlias = NDArray[np.float64]
-Complexes: TypeAlias = NDArray[np.complex128]
-"""Array of complex numbers."""
-
 
 def focus_bound(G: ArrayLike) -> float:
     """Return an upper bound on the pressure of the weakest focus over all drives.
@@ -59,17 +55,23 @@ def focus_bound(G: ArrayLike) -> float:
         G: transfer matrix (P, M), complex [Pa].
 
     Returns:
-        Bound [Pa] on min_p |(G q)_p| over all drives q of amplitudes <= 1, within about 1e-5 of the
-        semidefinite relaxation.
+        Bound [Pa] on min_p |(G q)_p| over all drives q of amplitudes <= 1. For up to four foci it is mostly
+        within 0.3 % of the highest attainable pressure; for more, it is the semidefinite relaxation.
 
     Raises:
         ValueError: not finite complex numbers, or not (P, M) with P, M >= 1.
     """
     matrix = checked_matrix(G)
-    return level_bound(matrix, np.ones(len(matrix)))[0]
+    return least_bound(matrix, np.ones(len(matrix)))
 
 
-def checked_matrix(G: ArrayLike) -> Complexes:
+@one_library_thread()
+def least_bound(foci: ComplexArray, wanted: Array) -> float:
+    """Return the lower one of `level_bound` and `phase_bound`."""
+    return phase_bound(foci, wanted, level_bound(foci, wanted)[0])
+
+
+def checked_matrix(G: ArrayLike) -> ComplexArray:
     """Return a transfer matrix (P, M) after checking it."""
     matrix = complex_tensor("G", G).detach().cpu().numpy().astype(np.complex128)
     if matrix.ndim != 2 or matrix.size == 0:
@@ -79,9 +81,9 @@ def checked_matrix(G: ArrayLike) -> Complexes:
 
 @one_library_thread()
 def level_bound(
-    foci: Complexes,
-    wanted: _Reals,
-    quiet: Complexes | None = None,
+    foci: ComplexArray,
+    wanted: Array,
+    quiet: ComplexArray | None = None,
     ratio: float = 1.0,
     together: bool = False,
     norm: bool = False,
@@ -132,7 +134,7 @@ def level_bound(
     return bound, float(x[count : count + len(silent)].sum())
 
 
-def contrast_bound(foci: Complexes, background: Complexes) -> float:
+def contrast_bound(foci: ComplexArray, background: ComplexArray) -> float:
     """Return a bound on the weakest focus over the rms pressure of the background, of any drive.
 
     With background rows B = U S V^H, the drive q = V S^-1 x has a background of the norm |x|.
@@ -152,7 +154,7 @@ def contrast_bound(foci: Complexes, background: Complexes) -> float:
     return level * math.sqrt(len(background)) * (1 + _SINGULAR_MARGIN)
 
 
-def _certified(x: _Reals, rows: Complexes, importance: _Reals) -> float:
+def _certified(x: Array, rows: ComplexArray, importance: Array) -> float:
     """Return the logarithm of the bound that x certifies, whatever the rounding; see `_log_bound`."""
     split, found = len(rows), []
     for width in _RANGES:
@@ -165,7 +167,7 @@ def _certified(x: _Reals, rows: Complexes, importance: _Reals) -> float:
     return min(found)
 
 
-def _dual(x: _Reals, rows: Complexes, importance: _Reals) -> tuple[_Reals, Complexes, _Reals]:
+def _dual(x: Array, rows: ComplexArray, importance: Array) -> tuple[Array, ComplexArray, Array]:
     """Return z over its largest, the rows over it, and the signed weights of all points; see `_log_bound`."""
     weights, prices, log_z = np.split(x, [len(importance), len(rows)])
     z = np.exp(log_z - log_z.max())
@@ -174,7 +176,7 @@ def _dual(x: _Reals, rows: Complexes, importance: _Reals) -> tuple[_Reals, Compl
     return z, rows / z, np.concatenate((weights * factor, -prices))
 
 
-def _log_bound(x: _Reals, rows: Complexes, importance: _Reals, order: float) -> tuple[float, _Reals]:
+def _log_bound(x: Array, rows: ComplexArray, importance: Array, order: float) -> tuple[float, Array]:
     """Return the logarithm of the bound over the least of `alone`, and its gradient.
 
     The Schatten norm of this `order`, of the positive part, replaces the largest eigenvalue.

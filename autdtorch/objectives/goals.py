@@ -11,7 +11,7 @@ from typing import ClassVar
 import numpy as np
 import torch
 
-from autdtorch.objectives.bound import checked_matrix, level_bound
+from autdtorch.objectives.bound import checked_matrix, least_bound, level_bound
 from autdtorch.objectives.objective import Score, checked_pressure, weakest_focus
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import ArrayLike, invalid, real_tensor
@@ -106,10 +106,10 @@ class WeakestFocus(Goal):
         return self.levels(torch.softmax(-levels * hardness, dim=-1))
 
     def bound(self, G: ArrayLike) -> float:
-        """Return the bound of a semidefinite relaxation [Pa]; see `Goal.bound`."""
+        """Return the bound [Pa], for few foci nearly attained; see `Goal.bound`."""
         matrix = checked_matrix(G)
         self.check(len(matrix))
-        return level_bound(matrix, self.wanted(len(matrix)))[0]
+        return least_bound(matrix, self.wanted(len(matrix)))
 
     def check(self, points: int) -> None:
         """Check the number of weights."""
@@ -180,7 +180,7 @@ class TargetPressures(Goal):
         """Return the bound from the largest share of the targets that all can reach; see `Goal.bound`."""
         matrix = checked_matrix(G)
         self.check(len(matrix))
-        share, _ = level_bound(matrix, np.array(self.targets))
+        share = least_bound(matrix, self.wanted(len(matrix)))
         return min(0.0, share - 1) / math.sqrt(len(matrix))
 
     def wanted(self, points: int) -> Array:

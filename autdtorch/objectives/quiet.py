@@ -10,9 +10,9 @@ from typing import ClassVar
 import numpy as np
 import torch
 
-from autdtorch.objectives.bound import Complexes, checked_matrix, contrast_bound, level_bound
+from autdtorch.objectives.bound import checked_matrix, contrast_bound, level_bound
 from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal, WeakestFocus
-from autdtorch.utils.array_types import Array
+from autdtorch.utils.array_types import Array, ComplexArray
 from autdtorch.utils.validation import ArrayLike, integers, invalid, positive, require_kind
 
 # Power of the excess of quiet points by which a score in Pa is divided
@@ -59,7 +59,7 @@ class QuietPoints(Goal):
 
     @property
     def absolute(self) -> bool:  # type: ignore[override]
-        """Whether the goal wants pressures in Pa."""
+        """True if the goal wants pressures in Pa."""
         return self.goal.absolute
 
     def __call__(self, pressure: ArrayLike) -> torch.Tensor:
@@ -203,7 +203,7 @@ def _parts(pressure: torch.Tensor, points: Sequence[int]) -> tuple[torch.Tensor,
     return pressure[..., _others(points, pressure.shape[-1])], pressure[..., list(points)]
 
 
-def _rows(matrix: Complexes, points: Sequence[int]) -> tuple[Complexes, Complexes]:
+def _rows(matrix: ComplexArray, points: Sequence[int]) -> tuple[ComplexArray, ComplexArray]:
     """Return the rows of the other points (P - K, M) and of these (K, M)."""
     return matrix[_others(points, len(matrix))], matrix[list(points)]
 

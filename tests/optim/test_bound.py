@@ -7,8 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autdtorch.methods.gabs import gabs
-from autdtorch.methods.gradient import gradient_ascent, random_drives
+from autdtorch.methods.gradient import climb, gradient_ascent, random_drives
 from autdtorch.objectives.bound import _certified, focus_bound
+from autdtorch.objectives.goals import WeakestFocus
 
 
 @settings(max_examples=40)
@@ -105,3 +106,20 @@ def test_rounding_takes_nothing_from_a_certificate(least):
     level = np.abs(rows[:2] @ drives).min(axis=0).max()
     x = np.array([1.0, 1.0, 1e-3, 0.0, 0.0, least])
     assert math.exp(_certified(x, rows, np.ones(2))) >= level
+
+
+@pytest.mark.parametrize(("points", "transducers"), [(2, 8), (3, 16), (4, 16), (4, 60), (5, 16)])
+def test_few_foci_nearly_attain_their_bound(random_matrix, points, transducers):
+    # 0.3 % are left to the search, and gradient ascent misses 0.1 %; the relaxation alone leaves up to 6 %
+    for seed in range(3):
+        matrix, generator = random_matrix(points, transducers, seed), torch.Generator().manual_seed(seed)
+        goal = WeakestFocus((1 + 2 * torch.rand(points, generator=generator)).tolist())
+        drive = climb(goal, matrix, random_drives(32, transducers, generator), 300)
+        score = float(goal((matrix @ drive).abs()))
+        assert score <= goal.bound(matrix) < 1.01 * score
+
+
+def test_foci_of_which_one_decides_have_the_bound_of_that_one(random_matrix):
+    # the weak one alone: a thousand times less than the others reach
+    matrix = random_matrix(4, 16, 0) * torch.tensor([1.0, 1e3, 2e3, 1e3], dtype=torch.float64)[:, None]
+    assert focus_bound(matrix) == pytest.approx(matrix[0].abs().sum().item(), rel=1e-5)

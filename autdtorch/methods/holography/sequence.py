@@ -1,8 +1,8 @@
 """Sequences of drives for foci that move: each frame begins at the one before and stays near it.
 
-Where phases jump, transducers fall silent for a moment, and the array is heard (Suzuki, Fujiwara, Makino and
-Shinoda 2020, doi:10.1109/TOH.2020.2965946). So phases change by limited steps from one frame to the next. The
-common phase of a frame changes no pressure; it is chosen for the smallest steps.
+A transducer whose phase jumps is silent for a moment, which is audible (Suzuki, Fujiwara, Makino and Shinoda
+2020, doi:10.1109/TOH.2020.2965946). So phases change by limited steps from one frame to the next. The common
+phase of a frame changes no pressure; it is chosen for the smallest steps.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ import numpy as np
 import torch
 
 from autdtorch.methods.holography.holography import TINY, UNREACHED
-from autdtorch.objectives.bound import Complexes
-from autdtorch.utils.array_types import Array
+from autdtorch.utils.array_types import Array, ComplexArray
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import (
     ArrayLike,
@@ -52,8 +51,8 @@ def drive_sequence(
         targets: wanted pressures (T, P) or (P,), > 0 and relative to each other; None for 1 everywhere.
         phase_step: largest change of a phase from one frame to the next [rad], > 0.
         closed: whether the first frame follows the last one again, within the same limit.
-        even: whether the amplitudes of each frame are lowered to one, so that its weakest focus over its
-            target is that of the weakest frame; otherwise all amplitudes are 1.
+        even: whether each frame is scaled down to the level of the weakest frame, which is the pressure of
+            its weakest focus over the target; otherwise all amplitudes are 1.
         iterations: of each frame, >= 1.
 
     Returns:
@@ -79,7 +78,7 @@ def drive_sequence(
     return torch.from_numpy(drives)
 
 
-def _first(matrix: Complexes, iterations: int) -> Complexes:
+def _first(matrix: ComplexArray, iterations: int) -> ComplexArray:
     """Return the best drive (M,) that iterations come to, from several phases of the foci (P,).
 
     For foci at symmetric places, equal phases can be the worst ones, and iterations stay at them.
@@ -93,7 +92,7 @@ def _first(matrix: Complexes, iterations: int) -> Complexes:
     return max(found, key=lambda drive: float(np.abs(matrix @ drive).min()))
 
 
-def _forward(rows: Complexes, first: Complexes, limit: float, iterations: int) -> Complexes:
+def _forward(rows: ComplexArray, first: ComplexArray, limit: float, iterations: int) -> ComplexArray:
     """Return drives (T, M) of frames (T, P, M), from the first drive on."""
     drives, weights = first[None].repeat(len(rows), axis=0), np.ones(rows.shape[1])
     for frame in range(1, len(rows)):
@@ -103,7 +102,7 @@ def _forward(rows: Complexes, first: Complexes, limit: float, iterations: int) -
     return drives
 
 
-def _closed(rows: Complexes, drives: Complexes, limit: float, iterations: int) -> Complexes:
+def _closed(rows: ComplexArray, drives: ComplexArray, limit: float, iterations: int) -> ComplexArray:
     """Return drives (T, M) of a path that begins again, from those of one lap.
 
     A second lap begins at the end of the first. What the phases of the foci miss after a lap is spread evenly
@@ -125,13 +124,13 @@ def _closed(rows: Complexes, drives: Complexes, limit: float, iterations: int) -
 
 
 def _frame(
-    matrix: Complexes,
-    drive: Complexes,
-    near: Callable[[Complexes], Complexes],
+    matrix: ComplexArray,
+    drive: ComplexArray,
+    near: Callable[[ComplexArray], ComplexArray],
     weights: Array,
-    imposed: Complexes | None,
+    imposed: ComplexArray | None,
     iterations: int,
-) -> tuple[Complexes, Array]:
+) -> tuple[ComplexArray, Array]:
     """Return the best drive (M,) that the iterations come to from a drive, and the last weights (P,).
 
     Signs of the pressures (P,) may be imposed.
@@ -148,17 +147,17 @@ def _frame(
     return best, weights
 
 
-def _near(before: Complexes, limit: float, drive: Complexes) -> Complexes:
+def _near(before: ComplexArray, limit: float, drive: ComplexArray) -> ComplexArray:
     """Return the drive (M,) nearest to one of any amplitudes and common phase, within a limit of `before`."""
     common = (drive * before.conj()).sum()
     step = np.angle(drive * (common.conjugate() / max(abs(common), TINY)) * before.conj())
-    found: Complexes = before * np.exp(1j * step.clip(-limit, limit))
+    found: ComplexArray = before * np.exp(1j * step.clip(-limit, limit))
     return found
 
 
 def _near_both(
-    before: Complexes, first: Complexes, limit: float, reach: float, drive: Complexes
-) -> Complexes:
+    before: ComplexArray, first: ComplexArray, limit: float, reach: float, drive: ComplexArray
+) -> ComplexArray:
     """Return the drive (M,) nearest to one of any amplitudes, within limits of two others.
 
     The phases are at most `limit` from those of `before` and `reach` from those of `first`. These two are at
@@ -168,7 +167,7 @@ def _near_both(
     if reach < math.pi:
         away = np.angle(before * first.conj())
         step = (away + step).clip(-reach, reach) - away
-    found: Complexes = before * np.exp(1j * step)
+    found: ComplexArray = before * np.exp(1j * step)
     return found
 
 
