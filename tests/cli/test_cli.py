@@ -21,7 +21,8 @@ from autdtorch.hardware import DEVICES, Limits
 from autdtorch.io.goal_section import GOALS, load_goal
 from autdtorch.io.scene_file import load_scene
 from autdtorch.methods.base import Method
-from autdtorch.objectives.goals import MeanPressure, QuietPoints, TargetPressures, WeakestFocus
+from autdtorch.objectives.goals import MeanPressure, TargetPressures, WeakestFocus
+from autdtorch.objectives.quiet import Contrast, QuietPoints
 from autdtorch.propagators import make_propagator
 from autdtorch.study.results_file import load_results
 
@@ -97,6 +98,7 @@ def test_the_papers_experiment(composed):
             ("goal=quiet_points", "goal.points=[0]", "goal.goal={name:target_pressures,targets:[4,2,4]}"),
             QuietPoints(TargetPressures([4, 2, 4]), [0], 0.03),
         ),
+        (("goal=contrast", "goal.points=1-3"), Contrast([1, 2, 3])),
     ],
 )
 def test_a_run_maximises_the_goal_of_its_settings(words, goal, run, tmp_path, capsys):

@@ -20,7 +20,8 @@ from autdtorch.cli.main import CONFIGS
 from autdtorch.hardware import LinkError, MovedMicrophone, OffError, Oscilloscope, ScopeSensor
 from autdtorch.io.drive_file import load_drive
 from autdtorch.io.scene_file import load_scene
-from autdtorch.objectives.goals import QuietPoints, TargetPressures, WeakestFocus
+from autdtorch.objectives.goals import TargetPressures, WeakestFocus
+from autdtorch.objectives.quiet import QuietPoints
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.study.report.hardware_report import compare
 

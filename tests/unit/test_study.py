@@ -18,7 +18,7 @@ from autdtorch.methods.identify import Identify
 from autdtorch.methods.lssg import LSSG, lssg
 from autdtorch.methods.prior import Prior
 from autdtorch.objectives.goals import Goal, MeanPressure, TargetPressures
-from autdtorch.objectives.quiet import QuietPoints
+from autdtorch.objectives.quiet import Contrast, QuietPoints
 from autdtorch.propagators import FreeSpacePropagator, Run, SteadyStateWarning
 from autdtorch.propagators.full import DomainSimulation
 from autdtorch.scene.geometry import Plane
@@ -201,7 +201,7 @@ def test_the_matrix_of_the_study_is_a_prior(tmp_path):
     assert found["identify"].solution.score > 0.999 * found["climb"].solution.score
 
 
-GOALS = [MeanPressure(), TargetPressures([9, 6, 9]), QuietPoints(MeanPressure(), [1], 0.1)]
+GOALS = [MeanPressure(), TargetPressures([9, 6, 9]), QuietPoints(MeanPressure(), [1], 0.1), Contrast([1])]
 
 
 @pytest.mark.parametrize("goal", GOALS, ids=lambda goal: goal.name)
