@@ -122,7 +122,7 @@ def test_results_of_another_goal_are_not_used(run, tmp_path, capsys):
 
 
 WRONG = [
-    (["goal=loudest"], "goal: 'loudest'; must be one of mean_pressure, quiet_points, "),
+    (["goal=loudest"], "goal: 'loudest'; must be one of contrast, mean_pressure, quiet_points, "),
     (["goal.name=loudest"], r"goal\.name: 'loudest'; must be one of weakest_focus, mean_pressure, "),
     (["goal=target_pressures"], "goal: targets: None; must be"),
     (["goal=target_pressures", "goal.targets=[4,-2,4,2]"], "goal: targets: .*; must be numbers > 0"),
