@@ -34,6 +34,7 @@ from .plot.trials import plot_convergence, plot_trials
 from .plot.view3d import animate3d, view3d
 from .propagators import SteadyStateWarning, cell_centers, differentiable_field, make_propagator, volume_field
 from .propagators.estimate import Estimate, estimate
+from .propagators.operator import ScatteringOperator
 from .scene.arrays import PAPER_SOURCE_STRENGTH, TransducerArray
 from .scene.drive import amplitudes_of, drive_from_phases, focus_phases, phases_of
 from .scene.geometry import Plane, circle_points, sphere_points
@@ -78,6 +79,7 @@ __all__ = [
     "QuietPoints",
     "RandomSearch",
     "ScaleWarning",
+    "ScatteringOperator",
     "Scene",
     "SimulatedObjective",
     "Solution",

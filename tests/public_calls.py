@@ -41,7 +41,16 @@ METHODS = ("BayesOpt", "GABS", "GradientAscent", "Holography", "Identify", "LSS"
 #: Results, parts of drivers, and calls that need a device.
 NOT_CALLED_BY_USERS = {
     *("Estimate", "Evaluation", "EvaluationLog", "FocusMetrics", "Preflight", "Run", "Solution", "Sweep"),
-    *("Adapter", "Device", "Dialect", "Obstacle", "OpenMPDBoard", "SimulatedPropagator", "UsbtmcPort"),
+    *(
+        "Adapter",
+        "Device",
+        "Dialect",
+        "Obstacle",
+        "OpenMPDBoard",
+        "ScatteringOperator",
+        "SimulatedPropagator",
+    ),
+    "UsbtmcPort",
     *("EmulatedBench.receive", "EmulatedScope.execute", "Goal", "Method", "State", "Waveform"),
     *("EmulatedScope.plug_into", "Oscilloscope.capture", "Oscilloscope.set_up"),
     *("Device.pack", "lock_log", "open_autd3"),  # the one only makes a context, the other asks the network
@@ -94,6 +103,11 @@ def board_file(folder: Path) -> Path:
     places = (f"({1e-2 * (number % 16)}, {1e-2 * (number // 16)}, 0)" for number in range(256))
     lines = ["board", "256", "128", *places, *map(str, range(256)), *["0"] * 256, *["1"] * 256]
     return written(folder, "board.pat", "\n".join(lines))
+
+
+@cache
+def operator() -> at.ScatteringOperator:
+    return at.ScatteringOperator.of(at.Sphere((40e-3, 12e-3, 12e-3), radius=4e-3, rigid=True), AIR, 40e3)
 
 
 def objective() -> at.SimulatedObjective:
@@ -299,6 +313,7 @@ OTHERS: dict[str, Any] = {
 #: Of classes that users do not make themselves.
 INSTANCES = {
     "SimulatedPropagator": Made(lambda _: at.make_propagator(SCENE, "box", 2e-3, 0.5, max_periods=6)),
+    "ScatteringOperator": Made(lambda _: operator()),
     "OpenMPDBoard": Made(lambda folder: at.OpenMPDBoard.load(board_file(folder))),
 }
 

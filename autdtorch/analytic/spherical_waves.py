@@ -1,0 +1,123 @@
+"""Spherical waves: regular j_l(kr) Y_lm, and outgoing h_l(kr) Y_lm, with e^(-i w t).
+
+The N = (L + 1)^2 waves up to the degree L are in the order (l, m), m from -l to l. With them,
+
+    e^(ik|r - s|) / |r - s| = 4 pi i k sum j_l(kr) Y_lm(r) h_l(ks) Y_lm(s)*,    |r| < |s|
+
+(Martin, Multiple Scattering (2006), chapter 3).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from scipy.special import spherical_jn, spherical_yn
+
+from autdtorch.utils.array_types import ComplexArray
+
+_TINY = 1e-12  # distance from the centre [m] below which a point has the direction z
+
+
+def degrees(degree: int) -> torch.Tensor:
+    """Return the degree l of each wave (N,), int64."""
+    every = torch.arange(degree + 1, device="cpu")
+    return every.repeat_interleave(2 * every + 1)
+
+
+def mirrored(degree: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the place of each wave (l, m) at (l, -m), and the sign (-1)^m, (N,) each."""
+    own = degrees(degree)
+    first = own.square()
+    order = torch.arange(len(own), device="cpu") - first - own
+    return first + own - order, 1.0 - 2.0 * (order % 2)
+
+
+def harmonics(degree: int, directions: torch.Tensor) -> torch.Tensor:
+    """Return the spherical harmonics Y_lm (..., N) of unit vectors (..., 3), differentiable in these.
+
+    Orthonormal, with the phase of Condon and Shortley. P_lm / sin^m and (x + iy)^m have no singular angles.
+    """
+    z = directions[..., 2, None]
+    turn = torch.complex(directions[..., 0], directions[..., 1])[..., None]
+    powers = [torch.ones_like(turn)]
+    for _ in range(degree):
+        powers.append(powers[-1] * turn)
+    power = torch.cat(powers, dim=-1)
+    top = math.sqrt(1 / (4 * math.pi))  # of m = l
+    before, last = z[..., :0], z.new_full(z.shape, top)  # of m = 0 to l
+    waves = [last.to(power.dtype)]
+    for n in range(1, degree + 1):
+        m = torch.arange(n - 1, dtype=z.dtype, device=z.device)
+        factor = ((4 * n * n - 1) / (n * n - m * m)).sqrt()
+        back = (((n - 1) ** 2 - m * m) / (4 * (n - 1) ** 2 - 1)).sqrt()
+        lower = factor * (z * last[..., : n - 1] - back * before)
+        beside = math.sqrt(2 * n + 1) * z * last[..., n - 1 :]
+        top *= -math.sqrt((2 * n + 1) / (2 * n))
+        before, last = last, torch.cat([lower, beside, z.new_full(z.shape, top)], dim=-1)
+        upper = last * power[..., : n + 1]
+        signs = 1.0 - 2.0 * (torch.arange(n, 0, -1, device=z.device) % 2)
+        waves.append(torch.cat([signs * upper[..., 1:].conj().flip(-1), upper], dim=-1))
+    return torch.cat(waves, dim=-1)
+
+
+def outgoing_waves(
+    degree: int, wavenumber: complex, offsets: torch.Tensor, conjugate: bool = False
+) -> torch.Tensor:
+    """Return h_l(kr) Y_lm (..., N) at offsets (..., 3) [m] from the centre, differentiable in these.
+
+    With `conjugate`, Y_lm is conjugated and h_l is not.
+    """
+    distance = torch.linalg.vector_norm(offsets, dim=-1, keepdim=True)
+    angular = harmonics(degree, offsets / distance)
+    x = wavenumber * distance
+    radial = [torch.exp(1j * x) / (1j * x)]
+    if degree:
+        radial.append(radial[0] * (1 / x - 1j))
+    for n in range(1, degree):
+        radial.append((2 * n + 1) / x * radial[-1] - radial[-2])
+    spread = torch.cat(radial, dim=-1)[..., degrees(degree).to(offsets.device)]
+    return spread * (angular.conj() if conjugate else angular)
+
+
+def regular_waves(degree: int, wavenumber: complex, offsets: torch.Tensor) -> torch.Tensor:
+    """Return j_l(kr) Y_lm (P, N) at offsets (P, 3) [m] from the centre."""
+    distance = torch.linalg.vector_norm(offsets, dim=-1, keepdim=True)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=offsets.dtype, device="cpu")
+    angular = harmonics(degree, torch.where(distance > _TINY, offsets / distance.clamp_min(_TINY), up))
+    x = wavenumber * distance.numpy()
+    radial = np.concatenate([spherical_jn(n, x) for n in range(degree + 1)], axis=1)
+    return torch.from_numpy(radial)[:, degrees(degree)] * angular
+
+
+def sphere_coefficients(
+    degree: int, size: float, density_ratio: float = math.inf, speed_ratio: float = 1.0
+) -> ComplexArray:
+    """Return b_l / d_l (L + 1,) of a sphere of size ka, for incoming d_l j_l Y_lm and outgoing b_l h_l Y_lm.
+
+    Args:
+        degree: L.
+        size: k a, real.
+        density_ratio: density of the sphere over that of the medium; infinite if rigid.
+        speed_ratio: sound speed of the sphere over that of the medium.
+    """
+    order = np.arange(degree + 1)
+    own, slope = spherical_jn(order, size), spherical_jn(order, size, derivative=True)
+    out = own + 1j * spherical_yn(order, size)
+    out_slope = slope + 1j * spherical_yn(order, size, derivative=True)
+    inner, inner_slope = np.ones(degree + 1), np.zeros(degree + 1)
+    if not math.isinf(density_ratio):
+        inner = spherical_jn(order, size / speed_ratio)
+        inner_slope = spherical_jn(order, size / speed_ratio, derivative=True) / (density_ratio * speed_ratio)
+    found: ComplexArray = -(slope * inner - own * inner_slope) / (out_slope * inner - out * inner_slope)
+    return found
+
+
+def enough_degrees(size: float, error: float) -> int:
+    """Return the degree up to which waves reach a body of size ka, to a relative error.
+
+    ka + 1.8 D^(2/3) (ka)^(1/3) for D digits (Song and Chew 2001, doi:10.1109/5.940280).
+    """
+    digits: float = max(-math.log10(error), 1.0)
+    return math.ceil(size + 1.8 * math.pow(digits, 2 / 3) * math.pow(size, 1 / 3))

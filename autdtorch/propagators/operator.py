@@ -1,0 +1,304 @@
+"""The scattering operator of a body: simulated once, then for any array, points and pose.
+
+Outside its circumscribed sphere a body is a linear map T from the regular waves that come in to the outgoing
+waves that it scatters, b = T d (Waterman 1969, doi:10.1121/1.1911498). A column of T is one run of the box
+solver, driven by one regular wave; the Huygens surface gives the outgoing ones.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from autdtorch.analytic.green import free_space_matrix
+from autdtorch.analytic.spherical_waves import (
+    degrees,
+    enough_degrees,
+    mirrored,
+    outgoing_waves,
+    regular_waves,
+    sphere_coefficients,
+)
+from autdtorch.fdtd.scattered_field import ScatteredField
+from autdtorch.fdtd.steady_state import run_to_steady_state
+from autdtorch.propagators.box import BoxSimulation
+from autdtorch.propagators.grids import one_box
+from autdtorch.propagators.plan import MOST_JUDGED, make_kernel, plan
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.geometry import sphere_points
+from autdtorch.scene.medium import Medium
+from autdtorch.scene.obstacles import Obstacle, Sphere
+from autdtorch.scene.scene import Scene
+from autdtorch.utils.files import replacing
+from autdtorch.utils.memory import require_memory
+from autdtorch.utils.numpy_file import read_arrays
+from autdtorch.utils.progress import show_progress
+from autdtorch.utils.threads import one_library_thread, spread
+from autdtorch.utils.validation import (
+    ArrayLike,
+    finite_vector,
+    invalid,
+    members,
+    number_between,
+    path_of,
+    points_tensor,
+    positive,
+    real_tensor,
+    require_kind,
+    within,
+)
+
+_ENTRY_BYTES = 16.0  # of complex128
+_ARRAYS = ("matrix", "center", "axes", "radius", "wavenumber")
+
+
+@dataclass(frozen=True, eq=False)
+class ScatteringOperator:
+    """A body that scatters sound, outside its circumscribed sphere, in any pose.
+
+    `ScatteringOperator.of` simulates obstacles that move as one body.
+
+    Attributes:
+        matrix: T (N, N), complex128, from regular to outgoing spherical waves around the centre, up to the
+            degree N^(1/2) - 1.
+        wavenumber: in the medium [rad/m], complex.
+        radius: of the circumscribed sphere [m]; points and transducers must lie outside.
+        center: of the sphere (3,) [m].
+        axes: of the body in the scene, the columns of a matrix (3, 3).
+    """
+
+    matrix: torch.Tensor
+    wavenumber: complex
+    radius: float
+    center: torch.Tensor
+    axes: torch.Tensor
+
+    @classmethod
+    def of(
+        cls,
+        obstacles: Obstacle | Iterable[Obstacle],
+        medium: Medium,
+        frequency: float,
+        spacing: float = 1e-3,
+        error: float = 1e-3,
+        kernel: str = "auto",
+    ) -> ScatteringOperator:
+        """Simulate the operator of obstacles; that of a single sphere is exact.
+
+        Args:
+            obstacles: one, or several that move as one body.
+            medium: around them.
+            frequency: [Hz].
+            spacing: edge of a cell [m].
+            error: relative error at which degrees are left out, and tolerance of the simulations, in
+                1e-8 to 0.1.
+            kernel: as of `make_propagator`.
+
+        Raises:
+            ValueError: a setting out of range, or a body of too many waves for the memory.
+        """
+        bodies = members("obstacles", [obstacles] if isinstance(obstacles, Obstacle) else obstacles, Obstacle)
+        if not bodies:
+            raise invalid("obstacles", obstacles, "must have at least one")
+        spacing, error = positive("spacing", spacing, "m"), number_between("error", error, 1e-8, 0.1)
+        center, radius = _circumscribed(bodies)
+        array = TransducerArray(
+            center[None] + torch.tensor([[3 * radius, 0.0, 0.0]]), (-1.0, 0.0, 0.0), radius=0
+        )
+        outside = center[None] - torch.tensor([[3 * radius, 0.0, 0.0]])
+        scene = Scene(
+            array, medium, frequency=frequency, control_points=outside, obstacles=bodies, name="body"
+        )
+        size = scene.wavenumber * radius
+        degree = enough_degrees(size, error)
+        count = (degree + 1) ** 2
+        if len(bodies) == 1 and isinstance(bodies[0], Sphere) and scene.complex_wavenumber.imag == 0:
+            body = bodies[0]
+            ratios = () if body.rigid else _ratios(body, medium)
+            each = torch.from_numpy(sphere_coefficients(degree, size, *ratios))
+            matrix = torch.diag(each[degrees(degree)])
+        else:
+            require_memory("obstacles", f"{count} waves", 3 * _ENTRY_BYTES * count**2)
+            planned = plan(scene, "box", spacing, error, kernel, "float32", 600, None)
+            grouping = one_box(planned.region, planned.spacing)
+            matrix = _simulated(BoxSimulation(replace(planned, grouping=grouping)), center, radius, degree)
+        turned = torch.eye(3, dtype=torch.float64, device="cpu")
+        return cls(matrix, scene.complex_wavenumber, radius, center, turned)
+
+    @property
+    def degree(self) -> int:
+        """The largest degree of the waves."""
+        return math.isqrt(len(self.matrix)) - 1
+
+    @property
+    def reciprocity(self) -> float:
+        """The relative difference of T from its image under reciprocity, which an exact T equals."""
+        place, sign = mirrored(self.degree)
+        image = sign[:, None] * self.matrix.mT[place][:, place] * sign
+        return float((self.matrix - image).norm() / self.matrix.norm())
+
+    @property
+    def energy(self) -> float:
+        """The rms of |S^H S - 1| over waves, S = 1 + 2 T: 0 for an exact T without losses."""
+        scattering = torch.eye(len(self.matrix), dtype=torch.complex128, device="cpu") + 2 * self.matrix
+        left = scattering.mH @ scattering - torch.eye(len(self.matrix), dtype=torch.complex128, device="cpu")
+        return float(left.norm() / math.sqrt(len(left)))
+
+    def moved(
+        self, offset: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> ScatteringOperator:
+        """Return the body after a shift, and a rotation about its centre.
+
+        Args:
+            offset: (3,) [m].
+            rotation: angles (3,) [rad] about the fixed axes x, y, z, in this order.
+
+        Gradients of both pass.
+        """
+        shift, angles = real_tensor("offset", offset, "m"), real_tensor("rotation", rotation, "rad")
+        for name, value in (("offset", shift), ("rotation", angles)):
+            if value.shape != (3,):
+                raise ValueError(f"{name}: shape {tuple(value.shape)}; must be (3,)")
+        return replace(self, center=self.center + shift, axes=_rotation(angles) @ self.axes)
+
+    def transfer_matrix(self, array: TransducerArray, points: ArrayLike) -> torch.Tensor:
+        """Return the transfer matrix (P, M), complex128 [Pa], of an array at points (P, 3) [m].
+
+        Gradients of the body's place and turn pass.
+
+        Raises:
+            ValueError: a point or transducer within the circumscribed sphere. `make_propagator` serves those.
+        """
+        require_kind("array", array, TransducerArray)
+        targets = points_tensor("points", points).cpu()
+        direct = free_space_matrix(targets, array, self.wavenumber)
+        return direct + self._outgoing(targets) @ self.matrix @ self._incoming(array).mT
+
+    def _incoming(self, array: TransducerArray) -> torch.Tensor:
+        """Return the coefficients (M, N) [Pa] of the regular waves of unit drives."""
+        positions, weights = array.nodes
+        offsets = self._offsets("array.positions", positions)
+        waves = outgoing_waves(self.degree, self.wavenumber, offsets, conjugate=True)
+        factor = 4j * math.pi * self.wavenumber * array.source_strength
+        return factor * torch.einsum("mnk,n->mk", waves, weights.to(waves.dtype))
+
+    def _outgoing(self, points: torch.Tensor) -> torch.Tensor:
+        """Return the outgoing waves (P, N) at points (P, 3) [m]."""
+        return outgoing_waves(self.degree, self.wavenumber, self._offsets("points", points))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the operator to a .npz file."""
+        path = path_of("path", path, suffixes=(".npz",))
+        arrays = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
+        with replacing(path) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **arrays)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> ScatteringOperator:
+        """Read an operator that `save` wrote; `ValueError` for another file."""
+        arrays = read_arrays(path_of("path", path, suffixes=(".npz",)))
+        if missing := [name for name in _ARRAYS if name not in arrays]:
+            raise ValueError(
+                f"{path}: no array {', '.join(missing)}; must be written by ScatteringOperator.save"
+            )
+        with within(path):
+            matrix = torch.from_numpy(arrays["matrix"]).to(torch.complex128)
+            if (
+                matrix.ndim != 2
+                or matrix.shape[0] != matrix.shape[1]
+                or math.isqrt(len(matrix)) ** 2 != len(matrix)
+            ):
+                raise ValueError(f"matrix: shape {tuple(matrix.shape)}; must be (N, N), N a square")
+            center = torch.tensor(finite_vector("center", arrays["center"]), dtype=torch.float64)
+            axes = real_tensor("axes", arrays["axes"])
+            if axes.shape != (3, 3):
+                raise ValueError(f"axes: shape {tuple(axes.shape)}; must be (3, 3)")
+            radius = positive("radius", float(arrays["radius"]), "m")
+            return cls(matrix, complex(arrays["wavenumber"]), radius, center, axes)
+
+    def _offsets(self, name: str, positions: torch.Tensor) -> torch.Tensor:
+        """Return positions (..., 3) in the coordinates of the body, after checking that they are outside."""
+        offsets = positions - self.center
+        nearest = float(torch.linalg.vector_norm(offsets, dim=-1).detach().amin())
+        if nearest < self.radius:
+            accepted = f"must be at least {self.radius:.4g} m from the centre of the body"
+            raise ValueError(f"{name}: {nearest:.4g} m at the nearest; {accepted}")
+        return offsets @ self.axes
+
+
+def _circumscribed(bodies: tuple[Obstacle, ...]) -> tuple[torch.Tensor, float]:
+    """Return centre (3,) and radius [m] of a sphere around all bodies."""
+    lower, upper = (
+        torch.tensor([getattr(body, side) for body in bodies], dtype=torch.float64)
+        for side in ("lower", "upper")
+    )
+    center = (lower.amin(dim=0) + upper.amax(dim=0)) / 2
+    if len(bodies) == 1 and isinstance(body := bodies[0], Sphere):
+        return center, body.radius
+    vertices = torch.cat([body.surface()[0] for body in bodies])
+    return center, float((vertices - center).norm(dim=1).max())
+
+
+def _ratios(body: Obstacle, medium: Medium) -> tuple[float, float]:
+    """Return density and sound speed of a fluid body over those of the medium."""
+    assert body.density is not None
+    assert body.sound_speed is not None
+    return body.density / medium.density, body.sound_speed / medium.sound_speed
+
+
+@one_library_thread()
+def _simulated(simulation: BoxSimulation, center: torch.Tensor, radius: float, degree: int) -> torch.Tensor:
+    """Return T (N, N) from a run for each regular wave."""
+    box, planned = simulation.boxes[0], simulation.plan
+    wavenumber, cells = box.wavenumber, box.surface[1]
+    incoming = regular_waves(degree, wavenumber, box.driven - center)
+    outgoing = _multipoles(box, center, degree)
+    judged = sphere_points(center, radius, MOST_JUDGED) - center
+    observed = outgoing_waves(degree, wavenumber, judged) @ outgoing
+    kernel = make_kernel(planned.kernel)
+    count = incoming.shape[1]
+    with show_progress(count, "simulating the waves of a body") as progress:
+
+        @torch.no_grad()
+        def run(number: int) -> torch.Tensor:
+            forces = box.sources(incoming[:, number])
+            steady = run_to_steady_state(
+                box.assembly,
+                kernel,
+                forces,
+                cells,
+                planned.tolerance,
+                planned.max_periods,
+                lambda phasors: observed @ phasors,
+                lambda periods: None,
+            )
+            progress.advance(1)
+            return steady.pressure
+
+        phasors = spread(run, range(count), kernel.at_once(box.assembly.grid.shape))
+    return outgoing @ torch.stack(phasors, dim=1)
+
+
+def _multipoles(box: ScatteredField, center: torch.Tensor, degree: int) -> torch.Tensor:
+    """Return the map (N, n) from phasors of the Huygens surface's cells to outgoing waves."""
+    positions, _, outward = box.surface
+    waves = regular_waves(degree, box.wavenumber, positions - center)
+    place, sign = mirrored(degree)
+    conjugate = sign * waves[:, place]  # j_l Y_lm^*, with the same j_l for a complex wavenumber
+    return 4j * math.pi * box.wavenumber * torch.from_numpy((outward.T @ conjugate.numpy()).T)
+
+
+def _rotation(angles: torch.Tensor) -> torch.Tensor:
+    """Return R = Rz Ry Rx (3, 3) of angles (3,), differentiable."""
+    (cx, cy, cz), (sx, sy, sz) = angles.cos(), angles.sin()
+    rows = (
+        (cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx),
+        (sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx),
+        (-sy, cy * sx, cy * cx),
+    )
+    return torch.stack([torch.stack(row) for row in rows])
