@@ -9,7 +9,9 @@ The N = (L + 1)^2 waves up to the degree L are in the order (l, m), m from -l to
 
 from __future__ import annotations
 
+import functools
 import math
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -39,27 +41,49 @@ def harmonics(degree: int, directions: torch.Tensor) -> torch.Tensor:
 
     Orthonormal, with the phase of Condon and Shortley. P_lm / sin^m and (x + iy)^m have no singular angles.
     """
+    table = _recurrence(degree)
     z = directions[..., 2, None]
     turn = torch.complex(directions[..., 0], directions[..., 1])[..., None]
-    powers = [torch.ones_like(turn)]
-    for _ in range(degree):
-        powers.append(powers[-1] * turn)
-    power = torch.cat(powers, dim=-1)
-    top = math.sqrt(1 / (4 * math.pi))  # of m = l
-    before, last = z[..., :0], z.new_full(z.shape, top)  # of m = 0 to l
-    waves = [last.to(power.dtype)]
+    powers = torch.cumprod(
+        torch.cat([torch.ones_like(turn), turn.expand(*turn.shape[:-1], degree)], dim=-1), dim=-1
+    )
+    rows = [z.new_full(z.shape, table.tops[0])]  # P_lm / sin^m of m = 0 to l
     for n in range(1, degree + 1):
-        m = torch.arange(n - 1, dtype=z.dtype, device=z.device)
-        factor = ((4 * n * n - 1) / (n * n - m * m)).sqrt()
-        back = (((n - 1) ** 2 - m * m) / (4 * (n - 1) ** 2 - 1)).sqrt()
-        lower = factor * (z * last[..., : n - 1] - back * before)
-        beside = math.sqrt(2 * n + 1) * z * last[..., n - 1 :]
-        top *= -math.sqrt((2 * n + 1) / (2 * n))
-        before, last = last, torch.cat([lower, beside, z.new_full(z.shape, top)], dim=-1)
-        upper = last * power[..., : n + 1]
-        signs = 1.0 - 2.0 * (torch.arange(n, 0, -1, device=z.device) % 2)
-        waves.append(torch.cat([signs * upper[..., 1:].conj().flip(-1), upper], dim=-1))
-    return torch.cat(waves, dim=-1)
+        above = z * rows[-1]
+        if n > 1:
+            above = torch.cat([above[..., :-1] - table.back[n] * rows[-2], above[..., -1:]], dim=-1)
+        rows.append(torch.cat([table.factor[n] * above, z.new_full(z.shape, table.tops[n])], dim=-1))
+    upper = torch.cat(rows, dim=-1) * powers[..., table.order]
+    return torch.cat([upper, upper.conj()], dim=-1)[..., table.place] * table.sign
+
+
+class _Recurrence(NamedTuple):
+    """Factors of P_lm / sin^m, and where the harmonics of all m are among those of m >= 0."""
+
+    factor: list[torch.Tensor]  # of z P_(l-1)m, for m = 0 to l - 1
+    back: list[torch.Tensor]  # of P_(l-2)m before that factor, for m = 0 to l - 2
+    tops: list[float]  # P_ll / sin^l
+    order: torch.Tensor  # m of each pair l, m >= 0
+    place: torch.Tensor  # (N,) among these pairs, then their conjugates
+    sign: torch.Tensor  # (N,)
+
+
+@functools.lru_cache(8)
+def _recurrence(degree: int) -> _Recurrence:
+    factor, back, tops = [torch.zeros(0)], [torch.zeros(0)], [math.sqrt(1 / (4 * math.pi))]
+    for n in range(1, degree + 1):
+        m = torch.arange(n, dtype=torch.float64, device="cpu")
+        factor.append(((4 * n * n - 1) / (n * n - m * m)).sqrt())
+        m = m[:-1]
+        back.append((((n - 1) ** 2 - m * m) / (4 * (n - 1) ** 2 - 1)).sqrt())
+        tops.append(-tops[-1] * math.sqrt((2 * n + 1) / (2 * n)))
+    pairs = (degree + 1) * (degree + 2) // 2
+    own = degrees(degree)
+    m = torch.arange(len(own), device="cpu") - own.square() - own
+    place = own * (own + 1) // 2 + m.abs()
+    order = torch.cat([torch.arange(n + 1, device="cpu") for n in range(degree + 1)])
+    sign = torch.where(m < 0, 1.0 - 2.0 * (m % 2), 1.0).to(torch.float64)
+    return _Recurrence(factor, back, tops, order, torch.where(m < 0, place + pairs, place), sign)
 
 
 def outgoing_waves(
@@ -71,12 +95,12 @@ def outgoing_waves(
     """
     distance = torch.linalg.vector_norm(offsets, dim=-1, keepdim=True)
     angular = harmonics(degree, offsets / distance)
-    x = wavenumber * distance
-    radial = [torch.exp(1j * x) / (1j * x)]
+    inverse = 1 / (wavenumber * distance)
+    radial = [torch.exp(1j * wavenumber * distance) * inverse / 1j]
     if degree:
-        radial.append(radial[0] * (1 / x - 1j))
+        radial.append(radial[0] * (inverse - 1j))
     for n in range(1, degree):
-        radial.append((2 * n + 1) / x * radial[-1] - radial[-2])
+        radial.append((2 * n + 1) * inverse * radial[-1] - radial[-2])
     spread = torch.cat(radial, dim=-1)[..., degrees(degree).to(offsets.device)]
     return spread * (angular.conj() if conjugate else angular)
 

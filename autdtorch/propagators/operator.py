@@ -46,7 +46,7 @@ from autdtorch.utils.validation import (
     members,
     number_between,
     path_of,
-    points_tensor,
+    points_grid,
     positive,
     real_tensor,
     require_kind,
@@ -166,8 +166,9 @@ class ScatteringOperator:
                 raise ValueError(f"{name}: shape {tuple(value.shape)}; must be (3,)")
         return replace(self, center=self.center + shift, axes=_rotation(angles) @ self.axes)
 
+    @one_library_thread()
     def transfer_matrix(self, array: TransducerArray, points: ArrayLike) -> torch.Tensor:
-        """Return the transfer matrix (P, M), complex128 [Pa], of an array at points (P, 3) [m].
+        """Return transfer matrices (..., P, M), complex128 [Pa], of an array at points (..., P, 3) [m].
 
         Gradients of the body's place and turn pass.
 
@@ -175,9 +176,10 @@ class ScatteringOperator:
             ValueError: a point or transducer within the circumscribed sphere. `make_propagator` serves those.
         """
         require_kind("array", array, TransducerArray)
-        targets = points_tensor("points", points).cpu()
-        direct = free_space_matrix(targets, array, self.wavenumber)
-        return direct + self._outgoing(targets) @ self.matrix @ self._incoming(array).mT
+        targets, grid = points_grid("points", points)
+        direct = free_space_matrix(targets.cpu(), array, self.wavenumber)
+        scattered = self._outgoing(targets.cpu()) @ (self.matrix @ self._incoming(array).mT)
+        return (direct + scattered).reshape(*grid, -1)
 
     def _incoming(self, array: TransducerArray) -> torch.Tensor:
         """Return the coefficients (M, N) [Pa] of the regular waves of unit drives."""
