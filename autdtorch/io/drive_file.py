@@ -47,7 +47,7 @@ def save_drive(
     transducers per unit): phase, and for AUTD3 intensity, for OpenMPD and Ultraino duty.
 
     A sequence has one axis more: `.csv` begins with the column frame, from 0, and arrays of `.npz` have the
-    frames first.
+    frames first. Rounding to levels changes the steps between frames, by one level at most.
 
     Args:
         path: of the file, which is replaced; the suffix decides the format.
@@ -98,19 +98,27 @@ def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
             accepted = "must have phase and amplitude, or a device's"
             raise ValueError(f"{path}: no column {', '.join(missing)}; {accepted}")
         with within(path):
-            return _in_frames(path, drive_from_phases(table["phase"], table["amplitude"]), table)
+            drive = drive_from_phases(table["phase"], table["amplitude"])
+        return _in_frames(path, drive, table)
     arrays = read_arrays(path)
     if "device" in arrays:
         name = str(arrays["device"])
         require_one_of(f"{path}: device", name, DEVICES)
-        frames = arrays[DEVICES[name].columns[0]].shape[:-2] if DEVICES[name].columns[0] in arrays else ()
+        shapes = {arrays[column].shape for column in DEVICES[name].columns if column in arrays}
+        if len(shapes) > 1 or any(len(shape) > 3 or 0 in shape for shape in shapes):
+            raise ValueError(
+                f"{path}: levels of shapes {shapes}; must be (units, M) or (T, units, M), all alike"
+            )
         levels = {f"{name} {key}": value.reshape(-1) for key, value in arrays.items()}
+        frames = [len(arrays[DEVICES[name].columns[0]])] if max(map(len, shapes), default=0) == 3 else []
         return _played(path, name, levels).reshape(*frames, -1)
     if "drive" not in arrays:
         raise ValueError(f"{path}: no array 'drive'; must be written by save_drive")
-    drive = arrays["drive"]
+    stored = arrays["drive"]
     with within(path):
-        return validate_drive(drive, drive.shape[-1] if drive.ndim else 1)
+        if stored.ndim not in (1, 2) or stored.size == 0:
+            raise ValueError(f"drive: shape {stored.shape}; must be (M,), or (T, M) for T frames")
+        return validate_drive(stored, stored.shape[-1])
 
 
 def _in_frames(path: Path, drive: torch.Tensor, table: Mapping[str, AnyArray]) -> torch.Tensor:

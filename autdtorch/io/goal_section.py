@@ -44,14 +44,24 @@ def load_goal(where: str, section: object) -> Goal:
     fields = [field.name for field in dataclasses.fields(kind)]
     require_known(where, section, ["name", *fields])
     settings = {field: section.get(field) for field in fields}
-    if span := re.fullmatch(r"(\d+)-(\d+)", str(settings.get("points"))):
-        settings["points"] = range(int(span[1]), int(span[2]) + 1)
+    if isinstance(points := settings.get("points"), str):
+        settings["points"] = _span(f"{where}.points", points)
     if "goal" in fields:
         settings["goal"] = load_goal(f"{where}.goal", settings["goal"])
     try:
         return kind(**settings)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
+
+
+def _span(where: str, text: str) -> range:
+    """Return the indices of text such as "4-67"."""
+    span = re.fullmatch(r"(\d{1,6})-(\d{1,6})", text)
+    if span is None or int(span[2]) < int(span[1]):
+        raise invalid(
+            where, text, 'must be indices, such as [4, 5, 6], or their first and last, such as "4-6"'
+        )
+    return range(int(span[1]), int(span[2]) + 1)
 
 
 def goal_section(goal: Goal) -> dict[str, Any]:

@@ -128,7 +128,11 @@ def _part(
             raise invalid(where, value, "must be a list of obstacles")
         places = [(f"{where}[{index}]", entry) for index, entry in enumerate(value)]
         return [_part(place, "obstacle", entry, air, folder, modules) for place, entry in places]
-    if key == "control_points" and isinstance(value, list) and value:
+    if key == "control_points" and isinstance(value, list):
+        if not value or not all(isinstance(entry, dict) for entry in value):
+            raise invalid(
+                where, value, "must be a mapping such as {type: points, positions: [...]}, or a list of these"
+            )
         groups = [(f"{where}[{index}]", entry) for index, entry in enumerate(value)]
         parts = [_part(place, key, entry, air, folder, modules) for place, entry in groups]
         return torch.cat(cast(list[torch.Tensor], parts))

@@ -23,9 +23,12 @@ _MOST_FOCI = 6  # With more, boxes are too many
 _TOLERANCE = 3e-3  # Relative distance of the bound to the highest level found
 _PARTS = 3  # of the circle of each phase in the beginning; more than 2, for a cosine > 0
 _MOST_WORK = 3e8  # Products of boxes, foci, transducers and iterations: about half a second
+_OWN_WORK = 60  # of a box, beside foci and transducers
+_MOST_BOXES = 50_000  # at once
 _ITERATIONS = 8  # of the weights a, which begin at those of the box that was divided
 _LARGEST_STEP = 2.0  # of the logarithm of a weight
-_MARGIN = 1e-12  # for the rounding of sums
+MARGIN = 1e-12
+"""Relative margin on top of a bound; rounding of the bound and of a pressure is below 1e-13."""
 
 
 class _Boxes(NamedTuple):
@@ -50,18 +53,18 @@ def phase_bound(foci: ComplexArray, wanted: Array, known: float) -> float:
     alone = np.abs(rows).sum(axis=1)  # level that each focus reaches alone
     if alone.min() == 0:
         return known
-    boxes, work = _whole((alone.min() / alone) ** 2), float(rows.size * _ITERATIONS)
+    boxes, work = _whole((alone.min() / alone) ** 2), float((rows.size + _OWN_WORK) * _ITERATIONS)
     attained, done, left = 0.0, 0.0, _MOST_WORK / work
     while len(boxes.centres):
         left -= len(boxes.centres)
-        if left < 0:
+        if left < 0 or len(boxes.centres) > _MOST_BOXES:
             return known
         bounds, weights, level = _bounded(rows, boxes)
         attained = max(attained, level)
         open_ = np.minimum(bounds, known) > attained * (1 + _TOLERANCE)
         done = max(done, bounds[~open_].max(initial=0.0))
         boxes = _divided(_Boxes(boxes.centres[open_], boxes.halves[open_], weights[open_]))
-    return min(known, done * (1 + _MARGIN))
+    return min(known, done * (1 + MARGIN))
 
 
 def _whole(weights: Array) -> _Boxes:

@@ -76,8 +76,9 @@ class QuietPoints(Goal):
         """Return those of the goal, and of a penalty for the smooth maximum of the excess."""
         loud, quiet = _parts(pressure, self.points)
         tiny = torch.finfo(loud.dtype).tiny
+        least = (_LEAST * loud.mean(dim=-1, keepdim=True)).clamp_min(math.sqrt(tiny))
         own, weakest = self.goal.slope(loud, smoothing), WEAKEST_FOCUS.slope(loud, smoothing)
-        limit = self.ratio * loud.amin(dim=-1, keepdim=True).clamp_min(tiny)
+        limit = self.ratio * loud.amin(dim=-1, keepdim=True).maximum(least)
         excess = (quiet.clamp_min(tiny) / limit).log() / smoothing
         weights = torch.softmax(torch.cat([torch.zeros_like(limit), excess], dim=-1), dim=-1)[..., 1:]
         penalty = _PENALTY * (own.abs() * loud).sum(dim=-1, keepdim=True)  # of the size of the score
@@ -167,7 +168,8 @@ class Contrast(Goal):
         """Return the bound, infinite where drives can silence the background; see `Goal.bound`."""
         matrix = checked_matrix(G)
         self.check(len(matrix))
-        return contrast_bound(*_rows(matrix, self.points))
+        bound = contrast_bound(*_rows(matrix, self.points))
+        return bound if math.isinf(bound) else min(bound, 1 / _LEAST)
 
     def wanted(self, points: int) -> Array:
         """Return 0 for the background, and 1 for each focus."""

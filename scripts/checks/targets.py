@@ -86,9 +86,9 @@ def report(name: str, outcomes: list[Outcome]) -> bool:
     """Print what was found; return whether it is within the limits."""
     left = [one for one in outcomes if one.reachable]
     errors = torch.cat([one.errors for one in left])
-    nulls = np.array([one.null for one in left if one.null > 0])
+    nulls = np.array([one.null for one in left if one.null > 0] or [0.0])
     median, high = float(errors.median()), float(errors.quantile(0.9))
-    quiet = 20 * np.log10(np.quantile(nulls, [0.5, 0.9]))
+    quiet = 20 * np.log10(np.quantile(nulls, [0.5, 0.9]).clip(1e-20))
     deep = float((nulls <= NULL).mean())
     print(
         f"{name}: {len(left)} of {len(outcomes)} sets can be reached by their bounds; errors of amplitudes: "
@@ -99,7 +99,7 @@ def report(name: str, outcomes: list[Outcome]) -> bool:
     return median <= ALLOWED and deep >= 0.9
 
 
-OPTIONS = {"--sets": {"type": int, "default": 1000, "help": "random sets in each scene"}}
+OPTIONS = {"--sets": {"type": int, "default": 1000, "help": "random sets in each scene, at least 32"}}
 
 
 def main(given: argparse.Namespace) -> int:

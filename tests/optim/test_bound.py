@@ -10,6 +10,7 @@ from autdtorch.methods.gabs import gabs
 from autdtorch.methods.gradient import climb, gradient_ascent, random_drives
 from autdtorch.objectives.bound import _certified, focus_bound
 from autdtorch.objectives.goals import WeakestFocus
+from autdtorch.objectives.quiet import QuietPoints
 
 
 @settings(max_examples=40)
@@ -105,7 +106,20 @@ def test_rounding_takes_nothing_from_a_certificate(least):
     drives = drives[:, np.abs(drives[2]) <= 1]  # the third point is at 0
     level = np.abs(rows[:2] @ drives).min(axis=0).max()
     x = np.array([1.0, 1.0, 1e-3, 0.0, 0.0, least])
-    assert math.exp(_certified(x, rows, np.ones(2))) >= level
+    assert (
+        level
+        <= math.exp(_certified(x, rows, np.ones(2)))
+        < 1.1 * math.exp(_certified(x.clip(-6), rows, np.ones(2)))
+    )
+
+
+@pytest.mark.parametrize("ratio", [3.8e-11, 1e-6])
+def test_a_bound_with_rows_of_any_size_holds(ratio):
+    # the quiet point is silenced by the last transducer, which the focus does not hear
+    matrix = torch.tensor([[7.4e5, 6.7, 6.1e-5], [1.5e-5, 3.2, 3.5e5]], dtype=torch.complex128)
+    goal = QuietPoints(WeakestFocus(), [1], ratio)
+    drive = torch.tensor([1.0, 0.0, -1.5e-5 / 3.5e5], dtype=torch.complex128)
+    assert float(goal((matrix @ drive).abs())) <= goal.bound(matrix)
 
 
 @pytest.mark.parametrize(("points", "transducers"), [(2, 8), (3, 16), (4, 16), (4, 60), (5, 16)])

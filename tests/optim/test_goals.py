@@ -148,6 +148,24 @@ def test_contrast_of_silence_is_finite():
     assert goal(torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]).double()).tolist() == [0, 1e10, 0]
 
 
+@pytest.mark.parametrize("number", range(10))
+def test_a_focus_that_nothing_reaches_leaves_finite_gradients(random_matrix, number):
+    goal, matrix = goals_for(4, unit=2.0)[number], random_matrix(4, 6, 0)
+    for silent in range(4):
+        some = matrix.clone()
+        some[silent] = 0
+        drive = climb(goal, some, random_drives(2, 6, torch.Generator().manual_seed(0)), 20)
+        assert torch.isfinite(goal((some @ drive).abs()))
+        assert goal.bound(some) >= goal((some @ drive).abs())
+
+
+def test_a_failed_transducer_changes_no_bound(random_matrix):
+    matrix = random_matrix(8, 5, 0)
+    silent = torch.cat([matrix, torch.zeros(8, 1, dtype=matrix.dtype)], dim=1)
+    for goal in goals_for(8, unit=2.0):
+        assert goal.bound(silent) == pytest.approx(goal.bound(matrix), rel=1e-3)
+
+
 def test_the_gradient_is_finite_where_targets_are_met():
     assert derivative(TargetPressures([1.0, 2.0]), torch.tensor([1.0, 2.0]).double()).tolist() == [0, 0]
 

@@ -114,6 +114,14 @@ def test_what_is_wrong_with_an_npz_file_is_said(tmp_path):
     np.savez(tmp_path / "d.npz", device="autd3", phase=np.array(["x"]), intensity=np.array([1]))
     with pytest.raises(ValueError, match=r"d.npz: autd3 phase: \('x',\); must be an array of real numbers"):
         load_drive(tmp_path / "d.npz")
+    for phase, intensity in (((0, 1, 249), (0, 1, 249)), ((2, 1, 249), (1, 2, 249)), ((2, 2, 1, 249),) * 2):
+        np.savez(tmp_path / "d.npz", device="autd3", phase=np.ones(phase), intensity=np.ones(intensity))
+        with pytest.raises(ValueError, match=r"d.npz: levels of shapes .*; must be \(units, M\) or"):
+            load_drive(tmp_path / "d.npz")
+    for shape in ((0, 5), (5, 0), (2, 3, 4)):
+        np.savez(tmp_path / "d.npz", drive=np.ones(shape, complex))
+        with pytest.raises(ValueError, match=r"d.npz: drive: shape .*; must be \(M,\), or \(T, M\)"):
+            load_drive(tmp_path / "d.npz")
     with (tmp_path / "d.npz").open("wb") as file:
         np.save(file, np.ones(3))  # a single array, as .npy
     with pytest.raises(ValueError, match=r"d.npz: no array 'drive'"):

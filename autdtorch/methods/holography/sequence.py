@@ -2,7 +2,7 @@
 
 A transducer whose phase jumps is silent for a moment, which is audible (Suzuki, Fujiwara, Makino and Shinoda
 2020, doi:10.1109/TOH.2020.2965946). So phases change by limited steps from one frame to the next. The common
-phase of a frame changes no pressure; it is chosen for the smallest steps.
+phase of a frame changes no pressure; it is chosen so that steps have the mean 0.
 """
 
 from __future__ import annotations
@@ -26,8 +26,7 @@ from autdtorch.utils.validation import (
     real_tensor,
 )
 
-_FIRST = 10  # Times as many iterations for the first frame, which has none before it, from each of its starts
-_STARTS, _TURN = 8, (math.sqrt(5) - 1) / 2  # of the first frame; turns between the phases of its foci
+_FIRST = 10  # Times as many iterations for the first frame, which has none before it
 # Power of wanted over present pressure in the weights: 1 overshoots, and loses foci in some frames
 _DAMPING = 0.5
 
@@ -59,7 +58,8 @@ def drive_sequence(
         Drives (T, M), complex128, |q| <= 1.
 
     Raises:
-        ValueError: not finite numbers, shapes that do not fit, targets <= 0, or a setting out of range.
+        ValueError: not finite numbers, shapes that do not fit, targets <= 0, a focus that no transducer
+            reaches, or a setting out of range.
     """
     matrix = complex_tensor("G", G).detach().cpu()
     if matrix.ndim != 3 or matrix.numel() == 0:
@@ -68,7 +68,11 @@ def drive_sequence(
     limit = min(positive("phase_step", phase_step, "rad"), math.pi)
     closed, even = boolean("closed", closed), boolean("even", even)
     iterations = integer_at_least("iterations", iterations, 1)
-    rows = (matrix.to(torch.complex128) / wanted[..., None]).numpy()
+    reached = matrix.abs().amax(dim=-1)
+    if (reached == 0).any():
+        frame, point = torch.nonzero(reached == 0)[0].tolist()
+        raise ValueError(f"G[{frame}, {point}]: 0 Pa of all transducers; every focus must be reached")
+    rows = (matrix.to(torch.complex128) / (reached.max() * wanted[..., None])).numpy()
     drives = _forward(rows, _first(rows[0], _FIRST * iterations), limit, iterations)
     if closed:
         drives = _closed(rows, drives, limit, iterations)
@@ -79,17 +83,10 @@ def drive_sequence(
 
 
 def _first(matrix: ComplexArray, iterations: int) -> ComplexArray:
-    """Return the best drive (M,) that iterations come to, from several phases of the foci (P,).
-
-    For foci at symmetric places, equal phases can be the worst ones, and iterations stay at them.
-    """
-    found = []
-    for start in range(_STARTS):
-        signs = np.exp(2j * math.pi * _TURN * start * np.arange(len(matrix)))
-        drive = np.exp(1j * np.angle(matrix.conj().T @ signs))
-        near = functools.partial(_near, drive, math.pi)
-        found.append(_frame(matrix, drive, near, np.ones(len(matrix)), None, iterations)[0])
-    return max(found, key=lambda drive: float(np.abs(matrix @ drive).min()))
+    """Return the drive (M,) that iterations come to from back-propagation."""
+    drive = np.exp(1j * np.angle(matrix.conj().T @ np.ones(len(matrix))))
+    near = functools.partial(_near, drive, math.pi)
+    return _frame(matrix, drive, near, np.ones(len(matrix)), None, iterations)[0]
 
 
 def _forward(rows: ComplexArray, first: ComplexArray, limit: float, iterations: int) -> ComplexArray:
