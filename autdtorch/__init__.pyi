@@ -33,6 +33,7 @@ from .plot.scene_figure import plot_scene
 from .plot.trials import plot_convergence, plot_trials
 from .plot.view3d import animate3d, view3d
 from .propagators import SteadyStateWarning, cell_centers, differentiable_field, make_propagator, volume_field
+from .propagators.bodies import ScatteringBodies
 from .propagators.estimate import Estimate, estimate
 from .propagators.operator import ScatteringOperator
 from .scene.arrays import PAPER_SOURCE_STRENGTH, TransducerArray
@@ -79,6 +80,7 @@ __all__ = [
     "QuietPoints",
     "RandomSearch",
     "ScaleWarning",
+    "ScatteringBodies",
     "ScatteringOperator",
     "Scene",
     "SimulatedObjective",

@@ -297,6 +297,7 @@ OTHERS: dict[str, Any] = {
     "plot_planes.obstacles": {"scene": (CUBE,)},
     "plot_planes.pressure": {"scene": {"gabs": np.ones((4, 4))}},
     "save_field.path": Made(lambda folder: folder / "field.vti"),
+    "ScatteringBodies.operators": Made(lambda _: [operator()]),
     "save_field.points": GRID,
     "save_field.pressure": torch.ones(2, 3, 4, dtype=torch.complex128),
     "weakest_focus.pressure": torch.ones(2, 3),
@@ -314,6 +315,7 @@ OTHERS: dict[str, Any] = {
 INSTANCES = {
     "SimulatedPropagator": Made(lambda _: at.make_propagator(SCENE, "box", 2e-3, 0.5, max_periods=6)),
     "ScatteringOperator": Made(lambda _: operator()),
+    "ScatteringBodies": Made(lambda _: at.ScatteringBodies([operator()])),
     "OpenMPDBoard": Made(lambda folder: at.OpenMPDBoard.load(board_file(folder))),
 }
 

@@ -178,20 +178,8 @@ class ScatteringOperator:
         require_kind("array", array, TransducerArray)
         targets, grid = points_grid("points", points)
         direct = free_space_matrix(targets.cpu(), array, self.wavenumber)
-        scattered = self._outgoing(targets.cpu()) @ (self.matrix @ self._incoming(array).mT)
+        scattered = waves_at(self, targets.cpu()) @ (self.matrix @ incoming_waves(self, array).mT)
         return (direct + scattered).reshape(*grid, -1)
-
-    def _incoming(self, array: TransducerArray) -> torch.Tensor:
-        """Return the coefficients (M, N) [Pa] of the regular waves of unit drives."""
-        positions, weights = array.nodes
-        offsets = self._offsets("array.positions", positions)
-        waves = outgoing_waves(self.degree, self.wavenumber, offsets, conjugate=True)
-        factor = 4j * math.pi * self.wavenumber * array.source_strength
-        return factor * torch.einsum("mnk,n->mk", waves, weights.to(waves.dtype))
-
-    def _outgoing(self, points: torch.Tensor) -> torch.Tensor:
-        """Return the outgoing waves (P, N) at points (P, 3) [m]."""
-        return outgoing_waves(self.degree, self.wavenumber, self._offsets("points", points))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the operator to a .npz file."""
@@ -223,14 +211,30 @@ class ScatteringOperator:
             radius = positive("radius", float(arrays["radius"]), "m")
             return cls(matrix, complex(arrays["wavenumber"]), radius, center, axes)
 
-    def _offsets(self, name: str, positions: torch.Tensor) -> torch.Tensor:
-        """Return positions (..., 3) in the coordinates of the body, after checking that they are outside."""
-        offsets = positions - self.center
-        nearest = float(torch.linalg.vector_norm(offsets, dim=-1).detach().amin())
-        if nearest < self.radius:
-            accepted = f"must be at least {self.radius:.4g} m from the centre of the body"
-            raise ValueError(f"{name}: {nearest:.4g} m at the nearest; {accepted}")
-        return offsets @ self.axes
+
+def incoming_waves(body: ScatteringOperator, array: TransducerArray) -> torch.Tensor:
+    """Return the coefficients (M, N) [Pa] of the regular waves of unit drives around a body."""
+    positions, weights = array.nodes
+    waves = outgoing_waves(
+        body.degree, body.wavenumber, _offsets(body, "array.positions", positions), conjugate=True
+    )
+    factor = 4j * math.pi * body.wavenumber * array.source_strength
+    return factor * torch.einsum("mnk,n->mk", waves, weights.to(waves.dtype))
+
+
+def waves_at(body: ScatteringOperator, points: torch.Tensor) -> torch.Tensor:
+    """Return the outgoing waves (P, N) of a body at points (P, 3) [m]."""
+    return outgoing_waves(body.degree, body.wavenumber, _offsets(body, "points", points))
+
+
+def _offsets(body: ScatteringOperator, name: str, positions: torch.Tensor) -> torch.Tensor:
+    """Return positions (..., 3) in the coordinates of a body, after checking that they are outside."""
+    offsets = positions - body.center
+    nearest = float(torch.linalg.vector_norm(offsets, dim=-1).detach().amin())
+    if nearest < body.radius:
+        accepted = f"must be at least {body.radius:.4g} m from the centre of the body"
+        raise ValueError(f"{name}: {nearest:.4g} m at the nearest; {accepted}")
+    return offsets @ body.axes
 
 
 def _circumscribed(bodies: tuple[Obstacle, ...]) -> tuple[torch.Tensor, float]:

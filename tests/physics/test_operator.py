@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.special import sph_harm_y
 
+from autdtorch.analytic.green import green
 from autdtorch.analytic.sphere import fluid_sphere, rigid_sphere
 from autdtorch.analytic.spherical_waves import (
     degrees,
@@ -18,8 +19,10 @@ from autdtorch.analytic.spherical_waves import (
     sphere_coefficients,
 )
 from autdtorch.propagators import make_propagator
+from autdtorch.propagators.bodies import ScatteringBodies
 from autdtorch.propagators.operator import ScatteringOperator
 from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.geometry import sphere_points
 from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Box, Sphere
 from autdtorch.scene.scene import Scene
@@ -179,3 +182,74 @@ def test_coefficients_conserve_energy_and_degrees_suffice():
     for size in (1.0, 6.0, 15.0):
         enough = enough_degrees(size, 1e-3)
         assert abs(sphere_coefficients(enough + 1, size)[-1]) < 1e-3
+
+
+SPHERES = (
+    Sphere(center=(30e-3, 8e-3, -1e-3), radius=6e-3, rigid=True),
+    Sphere(center=(33e-3, -6e-3, 2e-3), radius=5e-3, rigid=True),
+    Sphere(center=(45e-3, 3e-3, -3e-3), radius=6e-3, rigid=True),
+)
+OUTSIDE = torch.tensor([[70e-3, 0, 0], [60e-3, 12e-3, 5e-3], [35e-3, -4e-3, 25e-3]], dtype=torch.float64)
+
+
+def collocated(spheres: tuple[Sphere, ...]) -> torch.Tensor:
+    """The transfer matrix at `OUTSIDE` by outgoing waves whose normal velocity vanishes on all rigid spheres.
+
+    Least squares over 900 points of each surface: no translation of waves, no coefficient of a sphere.
+    """
+    degree, normals = 16, sphere_points((0, 0, 0), 1.0, 900)
+    centers = [torch.tensor(sphere.center, dtype=torch.float64) for sphere in spheres]
+    sources = ARRAY.positions.as_subclass(torch.Tensor)
+
+    def incident(points: torch.Tensor) -> torch.Tensor:
+        distance = (points[:, None] - sources).norm(dim=-1)
+        return ARRAY.source_strength * torch.exp(1j * WAVENUMBER * distance) / distance
+
+    def outgoing(points: torch.Tensor) -> torch.Tensor:
+        return torch.cat([outgoing_waves(degree, WAVENUMBER, points - center) for center in centers], dim=1)
+
+    surfaces = [center + sphere.radius * normals for center, sphere in zip(centers, spheres, strict=True)]
+    slopes = torch.cat([torch.func.jvp(outgoing, (points,), (normals,))[1] for points in surfaces])
+    driven = torch.cat([torch.func.jvp(incident, (points,), (normals,))[1] for points in surfaces])
+    size = slopes.norm(dim=0)
+    found = torch.linalg.lstsq(slopes / size, -driven).solution / size[:, None]
+    return incident(OUTSIDE) + outgoing(OUTSIDE) @ found
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_spheres_scatter_one_another(count):
+    spheres = SPHERES[:count]
+    bodies = [ScatteringOperator.of(sphere, AIR, FREQUENCY, error=1e-5) for sphere in spheres]
+    coupled = ScatteringBodies(bodies).transfer_matrix(ARRAY, OUTSIDE)
+    # 3e-8 to 2e-7 were measured
+    assert relative(coupled, collocated(spheres)) < 1e-5
+    if count > 1:  # each as if alone
+        alone = [body.transfer_matrix(ARRAY, OUTSIDE) for body in bodies]
+        direct = 4 * math.pi * ARRAY.source_strength * green(OUTSIDE, ARRAY.positions, WAVENUMBER)
+        assert relative(sum(alone) - (count - 1) * direct, coupled) > 0.01
+
+
+def test_gradients_by_the_place_of_one_of_several_bodies():
+    first, second = (ScatteringOperator.of(sphere, AIR, FREQUENCY, error=1e-2) for sphere in SPHERES[:2])
+
+    def loudness(offset: torch.Tensor) -> torch.Tensor:
+        return ScatteringBodies([first, second.moved(offset)]).transfer_matrix(ARRAY, OUTSIDE).abs().sum()
+
+    offset = torch.tensor([2e-3, -1e-3, 1e-3], dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(loudness(offset), offset)
+    for axis in range(3):
+        aside = 1e-6 * torch.eye(3, dtype=torch.float64)[axis]
+        slope = (loudness(offset.detach() + aside) - loudness(offset.detach() - aside)) / 2e-6
+        # the differences err by the square of the step
+        assert float(gradient[axis]) == pytest.approx(
+            float(slope), rel=1e-4, abs=1e-4 * float(gradient.norm())
+        )
+
+
+def test_bodies_that_do_not_fit_are_named(cube):
+    with pytest.raises(ValueError, match=r"operators\[1\].center: .* apart.*; must be at least 0.01039 m"):
+        ScatteringBodies([cube, cube.moved((5e-3, 0, 0))])
+    with pytest.raises(ValueError, match=r"operators\[1\].wavenumber"):
+        ScatteringBodies([cube, ScatteringOperator.of(SPHERES[2], AIR, 41e3)])
+    with pytest.raises(ValueError, match=r"operators: .*; must have at least one"):
+        ScatteringBodies([])
