@@ -24,7 +24,7 @@ _TINY = 1e-12  # distance from the centre [m] below which a point has the direct
 
 def degrees(degree: int) -> torch.Tensor:
     """Return the degree l of each wave (N,), int64."""
-    every = torch.arange(degree + 1, device="cpu")
+    every = torch.arange(degree + 1, dtype=torch.int64, device="cpu")
     return every.repeat_interleave(2 * every + 1)
 
 
@@ -32,7 +32,7 @@ def mirrored(degree: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the place of each wave (l, m) at (l, -m), and the sign (-1)^m, (N,) each."""
     own = degrees(degree)
     first = own.square()
-    order = torch.arange(len(own), device="cpu") - first - own
+    order = torch.arange(len(own), dtype=torch.int64, device="cpu") - first - own
     return first + own - order, 1.0 - 2.0 * (order % 2)
 
 
@@ -70,7 +70,8 @@ class _Recurrence(NamedTuple):
 
 @functools.lru_cache(8)
 def _recurrence(degree: int) -> _Recurrence:
-    factor, back, tops = [torch.zeros(0)], [torch.zeros(0)], [math.sqrt(1 / (4 * math.pi))]
+    none = torch.zeros(0, dtype=torch.float64, device="cpu")
+    factor, back, tops = [none], [none], [math.sqrt(1 / (4 * math.pi))]
     for n in range(1, degree + 1):
         m = torch.arange(n, dtype=torch.float64, device="cpu")
         factor.append(((4 * n * n - 1) / (n * n - m * m)).sqrt())
@@ -79,9 +80,9 @@ def _recurrence(degree: int) -> _Recurrence:
         tops.append(-tops[-1] * math.sqrt((2 * n + 1) / (2 * n)))
     pairs = (degree + 1) * (degree + 2) // 2
     own = degrees(degree)
-    m = torch.arange(len(own), device="cpu") - own.square() - own
+    m = torch.arange(len(own), dtype=torch.int64, device="cpu") - own.square() - own
     place = own * (own + 1) // 2 + m.abs()
-    order = torch.cat([torch.arange(n + 1, device="cpu") for n in range(degree + 1)])
+    order = torch.cat([torch.arange(n + 1, dtype=torch.int64, device="cpu") for n in range(degree + 1)])
     sign = torch.where(m < 0, 1.0 - 2.0 * (m % 2), 1.0).to(torch.float64)
     return _Recurrence(factor, back, tops, order, torch.where(m < 0, place + pairs, place), sign)
 

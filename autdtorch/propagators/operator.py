@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -107,13 +107,7 @@ class ScatteringOperator:
             raise invalid("obstacles", obstacles, "must have at least one")
         spacing, error = positive("spacing", spacing, "m"), number_between("error", error, 1e-8, 0.1)
         center, radius = _circumscribed(bodies)
-        array = TransducerArray(
-            center[None] + torch.tensor([[3 * radius, 0.0, 0.0]]), (-1.0, 0.0, 0.0), radius=0
-        )
-        outside = center[None] - torch.tensor([[3 * radius, 0.0, 0.0]])
-        scene = Scene(
-            array, medium, frequency=frequency, control_points=outside, obstacles=bodies, name="body"
-        )
+        scene = _scene(bodies, medium, frequency, center, radius)
         size = scene.wavenumber * radius
         degree = enough_degrees(size, error)
         count = (degree + 1) ** 2
@@ -204,7 +198,9 @@ class ScatteringOperator:
                 or math.isqrt(len(matrix)) ** 2 != len(matrix)
             ):
                 raise ValueError(f"matrix: shape {tuple(matrix.shape)}; must be (N, N), N a square")
-            center = torch.tensor(finite_vector("center", arrays["center"]), dtype=torch.float64)
+            center = torch.tensor(
+                finite_vector("center", arrays["center"]), dtype=torch.float64, device="cpu"
+            )
             axes = real_tensor("axes", arrays["axes"])
             if axes.shape != (3, 3):
                 raise ValueError(f"axes: shape {tuple(axes.shape)}; must be (3, 3)")
@@ -237,10 +233,21 @@ def _offsets(body: ScatteringOperator, name: str, positions: torch.Tensor) -> to
     return offsets @ body.axes
 
 
+def _scene(
+    bodies: Sequence[Obstacle], medium: Medium, frequency: float, center: torch.Tensor, radius: float
+) -> Scene:
+    """Return a scene of the bodies alone, with a transducer and a point that play no part."""
+    aside = torch.tensor([[3 * radius, 0.0, 0.0]], dtype=torch.float64, device="cpu")
+    array = TransducerArray(center + aside, (-1.0, 0.0, 0.0), radius=0)
+    return Scene(
+        array, medium, frequency=frequency, control_points=center - aside, obstacles=bodies, name="body"
+    )
+
+
 def _circumscribed(bodies: tuple[Obstacle, ...]) -> tuple[torch.Tensor, float]:
     """Return centre (3,) and radius [m] of a sphere around all bodies."""
     lower, upper = (
-        torch.tensor([getattr(body, side) for body in bodies], dtype=torch.float64)
+        torch.tensor([getattr(body, side) for body in bodies], dtype=torch.float64, device="cpu")
         for side in ("lower", "upper")
     )
     center = (lower.amin(dim=0) + upper.amax(dim=0)) / 2
