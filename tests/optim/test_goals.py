@@ -64,7 +64,7 @@ def test_scores_are_those_of_the_definitions():
         assert goal(PRESSURE[0]).shape == ()
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(points=st.integers(2, 6), transducers=st.integers(2, 24), seed=st.integers(0, 1000))
 def test_no_drive_scores_above_the_bound(random_matrix, points, transducers, seed):
     matrix, generator = random_matrix(points, transducers, seed), torch.Generator().manual_seed(seed)
