@@ -28,12 +28,16 @@ def degrees(degree: int) -> torch.Tensor:
     return every.repeat_interleave(2 * every + 1)
 
 
+def orders(degree: int) -> torch.Tensor:
+    """Return the order m of each wave (N,), int64."""
+    own = degrees(degree)
+    return torch.arange(len(own), dtype=torch.int64, device="cpu") - own.square() - own
+
+
 def mirrored(degree: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the place of each wave (l, m) at (l, -m), and the sign (-1)^m, (N,) each."""
-    own = degrees(degree)
-    first = own.square()
-    order = torch.arange(len(own), dtype=torch.int64, device="cpu") - first - own
-    return first + own - order, 1.0 - 2.0 * (order % 2)
+    own, order = degrees(degree), orders(degree)
+    return own.square() + own - order, 1.0 - 2.0 * (order % 2)
 
 
 def harmonics(degree: int, directions: torch.Tensor) -> torch.Tensor:
@@ -79,11 +83,10 @@ def _recurrence(degree: int) -> _Recurrence:
         back.append((((n - 1) ** 2 - m * m) / (4 * (n - 1) ** 2 - 1)).sqrt())
         tops.append(-tops[-1] * math.sqrt((2 * n + 1) / (2 * n)))
     pairs = (degree + 1) * (degree + 2) // 2
-    own = degrees(degree)
-    m = torch.arange(len(own), dtype=torch.int64, device="cpu") - own.square() - own
+    own, m = degrees(degree), orders(degree)
     place = own * (own + 1) // 2 + m.abs()
     order = torch.cat([torch.arange(n + 1, dtype=torch.int64, device="cpu") for n in range(degree + 1)])
-    sign = torch.where(m < 0, 1.0 - 2.0 * (m % 2), 1.0).to(torch.float64)
+    sign = torch.where(m < 0, mirrored(degree)[1], 1.0).to(torch.float64)
     return _Recurrence(factor, back, tops, order, torch.where(m < 0, place + pairs, place), sign)
 
 
@@ -111,9 +114,12 @@ def regular_waves(degree: int, wavenumber: complex, offsets: torch.Tensor) -> to
     distance = torch.linalg.vector_norm(offsets, dim=-1, keepdim=True)
     up = torch.tensor([0.0, 0.0, 1.0], dtype=offsets.dtype, device="cpu")
     angular = harmonics(degree, torch.where(distance > _TINY, offsets / distance.clamp_min(_TINY), up))
-    x = wavenumber * distance.numpy()
-    radial = np.concatenate([spherical_jn(n, x) for n in range(degree + 1)], axis=1)
-    return torch.from_numpy(radial)[:, degrees(degree)] * angular
+    return regular_radial(degree, wavenumber * distance) * angular
+
+
+def regular_radial(degree: int, x: torch.Tensor) -> torch.Tensor:
+    """Return j_l(x) (P, N) of all waves at x = k r (P, 1)."""
+    return torch.from_numpy(spherical_jn(np.arange(degree + 1), x.numpy()))[:, degrees(degree)]
 
 
 def sphere_coefficients(

@@ -21,8 +21,7 @@ from autdtorch.scene.drive import (
     validate_drive,
 )
 from autdtorch.utils.array_types import AnyArray
-from autdtorch.utils.files import replacing
-from autdtorch.utils.numpy_file import read_arrays
+from autdtorch.utils.numpy_file import read_arrays, write_arrays
 from autdtorch.utils.validation import ArrayLike, path_of, real_tensor, require_kind, require_one_of, within
 
 _FORMATS = (".csv", ".npz")
@@ -73,8 +72,7 @@ def save_drive(
     if path.suffix.lower() == ".csv":
         write_table(path, columns)
     else:
-        with replacing(path) as partial, partial.open("wb") as file:  # to a path, NumPy would add .npz
-            np.savez_compressed(file, allow_pickle=False, **arrays)
+        write_arrays(path, arrays)
 
 
 def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:

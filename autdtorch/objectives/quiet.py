@@ -154,14 +154,12 @@ class Contrast(Goal):
     def slope(self, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
         """Return those of the logarithm, with a smooth minimum."""
         foci, background = _parts(pressure, self.points)
-        own = WEAKEST_FOCUS.slope(foci, smoothing)
         tiny = torch.finfo(foci.dtype).tiny
+        weakest = foci.amin(dim=-1, keepdim=True).clamp_min(tiny)
+        power = background.square().sum(dim=-1, keepdim=True).clamp_min(tiny)
         slope = torch.zeros_like(pressure)
-        slope[..., _others(self.points, pressure.shape[-1])] = own / foci.amin(
-            dim=-1, keepdim=True
-        ).clamp_min(tiny)
-        power = background.square().sum(dim=-1, keepdim=True)
-        slope[..., list(self.points)] = -background / power.clamp_min(tiny)
+        slope[..., _others(self.points, pressure.shape[-1])] = WEAKEST_FOCUS.slope(foci, smoothing) / weakest
+        slope[..., list(self.points)] = -background / power
         return slope
 
     def bound(self, G: ArrayLike) -> float:

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.special import spherical_jn
 
 from autdtorch.analytic.green import free_space_matrix
-from autdtorch.analytic.spherical_waves import degrees, harmonics
+from autdtorch.analytic.spherical_waves import harmonics, regular_radial
 from autdtorch.propagators.operator import ScatteringOperator, incoming_waves, waves_at
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.utils.memory import require_memory
@@ -68,7 +67,8 @@ class ScatteringBodies:
             ValueError: a point or transducer within a circumscribed sphere.
         """
         require_kind("array", array, TransducerArray)
-        targets, grid = points_grid("points", points)
+        places, grid = points_grid("points", points)
+        targets = places.cpu()
         counts = [len(body.matrix) for body in self.operators]
         require_memory("operators", f"{sum(counts)} waves", _ENTRY_BYTES * sum(counts) ** 2)
         incoming = torch.cat([body.matrix @ incoming_waves(body, array).mT for body in self.operators])
@@ -82,8 +82,8 @@ class ScatteringBodies:
             ]
             rows.append(torch.cat(blocks, dim=1))
         scattered = torch.linalg.solve(torch.cat(rows), incoming)
-        outgoing = torch.cat([waves_at(body, targets.cpu()) for body in self.operators], dim=1)
-        direct = free_space_matrix(targets.cpu(), array, self.operators[0].wavenumber)
+        outgoing = torch.cat([waves_at(body, targets) for body in self.operators], dim=1)
+        direct = free_space_matrix(targets, array, self.operators[0].wavenumber)
         total: torch.Tensor = direct + outgoing @ scattered
         return total.reshape(*grid, -1)
 
@@ -107,9 +107,7 @@ def _regular_waves(body: ScatteringOperator, other: ScatteringOperator) -> torch
     area = torch.from_numpy(np.repeat(weights * 2 * math.pi / count, count))
     back = (harmonics(degree, directions).conj() * area[:, None]).mT
     radii = torch.tensor(_SHELLS, dtype=torch.float64, device="cpu") * body.radius
-    sizes = torch.from_numpy(
-        np.stack([spherical_jn(np.arange(degree + 1), body.wavenumber * float(radius)) for radius in radii])
-    )[:, degrees(degree)]
+    sizes = regular_radial(degree, body.wavenumber * radii[:, None])
     found: torch.Tensor = torch.zeros((), dtype=torch.complex128, device="cpu")
     for radius, size in zip(radii, sizes, strict=True):
         places = body.center + radius * directions @ body.axes.mT

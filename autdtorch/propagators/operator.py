@@ -30,13 +30,12 @@ from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.grids import one_box
 from autdtorch.propagators.plan import MOST_JUDGED, make_kernel, plan
 from autdtorch.scene.arrays import TransducerArray
-from autdtorch.scene.geometry import sphere_points
+from autdtorch.scene.geometry import composed_rotation, sphere_points
 from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Obstacle, Sphere
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.files import replacing
 from autdtorch.utils.memory import require_memory
-from autdtorch.utils.numpy_file import read_arrays
+from autdtorch.utils.numpy_file import read_arrays, write_arrays
 from autdtorch.utils.progress import show_progress
 from autdtorch.utils.threads import one_library_thread, spread
 from autdtorch.utils.validation import (
@@ -118,7 +117,7 @@ class ScatteringOperator:
             matrix = torch.diag(each[degrees(degree)])
         else:
             require_memory("obstacles", f"{count} waves", 3 * _ENTRY_BYTES * count**2)
-            planned = plan(scene, "box", spacing, error, kernel, "float32", 600, None)
+            planned = plan(scene, "box", spacing, error, kernel)
             grouping = one_box(planned.region, planned.spacing)
             matrix = _simulated(BoxSimulation(replace(planned, grouping=grouping)), center, radius, degree)
         turned = torch.eye(3, dtype=torch.float64, device="cpu")
@@ -158,7 +157,9 @@ class ScatteringOperator:
         for name, value in (("offset", shift), ("rotation", angles)):
             if value.shape != (3,):
                 raise ValueError(f"{name}: shape {tuple(value.shape)}; must be (3,)")
-        return replace(self, center=self.center + shift, axes=_rotation(angles) @ self.axes)
+        return replace(
+            self, center=self.center + shift, axes=composed_rotation(angles.cos(), angles.sin()) @ self.axes
+        )
 
     @one_library_thread()
     def transfer_matrix(self, array: TransducerArray, points: ArrayLike) -> torch.Tensor:
@@ -170,17 +171,17 @@ class ScatteringOperator:
             ValueError: a point or transducer within the circumscribed sphere. `make_propagator` serves those.
         """
         require_kind("array", array, TransducerArray)
-        targets, grid = points_grid("points", points)
-        direct = free_space_matrix(targets.cpu(), array, self.wavenumber)
-        scattered = waves_at(self, targets.cpu()) @ (self.matrix @ incoming_waves(self, array).mT)
+        places, grid = points_grid("points", points)
+        targets = places.cpu()
+        direct = free_space_matrix(targets, array, self.wavenumber)
+        scattered = waves_at(self, targets) @ (self.matrix @ incoming_waves(self, array).mT)
         return (direct + scattered).reshape(*grid, -1)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the operator to a .npz file."""
         path = path_of("path", path, suffixes=(".npz",))
         arrays = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
-        with replacing(path) as partial, partial.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **arrays)
+        write_arrays(path, arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> ScatteringOperator:
@@ -304,14 +305,3 @@ def _multipoles(box: ScatteredField, center: torch.Tensor, degree: int) -> torch
     place, sign = mirrored(degree)
     conjugate = sign * waves[:, place]  # j_l Y_lm^*, with the same j_l for a complex wavenumber
     return 4j * math.pi * box.wavenumber * torch.from_numpy((outward.T @ conjugate.numpy()).T)
-
-
-def _rotation(angles: torch.Tensor) -> torch.Tensor:
-    """Return R = Rz Ry Rx (3, 3) of angles (3,), differentiable."""
-    (cx, cy, cz), (sx, sy, sz) = angles.cos(), angles.sin()
-    rows = (
-        (cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx),
-        (sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx),
-        (-sy, cy * sx, cy * cx),
-    )
-    return torch.stack([torch.stack(row) for row in rows])

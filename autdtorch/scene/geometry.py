@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -99,13 +100,20 @@ def rotation_matrix(rotation: Vector) -> torch.Tensor:
 
 @functools.lru_cache(64)
 def _rotation_matrix(rotation: Vector) -> torch.Tensor:
+    return composed_rotation(list(map(math.cos, rotation)), list(map(math.sin, rotation)))
+
+
+def composed_rotation(
+    cosines: Sequence[float] | torch.Tensor, sines: Sequence[float] | torch.Tensor
+) -> torch.Tensor:
+    """Return the matrix of `rotation_matrix` from cosines and sines (3,), differentiable in tensors."""
     matrix = torch.eye(3, dtype=torch.float64, device="cpu")
-    for axis, angle in enumerate(rotation):
+    for axis, (cosine, sine) in enumerate(zip(cosines, sines, strict=True)):
         first, second = (axis + 1) % 3, (axis + 2) % 3
         turn = torch.eye(3, dtype=torch.float64, device="cpu")
-        turn[first, first] = turn[second, second] = math.cos(angle)
-        turn[second, first] = math.sin(angle)
-        turn[first, second] = -math.sin(angle)
+        turn[first, first] = turn[second, second] = cosine
+        turn[second, first] = sine
+        turn[first, second] = -sine
         matrix = turn @ matrix
     return matrix
 
@@ -128,10 +136,7 @@ def circle_points(
     Raises:
         ValueError: an argument is not finite, has the wrong shape or is out of range.
     """
-    origin = torch.tensor(finite_vector("center", center), dtype=torch.float64, device="cpu")
-    radius = positive("radius", radius, "m")
-    count = integer_at_least("count", count, 1)
-    require_memory("count", count, _POINT_BYTES * count)
+    origin, radius, count = _round(center, radius, count)
     u, v = plane_basis(normal)
     start = finite_number("angle", angle, "rad")
     angles = start + 2 * math.pi * torch.arange(count, dtype=torch.float64, device="cpu") / count
@@ -154,14 +159,20 @@ def sphere_points(center: ArrayLike, radius: float, count: int) -> torch.Tensor:
     Raises:
         ValueError: an argument is not finite, has the wrong shape or is out of range.
     """
-    origin = torch.tensor(finite_vector("center", center), dtype=torch.float64, device="cpu")
-    radius = positive("radius", radius, "m")
-    count = integer_at_least("count", count, 1)
-    require_memory("count", count, _POINT_BYTES * count)
+    origin, radius, count = _round(center, radius, count)
     number = torch.arange(count, dtype=torch.float64, device="cpu")
     height = 1 - (2 * number + 1) / count
     angle, across = math.pi * (3 - math.sqrt(5)) * number, (1 - height.square()).sqrt()
     return origin + radius * torch.stack((across * angle.cos(), across * angle.sin(), height), dim=1)
+
+
+def _round(center: ArrayLike, radius: float, count: int) -> tuple[torch.Tensor, float, int]:
+    """Return centre (3,) [m], radius [m] and number of points after checking them."""
+    origin = torch.tensor(finite_vector("center", center), dtype=torch.float64, device="cpu")
+    radius = positive("radius", radius, "m")
+    count = integer_at_least("count", count, 1)
+    require_memory("count", count, _POINT_BYTES * count)
+    return origin, radius, count
 
 
 @dataclass(frozen=True)

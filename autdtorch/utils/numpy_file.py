@@ -1,4 +1,4 @@
-"""Arrays from NumPy files, checked before they are allocated."""
+"""Arrays in NumPy files, checked before they are allocated."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 import tokenize
 import zipfile
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from autdtorch.utils.array_types import AnyArray
+from autdtorch.utils.files import replacing
 
 _LARGEST = 2**30  # [bytes] of unpacked arrays; a small file can hold many zeros
 _LONGEST_HEADER = 1000  # [bytes]; NumPy writes 128 for plain arrays
@@ -24,6 +26,12 @@ _DAMAGE = (OSError, ValueError, TypeError, LookupError, EOFError, OverflowError,
 _ARCHIVE_DAMAGE = (tokenize.TokenError, zipfile.BadZipFile, zlib.error)
 
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write arrays by name to a .npz file, which is replaced."""
+    with replacing(path) as partial, partial.open("wb") as file:  # to a path, NumPy would add .npz
+        np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 def read_arrays(path: str | os.PathLike[str]) -> dict[str, AnyArray]:

@@ -113,7 +113,7 @@ def holography(
     iterations = integer_at_least("iterations", iterations, 1)
     free = boolean("free_amplitudes", free_amplitudes)
     matrix = _checked_matrix(G)
-    wanted = _checked_targets(targets, matrix)
+    wanted = checked_targets(targets, matrix)
     drive = _solved(matrix, wanted, "wgs" if algorithm == "diff_pat" else algorithm, iterations, free)
     wanted, drive = wanted[..., None], drive[..., None]
     if free:
@@ -157,7 +157,7 @@ def _checked_matrix(G: ArrayLike) -> torch.Tensor:
     return matrix.resolve_conj().to(torch.complex64 if matrix.dtype == torch.complex64 else torch.complex128)
 
 
-def _checked_targets(targets: ArrayLike | None, matrix: torch.Tensor) -> torch.Tensor:
+def checked_targets(targets: ArrayLike | None, matrix: torch.Tensor) -> torch.Tensor:
     """Return targets (..., P) for matrices (..., P, M), in their precision."""
     shape = matrix.shape[:-1]
     if targets is None:

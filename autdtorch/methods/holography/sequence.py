@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from autdtorch.methods.holography.holography import TINY, UNREACHED
+from autdtorch.methods.holography.holography import TINY, UNREACHED, checked_targets
 from autdtorch.utils.array_types import Array, ComplexArray
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import (
@@ -22,8 +22,8 @@ from autdtorch.utils.validation import (
     boolean,
     complex_tensor,
     integer_at_least,
+    invalid,
     positive,
-    real_tensor,
 )
 
 _FIRST = 10  # Times as many iterations for the first frame, which has none before it
@@ -64,7 +64,9 @@ def drive_sequence(
     matrix = complex_tensor("G", G).detach().cpu()
     if matrix.ndim != 3 or matrix.numel() == 0:
         raise ValueError(f"G: shape {tuple(matrix.shape)}; must be (T, P, M) with T, P, M >= 1")
-    wanted = _checked_targets(targets, *matrix.shape[:2])
+    wanted = checked_targets(targets, matrix)
+    if not (wanted > 0).all():
+        raise invalid("targets", targets, "must be pressures, all > 0 Pa")
     limit = min(positive("phase_step", phase_step, "rad"), math.pi)
     closed, even = boolean("closed", closed), boolean("even", even)
     iterations = integer_at_least("iterations", iterations, 1)
@@ -166,14 +168,3 @@ def _near_both(
         step = (away + step).clip(-reach, reach) - away
     found: ComplexArray = before * np.exp(1j * step)
     return found
-
-
-def _checked_targets(targets: ArrayLike | None, frames: int, points: int) -> torch.Tensor:
-    """Return targets as they are multiplied with (T, P) pressures, after checking them."""
-    if targets is None:
-        return torch.ones(points, dtype=torch.float64, device="cpu")
-    wanted = real_tensor("targets", targets, "Pa").detach().cpu()
-    if wanted.shape not in ((frames, points), (points,)) or not (wanted > 0).all():
-        accepted = f"must be ({points},) or ({frames}, {points}), all > 0 Pa"
-        raise ValueError(f"targets: shape {tuple(wanted.shape)}; {accepted}")
-    return wanted
