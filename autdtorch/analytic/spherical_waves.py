@@ -40,6 +40,27 @@ def mirrored(degree: int) -> tuple[torch.Tensor, torch.Tensor]:
     return own.square() + own - order, 1.0 - 2.0 * (order % 2)
 
 
+def real_waves(degree: int) -> torch.Tensor:
+    """Return the unitary mixing (N, N) of waves to those with real harmonics.
+
+    Of (l, m) and (l, -m), column (l, m), m > 0, has cos(m phi), and column (l, -m) has sin(m phi).
+    """
+    order, (place, sign) = orders(degree), mirrored(degree)
+    mixing = torch.zeros(len(order), len(order), dtype=torch.complex128, device="cpu")
+    for own, m in enumerate(order.tolist()):
+        mixing[own, own] = 1.0 if m == 0 else math.sqrt(0.5) if m > 0 else 1j * math.sqrt(0.5)
+        if m != 0:
+            mixing[place[own], own] = sign[own] * (1.0 if m > 0 else -1.0) * mixing[own, own]
+    return mixing
+
+
+def parities(degree: int) -> torch.Tensor:
+    """Return whether each of the `real_waves` is odd in x, y and z: 0 or 1 (N, 3), int64."""
+    own, order = degrees(degree), orders(degree)
+    sine = (order < 0).to(torch.int64)
+    return torch.stack([(order.abs() + sine) % 2, sine, (own + order) % 2], dim=1)
+
+
 def harmonics(degree: int, directions: torch.Tensor) -> torch.Tensor:
     """Return the spherical harmonics Y_lm (..., N) of unit vectors (..., 3), differentiable in these.
 

@@ -21,23 +21,18 @@ from autdtorch.analytic.spherical_waves import (
     enough_degrees,
     mirrored,
     outgoing_waves,
-    regular_waves,
     sphere_coefficients,
 )
-from autdtorch.fdtd.scattered_field import ScatteredField
-from autdtorch.fdtd.steady_state import run_to_steady_state
-from autdtorch.propagators.box import BoxSimulation
-from autdtorch.propagators.grids import one_box
-from autdtorch.propagators.plan import MOST_JUDGED, make_kernel, plan
+from autdtorch.propagators.body_waves import simulated_operator
+from autdtorch.propagators.plan import plan
 from autdtorch.scene.arrays import TransducerArray
-from autdtorch.scene.geometry import composed_rotation, sphere_points
+from autdtorch.scene.geometry import composed_rotation
 from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Obstacle, Sphere
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.numpy_file import read_arrays, write_arrays
-from autdtorch.utils.progress import show_progress
-from autdtorch.utils.threads import one_library_thread, spread
+from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import (
     ArrayLike,
     finite_vector,
@@ -109,7 +104,7 @@ class ScatteringOperator:
         scene = _scene(bodies, medium, frequency, center, radius)
         size = scene.wavenumber * radius
         degree = enough_degrees(size, error)
-        count = (degree + 1) ** 2
+        count, axes = (degree + 1) ** 2, torch.eye(3, dtype=torch.float64, device="cpu")
         if len(bodies) == 1 and isinstance(bodies[0], Sphere) and scene.complex_wavenumber.imag == 0:
             body = bodies[0]
             ratios = () if body.rigid else _ratios(body, medium)
@@ -118,10 +113,8 @@ class ScatteringOperator:
         else:
             require_memory("obstacles", f"{count} waves", 3 * _ENTRY_BYTES * count**2)
             planned = plan(scene, "box", spacing, error, kernel)
-            grouping = one_box(planned.region, planned.spacing)
-            matrix = _simulated(BoxSimulation(replace(planned, grouping=grouping)), center, radius, degree)
-        turned = torch.eye(3, dtype=torch.float64, device="cpu")
-        return cls(matrix, scene.complex_wavenumber, radius, center, turned)
+            matrix, axes = simulated_operator(planned, center, radius, degree)
+        return cls(matrix, scene.complex_wavenumber, radius, center, axes)
 
     @property
     def degree(self) -> int:
@@ -180,8 +173,12 @@ class ScatteringOperator:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the operator to a .npz file."""
         path = path_of("path", path, suffixes=(".npz",))
-        arrays = {name: np.asarray(getattr(self, name)) for name in _ARRAYS}
-        write_arrays(path, arrays)
+        values = {name: getattr(self, name) for name in _ARRAYS}
+        plain = {
+            name: value.detach() if isinstance(value, torch.Tensor) else value
+            for name, value in values.items()
+        }
+        write_arrays(path, {name: np.asarray(value) for name, value in plain.items()})
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> ScatteringOperator:
@@ -263,45 +260,3 @@ def _ratios(body: Obstacle, medium: Medium) -> tuple[float, float]:
     assert body.density is not None
     assert body.sound_speed is not None
     return body.density / medium.density, body.sound_speed / medium.sound_speed
-
-
-@one_library_thread()
-def _simulated(simulation: BoxSimulation, center: torch.Tensor, radius: float, degree: int) -> torch.Tensor:
-    """Return T (N, N) from a run for each regular wave."""
-    box, planned = simulation.boxes[0], simulation.plan
-    wavenumber, cells = box.wavenumber, box.surface[1]
-    incoming = regular_waves(degree, wavenumber, box.driven - center)
-    outgoing = _multipoles(box, center, degree)
-    judged = sphere_points(center, radius, MOST_JUDGED) - center
-    observed = outgoing_waves(degree, wavenumber, judged) @ outgoing
-    kernel = make_kernel(planned.kernel)
-    count = incoming.shape[1]
-    with show_progress(count, "simulating the waves of a body") as progress:
-
-        @torch.no_grad()
-        def run(number: int) -> torch.Tensor:
-            forces = box.sources(incoming[:, number])
-            steady = run_to_steady_state(
-                box.assembly,
-                kernel,
-                forces,
-                cells,
-                planned.tolerance,
-                planned.max_periods,
-                lambda phasors: observed @ phasors,
-                lambda periods: None,
-            )
-            progress.advance(1)
-            return steady.pressure
-
-        phasors = spread(run, range(count), kernel.at_once(box.assembly.grid.shape))
-    return outgoing @ torch.stack(phasors, dim=1)
-
-
-def _multipoles(box: ScatteredField, center: torch.Tensor, degree: int) -> torch.Tensor:
-    """Return the map (N, n) from phasors of the Huygens surface's cells to outgoing waves."""
-    positions, _, outward = box.surface
-    waves = regular_waves(degree, box.wavenumber, positions - center)
-    place, sign = mirrored(degree)
-    conjugate = sign * waves[:, place]  # j_l Y_lm^*, with the same j_l for a complex wavenumber
-    return 4j * math.pi * box.wavenumber * torch.from_numpy((outward.T @ conjugate.numpy()).T)
