@@ -24,6 +24,7 @@ from autdtorch.hardware.emulator.emulated_scope import EmulatedInstrument
 
 PLANE = at.Plane(center=(20e-3, 12e-3, 12e-3), normal=(1, 0, 0), size=(8e-3, 8e-3))
 AIR_ALONE = small_scene()
+BALL = small_scene((at.Sphere((12e-3, 12e-3, 12e-3), radius=3e-3, rigid=True),))
 SCENE = replace(small_scene((CUBE,)), observation_plane=PLANE)
 MATRIX = torch.randn(3, 4, dtype=torch.complex128, generator=torch.Generator().manual_seed(0))
 DRIVE = torch.ones(4, dtype=torch.complex128)
@@ -41,15 +42,8 @@ METHODS = ("BayesOpt", "GABS", "GradientAscent", "Holography", "Identify", "LSS"
 #: Results, parts of drivers, and calls that need a device.
 NOT_CALLED_BY_USERS = {
     *("Estimate", "Evaluation", "EvaluationLog", "FocusMetrics", "Preflight", "Run", "Solution", "Sweep"),
-    *(
-        "Adapter",
-        "Device",
-        "Dialect",
-        "Obstacle",
-        "OpenMPDBoard",
-        "ScatteringOperator",
-        "SimulatedPropagator",
-    ),
+    *("Adapter", "Device", "Dialect", "Obstacle", "OpenMPDBoard"),
+    *("OperatorPropagator", "ScatteringOperator", "SimulatedPropagator"),
     "UsbtmcPort",
     *("EmulatedBench.receive", "EmulatedScope.execute", "Goal", "Method", "State", "Waveform"),
     *("EmulatedScope.plug_into", "Oscilloscope.capture", "Oscilloscope.set_up"),
@@ -314,6 +308,7 @@ OTHERS: dict[str, Any] = {
 #: Of classes that users do not make themselves.
 INSTANCES = {
     "SimulatedPropagator": Made(lambda _: at.make_propagator(SCENE, "box", 2e-3, 0.5, max_periods=6)),
+    "OperatorPropagator": Made(lambda _: at.make_propagator(BALL, "operator")),
     "ScatteringOperator": Made(lambda _: operator()),
     "ScatteringBodies": Made(lambda _: at.ScatteringBodies([operator()])),
     "OpenMPDBoard": Made(lambda folder: at.OpenMPDBoard.load(board_file(folder))),

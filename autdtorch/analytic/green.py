@@ -12,6 +12,7 @@ from autdtorch.utils.neighbours import distances
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
+    differentiable_points,
     invalid,
     not_negative,
     points_tensor,
@@ -30,16 +31,16 @@ def green(points: ArrayLike, sources: ArrayLike, wavenumber: complex) -> torch.T
         wavenumber: k [rad/m], > 0, or k + i alpha with an attenuation alpha >= 0 [Np/m].
 
     Returns:
-        complex128 (P, M) [1/m], on the device of `points`; not differentiable in the positions.
+        complex128 (P, M) [1/m], on the device of `points`, differentiable by them.
 
     Raises:
         ValueError: an argument is not finite or has another shape, k <= 0, alpha < 0, or a point on a source.
     """
-    targets = points_tensor("points", points)
+    targets = differentiable_points("points", points)
     origins = points_tensor("sources", sources).to(targets.device)
     k, alpha = _wavenumber(wavenumber)
     r = distances(targets, origins)
-    if r.min() < LENGTH_TOLERANCE:
+    if r.detach().min() < LENGTH_TOLERANCE:
         point, source = divmod(int(r.argmin()), len(origins))
         accepted = f"lies on source {source}, must be at least {LENGTH_TOLERANCE:g} m away"
         raise invalid(f"points[{point}]", tuple(targets[point].tolist()), accepted, "m")
@@ -53,7 +54,7 @@ def free_space_matrix(points: ArrayLike, array: TransducerArray, wavenumber: com
     unit drive.
     """
     positions, weights = array.nodes
-    points = points_tensor("points", points)
+    points = differentiable_points("points", points)
     require_memory("points", tuple(points.shape), PAIR_BYTES * len(points) * len(array))
     # node by node, with memory for one matrix only
     terms = (w * green(points, at, wavenumber) for at, w in zip(positions.unbind(1), weights, strict=True))

@@ -48,9 +48,10 @@ def real_waves(degree: int) -> torch.Tensor:
     order, (place, sign) = orders(degree), mirrored(degree)
     mixing = torch.zeros(len(order), len(order), dtype=torch.complex128, device="cpu")
     for own, m in enumerate(order.tolist()):
-        mixing[own, own] = 1.0 if m == 0 else math.sqrt(0.5) if m > 0 else 1j * math.sqrt(0.5)
-        if m != 0:
-            mixing[place[own], own] = sign[own] * (1.0 if m > 0 else -1.0) * mixing[own, own]
+        half = torch.tensor(math.sqrt(0.5) * (1 if m > 0 else 1j), dtype=mixing.dtype, device="cpu")
+        mixing[own, own] = half if m else 1.0
+        if m:
+            mixing[place[own], own] = sign[own] * half.conj()
     return mixing
 
 

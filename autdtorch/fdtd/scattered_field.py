@@ -156,11 +156,20 @@ class NearToFar:
 
     def field(self, phasors: Tensor) -> Tensor:
         """Return scattered fields (P, R) at the targets, from the cells' phasors (k, R) in R runs."""
-        amplitude, near = self.amplitudes(phasors), self.targets.chosen(~self.far)
-        field = torch.zeros((*self.within.shape, phasors.shape[1]), dtype=torch.complex128, device="cpu")
-        field[self.within] = torch.from_numpy(self.inward @ phasors.numpy())
+        return self._mean(self.amplitudes(phasors), torch.from_numpy(self.inward @ phasors.numpy()))
+
+    def radiated(self, amplitude: Tensor) -> Tensor:
+        """Return scattered fields (P, R) at targets outside the box, from amplitudes (n, R) [Pa m]."""
+        assert not self.within.any()
+        return self._mean(amplitude, amplitude[:0])
+
+    def _mean(self, amplitude: Tensor, inner: Tensor) -> Tensor:
+        """Return the means (P, R) over the targets' nodes, given the field `inner` at those in the box."""
+        near, runs = self.targets.chosen(~self.far), amplitude.shape[1]
+        field = torch.zeros((*self.within.shape, runs), dtype=torch.complex128, device="cpu")
+        field[self.within] = inner
         field[~self.within] = self.box.radiated(amplitude, near.positions[~self.within])
-        mean = torch.zeros((len(self.far), phasors.shape[1]), dtype=torch.complex128, device="cpu")
+        mean = torch.zeros((len(self.far), runs), dtype=torch.complex128, device="cpu")
         mean[~self.far] = torch.einsum("pnr,n->pr", field, near.weights.to(field.dtype))
         if self.far.any():
             mean[self.far] = self.box.radiated(amplitude, self.targets.chosen(self.far).discs)

@@ -69,23 +69,30 @@ class ScatteringBodies:
         require_kind("array", array, TransducerArray)
         places, grid = points_grid("points", points)
         targets = places.cpu()
-        counts = [len(body.matrix) for body in self.operators]
-        require_memory("operators", f"{sum(counts)} waves", _ENTRY_BYTES * sum(counts) ** 2)
-        incoming = torch.cat([body.matrix @ incoming_waves(body, array).mT for body in self.operators])
+        scattered = self._scattered(array)
+        outgoing = torch.cat([waves_at(body, targets) for body in self.operators], dim=1)
+        direct = free_space_matrix(targets, array, self.operators[0].wavenumber)
+        total: torch.Tensor = direct + outgoing @ scattered
+        return total.reshape(*grid, -1)
+
+    def _scattered(self, array: TransducerArray) -> torch.Tensor:
+        """Return the outgoing waves (N, M) of all bodies under unit drives of an array."""
+        alone = [body.matrix @ incoming_waves(body, array).mT for body in self.operators]
+        if len(alone) == 1:
+            return alone[0]
+        count = sum(map(len, alone))
+        require_memory("operators", f"{count} waves", _ENTRY_BYTES * count**2)
         rows = []
-        for body, own in zip(self.operators, counts, strict=True):
+        for body in self.operators:
             blocks = [
-                torch.eye(own, dtype=torch.complex128, device="cpu")
+                torch.eye(len(body.matrix), dtype=torch.complex128, device="cpu")
                 if other is body
                 else -body.matrix @ _regular_waves(body, other)
                 for other in self.operators
             ]
             rows.append(torch.cat(blocks, dim=1))
-        scattered = torch.linalg.solve(torch.cat(rows), incoming)
-        outgoing = torch.cat([waves_at(body, targets) for body in self.operators], dim=1)
-        direct = free_space_matrix(targets, array, self.operators[0].wavenumber)
-        total: torch.Tensor = direct + outgoing @ scattered
-        return total.reshape(*grid, -1)
+        found: torch.Tensor = torch.linalg.solve(torch.cat(rows), torch.cat(alone))
+        return found
 
 
 def _regular_waves(body: ScatteringOperator, other: ScatteringOperator) -> torch.Tensor:

@@ -7,11 +7,12 @@ after it.
 
 from __future__ import annotations
 
-import itertools
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import zip_longest
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ from autdtorch.analytic.spherical_waves import mirrored, outgoing_waves, paritie
 from autdtorch.fdtd.scattered_field import ScatteredField
 from autdtorch.fdtd.steady_state import SteadyState, run_to_steady_state
 from autdtorch.propagators.box import BoxSimulation
-from autdtorch.propagators.grids import one_box
+from autdtorch.propagators.grids import Grouping, one_box
 from autdtorch.propagators.plan import MOST_JUDGED, Plan, make_kernel
 from autdtorch.propagators.simulated import SteadyStateWarning
 from autdtorch.propagators.symmetry import symmetries
@@ -30,73 +31,102 @@ from autdtorch.utils.progress import show_progress
 from autdtorch.utils.threads import one_library_thread, spread
 
 
-@one_library_thread()
-def simulated_operator(
-    plan: Plan, center: torch.Tensor, radius: float, degree: int
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Simulate T (N, N) of a plan's obstacles around a centre (3,) [m], along the axes of the grid.
+@dataclass(frozen=True)
+class BodyWaves:
+    """The simulation of a body's answers to regular waves up to a degree.
 
-    Returns:
-        T, and the axes, the columns of a matrix (3, 3).
+    Centre (3,) and radius [m] are those of its circumscribed sphere.
     """
-    box = BoxSimulation(replace(plan, grouping=one_box(plan.region, plan.spacing))).boxes[0]
-    axes, kernel = torch.from_numpy(box.axes).mT.contiguous(), make_kernel(plan.kernel)
-    kind, mixing = _kinds(box, center, degree), real_waves(degree)
-    runs = _sharing(kind)
-    incoming = regular_waves(degree, box.wavenumber, (box.driven - center) @ axes) @ mixing
-    size = incoming.norm(dim=0).clamp_min(torch.finfo(torch.float64).tiny)
-    outgoing = mixing.mH @ _multipoles(box, (box.surface[0] - center) @ axes, degree)
-    judged = torch.as_tensor(sphere_points((0.0, 0.0, 0.0), radius, MOST_JUDGED))
-    observed = outgoing_waves(degree, box.wavenumber, judged) @ mixing @ outgoing
-    with show_progress(len(runs), "simulating the waves of a body") as progress:
 
-        @torch.no_grad()
-        def run(waves: list[int]) -> SteadyState:
-            forces = box.sources((incoming[:, waves] / size[waves]).sum(dim=1))
-            settings = plan.tolerance, plan.max_periods, lambda phasors: observed @ phasors, lambda _: None
-            steady = run_to_steady_state(box.assembly, kernel, forces, box.surface[1], *settings)
-            progress.advance(1)
-            return steady
+    plan: Plan
+    center: torch.Tensor
+    radius: float
+    degree: int
 
-        found = spread(run, runs, kernel.at_once(box.assembly.grid.shape))
-    _warn_of_unsettled(found, plan)
-    answers = outgoing @ torch.stack([steady.pressure for steady in found], dim=1)
-    matrix = torch.zeros(len(mixing), len(mixing), dtype=torch.complex128, device="cpu")
-    for waves, answer in zip(runs, answers.mT, strict=True):
-        for wave in waves:
-            matrix[:, wave] = torch.where(kind == kind[wave], answer * size[wave], 0)
-    return mixing @ matrix @ mixing.mH, axes
+    @cached_property
+    def axes(self) -> torch.Tensor:
+        """The axes of the grid, along which waves are taken: the columns of a matrix (3, 3)."""
+        return torch.from_numpy(self._grouping.axes[0]).mT.contiguous()
 
+    @cached_property
+    def runs(self) -> list[list[int]]:
+        """The real waves of each run, at most one of each kind; those of similar degree together."""
+        kinds = self._kinds
+        of_kind = [torch.nonzero(kinds == own)[:, 0].tolist() for own in range(int(kinds.max()) + 1)]
+        return [[wave for wave in waves if wave is not None] for waves in zip_longest(*of_kind)]
 
-def _kinds(box: ScatteredField, center: torch.Tensor, degree: int) -> torch.Tensor:
-    """Return the kind (N,) of each real wave: waves of different kinds do not scatter into one another."""
-    found = symmetries([box.assembly], box.axes, Apertures.of_points(center[None]))
-    turns = [box.axes @ symmetry.matrix @ box.axes.T for symmetry in found]
-    flips = np.stack([np.diag(turn) < 0 for turn in turns if np.allclose(np.abs(turn), np.eye(3))])
-    odd = parities(degree).numpy() @ flips.T.astype(np.int64) % 2  # by wave and symmetry
-    return torch.from_numpy(np.unique(odd, axis=0, return_inverse=True)[1].reshape(-1))
+    @one_library_thread()
+    def matrix(self) -> tuple[torch.Tensor, bool]:
+        """Simulate T (N, N); return also whether all runs reached their steady states."""
+        box, plan, kernel = self._box, self.plan, make_kernel(self.plan.kernel)
+        mixing = real_waves(self.degree)
+        incoming = self._regular(box.driven) @ mixing
+        size = incoming.norm(dim=0).clamp_min(torch.finfo(torch.float64).tiny)
+        outgoing = mixing.mH @ self._multipoles()
+        judged = sphere_points((0.0, 0.0, 0.0), self.radius, MOST_JUDGED)
+        observed = outgoing_waves(self.degree, box.wavenumber, judged) @ mixing @ outgoing
+        with show_progress(len(self.runs), "simulating the waves of a body") as progress:
 
+            @torch.no_grad()
+            def run(waves: list[int]) -> SteadyState:
+                forces = box.sources((incoming[:, waves] / size[waves]).sum(dim=1))
+                settings = (
+                    plan.tolerance,
+                    plan.max_periods,
+                    lambda phasors: observed @ phasors,
+                    lambda _: None,
+                )
+                steady = run_to_steady_state(box.assembly, kernel, forces, box.surface[1], *settings)
+                progress.advance(1)
+                return steady
 
-def _sharing(kind: torch.Tensor) -> list[list[int]]:
-    """Return the waves of each run, at most one of each kind; those of similar degree together."""
-    of_kind = [torch.nonzero(kind == own)[:, 0].tolist() for own in range(int(kind.max()) + 1)]
-    return [[wave for wave in waves if wave is not None] for waves in itertools.zip_longest(*of_kind)]
+            found = spread(run, self.runs, kernel.at_once(box.assembly.grid.shape))
+        answers = outgoing @ torch.stack([steady.pressure for steady in found], dim=1)
+        matrix, kinds = torch.zeros_like(mixing), self._kinds
+        for waves, answer in zip(self.runs, answers.mT, strict=True):
+            for wave in waves:
+                matrix[:, wave] = torch.where(kinds == kinds[wave], answer * size[wave], 0)
+        return mixing @ matrix @ mixing.mH, self._all_settled(found)
 
+    @cached_property
+    def _grouping(self) -> Grouping:
+        return one_box(self.plan.region, self.plan.spacing)
 
-def _multipoles(box: ScatteredField, offsets: torch.Tensor, degree: int) -> torch.Tensor:
-    """Return the map (N, n) from phasors of the Huygens surface, at offsets (m, 3), to outgoing waves."""
-    waves = regular_waves(degree, box.wavenumber, offsets)
-    place, sign = mirrored(degree)
-    conjugate = sign * waves[:, place]  # j_l Y_lm^*, with the same j_l for a complex wavenumber
-    return 4j * math.pi * box.wavenumber * torch.from_numpy((box.surface[2].T @ conjugate.numpy()).T)
+    @cached_property
+    def _box(self) -> ScatteredField:
+        return BoxSimulation(replace(self.plan, grouping=self._grouping)).boxes[0]
 
+    @cached_property
+    def _kinds(self) -> torch.Tensor:
+        """The kind (N,) of each real wave; waves of different kinds do not scatter into one another."""
+        box, odd = self._box, parities(self.degree).numpy()
+        found = symmetries([box.assembly], box.axes, Apertures.of_points(self.center[None]))
+        turns = [box.axes @ symmetry.matrix @ box.axes.T for symmetry in found]
+        flips = np.stack([np.diag(turn) < 0 for turn in turns if np.allclose(np.abs(turn), np.eye(3))])
+        odd = odd @ flips.T.astype(np.int64) % 2  # by wave and symmetry
+        return torch.from_numpy(np.unique(odd, axis=0, return_inverse=True)[1].reshape(-1))
 
-def _warn_of_unsettled(found: Sequence[SteadyState], plan: Plan) -> None:
-    if unsettled := [steady for steady in found if not steady.converged]:
-        error = max(steady.residual for steady in unsettled)
-        warnings.warn(
-            f"no steady state after {plan.max_periods} periods in {len(unsettled)} of {len(found)} runs of a "
-            f"body: estimated relative error up to {error:.1e}, asked for {plan.tolerance:g}",
-            SteadyStateWarning,
-            stacklevel=5,  # the caller of `ScatteringOperator.of`, through the decorator
-        )
+    def _regular(self, places: torch.Tensor) -> torch.Tensor:
+        """Return regular waves (n, N) at places (n, 3) [m]."""
+        return regular_waves(self.degree, self._box.wavenumber, (places - self.center) @ self.axes)
+
+    def _multipoles(self) -> torch.Tensor:
+        """Return the map (N, n) from phasors of the Huygens surface to outgoing waves."""
+        positions, _, outward = self._box.surface
+        place, sign = mirrored(self.degree)
+        conjugate = sign * self._regular(positions)[:, place]  # j_l Y_lm^*, also for a complex wavenumber
+        return 4j * math.pi * self._box.wavenumber * torch.from_numpy((outward.T @ conjugate.numpy()).T)
+
+    def _all_settled(self, found: Sequence[SteadyState]) -> bool:
+        """Return whether all runs reached their steady states; warn of those that did not."""
+        unsettled = [steady.residual for steady in found if not steady.converged]
+        if unsettled:
+            plan = self.plan
+            warnings.warn(
+                f"no steady state after {plan.max_periods} periods in {len(unsettled)} of {len(found)} runs "
+                f"of a body: estimated relative error up to {max(unsettled):.1e}, tolerance "
+                f"{plan.tolerance:g}",
+                SteadyStateWarning,
+                stacklevel=6,  # about where the operator is made
+            )
+        return not unsettled

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -43,6 +44,26 @@ Observe = Callable[[torch.Tensor], torch.Tensor]
 
 Simulate = Callable[[int, torch.Tensor, float, Observe], SteadyState]
 """Simulates a box, given its index, the incident field (n,), the tolerance and the observed quantity."""
+
+
+class Solved(NamedTuple):
+    """The steady states of R runs in boxes.
+
+    With the transform of each box to P receivers, the incident field (P, R) there, and the phasors (k, R) of
+    the cells of each box.
+    """
+
+    boxes: Sequence[ScatteredField]
+    transforms: Sequence[NearToFar]
+    incident: torch.Tensor
+    phasors: Sequence[torch.Tensor]
+    runs: list[Run]
+
+    @property
+    def amplitudes(self) -> list[torch.Tensor]:
+        """Amplitudes (n, R) [Pa m] of the Huygens surface of each box."""
+        pairs = zip(self.transforms, self.phasors, strict=True)
+        return [transform.amplitudes(part) for transform, part in pairs]
 
 
 class BoxSimulation(Simulation):
@@ -84,17 +105,37 @@ class BoxSimulation(Simulation):
     def _check(self, points: torch.Tensor) -> None:
         require_clear(self.plan.scene.array, "points", points)
 
-    @torch.no_grad()
     def _simulate(
         self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures, stepped: Stepped
     ) -> tuple[torch.Tensor, list[Run]]:
-        boxes, plan, points = self.boxes, self.plan, receivers.positions
+        solved = self.solved(sources, strength, receivers, stepped)
+        return self.total(solved, receivers), solved.runs
+
+    def total(self, solved: Solved, receivers: Apertures) -> torch.Tensor:
+        """Return the pressure (R, P) [Pa] at the receivers of runs."""
+        parts = zip(solved.transforms, solved.phasors, strict=True)
+        total = solved.incident + sum(transform.field(part) for transform, part in parts)
+        return total.mT.masked_fill(self._silent(receivers.positions), 0)
+
+    def incident(
+        self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures
+    ) -> torch.Tensor:
+        """Return the incident field (P, R) [Pa] at P receivers in R runs; see `run`."""
+        points, weights = receivers.positions, receivers.weights.to(torch.complex128)
+        drives = zip(sources, strength, strict=True)
+        fields = [self.boxes[0].incident(points.reshape(-1, 3), nodes, own) for nodes, own in drives]
+        return torch.stack([field.reshape(points.shape[:-1]) @ weights for field in fields], dim=1)
+
+    @torch.no_grad()
+    def solved(
+        self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures, stepped: Stepped
+    ) -> Solved:
+        """Simulate R runs, until the pressure at the receivers has converged; see `run`."""
+        boxes, plan = self.boxes, self.plan
         drives = list(zip(sources, strength, strict=True))
-        weights = receivers.weights.to(torch.complex128)
-        fields = [boxes[0].incident(points.reshape(-1, 3), nodes, own) for nodes, own in drives]
-        incident = torch.stack([field.reshape(points.shape[:-1]) @ weights for field in fields], dim=1)
+        incident = self.incident(sources, strength, receivers)
         transforms = [box.near_to_far(receivers) for box in boxes]
-        every = math.ceil(len(points) / MOST_JUDGED)
+        every = math.ceil(len(receivers.positions) / MOST_JUDGED)
         readings = [transform.readings(every) for transform in transforms]
         sizes = [len(transform.cells) for transform in transforms]
 
@@ -129,13 +170,11 @@ class BoxSimulation(Simulation):
             found = _coupled(boxes, transforms, driving, pressure, simulate, plan.tolerance)
             if not found:
                 logger.debug("the iteration between %d boxes does not converge: one box instead", len(boxes))
-                return self._in_one_box._simulate(sources, strength, receivers, stepped)
+                return self._in_one_box.solved(sources, strength, receivers, stepped)
         steady, seconds = zip(*found, strict=True)
         phasors = torch.stack([each.pressure for each in steady], dim=1)
-        parts = torch.split(phasors, sizes)
-        scattered = [transform.field(part) for transform, part in zip(transforms, parts, strict=True)]
-        total = incident + sum(scattered)
-        return total.mT.masked_fill(self._silent(points), 0), list(map(Run.of, steady, seconds))
+        runs = list(map(Run.of, steady, seconds))
+        return Solved(boxes, transforms, incident, torch.split(phasors, sizes), runs)
 
     def _silent(self, points: torch.Tensor) -> torch.Tensor:
         """Return which points (P, n, 3) [m] are in a rigid obstacle; of overlapping ones the later counts."""

@@ -10,6 +10,7 @@ import logging
 import os
 from dataclasses import fields
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -18,10 +19,12 @@ from autdtorch.propagators.plan import Plan
 from autdtorch.utils.array_types import AnyArray, ComplexArray
 from autdtorch.utils.digest import digest_of, package_versions, source_digest
 from autdtorch.utils.files import replace_file
+from autdtorch.utils.validation import invalid, path_of
 
 logger = logging.getLogger(__name__)
 
 SUFFIX = ".matrix"
+CACHE_VARIABLE = "AUTDTORCH_CACHE_DIR"
 
 _NO_EFFECT = ("control_points", "observation_plane", "name")
 """Scene fields that do not affect the pressure; left out of the key."""
@@ -67,6 +70,20 @@ class DiskCache:
 
     def _path(self, digest: str) -> Path:
         return self.folder / f"{digest}{SUFFIX}"
+
+
+def disk_cache(folder: str | os.PathLike[str] | Literal[False] | None) -> DiskCache | None:
+    """Return the cache in a folder, by default that of `CACHE_VARIABLE`, or none."""
+    name = "cache"
+    if folder is None:
+        name, folder = CACHE_VARIABLE, os.environ.get(CACHE_VARIABLE) or False
+    if folder is False:
+        return None
+    path = path_of(name, folder, "a folder, or False")
+    try:
+        return DiskCache(path)
+    except OSError as error:
+        raise invalid(name, str(path), f"must be a folder, or one that can be made ({error})") from error
 
 
 def _with_checksum(digest: str, shape: tuple[int, ...], body: bytes) -> bytes:

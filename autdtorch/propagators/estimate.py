@@ -13,6 +13,7 @@ from autdtorch.fdtd.grid import domain_extent
 from autdtorch.fdtd.region import Fluid, Region
 from autdtorch.fdtd.stepping import assemble, drive_signal
 from autdtorch.propagators.grids import grid_cost
+from autdtorch.propagators.operator_propagator import OperatorPropagator
 from autdtorch.propagators.plan import make_kernel, plan
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.scene.scene import Scene
@@ -35,8 +36,8 @@ class Estimate:
     """The cost of the transfer matrix of a scene's control points.
 
     Attributes:
-        method: "free_space", "box" or "full".
-        spacing: edge of a cell [m]; None in free space.
+        method: "free_space", "box", "full" or "operator".
+        spacing: edge of a cell [m]; None where nothing is simulated.
         cells: cells of all grids, boundary layers included.
         runs: number of simulations, with symmetries.
         memory: most memory in use at a time, without what is in use already [bytes].
@@ -85,14 +86,15 @@ def estimate(
     """
     spacing = positive("spacing", spacing, "m")
     planned = plan(scene, method, spacing, tolerance, kernel=kernel, dtype=dtype)
-    if planned.method == "free_space":
+    if planned.method == "free_space" or not planned.runs:
         nodes = len(scene.array) * len(scene.control_points) * len(scene.array.nodes.weights)
-        return Estimate("free_space", None, 0, 0, planned.memory, _NODE_SECONDS * nodes)
+        return Estimate(planned.method, None, 0, 0, planned.memory, _NODE_SECONDS * nodes)
     # a multiple of the spacing: a scene that is symmetric on one grid mostly is on the other
     factor = max(1, math.floor(planned.region.wavelength / _PILOT_CELLS / spacing))
     pilot = planned.at(spacing * factor, planned.tolerance)
+    kind = OperatorPropagator if planned.method == "operator" else SimulatedPropagator
     if pilot.memory < available_memory():
-        planned = replace(planned, runs=SimulatedPropagator(pilot).planned_runs)
+        planned = replace(planned, runs=kind(pilot).planned_runs)
     small, large = _MEASURED_CELLS
     cells = small if max(grid.cells for grid in planned.grouping.grids) < large / 2 else large
     seconds = planned.work / _rate(planned.kernel, planned.dtype, cells)

@@ -122,8 +122,8 @@ class Grouping:
 def choose_grids(
     region: Region, method: str, spacing: float, tolerance: float, runs: int
 ) -> tuple[str, Grouping]:
-    """Return "box" or "full" and its grids; for "auto" the cheapest that is accurate for the region."""
-    if method == "box":
+    """Return the method and its grids; for "auto" the cheapest of "box" and "full" that is accurate."""
+    if method in ("box", "operator"):
         return method, cheapest_boxes(region, spacing, tolerance, runs)
     own, extent = np.eye(3), domain_extent(region, spacing)
     aligned = bool(region.bodies) and all(flat_faces(shape).all_aligned(own) for shape in region.shapes)

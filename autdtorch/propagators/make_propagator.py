@@ -9,18 +9,17 @@ from typing import Literal
 import torch
 
 from autdtorch.fdtd.grid import warn_if_coarse
-from autdtorch.propagators.cache import DiskCache
+from autdtorch.propagators.cache import disk_cache
 from autdtorch.propagators.free_space import FreeSpacePropagator
+from autdtorch.propagators.operator_propagator import OperatorPropagator
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.refinement import Budget, refined
 from autdtorch.propagators.scene_region import warn_of_ending_walls, warn_of_near_points
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.validation import invalid, path_of, positive
+from autdtorch.utils.validation import invalid, positive
 
 logger = logging.getLogger(__name__)
-
-CACHE_VARIABLE = "AUTDTORCH_CACHE_DIR"
 
 
 def make_propagator(
@@ -36,7 +35,7 @@ def make_propagator(
     seconds: float | None = None,
     memory: float | None = None,
     cache: str | os.PathLike[str] | Literal[False] | None = None,
-) -> FreeSpacePropagator | SimulatedPropagator:
+) -> FreeSpacePropagator | OperatorPropagator | SimulatedPropagator:
     """Make the propagator of a scene. Nothing is simulated before its first use.
 
     Args:
@@ -45,10 +44,12 @@ def make_propagator(
             scattered field in a box around the obstacles, exact elsewhere, also outside the domain. Distant
             obstacles get boxes of their own, coupled by a multiple-scattering iteration, where that is
             cheaper. Obstacles are simulated as a whole, including parts outside the domain. The grid of a
-            box turns with tilted flat faces. "auto": free space without obstacles, full where a wall
-            continues through the boundary layer, box where other obstacles leave the domain or are tilted,
-            otherwise the cheaper of box and full. The propagator's `method` is the one
-            chosen; the reason is logged at level DEBUG.
+            box turns with tilted flat faces. "operator": scattering operators of the obstacles, each
+            simulated once for all poses, arrays and points, and known for spheres; see
+            `ScatteringOperator`. "auto": free space without obstacles, full where a wall continues through
+            the boundary layer, operator where it takes fewer simulations (spheres take none), box where
+            other obstacles leave the domain or are tilted, otherwise the cheaper of box and full. The
+            propagator's `method` is the one chosen; the reason is logged at level DEBUG.
         spacing: edge of a cell [m], at most a third of the wavelength. The error falls with its square, or
             faster along the grid (docs/decisions/error-bars.md). None: the scene is simulated on finer and
             finer grids, until the estimated error of the transfer matrix is within `tolerance`.
@@ -80,14 +81,20 @@ def make_propagator(
     memory = None if memory is None else positive("memory", memory, "bytes")
     if spacing is not None and (seconds, memory) != (None, None):
         raise invalid("spacing", spacing, "must be None where seconds or memory limit its choice", "m")
-    disk_cache = _disk_cache(cache)
+    kept = disk_cache(cache)
     if planned.method == "free_space":
         return FreeSpacePropagator(scene)
-    if spacing is None:
-        propagator = refined(planned, Budget(seconds, memory), disk_cache)
+    propagator: OperatorPropagator | SimulatedPropagator
+    if planned.method == "operator":
+        if spacing is None and planned.runs:
+            found = refined(planned.by_box, Budget(seconds, memory), kept)
+            planned = planned.at(found.spacing, planned.tolerance, time_step)
+        propagator = OperatorPropagator(planned, kept)
+    elif spacing is None:
+        propagator = refined(planned, Budget(seconds, memory), kept)
     else:
         planned.require_feasible()
-        propagator = SimulatedPropagator(planned, disk_cache)
+        propagator = SimulatedPropagator(planned, kept)
     if time_step is not None:
         logger.debug("time step %.4g us", 1e6 * propagator.time_step)  # refuses one that is not stable
     warn_if_coarse(planned.region.sound_speeds, scene.frequency, propagator.spacing)
@@ -95,16 +102,3 @@ def make_propagator(
     warn_of_near_points(scene, "array.positions", scene.array.positions, propagator.spacing)
     warn_of_near_points(scene, "control_points", scene.control_points, propagator.spacing)
     return propagator
-
-
-def _disk_cache(folder: str | os.PathLike[str] | Literal[False] | None) -> DiskCache | None:
-    name = "cache"
-    if folder is None:
-        name, folder = CACHE_VARIABLE, os.environ.get(CACHE_VARIABLE) or False
-    if folder is False:
-        return None
-    path = path_of(name, folder, "a folder, or False")
-    try:
-        return DiskCache(path)
-    except OSError as error:
-        raise invalid(name, str(path), f"must be a folder, or one that can be made ({error})") from error

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -18,13 +18,11 @@ from autdtorch.fdtd.grid import Grid, make_box
 from autdtorch.fdtd.region import Body, Fluid, Region
 from autdtorch.fdtd.stepping import Assembly, assemble_on
 from autdtorch.fdtd.turning import turned
-from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
+from autdtorch.scene.obstacles import Obstacle
+from autdtorch.scene.obstacles.moving import is_movable, shifted
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import Vector
 
-# The attribute that places an obstacle; boxes of others are not kept
-_PLACES = {Box: "center", Sphere: "center", Cylinder: "center", Mesh: "offset", VoxelMask: "origin"}
-_DIGITS = 14  # Decimals of a place [m]: far above its rounding, far below what an element can show
 # Assemblies kept, and the most cells of their grids: they hold about 20 bytes a cell, 250 MB in all
 _KEPT, _MOST_CELLS = 4, 3_000_000
 
@@ -49,7 +47,7 @@ def assembled_box(
     """Assemble the box of a region on a grid along `axes`, one a row (3, 3); see `stepping.assemble_on`."""
     part = turned(region, axes)
     grid = make_box(part, spacing)
-    if math.prod(grid.shape) > _MOST_CELLS or any(type(shape) not in _PLACES for shape in region.shapes):
+    if math.prod(grid.shape) > _MOST_CELLS or not all(map(is_movable, region.shapes)):
         return assemble_on(grid, part, dtype, time_step)
     bodies = tuple(_moved(body, grid, axes) for body in region.bodies)
     here, air = replace(grid, origin=(0.0, 0.0, 0.0)), (region.fluid, region.attenuation, region.frequency)
@@ -71,7 +69,5 @@ def _assembled(box: _Box) -> Assembly:
 
 def _moved(body: Body, grid: Grid, axes: Array) -> Body:
     """Return a body as seen from the first cell of a grid along `axes`."""
-    name = _PLACES[type(body.shape)]
-    place = np.array(getattr(body.shape, name)) - np.array(grid.origin) @ axes
-    there: dict[str, Any] = {name: tuple(place.round(_DIGITS).tolist())}
-    return replace(body, shape=replace(cast(Obstacle, body.shape), **there))
+    offset = torch.from_numpy(-np.array(grid.origin) @ axes)
+    return replace(body, shape=shifted(cast(Obstacle, body.shape), offset))

@@ -9,28 +9,22 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import torch
 
 from autdtorch.analytic.green import free_space_matrix
-from autdtorch.analytic.spherical_waves import (
-    degrees,
-    enough_degrees,
-    mirrored,
-    outgoing_waves,
-    sphere_coefficients,
-)
-from autdtorch.propagators.body_waves import simulated_operator
-from autdtorch.propagators.plan import plan
+from autdtorch.analytic.spherical_waves import mirrored, outgoing_waves
+from autdtorch.propagators.body_matrix import Solver, placed
+from autdtorch.propagators.cache import disk_cache
+from autdtorch.propagators.plan import available_kernel
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import composed_rotation
 from autdtorch.scene.medium import Medium
-from autdtorch.scene.obstacles import Obstacle, Sphere
-from autdtorch.scene.scene import Scene
-from autdtorch.utils.memory import require_memory
+from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.numpy_file import read_arrays, write_arrays
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import (
@@ -47,7 +41,6 @@ from autdtorch.utils.validation import (
     within,
 )
 
-_ENTRY_BYTES = 16.0  # of complex128
 _ARRAYS = ("matrix", "center", "axes", "radius", "wavenumber")
 
 
@@ -81,6 +74,8 @@ class ScatteringOperator:
         spacing: float = 1e-3,
         error: float = 1e-3,
         kernel: str = "auto",
+        *,
+        cache: str | os.PathLike[str] | Literal[False] | None = None,
     ) -> ScatteringOperator:
         """Simulate the operator of obstacles; that of a single sphere is exact.
 
@@ -91,7 +86,9 @@ class ScatteringOperator:
             spacing: edge of a cell [m].
             error: relative error at which degrees are left out, and tolerance of the simulations, in
                 1e-8 to 0.1.
-            kernel: as of `make_propagator`.
+            kernel: as in `make_propagator`.
+            cache: folder for simulated operators, as in `make_propagator`: used again for the same body,
+                wherever it is.
 
         Raises:
             ValueError: a setting out of range, or a body of too many waves for the memory.
@@ -99,22 +96,11 @@ class ScatteringOperator:
         bodies = members("obstacles", [obstacles] if isinstance(obstacles, Obstacle) else obstacles, Obstacle)
         if not bodies:
             raise invalid("obstacles", obstacles, "must have at least one")
+        require_kind("medium", medium, Medium)
+        frequency = positive("frequency", frequency, "Hz")
         spacing, error = positive("spacing", spacing, "m"), number_between("error", error, 1e-8, 0.1)
-        center, radius = _circumscribed(bodies)
-        scene = _scene(bodies, medium, frequency, center, radius)
-        size = scene.wavenumber * radius
-        degree = enough_degrees(size, error)
-        count, axes = (degree + 1) ** 2, torch.eye(3, dtype=torch.float64, device="cpu")
-        if len(bodies) == 1 and isinstance(bodies[0], Sphere) and scene.complex_wavenumber.imag == 0:
-            body = bodies[0]
-            ratios = () if body.rigid else _ratios(body, medium)
-            each = torch.from_numpy(sphere_coefficients(degree, size, *ratios))
-            matrix = torch.diag(each[degrees(degree)])
-        else:
-            require_memory("obstacles", f"{count} waves", 3 * _ENTRY_BYTES * count**2)
-            planned = plan(scene, "box", spacing, error, kernel)
-            matrix, axes = simulated_operator(planned, center, radius, degree)
-        return cls(matrix, scene.complex_wavenumber, radius, center, axes)
+        solver = Solver(spacing, error, available_kernel(kernel))
+        return cls(*placed(bodies, medium, frequency, solver).matrix(disk_cache(cache)))
 
     @property
     def degree(self) -> int:
@@ -229,34 +215,3 @@ def _offsets(body: ScatteringOperator, name: str, positions: torch.Tensor) -> to
         accepted = f"must be at least {body.radius:.4g} m from the centre of the body"
         raise ValueError(f"{name}: {nearest:.4g} m at the nearest; {accepted}")
     return offsets @ body.axes
-
-
-def _scene(
-    bodies: Sequence[Obstacle], medium: Medium, frequency: float, center: torch.Tensor, radius: float
-) -> Scene:
-    """Return a scene of the bodies alone, with a transducer and a point that play no part."""
-    aside = torch.tensor([[3 * radius, 0.0, 0.0]], dtype=torch.float64, device="cpu")
-    array = TransducerArray(center + aside, (-1.0, 0.0, 0.0), radius=0)
-    return Scene(
-        array, medium, frequency=frequency, control_points=center - aside, obstacles=bodies, name="body"
-    )
-
-
-def _circumscribed(bodies: tuple[Obstacle, ...]) -> tuple[torch.Tensor, float]:
-    """Return centre (3,) and radius [m] of a sphere around all bodies."""
-    lower, upper = (
-        torch.tensor([getattr(body, side) for body in bodies], dtype=torch.float64, device="cpu")
-        for side in ("lower", "upper")
-    )
-    center = (lower.amin(dim=0) + upper.amax(dim=0)) / 2
-    if len(bodies) == 1 and isinstance(body := bodies[0], Sphere):
-        return center, body.radius
-    vertices = torch.cat([body.surface()[0] for body in bodies])
-    return center, float((vertices - center).norm(dim=1).max())
-
-
-def _ratios(body: Obstacle, medium: Medium) -> tuple[float, float]:
-    """Return density and sound speed of a fluid body over those of the medium."""
-    assert body.density is not None
-    assert body.sound_speed is not None
-    return body.density / medium.density, body.sound_speed / medium.sound_speed

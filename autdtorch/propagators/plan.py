@@ -27,6 +27,7 @@ from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import phasors_kept
 from autdtorch.propagators.grids import USUAL_PERIODS, Grouping, choose_grids
+from autdtorch.propagators.scene_bodies import are_outside, bodies_of, waves_to_simulate
 from autdtorch.propagators.scene_region import hardened, region_of
 from autdtorch.scene.arrays import apertures_of
 from autdtorch.scene.obstacles import Mesh
@@ -94,7 +95,8 @@ class Plan:
         spacing: edge of a cell [m]; of no effect in free space.
         time_step: upper limit of the time step [s]; None for the largest stable one.
         grouping: the grids, and the obstacles on each; no grids in free space.
-        runs: number of simulations of the control points' transfer matrix; `plan` neglects symmetries.
+        runs: number of simulations of the control points' transfer matrix, or of the scattering operators;
+            `plan` neglects symmetries.
     """
 
     scene: Scene
@@ -120,6 +122,11 @@ class Plan:
         return self.at(second_spacing(self.region, self.spacing), self.tolerance)
 
     @property
+    def by_box(self) -> Self:
+        """The plan of the box that serves where scattering operators do not."""
+        return replace(self, method="box", runs=min(len(self.scene.control_points), len(self.scene.array)))
+
+    @property
     def order(self) -> float:
         """The power of the spacing with which errors fall."""
         return ALIGNED_ORDER if self.grouping.aligned else ORDER
@@ -132,14 +139,14 @@ class Plan:
     @property
     def memory(self) -> float:
         """The most memory in use at a time [bytes]."""
-        if self.method == "free_space":
+        if self.method == "free_space" or not self.runs:
             return PAIR_BYTES * len(self.scene.array) * len(self.scene.control_points)
         grids, filled, kept = self.grouping.grids, self._heterogeneity, self._kept
         block = 3 * max(grid.steps_per_period for grid in grids)
         run = _FIELD_NUMBERS * self.dtype.itemsize * self.cells
         run += kept * (16 * phasors_kept(kept) + _RECORDED * block)
         receivers = max(len(self.scene.control_points), len(self.scene.array))
-        judged = min(MOST_JUDGED, receivers) if self.method == "box" else 0
+        judged = 0 if self.method == "full" else min(MOST_JUDGED, receivers)
         lasting = _CELL_BYTES * self.cells + _CELL_MEMORY * filled.cells + _COLUMN_BYTES * filled.columns
         assembled = min(_ELEMENTS * filled.cut / len(grids), _MOST_ELEMENTS * thread_count())
         assembled *= _ALIKE if self.grouping.aligned else 1
@@ -153,10 +160,10 @@ class Plan:
         single = _CELL_STEPS * filled.cells + _COLUMN_STEPS * filled.columns
         stepping = sum(grid.work for grid in grids) + max(grid.steps for grid in grids) * single
         # coupled boxes are stepped to looser tolerances, and empty grids have no resonances
-        ringing = USUAL_PERIODS if filled.cells and passes == 1 and self.method == "box" else 1.0
+        ringing = USUAL_PERIODS if filled.cells and passes == 1 and self.method != "full" else 1.0
         run = _RUN_STEPS + ringing * passes * stepping
         assembly = _SCENE_STEPS + _ASSEMBLY_STEPS * filled.assembled + _MESH_STEPS * filled.meshed
-        pairs = sum(grid.radiating for grid in grids) * self._terms if self.method == "box" else 0
+        pairs = 0 if self.method == "full" else sum(grid.radiating for grid in grids) * self._terms
         return assembly + _PAIR_STEPS * pairs + math.ceil(self.runs / self._at_once) * run
 
     @cached_property
@@ -204,7 +211,7 @@ class Plan:
     @property
     def _kept(self) -> int:
         """Most cells of a grid whose phasors a run keeps."""
-        if self.method == "box":
+        if self.method != "full":
             return max(grid.radiating for grid in self.grouping.grids)
         return min(self.cells, self._receivers * self._width**3)
 
@@ -265,8 +272,8 @@ def plan(
     region = hardened(region, tolerance)
     max_periods = integer_at_least("max_periods", max_periods, 1)
     time_step = None if time_step is None else positive("time_step", time_step, "s")
-    require_one_of("method", method, ("auto", "free_space", "box", "full"))
-    if method == "box" and not scene.obstacles:
+    require_one_of("method", method, ("auto", "free_space", "box", "full", "operator"))
+    if method in ("box", "operator") and not scene.obstacles:
         raise invalid("method", method, "needs a scene with obstacles; take free_space")
     runs, grouping = min(len(scene.control_points), len(scene.array)), Grouping((), (), (), 0, aligned=False)
     if method == "auto" and not scene.obstacles:
@@ -274,10 +281,28 @@ def plan(
         method = "free_space"
     if method != "free_space":
         require_spacing(region, spacing)
-        method, grouping = choose_grids(region, method, spacing, tolerance, runs)
+        chosen, grouping = choose_grids(region, method, spacing, tolerance, runs)
+        method, runs = _by_operator(scene, region, method, chosen, tolerance, runs)
     return Plan(
         scene, region, method, spacing, tolerance, kernel, precision, max_periods, time_step, grouping, runs
     )
+
+
+def _by_operator(
+    scene: Scene, region: Region, method: str, chosen: str, tolerance: float, runs: int
+) -> tuple[str, int]:
+    """Return "operator" and its runs where it is asked for, or has fewer runs; otherwise what was chosen."""
+    if method not in ("auto", "operator"):
+        return chosen, runs
+    bodies = bodies_of(scene.obstacles)
+    waves = waves_to_simulate(scene, bodies, tolerance)
+    if method == "auto":
+        places = torch.cat([scene.control_points, scene.array.nodes.positions.reshape(-1, 3)])
+        walls = any(body.continued for body in region.bodies)
+        if walls or waves > runs or not are_outside(places, bodies).all():
+            return chosen, runs
+        logger.debug("method auto: operator; %d waves, where %s takes %d runs", waves, chosen, runs)
+    return "operator", waves
 
 
 def available_kernel(name: str) -> str:

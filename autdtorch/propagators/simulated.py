@@ -14,16 +14,14 @@ import torch
 
 from autdtorch.analytic.green import PAIR_BYTES
 from autdtorch.fdtd.grid import grid_errors
-from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.cache import DiskCache, cache_key
 from autdtorch.propagators.full import DomainSimulation
+from autdtorch.propagators.kept_fields import KeepingSimulation
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.scene_region import warn_of_near_points
 from autdtorch.propagators.simulation import Run, TransferMatrix
-from autdtorch.scene.arrays import apertures_of
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import ArrayLike, boolean, points_grid
@@ -81,9 +79,9 @@ class SimulatedPropagator:
         self.runs: list[Run] = []
         self._reported = 0
         self._plan, self._cache, self._given = plan, cache, tuple(others)
-        self._simulation = DomainSimulation(plan) if plan.method == "full" else BoxSimulation(plan)
+        self._simulation = DomainSimulation(plan) if plan.method == "full" else KeepingSimulation(plan)
         self._control: TransferMatrix | None = None
-        self._near_logged = self._near_points_logged = False
+        self._transducers_ran = self._near_logged = self._near_points_logged = False
 
     def __repr__(self) -> str:
         """Scene, settings and number of runs."""
@@ -98,7 +96,7 @@ class SimulatedPropagator:
     @property
     def planned_runs(self) -> int:
         """Number of simulations of the control points' transfer matrix."""
-        return self._simulation.orbits(self.scene.control_points).runs
+        return self._simulation.matrix_runs(self.scene.control_points)
 
     @cached_property
     def _others(self) -> tuple[SimulatedPropagator, ...]:
@@ -142,7 +140,7 @@ class SimulatedPropagator:
         result = self._with_error(places) if with_error else self._result(places)
         if places is not None:
             self._report_near(places)
-        self._report(self.scene.control_points if places is None else places)
+        self._report()
         return (result.matrix, result.error) if with_error else result.matrix
 
     @one_library_thread()
@@ -189,20 +187,19 @@ class SimulatedPropagator:
         if len(grid) == 1:  # others are pictures, which may cross obstacles
             self._report_near(points)
         flat = drive.reshape(-1, drive.shape[-1])
-        by_matrix = drive.requires_grad or len(flat) > self._simulation.orbits(points).runs
+        by_matrix = drive.requires_grad or len(flat) > self._simulation.matrix_runs(points)
         rows = len(self.scene.array) if by_matrix else len(flat)
         require_memory("points", (*grid, 3), PAIR_BYTES * rows * len(points))
         if by_matrix:
             result = self._executed(points)
-            self._report(points)
+            self._report()
             return (drive @ result.matrix.mT).reshape(*drive.shape[:-1], *grid)
         field = torch.zeros((len(flat), len(points)), dtype=torch.complex128, device="cpu")
         if (loud := flat.any(dim=1)).any():
-            strength = self.scene.array.source_strength * flat[loud]
-            apertures = [apertures_of(self.scene.array)] * len(strength)
-            field[loud], runs = self._simulation.run(apertures, strength, Apertures.of_points(points))
+            field[loud], runs = self._simulation.fields(flat[loud], points)
             self.runs += runs
-            self._report(None)
+            self._transducers_ran |= bool(runs)
+            self._report()
         return field.reshape(*drive.shape[:-1], *grid)
 
     def _result(self, points: torch.Tensor | None) -> TransferMatrix:
@@ -219,9 +216,10 @@ class SimulatedPropagator:
             key = cache_key(self._plan, points)
             if (found := cache.load(key, (len(points), len(self.scene.array)))) is not None:
                 logger.info("transfer matrix of %s loaded from %s", self.scene.name, cache.folder)
-                return TransferMatrix(torch.from_numpy(found[0]), found[1], ())
+                return TransferMatrix(torch.from_numpy(found[0]), found[1], (), from_points=True)
         result = self._simulation.transfer_matrix(points)
         self.runs += result.runs
+        self._transducers_ran |= bool(result.runs) and not result.from_points
         if cache is not None and all(run.reached for run in result.runs):
             cache.save(key, result.matrix.numpy(), result.error)
         return result
@@ -232,7 +230,7 @@ class SimulatedPropagator:
         own, others = self._result(points), [other._result(points) for other in self._others]
         whole = self._grid_errors(own.matrix.reshape(1, -1), [one.matrix.reshape(1, -1) for one in others])
         runs = own.runs + tuple(run for one in others for run in one.runs)
-        return TransferMatrix(own.matrix, own.error + float(whole), runs)
+        return replace(own, error=own.error + float(whole), runs=runs)
 
     @one_library_thread()
     def known_error(self) -> float:
@@ -252,17 +250,17 @@ class SimulatedPropagator:
         runs, self._reported = self.runs[self._reported :], len(self.runs)
         return runs
 
-    def _report(self, points: torch.Tensor | None) -> None:
+    def _report(self) -> None:
         """Warn of new runs that did not converge; log once if a source is next to an obstacle.
 
-        Without `points`, all transducers were sources. Coarse grids on the way to a tolerance do not matter.
+        Coarse grids on the way to a tolerance do not matter.
         """
-        simulation, runs = self._simulation, self._unreported()
+        runs = self._unreported()
         if not self._given and "_others" in vars(self):
             runs += [run for other in self._others for run in other._unreported()]
-        if runs and not self._near_logged and (points is None or not simulation.orbits(points).from_points):
+        if self._transducers_ran and not self._near_logged:
             self._near_logged = True
-            if any(map(simulation.near_obstacle, self.scene.array.nodes.positions)):
+            if any(map(self._simulation.near_obstacle, self.scene.array.nodes.positions)):
                 logger.warning(
                     "a source is within %.2g mm of an obstacle: less accurate; use a finer spacing than %.2g"
                     " mm", 1e3 * self._plan.source_clearance, 1e3 * self.spacing,

@@ -6,6 +6,7 @@ import logging
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,7 +25,7 @@ from autdtorch.propagators.symmetry import (
 )
 from autdtorch.scene.arrays import apertures_of
 from autdtorch.utils.apertures import Apertures
-from autdtorch.utils.progress import show_progress
+from autdtorch.utils.progress import Progress, show_progress
 from autdtorch.utils.validation import ArrayLike, points_tensor
 
 logger = logging.getLogger(__name__)
@@ -63,11 +64,13 @@ class TransferMatrix:
         matrix: complex128 (P, M) [Pa].
         error: estimated relative error; from a single grid the distance to the steady state alone.
         runs: the simulations it took; none if it was loaded.
+        from_points: whether they began at the points (reciprocity), not at the transducers.
     """
 
     matrix: torch.Tensor
     error: float
     runs: tuple[Run, ...]
+    from_points: bool
 
 
 class Simulation(ABC):
@@ -134,7 +137,18 @@ class Simulation(ABC):
         alone = [sources.chosen(slice(own, own + 1)) for own in orbits.representatives]
         found, runs = self.run(alone, strength, receivers)
         rows, remaining = orbits.expand(found), max(run.remaining for run in runs)
-        return TransferMatrix(rows if orbits.from_points else rows.mT.contiguous(), remaining, tuple(runs))
+        matrix = rows if orbits.from_points else rows.mT.contiguous()
+        return TransferMatrix(matrix, remaining, tuple(runs), orbits.from_points)
+
+    def matrix_runs(self, points: torch.Tensor) -> int:
+        """Return the number of runs that the transfer matrix of points (P, 3) takes."""
+        return self.orbits(points).runs
+
+    def fields(self, drive: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, list[Run]]:
+        """Return the pressure (R, P) [Pa] of drives (R, M), none of them silent, and the runs it took."""
+        array = self.plan.scene.array
+        sources, strength = [apertures_of(array)] * len(drive), array.source_strength * drive
+        return self.run(sources, strength, Apertures.of_points(points))
 
     def run(
         self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures
@@ -143,11 +157,14 @@ class Simulation(ABC):
 
         The strengths (R, N) [Pa m] of a run are not all zero; receivers take the mean over their nodes.
         """
+        with self._progress(len(sources)) as progress:
+            return self._simulate(sources, strength, receivers, progress.advance)
+
+    def _progress(self, runs: int) -> AbstractContextManager[Progress]:
+        """Log so many runs, and show their progress."""
         plan, grids = self.plan, [assembly.grid for assembly in self.assemblies]
         what = f"simulating {plan.scene.name}"
-        count = "1 run" if len(sources) == 1 else f"{len(sources)} runs"
+        count = "1 run" if runs == 1 else f"{runs} runs"
         logger.info("%s: %s, cells of %.3g mm, %s", what, plan.method, 1e3 * plan.spacing, count)
         arrival = max(grid.arrival for grid in grids)
-        periods = math.ceil(len(sources) * USUAL_PERIODS * fewest_periods(arrival))
-        with show_progress(periods, what) as progress:
-            return self._simulate(sources, strength, receivers, progress.advance)
+        return show_progress(math.ceil(runs * USUAL_PERIODS * fewest_periods(arrival)), what)

@@ -89,6 +89,11 @@ def orbits_of_transducers(points: torch.Tensor, symmetries: Sequence[Symmetry]) 
     return Orbits(False, *_representatives(np.stack(transducers)), np.stack(images))
 
 
+def orbits_of_array(symmetries: Sequence[Symmetry]) -> tuple[Index, Index]:
+    """Return the representative (M,) of each transducer, and the symmetry (M,) that maps it there."""
+    return _representatives(np.stack([symmetry.transducers for symmetry in symmetries]))
+
+
 def _representatives(images: Index) -> tuple[Index, Index]:
     """First image (n,) of each source and the symmetry (n,) that maps to it, from all images (S, n)."""
     known = np.where(images == _NONE, images.shape[1], images)

@@ -156,7 +156,7 @@ def _read_goal(attributes: Any) -> tuple[dict[str, Any], str]:
 def _read_simulation(group: Any) -> Simulation:
     attributes, runs = group.attrs, _entry(group, "runs")
     columns = [_array(runs, key).tolist() for key in _RUN]
-    require_one_of("method", attributes["method"], ("free_space", "box", "full"))
+    require_one_of("method", attributes["method"], ("free_space", "box", "full", "operator"))
     return Simulation(
         attributes["method"],
         positive("wavelength", attributes["wavelength"], "m"),

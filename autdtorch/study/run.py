@@ -22,7 +22,7 @@ from autdtorch.objectives.metrics import focus_metrics
 from autdtorch.objectives.objective import Objective
 from autdtorch.objectives.quiet import QuietPoints
 from autdtorch.objectives.simulated import SimulatedObjective
-from autdtorch.propagators import Propagator, SimulatedPropagator, make_propagator
+from autdtorch.propagators import OperatorPropagator, Propagator, SimulatedPropagator, make_propagator
 from autdtorch.scene.scene import Scene
 from autdtorch.study.folder import open_folder
 from autdtorch.study.provenance import provenance_now
@@ -228,7 +228,7 @@ def _run_scene(
         shown_plane = None if pressure is None else pressure[shown].clone()
         results[method_name] = MethodResult(solution, metrics, seconds, shown, shown_plane)
     simulation = Simulation("free_space", scene.wavelength, None, None, (), matrix_seconds, plane_seconds)
-    if isinstance(propagator, SimulatedPropagator):
+    if isinstance(propagator, SimulatedPropagator | OperatorPropagator):
         grid = {"spacing": propagator.spacing, "tolerance": propagator.tolerance}
         simulation = replace(simulation, method=propagator.method, **grid, runs=tuple(propagator.runs))
     known = transfer_matrix, float(goal.bound(transfer_matrix)), simulation, results

@@ -259,18 +259,23 @@ def magnitude_tensor(name: str, value: object, unit: str = "") -> torch.Tensor:
 
 def points_tensor(name: str, value: object) -> torch.Tensor:
     """Return a float64 copy of `value`, points (P, 3) [m], P >= 1, on its device and without gradient."""
+    return differentiable_points(name, value).detach().clone()
+
+
+def differentiable_points(name: str, value: object) -> torch.Tensor:
+    """Return points (P, 3) [m], P >= 1, as float64; a tensor keeps its device and its gradient."""
     points = real_tensor(name, value, "m")
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise ValueError(f"{name}: shape {tuple(points.shape)}; must be (P, 3) with P >= 1")
-    return points.detach().clone()
+    return points
 
 
 def points_grid(name: str, value: object) -> tuple[torch.Tensor, torch.Size]:
-    """Return points on a grid (..., 3) [m] as `points_tensor` does, and the shape (...) of the grid."""
+    """Return points on a grid (..., 3) [m] as (P, 3) with their gradient, and the grid's shape (...)."""
     points = real_tensor(name, value, "m")
     if points.ndim < 2 or points.shape[-1] != 3 or points.numel() == 0:
         raise ValueError(f"{name}: shape {tuple(points.shape)}; must be (P, 3) or (..., P, 3) with P >= 1")
-    return points_tensor(name, points.reshape(-1, 3)), points.shape[:-1]
+    return points.reshape(-1, 3), points.shape[:-1]
 
 
 def _in_unit(unit: str) -> str:

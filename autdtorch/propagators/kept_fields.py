@@ -1,0 +1,173 @@
+"""A simulation in boxes that keeps outgoing fields, so that new points and planes take sums, not runs.
+
+Outside the boxes a field is that of the Huygens surfaces. Their amplitudes are kept for the last drives and,
+once that has paid, for all transducers. Fewer runs from points are taken for a few points (reciprocity);
+after as many of them as the transducers would have taken, the transducers are simulated: at most twice the
+fewest runs, however many points follow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from scipy.spatial import KDTree
+
+from autdtorch.fdtd.scattered_field import ScatteredField
+from autdtorch.propagators.box import BoxSimulation, Solved
+from autdtorch.propagators.plan import Plan
+from autdtorch.propagators.simulation import Run, TransferMatrix
+from autdtorch.propagators.symmetry import Symmetry, orbits_of_array
+from autdtorch.scene.arrays import apertures_of
+from autdtorch.utils.apertures import Apertures
+from autdtorch.utils.array_types import Index
+
+_MOST_BYTES = 1e9  # of the amplitudes of all transducers
+_DRIVES = 16  # Drives whose fields are kept
+_ENTRY_BYTES = 16  # of complex128
+
+
+@dataclass(frozen=True)
+class KeptFields:
+    """Amplitudes (n, K) [Pa m] of the Huygens surface of each box under K drives, and the runs they took."""
+
+    boxes: Sequence[ScatteredField]
+    amplitudes: Sequence[torch.Tensor]
+    runs: tuple[Run, ...]
+
+    def scattered(self, receivers: Apertures, weights: torch.Tensor) -> torch.Tensor:
+        """Return the scattered field (R, P) at receivers outside the boxes, of sums with weights (R, K)."""
+        parts = zip(self.boxes, self.amplitudes, strict=True)
+        fields = [box.near_to_far(receivers).radiated(own @ weights.mT) for box, own in parts]
+        return torch.stack(fields).sum(dim=0).mT
+
+
+class KeepingSimulation(BoxSimulation):
+    """FDTD of the scattered field in boxes, whose outgoing fields are kept."""
+
+    def __init__(self, plan: Plan) -> None:
+        """Make the simulation of a plan; nothing is computed yet."""
+        super().__init__(plan)
+        self._transducers: KeptFields | None = None
+        self._drives: dict[bytes, KeptFields] = {}
+        self._runs_from_points, self._apart = 0, True
+
+    def matrix_runs(self, points: torch.Tensor) -> int:
+        """Return the number of runs that the transfer matrix of points (P, 3) takes."""
+        if not self._keeps(points) or self._begins_at(points):
+            return super().matrix_runs(points)
+        return self._fewest if self._transducers is None else 0
+
+    def transfer_matrix(self, points: torch.Tensor) -> TransferMatrix:
+        """Simulate the transfer matrix of points (P, 3), or sum the kept fields of the transducers."""
+        if self._keeps(points) and self._begins_at(points):
+            found = super().transfer_matrix(points)
+            self._runs_from_points += len(found.runs)
+            return found
+        new = self._keep_transducers(points) if self._keeps(points) else []
+        if self._transducers is None or not self._keeps(points):
+            return super().transfer_matrix(points)
+        unit = torch.eye(len(self.plan.scene.array), dtype=torch.complex128, device="cpu")
+        field = self._sum(self._transducers, unit, unit, points)
+        remaining = max(run.remaining for run in self._transducers.runs)
+        return TransferMatrix(field.mT.contiguous(), remaining, tuple(new), from_points=False)
+
+    def fields(self, drive: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, list[Run]]:
+        """Return the pressure (R, P) [Pa] of drives (R, M), none of them silent, and the runs it took."""
+        if not self._keeps(points):
+            return super().fields(drive, points)
+        if self._transducers is not None:
+            return self._sum(self._transducers, drive, drive, points), []
+        keys = [row.numpy().tobytes() for row in drive]
+        known = [row for row, key in enumerate(keys) if key in self._drives]
+        new = [row for row, key in enumerate(keys) if key not in self._drives]
+        field = torch.zeros((len(drive), len(points)), dtype=torch.complex128, device="cpu")
+        unit = torch.ones((1, 1), dtype=torch.complex128, device="cpu")
+        for row in known:
+            field[row] = self._sum(self._drives[keys[row]], unit, drive[row, None], points)[0]
+        if not new:
+            return field, []
+        array, receivers = self.plan.scene.array, Apertures.of_points(points)
+        sources, strength = [apertures_of(array)] * len(new), array.source_strength * drive[new]
+        solved = self._stepped(sources, strength, receivers)
+        field[new] = self.total(solved, receivers)
+        if self._apart:
+            each = (
+                KeptFields(solved.boxes, [own[:, place, None] for own in solved.amplitudes], (run,))
+                for place, run in enumerate(solved.runs)
+            )
+            self._drives |= dict(zip([keys[row] for row in new], each, strict=True))
+            self._drives = dict(list(self._drives.items())[-_DRIVES:])
+        return field, solved.runs
+
+    def _keeps(self, points: torch.Tensor) -> bool:
+        """Return whether kept fields can be summed at points (P, 3)."""
+        return self._apart and self._is_fit and not any(box.inside(points).any() for box in self.boxes)
+
+    @cached_property
+    def _is_fit(self) -> bool:
+        """Whether fields are worth keeping: they fit into memory, and no source is next to an obstacle.
+
+        Runs that begin at points are more accurate there.
+        """
+        size = _ENTRY_BYTES * len(self.plan.scene.array) * sum(len(box.surface[0]) for box in self.boxes)
+        nodes = self.plan.scene.array.nodes.positions.reshape(-1, 3)
+        return size <= _MOST_BYTES and not self.near_obstacle(nodes)
+
+    def _begins_at(self, points: torch.Tensor) -> bool:
+        """Return whether the matrix of points (P, 3) is simulated from these."""
+        orbits = self.orbits(points)
+        few = self._runs_from_points + orbits.runs <= self._fewest
+        return self._transducers is None and orbits.from_points and few
+
+    @property
+    def _fewest(self) -> int:
+        """Runs that the fields of all transducers take."""
+        return len(np.unique(orbits_of_array(self.symmetries)[0]))
+
+    def _keep_transducers(self, points: torch.Tensor) -> list[Run]:
+        """Simulate the fields of all transducers, judged at points (P, 3); return the runs it took.
+
+        Under a symmetry that maps a transducer to its representative, cells of the surface map to cells.
+        """
+        if self._transducers is not None:
+            return []
+        representative, symmetry = orbits_of_array(self.symmetries)
+        first, place = np.unique(representative, return_inverse=True)
+        array = self.plan.scene.array
+        alone = [apertures_of(array).chosen(slice(own, own + 1)) for own in first]
+        strength = torch.full((len(alone), 1), array.source_strength, dtype=torch.complex128, device="cpu")
+        solved = self._stepped(alone, strength, Apertures.of_points(points))
+        if self._apart:
+            amplitudes = []
+            for box, own in zip(solved.boxes, solved.amplitudes, strict=True):
+                images = np.stack([_images(box, each) for each in self.symmetries])
+                amplitudes.append(own[torch.from_numpy(images[symmetry].T), torch.from_numpy(place)])
+            self._transducers = KeptFields(solved.boxes, amplitudes, tuple(solved.runs))
+        return solved.runs
+
+    def _stepped(self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures) -> Solved:
+        """Simulate runs, and note whether the boxes were simulated apart, not in one."""
+        with self._progress(len(sources)) as progress:
+            solved = self.solved(sources, strength, receivers, progress.advance)
+        self._apart = solved.boxes is self.boxes
+        return solved
+
+    def _sum(
+        self, kept: KeptFields, weights: torch.Tensor, drive: torch.Tensor, points: torch.Tensor
+    ) -> torch.Tensor:
+        """Return the pressure (R, P) of drives (R, M), which have the weights (R, K) among kept fields."""
+        array, receivers = self.plan.scene.array, Apertures.of_points(points)
+        sources, strength = [apertures_of(array)] * len(drive), array.source_strength * drive
+        return self.incident(sources, strength, receivers).mT + kept.scattered(receivers, weights)
+
+
+def _images(box: ScatteredField, symmetry: Symmetry) -> Index:
+    """Return for each cell of the Huygens surface the place of its image among them."""
+    places = box.surface[0].numpy() - symmetry.center
+    if (symmetry.matrix == np.eye(3)).all():
+        return np.arange(len(places))
+    return np.asarray(KDTree(places).query(places @ symmetry.matrix.T)[1], np.int64)

@@ -1,0 +1,169 @@
+"""The propagator of scattering operators: each body of a scene is simulated once, wherever it is."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Literal, overload
+
+import torch
+
+from autdtorch.fdtd.grid import grid_errors
+from autdtorch.propagators.bodies import ScatteringBodies
+from autdtorch.propagators.body_matrix import Placed, Solver, placed
+from autdtorch.propagators.cache import DiskCache
+from autdtorch.propagators.operator import ScatteringOperator
+from autdtorch.propagators.plan import Plan
+from autdtorch.propagators.scene_bodies import Body, are_outside, bodies_of
+from autdtorch.propagators.simulated import SimulatedPropagator
+from autdtorch.propagators.simulation import Run
+from autdtorch.scene.drive import validate_drive
+from autdtorch.scene.scene import require_clear
+from autdtorch.utils.validation import ArrayLike, boolean, differentiable_points, points_grid
+
+logger = logging.getLogger(__name__)
+
+_AT_ONCE = 4096  # Points whose waves are computed at once: 50 MB for the paper's cubes
+_FEWER = 2  # Degrees left out to see how waves converge; even, as parities may alternate
+_SLOWEST = 0.9  # Ratio of successive pairs of degrees up to which a sum is extrapolated
+_ERRORS = 1e-8, 0.1  # Range of the error at which degrees are left out
+_TINY = torch.finfo(torch.float64).tiny
+
+
+class OperatorPropagator:
+    """A propagator by the scattering operators of a scene's bodies, simulated once or in closed form.
+
+    Obstacles whose circumscribed spheres overlap make one body. Points inside a sphere, or so near that the
+    waves have not converged to the tolerance, are served by a propagator of method "box", which is logged.
+
+    Attributes:
+        scene: the scene it was made for.
+        method: "operator".
+        spacing: edge of a cell [m].
+        tolerance: relative error at which waves are left out, and at which runs end.
+    """
+
+    def __init__(self, plan: Plan, cache: DiskCache | None = None) -> None:
+        """Use `make_propagator`, which checks its arguments. Nothing is computed here."""
+        self.scene, self.method, self.spacing = plan.scene, plan.method, plan.spacing
+        self.tolerance = plan.tolerance
+        self._plan, self._cache = plan, cache
+        self._logged = False
+
+    def __repr__(self) -> str:
+        """Scene, settings and number of bodies."""
+        settings = f"operator, spacing {1e3 * self.spacing:.4g} mm, tolerance {self.tolerance:g}"
+        return f"OperatorPropagator(scene {self.scene.name!r}, {settings})"
+
+    @property
+    def runs(self) -> list[Run]:
+        """The simulations of points that are served by the box; those of the bodies are not counted."""
+        return self._box.runs
+
+    @property
+    def time_step(self) -> float:
+        """The time step of the box [s]."""
+        return self._box.time_step
+
+    @cached_property
+    def bodies(self) -> ScatteringBodies:
+        """The bodies of the scene."""
+        return ScatteringBodies(ScatteringOperator(*body.matrix(self._cache)) for body in self._placed)
+
+    @property
+    def planned_runs(self) -> int:
+        """Number of simulations of all operators, if none is there."""
+        return sum(body.runs for body in self._placed)
+
+    @property
+    def _placed(self) -> list[Placed]:
+        plan, scene = self._plan, self.scene
+        error = min(max(plan.tolerance, _ERRORS[0]), _ERRORS[1])
+        solver = Solver(plan.spacing, error, plan.kernel, plan.dtype, plan.max_periods, plan.time_step)
+        groups = [[scene.obstacles[index] for index in body.obstacles] for body in self._spheres]
+        return [placed(group, scene.medium, scene.frequency, solver) for group in groups]
+
+    @cached_property
+    def _spheres(self) -> list[Body]:
+        return bodies_of(self.scene.obstacles)
+
+    @overload
+    def transfer_matrix(
+        self, points: ArrayLike | None = None, return_error: Literal[False] = False
+    ) -> torch.Tensor: ...
+    @overload
+    def transfer_matrix(
+        self, points: ArrayLike | None = None, *, return_error: Literal[True]
+    ) -> tuple[torch.Tensor, float]: ...
+    def transfer_matrix(
+        self, points: ArrayLike | None = None, return_error: bool = False
+    ) -> torch.Tensor | tuple[torch.Tensor, float]:
+        """Return the transfer matrix G; see `SimulatedPropagator.transfer_matrix`.
+
+        Differentiable by the points that are not served by the box. The error is that of the grid, from
+        operators on a second one, with the tolerance; in closed form it is the tolerance.
+        """
+        with_error = boolean("return_error", return_error)
+        places = differentiable_points("points", self.scene.control_points if points is None else points)
+        matrix = self._matrix(places.cpu())
+        return (matrix, self._error(matrix, places.detach().cpu())) if with_error else matrix
+
+    def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
+        """Return the pressure of drives at points; see `SimulatedPropagator.field`."""
+        drive = validate_drive(drive, len(self.scene.array))
+        places, grid = points_grid("points", points)
+        parts = [drive @ self._matrix(part).mT for part in torch.split(places.cpu(), _AT_ONCE)]
+        return torch.cat(parts, dim=-1).reshape(*drive.shape[:-1], *grid)
+
+    @cached_property
+    def _box(self) -> SimulatedPropagator:
+        return SimulatedPropagator(self._plan.by_box, self._cache)
+
+    def _matrix(self, points: torch.Tensor) -> torch.Tensor:
+        """Return G (P, M) at points (P, 3), those near a body by the box."""
+        require_clear(self.scene.array, "points", points.detach())
+        return torch.cat([self._part(part) for part in torch.split(points, _AT_ONCE)])
+
+    def _part(self, points: torch.Tensor) -> torch.Tensor:
+        served = are_outside(points.detach(), self._spheres)
+        matrix = torch.zeros((len(points), len(self.scene.array)), dtype=torch.complex128, device="cpu")
+        if served.any():
+            found = self.bodies.transfer_matrix(self.scene.array, points[served])
+            matrix = matrix.index_put((served,), found)
+            served = served.index_put((served.clone(),), self._have_converged(found, points[served]))
+        if not served.all():
+            if not self._logged:
+                self._logged = True
+                logger.info("%d points are too near an obstacle for its waves: by box", int((~served).sum()))
+            matrix = matrix.index_put((~served,), self._box.transfer_matrix(points[~served]))
+        return matrix
+
+    @torch.no_grad()
+    def _have_converged(self, matrix: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+        """Return for which rows of G (P, M) the waves left out are below the tolerance.
+
+        What they add is extrapolated from the last two pairs of degrees.
+        """
+        fewer = [matrix]
+        for left_out in (_FEWER, 2 * _FEWER):
+            counts = [(max(0, body.degree - left_out) + 1) ** 2 for body in self.bodies.operators]
+            some = zip(self.bodies.operators, counts, strict=True)
+            bodies = ScatteringBodies(
+                replace(body, matrix=body.matrix[:count, :count]) for body, count in some
+            )
+            fewer.append(bodies.transfer_matrix(self.scene.array, points))
+        last, before = ((one - other).norm(dim=1) for one, other in pairwise(fewer))
+        ratio = (last / before.clamp_min(_TINY)).clamp_max(_SLOWEST)
+        converged: torch.Tensor = last * ratio / (1 - ratio) <= self.tolerance * matrix.norm(dim=1)
+        return converged
+
+    def _error(self, matrix: torch.Tensor, points: torch.Tensor) -> float:
+        """Return the error of G (P, M) by operators on a second grid."""
+        if self._plan.runs == 0:
+            return self.tolerance
+        second = OperatorPropagator(self._plan.second, self._cache)
+        other, ratio = second.transfer_matrix(points), second.spacing / self.spacing
+        first, other = matrix.detach().reshape(1, -1), other.reshape(1, -1)
+        return float(grid_errors(first, other, ratio, self._plan.order)) + self.tolerance

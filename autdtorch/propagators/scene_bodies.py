@@ -1,0 +1,83 @@
+"""The bodies of a scene: groups of obstacles whose circumscribed spheres do not overlap."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import torch
+
+from autdtorch.analytic.spherical_waves import enough_degrees
+from autdtorch.scene.medium import Medium
+from autdtorch.scene.obstacles import Obstacle, Sphere
+from autdtorch.scene.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """Obstacles that scatter as one body.
+
+    Attributes:
+        obstacles: ascending indices of the scene's obstacles.
+        center: of the circumscribed sphere (3,) [m].
+        radius: of this sphere [m].
+    """
+
+    obstacles: tuple[int, ...]
+    center: torch.Tensor
+    radius: float
+
+
+def bodies_of(obstacles: Sequence[Obstacle]) -> list[Body]:
+    """Return the bodies of obstacles: those whose spheres overlap are joined, until none do."""
+    bodies = [_body(obstacles, (index,)) for index in range(len(obstacles))]
+    while pair := next((pair for pair in combinations(bodies, 2) if _overlap(*pair)), None):
+        joined = sorted(pair[0].obstacles + pair[1].obstacles)
+        bodies = [body for body in bodies if body not in pair] + [_body(obstacles, tuple(joined))]
+    return sorted(bodies, key=lambda body: body.obstacles)
+
+
+def has_closed_form(obstacles: Sequence[Obstacle], medium: Medium) -> bool:
+    """Return whether the scattering of a body is known: that of a sphere in a medium without losses."""
+    return len(obstacles) == 1 and type(obstacles[0]) is Sphere and medium.absorption == 0
+
+
+def waves_to_simulate(scene: Scene, bodies: Sequence[Body], error: float) -> int:
+    """Return the number of waves, up to a relative error, of the bodies that have no closed form."""
+    simulated = [
+        body
+        for body in bodies
+        if not has_closed_form([scene.obstacles[index] for index in body.obstacles], scene.medium)
+    ]
+    return sum((enough_degrees(scene.wavenumber * body.radius, error) + 1) ** 2 for body in simulated)
+
+
+def are_outside(points: torch.Tensor, bodies: Sequence[Body]) -> torch.Tensor:
+    """Return which points (P, 3) [m] are outside the spheres of all bodies."""
+    apart = torch.stack([(points - body.center).norm(dim=1) - body.radius for body in bodies])
+    return (apart > 0).all(dim=0)
+
+
+def circumscribed(obstacles: Sequence[Obstacle]) -> tuple[torch.Tensor, float]:
+    """Return centre (3,) and radius [m] of a sphere around all obstacles."""
+    lower, upper = (
+        torch.tensor([getattr(body, side) for body in obstacles], dtype=torch.float64, device="cpu")
+        for side in ("lower", "upper")
+    )
+    center = (lower.amin(dim=0) + upper.amax(dim=0)) / 2
+    reach = [
+        float((center - center.new_tensor(body.center)).norm()) + body.radius
+        if isinstance(body, Sphere)
+        else float((body.surface()[0] - center).norm(dim=1).max())
+        for body in obstacles
+    ]
+    return center, max(reach)
+
+
+def _body(obstacles: Sequence[Obstacle], chosen: tuple[int, ...]) -> Body:
+    return Body(chosen, *circumscribed([obstacles[index] for index in chosen]))
+
+
+def _overlap(one: Body, other: Body) -> bool:
+    return float((one.center - other.center).norm()) < one.radius + other.radius
