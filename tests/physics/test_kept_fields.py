@@ -71,7 +71,7 @@ def test_coupled_boxes_keep_their_fields():
     array = TransducerArray.grid((1, 2), pitch=8e-3, center=(1e-3, 35e-3, 35e-3))
     near = torch.tensor([13.8e-3, 15.2e-3, 15.2e-3], dtype=torch.float64)
     spheres = [Sphere(tuple(near + apart), 4e-3, rigid=True) for apart in (0.0, 45e-3)]
-    scene = Scene(array, AIR, 40e3, [[61e-3, 52e-3, 55e-3], [63e-3, 50e-3, 55e-3]], spheres)
+    scene = Scene(array, AIR, 40e3, [[61e-3, 32e-3, 35e-3], [63e-3, 30e-3, 35e-3]], spheres)
 
     def apart():
         return make_propagator(scene, "box", 1.4e-3, tolerance=1e-3, cache=False)
