@@ -30,7 +30,7 @@ from .objectives.simulated import SimulatedObjective
 from .plot.costs import plot_pareto, plot_scaling
 from .plot.pressure_maps import plot_plane, plot_planes
 from .plot.scene_figure import plot_scene
-from .plot.trials import plot_convergence, plot_trials
+from .plot.trials import plot_convergence, plot_poses, plot_trials
 from .plot.view3d import animate3d, view3d
 from .propagators import SteadyStateWarning, cell_centers, differentiable_field, make_propagator, volume_field
 from .propagators.bodies import ScatteringBodies
@@ -126,6 +126,7 @@ __all__ = [
     "plot_pareto",
     "plot_plane",
     "plot_planes",
+    "plot_poses",
     "plot_scaling",
     "plot_scene",
     "plot_trials",

@@ -33,6 +33,7 @@ _SETTINGS = (
     "trials",
     "seed",
     "plane_spacing",
+    "poses",
 )
 _PLACES = ("modules", "output")  # settings that change no result
 _NOT_OF_METHODS = ("objective", "trials", "seed", "score")  # the study's to give

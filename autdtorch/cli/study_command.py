@@ -11,9 +11,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
+from autdtorch.cli.poses import Poses, along_path
 from autdtorch.cli.settings import folder_of, is_given, load_method, scene_of, section_of, solver_of
 from autdtorch.io.goal_section import load_goal
 from autdtorch.propagators import CACHE_VARIABLE
@@ -41,6 +43,7 @@ def study(settings: dict[str, Any], modules: list[Any], output: Any, sweep: Path
         # A study that goes on needs them again, and jobs in one scene share them.
         solver["cache"] = (sweep or folder) / "matrices"
     settings["solver"] = {key: value for key, value in solver.items() if key != "cache"}  # changes no result
+    poses = None if settings.get("poses") is None else along_path(settings)
     scenes, methods = _parts(settings, modules)
     goal = load_goal("goal", settings.get("goal"))
     results = run_study(
@@ -51,9 +54,13 @@ def study(settings: dict[str, Any], modules: list[Any], output: Any, sweep: Path
         folder=folder,
         goal=goal,
         config=_as_text(settings, scenes),
+        poses=poses is not None,
     )
     shown = Path(os.path.relpath(folder))  # shorter, and equal on every machine
-    if "scenes" not in settings:
+    if poses is not None:
+        _draw_poses(results, poses, folder)
+        _print_table(results, f"The results are in {shown}")
+    elif "scenes" not in settings:
         _draw_plane(results, scenes, folder)
         _print_table(results, f"The results are in {shown}")
     else:
@@ -127,6 +134,19 @@ def _draw_plane(results: StudyResult, scenes: Mapping[str, Scene], folder: Path)
     if method.plane_pressure is not None and scene.observation_plane is not None:
         seen = scene.observation_plane, scene.control_points, scene.obstacles
         plot_plane(method.plane_pressure, *seen).savefig(folder / "plane.png")
+
+
+def _draw_poses(results: StudyResult, poses: Poses, folder: Path) -> None:
+    """Draw the scores along the path of the obstacles."""
+    from autdtorch.plot.trials import plot_poses
+
+    found = list(results.scenes.values())
+    scores = {
+        name: torch.stack([scene.methods[name].solution.score for scene in found])
+        for name in found[0].methods
+    }
+    bounds = [scene.bound for scene in found]
+    plot_poses(scores, poses.places, poses.label, found[0].score_label, bounds).savefig(folder / "poses.png")
 
 
 def _print_table(results: StudyResult, end: str) -> None:

@@ -69,7 +69,8 @@ def load_scene(source: str | os.PathLike[str] | Mapping[str, Any], modules: Coll
     """Read a scene from a YAML file, or from a mapping of the same layout such as Hydra's `cfg.scene`.
 
     Control points are a section, or a list of sections whose points follow one another. An obstacle has a
-    `type`, or the `_target_` of a class of the user's own, such as `mymodule.MyObstacle`.
+    `type`, or the `_target_` of a class of the user's own, such as `mymodule.MyObstacle`. The section `pose`,
+    with the keys `offset` and `rotation`, moves all obstacles as one body; see `Scene.moved`.
 
     Args:
         source: path of the file, or the mapping. A value may be an interpolation of another key, `${key}`;
@@ -88,6 +89,7 @@ def load_scene(source: str | os.PathLike[str] | Mapping[str, Any], modules: Coll
     where = "scene mapping" if isinstance(source, Mapping) else str(path_of("source", source))
     trusted = members("modules", modules, str)
     section = _mapping(where, _read(where, source))
+    pose = section.pop("pose", {})
     _check_keys(where, section, Scene)
     air = partial(Medium.air, frequency=section["frequency"])
     folder = Path() if isinstance(source, Mapping) else Path(source).parent
@@ -95,7 +97,7 @@ def load_scene(source: str | os.PathLike[str] | Mapping[str, Any], modules: Coll
         key: _part(f"{where}: {key}", key, value, air, folder, trusted) for key, value in section.items()
     }
     scene: Scene = _build(where, parts, Scene)
-    return scene
+    return _build(f"{where}: pose", _mapping(f"{where}: pose", pose), scene.moved) if pose else scene
 
 
 def _read(where: str, source: str | os.PathLike[str] | Mapping[str, Any]) -> object:

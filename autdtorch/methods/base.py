@@ -17,12 +17,14 @@ from autdtorch.objectives.objective import (
     Objective,
     Score,
     require_objective,
+    validate_drives,
     validate_matrix,
 )
 from autdtorch.objectives.perturbations import quantised, simulated_matrix
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.validation import (
+    complex_tensor,
     integer_at_least,
     integers,
     invalid,
@@ -56,6 +58,8 @@ class Problem:
         scene: geometry, for methods that start from free-space phases (`LSS`, `LSSG`).
         transfer_matrix: simulated G (P, M) [Pa], for `GradientAscent` and as a `Prior` of what is measured.
         quantise: function of drives (..., M) that gives the drives which the device plays.
+        start: drive (M,) that was good before, such as at the last pose of an obstacle, or one for each trial
+            (T, M); `BayesOpt`, `GABS` and `GradientAscent` begin there.
     """
 
     transducers: int
@@ -64,6 +68,7 @@ class Problem:
     scene: Scene | None = None
     transfer_matrix: torch.Tensor | None = None
     quantise: Callable[[torch.Tensor], torch.Tensor] = field(default=lambda drive: drive)
+    start: torch.Tensor | None = None
 
     def __post_init__(self) -> None:
         """Check the fields."""
@@ -79,14 +84,30 @@ class Problem:
         if self.transfer_matrix is not None:
             matrix = validate_matrix("transfer_matrix", self.transfer_matrix, self.foci, self.transducers)
             object.__setattr__(self, "transfer_matrix", matrix)
+        if self.start is not None:
+            start = validate_drives(complex_tensor("start", self.start), self.transducers)
+            if start.ndim > 2:
+                accepted = f"must be ({self.transducers},) or (T, {self.transducers})"
+                raise ValueError(f"start: shape {tuple(start.shape)}; {accepted}")
+            object.__setattr__(self, "start", start)
 
     @classmethod
-    def of(cls, objective: Objective, goal: Score = WEAKEST_FOCUS) -> Problem:
+    def of(
+        cls, objective: Objective, goal: Score = WEAKEST_FOCUS, start: torch.Tensor | None = None
+    ) -> Problem:
         """Return the problem that an objective poses, with the transfer matrix that it has inside, if any."""
         require_objective(objective)
         scene, matrix = objective.scene, simulated_matrix(objective)
         counts = len(scene.array), len(scene.control_points)
-        return cls(*counts, goal, scene, matrix, lambda drive: quantised(objective, drive))
+        return cls(*counts, goal, scene, matrix, lambda drive: quantised(objective, drive), start)
+
+    def starts(self, trials: int) -> torch.Tensor | None:
+        """Return the drive (T, M) that each of some trials begins at, if any."""
+        if self.start is None or self.start.ndim == 1:
+            return None if self.start is None else self.start.expand(trials, -1)
+        if len(self.start) != trials:
+            raise ValueError(f"start: {len(self.start)} drives; must be one for each of {trials} trials")
+        return self.start
 
 
 def known_matrix(problem: Problem) -> torch.Tensor:
@@ -222,6 +243,7 @@ class Method(ABC):
             raise invalid("trials", trials, f"must be 1: {self.label} has no random choices")
         count = len(seeds)
         self.require_fit(problem, count)
+        problem.starts(count)
         step = self.begin(problem, seeds)
         empty = Solution(
             torch.zeros(count, problem.transducers, dtype=torch.complex128, device="cpu"),

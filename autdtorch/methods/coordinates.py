@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import torch
 
 from autdtorch.methods.base import first_of_best
-from autdtorch.scene.drive import drive_from_phases
+from autdtorch.scene.drive import drive_from_phases, phases_of
 from autdtorch.utils.validation import integers, invalid
 
 Search = Mapping[str, torch.Tensor]
@@ -41,6 +41,12 @@ def require_all(order: str | Sequence[int], count: int) -> None:
 def indices_of(order: str | Sequence[int], count: int) -> torch.Tensor:
     """Return the indices (count,) of an order; in ascending order unless it is given by indices."""
     return torch.tensor(range(count) if isinstance(order, str) else order, dtype=torch.int64, device="cpu")
+
+
+def at_levels(drive: torch.Tensor, levels: int) -> torch.Tensor:
+    """Return drives (L, N) with the nearest of the phases, and amplitudes 1 where they are on."""
+    nearest = (phases_of(drive) * levels / (2 * math.pi)).round().to(torch.int64) % levels
+    return torch.where(drive == 0, 0, _phases(levels)[nearest])
 
 
 def begin_ascent(weights: torch.Tensor, order: torch.Tensor) -> Search:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import overload
 
 import torch
 
@@ -16,6 +17,7 @@ from autdtorch.utils.progress import show_progress
 from autdtorch.utils.validation import invalid, path_of, require_callable, require_kind
 
 
+@overload
 def run(
     method: Method,
     objective: Objective,
@@ -25,7 +27,30 @@ def run(
     score: Score = WEAKEST_FOCUS,
     stop: Callable[[State], bool] | None = None,
     state_file: str | Path | None = None,
-) -> Solution:
+    start: torch.Tensor | None = None,
+) -> Solution: ...
+@overload
+def run(
+    method: Method,
+    objective: Sequence[Objective],
+    trials: Trials = 1,
+    seed: int = 0,
+    *,
+    score: Score = WEAKEST_FOCUS,
+    stop: Callable[[State], bool] | None = None,
+    start: torch.Tensor | None = None,
+) -> list[Solution]: ...
+def run(
+    method: Method,
+    objective: Objective | Sequence[Objective],
+    trials: Trials = 1,
+    seed: int = 0,
+    *,
+    score: Score = WEAKEST_FOCUS,
+    stop: Callable[[State], bool] | None = None,
+    state_file: str | Path | None = None,
+    start: torch.Tensor | None = None,
+) -> Solution | list[Solution]:
     """Run a method on an objective: ask, observe and tell until the method is done.
 
     Progress and a forecast are shown when it takes longer than a few seconds. An objective with a log (a
@@ -34,15 +59,18 @@ def run(
 
     Args:
         method: such as ``GABS(levels=16)``.
-        objective: simulated or measured.
+        objective: simulated or measured; or a sequence of objectives, such as the poses of an obstacle, each
+            of which starts at the drives found for the one before.
         trials: number of trials T, >= 1, or their numbers.
         seed: of the random choices, >= 0. A trial's random choices do not depend on the other trials.
         score: function of pressures (..., P) [Pa] that is maximised.
         stop: function of the state that ends the run when it returns True; called after every step.
-        state_file: file that keeps the state after every step. If it exists, the run goes on from it.
+        state_file: file that keeps the state after every step. If it exists, the run goes on from it. Only
+            of one objective.
+        start: drive (M,) that was good before, or one for each trial (T, M); see `Problem`.
 
     Returns:
-        The drive that each trial chose.
+        The drive that each trial chose; of a sequence, a list of these.
 
     Raises:
         ValueError: an argument out of range, pressures or scores that are not finite, or a state file of
@@ -53,8 +81,29 @@ def run(
     require_callable("score", score)
     if stop is not None:
         require_callable("stop", stop)
-    problem = Problem.of(objective, score)
     path = None if state_file is None else path_of("state_file", state_file)
+    if not isinstance(objective, Sequence):
+        return _run(method, objective, trials, seed, score, stop, path, start)
+    if path is not None:
+        raise invalid("state_file", str(path), "must be None for a sequence of objectives")
+    found: list[Solution] = []
+    for pose in objective:
+        start = found[-1].drive if found else start
+        found.append(_run(method, pose, trials, seed, score, stop, None, start))
+    return found
+
+
+def _run(
+    method: Method,
+    objective: Objective,
+    trials: Trials,
+    seed: int,
+    score: Score,
+    stop: Callable[[State], bool] | None,
+    path: Path | None,
+    start: torch.Tensor | None,
+) -> Solution:
+    problem = Problem.of(objective, score, start)
     if path is not None and path.exists():
         state = load_state(path, method, problem)
         if state.seeds != tuple(trial_seeds(seed, trials)):

@@ -25,6 +25,9 @@ class GABS(Method):
     (coordinate ascent). A trial ends early with a pass that changes nothing. Where the last transducers only
     do harm, the best drive observed leaves them off.
 
+    Where the problem has a drive to start from, all its transducers are on from the beginning, with the
+    nearest of the phases, and every pass goes through all M of them.
+
     A trial takes 1 + (M - 1) * levels evaluations: the first transducer alone, whose phase changes no
     magnitude, then `levels` for each of the others. That is 241 for the paper's M = levels = 16; the paper
     counts M * levels = 256. The order "strength" takes M - 1 more, each further pass at most M * levels.
@@ -63,7 +66,8 @@ class GABS(Method):
 
     def most_evaluations(self, problem: Problem) -> int:
         """Return the evaluations of all passes."""
-        return self._alone(problem) + (self.passes * problem.transducers - 1) * self.levels
+        steps = self.passes * problem.transducers - self._skipped(problem)
+        return self._alone(problem) + steps * self.levels
 
     def most_at_once(self, problem: Problem) -> int:
         """Return the number of levels, or of transducers observed alone."""
@@ -79,28 +83,39 @@ class GABS(Method):
         if self.order == "random":
             shuffled = [torch.randperm(count, generator=own, device="cpu") for own in generators_of(seeds)]
             orders = torch.stack(shuffled)
-        search = self._first_on(orders)
+        search = self._begun(problem, orders)
         return Step(search["weights"][:, None], search)
 
     def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
         """Compare the phases of the next transducer."""
-        search, goes_on = state.search or self._first_on(_best_first(score)), None
-        step = (state.best.history.shape[1] - self._alone(state.problem)) // self.levels
-        if step > 0:
-            search, goes_on = coordinates.ascend(search, step, score)
-        if step + 1 == self.passes * state.problem.transducers:
+        problem = state.problem
+        search, goes_on = state.search or self._begun(problem, _best_first(score)), None
+        done = (state.best.history.shape[1] - self._alone(problem)) // self.levels
+        step = done + self._skipped(problem)
+        if done > 0:
+            search, goes_on = coordinates.ascend(search, step - 1, score)
+        if step == self.passes * problem.transducers:
             return Step(state.drives[:, :0], search)
-        return Step(coordinates.candidates(search, self.levels, step + 1), search, goes_on)
+        return Step(coordinates.candidates(search, self.levels, step), search, goes_on)
+
+    def _skipped(self, problem: Problem) -> int:
+        """Return 1 where the first transducer is on alone, whose phase changes nothing."""
+        return 1 if problem.start is None else 0
 
     def _alone(self, problem: Problem) -> int:
         """Return the number of transducers observed alone."""
         return problem.transducers if self.order == "strength" else 1
 
-    def _first_on(self, orders: torch.Tensor) -> coordinates.Search:
-        """Return the state of an ascent in `orders` (T, M), after `first`, with one transducer on."""
+    def _begun(self, problem: Problem, orders: torch.Tensor) -> coordinates.Search:
+        """Return the state of an ascent in `orders` (T, M), after `first`.
+
+        One transducer is on, or those of the drives to start from.
+        """
         if self.first is not None:
             others = orders[orders != self.first].reshape(len(orders), -1)
             orders = torch.cat([orders.new_full((len(orders), 1), self.first), others], dim=1)
+        if (given := problem.starts(len(orders))) is not None:
+            return coordinates.begin_ascent(coordinates.at_levels(given, self.levels), orders)
         alone = torch.eye(orders.shape[1], dtype=torch.complex128, device="cpu")
         return coordinates.begin_ascent(alone[orders[:, 0]], orders)
 

@@ -32,7 +32,8 @@ class GradientAscent(Method):
     """Climb the goal over all drives of amplitudes <= 1, by the transfer matrix of the problem.
 
     A trial climbs from `starts` drives of random phases and observes the highest: one evaluation. With 16
-    transducers that is nearly always the global maximum, to 1e-4; a few hundred need more `steps`.
+    transducers that is nearly always the global maximum, to 1e-4; a few hundred need more `steps`. Where the
+    problem has a drive to start from, it is the first of these.
 
     The matrix is the simulated one. Under perturbations, and on a bench, the drive is the best of the
     simulation, not of what is observed.
@@ -61,6 +62,8 @@ class GradientAscent(Method):
         """Climb, and observe the highest drive."""
         matrix = known_matrix(problem)
         starts = [random_drives(self.starts, problem.transducers, own) for own in generators_of(seeds)]
+        if (given := problem.starts(len(seeds))) is not None:
+            starts = [torch.cat([own[None], drawn[1:]]) for own, drawn in zip(given, starts, strict=True)]
         highest = [climb(problem.goal, matrix, start, self.steps) for start in starts]
         return Step(torch.stack(highest)[:, None], {})
 

@@ -16,7 +16,7 @@ from autdtorch.plot import style
 from autdtorch.plot.data import ByMethod, by_scene, labelled, methods_of
 from autdtorch.plot.style import TICK_SIZE, Look, add_legend, label_of, looks_of, styled
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.validation import finite_number, require_kind
+from autdtorch.utils.validation import ArrayLike, finite_number, magnitude_tensor, real_tensor, require_kind
 
 # The first is broad and pale, so that lines on it stay visible.
 _LEVELS: tuple[dict[str, Any], ...] = (
@@ -75,6 +75,42 @@ def plot_trials(quantities: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
         for method, look in looks.items()
     ]
     add_legend(figure, handles)
+    return figure
+
+
+@styled
+def plot_poses(
+    scores: ByMethod, places: ArrayLike, xlabel: str, ylabel: str, bounds: ArrayLike | None = None
+) -> Figure:
+    """Plot the scores of methods along a path of poses: the median of the trials, and their range.
+
+    Args:
+        scores: by method (poses, trials).
+        places: of the poses along the path (poses,).
+        xlabel: label of the places, with their unit.
+        ylabel: label of the scores, with their unit.
+        bounds: upper bound of the score at each pose (poses,); infinite where none is known.
+
+    Raises:
+        ValueError: no method, or values that are not numbers of these shapes.
+    """
+    (data,) = by_scene("scores", {"path": scores}, "poses", "trials").values()
+    along: Array = real_tensor("places", places).detach().cpu().numpy()
+    figure, looks = style.new_figure(4.6, 3.0), looks_of(data)
+    ax = figure.subplots()
+    for method, values in data.items():
+        if len(values) != len(along):
+            raise ValueError(f"scores[{method!r}]: {len(values)} poses; must be {len(along)}, as places")
+        ax.plot(along, np.median(values, axis=1), color=looks[method].colour, label=label_of(method))
+        ax.fill_between(
+            along, values.min(axis=1), values.max(axis=1), color=looks[method].colour, alpha=0.2, linewidth=0
+        )
+    if bounds is not None and np.isfinite(limits := magnitude_tensor("bounds", bounds).cpu().numpy()).any():
+        ax.plot(along, limits, "k:", label="bound")
+    ax.set(xlabel=xlabel, ylabel=ylabel)
+    ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]))
+    ax.tick_params(labelsize=TICK_SIZE)
+    add_legend(figure, ax.get_legend_handles_labels()[0])
     return figure
 
 

@@ -38,11 +38,14 @@ class KeptFields:
     amplitudes: Sequence[torch.Tensor]
     runs: tuple[Run, ...]
 
-    def scattered(self, receivers: Apertures, weights: torch.Tensor) -> torch.Tensor:
-        """Return the scattered field (R, P) at receivers outside the boxes, of sums with weights (R, K)."""
-        parts = zip(self.boxes, self.amplitudes, strict=True)
-        fields = [box.near_to_far(receivers).radiated(own @ weights.mT) for box, own in parts]
-        return torch.stack(fields).sum(dim=0).mT
+    def scattered(self, receivers: Apertures, weights: torch.Tensor | None) -> torch.Tensor:
+        """Return the scattered field (R, P) at receivers outside the boxes, of sums with weights (R, K).
+
+        Without weights, it is that of each drive.
+        """
+        amplitudes = [own if weights is None else own @ weights.mT for own in self.amplitudes]
+        parts = zip(self.boxes, amplitudes, strict=True)
+        return torch.stack([box.near_to_far(receivers).radiated(own) for box, own in parts]).sum(dim=0).mT
 
 
 class KeepingSimulation(BoxSimulation):
@@ -71,7 +74,7 @@ class KeepingSimulation(BoxSimulation):
         if self._transducers is None or not self._keeps(points):
             return super().transfer_matrix(points)
         unit = torch.eye(len(self.plan.scene.array), dtype=torch.complex128, device="cpu")
-        field = self._sum(self._transducers, unit, unit, points)
+        field = self._sum(self._transducers, None, unit, points)
         remaining = max(run.remaining for run in self._transducers.runs)
         return TransferMatrix(field.mT.contiguous(), remaining, tuple(new), from_points=False)
 
@@ -85,9 +88,8 @@ class KeepingSimulation(BoxSimulation):
         known = [row for row, key in enumerate(keys) if key in self._drives]
         new = [row for row, key in enumerate(keys) if key not in self._drives]
         field = torch.zeros((len(drive), len(points)), dtype=torch.complex128, device="cpu")
-        unit = torch.ones((1, 1), dtype=torch.complex128, device="cpu")
         for row in known:
-            field[row] = self._sum(self._drives[keys[row]], unit, drive[row, None], points)[0]
+            field[row] = self._sum(self._drives[keys[row]], None, drive[row, None], points)[0]
         if not new:
             return field, []
         array, receivers = self.plan.scene.array, Apertures.of_points(points)
@@ -157,9 +159,12 @@ class KeepingSimulation(BoxSimulation):
         return solved
 
     def _sum(
-        self, kept: KeptFields, weights: torch.Tensor, drive: torch.Tensor, points: torch.Tensor
+        self, kept: KeptFields, weights: torch.Tensor | None, drive: torch.Tensor, points: torch.Tensor
     ) -> torch.Tensor:
-        """Return the pressure (R, P) of drives (R, M), which have the weights (R, K) among kept fields."""
+        """Return the pressure (R, P) of drives (R, M), which have the weights (R, K) among kept fields.
+
+        Without weights, they are those that were kept.
+        """
         array, receivers = self.plan.scene.array, Apertures.of_points(points)
         sources, strength = [apertures_of(array)] * len(drive), array.source_strength * drive
         return self.incident(sources, strength, receivers).mT + kept.scattered(receivers, weights)

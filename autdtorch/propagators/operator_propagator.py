@@ -85,6 +85,12 @@ class OperatorPropagator:
         groups = [[scene.obstacles[index] for index in body.obstacles] for body in self._spheres]
         return [placed(group, scene.medium, scene.frequency, solver) for group in groups]
 
+    @property
+    def reaches_control_points(self) -> bool:
+        """Whether all control points and transducers are outside the spheres of the bodies."""
+        nodes = self.scene.array.nodes.positions.reshape(-1, 3)
+        return bool(are_outside(torch.cat([self.scene.control_points, nodes]), self._spheres).all())
+
     @cached_property
     def _spheres(self) -> list[Body]:
         return bodies_of(self.scene.obstacles)

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import attrgetter
 
 import torch
@@ -15,6 +15,7 @@ from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import Coordinates, Plane
 from autdtorch.scene.medium import Medium as Medium
 from autdtorch.scene.obstacles import Mesh, Obstacle
+from autdtorch.scene.obstacles.moving import moved
 from autdtorch.utils.html import html_facts
 from autdtorch.utils.neighbours import nearest, require_distinct
 from autdtorch.utils.validation import (
@@ -129,6 +130,21 @@ class Scene:
         _require_in_domain(self)
         _warn_of_overlaps(self.obstacles)
         _warn_of_units(self)
+
+    def moved(self, offset: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike = (0.0, 0.0, 0.0)) -> Scene:
+        """Return the scene with all obstacles shifted, and turned about their common centre, as one body.
+
+        Args:
+            offset: (3,) [m].
+            rotation: angles (3,) [rad] about the fixed axes x, y, z, in this order.
+
+        Raises:
+            ValueError: an obstacle then holds a transducer or control point, or is of a kind that cannot be
+                moved; a `VoxelMask` cannot be turned.
+        """
+        shift = torch.tensor(finite_vector("offset", offset), dtype=torch.float64, device="cpu")
+        angles = finite_vector("rotation", rotation, "rad")
+        return replace(self, obstacles=moved(self.obstacles, shift, angles))
 
     @property
     def angular_frequency(self) -> float:

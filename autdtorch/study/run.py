@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import logging
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -42,6 +43,8 @@ from autdtorch.utils.validation import (
     within,
 )
 
+logger = logging.getLogger(__name__)
+
 StudyMethod: TypeAlias = Method | Callable[..., Solution]
 """A `Method`, or a function of an objective with its settings bound. A function that has parameters `trials`
 and `seed` is given the numbers of the trials to run, as many as it is to return, and the study's seed. One
@@ -49,6 +52,8 @@ that has a parameter `score` is given the goal."""
 
 BLOCK = Method.block
 """Trials that are run and saved together. The end of the process costs the block in work at most."""
+
+_COUNTED_SPACING = 2e-3  # [m], of the grid on which the runs of poses are counted
 
 _MOST_SAMPLES = 10**6  # of an observation plane: 16 complex columns of them are 256 MB
 
@@ -64,6 +69,7 @@ def run_study(
     plane_spacing: float = 1e-3,
     goal: Goal = WEAKEST_FOCUS,
     config: str = "",
+    poses: bool = False,
 ) -> StudyResult:
     """Run every method in every scene; return the results of all scenes.
 
@@ -82,6 +88,9 @@ def run_study(
         config: all of the above as text. What the folder holds for the same text, made with the same source
             and packages, is taken from there. Without text, or with methods, obstacles or a goal that are not
             autdtorch's own, everything is computed.
+        poses: whether the scenes are poses of the obstacles, in order. Methods start at the drives found in
+            the scene before, and the method "auto" of the solver takes scattering operators where these are
+            fewer simulations in all.
 
     Raises:
         ValueError: an argument out of range, a solver's and a method's included, or another process writes
@@ -114,14 +123,41 @@ def run_study(
     with open_folder(folder, provenance, scenes, reuse=bool(config) and ours) as kept:
         missing = {name: scene for name, scene in scenes.items() if name not in kept.scenes}
         with within("solver"):
-            propagators = {name: make_propagator(scene, **(solver or {})) for name, scene in missing.items()}
+            settings = _for_poses(scenes, solver or {}) if poses else solver or {}
+            propagators = {name: make_propagator(scene, **settings) for name, scene in missing.items()}
         kept.begin()
         with show_progress(len(missing) * (sum(counts.values()) + 2)) as progress:
             for name in missing:
                 place = name, propagators.pop(name), planes[name]
-                finished = _run_scene(*place, methods, counts, seed, goal, kept.trials, progress)
+                before = kept.scenes.get(_before(name, scenes)) if poses else None
+                finished = _run_scene(*place, methods, counts, seed, goal, kept.trials, progress, before)
                 kept.save(name, finished)
         return StudyResult(kept.provenance, {name: kept.scenes[name] for name in scenes})
+
+
+def _before(name: str, scenes: Mapping[str, Scene]) -> str:
+    """Return the name of the scene before, or "" for the first."""
+    names = ["", *scenes]
+    return names[names.index(name) - 1]
+
+
+def _for_poses(scenes: Mapping[str, Scene], solver: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of `make_propagator` for poses of obstacles: by operators where they pay.
+
+    Runs are counted at the first pose.
+    """
+    settings = {"spacing": _COUNTED_SPACING, **{key: solver[key] for key in ("tolerance",) if key in solver}}
+    first = next(iter(scenes.values()))
+    each = make_propagator(first, **settings)
+    if solver.get("method", "auto") != "auto" or not isinstance(each, SimulatedPropagator):
+        return dict(solver)
+    once = make_propagator(first, "operator", **settings)
+    if each.method != "box" or not isinstance(once, OperatorPropagator):
+        return dict(solver)
+    if once.planned_runs > len(scenes) * each.planned_runs or not once.reaches_control_points:
+        return dict(solver)
+    logger.info("scattering operators: %d runs for all poses", once.planned_runs)
+    return {**solver, "method": "operator"}
 
 
 def _counts(methods: Mapping[str, StudyMethod], trials: int | Mapping[str, int], seed: int) -> dict[str, int]:
@@ -180,10 +216,17 @@ def _code_of(method: StudyMethod) -> Any:
     return method.func if isinstance(method, functools.partial) else method
 
 
-def solve(method: StudyMethod, objective: Objective, trials: Trials, seed: int, goal: Goal) -> Solution:
-    """Run trials of a method on an objective."""
+def solve(
+    method: StudyMethod,
+    objective: Objective,
+    trials: Trials,
+    seed: int,
+    goal: Goal,
+    start: torch.Tensor | None = None,
+) -> Solution:
+    """Run trials of a method on an objective, from drives (T, M) where it begins at any."""
     if isinstance(method, Method):
-        return run(method, objective, trials, seed, score=goal)
+        return run(method, objective, trials, seed, score=goal, start=start)
     taken = inspect.signature(method).parameters
     given = {"trials": trials, "seed": seed, "score": goal}
     return method(objective, **{key: value for key, value in given.items() if key in taken})
@@ -199,6 +242,7 @@ def _run_scene(
     goal: Goal,
     trials: TrialFile,
     progress: Progress,
+    before: SceneResult | None,
 ) -> SceneResult:
     scene = propagator.scene
     progress.begin(f"{name}: transfer matrix")
@@ -211,7 +255,14 @@ def _run_scene(
         where = name, method_name, counts[method_name]
         progress.advance(where[2] - len(trials.missing(*where)))
         size = method.block if isinstance(method, Method) else BLOCK
-        solved = functools.partial(solve, method, objective, seed=seed, goal=goal)
+        start = None if before is None else before.methods[method_name].solution.drive
+
+        def solved(
+            trials: range, method: StudyMethod = method, start: torch.Tensor | None = start
+        ) -> Solution:
+            own = None if start is None else start[list(trials)]
+            return solve(method, objective, trials, seed, goal, own)
+
         _run_trials(where, size, solved, trials, progress)
     found = {method_name: trials.found(name, method_name, count) for method_name, count in counts.items()}
     progress.begin(f"{name}: observation plane")

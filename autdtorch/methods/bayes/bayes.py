@@ -57,7 +57,8 @@ class BayesOpt(Method):
 
     The next phases maximise the expected improvement (Eq. 7) by Gaussian processes, BoTorch's `SingleTaskGP`.
     The trials of a block are in the batch shape of one model: another block rounds otherwise, and the search
-    amplifies that, so that numbers repeat for equal blocks only.
+    amplifies that, so that numbers repeat for equal blocks only. Where the problem has a drive to start from,
+    it is the first to be observed.
 
     Attributes:
         evaluations: number of evaluations of a trial, > `initial`; >= 2 with a prior.
@@ -147,6 +148,8 @@ class BayesOpt(Method):
             points = torch.stack([_sobol(self.initial, dimensions, seed) for seed in seeds])
         else:
             points = torch.stack([_uniform(own, self.initial, dimensions) for own in generators])
+        if (given := problem.starts(len(seeds))) is not None:
+            points[:, 0] = self._points(given)
         search = {
             "points": points,
             "values": torch.empty(len(seeds), 0, self._outputs(problem), dtype=torch.float64, device="cpu"),

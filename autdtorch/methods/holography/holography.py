@@ -16,6 +16,7 @@ batch. With t the wanted pressures, x / |x| entry by entry, and * for a product 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal, TypeAlias, cast, get_args
@@ -56,6 +57,7 @@ class Holography(Method):
         algorithm: "naive", "gs", "wgs", "gs_pat" or "diff_pat"; see `holography`.
         iterations: of the algorithm, >= 1; "naive" has none.
         free_amplitudes: whether amplitudes are free in [0, 1]; otherwise all are 1.
+        starts: number of first guesses, >= 1, of which the best drive is taken.
     """
 
     name: ClassVar[str] = "holography"
@@ -65,12 +67,14 @@ class Holography(Method):
     algorithm: Algorithm = "wgs"
     iterations: int = 200
     free_amplitudes: bool = False
+    starts: int = 1
 
     def __post_init__(self) -> None:
         """Check the settings."""
         require_one_of("algorithm", self.algorithm, get_args(Algorithm))
         object.__setattr__(self, "iterations", integer_at_least("iterations", self.iterations, 1))
         object.__setattr__(self, "free_amplitudes", boolean("free_amplitudes", self.free_amplitudes))
+        object.__setattr__(self, "starts", integer_at_least("starts", self.starts, 1))
 
     def begin(self, problem: Problem, seeds: Sequence[int]) -> Step:
         """Compute the drive, and observe it."""
@@ -79,9 +83,11 @@ class Holography(Method):
         if self.algorithm == "diff_pat" and not absolute:
             # as loud as the weakest focus of "wgs" over its weight
             loud = targets > 0
-            start = holography(matrix, targets, "wgs", self.iterations, self.free_amplitudes)
+            settings = self.iterations, self.free_amplitudes, self.starts
+            start = holography(matrix, targets, "wgs", *settings)
             targets = targets * ((matrix @ start).abs()[loud] / targets[loud]).amin()
-        drive = holography(matrix, targets, self.algorithm, self.iterations, self.free_amplitudes)
+        settings = self.iterations, self.free_amplitudes, self.starts
+        drive = holography(matrix, targets, self.algorithm, *settings)
         return Step(drive[None, None], {})
 
 
@@ -91,6 +97,7 @@ def holography(
     algorithm: Algorithm = "wgs",
     iterations: int = 200,
     free_amplitudes: bool = False,
+    starts: int = 1,
 ) -> torch.Tensor:
     """Return drives for wanted pressures, for one transfer matrix or a batch of them.
 
@@ -102,6 +109,9 @@ def holography(
         iterations: >= 1; "naive" has none.
         free_amplitudes: whether amplitudes are free in [0, 1]; otherwise all are 1, and pressures at best in
             proportion to the targets, except of "diff_pat".
+        starts: number of first guesses, >= 1, of which the best drive is returned: that of the highest
+            weakest pressure over its target. The first guess has equal phases, the others have random ones,
+            the same in every call. Iterations end in local maxima, at half of the best for symmetric foci.
 
     Returns:
         Drives (..., M), complex, |q| <= 1, in the precision and on the device of G.
@@ -114,7 +124,11 @@ def holography(
     free = boolean("free_amplitudes", free_amplitudes)
     matrix = _checked_matrix(G)
     wanted = checked_targets(targets, matrix)
-    drive = _solved(matrix, wanted, "wgs" if algorithm == "diff_pat" else algorithm, iterations, free)
+    solver = "wgs" if algorithm == "diff_pat" else algorithm
+    if (starts := integer_at_least("starts", starts, 1)) == 1:
+        drive = _solved(matrix, wanted, solver, iterations, free)
+    else:
+        drive = _best_of(matrix, wanted, solver, iterations, free, starts)
     wanted, drive = wanted[..., None], drive[..., None]
     if free:
         drive = _scaled(matrix, wanted, drive)
@@ -146,6 +160,28 @@ def _solved(
         return drive.reshape(*matrix.shape[:-2], matrix.shape[-1])
     project = _within_largest if free else torch.sgn
     return _SOLVERS[algorithm](matrix, wanted[..., None], iterations, project)[..., 0]
+
+
+def _best_of(
+    matrix: torch.Tensor, wanted: torch.Tensor, algorithm: str, iterations: int, free: bool, starts: int
+) -> torch.Tensor:
+    """Return the best drives (..., M) of several first guesses.
+
+    Iterations that begin at the drive 1 with rows and columns of other phases begin at these phases of the
+    points and transducers.
+    """
+    points, transducers = matrix.shape[-2:]
+    generator, count = torch.Generator("cpu").manual_seed(0), points + transducers
+    turns = torch.rand(starts, count, dtype=torch.float64, generator=generator, device="cpu")
+    turns[0] = 0
+    phases = torch.polar(torch.ones_like(turns), 2 * math.pi * turns).to(matrix)
+    rows, columns = phases[:, :points, None], phases[:, None, points:]
+    guesses = (*matrix.shape[:-2], starts, points)
+    turned = matrix[..., None, :, :] * rows * columns
+    drive = _solved(turned, wanted[..., None, :].expand(guesses), algorithm, iterations, free) * columns[:, 0]
+    pressure = (matrix[..., None, :, :] @ drive[..., None])[..., 0].abs()
+    best = (pressure / wanted[..., None, :]).nan_to_num(math.inf).amin(dim=-1).argmax(dim=-1)
+    return drive.take_along_dim(best[..., None, None], dim=-2)[..., 0, :]
 
 
 def _checked_matrix(G: ArrayLike) -> torch.Tensor:

@@ -23,6 +23,22 @@ _TURNS = {Box: "rotation", Mesh: "rotation", Cylinder: "axis", Sphere: ""}
 # can show. Fewer at rest, after two turns
 _DIGITS, _ANGLE_DIGITS = 14, 12
 _DIGITS_AT_REST, _ANGLE_DIGITS_AT_REST = 12, 10
+_SIDES = "lower", "upper"
+
+
+def moved(obstacles: Sequence[Obstacle], offset: torch.Tensor, rotation: Vector) -> tuple[Obstacle, ...]:
+    """Return obstacles turned about the middle of their bounding box and shifted by an offset (3,) [m].
+
+    Raises:
+        ValueError: an obstacle that cannot be moved or turned.
+    """
+    if fixed := [one for one in obstacles if not is_movable(one)]:
+        raise invalid("obstacles", type(fixed[0]).__name__, "must be of autdtorch's own kinds to be moved")
+    if any(rotation):
+        lower, upper = (offset.new_tensor([getattr(one, side) for one in obstacles]) for side in _SIDES)
+        middle, turn = (lower.amin(dim=0) + upper.amax(dim=0)) / 2, rotation_matrix(rotation)
+        obstacles = [turned(one, turn, middle) for one in obstacles]
+    return tuple(shifted(one, offset) for one in obstacles)
 
 
 def is_movable(obstacle: object) -> bool:
