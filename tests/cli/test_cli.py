@@ -371,3 +371,20 @@ def test_every_bench_has_the_same_keys(bench, sensor, composed):
     assert section["sensor"]["kind"] == sensor
     assert section["emulated"] is (bench == "emulated")
     assert section["limits"] == dataclasses.asdict(Limits(amplitude=1))
+
+
+def test_a_path_of_the_obstacles_is_a_study_of_its_poses(run, tmp_path, refused):
+    coarse = ("scene=two_cubes", "solver.spacing=2.5e-3", "solver.tolerance=0.1", "plane_spacing=0.02")
+    poses = "poses={offset: [0, 4e-3, 0], rotation: [0, 0, 0.1], count: 3}"
+    assert run(*coarse, "method=lssg", poses, "+scene.pose={offset: [0, 1e-3, 0]}", "output=path") == 0
+    results = load_results(tmp_path / "path")
+    assert list(results.scenes) == ["two_cubes_0", "two_cubes_1", "two_cubes_2"]
+    assert (tmp_path / "path" / "poses.png").stat().st_size > 0
+    scene = load_scene(CONFIGS / "scene" / "two_cubes.yaml").moved((0, 5e-3, 0), (0, 0, 0.1))
+    last = make_propagator(scene, spacing=2.5e-3, tolerance=0.1, cache=False).transfer_matrix()
+    # the same simulation, up to rounding in single precision
+    assert float((results.scenes["two_cubes_2"].transfer_matrix - last).norm() / last.norm()) < 1e-3
+    assert run("collect", "path") == 0
+    assert "count: 1; must be an integer >= 2" in refused(*coarse, "poses={count: 1}")
+    assert "unknown key 'ofset'" in refused(*coarse, "poses={ofset: [0, 0, 0]}")
+    assert "beside an experiment" in refused("experiment=paper", "poses={count: 2}")

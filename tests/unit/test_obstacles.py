@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
+from autdtorch.scene.obstacles.moving import at_rest, moved
 
 CENTER, TURN = (0.4, -0.2, 0.1), (0.5, -0.3, 2.0)
 BOX = Box(CENTER, (1.0, 0.6, 0.4), rotation=TURN, rigid=True)
@@ -208,3 +209,39 @@ def test_voxel_mask_is_read_from_numpy_files(tmp_path):
     wanted = VoxelMask(mask, 1e-3, (1.0, 2.0, 3.0), density=100.0, sound_speed=340.0)
     for name in ("mask.npy", "mask.npz"):
         assert VoxelMask.load(tmp_path / name, 1e-3, (1, 2, 3), density=100.0, sound_speed=340.0) == wanted
+
+
+ANGLES = st.tuples(*[st.floats(-3, 3)] * 3)
+
+
+@settings(max_examples=30)
+@given(ANGLES, ANGLES)
+def test_obstacles_move_as_one_body(first, second):
+    """Distances of points that move along stay, and the body at rest does not depend on the pose."""
+    bodies, points = (
+        (BOX, SPHERE, CYLINDER, replace(BOX, center=(1.0, 1.0, 0.0), rotation=(0.1, 0.2, 0.3))),
+        cloud(50),
+    )
+    offset, turn = torch.tensor([0.3, -0.1, 0.2], dtype=torch.float64), rotation_matrix(second)
+    lower, upper = (
+        torch.tensor([getattr(one, side) for one in bodies], dtype=torch.float64)
+        for side in ("lower", "upper")
+    )
+    middle = (lower.amin(dim=0) + upper.amax(dim=0)) / 2
+    found = moved(bodies, offset, second)
+    places = (points - middle) @ turn.T + middle + offset
+    for one, other in zip(bodies, found, strict=True):
+        # places are rounded to 1e-14 m, angles to 1e-12
+        assert torch.allclose(one.signed_distance(points), other.signed_distance(places), rtol=0, atol=1e-9)
+    rests = [at_rest(each)[0] for each in (found, moved(bodies, offset, first))]
+    centers = [torch.tensor([one.center for one in rest], dtype=torch.float64) for rest in rests]
+    apart = [center - center[:1] for center in centers]
+    assert torch.allclose(*apart, rtol=0, atol=1e-9)
+
+
+def test_what_cannot_be_moved_is_named():
+    voxels = VoxelMask(np.ones((2, 2, 2), bool), 1e-3, rigid=True)
+    still = moved((voxels,), torch.ones(3).double(), (0.0, 0.0, 0.0))
+    assert still[0].origin == (1.0, 1.0, 1.0)
+    with pytest.raises(ValueError, match="rotation: 'VoxelMask'; must be"):
+        moved((voxels,), torch.ones(3).double(), (0.1, 0.0, 0.0))

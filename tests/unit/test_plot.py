@@ -21,7 +21,7 @@ from autdtorch.plot.costs import plot_pareto, plot_scaling
 from autdtorch.plot.pressure_maps import plot_plane, plot_planes
 from autdtorch.plot.scene_figure import clipped, plot_scene
 from autdtorch.plot.style import looks_of
-from autdtorch.plot.trials import plot_convergence, plot_trials
+from autdtorch.plot.trials import plot_convergence, plot_poses, plot_trials
 
 PLANE = at.Plane(center=(80e-3, 50e-3, 40e-3), normal=(1, 0, 0), size=(60e-3, 40e-3))
 RANDOM = np.random.default_rng(7)
@@ -170,6 +170,20 @@ def test_convergence_draws_median_and_quartile_band() -> None:
     assert [ax.get_title() for ax in figure.axes] == ["empty", "two cubes"]
     assert first.get_xlabel() == "evaluations"
     assert first.get_ylabel().endswith("[Pa]")
+
+
+def test_poses_draw_the_median_and_the_bound_along_the_path() -> None:
+    scores = {"gabs": 1 + RANDOM.random((7, 5)), "lssg": 1 + RANDOM.random((7, 1))}
+    figure = plot_poses(scores, np.arange(7.0), "path [mm]", "weakest focus [Pa]", np.full(7, 2.0))
+    (ax,) = figure.axes
+    lines = {line.get_label(): line.get_xydata() for line in ax.get_lines()}
+    assert set(lines) == {"GABS", "LSSG", "bound"}
+    np.testing.assert_allclose(lines["GABS"][:, 1], np.median(scores["gabs"], axis=1))
+    assert ax.get_ylim()[0] == 0
+    without = plot_poses(scores, np.arange(7.0), "", "", np.full(7, np.inf))
+    assert len(without.axes[0].get_lines()) == 2
+    with pytest.raises(ValueError, match=r"scores\['gabs'\]: 7 poses; must be 6"):
+        plot_poses(scores, np.arange(6.0), "", "")
 
 
 def test_levels_are_drawn_across_their_scene() -> None:

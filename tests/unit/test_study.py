@@ -19,9 +19,10 @@ from autdtorch.methods.lssg import LSSG, lssg
 from autdtorch.methods.prior import Prior
 from autdtorch.objectives.goals import Goal, MeanPressure, TargetPressures
 from autdtorch.objectives.quiet import Contrast, QuietPoints
-from autdtorch.propagators import FreeSpacePropagator, Run, SteadyStateWarning
+from autdtorch.propagators import FreeSpacePropagator, Run, SteadyStateWarning, make_propagator
 from autdtorch.propagators.full import DomainSimulation
 from autdtorch.scene.geometry import Plane
+from autdtorch.scene.obstacles import Box
 from autdtorch.scene.scene import Scene
 from autdtorch.study.results_file import load_results
 from autdtorch.study.run import run_study
@@ -248,3 +249,34 @@ def test_a_method_returns_the_trials_it_is_asked_for(returned, tmp_path):
 
     with pytest.raises(ValueError, match=rf"method own: {returned} trials; must be the trials \[0, 1\]"):
         run_study({"a": scene(None)}, {"own": method}, tmp_path, solver=FREE_SPACE, trials=2)
+
+
+def test_poses_start_at_the_drives_of_the_scene_before(tmp_path):
+    scenes = {str(step): scene(None, (CUBE,)).moved((0, 1e-3 * step, 0)) for step in range(3)}
+    settings = {"method": "box", "spacing": 2e-3, "tolerance": 0.1}
+    method = GABS(levels=4, order="given")
+    results = run_study(scenes, {"gabs": method}, tmp_path / "poses", solver=settings, poses=True, trials=2)
+    found = [each.methods["gabs"].solution for each in results.scenes.values()]
+    # all transducers are on from the second pose on: one observation, then four phases of each
+    assert [int(solution.evaluations[0]) for solution in found] == [1 + 3 * 4, 1 + 4 * 4, 1 + 4 * 4]
+    for before, after, each in zip(found, found[1:], list(results.scenes.values())[1:], strict=False):
+        observed = (before.drive[0] @ each.transfer_matrix.T).abs().amin()
+        assert float(after.history[0, 0]) == pytest.approx(float(observed))
+
+
+def test_poses_are_simulated_by_operators_where_these_are_fewer_runs(tmp_path, monkeypatch):
+    chosen = []
+
+    def made(scene, method="auto", **settings):
+        chosen.append(method)
+        return make_propagator(scene, method, **settings)
+
+    monkeypatch.setattr(autdtorch.study.run, "make_propagator", made)
+    cube = Box((12e-3,) * 3, (3e-3,) * 3, rigid=True)
+    solver = {"spacing": 2e-3, "tolerance": 0.1}
+    for count, method in ((1, "auto"), (60, "operator")):
+        scenes = {f"{step}": scene(None, (cube,)).moved((0, 1e-5 * step, 0)) for step in range(count)}
+        chosen.clear()
+        folder = tmp_path / str(count)
+        run_study(scenes, {"lssg": LSSG(levels=2)}, folder, solver=solver, poses=True)
+        assert chosen[-count:] == [method] * count
