@@ -1,0 +1,159 @@
+"""How much of the focus is lost where an obstacle is not where it was assumed to be?
+
+Writes pose_errors.png and a block of pose_errors.md. Drives are the best for the paper's cubes at their
+place. Then all cubes of a scene are shifted in random directions, or turned about random axes, as one body.
+Scattering operators give the transfer matrix of each pose.
+
+    python scripts/study.py pose_error          about two minutes on 2 idle cores
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from matplotlib.figure import Figure
+from shared.document import fill_in, measured, percent, table
+from shared.scenes import PAPER, paper_scene
+
+import autdtorch as at
+from autdtorch.plot.style import TICK_SIZE, add_legend, looks_of, new_figure, readable, styled
+
+DOCUMENT = "pose_errors.md"
+SCENES = ("two_cubes", "three_cubes", "shadow of two_cubes")
+SHADOW = 10e-3
+"""Radius of the circle of the foci that are in the shadow of the larger cube [m]; the paper's is 30 mm."""
+
+SHIFTS = (0.2, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
+"""Distances [mm]."""
+TURNS = (1.0, 2.0, 5.0, 7.0, 10.0, 15.0, 20.0)
+"""Angles [degrees]."""
+TOLD = {"mm": (0.5, 1.0, 2.0, 5.0), "degrees": (2.0, 5.0, 10.0, 20.0)}
+"""Pose errors in the table."""
+STARTS = 8
+"""First guesses of the drives that follow the pose."""
+
+OPTIONS = {
+    "--poses": {"type": int, "default": 200, "help": "random directions of each pose error"},
+    "--spacing": {"type": float, "default": 1.0, "help": "of the simulations [mm]"},
+}
+
+
+class Losses(NamedTuple):
+    """Shares of the weakest focus under a pose error.
+
+    Attributes:
+        scene: name.
+        unit: of the error, "mm" or "degrees".
+        error: the pose error.
+        kept: share that the drive keeps, for each direction (N,).
+        followed: share of a drive that was computed for the pose (N,).
+    """
+
+    scene: str
+    unit: str
+    error: float
+    kept: torch.Tensor
+    followed: torch.Tensor
+
+
+def scene_of(name: str) -> at.Scene:
+    """Return one of the paper's scenes, or the two cubes with foci in their shadow."""
+    scene = paper_scene(name.removeprefix("shadow of "))
+    if name in PAPER:
+        return scene
+    foci = at.circle_points(center=(80e-3, 50e-3, 50e-3), radius=SHADOW, count=4, normal=(1, 0, 0))
+    return replace(scene, control_points=foci)
+
+
+def losses(name: str, count: int, spacing: float) -> Iterator[Losses]:
+    """Yield the losses of one of the scenes, for `count` directions, on cells of `spacing` [m]."""
+    scene = scene_of(name)
+    body = at.ScatteringOperator.of(scene.obstacles, scene.medium, scene.frequency, spacing)
+    objective = at.SimulatedObjective(scene, at.make_propagator(scene, "operator", spacing, 1e-3))
+    best = at.gradient_ascent(objective)
+    drive, full = best.drive[0], float(best.score[0])
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.randn(count, 3, dtype=torch.float64, generator=generator)
+    directions = directions / directions.norm(dim=1, keepdim=True)
+    for unit, errors in (("mm", SHIFTS), ("degrees", TURNS)):
+        for error in errors:
+            if unit == "mm":
+                poses = [body.moved(1e-3 * error * direction) for direction in directions]
+            else:
+                poses = [body.moved(rotation=math.radians(error) * direction) for direction in directions]
+            matrices = [pose.transfer_matrix(scene.array, scene.control_points) for pose in poses]
+            matrix = torch.stack(matrices)
+            yield Losses(
+                name,
+                unit,
+                error,
+                weakest(matrix, drive) / full,
+                weakest(matrix, at.holography(matrix, starts=STARTS)) / full,
+            )
+
+
+def weakest(matrix: torch.Tensor, drive: torch.Tensor) -> torch.Tensor:
+    """Return the weakest focus (N,) [Pa] of drives (N, M) or (M,), for matrices (N, P, M)."""
+    return (matrix @ drive[..., None])[..., 0].abs().amin(dim=1)
+
+
+@styled
+def plot_losses(found: Sequence[Losses]) -> Figure:
+    """Plot the share that is left over the pose error: the median, and nine of ten directions."""
+    figure, looks = new_figure(6.6, 3.0), looks_of(SCENES)
+    panels = figure.subplots(1, 2, sharey=True)
+    for ax, unit, label in zip(panels, TOLD, ("shift [mm]", "turn [degrees]"), strict=True):
+        for name in SCENES:
+            rows = [one for one in found if (one.scene, one.unit) == (name, unit)]
+            errors = [0.0, *(one.error for one in rows)]
+            low, middle, high = (
+                [1.0, *(float(one.kept.quantile(share)) for one in rows)] for share in (0.05, 0.5, 0.95)
+            )
+            followed = [1.0, *(float(one.followed.median()) for one in rows)]
+            look = looks[name]
+            ax.plot(errors, middle, color=look.colour, label=readable(name))
+            ax.fill_between(errors, low, high, color=look.colour, alpha=0.2, linewidth=0)
+            ax.plot(errors, followed, color=look.colour, linestyle=":", label=f"{readable(name)}, new drive")
+        ax.set_xlabel(label)
+        ax.set_xlim(left=0)
+        ax.set_ylim(0.4, 1.1)
+        ax.tick_params(labelsize=TICK_SIZE)
+    panels[0].set_ylabel("share of the weakest focus")
+    add_legend(figure, panels[0].get_legend_handles_labels()[0])
+    return figure
+
+
+def rows(found: Sequence[Losses]) -> Iterator[list[str]]:
+    """Yield the cells of the table."""
+    for one in found:
+        if one.error in TOLD[one.unit]:
+            kept = [percent(float(one.kept.quantile(share))) for share in (0.5, 0.05)]
+            yield [
+                readable(one.scene),
+                f"{one.error:g} {one.unit}",
+                *kept,
+                percent(float(one.followed.median())),
+            ]
+
+
+def main(given: argparse.Namespace) -> None:
+    """Simulate, and write the figure and the block."""
+    found = []
+    for name in SCENES:
+        for one in losses(name, given.poses, 1e-3 * given.spacing):
+            found.append(one)
+            print(f"{name}, {one.error:g} {one.unit}: {percent(float(one.kept.median()))}", flush=True)
+    head = ["scene", "pose error", "left, median", "left in 95 % of the directions", "new drive, median"]
+    parts = (
+        measured(),
+        "![Share of the weakest focus that is left, over shifts and turns of the obstacles](pose_errors.png)",
+        f"Weakest focus relative to that at the assumed pose, {given.poses} directions each:",
+        table(head, rows(found)),
+    )
+    fill_in(DOCUMENT, "study.py pose_error", parts, given.output)
+    plot_losses(found).savefig(given.output / "pose_errors.png")
