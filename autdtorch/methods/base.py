@@ -95,7 +95,10 @@ class Problem:
     def of(
         cls, objective: Objective, goal: Score = WEAKEST_FOCUS, start: torch.Tensor | None = None
     ) -> Problem:
-        """Return the problem that an objective poses, with the transfer matrix that it has inside, if any."""
+        """Return the problem that an objective poses, with the transfer matrix that it has inside, if any.
+
+        A drive (M,) or (T, M) to start from may be given.
+        """
         require_objective(objective)
         scene, matrix = objective.scene, simulated_matrix(objective)
         counts = len(scene.array), len(scene.control_points)

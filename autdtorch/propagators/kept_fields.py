@@ -64,6 +64,12 @@ class KeepingSimulation(BoxSimulation):
             return super().matrix_runs(points)
         return self._fewest if self._transducers is None else 0
 
+    def matrix_pays(self, drives: int, points: torch.Tensor) -> bool:
+        """Return whether so many drives take longer than the transfer matrix of points (P, 3)."""
+        if self._keeps(points) and self._transducers is not None:
+            return drives > len(self.plan.scene.array)  # sums for each
+        return super().matrix_pays(drives, points)
+
     def transfer_matrix(self, points: torch.Tensor) -> TransferMatrix:
         """Simulate the transfer matrix of points (P, 3), or sum the kept fields of the transducers."""
         if self._keeps(points) and self._begins_at(points):

@@ -57,6 +57,10 @@ class Propagator(Protocol):
 class SimulatedPropagator:
     """A propagator that simulates the steady state of the drive by FDTD.
 
+    By method "box", the outgoing fields of the last drives are kept and, once as many runs were taken from
+    points as the transducers would have needed, those of all transducers. More points outside the boxes, and
+    more drives, then take sums and no runs.
+
     Attributes:
         scene: the scene it was made for.
         method: "box" or "full".
@@ -187,7 +191,7 @@ class SimulatedPropagator:
         if len(grid) == 1:  # others are pictures, which may cross obstacles
             self._report_near(points)
         flat = drive.reshape(-1, drive.shape[-1])
-        by_matrix = drive.requires_grad or len(flat) > self._simulation.matrix_runs(points)
+        by_matrix = drive.requires_grad or self._simulation.matrix_pays(len(flat), points)
         rows = len(self.scene.array) if by_matrix else len(flat)
         require_memory("points", (*grid, 3), PAIR_BYTES * rows * len(points))
         if by_matrix:

@@ -144,6 +144,10 @@ class Simulation(ABC):
         """Return the number of runs that the transfer matrix of points (P, 3) takes."""
         return self.orbits(points).runs
 
+    def matrix_pays(self, drives: int, points: torch.Tensor) -> bool:
+        """Return whether so many drives take longer than the transfer matrix of points (P, 3)."""
+        return drives > self.matrix_runs(points)
+
     def fields(self, drive: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, list[Run]]:
         """Return the pressure (R, P) [Pa] of drives (R, M), none of them silent, and the runs it took."""
         array = self.plan.scene.array

@@ -1,4 +1,4 @@
-"""How much of the focus is lost where an obstacle is not where it was assumed to be?
+"""The loss of the foci where obstacles are not in their assumed pose.
 
 Writes pose_errors.png and a block of pose_errors.md. Drives are the best for the paper's cubes at their
 place. Then all cubes of a scene are shifted in random directions, or turned about random axes, as one body.
