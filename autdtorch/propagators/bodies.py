@@ -69,14 +69,16 @@ class ScatteringBodies:
         require_kind("array", array, TransducerArray)
         places, grid = points_grid("points", points)
         targets = places.cpu()
-        scattered = self._scattered(array)
-        outgoing = torch.cat([waves_at(body, targets) for body in self.operators], dim=1)
         direct = free_space_matrix(targets, array, self.operators[0].wavenumber)
-        total: torch.Tensor = direct + outgoing @ scattered
+        total: torch.Tensor = direct + self.waves_at(targets) @ self.scattered(array)
         return total.reshape(*grid, -1)
 
-    def _scattered(self, array: TransducerArray) -> torch.Tensor:
-        """Return the outgoing waves (N, M) of all bodies under unit drives of an array."""
+    def waves_at(self, points: torch.Tensor) -> torch.Tensor:
+        """Return the outgoing waves (P, N) of all bodies at points (P, 3) [m]."""
+        return torch.cat([waves_at(body, points) for body in self.operators], dim=1)
+
+    def scattered(self, array: TransducerArray) -> torch.Tensor:
+        """Return the coefficients (N, M) [Pa] of the outgoing waves under unit drives of an array."""
         alone = [body.matrix @ incoming_waves(body, array).mT for body in self.operators]
         if len(alone) == 1:
             return alone[0]

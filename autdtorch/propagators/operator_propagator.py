@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Literal, overload
 
 import torch
+from torch.nn.functional import pad
 
+from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd.grid import grid_errors
 from autdtorch.propagators.bodies import ScatteringBodies
 from autdtorch.propagators.body_matrix import Placed, Solver, placed
@@ -21,6 +24,7 @@ from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.propagators.simulation import Run
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import require_clear
+from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import ArrayLike, boolean, differentiable_points, points_grid
 
 logger = logging.getLogger(__name__)
@@ -85,11 +89,10 @@ class OperatorPropagator:
         groups = [[scene.obstacles[index] for index in body.obstacles] for body in self._spheres]
         return [placed(group, scene.medium, scene.frequency, solver) for group in groups]
 
-    @property
-    def reaches_control_points(self) -> bool:
-        """Whether all control points and transducers are outside the spheres of the bodies."""
+    def serves(self, points: torch.Tensor) -> torch.Tensor:
+        """Return which points (P, 3) are outside all bodies' spheres; none if a transducer is not."""
         nodes = self.scene.array.nodes.positions.reshape(-1, 3)
-        return bool(are_outside(torch.cat([self.scene.control_points, nodes]), self._spheres).all())
+        return are_outside(points, self._spheres) & are_outside(nodes, self._spheres).all()
 
     @cached_property
     def _spheres(self) -> list[Body]:
@@ -132,13 +135,20 @@ class OperatorPropagator:
         require_clear(self.scene.array, "points", points.detach())
         return torch.cat([self._part(part) for part in torch.split(points, _AT_ONCE)])
 
+    @one_library_thread()
     def _part(self, points: torch.Tensor) -> torch.Tensor:
-        served = are_outside(points.detach(), self._spheres)
+        served = self.serves(points.detach())
         matrix = torch.zeros((len(points), len(self.scene.array)), dtype=torch.complex128, device="cpu")
         if served.any():
-            found = self.bodies.transfer_matrix(self.scene.array, points[served])
+            outside = points[served]
+            waves, (scattered, *fewer) = self.bodies.waves_at(outside), self._scattered
+            found = waves @ scattered + free_space_matrix(
+                outside, self.scene.array, self.scene.complex_wavenumber
+            )
             matrix = matrix.index_put((served,), found)
-            served = served.index_put((served.clone(),), self._have_converged(found, points[served]))
+            left_out = self._left_out(waves.detach(), [scattered, *fewer])
+            converged = left_out <= self.tolerance * found.detach().norm(dim=1)
+            served = served.index_put((served.clone(),), converged)
         if not served.all():
             if not self._logged:
                 self._logged = True
@@ -146,24 +156,29 @@ class OperatorPropagator:
             matrix = matrix.index_put((~served,), self._box.transfer_matrix(points[~served]))
         return matrix
 
-    @torch.no_grad()
-    def _have_converged(self, matrix: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-        """Return for which rows of G (P, M) the waves left out are below the tolerance.
-
-        What they add is extrapolated from the last two pairs of degrees.
-        """
-        fewer = [matrix]
-        for left_out in (_FEWER, 2 * _FEWER):
-            counts = [(max(0, body.degree - left_out) + 1) ** 2 for body in self.bodies.operators]
-            some = zip(self.bodies.operators, counts, strict=True)
-            bodies = ScatteringBodies(
+    @cached_property
+    def _scattered(self) -> list[torch.Tensor]:
+        """Outgoing waves (N, M) of all bodies, by all degrees and with the highest ones left out."""
+        operators, found = self.bodies.operators, []
+        for left_out in (0, _FEWER, 2 * _FEWER):
+            counts = [(max(0, body.degree - left_out) + 1) ** 2 for body in operators]
+            some = zip(operators, counts, strict=True)
+            fewer = ScatteringBodies(
                 replace(body, matrix=body.matrix[:count, :count]) for body, count in some
             )
-            fewer.append(bodies.transfer_matrix(self.scene.array, points))
-        last, before = ((one - other).norm(dim=1) for one, other in pairwise(fewer))
+            parts = torch.split(fewer.scattered(self.scene.array), counts)
+            missing = [len(body.matrix) - count for body, count in zip(operators, counts, strict=True)]
+            pairs = zip(parts, missing, strict=True)
+            found.append(torch.cat([pad(part, (0, 0, 0, rows)) for part, rows in pairs]))
+        return found
+
+    @staticmethod
+    def _left_out(waves: torch.Tensor, scattered: Sequence[torch.Tensor]) -> torch.Tensor:
+        """Return what the waves left out would add (P,), extrapolated from the last two pairs of degrees."""
+        last, before = ((waves @ (one - other)).norm(dim=1) for one, other in pairwise(scattered))
         ratio = (last / before.clamp_min(_TINY)).clamp_max(_SLOWEST)
-        converged: torch.Tensor = last * ratio / (1 - ratio) <= self.tolerance * matrix.norm(dim=1)
-        return converged
+        left_out: torch.Tensor = last * ratio / (1 - ratio)
+        return left_out
 
     def _error(self, matrix: torch.Tensor, points: torch.Tensor) -> float:
         """Return the error of G (P, M) by operators on a second grid."""

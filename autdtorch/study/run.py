@@ -154,7 +154,7 @@ def _for_poses(scenes: Mapping[str, Scene], solver: Mapping[str, Any]) -> dict[s
     once = make_propagator(first, "operator", **settings)
     if each.method != "box" or not isinstance(once, OperatorPropagator):
         return dict(solver)
-    if once.planned_runs > len(scenes) * each.planned_runs or not once.reaches_control_points:
+    if once.planned_runs > len(scenes) * each.planned_runs or not once.serves(first.control_points).all():
         return dict(solver)
     logger.info("scattering operators: %d runs for all poses", once.planned_runs)
     return {**solver, "method": "operator"}

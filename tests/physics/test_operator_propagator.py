@@ -79,6 +79,13 @@ def test_points_near_a_body_are_served_by_the_box(caplog):
     assert relative_error(matrix, box) < 0.02
 
 
+def test_transducers_within_a_sphere_are_served_by_the_box():
+    array = type(ARRAY).grid((2, 2), 2.6e-3, (9e-3, 12e-3, 12e-3), (1, 0, 0), radius=0)  # 3.5 mm away
+    scene = Scene(array, AIR, 40e3, POINTS, [SMALL])
+    found = operator(scene).transfer_matrix()
+    assert torch.equal(found, make_propagator(scene, "box", **COARSE).transfer_matrix())
+
+
 def test_waves_near_a_sphere_are_checked():
     """Degrees that suffice far from a sphere do not suffice at its surface."""
     places = torch.tensor([[18.05e-3, 12e-3, 12e-3], [30e-3, 12e-3, 12e-3]]).double()
