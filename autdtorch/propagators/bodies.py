@@ -16,7 +16,7 @@ import torch
 
 from autdtorch.analytic.green import free_space_matrix
 from autdtorch.analytic.spherical_waves import harmonics, regular_radial
-from autdtorch.propagators.operator import ScatteringOperator, incoming_waves, waves_at
+from autdtorch.propagators.operator import ScatteringOperator, incoming_waves, parts_of, waves_at
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.threads import one_library_thread
@@ -70,8 +70,9 @@ class ScatteringBodies:
         places, grid = points_grid("points", points)
         targets = places.cpu()
         direct = free_space_matrix(targets, array, self.operators[0].wavenumber)
-        total: torch.Tensor = direct + self.waves_at(targets) @ self.scattered(array)
-        return total.reshape(*grid, -1)
+        scattered = self.scattered(array)
+        parts = [self.waves_at(part) @ scattered for part in parts_of(targets, len(scattered))]
+        return (direct + torch.cat(parts)).reshape(*grid, -1)
 
     def waves_at(self, points: torch.Tensor) -> torch.Tensor:
         """Return the outgoing waves (P, N) of all bodies at points (P, 3) [m]."""

@@ -41,6 +41,7 @@ from autdtorch.utils.validation import (
     within,
 )
 
+_AT_ONCE = 200_000  # Waves at points that are computed at once: 3 MB, which fit into a cache
 _ARRAYS = ("matrix", "center", "axes", "radius", "wavenumber")
 
 
@@ -153,8 +154,9 @@ class ScatteringOperator:
         places, grid = points_grid("points", points)
         targets = places.cpu()
         direct = free_space_matrix(targets, array, self.wavenumber)
-        scattered = waves_at(self, targets) @ (self.matrix @ incoming_waves(self, array).mT)
-        return (direct + scattered).reshape(*grid, -1)
+        scattered = self.matrix @ incoming_waves(self, array).mT
+        parts = [waves_at(self, part) @ scattered for part in parts_of(targets, len(self.matrix))]
+        return (direct + torch.cat(parts)).reshape(*grid, -1)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the operator to a .npz file."""
@@ -192,14 +194,25 @@ class ScatteringOperator:
             return cls(matrix, complex(arrays["wavenumber"]), radius, center, axes)
 
 
+def parts_of(points: torch.Tensor, waves: int) -> tuple[torch.Tensor, ...]:
+    """Return points (P, ..., 3) in parts, so that few of so many waves at them are in memory at once."""
+    each = points[0].numel() // 3
+    return torch.split(points, max(1, _AT_ONCE // (each * waves)))
+
+
 def incoming_waves(body: ScatteringOperator, array: TransducerArray) -> torch.Tensor:
     """Return the coefficients (M, N) [Pa] of the regular waves of unit drives around a body."""
     positions, weights = array.nodes
-    waves = outgoing_waves(
-        body.degree, body.wavenumber, _offsets(body, "array.positions", positions), conjugate=True
-    )
-    factor = 4j * math.pi * body.wavenumber * array.source_strength
-    return factor * torch.einsum("mnk,n->mk", waves, weights.to(waves.dtype))
+    offsets = _offsets(body, "array.positions", positions)
+    means = [
+        torch.einsum(
+            "mnk,n->mk",
+            outgoing_waves(body.degree, body.wavenumber, some, conjugate=True),
+            weights.to(torch.complex128),
+        )
+        for some in parts_of(offsets, len(body.matrix))
+    ]
+    return 4j * math.pi * body.wavenumber * array.source_strength * torch.cat(means)
 
 
 def waves_at(body: ScatteringOperator, points: torch.Tensor) -> torch.Tensor:

@@ -29,7 +29,7 @@ from autdtorch.utils.validation import ArrayLike, boolean, differentiable_points
 
 logger = logging.getLogger(__name__)
 
-_AT_ONCE = 4096  # Points whose waves are computed at once: 50 MB for the paper's cubes
+_AT_ONCE = 512  # Points whose waves are computed at once: 4 to 6 MB for the paper's cubes
 _FEWER = 2  # Degrees left out to see how waves converge; even, as parities may alternate
 _SLOWEST = 0.9  # Ratio of successive pairs of degrees up to which a sum is extrapolated
 _ERRORS = 1e-8, 0.1  # Range of the error at which degrees are left out
