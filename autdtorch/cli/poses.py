@@ -5,9 +5,12 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from hydra.core.hydra_config import HydraConfig
 
 from autdtorch.cli.settings import section_of
+from autdtorch.scene.geometry import rotation_matrix
+from autdtorch.scene.obstacles.moving import angles_of
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import finite_vector, integer_at_least, invalid, require_known, within
 
@@ -25,8 +28,8 @@ class Poses(NamedTuple):
 def along_path(settings: dict[str, Any]) -> Poses:
     """Replace scene and method in the settings by an experiment with a scene for each pose.
 
-    The first pose is that of the scene, the last is moved by `offset` and turned by `rotation`; those between
-    are evenly spaced.
+    The first pose is that of the scene. The last is moved by `offset` and turned by `rotation` from there;
+    shift and angles of those between are evenly spaced.
 
     Raises:
         ValueError: a setting of `poses` that is unknown or out of range, or an experiment beside it.
@@ -41,22 +44,29 @@ def along_path(settings: dict[str, Any]) -> Poses:
         count = integer_at_least("count", poses.get("count"), 2)
         if count > _MOST:
             raise invalid("count", count, f"must be at most {_MOST}")
+        if not (offset.any() or rotation.any()):
+            raise invalid(
+                "offset", offset.tolist(), "must move the obstacles, or rotation must turn them", "m"
+            )
     scene, chosen = section_of(settings, "scene"), HydraConfig.get().runtime.choices
-    first = scene.get("pose") or {}
+    first = section_of(scene, "pose") if scene.get("pose") else {}
+    require_known("scene.pose", first, _KEYS[:2])
     start = [np.array(finite_vector(f"scene.pose.{key}", first.get(key, (0, 0, 0)))) for key in _KEYS[:2]]
     shares, digits = np.linspace(0, 1, count), len(str(count - 1))
+    turns = [rotation_matrix(tuple((share * rotation).tolist())) for share in shares]
     settings["scenes"] = {
         f"{chosen['scene']}_{number:0{digits}d}": {
             **scene,
             "pose": {
                 "offset": (start[0] + share * offset).tolist(),
-                "rotation": (start[1] + share * rotation).tolist(),
+                "rotation": angles_of(turn @ rotation_matrix(tuple(start[1].tolist()))).tolist(),
             },
         }
-        for number, share in enumerate(shares)
+        for number, (share, turn) in enumerate(zip(shares, turns, strict=True))
     }
     settings["methods"] = {chosen["method"]: section_of(settings, "method")}
     del settings["scene"], settings["method"]
     if offset.any():
         return Poses(1e3 * float(np.linalg.norm(offset)) * shares, "path of the obstacles [mm]")
-    return Poses(np.degrees(float(np.linalg.norm(rotation))) * shares, "turn of the obstacles [degrees]")
+    cosines = [(float(torch.trace(turn)) - 1) / 2 for turn in turns]
+    return Poses(np.degrees(np.arccos(np.clip(cosines, -1, 1))), "turn of the obstacles [degrees]")

@@ -31,6 +31,7 @@ from autdtorch.utils.validation import (
     real_tensor,
     require_callable,
     require_kind,
+    within,
 )
 
 Trials: TypeAlias = int | Sequence[int]
@@ -85,10 +86,12 @@ class Problem:
             matrix = validate_matrix("transfer_matrix", self.transfer_matrix, self.foci, self.transducers)
             object.__setattr__(self, "transfer_matrix", matrix)
         if self.start is not None:
-            start = validate_drives(complex_tensor("start", self.start), self.transducers)
-            if start.ndim > 2:
+            start = complex_tensor("start", self.start)
+            if start.ndim not in (1, 2) or start.shape[-1] != self.transducers:
                 accepted = f"must be ({self.transducers},) or (T, {self.transducers})"
                 raise ValueError(f"start: shape {tuple(start.shape)}; {accepted}")
+            with within("start"):
+                start = validate_drives(start, self.transducers).clone()
             object.__setattr__(self, "start", start)
 
     @classmethod
@@ -104,13 +107,15 @@ class Problem:
         counts = len(scene.array), len(scene.control_points)
         return cls(*counts, goal, scene, matrix, lambda drive: quantised(objective, drive), start)
 
-    def starts(self, trials: int) -> torch.Tensor | None:
-        """Return the drive (T, M) that each of some trials begins at, if any."""
-        if self.start is None or self.start.ndim == 1:
-            return None if self.start is None else self.start.expand(trials, -1)
-        if len(self.start) != trials:
-            raise ValueError(f"start: {len(self.start)} drives; must be one for each of {trials} trials")
-        return self.start
+
+def starts_of(problem: Problem, trials: int) -> torch.Tensor | None:
+    """Return the drive (T, M) that each of some trials begins at, if any."""
+    start = problem.start
+    if start is None or start.ndim == 1:
+        return None if start is None else start.expand(trials, -1)
+    if len(start) != trials:
+        raise ValueError(f"start: {len(start)} drives; must be one for each of {trials} trials")
+    return start
 
 
 def known_matrix(problem: Problem) -> torch.Tensor:
@@ -246,7 +251,7 @@ class Method(ABC):
             raise invalid("trials", trials, f"must be 1: {self.label} has no random choices")
         count = len(seeds)
         self.require_fit(problem, count)
-        problem.starts(count)
+        starts_of(problem, count)
         step = self.begin(problem, seeds)
         empty = Solution(
             torch.zeros(count, problem.transducers, dtype=torch.complex128, device="cpu"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import overload
+from typing import cast, overload
 
 import torch
 
@@ -12,9 +12,9 @@ from autdtorch.methods.base import Method, Problem, State, Trials, trial_seeds
 from autdtorch.methods.solution import Solution
 from autdtorch.methods.state_file import load_state, save_state
 from autdtorch.objectives.goals import WEAKEST_FOCUS
-from autdtorch.objectives.objective import Objective, Score
+from autdtorch.objectives.objective import Objective, Score, require_objective
 from autdtorch.utils.progress import show_progress
-from autdtorch.utils.validation import invalid, path_of, require_callable, require_kind
+from autdtorch.utils.validation import invalid, path_of, require_callable, require_kind, within
 
 
 @overload
@@ -59,8 +59,8 @@ def run(
 
     Args:
         method: such as ``GABS(levels=16)``.
-        objective: simulated or measured; or a sequence of objectives, such as the poses of an obstacle, each
-            of which starts at the drives found for the one before.
+        objective: simulated or measured; or a list of objectives, such as the poses of an obstacle, each of
+            which starts at the drives found for the one before.
         trials: number of trials T, >= 1, or their numbers.
         seed: of the random choices, >= 0. A trial's random choices do not depend on the other trials.
         score: function of pressures (..., P) [Pa] that is maximised.
@@ -70,7 +70,7 @@ def run(
         start: drive (M,) that was good before, or one for each trial (T, M); see `Problem`.
 
     Returns:
-        The drive that each trial chose; of a sequence, a list of these.
+        The drive that each trial chose; of a list, a list of these.
 
     Raises:
         ValueError: an argument out of range, pressures or scores that are not finite, or a state file of
@@ -82,10 +82,15 @@ def run(
     if stop is not None:
         require_callable("stop", stop)
     path = None if state_file is None else path_of("state_file", state_file)
-    if not isinstance(objective, Sequence):
-        return _run(method, objective, trials, seed, score, stop, path, start)
+    if not isinstance(objective, list | tuple):
+        return _run(method, cast(Objective, objective), trials, seed, score, stop, path, start)
     if path is not None:
         raise invalid("state_file", str(path), "must be None for a sequence of objectives")
+    if not objective:
+        raise invalid("objective", objective, "must have at least one")
+    for number, pose in enumerate(objective):
+        with within(f"objective[{number}]"):
+            require_objective(pose)
     found: list[Solution] = []
     for pose in objective:
         start = found[-1].drive if found else start

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal
 import torch
 
 from autdtorch.methods import coordinates
-from autdtorch.methods.base import NEAR_TIE, Method, Problem, State, Step, Trials, generators_of
+from autdtorch.methods.base import NEAR_TIE, Method, Problem, State, Step, Trials, generators_of, starts_of
 from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS
@@ -26,7 +26,7 @@ class GABS(Method):
     do harm, the best drive observed leaves them off.
 
     Where the problem has a drive to start from, all its transducers are on from the beginning, with the
-    nearest of the phases, and every pass goes through all M of them.
+    nearest of the phases, and every pass goes through all M of them: 1 + M * levels evaluations.
 
     A trial takes 1 + (M - 1) * levels evaluations: the first transducer alone, whose phase changes no
     magnitude, then `levels` for each of the others. That is 241 for the paper's M = levels = 16; the paper
@@ -114,7 +114,7 @@ class GABS(Method):
         if self.first is not None:
             others = orders[orders != self.first].reshape(len(orders), -1)
             orders = torch.cat([orders.new_full((len(orders), 1), self.first), others], dim=1)
-        if (given := problem.starts(len(orders))) is not None:
+        if (given := starts_of(problem, len(orders))) is not None:
             return coordinates.begin_ascent(coordinates.at_levels(given, self.levels), orders)
         alone = torch.eye(orders.shape[1], dtype=torch.complex128, device="cpu")
         return coordinates.begin_ascent(alone[orders[:, 0]], orders)

@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import torch
 
-from autdtorch.methods.base import Method, Problem, Step, Trials, generators_of, known_matrix
+from autdtorch.methods.base import Method, Problem, Step, Trials, generators_of, known_matrix, starts_of
 from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS, slope_of
@@ -62,7 +62,7 @@ class GradientAscent(Method):
         """Climb, and observe the highest drive."""
         matrix = known_matrix(problem)
         starts = [random_drives(self.starts, problem.transducers, own) for own in generators_of(seeds)]
-        if (given := problem.starts(len(seeds))) is not None:
+        if (given := starts_of(problem, len(seeds))) is not None:
             starts = [torch.cat([own[None], drawn[1:]]) for own, drawn in zip(given, starts, strict=True)]
         highest = [climb(problem.goal, matrix, start, self.steps) for start in starts]
         return Step(torch.stack(highest)[:, None], {})

@@ -80,9 +80,9 @@ def load_state(path: str | os.PathLike[str], method: Method, problem: Problem) -
 
 
 def _origin(method: Method, problem: Problem) -> str:
-    """Return the method, its settings, the size of the problem and its goal as JSON; of a tensor, its digest.
+    """Return method, settings, size, goal and start of a problem as JSON; of a tensor, its digest.
 
-    The paper's goal is left out: older files do not name it.
+    The paper's goal, and no start, are left out: older files do not name them.
     """
     settings = dataclasses.asdict(method)
     prior = settings.get("prior")
@@ -91,7 +91,9 @@ def _origin(method: Method, problem: Problem) -> str:
     goal = problem.goal
     named = repr(goal) if isinstance(goal, Goal) else getattr(goal, "__qualname__", type(goal).__name__)
     goals = [] if goal == WEAKEST_FOCUS else [named]
-    return json.dumps([method.name, settings, problem.transducers, problem.foci, *goals], default=digest_of)
+    starts = [] if problem.start is None else [problem.start]
+    parts = [method.name, settings, problem.transducers, problem.foci, *goals, *starts]
+    return json.dumps(parts, default=digest_of)
 
 
 def _require_consistent(state: State) -> None:

@@ -96,6 +96,10 @@ def plot_poses(
     """
     (data,) = by_scene("scores", {"path": scores}, "poses", "trials").values()
     along: Array = real_tensor("places", places).detach().cpu().numpy()
+    if along.ndim != 1:
+        raise ValueError(f"places: shape {along.shape}; must be (poses,)")
+    require_kind("xlabel", xlabel, str)
+    require_kind("ylabel", ylabel, str)
     figure, looks = style.new_figure(4.6, 3.0), looks_of(data)
     ax = figure.subplots()
     for method, values in data.items():
@@ -105,8 +109,14 @@ def plot_poses(
         ax.fill_between(
             along, values.min(axis=1), values.max(axis=1), color=looks[method].colour, alpha=0.2, linewidth=0
         )
-    if bounds is not None and np.isfinite(limits := magnitude_tensor("bounds", bounds).cpu().numpy()).any():
-        ax.plot(along, limits, "k:", label="bound")
+    if bounds is not None:
+        limits: Array = magnitude_tensor("bounds", bounds).detach().cpu().numpy()
+        if limits.shape != along.shape:
+            raise ValueError(f"bounds: shape {limits.shape}; must be {along.shape}, as places")
+        if np.isnan(limits).any():
+            raise ValueError("bounds: nan; must be numbers, or infinite where none is known")
+        if np.isfinite(limits).any():
+            ax.plot(along, limits, "k:", label="bound")
     ax.set(xlabel=xlabel, ylabel=ylabel)
     ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]))
     ax.tick_params(labelsize=TICK_SIZE)

@@ -20,9 +20,16 @@ from autdtorch.propagators.operator import ScatteringOperator, incoming_waves, p
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.threads import one_library_thread
-from autdtorch.utils.validation import ArrayLike, invalid, members, points_grid, require_kind
+from autdtorch.utils.validation import (
+    LENGTH_TOLERANCE,
+    ArrayLike,
+    invalid,
+    members,
+    points_grid,
+    require_kind,
+)
 
-_SHELLS = (0.55, 0.7, 0.85, 1.0)  # Radii over that of the circumscribed sphere: j_l is small on one at most
+_SHELLS = (0.55, 0.7, 0.85, 0.99)  # Radii over that of the circumscribed sphere: j_l is small on one at most
 _ENTRY_BYTES = 48.0  # of a pair of waves, in the system of equations
 
 
@@ -50,7 +57,7 @@ class ScatteringBodies:
                 raise invalid(f"operators[{number}].wavenumber", body.wavenumber, "must be that of the first")
             for other in bodies[:number]:
                 apart = float((body.center - other.center).detach().norm())
-                if apart < body.radius + other.radius:
+                if apart < body.radius + other.radius - LENGTH_TOLERANCE:
                     accepted = (
                         f"must be at least {body.radius + other.radius:.4g} m from that of another body"
                     )
@@ -70,32 +77,35 @@ class ScatteringBodies:
         places, grid = points_grid("points", points)
         targets = places.cpu()
         direct = free_space_matrix(targets, array, self.operators[0].wavenumber)
-        scattered = self.scattered(array)
-        parts = [self.waves_at(part) @ scattered for part in parts_of(targets, len(scattered))]
+        scattered = scattered_waves(self, array)
+        parts = [bodies_at(self, part) @ scattered for part in parts_of(targets, len(scattered))]
         return (direct + torch.cat(parts)).reshape(*grid, -1)
 
-    def waves_at(self, points: torch.Tensor) -> torch.Tensor:
-        """Return the outgoing waves (P, N) of all bodies at points (P, 3) [m]."""
-        return torch.cat([waves_at(body, points) for body in self.operators], dim=1)
 
-    def scattered(self, array: TransducerArray) -> torch.Tensor:
-        """Return the coefficients (N, M) [Pa] of the outgoing waves under unit drives of an array."""
-        alone = [body.matrix @ incoming_waves(body, array).mT for body in self.operators]
-        if len(alone) == 1:
-            return alone[0]
-        count = sum(map(len, alone))
-        require_memory("operators", f"{count} waves", _ENTRY_BYTES * count**2)
-        rows = []
-        for body in self.operators:
-            blocks = [
-                torch.eye(len(body.matrix), dtype=torch.complex128, device="cpu")
-                if other is body
-                else -body.matrix @ _regular_waves(body, other)
-                for other in self.operators
-            ]
-            rows.append(torch.cat(blocks, dim=1))
-        found: torch.Tensor = torch.linalg.solve(torch.cat(rows), torch.cat(alone))
-        return found
+def bodies_at(bodies: ScatteringBodies, points: torch.Tensor) -> torch.Tensor:
+    """Return the outgoing waves (P, N) of all bodies at points (P, 3) [m]."""
+    return torch.cat([waves_at(body, points) for body in bodies.operators], dim=1)
+
+
+def scattered_waves(bodies: ScatteringBodies, array: TransducerArray) -> torch.Tensor:
+    """Return the coefficients (N, M) [Pa] of all bodies' outgoing waves under unit drives of an array."""
+    operators = bodies.operators
+    alone = [body.matrix @ incoming_waves(body, array).mT for body in operators]
+    if len(alone) == 1:
+        return alone[0]
+    count = sum(map(len, alone))
+    require_memory("operators", f"{count} waves", _ENTRY_BYTES * count**2)
+    rows = []
+    for body in operators:
+        blocks = [
+            torch.eye(len(body.matrix), dtype=torch.complex128, device="cpu")
+            if other is body
+            else -body.matrix @ _regular_waves(body, other)
+            for other in operators
+        ]
+        rows.append(torch.cat(blocks, dim=1))
+    found: torch.Tensor = torch.linalg.solve(torch.cat(rows), torch.cat(alone))
+    return found
 
 
 def _regular_waves(body: ScatteringOperator, other: ScatteringOperator) -> torch.Tensor:

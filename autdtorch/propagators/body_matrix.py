@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,12 +17,13 @@ from autdtorch.analytic.spherical_waves import degrees, enough_degrees, sphere_c
 from autdtorch.propagators.body_waves import BodyWaves
 from autdtorch.propagators.cache import DiskCache
 from autdtorch.propagators.plan import plan
-from autdtorch.propagators.scene_bodies import circumscribed, has_closed_form
+from autdtorch.propagators.scene_bodies import has_closed_form
+from autdtorch.propagators.simulated import SteadyStateWarning
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Obstacle, Sphere
-from autdtorch.scene.obstacles.moving import at_rest, is_movable, shifted
-from autdtorch.scene.scene import Scene
+from autdtorch.scene.obstacles.moving import at_rest, circumscribed, is_movable, shifted
+from autdtorch.scene.scene import OverlapWarning, ScaleWarning, Scene
 from autdtorch.utils.digest import digest_of, package_versions, source_digest
 from autdtorch.utils.memory import require_memory
 
@@ -54,7 +56,7 @@ class Solver(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Body:
+class StillBody:
     """A body at rest around the origin, and all that decides its matrix."""
 
     obstacles: tuple[Obstacle, ...]
@@ -68,7 +70,10 @@ class Body:
         center, radius = circumscribed(self.obstacles)
         aside = center.new_tensor([[3 * radius, 0.0, 0.0]])
         array = TransducerArray(center + aside, (-1.0, 0.0, 0.0), radius=0)
-        return Scene(array, self.medium, self.frequency, center - aside, self.obstacles, name="body")
+        with warnings.catch_warnings():  # of the scene that it is part of
+            warnings.simplefilter("ignore", OverlapWarning)
+            warnings.simplefilter("ignore", ScaleWarning)
+            return Scene(array, self.medium, self.frequency, center - aside, self.obstacles, name="body")
 
     @property
     def degree(self) -> int:
@@ -85,7 +90,7 @@ class Body:
 class Placed(NamedTuple):
     """A body with the turn (3, 3) and the shift (3,) [m] that bring it to its place."""
 
-    body: Body
+    body: StillBody
     turn: torch.Tensor
     shift: torch.Tensor
 
@@ -99,18 +104,20 @@ class Placed(NamedTuple):
         """Return T, from memory or disk if it is there."""
         body, scene = self.body, self.body.scene
         center, radius = circumscribed(body.obstacles)
+        count = (body.degree + 1) ** 2
+        require_memory("obstacles", f"{count} waves", _ENTRY_BYTES * count**2)
         if has_closed_form(body.obstacles, body.medium):
             matrix, axes = (
                 _of_sphere(body.obstacles[0], scene, body.degree),
                 torch.eye(3, dtype=torch.float64, device="cpu"),
             )
         else:
-            count = (body.degree + 1) ** 2
-            require_memory("obstacles", f"{count} waves", _ENTRY_BYTES * count**2)
             comparable = all(map(is_movable, body.obstacles))  # others may have no hash
-            matrix, axes = (_simulated if comparable else _simulated.__wrapped__)(
-                body, cache and cache.folder
-            )
+            simulate = _simulated if comparable else _simulated.__wrapped__
+            kept, axes, residual = simulate(body, cache and cache.folder)
+            matrix = kept.clone()
+            if residual > body.solver.error:
+                _warn_of_unsettled(body.solver, residual)
         place = self.turn @ center + self.shift
         return BodyMatrix(matrix, scene.complex_wavenumber, radius, place, self.turn @ axes)
 
@@ -122,7 +129,7 @@ def placed(obstacles: Sequence[Obstacle], medium: Medium, frequency: float, solv
     if all(map(is_movable, still)):
         shift, _ = circumscribed(still)
         still = tuple(shifted(one, -shift, _DIGITS) for one in still)
-    return Placed(Body(still, medium, frequency, solver), turn, turn @ shift)
+    return Placed(StillBody(still, medium, frequency, solver), turn, turn @ shift)
 
 
 def _of_sphere(sphere: Obstacle, scene: Scene, degree: int) -> torch.Tensor:
@@ -137,25 +144,34 @@ def _of_sphere(sphere: Obstacle, scene: Scene, degree: int) -> torch.Tensor:
 
 
 @functools.lru_cache(_KEPT)
-def _simulated(body: Body, folder: Path | None) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return T of a body from the cache in a folder, or simulate it, and the axes of its grid.
+def _simulated(body: StillBody, folder: Path | None) -> tuple[torch.Tensor, torch.Tensor, float]:
+    """Return T of a body from the cache in a folder, or simulate it.
 
-    The last ones are kept in memory.
+    With the axes of its grid and the largest residual of its runs; the last ones are kept in memory.
     """
     waves, shape = body.waves, 2 * ((body.degree + 1) ** 2,)
     cache = None if folder is None else DiskCache(folder)
     digest = digest_of(source_digest(), package_versions(), _described(body))
     if cache is not None and (found := cache.load(digest, shape)) is not None:
         logger.info("scattering operator loaded from %s", folder)
-        return torch.from_numpy(found[0]), waves.axes
+        return torch.from_numpy(found[0]), waves.axes, found[1]
     spacing = 1e3 * body.solver.spacing
     logger.info("simulating a scattering operator: %d waves, cells of %.3g mm", shape[0], spacing)
-    matrix, settled = waves.matrix()
-    if cache is not None and settled:
-        cache.save(digest, matrix.numpy(), body.solver.error)
-    return matrix, waves.axes
+    matrix, residual = waves.matrix()
+    if cache is not None and residual <= body.solver.error:
+        cache.save(digest, matrix.numpy(), residual)
+    return matrix, waves.axes, residual
 
 
-def _described(body: Body) -> tuple[object, ...]:
+def _warn_of_unsettled(solver: Solver, residual: float) -> None:
+    warnings.warn(
+        f"no steady state of the waves of a body after {solver.max_periods} periods: estimated relative "
+        f"error up to {residual:.1e}, tolerance {solver.error:g}; raise max_periods or tolerance",
+        SteadyStateWarning,
+        stacklevel=4,  # about where the operator is made
+    )
+
+
+def _described(body: StillBody) -> tuple[object, ...]:
     settings = tuple(str(each) if isinstance(each, torch.dtype) else each for each in body.solver)
     return body.obstacles, body.medium, body.frequency, settings

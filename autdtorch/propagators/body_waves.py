@@ -1,15 +1,13 @@
 """The runs of the box solver that make the scattering operator of a body.
 
 Each column of T is the answer to one regular wave. Where mirrors of the grid's axes map the body onto itself,
-waves of different parities scatter into waves of different parities: they share a run, and are told apart
+waves of different parities scatter into waves of different parities: they share a run, and are separated
 after it.
 """
 
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import zip_longest
@@ -23,7 +21,6 @@ from autdtorch.fdtd.steady_state import SteadyState, run_to_steady_state
 from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.grids import Grouping, one_box
 from autdtorch.propagators.plan import MOST_JUDGED, Plan, make_kernel
-from autdtorch.propagators.simulated import SteadyStateWarning
 from autdtorch.propagators.symmetry import symmetries
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.utils.apertures import Apertures
@@ -56,8 +53,11 @@ class BodyWaves:
         return [[wave for wave in waves if wave is not None] for waves in zip_longest(*of_kind)]
 
     @one_library_thread()
-    def matrix(self) -> tuple[torch.Tensor, bool]:
-        """Simulate T (N, N); return also whether all runs reached their steady states."""
+    def matrix(self) -> tuple[torch.Tensor, float]:
+        """Simulate T (N, N); return also the largest residual of the runs, relative."""
+        if not len(self._box.assembly.heterogeneous.index):  # obstacles of the medium's own material
+            count = (self.degree + 1) ** 2
+            return torch.zeros((count, count), dtype=torch.complex128, device="cpu"), 0.0
         box, plan, kernel = self._box, self.plan, make_kernel(self.plan.kernel)
         mixing = real_waves(self.degree)
         incoming = self._regular(box.driven) @ mixing
@@ -86,7 +86,7 @@ class BodyWaves:
         for waves, answer in zip(self.runs, answers.mT, strict=True):
             for wave in waves:
                 matrix[:, wave] = torch.where(kinds == kinds[wave], answer * size[wave], 0)
-        return mixing @ matrix @ mixing.mH, self._all_settled(found)
+        return mixing @ matrix @ mixing.mH, max(steady.residual for steady in found)
 
     @cached_property
     def _grouping(self) -> Grouping:
@@ -116,17 +116,3 @@ class BodyWaves:
         place, sign = mirrored(self.degree)
         conjugate = sign * self._regular(positions)[:, place]  # j_l Y_lm^*, also for a complex wavenumber
         return 4j * math.pi * self._box.wavenumber * torch.from_numpy((outward.T @ conjugate.numpy()).T)
-
-    def _all_settled(self, found: Sequence[SteadyState]) -> bool:
-        """Return whether all runs reached their steady states; warn of those that did not."""
-        unsettled = [steady.residual for steady in found if not steady.converged]
-        if unsettled:
-            plan = self.plan
-            warnings.warn(
-                f"no steady state after {plan.max_periods} periods in {len(unsettled)} of {len(found)} runs "
-                f"of a body: estimated relative error up to {max(unsettled):.1e}, tolerance "
-                f"{plan.tolerance:g}",
-                SteadyStateWarning,
-                stacklevel=6,  # about where the operator is made
-            )
-        return not unsettled

@@ -90,12 +90,12 @@ class KeepingSimulation(BoxSimulation):
             return super().fields(drive, points)
         if self._transducers is not None:
             return self._sum(self._transducers, drive, drive, points), []
-        keys = [row.numpy().tobytes() for row in drive]
-        known = [row for row, key in enumerate(keys) if key in self._drives]
-        new = [row for row, key in enumerate(keys) if key not in self._drives]
+        keys, kept = [row.numpy().tobytes() for row in drive], self._drives
+        known = [row for row, key in enumerate(keys) if key in kept]
+        new = [row for row, key in enumerate(keys) if key not in kept]
         field = torch.zeros((len(drive), len(points)), dtype=torch.complex128, device="cpu")
         for row in known:
-            field[row] = self._sum(self._drives[keys[row]], None, drive[row, None], points)[0]
+            field[row] = self._sum(kept[keys[row]], None, drive[row, None], points)[0]
         if not new:
             return field, []
         array, receivers = self.plan.scene.array, Apertures.of_points(points)
@@ -103,12 +103,13 @@ class KeepingSimulation(BoxSimulation):
         solved = self._stepped(sources, strength, receivers)
         field[new] = self.total(solved, receivers)
         if self._apart:
+            amplitudes = solved.amplitudes
             each = (
-                KeptFields(solved.boxes, [own[:, place, None] for own in solved.amplitudes], (run,))
+                KeptFields(solved.boxes, [own[:, place, None].clone() for own in amplitudes], (run,))
                 for place, run in enumerate(solved.runs)
             )
-            self._drives |= dict(zip([keys[row] for row in new], each, strict=True))
-            self._drives = dict(list(self._drives.items())[-_DRIVES:])
+            added = zip([keys[row] for row in new], each, strict=True)
+            self._drives = dict([*kept.items(), *added][-_DRIVES:])
         return field, solved.runs
 
     def _keeps(self, points: torch.Tensor) -> bool:

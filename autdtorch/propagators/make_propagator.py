@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
 from typing import Literal
@@ -86,10 +87,13 @@ def make_propagator(
         return FreeSpacePropagator(scene)
     propagator: OperatorPropagator | SimulatedPropagator
     if planned.method == "operator":
-        if spacing is None and planned.runs:
-            found = refined(planned.by_box, Budget(seconds, memory), kept)
-            planned = planned.at(found.spacing, planned.tolerance, time_step)
-        propagator = OperatorPropagator(planned, kept)
+        make_box = None
+        if spacing is None:
+            make_box = functools.cache(lambda: refined(planned.by_box, Budget(seconds, memory), kept))
+            planned = planned.at(make_box().spacing, tolerance, time_step) if planned.runs else planned
+        propagator = OperatorPropagator(planned, kept, make_box)
+        if not planned.runs:
+            return propagator
     elif spacing is None:
         propagator = refined(planned, Budget(seconds, memory), kept)
     else:

@@ -28,6 +28,7 @@ from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.numpy_file import read_arrays, write_arrays
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import (
+    LENGTH_TOLERANCE,
     ArrayLike,
     finite_vector,
     invalid,
@@ -113,7 +114,9 @@ class ScatteringOperator:
         """The relative difference of T from its image under reciprocity, which an exact T equals."""
         place, sign = mirrored(self.degree)
         image = sign[:, None] * self.matrix.mT[place][:, place] * sign
-        return float((self.matrix - image).norm() / self.matrix.norm())
+        return float(
+            (self.matrix - image).norm() / self.matrix.norm().clamp_min(torch.finfo(torch.float64).tiny)
+        )
 
     @property
     def energy(self) -> float:
@@ -224,7 +227,7 @@ def _offsets(body: ScatteringOperator, name: str, positions: torch.Tensor) -> to
     """Return positions (..., 3) in the coordinates of a body, after checking that they are outside."""
     offsets = positions - body.center
     nearest = float(torch.linalg.vector_norm(offsets, dim=-1).detach().amin())
-    if nearest < body.radius:
+    if nearest < body.radius - LENGTH_TOLERANCE:
         accepted = f"must be at least {body.radius:.4g} m from the centre of the body"
         raise ValueError(f"{name}: {nearest:.4g} m at the nearest; {accepted}")
     return offsets @ body.axes

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
@@ -14,7 +15,7 @@ from torch.nn.functional import pad
 
 from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd.grid import grid_errors
-from autdtorch.propagators.bodies import ScatteringBodies
+from autdtorch.propagators.bodies import ScatteringBodies, bodies_at, scattered_waves
 from autdtorch.propagators.body_matrix import Placed, Solver, placed
 from autdtorch.propagators.cache import DiskCache
 from autdtorch.propagators.operator import ScatteringOperator
@@ -25,7 +26,7 @@ from autdtorch.propagators.simulation import Run
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import require_clear
 from autdtorch.utils.threads import one_library_thread
-from autdtorch.utils.validation import ArrayLike, boolean, differentiable_points, points_grid
+from autdtorch.utils.validation import ArrayLike, boolean, differentiable_points, points_grid, points_tensor
 
 logger = logging.getLogger(__name__)
 
@@ -47,13 +48,23 @@ class OperatorPropagator:
         method: "operator".
         spacing: edge of a cell [m].
         tolerance: relative error at which waves are left out, and at which runs end.
+        max_periods: periods after which a run ends in any case.
     """
 
-    def __init__(self, plan: Plan, cache: DiskCache | None = None) -> None:
-        """Use `make_propagator`, which checks its arguments. Nothing is computed here."""
+    def __init__(
+        self,
+        plan: Plan,
+        cache: DiskCache | None = None,
+        make_box: Callable[[], SimulatedPropagator] | None = None,
+    ) -> None:
+        """Use `make_propagator`, which checks its arguments. Nothing is computed here.
+
+        `make_box` makes the propagator of points near a body; by default it has the plan's spacing.
+        """
         self.scene, self.method, self.spacing = plan.scene, plan.method, plan.spacing
-        self.tolerance = plan.tolerance
+        self.tolerance, self.max_periods = plan.tolerance, plan.max_periods
         self._plan, self._cache = plan, cache
+        self._make_box = make_box or functools.partial(SimulatedPropagator, plan.by_box, cache)
         self._logged = False
 
     def __repr__(self) -> str:
@@ -74,25 +85,27 @@ class OperatorPropagator:
     @cached_property
     def bodies(self) -> ScatteringBodies:
         """The bodies of the scene."""
-        return ScatteringBodies(ScatteringOperator(*body.matrix(self._cache)) for body in self._placed)
+        return ScatteringBodies([ScatteringOperator(*body.matrix(self._cache)) for body in self.placed])
 
     @property
     def planned_runs(self) -> int:
         """Number of simulations of all operators, if none is there."""
-        return sum(body.runs for body in self._placed)
+        return sum(body.runs for body in self.placed)
 
     @property
-    def _placed(self) -> list[Placed]:
+    def placed(self) -> list[Placed]:
+        """The bodies before they are simulated."""
         plan, scene = self._plan, self.scene
         error = min(max(plan.tolerance, _ERRORS[0]), _ERRORS[1])
         solver = Solver(plan.spacing, error, plan.kernel, plan.dtype, plan.max_periods, plan.time_step)
         groups = [[scene.obstacles[index] for index in body.obstacles] for body in self._spheres]
         return [placed(group, scene.medium, scene.frequency, solver) for group in groups]
 
-    def serves(self, points: torch.Tensor) -> torch.Tensor:
-        """Return which points (P, 3) are outside all bodies' spheres; none if a transducer is not."""
+    def serves(self, points: ArrayLike) -> torch.Tensor:
+        """Return which points (P, 3) [m] are outside all bodies' spheres; none if a transducer is not."""
         nodes = self.scene.array.nodes.positions.reshape(-1, 3)
-        return are_outside(points, self._spheres) & are_outside(nodes, self._spheres).all()
+        outside = are_outside(points_tensor("points", points).cpu(), self._spheres)
+        return outside & are_outside(nodes, self._spheres).all()
 
     @cached_property
     def _spheres(self) -> list[Body]:
@@ -106,55 +119,89 @@ class OperatorPropagator:
     def transfer_matrix(
         self, points: ArrayLike | None = None, *, return_error: Literal[True]
     ) -> tuple[torch.Tensor, float]: ...
+    @one_library_thread()
     def transfer_matrix(
         self, points: ArrayLike | None = None, return_error: bool = False
     ) -> torch.Tensor | tuple[torch.Tensor, float]:
         """Return the transfer matrix G; see `SimulatedPropagator.transfer_matrix`.
 
         Differentiable by the points that are not served by the box. The error is that of the grid, from
-        operators on a second one, with the tolerance; in closed form it is the tolerance.
+        operators on a second one, with the tolerance; in closed form it is the tolerance. Rows from the box
+        have the error that the box estimates.
         """
         with_error = boolean("return_error", return_error)
-        places = differentiable_points("points", self.scene.control_points if points is None else points)
-        matrix = self._matrix(places.cpu())
-        return (matrix, self._error(matrix, places.detach().cpu())) if with_error else matrix
+        places = self._checked(points)
+        matrix, served = self._by_waves(places)
+        near = places[~served].detach()
+        if len(near):
+            matrix = matrix.index_put((~served,), self._box.transfer_matrix(near))
+        if not with_error:
+            return matrix
+        rows = self.point_errors(points) * matrix.detach().norm(dim=1)
+        return matrix, float(rows.norm() / matrix.detach().norm().clamp_min(_TINY))
 
+    @one_library_thread()
+    def point_errors(self, points: ArrayLike | None = None) -> torch.Tensor:
+        """Return the estimated relative error of each point's row of the transfer matrix, float64 (P,)."""
+        places = self._checked(points).detach()
+        matrix, served = self._by_waves(places)
+        errors = torch.full((len(places),), self.tolerance, dtype=torch.float64, device="cpu")
+        if self._plan.runs:
+            second = OperatorPropagator(self._plan.second, self._cache)
+            other, ratio = second.transfer_matrix(places), second.spacing / self.spacing
+            errors = errors + grid_errors(matrix, other, ratio, self._plan.order)
+        if not served.all():
+            errors[~served] = self._box.point_errors(places[~served])
+        return errors
+
+    @one_library_thread()
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
         """Return the pressure of drives at points; see `SimulatedPropagator.field`."""
         drive = validate_drive(drive, len(self.scene.array))
         places, grid = points_grid("points", points)
-        parts = [drive @ self._matrix(part).mT for part in torch.split(places.cpu(), _AT_ONCE)]
-        return torch.cat(parts, dim=-1).reshape(*drive.shape[:-1], *grid)
+        places = self._checked(places)
+        parts, masks = [], []
+        for part in torch.split(places, _AT_ONCE):
+            matrix, served = self._by_waves(part)
+            parts.append(drive @ matrix.mT)
+            masks.append(served)
+        field, served = torch.cat(parts, dim=-1), torch.cat(masks)
+        if not served.all():
+            field = field.clone()
+            field[..., ~served] = self._box.field(drive, places[~served].detach())
+        return field.reshape(*drive.shape[:-1], *grid)
 
     @cached_property
     def _box(self) -> SimulatedPropagator:
-        return SimulatedPropagator(self._plan.by_box, self._cache)
+        """The propagator of points near a body; it is made, and its spacing chosen, when the first is met."""
+        return self._make_box()
 
-    def _matrix(self, points: torch.Tensor) -> torch.Tensor:
-        """Return G (P, M) at points (P, 3), those near a body by the box."""
-        require_clear(self.scene.array, "points", points.detach())
-        return torch.cat([self._part(part) for part in torch.split(points, _AT_ONCE)])
+    def _checked(self, points: ArrayLike | None) -> torch.Tensor:
+        places = differentiable_points("points", self.scene.control_points if points is None else points)
+        require_clear(self.scene.array, "points", places.detach())
+        return places.cpu()
 
-    @one_library_thread()
-    def _part(self, points: torch.Tensor) -> torch.Tensor:
-        served = self.serves(points.detach())
+    def _by_waves(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return G (P, M) at points (P, 3), and which rows (P,) the waves serve; others are 0."""
+        served = self.serves(points)
         matrix = torch.zeros((len(points), len(self.scene.array)), dtype=torch.complex128, device="cpu")
         if served.any():
             outside = points[served]
-            waves, (scattered, *fewer) = self.bodies.waves_at(outside), self._scattered
-            found = waves @ scattered + free_space_matrix(
-                outside, self.scene.array, self.scene.complex_wavenumber
-            )
-            matrix = matrix.index_put((served,), found)
-            left_out = self._left_out(waves.detach(), [scattered, *fewer])
-            converged = left_out <= self.tolerance * found.detach().norm(dim=1)
+            parts = [self._converged(part) for part in torch.split(outside, _AT_ONCE)]
+            found, converged = torch.cat([part for part, _ in parts]), torch.cat([own for _, own in parts])
             served = served.index_put((served.clone(),), converged)
-        if not served.all():
-            if not self._logged:
-                self._logged = True
-                logger.info("%d points are too near an obstacle for its waves: by box", int((~served).sum()))
-            matrix = matrix.index_put((~served,), self._box.transfer_matrix(points[~served]))
-        return matrix
+            matrix = matrix.index_put((served,), found[converged])
+        if not served.all() and not self._logged:
+            self._logged = True
+            logger.info("%d points are too near an obstacle for its waves: by box", int((~served).sum()))
+        return matrix, served
+
+    def _converged(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return G (P, M) at points (P, 3), and where (P,) the waves have converged to the tolerance."""
+        waves, (scattered, *fewer) = bodies_at(self.bodies, points), self._scattered
+        found = waves @ scattered + free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber)
+        left_out = self._left_out(waves.detach(), [scattered, *fewer])
+        return found, left_out <= self.tolerance * found.detach().norm(dim=1)
 
     @cached_property
     def _scattered(self) -> list[torch.Tensor]:
@@ -166,7 +213,7 @@ class OperatorPropagator:
             fewer = ScatteringBodies(
                 replace(body, matrix=body.matrix[:count, :count]) for body, count in some
             )
-            parts = torch.split(fewer.scattered(self.scene.array), counts)
+            parts = torch.split(scattered_waves(fewer, self.scene.array), counts)
             missing = [len(body.matrix) - count for body, count in zip(operators, counts, strict=True)]
             pairs = zip(parts, missing, strict=True)
             found.append(torch.cat([pad(part, (0, 0, 0, rows)) for part, rows in pairs]))
@@ -179,12 +226,3 @@ class OperatorPropagator:
         ratio = (last / before.clamp_min(_TINY)).clamp_max(_SLOWEST)
         left_out: torch.Tensor = last * ratio / (1 - ratio)
         return left_out
-
-    def _error(self, matrix: torch.Tensor, points: torch.Tensor) -> float:
-        """Return the error of G (P, M) by operators on a second grid."""
-        if self._plan.runs == 0:
-            return self.tolerance
-        second = OperatorPropagator(self._plan.second, self._cache)
-        other, ratio = second.transfer_matrix(points), second.spacing / self.spacing
-        first, other = matrix.detach().reshape(1, -1), other.reshape(1, -1)
-        return float(grid_errors(first, other, ratio, self._plan.order)) + self.tolerance

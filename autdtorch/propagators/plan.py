@@ -27,7 +27,7 @@ from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import phasors_kept
 from autdtorch.propagators.grids import USUAL_PERIODS, Grouping, choose_grids
-from autdtorch.propagators.scene_bodies import are_outside, bodies_of, waves_to_simulate
+from autdtorch.propagators.scene_bodies import are_outside, bodies_of, waves_of, waves_to_simulate
 from autdtorch.propagators.scene_region import hardened, region_of
 from autdtorch.scene.arrays import apertures_of
 from autdtorch.scene.obstacles import Mesh
@@ -75,6 +75,10 @@ _RUN_STEPS, _SCENE_STEPS = 4e7, 1e8
 _BESIDE, _SHARE_INSIDE = 2.0, 0.5
 """Heterogeneous cells for each area of a cell of a rigid or fluid surface; their share of the cuboid around
 an obstacle of another sound speed."""
+
+
+_MOST_BODIES, _MOST_WAVES = 3, 2000
+"""Bodies, and waves around all, up to which "auto" takes scattering operators: more are slower than a box."""
 
 
 class Heterogeneity(NamedTuple):
@@ -299,7 +303,8 @@ def _by_operator(
     if method == "auto":
         places = torch.cat([scene.control_points, scene.array.nodes.positions.reshape(-1, 3)])
         walls = any(body.continued for body in region.bodies)
-        if walls or waves > runs or not are_outside(places, bodies).all():
+        many = len(bodies) > _MOST_BODIES or waves_of(scene, bodies, tolerance) > _MOST_WAVES
+        if walls or many or waves > runs or not are_outside(places, bodies).all():
             return chosen, runs
         logger.debug("method auto: operator; %d waves, where %s takes %d runs", waves, chosen, runs)
     return "operator", waves

@@ -1,4 +1,4 @@
-"""The bodies of a scene: groups of obstacles whose circumscribed spheres do not overlap."""
+"""The bodies of a scene: groups of obstacles whose circumscribed spheres neither overlap nor touch."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ import torch
 from autdtorch.analytic.spherical_waves import enough_degrees
 from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Obstacle, Sphere
+from autdtorch.scene.obstacles.moving import circumscribed
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.validation import LENGTH_TOLERANCE
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,29 +52,18 @@ def waves_to_simulate(scene: Scene, bodies: Sequence[Body], error: float) -> int
         for body in bodies
         if not has_closed_form([scene.obstacles[index] for index in body.obstacles], scene.medium)
     ]
-    return sum((enough_degrees(scene.wavenumber * body.radius, error) + 1) ** 2 for body in simulated)
+    return waves_of(scene, simulated, error)
+
+
+def waves_of(scene: Scene, bodies: Sequence[Body], error: float) -> int:
+    """Return the number of waves of bodies, up to a relative error."""
+    return sum((enough_degrees(scene.wavenumber * body.radius, error) + 1) ** 2 for body in bodies)
 
 
 def are_outside(points: torch.Tensor, bodies: Sequence[Body]) -> torch.Tensor:
     """Return which points (P, 3) [m] are outside the spheres of all bodies."""
     apart = torch.stack([(points - body.center).norm(dim=1) - body.radius for body in bodies])
-    return (apart > 0).all(dim=0)
-
-
-def circumscribed(obstacles: Sequence[Obstacle]) -> tuple[torch.Tensor, float]:
-    """Return centre (3,) and radius [m] of a sphere around all obstacles."""
-    lower, upper = (
-        torch.tensor([getattr(body, side) for body in obstacles], dtype=torch.float64, device="cpu")
-        for side in ("lower", "upper")
-    )
-    center = (lower.amin(dim=0) + upper.amax(dim=0)) / 2
-    reach = [
-        float((center - center.new_tensor(body.center)).norm()) + body.radius
-        if isinstance(body, Sphere)
-        else float((body.surface()[0] - center).norm(dim=1).max())
-        for body in obstacles
-    ]
-    return center, max(reach)
+    return (apart > LENGTH_TOLERANCE).all(dim=0)
 
 
 def _body(obstacles: Sequence[Obstacle], chosen: tuple[int, ...]) -> Body:
@@ -80,4 +71,4 @@ def _body(obstacles: Sequence[Obstacle], chosen: tuple[int, ...]) -> Body:
 
 
 def _overlap(one: Body, other: Body) -> bool:
-    return float((one.center - other.center).norm()) < one.radius + other.radius
+    return float((one.center - other.center).norm()) <= one.radius + other.radius + LENGTH_TOLERANCE

@@ -14,6 +14,7 @@ import torch
 
 from autdtorch.analytic.green import PAIR_BYTES
 from autdtorch.fdtd.grid import grid_errors
+from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.cache import DiskCache, cache_key
 from autdtorch.propagators.full import DomainSimulation
 from autdtorch.propagators.kept_fields import KeepingSimulation
@@ -57,9 +58,9 @@ class Propagator(Protocol):
 class SimulatedPropagator:
     """A propagator that simulates the steady state of the drive by FDTD.
 
-    By method "box", the outgoing fields of the last drives are kept and, once as many runs were taken from
-    points as the transducers would have needed, those of all transducers. More points outside the boxes, and
-    more drives, then take sums and no runs.
+    By method "box" and without a cache, the outgoing fields of the last drives are kept and, once as many
+    runs were taken from points as the transducers would have needed, those of all transducers. More points
+    outside the boxes, and more drives, then take sums and no runs.
 
     Attributes:
         scene: the scene it was made for.
@@ -83,7 +84,9 @@ class SimulatedPropagator:
         self.runs: list[Run] = []
         self._reported = 0
         self._plan, self._cache, self._given = plan, cache, tuple(others)
-        self._simulation = DomainSimulation(plan) if plan.method == "full" else KeepingSimulation(plan)
+        # What a folder holds must not decide how later fields are computed: nothing is kept beside a cache.
+        boxes = KeepingSimulation if cache is None else BoxSimulation
+        self._simulation = DomainSimulation(plan) if plan.method == "full" else boxes(plan)
         self._control: TransferMatrix | None = None
         self._transducers_ran = self._near_logged = self._near_points_logged = False
 

@@ -132,7 +132,9 @@ class Scene:
         _warn_of_units(self)
 
     def moved(self, offset: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike = (0.0, 0.0, 0.0)) -> Scene:
-        """Return the scene with all obstacles shifted, and turned about their common centre, as one body.
+        """Return the scene with all obstacles shifted, and turned as one body.
+
+        They turn about the centre of the sphere around them, as those of a `ScatteringOperator`.
 
         Args:
             offset: (3,) [m].

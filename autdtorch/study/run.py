@@ -24,6 +24,8 @@ from autdtorch.objectives.objective import Objective
 from autdtorch.objectives.quiet import QuietPoints
 from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.propagators import OperatorPropagator, Propagator, SimulatedPropagator, make_propagator
+from autdtorch.propagators.plan import plan
+from autdtorch.scene.obstacles.moving import is_movable
 from autdtorch.scene.scene import Scene
 from autdtorch.study.folder import open_folder
 from autdtorch.study.provenance import provenance_now
@@ -53,7 +55,8 @@ that has a parameter `score` is given the goal."""
 BLOCK = Method.block
 """Trials that are run and saved together. The end of the process costs the block in work at most."""
 
-_COUNTED_SPACING = 2e-3  # [m], of the grid on which the runs of poses are counted
+_COUNTED_SPACING = 2e-3  # [m], of the grid on which the runs of poses are counted, at most
+_MOST_BODIES = 4  # Bodies whose operators are kept in memory
 
 _MOST_SAMPLES = 10**6  # of an observation plane: 16 complex columns of them are 256 MB
 
@@ -144,19 +147,29 @@ def _before(name: str, scenes: Mapping[str, Scene]) -> str:
 def _for_poses(scenes: Mapping[str, Scene], solver: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments of `make_propagator` for poses of obstacles: by operators where they pay.
 
-    Runs are counted at the first pose.
+    Runs are counted on a coarse grid, those of the boxes at the first pose.
     """
-    settings = {"spacing": _COUNTED_SPACING, **{key: solver[key] for key in ("tolerance",) if key in solver}}
     first = next(iter(scenes.values()))
-    each = make_propagator(first, **settings)
+    settings = {key: solver[key] for key in ("tolerance",) if key in solver}
+    spacing = min(_COUNTED_SPACING, solver.get("spacing") or math.inf, plan(first, spacing=None).spacing)
+    each = make_propagator(first, spacing=spacing, **settings)
     if solver.get("method", "auto") != "auto" or not isinstance(each, SimulatedPropagator):
         return dict(solver)
-    once = make_propagator(first, "operator", **settings)
-    if each.method != "box" or not isinstance(once, OperatorPropagator):
+    if each.method != "box" or not all(map(is_movable, first.obstacles)):
         return dict(solver)
-    if once.planned_runs > len(scenes) * each.planned_runs or not once.serves(first.control_points).all():
+    bodies = {}
+    for scene in scenes.values():
+        once = make_propagator(scene, "operator", spacing, **settings)
+        assert isinstance(once, OperatorPropagator)
+        if not once.serves(scene.control_points).all():
+            return dict(solver)
+        bodies.update({one.body: one for one in once.placed})
+        if len(bodies) > _MOST_BODIES:
+            return dict(solver)
+    runs = sum(one.runs for one in bodies.values())
+    if runs > len(scenes) * each.planned_runs:
         return dict(solver)
-    logger.info("scattering operators: %d runs for all poses", once.planned_runs)
+    logger.info("scattering operators: %d runs for all poses", runs)
     return {**solver, "method": "operator"}
 
 

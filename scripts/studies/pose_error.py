@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import torch
 from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
 from shared.document import fill_in, measured, percent, table
 from shared.scenes import PAPER, paper_scene
 
@@ -32,7 +33,7 @@ SHIFTS = (0.2, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
 """Distances [mm]."""
 TURNS = (1.0, 2.0, 5.0, 7.0, 10.0, 15.0, 20.0)
 """Angles [degrees]."""
-TOLD = {"mm": (0.5, 1.0, 2.0, 5.0), "degrees": (2.0, 5.0, 10.0, 20.0)}
+SHOWN = {"mm": (0.5, 1.0, 2.0, 5.0), "degrees": (2.0, 5.0, 10.0, 20.0)}
 """Pose errors in the table."""
 STARTS = 8
 """First guesses of the drives that follow the pose."""
@@ -85,7 +86,8 @@ def losses(name: str, count: int, spacing: float) -> Iterator[Losses]:
             if unit == "mm":
                 poses = [body.moved(1e-3 * error * direction) for direction in directions]
             else:
-                poses = [body.moved(rotation=math.radians(error) * direction) for direction in directions]
+                turns = Rotation.from_rotvec(math.radians(error) * directions.numpy()).as_euler("xyz")
+                poses = [body.moved(rotation=turn) for turn in turns]
             matrices = [pose.transfer_matrix(scene.array, scene.control_points) for pose in poses]
             matrix = torch.stack(matrices)
             yield Losses(
@@ -107,7 +109,7 @@ def plot_losses(found: Sequence[Losses]) -> Figure:
     """Plot the share that is left over the pose error: the median, and nine of ten directions."""
     figure, looks = new_figure(6.6, 3.0), looks_of(SCENES)
     panels = figure.subplots(1, 2, sharey=True)
-    for ax, unit, label in zip(panels, TOLD, ("shift [mm]", "turn [degrees]"), strict=True):
+    for ax, unit, label in zip(panels, SHOWN, ("shift [mm]", "turn [degrees]"), strict=True):
         for name in SCENES:
             rows = [one for one in found if (one.scene, one.unit) == (name, unit)]
             errors = [0.0, *(one.error for one in rows)]
@@ -131,7 +133,7 @@ def plot_losses(found: Sequence[Losses]) -> Figure:
 def rows(found: Sequence[Losses]) -> Iterator[list[str]]:
     """Yield the cells of the table."""
     for one in found:
-        if one.error in TOLD[one.unit]:
+        if one.error in SHOWN[one.unit]:
             kept = [percent(float(one.kept.quantile(share))) for share in (0.5, 0.05)]
             yield [
                 readable(one.scene),

@@ -58,7 +58,18 @@ def test_starts_that_do_not_fit_are_named(objectives):
         at.run(WARM[0], objectives[0], trials=3, start=DRIVE.expand(2, 5))
     with pytest.raises(ValueError, match=r"start: shape \(1, 2, 5\); must be \(5,\) or \(T, 5\)"):
         at.run(WARM[0], objectives[0], start=DRIVE.expand(1, 2, 5))
-    with pytest.raises(ValueError, match=r"drive: shape \(4,\)"):
+    with pytest.raises(ValueError, match=r"start: shape \(4,\)"):
         at.run(WARM[0], objectives[0], start=DRIVE[:4])
+    with pytest.raises(ValueError, match=r"objective\[1\]: objective: 'x'; must be"):
+        at.run(WARM[0], [objectives[0], "x"])
     with pytest.raises(ValueError, match=r"state_file: .* must be None for a sequence"):
         at.run(WARM[0], objectives, state_file="state.npz")
+
+
+def test_a_state_with_another_start_is_refused(objectives, tmp_path):
+    path = tmp_path / "state.npz"
+    at.run(WARM[0], objectives[0], state_file=path, start=DRIVE)
+    at.run(WARM[0], objectives[0], state_file=path, start=DRIVE)
+    for start in (None, 1j * DRIVE):
+        with pytest.raises(ValueError, match="state of"):
+            at.run(WARM[0], objectives[0], state_file=path, start=start)

@@ -25,6 +25,12 @@ CALLS = public_calls()
 EXPECTED = {
     ("load_scene", "source", "a dict"),  # a scene without the keys that it needs
     ("view3d", "volume", "itself, with nan"),  # unknown values of a volume
+    ("plot_poses", "bounds", "itself, with inf"),  # no bound is known
+    # whole metres, which move the obstacles out of the domain
+    *(
+        ("Scene.moved", "offset", f"a tensor {kind}")
+        for kind in ("of 8 bits", "of unsigned integers", "with gradient")
+    ),
 }
 
 #: Kinds of annotations that let a kind of value in.

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
-from autdtorch.scene.obstacles.moving import at_rest, moved
+from autdtorch.scene.obstacles.moving import at_rest, circumscribed, moved
 
 CENTER, TURN = (0.4, -0.2, 0.1), (0.5, -0.3, 2.0)
 BOX = Box(CENTER, (1.0, 0.6, 0.4), rotation=TURN, rigid=True)
@@ -223,16 +223,14 @@ def test_obstacles_move_as_one_body(first, second):
         cloud(50),
     )
     offset, turn = torch.tensor([0.3, -0.1, 0.2], dtype=torch.float64), rotation_matrix(second)
-    lower, upper = (
-        torch.tensor([getattr(one, side) for one in bodies], dtype=torch.float64)
-        for side in ("lower", "upper")
-    )
-    middle = (lower.amin(dim=0) + upper.amax(dim=0)) / 2
+    middle, _ = circumscribed(bodies)
     found = moved(bodies, offset, second)
     places = (points - middle) @ turn.T + middle + offset
     for one, other in zip(bodies, found, strict=True):
         # places are rounded to 1e-14 m, angles to 1e-12
         assert torch.allclose(one.signed_distance(points), other.signed_distance(places), rtol=0, atol=1e-9)
+    assert torch.allclose(circumscribed(found)[0], middle + offset, rtol=0, atol=1e-9)
+    assert circumscribed(found)[1] == pytest.approx(circumscribed(bodies)[1], abs=1e-9)
     rests = [at_rest(each)[0] for each in (found, moved(bodies, offset, first))]
     centers = [torch.tensor([one.center for one in rest], dtype=torch.float64) for rest in rests]
     apart = [center - center[:1] for center in centers]

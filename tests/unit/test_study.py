@@ -267,9 +267,9 @@ def test_poses_start_at_the_drives_of_the_scene_before(tmp_path):
 def test_poses_are_simulated_by_operators_where_these_are_fewer_runs(tmp_path, monkeypatch):
     chosen = []
 
-    def made(scene, method="auto", **settings):
+    def made(scene, method="auto", spacing=1e-3, **settings):
         chosen.append(method)
-        return make_propagator(scene, method, **settings)
+        return make_propagator(scene, method, spacing, **settings)
 
     monkeypatch.setattr(autdtorch.study.run, "make_propagator", made)
     cube = Box((12e-3,) * 3, (3e-3,) * 3, rigid=True)

@@ -10,7 +10,17 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 import torch
 
-from autdtorch.methods.base import Method, Problem, State, Step, Trials, generators_of, restored, states_of
+from autdtorch.methods.base import (
+    Method,
+    Problem,
+    State,
+    Step,
+    Trials,
+    generators_of,
+    restored,
+    starts_of,
+    states_of,
+)
 from autdtorch.methods.driver import run
 from autdtorch.methods.gradient import climbed
 from autdtorch.methods.matrix_posterior import kept, posteriors
@@ -148,7 +158,7 @@ class BayesOpt(Method):
             points = torch.stack([_sobol(self.initial, dimensions, seed) for seed in seeds])
         else:
             points = torch.stack([_uniform(own, self.initial, dimensions) for own in generators])
-        if (given := problem.starts(len(seeds))) is not None:
+        if (given := starts_of(problem, len(seeds))) is not None:
             points[:, 0] = self._points(given)
         search = {
             "points": points,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -23,22 +25,40 @@ _TURNS = {Box: "rotation", Mesh: "rotation", Cylinder: "axis", Sphere: ""}
 # can show. Fewer at rest, after two turns
 _DIGITS, _ANGLE_DIGITS = 14, 12
 _DIGITS_AT_REST, _ANGLE_DIGITS_AT_REST = 12, 10
-_SIDES = "lower", "upper"
 
 
 def moved(obstacles: Sequence[Obstacle], offset: torch.Tensor, rotation: Vector) -> tuple[Obstacle, ...]:
-    """Return obstacles turned about the middle of their bounding box and shifted by an offset (3,) [m].
+    """Return obstacles turned about the centre of their circumscribed sphere and shifted by offset (3,) [m].
 
     Raises:
         ValueError: an obstacle that cannot be moved or turned.
     """
     if fixed := [one for one in obstacles if not is_movable(one)]:
         raise invalid("obstacles", type(fixed[0]).__name__, "must be of autdtorch's own kinds to be moved")
-    if any(rotation):
-        lower, upper = (offset.new_tensor([getattr(one, side) for one in obstacles]) for side in _SIDES)
-        middle, turn = (lower.amin(dim=0) + upper.amax(dim=0)) / 2, rotation_matrix(rotation)
-        obstacles = [turned(one, turn, middle) for one in obstacles]
+    if obstacles and any(rotation):
+        (center, _), turn = circumscribed(obstacles), rotation_matrix(rotation)
+        obstacles = [turned(one, turn, center) for one in obstacles]
     return tuple(shifted(one, offset) for one in obstacles)
+
+
+def circumscribed(obstacles: Sequence[Obstacle]) -> tuple[torch.Tensor, float]:
+    """Return centre (3,) and radius [m] of a sphere around all obstacles, which moves along with them.
+
+    Its centre is that of their bounding box when they are `at_rest`.
+    """
+    still, turn = at_rest(obstacles)
+    lower, upper = (
+        torch.tensor([getattr(one, side) for one in still], dtype=torch.float64, device="cpu")
+        for side in ("lower", "upper")
+    )
+    center = (lower.amin(dim=0) + upper.amax(dim=0)) / 2
+    reach = [
+        float((center - center.new_tensor(one.center)).norm()) + one.radius
+        if isinstance(one, Sphere)
+        else float((one.surface()[0] - center).norm(dim=1).max())
+        for one in still
+    ]
+    return turn @ center, max(reach)
 
 
 def is_movable(obstacle: object) -> bool:
@@ -71,30 +91,45 @@ def turned(
     fields: dict[str, Any] = {_PLACES[kind]: _rounded(pivot + turn @ (place - pivot), digits)}
     if name := _TURNS[kind]:
         own = getattr(obstacle, name)
-        found = _angles(turn @ rotation_matrix(own)) if name == "rotation" else turn @ turn.new_tensor(own)
+        found = angles_of(turn @ rotation_matrix(own)) if name == "rotation" else turn @ turn.new_tensor(own)
         fields[name] = _rounded(found, angle_digits)
     return replace(obstacle, **fields)
 
 
 def at_rest(obstacles: Sequence[Obstacle]) -> tuple[tuple[Obstacle, ...], torch.Tensor]:
-    """Return obstacles turned back so that the first that has a rotation has none, and the turn (3, 3).
+    """Return obstacles turned back so that the first box or mesh has no rotation, and the turn (3, 3).
 
-    Obstacles that are shifted and turned as one body are at rest as before, but for the shift.
+    Without these, the axis of the first cylinder becomes z. Obstacles that are shifted and turned as one body
+    come to rest in one orientation.
     """
-    none = torch.eye(3, dtype=torch.float64, device="cpu")
-    rotations = [body.rotation for body in obstacles if isinstance(body, Box | Mesh)]
-    turn = rotation_matrix(rotations[0]) if rotations else none
-    if torch.equal(turn, none) or any(type(body) not in _TURNS for body in obstacles):
-        return tuple(obstacles), none
+    turn = _first_turn(obstacles)
+    if torch.equal(turn, torch.eye(3, dtype=torch.float64, device="cpu")):
+        return tuple(obstacles), turn
+    if any(type(one) not in _TURNS for one in obstacles):
+        return tuple(obstacles), torch.eye(3, dtype=torch.float64, device="cpu")
     digits = _DIGITS_AT_REST, _ANGLE_DIGITS_AT_REST
-    return tuple(turned(body, turn.mT, torch.zeros_like(none[0]), *digits) for body in obstacles), turn
+    return tuple(turned(one, turn.mT, torch.zeros_like(turn[0]), *digits) for one in obstacles), turn
 
 
-def _angles(turn: torch.Tensor) -> torch.Tensor:
-    """Return the angles (3,) [rad] of a rotation, as of `rotation_matrix`."""
+def _first_turn(obstacles: Sequence[Obstacle]) -> torch.Tensor:
+    """Return the turn (3, 3) of the first box or mesh, or from z to the axis of the first cylinder."""
+    for one in obstacles:
+        if isinstance(one, Box | Mesh):
+            return rotation_matrix(one.rotation)
+    for one in obstacles:
+        if isinstance(one, Cylinder):
+            x, y, z = one.axis
+            return rotation_matrix((0.0, math.acos(max(-1.0, min(1.0, z))), math.atan2(y, x)))
+    return torch.eye(3, dtype=torch.float64, device="cpu")
+
+
+def angles_of(turn: torch.Tensor) -> torch.Tensor:
+    """Return the angles (3,) [rad] of a rotation matrix (3, 3), as of `rotation_matrix`."""
     from scipy.spatial.transform import Rotation
 
-    return torch.from_numpy(Rotation.from_matrix(turn.numpy()).as_euler("xyz"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # where the angles are not unique, any will do
+        return torch.from_numpy(Rotation.from_matrix(turn.numpy()).as_euler("xyz"))
 
 
 def _rounded(vector: torch.Tensor, digits: int) -> Vector:
