@@ -28,8 +28,8 @@ class Poses(NamedTuple):
 def along_path(settings: dict[str, Any]) -> Poses:
     """Replace scene and method in the settings by an experiment with a scene for each pose.
 
-    The first pose is that of the scene. The last is moved by `offset` and turned by `rotation` from there;
-    shift and angles of those between are evenly spaced.
+    The path begins at the pose of the scene. The last pose is moved by `offset` and turned by `rotation` from
+    there. Shifts and angles between are evenly spaced.
 
     Raises:
         ValueError: a setting of `poses` that is unknown or out of range, or an experiment beside it.

@@ -73,7 +73,7 @@ class DiskCache:
 
 
 def disk_cache(folder: str | os.PathLike[str] | Literal[False] | None) -> DiskCache | None:
-    """Return the cache in a folder, by default that of `CACHE_VARIABLE`, or none."""
+    """Return the cache in a folder, by default the folder that `CACHE_VARIABLE` names, or None."""
     name = "cache"
     if folder is None:
         name, folder = CACHE_VARIABLE, os.environ.get(CACHE_VARIABLE) or False

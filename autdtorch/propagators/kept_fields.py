@@ -1,9 +1,9 @@
 """A simulation in boxes that keeps outgoing fields, so that new points and planes take sums, not runs.
 
-Outside the boxes a field is that of the Huygens surfaces. Their amplitudes are kept for the last drives and,
-once that has paid, for all transducers. Fewer runs from points are taken for a few points (reciprocity);
-after as many of them as the transducers would have taken, the transducers are simulated: at most twice the
-fewest runs, however many points follow.
+Outside the boxes, the Huygens surfaces radiate the whole scattered field. Their amplitudes are kept for the
+last drives and, once that has paid, for all transducers. A few points take fewer runs than the transducers
+(reciprocity). After as many runs from points as the transducers would have taken, these are simulated. That
+is at most twice the fewest runs, however many points follow.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class KeptFields:
     def scattered(self, receivers: Apertures, weights: torch.Tensor | None) -> torch.Tensor:
         """Return the scattered field (R, P) at receivers outside the boxes, of sums with weights (R, K).
 
-        Without weights, it is that of each drive.
+        Without weights, each drive has a row.
         """
         amplitudes = [own if weights is None else own @ weights.mT for own in self.amplitudes]
         parts = zip(self.boxes, amplitudes, strict=True)
@@ -118,9 +118,9 @@ class KeepingSimulation(BoxSimulation):
 
     @cached_property
     def _is_fit(self) -> bool:
-        """Whether fields are worth keeping: they fit into memory, and no source is next to an obstacle.
+        """True if the fields fit into memory, and no source is next to an obstacle.
 
-        Runs that begin at points are more accurate there.
+        For such sources, runs that begin at points are more accurate.
         """
         size = _ENTRY_BYTES * len(self.plan.scene.array) * sum(len(box.surface[0]) for box in self.boxes)
         nodes = self.plan.scene.array.nodes.positions.reshape(-1, 3)

@@ -47,9 +47,9 @@ def make_propagator(
             cheaper. Obstacles are simulated as a whole, including parts outside the domain. The grid of a
             box turns with tilted flat faces. "operator": scattering operators of the obstacles, each
             simulated once for all poses, arrays and points, and known for spheres; see
-            `ScatteringOperator`. "auto": free space without obstacles, full where a wall continues through
-            the boundary layer, operator where it takes fewer simulations (spheres take none), box where
-            other obstacles leave the domain or are tilted, otherwise the cheaper of box and full. The
+            `ScatteringOperator`. "auto": free space without obstacles; full where a wall continues through
+            the boundary layer; operator where it takes fewer simulations (up to three spheres take none); box
+            where other obstacles leave the domain or are tilted; otherwise the cheaper of box and full. The
             propagator's `method` is the one chosen; the reason is logged at level DEBUG.
         spacing: edge of a cell [m], at most a third of the wavelength. The error falls with its square, or
             faster along the grid (docs/decisions/error-bars.md). None: the scene is simulated on finer and

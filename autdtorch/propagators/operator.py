@@ -79,7 +79,7 @@ class ScatteringOperator:
         *,
         cache: str | os.PathLike[str] | Literal[False] | None = None,
     ) -> ScatteringOperator:
-        """Simulate the operator of obstacles; that of a single sphere is exact.
+        """Simulate the operator of obstacles; for a single sphere it is exact.
 
         Args:
             obstacles: one, or several that move as one body.

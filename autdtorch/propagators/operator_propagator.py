@@ -125,9 +125,9 @@ class OperatorPropagator:
     ) -> torch.Tensor | tuple[torch.Tensor, float]:
         """Return the transfer matrix G; see `SimulatedPropagator.transfer_matrix`.
 
-        Differentiable by the points that are not served by the box. The error is that of the grid, from
-        operators on a second one, with the tolerance; in closed form it is the tolerance. Rows from the box
-        have the error that the box estimates.
+        Differentiable by the points that are not served by the box. The error is the tolerance, and that of
+        the grid where operators are simulated, from a second grid. For rows from the box, the box estimates
+        it.
         """
         with_error = boolean("return_error", return_error)
         places = self._checked(points)

@@ -41,7 +41,7 @@ def bodies_of(obstacles: Sequence[Obstacle]) -> list[Body]:
 
 
 def has_closed_form(obstacles: Sequence[Obstacle], medium: Medium) -> bool:
-    """Return whether the scattering of a body is known: that of a sphere in a medium without losses."""
+    """Return whether T of a body has a closed form: a sphere, in a medium without losses."""
     return len(obstacles) == 1 and type(obstacles[0]) is Sphere and medium.absorption == 0
 
 

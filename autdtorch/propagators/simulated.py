@@ -58,9 +58,9 @@ class Propagator(Protocol):
 class SimulatedPropagator:
     """A propagator that simulates the steady state of the drive by FDTD.
 
-    By method "box" and without a cache, the outgoing fields of the last drives are kept and, once as many
-    runs were taken from points as the transducers would have needed, those of all transducers. More points
-    outside the boxes, and more drives, then take sums and no runs.
+    By method "box" and without a cache, the outgoing fields of the last drives are kept. Those of all
+    transducers are simulated and kept once they pay: after as many runs from points. More points outside the
+    boxes, and more drives, then take sums and no runs.
 
     Attributes:
         scene: the scene it was made for.

@@ -44,7 +44,7 @@ def moved(obstacles: Sequence[Obstacle], offset: torch.Tensor, rotation: Vector)
 def circumscribed(obstacles: Sequence[Obstacle]) -> tuple[torch.Tensor, float]:
     """Return centre (3,) and radius [m] of a sphere around all obstacles, which moves along with them.
 
-    Its centre is that of their bounding box when they are `at_rest`.
+    The centre is the middle of their bounding box when they are `at_rest`.
     """
     still, turn = at_rest(obstacles)
     lower, upper = (
