@@ -19,6 +19,7 @@ from scipy.special import spherical_jn, spherical_yn
 
 from autdtorch.utils.array_types import ComplexArray
 
+_LOST = 1e-280  # Magnitude below which j_l loses digits to underflow
 _TINY = 1e-12  # distance from the centre [m] below which a point has the direction z
 
 
@@ -161,8 +162,11 @@ def sphere_coefficients(
     out_slope = slope + 1j * spherical_yn(order, size, derivative=True)
     inner, inner_slope = np.ones(degree + 1), np.zeros(degree + 1)
     if not math.isinf(density_ratio):
-        inner = spherical_jn(order, size / speed_ratio)
-        inner_slope = spherical_jn(order, size / speed_ratio, derivative=True) / (density_ratio * speed_ratio)
+        inside = size / speed_ratio
+        inner, slope_inside = spherical_jn(order, inside), spherical_jn(order, inside, derivative=True)
+        lost = np.abs(inner) < _LOST  # j_l is proportional to x^l there
+        inner, slope_inside = np.where(lost, 1.0, inner), np.where(lost, order / inside, slope_inside)
+        inner_slope = slope_inside / (density_ratio * speed_ratio)
     found: ComplexArray = -(slope * inner - own * inner_slope) / (out_slope * inner - out * inner_slope)
     return found
 

@@ -27,7 +27,13 @@ from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import phasors_kept
 from autdtorch.propagators.grids import USUAL_PERIODS, Grouping, choose_grids
-from autdtorch.propagators.scene_bodies import are_outside, bodies_of, waves_of, waves_to_simulate
+from autdtorch.propagators.scene_bodies import (
+    are_outside,
+    bodies_of,
+    fewest_waves,
+    waves_of,
+    waves_to_simulate,
+)
 from autdtorch.propagators.scene_region import hardened, region_of
 from autdtorch.scene.arrays import apertures_of
 from autdtorch.scene.obstacles import Mesh
@@ -297,6 +303,8 @@ def _by_operator(
 ) -> tuple[str, int]:
     """Return "operator" and its runs where it is asked for, or has fewer runs; otherwise what was chosen."""
     if method not in ("auto", "operator"):
+        return chosen, runs
+    if method == "auto" and fewest_waves(scene, tolerance) > runs:
         return chosen, runs
     bodies = bodies_of(scene.obstacles)
     waves = waves_to_simulate(scene, bodies, tolerance)

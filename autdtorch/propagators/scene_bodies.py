@@ -55,6 +55,13 @@ def waves_to_simulate(scene: Scene, bodies: Sequence[Body], error: float) -> int
     return waves_of(scene, simulated, error)
 
 
+def fewest_waves(scene: Scene, error: float) -> int:
+    """Return a lower limit of `waves_to_simulate`, from bounding boxes alone."""
+    simulated = [one for one in scene.obstacles if not has_closed_form([one], scene.medium)]
+    edges = [max(high - low for low, high in zip(one.lower, one.upper, strict=True)) for one in simulated]
+    return max(((enough_degrees(scene.wavenumber * edge / 2, error) + 1) ** 2 for edge in edges), default=0)
+
+
 def waves_of(scene: Scene, bodies: Sequence[Body], error: float) -> int:
     """Return the number of waves of bodies, up to a relative error."""
     return sum((enough_degrees(scene.wavenumber * body.radius, error) + 1) ** 2 for body in bodies)

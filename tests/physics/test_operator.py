@@ -179,6 +179,9 @@ def test_coefficients_conserve_energy_and_degrees_suffice():
     for ratios in ((), (3.0, 0.7), (1e4, 5.0)):
         found = sphere_coefficients(20, 6.0, *ratios)
         assert np.abs(1 + 2 * found) == pytest.approx(np.ones(21), abs=1e-12)
+    # j_l in a stiff sphere is below the smallest number; it is nearly rigid
+    stiff, rigid = sphere_coefficients(170, 150.0, 1e5, 2941.0), sphere_coefficients(170, 150.0)
+    assert np.abs(stiff - rigid).max() < 1e-3
     for size in (1.0, 6.0, 15.0):
         enough = enough_degrees(size, 1e-3)
         assert abs(sphere_coefficients(enough + 1, size)[-1]) < 1e-3
