@@ -157,6 +157,8 @@ def test_an_operator_comes_back_from_its_file(cube, tmp_path):
     moved.save(tmp_path / "cube.npz")
     again = ScatteringOperator.load(tmp_path / "cube.npz")
     assert torch.equal(again.transfer_matrix(ARRAY, POINTS), moved.transfer_matrix(ARRAY, POINTS))
+    cube.moved(torch.zeros(3, dtype=torch.float64, requires_grad=True)).save(tmp_path / "varied.npz")
+    assert torch.equal(ScatteringOperator.load(tmp_path / "varied.npz").center, cube.center)
     np.savez(tmp_path / "other.npz", matrix=np.ones((2, 2)))
     with pytest.raises(ValueError, match=r"other.npz: no array center, axes"):
         ScatteringOperator.load(tmp_path / "other.npz")
