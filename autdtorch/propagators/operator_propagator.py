@@ -85,21 +85,14 @@ class OperatorPropagator:
     @cached_property
     def bodies(self) -> ScatteringBodies:
         """The bodies of the scene."""
-        return ScatteringBodies([ScatteringOperator(*body.matrix(self._cache)) for body in self.placed])
+        return ScatteringBodies(
+            [ScatteringOperator(*body.matrix(self._cache)) for body in placed_bodies(self._plan)]
+        )
 
     @property
     def planned_runs(self) -> int:
         """Number of simulations of all operators, if none is there."""
-        return sum(body.runs for body in self.placed)
-
-    @property
-    def placed(self) -> list[Placed]:
-        """The bodies before they are simulated."""
-        plan, scene = self._plan, self.scene
-        error = min(max(plan.tolerance, _ERRORS[0]), _ERRORS[1])
-        solver = Solver(plan.spacing, error, plan.kernel, plan.dtype, plan.max_periods, plan.time_step)
-        groups = [[scene.obstacles[index] for index in body.obstacles] for body in self._spheres]
-        return [placed(group, scene.medium, scene.frequency, solver) for group in groups]
+        return sum(body.runs for body in placed_bodies(self._plan))
 
     def serves(self, points: ArrayLike) -> torch.Tensor:
         """Return which points (P, 3) [m] are outside all bodies' spheres; none if a transducer is not."""
@@ -226,3 +219,11 @@ class OperatorPropagator:
         ratio = (last / before.clamp_min(_TINY)).clamp_max(_SLOWEST)
         left_out: torch.Tensor = last * ratio / (1 - ratio)
         return left_out
+
+
+def placed_bodies(plan: Plan) -> list[Placed]:
+    """Return the bodies of a plan's scene, before they are simulated."""
+    scene, error = plan.scene, min(max(plan.tolerance, _ERRORS[0]), _ERRORS[1])
+    solver = Solver(plan.spacing, error, plan.kernel, plan.dtype, plan.max_periods, plan.time_step)
+    groups = [[scene.obstacles[index] for index in body.obstacles] for body in bodies_of(scene.obstacles)]
+    return [placed(group, scene.medium, scene.frequency, solver) for group in groups]

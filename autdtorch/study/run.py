@@ -24,6 +24,7 @@ from autdtorch.objectives.objective import Objective
 from autdtorch.objectives.quiet import QuietPoints
 from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.propagators import OperatorPropagator, Propagator, SimulatedPropagator, make_propagator
+from autdtorch.propagators.operator_propagator import placed_bodies
 from autdtorch.propagators.plan import plan
 from autdtorch.scene.obstacles.moving import is_movable
 from autdtorch.scene.scene import Scene
@@ -159,11 +160,10 @@ def _for_poses(scenes: Mapping[str, Scene], solver: Mapping[str, Any]) -> dict[s
         return dict(solver)
     bodies = {}
     for scene in scenes.values():
-        once = make_propagator(scene, "operator", spacing, **settings)
-        assert isinstance(once, OperatorPropagator)
-        if not once.serves(scene.control_points).all():
+        once = plan(scene, "operator", spacing, **settings)
+        if not OperatorPropagator(once).serves(scene.control_points).all():
             return dict(solver)
-        bodies.update({one.body: one for one in once.placed})
+        bodies.update({one.body: one for one in placed_bodies(once)})
         if len(bodies) > _MOST_BODIES:
             return dict(solver)
     runs = sum(one.runs for one in bodies.values())
