@@ -143,7 +143,7 @@ def test_bad_input_is_named(given, message):
 
 @pytest.mark.parametrize("algorithm", ["gs", "wgs", "gs_pat"])
 def test_more_starts_find_better_drives_of_symmetric_foci(algorithm):
-    """Four foci on a circle in front of a square array: GS ends at two thirds of its best from equal phases."""
+    """Four foci on a circle in front of a square array: from equal phases GS ends at two thirds."""
     array = autdtorch.TransducerArray.grid((4, 4), 10e-3, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), radius=0)
     foci = autdtorch.circle_points((80e-3, 0, 0), 30e-3, 4, (1, 0, 0))
     scene = autdtorch.Scene(array, autdtorch.Medium(1.2, 340.0), 40e3, foci)
