@@ -98,3 +98,15 @@ def test_discs_keep_their_fields():
     found = propagator.transfer_matrix()
     assert len(propagator.runs) == before
     assert relative_error(found, discs().transfer_matrix()) < SAME
+
+
+def test_what_a_cache_holds_changes_no_field(tmp_path):
+    """Beside a cache nothing is kept: a resumed study finds the fields of one that never stopped."""
+    found = []
+    for _ in range(2):  # simulated, then loaded
+        settings = {"tolerance": 1e-3, "cache": tmp_path}
+        propagator = make_propagator(small_scene((ASIDE,)), "box", 1.3e-3, **settings)
+        for points in (PLANE[:3], PLANE[3:6], PLANE[6:9]):
+            propagator.transfer_matrix(points)
+        found.append(propagator.field(DRIVE, PLANE + 1e-3))
+    assert torch.equal(*found)
