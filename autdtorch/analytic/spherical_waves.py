@@ -153,8 +153,8 @@ def sphere_coefficients(
     Args:
         degree: L.
         size: k a, real.
-        density_ratio: density of the sphere over that of the medium; infinite if rigid.
-        speed_ratio: sound speed of the sphere over that of the medium.
+        density_ratio: density ratio, sphere over medium; infinite if rigid.
+        speed_ratio: ratio of sound speeds, sphere over medium.
     """
     order = np.arange(degree + 1)
     own, slope = spherical_jn(order, size), spherical_jn(order, size, derivative=True)

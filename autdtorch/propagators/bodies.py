@@ -8,14 +8,14 @@ doi:10.1063/1.1703737). It is exact while the circumscribed spheres do not overl
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from autdtorch.analytic.green import free_space_matrix
-from autdtorch.analytic.spherical_waves import harmonics, regular_radial
+from autdtorch.analytic.spherical_waves import degrees, harmonics, regular_radial
 from autdtorch.propagators.operator import ScatteringOperator, incoming_waves, parts_of, waves_at
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.utils.memory import require_memory
@@ -77,7 +77,7 @@ class ScatteringBodies:
         places, grid = points_grid("points", points)
         targets = places.cpu()
         direct = free_space_matrix(targets, array, self.operators[0].wavenumber)
-        scattered = scattered_waves(self, array)
+        (scattered,) = scattered_waves(self, array)
         parts = [bodies_at(self, part) @ scattered for part in parts_of(targets, len(scattered))]
         return (direct + torch.cat(parts)).reshape(*grid, -1)
 
@@ -87,25 +87,40 @@ def bodies_at(bodies: ScatteringBodies, points: torch.Tensor) -> torch.Tensor:
     return torch.cat([waves_at(body, points) for body in bodies.operators], dim=1)
 
 
-def scattered_waves(bodies: ScatteringBodies, array: TransducerArray) -> torch.Tensor:
-    """Return the coefficients (N, M) [Pa] of all bodies' outgoing waves under unit drives of an array."""
+def scattered_waves(
+    bodies: ScatteringBodies, array: TransducerArray, left_out: Sequence[int] = (0,)
+) -> list[torch.Tensor]:
+    """Return the coefficients (N, M) [Pa] of all bodies' outgoing waves under unit drives of an array.
+
+    Once for each number of highest degrees that are left out, whose coefficients are 0.
+    """
     operators = bodies.operators
-    alone = [body.matrix @ incoming_waves(body, array).mT for body in operators]
-    if len(alone) == 1:
-        return alone[0]
-    count = sum(map(len, alone))
+    incoming = [incoming_waves(body, array).mT for body in operators]
+    if len(operators) == 1:
+        return [_without(operators[0], fewer) @ incoming[0] for fewer in left_out]
+    count = sum(map(len, incoming))
     require_memory("operators", f"{count} waves", _ENTRY_BYTES * count**2)
-    rows = []
-    for body in operators:
-        blocks = [
-            torch.eye(len(body.matrix), dtype=torch.complex128, device="cpu")
-            if other is body
-            else -body.matrix @ _regular_waves(body, other)
+    rows = [
+        [
+            torch.zeros_like(body.matrix) if other is body else _regular_waves(body, other)
             for other in operators
         ]
-        rows.append(torch.cat(blocks, dim=1))
-    found: torch.Tensor = torch.linalg.solve(torch.cat(rows), torch.cat(alone))
+        for body in operators
+    ]
+    found = []
+    for fewer in left_out:
+        matrices = [_without(body, fewer) for body in operators]
+        alone = torch.cat([own @ waves for own, waves in zip(matrices, incoming, strict=True)])
+        coupled = torch.cat([own @ torch.cat(row, dim=1) for own, row in zip(matrices, rows, strict=True)])
+        identity = torch.eye(count, dtype=torch.complex128, device="cpu")
+        found.append(torch.linalg.solve(identity - coupled, alone))
     return found
+
+
+def _without(body: ScatteringOperator, fewer: int) -> torch.Tensor:
+    """Return T (N, N) of a body with 0 in place of its highest degrees."""
+    kept = degrees(body.degree) <= body.degree - fewer
+    return torch.where(kept[:, None] & kept, body.matrix, 0) if fewer else body.matrix
 
 
 def _regular_waves(body: ScatteringOperator, other: ScatteringOperator) -> torch.Tensor:

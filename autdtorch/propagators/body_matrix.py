@@ -8,6 +8,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -64,10 +65,15 @@ class StillBody:
     frequency: float
     solver: Solver
 
-    @property
+    @cached_property
+    def sphere(self) -> tuple[torch.Tensor, float]:
+        """Centre (3,) and radius [m] of the circumscribed sphere."""
+        return circumscribed(self.obstacles)
+
+    @cached_property
     def scene(self) -> Scene:
         """The body alone, with a transducer and a point that play no part."""
-        center, radius = circumscribed(self.obstacles)
+        center, radius = self.sphere
         aside = center.new_tensor([[3 * radius, 0.0, 0.0]])
         array = TransducerArray(center + aside, (-1.0, 0.0, 0.0), radius=0)
         with warnings.catch_warnings():  # of the scene that it is part of
@@ -78,13 +84,13 @@ class StillBody:
     @property
     def degree(self) -> int:
         """The largest degree of the waves."""
-        return enough_degrees(self.scene.wavenumber * circumscribed(self.obstacles)[1], self.solver.error)
+        return enough_degrees(self.scene.wavenumber * self.sphere[1], self.solver.error)
 
     @property
     def waves(self) -> BodyWaves:
         """The simulation of its waves."""
         planned = plan(self.scene, "box", *self.solver)
-        return BodyWaves(planned, *circumscribed(self.obstacles), self.degree)
+        return BodyWaves(planned, *self.sphere, self.degree)
 
 
 class Placed(NamedTuple):
@@ -103,7 +109,7 @@ class Placed(NamedTuple):
     def matrix(self, cache: DiskCache | None) -> BodyMatrix:
         """Return T, from memory or disk if it is there."""
         body, scene = self.body, self.body.scene
-        center, radius = circumscribed(body.obstacles)
+        center, radius = body.sphere
         count = (body.degree + 1) ** 2
         require_memory("obstacles", f"{count} waves", _ENTRY_BYTES * count**2)
         if has_closed_form(body.obstacles, body.medium):

@@ -72,12 +72,14 @@ class KeepingSimulation(BoxSimulation):
 
     def transfer_matrix(self, points: torch.Tensor) -> TransferMatrix:
         """Simulate the transfer matrix of points (P, 3), or sum the kept fields of the transducers."""
-        if self._keeps(points) and self._begins_at(points):
+        if not self._keeps(points):
+            return super().transfer_matrix(points)
+        if self._begins_at(points):
             found = super().transfer_matrix(points)
             self._runs_from_points += len(found.runs)
             return found
-        new = self._keep_transducers(points) if self._keeps(points) else []
-        if self._transducers is None or not self._keeps(points):
+        new = self._keep_transducers(points)
+        if self._transducers is None:  # the boxes are simulated as one
             return super().transfer_matrix(points)
         unit = torch.eye(len(self.plan.scene.array), dtype=torch.complex128, device="cpu")
         field = self._sum(self._transducers, None, unit, points)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import functools
 import logging
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Literal, overload
 
 import torch
-from torch.nn.functional import pad
 
 from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd.grid import grid_errors
@@ -125,26 +124,37 @@ class OperatorPropagator:
         with_error = boolean("return_error", return_error)
         places = self._checked(points)
         matrix, served = self._by_waves(places)
-        near = places[~served].detach()
-        if len(near):
+        near, box_error = places[~served].detach(), 0.0
+        if len(near) and with_error:
+            rows, box_error = self._box.transfer_matrix(near, return_error=True)
+            matrix = matrix.index_put((~served,), rows)
+        elif len(near):
             matrix = matrix.index_put((~served,), self._box.transfer_matrix(near))
         if not with_error:
             return matrix
-        rows = self.point_errors(points) * matrix.detach().norm(dim=1)
-        return matrix, float(rows.norm() / matrix.detach().norm().clamp_min(_TINY))
+        size = matrix.detach().norm(dim=1)
+        errors = self._wave_errors(places.detach()[served], matrix.detach()[served]) * size[served]
+        error = math.hypot(float(errors.norm()), box_error * float(size[~served].norm()))
+        return matrix, error / float(size.norm().clamp_min(_TINY))
 
     @one_library_thread()
     def point_errors(self, points: ArrayLike | None = None) -> torch.Tensor:
         """Return the estimated relative error of each point's row of the transfer matrix, float64 (P,)."""
         places = self._checked(points).detach()
         matrix, served = self._by_waves(places)
-        errors = torch.full((len(places),), self.tolerance, dtype=torch.float64, device="cpu")
-        if self._plan.runs:
-            second = OperatorPropagator(self._plan.second, self._cache)
-            other, ratio = second.transfer_matrix(places), second.spacing / self.spacing
-            errors = errors + grid_errors(matrix, other, ratio, self._plan.order)
+        errors = torch.zeros(len(places), dtype=torch.float64, device="cpu")
+        errors[served] = self._wave_errors(places[served], matrix[served])
         if not served.all():
             errors[~served] = self._box.point_errors(places[~served])
+        return errors
+
+    def _wave_errors(self, points: torch.Tensor, matrix: torch.Tensor) -> torch.Tensor:
+        """Return the estimated errors (P,) of rows of G (P, M) that the waves serve."""
+        errors = torch.full((len(points),), self.tolerance, dtype=torch.float64, device="cpu")
+        if self._plan.runs and len(points):
+            second = OperatorPropagator(self._plan.second, self._cache)
+            other, ratio = second.transfer_matrix(points), second.spacing / self.spacing
+            errors = errors + grid_errors(matrix, other, ratio, self._plan.order)
         return errors
 
     @one_library_thread()
@@ -199,18 +209,7 @@ class OperatorPropagator:
     @cached_property
     def _scattered(self) -> list[torch.Tensor]:
         """Outgoing waves (N, M) of all bodies, by all degrees and with the highest ones left out."""
-        operators, found = self.bodies.operators, []
-        for left_out in (0, _FEWER, 2 * _FEWER):
-            counts = [(max(0, body.degree - left_out) + 1) ** 2 for body in operators]
-            some = zip(operators, counts, strict=True)
-            fewer = ScatteringBodies(
-                replace(body, matrix=body.matrix[:count, :count]) for body, count in some
-            )
-            parts = torch.split(scattered_waves(fewer, self.scene.array), counts)
-            missing = [len(body.matrix) - count for body, count in zip(operators, counts, strict=True)]
-            pairs = zip(parts, missing, strict=True)
-            found.append(torch.cat([pad(part, (0, 0, 0, rows)) for part, rows in pairs]))
-        return found
+        return scattered_waves(self.bodies, self.scene.array, (0, _FEWER, 2 * _FEWER))
 
     @staticmethod
     def _left_out(waves: torch.Tensor, scattered: Sequence[torch.Tensor]) -> torch.Tensor:

@@ -109,8 +109,8 @@ def holography(
         iterations: >= 1; "naive" has none.
         free_amplitudes: whether amplitudes are free in [0, 1]; otherwise all are 1, and pressures at best in
             proportion to the targets, except of "diff_pat".
-        starts: number of first guesses, >= 1, of which the best drive is returned: that of the highest
-            weakest pressure over its target. The first guess has equal phases, the others have random ones,
+        starts: number of first guesses, >= 1. The drive whose weakest pressure, relative to its target, is
+            the highest is returned. The first guess has equal phases, the others have random ones,
             the same in every call. Iterations end in local maxima, at half of the best for symmetric foci.
 
     Returns:
