@@ -5,6 +5,7 @@ from .io.array_file import load_array
 from .io.drive_file import load_drive, save_drive
 from .io.field_file import save_field
 from .io.scene_file import load_scene
+from .io.scene_sections import save_scene
 from .methods.base import Method, Problem, State
 from .methods.bayes.bayes import BayesOpt, bayes_opt
 from .methods.bayes.focus_problem import FocusProblem
@@ -28,6 +29,7 @@ from .objectives.perturbations import Drift, FailedTransducers, Noise, Quantised
 from .objectives.quiet import Contrast, QuietPoints
 from .objectives.simulated import SimulatedObjective
 from .plot.costs import plot_pareto, plot_scaling
+from .plot.explore import explore
 from .plot.pressure_maps import plot_plane, plot_planes
 from .plot.scene_figure import plot_scene
 from .plot.trials import plot_convergence, plot_poses, plot_trials
@@ -104,6 +106,7 @@ __all__ = [
     "drive_from_phases",
     "drive_sequence",
     "estimate",
+    "explore",
     "focus_bound",
     "focus_metrics",
     "focus_phases",
@@ -134,6 +137,7 @@ __all__ = [
     "run",
     "save_drive",
     "save_field",
+    "save_scene",
     "save_state",
     "sphere_points",
     "true_pressure",

@@ -8,6 +8,7 @@ import torch
 
 from autdtorch.propagators.simulated import Propagator
 from autdtorch.scene.drive import validate_single_drive
+from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import ArrayLike, invalid, positive, require_kind
 
 _CLEARANCE = 0.5  # wavelengths around a transducer, where its own 1/r would hide the field of the others
@@ -40,11 +41,17 @@ def volume_field(propagator: Propagator, drive: ArrayLike, spacing: float | None
     steps = [torch.arange(count, dtype=torch.float64, device="cpu") + 0.5 for count in counts]
     axes = zip(lower, upper, steps, counts, strict=True)
     points = torch.cartesian_prod(*(low + (high - low) * step / count for low, high, step, count in axes))
+    valid = are_shown(scene, points)
+    field = torch.full((len(points),), complex(math.nan, math.nan), dtype=torch.complex128, device="cpu")
+    field[valid] = propagator.field(drive, points[valid])
+    return field.reshape(counts)
+
+
+def are_shown(scene: Scene, points: torch.Tensor) -> torch.Tensor:
+    """Return which points (N, 3) [m] are neither in obstacles nor next to transducers, bool (N,)."""
     valid = torch.ones(len(points), dtype=torch.bool, device="cpu")
     for node in scene.array.nodes.positions.reshape(-1, 3):
         valid &= torch.linalg.vector_norm(points - node, dim=1) > _CLEARANCE * scene.wavelength
     for obstacle in scene.obstacles:
         valid &= ~obstacle.contains(points)
-    field = torch.full((len(points),), complex(math.nan, math.nan), dtype=torch.complex128, device="cpu")
-    field[valid] = propagator.field(drive, points[valid])
-    return field.reshape(counts)
+    return valid

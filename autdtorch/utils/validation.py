@@ -10,6 +10,7 @@ import difflib
 import math
 import numbers
 import os
+import sys
 import re
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
@@ -30,6 +31,8 @@ Vector: TypeAlias = tuple[float, float, float]
 LENGTH_TOLERANCE = 1e-9
 """Lengths that differ by less are taken to be equal [m]: far above rounding at metre scale, and far below
 any wavelength."""
+
+_UNIT_ROUNDING = 4 * sys.float_info.epsilon  # by which the computed length of a unit vector may differ from 1
 
 _NAME = re.compile(r"(?!\.+$)[\w.+-]+")
 _LONGEST_NAME = 100  # bytes
@@ -222,6 +225,8 @@ def unit_vector(name: str, value: object) -> Vector:
     # A shorter vector may be the rounding error of a difference of metres, whose direction is noise.
     if not LENGTH_TOLERANCE < length < math.inf:
         raise invalid(name, value, f"must be a vector of finite length > {LENGTH_TOLERANCE:g}")
+    if abs(length - 1) < _UNIT_ROUNDING:  # so that a unit vector stays what it is, in files and their digests
+        return vector
     x, y, z = (entry / length for entry in vector)
     return x, y, z
 

@@ -44,27 +44,53 @@ def new_plotter(scene: Scene, off_screen: bool) -> pyvista.Plotter:
     """Return a plotter with obstacles, control points, axes and camera."""
     import pyvista
 
-    with pyvista.vtk_verbosity("error"):  # VTK warns of a missing X server, which it does not need
-        plotter = pyvista.Plotter(off_screen=off_screen, window_size=list(_WINDOW))
-    plotter.set_background("white")
+    plotter = empty_plotter(scene.domain, off_screen)
     for obstacle in scene.obstacles:
-        _add_obstacle(plotter, obstacle, scene.domain)
-    sphere = pyvista.Sphere(radius=MM * scene.wavelength / 5)
+        add_obstacle(plotter, obstacle, scene.domain)
     points = pyvista.PolyData(MM * scene.control_points.numpy())
-    plotter.add_mesh(points.glyph(orient=False, scale=False, geom=sphere), color=POINT_COLOUR, ambient=0.3)
-    lower, upper = scene.domain
-    bounds = [MM * corner[axis] for axis in range(3) for corner in (lower, upper)]
-    titles = {f"{name}title": f"{name} [mm]" for name in "xyz"}
-    style = {"grid": "back", "location": "outer", "fmt": "%.0f", "color": "black", "font_size": 15}
-    axes = plotter.show_bounds(bounds=bounds, **titles, **style)
-    for axis in range(3):
-        axes.SetAxisLabels(axis, None)  # PyVista's are not round numbers, VTK's are
-    plotter.view_vector(_CAMERA, viewup=(0.0, 0.0, 1.0))
-    plotter.enable_parallel_projection()
-    plotter.reset_camera()
-    plotter.camera.zoom(1.05)
+    spheres = points.glyph(orient=False, scale=False, geom=point_mesh(scene))
+    plotter.add_mesh(spheres, color=POINT_COLOUR, ambient=0.3)
     plotter.enable_anti_aliasing("ssaa")
     return plotter
+
+
+def empty_plotter(
+    domain: tuple[Vector, Vector], off_screen: bool, ink: str = "black", paper: str = "white"
+) -> pyvista.Plotter:
+    """Return a plotter with axes around a domain [m] and the camera, in colours of lines and background."""
+    import pyvista
+
+    with pyvista.vtk_verbosity("error"):  # VTK warns of a missing X server, which it does not need
+        plotter = pyvista.Plotter(off_screen=off_screen, window_size=list(_WINDOW))
+    plotter.set_background(paper)
+    add_axes(plotter, domain, ink)
+    plotter.view_vector(_CAMERA, viewup=(0.0, 0.0, 1.0))
+    plotter.enable_parallel_projection()
+    plotter.reset_camera(bounds=_bounds(domain))
+    plotter.camera.zoom(1.05)
+    return plotter
+
+
+def add_axes(plotter: pyvista.Plotter, domain: tuple[Vector, Vector], ink: str) -> None:
+    """Draw axes around a domain [m], in place of those that are there."""
+    plotter.remove_bounds_axes()
+    titles = {f"{name}title": f"{name} [mm]" for name in "xyz"}
+    style = {"grid": "back", "location": "outer", "fmt": "%.0f", "color": ink, "font_size": 15}
+    axes = plotter.show_bounds(bounds=_bounds(domain), **titles, **style)
+    for axis in range(3):
+        axes.SetAxisLabels(axis, None)  # PyVista's are not round numbers, VTK's are
+
+
+def _bounds(domain: tuple[Vector, Vector]) -> list[float]:
+    lower, upper = domain
+    return [MM * corner[axis] for axis in range(3) for corner in (lower, upper)]
+
+
+def point_mesh(scene: Scene) -> pyvista.PolyData:
+    """Return the sphere that stands for a control point."""
+    import pyvista
+
+    return pyvista.Sphere(radius=MM * scene.wavelength / 5)
 
 
 def emitted_phases(drive: ArrayLike, transducers: int) -> Array:
@@ -73,10 +99,13 @@ def emitted_phases(drive: ArrayLike, transducers: int) -> Array:
     return np.where(amplitudes_of(drive).detach().cpu().numpy() > 0, phases, np.nan)
 
 
-def add_transducers(plotter: pyvista.Plotter, scene: Scene, phases: Array | None) -> pyvista.PolyData:
+def add_transducers(
+    plotter: pyvista.Plotter, scene: Scene, phases: Array | None, bar: bool = True
+) -> pyvista.PolyData:
     """Draw the transducers as discs, coloured by their phases (M,) [rad], NaN for silent ones.
 
-    The mesh of all discs is returned, with the phases over pi as "phase" if given.
+    The mesh of all discs is returned, with the phases over pi as "phase" if given. A colour bar is drawn for
+    them, unless the view has its own.
     """
     import pyvista
 
@@ -98,7 +127,7 @@ def add_transducers(plotter: pyvista.Plotter, scene: Scene, phases: Array | None
     if phases is None:
         look = {"color": colours.TRANSDUCER_COLOUR}
     actor = plotter.add_mesh(face, lighting=False, show_scalar_bar=False, **look)
-    if phases is not None:
+    if phases is not None and bar:
         add_bar(plotter, actor, "phase / π", position=_PHASE_BAR, labels=5, fmt="%.1f")
     plotter.add_mesh(rim, color=colours.EDGE_COLOUR, lighting=False)
     plotter.add_mesh(points.glyph(geom=arrow, **along), color="#555555")
@@ -131,24 +160,29 @@ def _use_font(*properties: pyvista.TextProperty) -> None:
         text.SetFontFile(str(Path(get_data_path()) / "fonts/ttf/DejaVuSans.ttf"))
 
 
-def _add_obstacle(plotter: pyvista.Plotter, obstacle: Obstacle, domain: tuple[Vector, Vector]) -> None:
-    """Draw the obstacle's surface and its sharp edges, cut at the boundary of the domain."""
+def add_obstacle(
+    plotter: pyvista.Plotter, obstacle: Obstacle, domain: tuple[Vector, Vector] | None = None
+) -> list[pyvista.Actor]:
+    """Draw the obstacle's surface and its sharp edges, cut at the boundary of a domain [m]; return both."""
     import pyvista
 
     vertices, faces = obstacle.surface()
     surface = pyvista.PolyData.from_regular_faces(MM * vertices.numpy(), faces.numpy())
-    for outwards, corner in zip((-1.0, 1.0), domain, strict=True):
+    for outwards, corner in zip((-1.0, 1.0), domain or (), strict=False):
         for normal in outwards * np.eye(3):
             if (((surface.points - MM * np.array(corner)) @ normal) > 0).any():
                 surface = surface.clip(normal=normal, origin=MM * np.array(corner))
     if surface.n_cells == 0:  # only its bounding box reaches into the domain
-        return
+        return []
     sharp = math.degrees(colours.SHARP_ANGLE)
     normals = surface.compute_normals(split_vertices=True, feature_angle=sharp, auto_orient_normals=False)
-    plotter.add_mesh(normals, color=colours.OBSTACLE_COLOUR, ambient=0.35, smooth_shading=True)
+    look = {"color": colours.OBSTACLE_COLOUR, "ambient": 0.35, "smooth_shading": True}
+    actors = [plotter.add_mesh(normals, **look, reset_camera=False)]
     edges = surface.extract_feature_edges(sharp)
     if 0 < edges.n_cells <= colours.MOST_EDGES:
-        plotter.add_mesh(edges, color=colours.EDGE_COLOUR, line_width=2, lighting=False)
+        look = {"color": colours.EDGE_COLOUR, "line_width": 2, "lighting": False}
+        actors.append(plotter.add_mesh(edges, **look, reset_camera=False))
+    return actors
 
 
 def add_plane(plotter: pyvista.Plotter, plane: Plane, level: Array | None) -> None:
@@ -193,7 +227,9 @@ def plane_mesh(plane: Plane, values: Array) -> pyvista.PolyData:
     return mesh.extract_surface(algorithm=None)
 
 
-def add_isosurface(plotter: pyvista.Plotter, scene: Scene, level: Array, height: float) -> None:
+def add_isosurface(
+    plotter: pyvista.Plotter, scene: Scene, level: Array, height: float, name: str = "isosurface"
+) -> None:
     """Draw the surface where the level (Nx, Ny, Nz) [dB], at the domain's cell centres, is `height`.
 
     It is limited to the surroundings of the control points: near the array it would hide everything.
@@ -214,7 +250,8 @@ def add_isosurface(plotter: pyvista.Plotter, scene: Scene, level: Array, height:
         logger.warning("no isosurface: the level around the control points is below %g dB", height)
         return
     surface.clear_data()
-    plotter.add_mesh(surface.compute_normals(), color=_SURFACE_COLOUR, opacity=0.45, smooth_shading=True)
+    look = {"color": _SURFACE_COLOUR, "opacity": 0.45, "smooth_shading": True}
+    plotter.add_mesh(surface.compute_normals(), name=name, reset_camera=False, **look)
 
 
 def plane_pressure(scene: Scene, field: ArrayLike) -> tuple[Plane, Array]:
@@ -239,3 +276,11 @@ def volume_magnitude(scene: Scene, volume: ArrayLike) -> Array:
     )
     points = torch.from_numpy(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
     return np.where(inside_any(points, scene.obstacles).numpy(), np.nan, magnitude)
+
+
+def map_colours(name: str, count: int) -> list[str]:
+    """Return colours of a colour map from its lower end on, as of HTML."""
+    import pyvista
+
+    table = pyvista.LookupTable(name, n_values=count)
+    return ["#{:02x}{:02x}{:02x}".format(*rgba[:3]) for rgba in table.values]

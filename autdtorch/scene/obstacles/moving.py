@@ -66,6 +66,11 @@ def is_movable(obstacle: object) -> bool:
     return type(obstacle) in _PLACES
 
 
+def is_turnable(obstacle: object) -> bool:
+    """Return whether turning an obstacle changes it; a sphere stays what it is."""
+    return bool(_TURNS.get(type(obstacle)))  # type: ignore[call-overload]
+
+
 def shifted(obstacle: Obstacle, offset: torch.Tensor, digits: int = _DIGITS) -> Obstacle:
     """Return an obstacle shifted by an offset (3,) [m], its place rounded to decimals."""
     name = _PLACES[type(obstacle)]

@@ -1,0 +1,150 @@
+"""Scenes as sections of a scene file, to be written as YAML or as Python."""
+
+from __future__ import annotations
+
+import os
+import pprint
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+
+from autdtorch.scene.drive import amplitudes_of, phases_of
+from autdtorch.scene.geometry import Plane
+from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
+from autdtorch.scene.scene import Scene
+from autdtorch.utils.files import replace_file, replacing
+from autdtorch.utils.numpy_file import write_arrays
+from autdtorch.utils.validation import invalid, path_of, require_kind
+
+_KINDS = {Box: "box", Sphere: "sphere", Cylinder: "cylinder", Mesh: "mesh", VoxelMask: "voxel_mask"}
+
+
+def save_scene(path: str | os.PathLike[str], scene: Scene) -> None:
+    """Write a scene to a YAML file that `load_scene` reads.
+
+    Numbers keep their full precision. A mesh becomes an .obj file, a voxel mask an .npz file, beside the YAML
+    file and with its name. Files that are there are replaced.
+
+    Args:
+        path: of the file, ``.yaml`` or ``.yml``.
+        scene: the scene.
+
+    Raises:
+        ValueError: another suffix, or an obstacle of a class of the user's own.
+        OSError: the files cannot be written.
+    """
+    path = path_of("path", path, suffixes=(".yaml", ".yml"))
+    require_kind("scene", scene, Scene)
+    sections = scene_sections(scene, path.stem)
+    write_files(scene, path.with_suffix(""))
+    text = yaml.safe_dump(sections, sort_keys=False, default_flow_style=None, width=110, allow_unicode=True)
+    replace_file(path, text.encode())
+
+
+def scene_sections(scene: Scene, name: str) -> dict[str, Any]:
+    """Return the sections of a scene file called `name`, which may name files of `write_files`.
+
+    Raises:
+        ValueError: an obstacle of a class of the user's own.
+    """
+    array, medium = scene.array, scene.medium
+    normals = array.normals.tolist()
+    sections: dict[str, Any] = {
+        "name": scene.name,
+        "frequency": scene.frequency,
+        "medium": {field.name: getattr(medium, field.name) for field in fields(medium)},
+        "array": {
+            "type": "positions",
+            "positions": array.positions.tolist(),
+            "normals": normals[0] if all(normal == normals[0] for normal in normals) else normals,
+            "source_strength": array.source_strength,
+            "radius": array.radius,
+        },
+        "obstacles": [
+            _obstacle(one, f"{name}_{number}", f"Scene.obstacles[{number}]")
+            for number, one in enumerate(scene.obstacles)
+        ],
+        "control_points": {"type": "points", "positions": scene.control_points.tolist()},
+        "domain": dict(zip(("lower", "upper"), map(list, scene.domain), strict=True)),
+    }
+    if scene.observation_plane is not None:
+        plane = scene.observation_plane
+        sections["observation_plane"] = {field.name: list(getattr(plane, field.name)) for field in fields(Plane)}
+    return sections
+
+
+def write_files(scene: Scene, path: Path) -> None:
+    """Write the meshes and masks of a scene, beside the scene file of this path without its suffix."""
+    for number, obstacle in enumerate(scene.obstacles):
+        name = f"{path.name}_{number}"
+        if isinstance(obstacle, Mesh):
+            vertices, faces = (part.numpy() for part in obstacle.surface())
+            with replacing(path.with_name(f"{name}.obj")) as partial, partial.open("w", encoding="utf-8") as file:
+                np.savetxt(file, vertices, fmt="v %.17g %.17g %.17g")
+                np.savetxt(file, faces + 1, fmt="f %d %d %d")
+        elif isinstance(obstacle, VoxelMask):
+            write_arrays(path.with_name(f"{name}.npz"), {"mask": obstacle.mask})
+
+
+def _obstacle(obstacle: Obstacle, name: str, where: str) -> dict[str, Any]:
+    """Return the section of an obstacle, whose file, if any, has a name."""
+    if (kind := type(obstacle)) not in _KINDS:
+        accepted = f"must be one of {', '.join(known.__name__ for known in _KINDS)} to be saved"
+        raise invalid(where, kind.__name__, accepted)
+    section: dict[str, Any] = {"type": _KINDS[kind]}
+    given = {one.name: getattr(obstacle, one.name) for one in fields(obstacle) if one.init}
+    if isinstance(obstacle, Mesh):  # its triangles are written where they are now
+        section["path"] = f"{name}.obj"
+        given = {name: given[name] for name in ("density", "sound_speed", "rigid")}
+    elif isinstance(obstacle, VoxelMask):
+        section["path"] = f"{name}.npz"
+        del given["mask"]
+    for name, value in given.items():
+        if value is not None and value is not False:
+            section[name] = list(value) if isinstance(value, tuple) else value
+    return section
+
+
+def scene_lines(scene: Scene, drive: torch.Tensor, name: str) -> str:
+    """Return the lines of Python that make a scene and a drive (M,), beside a scene file called `name`."""
+    sections = scene_sections(scene, name)
+    array = {key: value for key, value in sections["array"].items() if key != "type"}
+    lines = ["import autdtorch as at", "", _call("array", "TransducerArray", array)]
+    names = []
+    for number, section in enumerate(sections["obstacles"]):
+        names.append(f"obstacle_{number}")
+        kind = next(known.__name__ for known, name in _KINDS.items() if name == section["type"])
+        function = f"{kind}.load" if kind == "VoxelMask" else kind
+        own = {key: value for key, value in section.items() if key != "type"}
+        lines.append(_call(names[-1], function, own))
+    plane = "None"
+    if scene.observation_plane is not None:
+        plane = "plane"
+        lines.append(_call(plane, "Plane", sections["observation_plane"]))
+    lines.append(_call("medium", "Medium", sections["medium"]))
+    lines.append(f"points = {_value(sections['control_points']['positions'], 9)}")
+    domain = [sections["domain"]["lower"], sections["domain"]["upper"]]
+    lines.append(
+        f"scene = at.Scene(\n    array, medium, {scene.frequency!r}, points, [{', '.join(names)}], {plane}, "
+        f"{domain!r}, name={scene.name!r}\n)"
+    )
+    values = {"phases": phases_of(drive).tolist()}
+    amplitudes = amplitudes_of(drive).clamp(max=1.0)  # rounding may exceed 1
+    if not torch.allclose(amplitudes, torch.ones_like(amplitudes), rtol=0, atol=1e-12):
+        values["amplitudes"] = amplitudes.tolist()
+    lines.append(_call("drive", "drive_from_phases", values))
+    return "\n".join(lines) + "\n"
+
+
+def _call(name: str, function: str, arguments: dict[str, Any]) -> str:
+    parts = "".join(f"    {key}={_value(value, 5 + len(key))},\n" for key, value in arguments.items())
+    return f"{name} = at.{function}(\n{parts})"
+
+
+def _value(value: Any, indent: int) -> str:
+    text = pprint.pformat(value, width=110 - indent, compact=True)
+    return text.replace("\n", "\n" + " " * indent)

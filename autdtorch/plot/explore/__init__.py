@@ -1,0 +1,67 @@
+"""A live view of a scene, in a notebook or a browser (optional extra ``explore``)."""
+
+from __future__ import annotations
+
+import importlib.util
+import webbrowser
+from typing import TYPE_CHECKING
+
+import torch
+
+from autdtorch.plot.view3d.opengl import require_rendering
+from autdtorch.scene.drive import validate_single_drive
+from autdtorch.scene.scene import Scene
+from autdtorch.utils.validation import ArrayLike, boolean, integer_at_least, invalid, positive, require_kind
+
+if TYPE_CHECKING:
+    from autdtorch.plot.explore.explorer import Explorer
+
+_LAST_PORT = 65535
+
+
+def explore(
+    scene: Scene,
+    drive: ArrayLike | None = None,
+    *,
+    spacing: float = 1e-3,
+    port: int = 0,
+    open_browser: bool = False,
+) -> Explorer:
+    """Show a scene in a live view: in a notebook, or in a browser at the address of what is returned.
+
+    Obstacles and foci are moved by mouse, sliders or numbers, drives found by any method or edited, and the
+    field is shown on a plane and in the volume: with cells twice as large while something is dragged, finely
+    and with its error when it is let go. Undo goes back step by step. Scene and drive are saved as files and
+    as lines of Python. The view answers on this machine's local interface alone, to whom knows its address.
+
+    Args:
+        scene: the scene.
+        drive: complex (M,), |q| <= 1, to begin with; by default what gradient ascent finds.
+        spacing: edge of a cell [m] when nothing is dragged; see `make_propagator`.
+        port: of the server, 0 to 65535; 0 for one that is free.
+        open_browser: True to open the page in this machine's browser.
+
+    Returns:
+        The live view. Its `scene` and `drive` are those that it shows; `close` ends it.
+
+    Raises:
+        ValueError: an argument out of range, or not a drive of the scene.
+        RuntimeError: this machine cannot render in 3D, or the extra ``explore`` is not installed; the message
+            names the cause.
+        OSError: the port is taken.
+    """
+    require_kind("scene", scene, Scene)
+    if drive is not None:
+        drive = validate_single_drive(drive, len(scene.array)).detach().to("cpu", torch.complex128)
+    spacing, browses = positive("spacing", spacing, "m"), boolean("open_browser", open_browser)
+    if not 0 <= (port := integer_at_least("port", port, 0)) <= _LAST_PORT:
+        raise invalid("port", port, f"must be at most {_LAST_PORT}")
+    if importlib.util.find_spec("trame_rca") is None:
+        raise RuntimeError("explore: needs trame: pip install 'autdtorch[explore]'")
+    require_rendering()
+    from autdtorch.plot.explore.explorer import Explorer
+
+    explorer = Explorer(scene, drive, spacing, port)
+    if browses:
+        webbrowser.open(explorer.address)
+    return explorer

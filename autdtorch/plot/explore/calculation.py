@@ -1,0 +1,229 @@
+"""The calculations of an explorer, in a thread of their own: fields, coarse and fine, and methods.
+
+The newest request counts. An older one ends at its next step, so that the picture follows a drag.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from autdtorch.methods.base import Method, Problem, State
+from autdtorch.methods.driver import observed
+from autdtorch.methods.gradient import GradientAscent
+from autdtorch.objectives.bound import focus_bound
+from autdtorch.objectives.simulated import SimulatedObjective
+from autdtorch.plot.explore.situation import Situation
+from autdtorch.propagators import Propagator, make_propagator, volume_field
+from autdtorch.propagators.volume import are_shown
+from autdtorch.scene.geometry import Plane
+from autdtorch.utils.array_types import Array
+
+logger = logging.getLogger(__name__)
+
+_MOST_CELLS = 10_000  # of the plane of a fine field: 0.1 to 0.2 s for the paper's cubes
+_CELLS_A_WAVELENGTH = 8
+_COARSER = 2  # Ratio of the spacings of a coarse and a fine calculation
+_COARSEST = 0.24  # wavelengths; the error of larger cells rises steeply, and each would log a warning
+
+
+@dataclass(frozen=True)
+class Request:
+    """A request to calculate.
+
+    Attributes:
+        number: of the request; results carry it.
+        situation: what is asked for.
+        fine: True for the fine spacing, with an error estimate; False while something is dragged.
+        follow: whether the drive is found again first.
+        volume: whether the field in the domain is wanted.
+        method: to be run first, if any.
+        seed: of its random choices.
+    """
+
+    number: int
+    situation: Situation
+    fine: bool = True
+    follow: bool = False
+    volume: bool = False
+    method: Method | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Result:
+    """What is known of a request so far.
+
+    Attributes:
+        request: the request.
+        drive: the drive (M,), found again where the request says so.
+        spacing: of the simulation [m].
+        pressure: magnitude at the control points (P,) [Pa].
+        field: complex pressure on the plane (Nu, Nv) [Pa], NaN in obstacles and next to transducers.
+        bound: no drive has a weakest focus above [Pa]; None while it is coarse.
+        error: relative error of the transfer matrix; None while it is not known.
+        volume: pressure in the domain (Nx, Ny, Nz) [Pa]; None where not asked for, or not yet there.
+        seconds: time since the request [s].
+    """
+
+    request: Request
+    drive: torch.Tensor
+    spacing: float
+    pressure: torch.Tensor
+    field: Array
+    bound: float | None = None
+    error: float | None = None
+    volume: torch.Tensor | None = None
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class Progress:
+    """The progress of a method: evaluations so far and at most, and the best weakest focus [Pa]."""
+
+    request: Request
+    label: str
+    evaluations: int
+    most: int
+    score: float
+
+
+class Calculator:
+    """A thread that answers the newest request."""
+
+    def __init__(self, spacing: float, report: Callable[[Result | Progress | Exception], None]) -> None:
+        """Calculate with cells of `spacing` [m] when fine; `report` is called in the thread."""
+        self._spacing, self._report = spacing, report
+        self._wanted: Request | None = None
+        self._changed = threading.Condition()
+        self._closed = False
+        self._propagators: dict[float, Propagator] = {}
+        self._thread = threading.Thread(target=self._work, name="autdtorch explore", daemon=True)
+        self._thread.start()
+
+    def ask(self, request: Request) -> None:
+        """Calculate this next, and end what is under way."""
+        with self._changed:
+            self._wanted = request
+            self._changed.notify()
+
+    def close(self) -> None:
+        """End the thread at its next step."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+        self._thread.join()
+
+    def _work(self) -> None:
+        while (request := self._next()) is not None:
+            try:
+                for result in self._results(request):
+                    self._report(result)
+                    if self._is_old():
+                        break
+            except Exception as error:  # the page shows it; the next request may well succeed
+                logger.debug("request %d", request.number, exc_info=True)
+                self._report(error)
+
+    def _next(self) -> Request | None:
+        with self._changed:
+            self._changed.wait_for(lambda: self._wanted is not None or self._closed)
+            request, self._wanted = self._wanted, None
+            return None if self._closed else request
+
+    def _is_old(self) -> bool:
+        return self._wanted is not None or self._closed
+
+    def _results(self, request: Request) -> Iterator[Result | Progress]:
+        """Yield ever more complete results of a request."""
+        begun = time.monotonic()
+        situation = request.situation
+        fine = request.fine
+        spacing = self._spacing if fine else coarse_spacing(situation, self._spacing)
+        propagator = self._propagator(situation, spacing)
+        drive = situation.drive
+        if request.method is not None:
+            state = None
+            for state in self._steps(request, propagator):
+                yield _progress(request, state)
+                if self._is_old():
+                    return
+            assert state is not None
+            drive = request.method.best(state).drive[0]
+        elif request.follow:
+            drive = _followed(propagator, drive)
+        result = _field(request, propagator, drive, spacing)
+        yield replace(result, seconds=time.monotonic() - begun)
+        if not fine or self._is_old():
+            return
+        matrix, error = propagator.transfer_matrix(return_error=True)
+        result = replace(result, bound=float(focus_bound(matrix)), error=error)
+        yield replace(result, seconds=time.monotonic() - begun)
+        if request.volume and not self._is_old():
+            volume = volume_field(propagator, drive, situation.scene.wavelength / 3)
+            yield replace(result, volume=volume, seconds=time.monotonic() - begun)
+
+    def _propagator(self, situation: Situation, spacing: float) -> Propagator:
+        """Return the propagator of a situation, that of the last request where the scene has not changed."""
+        found = self._propagators.get(spacing)
+        if found is None or found.scene is not situation.scene:
+            found = self._propagators[spacing] = make_propagator(situation.scene, spacing=spacing)
+        return found
+
+    def _steps(self, request: Request, propagator: Propagator) -> Iterator[State]:
+        """Yield the states of a method's trial."""
+        assert request.method is not None
+        objective = SimulatedObjective(propagator.scene, propagator)
+        state = request.method.start(Problem.of(objective), request.seed)
+        while not state.done:
+            drives = request.method.ask(state)
+            state = request.method.tell(state, observed(objective, drives, state.evaluations))
+            yield state
+
+
+def coarse_spacing(situation: Situation, spacing: float) -> float:
+    """Return the edge of a cell [m] while something is dragged."""
+    return max(spacing, min(_COARSER * spacing, _COARSEST * situation.scene.wavelength))
+
+
+def _progress(request: Request, state: State) -> Progress:
+    assert request.method is not None
+    most = request.method.most_evaluations(state.problem)
+    score = float(state.best.score[0])
+    return Progress(request, request.method.label, state.evaluations, most, score)
+
+
+def _followed(propagator: Propagator, drive: torch.Tensor) -> torch.Tensor:
+    """Return the drive that gradient ascent finds on the transfer matrix, beginning at a drive (M,), too."""
+    objective = SimulatedObjective(propagator.scene, propagator)
+    method = GradientAscent()
+    state = method.start(Problem.of(objective, start=drive), 0)
+    while not state.done:
+        state = method.tell(state, objective(method.ask(state)))
+    return method.best(state).drive[0]
+
+
+def _field(request: Request, propagator: Propagator, drive: torch.Tensor, spacing: float) -> Result:
+    """Return the pressure at the control points and on the plane, from one simulation of the drive."""
+    situation = request.situation
+    sheet = situation.sheet
+    grid = sheet.points(plane_spacing(sheet, situation.scene.wavelength, request.fine))
+    foci = situation.scene.control_points
+    shown = are_shown(situation.scene, grid.reshape(-1, 3))
+    pressure = propagator.field(drive, torch.cat([foci, grid.reshape(-1, 3)[shown]]))
+    field = np.full(grid.shape[:2], complex(math.nan, math.nan))
+    field[shown.reshape(field.shape).numpy()] = pressure[len(foci) :].numpy()
+    return Result(request, drive, spacing, pressure[: len(foci)].abs(), field)
+
+
+def plane_spacing(sheet: Plane, wavelength: float, fine: bool) -> float:
+    """Return the edge of a cell of the plane [m]."""
+    least = math.sqrt(sheet.size[0] * sheet.size[1] / _MOST_CELLS)
+    return max(wavelength / _CELLS_A_WAVELENGTH, least) * (1 if fine else _COARSER)

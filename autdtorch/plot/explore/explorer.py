@@ -1,0 +1,88 @@
+"""The explorer: a live view of a scene in a notebook or a browser."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from html import escape
+from typing import Any
+
+import torch
+from trame.ui.html import DivLayout
+from trame.widgets import rca
+
+from autdtorch.plot.explore.page import page
+from autdtorch.plot.explore.server import Server
+from autdtorch.plot.explore.session import Session
+from autdtorch.plot.explore.situation import Situation
+from autdtorch.scene.scene import Scene
+
+_HEIGHT = 780  # pixels of the frame in a notebook
+_FRAMES = 30.0  # a second, at most
+_QUALITY = 85  # of JPEG; a second frame of higher quality would be rendered anew
+
+
+class Explorer:
+    """A live view of a scene, as `explore` returns it. A notebook shows it in a frame.
+
+    Attributes:
+        address: of the page, with the token that opens it; for browsers on this machine.
+    """
+
+    def __init__(self, scene: Scene, drive: torch.Tensor | None, spacing: float, port: int) -> None:
+        """Use `explore`, which checks its arguments."""
+        in_phase = torch.ones(len(scene.array), dtype=torch.complex128, device="cpu")
+        self._situation = Situation.of(scene, in_phase if drive is None else drive)
+        self._first_method = "gradient_ascent" if drive is None else None
+        self._spacing = spacing
+        self._server = Server(self._build, port)
+        self.address = self._server.address
+
+    @property
+    def scene(self) -> Scene:
+        """The scene as it is now."""
+        return self._situation.scene
+
+    @property
+    def drive(self) -> torch.Tensor:
+        """The drive (M,) as it is now."""
+        return self._situation.drive.clone()
+
+    def close(self) -> None:
+        """End the live view."""
+        self._server.close()
+
+    def wait(self) -> None:
+        """Wait until the live view is closed."""
+        self._server.wait()
+
+    def __repr__(self) -> str:
+        """Scene and address."""
+        return f"Explorer(scene {self.scene.name!r}, {self.address})"
+
+    def _repr_html_(self) -> str:
+        """Return the frame that a notebook shows."""
+        title = escape(f"autdtorch explore: {self.scene.name}", quote=True)
+        size = f'width="100%" height="{_HEIGHT}" style="border: 0"'
+        return f'<iframe src="{escape(self.address)}" title="{title}" {size}></iframe>'
+
+    def _build(self, trame: Any) -> Callable[[], None]:
+        """Make the application on a trame server; return what ends it."""
+        session = Session(trame, self._situation, self._spacing, self._defer, self._note)
+        session.begin(self._first_method)
+        view = rca.RemoteControlledArea(name="view", display="image", event_throttle_ms=30, trame_server=trame)
+        handler = view.create_view_handler(
+            session.picture.plotter.render_window, encoder="jpeg", target_fps=_FRAMES,
+            interactive_quality=_QUALITY, still_quality=_QUALITY,
+        )  # fmt: skip
+        session.update = handler.update
+        with DivLayout(trame) as layout:
+            layout.root.classes = "explore"
+            layout.root.add_child(page(view.html))
+        return session.close
+
+    def _defer(self, function: Callable[..., object], *arguments: object) -> None:
+        self._server.call(function, *arguments)
+
+    def _note(self, situation: Situation) -> None:
+        self._situation = situation
+

@@ -1,0 +1,132 @@
+"""The page of a live view, as a template of Vue, which trame compiles in the browser.
+
+Names in the template are those of the state that page and server share. `trigger('name')` calls the action of
+that name; `explorer` has both.
+"""
+
+from __future__ import annotations
+
+_SLIDER = """
+<label class="slider"><span>{label}</span>
+  <input type="range" id="{name}" v-model.number="{name}" :min="{low}" :max="{high}" step="{step}"
+    :disabled="{disabled}" @change="settled += 1">
+  <input type="number" id="{name}_number" aria-label="{label}" :value="{name}" :min="{low}" :max="{high}"
+    step="any" :disabled="{disabled}" @change="{name} = $event.target.valueAsNumber; settled += 1">
+</label>"""
+_CHOICE = """
+<label>{label}
+  <select id="{name}" v-model="{name}">
+    <option v-for="one in {options}" :key="one[0]" :value="one[0]">{{{{ one[1] }}}}</option>
+  </select>
+</label>"""
+_NUMBER = """
+<label>{label}
+  <input type="number" id="{name}" :value="{name}" step="any" @change="{name} = $event.target.valueAsNumber">
+</label>"""
+_BOX = """
+<label class="box"><input type="checkbox" id="{name}" v-model="{name}"><span>{label}</span></label>"""
+_BUTTON = """
+<button type="button" id="{name}" @click="trigger('{name}')" :disabled="{disabled}">{label}</button>"""
+
+
+def _slider(name: str, label: str, low: str, high: str, step: float, disabled: str = "false") -> str:
+    return _SLIDER.format(name=name, label=label, low=low, high=high, step=step, disabled=disabled)
+
+
+def _place(name: str, disabled: str = "false") -> str:
+    """Return sliders of the coordinates of a body or a focus."""
+    return "".join(
+        _slider(f"{name}_{axis}", f"{axis} [mm]", f"range_{axis}[0]", f"range_{axis}[1]", 0.1, disabled)
+        for axis in "xyz"
+    )
+
+
+def _choice(name: str, label: str, options: str) -> str:
+    return _CHOICE.format(name=name, label=label, options=options)
+
+
+def _number(name: str, label: str) -> str:
+    return _NUMBER.format(name=name, label=label)
+
+
+def _box(name: str, label: str) -> str:
+    return _BOX.format(name=name, label=label)
+
+
+def _button(name: str, label: str, disabled: str = "false") -> str:
+    return _BUTTON.format(name=name, label=label, disabled=disabled)
+
+
+def page(view: str) -> str:
+    """Return the template of the page, with that of the picture in it."""
+    turns = "".join(
+        _slider(f"turn_{axis}", f"turn about {axis} [°]", "-180", "180", 1, "!body_turns") for axis in "xyz"
+    )
+    return f"""
+<header>
+  <h1>autdtorch explore: {{{{ name }}}}</h1>
+  {_button("undo", "Undo", "!can_undo")} {_button("redo", "Redo", "!can_redo")}
+  <span id="status" role="status">{{{{ status }}}}</span>
+</header>
+<p id="message" role="alert">{{{{ message }}}}</p>
+<main>
+  <section class="picture" aria-label="picture and readings" :aria-busy="shown != wanted" :data-shown="shown">
+    <div class="view" role="img" :aria-label="summary">{view}</div>
+    <div class="legend">
+      <span>{{{{ scale_low }}}}</span><span class="bar" :style="scale_style"></span><span>{{{{ scale_high }}}}</span>
+      <span class="hint">grey: in obstacles and next to transducers</span>
+    </div>
+    <p class="hint">Drag an obstacle or a focus to move it, an obstacle with Shift to turn it; click a transducer
+      to choose it. Drag elsewhere to look around, scroll to zoom.</p>
+    <p id="summary" aria-live="polite">{{{{ summary }}}}</p>
+    <div class="scroll" tabindex="0" role="region" aria-label="pressures">
+      <table>
+        <caption>Pressure at the foci</caption>
+        <thead><tr><th scope="col" v-for="title in columns" :key="title">{{{{ title }}}}</th></tr></thead>
+        <tbody>
+          <tr v-for="row in rows" :key="row[0]">
+            <th scope="row">{{{{ row[0] }}}}</th>
+            <td v-for="(cell, number) in row.slice(1)" :key="number">{{{{ cell }}}}</td>
+          </tr>
+        </tbody>
+      </table>
+    </div>
+    <details>
+      <summary id="write_python" @click="trigger('write_python')">Python</summary>
+      <button type="button" data-copy="python">Copy</button>
+      <pre id="python" tabindex="0">{{{{ python }}}}</pre>
+    </details>
+  </section>
+  <section class="controls" aria-label="controls">
+    <fieldset v-if="bodies.length"><legend>Obstacle</legend>
+      {_choice("body", "obstacle", "bodies")} {_place("body", "!body_moves")} {turns}
+    </fieldset>
+    <fieldset><legend>Focus</legend>
+      {_choice("focus", "focus", "foci")} {_place("focus")}
+      <div class="row">{_button("add_focus", "Add a focus")}
+        {_button("remove_focus", "Remove it", "foci.length < 2")}</div>
+    </fieldset>
+    <fieldset><legend>Drive</legend>
+      {_choice("method", "method", "methods")}
+      <div class="row">{_button("find", "Find the phases", "busy")} {_button("cancel", "Cancel", "!busy")}</div>
+      <progress max="100" :value="progress" aria-label="progress of the method" v-show="busy"></progress>
+      {_box("follow", "find them again after every move, by gradient ascent")}
+      {_choice("transducer", "transducer", "transducers")}
+      {_slider("phase", "phase [°]", "0", "360", 1)} {_slider("amplitude", "amplitude", "0", "1", 0.01)}
+      <div class="row">{_button("in_phase", "All in phase")}</div>
+    </fieldset>
+    <fieldset><legend>Field</legend>
+      {_choice("plane", "plane across", "planes")}
+      {_slider("height", "at [mm]", "range_height[0]", "range_height[1]", 0.5)}
+      {_choice("unit", "unit", "units")} {_number("reference", "brightest [Pa]")}
+      <div class="row">{_button("rescale", "Fit the colours")}</div>
+      {_box("volume", "surface of equal level in the volume")} {_number("surface", "at [dB]")}
+    </fieldset>
+    <fieldset><legend>Save</legend>
+      <label>folder <input type="text" id="folder" v-model="folder"></label>
+      {_choice("device", "levels for", "devices")}
+      <div class="row">{_button("save", "Save scene and drive")}</div>
+      <p id="saved" role="status">{{{{ saved }}}}</p>
+    </fieldset>
+  </section>
+</main>"""

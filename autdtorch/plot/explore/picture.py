@@ -1,0 +1,179 @@
+"""The picture of a situation: bodies, foci, transducers and the field, moved without drawing them anew."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from autdtorch.plot import colours
+from autdtorch.plot.data import MM, in_decibels
+from autdtorch.plot.explore.situation import Situation
+from autdtorch.plot.view3d import meshes
+from autdtorch.scene.geometry import Plane
+from autdtorch.utils.array_types import Array
+from autdtorch.utils.validation import Vector
+
+_INK = {False: ("black", "white"), True: ("#e6e6e6", "#14171c")}  # lines and background, by dark
+_SAMPLES = 600  # along a ray through the scene, to find the body under the mouse
+_SAMPLES_A_PIXEL = 4
+_CHOSEN = 1.7  # size of the chosen focus
+_SURFACE_NAME = "isosurface"
+
+
+class Grip(NamedTuple):
+    """What the mouse holds.
+
+    Attributes:
+        kind: "body", "focus" or "transducer".
+        index: of it.
+        place: where it is held (3,) [m].
+        origin: its centre at this moment (3,) [m].
+        angles: of a body at this moment (3,) [rad].
+    """
+
+    kind: str
+    index: int
+    place: Array
+    origin: Array
+    angles: Vector = (0.0, 0.0, 0.0)
+
+
+class Scale(NamedTuple):
+    """The colours of pressures: from 0 to `reference` [Pa], or from -30 dB to 0 dB, which is `reference`."""
+
+    reference: float
+    decibels: bool
+
+    def values(self, magnitude: Array) -> Array:
+        """Return what is drawn of |p| (Nu, Nv) [Pa], between the limits; NaN stays."""
+        if self.decibels:
+            return np.maximum(in_decibels(magnitude, self.reference), colours.FLOOR)
+        return magnitude
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Ends of the colour scale."""
+        return (colours.FLOOR, 0.0) if self.decibels else (0.0, self.reference)
+
+
+class Picture:
+    """The picture. All its methods are called in one thread, as OpenGL requires."""
+
+    def __init__(self, situation: Situation, dark: bool = False) -> None:
+        """Draw a situation, as yet without a field."""
+        ink, paper = _INK[dark]
+        scene = situation.scene
+        self.plotter = meshes.empty_plotter(scene.domain, off_screen=True, ink=ink, paper=paper)
+        self._bodies = [meshes.add_obstacle(self.plotter, body.first) for body in situation.bodies]
+        self._foci: list[Any] = []
+        self._faces = meshes.add_transducers(
+            self.plotter, scene, meshes.emitted_phases(situation.drive, len(scene.array)), bar=False
+        )
+        self._sheet = meshes.plane_mesh(situation.sheet, np.full((1, 1), math.nan))
+        self._actor = meshes.add_sheet(self.plotter, self._sheet, colours.PRESSURE_MAP, (0.0, 1.0))
+        self._situation = situation
+        self.place(situation, 0)
+
+    def set_dark(self, dark: bool) -> None:
+        """Take light lines on a dark background, or dark on light."""
+        ink, paper = _INK[dark]
+        self.plotter.set_background(paper)
+        meshes.add_axes(self.plotter, self._situation.scene.domain, ink)
+
+    def place(self, situation: Situation, focus: int) -> None:
+        """Move bodies and foci; `focus` is the chosen one."""
+        self._situation = situation
+        for actors, body in zip(self._bodies, situation.bodies, strict=True):
+            for actor in actors:
+                actor.user_matrix = _matrix(*body.pose)
+        points = MM * situation.scene.control_points.numpy()
+        look = {"color": meshes.POINT_COLOUR, "ambient": 0.3, "reset_camera": False}
+        while len(self._foci) > len(points):
+            self.plotter.remove_actor(self._foci.pop(), reset_camera=False, render=False)
+        for index, point in enumerate(points):
+            if index == len(self._foci):
+                sphere = meshes.point_mesh(situation.scene)
+                self._foci.append(self.plotter.add_mesh(sphere, **look))
+            self._foci[index].position = point
+            self._foci[index].scale = _CHOSEN if index == focus else 1.0
+        self.show_drive(situation.drive)
+
+    def smooth(self, fine: bool) -> None:
+        """Render with smooth edges, which takes four times as long, or without while something is dragged."""
+        self.plotter.render_window.SetMultiSamples(_SAMPLES_A_PIXEL if fine else 0)
+
+    def show_drive(self, drive: torch.Tensor) -> None:
+        """Colour the transducers by the phases of a drive (M,)."""
+        phases = meshes.emitted_phases(drive, len(drive))
+        self._faces["phase"] = np.repeat(phases / math.pi, self._faces.n_points // len(drive))
+
+    def show_field(self, plane: Plane, magnitude: Array, scale: Scale) -> None:
+        """Colour a plane by |p| (Nu, Nv) [Pa]; grey where it is NaN."""
+        sheet = meshes.plane_mesh(plane, scale.values(magnitude))
+        self._sheet.copy_from(sheet)
+        self._actor.mapper.scalar_range = scale.limits
+
+    def show_volume(self, volume: torch.Tensor | None, scale: Scale, height: float) -> None:
+        """Draw the surface where the level of a volume (Nx, Ny, Nz) [Pa] is `height` [dB], or nothing."""
+        self.plotter.remove_actor(_SURFACE_NAME, reset_camera=False, render=False)
+        if volume is not None:
+            level = in_decibels(volume.abs().numpy(), scale.reference)
+            meshes.add_isosurface(self.plotter, self._situation.scene, level, height, name=_SURFACE_NAME)
+
+    def grip(self, x: float, y: float) -> Grip | None:
+        """Return what lies at a point of the window [pixels from its lower left corner]."""
+        near, far = (self.at(x, y, depth) for depth in (0.0, 1.0))
+        scene = self._situation.scene
+        ray = torch.from_numpy(near + np.linspace(0, 1, _SAMPLES)[:, None] * (far - near))
+        hits: list[tuple[int, Grip]] = []
+        spots = {"focus": (scene.control_points, scene.wavelength / 4)}
+        spots["transducer"] = scene.array.positions, scene.array.radius or scene.wavelength / 3
+        for kind, (places, radius) in spots.items():
+            gaps = torch.cdist(ray, places)
+            if gaps.min() < radius:
+                index = int(gaps.min(dim=0).values.argmin())
+                place = places[index].numpy()
+                hits.append((int(gaps[:, index].argmin()), Grip(kind, index, place, place)))
+        for index, body in enumerate(self._situation.bodies):
+            inside = body.obstacle.contains(ray)
+            if inside.any():
+                first = int(inside.int().argmax())
+                grip = Grip("body", index, ray[first].numpy(), np.array(body.center), body.angles)
+                hits.append((first, grip))
+        return min(hits, key=lambda hit: hit[0])[1] if hits else None
+
+    def at(self, x: float, y: float, depth: float) -> Array:
+        """Return the place (3,) [m] of a point of the window at a depth, 0 near to 1 far."""
+        renderer = self.plotter.renderer
+        renderer.SetDisplayPoint(x, y, depth)
+        renderer.DisplayToWorld()
+        *place, weight = renderer.GetWorldPoint()
+        return np.array(place) / weight / MM
+
+    def moved(self, grip: Grip, x: float, y: float) -> Array:
+        """Return the place (3,) [m] of a grip that follows the mouse, at its distance from the camera."""
+        near, far = (self.at(x, y, depth) for depth in (0.0, 1.0))
+        along = far - near
+        share = ((grip.place - near) @ along) / (along @ along)
+        return near + share * along
+
+    def close(self) -> None:
+        """Free the window."""
+        self.plotter.close()
+
+
+def gradient(count: int = 9) -> Sequence[str]:
+    """Return colours of the pressure's scale from its lower end on, for a legend."""
+    return meshes.map_colours(colours.PRESSURE_MAP, count)
+
+
+def _matrix(turn: torch.Tensor, pivot: torch.Tensor, offset: torch.Tensor) -> Array:
+    """Return the matrix (4, 4), in mm, of a turn (3, 3) about a pivot (3,) [m] and an offset (3,) [m]."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn.numpy()
+    matrix[:3, 3] = MM * (pivot + offset - turn @ pivot).numpy()
+    return matrix

@@ -1,0 +1,50 @@
+"""The scene and the drive of an explorer as files and as lines of Python."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from autdtorch.hardware.devices import DEVICES
+from autdtorch.io.drive_file import save_drive
+from autdtorch.io.scene_sections import save_scene, scene_lines
+from autdtorch.plot.explore.situation import Situation
+
+SCENE = "scene"
+"""Name of the scene file and, with a number, of meshes beside it."""
+
+
+def python_of(situation: Situation) -> str:
+    """Return the lines of Python that make scene and drive; meshes are read from files of `save`."""
+    return scene_lines(situation.scene, situation.drive, SCENE)
+
+
+def devices_of(situation: Situation) -> list[str]:
+    """Return the names of the devices whose boards have the number of transducers."""
+    count = len(situation.drive)
+    return [name for name, device in DEVICES.items() if count % device.board == 0]
+
+
+def save(situation: Situation, folder: str, device: str) -> Path:
+    """Write scene.yaml, drive.npz, scene.py and, for a device, its drive.csv; return the folder.
+
+    Args:
+        situation: scene and drive.
+        folder: to write into, below the working directory; it is made.
+        device: a name in `devices_of`, or "".
+
+    Raises:
+        ValueError: a folder elsewhere, or another device.
+        OSError: the files cannot be written.
+    """
+    path, here = Path(folder), Path.cwd().resolve()
+    if not folder.strip() or path.is_absolute() or not (here / path).resolve().is_relative_to(here):
+        raise ValueError(f"folder: {folder!r}; must be below the working directory")
+    if device and device not in devices_of(situation):
+        raise ValueError(f"device: {device!r}; must be one of {devices_of(situation)}")
+    path.mkdir(parents=True, exist_ok=True)
+    save_scene(path / f"{SCENE}.yaml", situation.scene)
+    save_drive(path / "drive.npz", situation.drive, situation.scene.array)
+    if device:
+        save_drive(path / f"drive_{device}.csv", situation.drive, situation.scene.array, device)
+    (path / f"{SCENE}.py").write_text(python_of(situation), encoding="utf-8")
+    return path

@@ -1,0 +1,144 @@
+"""The server of a live view: on the local interface alone, in a thread, behind a token in its address."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import logging
+import secrets
+import threading
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+from aiohttp import web
+from trame.app import get_server
+from trame_client.module.vue3 import www
+
+HOST = "127.0.0.1"
+
+_NAMES = HOST, "localhost"  # by which a browser may call this machine; others are those of an attack
+_ASSETS = Path(__file__).with_name("assets")
+_PATIENCE = 60.0  # s until the server must have started
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+class Server:
+    """A thread with an event loop, in which a trame application runs; VTK renders in it, too.
+
+    Attributes:
+        port: the port that it listens on.
+        token: the first part of the path of all addresses.
+    """
+
+    def __init__(self, build: Callable[[Any], Any], port: int = 0) -> None:
+        """Start the server; `build` makes the application on a trame server, in the thread.
+
+        Raises:
+            OSError: the port is taken.
+        """
+        self.token = secrets.token_urlsafe(24)
+        self.port = port
+        self._build = build
+        self._failure: BaseException | None = None
+        self._started = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="autdtorch explore page", daemon=True)
+        self._thread.start()
+        if not self._started.wait(_PATIENCE):
+            raise TimeoutError(f"explore: the server did not start within {_PATIENCE:g} s")
+        if self._failure is not None:
+            raise self._failure
+
+    @property
+    def address(self) -> str:
+        """The address to open in a browser on this machine."""
+        return f"http://{HOST}:{self.port}/{self.token}/index.html"
+
+    @property
+    def running(self) -> bool:
+        """True until it is closed."""
+        return self._thread.is_alive()
+
+    def call(self, function: Callable[..., object], *arguments: object) -> None:
+        """Call a function in the thread, soon; any thread may ask for it."""
+        if not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(function, *arguments)
+
+    def wait(self) -> None:
+        """Wait until it is closed, in steps that let Ctrl+C through."""
+        while self.running:
+            self._thread.join(0.5)
+
+    def close(self) -> None:
+        """Stop the server and end the thread."""
+        if self.running:
+            asyncio.run_coroutine_threadsafe(self._trame.stop(), self._loop)
+            self._thread.join(_PATIENCE)
+
+    def _run(self) -> None:
+        self._loop = asyncio.new_event_loop()
+        asyncio.set_event_loop(self._loop)
+        try:
+            self._loop.run_until_complete(self._serve())
+        except BaseException as error:
+            self._failure = error
+        finally:
+            self._started.set()
+            _end_tasks(self._loop)
+            self._loop.close()
+
+    async def _serve(self) -> None:
+        self._trame = trame = get_server(f"explore-{self.token}", client_type="vue3")
+        # trame would read the arguments of the user's own program, among them the host
+        trame.cli.parse_known_args = functools.partial(trame.cli.parse_known_args, [])
+        trame.cli.set_defaults(ws=f"{self.token}/ws", host=HOST)
+        trame.enable_module({"serve": {"__explore": str(_ASSETS)}, "styles": ["__explore/explore.css"],
+                             "scripts": ["__explore/explore.js"]})  # fmt: skip
+        trame.controller.on_server_bind.add(self._guard)
+        trame.controller.on_server_ready.add(self._note)
+        close = self._build(trame)
+        try:
+            await trame.start(
+                port=self.port, host=HOST, exec_mode="coroutine", backend="aiohttp", timeout=0, thread=True,
+                open_browser=False, show_connection_info=False, disable_logging=True, follow_symlinks=False,
+            )  # fmt: skip
+        finally:
+            close()
+
+    def _note(self, **_: Any) -> None:
+        self.port = self._trame.port
+        self._started.set()
+
+    def _guard(self, server: Any) -> None:
+        """Serve the pages below the token alone, and refuse what does not come from them."""
+        app: web.Application = server.app
+        app.middlewares.append(self._refuse_others)
+        folders = {"": www} | {name: path for name, path in self._trame.serve.items()}
+        for name, path in sorted(folders.items(), reverse=True):
+            folder = path[0] if isinstance(path, list | tuple) else path
+            app.router.add_static(f"/{self.token}/{name}", folder)
+
+    @web.middleware
+    async def _refuse_others(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Refuse requests without the token, from pages of other origins, and by other names of this host."""
+        token = request.path.strip("/").partition("/")[0]
+        own = {f"{name}:{self.port}" for name in _NAMES}
+        origin = request.headers.get("Origin")
+        if not secrets.compare_digest(token.encode(), self.token.encode()) or request.host not in own:
+            raise web.HTTPForbidden(text="explore: open the address that was printed, with its token")
+        if origin is not None and origin.removeprefix("http://") not in own:
+            raise web.HTTPForbidden(text="explore: the page of another origin")
+        response = await handler(request)
+        if not response.prepared:
+            response.headers["Referrer-Policy"] = "no-referrer"  # the address has the token
+            response.headers["X-Content-Type-Options"] = "nosniff"
+        return response
+
+
+def _end_tasks(loop: asyncio.AbstractEventLoop) -> None:
+    """Cancel what still runs in a loop."""
+    tasks = asyncio.all_tasks(loop)
+    for task in tasks:
+        task.cancel()
+    loop.run_until_complete(asyncio.gather(*tasks, return_exceptions=True))

@@ -1,0 +1,481 @@
+"""The session of a live view: what the page changes, what is calculated for it, and what it shows.
+
+All methods are called in the thread of the server, which also renders.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+
+from autdtorch.plot.data import in_decibels
+from autdtorch.plot.explore import saving
+from autdtorch.plot.explore.calculation import Calculator, Progress, Request, Result
+from autdtorch.plot.explore.catalogue import OFFERED, choices
+from autdtorch.plot.explore.history import History
+from autdtorch.plot.explore.mouse import Mouse
+from autdtorch.plot.explore.picture import Grip, Picture, Scale, gradient
+from autdtorch.plot.explore.situation import OWN_PLANE, Situation
+from autdtorch.scene.drive import amplitudes_of, drive_from_phases, phases_of
+from autdtorch.scene.geometry import rotation_matrix
+from autdtorch.scene.obstacles.moving import angles_of
+from autdtorch.utils.array_types import Array
+
+_MM = 1e-3
+_DIGITS = 7  # decimals of lengths [m] from the page, whose steps are 0.1 mm
+_STEP = 0.1  # mm, to which the page rounds
+_NEW_FOCUS = 1.5  # wavelengths beside the last focus
+_BODY = ("body_x", "body_y", "body_z"), ("turn_x", "turn_y", "turn_z")
+_FOCUS = ("focus_x", "focus_y", "focus_z")
+_COLUMNS = ("focus", "x [mm]", "y [mm]", "z [mm]", "|p| [Pa]", "level [dB]")
+
+
+class Session:
+    """A situation that page, mouse and calculations share."""
+
+    def __init__(
+        self,
+        trame: Any,
+        situation: Situation,
+        spacing: float,
+        defer: Callable[..., None],
+        note: Callable[[Situation], None],
+    ) -> None:
+        """Begin with a situation; cells have a `spacing` [m] when nothing is dragged.
+
+        `defer` calls a function in this thread, soon. `note` is told of every situation.
+        """
+        self._trame, self._state, self._note = trame, trame.state, note
+        self._history = History(situation)
+        self.picture = Picture(situation)
+        self.update: Callable[[], None] = lambda: None  # sends the picture, once there is a page
+        self._calculator = Calculator(spacing, lambda found: defer(self._receive, found))
+        self._mouse = Mouse(self.picture, self)
+        self._result: Result | None = None
+        self._reference: float | None = None
+        self._number, self._running = 0, False
+        self._extras: tuple[object, ...] = ()
+        self._settled: object = 0
+
+    @property
+    def now(self) -> Situation:
+        """The situation that is shown."""
+        return self._history.now
+
+    def close(self) -> None:
+        """End calculations and rendering."""
+        self._calculator.close()
+        self.picture.close()
+
+    # What the page calls
+
+    def settle(self) -> None:
+        """Calculate finely: the mouse or a slider was let go."""
+        self._history.settle()
+        self._show_situation()
+        self._ask()
+
+    def undo(self) -> None:
+        """Go a step back."""
+        self._history.undo()
+        self._show_situation()
+        self._ask()
+
+    def redo(self) -> None:
+        """Take a step again."""
+        self._history.redo()
+        self._show_situation()
+        self._ask()
+
+    def add_focus(self) -> None:
+        """Add a focus beside the chosen one."""
+        points, scene = self.now.scene.control_points, self.now.scene
+        sheet = self.now.sheet
+        for direction in (*sheet.basis, *(-one for one in sheet.basis)):
+            new = points[self._chosen("focus", len(points))] + _NEW_FOCUS * scene.wavelength * direction
+            try:
+                self._change(self.now.with_points(torch.cat([points, new[None]])))
+            except ValueError as error:
+                refusal = error
+            else:
+                self._state.focus = len(points)
+                self.settle()
+                return
+        self._refuse(refusal)
+
+    def remove_focus(self) -> None:
+        """Remove the chosen focus."""
+        points = self.now.scene.control_points
+        if len(points) > 1:
+            kept = torch.arange(len(points), device="cpu") != self._chosen("focus", len(points))
+            self._change(self.now.with_points(points[kept]))
+            self._state.focus = 0
+            self.settle()
+
+    def in_phase(self) -> None:
+        """Give all transducers phase 0 and amplitude 1."""
+        self._change(self.now.with_drive(torch.ones_like(self.now.drive)))
+        self.settle()
+
+    def find(self) -> None:
+        """Run the chosen method."""
+        if (name := self._state.method) in OFFERED:
+            self._history.settle()
+            self._running = True
+            self._state.update({"busy": True, "progress": 0, "message": ""})
+            self._ask(method=name)
+
+    def cancel(self) -> None:
+        """End the method that runs; the drive stays."""
+        self._ask()
+
+    def rescale(self) -> None:
+        """Fit the colours to the field."""
+        self._reference = None
+        self._show_field()
+
+    def write_python(self) -> None:
+        """Write scene and drive as Python."""
+        self._state.python = saving.python_of(self.now)
+
+    def save(self) -> None:
+        """Write scene and drive to files."""
+        try:
+            folder = saving.save(self.now, str(self._state.folder), str(self._state.device))
+        except (ValueError, OSError) as error:
+            self._state.update({"saved": "", "message": str(error)})
+        else:
+            self._state.update({"saved": f"saved in {folder}", "message": ""})
+
+    # What the mouse calls
+
+    def drag(self, grip: Grip, place: Array) -> None:
+        """Move a body or a focus so that its grip is at a place (3,) [m]."""
+        offset = np.round((place - grip.place) / _MM, 1) * _MM
+        if grip.kind == "body":
+            body = self.now.bodies[grip.index]
+            x, y, z = (round(one, _DIGITS) for one in (grip.origin + offset).tolist())
+            self._try(lambda: self.now.with_body(grip.index, (x, y, z), body.angles))
+        else:
+            points = self.now.scene.control_points.clone()
+            points[grip.index] = points.new_tensor((grip.origin + offset).round(_DIGITS))
+            self._try(lambda: self.now.with_points(points))
+
+    def turn(self, grip: Grip, angle: float) -> None:
+        """Turn a body about the vertical by an angle [rad] from where it was gripped."""
+        if grip.kind == "body":
+            body = self.now.bodies[grip.index]
+            turn = rotation_matrix((0.0, 0.0, angle)) @ rotation_matrix(grip.angles)
+            a, b, c = angles_of(turn).tolist()
+            self._try(lambda: self.now.with_body(grip.index, body.center, (a, b, c)))
+
+    def choose(self, grip: Grip) -> None:
+        """Choose what was gripped in the lists of the page."""
+        with self._state:
+            self._state[grip.kind] = grip.index
+
+    # What the page changes
+
+    def begin(self, method: str | None) -> None:
+        """Set the state of the page, and what follows when it changes; run a method first, if given."""
+        state, scene = self._state, self.now.scene
+        lower, upper = scene.domain
+        for axis, low, high in zip("xyz", lower, upper, strict=True):
+            state[f"range_{axis}"] = [low / _MM, high / _MM]
+        names = [type(body.first).__name__.lower() for body in self.now.bodies]
+        devices = [("", "no device"), *((name, name) for name in saving.devices_of(self.now))]
+        planes = {"scene": "as in the scene"} | {axis: f"{axis}" for axis in "xyz"}
+        bar = f"background: linear-gradient(to right, {', '.join(gradient())})"
+        state.update(
+            {
+                "name": scene.name, "message": "", "status": "", "summary": "", "saved": "", "python": "",
+                "bodies": [(index, f"{index}: {name}") for index, name in enumerate(names)],
+                "transducers": [(index, str(index)) for index in range(len(scene.array))],
+                "methods": choices(), "devices": devices, "units": [("dB", "dB"), ("Pa", "Pa")],
+                "planes": [(name, planes[name]) for name in self.now.planes], "columns": _COLUMNS,
+                "body": 0, "focus": 0, "transducer": 0, "method": "gradient_ascent", "device": "",
+                "unit": "dB", "reference": 1.0, "surface": -6.0, "folder": "outputs/explore",
+                "follow": False, "volume": False, "busy": False, "progress": 0, "dark": False,
+                "rows": [], "scale_low": "", "scale_high": "", "scale_style": bar, "shown": -1, "wanted": 0, "settled": 0,
+                "trame__title": f"autdtorch explore: {scene.name}",
+            }
+        )  # fmt: skip
+        self._extras = state.follow, state.volume, state.surface
+        self._show_situation()
+        for names, changed in (
+            (("body", "focus", "transducer"), self._show_situation),
+            ((*_BODY[0], *_BODY[1]), self._move_body),
+            (_FOCUS, self._move_focus),
+            (("phase", "amplitude"), self._edit_drive),
+            (("plane",), self._choose_plane),
+            (("height",), self._move_plane),
+            (("unit", "reference"), self._choose_scale),
+            (("follow", "volume", "surface"), self._choose_extras),
+            (("dark",), self._choose_dark),
+            (("settled",), self._let_go),  # the last, as it follows changes that come with it
+        ):
+            state.change(*names)(lambda changed=changed, **_: changed())
+        for action in (
+            self.undo, self.redo, self.add_focus, self.remove_focus, self.in_phase, self.find,
+            self.cancel, self.rescale, self.write_python, self.save,
+        ):  # fmt: skip
+            self._trame.controller.trigger(action.__name__)(action)
+        self._ask(method=method)
+
+    def _move_body(self) -> None:
+        if not self.now.bodies:
+            return
+        index = self._chosen("body", len(self.now.bodies))
+        if self._entered((*_BODY[0], *_BODY[1])) == self._body_values(index):
+            return
+        place, angles = (self._entered(names) for names in _BODY)
+        x, y, z = (round(_MM * one, _DIGITS) for one in place)
+        a, b, c = (math.radians(one) for one in angles)
+        self._try(lambda: self.now.with_body(index, (x, y, z), (a, b, c)))
+
+    def _move_focus(self) -> None:
+        index = self._chosen("focus", len(self.now.scene.control_points))
+        if self._entered(_FOCUS) == self._focus_values(index):
+            return
+        points = self.now.scene.control_points.clone()
+        points[index] = points.new_tensor([round(_MM * one, _DIGITS) for one in self._entered(_FOCUS)])
+        self._try(lambda: self.now.with_points(points))
+
+    def _edit_drive(self) -> None:
+        index = self._chosen("transducer", len(self.now.drive))
+        entered = self._entered(("phase", "amplitude"))
+        if entered == self._drive_values(index):
+            return
+        phase, amplitude = entered
+        drive = self.now.drive.clone()
+
+        def edited() -> Situation:
+            drive[index] = drive_from_phases([math.radians(phase)], [amplitude])[0]
+            return self.now.with_drive(drive)
+
+        self._try(edited)
+
+    def _choose_plane(self) -> None:
+        if self._state.plane != self.now.plane:
+            self._try(lambda: self.now.with_plane(self._state.plane))
+            self._reference = None
+            self.settle()
+
+    def _move_plane(self) -> None:
+        (height,) = self._entered(("height",))
+        if height != _mm(self.now.height):
+            self._try(lambda: self.now.with_plane(self.now.plane, _MM * height))
+
+    def _choose_scale(self) -> None:
+        (reference,) = self._entered(("reference",))
+        if reference > 0 and self._reference is not None and reference != _digits(self._reference):
+            self._reference = reference
+        self._show_field()
+
+    def _choose_extras(self) -> None:
+        chosen = self._state.follow, self._state.volume, self._state.surface
+        if chosen != self._extras:
+            self._extras = chosen
+            self._ask()
+
+    def _choose_dark(self) -> None:
+        self.picture.set_dark(bool(self._state.dark))
+        self.update()
+
+    def _try(self, changed: Callable[[], Situation]) -> None:
+        """Change the situation if that is possible, and calculate it coarsely."""
+        try:
+            self._change(changed())
+        except ValueError as error:
+            self._refuse(error)
+        else:
+            self._show_situation()
+            if self._state.settled == self._settled:  # else the fine calculation follows at once
+                self._ask(fine=False)
+
+    def _let_go(self) -> None:
+        """Calculate finely, if a slider was let go or a number entered."""
+        if self._state.settled != self._settled:
+            self._settled = self._state.settled
+            self.settle()
+
+    def _change(self, situation: Situation) -> None:
+        self._history.change(situation)
+
+    def _refuse(self, error: Exception) -> None:
+        """Say why something cannot be, and set the page back."""
+        self._show_situation()
+        self._state.message = str(error)
+
+    def _entered(self, names: tuple[str, ...]) -> tuple[float, ...]:
+        """Return numbers of the page; what is none counts as unchanged."""
+        values = []
+        for name in names:
+            value = self._state[name]
+            is_number = isinstance(value, int | float) and math.isfinite(value)
+            values.append(float(value) if is_number else math.nan)
+        return tuple(values)
+
+    def _chosen(self, name: str, count: int) -> int:
+        """Return the index that a list of the page has chosen."""
+        value = self._state[name]
+        return min(max(int(value), 0), count - 1) if isinstance(value, int | float) else 0
+
+    # What the page shows
+
+    def _body_values(self, index: int) -> tuple[float, ...]:
+        body = self.now.bodies[index]
+        return (*map(_mm, body.center), *(_degrees(one) for one in body.angles))
+
+    def _focus_values(self, index: int) -> tuple[float, ...]:
+        return tuple(map(_mm, self.now.scene.control_points[index].tolist()))
+
+    def _drive_values(self, index: int) -> tuple[float, float]:
+        one = self.now.drive[index : index + 1]
+        return _degrees(float(phases_of(one))), round(float(amplitudes_of(one)), 4)
+
+    def _show_situation(self) -> None:
+        """Set the numbers of the page, and move what is in the picture."""
+        state, now = self._state, self.now
+        points = now.scene.control_points
+        focus = self._chosen("focus", len(points))
+        with state:
+            if now.bodies:
+                index = self._chosen("body", len(now.bodies))
+                self._set((*_BODY[0], *_BODY[1]), self._body_values(index))
+                body = now.bodies[index]
+                state.update({"body_moves": body.moves, "body_turns": body.turns})
+            self._set(_FOCUS, self._focus_values(focus))
+            self._set(("phase", "amplitude"), self._drive_values(self._chosen("transducer", len(now.drive))))
+            low, high = now.heights
+            state.update(
+                {
+                    "foci": [(index, str(index)) for index in range(len(points))], "focus": focus,
+                    "plane": now.plane, "height": _mm(now.height), "range_height": [_mm(low), _mm(high)],
+                    "can_undo": self._history.can_undo, "can_redo": self._history.can_redo, "message": "",
+                }
+            )  # fmt: skip
+        self.picture.place(now, focus)
+        self._note(now)
+        self.update()
+
+    def _set(self, names: tuple[str, ...], values: tuple[float, ...]) -> None:
+        self._state.update(dict(zip(names, values, strict=True)))
+
+    def _ask(self, fine: bool = True, method: str | None = None) -> None:
+        """Ask for the field of the situation."""
+        self.picture.smooth(fine)
+        self._number += 1
+        self._running = method is not None
+        self._calculator.ask(
+            Request(
+                self._number, self.now, fine,
+                follow=bool(self._state.follow) and method is None,
+                volume=bool(self._state.volume) and fine,
+                method=None if method is None else OFFERED[method],
+            )
+        )  # fmt: skip
+        with self._state:
+            self._state.update({"wanted": self._number, "busy": self._running})
+
+    def _receive(self, found: Result | Progress | Exception) -> None:
+        """Show what was calculated."""
+        state = self._state
+        with state:
+            if isinstance(found, Exception):
+                state.update({"message": str(found), "status": "", "busy": False})
+            elif isinstance(found, Progress):
+                if self._running:
+                    text = f"{found.label}: {found.evaluations} of at most {found.most} evaluations"
+                    state.progress = 100 * found.evaluations / max(found.most, 1)
+                    state.status = f"{text}, weakest focus {found.score:.3g} Pa"
+            else:
+                self._take(found)
+
+    def _take(self, result: Result) -> None:
+        request = result.request
+        if request.number == self._number and not torch.equal(result.drive, self.now.drive):
+            if request.method is not None:
+                self._change(self.now.with_drive(result.drive))
+                self._history.settle()
+                if request.number == 1:
+                    self._history = History(self.now)
+                self._reference = None
+            else:
+                self._history.now = self.now.with_drive(result.drive)
+            self._show_situation()
+        if request.number == self._number:
+            self._running = self._state.busy = False
+        self._result = result
+        self._show_field()
+        what = "calculated" if request.fine else "coarse, calculated"
+        self._state.status = f"{what} in {result.seconds:.2g} s"
+
+    def _show_field(self) -> None:
+        """Colour the plane, and set the readings."""
+        if (result := self._result) is None:
+            return
+        magnitude = np.abs(result.field)
+        if self._reference is None:
+            known = magnitude[np.isfinite(magnitude)]
+            self._reference = float(known.max()) if known.size and known.max() > 0 else 1.0
+        scale = Scale(self._reference, self._state.unit != "Pa")
+        situation = result.request.situation
+        self.picture.show_field(situation.sheet, magnitude, scale)
+        self.picture.show_volume(result.volume, scale, self._surface())
+        low, high = scale.limits
+        unit = "dB" if scale.decibels else "Pa"
+        with self._state:
+            self._state.update(
+                {
+                    "rows": _rows(result, self._reference), "summary": _summary(result),
+                    "reference": _digits(self._reference), "shown": result.request.number,
+                    "scale_low": f"{low:.3g} {unit}",
+                    "scale_high": f"{high:.3g} {unit}" + (f" = {self._reference:.3g} Pa" if unit == "dB" else ""),
+                }
+            )  # fmt: skip
+        self.update()
+
+    def _surface(self) -> float:
+        (height,) = self._entered(("surface",))
+        return height if -60.0 <= height <= 0.0 else -6.0
+
+
+def _mm(length: float) -> float:
+    return round(length / _MM, 4) + 0.0
+
+
+def _degrees(angle: float) -> float:
+    return round(math.degrees(angle), 6) + 0.0
+
+
+def _digits(value: float) -> float:
+    return float(f"{value:.4g}")
+
+
+def _rows(result: Result, reference: float) -> list[list[str]]:
+    """Return the lines of the table of foci."""
+    points = result.request.situation.scene.control_points
+    levels = in_decibels(result.pressure.numpy(), reference)
+    return [
+        [str(index), *(f"{one / _MM:.1f}" for one in point), f"{pressure:.3g}", f"{level:.1f}"]
+        for index, (point, pressure, level) in enumerate(
+            zip(points.tolist(), result.pressure.tolist(), levels.tolist(), strict=True)
+        )
+    ]
+
+
+def _summary(result: Result) -> str:
+    """Return the readings as a sentence or two."""
+    weakest = float(result.pressure.min())
+    text = f"Weakest focus {weakest:.3g} Pa"
+    if result.bound is not None:
+        text += f", {100 * weakest / result.bound:.0f} % of what any drive can reach ({result.bound:.3g} Pa)"
+    cells = f"cells of {result.spacing / _MM:.3g} mm"
+    if result.error is None:
+        return f"{text}. {cells.capitalize()}."
+    return f"{text}. Estimated error {100 * result.error:.2g} %, {cells}."

@@ -1,0 +1,181 @@
+"""The situation that an explorer shows: where bodies and foci are, the drive, and the plane of the field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import torch
+
+from autdtorch.scene.drive import validate_single_drive
+from autdtorch.scene.geometry import Plane, rotation_matrix
+from autdtorch.scene.obstacles import Obstacle
+from autdtorch.scene.obstacles.moving import is_movable, is_turnable, shifted, turned
+from autdtorch.scene.scene import Scene
+from autdtorch.utils.validation import Vector, finite_vector
+
+_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+OWN_PLANE = "scene"
+"""Name of the plane that is parallel to the scene's own observation plane."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """An obstacle that is moved and turned about its centre.
+
+    Attributes:
+        first: the obstacle where it was at first.
+        center: of its bounding box before turning (3,) [m].
+        angles: about the axes x, y, z (3,) [rad], as of `rotation_matrix`. Those of boxes and meshes are
+            theirs, those of cylinders begin at 0.
+    """
+
+    first: Obstacle
+    center: Vector
+    angles: Vector
+
+    @classmethod
+    def of(cls, obstacle: Obstacle) -> Body:
+        """Return the body of an obstacle where it is."""
+        return cls(obstacle, _middle(obstacle), getattr(obstacle, "rotation", (0.0, 0.0, 0.0)))
+
+    @property
+    def moves(self) -> bool:
+        """True for an obstacle that can be moved."""
+        return is_movable(self.first)
+
+    @property
+    def turns(self) -> bool:
+        """True for an obstacle that can be turned."""
+        return is_turnable(self.first)
+
+    @cached_property
+    def pose(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Turn (3, 3) about a pivot (3,) [m], and offset (3,) [m] after it, from where it was at first."""
+        pivot = torch.tensor(_middle(self.first), dtype=torch.float64, device="cpu")
+        turn = rotation_matrix(self.angles) @ rotation_matrix(Body.of(self.first).angles).mT
+        return turn, pivot, pivot.new_tensor(self.center) - pivot
+
+    @cached_property
+    def obstacle(self) -> Obstacle:
+        """The obstacle where it is now."""
+        if self == Body.of(self.first):
+            return self.first
+        turn, pivot, offset = self.pose
+        return shifted(turned(self.first, turn, pivot) if self.turns else self.first, offset)
+
+
+@dataclass(frozen=True, eq=False)
+class Situation:
+    """What is shown, and undone step by step.
+
+    Attributes:
+        bodies: the obstacles of the scene.
+        scene: the scene; its obstacles are those of the bodies.
+        drive: complex (M,).
+        plane: name of the plane of the field: "x", "y" or "z" for a section of the domain across this axis,
+            "scene" for the scene's own.
+        height: of the plane along its normal [m]; for the scene's own from where it was.
+    """
+
+    bodies: tuple[Body, ...]
+    scene: Scene
+    drive: torch.Tensor
+    plane: str
+    height: float
+    _own: Plane | None = field(repr=False)
+
+    @classmethod
+    def of(cls, scene: Scene, drive: torch.Tensor) -> Situation:
+        """Return the situation of a scene at first."""
+        bodies = tuple(map(Body.of, scene.obstacles))
+        own = scene.observation_plane
+        if own is not None:
+            return cls(bodies, scene, drive, OWN_PLANE, 0.0, own)
+        middle = scene.control_points.mean(dim=0)
+        axis = int((middle - scene.array.positions.mean(dim=0)).abs().argmax())
+        return cls(bodies, scene, drive, "xyz"[axis], float(middle[axis]), None)
+
+    @property
+    def planes(self) -> tuple[str, ...]:
+        """Names that `plane` can have."""
+        return (*_AXES, OWN_PLANE) if self._own is not None else tuple(_AXES)
+
+    @property
+    def heights(self) -> tuple[float, float]:
+        """Range of `height` within the domain [m]."""
+        lower, upper = self.scene.domain
+        if self.plane in _AXES:
+            axis = "xyz".index(self.plane)
+            return lower[axis], upper[axis]
+        assert self._own is not None
+        normal, middle = self._own.normal, self._own.center
+        steps = [
+            sorted(((low - at) / along, (high - at) / along))
+            for along, at, low, high in zip(normal, middle, lower, upper, strict=True)
+            if abs(along) > 1e-9
+        ]
+        return max(low for low, _ in steps), min(high for _, high in steps)
+
+    @cached_property
+    def sheet(self) -> Plane:
+        """The plane of the field."""
+        if self.plane == OWN_PLANE:
+            assert self._own is not None
+            along = zip(self._own.center, self._own.normal, strict=True)
+            x, y, z = (at + self.height * step for at, step in along)
+            return replace(self._own, center=(x, y, z))
+        axis = "xyz".index(self.plane)
+        lower, upper = self.scene.domain
+        center = [(low + high) / 2 for low, high in zip(lower, upper, strict=True)]
+        center[axis] = self.height
+        size = [high - low for low, high in zip(lower, upper, strict=True)]
+        return Plane(
+            (center[0], center[1], center[2]),
+            _AXES[self.plane],
+            (size[(axis + 1) % 3], size[(axis + 2) % 3]),
+        )
+
+    def with_body(self, index: int, center: Vector, angles: Vector) -> Situation:
+        """Return the situation with a body elsewhere: centre (3,) [m] and angles (3,) [rad].
+
+        Raises:
+            ValueError: the body cannot be there, such as on a control point.
+        """
+        body = self.bodies[index]
+        moved = replace(
+            body,
+            center=finite_vector("center", center) if body.moves else body.center,
+            angles=finite_vector("angles", angles, "rad") if body.turns else body.angles,
+        )
+        bodies = (*self.bodies[:index], moved, *self.bodies[index + 1 :])
+        obstacles = tuple(one.obstacle for one in bodies)
+        return replace(self, bodies=bodies, scene=replace(self.scene, obstacles=obstacles))
+
+    def with_points(self, points: torch.Tensor) -> Situation:
+        """Return the situation with other control points (P, 3) [m].
+
+        Raises:
+            ValueError: a point cannot be there.
+        """
+        return replace(self, scene=replace(self.scene, control_points=points))
+
+    def with_drive(self, drive: torch.Tensor) -> Situation:
+        """Return the situation with another drive (M,)."""
+        return replace(self, drive=validate_single_drive(drive, len(self.scene.array)))
+
+    def with_plane(self, plane: str, height: float | None = None) -> Situation:
+        """Return the situation with another plane; without a height it passes through the foci."""
+        if plane not in self.planes:
+            raise ValueError(f"plane: {plane!r}; must be one of {', '.join(self.planes)}")
+        changed = replace(self, plane=plane, height=0.0)
+        if height is None and plane in _AXES:
+            height = float(self.scene.control_points.mean(dim=0)["xyz".index(plane)])
+        low, high = changed.heights
+        return replace(changed, height=min(max(height or 0.0, low), high))
+
+
+def _middle(obstacle: Obstacle) -> Vector:
+    x, y, z = ((low + high) / 2 for low, high in zip(obstacle.lower, obstacle.upper, strict=True))
+    return getattr(obstacle, "center", (x, y, z))
+

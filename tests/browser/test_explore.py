@@ -1,0 +1,394 @@
+"""The live view in a real browser: what a user does there changes scene, drive and picture."""
+
+import contextlib
+import io
+import re
+import time
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import autdtorch as at
+from autdtorch.plot.view3d import rendering_problem
+
+pytest.importorskip("trame_rca", reason="trame: install autdtorch[explore]")
+
+SPACING = 1.5e-3  # cells of the fine calculation here
+PATIENCE = 20_000  # ms; the first simulation may compile kernels, and the machine may be busy
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Two cubes that are not alike, so that a mirrored picture is another."""
+    array = at.TransducerArray.grid((4, 4), 10e-3, (1e-3, 50e-3, 50e-3))
+    foci = at.circle_points((80e-3, 50e-3, 50e-3), 25e-3, 3, (1, 0, 0))
+    cubes = (
+        at.Box((40e-3, 45e-3, 50e-3), (14e-3,) * 3, density=100.0, sound_speed=340.0),
+        at.Sphere((30e-3, 70e-3, 60e-3), 4e-3, rigid=True),
+    )
+    plane = at.Plane((80e-3, 50e-3, 50e-3), (1, 0, 0), (100e-3, 100e-3))
+    domain = [[0, 0, 0], [0.1, 0.1, 0.1]]
+    return at.Scene(array, at.Medium.air(), 40e3, foci, cubes, plane, domain, name="cube and sphere")
+
+
+@pytest.fixture
+def live(scene, browser):
+    """A live view of the scene, and its page in a browser, when the first drive is found."""
+    if problem := rendering_problem():
+        pytest.skip(problem)
+    explorer = at.explore(scene, spacing=SPACING)
+    context = browser.new_context(viewport={"width": 1280, "height": 900})
+    page = context.new_page()
+    page.set_default_timeout(PATIENCE)
+    page.goto(explorer.address)
+    opened(page)
+    yield explorer, page
+    context.close()
+    explorer.close()
+
+
+def opened(page):
+    """Wait for the first result, with its error."""
+    page.wait_for_selector("section.picture[aria-busy=false]")
+    page.wait_for_function("document.getElementById('summary').textContent.includes('error')")
+
+
+@contextlib.contextmanager
+def settled(page):
+    """Wait for the result of what is done within, with its error."""
+    before = page.get_attribute("section.picture", "data-shown")
+    yield
+    page.wait_for_function(
+        """before => {
+            const data = document.querySelector('section.picture');
+            return data.dataset.shown > Number(before) && data.getAttribute('aria-busy') === 'false'
+                && document.getElementById('summary').textContent.includes('error');
+        }""",
+        arg=before,
+    )
+
+
+def set_slider(page, name, value, let_go=True):
+    """Move a slider as the mouse does, and let it go."""
+    page.eval_on_selector(
+        f"#{name}",
+        """(slider, [value, letGo]) => {
+            slider.value = value;
+            slider.dispatchEvent(new Event('input', {bubbles: true}));
+            if (letGo) slider.dispatchEvent(new Event('change', {bubbles: true}));
+        }""",
+        [str(value), let_go],
+    )
+
+
+def wait_for(condition, seconds=PATIENCE / 1000):
+    """Wait until a function of the live view's state is true."""
+    until = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < until, "the live view did not follow"
+        time.sleep(0.05)
+
+
+def pressures(page):
+    """Pressures of the table of foci [Pa]."""
+    cells = page.locator("table tbody tr td:nth-child(5)").all_text_contents()
+    return np.array([float(cell) for cell in cells])
+
+
+def pixels(page):
+    """The picture as it is on the screen (height, width, 3)."""
+    shot = page.locator(".view").screenshot()
+    return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(float)
+
+
+def simulated(explorer, spacing=SPACING):
+    """Pressures at the foci [Pa] of what the live view holds, simulated here."""
+    return at.make_propagator(explorer.scene, spacing=spacing).field(
+        explorer.drive, explorer.scene.control_points
+    ).abs().numpy()
+
+
+def center_of_box(page):
+    """A point of the window [pixels] where only the obstacle's grey is."""
+    seen = pixels(page)
+    grey = (np.ptp(seen, axis=-1) < 12) & (seen.mean(axis=-1) > 90) & (seen.mean(axis=-1) < 215)
+    height, width = grey.shape
+    blocks = np.lib.stride_tricks.sliding_window_view(grey, (25, 25))[::5, ::5].mean(axis=(2, 3))
+    row, column = np.unravel_index(blocks.argmax(), blocks.shape)
+    assert blocks.max() > 0.9, "no obstacle is seen"
+    box = page.locator(".view").bounding_box()
+    return box["x"] + float(5 * column + 12), box["y"] + float(5 * row + 12)
+
+
+def drag(page, start, offset, shift=False):
+    """Drag by some pixels, in steps."""
+    page.mouse.move(*start)
+    if shift:
+        page.keyboard.down("Shift")
+    page.mouse.down()
+    for share in (0.2, 0.4, 0.6, 0.8, 1.0):
+        page.mouse.move(start[0] + share * offset[0], start[1] + share * offset[1])
+        page.wait_for_timeout(60)  # the page sends at most one event in 30 ms
+    page.mouse.up()
+    if shift:
+        page.keyboard.up("Shift")
+
+
+def test_it_opens_with_a_good_drive_and_its_readings(live):
+    explorer, page = live
+    shown = pressures(page)
+    np.testing.assert_allclose(shown, simulated(explorer), rtol=1e-2)  # three digits are shown
+    bound = at.focus_bound(at.make_propagator(explorer.scene, spacing=SPACING).transfer_matrix())
+    assert shown.min() > 0.97 * bound
+    assert np.ptp(pixels(page)) > 200  # a picture is there
+    assert "two" not in page.title()
+    assert "cube and sphere" in page.title()
+
+
+def test_a_slider_breaks_the_foci_and_undo_mends_them(live):
+    explorer, page = live
+    before, picture = pressures(page), pixels(page)
+    set_slider(page, "body_y", 52.0, let_go=False)
+    # Coarse while it is dragged: 0.24 wavelengths
+    page.wait_for_function("document.getElementById('summary').textContent.includes('Cells of 2.06 mm')")
+    assert abs(explorer.scene.obstacles[0].center[1] - 52e-3) < 1e-9
+    with settled(page):
+        set_slider(page, "body_y", 52.0)
+    moved = pressures(page)
+    np.testing.assert_allclose(moved, simulated(explorer), rtol=1e-2)
+    assert moved.min() < 0.8 * before.min()
+    assert np.abs(pixels(page) - picture).max() > 100
+    with settled(page):
+        page.click("#undo")
+    assert np.array_equal(pressures(page), before)
+    with settled(page):
+        page.keyboard.press("Control+Shift+Z")
+    assert np.array_equal(pressures(page), moved)
+
+
+def test_numbers_and_the_keyboard_move_an_obstacle(live):
+    explorer, page = live
+    page.fill("#body_z_number", "55.3")
+    page.press("#body_z_number", "Enter")
+    wait_for(lambda: abs(explorer.scene.obstacles[0].center[2] - 55.3e-3) < 1e-9)
+    page.focus("#body_z")
+    page.keyboard.press("ArrowLeft")
+    wait_for(lambda: abs(explorer.scene.obstacles[0].center[2] - 55.2e-3) < 1e-9)
+    page.keyboard.press("Control+z")
+    wait_for(lambda: abs(explorer.scene.obstacles[0].center[2] - 55.3e-3) < 1e-9)
+
+
+def test_an_obstacle_is_turned_by_sliders(live):
+    explorer, page = live
+    with settled(page):
+        set_slider(page, "turn_z", 30)
+    np.testing.assert_allclose(explorer.scene.obstacles[0].rotation, (0, 0, np.pi / 6), atol=1e-6)
+    np.testing.assert_allclose(pressures(page), simulated(explorer), rtol=1e-2)
+    page.select_option("#body", label="1: sphere")
+    page.wait_for_selector("#turn_z[disabled]")  # turning a sphere changes nothing
+
+
+def test_an_obstacle_is_dragged_and_turned_in_the_picture(live):
+    explorer, page = live
+    start = center_of_box(page)
+    before = explorer.scene.obstacles[0]
+    with settled(page):
+        drag(page, start, (0, -60))
+    moved = explorer.scene.obstacles[0]
+    # The camera looks down a little, so that up on the screen is mostly up in space
+    assert moved.center[2] - before.center[2] > 5e-3
+    assert moved.rotation == before.rotation
+    drag(page, (start[0], start[1] - 60), (40, 0), shift=True)
+    wait_for(lambda: explorer.scene.obstacles[0].rotation != before.rotation)
+    np.testing.assert_allclose(explorer.scene.obstacles[0].rotation, (0, 0, np.radians(20)), atol=1e-6)
+    assert explorer.scene.obstacles[0].center == moved.center
+
+
+def test_elsewhere_the_mouse_turns_the_camera(live):
+    explorer, page = live
+    box = page.locator(".view").bounding_box()
+    before, scene = pixels(page), explorer.scene
+    drag(page, (box["x"] + 30, box["y"] + box["height"] - 30), (80, 40))
+    wait_for(lambda: np.abs(pixels(page) - before).mean() > 2)
+    assert explorer.scene is scene
+
+
+def test_foci_are_added_moved_and_removed(live):
+    explorer, page = live
+    with settled(page):
+        page.click("#add_focus")
+    assert len(explorer.scene.control_points) == 4
+    with settled(page):
+        set_slider(page, "focus_z", 30.0)
+    assert abs(float(explorer.scene.control_points[3, 2]) - 30e-3) < 1e-9
+    np.testing.assert_allclose(pressures(page), simulated(explorer), rtol=1e-2)
+    page.click("#remove_focus")
+    wait_for(lambda: len(explorer.scene.control_points) == 3)
+
+
+def test_methods_find_phases_and_can_be_cancelled(live):
+    explorer, page = live
+    with settled(page):
+        page.click("#in_phase")
+    assert torch.equal(explorer.drive, torch.ones_like(explorer.drive))
+    in_phase = pressures(page).min()
+    page.select_option("#method", "gabs")
+    with settled(page):
+        page.click("#find")
+        page.wait_for_function("document.getElementById('status').textContent.includes('GABS')")
+    page.wait_for_selector("#find:not([disabled])")
+    assert pressures(page).min() > 1.5 * in_phase
+    found = explorer.drive
+    page.select_option("#method", "bayes_opt")  # takes a minute
+    page.click("#find")
+    page.wait_for_selector("#cancel:not([disabled])")
+    page.click("#cancel")
+    page.wait_for_selector("#find:not([disabled])")
+    assert torch.equal(explorer.drive, found)
+    page.click("#undo")
+    wait_for(lambda: torch.equal(explorer.drive, torch.ones_like(explorer.drive)))
+
+
+def test_phases_follow_an_obstacle(live):
+    explorer, page = live
+    page.check("#follow")
+    with settled(page):
+        set_slider(page, "body_y", 52.0)
+    matrix = at.make_propagator(explorer.scene, spacing=SPACING).transfer_matrix()
+    assert float((matrix @ explorer.drive).abs().min()) > 0.97 * float(at.focus_bound(matrix))
+
+
+def test_the_drive_is_edited(live):
+    explorer, page = live
+    before = explorer.drive
+    page.select_option("#transducer", "5")
+    with settled(page):
+        set_slider(page, "phase", 90)
+    with settled(page):
+        set_slider(page, "amplitude", 0.5)
+    assert abs(complex(explorer.drive[5]) - -0.5j) < 1e-6  # q = a e^{-i phi}
+    others = [index for index in range(16) if index != 5]
+    assert torch.equal(explorer.drive[others], before[others])
+    np.testing.assert_allclose(pressures(page), simulated(explorer), rtol=1e-2)
+
+
+def test_plane_unit_and_volume_change_the_picture(live):
+    _, page = live
+    seen = [pixels(page)]
+
+    def require_another_picture():
+        wait_for(lambda: np.abs(pixels(page) - seen[-1]).mean() > 0.5)
+        seen.append(pixels(page))
+
+    with settled(page):
+        page.select_option("#plane", "z")
+    require_another_picture()
+    with settled(page):
+        set_slider(page, "height", 30)
+    require_another_picture()
+    page.select_option("#unit", "Pa")
+    require_another_picture()
+    assert page.inner_text(".legend span:first-child") == "0 Pa"
+    page.fill("#reference", "100")
+    page.press("#reference", "Enter")
+    require_another_picture()
+    page.click("#rescale")
+    page.check("#volume")
+    require_another_picture()
+
+
+def test_what_cannot_be_is_refused_and_said(live):
+    explorer, page = live
+    before = explorer.scene
+    page.fill("#focus_x_number", "40")  # into the cube
+    page.fill("#focus_y_number", "45")
+    page.fill("#focus_z_number", "50")
+    page.press("#focus_z_number", "Enter")
+    page.wait_for_function("document.getElementById('message').textContent.includes('obstacle')")
+    assert not any(one.contains(explorer.scene.control_points).any() for one in explorer.scene.obstacles)
+    page.fill("#body_x_number", "")
+    page.press("#body_x_number", "Enter")
+    page.fill("#body_x_number", "1e9")
+    page.press("#body_x_number", "Enter")
+    page.wait_for_timeout(300)
+    assert explorer.scene.obstacles == before.obstacles
+
+
+def test_files_and_lines_of_python_make_what_is_shown(live, tmp_path, monkeypatch):
+    explorer, page = live
+    monkeypatch.chdir(tmp_path)
+    set_slider(page, "turn_x", 25)
+    wait_for(lambda: explorer.scene.obstacles[0].rotation != (0.0, 0.0, 0.0))
+    page.fill("#folder", "here/there")
+    page.click("#save")
+    page.wait_for_function("document.getElementById('saved').textContent.includes('saved')")
+    scene = at.load_scene("here/there/scene.yaml")
+    assert scene.obstacles == explorer.scene.obstacles
+    assert torch.equal(scene.control_points, explorer.scene.control_points)
+    assert torch.equal(at.load_drive("here/there/drive.npz"), explorer.drive)
+    page.click("#write_python")
+    page.wait_for_function("document.getElementById('python').textContent.includes('at.Scene')")
+    made = {}
+    exec(page.text_content("#python"), made)
+    assert made["scene"].obstacles == explorer.scene.obstacles
+    torch.testing.assert_close(made["drive"], explorer.drive, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("folder", ["/tmp/elsewhere", "../elsewhere", "a/../../b", ""])
+def test_folders_elsewhere_are_refused(live, tmp_path, monkeypatch, folder):
+    _, page = live
+    inside = tmp_path / "inside"
+    inside.mkdir()
+    monkeypatch.chdir(inside)
+    page.fill("#folder", folder)
+    page.click("#save")
+    page.wait_for_function("document.getElementById('message').textContent.includes('folder')")
+    assert list(tmp_path.rglob("*")) == [inside]
+
+
+def test_it_works_offline_and_without_errors(scene, browser):
+    explorer = at.explore(scene, spacing=SPACING)
+    page = browser.new_page()
+    page.set_default_timeout(PATIENCE)
+    asked, errors = [], []
+    page.on("request", lambda request: asked.append(request.url))
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.goto(explorer.address)
+    opened(page)
+    own = explorer.address.removesuffix("index.html")
+    assert [url for url in asked if not url.startswith((own, "data:", "blob:"))] == []
+    assert errors == []
+    page.close()
+    explorer.close()
+
+
+@pytest.mark.parametrize("colours", ["light", "dark"])
+@pytest.mark.parametrize("width", [1200, 360])
+def test_the_page_is_accessible(scene, browser, colours, width):
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+    explorer = at.explore(scene, spacing=SPACING)
+    page = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=colours)
+    page.set_default_timeout(PATIENCE)
+    page.goto(explorer.address)
+    opened(page)
+    found = axe.run(page)
+    assert found.violations_count == 0, found.generate_report()
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    if colours == "dark":
+        wait_for(lambda: np.median(pixels(page)) < 80)
+    page.close()
+    explorer.close()
+
+
+def test_a_notebook_shows_a_frame_that_a_browser_fills(scene, browser):
+    explorer = at.explore(scene, spacing=SPACING)
+    page = browser.new_page()
+    page.set_default_timeout(PATIENCE)
+    page.set_content(f"<h1>notebook</h1>{explorer._repr_html_()}")
+    frame = page.frame_locator("iframe")
+    frame.locator("section.picture[aria-busy=false]").wait_for()
+    assert re.search(r"Weakest focus \d", frame.locator("#summary").inner_text())
+    page.close()
+    explorer.close()
