@@ -27,6 +27,9 @@ logger = logging.getLogger(__name__)
 
 _WINDOW = (1200, 860)  # pixels
 
+_LETTERS = 16.0  # size of tick labels and axis titles, VTK's 10 by default: a report halves the picture
+_TITLES = 30.0  # distance of the axis titles from the tick labels, VTK's 20 by default
+
 POINT_COLOUR = "#00C8A0"  # green: not in the colour map of the pressure
 _SILENT_COLOUR = "#C8C8C8"
 _PHASE_BAR = 0.03  # left edge of a colour bar, as a share of the window
@@ -59,10 +62,11 @@ def new_plotter(scene: Scene, off_screen: bool) -> pyvista.Plotter:
     axes = plotter.show_bounds(bounds=bounds, **titles, **style)
     for axis in range(3):
         axes.SetAxisLabels(axis, None)  # PyVista's are not round numbers, VTK's are
+    axes.SetScreenSize(_LETTERS)
+    axes.SetTitleOffset([_TITLES, _TITLES])
     plotter.view_vector(_CAMERA, viewup=(0.0, 0.0, 1.0))
     plotter.enable_parallel_projection()
     plotter.reset_camera()
-    plotter.camera.zoom(1.05)
     plotter.enable_anti_aliasing("ssaa")
     return plotter
 
