@@ -183,8 +183,12 @@ def _verdicts(verdicts: Sequence[Verdict], claims: int) -> str:
     """Return the sentence on the paper's claims."""
     held = sum(verdict.holds for verdict in verdicts)
     unclear = sum(not verdict.clear for verdict in verdicts)
-    parts = [f"{held} {'is' if held == 1 else 'are'} reproduced", f"{len(verdicts) - held} not"]
+    parts = [f"{_are(held)} reproduced", f"{_are(len(verdicts) - held)} not reproduced"]
     if len(verdicts) < claims:
-        parts.append(f"{claims - len(verdicts)} not judged for lack of data")
-    doubt = f"; {unclear} of these verdicts {'is' if unclear == 1 else 'are'} not clear" if unclear else ""
+        parts.append(f"{_are(claims - len(verdicts))} not judged for lack of data")
+    doubt = f"; {_are(unclear)} not clear with these trials" if unclear else ""
     return f"Of the paper's {claims} claims, {listed(parts)}{doubt}."
+
+
+def _are(count: int) -> str:
+    return f"{count or 'none'} {'is' if count <= 1 else 'are'}"
