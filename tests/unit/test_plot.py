@@ -158,7 +158,7 @@ def test_a_few_trials_are_dots_with_their_median() -> None:
 )
 def test_panels_of_few_values_are_low(scenes: int, trials: int, rows: int, highest: float) -> None:
     values = {f"scene {number}": {"gabs": RANDOM.random(trials)} for number in range(scenes)}
-    figure = plot_trials({label: values for label in ("mean [Pa]", "area [mm²]", "std [Pa]")})
+    figure = plot_trials(dict.fromkeys(("mean [Pa]", "area [mm²]", "std [Pa]"), values))
     assert figure.axes[0].get_subplotspec().get_gridspec().nrows == rows
     assert figure.get_figheight() <= highest
 
