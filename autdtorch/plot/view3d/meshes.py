@@ -27,7 +27,11 @@ logger = logging.getLogger(__name__)
 
 _WINDOW = (1200, 860)  # pixels
 
-_LETTERS = 16.0  # size of tick labels and axis titles, VTK's 10 by default: a report halves the picture
+_LETTERS = (
+    10.0,
+    16.0,
+)  # size of tick labels and axis titles: VTK's default, and one for a picture at half size
+_SHORT = 0.5  # of the longest side of the domain; on a shorter one, large labels would overlap
 _TITLES = 30.0  # distance of the axis titles from the tick labels, VTK's 20 by default
 
 POINT_COLOUR = "#00C8A0"  # green: not in the colour map of the pressure
@@ -62,7 +66,8 @@ def new_plotter(scene: Scene, off_screen: bool) -> pyvista.Plotter:
     axes = plotter.show_bounds(bounds=bounds, **titles, **style)
     for axis in range(3):
         axes.SetAxisLabels(axis, None)  # PyVista's are not round numbers, VTK's are
-    axes.SetScreenSize(_LETTERS)
+    sides = np.subtract(upper, lower)
+    axes.SetScreenSize(_LETTERS[int(min(sides) >= _SHORT * max(sides))])
     axes.SetTitleOffset([_TITLES, _TITLES])
     plotter.view_vector(_CAMERA, viewup=(0.0, 0.0, 1.0))
     plotter.enable_parallel_projection()
