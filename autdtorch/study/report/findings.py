@@ -186,7 +186,7 @@ def _verdicts(verdicts: Sequence[Verdict], claims: int) -> str:
     parts = [f"{_are(held)} reproduced", f"{_are(len(verdicts) - held)} not reproduced"]
     if len(verdicts) < claims:
         parts.append(f"{_are(claims - len(verdicts))} not judged for lack of data")
-    doubt = f"; {_are(unclear)} not clear with these trials" if unclear else ""
+    doubt = f"; of these verdicts, {_are(unclear)} not clear" if unclear else ""
     return f"Of the paper's {claims} claims, {listed(parts)}{doubt}."
 
 
