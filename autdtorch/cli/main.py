@@ -10,6 +10,7 @@ import hashlib
 import logging
 import os
 import re
+import shlex
 import sys
 import warnings
 from pathlib import Path
@@ -84,7 +85,7 @@ def _run(config: DictConfig) -> None:
     job = HydraConfig.get()
     swept = job.mode == RunMode.MULTIRUN
     if swept:
-        logger.info("job %s: %s", job.job.num, ", ".join(job.overrides.task))
+        logger.info("job %s: %s", job.job.num, shlex.join(job.overrides.task))
     try:
         with warnings.catch_warnings():
             warnings.showwarning = lambda message, *_: logger.warning("%s", message)  # without our source

@@ -59,15 +59,15 @@ def study(settings: dict[str, Any], modules: list[Any], output: Any, sweep: Path
     shown = Path(os.path.relpath(folder))  # shorter, and equal on every machine
     if poses is not None:
         _draw_poses(results, poses, folder)
-        _print_table(results, f"The results are in {shown}")
+        _print_table(results, f"The results are in {_quoted(shown)}")
     elif "scenes" not in settings:
         _draw_plane(results, scenes, folder)
-        _print_table(results, f"The results are in {shown}")
+        _print_table(results, f"The results are in {_quoted(shown)}")
     else:
         from autdtorch.study.report.study_report import write_report
 
         report = write_report(results, scenes, folder, shlex.join(["autdtorch", *sys.argv[1:]]))
-        _print_table(results, f"The report is {shown / report.name}")
+        _print_table(results, f"The report is {_quoted(shown / report.name)}")
 
 
 def collect(arguments: list[str]) -> None:
@@ -88,9 +88,10 @@ def collect(arguments: list[str]) -> None:
     sweep = collect_results(folder, modules)
     save_summary(sweep, folder / SUMMARY_FILE)
     command = shlex.join(["autdtorch", "collect", *arguments])
-    report = write_report(sweep.results, sweep.scenes, folder, command, sweep.seeds)
+    report = write_report(sweep.results, sweep.scenes, folder, command, sweep.seeds, sweep.unfinished)
     count = "1 study" if sweep.studies == 1 else f"{sweep.studies} studies"
-    _print_table(sweep.results, f"{count}: the table is {folder / SUMMARY_FILE}, the report {report}")
+    files = f"the table is {_quoted(folder / SUMMARY_FILE)}, the report {_quoted(report)}"
+    _print_table(sweep.results, f"{count}: {files}")
 
 
 def _parts(
@@ -147,6 +148,11 @@ def _draw_poses(results: StudyResult, poses: Poses, folder: Path) -> None:
     }
     bounds = [scene.bound for scene in found]
     plot_poses(scores, poses.places, poses.label, found[0].score_label, bounds).savefig(folder / "poses.png")
+
+
+def _quoted(path: Path) -> str:
+    """Return a path as a shell takes it."""
+    return shlex.quote(str(path))
 
 
 def _print_table(results: StudyResult, end: str) -> None:

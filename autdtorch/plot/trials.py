@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from string import ascii_lowercase
 from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from autdtorch.plot import style
-from autdtorch.plot.data import ByMethod, by_scene, labelled, methods_of
+from autdtorch.plot.data import ByMethod, Checked, by_scene, labelled, methods_of
 from autdtorch.plot.style import TICK_SIZE, Look, add_legend, label_of, looks_of, styled
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import ArrayLike, finite_number, magnitude_tensor, real_tensor, require_kind
@@ -25,8 +26,14 @@ _LEVELS: tuple[dict[str, Any], ...] = (
     {"color": "0.2", "linewidth": 1.0, "linestyle": (0, (1, 1.5))},
 )
 
+_SINGLE: dict[str, Any] = {"marker": "D", "markersize": 6}  # of a single trial
+_FEW: dict[str, Any] = {"marker": "o", "markersize": 4}  # of each of a few trials
+
 _WIDTH = 7.2  # of a figure of boxes [inch]
 _BOX = 0.22  # least width of a box with its margin [inch]
+_ROW = 2.1  # height of a panel of boxes [inch]
+_LOW_ROW = 1.4  # without boxes
+_FEWEST = 6  # trials for a box; of fewer, each is a dot
 _PANEL = (2.7, 2.6)  # convergence of a scene [inch]
 
 
@@ -35,7 +42,8 @@ def plot_trials(quantities: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
     """Plot the spread of quantities over the trials, one panel per quantity (the paper's Fig. 3(a) to (c)).
 
     A box spans the quartiles, with a line at the median. Its whiskers reach to the last trial within 1.5
-    times the box; trials beyond are points. A single trial is a diamond.
+    times the box; trials beyond are points. Of two to five trials, each is a dot, with a line at the median.
+    A single trial is a diamond. The panels of a single scene are side by side if its methods are few.
 
     Args:
         quantities: by label (with unit), scene and method: one value for each trial (trials,).
@@ -47,35 +55,46 @@ def plot_trials(quantities: Mapping[str, Mapping[str, ByMethod]]) -> Figure:
     methods = methods_of(values for scenes in data.values() for values in scenes.values())
     scenes = methods_of(data.values())
     looks = looks_of(methods)
-    width = max(_WIDTH, 1.0 + _BOX * len(scenes) * len(methods))
-    figure = style.new_figure(width, 0.7 + 2.1 * len(data))
-    axes = figure.subplots(len(data), squeeze=False, sharex=True)[:, 0]
-    single = dict.fromkeys(methods, True)
+    figure, axes, columns = _trial_panels(data, scenes, methods)
+    width, height = (
+        figure.get_figwidth() / columns - 1.0,
+        (figure.get_figheight() - 0.7) * columns / len(axes),
+    )
+    most = dict.fromkeys(methods, 1)
     for letter, ax, (label, of_scenes) in zip(ascii_lowercase, axes, data.items(), strict=False):
         for scene, by_method in of_scenes.items():
             for method, values in by_method.items():
                 place = 0.8 * ((methods.index(method) + 0.5) / len(methods) - 0.5)
                 _draw_trials(ax, values, scenes.index(scene) + place, 0.6 / len(methods), looks[method])
-                single[method] &= values.size == 1
+                most[method] = max(most[method], values.size)
         for border in range(1, len(scenes)):
             ax.axvline(border - 0.5, color="0.9", linewidth=0.8, zorder=0)
         ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]))
-        ax.set_ylabel(label)
+        ax.set_ylabel(style.wrapped(label, height))
         ax.tick_params(labelsize=TICK_SIZE)
+        ax.set_xlim(-0.5, len(scenes) - 0.5)
         if len(data) > 1:
             ax.set_title(f"({letter})", loc="left")
-    names = [style.wrapped(style.readable(scene), (width - 1.0) / len(scenes)) for scene in scenes]
-    axes[-1].set_xticks(range(len(scenes)), names)
-    axes[-1].set_xlim(-0.5, len(scenes) - 0.5)
-    axes[-1].set_xlabel("scene")
-    handles = [
-        Line2D([], [], color=look.colour, marker="D", linestyle="none", label=label_of(method))
-        if single[method]
-        else Patch(facecolor=(look.colour, 0.4), edgecolor=look.colour, label=label_of(method))
-        for method, look in looks.items()
-    ]
-    add_legend(figure, handles)
+    names = [style.wrapped(style.readable(scene), width / len(scenes)) for scene in scenes]
+    for ax in axes[-columns:]:
+        ax.set_xticks(range(len(scenes)), names)
+        ax.set_xlabel("scene")
+    add_legend(figure, [_trial_handle(method, look, most[method]) for method, look in looks.items()])
     return figure
+
+
+def _trial_panels(
+    data: Mapping[str, Checked], scenes: Sequence[str], methods: Sequence[str]
+) -> tuple[Figure, list[Axes], int]:
+    """Return a figure, its panels row by row, and the number of columns."""
+    width = 1.0 + _BOX * len(scenes) * len(methods)
+    if len(scenes) == 1 and width * len(data) <= _WIDTH:
+        figure = style.new_figure(_WIDTH, 0.7 + _ROW)
+        return figure, list(figure.subplots(1, len(data), squeeze=False)[0]), len(data)
+    sizes = (one.size for of_scenes in data.values() for own in of_scenes.values() for one in own.values())
+    row = _ROW if max(sizes) >= _FEWEST else _LOW_ROW
+    figure = style.new_figure(max(_WIDTH, width), 0.7 + max(_ROW, row * len(data)))
+    return figure, list(figure.subplots(len(data), squeeze=False, sharex=True)[:, 0]), 1
 
 
 @styled
@@ -175,10 +194,24 @@ def plot_convergence(
     return figure
 
 
+def _trial_handle(method: str, look: Look, trials: int) -> Artist:
+    """Return the entry of a method in the legend, as its most trials in a panel are drawn."""
+    label = label_of(method)
+    if trials >= _FEWEST:
+        return Patch(facecolor=(look.colour, 0.4), edgecolor=look.colour, label=label)
+    marker = _SINGLE if trials == 1 else _FEW
+    return Line2D([], [], color=look.colour, linestyle="none", label=label, **marker)
+
+
 def _draw_trials(ax: Axes, values: Array, position: float, width: float, look: Look) -> None:
     colour = look.colour
-    if values.size == 1:
-        ax.plot([position], values, linestyle="none", marker="D", markersize=6, color=colour, clip_on=False)
+    if values.size < _FEWEST:
+        marker = _SINGLE if values.size == 1 else _FEW
+        where = np.full(values.size, position)
+        ax.plot(where, values, linestyle="none", color=colour, clip_on=False, **marker)
+        if values.size > 1:
+            ends = position - width / 2, position + width / 2
+            ax.hlines(np.median(values), *ends, colors=colour, linewidth=2.2)
         return
     line = {"color": colour, "linewidth": 0.9}
     ax.boxplot(

@@ -46,6 +46,7 @@ class Sweep:
         swept: settings that differ between equal names, by names of scene and method.
         studies: number of studies.
         seeds: seeds of the studies, each once.
+        unfinished: studies and scenes that were left out, by their folders.
     """
 
     results: StudyResult
@@ -53,6 +54,7 @@ class Sweep:
     swept: dict[tuple[str, str], Settings]
     studies: int
     seeds: tuple[int, ...]
+    unfinished: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,9 +90,10 @@ def collect_results(folder: str | os.PathLike[str], modules: Collection[str] = (
         ValueError: results of another version, or of a study that was not run from the command line.
     """
     folder, modules = path_of("folder", folder, "a folder"), members("modules", modules, str)
-    for file in _files(folder, PROVENANCE_FILE):
-        if not file.with_name(RESULTS_FILE).exists():
-            logger.warning("%s: not finished, left out; repeat its command to finish it", file.parent)
+    started = [file.parent for file in _files(folder, PROVENANCE_FILE)]
+    unfinished = [str(path) for path in started if not (path / RESULTS_FILE).exists()]
+    for name in unfinished:
+        logger.warning("%s: not finished, left out; repeat its command to finish it", name)
     studies = {file.parent: load_results(file) for file in _files(folder, RESULTS_FILE)}
     if not studies:
         raise FileNotFoundError(f"{folder}: no finished study ({RESULTS_FILE}) there or below")
@@ -100,7 +103,11 @@ def collect_results(folder: str | os.PathLike[str], modules: Collection[str] = (
     for path, study in studies.items():
         if (other := first.setdefault(study.provenance.origin, path)) != path:
             logger.warning("%s: a copy of the study in %s, counted once", path, other)
-    parts = [part for path, study in studies.items() for part in _parts(path, study)]
+    parts: list[_Part] = []
+    for path, study in studies.items():
+        own, missing = _parts(path, study)
+        parts += own
+        unfinished += [f"{path}: {scene}" for scene in missing]
     groups, swept = _groups(parts)
     results = {scene: _merged_scene(methods) for scene, methods in groups.items()}
     sections = {scene: next(iter(methods.values()))[0].section for scene, methods in groups.items()}
@@ -108,7 +115,8 @@ def collect_results(folder: str | os.PathLike[str], modules: Collection[str] = (
     origin = next(iter(studies.values())).provenance
     texts = (f"# {path}\n{study.provenance.config.strip()}" for path, study in studies.items())
     merged = StudyResult(replace(origin, config="\n\n".join(texts)), results)
-    return Sweep(merged, scenes, swept, len(studies), tuple(sorted({part.seed for part in parts})))
+    seeds = sorted({part.seed for part in parts})
+    return Sweep(merged, scenes, swept, len(studies), tuple(seeds), tuple(unfinished))
 
 
 def _files(folder: Path, name: str) -> list[Path]:
@@ -116,7 +124,8 @@ def _files(folder: Path, name: str) -> list[Path]:
     return sorted(file for file in folder.rglob(name) if not file.parent.name.startswith(PREVIOUS))
 
 
-def _parts(path: Path, study: StudyResult) -> list[_Part]:
+def _parts(path: Path, study: StudyResult) -> tuple[list[_Part], list[str]]:
+    """Return the parts of a study, and the scenes that it has not finished."""
     file = path / RESULTS_FILE
     settings = unresolved(parse_yaml(study.provenance.config, f"{file}: settings"), f"{file}: settings")
     try:
@@ -133,7 +142,7 @@ def _parts(path: Path, study: StudyResult) -> list[_Part]:
                 of_method = dict(_flat({"method": chosen}))
                 seed = study.provenance.seed
                 parts.append(_Part(name, method, section, of_scene, of_method, seed, found))
-        return parts
+        return parts, missing
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{file}: no settings of a study; must come from the command line") from error
 

@@ -9,7 +9,7 @@ from html import escape
 def html_facts(title: str, facts: Sequence[tuple[str, str]]) -> str:
     """Return a table of names and values with a title."""
     rows = "".join(
-        f'<tr><th style="text-align: left">{escape(name)}</th>'
+        f'<tr><th scope="row" style="text-align: left">{escape(name)}</th>'
         f'<td style="text-align: left">{escape(value)}</td></tr>'
         for name, value in facts
     )
@@ -19,7 +19,7 @@ def html_facts(title: str, facts: Sequence[tuple[str, str]]) -> str:
 def html_table(title: str, rows: Sequence[Sequence[str]]) -> str:
     """Return a table with a title; the first row is the header."""
     head, *body = rows
-    lines = [_row("th", head), *(_row("td", row) for row in body)]
+    lines = [_row('th scope="col"', head), *(_row("td", row) for row in body)]
     return f"<table>{_caption(title)}{''.join(lines)}</table>"
 
 
@@ -28,4 +28,5 @@ def _caption(title: str) -> str:
 
 
 def _row(tag: str, cells: Sequence[str]) -> str:
-    return "<tr>" + "".join(f"<{tag}>{escape(cell)}</{tag}>" for cell in cells) + "</tr>"
+    end = tag.partition(" ")[0]
+    return "<tr>" + "".join(f"<{tag}>{escape(cell)}</{end}>" for cell in cells) + "</tr>"

@@ -2,7 +2,9 @@
 
 import csv
 import os
+import shlex
 import signal
+from pathlib import Path
 
 import pytest
 import torch
@@ -80,6 +82,25 @@ def test_the_folder_of_a_job_has_a_name_that_every_file_system_takes(run, tmp_pa
     folders = jobs(tmp_path)
     assert len(folders) == 2
     assert max(map(len, folders)) <= 150
+    assert [shlex.quote(name) for name in folders] == folders
+
+
+def test_settings_and_folders_of_jobs_can_be_pasted_into_a_shell(run, tmp_path, capsys):
+    settings = (*QUICK, "method=lssg", "poses={offset: [0, 2e-3, 0], count: 2}")
+    assert run("-m", *settings) == 0
+    printed = capsys.readouterr()
+    (folder,) = jobs(tmp_path)
+    assert shlex.quote(folder) == folder
+    assert Path(shlex.split(printed.out.splitlines()[-2])[-1]) == Path("multirun", folder)
+    (job,) = (line for line in printed.err.splitlines() if line.startswith("job 0: "))
+    pasted = [setting.replace(" ", "") for setting in shlex.split(job.removeprefix("job 0: "))]
+    assert pasted[:3] == list(settings[:3])
+    assert pasted[3].startswith("poses={offset:[0,")
+
+
+def test_a_folder_with_a_space_is_printed_in_quotes(run, capsys):
+    assert run(*QUICK, "method=lssg", "output=my results") == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "The results are in 'my results'"
 
 
 def test_a_sweep_says_where_its_folders_are_set(run, capsys):

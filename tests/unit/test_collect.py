@@ -108,8 +108,10 @@ def test_scenes_without_the_same_keys_have_names_that_files_can_have(study, tmp_
 def test_unfinished_scenes_are_left_out_with_a_warning(tmp_path, caplog):
     config = {"scenes": {"air": SCENE, "lab": SCENE}, "methods": {"lssg": {"_target_": "autdtorch.lssg"}}}
     run_study({"air": load_scene(SCENE)}, {"lssg": lssg}, folder=tmp_path, config=yaml.safe_dump(config))
-    assert names(collect_results(tmp_path)) == ["air"]
+    sweep = collect_results(tmp_path)
+    assert names(sweep) == ["air"]
     assert caplog.messages[-1].endswith(": lab")
+    assert sweep.unfinished == (f"{tmp_path}: lab",)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.axes import Axes
-from matplotlib.collections import QuadMesh
+from matplotlib.collections import LineCollection, QuadMesh
 from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from matplotlib.patches import PathPatch
@@ -201,8 +201,28 @@ def test_trials_draw_quartiles_of_many_and_a_marker_for_one() -> None:
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["GABS", "LSSG"]
 
 
+def test_a_few_trials_are_dots_with_their_median() -> None:
+    (ax,) = plot_trials({"f [1]": {"empty": {"gabs": [1.0, 2.0, 4.0]}}}).axes
+    (dots,) = ax.get_lines()
+    assert sorted(dots.get_ydata()) == [1.0, 2.0, 4.0]
+    (median,) = (artist for artist in ax.collections if isinstance(artist, LineCollection))
+    np.testing.assert_array_equal(median.get_segments()[0][:, 1], 2.0)
+    assert not ax.patches
+
+
+@pytest.mark.parametrize(
+    ("scenes", "trials", "rows", "highest"),
+    [(1, 1, 1, 3.0), (1, 50, 1, 3.0), (3, 1, 3, 5.0), (3, 50, 3, 7.1)],  # inches
+)
+def test_panels_of_few_values_are_low(scenes: int, trials: int, rows: int, highest: float) -> None:
+    values = {f"scene {number}": {"gabs": RANDOM.random(trials)} for number in range(scenes)}
+    figure = plot_trials(dict.fromkeys(("mean [Pa]", "area [mm²]", "std [Pa]"), values))
+    assert figure.axes[0].get_subplotspec().get_gridspec().nrows == rows
+    assert figure.get_figheight() <= highest
+
+
 def test_a_method_has_one_colour_in_all_figures() -> None:
-    trials = plot_trials({"f [1]": {"empty": {"other": [1.0, 2.0], "gabs": [1.0, 2.0]}}})
+    trials = plot_trials({"f [1]": {"empty": {"other": np.arange(6.0), "gabs": np.arange(6.0)}}})
     convergence = plot_convergence({"empty": {"gabs": [[1.0, 2.0]], "lssg": [[1.0]], "other": [[1.0, 2.0]]}})
     boxes = {patch.get_label(): patch.get_facecolor()[:3] for patch in trials.legends[0].get_patches()}
     lines = convergence.legends[0].get_lines()

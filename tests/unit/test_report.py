@@ -21,6 +21,9 @@ from autdtorch.objectives.bound import focus_bound
 from autdtorch.objectives.goals import TargetPressures
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.scene import Scene
+from autdtorch.study.report.claims import judge_claims
+from autdtorch.study.report.document import code
+from autdtorch.study.report.findings import findings
 from autdtorch.study.report.study_report import HTML_FILE, write_report
 from autdtorch.study.report.tables import gap_rows, simulation_rows
 from autdtorch.study.results import summary_rows
@@ -84,7 +87,7 @@ def test_all_figures_and_tables_are_there_and_no_number_is_missing(tmp_path):
     assert not re.search(r"\bnan\b|\binf\b|None|[{}]", report)
     for table in tables(report):
         assert len({len(row) for row in table}) == 1
-    _, summary, verdicts, beyond, simulation = tables(report)
+    summary, _, verdicts, beyond, simulation = tables(report)
     assert len(summary) == 2 + 2 * 3
     assert len(beyond) == 2 + 2 * (3 + 1)  # and the bound
     assert len(verdicts) == 2 + 11
@@ -206,9 +209,10 @@ def test_the_page_holds_the_same_and_needs_no_other_file(tmp_path):
     for source, name in zip(sources, figures(report), strict=True):
         content = base64.b64decode(source.removeprefix("data:image/png;base64,"))
         assert content == (tmp_path / unquote(name)).read_bytes()
-    assert not re.search(r"href=|url\(|<script|@import", page)
-    assert page.count('<div class="table"><table>') == len(tables(report))
-    for row in (cells for table in tables(report)[1:] for cells in table if cells[0] != "---"):
+    assert not re.search(r"href=\"(?!#)|url\(|<script|@import", page)
+    shown = [table for table in tables(report) if "![" not in str(table)]
+    assert page.count("<table") == len(shown) == len(tables(report)) - 1
+    for row in (cells for table in shown for cells in table if cells[0] != "---"):
         for cell in row:
             assert re.sub(r"[*_]", "", cell) in re.sub(r"[*_]|</?(em|strong)>", "", page)
     assert "trials: 1" in page
@@ -226,7 +230,7 @@ def test_methods_may_differ_between_scenes_and_claims_without_data_are_no_table(
     assert "claims 2, 3, 4, 7 of 11" in text  # those of obstacles
     del results.scenes["third"]
     report = write_report(results, scenes, tmp_path, "autdtorch collect it").read_text("utf-8")
-    assert "<h2>The paper's claims</h2>\n<p>No data" in report
+    assert "The paper's claims</h2>\n<p>No data" in report
     assert not re.search(r"\bnan\b|\binf\b|None", report)
 
 
@@ -236,3 +240,99 @@ def test_matrices_that_were_kept_are_no_runs_and_not_exact(tmp_path):
         scenes = {"cube": scene(None, (CUBE,))}
         results = run_study(scenes, {"gabs": METHODS["gabs"]}, tmp_path / runs, solver=solver)
         assert simulation_rows(results)[1][4] == runs
+
+
+def scored(results, scores, bound=10.0):
+    """Give each method in each scene the score of its name, in every trial."""
+    scenes = {}
+    for name, found in results.scenes.items():
+        methods = {
+            method: replace(
+                one,
+                solution=replace(
+                    one.solution, score=torch.full_like(one.solution.score, scores[name][method])
+                ),
+            )
+            for method, one in found.methods.items()
+            if method in scores[name]
+        }
+        scenes[name] = replace(found, methods=methods, bound=bound)
+    return replace(results, scenes=scenes)
+
+
+def test_the_findings_name_the_best_method_its_share_of_the_bound_and_what_obstacles_cost():
+    results = studied(BOTH, trials=2)
+    scores = {
+        "homogeneous": {"lssg": 5.0, "bayes_opt": 8.0, "gabs": 6.0},
+        "three_cubes": {"lssg": 2.0, "bayes_opt": 7.0, "gabs": 6.0},
+    }
+    winners, nearness, cost, claims = findings(scored(results, scores), judge_claims(results))
+    assert all(text in winners for text in ("8 Pa in homogeneous", "7 Pa in three_cubes", "by BO"))
+    assert "70 to 80\N{NO-BREAK SPACE}%" in nearness
+    assert "12\N{NO-BREAK SPACE}% lower in three_cubes" in cost  # 12.5 %, rounded to even
+    assert "LSSG loses most, 60\N{NO-BREAK SPACE}%" in cost
+    assert "11 claims" in claims
+    scores["three_cubes"] |= {"gabs": 6.99}
+    assert "by BO and GABS" in findings(scored(results, scores), [])[0]
+
+
+def test_findings_of_one_method_in_one_scene_are_no_comparison():
+    results = scored(studied({"a": scene(obstacles=(CUBE,))}), {"a": {"gabs": 4.0}})
+    winners, nearness, cost = findings(results, judge_claims(results))
+    assert "4 Pa in a" in winners
+    assert "best" not in winners
+    assert "40\N{NO-BREAK SPACE}%" in nearness
+    assert "not known" in cost
+
+
+def test_findings_of_many_scenes_count_them():
+    results = studied({"a": scene()})
+    scenes = {f"scene_{number}": results.scenes["a"] for number in range(20)}
+    scores = {name: {"gabs": 4.0} for name in scenes}
+    found = findings(scored(replace(results, scenes=scenes), scores), [])
+    assert "20 of 20 scenes" in found[0]
+    assert max(map(len, found)) < 200  # characters
+
+
+@pytest.mark.parametrize(("bound", "text"), [(math.inf, "No upper bound"), (-1.0, "3 Pa below")])
+def test_findings_without_shares_of_the_bound(bound, text):
+    results = scored(studied({"a": scene()}), {"a": {"gabs": -4.0}}, bound)
+    assert text in findings(results, [])[1]
+
+
+def test_what_is_missing_is_named(tmp_path):
+    scenes = {"lab": scene(), "other": scene()}
+    results = studied(scenes)
+    results.scenes["other"].methods.pop("lssg")
+    command = "autdtorch collect multirun"
+    write_report(results, scenes, tmp_path, command, (), ["multirun/a=`1`", "multirun/b: lab"])
+    report = (tmp_path / "report.md").read_text(encoding="utf-8")
+    assert "LSSG in other" in report
+    assert code("multirun/a=`1`") in report
+    assert "`multirun/b: lab`" in report
+
+
+def test_the_findings_come_first_and_each_figure_says_its_result_in_numbers(tmp_path):
+    results, report = reported(BOTH, tmp_path, trials=3)
+    title, first, second, *_ = re.findall(r"^#+ .*", report, flags=re.MULTILINE)
+    assert title.startswith("# ")
+    assert first == "## Findings"
+    assert report.index(first) < report.index(second) < report.index("| scene |") < report.index("![")
+    texts = {file: text for text, file in re.findall(r"!\[([^]]*)\]\(([^)]+)\)", report)}
+    metrics = results.scenes["three_cubes"].methods
+    means = sorted(float(method.metrics.mean.median()) for method in metrics.values())
+    for number in (means[0], means[-1]):
+        assert f"{number:.3g}" in texts["fig3abc.png"]
+    plane = max(float(method.plane_pressure.abs().max()) for method in metrics.values())
+    assert f"{plane:.3g} Pa" in texts["fig2.png"]
+    bound = results.scenes["three_cubes"].bound
+    assert f"bound {bound:.3g} Pa" in texts["fig3d.png"]
+    assert "4 transducers, 1 obstacle, 3 control points" in texts["fig1_three_cubes.png"]
+    assert re.search(r"fastest .* in \S+ s", texts["fig4.png"])
+
+
+def test_a_single_trial_has_no_figures_of_one_point(tmp_path, monkeypatch):
+    for name in ("lssg", "bayes_opt"):
+        monkeypatch.delitem(METHODS, name)
+    _, report = reported({"plain": scene()}, tmp_path)
+    assert figures(report) == ["fig1_plain.png", "fig2.png", "fig3d.png"]

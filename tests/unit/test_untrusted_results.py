@@ -1,6 +1,7 @@
 """Results from others: names are safe as file names, and texts stay texts in a report."""
 
 import functools
+import re
 import tempfile
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -136,8 +137,28 @@ class Tags(HTMLParser):
 
 
 OURS = {"html", "head", "meta", "title", "style", "body", "h1", "h2", "p", "br", "em", "strong", "code"}
-OURS |= {"pre", "img", "div", "table", "thead", "tbody", "tr", "th", "td", "ul", "li", "details", "summary"}
-ATTRIBUTES = {"lang", "charset", "name", "content", "class", "src", "alt"}
+OURS |= {
+    "main",
+    "nav",
+    "a",
+    "figure",
+    "figcaption",
+    "pre",
+    "img",
+    "div",
+    "table",
+    "thead",
+    "tbody",
+    "tr",
+    "th",
+    "td",
+    "ul",
+    "li",
+    "details",
+    "summary",
+}
+ATTRIBUTES = {"lang", "charset", "name", "content", "class", "src", "alt", "href", "id", "scope", "role"}
+ATTRIBUTES |= {"aria-label", "tabindex"}
 
 
 def test_a_report_shows_hostile_texts_as_texts(tmp_path):
@@ -149,6 +170,7 @@ def test_a_report_shows_hostile_texts_as_texts(tmp_path):
     assert {tag for tag, _, _ in found} <= OURS
     assert {name for _, name, _ in found if name} <= ATTRIBUTES
     assert all(value.startswith("data:image/png;base64,") for _, name, value in found if name == "src")
+    assert all(re.fullmatch(r"#section-\d+", value) for _, name, value in found if name == "href")
     # Each of the texts is there, and the version of autdtorch twice.
     assert page.count("alert(1)") == 7 * HOSTILE.count("alert(1)")
     text = (tmp_path / "report.md").read_text(encoding="utf-8")

@@ -27,6 +27,11 @@ logger = logging.getLogger(__name__)
 
 _WINDOW = (1200, 860)  # pixels
 
+# Size of tick labels and axis titles: VTK's default, and one for a picture at half size
+_LETTERS = 10.0, 16.0
+_SHORT = 0.5  # of the longest side of the domain; on a shorter one, large labels would overlap
+_TITLES = 30.0  # distance of the axis titles from the tick labels, VTK's 20 by default
+
 POINT_COLOUR = "#00C8A0"  # green: not in the colour map of the pressure
 _SILENT_COLOUR = "#C8C8C8"
 _PHASE_BAR = 0.03  # left edge of a colour bar, as a share of the window
@@ -79,6 +84,9 @@ def add_axes(plotter: pyvista.Plotter, domain: tuple[Vector, Vector], ink: str) 
     axes = plotter.show_bounds(bounds=_bounds(domain), **titles, **style)
     for axis in range(3):
         axes.SetAxisLabels(axis, None)  # PyVista's are not round numbers, VTK's are
+    sides = np.subtract(*reversed(domain))
+    axes.SetScreenSize(_LETTERS[int(min(sides) >= _SHORT * max(sides))])
+    axes.SetTitleOffset([_TITLES, _TITLES])
 
 
 def _bounds(domain: tuple[Vector, Vector]) -> list[float]:

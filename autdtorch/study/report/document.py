@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import itertools
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -11,10 +12,15 @@ from urllib.parse import unquote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markdown_it import MarkdownIt
+from markdown_it.renderer import RendererHTML
 from markdown_it.token import Token
+from markdown_it.utils import EnvType, OptionsDict
 
 _TAGS = ("<br>", "<details><summary>all settings</summary>", "</details>")
 """HTML that a report itself contains; names and settings may come from others and are shown as text."""
+
+_SHORT = 30  # characters; a table of no longer cells keeps each value in one line
+_ROUND = str.maketrans("[]", "()")
 
 
 def table(rows: Iterable[Sequence[str]]) -> str:
@@ -36,6 +42,11 @@ def fenced(text: str, language: str = "") -> str:
     """Return text as a code block, in which neither Markdown nor HTML has a meaning."""
     ticks = _longer_than_any(text, 2)
     return f"{ticks}{language}\n{text}\n{ticks}"
+
+
+def picture(file: str, alt: str) -> str:
+    """Return an image of the report's folder with its alternative text; brackets would end the text."""
+    return f"![{alt.translate(_ROUND)}]({file})"
 
 
 def _longer_than_any(text: str, least: int) -> str:
@@ -63,12 +74,24 @@ def as_page(text: str, folder: Path) -> str:
     """Return a report in Markdown without links as one HTML file; its first line is the title.
 
     HTML is shown as text, except for the tags of the report itself. Images must be PNG files in `folder`.
+    Sections get anchors. Tables get header cells and scroll by themselves; a table of images becomes figures.
     """
     markdown = MarkdownIt("commonmark", {"html": True}).enable("table")
     markdown.disable(["link", "autolink", "reference"])
     for rule in ("html_inline", "html_block"):
         markdown.add_render_rule(rule, _html)
+    for rule, render in (("table_open", _table_open), ("table_close", _table_close), ("figures", _figures)):
+        markdown.add_render_rule(rule, render)
     tokens = markdown.parse(text)
+    _embed_images(tokens, folder)
+    sections = _mark_sections(tokens)
+    tokens = _mark_tables(tokens)
+    body = markdown.renderer.render(tokens, markdown.options, {})
+    return rendered("page.html", title=text.partition("\n")[0].lstrip("# "), sections=sections, body=body)
+
+
+def _embed_images(tokens: Sequence[Token], folder: Path) -> None:
+    """Replace the names of image files by their contents."""
     for token in tokens:
         for part in token.children or ():
             if part.type == "image":
@@ -77,10 +100,77 @@ def as_page(text: str, folder: Path) -> str:
                     raise ValueError(f"image: {name!r}; must be a file in the folder of the report")
                 image = base64.b64encode((folder / name).read_bytes()).decode("ascii")
                 part.attrSet("src", f"data:image/png;base64,{image}")
-    body = markdown.renderer.render(tokens, markdown.options, {})
-    # A wide table scrolls by itself. All other HTML of this name has been escaped.
-    body = body.replace("<table>", '<div class="table"><table>').replace("</table>", "</table></div>")
-    return rendered("page.html", title=text.partition("\n")[0].lstrip("# "), body=body)
+
+
+def _mark_sections(tokens: Sequence[Token]) -> list[tuple[str, str]]:
+    """Give each section an anchor; return anchors and headings."""
+    found: list[tuple[str, str]] = []
+    for token, content in itertools.pairwise(tokens):
+        if token.type == "heading_open" and token.tag == "h2":
+            found.append((f"section-{len(found) + 1}", content.content))
+            token.attrSet("id", found[-1][0])
+    return found
+
+
+def _mark_tables(tokens: Sequence[Token]) -> list[Token]:
+    """Give tables a label and header cells with their scope; turn tables of images into figures."""
+    marked: list[Token] = []
+    section, count, start = "", 0, 0
+    for index, token in enumerate(tokens):
+        marked.append(token)
+        if token.type == "heading_open":
+            section, count = tokens[index + 1].content, 0
+        elif token.type == "table_open":
+            start = len(marked) - 1
+        elif token.type == "table_close":
+            own = marked[start:]
+            if pictures := _pictures(own):
+                marked[start:] = [Token("figures", "", 0, meta={"pictures": pictures})]
+                continue
+            count += 1
+            own[0].meta["label"] = f"{section}, table {count}" if count > 1 else f"{section}, table"
+            if max(len(cell.content) for cell in own if cell.type == "inline") <= _SHORT:
+                own[0].attrSet("class", "short")
+            _mark_headers(own)
+    return marked
+
+
+def _mark_headers(table: Sequence[Token]) -> None:
+    """Make the header of each column and the first cell of each row header cells with a scope."""
+    for before, token, _, close in zip(table, table[1:], table[2:], table[3:], strict=False):
+        if token.type == "th_open":
+            token.attrSet("scope", "col")
+        elif token.type == "td_open" and before.type == "tr_open":
+            token.tag = close.tag = "th"
+            token.attrSet("scope", "row")
+
+
+def _pictures(table: Sequence[Token]) -> list[tuple[Token, Token]]:
+    """Return the images of a table that has nothing else, each with the head of its column."""
+    heads = [content for cell, content in itertools.pairwise(table) if cell.type == "th_open"]
+    cells = [content for cell, content in itertools.pairwise(table) if cell.type == "td_open"]
+    images = [content for content in cells if [part.type for part in content.children or ()] == ["image"]]
+    return list(zip(images, heads, strict=False)) if len(images) == len(cells) else []
+
+
+def _table_open(renderer: RendererHTML, tokens: Sequence[Token], index: int, *_: object) -> str:
+    label, own = html.escape(tokens[index].meta["label"]), renderer.renderAttrs(tokens[index])
+    return f'<div class="table" role="group" aria-label="{label}" tabindex="0"><table{own}>\n'
+
+
+def _table_close(*_: object) -> str:
+    return "</table></div>\n"
+
+
+def _figures(
+    renderer: RendererHTML, tokens: Sequence[Token], index: int, options: OptionsDict, env: EnvType
+) -> str:
+    shown = (
+        f"<figure>{renderer.renderInline(image.children or [], options, env)}"
+        f"<figcaption>{renderer.renderInline(head.children or [], options, env)}</figcaption></figure>\n"
+        for image, head in tokens[index].meta["pictures"]
+    )
+    return f'<div class="figures">\n{"".join(shown)}</div>\n'
 
 
 def _html(_: object, tokens: Sequence[Token], index: int, *__: object) -> str:

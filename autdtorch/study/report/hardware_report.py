@@ -19,7 +19,8 @@ from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import Goal
 from autdtorch.objectives.objective import Objective
 from autdtorch.plot.trials import plot_convergence
-from autdtorch.study.report.document import code, rendered
+from autdtorch.study.report import alt_texts
+from autdtorch.study.report.document import code, picture, rendered
 from autdtorch.utils.files import naming, replace_file
 
 REPORT_FILE = "report.md"
@@ -83,6 +84,7 @@ def write_hardware_report(
         times=times,
         interval=statistics.median_low(gaps) if gaps else 0.0,  # an interruption does not change it
         found=found,
+        convergence=picture(_FIGURE, alt_texts.of_bench(found, scale, expected, goal.unit)),
         goal=score_label(goal.name),
         unit=goal.unit and f" {goal.unit}",
         score_again=float(goal(again_mean)),

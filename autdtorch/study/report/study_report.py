@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
 import torch
+from PIL import Image, ImageOps
 
 from autdtorch.io.goal_section import score_label
 from autdtorch.methods.catalogue import label_of
@@ -19,9 +19,10 @@ from autdtorch.plot.scene_figure import plot_scene
 from autdtorch.plot.trials import plot_convergence, plot_trials
 from autdtorch.plot.view3d import rendering_problem, view3d
 from autdtorch.scene.scene import Scene
-from autdtorch.study.report import tables
+from autdtorch.study.report import alt_texts, tables
 from autdtorch.study.report.claims import BO, GABS, judge_claims
-from autdtorch.study.report.document import as_page, rendered
+from autdtorch.study.report.document import as_page, picture, rendered
+from autdtorch.study.report.findings import findings, gaps
 from autdtorch.study.results import MethodResult, SceneResult, StudyResult, summary_rows
 from autdtorch.study.results_file import RESULTS_FILE
 from autdtorch.study.statistics import FEWEST_TRIALS, NEAR_BOUND, has_shares
@@ -37,17 +38,22 @@ _PLANES_A_FIGURE = 4
 
 
 def write_report(
-    results: StudyResult, scenes: Mapping[str, Scene], folder: Path, command: str, seeds: Sequence[int] = ()
+    results: StudyResult,
+    scenes: Mapping[str, Scene],
+    folder: Path,
+    command: str,
+    seeds: Sequence[int] = (),
+    unfinished: Sequence[str] = (),
 ) -> Path:
     """Write `report.md` and its figures, and both as one file `report.html`, whose path is returned.
 
     `scenes` are those of the results, by name. `seeds` are those of the studies that the results were merged
-    from; there are none for a single study in `folder`.
+    from; there are none for a single study in `folder`. `unfinished` names the studies that were left out.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder, prefix=".report-") as name:
         new = Path(name)
-        text = _markdown(results, scenes, new, command, seeds)
+        text = _markdown(results, scenes, new, command, seeds, unfinished)
         (new / REPORT_FILE).write_text(text, encoding="utf-8")
         (new / HTML_FILE).write_text(as_page(text, new), encoding="utf-8")
         # A file replaces an older one, or a link: nothing is written through a link.
@@ -57,17 +63,27 @@ def write_report(
 
 
 def _markdown(
-    results: StudyResult, scenes: Mapping[str, Scene], folder: Path, command: str, seeds: Sequence[int]
+    results: StudyResult,
+    scenes: Mapping[str, Scene],
+    folder: Path,
+    command: str,
+    seeds: Sequence[int],
+    unfinished: Sequence[str],
 ) -> str:
     """Draw the figures into a folder; return the text of the report."""
+    scenes = {name: scenes[name] for name in results.scenes}
     counts: dict[str, list[int]] = {}
     for scene in results.scenes.values():
         for name, method in scene.methods.items():
             counts.setdefault(name, []).append(method.trials)
     judged = judge_claims(results)
+    trials_picture, quantities = _draw_trials(results, folder)
     tolerances = {scene.simulation.tolerance for scene in results.scenes.values()}
     return rendered(
         "study.md",
+        findings=findings(results, judged),
+        gaps_in_methods=gaps(results),
+        unfinished=unfinished,
         command=command,
         provenance=results.provenance,
         versions=", ".join(f"{name} {version}" for name, version in results.provenance.versions.items()),
@@ -76,13 +92,17 @@ def _markdown(
         few=[label_of(name) for name in (BO, GABS) if max(counts.get(name, [_FEW_TRIALS])) < _FEW_TRIALS],
         fewest_trials=FEWEST_TRIALS,
         rendering_problem=_draw_scenes(scenes, folder),
-        scenes=[(name, f"![{name}](fig1_{name}.png)") for name in scenes],
+        scenes=[
+            (name, picture(f"fig1_{name}.png", alt_texts.of_scene(name, results.scenes[name])))
+            for name in scenes
+        ],
         planes=_draw_planes(results, scenes, folder),
         goals=list(dict.fromkeys(scene.score_label for scene in results.scenes.values())),
         differences=not all(has_shares(scene.bound) for scene in results.scenes.values()),
         convergence=_draw_convergence(results, folder),
         costs=_draw_costs(results, folder),
-        quantities=_draw_trials(results, folder),
+        trials_picture=trials_picture,
+        quantities=quantities,
         summary=summary_rows(results),
         claims=tables.claim_rows(judged),
         claims_in_all=len(judged),
@@ -101,31 +121,40 @@ def _draw_scenes(scenes: Mapping[str, Scene], folder: Path) -> str | None:
     """Return why the scenes are not rendered in 3D, or None."""
     problem = rendering_problem()
     for name, scene in scenes.items():
+        file = folder / f"fig1_{name}.png"
         if problem is None:
-            view3d(scene, save=folder / f"fig1_{name}.png").close()
+            view3d(scene, save=file).close()
+            _trim(file)
         else:
-            plot_scene(scene).savefig(folder / f"fig1_{name}.png")
+            plot_scene(scene).savefig(file)
     return problem
 
 
+def _trim(file: Path) -> None:
+    """Cut the white margin of a picture, which would make its labels small on a page."""
+    with Image.open(file) as picture:
+        kept = ImageOps.invert(picture.convert("RGB")).getbbox()
+        picture.crop(kept).save(file)
+
+
 def _draw_planes(results: StudyResult, scenes: Mapping[str, Scene], folder: Path) -> list[str]:
-    """Return the names of the files."""
+    """Return the pictures."""
     pressure = _by_method(results, lambda result: result.plane_pressure)
     planes = {name: plane for name in pressure if (plane := scenes[name].observation_plane) is not None}
     names = list(planes)
-    files: list[str] = []
+    pictures: list[str] = []
     for start in range(0, len(names), _PLANES_A_FIGURE):
-        part = names[start : start + _PLANES_A_FIGURE]
-        files.append(_numbered("fig2", files))
+        part = {name: pressure[name] for name in names[start : start + _PLANES_A_FIGURE]}
         points = {name: scenes[name].control_points for name in part}
         obstacles = {name: scenes[name].obstacles for name in part}
-        figure = plot_planes({name: pressure[name] for name in part}, planes, points, obstacles)
-        figure.savefig(folder / files[-1])
-    return files
+        file = _numbered("fig2", pictures)
+        plot_planes(part, planes, points, obstacles).savefig(folder / file)
+        pictures.append(picture(file, alt_texts.of_planes(part)))
+    return pictures
 
 
-def _draw_trials(results: StudyResult, folder: Path) -> list[str]:
-    """Return the labels of the quantities."""
+def _draw_trials(results: StudyResult, folder: Path) -> tuple[str, list[str]]:
+    """Return the picture and the labels of the quantities; both are empty if each has a single value."""
     areas = _by_method(
         results, lambda result: None if result.metrics.area is None else 1e6 * result.metrics.area
     )
@@ -134,8 +163,11 @@ def _draw_trials(results: StudyResult, folder: Path) -> list[str]:
         **({"area per focus [mm²]": areas} if areas else {}),
         "std among the foci [Pa]": _by_method(results, lambda result: result.metrics.std),
     }
+    counts = [method.trials for scene in results.scenes.values() for method in scene.methods.values()]
+    if counts == [1]:  # the table says it
+        return "", []
     plot_trials(quantities).savefig(folder / "fig3abc.png")
-    return list(quantities)
+    return picture("fig3abc.png", alt_texts.of_trials(quantities)), list(quantities)
 
 
 def _by_method(
@@ -150,28 +182,28 @@ def _by_method(
     return found
 
 
-def _numbered(name: str, files: Sequence[str]) -> str:
-    """Return the name of the file of a figure after those that it has."""
-    return f"{name}_{len(files) + 1}.png" if files else f"{name}.png"
+def _numbered(name: str, before: Sequence[str]) -> str:
+    """Return the name of the file of a figure after those before it."""
+    return f"{name}_{len(before) + 1}.png" if before else f"{name}.png"
 
 
 def _draw_convergence(results: StudyResult, folder: Path) -> list[str]:
-    """Return the names of the files, one for each goal and unit."""
-    files: list[str] = []
+    """Return the pictures, one for each goal and unit."""
+    pictures: list[str] = []
     for (goal, unit), scenes in _grouped(results, lambda scene: (scene.goal["name"], scene.unit)).items():
         history, levels = {}, {}
         for name, scene in scenes.items():
-            competitors = _competitors(scene)
+            competitors = tables.competitors(scene)
             history[name] = {method: found.solution.history for method, found in competitors.items()}
             levels[name] = _bounds(scene.bound) | {
                 label_of(method): float(found.solution.score.median())
                 for method, found in scene.methods.items()
                 if method not in competitors
             }
-        files.append(_numbered("fig3d", files))
-        label = score_label(f"{goal}, best so far", unit)
-        plot_convergence(history, levels, label=label).savefig(folder / files[-1])
-    return files
+        file, label = _numbered("fig3d", pictures), score_label(f"{goal}, best so far", unit)
+        plot_convergence(history, levels, label=label).savefig(folder / file)
+        pictures.append(picture(file, alt_texts.of_convergence(scenes)))
+    return pictures
 
 
 def _bounds(bound: float) -> dict[str, float]:
@@ -181,27 +213,32 @@ def _bounds(bound: float) -> dict[str, float]:
 
 
 def _draw_costs(results: StudyResult, folder: Path) -> list[str]:
-    """Return the names of the files: one for shares of the bound, and one for each other score."""
-    files: list[str] = []
+    """Return the pictures: one for shares of the bound, and one for each other score.
+
+    There are none where no scene has methods to compare.
+    """
+    if all(len(tables.competitors(scene)) == 1 for scene in results.scenes.values()):
+        return []
+    pictures: list[str] = []
     share = "score / bound [%]"
     groups = _grouped(results, lambda scene: share if has_shares(scene.bound) else scene.score_label)
     for label, scenes in groups.items():
         points = {
             name: {
-                method: [(float(found.seconds.median()), _median_score(found, scene.bound))]
-                for method, found in _competitors(scene).items()
+                method: [(float(found.seconds.median()), _shown_score(found, scene.bound))]
+                for method, found in tables.competitors(scene).items()
             }
             for name, scene in scenes.items()
         }
-        files.append(_numbered("fig4", files))
-        time = "median time of the search [s per trial]"
-        plot_pareto(points, time, label, higher_is_better=True).savefig(folder / files[-1])
-    return files
+        file, time = _numbered("fig4", pictures), "median time of the search [s per trial]"
+        plot_pareto(points, time, label, higher_is_better=True).savefig(folder / file)
+        pictures.append(picture(file, alt_texts.of_costs(scenes)))
+    return pictures
 
 
-def _median_score(method: MethodResult, bound: float) -> float:
+def _shown_score(method: MethodResult, bound: float) -> float:
     """Return the median score, in percent of the bound where it is a share of it."""
-    score = float(np.median(method.solution.score.numpy()))
+    score = tables.median_score(method)
     return 100 * score / bound if has_shares(bound) else score
 
 
@@ -211,9 +248,3 @@ def _grouped(results: StudyResult, key: Callable[[SceneResult], _Key]) -> dict[_
     for name, scene in results.scenes.items():
         found.setdefault(key(scene), {})[name] = scene
     return found
-
-
-def _competitors(scene: SceneResult) -> Mapping[str, MethodResult]:
-    """Return all methods except the baseline, which stays if it is the only one."""
-    methods = {name: method for name, method in scene.methods.items() if not tables.is_baseline(name)}
-    return methods or scene.methods

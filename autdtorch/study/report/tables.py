@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -28,9 +28,20 @@ def is_baseline(method: str) -> bool:
     return method.partition(",")[0] == BASELINE
 
 
+def competitors(scene: SceneResult) -> Mapping[str, MethodResult]:
+    """Return all methods except the baseline, which stays if it is the only one."""
+    methods = {name: method for name, method in scene.methods.items() if not is_baseline(name)}
+    return methods or scene.methods
+
+
+def median_score(method: MethodResult) -> float:
+    """Return the median score of the trials; of an even number, the mean of the middle two."""
+    return float(np.median(method.solution.score.numpy()))
+
+
 def claim_rows(judged: Iterable[tuple[Claim, Verdict | None]]) -> list[list[str]]:
     """Return the claims that have a verdict, with our numbers."""
-    rows = [["", "the paper's claim", "our reading", "our numbers", "verdict"]]
+    rows = [["no.", "the paper's claim", "our reading", "our numbers", "verdict"]]
     for number, (claim, verdict) in enumerate(judged, start=1):
         if verdict is not None:
             outcome = "**reproduced**" if verdict.holds else "**not reproduced**"

@@ -1,0 +1,194 @@
+"""The findings of a study in a few plain sentences, computed from its results."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+from autdtorch.methods.catalogue import label_of
+from autdtorch.study.report.claims import Claim, Verdict
+from autdtorch.study.report.tables import competitors, median_score
+from autdtorch.study.results import SceneResult, StudyResult
+from autdtorch.study.statistics import has_shares
+
+MOST_NAMED = 4  # scenes, groups or gaps that a sentence names; more are counted
+
+_LEVEL = 0.01  # methods are level with the best if their score is lower by less than this share of it
+_EQUAL = 0.005  # smaller changes by obstacles would be shown as 0 %
+
+
+class _Best(NamedTuple):
+    """The best score in a scene, and the labels of the methods that are level with it, best first."""
+
+    score: float
+    labels: tuple[str, ...]
+
+
+def findings(results: StudyResult, judged: Sequence[tuple[Claim, Verdict | None]]) -> list[str]:
+    """Return one sentence each on the best methods, the bound, the obstacles and the paper's claims.
+
+    Baselines are left out where there are other methods. The last sentence is left out where the results
+    have no data on any claim.
+    """
+    best = {name: _best(scene) for name, scene in results.scenes.items()}
+    verdicts = [verdict for _, verdict in judged if verdict is not None]
+    sentences = [_winners(results, best), _nearness(results, best), _cost_of_obstacles(results, best)]
+    sentences += [_verdicts(verdicts, len(judged))] if verdicts else []
+    return [sentence.replace(" %", "\N{NO-BREAK SPACE}%") for sentence in sentences]
+
+
+def gaps(results: StudyResult) -> list[str]:
+    """Return the methods that some scenes have and others lack, one text for each such scene."""
+    every = list(dict.fromkeys(name for scene in results.scenes.values() for name in scene.methods))
+    lacking = {
+        name: [label_of(method) for method in every if method not in scene.methods]
+        for name, scene in results.scenes.items()
+    }
+    texts = [f"{listed(labels)} in {name}" for name, labels in lacking.items() if labels]
+    return texts if len(texts) <= MOST_NAMED else [*texts[:MOST_NAMED], f"{len(texts) - MOST_NAMED} more"]
+
+
+def listed(words: Iterable[str]) -> str:
+    """Return words as "a", "a and b" or "a, b and c"."""
+    *others, last = words
+    return f"{', '.join(others)} and {last}" if others else last
+
+
+def _best(scene: SceneResult) -> _Best:
+    scores = {label_of(name): median_score(method) for name, method in competitors(scene).items()}
+    ranked = sorted(scores, key=lambda label: -scores[label])
+    top = scores[ranked[0]]
+    return _Best(top, tuple(label for label in ranked if top - scores[label] <= _LEVEL * abs(top)))
+
+
+def _winners(results: StudyResult, best: Mapping[str, _Best]) -> str:
+    """Return the sentence on the best scores, and the methods that reached them."""
+    scenes = results.scenes
+    goals = {scene.goal["name"].replace("_", " ") for scene in scenes.values()}
+    goal = goals.pop() if len(goals) == 1 else "of each scene"
+    median = any(method.trials > 1 for scene in scenes.values() for method in scene.methods.values())
+    every = {label_of(method) for scene in scenes.values() for method in competitors(scene)}
+    groups: dict[tuple[str, ...], list[str]] = {}
+    for name, found in best.items():
+        groups.setdefault(found.labels, []).append(name)
+    largest_first = sorted(groups, key=lambda labels: -len(groups[labels]))
+    parts = [
+        f"{_scores(groups[labels], scenes, best)}, by {listed(labels)}{_level(labels)}"
+        for labels in largest_first[:MOST_NAMED]
+    ]
+    if rest := sum(len(groups[labels]) for labels in largest_first[MOST_NAMED:]):
+        parts.append(f"by other methods in {rest} more scenes")
+    kind = f"{'best ' if len(every) > 1 else ''}{'median ' if median else ''}score"
+    return f"For the goal {goal}, the {kind} is {'; '.join(parts)}."
+
+
+def _level(labels: Sequence[str]) -> str:
+    return f" (less than {100 * _LEVEL:.0f} % apart)" if len(labels) > 1 else ""
+
+
+def _scores(names: Sequence[str], scenes: Mapping[str, SceneResult], best: Mapping[str, _Best]) -> str:
+    """Return the best scores of scenes, or the number of scenes and the range of the scores."""
+    if len(names) <= MOST_NAMED:
+        return _in_scenes({name: scenes[name].in_unit(f"{best[name].score:.3g}") for name in names})
+    where = f"in {len(names)} of {len(scenes)} scenes"
+    if any(not _comparable(scenes[name], scenes[names[0]]) for name in names):
+        return f"reached {where}"
+    low, high = (f"{edge(best[name].score for name in names):.3g}" for edge in (min, max))
+    return f"{low} to {scenes[names[0]].in_unit(high)} {where}"
+
+
+def _in_scenes(texts: Mapping[str, str]) -> str:
+    """Return the text of each scene as "1 Pa in a and b, and 2 Pa in c"."""
+    groups: dict[str, list[str]] = {}
+    for name, text in texts.items():
+        groups.setdefault(text, []).append(name)
+    *others, last = (f"{text} in {listed(names)}" for text, names in groups.items())
+    return f"{', '.join(others)}, and {last}" if others else last
+
+
+def _nearness(results: StudyResult, best: Mapping[str, _Best]) -> str:
+    """Return the sentence on the distance of the best scores from the certified bound."""
+    scenes = results.scenes
+    shares = [
+        100 * best[name].score / scene.bound for name, scene in scenes.items() if has_shares(scene.bound)
+    ]
+    parts = [f"{_range(shares)} % of the certified upper bound"] if shares else []
+    below = [
+        f"{scene.in_unit(f'{scene.bound - best[name].score:.3g}')} below the certified upper bound in {name}"
+        for name, scene in scenes.items()
+        if math.isfinite(scene.bound) and not has_shares(scene.bound)
+    ]
+    parts += below[:MOST_NAMED]
+    if not parts:
+        return "No upper bound on the score is known, so a better drive may exist."
+    unknown = len(scenes) - len(shares) - len(below)
+    rest = f" (not known for {unknown} of {len(scenes)} scenes)" if unknown else ""
+    subject = "This score is" if len(scenes) == 1 else "These scores are"
+    return f"{subject} {listed(parts)}{rest}; no drive can exceed the bound."
+
+
+def _range(values: Sequence[float]) -> str:
+    low, high = (f"{value:.0f}" if value >= 10 else f"{value:.2g}" for value in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"
+
+
+def _cost_of_obstacles(results: StudyResult, best: Mapping[str, _Best]) -> str:
+    """Return the sentence on the scores with obstacles against those without."""
+    with_obstacles = {name: scene for name, scene in results.scenes.items() if scene.obstacles}
+    if not with_obstacles:
+        return "No scene has obstacles."
+    for empty_name, empty in results.scenes.items():
+        same = {name: one for name, one in with_obstacles.items() if _comparable(one, empty)}
+        if empty.obstacles == 0 and best[empty_name].score > 0 and same:
+            break
+    else:
+        return "What the obstacles cost is not known: no scene of the same goal is without obstacles."
+    changes = {name: best[name].score / best[empty_name].score - 1 for name in same}
+    if len(changes) <= MOST_NAMED:
+        shown = _in_scenes({name: _change(change) for name, change in changes.items()})
+    else:
+        low, high = sorted(changes.values())[:: len(changes) - 1]
+        shown = f"from {_change(low)} to {_change(high)} in {len(changes)} scenes"
+    hardest = _hardest_hit(same, empty)
+    return f"Against {empty_name}, which has no obstacles, the best score is {shown}{hardest}."
+
+
+def _comparable(scene: SceneResult, other: SceneResult) -> bool:
+    return scene.goal == other.goal and scene.unit == other.unit
+
+
+def _hardest_hit(scenes: Mapping[str, SceneResult], empty: SceneResult) -> str:
+    """Return which method loses most by obstacles, or "" if there is only one, or none that loses."""
+    without = {name: median_score(method) for name, method in competitors(empty).items()}
+    shares = {
+        (label_of(name), scene_name): median_score(method) / without[name] - 1
+        for scene_name, scene in scenes.items()
+        for name, method in competitors(scene).items()
+        if without.get(name, 0.0) > 0
+    }
+    if len({label for label, _ in shares}) < 2 or min(shares.values()) > -_EQUAL:
+        return ""
+    label, name = min(shares, key=lambda key: shares[key])
+    return f"; {label} loses most, {-100 * shares[label, name]:.0f} % in {name}"
+
+
+def _change(share: float) -> str:
+    if abs(share) < _EQUAL:
+        return "unchanged"
+    return f"{100 * abs(share):.{0 if abs(share) >= 0.1 else 1}f} % {'lower' if share < 0 else 'higher'}"
+
+
+def _verdicts(verdicts: Sequence[Verdict], claims: int) -> str:
+    """Return the sentence on the paper's claims."""
+    held = sum(verdict.holds for verdict in verdicts)
+    unclear = sum(not verdict.clear for verdict in verdicts)
+    parts = [f"{_are(held)} reproduced", f"{_are(len(verdicts) - held)} not reproduced"]
+    if len(verdicts) < claims:
+        parts.append(f"{_are(claims - len(verdicts))} not judged for lack of data")
+    doubt = f"; of these verdicts, {_are(unclear)} not clear" if unclear else ""
+    return f"Of the paper's {claims} claims, {listed(parts)}{doubt}."
+
+
+def _are(count: int) -> str:
+    return f"{count or 'none'} {'is' if count <= 1 else 'are'}"
