@@ -11,7 +11,7 @@ from trame.ui.html import DivLayout
 from trame.widgets import rca
 
 from autdtorch.plot.explore.page import page
-from autdtorch.plot.explore.server import Server
+from autdtorch.plot.explore.server import Defer, Server
 from autdtorch.plot.explore.session import Session
 from autdtorch.plot.explore.situation import Situation
 from autdtorch.scene.scene import Scene
@@ -65,9 +65,9 @@ class Explorer:
         size = f'width="100%" height="{_HEIGHT}" style="border: 0"'
         return f'<iframe src="{escape(self.address)}" title="{title}" {size}></iframe>'
 
-    def _build(self, trame: Any) -> Callable[[], None]:
+    def _build(self, trame: Any, defer: Defer) -> Callable[[], None]:
         """Make the application on a trame server; return what ends it."""
-        session = Session(trame, self._situation, self._spacing, self._defer, self._note)
+        session = Session(trame, self._situation, self._spacing, defer, self._note)
         session.begin(self._first_method)
         view = rca.RemoteControlledArea(name="view", display="image", event_throttle_ms=30, trame_server=trame)
         handler = view.create_view_handler(
@@ -79,9 +79,6 @@ class Explorer:
             layout.root.classes = "explore"
             layout.root.add_child(page(view.html))
         return session.close
-
-    def _defer(self, function: Callable[..., object], *arguments: object) -> None:
-        self._server.call(function, *arguments)
 
     def _note(self, situation: Situation) -> None:
         self._situation = situation

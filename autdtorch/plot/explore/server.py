@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
 import logging
 import secrets
@@ -21,6 +22,7 @@ _NAMES = HOST, "localhost"  # by which a browser may call this machine; others a
 _ASSETS = Path(__file__).with_name("assets")
 _PATIENCE = 60.0  # s until the server must have started
 
+Defer = Callable[..., None]
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
@@ -32,8 +34,10 @@ class Server:
         token: the first part of the path of all addresses.
     """
 
-    def __init__(self, build: Callable[[Any], Any], port: int = 0) -> None:
-        """Start the server; `build` makes the application on a trame server, in the thread.
+    def __init__(self, build: Callable[[Any, Defer], Callable[[], None]], port: int = 0) -> None:
+        """Start the server; `build` makes the application, in the thread, and returns what ends it.
+
+        It is given a trame server, and a function that calls others in the thread, soon.
 
         Raises:
             OSError: the port is taken.
@@ -59,11 +63,6 @@ class Server:
     def running(self) -> bool:
         """True until it is closed."""
         return self._thread.is_alive()
-
-    def call(self, function: Callable[..., object], *arguments: object) -> None:
-        """Call a function in the thread, soon; any thread may ask for it."""
-        if not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(function, *arguments)
 
     def wait(self) -> None:
         """Wait until it is closed, in steps that let Ctrl+C through."""
@@ -97,7 +96,7 @@ class Server:
                              "scripts": ["__explore/explore.js"]})  # fmt: skip
         trame.controller.on_server_bind.add(self._guard)
         trame.controller.on_server_ready.add(self._note)
-        close = self._build(trame)
+        close = self._build(trame, self._call)
         try:
             await trame.start(
                 port=self.port, host=HOST, exec_mode="coroutine", backend="aiohttp", timeout=0, thread=True,
@@ -105,6 +104,10 @@ class Server:
             )  # fmt: skip
         finally:
             close()
+
+    def _call(self, function: Callable[..., object], *arguments: object) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody looks any more
+            self._loop.call_soon_threadsafe(function, *arguments)
 
     def _note(self, **_: Any) -> None:
         self.port = self._trame.port

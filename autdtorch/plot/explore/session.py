@@ -20,16 +20,17 @@ from autdtorch.plot.explore.history import History
 from autdtorch.plot.explore.mouse import Mouse
 from autdtorch.plot.explore.picture import Grip, Picture, Scale, gradient
 from autdtorch.plot.explore.situation import OWN_PLANE, Situation
-from autdtorch.scene.drive import amplitudes_of, drive_from_phases, phases_of
+from autdtorch.scene.drive import amplitudes_of, phases_of
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.moving import angles_of
 from autdtorch.utils.array_types import Array
 
 _MM = 1e-3
 _DIGITS = 7  # decimals of lengths [m] from the page, whose steps are 0.1 mm
-_STEP = 0.1  # mm, to which the page rounds
+
+_SURFACE = -6.0  # dB
 _NEW_FOCUS = 1.5  # wavelengths beside the last focus
-_BODY = ("body_x", "body_y", "body_z"), ("turn_x", "turn_y", "turn_z")
+_PLACE, _TURN = ("body_x", "body_y", "body_z"), ("turn_x", "turn_y", "turn_z")
 _FOCUS = ("focus_x", "focus_y", "focus_z")
 _COLUMNS = ("focus", "x [mm]", "y [mm]", "z [mm]", "|p| [Pa]", "level [dB]")
 
@@ -123,7 +124,7 @@ class Session:
 
     def find(self) -> None:
         """Run the chosen method."""
-        if (name := self._state.method) in OFFERED:
+        if (name := str(self._state.method)) in OFFERED:
             self._history.settle()
             self._running = True
             self._state.update({"busy": True, "progress": 0, "message": ""})
@@ -198,17 +199,17 @@ class Session:
                 "methods": choices(), "devices": devices, "units": [("dB", "dB"), ("Pa", "Pa")],
                 "planes": [(name, planes[name]) for name in self.now.planes], "columns": _COLUMNS,
                 "body": 0, "focus": 0, "transducer": 0, "method": "gradient_ascent", "device": "",
-                "unit": "dB", "reference": 1.0, "surface": -6.0, "folder": "outputs/explore",
+                "unit": "dB", "reference": 1.0, "surface": _SURFACE, "folder": "outputs/explore",
                 "follow": False, "volume": False, "busy": False, "progress": 0, "dark": False,
                 "rows": [], "scale_low": "", "scale_high": "", "scale_style": bar, "shown": -1, "wanted": 0, "settled": 0,
                 "trame__title": f"autdtorch explore: {scene.name}",
             }
         )  # fmt: skip
-        self._extras = state.follow, state.volume, state.surface
+        self._extras = state.follow, state.volume, self._surface()
         self._show_situation()
         for names, changed in (
             (("body", "focus", "transducer"), self._show_situation),
-            ((*_BODY[0], *_BODY[1]), self._move_body),
+            ((*_PLACE, *_TURN), self._move_body),
             (_FOCUS, self._move_focus),
             (("phase", "amplitude"), self._edit_drive),
             (("plane",), self._choose_plane),
@@ -227,37 +228,23 @@ class Session:
         self._ask(method=method)
 
     def _move_body(self) -> None:
-        if not self.now.bodies:
-            return
         index = self._chosen("body", len(self.now.bodies))
-        if self._entered((*_BODY[0], *_BODY[1])) == self._body_values(index):
-            return
-        place, angles = (self._entered(names) for names in _BODY)
-        x, y, z = (round(_MM * one, _DIGITS) for one in place)
-        a, b, c = (math.radians(one) for one in angles)
-        self._try(lambda: self.now.with_body(index, (x, y, z), (a, b, c)))
+        if self.now.bodies and (entered := self._entered((*_PLACE, *_TURN), self._body_values(index))):
+            x, y, z = (round(_MM * one, _DIGITS) for one in entered[:3])
+            a, b, c = (math.radians(one) for one in entered[3:])
+            self._try(lambda: self.now.with_body(index, (x, y, z), (a, b, c)))
 
     def _move_focus(self) -> None:
         index = self._chosen("focus", len(self.now.scene.control_points))
-        if self._entered(_FOCUS) == self._focus_values(index):
-            return
-        points = self.now.scene.control_points.clone()
-        points[index] = points.new_tensor([round(_MM * one, _DIGITS) for one in self._entered(_FOCUS)])
-        self._try(lambda: self.now.with_points(points))
+        if entered := self._entered(_FOCUS, self._focus_values(index)):
+            points = self.now.scene.control_points.clone()
+            points[index] = points.new_tensor([round(_MM * one, _DIGITS) for one in entered])
+            self._try(lambda: self.now.with_points(points))
 
     def _edit_drive(self) -> None:
         index = self._chosen("transducer", len(self.now.drive))
-        entered = self._entered(("phase", "amplitude"))
-        if entered == self._drive_values(index):
-            return
-        phase, amplitude = entered
-        drive = self.now.drive.clone()
-
-        def edited() -> Situation:
-            drive[index] = drive_from_phases([math.radians(phase)], [amplitude])[0]
-            return self.now.with_drive(drive)
-
-        self._try(edited)
+        if entered := self._entered(("phase", "amplitude"), self._drive_values(index)):
+            self._try(lambda: self.now.with_transducer(index, math.radians(entered[0]), entered[1]))
 
     def _choose_plane(self) -> None:
         if self._state.plane != self.now.plane:
@@ -266,18 +253,17 @@ class Session:
             self.settle()
 
     def _move_plane(self) -> None:
-        (height,) = self._entered(("height",))
-        if height != _mm(self.now.height):
-            self._try(lambda: self.now.with_plane(self.now.plane, _MM * height))
+        if entered := self._entered(("height",), (_mm(self.now.height),)):
+            self._try(lambda: self.now.with_plane(self.now.plane, _MM * entered[0]))
 
     def _choose_scale(self) -> None:
-        (reference,) = self._entered(("reference",))
-        if reference > 0 and self._reference is not None and reference != _digits(self._reference):
-            self._reference = reference
+        shown = 1.0 if self._reference is None else _digits(self._reference)
+        if (entered := self._entered(("reference",), (shown,))) and entered[0] > 0:
+            self._reference = entered[0]
         self._show_field()
 
     def _choose_extras(self) -> None:
-        chosen = self._state.follow, self._state.volume, self._state.surface
+        chosen = self._state.follow, self._state.volume, self._surface()
         if chosen != self._extras:
             self._extras = chosen
             self._ask()
@@ -311,19 +297,21 @@ class Session:
         self._show_situation()
         self._state.message = str(error)
 
-    def _entered(self, names: tuple[str, ...]) -> tuple[float, ...]:
-        """Return numbers of the page; what is none counts as unchanged."""
-        values = []
-        for name in names:
-            value = self._state[name]
-            is_number = isinstance(value, int | float) and math.isfinite(value)
-            values.append(float(value) if is_number else math.nan)
-        return tuple(values)
+    def _entered(self, names: tuple[str, ...], shown: tuple[float, ...]) -> tuple[float, ...] | None:
+        """Return numbers of the page, or None where they are those shown; what is no number is set back."""
+        given = tuple(self._state[name] for name in names)
+        if given == shown:
+            return None
+        if not all(isinstance(one, int | float) and math.isfinite(one) for one in given):
+            self._show_situation()
+            return None
+        return tuple(map(float, given))
 
     def _chosen(self, name: str, count: int) -> int:
         """Return the index that a list of the page has chosen."""
         value = self._state[name]
-        return min(max(int(value), 0), count - 1) if isinstance(value, int | float) else 0
+        is_index = isinstance(value, int) and 0 <= value < count
+        return int(value) if is_index else 0
 
     # What the page shows
 
@@ -346,7 +334,7 @@ class Session:
         with state:
             if now.bodies:
                 index = self._chosen("body", len(now.bodies))
-                self._set((*_BODY[0], *_BODY[1]), self._body_values(index))
+                self._set((*_PLACE, *_TURN), self._body_values(index))
                 body = now.bodies[index]
                 state.update({"body_moves": body.moves, "body_turns": body.turns})
             self._set(_FOCUS, self._focus_values(focus))
@@ -441,8 +429,10 @@ class Session:
         self.update()
 
     def _surface(self) -> float:
-        (height,) = self._entered(("surface",))
-        return height if -60.0 <= height <= 0.0 else -6.0
+        """Return the level of the surface in the volume [dB] that the page asks for."""
+        height = self._state.surface
+        is_level = isinstance(height, int | float) and -60.0 <= height <= 0.0
+        return float(height) if is_level else _SURFACE
 
 
 def _mm(length: float) -> float:

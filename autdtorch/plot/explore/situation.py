@@ -7,12 +7,12 @@ from functools import cached_property
 
 import torch
 
-from autdtorch.scene.drive import validate_single_drive
+from autdtorch.scene.drive import drive_from_phases, validate_single_drive
 from autdtorch.scene.geometry import Plane, rotation_matrix
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.obstacles.moving import is_movable, is_turnable, shifted, turned
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.validation import Vector, finite_vector
+from autdtorch.utils.validation import Vector, finite_vector, require_one_of
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 OWN_PLANE = "scene"
@@ -164,10 +164,19 @@ class Situation:
         """Return the situation with another drive (M,)."""
         return replace(self, drive=validate_single_drive(drive, len(self.scene.array)))
 
+    def with_transducer(self, index: int, phase: float, amplitude: float) -> Situation:
+        """Return the situation with another phase [rad] and amplitude of a transducer.
+
+        Raises:
+            ValueError: the amplitude is not in [0, 1].
+        """
+        drive = self.drive.clone()
+        drive[index] = drive_from_phases([phase], [amplitude])[0]
+        return self.with_drive(drive)
+
     def with_plane(self, plane: str, height: float | None = None) -> Situation:
         """Return the situation with another plane; without a height it passes through the foci."""
-        if plane not in self.planes:
-            raise ValueError(f"plane: {plane!r}; must be one of {', '.join(self.planes)}")
+        require_one_of("plane", plane, self.planes)
         changed = replace(self, plane=plane, height=0.0)
         if height is None and plane in _AXES:
             height = float(self.scene.control_points.mean(dim=0)["xyz".index(plane)])

@@ -1,0 +1,117 @@
+"""The server of the live view answers its own page alone."""
+
+import asyncio
+import socket
+import urllib.error
+import urllib.request
+from urllib.parse import urlsplit
+
+import pytest
+
+import autdtorch as at
+from autdtorch.plot.view3d import rendering_problem
+
+aiohttp = pytest.importorskip("aiohttp", reason="trame: install autdtorch[explore]")
+pytest.importorskip("trame_rca", reason="trame: install autdtorch[explore]")
+
+
+@pytest.fixture(scope="module")
+def explorer():
+    if problem := rendering_problem():
+        pytest.skip(problem)
+    scene = at.load_scene("configs/scene/sphere.yaml")
+    live = at.explore(scene, spacing=2e-3)
+    yield live
+    live.close()
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.1", urlsplit(live.address).port), timeout=5)
+
+
+def status(address, **headers):
+    """HTTP status of a request, and what it answers."""
+    try:
+        with urllib.request.urlopen(urllib.request.Request(address, headers=headers), timeout=10) as answer:
+            return answer.status, answer.read()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read()
+
+
+def socket_status(explorer, path, origin):
+    """HTTP status of the handshake of a WebSocket; 101 if it is accepted."""
+    port = urlsplit(explorer.address).port
+
+    async def shake():
+        headers = {} if origin is None else {"Origin": origin}
+        async with aiohttp.ClientSession() as session:
+            try:
+                async with session.ws_connect(f"ws://127.0.0.1:{port}/{path}", headers=headers):
+                    return 101
+            except aiohttp.WSServerHandshakeError as error:
+                return error.status
+
+    return asyncio.run(shake())
+
+
+def parts(explorer):
+    """Scheme with host and port, and the token, of the address."""
+    url = urlsplit(explorer.address)
+    return f"http://{url.netloc}", url.path.split("/")[1]
+
+
+def test_the_page_needs_the_token(explorer):
+    host, token = parts(explorer)
+    assert status(explorer.address)[0] == 200
+    assert len(token) >= 32
+    for path in ("", "index.html", "ws", "__explore/explore.js", f"{token[:-1]}/index.html", "x/index.html"):
+        code, text = status(f"{host}/{path}")
+        assert code == 403
+        assert token.encode() not in text
+
+
+def test_pages_of_other_origins_are_refused(explorer):
+    host, _ = parts(explorer)
+    assert status(explorer.address, Origin=host)[0] == 200
+    for origin in ("http://example.org", "null", "http://127.0.0.1:1", "https://127.0.0.1.example.org"):
+        assert status(explorer.address, Origin=origin)[0] == 403
+
+
+def test_other_names_of_this_machine_are_refused(explorer):
+    """A page whose name was made to point here would be of one origin with the live view."""
+    port = urlsplit(explorer.address).port
+    assert status(explorer.address, Host=f"localhost:{port}")[0] == 200
+    assert status(explorer.address, Host=f"example.org:{port}")[0] == 403
+
+
+def test_the_socket_needs_token_and_origin(explorer):
+    host, token = parts(explorer)
+    assert socket_status(explorer, f"{token}/ws", host) == 101
+    assert socket_status(explorer, "ws", host) == 403
+    assert socket_status(explorer, "wrong/ws", host) == 403
+    assert socket_status(explorer, f"{token}/ws", "http://example.org") == 403
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["../../../../etc/passwd", "..%2f..%2f..%2fetc/passwd", "%2e%2e/%2e%2e/etc/passwd", "__explore/../page.py",
+     "__explore/%2e%2e/server.py", "__explore//etc/passwd"],
+)  # fmt: skip
+def test_files_outside_are_refused(explorer, path):
+    host, token = parts(explorer)
+    url = urlsplit(host)
+    with socket.create_connection((url.hostname, url.port), timeout=10) as connection:  # as it is, no tidying
+        request = f"GET /{token}/{path} HTTP/1.1\r\nHost: {url.netloc}\r\nConnection: close\r\n\r\n"
+        connection.sendall(request.encode())
+        answer = b""
+        while more := connection.recv(65536):
+            answer += more
+    assert answer.split()[1] in (b"403", b"404")
+    assert b"root:" not in answer
+    assert b"def " not in answer
+
+
+def test_it_listens_on_the_local_interface_alone(explorer):
+    port = urlsplit(explorer.address).port
+    others = {info[4][0] for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)}
+    for address in others - {"127.0.0.1"}:
+        with pytest.raises(OSError):  # noqa: PT011 - refused, or no route
+            socket.create_connection((address, port), timeout=2)
