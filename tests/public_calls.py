@@ -241,6 +241,8 @@ ARGUMENTS: dict[str, Any] = {
     "timeout": 0.1,
     "stop": lambda state: True,
     "transducers": [3, 1, 7, 5],
+    "vmax": 3.0,
+    "vmin": 0.5,
     "volume": torch.ones(3, 3, 3, dtype=torch.complex128),
     "wavenumber": 7.0,
 }
@@ -286,7 +288,9 @@ OTHERS: dict[str, Any] = {
     "openmpd_boards.boards": Made(lambda folder: [at.OpenMPDBoard.load(board_file(folder))]),
     "plot_convergence.levels": {"scene": {"bound": 3.0}},
     "plot_pareto.points": {"scene": {"gabs": [[1.0, 1.0], [2.0, 3.0]]}},
+    "plot_plane.decibels": True,
     "plot_plane.pressure": np.ones((4, 4)),
+    "plot_plane.reference": 2.0,
     "plot_planes.control_points": {"scene": SCENE.control_points},
     "plot_planes.obstacles": {"scene": (CUBE,)},
     "plot_planes.pressure": {"scene": {"gabs": np.ones((4, 4))}},

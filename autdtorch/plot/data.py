@@ -6,10 +6,20 @@ from collections.abc import Collection, Iterable, Mapping
 from typing import TypeAlias
 
 import numpy as np
+import torch
 
 from autdtorch.scene.drive import phases_of, validate_single_drive
+from autdtorch.scene.geometry import Plane, cell_centers_of
+from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.validation import ArrayLike, invalid, magnitude_tensor, real_tensor, require_kind
+from autdtorch.utils.validation import (
+    ArrayLike,
+    invalid,
+    magnitude_tensor,
+    positive,
+    real_tensor,
+    require_kind,
+)
 
 ByMethod: TypeAlias = Mapping[str, ArrayLike]
 Checked: TypeAlias = dict[str, dict[str, Array]]  # by scene and method
@@ -80,6 +90,40 @@ def plane_magnitude(name: str, pressure: ArrayLike) -> Array:
     if magnitude.ndim != 2 or magnitude.size == 0:
         raise ValueError(f"{name}: shape {magnitude.shape}; must be (Nu, Nv), the points of a plane")
     return magnitude
+
+
+def outside_on_plane(magnitude: Array, plane: Plane, obstacles: Iterable[Obstacle]) -> Array:
+    """Return |p| (Nu, Nv) on a plane, NaN in cells whose centres are inside obstacles.
+
+    The field in a body may be many times that in air, which alone is heard.
+    """
+    points = cell_centers_of(plane, (magnitude.shape[0], magnitude.shape[1]))
+    return np.where(inside_any(points, obstacles).numpy(), np.nan, magnitude)
+
+
+def inside_any(points: torch.Tensor, obstacles: Iterable[Obstacle]) -> torch.Tensor:
+    """Return whether each of the points (..., 3) [m] is inside an obstacle, bool (...)."""
+    inside = torch.zeros(points.shape[:-1], dtype=torch.bool, device="cpu")
+    for obstacle in obstacles:
+        lower, upper = points.new_tensor(obstacle.lower), points.new_tensor(obstacle.upper)
+        near = ((points >= lower) & (points <= upper)).all(dim=-1) & ~inside  # distances to meshes are slow
+        inside[near] = obstacle.contains(points[near])
+    return inside
+
+
+def largest(magnitude: Array) -> float:
+    """Return the largest |p| [Pa] that is not NaN, 0 if there is none."""
+    return float(np.nanmax(magnitude, initial=0.0))
+
+
+def zero_level(reference: float | None, name: str, magnitude: Array) -> float:
+    """Return the pressure of 0 dB [Pa]: the reference, by default the largest |p| of the field `name`."""
+    if reference is not None:
+        return positive("reference", reference, "Pa")
+    peak = largest(magnitude)
+    if peak == 0:
+        raise ValueError(f"{name}: 0 Pa everywhere has no level; give the reference of 0 dB [Pa]")
+    return peak
 
 
 def in_decibels(magnitude: Array, zero: float) -> Array:

@@ -221,13 +221,18 @@ class Plane:
         spacing = positive("spacing", spacing, "m")
         counts = [max(1.0, round(length / spacing, 0)) for length in self.size]
         require_memory("spacing", spacing, _POINT_BYTES * math.prod(counts), "m")
-        along = [
-            length * ((torch.arange(int(count), dtype=torch.float64, device="cpu") + 0.5) / count - 0.5)
-            for length, count in zip(self.size, counts, strict=True)
-        ]
-        return self._at(along[0], along[1])
+        return cell_centers_of(self, (int(counts[0]), int(counts[1])))
 
     def _at(self, along_u: torch.Tensor, along_v: torch.Tensor) -> torch.Tensor:
         u, v = self.basis
         center = torch.tensor(self.center, dtype=torch.float64, device="cpu")
         return center + along_u[:, None, None] * u + along_v[None, :, None] * v
+
+
+def cell_centers_of(plane: Plane, counts: tuple[int, int]) -> torch.Tensor:
+    """Return the centres (Nu, Nv, 3) [m] of `counts` = (Nu, Nv) equal cells that fill a plane."""
+    along = [
+        length * ((torch.arange(count, dtype=torch.float64, device="cpu") + 0.5) / count - 0.5)
+        for length, count in zip(plane.size, counts, strict=True)
+    ]
+    return plane._at(along[0], along[1])

@@ -113,6 +113,64 @@ def test_plane_map_in_decibels_in_given_axes() -> None:
     assert "0 dB = 2 Pa" in figure.axes[1].get_ylabel()
 
 
+def field_of_a_ball() -> tuple[torch.Tensor, at.Plane, at.Sphere]:
+    """The exact field (40, 30) of a point source beside a ball of heavy gas, a lens, by a plane across it."""
+    ball = at.Sphere((30e-3, 0.0, 0.0), 8e-3, density=5.0, sound_speed=150.0)
+    plane = at.Plane((40e-3, 0.0, 0.0), (0, 0, 1), (40e-3, 30e-3))
+    ratios = {"density_ratio": 5.0 / 1.2, "speed_ratio": 150.0 / 340.0}
+    points = plane.points(1e-3)
+    field = at.analytic.fluid_sphere(
+        points.reshape(-1, 3), [[0.0, 0.0, 0.0]], 2 * np.pi * 40e3 / 340.0, ball.center, ball.radius, **ratios
+    )
+    return field.reshape(points.shape[:2]), plane, ball
+
+
+def test_obstacles_are_masked_and_the_scale_is_that_of_the_field_outside() -> None:
+    field, plane, ball = field_of_a_ball()
+    inside = (plane.points(1e-3) - torch.tensor(ball.center)).norm(dim=-1) < ball.radius
+    loudest = field.abs()[~inside].max().item()
+    assert field.abs().max() > 2 * loudest  # of the ball, which would be the scale
+    figures = (
+        plot_plane(field, plane, obstacles=[ball]),
+        plot_planes({"ball": {"gabs": field}}, {"ball": plane}, obstacles={"ball": [ball]}),
+        plot_plane(field, plane, obstacles=[ball], decibels=True),
+    )
+    for figure in figures:
+        mesh = mesh_of(figure.axes[0])
+        values = np.ma.getdata(mesh.get_array()).T
+        np.testing.assert_array_equal(np.isnan(values), inside)
+        assert mpl.colors.to_hex(mesh.get_cmap().get_bad()) == "#b0b0b0"
+        assert mesh.get_clim()[1] == pytest.approx(0.0 if figure is figures[-1] else loudest)
+    assert f"0 dB = {loudest:.3g} Pa" in figures[-1].axes[1].get_ylabel()
+    # No obstacles are given: there is nothing to mask.
+    assert mesh_of(plot_plane(field, plane).axes[0]).get_clim()[1] == pytest.approx(field.abs().max())
+
+
+def test_a_plane_within_an_obstacle_is_grey() -> None:
+    block = at.Box(PLANE.center, (0.1, 0.1, 0.1), rigid=True)
+    figure = plot_plane(np.ones((3, 2)), PLANE, obstacles=[block])
+    figure.draw_without_rendering()
+    assert np.isnan(np.ma.getdata(mesh_of(figure.axes[0]).get_array())).all()
+    with pytest.raises(ValueError, match="pressure: 0 Pa everywhere"):
+        plot_plane(np.ones((3, 2)), PLANE, obstacles=[block], decibels=True)
+
+
+def test_the_ends_of_the_colours_and_the_reference_can_be_chosen() -> None:
+    pressure = np.array([[2.0, 0.2], [0.0, 0.02]])
+    plain = plot_plane(pressure, PLANE, vmin=0.1, vmax=1.0)
+    assert mesh_of(plain.axes[0]).get_clim() == (0.1, 1.0)
+    levels = plot_plane(pressure, PLANE, decibels=True, reference=20.0, vmin=-45, vmax=-10)
+    mesh = mesh_of(levels.axes[0])
+    np.testing.assert_allclose(mesh.get_array().T, [[-20, -40], [-45, -45]], atol=1e-12)  # rounding
+    assert mesh.get_clim() == (-45, -10)
+    assert "0 dB = 20 Pa" in levels.axes[1].get_ylabel()
+    maps = {"a": {"gabs": pressure}, "b": {"gabs": 3 * pressure}}
+    figure = plot_planes(maps, dict.fromkeys(maps, PLANE), vmax=4.0)
+    assert [mesh_of(ax).get_clim() for ax in figure.axes[:2]] == [(0, 4), (0, 4)]
+    # An arrow at the end of the bar of b: some of its pressures are beyond.
+    assert [ax._colorbar.extend for ax in figure.axes[2:]] == ["neither", "max"]
+
+
 def test_planes_of_a_scene_share_their_colour_scale() -> None:
     pressure = {
         "three_cubes": {"lssg": np.full((3, 2), 1.0), "gabs": np.full((3, 2), 4.0)},
@@ -263,6 +321,15 @@ def test_nothing_is_cut_off_in_figures_of_all_methods_and_no_global_state_change
     [
         (lambda: plot_plane(np.ones(3), PLANE), r"pressure: shape \(3,\); must be \(Nu, Nv\)"),
         (lambda: plot_plane(np.zeros((2, 2)), PLANE, decibels=True), "pressure: 0 Pa everywhere"),
+        (lambda: plot_plane(np.ones((2, 2)), PLANE, vmin=-1), "vmin: -1 Pa; must be finite and >= 0"),
+        (lambda: plot_plane(np.ones((2, 2)), PLANE, vmin=2), "vmin: 2 Pa; must be < 1, the upper end"),
+        (
+            lambda: plot_plane(np.ones((2, 2)), PLANE, vmin=2, vmax=2),
+            "vmax: 2 Pa; must be > 2, the lower end",
+        ),
+        (lambda: plot_plane(np.ones((2, 2)), PLANE, decibels=True, vmin=0), "vmin: 0 dB; must be < 0"),
+        (lambda: plot_plane(np.ones((2, 2)), PLANE, reference=2), "reference: 2 Pa; must be None without"),
+        (lambda: plot_planes({"a": {"b": np.ones((2, 2))}}, {"a": PLANE}, vmax=0), "vmax: 0 Pa; must be > 0"),
         (lambda: plot_planes({"empty": {"gabs": np.ones((3, 2))}}, {}), r"planes: none for \['empty'\]"),
         (lambda: plot_pareto({"a": {"b": [(1.0,)]}}, "", ""), r"\['b'\]: shape \(1, 1\); must be"),
         (lambda: plot_pareto({"a": {"b": [(0.0, 1.0)]}}, "", ""), "0; must be > 0"),

@@ -4,6 +4,7 @@ import json
 import math
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -178,6 +179,28 @@ def test_the_isosurface_lies_where_the_volume_has_its_level(scene: at.Scene) -> 
     np.testing.assert_allclose(radius, 10.0, atol=0.1)  # linear in 2 mm cells: h^2 / 8 times the curvature
     assert surface.points[:, 0].max() <= 1e3 * center[0] + 2.0 + 1e-4
     assert surface.points[:, 0].min() == pytest.approx(1e3 * center[0] - 10.0, abs=0.1)
+
+
+@pytest.mark.usefixtures("renderer")
+def test_fields_inside_obstacles_are_not_shown(scene: at.Scene, caplog: pytest.LogCaptureFixture) -> None:
+    plane = at.Plane(center=(40e-3, 0, 0), normal=(0, 0, 1), size=(40e-3, 40e-3))  # across the box
+    scene = replace(scene, observation_plane=plane, control_points=[[60e-3, 0, 0]])
+    points = plane.points(2e-3)
+    inside = scene.obstacles[0].contains(points)
+    plotter = view3d(scene, field=torch.where(inside, 100.0, 2.0))
+    (sheet,) = (mesh for mesh in plotter.meshes if "field" in mesh.array_names)
+    captions = [actor.GetInput() for actor in plotter.actors.values() if hasattr(actor, "GetInput")]
+    plotter.close()
+    assert np.isnan(sheet["field"]).sum() == inside.sum()
+    assert np.nanmax(sheet["field"]) == 0
+    assert "0 dB = 2 Pa" in captions
+    # A volume that is loud in the box alone, near the control point, has no surface of that level.
+    lower, upper = np.array(scene.domain)
+    counts = np.round((upper - lower) / 2e-3).astype(int)
+    cells = lower + (upper - lower) * (np.moveaxis(np.indices(counts), 0, -1) + 0.5) / counts
+    volume = np.where(scene.obstacles[0].contains(cells), 100.0, 1.0)
+    view3d(scene, volume=volume, isosurface=-1.0, reference=100.0).close()
+    assert "no isosurface" in caplog.text
 
 
 @pytest.mark.usefixtures("renderer")

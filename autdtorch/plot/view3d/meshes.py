@@ -11,14 +11,14 @@ import numpy as np
 import torch
 
 from autdtorch.plot import colours
-from autdtorch.plot.data import MM, plane_magnitude, single_drive_phases
+from autdtorch.plot.data import MM, inside_any, outside_on_plane, plane_magnitude, single_drive_phases
 from autdtorch.scene.drive import amplitudes_of
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.neighbours import closest_pair, distances
-from autdtorch.utils.validation import ArrayLike, Vector, magnitude_tensor, positive
+from autdtorch.utils.validation import ArrayLike, Vector, magnitude_tensor
 
 if TYPE_CHECKING:
     import pyvista
@@ -169,8 +169,9 @@ def add_plane(plotter: pyvista.Plotter, plane: Plane, level: Array | None) -> No
 def add_sheet(
     plotter: pyvista.Plotter, sheet: pyvista.PolyData, colour_map: str, limits: tuple[float, float]
 ) -> pyvista.Actor:
-    """Draw a mesh from `plane_mesh`, coloured by its values, and its frame."""
-    actor = plotter.add_mesh(sheet, cmap=colour_map, clim=limits, lighting=False, show_scalar_bar=False)
+    """Draw a mesh from `plane_mesh`, coloured by its values, grey where they are NaN, and its frame."""
+    look = {"cmap": colour_map, "clim": limits, "nan_color": colours.OBSTACLE_COLOUR}
+    actor = plotter.add_mesh(sheet, lighting=False, show_scalar_bar=False, **look)
     frame = sheet.extract_feature_edges()
     frame.clear_data()
     plotter.add_mesh(frame, color=colours.EDGE_COLOUR, line_width=1, lighting=False)
@@ -217,31 +218,24 @@ def add_isosurface(plotter: pyvista.Plotter, scene: Scene, level: Array, height:
 
 
 def plane_pressure(scene: Scene, field: ArrayLike) -> tuple[Plane, Array]:
-    """Return the scene's observation plane and the magnitude of a `field` (Nu, Nv) on it."""
+    """Return the observation plane and the magnitude of a `field` (Nu, Nv) on it, NaN inside obstacles."""
     magnitude = plane_magnitude("field", field)
     if scene.observation_plane is None:
         raise ValueError("field: given for a scene without observation plane; must be None")
-    return scene.observation_plane, magnitude
+    return scene.observation_plane, outside_on_plane(magnitude, scene.observation_plane, scene.obstacles)
 
 
-def volume_magnitude(volume: ArrayLike) -> Array:
-    """Return |p| (Nx, Ny, Nz) of complex pressure, or of its magnitude; NaN where unknown."""
+def volume_magnitude(scene: Scene, volume: ArrayLike) -> Array:
+    """Return |p| (Nx, Ny, Nz) in the domain, NaN where it is unknown and inside obstacles."""
     magnitude: Array = magnitude_tensor("volume", volume, "Pa").detach().cpu().numpy()
     if magnitude.ndim != 3 or min(magnitude.shape) < 2:
         raise ValueError(f"volume: shape {magnitude.shape}; must be (Nx, Ny, Nz), each at least 2")
     if np.isnan(magnitude).all() or np.isinf(magnitude).any():
         raise ValueError("volume: infinite, or NaN everywhere; must be finite where it is known")
-    return magnitude
-
-
-def zero_level(reference: float | None, on_plane: Array | None, in_domain: Array | None) -> float:
-    """Return the pressure of 0 dB [Pa]: the reference, or the peak on the plane, or that in the volume."""
-    if reference is not None:
-        return positive("reference", reference, "Pa")
-    name, shown = ("field", on_plane) if on_plane is not None else ("volume", in_domain)
-    if shown is None:  # no pressure to draw
-        return 1.0
-    peak = float(np.nanmax(shown))
-    if peak == 0:
-        raise ValueError(f"{name}: 0 Pa everywhere has no level; give the reference of 0 dB [Pa]")
-    return peak
+    lower, upper = (np.asarray(corner) for corner in scene.domain)
+    axes = (
+        low + (high - low) * (np.arange(count) + 0.5) / count
+        for low, high, count in zip(lower, upper, magnitude.shape, strict=True)
+    )
+    points = torch.from_numpy(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
+    return np.where(inside_any(points, scene.obstacles).numpy(), np.nan, magnitude)

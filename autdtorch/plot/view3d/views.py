@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageColor
 
 from autdtorch.plot.colours import FLOOR, WAVE_MAP
-from autdtorch.plot.data import in_decibels
+from autdtorch.plot.data import in_decibels, largest, zero_level
 from autdtorch.plot.view3d import meshes
 from autdtorch.plot.view3d.export import export_path, write
 from autdtorch.plot.view3d.opengl import require_rendering
@@ -47,7 +47,8 @@ def view3d(
 ) -> pyvista.Plotter:
     """Render transducers, obstacles, control points, observation plane and field, in millimetres.
 
-    Pressures are shown as levels 20 lg(|p| / reference) from -30 to 0 dB. A caption gives the reference.
+    Pressures outside the obstacles are shown as levels 20 lg(|p| / reference) from -30 to 0 dB. A caption
+    gives the reference.
 
     Args:
         scene: scene to draw.
@@ -74,9 +75,10 @@ def view3d(
     off_screen = boolean("off_screen", off_screen)
     phases = None if drive is None else meshes.emitted_phases(drive, len(scene.array))
     on_plane = None if field is None else meshes.plane_pressure(scene, field)[1]
-    in_domain = None if volume is None else meshes.volume_magnitude(volume)
+    in_domain = None if volume is None else meshes.volume_magnitude(scene, volume)
     height = number_between("isosurface", isosurface, FLOOR, 0.0, "dB")
-    zero = meshes.zero_level(reference, on_plane, in_domain)
+    name, shown = ("volume", in_domain) if on_plane is None else ("field", on_plane)
+    zero = zero_level(reference, name, np.ones(1) if shown is None else shown)
     path = None if save is None else export_path("save", save)
     require_rendering()
     plotter = meshes.new_plotter(scene, off_screen)
@@ -99,7 +101,8 @@ def animate3d(
 ) -> None:
     """Write a GIF of the instantaneous pressure Re(p e^{-i w t}) on the observation plane over one period.
 
-    The colours of the transducers are their phases phi + w t. The GIF repeats without a jump.
+    The colours of the transducers are their phases phi + w t. The GIF repeats without a jump. The pressure
+    inside obstacles is not shown.
 
     Args:
         scene: scene to draw.
@@ -115,15 +118,16 @@ def animate3d(
     """
     require_kind("scene", scene, Scene)
     phases = meshes.emitted_phases(drive, len(scene.array))
-    plane, _ = meshes.plane_pressure(scene, field)
+    plane, magnitude = meshes.plane_pressure(scene, field)
     pressure = complex_tensor("field", field).detach().cpu().numpy()
+    pressure[np.isnan(magnitude)] = math.nan
     frames = integer_at_least("frames", frames, 2)
     path = path_of("path", path, suffixes=(".gif",))
     require_rendering()
     plotter = meshes.new_plotter(scene, off_screen=True)
     discs = meshes.add_transducers(plotter, scene, phases)
     sheet = meshes.plane_mesh(plane, pressure.real)
-    peak = float(np.abs(pressure).max())
+    peak = largest(magnitude)
     digit = 10.0 ** math.floor(math.log10(peak)) if peak else 1.0
     limit = digit * max(1, math.ceil(peak / digit))  # of one digit, for round numbers on the colour bar
     actor = meshes.add_sheet(plotter, sheet, WAVE_MAP, (-limit, limit))
