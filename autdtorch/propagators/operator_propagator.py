@@ -160,7 +160,7 @@ class OperatorPropagator:
     @one_library_thread()
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
         """Return the pressure of drives at points; see `SimulatedPropagator.field`."""
-        drive = validate_drive(drive, len(self.scene.array))
+        drive = validate_drive(drive, len(self.scene.array)).cpu()
         places, grid = points_grid("points", points)
         places = self._checked(places)
         parts, masks = [], []

@@ -179,16 +179,16 @@ class SimulatedPropagator:
         """Return the pressure of drives at points, from a simulation for each drive or the transfer matrix.
 
         Args:
-            drive: (..., M) complex, |q| <= 1.
+            drive: (..., M) complex, |q| <= 1, on any device.
             points: (P, 3) or a grid such as (Nu, Nv, 3) [m].
 
         Returns:
-            complex128 (..., P) or (..., Nu, Nv) [Pa]; differentiable by the drive.
+            complex128 (..., P) or (..., Nu, Nv) [Pa], on the CPU; differentiable by the drive.
 
         Raises:
             ValueError: drive or points of another shape or out of range, as in `transfer_matrix`.
         """
-        drive = validate_drive(drive, len(self.scene.array))
+        drive = validate_drive(drive, len(self.scene.array)).cpu()
         points, grid = points_grid("points", points)
         points = self._simulation.checked(points)
         if len(grid) == 1:  # others are pictures, which may cross obstacles

@@ -147,6 +147,7 @@ WRONG = [
     (["+method.trials=3"], "method: unknown key 'trials'; allowed keys: levels"),
     (["+scene.colour=red"], "scene: unknown key 'colour'"),
     (["solver.spacing=abc"], "solver: spacing: 'abc'; must be a real number"),
+    (["solver.device=gpu"], "solver: device: 'gpu'; must be 'cpu', 'cuda' or"),
     (["solver.method=fast"], "solver: method: 'fast'; must be one of auto, free_space, box, full"),
     (["method.levels=1"], "method: levels: 1; must be an integer >= 2"),
     (["plane_spacing=1"], r"plane_spacing: 1\.0 m; must be at most 0\.1 m, the plane's edge"),
