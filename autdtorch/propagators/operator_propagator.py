@@ -171,7 +171,10 @@ class OperatorPropagator:
         field, served = torch.cat(parts, dim=-1), torch.cat(masks)
         if not served.all():
             field = field.clone()
-            field[..., ~served] = self._box.field(drive, places[~served].detach())
+            near = places[~served].detach()
+            # Of a plane they stay a grid, for which the box may keep its matrix.
+            near = near if len(grid) == 1 else near[None]
+            field[..., ~served] = self._box.field(drive, near).reshape(*drive.shape[:-1], -1)
         return field.reshape(*drive.shape[:-1], *grid)
 
     @cached_property
