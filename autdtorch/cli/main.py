@@ -6,12 +6,14 @@ so that help is quick.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
 import os
 import re
 import sys
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -34,16 +36,18 @@ class _Carrier(BaseException):
     """Carries its cause past Hydra, which would print a line of its own about any `Exception`."""
 
 
-class SlurmCallback(Callback):
-    """Prepares a sweep on Slurm; `configs/config.yaml` names it to Hydra."""
+class SweepCallback(Callback):
+    """Prepares a sweep; `configs/config.yaml` names it to Hydra."""
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Watch the jobs of the sweep by `squeue`."""
+        """Log the sweep, or on Slurm watch its jobs by `squeue`, which logs them."""
         launcher = config.hydra.launcher
         if launcher._target_.endswith(".SlurmLauncher"):
             from autdtorch.cli.slurm import watch_queue
 
             watch_queue(launcher.submitit_folder)
+        else:
+            logger.info("sweep into %s: %s", config.hydra.sweep.dir, " ".join(config.hydra.overrides.task))
 
 
 def main() -> None:
@@ -83,10 +87,8 @@ def main() -> None:
 def _run(config: DictConfig) -> None:
     job = HydraConfig.get()
     swept = job.mode == RunMode.MULTIRUN
-    if swept:
-        logger.info("job %s: %s", job.job.num, ", ".join(job.overrides.task))
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), _named(f"job {job.job.num}: " if swept else ""):
             warnings.showwarning = lambda message, *_: logger.warning("%s", message)  # without our source
             _job(config, Path(job.sweep.dir) if swept else None)
     except Exception as error:
@@ -96,6 +98,24 @@ def _run(config: DictConfig) -> None:
         failure = f"job {job.job.num} failed: {in_one_line(error)}"
         logger.error(failure)
         raise FailedJob(f"{failure}; {AGAIN}") from error
+
+
+@contextlib.contextmanager
+def _named(prefix: str) -> Iterator[None]:
+    """Put the name of a job in front of its log lines; jobs that run side by side share stderr."""
+
+    def name(record: logging.LogRecord) -> bool:
+        record.msg, record.args = f"{prefix}{record.getMessage()}", None
+        return True
+
+    handlers = logging.getLogger().handlers if prefix else []
+    for handler in handlers:
+        handler.addFilter(name)
+    try:
+        yield
+    finally:
+        for handler in handlers:
+            handler.removeFilter(name)
 
 
 def _job(config: DictConfig, sweep: Path | None) -> None:

@@ -81,6 +81,11 @@ class OperatorPropagator:
         """The time step of the box [s]."""
         return self._box.time_step
 
+    @property
+    def cells(self) -> int:
+        """Number of cells of all grids; 0 where the operators are known."""
+        return self._plan.cells if self._plan.runs else 0
+
     @cached_property
     def bodies(self) -> ScatteringBodies:
         """The bodies of the scene."""
@@ -199,7 +204,7 @@ class OperatorPropagator:
             matrix = matrix.index_put((served,), found[converged])
         if not served.all() and not self._logged:
             self._logged = True
-            logger.info("%d points are too near an obstacle for its waves: by box", int((~served).sum()))
+            logger.debug("%d points are too near an obstacle for its waves: by box", int((~served).sum()))
         return matrix, served
 
     def _converged(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -106,6 +106,11 @@ class SimulatedPropagator:
         return self._simulation.time_step
 
     @property
+    def cells(self) -> int:
+        """Number of cells of all grids."""
+        return self._plan.cells
+
+    @property
     def planned_runs(self) -> int:
         """Number of simulations of the control points' transfer matrix."""
         return self._simulation.matrix_runs(self.scene.control_points)

@@ -262,7 +262,7 @@ def test_one_scene_and_one_method(run, tmp_path, capsys):
     assert head.split()[:3] == ["scene", "method", "trials"]
     assert row.split()[:4] == ["homogeneous", "GABS", "2", f"{method.metrics.mean.mean():.2f}"]
     assert end == f"The results are in {Path('outputs', 'homogeneous_gabs')}"
-    assert "homogeneous: gabs, trials 1 to 2 of 2" in captured.err
+    assert captured.err.startswith("homogeneous: free space, ")
 
 
 def test_what_is_finished_is_not_computed_again(run, tmp_path, capsys, monkeypatch):
@@ -352,6 +352,37 @@ def test_help_tells_what_there_is(run, tmp_path, capsys):
     assert f"scene: {', '.join(CONFIG_NAMES['scene'])}" in text
     assert "  spacing: 0.001" in text
     assert written(tmp_path) == set()
+
+
+NUMBER = r"[\d.e-]+"
+
+
+@pytest.mark.parametrize(
+    ("given", "work"),
+    [
+        (["scene=homogeneous"], "homogeneous: free space"),
+        (["scene=sphere"], f"sphere: operator, exact waves, error {NUMBER}"),
+        (
+            ["scene=two_cubes", "solver.spacing=2.1e-3", "solver.tolerance=0.1"],
+            rf"two_cubes: box, \d runs?, within {NUMBER} of steady, [\d,]+ cells of 2.1 mm",
+        ),
+        (
+            ["scene=two_cubes", "solver.spacing=null", "solver.tolerance=0.1"],
+            rf"two_cubes: box, \d runs?, estimated error {NUMBER}, [\d,]+ cells of {NUMBER} mm",
+        ),
+    ],
+)
+def test_a_job_logs_one_line_of_cells_runs_error_and_seconds(run, capsys, given, work):
+    given = [*given, "method=gabs", "trials=2", "plane_spacing=0.02"]
+    assert run(*given) == 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.fullmatch(rf"{work}, {NUMBER} s; gabs, 2 trials, {NUMBER} s", line)
+    if "scene=sphere" in given:
+        assert run(*given) == 0  # finished before
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("re-using sphere from ")
+    assert run(*given, "hydra.verbose=autdtorch", "seed=1") == 0
+    assert "transfer matrix" in capsys.readouterr().err
 
 
 def test_solver_settings_are_the_defaults_of_make_propagator():
