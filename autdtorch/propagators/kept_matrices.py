@@ -6,6 +6,8 @@ runs of drives, its matrix is simulated: at most twice the fewest runs, however 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from autdtorch.propagators.simulation import TransferMatrix
@@ -28,7 +30,8 @@ class KeptMatrices:
 
     def add(self, points: torch.Tensor, result: TransferMatrix) -> None:
         """Keep the matrix of points (P, 3), and let the oldest go that no longer fit into the memory."""
-        self._matrices[digest_of(points)] = result
+        with torch.inference_mode(False):  # later calls may need gradients
+            self._matrices[digest_of(points)] = replace(result, matrix=result.matrix.clone())
         sizes = {
             key: kept.matrix.numel() * kept.matrix.element_size() for key, kept in self._matrices.items()
         }
