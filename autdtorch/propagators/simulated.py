@@ -63,9 +63,9 @@ class SimulatedPropagator:
     transducers are simulated and kept once they pay: after as many runs from points. More points outside the
     boxes, and more drives, then take sums and no runs.
 
-    The last transfer matrices are kept, up to 250 MB. Without a cache, that of a plane, given as a grid
-    (Nu, Nv, 3), is simulated after as many runs of single drives there as it takes. More drives then take
-    products and no runs.
+    The last transfer matrices are kept, up to 250 MB. Points that are given as a grid (Nu, Nv, 3), such as a
+    plane, are likely to be looked at again. Without a cache, their matrix is simulated once drives there have
+    taken as many runs as the matrix takes; more drives then take no runs.
 
     Attributes:
         scene: the scene it was made for.
