@@ -12,7 +12,9 @@ from autdtorch.cli import main as command_line
 
 
 def main() -> None:
-    """Run the command line."""
+    """Run the command line. The help has that of `autdtorch` after this docstring."""
+    if {"-h", "--help"} & set(sys.argv[1:]):
+        print(__doc__)
     if not any(word.startswith("hardware=") for word in sys.argv[1:]):
         sys.argv.append("hardware=emulated")
     command_line.main()

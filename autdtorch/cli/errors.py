@@ -81,7 +81,7 @@ def _of_hydra(error: BaseException, text: str) -> str:
     # Hydra would advise to add the key, which we would then refuse.
     if unknown := re.match(r"Could not override '(.+)'", text):
         key = getattr(error.__cause__, "full_key", None) or unknown[1]
-        return f"{key}: unknown key; autdtorch --help lists the settings"
+        return f"{key}: unknown key; autdtorch --cfg job lists the settings"
     if found := re.match(r"(Error merging override [^,\n]+)", text):
         text = f"{found[1]}: {error.__cause__}"
     if missing := re.match(r"Missing mandatory value: (\S+)", text):

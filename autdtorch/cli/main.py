@@ -1,4 +1,4 @@
-"""The command line `autdtorch`: reads settings with Hydra, runs a study or a hardware trial.
+"""The command line `autdtorch`: reads settings with Hydra, runs a study, a hardware trial or a live view.
 
 Errors are one line on stderr (`errors`). Modules that take seconds to import are imported when a job starts,
 so that help is quick.
@@ -6,6 +6,7 @@ so that help is quick.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
 import os
@@ -13,6 +14,7 @@ import re
 import shlex
 import sys
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -35,16 +37,18 @@ class _Carrier(BaseException):
     """Carries its cause past Hydra, which would print a line of its own about any `Exception`."""
 
 
-class SlurmCallback(Callback):
-    """Prepares a sweep on Slurm; `configs/config.yaml` names it to Hydra."""
+class SweepCallback(Callback):
+    """Prepares a sweep; `configs/config.yaml` names it to Hydra."""
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Watch the jobs of the sweep by `squeue`."""
+        """Log the sweep, or on Slurm watch its jobs by `squeue`, which logs them."""
         launcher = config.hydra.launcher
         if launcher._target_.endswith(".SlurmLauncher"):
             from autdtorch.cli.slurm import watch_queue
 
             watch_queue(launcher.submitit_folder)
+        else:
+            logger.info("sweep into %s: %s", config.hydra.sweep.dir, shlex.join(config.hydra.overrides.task))
 
 
 def main() -> None:
@@ -57,6 +61,10 @@ def main() -> None:
             from autdtorch.cli.study_command import collect
 
             collect(sys.argv[2:])
+        elif sys.argv[1:2] == ["explore"]:
+            del sys.argv[1]
+            register()
+            _explore()
         elif sys.argv[1:] == ["--version"]:
             print(f"autdtorch {autdtorch.__version__}")
         else:
@@ -84,10 +92,8 @@ def main() -> None:
 def _run(config: DictConfig) -> None:
     job = HydraConfig.get()
     swept = job.mode == RunMode.MULTIRUN
-    if swept:
-        logger.info("job %s: %s", job.job.num, shlex.join(job.overrides.task))
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), _named(f"job {job.job.num}: " if swept else ""):
             warnings.showwarning = lambda message, *_: logger.warning("%s", message)  # without our source
             _job(config, Path(job.sweep.dir) if swept else None)
     except Exception as error:
@@ -99,11 +105,44 @@ def _run(config: DictConfig) -> None:
         raise FailedJob(f"{failure}; {AGAIN}") from error
 
 
+@hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name="config")
+def _explore(config: DictConfig) -> None:
+    from autdtorch.cli.explore_command import explore_scene
+    from autdtorch.cli.settings import settings_of
+
+    try:
+        if HydraConfig.get().mode == RunMode.MULTIRUN:
+            raise ValueError("explore: a sweep; must be one scene at a time")
+        settings, modules, _ = settings_of(config)
+        explore_scene(settings, modules)
+    except Exception as error:
+        raise _Carrier from error
+
+
+@contextlib.contextmanager
+def _named(prefix: str) -> Iterator[None]:
+    """Put the name of a job in front of its log lines; jobs that run side by side share stderr."""
+
+    def name(record: logging.LogRecord) -> bool:
+        record.msg, record.args = f"{prefix}{record.getMessage()}", None
+        return True
+
+    handlers = logging.getLogger().handlers if prefix else []
+    for handler in handlers:
+        handler.addFilter(name)
+    try:
+        yield
+    finally:
+        for handler in handlers:
+            handler.removeFilter(name)
+
+
 def _job(config: DictConfig, sweep: Path | None) -> None:
     """Run a study, or a hardware trial if there is a section `hardware`."""
     from autdtorch.cli.settings import settings_of
 
     settings, modules, output = settings_of(config)
+    settings.pop("explore", None)
     if settings.get("hardware") is None:
         from autdtorch.cli.study_command import study
 

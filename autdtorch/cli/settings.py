@@ -34,6 +34,7 @@ _SETTINGS = (
     "seed",
     "plane_spacing",
     "poses",
+    "explore",
 )
 _PLACES = ("modules", "output")  # settings that change no result
 _NOT_OF_METHODS = ("objective", "trials", "seed", "score")  # the study's to give

@@ -59,7 +59,7 @@ def largest_eigenvalue(index: Index, weight: Array, stencil: Stencil, shape: tup
     if bound <= CLOSE * air:
         return bound
     if len(index) > MOST_CELLS:
-        logger.info(
+        logger.debug(
             "time step up to a quarter below the stability limit: %d heterogeneous cells, and the eigenvalue"
             " is iterated for at most %d", len(index), MOST_CELLS,
         )  # fmt: skip

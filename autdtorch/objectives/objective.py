@@ -1,11 +1,13 @@
 """Objectives: black boxes that take drives and give the pressure magnitudes at the control points.
 
 Neither a microphone nor a thermal camera measures a phase, so a method cannot distinguish a simulated
-objective from a measured one.
+objective from a measured one. For the same reason, observations have no gradient; propagators have.
 """
 
 from __future__ import annotations
 
+import functools
+import logging
 from collections.abc import Callable
 from typing import Protocol, TypeAlias, runtime_checkable
 
@@ -15,6 +17,8 @@ from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import ArrayLike, complex_tensor, invalid, real_tensor, require_kind
 
+logger = logging.getLogger(__name__)
+
 Score: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
 """A goal: function of pressures (..., P) [Pa] that gives the scores (...) to maximise."""
 
@@ -22,6 +26,10 @@ Score: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
 @runtime_checkable
 class Objective(Protocol):
     """Observes the control points of a scene, simulated or real.
+
+    Observations are plain numbers, as of a microphone: the gradient of a drive ends here, and is logged once
+    as lost. Gradients by the drive come from a propagator's `field` or `transfer_matrix`, gradients by
+    materials too from `differentiable_field`. `gradient_ascent` maximises a goal by them.
 
     Attributes:
         scene: its array plays the drives, and its control points are observed.
@@ -63,10 +71,21 @@ def observe_drives(
 
 def validate_drives(drive: torch.Tensor, transducers: int) -> torch.Tensor:
     """Check drives (..., M), at least one, and return them as complex128 on the CPU, without gradient."""
-    drive = validate_drive(drive, transducers).detach().cpu()
+    drive = validate_drive(drive, transducers)
+    if drive.requires_grad and torch.is_grad_enabled():
+        _log_lost_gradient()
+    drive = drive.detach().cpu()
     if drive.numel() == 0:
         raise ValueError(f"drive: shape {tuple(drive.shape)}; must be (..., {transducers}), not empty")
     return drive
+
+
+@functools.cache  # once is enough: drives in a loop would fill the log
+def _log_lost_gradient() -> None:
+    logger.warning(
+        "an objective observes magnitudes without gradient, and the drive's is lost; propagator.field(drive, "
+        "points), at.differentiable_field and at.gradient_ascent have gradients"
+    )
 
 
 def validate_magnitudes(name: str, value: object, points: int) -> torch.Tensor:

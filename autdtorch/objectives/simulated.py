@@ -18,6 +18,10 @@ _PRODUCTS = 2**16  # of transfer matrix and drives, that are computed at once
 class SimulatedObjective:
     """An objective whose observations are simulated.
 
+    It gives magnitudes without gradient, as a measurement would (see `Objective`). With gradient, the
+    pressures of the control points are ``propagator.field(drive, scene.control_points)``, or ``drive @ G.mT``
+    with its `transfer_matrix` G.
+
     Attributes:
         scene: its array plays the drives, and its control points are observed.
         evaluations: number of observations so far.

@@ -95,7 +95,7 @@ def plane_magnitude(name: str, pressure: ArrayLike) -> Array:
 def outside_on_plane(magnitude: Array, plane: Plane, obstacles: Iterable[Obstacle]) -> Array:
     """Return |p| (Nu, Nv) on a plane, NaN in cells whose centres are inside obstacles.
 
-    The field in a body may be many times that in air, which alone is heard.
+    The field in a body may be many times that in air, and would take up the scale of a picture.
     """
     points = cell_centers_of(plane, (magnitude.shape[0], magnitude.shape[1]))
     return np.where(inside_any(points, obstacles).numpy(), np.nan, magnitude)

@@ -159,10 +159,10 @@ def _simulated(body: StillBody, folder: Path | None) -> tuple[torch.Tensor, torc
     cache = None if folder is None else DiskCache(folder)
     digest = digest_of(source_digest(), package_versions(), _described(body))
     if cache is not None and (found := cache.load(digest, shape)) is not None:
-        logger.info("scattering operator loaded from %s", folder)
+        logger.debug("scattering operator loaded from %s", folder)
         return torch.from_numpy(found[0]), waves.axes, found[1]
     spacing = 1e3 * body.solver.spacing
-    logger.info("simulating a scattering operator: %d waves, cells of %.3g mm", shape[0], spacing)
+    logger.debug("simulating a scattering operator: %d waves, cells of %.3g mm", shape[0], spacing)
     matrix, residual = waves.matrix()
     if cache is not None and residual <= body.solver.error:
         cache.save(digest, matrix.numpy(), residual)

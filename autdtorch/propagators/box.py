@@ -83,7 +83,7 @@ class BoxSimulation(Simulation):
         for group, axes in zip(plan.grouping.groups, plan.grouping.axes, strict=True):
             part = replace(plan.region, bodies=tuple(plan.region.bodies[one] for one in group))
             if is_turned(axes):
-                logger.info("the grid around obstacles %s is turned along their faces", list(group))
+                logger.debug("the grid around obstacles %s is turned along their faces", list(group))
             assembly = assembled_box(part, axes, plan.spacing, plan.dtype, plan.time_step)
             boxes.append(ScatteredField(assembly, plan.scene.complex_wavenumber, axes))
         return boxes

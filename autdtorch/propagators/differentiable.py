@@ -35,6 +35,7 @@ def differentiable_field(
     sound_speed: ArrayLike | None = None,
     spacing: float = 1e-3,
     periods: int | None = None,
+    device: torch.device | str | None = None,
     kernel: str = "auto",
     dtype: str | torch.dtype = "float32",
     time_step: float | None = None,
@@ -56,7 +57,9 @@ def differentiable_field(
         spacing: edge of a cell [m], at most a third of the wavelength.
         periods: periods of the drive that are stepped, in blocks of a few; the phasors are those of the last
             block. By default sound crosses the domain twice; resonances need more.
-        kernel: as in `make_propagator`.
+        device: as in `make_propagator`, as is `kernel`. The result is on the CPU; gradients pass to tensors
+            on any device.
+        kernel: the kernel.
         dtype: precision of the fields, float32 or float64.
         time_step: upper limit [s], as in `make_propagator`. The default, the largest stable one, may change
             with the medium from call to call, and the field slightly with it.
@@ -69,7 +72,7 @@ def differentiable_field(
             obstacles, or a differentiated obstacle reaches into the boundary layers.
     """
     require_kind("scene", scene, Scene)
-    kernel, precision = available_kernel(kernel), precision_of(dtype)
+    kernel, precision = available_kernel(kernel, device), precision_of(dtype)
     drive = validate_drive(drive, len(scene.array))
     targets = scene.control_points if points is None else points_tensor("points", points).cpu()
     require_inside(scene.domain, "points", targets)

@@ -64,6 +64,7 @@ def estimate(
     tolerance: float = 2e-3,
     *,
     method: str = "auto",
+    device: torch.device | str | None = None,
     kernel: str = "auto",
     dtype: str | torch.dtype = "float32",
 ) -> Estimate:
@@ -77,7 +78,8 @@ def estimate(
         scene: the scene.
         spacing: edge of a cell [m].
         tolerance: relative distance to the steady state, in (0, 1).
-        method: as in `make_propagator`, as are `kernel` and `dtype`.
+        method: as in `make_propagator`, as are `device`, `kernel` and `dtype`.
+        device: where simulations would run.
         kernel: the kernel.
         dtype: precision of the fields.
 
@@ -85,7 +87,7 @@ def estimate(
         ValueError: an argument is out of range.
     """
     spacing = positive("spacing", spacing, "m")
-    planned = plan(scene, method, spacing, tolerance, kernel=kernel, dtype=dtype)
+    planned = plan(scene, method, spacing, tolerance, kernel=kernel, dtype=dtype, device=device)
     if planned.method == "free_space" or not planned.runs:
         nodes = len(scene.array) * len(scene.control_points) * len(scene.array.nodes.weights)
         return Estimate(planned.method, None, 0, 0, planned.memory, _NODE_SECONDS * nodes)

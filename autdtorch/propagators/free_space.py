@@ -57,6 +57,6 @@ class FreeSpacePropagator:
 
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
         """Return the pressure of drives at points; see `SimulatedPropagator.field`."""
-        drive = validate_drive(drive, len(self.scene.array))
+        drive = validate_drive(drive, len(self.scene.array)).cpu()
         points, grid = points_grid("points", points)
         return (drive @ self.transfer_matrix(points).mT).reshape(*drive.shape[:-1], *grid)

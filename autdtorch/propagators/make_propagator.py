@@ -29,6 +29,7 @@ def make_propagator(
     spacing: float | None = 1e-3,
     tolerance: float = 2e-3,
     *,
+    device: torch.device | str | None = None,
     kernel: str = "auto",
     dtype: str | torch.dtype = "float32",
     max_periods: int = 600,
@@ -57,8 +58,11 @@ def make_propagator(
         tolerance: relative error, in (0, 1): the distance to the steady state at which a simulation ends,
             or the estimated error where the spacing is chosen. Hard obstacles are simulated as rigid where
             the difference is smaller.
+        device: where simulations run: "cpu", "cuda" (an NVIDIA GPU, the current one) or a `torch.device`; by
+            default a GPU if there is one. Results are on the CPU, and equal to rounding wherever they come
+            from.
         kernel: "cpu" (numba), "cuda" (Triton, on an NVIDIA GPU), "reference" (torch, slow, readable), or
-            "auto" for the fastest available.
+            "auto" for the fastest available on the device.
         dtype: precision of the fields, float32 or float64.
         max_periods: periods of the drive after which a simulation ends in any case, with a
             `SteadyStateWarning`. Periods are stepped in blocks of a few; the last block is completed.
@@ -74,10 +78,10 @@ def make_propagator(
         A propagator of the scene.
 
     Raises:
-        ValueError: an argument is out of range, the kernel needs a package that is not installed, or the
-            simulation needs more memory than available.
+        ValueError: an argument is out of range, the device or kernel needs a GPU or a package that is not
+            there, or the simulation needs more memory than available.
     """
-    planned = plan(scene, method, spacing, tolerance, kernel, dtype, max_periods, time_step)
+    planned = plan(scene, method, spacing, tolerance, kernel, dtype, max_periods, time_step, device)
     seconds = None if seconds is None else positive("seconds", seconds, "s")
     memory = None if memory is None else positive("memory", memory, "bytes")
     if spacing is not None and (seconds, memory) != (None, None):

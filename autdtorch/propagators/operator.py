@@ -77,6 +77,7 @@ class ScatteringOperator:
         error: float = 1e-3,
         kernel: str = "auto",
         *,
+        device: torch.device | str | None = None,
         cache: str | os.PathLike[str] | Literal[False] | None = None,
     ) -> ScatteringOperator:
         """Simulate the operator of obstacles; for a single sphere it is exact.
@@ -88,7 +89,8 @@ class ScatteringOperator:
             spacing: edge of a cell [m].
             error: relative error at which degrees are left out, and tolerance of the simulations, in
                 1e-8 to 0.1.
-            kernel: as in `make_propagator`.
+            kernel: as in `make_propagator`, as is `device`.
+            device: where simulations run.
             cache: folder for simulated operators, as in `make_propagator`: used again for the same body,
                 wherever it is.
 
@@ -101,7 +103,7 @@ class ScatteringOperator:
         require_kind("medium", medium, Medium)
         frequency = positive("frequency", frequency, "Hz")
         spacing, error = positive("spacing", spacing, "m"), number_between("error", error, 1e-8, 0.1)
-        solver = Solver(spacing, error, available_kernel(kernel))
+        solver = Solver(spacing, error, available_kernel(kernel, device))
         return cls(*placed(bodies, medium, frequency, solver).matrix(disk_cache(cache)))
 
     @property

@@ -81,6 +81,11 @@ class OperatorPropagator:
         """The time step of the box [s]."""
         return self._box.time_step
 
+    @property
+    def cells(self) -> int:
+        """Number of cells of all grids; 0 where the operators are known."""
+        return self._plan.cells if self._plan.runs else 0
+
     @cached_property
     def bodies(self) -> ScatteringBodies:
         """The bodies of the scene."""
@@ -160,7 +165,7 @@ class OperatorPropagator:
     @one_library_thread()
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
         """Return the pressure of drives at points; see `SimulatedPropagator.field`."""
-        drive = validate_drive(drive, len(self.scene.array))
+        drive = validate_drive(drive, len(self.scene.array)).cpu()
         places, grid = points_grid("points", points)
         places = self._checked(places)
         parts, masks = [], []
@@ -171,7 +176,10 @@ class OperatorPropagator:
         field, served = torch.cat(parts, dim=-1), torch.cat(masks)
         if not served.all():
             field = field.clone()
-            field[..., ~served] = self._box.field(drive, places[~served].detach())
+            near = places[~served].detach()
+            # Of a plane they stay a grid, for which the box may keep its matrix.
+            near = near if len(grid) == 1 else near[None]
+            field[..., ~served] = self._box.field(drive, near).reshape(*drive.shape[:-1], -1)
         return field.reshape(*drive.shape[:-1], *grid)
 
     @cached_property
@@ -196,7 +204,7 @@ class OperatorPropagator:
             matrix = matrix.index_put((served,), found[converged])
         if not served.all() and not self._logged:
             self._logged = True
-            logger.info("%d points are too near an obstacle for its waves: by box", int((~served).sum()))
+            logger.debug("%d points are too near an obstacle for its waves: by box", int((~served).sum()))
         return matrix, served
 
     def _converged(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

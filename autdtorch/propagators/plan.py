@@ -41,7 +41,15 @@ from autdtorch.scene.scene import Scene
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.threads import thread_count
 from autdtorch.utils.triangles import doubled_normals
-from autdtorch.utils.validation import integer_at_least, invalid, positive, require_kind, require_one_of
+from autdtorch.utils.validation import (
+    ON_CPU,
+    device_type,
+    integer_at_least,
+    invalid,
+    positive,
+    require_kind,
+    require_one_of,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -271,10 +279,11 @@ def plan(
     dtype: str | torch.dtype = "float32",
     max_periods: int = 600,
     time_step: float | None = None,
+    device: torch.device | str | None = None,
 ) -> Plan:
     """Plan a simulation, with the arguments of `make_propagator`; no spacing gives the coarsest."""
     require_kind("scene", scene, Scene)
-    region, kernel, precision = region_of(scene), available_kernel(kernel), precision_of(dtype)
+    region, kernel, precision = region_of(scene), available_kernel(kernel, device), precision_of(dtype)
     spacing = coarsest_spacing(region) if spacing is None else positive("spacing", spacing, "m")
     tolerance = positive("tolerance", tolerance)
     if tolerance >= 1:
@@ -318,16 +327,21 @@ def _by_operator(
     return "operator", waves
 
 
-def available_kernel(name: str) -> str:
-    """Return the checked name of a kernel, the fastest available for "auto"."""
+def available_kernel(name: str, device: torch.device | str | None = None) -> str:
+    """Return the checked name of a kernel, for "auto" the one of the device or the fastest available."""
     require_one_of("kernel", name, ("auto", "cpu", "cuda", "reference"))
-    has_triton = find_spec("triton") is not None
-    if name == "auto":
+    has_triton, kind = find_spec("triton") is not None, device_type("device", device)
+    if name != "auto" and kind not in (None, "cuda" if name == "cuda" else "cpu"):
+        raise invalid("device", str(device), f"must fit kernel {name!r}, or one of them be left out")
+    if name == "auto" and kind is None:
         has_cuda = torch.cuda.is_available()
         name = "cuda" if has_cuda and has_triton else "cpu"
         logger.debug("kernel auto: %s (CUDA device: %s, Triton: %s)", name, has_cuda, has_triton)
+    elif name == "auto":
+        name = str(kind)
     if name == "cuda" and not has_triton:
-        raise invalid("kernel", name, "needs Triton: pip install 'autdtorch[cuda]'")
+        field, value = ("kernel", name) if device is None else ("device", str(device))
+        raise invalid(field, value, f"needs Triton: pip install 'autdtorch[cuda]'; {ON_CPU}")
     return name
 
 

@@ -68,7 +68,7 @@ def refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPr
                 accepted = f"too few: at a spacing of {plan.spacing:.3g} m no run came near its steady state"
                 raise invalid("max_periods", pilot.max_periods, accepted)
             step = min(max((error / (_AIM * tolerance)) ** (1 / order), _SMALLEST_STEP), _LARGEST_STEP)
-        logger.info("spacing %.3g mm: estimated error %.2g", 1e3 * plan.spacing, error)
+        logger.debug("spacing %.3g mm: estimated error %.2g", 1e3 * plan.spacing, error)
         if error <= tolerance:
             return found
         for ratio in (step, _SMALLEST_STEP):

@@ -48,7 +48,7 @@ def hardened(region: Region, tolerance: float) -> Region:
             body = replace(body, fluid=None)
         bodies.append(body)
     if hard:
-        logger.info("obstacle %s is taken as rigid: the difference is below the tolerance", ", ".join(hard))
+        logger.debug("obstacle %s is taken as rigid: the difference is below the tolerance", ", ".join(hard))
     return replace(region, bodies=tuple(bodies)) if hard else region
 
 

@@ -18,6 +18,7 @@ from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.cache import DiskCache, cache_key
 from autdtorch.propagators.full import DomainSimulation
 from autdtorch.propagators.kept_fields import KeepingSimulation
+from autdtorch.propagators.kept_matrices import KeptMatrices
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.scene_region import warn_of_near_points
 from autdtorch.propagators.simulation import Run, TransferMatrix
@@ -62,6 +63,10 @@ class SimulatedPropagator:
     transducers are simulated and kept once they pay: after as many runs from points. More points outside the
     boxes, and more drives, then take sums and no runs.
 
+    The last transfer matrices are kept, up to 250 MB. Points that are given as a grid (Nu, Nv, 3), such as a
+    plane, are likely to be looked at again. Without a cache, their matrix is simulated once drives there have
+    taken as many runs as the matrix takes; more drives then take no runs.
+
     Attributes:
         scene: the scene it was made for.
         method: "box" or "full".
@@ -87,7 +92,7 @@ class SimulatedPropagator:
         # What a folder holds must not decide how later fields are computed: nothing is kept beside a cache.
         boxes = KeepingSimulation if cache is None else BoxSimulation
         self._simulation = DomainSimulation(plan) if plan.method == "full" else boxes(plan)
-        self._control: TransferMatrix | None = None
+        self._kept = KeptMatrices()
         self._transducers_ran = self._near_logged = self._near_points_logged = False
 
     def __repr__(self) -> str:
@@ -99,6 +104,11 @@ class SimulatedPropagator:
     def time_step(self) -> float:
         """The time step [s], of several boxes the shortest."""
         return self._simulation.time_step
+
+    @property
+    def cells(self) -> int:
+        """Number of cells of all grids."""
+        return self._plan.cells
 
     @property
     def planned_runs(self) -> int:
@@ -179,22 +189,26 @@ class SimulatedPropagator:
         """Return the pressure of drives at points, from a simulation for each drive or the transfer matrix.
 
         Args:
-            drive: (..., M) complex, |q| <= 1.
+            drive: (..., M) complex, |q| <= 1, on any device.
             points: (P, 3) or a grid such as (Nu, Nv, 3) [m].
 
         Returns:
-            complex128 (..., P) or (..., Nu, Nv) [Pa]; differentiable by the drive.
+            complex128 (..., P) or (..., Nu, Nv) [Pa], on the CPU; differentiable by the drive.
 
         Raises:
             ValueError: drive or points of another shape or out of range, as in `transfer_matrix`.
         """
-        drive = validate_drive(drive, len(self.scene.array))
+        drive = validate_drive(drive, len(self.scene.array)).cpu()
         points, grid = points_grid("points", points)
         points = self._simulation.checked(points)
         if len(grid) == 1:  # others are pictures, which may cross obstacles
             self._report_near(points)
         flat = drive.reshape(-1, drive.shape[-1])
-        by_matrix = drive.requires_grad or self._simulation.matrix_pays(len(flat), points)
+        # Planes are looked at again, with other drives. Beside a cache, earlier calls decide nothing.
+        revisited = len(grid) > 1 and self._cache is None
+        drives = len(flat) + (self._kept.runs(points) if revisited else 0)
+        known = revisited and self._kept.get(points) is not None
+        by_matrix = known or drive.requires_grad or self._simulation.matrix_pays(drives, points)
         rows = len(self.scene.array) if by_matrix else len(flat)
         require_memory("points", (*grid, 3), PAIR_BYTES * rows * len(points))
         if by_matrix:
@@ -205,31 +219,40 @@ class SimulatedPropagator:
         if (loud := flat.any(dim=1)).any():
             field[loud], runs = self._simulation.fields(flat[loud], points)
             self.runs += runs
+            if revisited:
+                self._kept.count(points, len(runs))
             self._transducers_ran |= bool(runs)
             self._report()
         return field.reshape(*drive.shape[:-1], *grid)
 
     def _result(self, points: torch.Tensor | None) -> TransferMatrix:
-        """Return the matrix of points, by default of the control points, which is kept."""
-        if points is not None:
-            return self._executed(points)
-        kept = self._control = self._control or self._executed(self.scene.control_points)
+        """Return the matrix of points, by default of the control points; it may be changed."""
+        kept = self._executed(self.scene.control_points if points is None else points)
         return replace(kept, matrix=kept.matrix.clone())
 
     def _executed(self, points: torch.Tensor) -> TransferMatrix:
-        """Return the matrix of points, simulated or from the cache. One that has converged is added to it."""
-        cache, key = self._cache, ""
-        if cache is not None:
-            key = cache_key(self._plan, points)
-            if (found := cache.load(key, (len(points), len(self.scene.array)))) is not None:
-                logger.info("transfer matrix of %s loaded from %s", self.scene.name, cache.folder)
-                return TransferMatrix(torch.from_numpy(found[0]), found[1], (), from_points=True)
-        result = self._simulation.transfer_matrix(points)
-        self.runs += result.runs
-        self._transducers_ran |= bool(result.runs) and not result.from_points
-        if cache is not None and all(run.reached for run in result.runs):
-            cache.save(key, result.matrix.numpy(), result.error)
+        """Return the matrix of points: kept, from the cache or simulated. The cache gets those converged."""
+        if (kept := self._kept.get(points)) is not None:
+            return kept
+        result = self._loaded(points)
+        if result is None:
+            result = self._simulation.transfer_matrix(points)
+            self.runs += result.runs
+            self._transducers_ran |= bool(result.runs) and not result.from_points
+            if self._cache is not None and all(run.reached for run in result.runs):
+                self._cache.save(cache_key(self._plan, points), result.matrix.numpy(), result.error)
+        self._kept.add(points, result)
         return result
+
+    def _loaded(self, points: torch.Tensor) -> TransferMatrix | None:
+        """Return the matrix of points from the cache, if it is there."""
+        if self._cache is None:
+            return None
+        shape = len(points), len(self.scene.array)
+        if (found := self._cache.load(cache_key(self._plan, points), shape)) is None:
+            return None
+        logger.debug("transfer matrix of %s loaded from %s", self.scene.name, self._cache.folder)
+        return TransferMatrix(torch.from_numpy(found[0]), found[1], (), from_points=True)
 
     @one_library_thread()
     def _with_error(self, points: torch.Tensor | None) -> TransferMatrix:

@@ -165,10 +165,10 @@ class Simulation(ABC):
             return self._simulate(sources, strength, receivers, progress.advance)
 
     def _progress(self, runs: int) -> AbstractContextManager[Progress]:
-        """Log so many runs, and show their progress."""
+        """Show the progress of so many runs."""
         plan, grids = self.plan, [assembly.grid for assembly in self.assemblies]
         what = f"simulating {plan.scene.name}"
         count = "1 run" if runs == 1 else f"{runs} runs"
-        logger.info("%s: %s, cells of %.3g mm, %s", what, plan.method, 1e3 * plan.spacing, count)
+        logger.debug("%s: %s, cells of %.3g mm, %s", what, plan.method, 1e3 * plan.spacing, count)
         arrival = max(grid.arrival for grid in grids)
         return show_progress(math.ceil(runs * USUAL_PERIODS * fewest_periods(arrival)), what)

@@ -67,7 +67,7 @@ class StudyFolder:
         if TRIALS_FILE in self._not_used:
             self.trials = self._trial_file()
         self.trials.mend()
-        if len(self.trials):
+        if len(self.trials) and len(self.scenes) < len(self._shapes):
             logger.info("re-using %d trials from %s", len(self.trials), self.path)
 
     def _take_up(self) -> None:

@@ -132,10 +132,15 @@ def run_study(
         kept.begin()
         with show_progress(len(missing) * (sum(counts.values()) + 2)) as progress:
             for name in missing:
-                place = name, propagators.pop(name), planes[name]
+                propagator = propagators.pop(name)
                 before = kept.scenes.get(_before(name, scenes)) if poses else None
+                place = name, propagator, planes[name]
                 finished = _run_scene(*place, methods, counts, seed, goal, kept.trials, progress, before)
                 kept.save(name, finished)
+                level = logging.DEBUG if poses else logging.INFO
+                logger.log(level, "%s: %s", name, _in_short(propagator, finished))
+        if poses and missing:
+            logger.info("%d poses, the last: %s", len(missing), _in_short(propagator, finished))
         return StudyResult(kept.provenance, {name: kept.scenes[name] for name in scenes})
 
 
@@ -169,7 +174,7 @@ def _for_poses(scenes: Mapping[str, Scene], solver: Mapping[str, Any]) -> dict[s
     runs = sum(one.runs for one in bodies.values())
     if runs > len(scenes) * each.planned_runs:
         return dict(solver)
-    logger.info("scattering operators: %d runs for all poses", runs)
+    logger.debug("scattering operators: %d runs for all poses", runs)
     return {**solver, "method": "operator"}
 
 
@@ -258,7 +263,7 @@ def _run_scene(
     before: SceneResult | None,
 ) -> SceneResult:
     scene = propagator.scene
-    progress.begin(f"{name}: transfer matrix")
+    progress.describe(f"{name}: transfer matrix")
     begin = time.perf_counter()
     transfer_matrix = propagator.transfer_matrix().cpu()
     matrix_seconds = time.perf_counter() - begin
@@ -278,7 +283,7 @@ def _run_scene(
 
         _run_trials(where, size, solved, trials, progress)
     found = {method_name: trials.found(name, method_name, count) for method_name, count in counts.items()}
-    progress.begin(f"{name}: observation plane")
+    progress.describe(f"{name}: observation plane")
     begin = time.perf_counter()
     planes, cell_area = _plane_pressures(
         propagator, [solution.drive for solution, _ in found.values()], plane
@@ -314,7 +319,7 @@ def _run_trials(
             continue
         first, last = block[0] + 1, block[-1] + 1
         numbers = f"trial {first}" if first == last else f"trials {first} to {last}"
-        progress.begin(f"{scene}: {method}, {numbers} of {count}")
+        progress.describe(f"{scene}: {method}, {numbers} of {count}")
         begin = time.perf_counter()
         solution = solve(trials=block)
         seconds = time.perf_counter() - begin
@@ -325,6 +330,33 @@ def _run_trials(
             raise invalid(f"method {method}", len(solution.score), accepted, "trials")
         trials.append(scene, method, block, solution, seconds)
         progress.advance(len(missing.intersection(block)))
+
+
+def _in_short(propagator: Propagator, result: SceneResult) -> str:
+    """Return the work of a scene in a line: how it was simulated, the error that is known, and the trials."""
+    simulation = result.simulation
+    work = "free space" if simulation.method == "free_space" else f"{simulation.method}, "
+    if isinstance(propagator, SimulatedPropagator | OperatorPropagator):
+        work += _accuracy(propagator, simulation)
+        if propagator.cells:
+            work += f", {propagator.cells:,} cells of {1e3 * propagator.spacing:.3g} mm"
+    parts = [f"{work}, {simulation.matrix_seconds + simulation.plane_seconds:.1f} s"]
+    for name, method in result.methods.items():
+        trials = "1 trial" if method.trials == 1 else f"{method.trials} trials"
+        parts.append(f"{name}, {trials}, {float(method.seconds.sum()):.1f} s")
+    return "; ".join(parts)
+
+
+def _accuracy(propagator: SimulatedPropagator | OperatorPropagator, simulation: Simulation) -> str:
+    """Return the number of simulations, and the relative error as far as it is known."""
+    if isinstance(propagator, OperatorPropagator):
+        waves = f"{propagator.planned_runs} waves" if propagator.cells else "exact waves"
+        return f"{waves}, error {propagator.tolerance:g}"
+    count, error = len(simulation.runs), propagator.known_error()
+    runs = "1 run" if count == 1 else f"{count} runs"
+    if math.isfinite(error):
+        return f"{runs}, estimated error {error:.1g}"
+    return f"{runs}, within {max((run.remaining for run in simulation.runs), default=0.0):.1g} of steady"
 
 
 def _plane_points(scene: Scene, spacing: float) -> torch.Tensor | None:

@@ -6,12 +6,13 @@ value raises a `ValueError` of one line, ``field: value unit; accepted range``.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import math
 import numbers
 import os
-import sys
 import re
+import sys
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias, TypeGuard
@@ -33,6 +34,9 @@ LENGTH_TOLERANCE = 1e-9
 any wavelength."""
 
 _UNIT_ROUNDING = 4 * sys.float_info.epsilon  # by which the computed length of a unit vector may differ from 1
+
+ON_CPU = "the CPU gives the same results, to rounding"
+"""Last words of messages about a missing GPU."""
 
 _NAME = re.compile(r"(?!\.+$)[\w.+-]+")
 _LONGEST_NAME = 100  # bytes
@@ -102,6 +106,35 @@ def _listed(name: str, value: object, accepted: str) -> list[Any]:
     except Exception as error:
         raise invalid(name, value, accepted) from error
     raise invalid(name, value, accepted)
+
+
+def device_type(name: str, value: object) -> str | None:
+    """Return "cpu" or "cuda", the type of a device given as text or `torch.device`, or None for None."""
+    if value is None:
+        return None
+    device = None
+    if isinstance(value, str | torch.device):
+        with contextlib.suppress(RuntimeError):  # of text that PyTorch does not know
+            device = torch.device(value)
+    if device is None or device.type not in ("cpu", "cuda"):
+        raise invalid(name, value, "must be 'cpu', 'cuda' or a torch.device of these")
+    if device.type == "cuda":
+        if not torch.cuda.is_available():
+            raise invalid(name, str(device), no_cuda())
+        current = torch.cuda.current_device()
+        if device.index not in (None, current):
+            accepted = f"must be the current one, cuda:{current}; torch.cuda.set_device chooses it"
+            raise invalid(name, str(device), accepted)
+    return device.type
+
+
+def no_cuda() -> str:
+    """Return for messages why PyTorch finds no CUDA device, and what to do."""
+    built = torch.version.cuda is not None
+    why = "it finds no GPU or driver" if built else "it is built for the CPU; pytorch.org has builds for CUDA"
+    return (
+        f"needs an NVIDIA GPU that PyTorch can use, but {why} (torch.cuda.is_available() is false); {ON_CPU}"
+    )
 
 
 def require_callable(name: str, value: object) -> None:

@@ -40,7 +40,15 @@ def run(folder: str, description: str) -> int:
     for name, summary in commands(folder).items():
         command = names.add_parser(name, help=summary, description=summary, formatter_class=_Help)
         if chosen == [name]:
-            module = importlib.import_module(f"{folder}.{name}")
+            try:
+                module = importlib.import_module(f"{folder}.{name}")
+            except ModuleNotFoundError as error:  # a package that only this command needs
+                missing = f"needs {error.name}, which is not installed; docs/install.md has the extras"
+                command.epilog = f"The command {missing}. Its options show when it is."
+                if {"-h", "--help"} & set(sys.argv[2:]):
+                    command.print_help()
+                    return 0
+                command.exit(2, f"{folder}/{name}.py {missing}\n")
             command.description = module.__doc__
             for flag, settings in getattr(module, "OPTIONS", {}).items():
                 command.add_argument(flag, **settings)

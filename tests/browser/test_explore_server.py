@@ -4,6 +4,7 @@ import asyncio
 import socket
 import urllib.error
 import urllib.request
+from concurrent.futures import ThreadPoolExecutor
 from urllib.parse import urlsplit
 
 import pytest
@@ -49,7 +50,8 @@ def socket_status(explorer, path, origin):
             except aiohttp.WSServerHandshakeError as error:
                 return error.status
 
-    return asyncio.run(shake())
+    with ThreadPoolExecutor(1) as thread:  # in this one, Playwright may have a loop
+        return thread.submit(asyncio.run, shake()).result()
 
 
 def parts(explorer):

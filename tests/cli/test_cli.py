@@ -18,6 +18,7 @@ import autdtorch.study.run
 from autdtorch.cli.config_files import CONFIGS
 from autdtorch.cli.settings import load_method
 from autdtorch.hardware import DEVICES, Limits
+from autdtorch.io.drive_file import save_drive
 from autdtorch.io.goal_section import GOALS, load_goal
 from autdtorch.io.scene_file import load_scene
 from autdtorch.methods.base import Method
@@ -147,6 +148,7 @@ WRONG = [
     (["+method.trials=3"], "method: unknown key 'trials'; allowed keys: levels"),
     (["+scene.colour=red"], "scene: unknown key 'colour'"),
     (["solver.spacing=abc"], "solver: spacing: 'abc'; must be a real number"),
+    (["solver.device=gpu"], "solver: device: 'gpu'; must be 'cpu', 'cuda' or"),
     (["solver.method=fast"], "solver: method: 'fast'; must be one of auto, free_space, box, full"),
     (["method.levels=1"], "method: levels: 1; must be an integer >= 2"),
     (["plane_spacing=1"], r"plane_spacing: 1\.0 m; must be at most 0\.1 m, the plane's edge"),
@@ -261,7 +263,7 @@ def test_one_scene_and_one_method(run, tmp_path, capsys):
     assert head.split()[:3] == ["scene", "method", "trials"]
     assert row.split()[:4] == ["homogeneous", "GABS", "2", f"{method.metrics.mean.mean():.2f}"]
     assert end == f"The results are in {Path('outputs', 'homogeneous_gabs')}"
-    assert "homogeneous: gabs, trials 1 to 2 of 2" in captured.err
+    assert captured.err.startswith("homogeneous: free space, ")
 
 
 def test_what_is_finished_is_not_computed_again(run, tmp_path, capsys, monkeypatch):
@@ -349,8 +351,59 @@ def test_help_tells_what_there_is(run, tmp_path, capsys):
     text = capsys.readouterr().out
     assert "autdtorch experiment=paper" in text
     assert f"scene: {', '.join(CONFIG_NAMES['scene'])}" in text
-    assert "  spacing: 0.001" in text
+    assert len(text.splitlines()) <= 45
     assert written(tmp_path) == set()
+
+
+def test_the_settings_of_the_help_are_those_there_are_with_their_defaults(run, capsys):
+    assert run("--help") == 0
+    rows = re.findall(r"^  ([a-z_.]+) +\S.* \[(.*)\]$", capsys.readouterr().out, re.MULTILINE)
+    assert len(rows) >= 8
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        config = compose("config")
+    for key, default in rows:
+        if key != "output":  # named after scene and method
+            assert (
+                OmegaConf.select(config, key, throw_on_missing=True) == OmegaConf.create(f"x: {default}").x
+            ), key
+
+
+@pytest.mark.parametrize("flag", ["--cfg", "--hydra-help"])
+def test_the_other_flags_that_the_help_names_print_and_run_nothing(run, tmp_path, capsys, flag):
+    assert run(flag, *(["job"] if flag == "--cfg" else [])) == 0
+    assert ("tolerance: 0.002" if flag == "--cfg" else "--multirun") in capsys.readouterr().out
+    assert written(tmp_path) == set()
+
+
+NUMBER = r"[\d.e-]+"
+
+
+@pytest.mark.parametrize(
+    ("given", "work"),
+    [
+        (["scene=homogeneous"], "homogeneous: free space"),
+        (["scene=sphere"], f"sphere: operator, exact waves, error {NUMBER}"),
+        (
+            ["scene=two_cubes", "solver.spacing=2.1e-3", "solver.tolerance=0.1"],
+            rf"two_cubes: box, \d runs?, within {NUMBER} of steady, [\d,]+ cells of 2.1 mm",
+        ),
+        (
+            ["scene=two_cubes", "solver.spacing=null", "solver.tolerance=0.1"],
+            rf"two_cubes: box, \d runs?, estimated error {NUMBER}, [\d,]+ cells of {NUMBER} mm",
+        ),
+    ],
+)
+def test_a_job_logs_one_line_of_cells_runs_error_and_seconds(run, capsys, given, work):
+    given = [*given, "method=gabs", "trials=2", "plane_spacing=0.02"]
+    assert run(*given) == 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.fullmatch(rf"{work}, {NUMBER} s; gabs, 2 trials, {NUMBER} s", line)
+    if "scene=sphere" in given:
+        assert run(*given) == 0  # finished before
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("re-using sphere from ")
+    assert run(*given, "hydra.verbose=autdtorch", "seed=1") == 0
+    assert "transfer matrix" in capsys.readouterr().err
 
 
 def test_solver_settings_are_the_defaults_of_make_propagator():
@@ -388,3 +441,47 @@ def test_a_path_of_the_obstacles_is_a_study_of_its_poses(run, tmp_path, refused)
     assert "count: 1; must be an integer >= 2" in refused(*coarse, "poses={count: 1}")
     assert "unknown key 'ofset'" in refused(*coarse, "poses={ofset: [0, 0, 0]}")
     assert "beside an experiment" in refused("experiment=paper", "poses={count: 2}")
+
+
+@pytest.mark.parametrize(
+    ("setting", "named"),
+    [
+        ("method=lssg", "method=lssg"),
+        ("solver.tolerance=0.1", "solver.tolerance"),
+        ("explore.port=70000", "port"),
+        ("+explore.other=1", "other"),
+        ("explore.drive=missing.npz", "missing.npz"),
+        ("solver.spacing=-1", "spacing"),
+    ],
+)
+def test_explore_refuses_settings_that_it_cannot_use(refused, setting, named):
+    assert named in refused("explore", "scene=sphere", setting)
+
+
+def test_explore_shows_the_scene_and_drive_of_the_settings(run, write, monkeypatch, capsys):
+    shown = {}
+
+    class Live:
+        address = "http://127.0.0.1:1/token/index.html"
+
+        def wait(self):
+            raise KeyboardInterrupt
+
+        def close(self):
+            shown["closed"] = True
+
+    def explore(scene, drive, **settings):
+        shown.update(settings, scene=scene, drive=drive)
+        return Live()
+
+    monkeypatch.setattr("autdtorch.cli.explore_command.explore", explore)
+    drive = np.linspace(0.1, 1, 16) * 1j
+    array = load_scene(CONFIGS / "scene" / "sphere.yaml").array
+    save_drive("drive.npz", drive, array)
+    arguments = ("explore", "scene=sphere", "explore.drive=drive.npz", "explore.browser=false")
+    assert run(*arguments, "solver.spacing=2e-3", "scene.frequency=41e3", "explore.port=8123") == 0
+    assert shown["scene"].frequency == 41e3
+    assert np.array_equal(shown["drive"], drive)
+    assert (shown["spacing"], shown["port"], shown["open_browser"]) == (2e-3, 8123, False)
+    assert shown["closed"]
+    assert Live.address in capsys.readouterr().out

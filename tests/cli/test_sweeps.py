@@ -4,6 +4,8 @@ import csv
 import os
 import shlex
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -27,6 +29,29 @@ def test_a_sweep_has_a_folder_for_each_job(run, tmp_path):
     assert jobs(tmp_path) == [
         f"method={name},plane_spacing=0.02,scene=homogeneous" for name in ("gabs", "lssg")
     ]
+
+
+@pytest.mark.parametrize("launcher", ["basic", "joblib"])
+def test_a_sweep_logs_a_line_for_each_job_between_its_start_and_its_end(tmp_path, launcher):
+    """In a process of its own, as workers write to stderr and not to what stands for it in a test."""
+    command = [
+        sys.executable,
+        "-m",
+        "autdtorch",
+        "-m",
+        *QUICK,
+        "method=gabs,lssg",
+        f"hydra/launcher={launcher}",
+    ]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    start, *each = done.stderr.splitlines()
+    assert start.startswith("sweep into multirun: ")
+    assert start.endswith("method=gabs,lssg")
+    assert sorted(line.partition(" free space")[0] for line in each) == [
+        "job 0: homogeneous:",
+        "job 1: homogeneous:",
+    ]
+    assert done.stdout.splitlines()[-1].startswith("autdtorch collect merges")
 
 
 def test_jobs_in_one_scene_share_its_matrices(run, tmp_path):
@@ -92,8 +117,8 @@ def test_settings_and_folders_of_jobs_can_be_pasted_into_a_shell(run, tmp_path, 
     (folder,) = jobs(tmp_path)
     assert shlex.quote(folder) == folder
     assert Path(shlex.split(printed.out.splitlines()[-2])[-1]) == Path("multirun", folder)
-    (job,) = (line for line in printed.err.splitlines() if line.startswith("job 0: "))
-    pasted = [setting.replace(" ", "") for setting in shlex.split(job.removeprefix("job 0: "))]
+    (begun,) = (line for line in printed.err.splitlines() if line.startswith("sweep into multirun: "))
+    pasted = [setting.replace(" ", "") for setting in shlex.split(begun.removeprefix("sweep into multirun: "))]
     assert pasted[:3] == list(settings[:3])
     assert pasted[3].startswith("poses={offset:[0,")
 

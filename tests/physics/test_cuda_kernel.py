@@ -20,8 +20,10 @@ from autdtorch.fdtd.kernels.cpu import CpuKernel
 from autdtorch.fdtd.kernels.cuda import Blocks, CudaKernel
 from autdtorch.fdtd.kernels.reference import ReferenceKernel
 from autdtorch.fdtd.stepping import assemble
-from autdtorch.propagators import make_propagator
+from autdtorch.propagators import SimulatedPropagator, make_propagator
+from autdtorch.propagators.plan import plan
 from autdtorch.propagators.scene_region import region_of
+from autdtorch.scene.drive import drive_from_phases
 from autdtorch.scene.obstacles import Box, Obstacle
 
 needs_gpu = pytest.mark.skipif(
@@ -135,14 +137,43 @@ def test_a_returned_state_stays_while_another_is_stepped() -> None:
     assert torch.equal(state.now, pressure)
 
 
-def test_a_missing_gpu_or_triton_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+def small_propagator(**given: object) -> SimulatedPropagator:
+    return make_propagator(small_scene((HEAVY,), SIZE), "full", **given)
+
+
+@pytest.mark.parametrize("name", ["device", "kernel"])
+def test_a_missing_gpu_or_triton_is_named(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(ValueError, match=r"kernel: 'cuda'; needs an NVIDIA GPU"):
-        make_propagator(small_scene((HEAVY,), SIZE), kernel="cuda")
+    for version, why in (("12.8", "it finds no GPU or driver"), (None, "it is built for the CPU")):
+        monkeypatch.setattr(torch.version, "cuda", version)
+        monkeypatch.setattr("triton.knobs.runtime.interpret", False)
+        with pytest.raises(ValueError, match=f"{name}: 'cuda'; needs an NVIDIA GPU .*{why}.*the CPU gives"):
+            small_propagator(**{name: "cuda"})
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     monkeypatch.setitem(sys.modules, "triton", None)
-    with pytest.raises(ValueError, match=r"kernel: 'cuda'; needs Triton: pip install 'autdtorch\[cuda\]'"):
-        make_propagator(small_scene((HEAVY,), SIZE), kernel="cuda")
+    with pytest.raises(ValueError, match=rf"{name}: 'cuda'; needs Triton: pip install 'autdtorch\[cuda\]'"):
+        small_propagator(**{name: "cuda"})
+
+
+@pytest.mark.parametrize("device", ["cuda", "cuda:0", torch.device("cuda")], ids=str)
+def test_a_device_chooses_its_kernel(device: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    scene = small_scene((HEAVY,), SIZE)
+    assert plan(scene, device=device).kernel == "cuda"
+    assert plan(scene, device=device, kernel="cuda").kernel == "cuda"
+    assert plan(scene, device="cpu").kernel == "cpu"
+    assert plan(scene, device=torch.device("cpu"), kernel="reference").kernel == "reference"
+    for given, message in (
+        ({"device": device, "kernel": "cpu"}, "device: 'cuda.*'; must fit kernel 'cpu'"),
+        ({"device": "cpu", "kernel": "cuda"}, "device: 'cpu'; must fit kernel 'cuda'"),
+        ({"device": "cuda:1"}, "device: 'cuda:1'; must be the current one, cuda:0"),
+        ({"device": "mps"}, "device: 'mps'; must be 'cpu', 'cuda' or a torch.device"),
+        ({"device": "gpu"}, "device: 'gpu'; must be 'cpu', 'cuda' or a torch.device"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            plan(scene, **given)
 
 
 def test_every_launch_compiles_for_a_gpu(tmp_path: Path) -> None:
@@ -169,7 +200,8 @@ def test_captured_steps_are_those_of_the_cpu_kernel(dtype: torch.dtype, toleranc
 @needs_gpu
 def test_transfer_matrix_is_that_of_the_cpu_kernel() -> None:
     scene = small_scene((CUBE,))
-    matrix, expected = (
-        make_propagator(scene, spacing=2e-3, kernel=kernel).transfer_matrix() for kernel in ("cuda", "cpu")
-    )
-    assert relative_error(matrix, expected) < 1e-4  # rounding in float32, of all of a run
+    on_gpu, on_cpu = (make_propagator(scene, spacing=2e-3, device=device) for device in ("cuda", "cpu"))
+    matrix, drive = on_gpu.transfer_matrix(), drive_from_phases([0.0, 1.0, 2.0, 3.0])
+    assert relative_error(matrix, on_cpu.transfer_matrix()) < 1e-4  # rounding in float32, of all of a run
+    found = on_gpu.field(drive.cuda(), scene.control_points)
+    assert relative_error(found, on_cpu.field(drive, scene.control_points)) < 1e-4

@@ -1,4 +1,4 @@
-"""Fields that a box keeps: other points, planes and drives are sums, and equal new simulations."""
+"""Fields that a box keeps, and matrices of planes: more points, planes and drives take no runs."""
 
 from dataclasses import replace
 
@@ -110,3 +110,50 @@ def test_what_a_cache_holds_changes_no_field(tmp_path):
             propagator.transfer_matrix(points)
         found.append(propagator.field(DRIVE, PLANE + 1e-3))
     assert torch.equal(*found)
+
+
+ACROSS = torch.stack(
+    torch.meshgrid(*(2e-3 * torch.arange(4.0, 10).double() for _ in range(2)), indexing="ij")
+)
+ACROSS = torch.stack((*ACROSS, torch.full_like(ACROSS[0], 12.3e-3)), dim=-1)  # a plane through the obstacle
+
+
+@pytest.mark.parametrize("method", ["box", "full", "operator"])
+@pytest.mark.parametrize("plane", [PLANE.reshape(5, 5, 3), ACROSS], ids=["behind", "across"])
+def test_the_matrix_of_a_plane_is_kept_once_its_drives_took_as_many_runs(method, plane):
+    def new():
+        return make_propagator(small_scene((ASIDE,)), method, 1.3e-3, SETTLED, dtype="float64", cache=False)
+
+    propagator, runs = new(), []
+    drives = torch.stack([DRIVE**power for power in range(1, 8)])
+    for drive in drives:
+        before = len(propagator.runs)
+        field = propagator.field(drive, plane)
+        runs.append(len(propagator.runs) - before)
+    assert runs == [1, 1, 1, 1, 4, 0, 0]  # a run for each of the four transducers
+    one = new().field(drives[-1], plane)  # simulated as a drive
+    assert relative_error(field, one) < SAME
+
+
+@pytest.mark.parametrize("method", ["box", "full"])
+def test_gradients_at_known_points_take_no_runs(method):
+    propagator = make_propagator(small_scene((ASIDE,)), method, 1.3e-3, tolerance=1e-2, cache=False)
+    points, drive = propagator.scene.control_points, DRIVE.clone().requires_grad_()
+    propagator.transfer_matrix()
+    before, fields = len(propagator.runs), []
+    for _ in range(3):
+        fields.append(propagator.field(drive, points))
+        fields[-1].abs().amin().backward()
+    assert len(propagator.runs) == before
+    assert drive.grad.abs().max() > 0
+    matrix = propagator.transfer_matrix(points)
+    matrix.zero_()  # the caller's own
+    assert torch.equal(propagator.field(drive, points), fields[0])
+
+
+def test_beside_a_cache_earlier_drives_decide_nothing(tmp_path):
+    plane = PLANE.reshape(5, 5, 3)
+    propagator = make_propagator(small_scene((ASIDE,)), "full", 1.3e-3, tolerance=1e-2, cache=tmp_path)
+    fields = [propagator.field(DRIVE, plane) for _ in range(6)]
+    assert len(propagator.runs) == 6
+    assert all(torch.equal(field, fields[0]) for field in fields)

@@ -71,7 +71,7 @@ def test_auto_takes_operators_where_they_are_fewer_runs():
 
 
 def test_points_near_a_body_are_served_by_the_box(caplog):
-    caplog.set_level(logging.INFO)
+    caplog.set_level(logging.DEBUG)
     near = torch.tensor([[12e-3, 12e-3, 14.2e-3], [14.6e-3, 12e-3, 12e-3]]).double()
     scene = scene_of(SMALL, points=torch.cat((POINTS, near)))
     matrix = operator(scene).transfer_matrix()

@@ -5,7 +5,7 @@ import pytest
 import torch
 from small_scenes import AIR, small_scene
 
-from autdtorch.objectives.objective import weakest_focus
+from autdtorch.objectives.objective import _log_lost_gradient, weakest_focus
 from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.propagators import FreeSpacePropagator, make_propagator
 from autdtorch.scene.arrays import TransducerArray
@@ -79,6 +79,30 @@ def test_a_row_does_not_depend_on_the_number_of_threads():
             assert torch.equal(objective(drive), expected)
     finally:
         torch.set_num_threads(threads)
+
+
+def test_the_end_of_a_gradient_is_logged_once_and_the_docstring_has_the_way_around(scene, drive, caplog):
+    _log_lost_gradient.cache_clear()
+    propagator = make_propagator(scene, "free_space")
+    objective = SimulatedObjective(scene, propagator)
+    objective(drive)
+    assert not caplog.records
+    by_drive = drive.clone().requires_grad_()
+    observed = objective(by_drive)
+    objective(by_drive)
+    assert not observed.requires_grad
+    (record,) = caplog.records
+    assert "the drive's is lost; propagator.field(drive, points)" in record.message
+    # d|p|/dq of one drive, through both ways that the docstring names
+    gradients = []
+    for pressure in (
+        propagator.field(by_drive, scene.control_points),
+        by_drive @ objective.transfer_matrix.mT,
+    ):
+        torch.testing.assert_close(pressure.detach().abs(), observed)
+        gradients += torch.autograd.grad(weakest_focus(pressure.abs()).sum(), by_drive)
+    assert gradients[0].abs().max() > 0
+    torch.testing.assert_close(*gradients)
 
 
 @pytest.mark.parametrize(

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
+from typing import Any
 
 import pytest
 from shared.document import DOCS, with_block
-from shared.runner import SCRIPTS, commands
+from shared.runner import SCRIPTS, commands, run
 
 FOLDERS = {"benchmark": "benchmarks", "check": "checks", "study": "studies"}
+PATHS = os.pathsep.join((str(SCRIPTS), str(SCRIPTS.parent)))
+OUTPUT: dict[str, Any] = {"capture_output": True, "text": True, "timeout": 120}
 
 
 @pytest.mark.parametrize("script", FOLDERS)
@@ -20,3 +26,58 @@ def test_every_command_has_a_summary_and_its_block_in_the_documentation(script: 
         source = (SCRIPTS / FOLDERS[script] / f"{name}.py").read_text(encoding="utf-8")
         for document in re.findall(r'^DOCUMENT = "(.+)"', source, re.MULTILINE):
             with_block((DOCS / document).read_text(encoding="utf-8"), f"{script}.py {name}", "")
+
+
+# In one process, which imports what all of them need. None may come as far as its work.
+ALL_HELP = """
+import importlib, sys
+from shared.runner import commands, run
+
+def work(given):
+    raise AssertionError("the work was started")
+
+for folder in sys.argv[1:]:
+    for name in commands(folder):
+        try:
+            importlib.import_module(f"{folder}.{name}").main = work
+        except ModuleNotFoundError:
+            pass  # of an extra; there is a help without its options
+        for flag in ("--help", "-h"):
+            sys.argv = [folder, name, flag]
+            try:
+                status = run(folder, "")
+            except SystemExit as end:
+                status = end.code
+            assert status == 0, (name, status)
+"""
+
+
+def test_the_help_of_every_command_is_printed_and_nothing_is_started(tmp_path) -> None:
+    code = [sys.executable, "-c", ALL_HELP, *FOLDERS.values()]
+    done = subprocess.run(code, cwd=tmp_path, env=os.environ | {"PYTHONPATH": PATHS}, **OUTPUT)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("usage: ") == 2 * sum(len(commands(folder)) for folder in FOLDERS.values())
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("script", [*FOLDERS, "hardware_trial", "one_node_slurm"])
+def test_the_help_of_a_script_is_printed_and_nothing_is_started(script: str, tmp_path) -> None:
+    code = [sys.executable, SCRIPTS / f"{script}.py", "--help"]
+    done = subprocess.run(code, cwd=tmp_path, env=os.environ | {"PYTHONPATH": PATHS}, **OUTPUT)
+    assert done.returncode == 0, done.stderr
+    source = (SCRIPTS / f"{script}.py").read_text(encoding="utf-8")
+    assert source.partition('"""')[2].partition("\n")[0].removesuffix('"""') in done.stdout
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_command_without_its_package_is_refused_in_a_line(monkeypatch, capsys) -> None:
+    def missing(name: str) -> None:
+        raise ModuleNotFoundError(f"No module named {name}", name="acoustools")
+
+    monkeypatch.setattr("shared.runner.importlib.import_module", missing)
+    monkeypatch.setattr(sys, "argv", ["check.py", "bound"])
+    with pytest.raises(SystemExit) as end:
+        run("checks", "")
+    assert end.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("checks/bound.py needs acoustools, which is not installed")

@@ -73,7 +73,7 @@ def test_many_cells_get_the_bound(monkeypatch: pytest.MonkeyPatch, caplog: pytes
     index, weight = random_weights(0, contrast=100.0, negative=0.2)
     iterated = largest_eigenvalue(index, weight, STENCIL, SHAPE)
     monkeypatch.setattr(stability, "MOST_CELLS", len(index) - 1)
-    with caplog.at_level(logging.INFO):
+    with caplog.at_level(logging.DEBUG):
         assert largest_eigenvalue(index, weight, STENCIL, SHAPE) > iterated
     assert f"{len(index)} heterogeneous cells" in caplog.text
 

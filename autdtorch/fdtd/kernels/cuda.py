@@ -16,7 +16,7 @@ from torch import Tensor
 from autdtorch.fdtd.kernels import cuda_steps
 from autdtorch.fdtd.kernels import cuda_tables as tables
 from autdtorch.fdtd.kernels.contract import Coefficients, Layer, Memory, Receivers, Sources, State
-from autdtorch.utils.validation import invalid
+from autdtorch.utils.validation import invalid, no_cuda
 
 _GRAPH_STEPS = 16  # Steps of a captured graph; even, so that both fields return to their places
 # Most cells of a grid whose steps are captured. Beyond, a step should take longer than its launches: 33
@@ -158,7 +158,7 @@ class CudaKernel:
         """Find the device; Triton may interpret without one."""
         interpreted = triton.knobs.runtime.interpret
         if not interpreted and not torch.cuda.is_available():
-            raise invalid("kernel", "cuda", "needs an NVIDIA GPU: torch.cuda.is_available() is false")
+            raise invalid("kernel", "cuda", no_cuda())
         self._device = torch.device("cpu" if interpreted else "cuda")
         self._blocks = blocks
         self._medium: DeviceMedium | None = None

@@ -291,6 +291,7 @@ class Session:
 
     def _change(self, situation: Situation) -> None:
         self._history.change(situation)
+        self._state.message = ""
 
     def _refuse(self, error: Exception) -> None:
         """Say why something cannot be, and set the page back."""
@@ -344,7 +345,7 @@ class Session:
                 {
                     "foci": [(index, str(index)) for index in range(len(points))], "focus": focus,
                     "plane": now.plane, "height": _mm(now.height), "range_height": [_mm(low), _mm(high)],
-                    "can_undo": self._history.can_undo, "can_redo": self._history.can_redo, "message": "",
+                    "can_undo": self._history.can_undo, "can_redo": self._history.can_redo,
                 }
             )  # fmt: skip
         self.picture.place(now, focus)
