@@ -35,14 +35,10 @@ def explore_scene(settings: dict[str, Any], modules: list[Any]) -> None:
         with within("explore.drive"):
             drive = load_drive(path_of("drive", file))
     scene = scene_of("scene", section_of(settings, "scene"), modules)
-    spacing = solver_of(settings)["spacing"]
-    explorer = explore(
-        scene, drive, spacing=spacing, port=section.get("port"), open_browser=section.get("browser")
-    )
+    spacing, port, browser = solver_of(settings)["spacing"], section["port"], section["browser"]
+    explorer = explore(scene, drive, spacing=spacing, port=port, open_browser=browser)
     try:
         print(f"The live view is at {explorer.address}\nCtrl+C ends it.", flush=True)
         explorer.wait()
     except KeyboardInterrupt:
         explorer.close()
-
-

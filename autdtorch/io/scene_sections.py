@@ -73,7 +73,9 @@ def scene_sections(scene: Scene, name: str) -> dict[str, Any]:
     }
     if scene.observation_plane is not None:
         plane = scene.observation_plane
-        sections["observation_plane"] = {field.name: list(getattr(plane, field.name)) for field in fields(Plane)}
+        sections["observation_plane"] = {
+            field.name: list(getattr(plane, field.name)) for field in fields(Plane)
+        }
     return sections
 
 
@@ -83,7 +85,10 @@ def write_files(scene: Scene, path: Path) -> None:
         name = f"{path.name}_{number}"
         if isinstance(obstacle, Mesh):
             vertices, faces = (part.numpy() for part in obstacle.surface())
-            with replacing(path.with_name(f"{name}.obj")) as partial, partial.open("w", encoding="utf-8") as file:
+            with (
+                replacing(path.with_name(f"{name}.obj")) as partial,
+                partial.open("w", encoding="utf-8") as file,
+            ):
                 np.savetxt(file, vertices, fmt="v %.17g %.17g %.17g")
                 np.savetxt(file, faces + 1, fmt="f %d %d %d")
         elif isinstance(obstacle, VoxelMask):

@@ -57,7 +57,7 @@ def parse_yaml(text: str, where: str) -> Config:
     """Read a mapping or list in YAML with OmegaConf, after checking the size with aliases expanded."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
-    from yaml import MarkedYAMLError, YAMLError  # type: ignore[import-untyped]
+    from yaml import MarkedYAMLError, YAMLError
 
     try:
         _require_bounded(text)

@@ -43,7 +43,7 @@ def volume_field(propagator: Propagator, drive: ArrayLike, spacing: float | None
     points = torch.cartesian_prod(*(low + (high - low) * step / count for low, high, step, count in axes))
     valid = are_shown(scene, points)
     field = torch.full((len(points),), complex(math.nan, math.nan), dtype=torch.complex128, device="cpu")
-    field[valid] = propagator.field(drive, points[valid])
+    field[valid] = propagator.field(drive, points[None, valid])[0]  # a grid, which may touch obstacles
     return field.reshape(counts)
 
 

@@ -94,9 +94,15 @@ def test_the_socket_needs_token_and_origin(explorer):
 
 @pytest.mark.parametrize(
     "path",
-    ["../../../../etc/passwd", "..%2f..%2f..%2fetc/passwd", "%2e%2e/%2e%2e/etc/passwd", "__explore/../page.py",
-     "__explore/%2e%2e/server.py", "__explore//etc/passwd"],
-)  # fmt: skip
+    [
+        "../../../../etc/passwd",
+        "..%2f..%2f..%2fetc/passwd",
+        "%2e%2e/%2e%2e/etc/passwd",
+        "__explore/../page.py",
+        "__explore/%2e%2e/server.py",
+        "__explore//etc/passwd",
+    ],
+)
 def test_files_outside_are_refused(explorer, path):
     host, token = parts(explorer)
     url = urlsplit(host)

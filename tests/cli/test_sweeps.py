@@ -118,7 +118,9 @@ def test_settings_and_folders_of_jobs_can_be_pasted_into_a_shell(run, tmp_path, 
     assert shlex.quote(folder) == folder
     assert Path(shlex.split(printed.out.splitlines()[-2])[-1]) == Path("multirun", folder)
     (begun,) = (line for line in printed.err.splitlines() if line.startswith("sweep into multirun: "))
-    pasted = [setting.replace(" ", "") for setting in shlex.split(begun.removeprefix("sweep into multirun: "))]
+    pasted = [
+        setting.replace(" ", "") for setting in shlex.split(begun.removeprefix("sweep into multirun: "))
+    ]
     assert pasted[:3] == list(settings[:3])
     assert pasted[3].startswith("poses={offset:[0,")
 

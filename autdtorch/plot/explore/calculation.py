@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -21,10 +22,18 @@ from autdtorch.methods.gradient import GradientAscent
 from autdtorch.objectives.bound import focus_bound
 from autdtorch.objectives.simulated import SimulatedObjective
 from autdtorch.plot.explore.situation import Situation
-from autdtorch.propagators import Propagator, make_propagator, volume_field
+from autdtorch.propagators import (
+    FreeSpacePropagator,
+    OperatorPropagator,
+    SimulatedPropagator,
+    make_propagator,
+    volume_field,
+)
 from autdtorch.propagators.volume import are_shown
 from autdtorch.scene.geometry import Plane
 from autdtorch.utils.array_types import Array
+
+Propagator: TypeAlias = FreeSpacePropagator | OperatorPropagator | SimulatedPropagator
 
 logger = logging.getLogger(__name__)
 
@@ -217,7 +226,8 @@ def _field(request: Request, propagator: Propagator, drive: torch.Tensor, spacin
     grid = sheet.points(plane_spacing(sheet, situation.scene.wavelength, request.fine))
     foci = situation.scene.control_points
     shown = are_shown(situation.scene, grid.reshape(-1, 3))
-    pressure = propagator.field(drive, torch.cat([foci, grid.reshape(-1, 3)[shown]]))
+    points = torch.cat([foci, grid.reshape(-1, 3)[shown]])
+    (pressure,) = propagator.field(drive, points[None])  # a grid, which may cross obstacles without a warning
     field = np.full(grid.shape[:2], complex(math.nan, math.nan))
     field[shown.reshape(field.shape).numpy()] = pressure[len(foci) :].numpy()
     return Result(request, drive, spacing, pressure[: len(foci)].abs(), field)

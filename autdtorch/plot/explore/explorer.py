@@ -69,7 +69,9 @@ class Explorer:
         """Make the application on a trame server; return what ends it."""
         session = Session(trame, self._situation, self._spacing, defer, self._note)
         session.begin(self._first_method)
-        view = rca.RemoteControlledArea(name="view", display="image", event_throttle_ms=30, trame_server=trame)
+        view = rca.RemoteControlledArea(
+            name="view", display="image", event_throttle_ms=30, trame_server=trame
+        )
         handler = view.create_view_handler(
             session.picture.plotter.render_window, encoder="jpeg", target_fps=_FRAMES,
             interactive_quality=_QUALITY, still_quality=_QUALITY,
@@ -82,4 +84,3 @@ class Explorer:
 
     def _note(self, situation: Situation) -> None:
         self._situation = situation
-

@@ -6,6 +6,17 @@ that name; `explorer` has both.
 
 from __future__ import annotations
 
+from typing import Any
+
+from autdtorch.plot.explore import saving
+from autdtorch.plot.explore.catalogue import choices
+from autdtorch.plot.explore.picture import gradient
+from autdtorch.plot.explore.readings import COLUMNS, in_mm
+from autdtorch.plot.explore.situation import OWN_PLANE, Situation
+
+FIRST_SURFACE = -6.0
+"""The level of the surface in the volume at first [dB]."""
+
 _SLIDER = """
 <label class="slider"><span>{label}</span>
   <input type="range" id="{name}" v-model.number="{name}" :min="{low}" :max="{high}" step="{step}"
@@ -73,11 +84,12 @@ def page(view: str) -> str:
   <section class="picture" aria-label="picture and readings" :aria-busy="shown != wanted" :data-shown="shown">
     <div class="view" role="img" :aria-label="summary">{view}</div>
     <div class="legend">
-      <span>{{{{ scale_low }}}}</span><span class="bar" :style="scale_style"></span><span>{{{{ scale_high }}}}</span>
+      <span>{{{{ scale_low }}}}</span><span class="bar" :style="scale_style"></span>
+      <span>{{{{ scale_high }}}}</span>
       <span class="hint">grey: in obstacles and next to transducers</span>
     </div>
-    <p class="hint">Drag an obstacle or a focus to move it, an obstacle with Shift to turn it; click a transducer
-      to choose it. Drag elsewhere to look around, scroll to zoom.</p>
+    <p class="hint">Drag an obstacle or a focus to move it, an obstacle with Shift to turn it. Click a
+      transducer to choose it. Drag elsewhere to look around, scroll to zoom.</p>
     <p id="summary" aria-live="polite">{{{{ summary }}}}</p>
     <div class="scroll" tabindex="0" role="region" aria-label="pressures">
       <table>
@@ -108,7 +120,8 @@ def page(view: str) -> str:
     </fieldset>
     <fieldset><legend>Drive</legend>
       {_choice("method", "method", "methods")}
-      <div class="row">{_button("find", "Find the phases", "busy")} {_button("cancel", "Cancel", "!busy")}</div>
+      <div class="row">{_button("find", "Find the phases", "busy")}
+        {_button("cancel", "Cancel", "!busy")}</div>
       <progress max="100" :value="progress" aria-label="progress of the method" v-show="busy"></progress>
       {_box("follow", "find them again after every move, by gradient ascent")}
       {_choice("transducer", "transducer", "transducers")}
@@ -130,3 +143,30 @@ def page(view: str) -> str:
     </fieldset>
   </section>
 </main>"""
+
+
+def first_state(situation: Situation) -> dict[str, Any]:
+    """Return the state of the page at first, but for what changes with the situation."""
+    scene = situation.scene
+    lower, upper = scene.domain
+    obstacles = [
+        f"{index}: {type(body.first).__name__.lower()}" for index, body in enumerate(situation.bodies)
+    ]
+    devices = [("", "no device"), *((name, name) for name in saving.devices_of(situation))]
+    planes = [(name, "as in the scene" if name == OWN_PLANE else name) for name in situation.planes]
+    return {
+        "trame__title": f"autdtorch explore: {scene.name}", "name": scene.name,
+        "message": "", "status": "", "summary": "", "saved": "", "python": "", "rows": [], "columns": COLUMNS,
+        "bodies": list(enumerate(obstacles)), "body": 0, "body_moves": False, "body_turns": False,
+        "focus": 0, "transducers": [(index, str(index)) for index in range(len(scene.array))],
+        "transducer": 0,
+        "methods": choices(), "method": "gradient_ascent", "follow": False, "busy": False, "progress": 0,
+        "planes": planes, "units": [("dB", "dB"), ("Pa", "Pa")], "unit": "dB", "reference": 1.0,
+        "volume": False, "surface": FIRST_SURFACE, "dark": False, "scale_low": "", "scale_high": "",
+        "scale_style": f"background: linear-gradient(to right, {', '.join(gradient())})",
+        "devices": devices, "device": "", "folder": "outputs/explore",
+        "shown": -1, "wanted": 0, "settled": 0,
+    } | {
+        f"range_{axis}": [in_mm(low), in_mm(high)]
+        for axis, low, high in zip("xyz", lower, upper, strict=True)
+    }  # fmt: skip

@@ -29,14 +29,14 @@ class Grip(NamedTuple):
 
     Attributes:
         kind: "body", "focus" or "transducer".
-        index: of it.
+        number: its index.
         place: where it is held (3,) [m].
         origin: its centre at this moment (3,) [m].
         angles: of a body at this moment (3,) [rad].
     """
 
     kind: str
-    index: int
+    number: int
     place: Array
     origin: Array
     angles: Vector = (0.0, 0.0, 0.0)
@@ -152,14 +152,16 @@ class Picture:
         renderer.SetDisplayPoint(x, y, depth)
         renderer.DisplayToWorld()
         *place, weight = renderer.GetWorldPoint()
-        return np.array(place) / weight / MM
+        found: Array = np.array(place) / weight / MM
+        return found
 
     def moved(self, grip: Grip, x: float, y: float) -> Array:
         """Return the place (3,) [m] of a grip that follows the mouse, at its distance from the camera."""
         near, far = (self.at(x, y, depth) for depth in (0.0, 1.0))
         along = far - near
         share = ((grip.place - near) @ along) / (along @ along)
-        return near + share * along
+        place: Array = near + share * along
+        return place
 
     def close(self) -> None:
         """Free the window."""

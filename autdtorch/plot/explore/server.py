@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
-import logging
 import secrets
 import threading
 from collections.abc import Awaitable, Callable
@@ -78,6 +77,7 @@ class Server:
     def _run(self) -> None:
         self._loop = asyncio.new_event_loop()
         asyncio.set_event_loop(self._loop)
+        self._loop.set_exception_handler(_note_failure)
         try:
             self._loop.run_until_complete(self._serve())
         except BaseException as error:
@@ -117,7 +117,7 @@ class Server:
         """Serve the pages below the token alone, and refuse what does not come from them."""
         app: web.Application = server.app
         app.middlewares.append(self._refuse_others)
-        folders = {"": www} | {name: path for name, path in self._trame.serve.items()}
+        folders = {"": www} | dict(self._trame.serve)
         for name, path in sorted(folders.items(), reverse=True):
             folder = path[0] if isinstance(path, list | tuple) else path
             app.router.add_static(f"/{self.token}/{name}", folder)
@@ -137,6 +137,12 @@ class Server:
             response.headers["Referrer-Policy"] = "no-referrer"  # the address has the token
             response.headers["X-Content-Type-Options"] = "nosniff"
         return response
+
+
+def _note_failure(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Log what failed in the loop, but not that a page was closed while something was sent to it."""
+    if not isinstance(context.get("exception"), ConnectionResetError):
+        loop.default_exception_handler(context)
 
 
 def _end_tasks(loop: asyncio.AbstractEventLoop) -> None:

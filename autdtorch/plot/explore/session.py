@@ -12,27 +12,25 @@ from typing import Any
 import numpy as np
 import torch
 
-from autdtorch.plot.data import in_decibels
 from autdtorch.plot.explore import saving
 from autdtorch.plot.explore.calculation import Calculator, Progress, Request, Result
-from autdtorch.plot.explore.catalogue import OFFERED, choices
+from autdtorch.plot.explore.catalogue import OFFERED
 from autdtorch.plot.explore.history import History
 from autdtorch.plot.explore.mouse import Mouse
-from autdtorch.plot.explore.picture import Grip, Picture, Scale, gradient
-from autdtorch.plot.explore.situation import OWN_PLANE, Situation
+from autdtorch.plot.explore.page import FIRST_SURFACE, first_state
+from autdtorch.plot.explore.picture import Grip, Picture, Scale
+from autdtorch.plot.explore.readings import MM, four_digits, in_degrees, in_mm, rows, summary
+from autdtorch.plot.explore.situation import Situation
 from autdtorch.scene.drive import amplitudes_of, phases_of
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.moving import angles_of
 from autdtorch.utils.array_types import Array
 
-_MM = 1e-3
 _DIGITS = 7  # decimals of lengths [m] from the page, whose steps are 0.1 mm
 
-_SURFACE = -6.0  # dB
 _NEW_FOCUS = 1.5  # wavelengths beside the last focus
 _PLACE, _TURN = ("body_x", "body_y", "body_z"), ("turn_x", "turn_y", "turn_z")
 _FOCUS = ("focus_x", "focus_y", "focus_z")
-_COLUMNS = ("focus", "x [mm]", "y [mm]", "z [mm]", "|p| [Pa]", "level [dB]")
 
 
 class Session:
@@ -156,58 +154,38 @@ class Session:
 
     def drag(self, grip: Grip, place: Array) -> None:
         """Move a body or a focus so that its grip is at a place (3,) [m]."""
-        offset = np.round((place - grip.place) / _MM, 1) * _MM
+        offset = np.round((place - grip.place) / MM, 1) * MM
         if grip.kind == "body":
-            body = self.now.bodies[grip.index]
+            body = self.now.bodies[grip.number]
             x, y, z = (round(one, _DIGITS) for one in (grip.origin + offset).tolist())
-            self._try(lambda: self.now.with_body(grip.index, (x, y, z), body.angles))
+            self._try(lambda: self.now.with_body(grip.number, (x, y, z), body.angles))
         else:
             points = self.now.scene.control_points.clone()
-            points[grip.index] = points.new_tensor((grip.origin + offset).round(_DIGITS))
+            points[grip.number] = points.new_tensor((grip.origin + offset).round(_DIGITS))
             self._try(lambda: self.now.with_points(points))
 
     def turn(self, grip: Grip, angle: float) -> None:
         """Turn a body about the vertical by an angle [rad] from where it was gripped."""
         if grip.kind == "body":
-            body = self.now.bodies[grip.index]
+            body = self.now.bodies[grip.number]
             turn = rotation_matrix((0.0, 0.0, angle)) @ rotation_matrix(grip.angles)
             a, b, c = angles_of(turn).tolist()
-            self._try(lambda: self.now.with_body(grip.index, body.center, (a, b, c)))
+            self._try(lambda: self.now.with_body(grip.number, body.center, (a, b, c)))
 
     def choose(self, grip: Grip) -> None:
         """Choose what was gripped in the lists of the page."""
         with self._state:
-            self._state[grip.kind] = grip.index
+            self._state[grip.kind] = grip.number
 
     # What the page changes
 
     def begin(self, method: str | None) -> None:
         """Set the state of the page, and what follows when it changes; run a method first, if given."""
-        state, scene = self._state, self.now.scene
-        lower, upper = scene.domain
-        for axis, low, high in zip("xyz", lower, upper, strict=True):
-            state[f"range_{axis}"] = [low / _MM, high / _MM]
-        names = [type(body.first).__name__.lower() for body in self.now.bodies]
-        devices = [("", "no device"), *((name, name) for name in saving.devices_of(self.now))]
-        planes = {"scene": "as in the scene"} | {axis: f"{axis}" for axis in "xyz"}
-        bar = f"background: linear-gradient(to right, {', '.join(gradient())})"
-        state.update(
-            {
-                "name": scene.name, "message": "", "status": "", "summary": "", "saved": "", "python": "",
-                "bodies": [(index, f"{index}: {name}") for index, name in enumerate(names)],
-                "transducers": [(index, str(index)) for index in range(len(scene.array))],
-                "methods": choices(), "devices": devices, "units": [("dB", "dB"), ("Pa", "Pa")],
-                "planes": [(name, planes[name]) for name in self.now.planes], "columns": _COLUMNS,
-                "body": 0, "focus": 0, "transducer": 0, "method": "gradient_ascent", "device": "",
-                "unit": "dB", "reference": 1.0, "surface": _SURFACE, "folder": "outputs/explore",
-                "follow": False, "volume": False, "busy": False, "progress": 0, "dark": False,
-                "rows": [], "scale_low": "", "scale_high": "", "scale_style": bar, "shown": -1, "wanted": 0, "settled": 0,
-                "trame__title": f"autdtorch explore: {scene.name}",
-            }
-        )  # fmt: skip
+        state = self._state
+        state.update(first_state(self.now))
         self._extras = state.follow, state.volume, self._surface()
         self._show_situation()
-        for names, changed in (
+        followed: list[tuple[tuple[str, ...], Callable[[], None]]] = [
             (("body", "focus", "transducer"), self._show_situation),
             ((*_PLACE, *_TURN), self._move_body),
             (_FOCUS, self._move_focus),
@@ -218,7 +196,8 @@ class Session:
             (("follow", "volume", "surface"), self._choose_extras),
             (("dark",), self._choose_dark),
             (("settled",), self._let_go),  # the last, as it follows changes that come with it
-        ):
+        ]
+        for names, changed in followed:
             state.change(*names)(lambda changed=changed, **_: changed())
         for action in (
             self.undo, self.redo, self.add_focus, self.remove_focus, self.in_phase, self.find,
@@ -230,7 +209,7 @@ class Session:
     def _move_body(self) -> None:
         index = self._chosen("body", len(self.now.bodies))
         if self.now.bodies and (entered := self._entered((*_PLACE, *_TURN), self._body_values(index))):
-            x, y, z = (round(_MM * one, _DIGITS) for one in entered[:3])
+            x, y, z = (round(MM * one, _DIGITS) for one in entered[:3])
             a, b, c = (math.radians(one) for one in entered[3:])
             self._try(lambda: self.now.with_body(index, (x, y, z), (a, b, c)))
 
@@ -238,7 +217,7 @@ class Session:
         index = self._chosen("focus", len(self.now.scene.control_points))
         if entered := self._entered(_FOCUS, self._focus_values(index)):
             points = self.now.scene.control_points.clone()
-            points[index] = points.new_tensor([round(_MM * one, _DIGITS) for one in entered])
+            points[index] = points.new_tensor([round(MM * one, _DIGITS) for one in entered])
             self._try(lambda: self.now.with_points(points))
 
     def _edit_drive(self) -> None:
@@ -253,11 +232,11 @@ class Session:
             self.settle()
 
     def _move_plane(self) -> None:
-        if entered := self._entered(("height",), (_mm(self.now.height),)):
-            self._try(lambda: self.now.with_plane(self.now.plane, _MM * entered[0]))
+        if entered := self._entered(("height",), (in_mm(self.now.height),)):
+            self._try(lambda: self.now.with_plane(self.now.plane, MM * entered[0]))
 
     def _choose_scale(self) -> None:
-        shown = 1.0 if self._reference is None else _digits(self._reference)
+        shown = 1.0 if self._reference is None else four_digits(self._reference)
         if (entered := self._entered(("reference",), (shown,))) and entered[0] > 0:
             self._reference = entered[0]
         self._show_field()
@@ -303,7 +282,7 @@ class Session:
         given = tuple(self._state[name] for name in names)
         if given == shown:
             return None
-        if not all(isinstance(one, int | float) and math.isfinite(one) for one in given):
+        if not all(type(one) in (int, float) and math.isfinite(one) for one in given):  # bool is an int
             self._show_situation()
             return None
         return tuple(map(float, given))
@@ -318,14 +297,14 @@ class Session:
 
     def _body_values(self, index: int) -> tuple[float, ...]:
         body = self.now.bodies[index]
-        return (*map(_mm, body.center), *(_degrees(one) for one in body.angles))
+        return (*map(in_mm, body.center), *(in_degrees(one) for one in body.angles))
 
     def _focus_values(self, index: int) -> tuple[float, ...]:
-        return tuple(map(_mm, self.now.scene.control_points[index].tolist()))
+        return tuple(map(in_mm, self.now.scene.control_points[index].tolist()))
 
     def _drive_values(self, index: int) -> tuple[float, float]:
         one = self.now.drive[index : index + 1]
-        return _degrees(float(phases_of(one))), round(float(amplitudes_of(one)), 4)
+        return in_degrees(float(phases_of(one))), round(float(amplitudes_of(one)), 4)
 
     def _show_situation(self) -> None:
         """Set the numbers of the page, and move what is in the picture."""
@@ -344,7 +323,8 @@ class Session:
             state.update(
                 {
                     "foci": [(index, str(index)) for index in range(len(points))], "focus": focus,
-                    "plane": now.plane, "height": _mm(now.height), "range_height": [_mm(low), _mm(high)],
+                    "plane": now.plane, "height": in_mm(now.height),
+                    "range_height": [in_mm(low), in_mm(high)],
                     "can_undo": self._history.can_undo, "can_redo": self._history.can_redo,
                 }
             )  # fmt: skip
@@ -417,14 +397,14 @@ class Session:
         self.picture.show_field(situation.sheet, magnitude, scale)
         self.picture.show_volume(result.volume, scale, self._surface())
         low, high = scale.limits
-        unit = "dB" if scale.decibels else "Pa"
+        zero = f"0 dB = {self._reference:.3g} Pa"
         with self._state:
             self._state.update(
                 {
-                    "rows": _rows(result, self._reference), "summary": _summary(result),
-                    "reference": _digits(self._reference), "shown": result.request.number,
-                    "scale_low": f"{low:.3g} {unit}",
-                    "scale_high": f"{high:.3g} {unit}" + (f" = {self._reference:.3g} Pa" if unit == "dB" else ""),
+                    "rows": rows(result, self._reference), "summary": summary(result),
+                    "reference": four_digits(self._reference), "shown": result.request.number,
+                    "scale_low": f"{low:.3g} {'dB' if scale.decibels else 'Pa'}",
+                    "scale_high": zero if scale.decibels else f"{high:.3g} Pa",
                 }
             )  # fmt: skip
         self.update()
@@ -433,40 +413,4 @@ class Session:
         """Return the level of the surface in the volume [dB] that the page asks for."""
         height = self._state.surface
         is_level = isinstance(height, int | float) and -60.0 <= height <= 0.0
-        return float(height) if is_level else _SURFACE
-
-
-def _mm(length: float) -> float:
-    return round(length / _MM, 4) + 0.0
-
-
-def _degrees(angle: float) -> float:
-    return round(math.degrees(angle), 6) + 0.0
-
-
-def _digits(value: float) -> float:
-    return float(f"{value:.4g}")
-
-
-def _rows(result: Result, reference: float) -> list[list[str]]:
-    """Return the lines of the table of foci."""
-    points = result.request.situation.scene.control_points
-    levels = in_decibels(result.pressure.numpy(), reference)
-    return [
-        [str(index), *(f"{one / _MM:.1f}" for one in point), f"{pressure:.3g}", f"{level:.1f}"]
-        for index, (point, pressure, level) in enumerate(
-            zip(points.tolist(), result.pressure.tolist(), levels.tolist(), strict=True)
-        )
-    ]
-
-
-def _summary(result: Result) -> str:
-    """Return the readings as a sentence or two."""
-    weakest = float(result.pressure.min())
-    text = f"Weakest focus {weakest:.3g} Pa"
-    if result.bound is not None:
-        text += f", {100 * weakest / result.bound:.0f} % of what any drive can reach ({result.bound:.3g} Pa)"
-    cells = f"cells of {result.spacing / _MM:.3g} mm"
-    if result.error is None:
-        return f"{text}. {cells.capitalize()}."
-    return f"{text}. Estimated error {100 * result.error:.2g} %, {cells}."
+        return float(height) if is_level else FIRST_SURFACE

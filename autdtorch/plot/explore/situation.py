@@ -187,4 +187,3 @@ class Situation:
 def _middle(obstacle: Obstacle) -> Vector:
     x, y, z = ((low + high) / 2 for low, high in zip(obstacle.lower, obstacle.upper, strict=True))
     return getattr(obstacle, "center", (x, y, z))
-

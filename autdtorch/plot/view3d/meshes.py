@@ -84,7 +84,8 @@ def add_axes(plotter: pyvista.Plotter, domain: tuple[Vector, Vector], ink: str) 
     axes = plotter.show_bounds(bounds=_bounds(domain), **titles, **style)
     for axis in range(3):
         axes.SetAxisLabels(axis, None)  # PyVista's are not round numbers, VTK's are
-    sides = np.subtract(*reversed(domain))
+    lower, upper = domain
+    sides = np.subtract(upper, lower)
     axes.SetScreenSize(_LETTERS[int(min(sides) >= _SHORT * max(sides))])
     axes.SetTitleOffset([_TITLES, _TITLES])
 
