@@ -9,6 +9,7 @@ import torch
 from autdtorch.propagators.simulated import Propagator
 from autdtorch.scene.drive import validate_single_drive
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.neighbours import nearest
 from autdtorch.utils.validation import ArrayLike, invalid, positive, require_kind
 
 _CLEARANCE = 0.5  # wavelengths around a transducer, where its own 1/r would hide the field of the others
@@ -49,9 +50,10 @@ def volume_field(propagator: Propagator, drive: ArrayLike, spacing: float | None
 
 def are_shown(scene: Scene, points: torch.Tensor) -> torch.Tensor:
     """Return which points (N, 3) [m] are neither in obstacles nor next to transducers, bool (N,)."""
-    valid = torch.ones(len(points), dtype=torch.bool, device="cpu")
-    for node in scene.array.nodes.positions.reshape(-1, 3):
-        valid &= torch.linalg.vector_norm(points - node, dim=1) > _CLEARANCE * scene.wavelength
+    gap, _ = nearest(points, scene.array.nodes.positions.reshape(-1, 3))
+    valid = gap > _CLEARANCE * scene.wavelength
     for obstacle in scene.obstacles:
-        valid &= ~obstacle.contains(points)
+        lower, upper = points.new_tensor(obstacle.lower), points.new_tensor(obstacle.upper)
+        near = ((points >= lower) & (points <= upper)).all(dim=1)  # distances to meshes are slow
+        valid[near] &= ~obstacle.contains(points[near])
     return valid

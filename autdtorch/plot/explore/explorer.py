@@ -18,7 +18,7 @@ from autdtorch.scene.scene import Scene
 
 _HEIGHT = 780  # pixels of the frame in a notebook
 _FRAMES = 30.0  # a second, at most
-_QUALITY = 85  # of JPEG; a second frame of higher quality would be rendered anew
+_QUALITY = {"interactive_quality": 75, "still_quality": 90}  # of JPEG; the second frame comes at rest
 
 
 class Explorer:
@@ -74,7 +74,7 @@ class Explorer:
         )
         handler = view.create_view_handler(
             session.picture.plotter.render_window, encoder="jpeg", target_fps=_FRAMES,
-            interactive_quality=_QUALITY, still_quality=_QUALITY,
+            **_QUALITY,
         )  # fmt: skip
         session.update = handler.update
         with DivLayout(trame) as layout:

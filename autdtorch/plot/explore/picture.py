@@ -19,6 +19,8 @@ from autdtorch.utils.validation import Vector
 
 _INK = {False: ("black", "white"), True: ("#e6e6e6", "#14171c")}  # lines and background, by dark
 _SAMPLES = 600  # along a ray through the scene, to find the body under the mouse
+_AROUND = 1.05  # height of the window over that of the domain's sphere, for letters around it
+_LETTERS = 9.0  # size of tick labels and titles
 _SAMPLES_A_PIXEL = 4
 _CHOSEN = 1.7  # size of the chosen focus
 _SURFACE_NAME = "isosurface"
@@ -63,11 +65,10 @@ class Scale(NamedTuple):
 class Picture:
     """The picture. All its methods are called in one thread, as OpenGL requires."""
 
-    def __init__(self, situation: Situation, dark: bool = False) -> None:
+    def __init__(self, situation: Situation) -> None:
         """Draw a situation, as yet without a field."""
-        ink, paper = _INK[dark]
         scene = situation.scene
-        self.plotter = meshes.empty_plotter(scene.domain, off_screen=True, ink=ink, paper=paper)
+        self.plotter = meshes.empty_plotter(scene.domain, off_screen=True)
         self._bodies = [meshes.add_obstacle(self.plotter, body.first) for body in situation.bodies]
         self._foci: list[Any] = []
         self._faces = meshes.add_transducers(
@@ -76,13 +77,25 @@ class Picture:
         self._sheet = meshes.plane_mesh(situation.sheet, np.full((1, 1), math.nan))
         self._actor = meshes.add_sheet(self.plotter, self._sheet, colours.PRESSURE_MAP, (0.0, 1.0))
         self._situation = situation
+        self.set_dark(False)
         self.place(situation, 0)
+        self._fitted = self.plotter.camera.parallel_scale
+        self.plotter.render_window.AddObserver("WindowResizeEvent", lambda *_: self._fit())
+
+    def _fit(self) -> None:
+        """Show the whole domain in a window of another size, unless the user has zoomed."""
+        camera = self.plotter.camera
+        if camera.parallel_scale == self._fitted:
+            width, height = self.plotter.render_window.GetSize()
+            lower, upper = map(np.array, self._situation.scene.domain)
+            radius = MM * float(np.linalg.norm(upper - lower)) / 2
+            camera.parallel_scale = self._fitted = _AROUND * radius * max(1.0, height / width)
 
     def set_dark(self, dark: bool) -> None:
         """Take light lines on a dark background, or dark on light."""
         ink, paper = _INK[dark]
         self.plotter.set_background(paper)
-        meshes.add_axes(self.plotter, self._situation.scene.domain, ink)
+        meshes.add_axes(self.plotter, self._situation.scene.domain, ink, _LETTERS)
 
     def place(self, situation: Situation, focus: int) -> None:
         """Move bodies and foci; `focus` is the chosen one."""

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from autdtorch.plot.data import largest
 from autdtorch.plot.explore import saving
 from autdtorch.plot.explore.calculation import Calculator, Progress, Request, Result
 from autdtorch.plot.explore.catalogue import OFFERED
@@ -228,7 +229,6 @@ class Session:
     def _choose_plane(self) -> None:
         if self._state.plane != self.now.plane:
             self._try(lambda: self.now.with_plane(self._state.plane))
-            self._reference = None
             self.settle()
 
     def _move_plane(self) -> None:
@@ -304,7 +304,7 @@ class Session:
 
     def _drive_values(self, index: int) -> tuple[float, float]:
         one = self.now.drive[index : index + 1]
-        return in_degrees(float(phases_of(one))), round(float(amplitudes_of(one)), 4)
+        return round(math.degrees(float(phases_of(one))), 2), round(float(amplitudes_of(one)), 4)
 
     def _show_situation(self) -> None:
         """Set the numbers of the page, and move what is in the picture."""
@@ -389,20 +389,20 @@ class Session:
         if (result := self._result) is None:
             return
         magnitude = np.abs(result.field)
-        if self._reference is None:
-            known = magnitude[np.isfinite(magnitude)]
-            self._reference = float(known.max()) if known.size and known.max() > 0 else 1.0
-        scale = Scale(self._reference, self._state.unit != "Pa")
+        reference = self._reference or largest(magnitude) or 1.0
+        if result.request.number == self._number:
+            self._reference = reference
+        scale = Scale(reference, self._state.unit != "Pa")
         situation = result.request.situation
         self.picture.show_field(situation.sheet, magnitude, scale)
         self.picture.show_volume(result.volume, scale, self._surface())
         low, high = scale.limits
-        zero = f"0 dB = {self._reference:.3g} Pa"
+        zero = f"0 dB = {reference:.3g} Pa"
         with self._state:
             self._state.update(
                 {
-                    "rows": rows(result, self._reference), "summary": summary(result),
-                    "reference": four_digits(self._reference), "shown": result.request.number,
+                    "rows": rows(result, reference), "summary": summary(result),
+                    "reference": four_digits(reference), "shown": result.request.number,
                     "scale_low": f"{low:.3g} {'dB' if scale.decibels else 'Pa'}",
                     "scale_high": zero if scale.decibels else f"{high:.3g} Pa",
                 }

@@ -59,16 +59,14 @@ def new_plotter(scene: Scene, off_screen: bool) -> pyvista.Plotter:
     return plotter
 
 
-def empty_plotter(
-    domain: tuple[Vector, Vector], off_screen: bool, ink: str = "black", paper: str = "white"
-) -> pyvista.Plotter:
-    """Return a plotter with axes around a domain [m] and the camera, in colours of lines and background."""
+def empty_plotter(domain: tuple[Vector, Vector], off_screen: bool) -> pyvista.Plotter:
+    """Return a plotter with axes around a domain [m] and the camera."""
     import pyvista
 
     with pyvista.vtk_verbosity("error"):  # VTK warns of a missing X server, which it does not need
         plotter = pyvista.Plotter(off_screen=off_screen, window_size=list(_WINDOW))
-    plotter.set_background(paper)
-    add_axes(plotter, domain, ink)
+    plotter.set_background("white")
+    add_axes(plotter, domain)
     plotter.view_vector(_CAMERA, viewup=(0.0, 0.0, 1.0))
     plotter.enable_parallel_projection()
     plotter.reset_camera(bounds=_bounds(domain))
@@ -76,8 +74,13 @@ def empty_plotter(
     return plotter
 
 
-def add_axes(plotter: pyvista.Plotter, domain: tuple[Vector, Vector], ink: str) -> None:
-    """Draw axes around a domain [m], in place of those that are there."""
+def add_axes(
+    plotter: pyvista.Plotter, domain: tuple[Vector, Vector], ink: str = "black", letters: float | None = None
+) -> None:
+    """Draw axes around a domain [m], in place of those that are there.
+
+    Letters have the size of VTK's screen units; by default that of a picture shown at half its size.
+    """
     plotter.remove_bounds_axes()
     titles = {f"{name}title": f"{name} [mm]" for name in "xyz"}
     style = {"grid": "back", "location": "outer", "fmt": "%.0f", "color": ink, "font_size": 15}
@@ -86,7 +89,7 @@ def add_axes(plotter: pyvista.Plotter, domain: tuple[Vector, Vector], ink: str) 
         axes.SetAxisLabels(axis, None)  # PyVista's are not round numbers, VTK's are
     lower, upper = domain
     sides = np.subtract(upper, lower)
-    axes.SetScreenSize(_LETTERS[int(min(sides) >= _SHORT * max(sides))])
+    axes.SetScreenSize(letters or _LETTERS[int(min(sides) >= _SHORT * max(sides))])
     axes.SetTitleOffset([_TITLES, _TITLES])
 
 
