@@ -277,7 +277,7 @@ def test_every_rule_is_needed():
         assert pattern == explore or any(re.match(pattern, text) for text in texts), pattern
 
 
-# docs/hardware.md opens devices and an oscilloscope: emulated ones take their places.
+# These pages open devices and an oscilloscope: emulated ones take their places.
 EMULATED = """
 from pathlib import Path
 
@@ -318,7 +318,7 @@ for name in ("left", "right"):
     places, pins = "(0, 0, 0) " * 256, " ".join(map(str, range(256)))
     Path(f"{name}.pat").write_text("\\n".join([name, "256", "128", places, pins, zeros, gains]))
 """
-STAND_INS = {"docs/hardware.md": EMULATED}
+STAND_INS = {"docs/hardware.md": EMULATED, "docs/devices.md": EMULATED}
 NOT_RUN = {"docs/explore.md": "waits for a browser"}
 
 
