@@ -228,7 +228,7 @@ def left_out(reason):
     return rule
 
 
-SHORT = "trials=1 solver.spacing=2e-3"
+SHORT = "trials=1 solver.spacing=2e-3 plane_spacing=4e-3"
 RULES = [
     (r"pip install ", installs),
     (r"make ", makes),
