@@ -358,7 +358,7 @@ def test_the_factor_between_simulation_and_bench_is_found():
 def test_the_documented_scene_lies_in_the_middle_of_a_sonicsurface(tmp_path):
     """With the device turned as the documentation says, for the transducers of its command."""
     text = (Path(__file__).parents[2] / "docs" / "hardware.md").read_text("utf-8")
-    block = re.search(r"```yaml\n(name.*?)```", text, re.DOTALL)
+    block = re.search(r"```yaml\n# .*\n(name.*?)```", text, re.DOTALL)
     chosen = re.search(r"transducers[=:] *[\"']*([0-9][0-9,-]+)", text)
     assert block is not None
     assert chosen is not None

@@ -4,11 +4,13 @@ import inspect
 import os
 import subprocess
 import sys
+import tomllib
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import pytest
+import yaml
 from filelock import FileLock
 from sphinx.util.inventory import InventoryFile
 
@@ -55,6 +57,17 @@ def built(tmp_path_factory):
 @pytest.fixture(scope="session")
 def pages(built):
     return {path: Page(path) for path in built.rglob("*.html")}
+
+
+def test_the_citation_names_the_package_and_the_paper():
+    citation = yaml.safe_load((DOCS.parent / "CITATION.cff").read_text("utf-8"))
+    project = tomllib.loads((DOCS.parent / "pyproject.toml").read_text("utf-8"))["project"]
+    assert (citation["authors"], citation["license"]) == (project["authors"], project["license"])
+    assert citation["title"].startswith(project["name"])
+    (paper,) = citation["references"]
+    faq = " ".join((DOCS / "faq.md").read_text("utf-8").split())
+    assert paper["title"] in faq
+    assert paper["doi"] in faq
 
 
 def test_every_notebook_was_executed(built, pages):

@@ -1,0 +1,345 @@
+"""Every command and every block of Python in README and the documentation runs, or a rule says why not.
+
+The commands of a page run in their order in one folder, a copy of what a clone holds. So do its blocks of
+Python, in one process. Cells of notebooks are executed by the build of the documentation (test_docs.py).
+"""
+
+import importlib
+import itertools
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).parents[2]
+PAGES = [
+    page.relative_to(ROOT).as_posix()
+    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/**/*.md")))
+]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+
+
+class Command(NamedTuple):
+    page: str
+    text: str
+    variables: str = ""  # assignments of its block
+
+
+# --- what the pages hold
+
+
+def text_of(page):
+    return (ROOT / page).read_text("utf-8")
+
+
+def blocks(page, language):
+    return re.findall(rf"^```{language}\n(.*?)^```$", text_of(page), re.DOTALL | re.MULTILINE)
+
+
+def listed(page):
+    """Yield the commands of the page's ```sh blocks."""
+    for block in blocks(page, "sh"):
+        variables = ""
+        for line in block.replace("\\\n", " ").splitlines():
+            text = re.sub(r"(^|\s+)#\s.*$", "", line).strip()
+            if re.match(r"\w+=", text):
+                variables += f"{text}; "
+            elif text:
+                yield Command(page, text, variables)
+
+
+def mentioned(page):
+    """Yield commands in the text: indented, or `code` that begins like one."""
+    prose = re.sub(r"^```.*?^```$", "", text_of(page), flags=re.DOTALL | re.MULTILINE)
+    programs = r"(?:python scripts/|autdtorch |make |pytest |pip install )"
+    for text in re.findall(rf"^    ({programs}.*)$", prose, re.MULTILINE):
+        yield Command(page, re.sub(r"\s+#\s.*$", "", text))
+    for text in re.findall(rf"`({programs}[^`]+)`", " ".join(prose.split())):
+        if "..." not in text and "$" not in text:  # a command with something left to fill in
+            yield Command(page, text)
+
+
+LISTED = {page: found for page in PAGES if (found := list(listed(page)))}
+IN_BLOCKS = {command.text for found in LISTED.values() for command in found}
+MENTIONED = sorted(
+    {command for page in PAGES for command in mentioned(page) if command.text not in IN_BLOCKS}
+)
+PYTHON = {
+    page: "".join(f"{block}\n" for block in found) for page in PAGES if (found := blocks(page, "python"))
+}
+
+
+# --- a folder like a clone
+
+
+def furnish(folder):
+    """Make what a clone has, and the files that pages tell to write: YAML blocks that begin with `# name`."""
+    shutil.copytree(ROOT / "configs", folder / "configs")
+    (folder / "docs").mkdir()
+    for name in ("scripts", "constraints.txt", "pyproject.toml", "Makefile"):
+        (folder / name).symlink_to(ROOT / name)
+    for page in PAGES:
+        for block in blocks(page, "yaml"):
+            if named := re.match(r"# ([\w/]+\.yaml)\b", block):
+                path = folder / named[1]
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(block, "utf-8")
+    # scenes, a method and a launcher of the user's own
+    scene = (folder / "configs/scene/two_cubes.yaml").read_text("utf-8")
+    (folder / "mine/scene/duct.yaml").write_text(scene.replace("two_cubes", "duct"), "utf-8")
+    zone = folder / "mine/scene/zone.yaml"
+    others = re.sub(r"^control_points:.*?(?=^\S)", "", scene, flags=re.DOTALL | re.MULTILINE)
+    zone.write_text(others.replace("two_cubes", "zone") + zone.read_text("utf-8"), "utf-8")
+    (climb,) = (
+        cell for cell in blocks("docs/extending.md", r"\{code-cell\} ipython3") if "class HillClimb" in cell
+    )
+    (folder / "climbing.py").write_text(climb, "utf-8")
+    launcher = folder / "cluster/hydra/launcher/mine.yaml"
+    launcher.parent.mkdir(parents=True)
+    shutil.copy(ROOT / "configs/hydra/launcher/slurm.yaml", launcher)
+    programs = folder / "programs"
+    programs.mkdir()
+    for name, arguments in {"autdtorch": "-m autdtorch", "python": ""}.items():
+        (programs / name).write_text(f'#!/bin/sh\nexec "{sys.executable}" {arguments} "$@"\n', "utf-8")
+        (programs / name).chmod(0o755)
+
+
+def run(command, folder):
+    environment = {
+        **os.environ,
+        "PATH": f"{folder / 'programs'}{os.pathsep}{os.environ['PATH']}",
+        "PYTHONPATH": str(ROOT),
+        "MPLBACKEND": "Agg",
+    }
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, input="\n")
+
+
+# --- rules
+
+
+def runs(extra=""):
+    """The command runs, with `extra` settings that make it shorter."""
+
+    def rule(command, folder):
+        done = run(["bash", "-ec", f"{command.variables}{command.text} {extra}"], folder)
+        assert done.returncode == 0, done.stdout + done.stderr
+
+    return rule
+
+
+def parses(command, folder):
+    """The script exists and accepts the arguments; it would run for minutes to hours."""
+    from shared import runner
+
+    _, script, *arguments = shlex.split(command.text)
+    names = {"benchmark": "benchmarks", "study": "studies", "check": "checks"}
+    package = names[Path(script).stem]
+    assert (ROOT / script).is_file()
+    assert arguments[0] in runner.commands(package)
+    source = (ROOT / "scripts" / package / f"{arguments[0]}.py").read_text("utf-8")
+    if "autdtorch[crosscheck]" in source:  # may not be installed, and a page that names it says so
+        assert "crosscheck" in text_of(command.page)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [Path(script).name, *arguments])
+        try:
+            module = importlib.import_module(f"{package}.{arguments[0]}")
+        except ModuleNotFoundError:
+            if "autdtorch[crosscheck]" not in source:
+                raise
+            return
+        patch.setattr(module, "main", lambda given: 0)
+        assert runner.run(package, "") == 0
+
+
+def installs(command, folder):
+    """Files, extras and pins exist; CI installs the package by `make test`."""
+    arguments = shlex.split(command.text)[2:]
+    pins = {pin.name: pin for pin in map(Requirement, pinned_lines())}
+    for option, value in itertools.pairwise(arguments):
+        assert option != "-c" or (ROOT / value).is_file()
+    for argument in arguments:
+        if argument.startswith("."):
+            extras = Requirement(f"autdtorch{argument[1:]}").extras
+            assert extras <= set(PROJECT["project"]["optional-dependencies"])
+        elif "==" in argument:
+            wanted = Requirement(argument)
+            assert wanted.specifier == pins[wanted.name].specifier
+
+
+def pinned_lines():
+    lines = text_of("constraints.txt").splitlines()
+    return [line for line in lines if line and not line.startswith("#")]
+
+
+def makes(command, folder):
+    """`make` knows the target and its variables; CI runs `make test` and `make lint`."""
+    program, *arguments = shlex.split(command.text)
+    done = run([program, "-n", *arguments], folder)
+    assert done.returncode == 0, done.stderr
+
+
+def selects(command, folder):
+    """The files and the marker exist; the tests run in this suite."""
+    arguments = iter(shlex.split(command.text)[1:])
+    markers = {marker.partition(":")[0] for marker in PROJECT["tool"]["pytest"]["ini_options"]["markers"]}
+    for argument in arguments:
+        if argument == "-m":
+            assert next(arguments) in markers
+        else:
+            assert (ROOT / argument).exists()
+
+
+def substituted(command, folder):
+    """Only the part in $(...) runs: the rest needs root. It prints the name of a file."""
+    inner = re.search(r"\$\((.*)\)", command.text)
+    done = run(["bash", "-ec", inner[1]], folder)
+    assert Path(done.stdout.strip()).is_file(), done.stderr
+
+
+def covered_by(path, name):
+    """Another test runs the command."""
+
+    def rule(command, folder):
+        assert f"def {name}(" in text_of(path)
+
+    return rule
+
+
+def launches(command, folder):
+    """Hydra finds the launcher and prints its settings; tests/cli/test_slurm.py runs sweeps on Slurm."""
+    one_job = re.sub(r"(=\w+),\w+", r"\1", command.text.replace(" -m ", " "))
+    runs("--cfg hydra")(command._replace(text=one_job), folder)
+
+
+def left_out(reason):
+    """The command cannot run in a test."""
+
+    def rule(command, folder):
+        assert reason
+
+    return rule
+
+
+SHORT = "trials=1 solver.spacing=2e-3 plane_spacing=4e-3"
+RULES = [
+    (r"pip install ", installs),
+    (r"make ", makes),
+    (r"pytest ", selects),
+    (r"python scripts/(benchmark|study|check)\.py ", parses),
+    (r"python3 -m venv ", left_out("makes an environment, as `make test` does")),
+    (r"sudo cp ", substituted),
+    (r"sudo udevadm ", left_out("needs root, and a device")),
+    (r"jupyter lab ", left_out("waits for a browser")),
+    (r"jupytext ", covered_by("tests/docs/test_notebooks.py", "test_jupytext_executes_a_page")),
+    (r"autdtorch explore\b", left_out("waits for a browser")),
+    (r"autdtorch .*hydra/launcher=mine", launches),
+    (r"python scripts/hardware_trial.py \$bench", runs("hardware.emulated=true")),
+    (r"autdtorch hardware=emulated|python scripts/hardware_trial.py ", runs()),
+    (r"autdtorch .*poses=", runs("solver.spacing=2e-3 poses.count=3")),
+    (r"autdtorch collect |autdtorch --help", runs()),
+    (r"autdtorch ", runs(SHORT)),
+    (r"python -c ", runs()),
+]
+
+
+def follow(command, folder):
+    for pattern, rule in RULES:
+        if re.match(pattern, command.text):
+            return rule(command, folder)
+    pytest.fail(f"{command.page}: no rule says how to test {command.text!r}")
+
+
+# --- tests
+
+
+@pytest.mark.parametrize("page", LISTED)
+def test_commands_of_a_page_run(page, tmp_path):
+    furnish(tmp_path)
+    for command in LISTED[page]:
+        assert "..." not in command.text, "is no command"
+        follow(command, tmp_path)
+
+
+@pytest.mark.parametrize("command", MENTIONED, ids=lambda command: f"{command.page}: {command.text}")
+def test_commands_in_the_text_are_accepted(command, tmp_path):
+    furnish(tmp_path)
+    follow(command, tmp_path)
+
+
+def test_every_rule_is_needed():
+    texts = [*IN_BLOCKS, *(command.text for command in MENTIONED)]
+    explore = r"autdtorch explore\b"
+    for pattern, _ in RULES:
+        assert pattern == explore or any(re.match(pattern, text) for text in texts), pattern
+
+
+# These pages open devices and an oscilloscope: emulated ones take their places.
+EMULATED = """
+from pathlib import Path
+
+import torch
+
+import autdtorch as at
+from autdtorch import hardware
+
+benches, open_link, open_scope = [], hardware.open_link, hardware.open_scope
+
+
+def emulated_link(device, transducers=None, **given):
+    count = device.transducers if transducers is None else len(transducers)
+    matrix = torch.polar(1 + torch.rand(4, count), 6 * torch.rand(4, count)).to(torch.complex128)
+    benches.append(hardware.EmulatedBench(device, matrix, transducers))
+    return open_link(device, transducers, backend=benches[-1].bus, **given)
+
+
+def emulated_scope(chip, dialect=hardware.KEYSIGHT, backend=None):
+    if backend is None:
+        scope = hardware.EmulatedScope(benches[-1].pressure, 40e3, sensitivity=0.04, points=[0, 1, 2, 3])
+        scope.plug_into(benches[-1], chip)
+        backend = benches[-1].bus
+    return open_scope(chip, dialect, backend=backend)
+
+
+class Microphones:
+    def __init__(self, path, points):
+        pass
+
+    def read(self):
+        return hardware.EmulatedSensor(benches[-1]).read()
+
+
+hardware.open_link, hardware.open_scope, hardware.FileSensor = emulated_link, emulated_scope, Microphones
+for name in ("left", "right"):
+    zeros, gains = " ".join(["0"] * 256), " ".join(["1"] * 256)
+    places, pins = "(0, 0, 0) " * 256, " ".join(map(str, range(256)))
+    Path(f"{name}.pat").write_text("\\n".join([name, "256", "128", places, pins, zeros, gains]))
+"""
+STAND_INS = {"docs/hardware.md": EMULATED, "docs/devices.md": EMULATED}
+NOT_RUN = {"docs/explore.md": "waits for a browser"}
+
+
+@pytest.mark.parametrize("page", [page for page in PYTHON if page not in NOT_RUN])
+def test_python_of_a_page_runs(page, tmp_path):
+    code = PYTHON[page]
+    if "view3d" in code:
+        from autdtorch.plot.view3d import rendering_problem
+
+        if problem := rendering_problem():
+            pytest.skip(problem)
+    furnish(tmp_path)
+    (tmp_path / "page.py").write_text(STAND_INS.get(page, "") + code, "utf-8")
+    done = run([sys.executable, "page.py"], tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_gallery_shows_every_picture():
+    shown = set(re.findall(r"\]\((\w+\.png)\)", text_of("docs/gallery.md")))
+    assert shown == {path.name for path in ROOT.glob("docs/**/*.png")}
