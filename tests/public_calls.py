@@ -283,6 +283,8 @@ OTHERS: dict[str, Any] = {
     "save_state.state": Made(lambda _: state("GABS")),
     "load_array.path": Made(array_file),
     "load_drive.path": Made(drive_file),
+    "explore.port": 0,
+    "save_scene.path": Made(lambda folder: folder / "scene.yaml"),
     "open_link.port": None,
     "open_scope.backend": Made(lambda _: scope_bus()),
     "openmpd_boards.boards": Made(lambda folder: [at.OpenMPDBoard.load(board_file(folder))]),

@@ -43,7 +43,8 @@ _MOVE = """([name, value, letGo]) => new Promise((resolve, reject) => {
     const before = Number(section.dataset.shown);
     const begun = performance.now();
     const watch = new MutationObserver(changes => {
-        const isNew = Number(section.dataset.shown) > before;
+        const isCoarse = document.getElementById('summary').textContent.includes('Coarse');
+        const isNew = Number(section.dataset.shown) > before && (isCoarse !== letGo);
         if (isNew && changes.some(change => change.target === image)) {
             watch.disconnect();
             requestAnimationFrame(() => resolve(performance.now() - begun));

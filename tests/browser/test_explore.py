@@ -154,7 +154,9 @@ def test_a_slider_breaks_the_foci_and_undo_mends_them(live):
     before, picture = pressures(page), pixels(page)
     set_slider(page, "body_y", 52.0, let_go=False)
     # Coarse while it is dragged: 0.24 wavelengths
-    page.wait_for_function("document.getElementById('summary').textContent.includes('Cells of 2.06 mm')")
+    page.wait_for_function(
+        "document.getElementById('summary').textContent.includes('Coarse, cells of 2.06 mm')"
+    )
     assert abs(explorer.scene.obstacles[0].center[1] - 52e-3) < 1e-9
     with settled(page):
         set_slider(page, "body_y", 52.0)

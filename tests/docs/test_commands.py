@@ -9,6 +9,7 @@ import itertools
 import os
 import re
 import shlex
+import signal
 import shutil
 import subprocess
 import sys
@@ -112,14 +113,18 @@ def furnish(folder):
         (programs / name).chmod(0o755)
 
 
-def run(command, folder):
-    environment = {
+def environment(folder):
+    return {
         **os.environ,
         "PATH": f"{folder / 'programs'}{os.pathsep}{os.environ['PATH']}",
         "PYTHONPATH": str(ROOT),
         "MPLBACKEND": "Agg",
     }
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, input="\n")
+
+
+def run(command, folder):
+    given = environment(folder)
+    return subprocess.run(command, cwd=folder, env=given, capture_output=True, text=True, input="\n")
 
 
 # --- rules
@@ -219,6 +224,21 @@ def launches(command, folder):
     runs("--cfg hydra")(command._replace(text=one_job), folder)
 
 
+def lives(command, folder):
+    """The live view prints its address, and Ctrl+C ends it; tests/browser shows what it does."""
+    from autdtorch.plot.view3d import rendering_problem
+
+    if problem := rendering_problem():
+        pytest.skip(problem)
+    words = [*shlex.split(command.text), "explore.browser=false"]
+    with subprocess.Popen(
+        words, cwd=folder, env=environment(folder), stdout=subprocess.PIPE, text=True
+    ) as live:
+        assert live.stdout.readline().startswith("The live view is at http://127.0.0.1:")
+        live.send_signal(signal.SIGINT)
+        assert live.wait(timeout=60) == 0
+
+
 def left_out(reason):
     """The command cannot run in a test."""
 
@@ -239,7 +259,8 @@ RULES = [
     (r"sudo udevadm ", left_out("needs root, and a device")),
     (r"jupyter lab ", left_out("waits for a browser")),
     (r"jupytext ", covered_by("tests/docs/test_notebooks.py", "test_jupytext_executes_a_page")),
-    (r"autdtorch explore\b", left_out("waits for a browser")),
+    (r"autdtorch explore\b", lives),
+    (r"ssh ", left_out("needs another machine")),
     (r"autdtorch .*hydra/launcher=mine", launches),
     (r"python scripts/hardware_trial.py \$bench", runs("hardware.emulated=true")),
     (r"autdtorch hardware=emulated|python scripts/hardware_trial.py ", runs()),
@@ -276,9 +297,8 @@ def test_commands_in_the_text_are_accepted(command, tmp_path):
 
 def test_every_rule_is_needed():
     texts = [*IN_BLOCKS, *(command.text for command in MENTIONED)]
-    explore = r"autdtorch explore\b"
     for pattern, _ in RULES:
-        assert pattern == explore or any(re.match(pattern, text) for text in texts), pattern
+        assert any(re.match(pattern, text) for text in texts), pattern
 
 
 # These pages open devices and an oscilloscope: emulated ones take their places.
@@ -323,13 +343,12 @@ for name in ("left", "right"):
     Path(f"{name}.pat").write_text("\\n".join([name, "256", "128", places, pins, zeros, gains]))
 """
 STAND_INS = {"docs/hardware.md": EMULATED, "docs/devices.md": EMULATED}
-NOT_RUN = {"docs/explore.md": "waits for a browser"}
 
 
-@pytest.mark.parametrize("page", [page for page in PYTHON if page not in NOT_RUN])
+@pytest.mark.parametrize("page", PYTHON)
 def test_python_of_a_page_runs(page, tmp_path):
     code = PYTHON[page]
-    if "view3d" in code:
+    if "view3d" in code or "explore" in code:
         from autdtorch.plot.view3d import rendering_problem
 
         if problem := rendering_problem():

@@ -16,6 +16,7 @@ from public_calls import Call, public_calls
 from wrong_values import WRONG, Wrong, spoiled
 
 import autdtorch as at
+from autdtorch.plot import explore
 from autdtorch.plot.view3d import views
 from autdtorch.scene.drive import normalise, validate_drive
 from autdtorch.scene.geometry import plane_basis
@@ -52,6 +53,7 @@ def nothing_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
         raise Accepted
 
     monkeypatch.setattr(views, "require_rendering", stop)
+    monkeypatch.setattr(explore, "require_rendering", stop)
 
 
 def refusal(function: Callable[..., Any], arguments: dict[str, Any]) -> Exception | None:

@@ -45,5 +45,5 @@ def summary(result: Result) -> str:
         text += f", {100 * weakest / result.bound:.0f} % of what any drive can reach ({result.bound:.3g} Pa)"
     cells = f"cells of {result.spacing / MM:.3g} mm"
     if result.error is None:
-        return f"{text}. {cells.capitalize()}."
+        return f"{text}. {'Fine' if result.request.fine else 'Coarse'}, {cells}."
     return f"{text}. Estimated error {100 * result.error:.2g} %, {cells}."

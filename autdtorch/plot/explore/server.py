@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import atexit
 import contextlib
 import functools
 import secrets
@@ -52,6 +53,7 @@ class Server:
             raise TimeoutError(f"explore: the server did not start within {_PATIENCE:g} s")
         if self._failure is not None:
             raise self._failure
+        atexit.register(self.close)  # OpenGL must end in its thread, before the interpreter does
 
     @property
     def address(self) -> str:
@@ -70,6 +72,7 @@ class Server:
 
     def close(self) -> None:
         """Stop the server and end the thread."""
+        atexit.unregister(self.close)
         if self.running:
             asyncio.run_coroutine_threadsafe(self._trame.stop(), self._loop)
             self._thread.join(_PATIENCE)

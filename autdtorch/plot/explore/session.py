@@ -5,6 +5,7 @@ All methods are called in the thread of the server, which also renders.
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections.abc import Callable
 from typing import Any
@@ -29,6 +30,7 @@ from autdtorch.utils.array_types import Array
 
 _DIGITS = 7  # decimals of lengths [m] from the page, whose steps are 0.1 mm
 
+_PATIENCE = 0.25  # s; a picture before the field would slow its calculation down
 _NEW_FOCUS = 1.5  # wavelengths beside the last focus
 _PLACE, _TURN = ("body_x", "body_y", "body_z"), ("turn_x", "turn_y", "turn_z")
 _FOCUS = ("focus_x", "focus_y", "focus_z")
@@ -60,6 +62,7 @@ class Session:
         self._number, self._running = 0, False
         self._extras: tuple[object, ...] = ()
         self._settled: object = 0
+        self._waiting = asyncio.get_running_loop().call_later(_PATIENCE, self.update)
 
     @property
     def now(self) -> Situation:
@@ -187,7 +190,7 @@ class Session:
         self._extras = state.follow, state.volume, self._surface()
         self._show_situation()
         followed: list[tuple[tuple[str, ...], Callable[[], None]]] = [
-            (("body", "focus", "transducer"), self._show_situation),
+            (("body", "focus", "transducer"), self._show_choice),
             ((*_PLACE, *_TURN), self._move_body),
             (_FOCUS, self._move_focus),
             (("phase", "amplitude"), self._edit_drive),
@@ -330,14 +333,20 @@ class Session:
             )  # fmt: skip
         self.picture.place(now, focus)
         self._note(now)
+
+    def _show_choice(self) -> None:
+        """Show what is chosen in the lists of the page."""
+        self._show_situation()
         self.update()
 
     def _set(self, names: tuple[str, ...], values: tuple[float, ...]) -> None:
         self._state.update(dict(zip(names, values, strict=True)))
 
     def _ask(self, fine: bool = True, method: str | None = None) -> None:
-        """Ask for the field of the situation."""
+        """Ask for the field of the situation, and show the picture with it, or without if that takes long."""
         self.picture.smooth(fine)
+        self._waiting.cancel()
+        self._waiting = asyncio.get_running_loop().call_later(_PATIENCE, self.update)
         self._number += 1
         self._running = method is not None
         self._calculator.ask(
@@ -388,6 +397,7 @@ class Session:
         """Colour the plane, and set the readings."""
         if (result := self._result) is None:
             return
+        self._waiting.cancel()
         magnitude = np.abs(result.field)
         reference = self._reference or largest(magnitude) or 1.0
         if result.request.number == self._number:
