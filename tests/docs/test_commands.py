@@ -9,8 +9,8 @@ import itertools
 import os
 import re
 import shlex
-import signal
 import shutil
+import signal
 import subprocess
 import sys
 import tomllib
