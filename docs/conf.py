@@ -23,6 +23,7 @@ html_theme = "furo"
 html_title = f"autdtorch {version}"
 html_static_path = ["_static"]
 html_css_files = ["wide.css"]
+html_js_files = ["accessible.js"]
 html_copy_source = False
 html_show_sourcelink = False
 

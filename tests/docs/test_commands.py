@@ -353,6 +353,8 @@ def test_python_of_a_page_runs(page, tmp_path):
 
         if problem := rendering_problem():
             pytest.skip(problem)
+    if "playwright" in code and shutil.which("chromium") is None:
+        pytest.skip("no Chromium")
     furnish(tmp_path)
     (tmp_path / "page.py").write_text(STAND_INS.get(page, "") + code, "utf-8")
     done = run([sys.executable, "page.py"], tmp_path)

@@ -95,6 +95,19 @@ def test_no_link_is_broken(built, pages):
     assert not broken
 
 
+@pytest.mark.parametrize("colours", ["light", "dark"])
+@pytest.mark.parametrize("width", [1200, 360])
+def test_the_front_page_is_accessible(built, browser, colours, width):
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe: install autdtorch[dev]").Axe()
+    page = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=colours)
+    page.goto((built / "index.html").as_uri())
+    found = axe.run(page)
+    scrolls = page.evaluate("document.documentElement.scrollWidth")
+    page.close()
+    assert found.violations_count == 0, found.generate_report()
+    assert scrolls <= width
+
+
 def test_the_reference_has_every_public_name(built):
     inventory = InventoryFile.loads((built / "objects.inv").read_bytes(), uri="")
     documented = {item for kind in inventory.data.values() for item in kind}
