@@ -98,7 +98,9 @@ def test_no_link_is_broken(built, pages):
 @pytest.mark.parametrize("colours", ["light", "dark"])
 @pytest.mark.parametrize("width", [1200, 360])
 def test_the_front_page_is_accessible(built, browser, colours, width):
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe: install autdtorch[dev]").Axe()
+    axe = pytest.importorskip(
+        "axe_playwright_python.sync_playwright", reason="axe: install autdtorch[dev]"
+    ).Axe()
     page = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=colours)
     page.goto((built / "index.html").as_uri())
     found = axe.run(page)

@@ -1,0 +1,118 @@
+"""Situations of a live view: bodies that are moved and turned, planes, and what is undone."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from small_scenes import AIR, small_scene
+
+import autdtorch as at
+from autdtorch.plot.explore.history import History
+from autdtorch.plot.explore.situation import OWN_PLANE, Body, Situation
+
+PLACE = st.tuples(*[st.floats(-0.1, 0.1)] * 3)
+ANGLES = st.tuples(*[st.floats(-math.pi, math.pi)] * 3)
+CUBE = at.Box((10e-3, 20e-3, 5e-3), (3e-3, 4e-3, 5e-3), (0.3, -0.2, 0.5), rigid=True)
+PEG = at.Cylinder((10e-3, 20e-3, 5e-3), 2e-3, 7e-3, (1, 2, 3), rigid=True)
+WEDGE = at.Mesh.from_surface(
+    ([[0, 0, 0], [5e-3, 0, 0], [0, 6e-3, 0], [0, 0, 7e-3]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]),
+    offset=(10e-3, 0, 0), rotation=(0.1, 0.2, 0.3), rigid=True,
+)  # fmt: skip
+DRIVE = torch.ones(4, dtype=torch.complex128)
+
+
+def oblique_scene():
+    plane = at.Plane((20e-3, 12e-3, 12e-3), (1, 1, 0), (4e-3, 4e-3))
+    scene = small_scene()
+    return at.Scene(scene.array, AIR, scene.frequency, scene.control_points, (), plane, scene.domain)
+
+
+@given(st.sampled_from([CUBE, PEG, WEDGE]), PLACE, ANGLES)
+def test_the_pose_of_a_picture_is_that_of_the_obstacle(obstacle, center, angles):
+    body = Body(obstacle, center, angles)
+    turn, pivot, offset = body.pose
+    moved = (obstacle.surface()[0] - pivot) @ turn.mT + pivot + offset
+    # A cylinder's polygon may begin elsewhere on its rim; its axis has ten decimals
+    found, tolerance = (body.obstacle.surface()[0], 1e-9)
+    if obstacle is PEG:
+        found, moved = (torch.stack([part.amin(dim=0), part.amax(dim=0)]) for part in (found, moved))
+        tolerance = 1e-5
+    torch.testing.assert_close(found, moved, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("obstacle", [CUBE, PEG, WEDGE, at.Sphere((0, 0, 0), 1e-3, rigid=True)])
+def test_an_obstacle_that_has_not_moved_is_itself(obstacle):
+    assert Body.of(obstacle).obstacle is obstacle
+
+
+def test_angles_of_boxes_are_theirs():
+    assert Body(CUBE, CUBE.center, (0.0, 0.0, 0.7)).obstacle.rotation == pytest.approx((0, 0, 0.7), abs=1e-9)
+
+
+def test_a_sphere_moves_and_does_not_turn():
+    ball = Body(at.Sphere((0, 0, 0), 1e-3, rigid=True), (1e-3, 0, 0), (1.0, 0, 0))
+    assert ball.obstacle.center == (1e-3, 0, 0)
+    assert not ball.turns
+
+
+def test_a_plane_without_observation_plane_passes_through_the_foci():
+    scene = small_scene()
+    situation = Situation.of(scene, DRIVE)
+    normal, center = (
+        torch.tensor(part, dtype=torch.float64) for part in (situation.sheet.normal, situation.sheet.center)
+    )
+    assert float((scene.control_points.mean(dim=0) - center) @ normal) == pytest.approx(0, abs=1e-9)
+    assert OWN_PLANE not in situation.planes
+
+
+@pytest.mark.parametrize("plane", ["x", "y", "z"])
+@pytest.mark.parametrize("height", [-1.0, 10e-3, 1.0])
+def test_planes_stay_in_the_domain(plane, height):
+    situation = Situation.of(small_scene(), DRIVE).with_plane(plane, height)
+    lower, upper = (torch.tensor(corner, dtype=torch.float64) for corner in situation.scene.domain)
+    corners = situation.sheet.corners
+    assert (corners > lower - 1e-9).all()
+    assert (corners < upper + 1e-9).all()
+
+
+def test_an_oblique_observation_plane_moves_along_its_normal():
+    situation = Situation.of(oblique_scene(), DRIVE)
+    assert situation.plane == OWN_PLANE
+    moved = situation.with_plane(OWN_PLANE, 2e-3)
+    steps = torch.tensor(moved.sheet.center) - torch.tensor(situation.sheet.center)
+    assert steps.tolist() == pytest.approx([2e-3 / math.sqrt(2), 2e-3 / math.sqrt(2), 0], abs=1e-9)
+    assert moved.with_plane("x").with_plane(OWN_PLANE).sheet == situation.sheet
+
+
+def test_unknown_planes_are_refused():
+    with pytest.raises(ValueError, match="plane: 'w'"):
+        Situation.of(small_scene(), DRIVE).with_plane("w")
+
+
+def test_a_drag_is_undone_in_one_step():
+    first = Situation.of(small_scene(), DRIVE)
+    history = History(first)
+    for height in (1e-3, 2e-3, 3e-3):
+        history.change(first.with_plane("z", height))
+    history.settle()
+    last = history.now
+    history.settle()  # nothing was changed since
+    history.undo()
+    assert history.now is first
+    assert not history.can_undo
+    history.redo()
+    assert history.now is last
+    assert not history.can_redo
+
+
+def test_a_change_after_undo_forgets_what_was_undone():
+    first = Situation.of(small_scene(), DRIVE)
+    history = History(first)
+    history.change(first.with_plane("z"))
+    history.undo()  # also of a step that has not ended
+    assert history.now is first
+    history.change(first.with_plane("y"))
+    history.settle()
+    assert not history.can_redo
