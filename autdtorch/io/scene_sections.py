@@ -26,8 +26,8 @@ _KINDS = {Box: "box", Sphere: "sphere", Cylinder: "cylinder", Mesh: "mesh", Voxe
 def save_scene(path: str | os.PathLike[str], scene: Scene) -> None:
     """Write a scene to a YAML file that `load_scene` reads.
 
-    Numbers keep their full precision. A mesh becomes an .obj file, a voxel mask an .npz file, beside the YAML
-    file and with its name. Files that are there are replaced.
+    Numbers keep their full precision. A mesh becomes an .obj file in its own coordinates, a voxel mask an .npz
+    file, beside the YAML file and with its name. Files that are there are replaced.
 
     Args:
         path: of the file, ``.yaml`` or ``.yml``.
@@ -84,7 +84,7 @@ def write_files(scene: Scene, path: Path) -> None:
     for number, obstacle in enumerate(scene.obstacles):
         name = f"{path.name}_{number}"
         if isinstance(obstacle, Mesh):
-            vertices, faces = (part.numpy() for part in obstacle.surface())
+            vertices, faces = obstacle.triangles
             with (
                 replacing(path.with_name(f"{name}.obj")) as partial,
                 partial.open("w", encoding="utf-8") as file,
@@ -102,9 +102,8 @@ def _obstacle(obstacle: Obstacle, name: str, where: str) -> dict[str, Any]:
         raise invalid(where, kind.__name__, accepted)
     section: dict[str, Any] = {"type": _KINDS[kind]}
     given = {one.name: getattr(obstacle, one.name) for one in fields(obstacle) if one.init}
-    if isinstance(obstacle, Mesh):  # its triangles are written where they are now
-        section["path"] = f"{name}.obj"
-        given = {name: given[name] for name in ("density", "sound_speed", "rigid")}
+    if isinstance(obstacle, Mesh):
+        given["path"] = f"{name}.obj"
     elif isinstance(obstacle, VoxelMask):
         section["path"] = f"{name}.npz"
         del given["mask"]

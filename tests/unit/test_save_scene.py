@@ -82,6 +82,15 @@ def test_lines_of_python_make_scene_and_drive(tmp_path_factory, obstacle, plane,
     torch.testing.assert_close(made["drive"], drive, rtol=0, atol=1e-14)
 
 
+def test_a_saved_mesh_keeps_its_coordinates_and_pose(tmp_path):
+    vertices, faces = TETRAHEDRON
+    mesh = at.Mesh.from_surface((1e3 * vertices, faces), 1e-3, (40e-3,) * 3, (0.0, 0.3, 1.0), rigid=True)
+    at.save_scene(tmp_path / "scene.yaml", scene_with(mesh, plane=False))
+    (found,) = at.load_scene(tmp_path / "scene.yaml").obstacles
+    assert (found.scale, found.offset, found.rotation) == (mesh.scale, mesh.offset, mesh.rotation)
+    assert torch.equal(found.vertices, mesh.vertices)
+
+
 def test_an_obstacle_of_ones_own_is_refused(tmp_path):
     class Own(at.Sphere):
         pass

@@ -107,6 +107,11 @@ class Mesh(Obstacle):
         return cls(source, scale, offset, rotation, density=density, sound_speed=sound_speed, rigid=rigid)
 
     @property
+    def triangles(self) -> Triangles:
+        """Vertices (V, 3) in the coordinates and units of the file, and `faces`; not to be changed."""
+        return self._source.vertices, self._source.faces
+
+    @property
     def lower(self) -> Vector:
         """Corner of the bounding box with the smallest coordinates (3,) [m]."""
         x, y, z = self.vertices.amin(dim=0).tolist()
