@@ -26,8 +26,8 @@ _KINDS = {Box: "box", Sphere: "sphere", Cylinder: "cylinder", Mesh: "mesh", Voxe
 def save_scene(path: str | os.PathLike[str], scene: Scene) -> None:
     """Write a scene to a YAML file that `load_scene` reads.
 
-    Numbers keep their full precision. A mesh becomes an .obj file in its own coordinates, a voxel mask an .npz
-    file, beside the YAML file and with its name. Files that are there are replaced.
+    Numbers keep their full precision. A mesh becomes an .obj file in its own coordinates, a voxel mask
+    an .npz file, beside the YAML file and with its name. Files that are there are replaced.
 
     Args:
         path: of the file, ``.yaml`` or ``.yml``.
