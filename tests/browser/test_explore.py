@@ -184,6 +184,16 @@ def test_numbers_and_the_keyboard_move_an_obstacle(live):
     wait_for(lambda: abs(explorer.scene.obstacles[0].center[2] - 55.3e-3) < 1e-9)
 
 
+def test_a_result_that_arrives_leaves_a_number_that_is_being_typed(live):
+    explorer, page = live
+    page.fill("#body_z_number", "55.3")
+    with settled(page):
+        page.evaluate("window.trame.trigger('in_phase')")
+    assert page.input_value("#body_z_number") == "55.3"
+    page.press("#body_z_number", "Enter")
+    wait_for(lambda: abs(explorer.scene.obstacles[0].center[2] - 55.3e-3) < 1e-9)
+
+
 def test_an_obstacle_is_turned_by_sliders(live):
     explorer, page = live
     with settled(page):

@@ -21,8 +21,8 @@ _SLIDER = """
 <label class="slider"><span>{label}</span>
   <input type="range" id="{name}" v-model.number="{name}" :min="{low}" :max="{high}" step="{step}"
     :disabled="{disabled}" @change="settled += 1">
-  <input type="number" id="{name}_number" aria-label="{label}" :value="{name}" :min="{low}" :max="{high}"
-    step="any" :disabled="{disabled}" @change="{name} = $event.target.valueAsNumber; settled += 1">
+  <input type="number" id="{name}_number" aria-label="{label}" v-model.lazy.number="{name}" :min="{low}"
+    :max="{high}" step="any" :disabled="{disabled}" @change="settled += 1">
 </label>"""
 _CHOICE = """
 <label>{label}
@@ -32,7 +32,7 @@ _CHOICE = """
 </label>"""
 _NUMBER = """
 <label>{label}
-  <input type="number" id="{name}" :value="{name}" step="any" @change="{name} = $event.target.valueAsNumber">
+  <input type="number" id="{name}" v-model.lazy.number="{name}" step="any">
 </label>"""
 _BOX = """
 <label class="box"><input type="checkbox" id="{name}" v-model="{name}"><span>{label}</span></label>"""
