@@ -20,6 +20,11 @@ from autdtorch.utils.files import replace_file, replacing
 from autdtorch.utils.numpy_file import write_arrays
 from autdtorch.utils.validation import invalid, path_of, require_kind
 
+
+class _Code(str):
+    """An expression in Python."""
+
+
 _KINDS = {Box: "box", Sphere: "sphere", Cylinder: "cylinder", Mesh: "mesh", VoxelMask: "voxel_mask"}
 
 
@@ -113,17 +118,31 @@ def _obstacle(obstacle: Obstacle, name: str, where: str) -> dict[str, Any]:
     return section
 
 
-def scene_lines(scene: Scene, drive: torch.Tensor, name: str) -> str:
-    """Return the lines of Python that make a scene and a drive (M,), beside a scene file called `name`."""
+def scene_lines(scene: Scene, drive: torch.Tensor, name: str, beside: bool = False) -> str:
+    """Return the lines of Python that make a scene and a drive (M,).
+
+    Args:
+        scene: the scene.
+        drive: the drive.
+        name: path, without suffix, of the scene file whose meshes and masks are read.
+        beside: True for lines in a file, and a path from there; False for one from the working directory.
+
+    Raises:
+        ValueError: an obstacle of a class of the user's own.
+    """
     sections = scene_sections(scene, name)
     array = {key: value for key, value in sections["array"].items() if key != "type"}
-    lines = ["import autdtorch as at", "", _call("array", "TransducerArray", array)]
+    beside = beside and any("path" in section for section in sections["obstacles"])
+    lines = ["from pathlib import Path", ""] if beside else []
+    lines += ["import autdtorch as at", "", _call("array", "TransducerArray", array)]
     names = []
     for number, section in enumerate(sections["obstacles"]):
         names.append(f"obstacle_{number}")
         kind = next(known.__name__ for known, name in _KINDS.items() if name == section["type"])
         function = f"{kind}.load" if kind == "VoxelMask" else kind
         own = {key: value for key, value in section.items() if key != "type"}
+        if beside and "path" in own:
+            own["path"] = _Code(f"Path(__file__).with_name({own['path']!r})")
         lines.append(_call(names[-1], function, own))
     plane = "None"
     if scene.observation_plane is not None:
@@ -150,5 +169,7 @@ def _call(name: str, function: str, arguments: dict[str, Any]) -> str:
 
 
 def _value(value: Any, indent: int) -> str:
+    if isinstance(value, _Code):
+        return value
     text = pprint.pformat(value, width=110 - indent, compact=True)
     return text.replace("\n", "\n" + " " * indent)

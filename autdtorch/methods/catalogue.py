@@ -22,6 +22,7 @@ METHODS: dict[str, type[Method]] = {
 _VARIANTS = {
     "bo_foci": "BO per focus",
     "bo_circle": "BO on the circle",
+    "naive": "naive (model-based)",
     "gs": "GS (model-based)",
     "wgs": "WGS (model-based)",
     "gs_pat": "GS-PAT (model-based)",

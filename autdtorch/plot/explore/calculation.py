@@ -41,6 +41,7 @@ _MOST_CELLS = 10_000  # of the plane of a fine field: 0.1 to 0.2 s for the paper
 _CELLS_A_WAVELENGTH = 8
 _COARSER = 2  # Ratio of the spacings of a coarse and a fine calculation
 _COARSE_TOLERANCE = 1e-2  # half the time of the default, where the grid errs by 2 to 5 %
+_REST = 1.0  # s without a request before a volume is calculated, which a request does not end
 _COARSEST = 0.24  # wavelengths; the error of larger cells rises steeply, and each would log a warning
 
 
@@ -74,7 +75,7 @@ class Result:
     Attributes:
         request: the request.
         drive: the drive (M,), found again where the request says so.
-        spacing: of the simulation [m].
+        spacing: of the simulation [m]; None where it has a closed form.
         pressure: magnitude at the control points (P,) [Pa].
         field: complex pressure on the plane (Nu, Nv) [Pa], NaN in obstacles and next to transducers.
         bound: no drive has a weakest focus above [Pa]; None while it is coarse.
@@ -85,7 +86,7 @@ class Result:
 
     request: Request
     drive: torch.Tensor
-    spacing: float
+    spacing: float | None
     pressure: torch.Tensor
     field: Array
     bound: float | None = None
@@ -105,10 +106,18 @@ class Progress:
     score: float
 
 
+@dataclass(frozen=True)
+class Failure:
+    """An error that ended a request."""
+
+    request: Request
+    error: Exception
+
+
 class Calculator:
     """A thread that answers the newest request."""
 
-    def __init__(self, spacing: float, report: Callable[[Result | Progress | Exception], None]) -> None:
+    def __init__(self, spacing: float, report: Callable[[Result | Progress | Failure], None]) -> None:
         """Calculate with cells of `spacing` [m] when fine; `report` is called in the thread."""
         self._spacing, self._report = spacing, report
         self._wanted: Request | None = None
@@ -140,7 +149,7 @@ class Calculator:
                         break
             except Exception as error:  # the page shows it; the next request may well succeed
                 logger.debug("request %d", request.number, exc_info=True)
-                self._report(error)
+                self._report(Failure(request, error))
 
     def _next(self) -> Request | None:
         with self._changed:
@@ -150,6 +159,11 @@ class Calculator:
 
     def _is_old(self) -> bool:
         return self._wanted is not None or self._closed
+
+    def _rests(self) -> bool:
+        """Return whether nothing is asked for within a while."""
+        with self._changed:
+            return not self._changed.wait_for(self._is_old, _REST)
 
     def _results(self, request: Request) -> Iterator[Result | Progress]:
         """Yield ever more complete results of a request."""
@@ -168,14 +182,15 @@ class Calculator:
             drive = request.method.best(state).drive[0]
         elif request.follow:
             drive = _followed(propagator, drive)
-        result = _field(request, propagator, drive, self._spacing if fine else self._coarse(situation))
+        cells = (self._spacing if fine else self._coarse(situation)) if _has_cells(propagator) else None
+        result = _field(request, propagator, drive, cells)
         yield replace(result, seconds=time.monotonic() - begun)
         if not fine or self._is_old():
             return
         matrix, error = propagator.transfer_matrix(return_error=True)
         result = replace(result, bound=float(focus_bound(matrix)), error=error)
         yield replace(result, seconds=time.monotonic() - begun)
-        if request.volume and not self._is_old():
+        if request.volume and self._rests():
             volume = volume_field(propagator, drive, situation.scene.wavelength / 3)
             yield replace(result, volume=volume, seconds=time.monotonic() - begun)
 
@@ -206,6 +221,11 @@ class Calculator:
             yield state
 
 
+def _has_cells(propagator: Propagator) -> bool:
+    """Return whether a propagator simulates on a grid; others have a closed form."""
+    return not isinstance(propagator, FreeSpacePropagator) and propagator.cells > 0
+
+
 def _progress(request: Request, state: State) -> Progress:
     assert request.method is not None
     most = request.method.most_evaluations(state.problem)
@@ -223,7 +243,7 @@ def _followed(propagator: Propagator, drive: torch.Tensor) -> torch.Tensor:
     return method.best(state).drive[0]
 
 
-def _field(request: Request, propagator: Propagator, drive: torch.Tensor, spacing: float) -> Result:
+def _field(request: Request, propagator: Propagator, drive: torch.Tensor, spacing: float | None) -> Result:
     """Return the pressure at the control points and on the plane, from one simulation of the drive."""
     situation = request.situation
     sheet = situation.sheet

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 from autdtorch.methods.base import Method
 from autdtorch.methods.bayes.bayes import BayesOpt
 from autdtorch.methods.catalogue import METHODS, label_of
-from autdtorch.methods.holography.holography import Holography
-
-OFFERED: dict[str, Method] = {name: kind() for name, kind in METHODS.items() if kind is not Holography} | {
-    "bo_foci": BayesOpt(
-        evaluations=64, initial=4, model="foci", kernel="phasor", initial_points="sobol", noise="inferred"
-    ),
-    **{name: Holography(algorithm=name) for name in ("gs", "wgs", "gs_pat", "diff_pat")},
-}
-"""Methods by name."""
+from autdtorch.methods.holography.holography import Algorithm, Holography
 
 
-def choices() -> list[tuple[str, str]]:
+def offered(transducers: int) -> dict[str, Method]:
+    """Return the methods by name, for an array of so many transducers."""
+    fixed = min(BayesOpt.fixed_transducer, transducers - 1)
+    own: dict[str, Method] = {
+        "bayes_opt": BayesOpt(fixed_transducer=fixed),
+        "bo_circle": BayesOpt(kernel="circle", fixed_transducer=fixed),
+        "bo_foci": BayesOpt(
+            evaluations=64, initial=4, model="foci", kernel="phasor", noise="inferred", fixed_transducer=fixed
+        ),
+    }
+    others = {name: kind() for name, kind in METHODS.items() if kind not in (BayesOpt, Holography)}
+    return others | own | {name: Holography(algorithm=name) for name in get_args(Algorithm)}
+
+
+def choices(methods: dict[str, Method]) -> list[tuple[str, str]]:
     """Return names and labels, those first that need least time."""
     first = ("gradient_ascent", "identify", "gabs")
-    return [(name, label_of(name)) for name in sorted(OFFERED, key=lambda name: name not in first)]
+    return [(name, label_of(name)) for name in sorted(methods, key=lambda name: name not in first)]

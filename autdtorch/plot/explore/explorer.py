@@ -10,6 +10,7 @@ import torch
 from trame.ui.html import DivLayout
 from trame.widgets import rca
 
+from autdtorch.plot.explore.controls import Controls
 from autdtorch.plot.explore.page import page
 from autdtorch.plot.explore.server import Defer, Server
 from autdtorch.plot.explore.session import Session
@@ -68,15 +69,16 @@ class Explorer:
     def _build(self, trame: Any, defer: Defer) -> Callable[[], None]:
         """Make the application on a trame server; return what ends it."""
         session = Session(trame, self._situation, self._spacing, defer, self._note)
+        Controls(trame, session)
         session.begin(self._first_method)
         view = rca.RemoteControlledArea(
             name="view", display="image", event_throttle_ms=30, trame_server=trame
         )
         handler = view.create_view_handler(
-            session.picture.plotter.render_window, encoder="jpeg", target_fps=_FRAMES,
+            session.display.picture.plotter.render_window, encoder="jpeg", target_fps=_FRAMES,
             **_QUALITY,
         )  # fmt: skip
-        session.update = handler.update
+        session.display.update = handler.update
         with DivLayout(trame) as layout:
             layout.root.classes = "explore"
             layout.root.add_child(page(view.html))

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from autdtorch.plot.explore.situation import Situation
+from autdtorch.scene.obstacles import Mesh
 
-_MOST = 200  # steps that are kept; a situation shares almost all with the one before
+_MOST = 200  # steps that are kept
+_MOST_BYTES = 100_000_000  # of the vertices of meshes in them; all else is small, or shared
 
 
 class History:
@@ -35,15 +37,19 @@ class History:
 
     def change(self, situation: Situation) -> None:
         """Show another situation; the step ends with `settle`."""
+        if situation is self.now:
+            return
         if self._before is None:
             self._before = self.now
         self.now = situation
 
-    def settle(self) -> None:
-        """End a step, if one has begun."""
-        if self._before is not None:
-            self._done = [*self._done, self._before][-_MOST:]
-            self._undone, self._before = [], None
+    def settle(self) -> bool:
+        """End a step; return False if none has begun."""
+        if self._before is None:
+            return False
+        self._done = [*self._done, self._before][-_most(self.now) :]
+        self._undone, self._before = [], None
+        return True
 
     def undo(self) -> None:
         """Go back to the situation before the last step."""
@@ -57,3 +63,10 @@ class History:
         if self._undone:
             self._done.append(self.now)
             self.now = self._undone.pop()
+
+
+def _most(situation: Situation) -> int:
+    """Return the number of steps that are kept."""
+    meshes = [one for one in situation.scene.obstacles if isinstance(one, Mesh)]
+    size = sum(mesh.vertices.nbytes for mesh in meshes)
+    return max(1, min(_MOST, _MOST_BYTES // max(size, 1)))

@@ -10,6 +10,7 @@ from autdtorch.utils.array_types import Array
 
 _FIRST = 10.0  # priority before that of the camera
 _ANGLE = math.radians(0.5)  # for each pixel
+_KEYS = "CharEvent", "KeyPressEvent", "KeyReleaseEvent"  # VTK would change the picture, such as to stereo
 
 
 class Owner(Protocol):
@@ -37,6 +38,8 @@ class Mouse:
         self._grip: Grip | None = None
         self._from = 0.0
         self._interactor: Any = picture.plotter.iren.interactor
+        for event in _KEYS:
+            self._interactor.RemoveObservers(event)
         for event, listener in (
             ("LeftButtonPressEvent", self._press),
             ("MouseMoveEvent", self._move),

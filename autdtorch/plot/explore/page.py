@@ -6,13 +6,34 @@ that name; `explorer` has both.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
+from autdtorch.methods.base import Method
 from autdtorch.plot.explore import saving
 from autdtorch.plot.explore.catalogue import choices
 from autdtorch.plot.explore.picture import gradient
 from autdtorch.plot.explore.readings import COLUMNS, in_mm
 from autdtorch.plot.explore.situation import OWN_PLANE, Situation
+
+
+class Look(NamedTuple):
+    """A button that moves the camera: its label, its name, and what `Picture.move_camera` takes."""
+
+    label: str
+    title: str
+    move: tuple[float, float, float]
+
+
+CAMERA = {
+    "look_left": Look("←", "look from further left", (15.0, 0.0, 1.0)),
+    "look_right": Look("→", "look from further right", (-15.0, 0.0, 1.0)),
+    "look_up": Look("↑", "look from further up", (0.0, 15.0, 1.0)),
+    "look_down": Look("↓", "look from further down", (0.0, -15.0, 1.0)),
+    "zoom_in": Look("+", "zoom in", (0.0, 0.0, 1.25)),
+    "zoom_out": Look("-", "zoom out", (0.0, 0.0, 0.8)),
+    "look_first": Look("First view", "first view", (0.0, 0.0, 0.0)),
+}
+"""Buttons of the camera, by action."""
 
 FIRST_SURFACE = -6.0
 """The level of the surface in the volume at first [dB]."""
@@ -38,6 +59,9 @@ _BOX = """
 <label class="box"><input type="checkbox" id="{name}" v-model="{name}"><span>{label}</span></label>"""
 _BUTTON = """
 <button type="button" id="{name}" @click="trigger('{name}')" :disabled="{disabled}">{label}</button>"""
+_LOOK = """
+<button type="button" id="{name}" title="{title}" aria-label="{title}"
+  @click="trigger('{name}')">{label}</button>"""
 
 
 def _slider(name: str, label: str, low: str, high: str, step: float, disabled: str = "false") -> str:
@@ -70,6 +94,7 @@ def _button(name: str, label: str, disabled: str = "false") -> str:
 
 def page(view: str) -> str:
     """Return the template of the page, with that of the picture in it."""
+    looks = "".join(_LOOK.format(name=name, **look._asdict()) for name, look in CAMERA.items())
     turns = "".join(
         _slider(f"turn_{axis}", f"turn about {axis} [°]", "-180", "180", 1, "!body_turns") for axis in "xyz"
     )
@@ -88,6 +113,7 @@ def page(view: str) -> str:
       <span>{{{{ scale_high }}}}</span>
       <span class="hint">grey: in obstacles and next to transducers</span>
     </div>
+    <div class="row" role="group" aria-label="camera">{looks}</div>
     <p class="hint">Drag an obstacle or a focus to move it, an obstacle with Shift to turn it. Click a
       transducer to choose it. Drag elsewhere to look around, scroll to zoom.</p>
     <p id="summary" aria-live="polite">{{{{ summary }}}}</p>
@@ -106,6 +132,7 @@ def page(view: str) -> str:
     <details>
       <summary id="write_python" @click="trigger('write_python')">Python</summary>
       <button type="button" data-copy="python">Copy</button>
+      <p class="hint" v-if="python.includes('path=')">It reads files that Save writes.</p>
       <pre id="python" tabindex="0">{{{{ python }}}}</pre>
     </details>
   </section>
@@ -145,8 +172,8 @@ def page(view: str) -> str:
 </main>"""
 
 
-def first_state(situation: Situation) -> dict[str, Any]:
-    """Return the state of the page at first, but for what changes with the situation."""
+def first_state(situation: Situation, methods: dict[str, Method]) -> dict[str, Any]:
+    """Return the state of the page at first, without what `Display.place` sets."""
     scene = situation.scene
     lower, upper = scene.domain
     obstacles = [
@@ -160,11 +187,12 @@ def first_state(situation: Situation) -> dict[str, Any]:
         "bodies": list(enumerate(obstacles)), "body": 0, "body_moves": False, "body_turns": False,
         "focus": 0, "transducers": [(index, str(index)) for index in range(len(scene.array))],
         "transducer": 0,
-        "methods": choices(), "method": "gradient_ascent", "follow": False, "busy": False, "progress": 0,
+        "methods": choices(methods), "method": "gradient_ascent", "follow": False, "busy": False,
+        "progress": 0,
         "planes": planes, "units": [("dB", "dB"), ("Pa", "Pa")], "unit": "dB", "reference": 1.0,
         "volume": False, "surface": FIRST_SURFACE, "dark": False, "scale_low": "", "scale_high": "",
         "scale_style": f"background: linear-gradient(to right, {', '.join(gradient())})",
-        "devices": devices, "device": "", "folder": "outputs/explore",
+        "devices": devices, "device": "", "folder": saving.free_folder(),
         "shown": -1, "wanted": 0, "settled": 0,
     } | {
         f"range_{axis}": [in_mm(low), in_mm(high)]

@@ -80,6 +80,7 @@ class Picture:
         self.set_dark(False)
         self.place(situation, 0)
         self._fitted = self.plotter.camera.parallel_scale
+        self._first = self.plotter.camera_position
         self.plotter.render_window.AddObserver("WindowResizeEvent", lambda *_: self._fit())
 
     def _fit(self) -> None:
@@ -90,6 +91,19 @@ class Picture:
             lower, upper = map(np.array, self._situation.scene.domain)
             radius = MM * float(np.linalg.norm(upper - lower)) / 2
             camera.parallel_scale = self._fitted = _AROUND * radius * max(1.0, height / width)
+
+    def move_camera(self, azimuth: float, elevation: float, zoom: float) -> None:
+        """Turn the camera [degrees] around the domain, and zoom by a factor; 0 sets both back."""
+        camera = self.plotter.camera
+        if zoom:
+            camera.Azimuth(azimuth)
+            camera.Elevation(elevation)
+            camera.OrthogonalizeViewUp()
+            camera.Zoom(zoom)
+        else:
+            self.plotter.camera_position = self._first
+            camera.parallel_scale = self._fitted
+        self.plotter.renderer.ResetCameraClippingRange()
 
     def set_dark(self, dark: bool) -> None:
         """Take light lines on a dark background, or dark on light."""
@@ -130,12 +144,16 @@ class Picture:
         self._sheet.copy_from(sheet)
         self._actor.mapper.scalar_range = scale.limits
 
-    def show_volume(self, volume: torch.Tensor | None, scale: Scale, height: float) -> None:
-        """Draw the surface where the level of a volume (Nx, Ny, Nz) [Pa] is `height` [dB], or nothing."""
+    def show_volume(self, volume: torch.Tensor | None, scale: Scale, height: float) -> bool:
+        """Draw the surface where the level of a volume (Nx, Ny, Nz) [Pa] is `height` [dB], or nothing.
+
+        Return False where a volume has no such surface.
+        """
         self.plotter.remove_actor(_SURFACE_NAME, reset_camera=False, render=False)
-        if volume is not None:
-            level = in_decibels(volume.abs().numpy(), scale.reference)
-            meshes.add_isosurface(self.plotter, self._situation.scene, level, height, name=_SURFACE_NAME)
+        if volume is None:
+            return True
+        level = in_decibels(volume.abs().numpy(), scale.reference)
+        return meshes.add_isosurface(self.plotter, self._situation.scene, level, height, name=_SURFACE_NAME)
 
     def grip(self, x: float, y: float) -> Grip | None:
         """Return what lies at a point of the window [pixels from its lower left corner]."""

@@ -43,7 +43,9 @@ def summary(result: Result) -> str:
     text = f"Weakest focus {weakest:.3g} Pa"
     if result.bound is not None:
         text += f", {100 * weakest / result.bound:.0f} % of what any drive can reach ({result.bound:.3g} Pa)"
-    cells = f"cells of {result.spacing / MM:.3g} mm"
+    if result.spacing is None and not result.error:
+        return f"{text}. In closed form, without cells."
+    cells = "without cells" if result.spacing is None else f"cells of {result.spacing / MM:.3g} mm"
     if result.error is None:
         return f"{text}. {'Fine' if result.request.fine else 'Coarse'}, {cells}."
     return f"{text}. Estimated error {100 * result.error:.2g} %, {cells}."

@@ -148,6 +148,8 @@ class Situation:
             center=finite_vector("center", center) if body.moves else body.center,
             angles=finite_vector("angles", angles, "rad") if body.turns else body.angles,
         )
+        if moved == body:
+            return self
         bodies = (*self.bodies[:index], moved, *self.bodies[index + 1 :])
         obstacles = tuple(one.obstacle for one in bodies)
         return replace(self, bodies=bodies, scene=replace(self.scene, obstacles=obstacles))
@@ -158,10 +160,14 @@ class Situation:
         Raises:
             ValueError: a point cannot be there.
         """
+        if torch.equal(points, self.scene.control_points):
+            return self
         return replace(self, scene=replace(self.scene, control_points=points))
 
     def with_drive(self, drive: torch.Tensor) -> Situation:
         """Return the situation with another drive (M,)."""
+        if torch.equal(drive, self.drive):
+            return self
         return replace(self, drive=validate_single_drive(drive, len(self.scene.array)))
 
     def with_transducer(self, index: int, phase: float, amplitude: float) -> Situation:
@@ -181,7 +187,8 @@ class Situation:
         if height is None and plane in _AXES:
             height = float(self.scene.control_points.mean(dim=0)["xyz".index(plane)])
         low, high = changed.heights
-        return replace(changed, height=min(max(height or 0.0, low), high))
+        height = min(max(height or 0.0, low), high)
+        return self if (plane, height) == (self.plane, self.height) else replace(changed, height=height)
 
 
 def _middle(obstacle: Obstacle) -> Vector:

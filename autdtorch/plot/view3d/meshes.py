@@ -241,10 +241,11 @@ def plane_mesh(plane: Plane, values: Array) -> pyvista.PolyData:
 
 def add_isosurface(
     plotter: pyvista.Plotter, scene: Scene, level: Array, height: float, name: str = "isosurface"
-) -> None:
+) -> bool:
     """Draw the surface where the level (Nx, Ny, Nz) [dB], at the domain's cell centres, is `height`.
 
-    It is limited to the surroundings of the control points: near the array it would hide everything.
+    It is limited to the surroundings of the control points: near the array it would hide everything. Return
+    False where there is none.
     """
     import pyvista
 
@@ -260,10 +261,11 @@ def add_isosurface(
     surface = surface.clip_scalar(scalars="away", value=MM * _REACH * scene.wavelength)
     if surface.n_cells == 0:
         logger.warning("no isosurface: the level around the control points is below %g dB", height)
-        return
+        return False
     surface.clear_data()
     look = {"color": _SURFACE_COLOUR, "opacity": 0.45, "smooth_shading": True}
     plotter.add_mesh(surface.compute_normals(), name=name, reset_camera=False, **look)
+    return True
 
 
 def plane_pressure(scene: Scene, field: ArrayLike) -> tuple[Plane, Array]:
