@@ -1,9 +1,11 @@
 """The server of the live view answers its own page alone."""
 
 import asyncio
+import gc
 import socket
 import urllib.error
 import urllib.request
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from urllib.parse import urlsplit
 
@@ -82,6 +84,8 @@ def test_other_names_of_this_machine_are_refused(explorer):
     port = urlsplit(explorer.address).port
     assert status(explorer.address, Host=f"localhost:{port}")[0] == 200
     assert status(explorer.address, Host=f"example.org:{port}")[0] == 403
+    tunnel = "127.0.0.1:9000"  # of SSH, which may begin at another port
+    assert status(explorer.address, Host=tunnel, Origin=f"http://{tunnel}")[0] == 200
 
 
 def test_the_socket_needs_token_and_origin(explorer):
@@ -115,6 +119,21 @@ def test_files_outside_are_refused(explorer, path):
     assert answer.split()[1] in (b"403", b"404")
     assert b"root:" not in answer
     assert b"def " not in answer
+
+
+def test_a_live_view_that_nobody_has_any_more_ends():
+    live = at.explore(at.load_scene("configs/scene/sphere.yaml"), spacing=2e-3)
+    port, gone = urlsplit(live.address).port, weakref.ref(live)
+    del live
+    gc.collect()
+    assert gone() is None
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.1", port), timeout=5)
+
+
+def test_a_spacing_too_large_for_the_scene_is_refused():
+    with pytest.raises(ValueError, match="spacing"):
+        at.explore(at.load_scene("configs/scene/sphere.yaml"), spacing=6e-3)
 
 
 def test_it_listens_on_the_local_interface_alone(explorer):

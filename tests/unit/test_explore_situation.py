@@ -1,14 +1,18 @@
 """Situations of a live view: bodies that are moved and turned, planes, and what is undone."""
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from small_scenes import AIR, small_scene
 
 import autdtorch as at
+from autdtorch.plot.explore import history as history_module
+from autdtorch.plot.explore.catalogue import offered
 from autdtorch.plot.explore.history import History
 from autdtorch.plot.explore.situation import OWN_PLANE, Body, Situation
 
@@ -116,3 +120,53 @@ def test_a_change_after_undo_forgets_what_was_undone():
     history.change(first.with_plane("y"))
     history.settle()
     assert not history.can_redo
+
+
+def test_what_changes_nothing_is_no_step():
+    scene = at.load_scene("configs/scene/two_cubes.yaml")
+    situation = Situation.of(scene, torch.ones(16, dtype=torch.complex128))
+    body = situation.bodies[0]
+    history = History(situation)
+    history.change(situation.with_body(0, body.center, body.angles))
+    history.change(situation.with_points(scene.control_points.clone()))
+    history.change(situation.with_drive(situation.drive.clone()))
+    history.change(situation.with_plane(situation.plane, situation.height))
+    assert not history.settle()
+    assert history.now is situation
+
+
+def test_few_steps_are_kept_of_large_meshes(monkeypatch):
+    scene = small_scene()
+    mesh = at.Mesh.from_surface(WEDGE.triangles, offset=(10e-3, 10e-3, 10e-3), rigid=True)
+    scene = at.Scene(scene.array, AIR, scene.frequency, scene.control_points, (mesh,), None, scene.domain)
+    monkeypatch.setattr(history_module, "_MOST_BYTES", 3 * mesh.vertices.nbytes)
+    first = Situation.of(scene, DRIVE)
+    history = History(first)
+    for step in range(5):
+        history.change(first.with_plane("z", 1e-3 * step))
+        history.settle()
+    for _ in range(3):
+        assert history.can_undo
+        history.undo()
+    assert not history.can_undo
+
+
+@pytest.mark.parametrize(
+    "name", ["gabs", "lssg", "identify", "bo", "bo_circle", "bo_foci", "gs_pat", "diff_pat"]
+)
+def test_methods_have_the_settings_of_their_configs(name):
+    config = yaml.safe_load(Path(f"configs/method/{name}.yaml").read_text("utf-8"))
+    method = offered(16)[{"bo": "bayes_opt"}.get(name, name)]
+    for key, value in config.items():
+        if key != "_target_" and hasattr(method, key):
+            assert getattr(method, key) == (float(value) if value == "1e-4" else value)
+
+
+@pytest.mark.parametrize("rows", [1, 3])
+def test_all_methods_begin_with_few_transducers(rows):
+    array = at.TransducerArray.grid((2, rows), 10e-3, (0, 0, 0))
+    scene = at.Scene(array, AIR, 40e3, [[0.05, 0, 0]], (), None, [[-0.05] * 3, [0.1] * 3])
+    objective = at.SimulatedObjective(scene, at.make_propagator(scene))
+    for method in offered(2 * rows).values():
+        state = method.start(at.Problem.of(objective), 0)
+        assert method.ask(state).shape[-1] == 2 * rows

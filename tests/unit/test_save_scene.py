@@ -1,6 +1,7 @@
 """A scene that is saved is the scene that is loaded, and so are the lines of Python that make it."""
 
 import math
+import runpy
 
 import numpy as np
 import pytest
@@ -89,6 +90,17 @@ def test_a_saved_mesh_keeps_its_coordinates_and_pose(tmp_path):
     (found,) = at.load_scene(tmp_path / "scene.yaml").obstacles
     assert (found.scale, found.offset, found.rotation) == (mesh.scale, mesh.offset, mesh.rotation)
     assert torch.equal(found.vertices, mesh.vertices)
+
+
+def test_a_file_of_the_lines_finds_its_meshes_from_anywhere(tmp_path, monkeypatch):
+    mesh = at.Mesh.from_surface(TETRAHEDRON, 1.0, (40e-3,) * 3, rigid=True)
+    scene = scene_with(mesh, plane=False)
+    write_files(scene, tmp_path / "scene")
+    file = tmp_path / "lines.py"
+    file.write_text(scene_lines(scene, torch.ones(4, dtype=torch.complex128), "scene", beside=True), "utf-8")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    require_equal(runpy.run_path(str(file))["scene"], scene)
 
 
 def test_an_obstacle_of_ones_own_is_refused(tmp_path):

@@ -60,7 +60,9 @@ def explore(
         raise RuntimeError("explore: needs trame: pip install 'autdtorch[explore]'")
     require_rendering()
     from autdtorch.plot.explore.explorer import Explorer
+    from autdtorch.propagators.plan import plan
 
+    plan(scene, spacing=spacing)  # refuses a spacing too large for the scene, before there is a page
     explorer = Explorer(scene, drive, spacing, port)
     if browses:
         webbrowser.open(explorer.address)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import weakref
 from collections.abc import Callable
 from html import escape
 from typing import Any
@@ -25,6 +27,9 @@ _QUALITY = {"interactive_quality": 75, "still_quality": 90}  # of JPEG; the seco
 class Explorer:
     """A live view of a scene, as `explore` returns it. A notebook shows it in a frame.
 
+    It ends with `close`, or when nothing refers to it any more. Until the first drive is found, that of all
+    transducers in phase is shown.
+
     Attributes:
         address: of the page, with the token that opens it; for browsers on this machine.
     """
@@ -32,25 +37,26 @@ class Explorer:
     def __init__(self, scene: Scene, drive: torch.Tensor | None, spacing: float, port: int) -> None:
         """Use `explore`, which checks its arguments."""
         in_phase = torch.ones(len(scene.array), dtype=torch.complex128, device="cpu")
-        self._situation = Situation.of(scene, in_phase if drive is None else drive)
-        self._first_method = "gradient_ascent" if drive is None else None
-        self._spacing = spacing
-        self._server = Server(self._build, port)
+        self._shown = _Shown(Situation.of(scene, in_phase if drive is None else drive))
+        first_method = "gradient_ascent" if drive is None else None
+        self._server = Server(functools.partial(_build, self._shown, first_method, spacing), port)
         self.address = self._server.address
+        # When nobody has it any more, or at exit: OpenGL must end in its thread, before the interpreter does
+        self._end = weakref.finalize(self, self._server.close)
 
     @property
     def scene(self) -> Scene:
         """The scene as it is now."""
-        return self._situation.scene
+        return self._shown.situation.scene
 
     @property
     def drive(self) -> torch.Tensor:
         """The drive (M,) as it is now."""
-        return self._situation.drive.clone()
+        return self._shown.situation.drive.clone()
 
     def close(self) -> None:
         """End the live view."""
-        self._server.close()
+        self._end()
 
     def wait(self) -> None:
         """Wait until the live view is closed."""
@@ -66,23 +72,29 @@ class Explorer:
         size = f'width="100%" height="{_HEIGHT}" style="border: 0"'
         return f'<iframe src="{escape(self.address)}" title="{title}" {size}></iframe>'
 
-    def _build(self, trame: Any, defer: Defer) -> Callable[[], None]:
-        """Make the application on a trame server; return what ends it."""
-        session = Session(trame, self._situation, self._spacing, defer, self._note)
-        Controls(trame, session)
-        session.begin(self._first_method)
-        view = rca.RemoteControlledArea(
-            name="view", display="image", event_throttle_ms=30, trame_server=trame
-        )
-        handler = view.create_view_handler(
-            session.display.picture.plotter.render_window, encoder="jpeg", target_fps=_FRAMES,
-            **_QUALITY,
-        )  # fmt: skip
-        session.display.update = handler.update
-        with DivLayout(trame) as layout:
-            layout.root.classes = "explore"
-            layout.root.add_child(page(view.html))
-        return session.close
 
-    def _note(self, situation: Situation) -> None:
-        self._situation = situation
+class _Shown:
+    """The situation that is shown."""
+
+    def __init__(self, situation: Situation) -> None:
+        self.situation = situation
+
+    def note(self, situation: Situation) -> None:
+        self.situation = situation
+
+
+def _build(shown: _Shown, method: str | None, spacing: float, trame: Any, defer: Defer) -> Callable[[], None]:
+    """Make the application on a trame server; return what ends it."""
+    session = Session(trame, shown.situation, spacing, defer, shown.note)
+    Controls(trame, session)
+    session.begin(method)
+    view = rca.RemoteControlledArea(name="view", display="image", event_throttle_ms=30, trame_server=trame)
+    handler = view.create_view_handler(
+        session.display.picture.plotter.render_window, encoder="jpeg", target_fps=_FRAMES,
+        **_QUALITY,
+    )  # fmt: skip
+    session.display.update = handler.update
+    with DivLayout(trame) as layout:
+        layout.root.classes = "explore"
+        layout.root.add_child(page(view.html))
+    return session.close

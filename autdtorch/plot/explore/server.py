@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import atexit
 import contextlib
 import functools
 import secrets
@@ -14,6 +13,7 @@ from typing import Any
 
 from aiohttp import web
 from trame.app import get_server
+from trame.app.core import AVAILABLE_SERVERS
 from trame_client.module.vue3 import www
 
 HOST = "127.0.0.1"
@@ -53,7 +53,6 @@ class Server:
             raise TimeoutError(f"explore: the server did not start within {_PATIENCE:g} s")
         if self._failure is not None:
             raise self._failure
-        atexit.register(self.close)  # OpenGL must end in its thread, before the interpreter does
 
     @property
     def address(self) -> str:
@@ -72,7 +71,6 @@ class Server:
 
     def close(self) -> None:
         """Stop the server and end the thread."""
-        atexit.unregister(self.close)
         if self.running:
             asyncio.run_coroutine_threadsafe(self._trame.stop(), self._loop)
             self._thread.join(_PATIENCE)
@@ -92,6 +90,7 @@ class Server:
 
     async def _serve(self) -> None:
         self._trame = trame = get_server(f"explore-{self.token}", client_type="vue3")
+        del AVAILABLE_SERVERS[f"explore-{self.token}"]  # which would keep it, and all that it shows, for ever
         # trame would read the arguments of the user's own program, among them the host
         trame.cli.parse_known_args = functools.partial(trame.cli.parse_known_args, [])
         trame.cli.set_defaults(ws=f"{self.token}/ws", host=HOST)
@@ -129,11 +128,11 @@ class Server:
     async def _refuse_others(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Refuse requests without the token, from pages of other origins, and by other names of this host."""
         token = request.path.strip("/").partition("/")[0]
-        own = {f"{name}:{self.port}" for name in _NAMES}
         origin = request.headers.get("Origin")
-        if not secrets.compare_digest(token.encode(), self.token.encode()) or request.host not in own:
+        known = request.host.partition(":")[0] in _NAMES  # with any port, as a tunnel may begin at another
+        if not secrets.compare_digest(token.encode(), self.token.encode()) or not known:
             raise web.HTTPForbidden(text="explore: open the address that was printed, with its token")
-        if origin is not None and origin.removeprefix("http://") not in own:
+        if origin is not None and origin != f"http://{request.host}":
             raise web.HTTPForbidden(text="explore: the page of another origin")
         response = await handler(request)
         if not response.prepared:
