@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any, Protocol
 
@@ -38,9 +39,8 @@ class Mouse:
         self._grip: Grip | None = None
         self._from = 0.0
         self._interactor: Any = picture.plotter.iren.interactor
-        for event in _KEYS:
-            self._interactor.RemoveObservers(event)
         for event, listener in (
+            *((event, functools.partial(self._stop, event)) for event in _KEYS),
             ("LeftButtonPressEvent", self._press),
             ("MouseMoveEvent", self._move),
             ("LeftButtonReleaseEvent", self._release),
@@ -74,6 +74,6 @@ class Mouse:
             self._stop("LeftButtonReleaseEvent")
             self._owner.settle()
 
-    def _stop(self, event: str) -> None:
+    def _stop(self, event: str, *_: object) -> None:
         """Keep the event from the camera."""
         getattr(self, f"_{event}").SetAbortFlag(1)
