@@ -188,7 +188,9 @@ class Calculator:
         if not fine or self._is_old():
             return
         matrix, error = propagator.transfer_matrix(return_error=True)
-        result = replace(result, bound=float(focus_bound(matrix)), error=error)
+        # The pressure of the matrix, which is one for all planes
+        pressure = (matrix @ drive).abs()
+        result = replace(result, pressure=pressure, bound=float(focus_bound(matrix)), error=error)
         yield replace(result, seconds=time.monotonic() - begun)
         if request.volume and self._rests():
             volume = volume_field(propagator, drive, situation.scene.wavelength / 3)

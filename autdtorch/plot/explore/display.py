@@ -88,7 +88,7 @@ class Display:
                     "can_undo": history.can_undo, "can_redo": history.can_redo,
                 }
             )  # fmt: skip
-        self.picture.place(now, focus)
+        self.picture.place(now, focus, transducer)
 
     def show(self, result: Result, keeps: bool) -> None:
         """Show a result; its colour scale stays for the next ones if it `keeps`."""

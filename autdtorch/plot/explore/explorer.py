@@ -19,7 +19,7 @@ from autdtorch.plot.explore.session import Session
 from autdtorch.plot.explore.situation import Situation
 from autdtorch.scene.scene import Scene
 
-_HEIGHT = 780  # pixels of the frame in a notebook
+_HEIGHT = 1200  # pixels of the frame in a notebook
 _FRAMES = 30.0  # a second, at most
 _QUALITY = {"interactive_quality": 75, "still_quality": 90}  # of JPEG; the second frame comes at rest
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from autdtorch.methods.base import Method
+from autdtorch.plot import colours
 from autdtorch.plot.explore import saving
 from autdtorch.plot.explore.catalogue import choices
 from autdtorch.plot.explore.picture import gradient
@@ -42,7 +43,7 @@ _SLIDER = """
 <label class="slider"><span>{label}</span>
   <input type="range" id="{name}" v-model.number="{name}" :min="{low}" :max="{high}" step="{step}"
     :disabled="{disabled}" @change="settled += 1">
-  <input type="number" id="{name}_number" aria-label="{label}" v-model.lazy.number="{name}" :min="{low}"
+  <input type="number" id="{name}_number" aria-label="{spoken}" v-model.lazy.number="{name}" :min="{low}"
     :max="{high}" step="any" :disabled="{disabled}" @change="settled += 1">
 </label>"""
 _CHOICE = """
@@ -64,8 +65,12 @@ _LOOK = """
   @click="trigger('{name}')">{label}</button>"""
 
 
-def _slider(name: str, label: str, low: str, high: str, step: float, disabled: str = "false") -> str:
-    return _SLIDER.format(name=name, label=label, low=low, high=high, step=step, disabled=disabled)
+def _slider(
+    name: str, label: str, low: str, high: str, step: float, disabled: str = "false", spoken: str = ""
+) -> str:
+    """Return a slider and a number; `spoken` is the label for screen readers, if it differs."""
+    bounds = {"low": low, "high": high, "step": step, "disabled": disabled}
+    return _SLIDER.format(name=name, label=label, spoken=spoken or label, **bounds)
 
 
 def _place(name: str, disabled: str = "false") -> str:
@@ -94,6 +99,10 @@ def _button(name: str, label: str, disabled: str = "false") -> str:
 
 def page(view: str) -> str:
     """Return the template of the page, with that of the picture in it."""
+    height = _slider(
+        "height", f"{{{{ plane === '{OWN_PLANE}' ? 'shifted by' : 'at' }}}} [mm]", "range_height[0]",
+        "range_height[1]", 0.5, spoken="place of the plane [mm]",
+    )  # fmt: skip
     looks = "".join(_LOOK.format(name=name, **look._asdict()) for name, look in CAMERA.items())
     turns = "".join(
         _slider(f"turn_{axis}", f"turn about {axis} [°]", "-180", "180", 1, "!body_turns") for axis in "xyz"
@@ -112,6 +121,10 @@ def page(view: str) -> str:
       <span>{{{{ scale_low }}}}</span><span class="bar" :style="scale_style"></span>
       <span>{{{{ scale_high }}}}</span>
       <span class="hint">grey: in obstacles and next to transducers</span>
+    </div>
+    <div class="legend">
+      <span>phase 0°</span><span class="bar" :style="phase_style"></span><span>360°</span>
+      <span class="hint">of the transducers; light grey: silent</span>
     </div>
     <div class="row" role="group" aria-label="camera">{looks}</div>
     <p class="hint">Drag an obstacle or a focus to move it, an obstacle with Shift to turn it. Click a
@@ -157,7 +170,7 @@ def page(view: str) -> str:
     </fieldset>
     <fieldset><legend>Field</legend>
       {_choice("plane", "plane across", "planes")}
-      {_slider("height", "at [mm]", "range_height[0]", "range_height[1]", 0.5)}
+      {height}
       {_choice("unit", "unit", "units")} {_number("reference", "brightest [Pa]")}
       <div class="row">{_button("rescale", "Fit the colours")}</div>
       {_box("volume", "surface of equal level in the volume")} {_number("surface", "at [dB]")}
@@ -191,7 +204,7 @@ def first_state(situation: Situation, methods: dict[str, Method]) -> dict[str, A
         "progress": 0,
         "planes": planes, "units": [("dB", "dB"), ("Pa", "Pa")], "unit": "dB", "reference": 1.0,
         "volume": False, "surface": FIRST_SURFACE, "dark": False, "scale_low": "", "scale_high": "",
-        "scale_style": f"background: linear-gradient(to right, {', '.join(gradient())})",
+        "scale_style": gradient(colours.PRESSURE_MAP), "phase_style": gradient(colours.PHASE_MAP),
         "devices": devices, "device": "", "folder": saving.free_folder(),
         "shown": -1, "wanted": 0, "settled": 0,
     } | {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +22,7 @@ _AROUND = 1.05  # height of the window over that of the domain's sphere, for let
 _LETTERS = 9.0  # size of tick labels and titles
 _SAMPLES_A_PIXEL = 4
 _CHOSEN = 1.7  # size of the chosen focus
+_RING = 1.1, 1.4  # radii of the ring around the chosen transducer, over that of its disc
 _SURFACE_NAME = "isosurface"
 
 
@@ -67,18 +67,19 @@ class Picture:
 
     def __init__(self, situation: Situation) -> None:
         """Draw a situation, as yet without a field."""
-        scene = situation.scene
+        scene, self._situation = situation.scene, situation
         self.plotter = meshes.empty_plotter(scene.domain, off_screen=True)
         self._bodies = [meshes.add_obstacle(self.plotter, body.first) for body in situation.bodies]
         self._foci: list[Any] = []
         self._faces = meshes.add_transducers(
             self.plotter, scene, meshes.emitted_phases(situation.drive, len(scene.array)), bar=False
         )
+        self._ring = self._around(0)
+        self.plotter.add_mesh(self._ring, color=meshes.POINT_COLOUR, lighting=False, reset_camera=False)
         self._sheet = meshes.plane_mesh(situation.sheet, np.full((1, 1), math.nan))
         self._actor = meshes.add_sheet(self.plotter, self._sheet, colours.PRESSURE_MAP, (0.0, 1.0))
-        self._situation = situation
         self.set_dark(False)
-        self.place(situation, 0)
+        self.place(situation, 0, 0)
         self._fitted = self.plotter.camera.parallel_scale
         self._first = self.plotter.camera_position
         self.plotter.render_window.AddObserver("WindowResizeEvent", lambda *_: self._fit())
@@ -111,8 +112,8 @@ class Picture:
         self.plotter.set_background(paper)
         meshes.add_axes(self.plotter, self._situation.scene.domain, ink, _LETTERS)
 
-    def place(self, situation: Situation, focus: int) -> None:
-        """Move bodies and foci; `focus` is the chosen one."""
+    def place(self, situation: Situation, focus: int, transducer: int) -> None:
+        """Move bodies and foci; mark the chosen focus and transducer by their indices."""
         self._situation = situation
         for actors, body in zip(self._bodies, situation.bodies, strict=True):
             for actor in actors:
@@ -127,7 +128,18 @@ class Picture:
                 self._foci.append(self.plotter.add_mesh(sphere, **look))
             self._foci[index].position = point
             self._foci[index].scale = _CHOSEN if index == focus else 1.0
+        self._ring.copy_from(self._around(transducer))
         self.show_drive(situation.drive)
+
+    def _around(self, transducer: int) -> Any:
+        """Return a ring around the disc of a transducer."""
+        import pyvista
+
+        array = self._situation.scene.array
+        center, normal = MM * array.positions[transducer].numpy(), array.normals[transducer].tolist()
+        disc = self._faces.points.reshape(len(array), -1, 3)[transducer]
+        inner, outer = (share * np.linalg.norm(disc - center, axis=1).max() for share in _RING)
+        return pyvista.Disc(center=center, inner=inner, outer=outer, normal=normal, c_res=48)
 
     def smooth(self, fine: bool) -> None:
         """Render with smooth edges, which takes four times as long, or without while something is dragged."""
@@ -199,9 +211,9 @@ class Picture:
         self.plotter.close()
 
 
-def gradient(count: int = 9) -> Sequence[str]:
-    """Return colours of the pressure's scale from its lower end on, for a legend."""
-    return meshes.map_colours(colours.PRESSURE_MAP, count)
+def gradient(name: str, count: int = 9) -> str:
+    """Return the colours of a map, from its lower end on, as a background of a legend."""
+    return f"background: linear-gradient(to right, {', '.join(meshes.map_colours(name, count))})"
 
 
 def _matrix(turn: torch.Tensor, pivot: torch.Tensor, offset: torch.Tensor) -> Array:

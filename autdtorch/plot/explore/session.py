@@ -20,7 +20,7 @@ from autdtorch.plot.explore.display import Display
 from autdtorch.plot.explore.history import History
 from autdtorch.plot.explore.mouse import Mouse
 from autdtorch.plot.explore.picture import Grip
-from autdtorch.plot.explore.readings import MM
+from autdtorch.plot.explore.readings import MM, refusal
 from autdtorch.plot.explore.situation import Situation
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.moving import angles_of
@@ -118,7 +118,7 @@ class Session:
     def refuse(self, error: Exception) -> None:
         """Say why something cannot be, and set the page back."""
         self.place()
-        self._state.message = f"Not possible: {str(error) or repr(error)}"
+        self._state.message = f"Not possible: {refusal(error)}"
 
     def drag(self, grip: Grip, place: Array) -> None:
         """Move a body or a focus so that its grip is at a place (3,) [m]."""
@@ -281,9 +281,13 @@ class Session:
                 return
             elif isinstance(found, Failure):
                 self._search, self._running = None, False
-                message = str(found.error) or repr(found.error)
                 self._state.update(
-                    {"message": message, "status": "", "busy": False, "shown": found.request.number}
+                    {
+                        "message": refusal(found.error),
+                        "status": "",
+                        "busy": False,
+                        "shown": found.request.number,
+                    }
                 )
             elif self._running:
                 text = f"{found.label}: {found.evaluations} of at most {found.most} evaluations"
