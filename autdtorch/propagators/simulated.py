@@ -63,9 +63,10 @@ class SimulatedPropagator:
     transducers are simulated and kept once they pay: after as many runs from points. More points outside the
     boxes, and more drives, then take sums and no runs.
 
-    The last transfer matrices are kept, up to 250 MB. Points that are given as a grid (Nu, Nv, 3), such as a
-    plane, are likely to be looked at again. Without a cache, their matrix is simulated once drives there have
-    taken as many runs as the matrix takes; more drives then take no runs.
+    The last transfer matrices are kept, up to 250 MB in all; a larger one is simulated whenever it is needed.
+    Points that are given as a grid (Nu, Nv, 3), such as a plane, are likely to be looked at again. Without a
+    cache, their matrix is simulated once drives there have taken as many runs as the matrix takes, if it can
+    be kept; more drives then take no runs.
 
     Attributes:
         scene: the scene it was made for.
@@ -92,7 +93,7 @@ class SimulatedPropagator:
         # What a folder holds must not decide how later fields are computed: nothing is kept beside a cache.
         boxes = KeepingSimulation if cache is None else BoxSimulation
         self._simulation = DomainSimulation(plan) if plan.method == "full" else boxes(plan)
-        self._kept = KeptMatrices()
+        self._kept = KeptMatrices(len(plan.scene.array))
         self._transducers_ran = self._near_logged = self._near_points_logged = False
 
     def __repr__(self) -> str:
@@ -135,7 +136,7 @@ class SimulatedPropagator:
         """Return the transfer matrix G, from one simulation for each transducer or each point (reciprocity).
 
         Simulations start at the transducers if a point is next to an obstacle. Points or transducers in one
-        symmetry orbit of the scene on its grid share a simulation. The matrix of the control points is kept.
+        symmetry orbit of the scene on its grid share a simulation. The last matrices are kept, up to 250 MB.
 
         Args:
             points: (P, 3) [m]; by default the scene's control points.
@@ -227,11 +228,16 @@ class SimulatedPropagator:
 
     def _result(self, points: torch.Tensor | None) -> TransferMatrix:
         """Return the matrix of points, by default of the control points; it may be changed."""
-        kept = self._executed(self.scene.control_points if points is None else points)
-        return replace(kept, matrix=kept.matrix.clone())
+        points = self.scene.control_points if points is None else points
+        result = self._executed(points)
+        own = self._kept.get(points) is not result
+        return result if own else replace(result, matrix=result.matrix.clone())
 
     def _executed(self, points: torch.Tensor) -> TransferMatrix:
-        """Return the matrix of points: kept, from the cache or simulated. The cache gets those converged."""
+        """Return the matrix of points: kept, from the cache or simulated. The cache gets those converged.
+
+        It is not to be changed if it is kept.
+        """
         if (kept := self._kept.get(points)) is not None:
             return kept
         result = self._loaded(points)
@@ -241,8 +247,7 @@ class SimulatedPropagator:
             self._transducers_ran |= bool(result.runs) and not result.from_points
             if self._cache is not None and all(run.reached for run in result.runs):
                 self._cache.save(cache_key(self._plan, points), result.matrix.numpy(), result.error)
-        self._kept.add(points, result)
-        return result
+        return self._kept.add(points, result) or result
 
     def _loaded(self, points: torch.Tensor) -> TransferMatrix | None:
         """Return the matrix of points from the cache, if it is there."""

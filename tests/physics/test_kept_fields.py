@@ -6,7 +6,7 @@ import pytest
 import torch
 from small_scenes import AIR, CUBE, relative_error, small_scene
 
-from autdtorch.propagators import make_propagator
+from autdtorch.propagators import kept_matrices, make_propagator
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Sphere
 from autdtorch.scene.scene import Scene
@@ -133,6 +133,77 @@ def test_the_matrix_of_a_plane_is_kept_once_its_drives_took_as_many_runs(method,
     assert runs == [1, 1, 1, 1, 4, 0, 0]  # a run for each of the four transducers
     one = new().field(drives[-1], plane)  # simulated as a drive
     assert relative_error(field, one) < SAME
+
+
+BYTES = 16 * 25 * 4  # of the matrix of a plane
+
+
+def runs_of_single_drives(monkeypatch, most_bytes, planes):
+    """Return the propagator, the runs of each call and the most bytes kept, where so many may be."""
+    monkeypatch.setattr(kept_matrices, "_MOST_BYTES", most_bytes)
+    propagator = make_propagator(small_scene((ASIDE,)), "full", 1.3e-3, tolerance=1e-1, cache=False)
+    runs, kept = [], []
+    for power, plane in enumerate(planes):
+        before = len(propagator.runs)
+        propagator.field(DRIVE**power, plane.reshape(5, 5, 3))
+        runs.append(len(propagator.runs) - before)
+        kept.append(propagator._kept.bytes)
+    return propagator, runs, max(kept)
+
+
+def test_a_matrix_that_is_too_large_is_not_kept_and_never_simulated_for_drives(monkeypatch):
+    propagator, runs, most = runs_of_single_drives(monkeypatch, BYTES - 1, [PLANE] * 7)
+    assert (runs, most) == ([1] * 7, 0)
+    matrix = propagator.transfer_matrix(PLANE)
+    assert propagator._kept.bytes == 0
+    before = len(propagator.runs)
+    assert torch.equal(propagator.transfer_matrix(PLANE), matrix)
+    assert len(propagator.runs) == before + 4
+
+
+def test_planes_that_do_not_all_fit_take_at_most_two_runs_a_drive(monkeypatch):
+    planes = [PLANE, PLANE + 1e-3] * 12
+    _, runs, most = runs_of_single_drives(monkeypatch, 2 * BYTES - 1, planes)
+    assert most == BYTES
+    assert sum(runs) <= 2 * len(planes)
+    _, runs, most = runs_of_single_drives(monkeypatch, 2 * BYTES, planes)
+    assert most == 2 * BYTES
+    assert sum(runs) == 2 * (4 + 4)  # of drives, then of both matrices
+
+
+def test_runs_of_few_planes_are_counted(monkeypatch):
+    monkeypatch.setattr(kept_matrices, "_MOST_PLANES", 3)
+    kept = kept_matrices.KeptMatrices(4)
+    for moved in range(5):
+        kept.count(PLANE + moved, 1)
+        kept.count(PLANE, 1)
+    assert len(kept._runs) == 3
+    assert [kept.runs(PLANE + moved) for moved in range(5)] == [6, 0, 0, 1, 1]
+
+
+def test_a_matrix_is_held_once(monkeypatch):
+    """The one simulated is the one kept; the caller gets a copy, unless it is not kept."""
+    propagator, points = box((ASIDE,)), PLANE[:3]
+    made = []
+    simulate = propagator._simulation.transfer_matrix
+    monkeypatch.setattr(
+        propagator._simulation, "transfer_matrix", lambda given: made.append(simulate(given)) or made[-1]
+    )
+    found = propagator.transfer_matrix(points)
+    assert propagator._kept.get(points) is made[0]
+    assert found.data_ptr() != made[0].matrix.data_ptr()
+    monkeypatch.setattr(kept_matrices, "_MOST_BYTES", 0)
+    assert propagator.transfer_matrix(PLANE[3:6]).data_ptr() == made[1].matrix.data_ptr()
+
+
+def test_a_matrix_made_without_gradients_serves_calls_with_them():
+    propagator, drive = box((ASIDE,)), DRIVE.clone().requires_grad_()
+    with torch.inference_mode():
+        propagator.transfer_matrix()
+    before = len(propagator.runs)
+    propagator.field(drive, propagator.scene.control_points).abs().sum().backward()
+    assert len(propagator.runs) == before
+    assert drive.grad.abs().max() > 0
 
 
 @pytest.mark.parametrize("method", ["box", "full"])
