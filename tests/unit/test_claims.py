@@ -92,7 +92,7 @@ def test_a_claim_fails_on_contrary_data(broken, scene, method, change):
 def test_a_difference_has_an_interval_and_is_clear_where_it_excludes_zero():
     _, verdict = judge_claims(study(spread=0.3, trials=15))[4]
     line = verdict.evidence[2]
-    start = "two_cubes: BO 6.00, GABS 7.00 Pa; GABS - BO 1.00 ["
+    start = "two_cubes: BO 6.00, GABS 7.00 Pa; GABS minus BO: 1.00 ["
     assert line.startswith(start)
     # The trials are at 1, 1 +- 0.3/8, ... 1 +- 7/8 0.3 of the mean: their standard deviation is 0.168 of it.
     half = 1.96 * 0.168 * math.hypot(6, 7) / math.sqrt(15)

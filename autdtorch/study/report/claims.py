@@ -127,7 +127,7 @@ def _ordered(smaller: str, larger: tuple[str, ...], quantity: str) -> Compare:
         for name in larger:
             both = (_values(scene, method, quantity) for method in (name, smaller))
             margins.append(bootstrap(*both, combine=operator.sub))
-            parts.append(f"{label_of(name)} - {label_of(smaller)} {margins[-1]}")
+            parts.append(f"{label_of(name)} minus {label_of(smaller)}: {margins[-1]}")
         return "; ".join(parts), margins
 
     return compare
