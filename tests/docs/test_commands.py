@@ -1,13 +1,18 @@
 """Every command and every block of Python in README and the documentation runs, or a rule says why not.
 
-The commands of a page run in their order in one folder, a copy of what a clone holds. So do its blocks of
-Python, in one process. Cells of notebooks are executed by the build of the documentation (test_docs.py).
+The commands of a page run in their order in one folder, a copy of what a clone holds, and so do its blocks of
+Python. Bash reads the commands; `autdtorch` and Python then run in this process, which has imported PyTorch.
+Cells of notebooks are executed by the build of the documentation (test_docs.py).
 """
 
+import contextlib
 import importlib
+import io
 import itertools
+import logging
 import os
 import re
+import runpy
 import shlex
 import shutil
 import signal
@@ -17,8 +22,12 @@ import tomllib
 from pathlib import Path
 from typing import NamedTuple
 
+import matplotlib
 import pytest
 from packaging.requirements import Requirement
+
+from autdtorch import hardware
+from autdtorch.cli import main as command_line
 
 ROOT = Path(__file__).parents[2]
 PAGES = [
@@ -130,14 +139,64 @@ def run(command, folder):
 # --- rules
 
 
+def words_of(command, extra, folder):
+    """Return the words that bash makes of a command, with its variables."""
+    read = run(["bash", "-ec", f"{command.variables}printf '%s\\0' {command.text} {extra}"], folder)
+    assert read.returncode == 0, read.stderr
+    return read.stdout.split("\0")[:-1]
+
+
 def runs(extra=""):
     """The command runs, with `extra` settings that make it shorter."""
 
     def rule(command, folder):
-        done = run(["bash", "-ec", f"{command.variables}{command.text} {extra}"], folder)
-        assert done.returncode == 0, done.stdout + done.stderr
+        program, *arguments = words_of(command, extra, folder)
+        with here(folder) as patch:
+            if program == "autdtorch":
+                patch.setattr(sys, "argv", [program, *arguments])
+                status = ending(command_line.main)
+            elif arguments[0] == "-c":
+                status = ending(exec, arguments[1], {})
+            else:
+                patch.setattr(sys, "argv", arguments)
+                status = ending(runpy.run_path, arguments[0], run_name="__main__")
+        assert status == 0
 
     return rule
+
+
+def starts(command, folder):
+    """The command runs in a process of its own, as a user's does."""
+    done = run(["bash", "-ec", command.text], folder)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@contextlib.contextmanager
+def here(folder):
+    """Be in the folder as a new process is, in front of someone who presses Enter; undo all at the end."""
+    root, package = logging.getLogger(), logging.getLogger("autdtorch")
+    handlers, levels, modules = root.handlers[:], (root.level, package.level), set(sys.modules)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(sys, "path", [str(folder), *sys.path])
+        patch.setattr(sys, "stdin", io.StringIO("\n"))
+        patch.delenv("HYDRA_FULL_ERROR", raising=False)
+        yield patch
+    root.handlers[:] = handlers  # Hydra's write to the stderr of this test
+    root.setLevel(levels[0])
+    package.setLevel(levels[1])
+    for name in set(sys.modules) - modules:
+        if Path(getattr(sys.modules[name], "__file__", None) or "").parent == folder:
+            del sys.modules[name]
+
+
+def ending(function, *given, **named):
+    """Return the status with which a program ends."""
+    try:
+        function(*given, **named)
+    except SystemExit as end:
+        return end.code or 0
+    return 0
 
 
 def parses(command, folder):
@@ -265,7 +324,8 @@ RULES = [
     (r"python scripts/hardware_trial.py \$bench", runs("hardware.emulated=true")),
     (r"autdtorch hardware=emulated|python scripts/hardware_trial.py ", runs()),
     (r"autdtorch .*poses=", runs("solver.spacing=2e-3 poses.count=3")),
-    (r"autdtorch collect |autdtorch --help", runs()),
+    (r"autdtorch --help", starts),
+    (r"autdtorch collect ", runs()),
     (r"autdtorch ", runs(SHORT)),
     (r"python -c ", runs()),
 ]
@@ -356,9 +416,16 @@ def test_python_of_a_page_runs(page, tmp_path):
     if "playwright" in code and shutil.which("chromium") is None:
         pytest.skip("no Chromium")
     furnish(tmp_path)
-    (tmp_path / "page.py").write_text(STAND_INS.get(page, "") + code, "utf-8")
-    done = run([sys.executable, "page.py"], tmp_path)
-    assert done.returncode == 0, done.stderr
+    code = STAND_INS.get(page, "") + code
+    if "explore" in code or "playwright" in code:  # has loops and threads that end with the process
+        (tmp_path / "page.py").write_text(code, "utf-8")
+        done = run([sys.executable, "page.py"], tmp_path)
+        assert done.returncode == 0, done.stderr
+        return
+    with here(tmp_path) as patch, matplotlib.rc_context({"backend": "Agg"}):
+        for name in ("open_link", "open_scope", "FileSensor"):  # to be undone
+            patch.setattr(hardware, name, getattr(hardware, name))
+        exec(compile(code, f"{page} as Python", "exec"), {"__name__": "__main__"})
 
 
 def test_the_gallery_shows_every_picture():
