@@ -133,13 +133,11 @@ class Picture:
 
     def _around(self, transducer: int) -> Any:
         """Return a ring around the disc of a transducer."""
-        import pyvista
-
         array = self._situation.scene.array
         center, normal = MM * array.positions[transducer].numpy(), array.normals[transducer].tolist()
         disc = self._faces.points.reshape(len(array), -1, 3)[transducer]
-        inner, outer = (share * np.linalg.norm(disc - center, axis=1).max() for share in _RING)
-        return pyvista.Disc(center=center, inner=inner, outer=outer, normal=normal, c_res=48)
+        inner, outer = (share * float(np.linalg.norm(disc - center, axis=1).max()) for share in _RING)
+        return meshes.ring_mesh(center, normal, inner, outer)
 
     def smooth(self, fine: bool) -> None:
         """Render with smooth edges, which takes four times as long, or without while something is dragged."""

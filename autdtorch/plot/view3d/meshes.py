@@ -146,6 +146,13 @@ def add_transducers(
     return face
 
 
+def ring_mesh(center: Array, normal: list[float], inner: float, outer: float) -> pyvista.PolyData:
+    """Return a flat ring; lengths in mm."""
+    import pyvista
+
+    return pyvista.Disc(center=center, inner=inner, outer=outer, normal=normal, c_res=48)
+
+
 def add_bar(
     plotter: pyvista.Plotter, mesh: pyvista.Actor, title: str, *, position: float, labels: int, fmt: str
 ) -> None:
