@@ -74,7 +74,7 @@ class Picture:
         self._faces = meshes.add_transducers(
             self.plotter, scene, meshes.emitted_phases(situation.drive, len(scene.array)), bar=False
         )
-        self._ring = self._around(0)
+        self._ringed, self._ring = 0, self._around(0)
         self.plotter.add_mesh(self._ring, color=meshes.POINT_COLOUR, lighting=False, reset_camera=False)
         self._sheet = meshes.plane_mesh(situation.sheet, np.full((1, 1), math.nan))
         self._actor = meshes.add_sheet(self.plotter, self._sheet, colours.PRESSURE_MAP, (0.0, 1.0))
@@ -128,7 +128,9 @@ class Picture:
                 self._foci.append(self.plotter.add_mesh(sphere, **look))
             self._foci[index].position = point
             self._foci[index].scale = _CHOSEN if index == focus else 1.0
-        self._ring.copy_from(self._around(transducer))
+        if transducer != self._ringed:
+            self._ringed = transducer
+            self._ring.copy_from(self._around(transducer))
         self.show_drive(situation.drive)
 
     def _around(self, transducer: int) -> Any:
