@@ -1,163 +1,26 @@
 """The live view in a real browser: what a user does there changes scene, drive and picture."""
 
-import contextlib
-import io
-import re
-import time
-
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from live_view import (
+    PATIENCE,
+    SPACING,
+    center_of_box,
+    drag,
+    opened,
+    pixels,
+    pressures,
+    set_slider,
+    settled,
+    share_of_bound,
+    simulated,
+    wait_for,
+)
 
 import autdtorch as at
-from autdtorch.plot.view3d import rendering_problem
 
 pytest.importorskip("trame_rca", reason="trame: install autdtorch[explore]")
-
-SPACING = 1.5e-3  # cells of the fine calculation here
-PATIENCE = 30_000  # ms; the first simulation may compile kernels, and the machine may be busy
-
-
-@pytest.fixture(scope="module")
-def scene():
-    """Two cubes that are not alike, so that a mirrored picture is another."""
-    array = at.TransducerArray.grid((4, 4), 10e-3, (1e-3, 50e-3, 50e-3))
-    foci = at.circle_points((80e-3, 50e-3, 50e-3), 25e-3, 3, (1, 0, 0))
-    cubes = (
-        at.Box((40e-3, 45e-3, 50e-3), (14e-3,) * 3, density=100.0, sound_speed=340.0),
-        at.Sphere((30e-3, 70e-3, 60e-3), 4e-3, rigid=True),
-    )
-    plane = at.Plane((80e-3, 50e-3, 50e-3), (1, 0, 0), (100e-3, 100e-3))
-    domain = [[0, 0, 0], [0.1, 0.1, 0.1]]
-    return at.Scene(array, at.Medium.air(), 40e3, foci, cubes, plane, domain, name="cube and sphere")
-
-
-@pytest.fixture
-def live(scene, browser):
-    """A live view of the scene, and its page in a browser, when the first drive is found."""
-    if problem := rendering_problem():
-        pytest.skip(problem)
-    explorer = at.explore(scene, spacing=SPACING)
-    with opened(browser, explorer) as page:
-        yield explorer, page
-    explorer.close()
-
-
-@pytest.fixture(scope="module")
-def unchanged(scene):
-    """A live view that tests share, since they leave scene and drive as they are."""
-    if problem := rendering_problem():
-        pytest.skip(problem)
-    explorer = at.explore(scene, spacing=SPACING)
-    yield explorer
-    explorer.close()
-
-
-@contextlib.contextmanager
-def opened(browser, explorer, width=1280, **options):
-    """The page of a live view, when the first drive is found."""
-    page = browser.new_page(viewport={"width": width, "height": 900}, **options)
-    page.set_default_timeout(PATIENCE)
-    page.goto(explorer.address)
-    wait_for_first(page)
-    yield page
-    page.close()
-
-
-def wait_for_first(page):
-    """Wait for the first result, with its error."""
-    page.wait_for_selector("section.picture[aria-busy=false]")
-    page.wait_for_function("document.getElementById('summary').textContent.includes('error')")
-
-
-@contextlib.contextmanager
-def settled(page):
-    """Wait for the result of what is done within, with its error."""
-    before = page.get_attribute("section.picture", "data-shown")
-    yield
-    page.wait_for_function(
-        """before => {
-            const data = document.querySelector('section.picture');
-            return data.dataset.shown > Number(before) && data.getAttribute('aria-busy') === 'false'
-                && document.getElementById('summary').textContent.includes('error');
-        }""",
-        arg=before,
-    )
-
-
-def set_slider(page, name, value, let_go=True):
-    """Move a slider as the mouse does, and let it go."""
-    page.eval_on_selector(
-        f"#{name}",
-        """(slider, [value, letGo]) => {
-            slider.value = value;
-            slider.dispatchEvent(new Event('input', {bubbles: true}));
-            if (letGo) slider.dispatchEvent(new Event('change', {bubbles: true}));
-        }""",
-        [str(value), let_go],
-    )
-
-
-def wait_for(condition, seconds=PATIENCE / 1000):
-    """Wait until a function of the live view's state is true."""
-    until = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < until, "the live view did not follow"
-        time.sleep(0.05)
-
-
-def pressures(page):
-    """Pressures of the table of foci [Pa]."""
-    cells = page.locator("table tbody tr td:nth-child(5)").all_text_contents()
-    return np.array([float(cell) for cell in cells])
-
-
-def pixels(page):
-    """The picture as it is on the screen (height, width, 3)."""
-    shot = page.locator(".view").screenshot()
-    return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(float)
-
-
-def simulated(explorer, spacing=SPACING):
-    """Pressures at the foci [Pa] of what the live view holds, simulated here."""
-    return (
-        at.make_propagator(explorer.scene, spacing=spacing)
-        .field(explorer.drive, explorer.scene.control_points)
-        .abs()
-        .numpy()
-    )
-
-
-def center_of_box(page):
-    """A point of the window [pixels] where only the obstacle's grey is."""
-    seen = pixels(page)
-    grey = (np.ptp(seen, axis=-1) < 12) & (seen.mean(axis=-1) > 90) & (seen.mean(axis=-1) < 215)
-    blocks = np.lib.stride_tricks.sliding_window_view(grey, (25, 25))[::5, ::5].mean(axis=(2, 3))
-    row, column = np.unravel_index(blocks.argmax(), blocks.shape)
-    assert blocks.max() > 0.9, "no obstacle is seen"
-    box = page.locator(".view").bounding_box()
-    return box["x"] + float(5 * column + 12), box["y"] + float(5 * row + 12)
-
-
-def drag(page, start, offset, shift=False):
-    """Drag by some pixels, in steps."""
-    page.mouse.move(*start)
-    if shift:
-        page.keyboard.down("Shift")
-    page.mouse.down()
-    for share in (0.2, 0.4, 0.6, 0.8, 1.0):
-        page.mouse.move(start[0] + share * offset[0], start[1] + share * offset[1])
-        page.wait_for_timeout(60)  # the page sends at most one event in 30 ms
-    page.mouse.up()
-    if shift:
-        page.keyboard.up("Shift")
-
-
-def share_of_bound(explorer):
-    """Weakest focus of what a live view holds, over the most that any drive reaches."""
-    matrix = at.make_propagator(explorer.scene, spacing=SPACING).transfer_matrix()
-    return float((matrix @ explorer.drive).abs().min()) / float(at.focus_bound(matrix))
 
 
 def test_it_opens_with_a_good_drive_and_its_readings(unchanged, browser):
@@ -386,128 +249,3 @@ def test_plane_unit_and_volume_change_the_picture(live):
     page.fill("#surface", "5")
     page.press("#surface", "Enter")
     wait_for(lambda: page.input_value("#surface") == "-6")
-
-
-def test_what_cannot_be_is_refused_and_said(live):
-    explorer, page = live
-    before = explorer.scene
-    page.fill("#focus_x_number", "40")  # into the cube
-    page.fill("#focus_y_number", "45")
-    page.fill("#focus_z_number", "50")
-    page.press("#focus_z_number", "Enter")
-    page.wait_for_function("document.getElementById('message').textContent.includes('obstacle')")
-    assert not any(one.contains(explorer.scene.control_points).any() for one in explorer.scene.obstacles)
-    page.fill("#body_x_number", "")
-    page.press("#body_x_number", "Enter")
-    page.fill("#body_x_number", "1e9")
-    page.press("#body_x_number", "Enter")
-    page.wait_for_timeout(300)
-    assert explorer.scene.obstacles == before.obstacles
-
-
-def test_files_and_lines_of_python_make_what_is_shown(live, tmp_path, monkeypatch):
-    explorer, page = live
-    monkeypatch.chdir(tmp_path)
-    set_slider(page, "turn_x", 25)
-    wait_for(lambda: explorer.scene.obstacles[0].rotation != (0.0, 0.0, 0.0))
-    page.fill("#folder", "here/there")
-    page.click("#save")
-    page.wait_for_function("document.getElementById('saved').textContent.includes('saved')")
-    scene = at.load_scene("here/there/scene.yaml")
-    assert scene.obstacles == explorer.scene.obstacles
-    assert torch.equal(scene.control_points, explorer.scene.control_points)
-    assert torch.equal(at.load_drive("here/there/drive.npz"), explorer.drive)
-    page.click("#save")  # this folder is its own
-    page.wait_for_function("document.getElementById('message').textContent === ''")
-    page.click("#write_python")
-    page.wait_for_function("document.getElementById('python').textContent.includes('at.Scene')")
-    before = page.text_content("#python")
-    with settled(page):
-        set_slider(page, "body_x", 42)
-    page.wait_for_function("old => document.getElementById('python').textContent !== old", arg=before)
-    made = {}
-    exec(page.text_content("#python"), made)
-    assert made["scene"].obstacles == explorer.scene.obstacles
-    torch.testing.assert_close(made["drive"], explorer.drive, rtol=0, atol=1e-12)
-
-
-def test_folders_elsewhere_and_those_of_others_are_refused(unchanged, browser, tmp_path, monkeypatch):
-    inside = tmp_path / "inside"
-    inside.mkdir()
-    mine = inside / "scene.yaml"
-    mine.write_text("mine", "utf-8")
-    monkeypatch.chdir(inside)
-    with opened(browser, unchanged) as page:
-        for folder in ("/tmp/elsewhere", "../elsewhere", "a/../../b", "", "."):
-            page.fill("#folder", folder)
-            page.click("#save")
-            page.wait_for_function(
-                "folder => document.getElementById('message').textContent.includes(`'${folder}'`)", arg=folder
-            )
-    assert sorted(tmp_path.rglob("*")) == [inside, mine]
-    assert mine.read_text("utf-8") == "mine"
-
-
-def test_what_a_page_sends_is_not_run(live, tmp_path, monkeypatch):
-    """Values of any kind in any place leave the server as it was, and it goes on."""
-    explorer, page = live
-    monkeypatch.chdir(tmp_path)
-    before, drive = explorer.scene, explorer.drive
-    code = "__import__('pathlib').Path('marker').touch()"
-    page.evaluate(
-        """code => {
-            const bad = [code, {__class__: code}, [[[]]], null, Infinity, -1, 1e9, 'x'.repeat(10000), true];
-            const names = ['body_x', 'turn_y', 'focus_y', 'phase', 'amplitude', 'plane', 'height', 'method',
-                'transducer', 'body', 'focus', 'device', 'settled', 'unit', 'reference', 'surface', 'dark',
-                'follow', 'volume', 'rows'];
-            for (const value of bad) for (const name of names) window.trame.state.set(name, value);
-            for (const action of [code, 'os.system', '__class__', 'find', 'save', 'settle', 'close'])
-                for (const given of [[], [code]]) window.trame.trigger(action, given).catch(() => {});
-        }""",
-        code,
-    )
-    page.wait_for_timeout(1000)
-    assert not list(tmp_path.rglob("marker"))
-    assert explorer.scene.obstacles[0].size == before.obstacles[0].size
-    page.reload()
-    page.uncheck("#follow")
-    page.uncheck("#volume")
-    wait_for_first(page)
-    page.click("#in_phase")
-    wait_for(lambda: torch.equal(explorer.drive, torch.ones_like(drive)))
-
-
-def test_it_works_offline_and_without_errors(unchanged, browser):
-    page = browser.new_page()
-    page.set_default_timeout(PATIENCE)
-    asked, errors = [], []
-    page.on("request", lambda request: asked.append(request.url))
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    page.goto(unchanged.address)
-    wait_for_first(page)
-    own = unchanged.address.removesuffix("index.html")
-    assert [url for url in asked if not url.startswith((own, "data:", "blob:"))] == []
-    assert errors == []
-    page.close()
-
-
-@pytest.mark.parametrize("colours", ["light", "dark"])
-@pytest.mark.parametrize("width", [1200, 360])
-def test_the_page_is_accessible(unchanged, browser, colours, width):
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
-    with opened(browser, unchanged, width, color_scheme=colours) as page:
-        found = axe.run(page)
-        assert found.violations_count == 0, found.generate_report()
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
-        if colours == "dark":
-            wait_for(lambda: np.median(pixels(page)) < 80)
-
-
-def test_a_notebook_shows_a_frame_that_a_browser_fills(unchanged, browser):
-    page = browser.new_page()
-    page.set_default_timeout(PATIENCE)
-    page.set_content(f"<h1>notebook</h1>{unchanged._repr_html_()}")
-    frame = page.frame_locator("iframe")
-    frame.locator("section.picture[aria-busy=false]").wait_for()
-    assert re.search(r"Weakest focus \d", frame.locator("#summary").inner_text())
-    page.close()
