@@ -70,7 +70,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Result:
-    """What is known of a request so far.
+    """The answer to a request, as far as it is known.
 
     Attributes:
         request: the request.
@@ -197,7 +197,7 @@ class Calculator:
             yield replace(result, volume=volume, seconds=time.monotonic() - begun)
 
     def _propagator(self, situation: Situation, fine: bool) -> Propagator:
-        """Return the propagator of a situation, that of the last request where the scene has not changed."""
+        """Return the propagator of a situation; it is kept while the scene stays."""
         found = self._propagators.get(fine)
         if found is None or found.scene is not situation.scene:
             if fine:

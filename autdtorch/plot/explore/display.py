@@ -35,7 +35,7 @@ class Display:
     """
 
     def __init__(self, state: Any, situation: Situation) -> None:
-        """Draw a situation; `state` is that of trame."""
+        """Draw a situation; `state` is trame's."""
         self._state = state
         self.picture = Picture(situation)
         self.update: Callable[[], None] = lambda: None

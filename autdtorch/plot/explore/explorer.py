@@ -27,8 +27,8 @@ _QUALITY = {"interactive_quality": 75, "still_quality": 90}  # of JPEG; the seco
 class Explorer:
     """A live view of a scene, as `explore` returns it. A notebook shows it in a frame.
 
-    It ends with `close`, or when nothing refers to it any more. Until the first drive is found, that of all
-    transducers in phase is shown.
+    It ends with `close`, or when nothing refers to it any more. Until the first drive is found, all
+    transducers are in phase.
 
     Attributes:
         address: of the page, with the token that opens it; for browsers on this machine.

@@ -9,13 +9,13 @@ from typing import Any, Protocol
 from autdtorch.plot.explore.picture import Grip, Picture
 from autdtorch.utils.array_types import Array
 
-_FIRST = 10.0  # priority before that of the camera
+_FIRST = 10.0  # priority; the camera's is lower
 _ANGLE = math.radians(0.5)  # for each pixel
 _KEYS = "CharEvent", "KeyPressEvent", "KeyReleaseEvent"  # VTK would change the picture, such as to stereo
 
 
 class Owner(Protocol):
-    """What follows from the mouse."""
+    """The session, as the mouse knows it."""
 
     def drag(self, grip: Grip, place: Array) -> None:
         """Move what is gripped to a place (3,) [m]."""

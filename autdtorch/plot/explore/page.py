@@ -98,7 +98,7 @@ def _button(name: str, label: str, disabled: str = "false") -> str:
 
 
 def page(view: str) -> str:
-    """Return the template of the page, with that of the picture in it."""
+    """Return the template of the page around the picture's, `view`."""
     height = _slider(
         "height", f"{{{{ plane === '{OWN_PLANE}' ? 'shifted by' : 'at' }}}} [mm]", "range_height[0]",
         "range_height[1]", 0.5, spoken="place of the plane [mm]",

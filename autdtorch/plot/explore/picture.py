@@ -1,4 +1,4 @@
-"""The picture of a situation: bodies, foci, transducers and the field, moved without drawing them anew."""
+"""The picture of a situation: bodies, foci, transducers and the field, which move and are not made again."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from autdtorch.utils.validation import Vector
 
 _INK = {False: ("black", "white"), True: ("#e6e6e6", "#14171c")}  # lines and background, by dark
 _SAMPLES = 600  # along a ray through the scene, to find the body under the mouse
-_AROUND = 1.05  # height of the window over that of the domain's sphere, for letters around it
+_AROUND = 1.05  # height of the window, relative to the domain's sphere; leaves room for letters
 _LETTERS = 9.0  # size of tick labels and titles
 _SAMPLES_A_PIXEL = 4
 _CHOSEN = 1.7  # size of the chosen focus
-_RING = 1.1, 1.4  # radii of the ring around the chosen transducer, over that of its disc
+_RING = 1.1, 1.4  # radii of the ring around the chosen transducer, relative to its disc
 _SURFACE_NAME = "isosurface"
 
 
 class Grip(NamedTuple):
-    """What the mouse holds.
+    """A hold of the mouse on something in the picture.
 
     Attributes:
         kind: "body", "focus" or "transducer".

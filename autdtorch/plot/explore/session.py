@@ -55,7 +55,7 @@ class Session:
     ) -> None:
         """Begin with a situation; cells have a `spacing` [m] when nothing is dragged.
 
-        `defer` calls a function in this thread, soon. `note` is told of every situation.
+        `defer` calls a function in this thread, soon. `note` takes every situation.
         """
         self._state, self._note = trame.state, note
         self._history = History(situation)

@@ -67,7 +67,7 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Situation:
-    """What is shown, and undone step by step.
+    """A situation: all that is shown, and undone step by step.
 
     Attributes:
         bodies: the obstacles of the scene.
