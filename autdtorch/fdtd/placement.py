@@ -1,9 +1,10 @@
 """Placement of the grid: axis-aligned faces lie about half-way between cell centres where possible.
 
-Elements at faces and edges are accurate to second order wherever these fall (`assembly/aligned_edges.py`).
-What is left is least for a face 0.45 cells behind the last centre: 0.1 % of the field for a rigid cube at
-1 mm, 0.5 % at 0.1 cells and 1 % at 0.9. Among similar placements the grid takes a symmetric one: a symmetric
-scene needs fewer runs (`propagators/symmetry.py`).
+Elements at faces and edges are accurate to second order wherever these fall (`assembly/prisms.py`). What is
+left is least for a face 0.45 cells behind the last centre: 0.1 % of the field for a rigid cube at 1 mm, 0.5 %
+at 0.1 cells and 1 % at 0.9. A slit narrower than a cell needs a layer of centres in it: without a pressure of
+its own it is closed. Among similar placements the grid takes a symmetric one: a symmetric scene needs fewer
+runs (`propagators/symmetry.py`).
 """
 
 from __future__ import annotations
@@ -13,9 +14,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from autdtorch.fdtd.assembly.slender import slender_faces
 from autdtorch.fdtd.region import Region, Shape
 from autdtorch.fdtd.turning import ALIGNED
-from autdtorch.utils.array_types import Array
+from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.triangles import doubled_normals
 from autdtorch.utils.validation import LENGTH_TOLERANCE
 
@@ -31,13 +33,14 @@ _WORTHWHILE = 0.9  # Error of an asymmetric placement, relative to the symmetric
 # a fifth of the largest. `docs/decisions/runs.md` has the errors.
 _ALLOWANCE = 0.1
 _BEST = 0.45  # Best distance of a face behind the last centre [cells]
+_CLOSED = 1.0  # Square error of the faces of a slit without a centre in it
 
 
 def grid_offset(
     region: Region, spacing: float, lower: Sequence[float], upper: Sequence[float]
 ) -> tuple[float, float, float]:
     """Return the offset of a grid's first cell below a lower corner (3,) [m], per axis [cells], in [0, 1)."""
-    surfaces = [_triangles(shape) for shape in region.shapes]
+    surfaces = [_flat_surface(shape, spacing) for shape in region.shapes]
     x, y, z = (
         _axis_offset(_faces(region, surfaces, axis, low), region.sources[:, axis] - low, high - low, spacing)
         for axis, (low, high) in enumerate(zip(lower, upper, strict=True))
@@ -45,11 +48,19 @@ def grid_offset(
     return x, y, z
 
 
-def _triangles(shape: Shape) -> tuple[Array, Array]:
-    """Return the first corners (n, 3) [m] of triangles, and their outward normals of twice their area."""
+def _flat_surface(shape: Shape, spacing: float) -> tuple[Array, Array]:
+    """Return the first corners (n, 3) [m] of triangles, and their outward normals of twice their area.
+
+    Of a slender cylinder these are the faces of the cuboid around it.
+    """
     vertices, triangles = (part.numpy() for part in shape.surface())
-    corners = vertices[triangles]
-    return corners[:, 0], doubled_normals(corners)
+    if slender_faces(vertices / spacing) is None:
+        corners = vertices[triangles]
+        return corners[:, 0], doubled_normals(corners)
+    ends = np.stack((vertices.min(axis=0), vertices.max(axis=0)))
+    size = ends[1] - ends[0]
+    areas = 2 * np.prod(size) / size
+    return np.repeat(ends, 3, axis=0), np.concatenate((-np.diag(areas), np.diag(areas)))
 
 
 def _faces(region: Region, surfaces: list[tuple[Array, Array]], axis: int, origin: float) -> Array:
@@ -79,18 +90,31 @@ def _axis_offset(faces: Array, transducers: Array, length: float, spacing: float
     middle = (math.ceil(whole - _ROUNDING) - whole) / 2
     if len(place) == 0:
         return middle
+    slits = _slits(cells, first)
     between = np.unique(np.round(-cells % 1, 9))[:_STEPS]
-    offsets = np.concatenate((middle + np.arange(_STEPS) / _STEPS, between))
+    opened = np.unique(np.round((0.5 - cells[slits].mean(axis=1)) % 1, 9))[:_STEPS]
+    offsets = np.concatenate((middle + np.arange(_STEPS) / _STEPS, between, opened))
     offsets -= np.floor(offsets + _ROUNDING)
-    distance = first * (cells + offsets[:, None] - 0.5)
-    distance = (distance - _TOUCHING) % 1 + _TOUCHING
-    missed = (distance - _BEST) ** 2 @ area / area.sum()
+    place = cells + offsets[:, None] - 0.5  # centres are whole numbers
+    distance = (first * place - _TOUCHING) % 1 + _TOUCHING
+    closed = np.diff(np.floor(place[:, slits]), axis=2)[:, :, 0] == 0
+    missed = (distance - _BEST) ** 2 @ area + _CLOSED * closed @ area[slits].sum(axis=1)
+    missed /= area.sum()
     best, symmetric = int(missed.argmin()), min(_SYMMETRIC, key=lambda number: missed[number])
     allowed = missed[best] / _WORTHWHILE
     pointlike = np.stack((transducers, np.zeros_like(transducers), np.zeros_like(transducers)))
     if _mirrored(np.concatenate((faces, pointlike), axis=1), length):
         allowed = max(allowed, (math.sqrt(missed[best]) + _ALLOWANCE) ** 2)
     return float(offsets[symmetric if missed[symmetric] <= allowed else best])
+
+
+def _slits(cells: Array, first: Array) -> Index:
+    """Return the pairs (s, 2) of faces around slits narrower than a cell, given places [cells] and sides."""
+    order = np.argsort(cells, kind="stable")
+    before, behind = order[:-1], order[1:]
+    width = cells[behind] - cells[before]
+    narrow = (first[before] < 0) & (first[behind] > 0) & (width < 1) & (width > _TOUCHING)
+    return np.stack((before[narrow], behind[narrow]), axis=1)
 
 
 def _mirrored(things: Array, length: float) -> bool:

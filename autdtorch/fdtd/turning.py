@@ -25,6 +25,7 @@ ALIGNED = 1 - 1e-9  # Smallest cosine between the normal of a face and an axis t
 _PERPENDICULAR = 4e-5  # Largest cosine between perpendicular normals; the same angle
 # Share of all surfaces that must become aligned before a grid is turned, which may cost symmetries
 _WORTHWHILE = 0.4
+_AXES_DECIMALS = 12  # Decimals of the normals that axes follow: rounding of a place must not turn the grid
 _DECIMALS = 6  # Normals that agree to so many decimals are equal: files hold single precision
 _ALL = 1 - 1e-6  # Share of a surface that is aligned if it all is: slivers do not count
 _SAGITTA = 1.5  # Growth of a bounding box, relative to the distance of triangles from a curved surface
@@ -124,6 +125,7 @@ def flat_faces(shape: Shape) -> FlatFaces:
 
 def _own_axes(normals: Array, areas: Array) -> Array:
     """Return the axes (3, 3) of the largest face and of the largest perpendicular one, in the usual order."""
+    normals = normals.round(_AXES_DECIMALS)
     first = normals[areas.argmax()]
     beside = np.abs(normals @ first) < _PERPENDICULAR
     helper = np.eye(3)[np.abs(first).argmin()]

@@ -44,8 +44,8 @@ def test_elements_sharing_a_face_get_opposite_forces(ratio: float) -> None:
 @RATIOS
 def test_stiffness_gives_the_fields_their_forces(ratio: float) -> None:
     here = random_planes(ratio)
-    uniform, mobility, tilted = np.full(28, 0.1), np.full((200, 64), 1 / 64), np.ones(200, bool)
-    coupling, weight = smooth_stiffness(here, tilted, mobility, np.tile(uniform, (200, 1)), uniform)
+    uniform, mobility = np.full(28, 0.1), np.full((200, 64), 1 / 64)
+    coupling, weight = smooth_stiffness(here, mobility, np.tile(uniform, (200, 1)), uniform)
     assert (weight == 1).mean() > 0.99  # the others' energy would not be positive
     matrix, local, force = stiffness_matrix(coupling), fields(here), forces(here)
     own = weight == 1

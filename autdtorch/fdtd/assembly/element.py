@@ -7,6 +7,7 @@ and of a lumped mass at each vertex. Lengths are in cells, densities and masses 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -51,6 +52,11 @@ class InterfaceElements(NamedTuple):
     mass: Array  # lumped mass at the vertices (n, 8)
     material: Index  # number of the material at each vertex (n, 8)
     finite: NDArray[np.bool_]  # whether it is a finite element, whose sound-hard vertices stay cells (n,)
+
+    @classmethod
+    def joined(cls, parts: Sequence[InterfaceElements]) -> InterfaceElements:
+        """Return the elements of several parts in their order."""
+        return cls(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
     def chosen(self, some: Index) -> InterfaceElements:
         """Return some of the elements."""

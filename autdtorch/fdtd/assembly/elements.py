@@ -2,35 +2,32 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
+from autdtorch.fdtd.assembly.aligned import aligned_elements
+from autdtorch.fdtd.assembly.blocks import Blocks
 from autdtorch.fdtd.assembly.distances import HALF_DIAGONAL, lattice_distances, located
 from autdtorch.fdtd.assembly.edges import edges_of, reductions
 from autdtorch.fdtd.assembly.element import FAR, LATTICE, InterfaceElements, Materials
 from autdtorch.fdtd.assembly.interface import Bodies, interface_elements
 from autdtorch.fdtd.assembly.smooth_faces import mean_gradient, roughness
+from autdtorch.fdtd.assembly.unions import Union, unions_of
 from autdtorch.fdtd.grid import Grid
-from autdtorch.fdtd.region import Fluid, Region, Shape, bounds
+from autdtorch.fdtd.region import Region, bounds
 from autdtorch.fdtd.stencil import Stencil
-from autdtorch.fdtd.turning import flat_faces
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.progress import show_progress
 from autdtorch.utils.threads import spread
 
-# Density with which sound-hard bodies are assembled. Cells that stay almost uncoupled become sound-hard.
-_SOUND_HARD_DENSITY = 1e5
-# Distance by which bodies are grown, so that touching bodies leave no film of air between them
-_CONTACT_GAP = 1e-9
 _CHUNK = 8192  # Interface elements assembled at a time
 # Depths below its surface at which a body must be there to be thick [cells]. Sound would pass through thinner
 # walls of finite elements, whose vertices can belong to both sides.
-_DEPTHS = np.array([1.2, 2.3, 3.5])
+_DEPTHS = np.array([1.0, 1.6, 2.2])
 # Deviation [cells] of a signed distance from a quadratic one at which a second face is near
 _ROUGH = 0.01
 # Share of a rigid edge's reduction that edges of fluids have. With 0.15 and 0.3, tilted cubes of ratio
@@ -51,103 +48,67 @@ class Elements:
     interface: InterfaceElements  # their coupling coefficients and masses
 
 
-@dataclass(frozen=True)
-class _Union:
-    """Union of consecutive bodies of one material."""
-
-    shapes: tuple[Shape, ...]
-    material: int
-    continued: bool  # whether they continue through the boundary layers, unchanged from the interior
-    aligned: bool  # whether all its faces are flat and parallel to the grid
-    sound_hard: bool
-    finite: bool  # whether finite elements represent its surface; of a fluid only the edges
-
-    def distance(self, cell: Array, grid: Grid) -> Array:
-        """Return the signed distance [cells] of positions (..., 3) in cells."""
-        places = np.array(grid.origin) + grid.spacing * (grid.clip(cell) if self.continued else cell)
-        each = [shape.signed_distance(torch.from_numpy(places)) for shape in self.shapes]
-        distance = torch.stack(each).amin(dim=0).numpy() / grid.spacing - _CONTACT_GAP
-        if self.continued:
-            return np.asarray(distance)
-        beyond = np.maximum(np.array(grid.first) - cell, cell - np.array(grid.last) + 1).max(axis=-1) + 0.5
-        return np.asarray(np.maximum(distance, beyond))
-
-
-def speed_factor(stencil: Stencil, speed_ratio: float) -> float:
-    """Return the factor by which to divide masses, so that a wave in a material has the drive's frequency."""
-    return stencil.symbol / stencil.isotropic_symbol(stencil.kappa / speed_ratio)
-
-
-def flow_factor(kappa: float, speed_ratio: float) -> float:
-    """Return the factor on a material's coupling and mass with which waves keep their flow at its surface.
-
-    Where a wave of unit pressure and flow passes a grid, the discrete flow is sin(k) / k, with the material's
-    own k. At oblique incidence the two normal k differ, but the ratio is unchanged to second order.
-    """
-    own = kappa / speed_ratio
-    return math.sin(kappa) / kappa / (math.sin(own) / own)
-
-
 def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
     """Return the material of every element, set by the last body there, and the interface elements."""
-    bodies, materials = _unions(region, stencil)
+    bodies, materials = unions_of(region, grid, stencil)
+    blocks = _blocks(bodies, grid)
+    material, cut, beside = _located(bodies, grid)
+    material = np.where(beside, material, blocks.at_centers).astype(np.int16)
+    axes = sum(each[blocks.kinds].astype(np.int64) for each in blocks.varied)  # along which elements vary
+    cut = np.where(beside, cut, axes > 0)
+    whole = np.where(cut, -1, material)
+    simple = cut & ~beside
+    index = np.flatnonzero(simple), np.flatnonzero(cut & ~simple)
+    parts = (
+        aligned_elements(
+            np.stack(np.unravel_index(index[0], cut.shape), axis=-1), blocks, materials, stencil
+        ),
+        _interface(bodies, index[1], whole, grid, materials, stencil),
+    )
+    order = np.argsort(np.concatenate(index))
+    return Elements(
+        materials, material, np.concatenate(index)[order], InterfaceElements.joined(parts).chosen(order)
+    )
+
+
+def _blocks(bodies: Sequence[Union], grid: Grid) -> Blocks:
+    """Return the blocks of the bodies whose faces are parallel to the grid."""
+    aligned = [body for body in bodies if body.aligned]
+    faces = [np.zeros((3, 0)), *(body.faces(grid) for body in aligned)]
+
+    def material(cells: Array) -> Index:
+        found = np.zeros(cells.shape[:-1], np.int64)
+        for body in aligned:
+            found[body.distance(cells, grid) < 0] = body.material
+        return found
+
+    places = [np.concatenate(own) for own in zip(*faces, strict=True)]
+    return Blocks.between(places, [cells - 1 for cells in grid.shape], material)
+
+
+def _located(
+    bodies: Sequence[Union], grid: Grid
+) -> tuple[NDArray[np.int16], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return the material at the centre of each element, whether a surface intersects it, and which count.
+
+    These are beside a tilted or curved body. All others are left to `_blocks`.
+    """
     material = np.zeros([cells - 1 for cells in grid.shape], np.int16)
-    cut = np.zeros(material.shape, bool)
+    cut, beside = np.zeros(material.shape, bool), np.zeros(material.shape, bool)
+    if all(body.aligned for body in bodies):
+        return material, cut, beside
     for body in bodies:
-        near, distance, inside = located(partial(body.distance, grid=grid), *_range(body, grid))
+        near, distance, inside = located(partial(body.distance, grid=grid), *body.range(grid))
         own = tuple(near.T)
         material[tuple(near[distance < 0].T)] = material[tuple(inside.T)] = body.material
         cut[own] = (cut[own] | (distance < HALF_DIAGONAL)) & (distance > -HALF_DIAGONAL)
         cut[tuple(inside.T)] = False
-    index = np.flatnonzero(cut)
-    whole = np.where(cut, -1, material)
-    return Elements(materials, material, index, _interface(bodies, index, whole, grid, materials, stencil))
+        if not body.aligned:
+            beside[tuple(near[distance < HALF_DIAGONAL].T)] = beside[tuple(inside.T)] = True
+    return material, cut, beside
 
 
-def _unions(region: Region, stencil: Stencil) -> tuple[list[_Union], Materials]:
-    """Return unions of consecutive bodies that share a material, and the materials."""
-    air = region.fluid
-    known: list[Fluid | None] = [air]
-    unions: list[_Union] = []
-    for body in region.bodies:
-        if body.fluid not in known:
-            known.append(body.fluid)
-        aligned = flat_faces(body.shape).all_aligned(np.eye(3))
-        own = _Union(
-            (body.shape,),
-            known.index(body.fluid),
-            body.continued,
-            aligned,
-            body.fluid is None,
-            not aligned and (body.fluid is None or body.fluid.density > air.density),
-        )
-        if unions and own == replace(unions[-1], shapes=own.shapes):
-            unions[-1] = replace(own, shapes=(*unions[-1].shapes, body.shape))
-        else:
-            unions.append(own)
-    density = np.full(len(known), _SOUND_HARD_DENSITY)
-    factor, slowness = np.ones(len(known)), np.ones(len(known))
-    for number, fluid in enumerate(known):
-        if fluid is not None:
-            ratio = fluid.sound_speed / air.sound_speed
-            density[number] = fluid.density / air.density / flow_factor(stencil.kappa, ratio)
-            factor[number], slowness[number] = speed_factor(stencil, ratio), 1 / ratio
-    sound_hard = np.array([fluid is None for fluid in known])
-    return unions, Materials(density, 1 / (density * factor), slowness, sound_hard)
-
-
-def _range(body: _Union, grid: Grid) -> Index:
-    """Return the first element around a body along each axis, and one past the last (2, 3)."""
-    middle = [np.arange(cells - 1) + 0.5 for cells in grid.shape]
-    lower, upper = bounds(body.shapes)
-    ranges = []
-    for axis, low, high in zip(range(3), lower - grid.spacing, upper + grid.spacing, strict=True):
-        inside = middle[axis].clip(grid.first[axis], grid.last[axis] - 1)
-        ranges.append(np.searchsorted(grid.origin[axis] + grid.spacing * inside, (low, high)))
-    return np.array(ranges, np.int64).T
-
-
-def _distances(bodies: list[_Union], first: Index, grid: Grid) -> Array:
+def _distances(bodies: list[Union], first: Index, grid: Grid) -> Array:
     """Return distances (K, n, L) of bodies from the lattices of elements, by their first cells (n, 3)."""
     center = np.array(grid.origin) + grid.spacing * grid.clip(np.asarray(first + 0.5))
     distance = np.full((len(bodies), len(first), len(LATTICE)), FAR)
@@ -160,7 +121,7 @@ def _distances(bodies: list[_Union], first: Index, grid: Grid) -> Array:
 
 
 def _finite(
-    bodies: list[_Union],
+    bodies: list[Union],
     distance: Array,
     first: Index,
     near_edge: NDArray[np.bool_],
@@ -186,7 +147,7 @@ def _finite(
 
 
 def _thick(
-    body: _Union, distance: Array, first: Index, whole: NDArray[np.int16], grid: Grid
+    body: Union, distance: Array, first: Index, whole: NDArray[np.int16], grid: Grid
 ) -> NDArray[np.bool_]:
     """Return whether a sound-hard body has one face in elements (n,), with enough of the body behind it.
 
@@ -220,7 +181,7 @@ def _distinct(distance: Array, finite: NDArray[np.bool_], less: Array) -> tuple[
 
 
 def _interface(
-    bodies: list[_Union],
+    bodies: list[Union],
     index: Index,
     whole: NDArray[np.int16],
     grid: Grid,
@@ -230,7 +191,6 @@ def _interface(
     """Return the interface elements, at flat indices (n,); `whole` as in `_thick`."""
     none = np.zeros((0, 28)), np.zeros((0, 8)), np.zeros((0, 8), np.int64), np.zeros(0, bool)
     numbers = np.array([body.material for body in bodies], np.int64)
-    aligned = np.array([body.aligned for body in bodies], bool)
     shapes = [shape for body in bodies for shape in body.shapes]
     edges = [
         replace(edge, reduction=edge.reduction * (1 if body.sound_hard else _FLUID_REDUCTION))
@@ -249,7 +209,7 @@ def _interface(
         edged = np.asarray(less.any(axis=(1, 2)))
         finite = _finite(bodies, distance, first, edged, whole, grid)
         own, place = _distinct(distance, finite, less)
-        near = Bodies(distance, numbers, aligned, finite, less).chosen(own)
+        near = Bodies(distance, numbers, finite, less).chosen(own)
         found = interface_elements(near, materials, stencil)
         progress.advance(len(first))
         return found.chosen(place)

@@ -18,8 +18,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from autdtorch.fdtd.assembly.aligned_edges import edge_elements
-from autdtorch.fdtd.assembly.aligned_faces import layered_axis, layered_elements, mean_thickness
 from autdtorch.fdtd.assembly.coverage import (
     distance_to_material,
     line_coverage,
@@ -35,6 +33,8 @@ from autdtorch.fdtd.assembly.element import (
     Materials,
     uniform_coupling,
 )
+from autdtorch.fdtd.assembly.flat_faces import crossed_by_layers, flat_elements, layered_axis
+from autdtorch.fdtd.assembly.layers import mean_thickness
 from autdtorch.fdtd.assembly.masses import balanced_mass, lumped_mass
 from autdtorch.fdtd.assembly.smooth_faces import Surface, smooth_stiffness, surfaces
 from autdtorch.fdtd.assembly.sound_hard import added_thickness, cut_coupling, cut_mass
@@ -52,7 +52,6 @@ class Bodies(NamedTuple):
 
     distance: Array  # signed distances of K bodies (K, n, 125) [cells]; `FAR` for those that are not near
     material: Index  # number of the material of each body (K,)
-    aligned: NDArray[np.bool_]  # whether all faces of a body are parallel to the grid (K,)
     finite: NDArray[np.bool_]  # whether finite elements represent it in an element (K, n)
     reductions: Array  # share of the stiffness that is taken away near edges of such bodies (n, 3, 3)
 
@@ -67,12 +66,13 @@ def interface_elements(bodies: Bodies, materials: Materials, stencil: Stencil) -
     """Return the stiffness and mass of n elements that surfaces of K bodies intersect."""
     distance, material = bodies.distance, bodies.material
     # bodies that do not intersect an element must not enter its shares
-    distance = np.where((distance > 0).all(axis=2, keepdims=True), FAR, distance)
-    distance = np.where((distance < 0).all(axis=2, keepdims=True), -FAR, distance)
+    crossed = crossed_by_layers(distance)
+    outside, inside = (distance > 0).all(axis=2) & ~crossed, (distance < 0).all(axis=2) & ~crossed
+    distance = np.where(outside[:, :, None], FAR, np.where(inside[:, :, None], -FAR, distance))
     bodies = bodies._replace(distance=distance)
     volumes = shares(volume_coverage, distance, material, len(materials.density))
     vertex = _vertex_materials(distance, material)
-    layered = layered_axis(vertex, volumes, distance[~bodies.aligned])
+    layered = layered_axis(distance)
     near = (np.abs(distance) < FAR).any(axis=2)
     finite = (near & bodies.finite).any(axis=0) & (layered < 0)
     coupling, mass = np.zeros((len(vertex), 28)), np.zeros(vertex.shape)
@@ -101,9 +101,7 @@ def _set_others(cut: _Cut, bodies: Bodies, layered: Index, materials: Materials,
     """
     count, distance, material = len(materials.density), bodies.distance, bodies.material
     vertex, volumes, coupling, mass = cut
-    near = (np.abs(distance) < FAR).any(axis=2)
-    straight = (bodies.aligned[:, None] | ~near).all(axis=0) | (layered >= 0)
-    moved = np.flatnonzero(~straight)
+    moved = np.flatnonzero(layered < 0)
     grow = mean_thickness(materials, stencil)[material, None, None]
     volumes[moved] = shares(volume_coverage, distance[:, moved] - grow, material, count)
     lines = shares(line_coverage, distance, material, count)
@@ -111,19 +109,11 @@ def _set_others(cut: _Cut, bodies: Bodies, layered: Index, materials: Materials,
     mass[:] = lumped_mass(vertex, volumes, materials)
     for axis in range(3):
         own = np.flatnonzero(layered == axis)
-        share = volumes[own].mean(axis=1)
-        coupling[own], mass[own] = layered_elements(axis, vertex[own], share, mass[own], materials, stencil)
-    cornered = np.flatnonzero(straight & (layered < 0))
-    edged, *found = edge_elements(
-        distance[:, cornered], material, vertex[cornered], volumes[cornered], materials, stencil
-    )
-    edged = cornered[edged]
-    coupling[edged], mass[edged] = found
+        coupling[own], mass[own] = flat_elements(axis, distance[:, own], material, materials, stencil)
     held = (vertex[:, :, None] == np.arange(count)).any(axis=1)
     present = volumes.mean(axis=1) > _ABSENT_SHARE
     two = (held.sum(axis=1) == 2) & (present <= held).all(axis=1) & (layered < 0)
-    two[edged] = False
-    _set_smooth(cut, bodies, held, np.flatnonzero(two), straight, materials, stencil)
+    _set_smooth(cut, bodies, held, np.flatnonzero(two), materials, stencil)
 
 
 def _set_smooth(
@@ -131,13 +121,12 @@ def _set_smooth(
     bodies: Bodies,
     held: NDArray[np.bool_],
     chosen: Index,
-    straight: NDArray[np.bool_],
     materials: Materials,
     stencil: Stencil,
 ) -> None:
     """Set the `chosen` elements of two materials in which the surface between them has one normal.
 
-    `held` (n, m) are the materials at the vertices. Elements `straight` (n,) along the grid have no forces.
+    `held` (n, m) are the materials at the vertices.
     """
     count = len(materials.density)
     inner = count - 1 - held[chosen, ::-1].argmax(axis=1)
@@ -147,7 +136,7 @@ def _set_smooth(
     own, pair = chosen[flat], sides[flat]
     mobility = cut.volumes[own] @ (1 / materials.density) / SUBCELLS**3
     cut.coupling[own], weight = smooth_stiffness(
-        surface, ~straight[own], mobility, cut.coupling[own], uniform_coupling(stencil)
+        surface, mobility, cut.coupling[own], uniform_coupling(stencil)
     )
     some = weight > 0
     own, pair, surface, weight = own[some], pair[some], surface.chosen(some), weight[some, None]

@@ -154,14 +154,14 @@ def weight_of_forces(surface: Surface) -> Array:
 
 
 def smooth_stiffness(
-    surface: Surface, tilted: NDArray[np.bool_], mobility: Array, coupling: Array, uniform: Array
+    surface: Surface, mobility: Array, coupling: Array, uniform: Array
 ) -> tuple[Array, Array]:
     """Return the coupling (n, 28) of elements with a smooth surface, and the share (n,) of forces in it.
 
-    Elements `tilted` (n,) may have forces. `mobility` (n, 64) belongs to the sub-cells; `coupling` (n, 28) is
+    `mobility` (n, 64) belongs to the sub-cells; `coupling` (n, 28) is
     in series, and `uniform` (28,) in air.
     """
-    weight = np.where(tilted, weight_of_forces(surface), 0)
+    weight = weight_of_forces(surface)
     total = np.zeros((len(weight), 8, 8))
     some = np.flatnonzero(weight)
     # a line in a sliver of a light fluid would be much stiffer than the element

@@ -62,6 +62,6 @@ def added_thickness(kappa: float) -> float:
 
     A wave on the grid is otherwise reflected so far behind the surface, at any tilt and incidence. It is the
     mean of kappa^2 (d^3 / 3 - d / 12) over all places d of a face between the cells, and higher terms;
-    `aligned_faces.mean_thickness` serves fluids.
+    `layers.mean_thickness` serves fluids.
     """
     return (math.tan(kappa / 2) / (kappa / 2) - 1) / 2

@@ -1,0 +1,147 @@
+"""Elements that vary along one axis: layers between two planes of vertices.
+
+At normal incidence layers are a two-port: pressure and flow at one plane follow from those at the other. Any
+two-port without loss is a coupling between the planes and a mass at each. The scheme is then exact, wherever
+the faces are and however thin a layer is. A second angle of incidence decides the mobility along the planes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from autdtorch.fdtd.assembly.element import (
+    EDGES_BETWEEN,
+    PAIRS,
+    VERTICES,
+    Materials,
+    coupling_by_edges,
+    uniform_coupling,
+)
+from autdtorch.fdtd.stencil import Stencil
+from autdtorch.utils.array_types import Array, Index
+
+# Square of the sine of the second angle of incidence. With s for this square, the second-order term of the
+# exact mass is (1 - s)^2. The scheme has 1 - 1.25 s, nearest to it over s of 0 to 1: equal at 0 and 0.75.
+_OBLIQUE = 0.75
+# Largest relative change by terms of second order: coarse grids of slow materials stay stable
+_LARGEST_CHANGE = 0.5
+_SMALL = 0.1  # Wavenumber, relative to the drive's, at which second derivatives by it are evaluated
+_SHORT = 1e-8  # Phase across a layer up to which its sine is the phase [rad]
+_PLACES = 40  # Places of a face between two cells
+
+
+class TwoPort(NamedTuple):
+    """n stacks of layers as two planes of vertices see them; in air 1, 1/2 and 1."""
+
+    link: Array  # coupling across (n,)
+    thickness: Array  # masses of the planes (n, 2), in those of a cell of the plane's material
+    mobility: Array  # mobilities along the planes (n, 2)
+
+
+def two_port(width: Array, density: Array, wavenumber: Array, air: float) -> TwoPort:
+    """Return the two-ports of n stacks of L layers, exact to second order in the wavenumbers.
+
+    Widths [cells], densities as assembled and wavenumbers [rad/cell] are (n, L), and `air` is the wavenumber
+    of air. The first and the last layer are the materials of the planes; a width may be zero.
+    """
+    still = long_wave_port(width, density, wavenumber)
+    near = _exact_port(width, density, _SMALL * wavenumber, _SMALL * air)
+    return TwoPort(*(_corrected(*pair) for pair in zip(still, near, strict=True)))
+
+
+def _corrected(still: Array, near: Array) -> Array:
+    """Return a value at the drive, given those for long waves and at `_SMALL` times its wavenumber."""
+    most = _LARGEST_CHANGE * still
+    return np.asarray(still + np.clip((near - still) / _SMALL**2, -most, most))
+
+
+def long_wave_port(width: Array, density: Array, wavenumber: Array) -> TwoPort:
+    """Return the two-ports for long waves."""
+    shares, ends = long_wave_shares(width, density), [0, -1]
+    stiffness = (shares @ (wavenumber**2 / density)[:, :, None])[:, :, 0]
+    thickness = stiffness * density[:, ends] / wavenumber[:, ends] ** 2
+    mobility = 2 * (shares @ (1 / density)[:, :, None])[:, :, 0]
+    return TwoPort(1 / (width * density).sum(axis=1), thickness, mobility)
+
+
+def long_wave_shares(width: Array, density: Array) -> Array:
+    """Return the widths (n, 2, L) of layers that count for each plane: a steady flow divides them."""
+    resistance = width * density
+    middle = (np.cumsum(resistance, axis=1) - resistance / 2) / resistance.sum(axis=1)[:, None]
+    return np.stack((1 - middle, middle), axis=1) * width[:, None]
+
+
+def _exact_port(width: Array, density: Array, wavenumber: Array, air: float) -> TwoPort:
+    """Return the two-ports that are exact at normal incidence, and whose mobility is that of `_OBLIQUE`."""
+    resistance, flow = _flows(width, density, wavenumber, 0.0)
+    _, oblique = _flows(width, density, wavenumber, _OBLIQUE * air**2)
+    own_density, own_wavenumber = (part[:, [0, -1]].reshape(-1, 1) for part in (density, wavenumber))
+    whole = np.ones_like(own_density)
+    own, own_oblique = (
+        _flows(whole, own_density, own_wavenumber, across)[1][:, 0].reshape(-1, 2)
+        for across in (0.0, _OBLIQUE * air**2)
+    )
+    mobility = (flow - oblique) / (own - own_oblique) / density[:, [0, -1]]
+    return TwoPort(1 / resistance, flow / (2 * own), mobility)
+
+
+def _flows(width: Array, density: Array, wavenumber: Array, across: float) -> tuple[Array, Array]:
+    """Return the resistance between the planes (n,), and the flow into each at equal unit pressures (n, 2).
+
+    `across` is the square of the wavenumber along the planes [rad^2/cell^2]. Assembled densities give the
+    waves their exact flow on the grid (`elements.flow_factor`).
+    """
+    true = density * wavenumber / np.sin(wavenumber)
+    square = wavenumber**2 - across
+    phase = np.sqrt(square.astype(complex)) * width
+    short = np.abs(phase) < _SHORT
+    cosine = np.cos(phase).real
+    sine = width * np.where(short, 1, np.sin(phase) / np.where(short, 1, phase)).real
+    # from pressure and flow at the first plane to those at the second
+    whole = np.broadcast_to(np.eye(2), (len(width), 2, 2))
+    for layer in range(width.shape[1]):
+        here, there, heavy = cosine[:, layer], sine[:, layer], true[:, layer]
+        part = np.array([[here, heavy * there], [-square[:, layer] / heavy * there, here]])
+        whole = np.moveaxis(part, -1, 0) @ whole
+    resistance = whole[:, 0, 1]
+    return resistance, (1 - whole[:, [0, 1], [0, 1]]) / resistance[:, None]
+
+
+def layered_elements(
+    axis: int, ports: TwoPort, ends: Index, materials: Materials, stencil: Stencil
+) -> tuple[Array, Array]:
+    """Return coupling (n, 28) and mass (n, 8) of elements with layers across an axis.
+
+    `ends` (n, 2) are the materials of the two planes. With p0 and p1 the pressures in the planes, the energy
+    is g (p1 - p0)^T W (p1 - p0), W being the averages along a plane in air, and for each plane that of air
+    times a mobility. Each part is positive: waves would grow in a boundary layer otherwise.
+    """
+    across, side = EDGES_BETWEEN[:, axis] == 1, VERTICES[:, axis]
+    uniform = uniform_coupling(stencil)
+    beside = np.where(across, 0, coupling_by_edges(stencil)[np.minimum(EDGES_BETWEEN.sum(axis=1) + 1, 3)])
+    along = ports.mobility[:, side[PAIRS[:, 0]]]
+    link = np.where(across, uniform, -beside) * ports.link[:, None]
+    mass = (ports.thickness * materials.mass[ends] / 4)[:, side]
+    return np.where(across, 0, along * (uniform + beside)) + link, mass
+
+
+def mean_thickness(materials: Materials, stencil: Stencil) -> Array:
+    """Return the second-order thickness [cells] of air before each material (m,), averaged over places.
+
+    A wave on the grid is reflected so far behind surfaces of fluids that are not parallel to it. Sound-hard
+    ones need none.
+    """
+    depth = (np.arange(_PLACES) + 0.5) / _PLACES
+    width, found = np.stack((depth, 1 - depth), axis=1), np.zeros(len(materials.density))
+    for number in np.flatnonzero(~materials.sound_hard)[1:]:
+        density, slowness = (
+            np.broadcast_to(part[[0, number]], width.shape)
+            for part in (materials.density, materials.slowness)
+        )
+        wavenumber = stencil.kappa * slowness
+        waves = two_port(width, density, wavenumber, stencil.kappa).thickness
+        still = long_wave_port(width, density, wavenumber).thickness
+        found[number] = (waves - still)[:, 0].mean()
+    return found

@@ -1,0 +1,117 @@
+"""Bodies as the assembly sees them: unions of consecutive bodies of one material, and the materials."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from autdtorch.fdtd.assembly.element import Materials
+from autdtorch.fdtd.assembly.slender import slender_faces
+from autdtorch.fdtd.grid import Grid
+from autdtorch.fdtd.region import Fluid, Region, Shape, bounds
+from autdtorch.fdtd.stencil import Stencil
+from autdtorch.fdtd.turning import flat_faces
+from autdtorch.utils.array_types import Array, Index
+
+# Density with which sound-hard bodies are assembled. Cells that stay almost uncoupled become sound-hard.
+_SOUND_HARD_DENSITY = 1e5
+# Distance by which bodies are grown, so that touching bodies leave no film of air between them
+_CONTACT_GAP = 1e-9
+
+
+@dataclass(frozen=True)
+class Union:
+    """Union of consecutive bodies of one material."""
+
+    shapes: tuple[Shape, ...]
+    material: int
+    continued: bool  # whether they continue through the boundary layers, unchanged from the interior
+    aligned: (
+        bool  # whether blocks represent it: all its faces are flat and parallel to the grid, or it is slender
+    )
+    sound_hard: bool
+    finite: bool  # whether finite elements represent its surface; of a fluid only the edges
+
+    def distance(self, cell: Array, grid: Grid) -> Array:
+        """Return the signed distance [cells] of positions (..., 3) in cells."""
+        places = np.array(grid.origin) + grid.spacing * (grid.clip(cell) if self.continued else cell)
+        each = [shape.signed_distance(torch.from_numpy(places)) for shape in self.shapes]
+        distance = torch.stack(each).amin(dim=0).numpy() / grid.spacing - _CONTACT_GAP
+        if self.continued:
+            return np.asarray(distance)
+        beyond = np.maximum(np.array(grid.first) - cell, cell - np.array(grid.last) + 1).max(axis=-1) + 0.5
+        return np.asarray(np.maximum(distance, beyond))
+
+    def faces(self, grid: Grid) -> list[Array]:
+        """Return the places [cells] of its faces along each axis, up to its end on a grid."""
+        corners = [grid.to_cells(one.surface()[0]) for one in self.shapes]
+        faces = [slender_faces(own) or list(own.T) for own in corners]
+        found = []
+        for axis, own in enumerate(map(np.concatenate, zip(*faces, strict=True))):
+            first, last = float(grid.first[axis]), grid.last[axis] - 1.0
+            inside = own[(own > first) & (own < last)]
+            found.append(inside if self.continued else np.clip(own, first + 0.5, last - 0.5))
+        return found
+
+    def range(self, grid: Grid) -> Index:
+        """Return the first element around it along each axis, and one past the last (2, 3)."""
+        middle = [np.arange(cells - 1) + 0.5 for cells in grid.shape]
+        lower, upper = bounds(self.shapes)
+        ranges = []
+        for axis, low, high in zip(range(3), lower - grid.spacing, upper + grid.spacing, strict=True):
+            inside = middle[axis].clip(grid.first[axis], grid.last[axis] - 1)
+            ranges.append(np.searchsorted(grid.origin[axis] + grid.spacing * inside, (low, high)))
+        return np.array(ranges, np.int64).T
+
+
+def speed_factor(stencil: Stencil, speed_ratio: float) -> float:
+    """Return the factor by which to divide masses, so that a wave in a material has the drive's frequency."""
+    return stencil.symbol / stencil.isotropic_symbol(stencil.kappa / speed_ratio)
+
+
+def flow_factor(kappa: float, speed_ratio: float) -> float:
+    """Return the factor on a material's coupling and mass with which waves keep their flow at its surface.
+
+    Where a wave of unit pressure and flow passes a grid, the discrete flow is sin(k) / k, with the material's
+    own k. At oblique incidence the two normal k differ, but the ratio is unchanged to second order.
+    """
+    own = kappa / speed_ratio
+    return math.sin(kappa) / kappa / (math.sin(own) / own)
+
+
+def unions_of(region: Region, grid: Grid, stencil: Stencil) -> tuple[list[Union], Materials]:
+    """Return unions of consecutive bodies that share a material, and the materials."""
+    air = region.fluid
+    known: list[Fluid | None] = [air]
+    unions: list[Union] = []
+    for body in region.bodies:
+        if body.fluid not in known:
+            known.append(body.fluid)
+        aligned = (
+            flat_faces(body.shape).all_aligned(np.eye(3))
+            or slender_faces(grid.to_cells(body.shape.surface()[0])) is not None
+        )
+        own = Union(
+            (body.shape,),
+            known.index(body.fluid),
+            body.continued,
+            aligned,
+            body.fluid is None,
+            not aligned and (body.fluid is None or body.fluid.density > air.density),
+        )
+        if unions and own == replace(unions[-1], shapes=own.shapes):
+            unions[-1] = replace(own, shapes=(*unions[-1].shapes, body.shape))
+        else:
+            unions.append(own)
+    density = np.full(len(known), _SOUND_HARD_DENSITY)
+    factor, slowness = np.ones(len(known)), np.ones(len(known))
+    for number, fluid in enumerate(known):
+        if fluid is not None:
+            ratio = fluid.sound_speed / air.sound_speed
+            density[number] = fluid.density / air.density / flow_factor(stencil.kappa, ratio)
+            factor[number], slowness[number] = speed_factor(stencil, ratio), 1 / ratio
+    sound_hard = np.array([fluid is None for fluid in known])
+    return unions, Materials(density, 1 / (density * factor), slowness, sound_hard)
