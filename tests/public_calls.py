@@ -146,6 +146,15 @@ def bench() -> hardware.EmulatedBench:
     return hardware.EmulatedBench(hardware.SONICSURFACE, MATRIX, [3, 1, 7, 5])
 
 
+def image() -> Any:
+    """An image of 2 by 2 by 2 voxels of a body."""
+    import pyvista
+
+    found = pyvista.ImageData(dimensions=(3, 3, 3), spacing=(1e-3,) * 3)
+    found.cell_data["body"] = np.ones(8, np.uint8)
+    return found
+
+
 def scope() -> hardware.Oscilloscope:
     return hardware.open_scope(CHIP, backend=scope_bus())
 
@@ -271,6 +280,8 @@ OTHERS: dict[str, Any] = {
     "Oscilloscope.port": Made(lambda _: scope()._port),
     "Plane.size": (0.1, 0.1),
     "SimulatedObjective.scene": AIR_ALONE,
+    "VoxelMask.from_image.image": Made(lambda _: image()),
+    "VoxelMask.from_image.name": None,
     "VoxelMask.load.path": Made(lambda folder: saved(folder, "mask.npy", np.ones((2, 2, 2), bool))),
     "animate3d.path": Made(lambda folder: folder / "wave.gif"),
     "cell_centers.scene": AIR_ALONE,

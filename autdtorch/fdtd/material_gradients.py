@@ -65,7 +65,7 @@ def cells_of_obstacles(
     every = [base.index, *(cells.index for _, _, sides in differences for cells in sides)]
     index = np.unique(np.concatenate(every))
     weight, mass = (torch.from_numpy(part) for part in _on(index, base, stencil))
-    cells = HeterogeneousCells(index, weight.numpy(), mass.numpy(), base.sound_hard, base.shell)
+    cells = replace(base, index=index, weight=weight.numpy(), mass=mass.numpy())
     for value, step, sides in differences:
         ahead, behind = (_on(index, side, stencil) for side in sides)
         rows, masses = ((more - less) / (2 * step) for more, less in zip(ahead, behind, strict=True))
@@ -147,7 +147,7 @@ def cells_of_maps(
     index = np.ravel_multi_index(np.meshgrid(*axes, indexing="ij"), grid.shape).ravel()
     nothing = np.zeros(0, np.int64)
     values = weight.detach().numpy(), mass.detach().numpy()
-    return DifferentiableCells(HeterogeneousCells(index, *values, nothing, nothing), weight, mass)
+    return DifferentiableCells(HeterogeneousCells(index, *values, nothing, nothing, nothing), weight, mass)
 
 
 def _speed_factor(stencil: Stencil, speed_ratio: Tensor) -> Tensor:

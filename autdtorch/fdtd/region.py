@@ -52,6 +52,7 @@ class Body:
     shape: Shape
     fluid: Fluid | None  # its material, None where it is sound-hard
     continued: bool = False  # whether it continues through the boundary layers instead of ending before them
+    uncertainty: float = 0.0  # distance [m] by which its surface may be off (rms)
 
 
 @dataclass(frozen=True, eq=False)

@@ -102,6 +102,13 @@ class ScatteredField:
         """Return whether the interpolation kernel of any point (N, 3) in the box has heterogeneous cells."""
         return self.assembly.touches_heterogeneous(self._on_axes(points[self.inside(points)]))
 
+    def enclosed(self, points: Tensor) -> Tensor:
+        """Return which points (..., 3) [m] are in air that sound-hard bodies enclose."""
+        found, inside = torch.zeros(points.shape[:-1], dtype=torch.bool, device="cpu"), self.inside(points)
+        if inside.any():
+            found[inside] = torch.from_numpy(self.assembly.is_enclosed(self._on_axes(points[inside])))
+        return found
+
     def positions(self, cells: Index) -> Tensor:
         """Return the centres (n, 3) [m] of cells."""
         grid = self.assembly.grid

@@ -33,6 +33,9 @@ _FEWEST_PHASORS, _MOST_PHASORS = 12, 64
 _MOST_NUMBERS = 20_000_000  # Most complex numbers that the phasors kept may hold: 320 MB
 _MOST_FITTED = 2048  # Most cells whose phasors decide the means
 _ROUNDING = 1e-13  # Regularisation of the normal equations, relative to the mean square of the differences
+# Pressure relative to that in free space, -80 dB, below which errors are relative to this floor: behind a
+# wall or in an enclosure nothing arrives
+SILENCE = 1e-4
 _JUDGED = 4  # Blocks whose changes decide whether a run has converged
 # Safety factor: the residual is estimated as this many times the changes over the last two blocks
 _CAUTION = 2.0
@@ -59,11 +62,13 @@ def run_to_steady_state(
     max_periods: int,
     observe: Callable[[Tensor], Tensor],
     stepped: Callable[[int], None],
+    floor: float = 0.0,
 ) -> SteadyState:
     """Step until the relative residual is within `tolerance`, or `max_periods` have passed.
 
     `observe` maps the phasors of `cells` (k,) to the quantity that must converge, once sound has arrived
-    everywhere. `stepped` is called with the number of periods after each block.
+    everywhere; the residual is relative to its norm, or to `floor` if that is more. `stepped` is called with
+    the number of periods after each block.
     """
     earliest, block = fewest_periods(assembly.grid.arrival), block_of(assembly.steps_per_period)[1]
     sequence = Extrapolation(phasors_kept(len(cells)))
@@ -79,7 +84,7 @@ def run_to_steady_state(
             continue
         limit = torch.from_numpy(sequence.limit() if len(sequence) else windows[-1][1])
         values.append(observe(limit))
-        residual = _residual(values)
+        residual = _residual(values, floor)
         converged = count >= earliest and residual <= tolerance
         if converged or count >= max_periods:
             break
@@ -177,9 +182,9 @@ def _is_needed(time: int, steps: int, shift: int) -> bool:
     return time % shift == 0 or (time + steps) % shift == 0
 
 
-def _residual(values: deque[Tensor]) -> float:
+def _residual(values: deque[Tensor], floor: float) -> float:
     """Return the residual of the last value, estimated from its changes over the last blocks."""
-    last, size = values[-1], float(values[-1].norm())
+    last, size = values[-1], max(float(values[-1].norm()), floor)
     if len(values) < 3 or not size:
         return math.inf
     changes = [float((one - before).norm()) / size for before, one in itertools.pairwise(values)]

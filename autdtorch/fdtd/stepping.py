@@ -9,6 +9,7 @@ from fractions import Fraction
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from autdtorch.fdtd.assembly.elements import elements_of
@@ -71,6 +72,19 @@ class Assembly:
     def touches_heterogeneous(self, points: Tensor) -> bool:
         """Return whether the interpolation of any of the points (N, 3) [m] uses cells that are not of air."""
         return len(points) > 0 and bool(np.isin(self._in_air(points).index, self.heterogeneous.index).any())
+
+    def is_enclosed(self, points: Tensor) -> NDArray[np.bool_]:
+        """Return whether points (N, 3) [m] are nearer to enclosed cells than to others of air."""
+        if not len(self.heterogeneous.enclosed):
+            return np.zeros(len(points), bool)
+        cells, shape = self.grid.to_cells(points), np.array(self.grid.shape)
+        corners = np.floor(cells).astype(np.int64)[:, None] + np.indices((2, 2, 2)).reshape(3, 8).T
+        far = ((corners - cells[:, None]) ** 2).sum(axis=2)
+        index = np.ravel_multi_index(tuple(np.moveaxis(corners.clip(0, shape - 1), -1, 0)), self.grid.shape)
+        enclosed = np.isin(index, self.heterogeneous.enclosed)
+        open_air = ~np.isin(index, self.heterogeneous.sound_hard)
+        nearest = [np.where(kind, far, np.inf).min(axis=1) for kind in (enclosed, open_air)]
+        return np.asarray(nearest[0] < nearest[1])
 
     def receivers(self, points: Tensor, weights: Tensor = _ONE_NODE) -> Receivers:
         """Return receivers at points (P, 3) [m], or of means over nodes (P, n, 3) with `weights` (n,)."""

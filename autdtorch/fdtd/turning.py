@@ -97,17 +97,31 @@ class FlatFaces(NamedTuple):
         aligned = (np.abs(self.normals @ axes.T) > ALIGNED).any(axis=1)
         return 1.0 if aligned.all() else float(self.areas[aligned].sum() / self.areas.sum())
 
+    def is_prism(self, axis: Array) -> bool:
+        """Return whether each of them is parallel or normal to an axis (3,)."""
+        along = np.abs(self.normals @ axis)
+        return bool(((along < _PERPENDICULAR) | (along > ALIGNED)).all())
+
     def all_aligned(self, axes: Array) -> bool:
         """Return whether all of them are normal to one of the axes, one a row (3, 3)."""
         return self.aligned_share(axes) >= _ALL
 
 
 def axes_along(surfaces: Sequence[FlatFaces]) -> Array:
-    """Return the axes, one a row (3, 3), that are normal to the largest area of surfaces."""
+    """Return the axes, one a row (3, 3), that are normal to the largest area of surfaces.
+
+    Where flat faces are too small, a direction along which no body varies, as along a cylinder, is an axis.
+    """
     together = FlatFaces(*(np.concatenate(parts) for parts in zip(*surfaces, strict=True)))
     own = np.eye(3)
     best = max((_own_axes(*faces) for faces in surfaces), key=together.aligned_share)
-    return best if together.aligned_share(best) > together.aligned_share(own) + _WORTHWHILE else own
+    if together.aligned_share(best) > together.aligned_share(own) + _WORTHWHILE:
+        return best
+    if any(together.is_prism(axis) for axis in own):
+        return own
+    _, directions = np.linalg.eigh(together.normals.T @ (together.areas[:, None] * together.normals))
+    along = next((axis for axis in directions.T if together.is_prism(axis)), None)
+    return own if along is None else _axes_with(along.round(_AXES_DECIMALS))
 
 
 def flat_faces(shape: Shape) -> FlatFaces:
@@ -128,9 +142,13 @@ def _own_axes(normals: Array, areas: Array) -> Array:
     normals = normals.round(_AXES_DECIMALS)
     first = normals[areas.argmax()]
     beside = np.abs(normals @ first) < _PERPENDICULAR
-    helper = np.eye(3)[np.abs(first).argmin()]
-    second = normals[beside][areas[beside].argmax()] if beside.any() else helper - (helper @ first) * first
-    second = second - (second @ first) * first
+    return _axes_with(first, normals[beside][areas[beside].argmax()] if beside.any() else None)
+
+
+def _axes_with(first: Array, second: Array | None = None) -> Array:
+    """Return axes (3, 3) along a direction (3,) and one about perpendicular, in the usual order."""
+    second = np.eye(3)[np.abs(first).argmin()] if second is None else second
+    second = second - (second @ first) / (first @ first) * first
     first, second = first / np.linalg.norm(first), second / np.linalg.norm(second)
     axes = np.stack((first, second, np.cross(first, second)))
     orders = [axes[list(order)] for order in itertools.permutations(range(3))]

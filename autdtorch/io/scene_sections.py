@@ -106,14 +106,15 @@ def _obstacle(obstacle: Obstacle, name: str, where: str) -> dict[str, Any]:
         accepted = f"must be one of {', '.join(known.__name__ for known in _KINDS)} to be saved"
         raise invalid(where, kind.__name__, accepted)
     section: dict[str, Any] = {"type": _KINDS[kind]}
-    given = {one.name: getattr(obstacle, one.name) for one in fields(obstacle) if one.init}
+    known = {one.name: one.default for one in fields(obstacle) if one.init}
+    given = {name: getattr(obstacle, name) for name in known}
     if isinstance(obstacle, Mesh):
         given["path"] = f"{name}.obj"
     elif isinstance(obstacle, VoxelMask):
         section["path"] = f"{name}.npz"
         del given["mask"]
     for name, value in given.items():
-        if value is not None and value is not False:
+        if value != known.get(name):
             section[name] = list(value) if isinstance(value, tuple) else value
     return section
 

@@ -14,19 +14,20 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
 
 from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
-from autdtorch.fdtd.steady_state import Extrapolation, SteadyState, run_to_steady_state
+from autdtorch.fdtd.steady_state import SILENCE, Extrapolation, SteadyState, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.turning import is_turned
 from autdtorch.propagators.grids import MOST_PASSES, one_box
 from autdtorch.propagators.moved_boxes import assembled_box
 from autdtorch.propagators.plan import MOST_JUDGED
 from autdtorch.propagators.simulation import Run, Simulation, Stepped
+from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.scene import require_clear
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.threads import one_library_thread, spread
@@ -115,7 +116,7 @@ class BoxSimulation(Simulation):
         """Return the pressure (R, P) [Pa] at the receivers of runs."""
         parts = zip(solved.transforms, solved.phasors, strict=True)
         total = solved.incident + sum(transform.field(part) for transform, part in parts)
-        return total.mT.masked_fill(self._silent(receivers.positions), 0)
+        return total.mT.masked_fill(self._silent(receivers.positions), 0)  # kept fields have them too
 
     def incident(
         self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures
@@ -138,28 +139,33 @@ class BoxSimulation(Simulation):
         every = math.ceil(len(receivers.positions) / MOST_JUDGED)
         readings = [transform.readings(every) for transform in transforms]
         sizes = [len(transform.cells) for transform in transforms]
+        heard = (~self._silent(receivers.positions[::every])).to(incident.dtype)[:, None]
+        floors = (SILENCE * incident[::every].norm(dim=0)).tolist()
 
         def pressure(phasors: torch.Tensor) -> torch.Tensor:
             parts = zip(readings, torch.split(phasors, sizes), strict=True)
-            return incident[::every] + sum(reading.field(part) for reading, part in parts)
+            return heard * (incident[::every] + sum(reading.field(part) for reading, part in parts))
 
-        def simulate(index: int, field: torch.Tensor, tolerance: float, observe: Observe) -> SteadyState:
+        def simulate(
+            index: int, field: torch.Tensor, tolerance: float, observe: Observe, floor: float = 0.0
+        ) -> SteadyState:
             box, cells = boxes[index], transforms[index].cells
             forces = box.sources(field)
             if not forces.force.any():  # obstacles of air, or drives that cancel
                 silent = torch.zeros(len(cells), dtype=torch.complex128, device="cpu")
                 return SteadyState(silent, 0, 0.0, True)
-            return run_to_steady_state(
-                box.assembly, self._kernel, forces, cells, tolerance, plan.max_periods, observe, stepped
-            )
+            settings = tolerance, plan.max_periods, observe, stepped, floor
+            return run_to_steady_state(box.assembly, self._kernel, forces, cells, *settings)
 
         @torch.no_grad()  # holds in one thread only
         def alone(run: int) -> tuple[SteadyState, float]:
             begin, (nodes, own), direct = time.perf_counter(), drives[run], incident[::every, run]
             field = boxes[0].driving(nodes, own)
-            steady = simulate(
-                0, field, plan.tolerance, lambda part: direct + readings[0].field(part[:, None])[:, 0]
-            )
+
+            def total(phasors: torch.Tensor) -> torch.Tensor:
+                return heard[:, 0] * (direct + readings[0].field(phasors[:, None])[:, 0])
+
+            steady = simulate(0, field, plan.tolerance, total, floors[run])
             return steady, time.perf_counter() - begin
 
         if len(boxes) == 1:
@@ -177,11 +183,21 @@ class BoxSimulation(Simulation):
         return Solved(boxes, transforms, incident, torch.split(phasors, sizes), runs)
 
     def _silent(self, points: torch.Tensor) -> torch.Tensor:
-        """Return which points (P, n, 3) [m] are in a rigid obstacle; of overlapping ones the later counts."""
+        """Return which points (P, n, 3) [m] are in a rigid obstacle or enclosed by some.
+
+        Of overlapping obstacles the later counts.
+        """
         silent = torch.zeros(len(points), dtype=torch.bool, device="cpu")
-        for obstacle, body in zip(self.plan.scene.obstacles, self.plan.region.bodies, strict=True):
-            silent = torch.where(obstacle.contains(points).any(dim=1), body.fluid is None, silent)
-        return silent
+        for body in self.plan.region.bodies:
+            inside = cast(Obstacle, body.shape).contains(points).any(dim=1)
+            silent = torch.where(inside, body.fluid is None, silent)
+        return silent | self.enclosed(points).any(dim=1)
+
+    def _in_enclosed_cells(self, points: torch.Tensor) -> torch.Tensor:
+        found = torch.zeros(points.shape[:-1], dtype=torch.bool, device="cpu")
+        for box in self.boxes:
+            found |= box.enclosed(points)
+        return found
 
 
 def _coupled(

@@ -187,7 +187,7 @@ class _Box:
         axes = axes_along(faces)
         shapes = [turned_shape(region.bodies[index].shape, axes) for index in group]
         aligned = all(each.all_aligned(axes) for each in faces)
-        return cls(tuple(group), axes, bodies_extent(shapes), aligned)
+        return cls(tuple(group), axes, bodies_extent(shapes, region.wavelength), aligned)
 
     @property
     def middle(self) -> Array:

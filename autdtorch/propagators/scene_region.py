@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import torch
 
 from autdtorch.fdtd.region import Body, Fluid, Region, Shape
-from autdtorch.scene.obstacles import Box
+from autdtorch.scene.obstacles import Box, Obstacle
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.triangles import doubled_normals
 
@@ -29,7 +30,7 @@ def region_of(scene: Scene) -> Region:
     for one, (_, continued) in zip(scene.obstacles, _walls(scene), strict=True):
         density, speed = one.density, one.sound_speed
         fluid = None if density is None or speed is None else Fluid(density, speed)
-        bodies.append(Body(one, fluid, continued))
+        bodies.append(Body(one, fluid, continued, one.uncertainty))
     medium, positions = scene.medium, np.asarray(scene.array.positions.numpy())
     air = Fluid(medium.density, medium.sound_speed)
     return Region(air, scene.attenuation, scene.frequency, tuple(bodies), scene.domain, positions)
@@ -38,7 +39,8 @@ def region_of(scene: Scene) -> Region:
 def hardened(region: Region, tolerance: float) -> Region:
     """Return the region with its hard bodies rigid, where that changes the field by less than a tolerance.
 
-    A body that a later one may cut into keeps its material: what is left of it may be thin.
+    A body that a later one may cut into keeps its material: what is left of it may be thin. No sound enters
+    the cavities of rigid bodies, so they are filled.
     """
     bodies, hard = [], []
     for index, body in enumerate(region.bodies):
@@ -46,10 +48,12 @@ def hardened(region: Region, tolerance: float) -> Region:
         if body.fluid is not None and whole and difference_from_rigid(body, region) <= tolerance:
             hard.append(str(index))
             body = replace(body, fluid=None)
+        if body.fluid is None and whole:
+            body = replace(body, shape=cast(Obstacle, body.shape).filled())
         bodies.append(body)
     if hard:
         logger.debug("obstacle %s is taken as rigid: the difference is below the tolerance", ", ".join(hard))
-    return replace(region, bodies=tuple(bodies)) if hard else region
+    return replace(region, bodies=tuple(bodies))
 
 
 def _overlap(one: Shape, other: Shape) -> bool:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import torch
 
@@ -24,9 +25,10 @@ from autdtorch.propagators.symmetry import (
     symmetries,
 )
 from autdtorch.scene.arrays import apertures_of
+from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.progress import Progress, show_progress
-from autdtorch.utils.validation import ArrayLike, points_tensor
+from autdtorch.utils.validation import ArrayLike, invalid, points_tensor
 
 logger = logging.getLogger(__name__)
 
@@ -91,6 +93,10 @@ class Simulation(ABC):
         """Return whether the interpolation kernel of any point (N, 3) has heterogeneous cells."""
 
     @abstractmethod
+    def _in_enclosed_cells(self, points: torch.Tensor) -> torch.Tensor:
+        """Return which points (..., 3) are in cells of air that rigid obstacles enclose."""
+
+    @abstractmethod
     def _check(self, points: torch.Tensor) -> None:
         """Refuse points (P, 3) whose pressure cannot be computed."""
 
@@ -105,6 +111,23 @@ class Simulation(ABC):
         points = points_tensor("points", points).cpu()
         self._check(points)
         return points
+
+    def enclosed(self, points: torch.Tensor) -> torch.Tensor:
+        """Return which points (..., 3) are in air that rigid obstacles enclose."""
+        found = self._in_enclosed_cells(points)
+        for obstacle, body in zip(self.plan.scene.obstacles, self.plan.region.bodies, strict=True):
+            if body.shape is not obstacle:  # its cavities are filled
+                found = found | (cast(Obstacle, body.shape).contains(points) & ~obstacle.contains(points))
+        return found
+
+    def _refuse_enclosed_sources(self) -> None:
+        """Refuse transducers that rigid obstacles enclose: no sound leaves, and there is no steady state."""
+        nodes = self.plan.scene.array.nodes.positions
+        if (enclosed := self.enclosed(nodes).any(dim=1)).any():
+            number = int(enclosed.nonzero()[0, 0])
+            place = tuple(self.plan.scene.array.positions[number].tolist())
+            accepted = "is enclosed by rigid obstacles, which no sound leaves; must be outside"
+            raise invalid(f"array.positions[{number}]", place, accepted, "m")
 
     @cached_property
     def symmetries(self) -> list[Symmetry]:
@@ -161,6 +184,7 @@ class Simulation(ABC):
 
         The strengths (R, N) [Pa m] of a run are not all zero; receivers take the mean over their nodes.
         """
+        self._refuse_enclosed_sources()
         with self._progress(len(sources)) as progress:
             return self._simulate(sources, strength, receivers, progress.advance)
 

@@ -159,11 +159,9 @@ def test_axes_follow_flat_faces_only(rotation):
     turn = rotation_matrix(rotation).numpy()
     assert np.allclose(np.abs(axes @ turn).round(6), np.abs(axes @ turn).round(), atol=1e-6)
     assert np.linalg.det(axes) == pytest.approx(1)
-    for curved in (
-        Sphere((0, 0, 0), 1e-2, rigid=True),
-        Cylinder((0, 0, 0), 1e-2, 2e-2, (1, 1, 1), rigid=True),
-    ):
-        assert (axes_along([flat_faces(curved)]) == np.eye(3)).all()
+    assert (axes_along([flat_faces(Sphere((0, 0, 0), 1e-2, rigid=True))]) == np.eye(3)).all()
+    along = axes_along([flat_faces(Cylinder((0, 0, 0), 1e-2, 2e-2, (1, 1, 1), rigid=True))])
+    assert np.abs(along @ np.full(3, 3**-0.5)).max() == pytest.approx(1)
 
 
 @pytest.mark.parametrize("rotation", TILTS)

@@ -107,8 +107,10 @@ def test_surfaces_enclose_the_volume_and_face_outwards(box_mesh):
     assert volume(*CYLINDER.surface()) == pytest.approx(math.pi * 0.5**2 * 1.2 * polygon, rel=1e-12)
     assert volume(*SPHERE.surface()) == pytest.approx(4 / 3 * math.pi * 0.7**3, rel=3 * SAGITTA)
     mask = np.random.default_rng(0).random((5, 4, 3)) < 0.5
-    voxels = VoxelMask(mask, 0.5, rigid=True)
-    assert volume(*voxels.surface()) == pytest.approx(mask.sum() * 0.5**3, rel=1e-12)
+    cubes = VoxelMask(mask, 0.5, smooth=False, rigid=True)
+    assert volume(*cubes.surface()) == pytest.approx(mask.sum() * 0.5**3, rel=1e-12)
+    smooth = VoxelMask(mask, 0.5, rigid=True)
+    assert volume(*smooth.surface()) == pytest.approx(mask.sum() * 0.5**3, rel=1e-6)  # found in steps
 
 
 def test_rotations_are_about_fixed_axes_x_first():
@@ -166,7 +168,9 @@ def test_meshes_and_masks_are_equal_by_content(folder, box_mesh):
 
 def test_mesh_and_mask_survive_pickling_without_their_files(folder, box_mesh):
     path = saved(folder, "gone.obj", *box_mesh.surface())
-    packed = pickle.dumps((Mesh(path, rigid=True), VoxelMask(np.ones((2, 3, 4), bool), 0.1, rigid=True)))
+    packed = pickle.dumps(
+        (Mesh(path, rigid=True), VoxelMask(np.ones((2, 3, 4), bool), 0.1, smooth=False, rigid=True))
+    )
     path.unlink()
     mesh, voxels = pickle.loads(packed)
     torch.testing.assert_close(mesh.signed_distance(cloud()), box_mesh.signed_distance(cloud()))
@@ -188,7 +192,7 @@ def test_a_mesh_is_moved_rescaled_and_changed_without_its_file(folder, box_mesh)
 def test_voxels_that_fill_a_box_are_that_box():
     spacing, mask = 0.05, np.zeros((14, 12, 16), bool)
     mask[2:12, 3:9, 4:8] = True
-    voxels = VoxelMask(mask, spacing, origin=(1.0, 2.0, 3.0), rigid=True)
+    voxels = VoxelMask(mask, spacing, origin=(1.0, 2.0, 3.0), smooth=False, rigid=True)
     box = Box((1.35, 2.3, 3.3), (0.5, 0.3, 0.2), rigid=True)
     assert (voxels.lower, voxels.upper) == (pytest.approx(box.lower), pytest.approx(box.upper))
     points = torch.tensor(box.center, dtype=torch.float64) + cloud(4000, 0.3)

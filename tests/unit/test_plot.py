@@ -81,7 +81,7 @@ def test_edges_that_their_own_obstacle_hides_are_not_drawn() -> None:
     with_voxel_behind[3, 3, 1] = True  # seen from low x, low y and high z, the slab is in front of it
     drawn = []
     for mask in (slab, with_voxel_behind):
-        voxels = at.VoxelMask(mask, 4e-3, origin=(30e-3, 30e-3, 30e-3), rigid=True)
+        voxels = at.VoxelMask(mask, 4e-3, origin=(30e-3, 30e-3, 30e-3), smooth=False, rigid=True)
         ax = plot_scene(small_scene((voxels,), extent=80e-3)).axes[0]
         (edges,) = (artist for artist in ax.collections if isinstance(artist, Line3DCollection))
         drawn.append(edges._segments3d)

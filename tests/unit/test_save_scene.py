@@ -34,8 +34,10 @@ OBSTACLES = st.one_of(
         PLACE, ANGLES, MATERIAL,
     ),
     st.builds(
-        lambda place, fluid: at.VoxelMask(np.eye(3, dtype=bool)[:, :, None], 1e-3, place, **fluid),
-        PLACE, MATERIAL,
+        lambda place, smooth, fluid: at.VoxelMask(
+            np.eye(3, dtype=bool)[:, :, None], (1e-3, 2e-3, 1e-3), place, smooth=smooth, **fluid
+        ),
+        PLACE, st.booleans(), MATERIAL,
     ),
 )  # fmt: skip
 

@@ -115,7 +115,7 @@ obstacles:
 def test_path_in_a_mapping_starts_from_the_working_directory(tmp_path, monkeypatch):
     np.save(tmp_path / "mask.npy", np.ones((2, 3, 4), bool))
     monkeypatch.chdir(tmp_path)
-    obstacle = {"type": "voxel_mask", "path": "mask.npy", "spacing": 1e-3, "rigid": True}
+    obstacle = {"type": "voxel_mask", "path": "mask.npy", "spacing": 1e-3, "smooth": False, "rigid": True}
     scene = load_scene({**OmegaConf.create(SMALL), "obstacles": [obstacle | {"origin": [0.06, 0, 0]}]})
     (found,) = scene.obstacles
     assert found.upper == pytest.approx((62e-3, 3e-3, 4e-3))

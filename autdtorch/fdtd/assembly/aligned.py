@@ -8,13 +8,14 @@ from scipy.ndimage import label
 from autdtorch.fdtd.assembly.blocks import Blocks, varies
 from autdtorch.fdtd.assembly.element import VERTICES, InterfaceElements, Materials, uniform_coupling
 from autdtorch.fdtd.assembly.layers import layered_elements, two_port
-from autdtorch.fdtd.assembly.prisms import Prisms, extruded, prisms, stacked
+from autdtorch.fdtd.assembly.prisms import Prisms, prisms, stacked
 from autdtorch.fdtd.assembly.sections import Kinds, Section
 from autdtorch.fdtd.stencil import Stencil
 from autdtorch.utils.array_types import Array, Index
 
 # Most elements along an axis of those that are fitted together; edges farther apart are fitted as if alone
 _TOGETHER = 4
+_SOUND_HARD_DENSITY = 1e12
 # Stiffness that elements at corners get beyond the mean of their slices, relative to what the slices lack
 _STIFFER = 0.2
 
@@ -60,7 +61,7 @@ def _layered(
         width[number, : last - first + 1] = np.diff(ends)
         layer[number] = columns[place][np.minimum(first + np.arange(most), last)]
     wavenumber = stencil.kappa * materials.slowness[layer]
-    ports = two_port(width, materials.density[layer], wavenumber, stencil.kappa)
+    ports = two_port(width, _densities(materials)[layer], wavenumber, stencil.kappa)
     return layered_elements(axis, ports, layer[:, [0, -1]], materials, stencil)
 
 
@@ -69,25 +70,28 @@ def _prismatic(
 ) -> tuple[Array, Array]:
     """Return coupling (n, 28) and mass (n, 8) of kinds of elements (n, 3) that do not vary along an axis."""
     number = _numbers(materials)
-    coupling, mass = np.zeros((len(kinds), 28)), np.zeros((len(kinds), 2, 2))
+    coupling, mass = np.zeros((len(kinds), 28)), np.zeros((len(kinds), 8))
     planes = blocks.planes[axis]
     levels = planes.centers[planes.begin[kinds[:, axis]]]
     across = [other for other in range(3) if other != axis]
     for level in np.unique(levels):
         sections = _Sections(blocks, axis, int(level))
         for row in np.flatnonzero(levels == level):
-            section, (x, y) = sections.around(kinds[row, across])
-            found = prisms(section, number, stencil)
-            coupling[row] = extruded(found.coupling[x, y], found.mobility[x, y], axis, stencil)
-            mass[row] = found.mass[x, y] / 2
-    repeated = np.broadcast_to(np.expand_dims(mass, 1 + axis), (len(kinds), 2, 2, 2))
-    return coupling, repeated.reshape(len(kinds), 8)
+            section, place = sections.around(kinds[row, across])
+            own = Prisms(*(part[place] for part in prisms(section, number, stencil)))
+            coupling[row], mass[row] = stacked(np.ones(1), [own], axis, stencil)
+    return coupling, mass
+
+
+def _densities(materials: Materials) -> Array:
+    """Return the densities (m,) with sound-hard ones so large that the thinnest sheet lets nothing pass."""
+    return np.where(materials.sound_hard, _SOUND_HARD_DENSITY, materials.density)
 
 
 def _numbers(materials: Materials) -> Kinds:
     """Return materials as numbers that can be keys."""
     return Kinds(
-        tuple(materials.density.tolist()),
+        tuple(_densities(materials).tolist()),
         tuple(materials.mass.tolist()),
         tuple(materials.sound_hard.tolist()),
     )

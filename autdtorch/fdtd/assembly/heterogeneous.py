@@ -21,6 +21,7 @@ from autdtorch.fdtd.assembly.element import (
     uniform_coupling,
 )
 from autdtorch.fdtd.assembly.elements import Elements
+from autdtorch.fdtd.assembly.enclosed import enclosed_cells
 from autdtorch.fdtd.stencil import Stencil, flat_offsets
 from autdtorch.utils.array_types import Array, Index
 
@@ -54,6 +55,7 @@ class HeterogeneousCells:
     mass: Array  # m_i (n,), 1 in air
     sound_hard: Index  # flat indices of the sound-hard cells, ascending
     shell: Index  # sound-hard cells next to other cells; those behind them are never read
+    enclosed: Index  # sound-hard cells of air that no sound reaches, ascending
 
     def mass_of(self, cells: Index) -> Array:
         """Return the mass (k,) of cells (k,) that are heterogeneous or of air."""
@@ -70,6 +72,9 @@ def heterogeneous_cells(elements: Elements, stencil: Stencil) -> HeterogeneousCe
     touched = np.unique(_vertices(elements, shape))
     touched = touched[_inner(touched, shape)]
     coupling, mass, hard = _without_sound_hard(elements, touched, shape, stencil)
+    enclosed = enclosed_cells(coupling, touched, hard, shape)
+    hard[enclosed] = True
+    coupling *= ~(hard[touched, None] | hard[_neighbours(touched, shape)])
     largest = _ROW_SUM_MARGIN * stencil.total * float(elements.materials.speed.max())
     mass = _transferred_mass(coupling, mass, elements, touched, shape, largest)
     weight = coupling / mass[:, None]
@@ -81,7 +86,8 @@ def heterogeneous_cells(elements: Elements, stencil: Stencil) -> HeterogeneousCe
     order = np.argsort(index)
     around = np.unique(_neighbours(touched, shape))
     shell = around[hard[around] & _inner(around, shape)]
-    return HeterogeneousCells(index[order], weight[order], mass[order], np.flatnonzero(hard), shell)
+    rows = index[order], weight[order], mass[order]
+    return HeterogeneousCells(*rows, np.flatnonzero(hard), shell, enclosed)
 
 
 def _neighbours(index: Index, shape: Shape) -> Index:

@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from scipy.optimize import nnls
 
-from autdtorch.fdtd.assembly.element import PAIRS, VERTICES, coupling_by_edges
+from autdtorch.fdtd.assembly.element import PAIRS, coupling_by_edges
 from autdtorch.fdtd.assembly.plane_fields import plane_fields
 from autdtorch.fdtd.assembly.prism_fit import fitted_couplings, importance
 from autdtorch.fdtd.assembly.sections import (
@@ -98,28 +98,12 @@ def _original(fit: Prisms, image: Image) -> Prisms:
     return Prisms(*map(turned, fit))
 
 
-def extruded(flat: Array, mobility: Array, axis: int, stencil: Stencil) -> Array:
-    """Return the coupling (28,) of an element, given that of its columns along an axis (2, 2, 2, 2).
-
-    `mobility` (2, 2) is that along the columns. The energy across them is averaged over both ends of the
-    columns; each column adds its own along them.
-    """
-    by_edges = coupling_by_edges(stencil)
-    places = np.delete(VERTICES, axis, axis=1)
-    one, other = places[PAIRS[:, 0]], places[PAIRS[:, 1]]
-    beside = (VERTICES[PAIRS[:, 0], axis] != VERTICES[PAIRS[:, 1], axis]).astype(np.int64)
-    sides = np.abs(one - other).sum(axis=1)
-    coupling = by_edges[sides + beside] * flat[one[:, 0], one[:, 1], other[:, 0], other[:, 1]]
-    taken = np.einsum("abcd,abcd->ab", flat, by_edges[_sides_between() + 1])
-    own = mobility - taken
-    return np.asarray(np.where(sides == 0, own[one[:, 0], one[:, 1]], coupling))
-
-
 def stacked(width: Array, slices: Sequence[Prisms], axis: int, stencil: Stencil) -> tuple[Array, Array]:
     """Return the coupling (28,) and mass (8,) of an element, a stack of slices of prisms along an axis.
 
     Each slice has a width (L,). A flow along a column passes all slices, which decides the pressure in each.
-    The energy across the columns is that of a slice, at the pressures there.
+    The energy across the columns is that of a slice, at the pressures there. What pressures that differ at
+    the ends of the columns have beyond is not negative: the stencil would take some from strong couplings.
     """
     flat, mass, mobility = (np.stack(parts) for parts in zip(*slices, strict=True))
     resistance = width[:, None, None] / np.maximum(mobility, _LEAST_MOBILITY)
@@ -131,17 +115,23 @@ def stacked(width: Array, slices: Sequence[Prisms], axis: int, stencil: Stencil)
     number = np.moveaxis(np.arange(8).reshape(2, 2, 2), axis, 0).reshape(2, 4)  # vertices at both ends
     matrix, masses = np.zeros((8, 8)), np.zeros(8)
     low, high = np.eye(8)[number]
-    for own, thick, part, place, change in zip(flat, width, mass, middle, drop, strict=True):
+    slices_of = zip(flat, width, mass, resistance, middle, drop, strict=True)
+    for own, thick, part, passed, place, change in slices_of:
         at_middle = (1 - place).reshape(4, 1) * low + place.reshape(4, 1) * high
         along = change.reshape(4, 1) * (high - low)
         across = _laplacian(2 * (straight + oblique) * own)
-        matrix += thick * at_middle.T @ across @ at_middle + thick / 12 * along.T @ across @ along
         # what the stencil has beyond pressures that vary linearly along the columns
-        matrix += along.T @ _laplacian(((straight + oblique) / 3 - oblique) * own) @ along / thick
+        beyond = _laplacian(((straight + oblique) / 3 - oblique) * own)
+        own_along = np.diag(1 / passed.ravel()) + thick / 12 * across + beyond / thick
+        matrix += thick * at_middle.T @ across @ at_middle + along.T @ _without_negative(own_along) @ along
         masses[number] += thick * np.stack(((1 - place) * part, place * part)).reshape(2, 4)
-    columns = high - low
-    matrix += (columns.T / resistance.sum(axis=0).ravel()) @ columns
     return -matrix[PAIRS[:, 0], PAIRS[:, 1]], masses
+
+
+def _without_negative(matrix: Array) -> Array:
+    """Return a symmetric matrix without its negative eigenvalues."""
+    value, vector = np.linalg.eigh(matrix)
+    return np.asarray((vector * np.maximum(value, 0)) @ vector.T) if value[0] < 0 else matrix
 
 
 def _laplacian(coupling: Array) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 
@@ -44,6 +45,15 @@ class Obstacle(ABC):
         density, sound_speed = fluid(kind, self.density, self.sound_speed)
         object.__setattr__(self, "density", density)
         object.__setattr__(self, "sound_speed", sound_speed)
+
+    @property
+    def uncertainty(self) -> float:
+        """Distance [m] by which its surface may be off (rms); 0 where it is exact."""
+        return 0.0
+
+    def filled(self) -> Self:
+        """Return the obstacle without its cavities, which no sound enters if it is rigid."""
+        return self
 
     @property
     @abstractmethod

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.base import Obstacle
 from autdtorch.scene.obstacles.mesh_distance import MeshDistance
 from autdtorch.scene.obstacles.mesh_file import read_mesh
-from autdtorch.scene.obstacles.mesh_solid import Triangles, solid_of
+from autdtorch.scene.obstacles.mesh_solid import Triangles, outer_parts, solid_of
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.validation import Vector, finite_vector, invalid, positive, real_tensor, within
@@ -105,6 +105,15 @@ class Mesh(Obstacle):
         with within("Mesh.surface"):
             source.vertices, source.faces = solid_of(*_triangles(surface))
         return cls(source, scale, offset, rotation, density=density, sound_speed=sound_speed, rigid=rigid)
+
+    def filled(self) -> Self:
+        """Return the mesh without its cavities and what is in them; see `Obstacle.filled`."""
+        outer = outer_parts(*self.triangles)
+        if outer.all():
+            return self
+        source = _Source(self._source)
+        source.vertices, source.faces = self._source.vertices, self._source.faces[outer]
+        return replace(self, path=source)
 
     @property
     def triangles(self) -> Triangles:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -81,6 +82,20 @@ def solid_of(corners: Array, triangles: Index) -> Triangles:
     joined = _union(solids)
     chosen = joined if slivers or not _agree(joined, parts) else whole
     return chosen.vertices, chosen.faces
+
+
+def outer_parts(vertices: Array, faces: Index) -> NDArray[np.bool_]:
+    """Return which faces (F,) of a solid bound it from outside: not those of cavities and bodies in these."""
+    label = _labels(vertices, faces)
+    parts = [_part(vertices, own) for own in _split(faces, label)]
+    if all(part.volume >= 0 for part in parts):
+        return np.ones(len(faces), bool)
+    outer = np.array([part.volume > 0 for part in parts])
+    for number in np.flatnonzero(outer):
+        place = parts[number].vertices[parts[number].faces[0, 0]][None]
+        others = [part for other, part in enumerate(parts) if other != number and part.volume > 0]
+        outer[number] = not any(winding_number(*part[:2], place)[0] > 0.5 for part in others)
+    return np.asarray(outer[label])
 
 
 def winding_number(vertices: Array, faces: Index, points: Array) -> Array:

@@ -74,8 +74,11 @@ def is_turnable(obstacle: object) -> bool:
 def shifted(obstacle: Obstacle, offset: torch.Tensor, digits: int = _DIGITS) -> Obstacle:
     """Return an obstacle shifted by an offset (3,) [m], its place rounded to decimals."""
     name = _PLACES[type(obstacle)]
-    place: dict[str, Any] = {name: _rounded(offset.new_tensor(getattr(obstacle, name)) + offset, digits)}
-    return replace(obstacle, **place)
+    place = _rounded(offset.new_tensor(getattr(obstacle, name)) + offset, digits)
+    if isinstance(obstacle, VoxelMask):
+        return obstacle.at(place)
+    there: dict[str, Any] = {name: place}
+    return replace(obstacle, **there)
 
 
 def turned(

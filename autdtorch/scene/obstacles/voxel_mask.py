@@ -2,183 +2,265 @@
 
 from __future__ import annotations
 
+import logging
+import math
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from autdtorch.scene.obstacles.base import Obstacle
-from autdtorch.scene.obstacles.triangles import BOX_TRIANGLES
+from autdtorch.scene.obstacles.voxel_cubes import VoxelCubes
+from autdtorch.scene.obstacles.voxel_surface import VanishedError, VoxelSurface
+from autdtorch.utils.array_types import Array
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.numpy_file import read_arrays
-from autdtorch.utils.validation import Vector, finite_vector, invalid, is_dense, path_of, positive
+from autdtorch.utils.validation import (
+    Vector,
+    boolean,
+    finite_number,
+    finite_vector,
+    invalid,
+    is_dense,
+    path_of,
+    positive,
+    positive_entries,
+)
 
-_AIR = 2  # voxels of air around the body in the distance transform; points farther away use a search tree
+logger = logging.getLogger(__name__)
+
+_MOST_UNEQUAL = 20  # Ratio of a voxel's edges: smoothing over the longest takes so many of the shortest
 
 
 @dataclass(frozen=True)
 class VoxelMask(Obstacle):
-    """A body made of cubic voxels, such as a segmented scan.
+    """A body of voxels, such as a segmented scan.
 
-    The signed distance at a voxel centre is the distance to the cube of the nearest voxel of the other kind.
-    Between centres it is interpolated: exact at flat faces, with an error of up to half a voxel at edges and
-    corners and on the medial axis.
+    Voxels are samples: the body is the smooth one that has them, with flat faces and edges where the voxels
+    show some, and with their volume (`voxel_surface.py`). Errors of fields count the `uncertainty` of its
+    surface. With `smooth=False` it is made of the voxels themselves.
 
     Attributes:
-        mask: (nx, ny, nz), bool, True in the body; a read-only copy.
-        spacing: edge of a voxel [m], > 0.
+        mask: (nx, ny, nz): booleans, True in the body; or whole numbers, 0 outside and one other inside; or
+            grey values with a `level`. A read-only copy.
+        spacing: edge of a voxel [m], > 0; or the edges along x, y and z (3,).
         origin: corner of voxel (0, 0, 0) with the smallest coordinates (3,) [m]; voxel (i, j, k) has its
             centre at origin + spacing (i + 1/2, j + 1/2, k + 1/2).
+        level: grey value at the surface; the body is above it. None: the values are a mask.
+        smooth: whether voxels are samples of a smooth body, or cuboids.
         digest: of the mask; compared in place of it.
 
     Raises:
-        ValueError: a mask that is not boolean, not (nx, ny, nz) or nowhere True; or another attribute that is
-            not finite, has the wrong shape or is out of range; see also `Obstacle`.
+        ValueError: values that are no mask and have no level, are not (nx, ny, nz) or nowhere in the body;
+            `smooth=False` with a level; or another attribute that is not finite, has the wrong shape or is
+            out of range; see also `Obstacle`.
     """
 
-    mask: NDArray[np.bool_] = field(repr=False, compare=False)
-    spacing: float
+    mask: NDArray[Any] = field(repr=False, compare=False)
+    spacing: float | Vector
     origin: Vector = (0.0, 0.0, 0.0)
+    level: float | None = None
+    smooth: bool = True
     digest: str = field(init=False)
 
     def __post_init__(self) -> None:
         """Check the attributes and copy the mask."""
         super().__post_init__()
-        object.__setattr__(self, "mask", _checked_mask(self.mask))
-        object.__setattr__(self, "spacing", positive("VoxelMask.spacing", self.spacing, "m"))
+        object.__setattr__(self, "spacing", _checked_spacing(self.spacing))
         object.__setattr__(self, "origin", finite_vector("VoxelMask.origin", self.origin))
+        object.__setattr__(self, "smooth", boolean("VoxelMask.smooth", self.smooth))
+        if self.level is not None:
+            object.__setattr__(self, "level", finite_number("VoxelMask.level", self.level))
+            if not self.smooth:
+                raise invalid("VoxelMask.smooth", False, "must be True where a level is given")
+        values = _checked_mask(self.mask) if self.level is None else _checked_grey(self.mask, self.level)
+        object.__setattr__(self, "mask", values)
         object.__setattr__(self, "digest", digest_of(self.mask)[:16])
 
     @classmethod
     def load(
         cls,
         path: str | os.PathLike[str],
-        spacing: float,
+        spacing: float | Vector,
         origin: Vector = (0.0, 0.0, 0.0),
+        level: float | None = None,
+        smooth: bool = True,
         *,
         density: float | None = None,
         sound_speed: float | None = None,
         rigid: bool = False,
     ) -> VoxelMask:
-        """Read the mask from `path`, a .npy file or an .npz file with a single array.
+        """Read the voxels from `path`, a .npy file or an .npz file with a single array.
 
         For the other arguments see `VoxelMask`, and for the material see `Obstacle`.
 
         Raises:
             ValueError: no such file, or no single array in it; see also `VoxelMask`.
         """
-        mask = _read(path_of("VoxelMask.path", path))
-        return cls(mask, spacing, origin, density=density, sound_speed=sound_speed, rigid=rigid)
+        values = _read(path_of("VoxelMask.path", path))
+        material: dict[str, Any] = {"density": density, "sound_speed": sound_speed, "rigid": rigid}
+        return cls(values, spacing, origin, level, smooth, **material)
+
+    @classmethod
+    def from_image(
+        cls,
+        image: Any,
+        name: str | None = None,
+        level: float | None = None,
+        smooth: bool = True,
+        *,
+        scale: float = 1.0,
+        density: float | None = None,
+        sound_speed: float | None = None,
+        rigid: bool = False,
+    ) -> VoxelMask:
+        """Make a body of a PyVista `ImageData`, from the values of its cells or, without any, of its points.
+
+        A value at a point stands for the voxel around it. Spacing and origin of the image count, times
+        `scale`, metres per unit of the image: 1e-3 for one in millimetres. `name` is that of the array, by
+        default the active one. For the other arguments see `VoxelMask`, and for the material see `Obstacle`.
+
+        Raises:
+            ValueError: no image, no such array, or an array without one number for each voxel; see also
+                `VoxelMask`.
+        """
+        values, spacing, origin = _image_values(image, name)
+        scale = positive("VoxelMask.scale", scale)
+        edges, lower = (tuple(scale * one for one in each) for each in (spacing, origin))
+        material: dict[str, Any] = {"density": density, "sound_speed": sound_speed, "rigid": rigid}
+        return cls(values, edges, lower, level, smooth, **material)
+
+    @property
+    def uncertainty(self) -> float:
+        """Distance [m] by which the surface may be off (rms): voxels do not say where it is between them."""
+        return self._shape.uncertainty
 
     @property
     def lower(self) -> Vector:
         """Corner of the body's bounding box with the smallest coordinates (3,) [m]."""
-        return self._corner(self._extent[0])
+        return self._moved(self._shape.bounds[0])
 
     @property
     def upper(self) -> Vector:
         """Corner of the body's bounding box with the largest coordinates (3,) [m]."""
-        return self._corner(self._extent[1])
+        return self._moved(self._shape.bounds[1])
 
     def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the faces between voxels of body and air; see `Obstacle.surface`."""
-        mask = np.pad(self.mask, 1)
-        corners = np.indices((2, 2, 2)).reshape(3, 8).T
-        quads = []
-        for side, triangles in enumerate(BOX_TRIANGLES.reshape(6, 2, 3).numpy()):
-            axis, step = side // 2, 2 * (side % 2) - 1
-            bare = np.argwhere(mask & ~np.roll(mask, -step, axis=axis)) - 1
-            quads.append((bare[:, None, None, :] + corners[triangles]).reshape(-1, 3))
-        nodes, index = np.unique(np.concatenate(quads), axis=0, return_inverse=True)
-        vertices = np.array(self.origin) + self.spacing * nodes
-        return torch.from_numpy(vertices), torch.from_numpy(index.reshape(-1, 3))
+        """Return the surface, of cubes the faces between voxels of body and air; see `Obstacle.surface`."""
+        vertices, triangles = self._shape.surface()
+        return torch.from_numpy(vertices + self.origin), torch.from_numpy(triangles)
+
+    def filled(self) -> Self:
+        """Return the body without its cavities; see `Obstacle.filled`."""
+        from scipy.ndimage import binary_fill_holes
+
+        body = self.mask if self.level is None else self.mask > self.level
+        holes = binary_fill_holes(body) & ~body
+        return replace(self, mask=np.where(holes, self.mask[body].max(), self.mask)) if holes.any() else self
+
+    def at(self, origin: Vector) -> Self:
+        """Return the body with another origin (3,) [m]; both share their shape."""
+        copy = replace(self, origin=origin)
+        vars(copy)["_shape"] = self._shape
+        return copy
 
     @cached_property
-    def _extent(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """First voxel of the body and one past the last along each axis, (3,) each."""
-        filled = np.argwhere(self.mask)
-        return filled.min(axis=0), filled.max(axis=0) + 1
+    def _shape(self) -> VoxelSurface | VoxelCubes:
+        edges = np.broadcast_to(np.array(self.spacing, np.float64), 3)
+        if not self.smooth:
+            return VoxelCubes(self.mask, edges)
+        try:
+            return VoxelSurface(self.mask, edges, self.level)
+        except VanishedError:
+            logger.warning("a body of %d voxels is too thin to be smooth: taken as cuboids", self.mask.sum())
+            return VoxelCubes(self.mask, edges)
 
-    @cached_property
-    def _field(self) -> NDArray[np.float64]:
-        """Signed distances in voxels at the voxel centres of the body's extent, with `_AIR` around it."""
-        from scipy.ndimage import distance_transform_edt
-
-        first, last = self._extent
-        window = tuple(slice(low, high) for low, high in zip(first, last, strict=True))
-        body = np.pad(self.mask[window], _AIR)
-        here = np.indices(body.shape)
-        outside, inside = (
-            _to_cube(distance_transform_edt(kind, return_distances=False, return_indices=True) - here, axis=0)
-            for kind in (~body, body)
-        )
-        return np.where(body, -inside, outside)
-
-    @cached_property
-    def _shell(self) -> Any:
-        """Search tree of the body's outer voxels."""
-        from scipy.ndimage import binary_erosion
-        from scipy.spatial import KDTree
-
-        mask = self.mask
-        return KDTree(np.argwhere(mask & ~binary_erosion(mask)))
-
-    def _corner(self, voxel: NDArray[np.int64]) -> Vector:
-        x, y, z = (low + self.spacing * int(count) for low, count in zip(self.origin, voxel, strict=True))
+    def _moved(self, corner: Array) -> Vector:
+        x, y, z = (float(low + place) for low, place in zip(self.origin, corner, strict=True))
         return x, y, z
 
-    def _voxels(self, points: torch.Tensor) -> NDArray[np.float64]:
-        """Return positions (N, 3) in voxels; voxel centres have whole numbers."""
-        return np.asarray(points.detach().cpu().numpy() - self.origin, np.float64) / self.spacing - 0.5
+    def _from_origin(self, points: torch.Tensor) -> Array:
+        return np.asarray(points.detach().cpu().numpy() - self.origin, np.float64)
 
     def _inside(self, points: torch.Tensor, margin: float) -> torch.Tensor:
-        """Count the lower faces of a voxel as inside and the upper faces as outside."""
-        mask = self.mask
-        voxel = np.floor(self._voxels(points) + 0.5)
-        within = ((voxel >= 0) & (voxel < mask.shape)).all(axis=1)
-        filled = np.zeros(len(points), bool)
-        filled[within] = mask[tuple(voxel[within].astype(np.int64).T)]
-        inside = torch.from_numpy(filled).to(points.device)
+        inside = torch.from_numpy(self._shape.inside(self._from_origin(points))).to(points.device)
         return inside | (self._distance(points) < margin) if margin > 0 else inside
 
     def _distance(self, points: torch.Tensor) -> torch.Tensor:
-        from scipy.ndimage import map_coordinates
-
-        voxels = self._voxels(points)
-        local = voxels - self._extent[0] + _AIR
-        near = ((local >= 0) & (local <= np.array(self._field.shape) - 1)).all(axis=1)
-        distance = np.empty(len(voxels))
-        distance[near] = map_coordinates(self._field, local[near].T, order=1)
-        if not near.all():
-            nearest = self._shell.query(voxels[~near])[1]
-            distance[~near] = _to_cube(self._shell.data[nearest] - voxels[~near], axis=1)
-        return torch.from_numpy(self.spacing * distance).to(points)
+        return torch.from_numpy(self._shape.distance(self._from_origin(points))).to(points)
 
 
-def _to_cube(offset: NDArray[Any], axis: int) -> NDArray[np.float64]:
-    """Return the distance to a unit cube whose centre is at `offset`; coordinates are along `axis`."""
-    return np.asarray(np.linalg.norm(np.maximum(np.abs(offset) - 0.5, 0), axis=axis), np.float64)
+def _checked_spacing(given: object) -> float | Vector:
+    """Return the edge of a voxel, or its three edges."""
+    if isinstance(given, list | tuple) or (isinstance(given, np.ndarray | torch.Tensor) and given.ndim == 1):
+        x, y, z = positive_entries("VoxelMask.spacing", given, 3)
+        if max(x, y, z) > _MOST_UNEQUAL * min(x, y, z):
+            accepted = f"edges must be within a factor of {_MOST_UNEQUAL} of each other; resample the voxels"
+            raise invalid("VoxelMask.spacing", (x, y, z), accepted, "m")
+        return x if x == y == z else (x, y, z)
+    return positive("VoxelMask.spacing", given, "m")
+
+
+def _checked_values(given: object, accepted: str) -> NDArray[Any]:
+    """Return a copy of an array (nx, ny, nz) of real numbers or booleans."""
+    if not isinstance(given, torch.Tensor | np.ndarray) or not is_dense(given) or given.ndim != 3:
+        raise invalid("VoxelMask.mask", given, accepted)
+    values = given.cpu().numpy() if isinstance(given, torch.Tensor) else given
+    if values.dtype.kind not in "buif" or not np.isfinite(values).all():
+        raise invalid("VoxelMask.mask", given, accepted)
+    return np.array(values)
 
 
 def _checked_mask(given: object) -> NDArray[np.bool_]:
-    if (
-        not isinstance(given, torch.Tensor | np.ndarray)
-        or given.dtype not in (torch.bool, np.bool_)
-        or not is_dense(given)
-        or given.ndim != 3
-    ):
-        raise invalid("VoxelMask.mask", given, "must be an array (nx, ny, nz) of booleans")
-    mask = given.cpu().numpy() if isinstance(given, torch.Tensor) else given
-    if not mask.any():
-        raise ValueError(f"VoxelMask.mask: array of shape {mask.shape}; must be True somewhere")
-    mask = np.array(mask)
-    mask.flags.writeable = False
-    return mask
+    values = _checked_values(given, "must be an array (nx, ny, nz) of booleans or of whole numbers")
+    if values.dtype != np.bool_:
+        found = np.unique(values)
+        if values.dtype.kind not in "ui" or len(found) > 2 or (len(found) == 2 and found[0] != 0):
+            accepted = "must be booleans, or whole numbers that are 0 and one other; grey values need a level"
+            raise ValueError(f"VoxelMask.mask: {values.dtype} array with {len(found)} values; {accepted}")
+    return _read_only(values != 0)
+
+
+def _checked_grey(given: object, level: float) -> NDArray[np.float64]:
+    values = _checked_values(given, "must be an array (nx, ny, nz) of real numbers").astype(np.float64)
+    if not (values > level).any():
+        raise invalid("VoxelMask.level", level, f"must be below the largest grey value, {values.max():g}")
+    return _read_only(values)
+
+
+def _read_only(values: NDArray[Any]) -> NDArray[Any]:
+    if values.dtype == np.bool_ and not values.any():
+        raise ValueError(f"VoxelMask.mask: array of shape {values.shape}; must be True somewhere")
+    values.flags.writeable = False
+    return values
+
+
+def _image_values(image: Any, name: str | None) -> tuple[NDArray[Any], Any, Any]:
+    """Return the values of an image (nx, ny, nz), its spacing (3,), and its first voxel's corner (3,)."""
+    try:
+        counts, spacing, origin = image.dimensions, image.spacing, image.origin
+        cells, points = image.cell_data, image.point_data
+    except AttributeError as error:
+        raise invalid("image", type(image).__name__, "must be a PyVista ImageData") from error
+    if name is not None and not isinstance(name, str):
+        raise invalid("name", name, "must be that of an array of the image, or None")
+    of_cells = name in cells if name is not None else len(cells) > 0
+    data = cells if of_cells else points
+    key = name if name is not None else data.active_scalars_name or next(iter(data.keys()), None)
+    if key is None or key not in data:
+        known = ", ".join([*cells.keys(), *points.keys()]) or "none"
+        raise invalid("name", name, f"must be an array of the image; it has {known}")
+    shape = tuple(max(count - 1, 1) for count in counts) if of_cells else tuple(counts)
+    values = np.asarray(data[key])
+    if values.shape != (math.prod(shape),):
+        raise ValueError(f"name: array {key!r} of shape {values.shape}; must have one number for each voxel")
+    corner = [low - (0 if of_cells else edge / 2) for low, edge in zip(origin, spacing, strict=True)]
+    return values.reshape(shape, order="F"), spacing, corner
 
 
 def _read(path: Path) -> NDArray[Any]:

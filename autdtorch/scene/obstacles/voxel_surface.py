@@ -1,0 +1,230 @@
+"""The smooth surface that voxels sample.
+
+A mask says of each voxel whether its centre is in a body. The body is not made of cubes: those of a sphere
+have more than its surface, and a tilted face has stairs. The surface of a mask is found in three steps: the
+mask is smoothed and becomes a level set; its normals are averaged among those of nearby triangles that are
+nearly parallel (bilateral filter: Zheng et al. 2011, doi:10.1109/TVCG.2010.264), so that flat faces become
+flat and edges stay sharp; vertices follow the normals (Sun et al. 2007, doi:10.1109/TVCG.2007.1065). The
+volume is kept. Grey values, as those of a scan, have their surface at a level between voxels.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
+
+from autdtorch.scene.obstacles.mesh_distance import MeshDistance
+from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.triangles import doubled_normals
+
+_BLUR = 0.5  # Standard deviation of the first smoothing [voxels]
+# Rounds of the filter, and in each the averages of normals and the moves of vertices
+_ROUNDS, _AVERAGED, _MOVED = 3, 12, 12
+# Standard deviations of the distance between triangles whose normals are averaged [voxels], and of the
+# difference of these normals: with 0.3 spheres get facets, with 0.5 edges are rounded
+_NEAR, _PARALLEL = 1.8, 0.38
+_REACH = 1.7  # Distance of the farthest of them, in the former
+_VOLUME_STEPS, _KEPT = 20, 1e-9  # Most steps until the volume is kept, and the relative error at which it is
+# Standard deviations of the levels of smoothing that are compared [voxels], and the difference from the mask
+# at which a level is too smooth
+_LEVELS, _MISSED = (0.5, 0.8, 1.2, 1.8, 2.6), 0.15
+# Share of the distance between the surface and a smoother one that is the uncertainty: fitted to the fields
+# of spheres and boxes
+_UNCERTAIN = 0.5
+# Distance [voxels] from the smoother surface at which sharpening has made a cube of a body of few voxels, and
+# the uncertainty of the smoother surface, which is then taken
+_COLLAPSED, _UNCERTAIN_SMOOTH = 0.3, 0.1
+_UNCERTAIN_GREY = 0.02  # The same for grey values [voxels]
+_LEAST = 1e-7  # Share of a smoothed mask that is rounding
+
+
+class VanishedError(ValueError):
+    """Nothing is left of a mask once it is smoothed."""
+
+
+class VoxelSurface:
+    """A closed surface through voxels with edges (3,) [m]; coordinates from the corner of the first one on.
+
+    A mask (nx, ny, nz) is smoothed; of grey values the surface at a level counts, with the body above it.
+    """
+
+    def __init__(self, values: NDArray[Any], edges: Array, level: float | None) -> None:
+        """Take a mask, or grey values with a level.
+
+        Raises:
+            VanishedError: a mask of single voxels, or one as thin.
+        """
+        self._values, self._edges, self._level = values, edges, level
+        self._built = self._surface_and_uncertainty()
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Corners (3,) [m] of the bounding box."""
+        vertices, _ = self.surface()
+        return vertices.min(axis=0), vertices.max(axis=0)
+
+    def surface(self) -> tuple[Array, Index]:
+        """Return vertices (V, 3) [m] and outward triangles (F, 3)."""
+        return self._built[:2]
+
+    @property
+    def uncertainty(self) -> float:
+        """Distance [m] by which the surface may be off (rms)."""
+        return self._built[2]
+
+    def inside(self, points: Array) -> NDArray[np.bool_]:
+        """Return which points (N, 3) are in the body."""
+        return np.asarray(self.distance(points) < 0)
+
+    def distance(self, points: Array) -> Array:
+        """Return the signed distances (N,) [m] of points (N, 3)."""
+        return self._distance(points)
+
+    def _surface_and_uncertainty(self) -> tuple[Array, Index, float]:
+        edge = float(np.cbrt(np.prod(self._edges)))
+        if self._level is not None:
+            least = float(self._values.min())
+            grey = np.pad(self._level - self._values, 1, constant_values=self._level - least + 1)
+            return *_contour(grey, self._edges, 1), _UNCERTAIN_GREY * edge
+        rough, faces = _contour(*_smoothed(self._values, self._edges, _BLUR))
+        if not len(faces):
+            raise VanishedError
+        sharp = _volume_kept(_sharpened(rough, faces, float(self._edges.max())), faces, self._volume)
+        smooth = _contour(*_smoothest(self._values, self._edges))
+        off = math.sqrt(float((MeshDistance(*sharp)(smooth[0]) ** 2).mean()))
+        if off > _COLLAPSED * edge:
+            return *_volume_kept(*smooth, self._volume), _UNCERTAIN_SMOOTH * edge
+        return *sharp, _UNCERTAIN * off
+
+    @property
+    def _volume(self) -> float:
+        return float(self._values.sum() * np.prod(self._edges))
+
+    @cached_property
+    def _distance(self) -> MeshDistance:
+        return MeshDistance(*self.surface())
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the search structures, which are built again."""
+        return {name: value for name, value in vars(self).items() if name != "_distance"}
+
+
+def _contour(field: Array, edges: Array, pad: int) -> tuple[Array, Index]:
+    """Return the surface where a field at voxel centres, with `pad` voxels around, changes its sign."""
+    import igl
+
+    places = np.stack(np.meshgrid(*(np.arange(count) for count in field.shape), indexing="ij"), axis=-1)
+    points = np.ascontiguousarray(places.transpose(2, 1, 0, 3).reshape(-1, 3), np.float64)
+    values = np.ascontiguousarray(field.transpose(2, 1, 0).ravel(), np.float64)
+    vertices, faces, _ = igl.marching_cubes(values, points, *field.shape, 0.0)
+    corners = vertices[faces]
+    if np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) < 0:
+        faces = faces[:, ::-1]
+    return (vertices - pad + 0.5) * edges, np.ascontiguousarray(faces)
+
+
+def _smoothed(mask: NDArray[np.bool_], edges: Array, blur: float) -> tuple[Array, Array, int]:
+    """Return the level set of a mask smoothed by `blur` [voxels], the edges, and the voxels around.
+
+    The share p of a flat body after smoothing by s is Phi(-d / s) at a distance d from it. A curved surface
+    moves inwards by s^2 times its mean curvature, which is given back.
+    """
+    from scipy.ndimage import gaussian_filter
+    from scipy.special import ndtri
+
+    longest = float(edges.max())
+    sigmas = blur * longest / edges
+    pad = math.ceil(3 * float(sigmas.max())) + 2
+    share = gaussian_filter(np.pad(mask, pad).astype(np.float64), sigmas)
+    level = -blur * longest * ndtri(np.clip(share, _LEAST, 1 - _LEAST))
+    slopes = np.stack(np.gradient(level, *edges))
+    normals = slopes / np.maximum(np.linalg.norm(slopes, axis=0), _LEAST)
+    curvature = sum(np.gradient(normals[axis], edges[axis], axis=axis) for axis in range(3))
+    moved = gaussian_filter((blur * longest) ** 2 / 2 * curvature, longest / edges)
+    return level - np.clip(moved, -blur * longest, blur * longest), edges, pad
+
+
+def _smoothest(mask: NDArray[np.bool_], edges: Array) -> tuple[Array, Array, int]:
+    """Return the level set of a mask that is as smooth everywhere as its voxels allow; see `_smoothed`."""
+    from scipy.ndimage import gaussian_filter, maximum_filter
+
+    longest = float(edges.max())
+    levels = [_smoothed(mask, edges, blur) for blur in _LEVELS]
+    pad = levels[-1][2]
+    sign = np.where(np.pad(mask, pad), -1.0, 1.0)
+    total, rest = np.zeros(sign.shape), np.ones(sign.shape)
+    for blur, (level, _, own) in zip(_LEVELS[::-1], levels[::-1], strict=True):
+        level = np.pad(level, pad - own, mode="edge")
+        missed = np.maximum(0, -sign * level).clip(max=2 * blur * longest)
+        around = maximum_filter(missed, 2 * math.ceil(2 * blur) + 1)
+        weight = np.exp(-((around / (_MISSED * longest)) ** 2)) if blur > _LEVELS[0] else np.ones(sign.shape)
+        weight = gaussian_filter(weight, max(0.7, 0.7 * blur))
+        total += rest * weight * np.clip(level, -3 * longest, 3 * longest)
+        rest *= 1 - weight
+    return total, edges, pad
+
+
+def _sharpened(vertices: Array, faces: Index, edge: float) -> Array:
+    """Return vertices (V, 3) whose triangles follow the normals of those around that are nearly parallel."""
+    from scipy.spatial import KDTree
+
+    count = len(faces)
+    place = faces.ravel(), np.repeat(np.arange(count), 3)
+    beside = csr_array(coo_array((np.ones(3 * count), place), (len(vertices), count)))
+    number = np.asarray(beside.sum(axis=1)).ravel()[:, None]
+    for _ in range(_ROUNDS):
+        corners = vertices[faces]
+        doubled = doubled_normals(corners)
+        area = np.maximum(np.linalg.norm(doubled, axis=1), _LEAST * edge**2)
+        middles, normals = corners.mean(axis=1), doubled / area[:, None]
+        pairs = KDTree(middles).query_pairs(_REACH * _NEAR * edge, output_type="ndarray")
+        near = _nearness(middles, pairs, edge)
+        for _ in range(_AVERAGED):
+            normals = _averaged(normals, area, near)
+        square = (beside @ (normals[:, :, None] * normals[:, None]).reshape(count, 9)).reshape(-1, 3, 3)
+        for _ in range(_MOVED):
+            depth = (normals * vertices[faces].mean(axis=1)).sum(axis=1)
+            pull = beside @ (normals * depth[:, None])
+            vertices = vertices + (pull - (square @ vertices[:, :, None])[:, :, 0]) / number
+    return vertices
+
+
+def _nearness(middles: Array, pairs: Index, edge: float) -> csr_array:
+    """Return the weights of pairs of triangles by distance, each pair once, in single precision."""
+    one, other = pairs.T
+    far = ((middles[one] - middles[other]) ** 2).sum(axis=1)
+    weight = np.exp(-far / (2 * (_NEAR * edge) ** 2)).astype(np.float32)
+    return csr_array(coo_array((weight, (one, other)), (len(middles),) * 2))
+
+
+def _averaged(normals: Array, area: Array, near: csr_array) -> Array:
+    """Return unit normals (F, 3): means of those around each, by area and by how parallel they are."""
+    single = normals.astype(np.float32)
+    rows = np.repeat(np.arange(len(normals)), np.diff(near.indptr))
+    cosine = np.einsum("ij,ij->i", single[rows], single[near.indices])
+    own = near.data * np.exp((cosine - 1) / np.float32(_PARALLEL**2))
+    weights = csr_array((own, near.indices, near.indptr), near.shape)
+    weighted = area[:, None] * normals
+    mean = weighted + weights @ weighted + weights.T @ weighted
+    return np.asarray(mean / np.linalg.norm(mean, axis=1, keepdims=True))
+
+
+def _volume_kept(vertices: Array, faces: Index, volume: float) -> tuple[Array, Index]:
+    """Return a surface moved along its normals until it encloses a volume [m^3]."""
+    for _ in range(_VOLUME_STEPS):
+        corners = vertices[faces]
+        doubled = doubled_normals(corners)
+        missing = volume - np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
+        if abs(missing) < _KEPT * volume:
+            break
+        area = np.linalg.norm(doubled, axis=1).sum() / 2
+        normals = np.zeros_like(vertices)
+        np.add.at(normals, faces.ravel(), np.repeat(doubled, 3, axis=0))
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        vertices = vertices + normals / np.where(length > 0, length, 1) * (missing / area)
+    return vertices, faces
