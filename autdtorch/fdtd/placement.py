@@ -32,6 +32,7 @@ _WORTHWHILE = 0.9  # Error of an asymmetric placement, relative to the symmetric
 # Additional distance from the best place [cells, rms] allowed to a symmetric grid if the faces are symmetric:
 # a fifth of the largest. `docs/decisions/runs.md` has the errors.
 _ALLOWANCE = 0.1
+_NARROWER = 0.2  # Distance by which faces that stand for a slender cylinder are within it [cells]
 _BEST = 0.45  # Best distance of a face behind the last centre [cells]
 _CLOSED = 1.0  # Square error of the faces of a slit without a centre in it
 
@@ -51,13 +52,18 @@ def grid_offset(
 def _flat_surface(shape: Shape, spacing: float) -> tuple[Array, Array]:
     """Return the first corners (n, 3) [m] of triangles, and their outward normals of twice their area.
 
-    Of a slender cylinder these are the faces of the cuboid around it.
+    Of a slender cylinder these are the faces of a narrower cuboid in it: half a cell thick, it has no centre
+    in it yet.
     """
     vertices, triangles = (part.numpy() for part in shape.surface())
     if slender_faces(vertices / spacing) is None:
         corners = vertices[triangles]
         return corners[:, 0], doubled_normals(corners)
     ends = np.stack((vertices.min(axis=0), vertices.max(axis=0)))
+    across = np.delete(np.arange(3), int(np.ptp(ends, axis=0).argmax()))
+    ends[:, across] += np.array([[1], [-1]]) * np.minimum(
+        _NARROWER * spacing, 0.49 * np.ptp(ends, axis=0)[across]
+    )
     size = ends[1] - ends[0]
     areas = 2 * np.prod(size) / size
     return np.repeat(ends, 3, axis=0), np.concatenate((-np.diag(areas), np.diag(areas)))

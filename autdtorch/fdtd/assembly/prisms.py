@@ -14,7 +14,7 @@ from functools import lru_cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from scipy.optimize import nnls
+from scipy.optimize import lsq_linear
 
 from autdtorch.fdtd.assembly.element import PAIRS, coupling_by_edges
 from autdtorch.fdtd.assembly.plane_fields import plane_fields
@@ -33,6 +33,10 @@ from autdtorch.utils.array_types import Array, Index
 
 # Fields of the fit of one element; each further one needs two more, up to a limit
 _FIELDS, _MOST_FIELDS = 8, 12
+# Most mass of a column in a heavy body, relative to its material's or to how strongly it is coupled (air: 1).
+# One that air reaches weakly would else be a pipe that resonates
+_REACHED = 2.0
+_LEAST_WEIGHT, _EXACT, _MOST_STEPS = 1e-12, 1e-14, 100
 _SUM = 100.0  # Weight of the sum of masses, relative to their moments
 _LEAST_MOBILITY = 1e-9  # Mobility of a column that a sound-hard material closes
 _DECIMALS = 9  # Sections that agree to so many decimals [cells] share their fit
@@ -163,9 +167,12 @@ def _fitted(section: Section, kinds: Kinds, stencil: Stencil) -> Prisms:
     couplings = fitted_couplings(section, varied, fields, kinds, stencil)
     for (x, y), coupling in zip(varied, couplings, strict=True):
         found.coupling[x, y] = _by_columns(coupling / uniform)
+        reached = np.bincount(COLUMN_PAIRS.ravel(), np.repeat(coupling, 2), 4) / (2 * uniform.sum() / 4)
         values = fields.values[RING + x : RING + x + 2, RING + y : RING + y + 2].reshape(4, -1)
         for part, weight in ((found.mass, kinds.masses), (found.mobility, kinds.mobility)):
-            part[x, y] = _lumped(values, fields.over_element(weight, x, y), fields.order)
+            own = weight[section.at_columns(x, y)]
+            most = np.where(own < weight.max(), np.maximum(own, _REACHED * reached) / 4, np.inf)
+            part[x, y] = _lumped(values, fields.over_element(weight, x, y), fields.order, most)
     return found
 
 
@@ -177,12 +184,20 @@ def _by_columns(coupling: Array) -> Array:
     return found
 
 
-def _lumped(values: Array, integrals: Array, order: Array) -> Array:
+def _lumped(values: Array, integrals: Array, order: Array, most: Array) -> Array:
     """Return weights (2, 2) of the columns with which fields (4, m) have their integrals (m,).
 
-    Their sum is nearly exact, the others as exact as weights that are not negative allow.
+    Their sum is nearly exact, the others as exact as weights from 0 up to `most` (4,) allow.
     """
     weight = importance(order)
     weight[0] = _SUM
-    found, _ = nnls(weight[:, None] * values.T, weight * integrals)
-    return np.asarray(found.reshape(2, 2))
+    bounds = np.zeros(4), np.maximum(most, _LEAST_WEIGHT)
+    found = lsq_linear(
+        weight[:, None] * values.T,
+        weight * integrals,
+        bounds,
+        method="bvls",
+        tol=_EXACT,
+        max_iter=_MOST_STEPS,
+    )
+    return np.asarray(found.x.reshape(2, 2))

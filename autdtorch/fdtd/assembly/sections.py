@@ -49,6 +49,11 @@ class Section(NamedTuple):
         """Return the blocks at coordinates along both axes."""
         return np.searchsorted(self.cuts[0], x), np.searchsorted(self.cuts[1], y)
 
+    def at_columns(self, x: int, y: int) -> Index:
+        """Return the materials (4,) at the columns of an element."""
+        places = np.array((x, y)) + COLUMNS
+        return np.array(self.material)[self.blocks_at(*places.T)]
+
     def ends(self, axis: int, begin: int) -> Array:
         """Return the ends of the blocks in the element that begins at a coordinate along an axis."""
         inner = [cut for cut in self.cuts[axis] if begin < cut < begin + 1]
