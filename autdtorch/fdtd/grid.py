@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -42,10 +41,6 @@ FINE_LAYER_CELLS, COARSE_LAYER_CELLS = 6, 8
 # field cancel: behind a plate of 0.1 m, 12 wavelengths, the error at 1 mm falls from 1.1 to 0.3 % with the
 # whole layer.
 _THINNER, _SMALL_BODIES = 2, 4
-# Power of the spacing with which errors fall, where all faces are parallel to the axes of their grids and
-# elsewhere. Between these differences of two matrices the latter rises by one. Fitted to two thirds of the
-# scenes of docs/benchmarks.md: over 90 % of the estimates are within a factor of three.
-ALIGNED_ORDER, ORDER, _SMALL, _LARGE = 3.3, 2, 0.02, 0.06
 RATIO = 1.5  # Ratio of the spacings of the two grids: the coarser costs a fifth of the finer
 
 
@@ -211,7 +206,8 @@ def warn_if_coarse(speeds: Mapping[str, float], frequency: float, spacing: float
     if coarse:
         logger.warning(
             "spacing %.3g mm is coarse, %s: from %g cells to %g the error in air rises from 0.5 to 3 %%, and"
-            " that of the sound speed in obstacles from 0.3 to 1 %%",
+            " that of the sound speed in obstacles from 0.3 to 1 %%: fields of slow ones are off by tens of"
+            " per cent; transfer_matrix(return_error=True) estimates the error",
             spacing * 1e3, ", ".join(coarse), FAIR_CELLS_PER_WAVELENGTH, MIN_CELLS_PER_WAVELENGTH,
         )  # fmt: skip
 
@@ -225,17 +221,3 @@ def second_spacing(region: Region, spacing: float) -> float:
     """Return the spacing [m] of the second grid of an error estimate: coarser where fair, else finer."""
     coarser = RATIO * spacing
     return coarser if coarser <= coarsest_spacing(region) else spacing / RATIO
-
-
-def grid_errors(matrix: Tensor, second: Tensor, ratio: float, order: float) -> Tensor:
-    """Return the estimated relative error (P,) of each row of a matrix (P, M), given a second one.
-
-    `ratio` is the second spacing over the first. Errors fall with the spacing to the power of `order`;
-    large ones, of grids that hardly resolve the wave, at least with up to the third power.
-    """
-    size = matrix.norm(dim=1).clamp(min=torch.finfo(torch.float64).tiny)
-    difference = (matrix - second).norm(dim=1) / size
-    rise = ((difference - _SMALL) / (_LARGE - _SMALL)).clamp(0, 1)
-    power = (ORDER + rise).clamp(min=order)
-    error: Tensor = difference / (ratio**power - 1).abs()
-    return error

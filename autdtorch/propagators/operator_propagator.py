@@ -13,7 +13,7 @@ from typing import Literal, overload
 import torch
 
 from autdtorch.analytic.green import free_space_matrix
-from autdtorch.fdtd.grid import grid_errors
+from autdtorch.fdtd.grid_errors import grid_errors, shape_errors, sizes
 from autdtorch.propagators.bodies import ScatteringBodies, bodies_at, scattered_waves
 from autdtorch.propagators.body_matrix import Placed, Solver, placed
 from autdtorch.propagators.cache import DiskCache
@@ -33,6 +33,8 @@ _AT_ONCE = 512  # Points whose waves are computed at once: 4 to 6 MB for the pap
 _FEWER = 2  # Degrees left out to see how waves converge; even, as parities may alternate
 _SLOWEST = 0.9  # Ratio of successive pairs of degrees up to which a sum is extrapolated
 _ERRORS = 1e-8, 0.1  # Range of the error at which degrees are left out
+_MORE_WAVES = 1e-3  # Tolerance for which the waves left out are computed, relative to the one asked for
+_ROUNDING = 1e-12  # Error of sums of all waves
 _TINY = torch.finfo(torch.float64).tiny
 
 
@@ -155,12 +157,17 @@ class OperatorPropagator:
 
     def _wave_errors(self, points: torch.Tensor, matrix: torch.Tensor) -> torch.Tensor:
         """Return the estimated errors (P,) of rows of G (P, M) that the waves serve."""
-        errors = torch.full((len(points),), self.tolerance, dtype=torch.float64, device="cpu")
-        if self._plan.runs and len(points):
-            second = OperatorPropagator(self._plan.second, self._cache)
-            other, ratio = second.transfer_matrix(points), second.spacing / self.spacing
-            errors = errors + grid_errors(matrix, other, ratio, self._plan.order)
-        return errors
+        free = free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber)
+        size, region = sizes(matrix, free), self._plan.region
+        if not self._plan.runs:  # exact but for the waves left out
+            more = self._plan.at(self.spacing, _MORE_WAVES * self.tolerance)
+            other, served = OperatorPropagator(more, self._cache)._by_waves(points)
+            errors = torch.full((len(points),), self.tolerance, dtype=torch.float64, device="cpu")
+            return torch.where(served, (matrix - other).norm(dim=1) / size + _ROUNDING, errors)
+        second = OperatorPropagator(self._plan.second, self._cache)
+        other = second.transfer_matrix(points)
+        errors = grid_errors(matrix, self.spacing, [(other, second.spacing)], region.wavelength, size)
+        return self.tolerance + errors + shape_errors(matrix, free, region, size)
 
     @one_library_thread()
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:

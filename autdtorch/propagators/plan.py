@@ -14,9 +14,7 @@ import torch
 
 from autdtorch.analytic.green import PAIR_BYTES
 from autdtorch.fdtd.grid import (
-    ALIGNED_ORDER,
     MAX_CELLS,
-    ORDER,
     coarsest_spacing,
     domain_extent,
     require_spacing,
@@ -143,11 +141,6 @@ class Plan:
     def by_box(self) -> Self:
         """The plan of the box that serves where scattering operators do not."""
         return replace(self, method="box", runs=min(len(self.scene.control_points), len(self.scene.array)))
-
-    @property
-    def order(self) -> float:
-        """The power of the spacing with which errors fall."""
-        return ALIGNED_ORDER if self.grouping.aligned else ORDER
 
     @property
     def cells(self) -> int:

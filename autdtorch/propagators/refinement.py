@@ -8,6 +8,7 @@ import time
 from dataclasses import dataclass, field
 
 from autdtorch.fdtd.grid import coarsest_spacing
+from autdtorch.fdtd.grid_errors import growth, spacing_of
 from autdtorch.propagators.cache import DiskCache
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.simulated import SimulatedPropagator
@@ -15,17 +16,21 @@ from autdtorch.utils.validation import invalid
 
 logger = logging.getLogger(__name__)
 
-_FIRST_SPACING = 1.9
-"""First spacing for a tolerance of 1, in wavelengths; it falls as the error does."""
+_FIRST_ERROR = 0.05
+"""Tolerance relative to the `growth` of the first spacing: its error is about four times as large."""
 
-_FIRST_STEP, _SMALLEST_STEP, _LARGEST_STEP = 1.7, 1.25, 2.5
+_FIRST_STEP, _SMALLEST_STEP, _LARGEST_STEP = 1.3, 1.25, 2.5
 """Ratios of a spacing and the next: the first, the smallest that tells two errors apart, and the largest over
-which an error is trusted to fall with a power of the spacing."""
+which the fall of an error is trusted."""
 
-_AIM = 0.7
+_BY_TWO_GRIDS, _BY_THREE_GRIDS = 0.3, 0.6
+"""Estimated error, relative to the tolerance, that is accepted. Two coarse grids may agree by chance; by
+three, one in twenty errors is more than 1.5 times its estimate."""
+
+_AIM = 0.45
 """Error for which a spacing is chosen, relative to the tolerance."""
 
-_SETTLED = 0.1
+_SETTLED = 0.05
 """Distance to the steady state at which runs end, relative to the tolerance."""
 
 
@@ -54,23 +59,25 @@ def refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPr
 
     Where the budget does not suffice, it is the finest that fits, and a warning says which error it has.
     """
-    tolerance, region, order = pilot.tolerance, pilot.region, pilot.order
+    tolerance, region, wavelength = pilot.tolerance, pilot.region, pilot.region.wavelength
     others: list[SimulatedPropagator] = []
-    spacing = min(_FIRST_SPACING * region.wavelength * tolerance ** (1 / order), coarsest_spacing(region))
+    spacing = min(spacing_of(tolerance / _FIRST_ERROR, wavelength), coarsest_spacing(region))
     plan = pilot.at(spacing, _SETTLED * tolerance, pilot.time_step)
     while True:
         plan.require_feasible("tolerance", tolerance)
         begin, found = time.perf_counter(), SimulatedPropagator(plan, cache, others)
-        error, step = found.known_error(), _FIRST_STEP
+        error = found.known_error()
         taken = time.perf_counter() - begin
+        logger.debug("spacing %.3g mm: estimated error %.2g", 1e3 * plan.spacing, error)
+        step = _FIRST_STEP
         if others:
+            if error <= tolerance * (_BY_TWO_GRIDS if len(others) == 1 else _BY_THREE_GRIDS):
+                return found
             if not math.isfinite(error):
                 accepted = f"too few: at a spacing of {plan.spacing:.3g} m no run came near its steady state"
                 raise invalid("max_periods", pilot.max_periods, accepted)
-            step = min(max((error / (_AIM * tolerance)) ** (1 / order), _SMALLEST_STEP), _LARGEST_STEP)
-        logger.debug("spacing %.3g mm: estimated error %.2g", 1e3 * plan.spacing, error)
-        if error <= tolerance:
-            return found
+            wanted = _AIM * tolerance / error * growth(plan.spacing, wavelength)
+            step = min(max(plan.spacing / spacing_of(wanted, wavelength), _SMALLEST_STEP), _LARGEST_STEP)
         for ratio in (step, _SMALLEST_STEP):
             finer = plan.at(plan.spacing / ratio, plan.tolerance, pilot.time_step)
             if budget.fits(finer, plan, taken):

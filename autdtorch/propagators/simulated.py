@@ -12,8 +12,8 @@ from typing import Literal, Protocol, overload, runtime_checkable
 
 import torch
 
-from autdtorch.analytic.green import PAIR_BYTES
-from autdtorch.fdtd.grid import grid_errors
+from autdtorch.analytic.green import PAIR_BYTES, free_space_matrix
+from autdtorch.fdtd.grid_errors import grid_errors, shape_errors, sizes
 from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.cache import DiskCache, cache_key
 from autdtorch.propagators.full import DomainSimulation
@@ -29,8 +29,6 @@ from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import ArrayLike, boolean, points_grid
 
 logger = logging.getLogger(__name__)
-
-_TINY = torch.finfo(torch.float64).tiny
 
 
 class SteadyStateWarning(UserWarning):
@@ -94,7 +92,8 @@ class SimulatedPropagator:
         boxes = KeepingSimulation if cache is None else BoxSimulation
         self._simulation = DomainSimulation(plan) if plan.method == "full" else boxes(plan)
         self._kept = KeptMatrices(len(plan.scene.array))
-        self._transducers_ran = self._near_logged = self._near_points_logged = False
+        self._transducers_ran = self._near_logged = False
+        self._near_points_logged = self._enclosed_logged = False
 
     def __repr__(self) -> str:
         """Scene, settings and number of runs."""
@@ -158,6 +157,7 @@ class SimulatedPropagator:
         result = self._with_error(places) if with_error else self._result(places)
         if places is not None:
             self._report_near(places)
+        self._report_enclosed(self.scene.control_points if places is None else places)
         self._report()
         return (result.matrix, result.error) if with_error else result.matrix
 
@@ -169,21 +169,28 @@ class SimulatedPropagator:
         """
         places = None if points is None else self._simulation.checked(points)
         result = self._result(places)
-        settling = result.error * result.matrix.norm() / result.matrix.norm(dim=1).clamp(min=_TINY)
         others = [other._result(places).matrix for other in self._others]
-        errors: torch.Tensor = self._grid_errors(result.matrix, others) + settling
-        return errors
+        free = self._free(places)
+        errors, size = self._errors(result.matrix, others, free)
+        settling: torch.Tensor = result.error * result.matrix.norm() / size
+        return errors + settling
 
-    def _grid_errors(self, matrix: torch.Tensor, others: Sequence[torch.Tensor]) -> torch.Tensor:
-        """Return the errors (P,) of the rows of a matrix, given those on the other grids; the least counts.
+    def _errors(
+        self, matrix: torch.Tensor, others: Sequence[torch.Tensor], free: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the errors (P,) of the rows of a matrix by grid and shape, and the rows' sizes (P,).
 
-        A grid that is too coarse for the scene makes the error seem larger.
+        Rows of the matrices on the other grids and in free space belong to them.
         """
-        ratios = (other.spacing / self.spacing for other in self._others)
-        order = self._plan.order
-        return torch.stack(
-            [grid_errors(matrix, second, ratio, order) for second, ratio in zip(others, ratios, strict=True)]
-        ).amin(dim=0)
+        region, size = self._plan.region, sizes(matrix, free)
+        grids = [(other, one.spacing) for other, one in zip(others, self._others, strict=True)]
+        errors = grid_errors(matrix, self.spacing, grids, region.wavelength, size)
+        return errors + shape_errors(matrix, free, region, size), size
+
+    def _free(self, points: torch.Tensor | None) -> torch.Tensor:
+        """Return the matrix of points in free space, by default of the control points."""
+        points = self.scene.control_points if points is None else points
+        return free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber)
 
     @one_library_thread()
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:
@@ -204,6 +211,7 @@ class SimulatedPropagator:
         points = self._simulation.checked(points)
         if len(grid) == 1:  # others are pictures, which may cross obstacles
             self._report_near(points)
+            self._report_enclosed(points)
         flat = drive.reshape(-1, drive.shape[-1])
         # Planes are looked at again, with other drives. Beside a cache, earlier calls decide nothing.
         revisited = len(grid) > 1 and self._cache is None
@@ -261,9 +269,12 @@ class SimulatedPropagator:
 
     @one_library_thread()
     def _with_error(self, points: torch.Tensor | None) -> TransferMatrix:
-        """Return the matrix of points with its error, estimated from a second grid."""
+        """Return the matrix of points with its error, estimated from other grids."""
         own, others = self._result(points), [other._result(points) for other in self._others]
-        whole = self._grid_errors(own.matrix.reshape(1, -1), [one.matrix.reshape(1, -1) for one in others])
+        matrix, free, *rest = (
+            each.reshape(1, -1) for each in (own.matrix, self._free(points), *(one.matrix for one in others))
+        )
+        whole, _ = self._errors(matrix, rest, free)
         runs = own.runs + tuple(run for one in others for run in one.runs)
         return replace(own, error=own.error + float(whole), runs=runs)
 
@@ -279,6 +290,14 @@ class SimulatedPropagator:
         """Log once, of the points of any call, which are next to a surface."""
         if not self._near_points_logged:
             self._near_points_logged = warn_of_near_points(self.scene, "points", points, self.spacing)
+
+    def _report_enclosed(self, points: torch.Tensor) -> None:
+        """Log once that points are in a cavity of rigid obstacles, which no sound reaches."""
+        if not self._enclosed_logged and (found := self._simulation.enclosed(points).nonzero()).numel():
+            self._enclosed_logged, number = True, int(found[0, 0])
+            place = tuple(round(1e3 * entry, 3) for entry in points[number].tolist())
+            more = f", and of {len(found) - 1} more," if len(found) > 1 else ""
+            logger.warning("rigid obstacles enclose the point at %s mm: its pressure%s is 0", place, more)
 
     def _unreported(self) -> list[Run]:
         """Return the runs since the last call."""

@@ -24,8 +24,6 @@ def enclosed_cells(
     `coupling` (n, 27) is that of the `touched` cells (n,); all others are connected with the six beside them,
     unless they are sound-hard.
     """
-    if not hard.any():
-        return np.zeros(0, np.int64)
     free = ~hard
     uniform = free.copy()
     uniform[touched] = False

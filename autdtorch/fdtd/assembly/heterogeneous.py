@@ -72,7 +72,8 @@ def heterogeneous_cells(elements: Elements, stencil: Stencil) -> HeterogeneousCe
     touched = np.unique(_vertices(elements, shape))
     touched = touched[_inner(touched, shape)]
     coupling, mass, hard = _without_sound_hard(elements, touched, shape, stencil)
-    enclosed = enclosed_cells(coupling, touched, hard, shape)
+    walls = elements.materials.sound_hard.any()
+    enclosed = enclosed_cells(coupling, touched, hard, shape) if walls else np.zeros(0, np.int64)
     hard[enclosed] = True
     coupling *= ~(hard[touched, None] | hard[_neighbours(touched, shape)])
     largest = _ROW_SUM_MARGIN * stencil.total * float(elements.materials.speed.max())

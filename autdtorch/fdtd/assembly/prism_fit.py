@@ -68,7 +68,30 @@ def fitted_couplings(
         return np.asarray(by_coupling @ roots.slopes(root))
 
     found = least_squares(missed, start, slopes, ftol=_EXACT, xtol=_EXACT, gtol=_EXACT, max_nfev=_MOST_STEPS)
-    return roots.couplings(found.x)
+    parts = [section.parts(*place, kinds.sound_hard) for place in varied]
+    return np.stack([_apart(own, part) for own, part in zip(roots.couplings(found.x), parts, strict=True)])
+
+
+def _apart(coupling: Array, part: Index) -> Array:
+    """Return the coupling (6,) of an element without any between columns (4,) in different parts.
+
+    The energy of pressures that vary in one part only stays, so that it is not negative.
+    """
+    matrix, separate = _stiffness(coupling), np.zeros((4, 4))
+    for number in range(1, int(part.max()) + 1):
+        own: NDArray[np.bool_] = part == number
+        basis = _differences(own)
+        separate += basis @ (basis.T @ matrix @ basis) @ basis.T
+    return np.asarray(-separate[tuple(COLUMN_PAIRS.T)])
+
+
+def _stiffness(coupling: Array) -> Array:
+    """Return the stiffness matrix (4, 4) of the coupling (6,) of an element."""
+    matrix = np.zeros((4, 4))
+    matrix[tuple(COLUMN_PAIRS.T)] = -coupling
+    matrix += matrix.T
+    matrix[range(4), range(4)] = -matrix.sum(axis=1)
+    return matrix
 
 
 class _Window:
@@ -165,12 +188,8 @@ class _Roots:
         """Return the roots of couplings (k, 6) of positive energy between the columns that are present."""
         found = []
         for basis, own in zip(self._bases, coupling, strict=True):
-            matrix = np.zeros((4, 4))
-            matrix[tuple(COLUMN_PAIRS.T)] = -own
-            matrix += matrix.T
-            absent = ~basis.any(axis=1)
-            matrix[absent] = matrix[:, absent] = 0
-            matrix[range(4), range(4)] = -matrix.sum(axis=1)
+            present = np.asarray(basis.any(axis=1))[COLUMN_PAIRS].all(axis=1)
+            matrix = _stiffness(np.where(present, own, 0))
             found.append(np.linalg.cholesky(basis.T @ matrix @ basis)[np.tril_indices(basis.shape[1])])
         return np.concatenate(found)
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import label
 
 from autdtorch.fdtd.assembly.element import coupling_by_edges
 from autdtorch.fdtd.assembly.layers import long_wave_port, long_wave_shares
@@ -53,6 +55,15 @@ class Section(NamedTuple):
         """Return the materials (4,) at the columns of an element."""
         places = np.array((x, y)) + COLUMNS
         return np.array(self.material)[self.blocks_at(*places.T)]
+
+    def parts(self, x: int, y: int, sound_hard: Sequence[bool]) -> Index:
+        """Return which part of an element each column (4,) is in, 0 for sound-hard material.
+
+        Sound-hard material divides an element into parts.
+        """
+        *_, material = self.element(x, y)
+        part, _ = label(~np.array(sound_hard)[material])
+        return np.asarray(part[np.ix_((0, -1), (0, -1))].ravel(), np.int64)
 
     def ends(self, axis: int, begin: int) -> Array:
         """Return the ends of the blocks in the element that begins at a coordinate along an axis."""

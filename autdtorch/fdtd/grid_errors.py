@@ -1,0 +1,67 @@
+"""The error of a grid, as other grids and the uncertain surfaces of bodies tell it.
+
+Errors of all kinds of scenes grow alike with the spacing: with its square where it is fine, and faster where
+it is coarse, as the dispersion of the stencil is of fourth order. Which of two grids is nearer the truth is a
+matter of chance; the estimate is the geometric mean over two of them, where there are two.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from autdtorch.fdtd.region import Region
+from autdtorch.fdtd.steady_state import SILENCE
+
+# Spacing [wavelengths in air] at which the parts of second and fourth order are equal, and a margin. Fitted to
+# 200 scenes of plates, slits, corners, cylinders, spheres, tori and shells on grids of 2.1 to 0.7 mm: the ratio
+# of error and estimate has a standard deviation of a factor of 1.7, and 93 % are within one of 3
+_EQUAL, _MARGIN = 0.224, 1.15
+_COMPARED = 2  # Other grids that count: those before, which may be too coarse for the scene, do not
+_TINY = torch.finfo(torch.float64).tiny
+
+
+def growth(spacing: float, wavelength: float) -> float:
+    """Return the error of a spacing relative to those of others, given the wavelength in air [both in m]."""
+    share = spacing / wavelength
+    return share**2 * (1 + (share / _EQUAL) ** 2)
+
+
+def spacing_of(wanted: float, wavelength: float) -> float:
+    """Return the spacing [m] whose `growth` is as `wanted`."""
+    square = (math.sqrt(1 + 4 * wanted / _EQUAL**2) - 1) / 2
+    return _EQUAL * math.sqrt(square) * wavelength
+
+
+def sizes(matrix: Tensor, free: Tensor) -> Tensor:
+    """Return the norms (P,) of rows of a matrix (P, M), at least -80 dB of those in free space (P, M)."""
+    return torch.maximum(matrix.norm(dim=1), SILENCE * free.norm(dim=1)).clamp(min=_TINY)
+
+
+def grid_errors(
+    matrix: Tensor, spacing: float, others: Sequence[tuple[Tensor, float]], wavelength: float, size: Tensor
+) -> Tensor:
+    """Return the estimated errors (P,) of the rows of a matrix (P, M), relative to their `size` (P,).
+
+    `others` are the matrices (P, M) on other grids and their spacings [m]; the last ones count.
+    """
+    own, logarithms = growth(spacing, wavelength), []
+    for other, coarser in others[-_COMPARED:]:
+        difference = (matrix - other).norm(dim=1) / size
+        ratio = abs(growth(coarser, wavelength) / own - 1)
+        logarithms.append((_MARGIN * difference / ratio).clamp(min=_TINY).log())
+    return torch.stack(logarithms).mean(dim=0).exp()
+
+
+def shape_errors(matrix: Tensor, free: Tensor, region: Region, size: Tensor) -> Tensor:
+    """Return the errors (P,) of the rows of a matrix (P, M) as its bodies' surfaces are uncertain.
+
+    A surface off by a distance d turns the phase of what it scatters by up to 2 k d. What a row has of it is
+    the difference from that in free space (P, M).
+    """
+    distance = max((body.uncertainty for body in region.bodies), default=0.0)
+    errors: Tensor = 2 * region.wavenumber * distance * (matrix - free).norm(dim=1) / size
+    return errors

@@ -1,0 +1,106 @@
+"""Cavities and rooms of rigid walls: no sound reaches them, and they change nothing outside."""
+
+import itertools
+
+import numpy as np
+import pytest
+import pyvista
+import torch
+from small_scenes import relative_error, small_scene
+
+from autdtorch.propagators import make_propagator
+from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.obstacles import Box, Mesh, Sphere, VoxelMask
+from autdtorch.scene.scene import Scene
+
+CENTER = (12.2e-3, 11.9e-3, 12.1e-3)
+RADIUS, SPACING, SETTLED = 4.2e-3, 1e-3, 1e-4
+
+
+def hollow_ball(wall: float) -> Mesh:
+    outer, inner = (pyvista.Icosphere(radius=radius, nsub=4) for radius in (RADIUS, RADIUS - wall))
+    triangles = [ball.faces.reshape(-1, 4)[:, 1:] for ball in (outer, inner)]
+    vertices = np.concatenate([outer.points, inner.points]).astype(np.float64) + CENTER
+    return Mesh.from_surface(
+        (vertices, np.concatenate([triangles[0], triangles[1][:, ::-1] + len(outer.points)])), rigid=True
+    )
+
+
+def room(wall: float, half: float = 4e-3) -> list[Box]:
+    """Six walls around a cube of air."""
+    walls = []
+    for axis, sign in itertools.product(range(3), (-1, 1)):
+        size, place = [2 * (half + wall)] * 3, list(CENTER)
+        size[axis], place[axis] = wall, place[axis] + sign * (half + wall / 2)
+        walls.append(Box(tuple(place), tuple(size), rigid=True))
+    return walls
+
+
+def with_points(scene: Scene, *points: tuple[float, float, float]) -> torch.Tensor:
+    return torch.cat((scene.control_points, torch.tensor(points, dtype=torch.float64)))
+
+
+@pytest.mark.parametrize("wall", [0.3e-3, 1e-3])
+def test_a_hollow_rigid_ball_is_a_solid_one(wall):
+    solid = pyvista.Icosphere(radius=RADIUS, nsub=4)
+    vertices = solid.points.astype(np.float64) + CENTER
+    bodies = hollow_ball(wall), Mesh.from_surface((vertices, solid.faces.reshape(-1, 4)[:, 1:]), rigid=True)
+    found = [
+        make_propagator(small_scene((body,)), "box", SPACING, SETTLED).transfer_matrix() for body in bodies
+    ]
+    assert relative_error(*found) < 10 * SETTLED  # the same geometry, up to the order of triangles
+
+
+def test_a_hollow_mask_is_a_solid_one():
+    mask = np.ones((8, 8, 8), bool)
+    hollow = mask.copy()
+    hollow[3:5, 3:5, 3:5] = False
+    found = [
+        make_propagator(
+            small_scene((VoxelMask(each, 1e-3, (8e-3,) * 3, rigid=True),)), "box", SPACING, SETTLED
+        ).transfer_matrix()
+        for each in (mask, hollow)
+    ]
+    assert torch.equal(*found)
+
+
+@pytest.mark.parametrize("method", ["box", "full"])
+@pytest.mark.parametrize("wall", [0.2e-3, 1.5e-3])
+def test_a_closed_room_is_silent_and_told(method, wall, caplog):
+    scene = small_scene(room(wall))
+    propagator = make_propagator(scene, method, SPACING, 1e-3)
+    points = with_points(scene, CENTER)
+    matrix = propagator.transfer_matrix(points)
+    assert not matrix[-1].any()
+    assert (matrix[:-1].norm(dim=1) > 0).all()
+    assert "enclose the point at (12.2, 11.9, 12.1) mm" in caplog.text
+    assert max(run.periods for run in propagator.runs) < 100  # the empty room does not ring
+    block = make_propagator(
+        small_scene((Box(CENTER, (2 * (4e-3 + wall),) * 3, rigid=True),)), method, SPACING, 1e-3
+    )
+    # the same outer faces; next to transducers and points each is within 2.5 % of the truth at 1 mm
+    assert relative_error(matrix[:-1], block.transfer_matrix(points)[:-1]) < 0.05
+
+
+def test_an_open_room_is_not_silent(caplog):
+    scene = small_scene(room(0.5e-3)[1:])
+    points = with_points(scene, CENTER)
+    matrix = make_propagator(scene, "box", SPACING, 1e-3).transfer_matrix(points)
+    assert matrix[-1].norm() > 0
+    assert "enclose" not in caplog.text
+
+
+def test_a_transducer_in_a_closed_room_is_refused():
+    around = small_scene(room(1e-3))
+    inside = TransducerArray([CENTER], (0, 0, 1))
+    scene = Scene(inside, around.medium, 40e3, around.control_points, around.obstacles, domain=around.domain)
+    with pytest.raises(ValueError, match=r"array\.positions\[0\]: .* is enclosed by rigid obstacles"):
+        make_propagator(scene, "box", SPACING).transfer_matrix()
+
+
+def test_points_behind_a_ball_need_no_more_periods_than_others():
+    """All points where little arrives: a run still ends by the floor, -80 dB of free space."""
+    scene = small_scene((Sphere(CENTER, RADIUS, rigid=True),))
+    propagator = make_propagator(scene, "box", SPACING, 1e-3)
+    propagator.transfer_matrix()
+    assert max(run.periods for run in propagator.runs) < 100
