@@ -16,9 +16,9 @@ from torch import Tensor
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import SILENCE
 
-# Spacing [wavelengths in air] at which the parts of second and fourth order are equal, and a margin. Fitted to
-# 200 scenes of plates, slits, corners, cylinders, spheres, tori and shells on grids of 2.1 to 0.7 mm: the ratio
-# of error and estimate has a standard deviation of a factor of 1.7, and 93 % are within one of 3
+# Spacing [wavelengths in air] at which the parts of second and fourth order are equal, and a margin. Fitted
+# to 200 scenes of plates, slits, corners, cylinders, spheres, tori and shells on grids of 2.1 to 0.7 mm: the
+# ratio of error and estimate has a standard deviation of a factor of 1.7, and 93 % are within one of 3
 _EQUAL, _MARGIN = 0.224, 1.15
 _COMPARED = 2  # Other grids that count: those before, which may be too coarse for the scene, do not
 _TINY = torch.finfo(torch.float64).tiny

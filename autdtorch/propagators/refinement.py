@@ -42,12 +42,17 @@ class Budget:
     memory: float | None = None
     begin: float = field(default_factory=time.perf_counter)
 
+    @property
+    def is_unlimited(self) -> bool:
+        """Whether neither time nor memory is limited."""
+        return self.seconds is None and self.memory is None
+
     def fits(self, plan: Plan, last: Plan, taken: float) -> bool:
         """Return whether a plan is expected to fit, after the `last` one took `taken` [s].
 
         Without limits every plan does: one that the machine cannot hold is refused.
         """
-        if self.seconds is None and self.memory is None:
+        if self.is_unlimited:
             return True
         spent = time.perf_counter() - self.begin
         in_time = self.seconds is None or spent + taken * plan.work / last.work <= self.seconds
@@ -61,7 +66,9 @@ def refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPr
     """
     tolerance, region, wavelength = pilot.tolerance, pilot.region, pilot.region.wavelength
     others: list[SimulatedPropagator] = []
-    spacing = min(spacing_of(tolerance / _FIRST_ERROR, wavelength), coarsest_spacing(region))
+    spacing = coarsest_spacing(region)
+    if budget.is_unlimited:
+        spacing = min(spacing, spacing_of(tolerance / _FIRST_ERROR, wavelength))
     plan = pilot.at(spacing, _SETTLED * tolerance, pilot.time_step)
     while True:
         plan.require_feasible("tolerance", tolerance)

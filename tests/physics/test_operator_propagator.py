@@ -236,7 +236,7 @@ def test_errors_of_points_within_a_body_are_those_of_the_box():
     propagator = make_propagator(scene, "operator", 1e-3, cache=False)
     matrix, error = propagator.transfer_matrix(inside, return_error=True)
     errors = propagator.point_errors(inside)
-    assert errors[:3].tolist() == [2e-3] * 3
+    assert (errors[:3] < 2e-3).all()  # of the waves left out
     box = make_propagator(scene, "box", 1e-3, cache=False)
     assert float(errors[3]) == pytest.approx(float(box.point_errors(inside[3:])), rel=0.1)
     whole = (errors * matrix.norm(dim=1)).norm() / matrix.norm()

@@ -1,0 +1,198 @@
+"""Random scenes by family: each kind of body that a claim of error must hold for, next to three points.
+
+Sizes are of things on a bench: paper and phone backs, slits between them, wires, balls of foam, scans.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyvista
+import torch
+
+import autdtorch as at
+from autdtorch import analytic
+from autdtorch.scene.geometry import rotation_matrix
+from autdtorch.utils.array_types import Array
+from autdtorch.utils.validation import Vector
+
+AIR, FREQUENCY = at.Medium(1.2, 343.0), 40e3
+_CLEAR = 4e-3  # Least distance of sources and points from a surface [m]
+
+
+class Exact(NamedTuple):
+    """A sphere whose series is the truth: centre (3,) and radius [m], ratios of density and sound speed."""
+
+    center: Array
+    radius: float
+    ratios: tuple[float, float] | None  # None: rigid
+
+
+class Drawn(NamedTuple):
+    """The bodies of a scene, and the sphere that is the same, if any."""
+
+    bodies: list[at.Obstacle]
+    exact: Exact | None = None
+
+
+Family = Callable[[np.random.Generator], Drawn]
+
+
+def _between(rng: np.random.Generator, low: float, high: float) -> float:
+    """Draw a number evenly by its logarithm."""
+    return float(np.exp(rng.uniform(math.log(low), math.log(high))))
+
+
+def _angles(rng: np.random.Generator) -> Vector:
+    """Draw angles, in every third scene none."""
+    x, y, z = rng.uniform(-math.pi, math.pi, 3) * (rng.uniform() < 0.67)
+    return float(x), float(y), float(z)
+
+
+def _material(rng: np.random.Generator) -> dict[str, Any]:
+    """Draw a rigid body or a fluid that is denser than air."""
+    if rng.uniform() < 0.5:
+        return {"rigid": True}
+    speed = AIR.sound_speed * _between(rng, 0.9, 5.0)
+    return {"density": AIR.density * _between(rng, 2.0, 5e3), "sound_speed": speed}
+
+
+def _middle(rng: np.random.Generator) -> Array:
+    return rng.uniform(-1.5e-3, 1.5e-3, 3)
+
+
+def _placed(rotation: Vector, parts: list[tuple[Array, Array]], material: dict[str, Any]) -> Drawn:
+    """Return boxes of centres and sizes (3,) [m] that turn together."""
+    turn = rotation_matrix(rotation).numpy()
+    boxes = [
+        at.Box(tuple((turn @ center).tolist()), tuple(size.tolist()), rotation, **material)
+        for center, size in parts
+    ]
+    return Drawn(boxes)
+
+
+def plate(rng: np.random.Generator) -> Drawn:
+    """A plate of 0.02 to 1 mm."""
+    size = np.array([_between(rng, 0.02e-3, 1e-3), *rng.uniform(6e-3, 14e-3, 2)])
+    return _placed(_angles(rng), [(_middle(rng), rng.permutation(size))], _material(rng))
+
+
+def slit(rng: np.random.Generator) -> Drawn:
+    """Two blocks with a slit of 0.3 to 2 mm."""
+    gap, size = _between(rng, 0.3e-3, 2e-3), rng.uniform(4e-3, 9e-3, 3)
+    apart, middle = np.array([(gap + size[0]) / 2, 0, 0]), _middle(rng)
+    return _placed(_angles(rng), [(middle - apart, size), (middle + apart, size)], _material(rng))
+
+
+def corner(rng: np.random.Generator) -> Drawn:
+    """An L of two plates of 0.3 to 1.5 mm."""
+    thick, (long, wide), middle = _between(rng, 0.3e-3, 1.5e-3), rng.uniform(7e-3, 12e-3, 2), _middle(rng)
+    floor = middle, np.array([long, wide, thick])
+    wall = middle + np.array([thick - long, 0, long - thick]) / 2, np.array([thick, wide, long])
+    return _placed(_angles(rng), [floor, wall], _material(rng))
+
+
+def needle(rng: np.random.Generator) -> Drawn:
+    """A wire of 0.2 to 1 mm, 15 to 25 mm long."""
+    axis = rng.normal(size=3) if rng.uniform() < 0.67 else np.eye(3)[rng.integers(3)]
+    height, radius = rng.uniform(15e-3, 25e-3), _between(rng, 0.1e-3, 0.5e-3)
+    body = at.Cylinder(tuple(_middle(rng).tolist()), radius, height, tuple(axis.tolist()), **_material(rng))
+    return Drawn([body])
+
+
+def cylinder(rng: np.random.Generator) -> Drawn:
+    """A cylinder from a coin to a rod."""
+    radius, height = rng.uniform(2e-3, 7e-3), _between(rng, 1e-3, 12e-3)
+    axis, center = rng.normal(size=3).tolist(), _middle(rng).tolist()
+    return Drawn([at.Cylinder(tuple(center), radius, height, tuple(axis), **_material(rng))])
+
+
+def _ball(rng: np.random.Generator, radius: float, ratios: tuple[float, float]) -> Drawn:
+    center = _middle(rng)
+    material = {"density": AIR.density * ratios[0], "sound_speed": AIR.sound_speed * ratios[1]}
+    return Drawn([at.Sphere(tuple(center.tolist()), radius, **material)], Exact(center, radius, ratios))
+
+
+def sphere(rng: np.random.Generator) -> Drawn:
+    """A fluid ball, light or dense."""
+    return _ball(rng, rng.uniform(2e-3, 9e-3), (_between(rng, 0.05, 1e4), _between(rng, 0.6, 10)))
+
+
+def slow(rng: np.random.Generator) -> Drawn:
+    """A ball of a fluid in which sound is slow."""
+    return _ball(rng, rng.uniform(1e-3, 3e-3), (_between(rng, 0.1, 100), _between(rng, 0.3, 0.6)))
+
+
+def touching(rng: np.random.Generator) -> Drawn:
+    """Two cubes that touch at faces, edges or corners."""
+    edges, middle = rng.uniform(4e-3, 8e-3, 2), _middle(rng)
+    apart = edges.sum() / 2 * np.array([1, *(rng.uniform(size=2) < 0.5)])
+    return _placed(
+        _angles(rng), [(middle, np.full(3, edges[0])), (middle + apart, np.full(3, edges[1]))], _material(rng)
+    )
+
+
+def torus(rng: np.random.Generator) -> Drawn:
+    """A ring as a mesh."""
+    tube = rng.uniform(0.8, 2.5)
+    ring = pyvista.ParametricTorus(ringradius=rng.uniform(4, 7), crosssectionradius=tube, u_res=60, v_res=30)
+    place = {"scale": 1e-3, "rotation": _angles(rng), "offset": tuple(_middle(rng).tolist())}
+    return Drawn([at.Mesh.from_surface(ring.clean().triangulate(), **place, **_material(rng))])
+
+
+def shell(rng: np.random.Generator) -> Drawn:
+    """A hollow rigid ball with a wall of 0.3 to 3 mm; no sound enters."""
+    radius, center = rng.uniform(6e-3, 11e-3), _middle(rng)
+    balls = [
+        pyvista.Icosphere(radius=each, nsub=5) for each in (radius, radius - _between(rng, 0.3e-3, 3e-3))
+    ]
+    outer, inner = (ball.faces.reshape(-1, 4)[:, 1:] for ball in balls)
+    vertices = np.concatenate([ball.points for ball in balls]).astype(np.float64) + center
+    surface = vertices, np.concatenate([outer, inner[:, ::-1] + len(balls[0].points)])
+    # the ball of the same volume: facets are within the sphere
+    same = radius * (balls[0].volume / (4 / 3 * math.pi * radius**3)) ** (1 / 3)
+    return Drawn([at.Mesh.from_surface(surface, rigid=True)], Exact(center, same, None))
+
+
+def voxels(rng: np.random.Generator) -> Drawn:
+    """A rigid ball as a mask of voxels of 0.4 to 1.2 mm."""
+    radius, edge, center = rng.uniform(6e-3, 11e-3), _between(rng, 0.4e-3, 1.2e-3), _middle(rng)
+    count = math.ceil(2 * radius / edge) + 3
+    lower = center - edge * (count / 2 + rng.uniform(-0.5, 0.5, 3))
+    places = np.stack(np.meshgrid(*[np.arange(count) + 0.5] * 3, indexing="ij"), axis=-1) * edge + lower
+    mask = np.linalg.norm(places - center, axis=-1) < radius
+    return Drawn([at.VoxelMask(mask, edge, tuple(lower.tolist()), rigid=True)], Exact(center, radius, None))
+
+
+FAMILIES: Mapping[str, Family] = {
+    each.__name__: each
+    for each in (plate, slit, corner, needle, cylinder, sphere, slow, touching, torus, shell, voxels)
+}
+
+
+def scene_of(family: str, seed: int) -> tuple[at.Scene, torch.Tensor | None]:
+    """Return a scene of three sources and three points around drawn bodies, and its exact matrix if known."""
+    rng = np.random.default_rng([seed, *family.encode()])
+    bodies, exact = FAMILIES[family](rng)
+    places: list[Array] = []
+    while len(places) < 6:
+        direction = rng.normal(size=3)
+        place = direction / np.linalg.norm(direction) * rng.uniform(18e-3, 34e-3)
+        if all(float(body.signed_distance(torch.from_numpy(place)[None])) > _CLEAR for body in bodies):
+            places.append(place)
+    array = at.TransducerArray(np.array(places[:3]), (1, 0, 0))
+    scene = at.Scene(array, AIR, FREQUENCY, np.array(places[3:]), bodies)
+    return scene, None if exact is None else _exact_matrix(scene, exact)
+
+
+def _exact_matrix(scene: at.Scene, exact: Exact) -> torch.Tensor:
+    where = scene.control_points, scene.array.positions, scene.wavenumber, tuple(exact.center), exact.radius
+    field = (
+        analytic.rigid_sphere(*where)
+        if exact.ratios is None
+        else analytic.fluid_sphere(*where, *exact.ratios)
+    )
+    return 4 * math.pi * scene.array.source_strength * field
