@@ -33,13 +33,16 @@ LONG_SHARE = 0.01
 INSIDE_SHARE = 0.75
 """Share of the scenes without obstacles in the boundary layer."""
 KINDS = {
-    "box": 0.25,
-    "rotated box": 0.15,
-    "sphere": 0.15,
-    "cylinder": 0.15,
+    "box": 0.15,
+    "rotated box": 0.1,
+    "sphere": 0.1,
+    "cylinder": 0.1,
+    "plate": 0.15,
+    "needle": 0.1,
+    "shell": 0.05,
     "voxels": 0.05,
     "mesh": 0.05,
-    "wall": 0.2,
+    "wall": 0.15,
 }
 """Kinds of obstacles and their shares; walls are unbounded, in the scenes that allow it."""
 
@@ -191,7 +194,13 @@ class _Draft:
         axis, turn = rng.normal(size=3), rng.uniform(-math.pi, math.pi, 3)
         if aligned:
             size, axis, turn = np.rint(size), np.eye(3)[rng.integers(3)], np.zeros(3)
-        if thin:
+        if kind == "plate":
+            size[rng.integers(3)] = _log_uniform(rng, 0.01, 1.0)
+        elif kind == "needle":
+            size[0] = _log_uniform(rng, 0.1, 1.5)
+        elif kind == "shell":
+            size[:] = size.max()
+        elif thin:
             size[rng.integers(3)] = _log_uniform(rng, 0.1, 1.0)
         center, place = self._center(size)
         if aligned and place == "apart":
@@ -236,12 +245,14 @@ def _make(
     middle, (x, y, z), angles = tuple(center.tolist()), size.tolist(), tuple(turn.tolist())
     if kind == "sphere":
         return Sphere(middle, x / 2, **material)
-    if kind == "cylinder":
+    if kind in ("cylinder", "needle"):
         return Cylinder(middle, x / 2, z, tuple(axis.tolist()), **material)
     if kind in ("box", "wall"):
         return Box(middle, (x, y, z), **material)
-    if kind == "rotated box":
+    if kind in ("rotated box", "plate"):
         return Box(middle, (x, y, z), angles, **material)
+    if kind == "shell":
+        return _hollow(size, **material, offset=middle, rotation=angles, wall=rng.uniform(0.02, 0.3))
     if kind == "voxels":
         mask = rng.uniform(size=(3, 3, 3)) < 0.6
         mask[1, 1, 1] = True
@@ -250,3 +261,11 @@ def _make(
         path = Path(folder) / "tetrahedron.obj"
         path.write_text(TETRAHEDRON, encoding="utf-8")
         return Mesh(str(path), scale=x, offset=middle, rotation=angles, **material)
+
+
+def _hollow(size: Array, wall: float, **placed: Any) -> Mesh:
+    """Return a hollow cuboid of size (3,) [m], with a wall of that share of it."""
+    vertices, triangles = Box((0, 0, 0), (1.0, 1.0, 1.0), rigid=True).surface()
+    both = np.concatenate([size * vertices.numpy(), (1 - 2 * wall) * size * vertices.numpy()])
+    faces = np.concatenate([triangles.numpy(), triangles.numpy()[:, ::-1] + len(vertices)])
+    return Mesh.from_surface((both, faces), **placed)

@@ -247,3 +247,87 @@ def test_what_cannot_be_moved_is_named():
     assert still[0].origin == (1.0, 1.0, 1.0)
     with pytest.raises(ValueError, match="rotation: 'VoxelMask'; must be"):
         moved((voxels,), torch.ones(3).double(), (0.1, 0.0, 0.0))
+
+
+def ball_of_voxels(edges, radius=4.3e-3, center=(0.3e-3, -0.2e-3, 0.1e-3)):
+    """A mask of a ball, its spacing, and its origin."""
+    count = [math.ceil(2 * radius / edge) + 3 for edge in edges]
+    lower = np.array(center) - np.array(edges) * np.array(count) / 2
+    places = np.stack(np.meshgrid(*[np.arange(n) + 0.5 for n in count], indexing="ij"), axis=-1)
+    distance = np.linalg.norm(places * edges + lower - center, axis=-1) - radius
+    return distance, tuple(edges), tuple(lower.tolist())
+
+
+@pytest.mark.parametrize("edges", [(0.7e-3,) * 3, (0.5e-3, 0.7e-3, 1e-3)])
+def test_the_surface_of_a_mask_is_that_of_the_ball_it_samples(edges):
+    distance, spacing, origin = ball_of_voxels(edges)
+    voxels = VoxelMask(distance < 0, spacing, origin, rigid=True)
+    vertices, _ = voxels.surface()
+    off = Sphere((0.3e-3, -0.2e-3, 0.1e-3), 4.3e-3, rigid=True).signed_distance(vertices)
+    # voxels are known to half an edge; their average over many to far less
+    assert float(off.abs().max()) < 0.4 * max(edges)
+    assert float((off**2).mean().sqrt()) < 0.12 * max(edges)
+    assert volume(*voxels.surface()) == pytest.approx((distance < 0).sum() * np.prod(edges), rel=1e-6)
+    assert 0 < voxels.uncertainty < 0.1 * max(edges)
+
+
+def test_grey_values_have_their_surface_between_voxels():
+    distance, spacing, origin = ball_of_voxels((0.7e-3,) * 3)
+    voxels = VoxelMask(-distance, spacing, origin, level=0.0, rigid=True)
+    vertices, _ = voxels.surface()
+    off = Sphere((0.3e-3, -0.2e-3, 0.1e-3), 4.3e-3, rigid=True).signed_distance(vertices)
+    assert float(off.abs().max()) < 0.03 * 0.7e-3  # a sphere is flat to 0.7^2 / (8 * 4.3) of a voxel
+    with pytest.raises(ValueError, match=r"VoxelMask\.level: 1.0; must be below the largest grey value"):
+        VoxelMask(-distance, spacing, origin, level=1.0, rigid=True)
+    with pytest.raises(ValueError, match="grey values need a level"):
+        VoxelMask(np.arange(27, dtype=np.uint8).reshape(3, 3, 3), 1e-3, rigid=True)
+
+
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.4, 0.3, 0.2)])
+def test_corners_of_a_box_are_not_rounded_by_more_than_a_voxel(turn):
+    box, edge = Box((0.0, 0.0, 0.0), (9.6e-3, 7.2e-3, 8.4e-3), turn, rigid=True), 0.6e-3
+    count = 28
+    places = torch.from_numpy(np.stack(np.meshgrid(*[np.arange(count) + 0.5] * 3, indexing="ij"), axis=-1))
+    points = edge * (places - count / 2).reshape(-1, 3)
+    mask = box.contains(points).reshape((count,) * 3).numpy()
+    voxels = VoxelMask(mask, edge, (-edge * count / 2,) * 3, rigid=True)
+    vertices, _ = voxels.surface()
+    off = box.signed_distance(vertices)
+    assert float((off**2).mean().sqrt()) < 0.2 * edge
+    corners = rotation_matrix(turn) @ (torch.tensor(box.size, dtype=torch.float64) / 2)
+    assert float((vertices - corners).norm(dim=1).min()) < edge
+
+
+def test_an_image_of_pyvista_is_read_with_its_spacing_and_origin():
+    import pyvista
+
+    distance, spacing, origin = ball_of_voxels((0.5e-3, 0.7e-3, 1e-3))
+    given = VoxelMask(distance < 0, spacing, origin, rigid=True)
+    image = pyvista.ImageData(
+        dimensions=[n + 1 for n in distance.shape],
+        spacing=[1e3 * x for x in spacing],
+        origin=[1e3 * x for x in origin],
+    )
+    image.cell_data["label"] = 7 * (distance < 0).astype(np.uint8).ravel(order="F")
+    read = VoxelMask.from_image(image, scale=1e-3, rigid=True)
+    assert np.array_equal(read.mask, given.mask)
+    assert (read.spacing, read.origin) == (pytest.approx(given.spacing), pytest.approx(given.origin))
+    with pytest.raises(ValueError, match="must be an array of the image; it has label"):
+        VoxelMask.from_image(image, "other", rigid=True)
+
+
+def test_cavities_of_masks_and_meshes_are_filled():
+    mask = np.ones((5, 5, 5), bool)
+    mask[2, 2, 2] = False
+    hollow = VoxelMask(mask, 1e-3, rigid=True)
+    assert hollow.filled().mask.all()
+    solid = hollow.filled()
+    assert solid.filled() is solid
+
+
+def test_voxels_that_vanish_when_smoothed_stay_cubes(caplog):
+    mask = np.zeros((3, 3, 3), bool)
+    mask[1, 1, 1] = True
+    voxels = VoxelMask(mask, (1e-3, 2e-3, 1e-3), rigid=True)
+    assert voxels.lower == pytest.approx((1e-3, 2e-3, 1e-3))
+    assert "too thin to be smooth" in caplog.text
