@@ -16,10 +16,10 @@ from torch import Tensor
 from autdtorch.fdtd.region import Region
 from autdtorch.fdtd.steady_state import SILENCE
 
-# Spacing [wavelengths in air] at which the parts of second and fourth order are equal, and a margin. Fitted
-# to 200 scenes of plates, slits, corners, cylinders, spheres, tori and shells on grids of 2.1 to 0.7 mm: the
-# ratio of error and estimate has a standard deviation of a factor of 1.7, and 93 % are within one of 3
-_EQUAL, _MARGIN = 0.224, 1.15
+# Spacing [wavelengths in air] at which the parts of second and fourth order are equal. Fitted to 200 scenes
+# of plates, slits, corners, cylinders, spheres, tori and shells on grids of 2.1 to 0.7 mm: the ratio of error
+# and estimate has a standard deviation of a factor of 1.7
+_EQUAL = 0.224
 _COMPARED = 2  # Other grids that count: those before, which may be too coarse for the scene, do not
 _TINY = torch.finfo(torch.float64).tiny
 
@@ -52,7 +52,7 @@ def grid_errors(
     for other, coarser in others[-_COMPARED:]:
         difference = (matrix - other).norm(dim=1) / size
         ratio = abs(growth(coarser, wavelength) / own - 1)
-        logarithms.append((_MARGIN * difference / ratio).clamp(min=_TINY).log())
+        logarithms.append((difference / ratio).clamp(min=_TINY).log())
     return torch.stack(logarithms).mean(dim=0).exp()
 
 

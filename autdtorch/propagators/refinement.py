@@ -23,14 +23,14 @@ _FIRST_STEP, _SMALLEST_STEP, _LARGEST_STEP = 1.3, 1.25, 2.5
 """Ratios of a spacing and the next: the first, the smallest that tells two errors apart, and the largest over
 which the fall of an error is trusted."""
 
-_BY_TWO_GRIDS, _BY_THREE_GRIDS = 0.3, 0.6
+_BY_TWO_GRIDS, _BY_THREE_GRIDS = 0.3, 0.5
 """Estimated error, relative to the tolerance, that is accepted. Two coarse grids may agree by chance; by
-three, one in twenty errors is more than 1.5 times its estimate."""
+three, one in twenty errors is more than 1.7 times its estimate."""
 
-_AIM = 0.45
+_AIM = 0.4
 """Error for which a spacing is chosen, relative to the tolerance."""
 
-_SETTLED = 0.05
+_SETTLED = 0.03
 """Distance to the steady state at which runs end, relative to the tolerance."""
 
 

@@ -105,9 +105,9 @@ def test_errors_are_known_from_either_grid(ratio, error, spacing):
     fine, coarse = one * (1 + error), one * (1 + other)
     size = sizes(one, one)
     known = grid_errors(fine, spacing, [(coarse, ratio * spacing)], 1.0, size)
-    assert (known / error).numpy() == pytest.approx(1, abs=0.2)  # with a margin
+    assert (known / error).numpy() == pytest.approx(1)
     known = grid_errors(coarse, ratio * spacing, [(fine, spacing)], 1.0, size)
-    assert (known / other).numpy() == pytest.approx(1, abs=0.2)
+    assert (known / other).numpy() == pytest.approx(1)
     # one that agrees by chance is outvoted by another
     chance = [(fine * (1 + 1e-4 * error), 2 * spacing), (coarse, ratio * spacing)]
     assert (grid_errors(fine, spacing, chance, 1.0, size) > 1e-3 * error).all()

@@ -34,6 +34,7 @@ _PRIOR = 1e-4  # Weight of the first guess, for what the fields do not determine
 _LEAST_START = 0.03  # Least coupling to start from, relative to air: no slope leads away from zero
 # Relative change at which a fit ends: symmetric scenes stay so, and derivatives by density are smooth
 _EXACT = 1e-13
+_GROUND = 1e-9  # Stiffness to zero pressure, for a cavity that sound-hard material closes within the window
 _MOST_STEPS = 80  # of a fit; within a heavy cylinder it is too flat to end by itself
 
 
@@ -140,7 +141,7 @@ class _Window:
         for rows, columns, sign in ((one, other, -1), (other, one, -1), (one, one, 1), (other, other, 1)):
             np.add.at(whole, (rows, columns), sign * own)
         matrix = self._matrix + whole[self._free]
-        inverse = np.linalg.inv(matrix[:, self._free])
+        inverse = np.linalg.inv(matrix[:, self._free] + _GROUND * np.eye(len(matrix)))
         solution = self._fields.copy()
         solution[self._free] = -inverse @ (matrix[:, self._given] @ self._fields[self._given])
         return solution, np.asarray(inverse)
