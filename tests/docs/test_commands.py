@@ -18,6 +18,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 import tomllib
 from pathlib import Path
 from typing import NamedTuple
@@ -294,6 +295,7 @@ def lives(command, folder):
         words, cwd=folder, env=environment(folder), stdout=subprocess.PIPE, text=True
     ) as live:
         assert live.stdout.readline().startswith("The live view is at http://127.0.0.1:")
+        time.sleep(1)  # nobody is quicker
         live.send_signal(signal.SIGINT)
         assert live.wait(timeout=60) == 0
 
