@@ -50,13 +50,14 @@ Simulate = Callable[[int, torch.Tensor, float, Observe], SteadyState]
 class Solved(NamedTuple):
     """The steady states of R runs in boxes.
 
-    With the transform of each box to P receivers, the incident field (P, R) there, and the phasors (k, R) of
-    the cells of each box.
+    With the transform of each box to P receivers, the incident field (P, R) there, which of them are silent
+    (P,), and the phasors (k, R) of the cells of each box.
     """
 
     boxes: Sequence[ScatteredField]
     transforms: Sequence[NearToFar]
     incident: torch.Tensor
+    silent: torch.Tensor
     phasors: Sequence[torch.Tensor]
     runs: list[Run]
 
@@ -110,13 +111,13 @@ class BoxSimulation(Simulation):
         self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures, stepped: Stepped
     ) -> tuple[torch.Tensor, list[Run]]:
         solved = self.solved(sources, strength, receivers, stepped)
-        return self.total(solved, receivers), solved.runs
+        return self.total(solved), solved.runs
 
-    def total(self, solved: Solved, receivers: Apertures) -> torch.Tensor:
+    def total(self, solved: Solved) -> torch.Tensor:
         """Return the pressure (R, P) [Pa] at the receivers of runs."""
         parts = zip(solved.transforms, solved.phasors, strict=True)
         total = solved.incident + sum(transform.field(part) for transform, part in parts)
-        return total.mT.masked_fill(self._silent(receivers.positions), 0)  # kept fields have them too
+        return total.mT.masked_fill(solved.silent, 0)  # kept fields have them too
 
     def incident(
         self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures
@@ -139,7 +140,8 @@ class BoxSimulation(Simulation):
         every = math.ceil(len(receivers.positions) / MOST_JUDGED)
         readings = [transform.readings(every) for transform in transforms]
         sizes = [len(transform.cells) for transform in transforms]
-        heard = (~self._silent(receivers.positions[::every])).to(incident.dtype)[:, None]
+        silent = self._silent(receivers.positions)
+        heard = (~silent[::every]).to(incident.dtype)[:, None]
         floors = (SILENCE * incident[::every].norm(dim=0)).tolist()
 
         def pressure(phasors: torch.Tensor) -> torch.Tensor:
@@ -180,7 +182,7 @@ class BoxSimulation(Simulation):
         steady, seconds = zip(*found, strict=True)
         phasors = torch.stack([each.pressure for each in steady], dim=1)
         runs = list(map(Run.of, steady, seconds))
-        return Solved(boxes, transforms, incident, torch.split(phasors, sizes), runs)
+        return Solved(boxes, transforms, incident, silent, torch.split(phasors, sizes), runs)
 
     def _silent(self, points: torch.Tensor) -> torch.Tensor:
         """Return which points (P, n, 3) [m] are in a rigid obstacle or enclosed by some.

@@ -103,7 +103,7 @@ class KeepingSimulation(BoxSimulation):
         array, receivers = self.plan.scene.array, Apertures.of_points(points)
         sources, strength = [apertures_of(array)] * len(new), array.source_strength * drive[new]
         solved = self._stepped(sources, strength, receivers)
-        field[new] = self.total(solved, receivers)
+        field[new] = self.total(solved)
         if self._apart:
             amplitudes = solved.amplitudes
             each = (

@@ -30,7 +30,6 @@ from autdtorch.utils.validation import ArrayLike, boolean, points_grid
 
 logger = logging.getLogger(__name__)
 
-
 # Periods from which a run tells of a resonance. Runs of bodies without any take 15 to 60; a quality factor is
 # about half the periods, and a grid of 1.3 mm shifts frequencies by 0.2 %
 _RINGING = 100
@@ -162,7 +161,7 @@ class SimulatedPropagator:
         result = self._with_error(places) if with_error else self._result(places)
         if places is not None:
             self._report_near(places)
-        self._report_enclosed(self.scene.control_points if places is None else places)
+        self._report_enclosed(self.scene.control_points if places is None else places, result.matrix.mT)
         if with_error:
             self._report_ringing(result.runs)
         self._report()
@@ -218,7 +217,6 @@ class SimulatedPropagator:
         points = self._simulation.checked(points)
         if len(grid) == 1:  # others are pictures, which may cross obstacles
             self._report_near(points)
-            self._report_enclosed(points)
         flat = drive.reshape(-1, drive.shape[-1])
         # Planes are looked at again, with other drives. Beside a cache, earlier calls decide nothing.
         revisited = len(grid) > 1 and self._cache is None
@@ -230,6 +228,8 @@ class SimulatedPropagator:
         if by_matrix:
             result = self._executed(points)
             self._report()
+            if len(grid) == 1:
+                self._report_enclosed(points, result.matrix.mT)
             return (drive @ result.matrix.mT).reshape(*drive.shape[:-1], *grid)
         field = torch.zeros((len(flat), len(points)), dtype=torch.complex128, device="cpu")
         if (loud := flat.any(dim=1)).any():
@@ -239,6 +239,8 @@ class SimulatedPropagator:
                 self._kept.count(points, len(runs))
             self._transducers_ran |= bool(runs)
             self._report()
+            if len(grid) == 1:
+                self._report_enclosed(points, field[loud])
         return field.reshape(*drive.shape[:-1], *grid)
 
     def _result(self, points: torch.Tensor | None) -> TransferMatrix:
@@ -277,13 +279,14 @@ class SimulatedPropagator:
     @one_library_thread()
     def _with_error(self, points: torch.Tensor | None) -> TransferMatrix:
         """Return the matrix of points with its error, estimated from other grids."""
-        own, others = self._result(points), [other._result(points) for other in self._others]
+        result, others = self._result(points), [other._result(points) for other in self._others]
         matrix, free, *rest = (
-            each.reshape(1, -1) for each in (own.matrix, self._free(points), *(one.matrix for one in others))
+            each.reshape(1, -1)
+            for each in (result.matrix, self._free(points), *(one.matrix for one in others))
         )
         whole, _ = self._errors(matrix, rest, free)
-        runs = own.runs + tuple(run for one in others for run in one.runs)
-        return replace(own, error=own.error + float(whole), runs=runs)
+        runs = result.runs + tuple(run for one in others for run in one.runs)
+        return replace(result, error=result.error + float(whole), runs=runs)
 
     @one_library_thread()
     def known_error(self) -> float:
@@ -298,12 +301,13 @@ class SimulatedPropagator:
         if not self._near_points_logged:
             self._near_points_logged = warn_of_near_points(self.scene, "points", points, self.spacing)
 
-    def _report_enclosed(self, points: torch.Tensor) -> None:
-        """Log once that points are in a cavity of rigid obstacles, which no sound reaches."""
-        if not self._enclosed_logged and (found := self._simulation.enclosed(points).nonzero()).numel():
-            self._enclosed_logged, number = True, int(found[0, 0])
-            place = tuple(round(1e3 * entry, 3) for entry in points[number].tolist())
-            more = f", and of {len(found) - 1} more," if len(found) > 1 else ""
+    def _report_enclosed(self, points: torch.Tensor, pressure: torch.Tensor) -> None:
+        """Log once that points (P, 3) of pressure (R, P) are in a cavity of rigid obstacles."""
+        silent = points[(pressure == 0).all(dim=0)]
+        if not self._enclosed_logged and len(silent) and (found := self._simulation.enclosed(silent)).any():
+            self._enclosed_logged, count = True, int(found.sum())
+            place = tuple(round(1e3 * entry, 3) for entry in silent[found][0].tolist())
+            more = f", and of {count - 1} more," if count > 1 else ""
             logger.warning("rigid obstacles enclose the point at %s mm: its pressure%s is 0", place, more)
 
     def _report_ringing(self, runs: Sequence[Run]) -> None:

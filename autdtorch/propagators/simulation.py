@@ -120,11 +120,15 @@ class Simulation(ABC):
                 found = found | (cast(Obstacle, body.shape).contains(points) & ~obstacle.contains(points))
         return found
 
-    def _refuse_enclosed_sources(self) -> None:
+    @cached_property
+    def _enclosed_transducers(self) -> torch.Tensor:
+        """Numbers (n,) of the transducers that rigid obstacles enclose."""
+        return self.enclosed(self.plan.scene.array.nodes.positions).any(dim=1).nonzero()[:, 0]
+
+    def _refuse_enclosed_transducers(self) -> None:
         """Refuse transducers that rigid obstacles enclose: no sound leaves, and there is no steady state."""
-        nodes = self.plan.scene.array.nodes.positions
-        if (enclosed := self.enclosed(nodes).any(dim=1)).any():
-            number = int(enclosed.nonzero()[0, 0])
+        if len(self._enclosed_transducers):
+            number = int(self._enclosed_transducers[0])
             place = tuple(self.plan.scene.array.positions[number].tolist())
             accepted = "is enclosed by rigid obstacles, which no sound leaves; must be outside"
             raise invalid(f"array.positions[{number}]", place, accepted, "m")
@@ -184,7 +188,7 @@ class Simulation(ABC):
 
         The strengths (R, N) [Pa m] of a run are not all zero; receivers take the mean over their nodes.
         """
-        self._refuse_enclosed_sources()
+        self._refuse_enclosed_transducers()
         with self._progress(len(sources)) as progress:
             return self._simulate(sources, strength, receivers, progress.advance)
 

@@ -73,10 +73,11 @@ def uniform_coupling(stencil: Stencil) -> Array:
     return np.asarray(coupling_by_edges(stencil)[EDGES_BETWEEN.sum(axis=1)])
 
 
-def stiffness_matrix(coupling: Array) -> Array:
-    """Return the stiffness matrices (n, 8, 8) of coupling coefficients (n, 28)."""
-    matrix = np.zeros((len(coupling), 8, 8))
-    matrix[:, PAIRS[:, 0], PAIRS[:, 1]] = -coupling
-    matrix += matrix.transpose(0, 2, 1)
-    matrix[:, range(8), range(8)] = -matrix.sum(axis=2)
+def stiffness_matrix(coupling: Array, pairs: Index = PAIRS) -> Array:
+    """Return the stiffness matrices (..., v, v) of coupling coefficients (..., k) of pairs of vertices."""
+    size = int(pairs.max()) + 1
+    matrix = np.zeros((*coupling.shape[:-1], size, size))
+    matrix[..., pairs[:, 0], pairs[:, 1]] = -coupling
+    matrix += matrix.swapaxes(-2, -1)
+    matrix[..., range(size), range(size)] = -matrix.sum(axis=-1)
     return matrix

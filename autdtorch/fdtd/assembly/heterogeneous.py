@@ -75,7 +75,8 @@ def heterogeneous_cells(elements: Elements, stencil: Stencil) -> HeterogeneousCe
     walls = elements.materials.sound_hard.any()
     enclosed = enclosed_cells(coupling, touched, hard, shape) if walls else np.zeros(0, np.int64)
     hard[enclosed] = True
-    coupling *= ~(hard[touched, None] | hard[_neighbours(touched, shape)])
+    if len(enclosed):
+        coupling *= _both_open(hard, touched, shape)
     largest = _ROW_SUM_MARGIN * stencil.total * float(elements.materials.speed.max())
     mass = _transferred_mass(coupling, mass, elements, touched, shape, largest)
     weight = coupling / mass[:, None]
@@ -128,7 +129,7 @@ def _without_sound_hard(
     hard[touched] = False
     coupling, mass = _assembled(elements, interface, touched, shape, stencil)
     while True:
-        coupling *= ~(hard[touched, None] | hard[_neighbours(touched, shape)])
+        coupling *= _both_open(hard, touched, shape)
         hard[touched] |= inside & (np.abs(coupling).sum(axis=1) <= least[touched])
         if hard.sum() == known or not inside.any():
             return coupling, mass, hard
@@ -136,6 +137,11 @@ def _without_sound_hard(
         interface = condensed(elements.interface, out)
         changed = np.isin(touched, vertices[out.any(axis=1)])
         coupling[changed], mass[changed] = _assembled(elements, interface, touched[changed], shape, stencil)
+
+
+def _both_open(hard: NDArray[np.bool_], touched: Index, shape: Shape) -> NDArray[np.bool_]:
+    """Return whether a touched cell and its neighbours (n, 27) are both open, from the `hard` of all (k,)."""
+    return np.asarray(~(hard[touched, None] | hard[_neighbours(touched, shape)]))
 
 
 def condensed(interface: InterfaceElements, out: NDArray[np.bool_]) -> InterfaceElements:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from autdtorch.fdtd.assembly.element import stiffness_matrix
 from autdtorch.fdtd.assembly.plane_fields import PlaneFields
 from autdtorch.fdtd.assembly.sections import (
     COLUMN_PAIRS,
@@ -78,21 +79,12 @@ def _apart(coupling: Array, part: Index) -> Array:
 
     The energy of pressures that vary in one part only stays, so that it is not negative.
     """
-    matrix, separate = _stiffness(coupling), np.zeros((4, 4))
+    matrix, separate = stiffness_matrix(coupling, COLUMN_PAIRS), np.zeros((4, 4))
     for number in range(1, int(part.max()) + 1):
         own: NDArray[np.bool_] = part == number
         basis = _differences(own)
         separate += basis @ (basis.T @ matrix @ basis) @ basis.T
     return np.asarray(-separate[tuple(COLUMN_PAIRS.T)])
-
-
-def _stiffness(coupling: Array) -> Array:
-    """Return the stiffness matrix (4, 4) of the coupling (6,) of an element."""
-    matrix = np.zeros((4, 4))
-    matrix[tuple(COLUMN_PAIRS.T)] = -coupling
-    matrix += matrix.T
-    matrix[range(4), range(4)] = -matrix.sum(axis=1)
-    return matrix
 
 
 class _Window:
@@ -190,7 +182,7 @@ class _Roots:
         found = []
         for basis, own in zip(self._bases, coupling, strict=True):
             present = np.asarray(basis.any(axis=1))[COLUMN_PAIRS].all(axis=1)
-            matrix = _stiffness(np.where(present, own, 0))
+            matrix = stiffness_matrix(np.where(present, own, 0), COLUMN_PAIRS)
             found.append(np.linalg.cholesky(basis.T @ matrix @ basis)[np.tril_indices(basis.shape[1])])
         return np.concatenate(found)
 

@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from autdtorch.fdtd.assembly.element import PAIRS, coupling_by_edges
+from autdtorch.fdtd.assembly.element import PAIRS, coupling_by_edges, stiffness_matrix
 from autdtorch.fdtd.assembly.plane_fields import plane_fields
 from autdtorch.fdtd.assembly.prism_fit import fitted_couplings, importance
 from autdtorch.fdtd.assembly.sections import (
@@ -123,9 +123,9 @@ def stacked(width: Array, slices: Sequence[Prisms], axis: int, stencil: Stencil)
     for own, thick, part, passed, place, change in slices_of:
         at_middle = (1 - place).reshape(4, 1) * low + place.reshape(4, 1) * high
         along = change.reshape(4, 1) * (high - low)
-        across = _laplacian(2 * (straight + oblique) * own)
+        across = _stiffness(2 * (straight + oblique) * own)
         # what the stencil has beyond pressures that vary linearly along the columns
-        beyond = _laplacian(((straight + oblique) / 3 - oblique) * own)
+        beyond = _stiffness(((straight + oblique) / 3 - oblique) * own)
         own_along = np.diag(1 / passed.ravel()) + thick / 12 * across + beyond / thick
         matrix += thick * at_middle.T @ across @ at_middle + along.T @ _without_negative(own_along) @ along
         masses[number] += thick * np.stack(((1 - place) * part, place * part)).reshape(2, 4)
@@ -138,10 +138,9 @@ def _without_negative(matrix: Array) -> Array:
     return np.asarray((vector * np.maximum(value, 0)) @ vector.T) if value[0] < 0 else matrix
 
 
-def _laplacian(coupling: Array) -> Array:
+def _stiffness(coupling: Array) -> Array:
     """Return the stiffness matrix (4, 4) of coupling between columns (2, 2, 2, 2)."""
-    matrix = -coupling.reshape(4, 4)
-    return np.asarray(matrix - np.diag(matrix.sum(axis=0)))
+    return stiffness_matrix(coupling.reshape(4, 4)[tuple(COLUMN_PAIRS.T)], COLUMN_PAIRS)
 
 
 def _sides_between() -> Index:
