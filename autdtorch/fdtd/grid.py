@@ -214,7 +214,7 @@ def warn_if_coarse(speeds: Mapping[str, float], frequency: float, spacing: float
 
 def coarsest_spacing(region: Region) -> float:
     """Return the largest spacing [m] with a fair number of cells per wavelength everywhere."""
-    return min(region.sound_speeds.values()) / region.frequency / FAIR_CELLS_PER_WAVELENGTH
+    return region.shortest_wavelength / FAIR_CELLS_PER_WAVELENGTH
 
 
 def second_spacing(region: Region, spacing: float) -> float:

@@ -79,6 +79,11 @@ class Region:
         return self.fluid.sound_speed / self.frequency
 
     @property
+    def shortest_wavelength(self) -> float:
+        """Wavelength [m] where sound is slowest."""
+        return min(self.sound_speeds.values()) / self.frequency
+
+    @property
     def shapes(self) -> list[Shape]:
         """Shapes of the bodies."""
         return [body.shape for body in self.bodies]

@@ -158,16 +158,18 @@ class OperatorPropagator:
     def _wave_errors(self, points: torch.Tensor, matrix: torch.Tensor) -> torch.Tensor:
         """Return the estimated errors (P,) of rows of G (P, M) that the waves serve."""
         free = free_space_matrix(points, self.scene.array, self.scene.complex_wavenumber)
-        size, region = sizes(matrix, free), self._plan.region
+        region = self._plan.region
         if not self._plan.runs:  # exact but for the waves left out
             more = self._plan.at(self.spacing, _MORE_WAVES * self.tolerance)
             other, served = OperatorPropagator(more, self._cache)._by_waves(points)
+            left_out = (matrix - other).norm(dim=1) / sizes(matrix, free)
             errors = torch.full((len(points),), self.tolerance, dtype=torch.float64, device="cpu")
-            return torch.where(served, (matrix - other).norm(dim=1) / size + _ROUNDING, errors)
+            return torch.where(served, left_out + _ROUNDING, errors)
         second = OperatorPropagator(self._plan.second, self._cache)
         other = second.transfer_matrix(points)
-        errors = grid_errors(matrix, self.spacing, [(other, second.spacing)], region.wavelength, size)
-        return self.tolerance + errors + shape_errors(matrix, free, region, size)
+        others = [(other, second.spacing)]
+        errors = grid_errors(matrix, free, self.spacing, others, region.shortest_wavelength)
+        return self.tolerance + errors + shape_errors(matrix, free, region)
 
     @one_library_thread()
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 from autdtorch.fdtd.grid import coarsest_spacing
 from autdtorch.fdtd.grid_errors import growth, spacing_of
+from autdtorch.fdtd.region import Region
 from autdtorch.propagators.cache import DiskCache
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.simulated import SimulatedPropagator
@@ -19,16 +20,18 @@ logger = logging.getLogger(__name__)
 _FIRST_ERROR = 0.05
 """Tolerance relative to the `growth` of the first spacing: its error is about four times as large."""
 
-_FIRST_STEP, _SMALLEST_STEP, _LARGEST_STEP = 1.3, 1.25, 2.5
+_FIRST_STEP, _SMALLEST_STEP, _LARGEST_STEP = 1.6, 1.25, 2.5
 """Ratios of a spacing and the next: the first, the smallest that tells two errors apart, and the largest over
 which the fall of an error is trusted."""
 
-_BY_TWO_GRIDS, _BY_THREE_GRIDS = 0.3, 0.5
-"""Estimated error, relative to the tolerance, that is accepted. Two coarse grids may agree by chance; by
-three, one in twenty errors is more than 1.7 times its estimate."""
+_BY_TWO_GRIDS, _BY_THREE_GRIDS = 0.4, 0.6
+"""Estimated error, relative to the tolerance, that is accepted. Two coarse grids may agree by chance."""
 
-_AIM = 0.4
+_AIM = 0.5
 """Error for which a spacing is chosen, relative to the tolerance."""
+
+_SHAPE = 3.0
+"""Ratio of the errors of uncertain surfaces and of the grid from which a finer grid is of no use."""
 
 _SETTLED = 0.03
 """Distance to the steady state at which runs end, relative to the tolerance."""
@@ -64,7 +67,7 @@ def refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPr
 
     Where the budget does not suffice, it is the finest that fits, and a warning says which error it has.
     """
-    tolerance, region, wavelength = pilot.tolerance, pilot.region, pilot.region.wavelength
+    tolerance, region, wavelength = pilot.tolerance, pilot.region, pilot.region.shortest_wavelength
     others: list[SimulatedPropagator] = []
     spacing = coarsest_spacing(region)
     if budget.is_unlimited:
@@ -78,12 +81,16 @@ def refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPr
         logger.debug("spacing %.3g mm: estimated error %.2g", 1e3 * plan.spacing, error)
         step = _FIRST_STEP
         if others:
-            if error <= tolerance * (_BY_TWO_GRIDS if len(others) == 1 else _BY_THREE_GRIDS):
+            accepted = tolerance * (_BY_TWO_GRIDS if len(others) == 1 else _BY_THREE_GRIDS)
+            shape = found.shape_error()
+            if error - shape <= max(accepted - shape, shape / _SHAPE):
+                _warn_of_shape(region, shape, error, tolerance)
                 return found
             if not math.isfinite(error):
-                accepted = f"too few: at a spacing of {plan.spacing:.3g} m no run came near its steady state"
-                raise invalid("max_periods", pilot.max_periods, accepted)
-            wanted = _AIM * tolerance / error * growth(plan.spacing, wavelength)
+                reason = f"too few: at a spacing of {plan.spacing:.3g} m no run came near its steady state"
+                raise invalid("max_periods", pilot.max_periods, reason)
+            aim = max(_AIM * tolerance - shape, shape / _SHAPE)
+            wanted = aim / (error - shape) * growth(plan.spacing, wavelength)
             step = min(max(plan.spacing / spacing_of(wanted, wavelength), _SMALLEST_STEP), _LARGEST_STEP)
         for ratio in (step, _SMALLEST_STEP):
             finer = plan.at(plan.spacing / ratio, plan.tolerance, pilot.time_step)
@@ -94,3 +101,14 @@ def refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPr
             logger.warning("the budget ends at %.3g mm: estimated error %.2g, tolerance %g", *shown)
             return found
         plan, others = finer, [*others, found]
+
+
+def _warn_of_shape(region: Region, shape: float, error: float, tolerance: float) -> None:
+    """Log that the surface of an obstacle is not known well enough for a tolerance."""
+    if error <= tolerance:
+        return
+    number, body = max(enumerate(region.bodies), key=lambda pair: pair[1].uncertainty)
+    logger.warning(
+        "the surface of obstacle %d is known to %.2g mm, which leaves an error of %.2g: estimated error %.2g,"
+        " tolerance %g; smaller voxels are needed", number, 1e3 * body.uncertainty, shape, error, tolerance,
+    )  # fmt: skip

@@ -177,21 +177,20 @@ class SimulatedPropagator:
         result = self._result(places)
         others = [other._result(places).matrix for other in self._others]
         free = self._free(places)
-        errors, size = self._errors(result.matrix, others, free)
-        settling: torch.Tensor = result.error * result.matrix.norm() / size
-        return errors + settling
+        settling: torch.Tensor = result.error * result.matrix.norm() / sizes(result.matrix, free)
+        return self._errors(result.matrix, others, free) + settling
 
     def _errors(
         self, matrix: torch.Tensor, others: Sequence[torch.Tensor], free: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the errors (P,) of the rows of a matrix by grid and shape, and the rows' sizes (P,).
+    ) -> torch.Tensor:
+        """Return the errors (P,) of the rows of a matrix by grid and shape.
 
         Rows of the matrices on the other grids and in free space belong to them.
         """
-        region, size = self._plan.region, sizes(matrix, free)
+        region = self._plan.region
         grids = [(other, one.spacing) for other, one in zip(others, self._others, strict=True)]
-        errors = grid_errors(matrix, self.spacing, grids, region.wavelength, size)
-        return errors + shape_errors(matrix, free, region, size), size
+        errors = grid_errors(matrix, free, self.spacing, grids, region.shortest_wavelength)
+        return errors + shape_errors(matrix, free, region)
 
     def _free(self, points: torch.Tensor | None) -> torch.Tensor:
         """Return the matrix of points in free space, by default of the control points."""
@@ -284,7 +283,7 @@ class SimulatedPropagator:
             each.reshape(1, -1)
             for each in (result.matrix, self._free(points), *(one.matrix for one in others))
         )
-        whole, _ = self._errors(matrix, rest, free)
+        whole = self._errors(matrix, rest, free)
         runs = result.runs + tuple(run for one in others for run in one.runs)
         return replace(result, error=result.error + float(whole), runs=runs)
 
@@ -295,6 +294,11 @@ class SimulatedPropagator:
             return self._with_error(None).error
         self._result(None)
         return math.inf
+
+    def shape_error(self) -> float:
+        """Return the part of the error that uncertain surfaces cause, which no grid makes smaller."""
+        matrix, free = (part.reshape(1, -1) for part in (self._result(None).matrix, self._free(None)))
+        return float(shape_errors(matrix, free, self._plan.region))
 
     def _report_near(self, points: torch.Tensor) -> None:
         """Log once, of the points of any call, which are next to a surface."""
