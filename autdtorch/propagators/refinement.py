@@ -20,6 +20,10 @@ logger = logging.getLogger(__name__)
 _FIRST_ERROR = 0.05
 """Tolerance relative to the `growth` of the first spacing: its error is about four times as large."""
 
+_FINER_IF_SLOW = 1.6
+"""Most by which the first spacing is finer where sound is slower than in air. Such bodies resonate, and what
+a coarse grid gives next to a resonance tells nothing of the others."""
+
 _FIRST_STEP, _SMALLEST_STEP, _LARGEST_STEP = 1.6, 1.25, 2.5
 """Ratios of a spacing and the next: the first, the smallest that tells two errors apart, and the largest over
 which the fall of an error is trusted."""
@@ -71,6 +75,7 @@ def refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPr
     others: list[SimulatedPropagator] = []
     spacing = coarsest_spacing(region)
     if budget.is_unlimited:
+        spacing /= min(region.wavelength / wavelength, _FINER_IF_SLOW)
         spacing = min(spacing, spacing_of(tolerance / _FIRST_ERROR, wavelength))
     plan = pilot.at(spacing, _SETTLED * tolerance, pilot.time_step)
     while True:

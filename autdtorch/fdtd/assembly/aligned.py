@@ -132,7 +132,7 @@ class _Sections:
         self._group = np.asarray(label(varied[0] & varied[1], np.ones((3, 3)))[0])
 
     def around(self, kind: Index) -> tuple[Section, tuple[int, int]]:
-        """Return the section of a kind (2,) of elements and those that touch it, and its place therein."""
+        """Return the section of elements of a kind (2,) and those that touch them, and their place in it."""
         x, y = map(int, kind)
         ends = [(x, x), (y, y)]
         if self._group[x, y]:
