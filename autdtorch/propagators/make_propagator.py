@@ -17,6 +17,7 @@ from autdtorch.propagators.plan import plan
 from autdtorch.propagators.refinement import Budget, refined
 from autdtorch.propagators.scene_region import warn_of_ending_walls, warn_of_near_points
 from autdtorch.propagators.simulated import SimulatedPropagator
+from autdtorch.propagators.thin_walls import warn_of_thin_walls
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import invalid, positive
 
@@ -107,6 +108,7 @@ def make_propagator(
         logger.debug("time step %.4g us", 1e6 * propagator.time_step)  # refuses one that is not stable
     warn_if_coarse(planned.region.sound_speeds, scene.frequency, propagator.spacing)
     warn_of_ending_walls(scene)
+    warn_of_thin_walls(planned.at(propagator.spacing, tolerance, time_step))
     warn_of_near_points(scene, "array.positions", scene.array.positions, propagator.spacing)
     warn_of_near_points(scene, "control_points", scene.control_points, propagator.spacing)
     return propagator

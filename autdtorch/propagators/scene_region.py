@@ -13,7 +13,7 @@ import torch
 from autdtorch.fdtd.region import Body, Fluid, Region, Shape
 from autdtorch.scene.obstacles import Box, Obstacle
 from autdtorch.scene.scene import Scene
-from autdtorch.utils.triangles import doubled_normals
+from autdtorch.utils.triangles import mean_thickness
 
 logger = logging.getLogger(__name__)
 
@@ -74,10 +74,7 @@ def difference_from_rigid(body: Body, region: Region) -> float:
     stiffer = body.fluid.sound_speed / region.fluid.sound_speed
     if heavier <= 1 or stiffer < _STIFF:
         return math.inf
-    vertices, triangles = (part.numpy() for part in body.shape.surface())
-    corners = vertices[triangles] - vertices.mean(axis=0)
-    area = np.linalg.norm(doubled_normals(corners), axis=1).sum() / 2
-    thickness = 2 * abs(np.linalg.det(corners).sum() / 6) / area
+    thickness = mean_thickness(*(part.numpy() for part in body.shape.surface()))
     moved = 1 + 1 / (region.wavenumber * thickness)
     return float(_HARDNESS * (moved + 1 / stiffer) / heavier)
 

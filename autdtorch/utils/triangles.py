@@ -16,3 +16,10 @@ def doubled_normals(corners: Array) -> Array:
 def sides_of(triangles: Index) -> Index:
     """Return the vertices (3 T, 2) of the sides of triangles (T, 3): the first of each, then the others."""
     return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+
+
+def mean_thickness(vertices: Array, triangles: Index) -> float:
+    """Return twice the volume over the area of a closed surface, vertices (V, 3), triangles (T, 3)."""
+    corners = vertices[triangles] - vertices.mean(axis=0)
+    area = np.linalg.norm(doubled_normals(corners), axis=1).sum() / 2
+    return float(2 * abs(np.linalg.det(corners).sum() / 6) / area)

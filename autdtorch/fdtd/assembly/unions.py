@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from autdtorch.fdtd.assembly.element import Materials
+from autdtorch.fdtd.assembly.sheets import thickened
 from autdtorch.fdtd.assembly.slender import slender_faces
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Fluid, Region, Shape, bounds
@@ -94,8 +95,9 @@ def unions_of(region: Region, grid: Grid, stencil: Stencil) -> tuple[list[Union]
             flat_faces(body.shape).all_aligned(np.eye(3))
             or slender_faces(grid.to_cells(body.shape.surface()[0])) is not None
         )
+        oblique = body.fluid is None and not aligned and not body.continued
         own = Union(
-            (body.shape,),
+            (thickened(body.shape, grid.spacing) if oblique else body.shape,),
             known.index(body.fluid),
             body.continued,
             aligned,
@@ -103,7 +105,7 @@ def unions_of(region: Region, grid: Grid, stencil: Stencil) -> tuple[list[Union]
             not aligned and (body.fluid is None or body.fluid.density > air.density),
         )
         if unions and own == replace(unions[-1], shapes=own.shapes):
-            unions[-1] = replace(own, shapes=(*unions[-1].shapes, body.shape))
+            unions[-1] = replace(own, shapes=(*unions[-1].shapes, *own.shapes))
         else:
             unions.append(own)
     density = np.full(len(known), _SOUND_HARD_DENSITY)
