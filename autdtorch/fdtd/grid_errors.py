@@ -51,12 +51,12 @@ def grid_errors(
 
     `others` are the matrices (P, M) on other grids and their spacings [m]; the last ones count.
     """
-    own, size, logarithms = growth(spacing, wavelength), sizes(matrix, free), []
+    grown, size, logarithms = growth(spacing, wavelength), sizes(matrix, free), []
     for other, coarser in others[-_COMPARED:]:
         difference = (matrix - other).norm(dim=1) / size
-        ratio = abs(growth(coarser, wavelength) / own - 1)
+        ratio = abs(growth(coarser, wavelength) / grown - 1)
         logarithms.append((difference / ratio).clamp(min=_TINY).log())
-    least = _LEAST * own * _scattered(matrix, free)
+    least = _LEAST * grown * _scattered(matrix, free)
     return torch.maximum(torch.stack(logarithms).mean(dim=0).exp(), least)
 
 

@@ -29,28 +29,28 @@ def enclosed_cells(
     uniform[touched] = False
     regions, count = label(uniform.reshape(shape))
     number = regions.ravel().astype(np.int64)  # of each connected region of uniform cells, from 1 on
-    own = np.flatnonzero(free[touched])
-    number[touched[own]] = count + 1 + np.arange(len(own))
-    one, other = _connections(coupling, touched, own, free, shape)
-    size = count + 1 + len(own)
+    places = np.flatnonzero(free[touched])
+    number[touched[places]] = count + 1 + np.arange(len(places))
+    one, other = _connections(coupling, touched, places, free, shape)
+    size = count + 1 + len(places)
     ends = number[one], number[other]
-    _, part = connected_components(coo_array((np.ones(len(one)), ends), (size, size)), directed=False)
+    _, connected = connected_components(coo_array((np.ones(len(one)), ends), (size, size)), directed=False)
     inner = np.zeros(shape, bool)
     inner[1:-1, 1:-1, 1:-1] = True
     rim = inner & ~np.pad(inner[2:-2, 2:-2, 2:-2], 2)
-    outside = np.unique(part[number[rim.ravel() & free]])
-    reached = np.isin(part[number], outside)
+    outside = np.unique(connected[number[rim.ravel() & free]])
+    reached = np.isin(connected[number], outside)
     return np.flatnonzero(free & inner.ravel() & ~reached)
 
 
 def _connections(
-    coupling: Array, touched: Index, own: Index, free: NDArray[np.bool_], shape: tuple[int, int, int]
+    coupling: Array, touched: Index, places: Index, free: NDArray[np.bool_], shape: tuple[int, int, int]
 ) -> tuple[Index, Index]:
-    """Return the pairs of cells (k,) and (k,) between which sound passes, of the touched ones `own`."""
+    """Return the pairs of cells (k,) and (k,) between which sound passes, of the touched ones at `places`."""
     size = np.abs(coupling)
-    row, neighbour = size.sum(axis=1), touched[own, None] + flat_offsets(shape)
+    row, neighbour = size.sum(axis=1), touched[places, None] + flat_offsets(shape)
     place = np.searchsorted(touched, neighbour).clip(max=len(touched) - 1)
     theirs = np.where(touched[place] == neighbour, row[place], np.inf)
-    passes = (size[own] > _CLOSED * np.minimum(row[own, None], theirs)) & free[neighbour]
+    passes = (size[places] > _CLOSED * np.minimum(row[places, None], theirs)) & free[neighbour]
     first, offset = np.nonzero(passes)
-    return touched[own[first]], neighbour[first, offset]
+    return touched[places[first]], neighbour[first, offset]
