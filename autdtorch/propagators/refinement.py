@@ -24,9 +24,9 @@ _FINER_IF_SLOW = 1.6
 """Most by which the first spacing is finer where sound is slower than in air. Such bodies resonate, and what
 a coarse grid gives next to a resonance tells nothing of the others."""
 
-_FIRST_STEP, _SMALLEST_STEP, _LARGEST_STEP = 1.6, 1.25, 2.5
-"""Ratios of a spacing and the next: the first, the smallest that tells two errors apart, and the largest over
-which the fall of an error is trusted."""
+_SMALLEST_STEP, _LARGEST_STEP = 1.25, 1.6
+"""Ratios of a spacing and the next: the smallest that tells two errors apart; the largest, also the first,
+over which the fall of an error is known."""
 
 _BY_TWO_GRIDS, _BY_THREE_GRIDS = 0.4, 0.6
 """Estimated error, relative to the tolerance, that is accepted. Two coarse grids may agree by chance."""
@@ -84,7 +84,7 @@ def refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPr
         error = found.known_error()
         taken = time.perf_counter() - begin
         logger.debug("spacing %.3g mm: estimated error %.2g", 1e3 * plan.spacing, error)
-        step = _FIRST_STEP
+        step = _LARGEST_STEP
         if others:
             accepted = tolerance * (_BY_TWO_GRIDS if len(others) == 1 else _BY_THREE_GRIDS)
             shape = found.shape_error()
