@@ -21,10 +21,12 @@ from autdtorch.fdtd.steady_state import SILENCE
 # to 150 scenes of plates, slits, corners, needles, cylinders, balls, cubes that touch, and tori on grids of 4
 # to 16 cells per wavelength
 _EQUAL = 0.2
-# Median error of these scenes relative to `growth` and to the scattered field, from which a factor of 2.6 is
-# the standard deviation; its weight beside what grids tell, the largest ratio of both that counts, and the
-# share of it that is claimed at least, as grids may agree by chance
-_TYPICAL, _WEIGHT, _MOST_APART, _LEAST = 0.8, 0.2, 10.0, 0.37
+# Median error of these scenes relative to `growth` and to the scattered field; the standard deviation is a
+# factor of 2.6. Estimates lean towards it, as grids may agree by chance
+_USUAL = 0.8
+_WEIGHT = 0.2  # of its logarithm
+_MOST_APART = 10.0  # Largest ratio of both for which it has this weight; beyond, it counts as if so far apart
+_LEAST = 0.37  # Share of the usual error that is claimed at least
 _COMPARED = 2  # Other grids that count: those before, which may be too coarse for the scene, do not
 _TINY = torch.finfo(torch.float64).tiny
 
@@ -49,25 +51,33 @@ def sizes(matrix: Tensor, free: Tensor) -> Tensor:
 def grid_errors(
     matrix: Tensor, free: Tensor, spacing: float, others: Sequence[tuple[Tensor, float]], wavelength: float
 ) -> Tensor:
-    """Return the estimated relative errors (P,) of the rows of a matrix (P, M), `free` (P, M) in free space.
+    """Return the estimated relative errors (P,) of the rows of a matrix (P, M) whose incident field is exact.
 
-    `others` are the matrices (P, M) on other grids and their spacings [m]; the last ones count.
+    `free` (P, M) is the matrix in free space. `others` are the matrices (P, M) on other grids and their
+    spacings [m]; the last ones count.
     """
-    grown, size, logarithms = growth(spacing, wavelength), sizes(matrix, free), []
+    by_grids = errors_by_grids(matrix, free, spacing, others, wavelength)
+    usual = _USUAL * growth(spacing, wavelength) * _scattered(matrix, free)
+    near = torch.minimum(torch.maximum(usual, by_grids / _MOST_APART), by_grids * _MOST_APART)
+    return torch.maximum(by_grids ** (1 - _WEIGHT) * near**_WEIGHT, _LEAST * usual)
+
+
+def errors_by_grids(
+    matrix: Tensor, free: Tensor, spacing: float, others: Sequence[tuple[Tensor, float]], wavelength: float
+) -> Tensor:
+    """Return the errors (P,) that other grids tell; see `grid_errors`."""
+    size, logarithms = sizes(matrix, free), []
     for other, coarser in others[-_COMPARED:]:
         difference = (matrix - other).norm(dim=1) / size
-        ratio = abs(growth(coarser, wavelength) / grown - 1)
+        ratio = abs(growth(coarser, wavelength) / growth(spacing, wavelength) - 1)
         logarithms.append((difference / ratio).clamp(min=_TINY).log())
-    by_grids, typical = torch.stack(logarithms).mean(dim=0).exp(), _TYPICAL * grown * _scattered(matrix, free)
-    near = torch.minimum(torch.maximum(typical, by_grids / _MOST_APART), by_grids * _MOST_APART)
-    return torch.maximum(by_grids ** (1 - _WEIGHT) * near**_WEIGHT, _LEAST * typical)
+    return torch.stack(logarithms).mean(dim=0).exp()
 
 
 def shape_errors(matrix: Tensor, free: Tensor, region: Region) -> Tensor:
     """Return the relative errors (P,) of the rows of a matrix (P, M) as its bodies' surfaces are uncertain.
 
-    A surface off by a distance d turns the phase of what it scatters by up to 2 k d. What a row has of it is
-    the difference from that in free space (P, M).
+    A surface off by a distance d turns the phase of what it scatters by up to 2 k d.
     """
     distance = max((body.uncertainty for body in region.bodies), default=0.0)
     errors: Tensor = 2 * region.wavenumber * distance * _scattered(matrix, free)

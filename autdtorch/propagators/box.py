@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -27,7 +27,6 @@ from autdtorch.propagators.grids import MOST_PASSES, one_box
 from autdtorch.propagators.moved_boxes import assembled_box
 from autdtorch.propagators.plan import MOST_JUDGED
 from autdtorch.propagators.simulation import Run, Simulation, Stepped
-from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.scene import require_clear
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.threads import one_library_thread, spread
@@ -50,8 +49,8 @@ Simulate = Callable[[int, torch.Tensor, float, Observe], SteadyState]
 class Solved(NamedTuple):
     """The steady states of R runs in boxes.
 
-    With the transform of each box to P receivers, the incident field (P, R) there, which of them are silent
-    (P,), and the phasors (k, R) of the cells of each box.
+    With the transform of each box to P receivers, the incident field (P, R) there, which receivers (P,) are
+    silent, and the phasors (k, R) of the cells of each box.
     """
 
     boxes: Sequence[ScatteredField]
@@ -140,7 +139,7 @@ class BoxSimulation(Simulation):
         every = math.ceil(len(receivers.positions) / MOST_JUDGED)
         readings = [transform.readings(every) for transform in transforms]
         sizes = [len(transform.cells) for transform in transforms]
-        silent = self._silent(receivers.positions)
+        silent = self.silent(receivers.positions)
         heard = (~silent[::every]).to(incident.dtype)[:, None]
         floors = (SILENCE * incident[::every].norm(dim=0)).tolist()
 
@@ -154,8 +153,8 @@ class BoxSimulation(Simulation):
             box, cells = boxes[index], transforms[index].cells
             forces = box.sources(field)
             if not forces.force.any():  # obstacles of air, or drives that cancel
-                silent = torch.zeros(len(cells), dtype=torch.complex128, device="cpu")
-                return SteadyState(silent, 0, 0.0, True)
+                nothing = torch.zeros(len(cells), dtype=torch.complex128, device="cpu")
+                return SteadyState(nothing, 0, 0.0, True)
             settings = tolerance, plan.max_periods, observe, stepped, floor
             return run_to_steady_state(box.assembly, self._kernel, forces, cells, *settings)
 
@@ -183,17 +182,6 @@ class BoxSimulation(Simulation):
         phasors = torch.stack([each.pressure for each in steady], dim=1)
         runs = list(map(Run.of, steady, seconds))
         return Solved(boxes, transforms, incident, silent, torch.split(phasors, sizes), runs)
-
-    def _silent(self, points: torch.Tensor) -> torch.Tensor:
-        """Return which points (P, n, 3) [m] are in a rigid obstacle or enclosed by some.
-
-        Of overlapping obstacles the later counts.
-        """
-        silent = torch.zeros(len(points), dtype=torch.bool, device="cpu")
-        for body in self.plan.region.bodies:
-            inside = cast(Obstacle, body.shape).contains(points).any(dim=1)
-            silent = torch.where(inside, body.fluid is None, silent)
-        return silent | self.enclosed(points).any(dim=1)
 
     def _in_enclosed_cells(self, points: torch.Tensor) -> torch.Tensor:
         found = torch.zeros(points.shape[:-1], dtype=torch.bool, device="cpu")

@@ -61,8 +61,7 @@ class DomainSimulation(Simulation):
             )  # fmt: skip
             runs.append(Run.of(steady, time.perf_counter() - begin))
             rows.append(torch.from_numpy(read @ steady.pressure.numpy()))
-        silent = self.enclosed(receivers.positions).any(dim=1)
-        return torch.stack(rows).masked_fill(silent, 0), runs
+        return torch.stack(rows).masked_fill(self.silent(receivers.positions), 0), runs
 
     def _free_field(self, points: torch.Tensor, nodes: Apertures, strength: torch.Tensor) -> torch.Tensor:
         """Return the pressure at the first nodes of points (P, n, 3) as if there were no obstacles."""

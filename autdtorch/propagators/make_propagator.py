@@ -17,7 +17,6 @@ from autdtorch.propagators.plan import plan
 from autdtorch.propagators.refinement import Budget, refined
 from autdtorch.propagators.scene_region import warn_of_ending_walls, warn_of_near_points
 from autdtorch.propagators.simulated import SimulatedPropagator
-from autdtorch.propagators.thin_walls import warn_of_thin_walls
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import invalid, positive
 
@@ -57,8 +56,8 @@ def make_propagator(
             faster along the grid (docs/decisions/error-bars.md). None: the scene is simulated on finer and
             finer grids, until the estimated error of the transfer matrix is within `tolerance`.
         tolerance: relative error, in (0, 1): the distance to the steady state at which a simulation ends,
-            or the estimated error where the spacing is chosen. Hard obstacles are simulated as rigid where
-            the difference is smaller.
+            or the estimated error where the spacing is chosen; a warning tells where voxels are too coarse
+            for it. Hard obstacles are simulated as rigid where the difference is smaller.
         device: where simulations run: "cpu", "cuda" (an NVIDIA GPU, the current one) or a `torch.device`; by
             default a GPU if there is one. Results are on the CPU, and equal to rounding wherever they come
             from.
@@ -108,7 +107,7 @@ def make_propagator(
         logger.debug("time step %.4g us", 1e6 * propagator.time_step)  # refuses one that is not stable
     warn_if_coarse(planned.region.sound_speeds, scene.frequency, propagator.spacing)
     warn_of_ending_walls(scene)
-    warn_of_thin_walls(planned.at(propagator.spacing, tolerance, time_step))
+    propagator.warn_of_thin_walls()
     warn_of_near_points(scene, "array.positions", scene.array.positions, propagator.spacing)
     warn_of_near_points(scene, "control_points", scene.control_points, propagator.spacing)
     return propagator

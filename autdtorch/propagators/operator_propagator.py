@@ -14,6 +14,7 @@ import torch
 
 from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd.grid_errors import grid_errors, shape_errors, sizes
+from autdtorch.fdtd.turning import axes_along, flat_faces
 from autdtorch.propagators.bodies import ScatteringBodies, bodies_at, scattered_waves
 from autdtorch.propagators.body_matrix import Placed, Solver, placed
 from autdtorch.propagators.cache import DiskCache
@@ -22,6 +23,7 @@ from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.scene_bodies import Body, are_outside, bodies_of
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.propagators.simulation import Run
+from autdtorch.propagators.thin_walls import warn_of_thin_walls
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import require_clear
 from autdtorch.utils.threads import one_library_thread
@@ -94,6 +96,12 @@ class OperatorPropagator:
         return ScatteringBodies(
             [ScatteringOperator(*body.matrix(self._cache)) for body in placed_bodies(self._plan)]
         )
+
+    def warn_of_thin_walls(self) -> None:
+        """Log which obstacles have walls thinner than a cell, oblique to a grid along their own faces."""
+        shapes = self._plan.region.shapes
+        grids = [([number], axes_along([flat_faces(shape)])) for number, shape in enumerate(shapes)]
+        warn_of_thin_walls(self._plan.region, self.spacing, grids)
 
     @property
     def planned_runs(self) -> int:

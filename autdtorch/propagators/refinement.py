@@ -18,7 +18,7 @@ from autdtorch.utils.validation import invalid
 logger = logging.getLogger(__name__)
 
 _FIRST_ERROR = 0.05
-"""Tolerance relative to the `growth` of the first spacing: its error is about four times as large."""
+"""Tolerance relative to the `growth` of the first spacing, whose error is several times as large."""
 
 _FINER_IF_SLOW = 1.6
 """Most by which the first spacing is finer where sound is slower than in air. Such bodies resonate, and what
@@ -69,7 +69,8 @@ class Budget:
 def refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPropagator:
     """Return a propagator whose estimated error is within the tolerance of a plan.
 
-    Where the budget does not suffice, it is the finest that fits, and a warning says which error it has.
+    Where the budget does not suffice, it is the finest that fits, and where the surface of an obstacle is not
+    known well enough, it is one that does not add to that. A warning says which error it has.
     """
     tolerance, region, wavelength = pilot.tolerance, pilot.region, pilot.region.shortest_wavelength
     others: list[SimulatedPropagator] = []
@@ -81,13 +82,12 @@ def refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPr
     while True:
         plan.require_feasible("tolerance", tolerance)
         begin, found = time.perf_counter(), SimulatedPropagator(plan, cache, others)
-        error = found.known_error()
+        error, shape = found.known_errors()
         taken = time.perf_counter() - begin
         logger.debug("spacing %.3g mm: estimated error %.2g", 1e3 * plan.spacing, error)
         step = _LARGEST_STEP
         if others:
             accepted = tolerance * (_BY_TWO_GRIDS if len(others) == 1 else _BY_THREE_GRIDS)
-            shape = found.shape_error()
             if error - shape <= max(accepted - shape, shape / _SHAPE):
                 _warn_of_shape(region, shape, error, tolerance)
                 return found

@@ -13,7 +13,7 @@ from typing import Literal, Protocol, overload, runtime_checkable
 import torch
 
 from autdtorch.analytic.green import PAIR_BYTES, free_space_matrix
-from autdtorch.fdtd.grid_errors import grid_errors, shape_errors, sizes
+from autdtorch.fdtd.grid_errors import errors_by_grids, grid_errors, shape_errors, sizes
 from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.cache import DiskCache, cache_key
 from autdtorch.propagators.full import DomainSimulation
@@ -22,6 +22,7 @@ from autdtorch.propagators.kept_matrices import KeptMatrices
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.scene_region import warn_of_near_points
 from autdtorch.propagators.simulation import Run, TransferMatrix
+from autdtorch.propagators.thin_walls import warn_of_thin_walls
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.memory import require_memory
@@ -114,6 +115,11 @@ class SimulatedPropagator:
         """Number of cells of all grids."""
         return self._plan.cells
 
+    def warn_of_thin_walls(self) -> None:
+        """Log which obstacles have walls thinner than a cell, oblique to their grid."""
+        grids = zip(self._plan.grouping.groups, self._plan.grouping.axes, strict=True)
+        warn_of_thin_walls(self._plan.region, self.spacing, grids)
+
     @property
     def planned_runs(self) -> int:
         """Number of simulations of the control points' transfer matrix."""
@@ -189,7 +195,10 @@ class SimulatedPropagator:
         """
         region = self._plan.region
         grids = [(other, one.spacing) for other, one in zip(others, self._others, strict=True)]
-        errors = grid_errors(matrix, free, self.spacing, grids, region.shortest_wavelength)
+        if self.method == "full":
+            errors = errors_by_grids(matrix, free, self.spacing, grids, region.shortest_wavelength)
+        else:
+            errors = grid_errors(matrix, free, self.spacing, grids, region.shortest_wavelength)
         return errors + shape_errors(matrix, free, region)
 
     def _free(self, points: torch.Tensor | None) -> torch.Tensor:
@@ -288,17 +297,17 @@ class SimulatedPropagator:
         return replace(result, error=result.error + float(whole), runs=runs)
 
     @one_library_thread()
-    def known_error(self) -> float:
-        """Simulate the control points; return the error by the grids given, infinite without any."""
-        if self._given:
-            return self._with_error(None).error
-        self._result(None)
-        return math.inf
+    def known_errors(self) -> tuple[float, float]:
+        """Simulate the control points; return their error, and the part of it by uncertain surfaces.
 
-    def shape_error(self) -> float:
-        """Return the part of the error that uncertain surfaces cause, which no grid makes smaller."""
-        matrix, free = (part.reshape(1, -1) for part in (self._result(None).matrix, self._free(None)))
-        return float(shape_errors(matrix, free, self._plan.region))
+        The error is that by the grids given, infinite without any.
+        """
+        if not self._given:
+            self._result(None)
+            return math.inf, 0.0
+        result = self._with_error(None)
+        matrix, free = (part.reshape(1, -1) for part in (result.matrix, self._free(None)))
+        return result.error, float(shape_errors(matrix, free, self._plan.region))
 
     def _report_near(self, points: torch.Tensor) -> None:
         """Log once, of the points of any call, which are next to a surface."""

@@ -7,7 +7,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import cast
 
@@ -120,6 +120,17 @@ class Simulation(ABC):
                 found = found | (cast(Obstacle, body.shape).contains(points) & ~obstacle.contains(points))
         return found
 
+    def silent(self, nodes: torch.Tensor) -> torch.Tensor:
+        """Return which receivers (P,), with nodes (P, n, 3) [m], are in a rigid obstacle or enclosed by some.
+
+        Of overlapping obstacles the later counts.
+        """
+        silent = torch.zeros(len(nodes), dtype=torch.bool, device="cpu")
+        for body in self.plan.region.bodies:
+            inside = cast(Obstacle, body.shape).contains(nodes).any(dim=1)
+            silent = torch.where(inside, body.fluid is None, silent)
+        return silent | self.enclosed(nodes).any(dim=1)
+
     @cached_property
     def _enclosed_transducers(self) -> torch.Tensor:
         """Numbers (n,) of the transducers that rigid obstacles enclose."""
@@ -154,7 +165,17 @@ class Simulation(ABC):
         return backward if fewer else forward
 
     def transfer_matrix(self, points: torch.Tensor) -> TransferMatrix:
-        """Simulate the transfer matrix of points (P, 3)."""
+        """Simulate the transfer matrix of points (P, 3); no run begins at one that no sound reaches."""
+        heard = ~self.silent(points[:, None])
+        matrix = torch.zeros((len(points), len(self.plan.scene.array)), dtype=torch.complex128, device="cpu")
+        if not heard.any():
+            return TransferMatrix(matrix, 0.0, (), from_points=True)
+        found = self._matrix_of(points[heard])
+        matrix[heard] = found.matrix
+        return replace(found, matrix=matrix)
+
+    def _matrix_of(self, points: torch.Tensor) -> TransferMatrix:
+        """Simulate the transfer matrix of points (P, 3), none of them silent."""
         array, orbits = self.plan.scene.array, self.orbits(points)
         targets, transducers = Apertures.of_points(points), apertures_of(array)
         sources, receivers = (targets, transducers) if orbits.from_points else (transducers, targets)

@@ -3,69 +3,74 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable
 
 import numpy as np
 import torch
 
 from autdtorch.fdtd.assembly.slender import slender_faces
-from autdtorch.fdtd.region import Body, Fluid, Shape
+from autdtorch.fdtd.region import Region, Shape
 from autdtorch.fdtd.turning import flat_faces
-from autdtorch.propagators.plan import Plan
 from autdtorch.utils.array_types import Array
-from autdtorch.utils.triangles import doubled_normals
+from autdtorch.utils.triangles import doubled_normals, extents
 
 logger = logging.getLogger(__name__)
 
-_MOST_PLACES, _DEPTHS = 200, 16  # Places of a surface where the thickness is measured, and depths below each
+_PLACES, _DEPTHS = 200, 16  # Places of a surface where the thickness is measured, and depths below each
 _LEAST_SHARE = 0.05  # Least share of a surface that is a thin wall; at sharp edges less is
+_PARALLEL = 0.85  # Least cosine of the angle between the faces of a wall
 _ALIKE = 2.0  # Ratio of densities up to which a thin wall of fluid causes little
 
 
-def warn_of_thin_walls(plan: Plan) -> None:
-    """Log which obstacles of a plan have walls thinner than a cell, oblique to the grid."""
-    for group, axes in zip(plan.grouping.groups, plan.grouping.axes, strict=True):
-        for index in group:
-            body = plan.region.bodies[index]
-            if not _is_oblique(body, axes, plan.spacing) or _is_alike(body, plan.region.fluid):
+def warn_of_thin_walls(region: Region, spacing: float, grids: Iterable[tuple[Iterable[int], Array]]) -> None:
+    """Log which bodies have walls thinner than a cell [m], oblique to their grid.
+
+    `grids` are the numbers of the bodies on each, and its axes, one a row (3, 3).
+    """
+    for numbers, axes in grids:
+        for number in numbers:
+            body = region.bodies[number]
+            ratio = 0.0 if body.fluid is None else body.fluid.density / region.fluid.density
+            if 1 / _ALIKE < ratio < _ALIKE or _is_along(body.shape, axes, spacing):
                 continue
-            if (found := thin_wall(body.shape, plan.spacing)) is not None:
-                thickness, place = found
+            if (wall := thin_wall(body.shape, spacing)) is not None:
+                thickness, place = wall
                 logger.warning(
                     "obstacle %d has a wall of %.2g mm at %s mm, oblique to the grid and thinner than a cell"
                     " of %.3g mm: the error may be larger than estimated",
-                    index, 1e3 * thickness, tuple((1e3 * place).round(2).tolist()), 1e3 * plan.spacing,
+                    number, 1e3 * thickness, tuple((1e3 * place).round(2).tolist()), 1e3 * spacing,
                 )  # fmt: skip
 
 
 def thin_wall(shape: Shape, spacing: float) -> tuple[float, Array] | None:
-    """Return the least thickness [m] of a shape and where (3,) [m], if walls are thinner than a cell."""
+    """Return the median thickness [m] of the walls of a shape thinner than a cell, and its place (3,) [m].
+
+    Thickness is measured along the inward normal, at places that share the area evenly, up to a face that is
+    nearly parallel.
+    """
     vertices, triangles = (part.numpy() for part in shape.surface())
+    if extents(vertices)[1] < spacing:
+        return None
     corners = vertices[triangles]
     normals = doubled_normals(corners)
-    size = np.linalg.norm(normals, axis=1)
-    some = np.argsort(-size)[:: max(1, len(size) // _MOST_PLACES)]
-    some = some[size[some] > 0]
-    depths = spacing * np.arange(1, _DEPTHS + 1) / _DEPTHS
-    inwards = -normals[some] / size[some, None]
-    places = corners[some].mean(axis=1)[:, None] + depths[:, None] * inwards[:, None]
-    distance = shape.signed_distance(torch.from_numpy(places)).numpy()
-    first = (distance > 0).argmax(axis=1)  # depth behind the opposite face
-    behind = distance[range(len(first)), first]
-    thin = behind > 0
-    if size[some][thin].sum() < _LEAST_SHARE * size[some].sum():
+    area = np.linalg.norm(normals, axis=1)
+    some = np.searchsorted(np.cumsum(area), (np.arange(_PLACES) + 0.5) / _PLACES * area.sum())
+    places, inwards = corners[some].mean(axis=1), -normals[some] / area[some, None]
+    step = spacing / _DEPTHS
+    depths = step * np.arange(1, _DEPTHS + 2)  # one beyond a cell, for the slope there
+    below = places[:, None] + depths[:, None] * inwards[:, None]
+    distance = shape.signed_distance(torch.from_numpy(below)).numpy()
+    first = (distance[:, :-1] > 0).argmax(axis=1)  # depth behind the opposite face
+    behind, farther = (distance[np.arange(_PLACES), first + more] for more in (0, 1))
+    thin = (behind > 0) & (farther - behind > _PARALLEL * step)
+    if thin.mean() < _LEAST_SHARE:
         return None
-    thickness = np.where(thin, depths[first] - behind, np.inf)
-    least = int(thickness.argmin())
-    return float(thickness[least]), np.asarray(corners[some[least]].mean(axis=0))
+    thickness = depths[first[thin]] - behind[thin]
+    median = int(np.argsort(thickness)[len(thickness) // 2])
+    return float(thickness[median]), np.asarray(places[thin][median])
 
 
-def _is_oblique(body: Body, axes: Array, spacing: float) -> bool:
-    """Return whether a body is neither flat along the `axes` of a grid nor a needle along one of them."""
-    if body.continued or flat_faces(body.shape).all_aligned(axes):
-        return False
-    return slender_faces(body.shape.surface()[0].numpy() @ axes.T / spacing) is None
-
-
-def _is_alike(body: Body, air: Fluid) -> bool:
-    """Return whether a body is a fluid about as dense as air."""
-    return body.fluid is not None and 1 / _ALIKE < body.fluid.density / air.density < _ALIKE
+def _is_along(shape: Shape, axes: Array, spacing: float) -> bool:
+    """Return whether the faces of a shape are along the axes of a grid, or it is a needle along one."""
+    cells = shape.surface()[0].numpy() @ axes.T / spacing
+    return flat_faces(shape).all_aligned(axes) or slender_faces(cells) is not None

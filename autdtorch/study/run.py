@@ -352,7 +352,7 @@ def _accuracy(propagator: SimulatedPropagator | OperatorPropagator, simulation: 
     if isinstance(propagator, OperatorPropagator):
         waves = f"{propagator.planned_runs} waves" if propagator.cells else "exact waves"
         return f"{waves}, error {propagator.tolerance:g}"
-    count, error = len(simulation.runs), propagator.known_error()
+    count, error = len(simulation.runs), propagator.known_errors()[0]
     runs = "1 run" if count == 1 else f"{count} runs"
     if math.isfinite(error):
         return f"{runs}, estimated error {error:.1g}"

@@ -23,3 +23,10 @@ def mean_thickness(vertices: Array, triangles: Index) -> float:
     corners = vertices[triangles] - vertices.mean(axis=0)
     area = np.linalg.norm(doubled_normals(corners), axis=1).sum() / 2
     return float(2 * abs(np.linalg.det(corners).sum() / 6) / area)
+
+
+def extents(vertices: Array) -> Array:
+    """Return the extents (3,) of vertices (V, 3) along their principal axes, the largest first."""
+    centered = vertices - vertices.mean(axis=0)
+    _, _, axes = np.linalg.svd(centered, full_matrices=False)
+    return np.sort(np.ptp(centered @ axes.T, axis=0))[::-1]

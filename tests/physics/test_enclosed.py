@@ -82,6 +82,18 @@ def test_a_closed_room_is_silent_and_told(method, wall, caplog):
     assert relative_error(matrix[:-1], block.transfer_matrix(points)[:-1]) < 0.05
 
 
+def test_no_run_begins_at_a_point_in_a_closed_room(caplog):
+    """Points fewer than transducers, far from the walls: runs would begin at them."""
+    around = small_scene(room(0.5e-3, 9e-3), extent=0.05)
+    center = torch.tensor([CENTER], dtype=torch.float64)
+    outside = TransducerArray([(40e-3, 40e-3, 30e-3 + 2e-3 * step) for step in range(3)], (0, 0, 1))
+    scene = Scene(outside, around.medium, 40e3, around.control_points, around.obstacles, domain=around.domain)
+    propagator = make_propagator(scene, "box", SPACING, 1e-3)
+    assert not propagator.transfer_matrix(center).any()
+    assert not propagator.runs
+    assert "enclose the point" in caplog.text
+
+
 def test_an_open_room_is_not_silent(caplog):
     scene = small_scene(room(0.5e-3)[1:])
     points = with_points(scene, CENTER)

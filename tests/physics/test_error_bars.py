@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -11,11 +12,11 @@ from small_scenes import AIR, relative_error, small_scene
 from autdtorch import analytic
 from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd.grid import RATIO, coarsest_spacing, second_spacing
-from autdtorch.fdtd.grid_errors import grid_errors, growth, spacing_of
+from autdtorch.fdtd.grid_errors import errors_by_grids, grid_errors, growth, spacing_of
 from autdtorch.propagators import FreeSpacePropagator, make_propagator
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.scene_region import region_of
-from autdtorch.scene.obstacles import Sphere
+from autdtorch.scene.obstacles import Sphere, VoxelMask
 
 CENTER, RADIUS = (12.2e-3, 11.9e-3, 12.1e-3), 3.3e-3
 RIGID = Sphere(CENTER, RADIUS, rigid=True)
@@ -98,21 +99,56 @@ def test_without_an_estimate_no_spacing_is_chosen():
         make_propagator(small_scene((RIGID,)), "box", None, tolerance=0.1, max_periods=1)
 
 
-@given(st.floats(1.25, 3.0), st.floats(1e-5, 5e-3), st.floats(0.02, 0.08))
+@given(st.floats(1.25, 3.0), st.floats(1e-5, 5e-3), st.floats(0.02, 0.3))
 def test_errors_are_known_from_either_grid(ratio, error, spacing):
     one = torch.ones(2, 3, dtype=torch.complex128)
     other = error * growth(ratio * spacing, 1.0) / growth(spacing, 1.0)
     fine, coarse = one * (1 + error), one * (1 + other)
-    usual = 1.001 * 10**0.2  # what such grids usually err by moves an estimate by this much at most
-    known = grid_errors(fine, one, spacing, [(coarse, ratio * spacing)], 1.0)
-    assert (known / error / usual < 1).all()
-    assert (known / error * usual > 1 / (1 + error)).all()
-    known = grid_errors(coarse, one, ratio * spacing, [(fine, spacing)], 1.0)
-    assert (known / other / usual < 1).all()
-    assert (known / other * usual > 1 / (1 + other)).all()
-    # one that agrees by chance is outvoted by another
-    chance = [(fine * (1 + 1e-4 * error), 2 * spacing), (coarse, ratio * spacing)]
-    assert (grid_errors(fine, one, spacing, chance, 1.0) > 1e-3 * error).all()
+    known = errors_by_grids(fine, one, spacing, [(coarse, ratio * spacing)], 1.0)
+    assert (known * (1 + error) / error).numpy() == pytest.approx(1)
+    known = errors_by_grids(coarse, one, ratio * spacing, [(fine, spacing)], 1.0)
+    assert (known * (1 + other) / other).numpy() == pytest.approx(1)
+
+
+@given(st.floats(0.05, 0.25), st.floats(0.01, 1.0), st.floats(-7, 0))
+def test_estimates_lean_towards_the_usual_error(spacing, scattered, logarithm):
+    """By a fifth of the logarithm, by 10^0.2 at most, and not below 0.37 of it: also of grids that agree."""
+    free = torch.ones(1, 3, dtype=torch.complex128)
+    matrix, usual = free * (1 + scattered), 0.8 * growth(spacing, 1.0) * scattered / (1 + scattered)
+    coarser = matrix * (1 + 10**logarithm), 1.3 * spacing
+    (told,), (found,) = (
+        of(matrix, free, spacing, [coarser], 1.0).tolist() for of in (errors_by_grids, grid_errors)
+    )
+    assert found >= 0.36 * usual
+    assert found <= max(told, 0.38 * usual, min(usual, 1.59 * told))
+    (agreed,) = grid_errors(matrix, free, spacing, [(matrix, 1.3 * spacing)], 1.0).tolist()
+    assert agreed == pytest.approx(0.37 * usual)
+
+
+def test_a_grid_that_agrees_by_chance_is_outvoted_by_another():
+    one = torch.ones(2, 3, dtype=torch.complex128)
+    others = [(one * (1 + 1e-7), 0.2), (one * 1.01, 0.13)]
+    assert (errors_by_grids(one, one, 0.1, others, 1.0) > 1e-5).all()
+
+
+@pytest.mark.parametrize("ratio", [0.5, 1.0])
+def test_bodies_of_slow_fluids_start_on_a_finer_grid(ratio):
+    """Loose enough for two grids, the second 1.6 times as fine as the first."""
+    ball = Sphere(CENTER, 1.5e-3, density=3 * AIR.density, sound_speed=ratio * AIR.sound_speed)
+    scene = small_scene((ball,))
+    chosen = make_propagator(scene, "box", None, tolerance=0.5).spacing
+    assert chosen == pytest.approx(coarsest_spacing(region_of(scene)) / 1.6 / min(1 / ratio, 1.6))
+
+
+def test_a_choice_ends_where_voxels_are_too_coarse(caplog):
+    """No grid tells where between the centres of voxels the surface is."""
+    mask = np.zeros((10, 10, 10), bool)
+    mask[2:8, 2:8, 2:8] = np.indices((6, 6, 6)).sum(axis=0) > 2
+    voxels = VoxelMask(mask, 1.1e-3, (6.5e-3,) * 3, rigid=True)
+    propagator = make_propagator(small_scene((voxels,)), "box", None, tolerance=2e-3)
+    assert propagator.spacing > 0.3e-3
+    assert propagator.transfer_matrix(return_error=True)[1] > 2e-3
+    assert "the surface of obstacle 0 is known to" in caplog.text
 
 
 @given(st.floats(1e-3, 0.3))

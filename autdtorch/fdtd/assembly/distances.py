@@ -25,6 +25,9 @@ _STEEPEST = math.sqrt(3)
 # Largest difference [cells] of the distances in an element from a quadratic function at which the surface is
 # smooth: two faces at 6 degrees reach it. Distances at all points are then interpolated.
 _SMOOTH = 0.01
+# Least mean gradient of such distances: between the faces of a sheet along the grid they turn at its middle,
+# which three points along an axis do not show
+_STEEP = 0.9
 
 
 def located(measure: Measure, lower: Index, upper: Index) -> tuple[Index, Array, Index]:
@@ -48,7 +51,8 @@ def located(measure: Measure, lower: Index, upper: Index) -> tuple[Index, Array,
 def lattice_distances(measure: Measure, first: Index) -> Array:
     """Return the distances (n, 125) at the lattice of elements, given their first cells (n, 3)."""
     halves = _at_lattice(measure, first, _HALVES)
-    rough = np.flatnonzero((np.abs(halves @ _BEYOND_QUADRATIC) > _SMOOTH).any(axis=1))
+    bent = (np.abs(halves @ _BEYOND_QUADRATIC) > _SMOOTH).any(axis=1)
+    rough = np.flatnonzero(bent | (np.linalg.norm(halves @ _GRADIENT, axis=1) < _STEEP))
     distance = np.asarray(halves @ _INTERPOLATION)
     distance[rough] = _at_lattice(measure, first[rough], LATTICE)
     return distance
@@ -88,5 +92,6 @@ _X, _Y, _Z = (_quadratic_factors(x) for x in LATTICE.T)
 # Values at the lattice (27, 125) of the product of quadratic polynomials through those at `_HALVES`
 _INTERPOLATION = np.einsum("pi,pj,pk->ijkp", _X, _Y, _Z).reshape(27, -1)
 _MONOMIALS = quadratic(_HALVES - 0.5)
+_GRADIENT = np.linalg.pinv(_MONOMIALS)[1:4].T  # Mean gradient (27, 3) of values at `_HALVES`
 # Differences (27, 27) of values at `_HALVES` from the quadratic function that fits them best
 _BEYOND_QUADRATIC = np.eye(27) - _MONOMIALS @ np.linalg.pinv(_MONOMIALS)

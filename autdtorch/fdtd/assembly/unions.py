@@ -95,7 +95,7 @@ def unions_of(region: Region, grid: Grid, stencil: Stencil) -> tuple[list[Union]
             flat_faces(body.shape).all_aligned(np.eye(3))
             or slender_faces(grid.to_cells(body.shape.surface()[0])) is not None
         )
-        oblique = body.fluid is None and not aligned and not body.continued
+        oblique = body.fluid is None and not aligned
         own = Union(
             (thickened(body.shape, grid.spacing) if oblique else body.shape,),
             known.index(body.fluid),
