@@ -90,4 +90,5 @@ def _scattered(matrix: Tensor, free: Tensor) -> Tensor:
     In a shadow more of it only cancels the field in free space (P, M), wherever the surface is.
     """
     scattered = torch.minimum((matrix - free).norm(dim=1), matrix.norm(dim=1))
-    return torch.asarray(scattered / sizes(matrix, free))
+    share: Tensor = scattered / sizes(matrix, free)
+    return share

@@ -14,7 +14,8 @@ from autdtorch.fdtd.region import Shape
 from autdtorch.utils.triangles import extents, mean_thickness
 from autdtorch.utils.validation import Vector
 
-_THINNEST = 0.32  # Least thickness [cells]; 0.27 and 0.4 have larger errors
+_THINNEST = 0.32  # Least thickness [cells]
+_OPEN = 1e-9  # Thickness [cells] up to which a surface is not closed, such as that of a half-space
 _WIDE = 2.0  # Least extent [cells] of a sheet along two axes: needles would become much thicker than they are
 
 
@@ -49,7 +50,7 @@ class Thickened:
 def thickened(shape: Shape, spacing: float) -> Shape:
     """Return a sheet of the least thickness on cells of a spacing [m], and any other shape as it is."""
     vertices, triangles = (part.numpy() for part in shape.surface())
-    missing = _THINNEST * spacing - mean_thickness(vertices, triangles)
-    if missing <= 0 or extents(vertices)[1] < _WIDE * spacing:
+    thickness = mean_thickness(vertices, triangles) / spacing
+    if not _OPEN < thickness < _THINNEST or extents(vertices)[1] < _WIDE * spacing:
         return shape
-    return Thickened(shape, missing / 2)
+    return Thickened(shape, (_THINNEST - thickness) * spacing / 2)
