@@ -5,7 +5,7 @@ is an exact series, or a grid 2.5 times finer that a second one confirms; scenes
 third of the tolerance are left out. Required: in every family at most 5 % of the scenes miss their tolerance
 without a warning, and claims are within a factor of three in 90 %.
 
-    python scripts/benchmark.py claims              about 10 minutes on 2 idle cores
+    python scripts/benchmark.py claims              about 4 minutes on 2 idle cores
     python scripts/benchmark.py claims --families plate slit --first 100 --scenes 10
 """
 
