@@ -176,7 +176,7 @@ class OperatorPropagator:
         second = OperatorPropagator(self._plan.second, self._cache)
         other = second.transfer_matrix(points)
         others = [(other, second.spacing)]
-        errors = grid_errors(matrix, free, self.spacing, others, region.shortest_wavelength)
+        errors = grid_errors(matrix, free, self.spacing, others, self._plan.law)
         return self.tolerance + errors + shape_errors(matrix, free, region)
 
     @one_library_thread()

@@ -20,6 +20,7 @@ from autdtorch.fdtd.grid import (
     require_spacing,
     second_spacing,
 )
+from autdtorch.fdtd.grid_errors import Law
 from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.kernels.contract import Kernel
 from autdtorch.fdtd.region import Region
@@ -136,6 +137,11 @@ class Plan:
     def second(self) -> Self:
         """The plan on a second grid, for an estimate of the grid's error."""
         return self.at(second_spacing(self.region, self.spacing), self.tolerance)
+
+    @property
+    def law(self) -> Law:
+        """How its errors grow with the spacing."""
+        return Law(self.region.shortest_wavelength, self.grouping.aligned)
 
     @property
     def by_box(self) -> Self:

@@ -8,7 +8,6 @@ import time
 from dataclasses import dataclass, field
 
 from autdtorch.fdtd.grid import coarsest_spacing
-from autdtorch.fdtd.grid_errors import growth, spacing_of
 from autdtorch.fdtd.region import Region
 from autdtorch.propagators.cache import DiskCache
 from autdtorch.propagators.plan import Plan
@@ -28,10 +27,10 @@ _SMALLEST_STEP, _LARGEST_STEP = 1.25, 1.6
 """Ratios of a spacing and the next: the smallest that tells two errors apart; the largest, also the first,
 over which the fall of an error is known."""
 
-_BY_TWO_GRIDS, _BY_THREE_GRIDS = 0.35, 0.5
+_BY_TWO_GRIDS, _BY_THREE_GRIDS = 0.35, 0.6
 """Estimated error, relative to the tolerance, that is accepted. Two coarse grids may agree by chance."""
 
-_AIM = 0.45
+_AIM = 0.5
 """Error for which a spacing is chosen, relative to the tolerance."""
 
 _SHAPE = 3.0
@@ -72,12 +71,12 @@ def refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPr
     Where the budget does not suffice, it is the finest that fits, and where the surface of an obstacle is not
     known well enough, it is one that does not add to that. A warning says which error it has.
     """
-    tolerance, region, wavelength = pilot.tolerance, pilot.region, pilot.region.shortest_wavelength
+    tolerance, region, law = pilot.tolerance, pilot.region, pilot.law
     others: list[SimulatedPropagator] = []
     spacing = coarsest_spacing(region)
     if budget.is_unlimited:
-        spacing /= min(region.wavelength / wavelength, _FINER_IF_SLOW)
-        spacing = min(spacing, spacing_of(tolerance / _FIRST_ERROR, wavelength))
+        spacing /= min(region.wavelength / region.shortest_wavelength, _FINER_IF_SLOW)
+        spacing = min(spacing, law.spacing_of(tolerance / _FIRST_ERROR))
     plan = pilot.at(spacing, _SETTLED * tolerance, pilot.time_step)
     while True:
         plan.require_feasible("tolerance", tolerance)
@@ -95,8 +94,8 @@ def refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPr
                 reason = f"too few: at a spacing of {plan.spacing:.3g} m no run came near its steady state"
                 raise invalid("max_periods", pilot.max_periods, reason)
             aim = max(_AIM * tolerance - shape, shape / _SHAPE)
-            wanted = aim / (error - shape) * growth(plan.spacing, wavelength)
-            step = min(max(plan.spacing / spacing_of(wanted, wavelength), _SMALLEST_STEP), _LARGEST_STEP)
+            wanted = aim / (error - shape) * law.growth(plan.spacing)
+            step = min(max(plan.spacing / law.spacing_of(wanted), _SMALLEST_STEP), _LARGEST_STEP)
         for ratio in (step, _SMALLEST_STEP):
             finer = plan.at(plan.spacing / ratio, plan.tolerance, pilot.time_step)
             if budget.fits(finer, plan, taken):

@@ -196,9 +196,9 @@ class SimulatedPropagator:
         region = self._plan.region
         grids = [(other, one.spacing) for other, one in zip(others, self._others, strict=True)]
         if self.method == "full":
-            errors = errors_by_grids(matrix, free, self.spacing, grids, region.shortest_wavelength)
+            errors = errors_by_grids(matrix, free, self.spacing, grids, self._plan.law)
         else:
-            errors = grid_errors(matrix, free, self.spacing, grids, region.shortest_wavelength)
+            errors = grid_errors(matrix, free, self.spacing, grids, self._plan.law)
         return errors + shape_errors(matrix, free, region)
 
     def _free(self, points: torch.Tensor | None) -> torch.Tensor:

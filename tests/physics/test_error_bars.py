@@ -12,7 +12,7 @@ from small_scenes import AIR, relative_error, small_scene
 from autdtorch import analytic
 from autdtorch.analytic.green import free_space_matrix
 from autdtorch.fdtd.grid import RATIO, coarsest_spacing, second_spacing
-from autdtorch.fdtd.grid_errors import errors_by_grids, grid_errors, growth, spacing_of
+from autdtorch.fdtd.grid_errors import Law, errors_by_grids, grid_errors
 from autdtorch.propagators import FreeSpacePropagator, make_propagator
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.scene_region import region_of
@@ -22,6 +22,7 @@ CENTER, RADIUS = (12.2e-3, 11.9e-3, 12.1e-3), 3.3e-3
 RIGID = Sphere(CENTER, RADIUS, rigid=True)
 HEAVY = Sphere(CENTER, RADIUS, density=10 * AIR.density, sound_speed=1.5 * AIR.sound_speed)
 EMPTY = small_scene()
+LAW = Law(1.0, aligned=False)
 
 
 def exact(sphere):
@@ -102,11 +103,11 @@ def test_without_an_estimate_no_spacing_is_chosen():
 @given(st.floats(1.25, 3.0), st.floats(1e-5, 5e-3), st.floats(0.02, 0.3))
 def test_errors_are_known_from_either_grid(ratio, error, spacing):
     one = torch.ones(2, 3, dtype=torch.complex128)
-    other = error * growth(ratio * spacing, 1.0) / growth(spacing, 1.0)
+    other = error * LAW.growth(ratio * spacing) / LAW.growth(spacing)
     fine, coarse = one * (1 + error), one * (1 + other)
-    known = errors_by_grids(fine, one, spacing, [(coarse, ratio * spacing)], 1.0)
+    known = errors_by_grids(fine, one, spacing, [(coarse, ratio * spacing)], LAW)
     assert (known * (1 + error) / error).numpy() == pytest.approx(1)
-    known = errors_by_grids(coarse, one, ratio * spacing, [(fine, spacing)], 1.0)
+    known = errors_by_grids(coarse, one, ratio * spacing, [(fine, spacing)], LAW)
     assert (known * (1 + other) / other).numpy() == pytest.approx(1)
 
 
@@ -114,21 +115,21 @@ def test_errors_are_known_from_either_grid(ratio, error, spacing):
 def test_estimates_lean_towards_the_usual_error(spacing, scattered, logarithm):
     """By a fifth of the logarithm, by 10^0.2 at most, and not below 0.37 of it: also of grids that agree."""
     free = torch.ones(1, 3, dtype=torch.complex128)
-    matrix, usual = free * (1 + scattered), 0.8 * growth(spacing, 1.0) * scattered / (1 + scattered)
+    matrix, usual = free * (1 + scattered), 1.3 * LAW.growth(spacing) * scattered / (1 + scattered)
     coarser = matrix * (1 + 10**logarithm), 1.3 * spacing
     (told,), (found,) = (
-        of(matrix, free, spacing, [coarser], 1.0).tolist() for of in (errors_by_grids, grid_errors)
+        of(matrix, free, spacing, [coarser], LAW).tolist() for of in (errors_by_grids, grid_errors)
     )
     assert found >= 0.36 * usual
     assert found <= max(told, 0.38 * usual, min(usual, 1.59 * told))
-    (agreed,) = grid_errors(matrix, free, spacing, [(matrix, 1.3 * spacing)], 1.0).tolist()
+    (agreed,) = grid_errors(matrix, free, spacing, [(matrix, 1.3 * spacing)], LAW).tolist()
     assert agreed == pytest.approx(0.37 * usual)
 
 
 def test_a_grid_that_agrees_by_chance_is_outvoted_by_another():
     one = torch.ones(2, 3, dtype=torch.complex128)
     others = [(one * (1 + 1e-7), 0.2), (one * 1.01, 0.13)]
-    assert (errors_by_grids(one, one, 0.1, others, 1.0) > 1e-5).all()
+    assert (errors_by_grids(one, one, 0.1, others, LAW) > 1e-5).all()
 
 
 @pytest.mark.parametrize("ratio", [0.5, 1.0])
@@ -151,14 +152,15 @@ def test_a_choice_ends_where_voxels_are_too_coarse(caplog):
     assert "the surface of obstacle 0 is known to" in caplog.text
 
 
-@given(st.floats(1e-3, 0.3))
-def test_a_spacing_has_its_growth(spacing):
-    assert spacing_of(growth(spacing, 8.5e-3), 8.5e-3) == pytest.approx(spacing)
+@given(st.floats(1e-3, 0.3), st.booleans())
+def test_a_spacing_has_its_growth(spacing, aligned):
+    law = Law(8.5e-3, aligned)
+    assert law.spacing_of(law.growth(spacing)) == pytest.approx(spacing)
 
 
 def test_rows_where_nothing_arrives_have_an_error_relative_to_free_space():
     quiet, free = torch.full((1, 3), 1e-9), torch.ones(1, 3)
-    assert grid_errors(quiet, free, 1.0, [(0 * quiet, 2.0)], 8.0).item() < 1e-4
+    assert grid_errors(quiet, free, 1.0, [(0 * quiet, 2.0)], Law(8.0, aligned=True)).item() < 1e-4
 
 
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-5])
