@@ -1,9 +1,7 @@
 """The error of a grid, as other grids and the uncertain surfaces of bodies tell it.
 
-Errors of all kinds of scenes grow alike with the spacing: with its square where it is fine, and faster where
-it is coarse, as the dispersion of the stencil is of fourth order. Which of two grids is nearer the truth is a
-matter of chance; the estimate is the geometric mean over two of them, where there are two, and of what such
-a grid usually errs by.
+Which of two grids is nearer the truth is a matter of chance; the estimate is the geometric mean over two of
+them, where there are two, and of what such a grid usually errs by.
 """
 
 from __future__ import annotations
