@@ -193,13 +193,12 @@ class SimulatedPropagator:
 
         Rows of the matrices on the other grids and in free space belong to them.
         """
-        region = self._plan.region
         grids = [(other, one.spacing) for other, one in zip(others, self._others, strict=True)]
-        if self.method == "full":
-            errors = errors_by_grids(matrix, free, self.spacing, grids, self._plan.law)
-        else:
-            errors = grid_errors(matrix, free, self.spacing, grids, self._plan.law)
-        return errors + shape_errors(matrix, free, region)
+        of_grids = (
+            errors_by_grids if self.method == "full" else grid_errors
+        )  # only boxes know the incident field
+        errors = of_grids(matrix, free, self.spacing, grids, self._plan.law)
+        return errors + shape_errors(matrix, free, self._plan.region)
 
     def _free(self, points: torch.Tensor | None) -> torch.Tensor:
         """Return the matrix of points in free space, by default of the control points."""

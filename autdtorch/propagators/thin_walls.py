@@ -8,9 +8,8 @@ from collections.abc import Iterable
 import numpy as np
 import torch
 
-from autdtorch.fdtd.assembly.slender import slender_faces
+from autdtorch.fdtd.assembly.slender import is_along
 from autdtorch.fdtd.region import Region, Shape
-from autdtorch.fdtd.turning import flat_faces
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.triangles import doubled_normals, extents
 
@@ -31,7 +30,7 @@ def warn_of_thin_walls(region: Region, spacing: float, grids: Iterable[tuple[Ite
         for number in numbers:
             body = region.bodies[number]
             ratio = 0.0 if body.fluid is None else body.fluid.density / region.fluid.density
-            if 1 / _ALIKE < ratio < _ALIKE or _is_along(body.shape, axes, spacing):
+            if 1 / _ALIKE < ratio < _ALIKE or is_along(body.shape, axes, spacing):
                 continue
             if (wall := thin_wall(body.shape, spacing)) is not None:
                 thickness, place = wall
@@ -68,9 +67,3 @@ def thin_wall(shape: Shape, spacing: float) -> tuple[float, Array] | None:
     thickness = depths[first[thin]] - behind[thin]
     median = int(np.argsort(thickness)[len(thickness) // 2])
     return float(thickness[median]), np.asarray(places[thin][median])
-
-
-def _is_along(shape: Shape, axes: Array, spacing: float) -> bool:
-    """Return whether the faces of a shape are along the axes of a grid, or it is a needle along one."""
-    cells = shape.surface()[0].numpy() @ axes.T / spacing
-    return flat_faces(shape).all_aligned(axes) or slender_faces(cells) is not None

@@ -92,6 +92,7 @@ _X, _Y, _Z = (_quadratic_factors(x) for x in LATTICE.T)
 # Values at the lattice (27, 125) of the product of quadratic polynomials through those at `_HALVES`
 _INTERPOLATION = np.einsum("pi,pj,pk->ijkp", _X, _Y, _Z).reshape(27, -1)
 _MONOMIALS = quadratic(_HALVES - 0.5)
-_GRADIENT = np.linalg.pinv(_MONOMIALS)[1:4].T  # Mean gradient (27, 3) of values at `_HALVES`
+_FIT = np.linalg.pinv(_MONOMIALS)
+_GRADIENT = _FIT[1:4].T  # Mean gradient (27, 3) of values at `_HALVES`
 # Differences (27, 27) of values at `_HALVES` from the quadratic function that fits them best
-_BEYOND_QUADRATIC = np.eye(27) - _MONOMIALS @ np.linalg.pinv(_MONOMIALS)
+_BEYOND_QUADRATIC = np.eye(27) - _MONOMIALS @ _FIT

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from autdtorch.fdtd.region import Shape
+from autdtorch.fdtd.turning import flat_faces
 from autdtorch.utils.array_types import Array
 
 # Largest radius [cells] of such a cylinder: elements across it are fitted together, at most four by four
@@ -41,3 +43,10 @@ def slender_faces(corners: Array) -> list[Array] | None:
         return None
     steps = radius * _SCALE * np.concatenate((-_STEPS, _STEPS))
     return [np.array([low, high]) if one == axis else middle[one] + steps for one in range(3)]
+
+
+def is_along(shape: Shape, axes: Array, spacing: float) -> bool:
+    """Return whether a shape has flat faces along `axes`, one a row (3, 3), or is slender on cells [m]."""
+    if flat_faces(shape).all_aligned(axes):
+        return True
+    return slender_faces(shape.surface()[0].numpy() @ axes.T / spacing) is not None

@@ -10,11 +10,10 @@ import torch
 
 from autdtorch.fdtd.assembly.element import Materials
 from autdtorch.fdtd.assembly.sheets import thickened
-from autdtorch.fdtd.assembly.slender import slender_faces
+from autdtorch.fdtd.assembly.slender import is_along, slender_faces
 from autdtorch.fdtd.grid import Grid
 from autdtorch.fdtd.region import Fluid, Region, Shape, bounds
 from autdtorch.fdtd.stencil import Stencil
-from autdtorch.fdtd.turning import flat_faces
 from autdtorch.utils.array_types import Array, Index
 
 # Density with which sound-hard bodies are assembled. Cells that stay almost uncoupled become sound-hard.
@@ -91,10 +90,7 @@ def unions_of(region: Region, grid: Grid, stencil: Stencil) -> tuple[list[Union]
     for body in region.bodies:
         if body.fluid not in known:
             known.append(body.fluid)
-        aligned = (
-            flat_faces(body.shape).all_aligned(np.eye(3))
-            or slender_faces(grid.to_cells(body.shape.surface()[0])) is not None
-        )
+        aligned = is_along(body.shape, np.eye(3), grid.spacing)
         oblique = body.fluid is None and not aligned
         own = Union(
             (thickened(body.shape, grid.spacing) if oblique else body.shape,),
