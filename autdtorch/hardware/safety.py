@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import functools
 import logging
@@ -47,8 +48,9 @@ def ended_by_signals() -> Iterator[None]:
 
     The signals are Ctrl-C, Ctrl-Z, SIGTERM, SIGHUP, SIGQUIT and SIGTTIN; an ignored one, as by ``nohup``,
     stays ignored. While a `Signalled` is on its way out, further signals do not raise: they must not
-    interrupt the switching off. Later ones do, as Python drops exceptions of a ``__del__`` or a callback. Use
-    it around the link.
+    interrupt the switching off. Python drops what is raised in a ``__del__``: a signal that comes there comes
+    again when it has ended. After what is dropped elsewhere, as in a callback, the next signal does raise.
+    Use it around the link.
 
     Raises:
         Signalled: such a signal came.
@@ -56,12 +58,15 @@ def ended_by_signals() -> Iterator[None]:
     """
     outside = sys.exception()
 
-    def end(number: int, _: FrameType | None) -> None:
+    def end(number: int, frame: FrameType | None) -> None:
         error = sys.exception()
         while error is not outside and error is not None:
             if isinstance(error, Signalled):  # it is on its way out
                 return
             error = error.__context__
+        if _finalises(frame):  # a thread without the locks of `threading`, which the main thread may hold
+            _thread.start_new_thread(_signal_again, (signal.Signals(number),))
+            return
         raise Signalled(number)
 
     def restore() -> None:
@@ -80,6 +85,20 @@ def ended_by_signals() -> Iterator[None]:
         except Signalled:  # the first one; no other is raised while it is handled
             restore()
             raise
+
+
+def _finalises(frame: FrameType | None) -> bool:
+    """Tell whether a frame runs in a ``__del__``."""
+    while frame is not None:
+        if frame.f_code.co_name == "__del__":
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _signal_again(number: signal.Signals) -> None:
+    time.sleep(0.001)
+    _thread.interrupt_main(number)
 
 
 @dataclass(frozen=True)

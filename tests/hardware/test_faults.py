@@ -2,6 +2,8 @@
 
 import signal
 import sys
+import time
+import weakref
 from collections.abc import Callable
 from functools import partial
 
@@ -197,13 +199,13 @@ def test_two_signals_at_once_end_the_trial_by_the_first(monkeypatch, number):
 
 
 def test_after_a_signal_that_python_drops_the_next_ends_the_trial(monkeypatch):
-    class Dropping:
-        def __del__(self):
-            signal.raise_signal(signal.SIGTERM)
+    class Thing: ...
 
     def trial() -> None:
+        thing = Thing()
+        _ = weakref.ref(thing, lambda _: signal.raise_signal(signal.SIGTERM))
         with hw.ended_by_signals():
-            Dropping()
+            del thing
             signal.raise_signal(signal.SIGTERM)
 
     dropped: list[object] = []
@@ -216,6 +218,30 @@ def test_after_a_signal_that_python_drops_the_next_ends_the_trial(monkeypatch):
     except hw.Signalled:  # what is handled around a trial does not count
         with pytest.raises(hw.Signalled):
             trial()
+
+
+def test_a_signal_during_a_finaliser_ends_the_trial_after_it(monkeypatch):
+    class Finalised:
+        def __del__(self):
+            self.signal()
+            ended.append(True)
+
+        def signal(self):
+            signal.raise_signal(signal.SIGTERM)
+
+    ended: list[bool] = []
+    dropped: list[object] = []
+    monkeypatch.setattr(sys, "unraisablehook", dropped.append)
+
+    def trial() -> None:
+        with hw.ended_by_signals():
+            Finalised()
+            time.sleep(30)
+
+    with pytest.raises(hw.Signalled, match="SIGTERM"):
+        trial()
+    assert ended == [True]
+    assert not dropped
 
 
 @pytest.mark.parametrize("handlers_set", [2, 7], ids=["begins", "ends"])  # of 6, and 6 as they were
