@@ -158,9 +158,9 @@ def _simulated(body: StillBody, folder: Path | None) -> tuple[torch.Tensor, torc
     waves, shape = body.waves, 2 * ((body.degree + 1) ** 2,)
     cache = None if folder is None else DiskCache(folder)
     digest = digest_of(source_digest(), package_versions(), _described(body))
-    if cache is not None and (found := cache.load(digest, shape)) is not None:
+    if cache is not None and (found := cache.load(digest, shape, 1)) is not None:
         logger.debug("scattering operator loaded from %s", folder)
-        return torch.from_numpy(found[0]), waves.axes, found[1]
+        return torch.from_numpy(found[0]), waves.axes, found[1][0]
     spacing = 1e3 * body.solver.spacing
     logger.debug("simulating a scattering operator: %d waves, cells of %.3g mm", shape[0], spacing)
     matrix, residual = waves.matrix()

@@ -31,15 +31,17 @@ _NO_EFFECT = ("control_points", "observation_plane", "name")
 
 
 class DiskCache:
-    """A folder of complex matrices, each with one number, under their digests."""
+    """A folder of complex matrices, each with a few numbers, under their digests."""
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         """Make the folder if it is missing."""
         self.folder = Path(folder)
         self.folder.mkdir(parents=True, exist_ok=True)
 
-    def load(self, digest: str, shape: tuple[int, ...]) -> tuple[ComplexArray, float] | None:
-        """Return a saved matrix and number; None if there is none, or it is damaged or of another shape."""
+    def load(
+        self, digest: str, shape: tuple[int, ...], numbers: int
+    ) -> tuple[ComplexArray, list[float]] | None:
+        """Return a saved matrix and its numbers; None if there is none, it is damaged or of another shape."""
         path = self._path(digest)
         try:
             content = path.read_bytes()
@@ -52,16 +54,16 @@ class DiskCache:
         if content != _with_checksum(digest, shape, body):
             logger.warning("%s is damaged (its checksum is wrong): computing again", path)
             return None
-        whole = len(body) == np.dtype(np.complex128).itemsize * (np.prod(shape, dtype=int) + 1)
+        whole = len(body) == np.dtype(np.complex128).itemsize * (np.prod(shape, dtype=int) + numbers)
         values = np.frombuffer(body, np.complex128) if whole else np.array([np.nan])
         if not np.isfinite(values).all():
             logger.warning("%s holds no finite matrix of shape %s: computing again", path, shape)
             return None
-        return values[:-1].reshape(shape).copy(), float(values[-1].real)
+        return values[:-numbers].reshape(shape).copy(), values[-numbers:].real.tolist()
 
-    def save(self, digest: str, matrix: AnyArray, number: float) -> None:
-        """Save a matrix and a number; a file that cannot be written is logged and left out."""
-        body = np.append(matrix, number).astype(np.complex128).tobytes()
+    def save(self, digest: str, matrix: AnyArray, *numbers: float) -> None:
+        """Save a matrix and its numbers; a file that cannot be written is logged and left out."""
+        body = np.append(matrix, numbers).astype(np.complex128).tobytes()
         path = self._path(digest)
         try:
             replace_file(path, _with_checksum(digest, matrix.shape, body))

@@ -83,8 +83,9 @@ class KeepingSimulation(BoxSimulation):
             return super().transfer_matrix(points)
         unit = torch.eye(len(self.plan.scene.array), dtype=torch.complex128, device="cpu")
         field = self._sum(self._transducers, None, unit, points)
-        remaining = max(run.remaining for run in self._transducers.runs)
-        return TransferMatrix(field.mT.contiguous(), remaining, tuple(new), from_points=False)
+        kept = self._transducers.runs
+        remaining, periods = max(run.remaining for run in kept), max(run.periods for run in kept)
+        return TransferMatrix(field.mT.contiguous(), remaining, periods, tuple(new), from_points=False)
 
     def fields(self, drive: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, list[Run]]:
         """Return the pressure (R, P) [Pa] of drives (R, M), none of them silent, and the runs it took."""

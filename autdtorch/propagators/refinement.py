@@ -27,7 +27,7 @@ _SMALLEST_STEP, _LARGEST_STEP = 1.25, 1.6
 """Ratios of a spacing and the next: the smallest that tells two errors apart; the largest, also the first,
 over which the fall of an error is known."""
 
-_BY_TWO_GRIDS, _BY_THREE_GRIDS = 0.35, 0.6
+_BY_TWO_GRIDS, _BY_THREE_GRIDS = 0.45, 0.7
 """Estimated error, relative to the tolerance, that is accepted. Two coarse grids may agree by chance."""
 
 _AIM = 0.5

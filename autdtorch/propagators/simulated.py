@@ -35,6 +35,9 @@ logger = logging.getLogger(__name__)
 # about half the periods, and a grid of 1.3 mm shifts frequencies by 0.2 %
 _RINGING = 100
 
+# Ratio of periods from which another grid is next to a resonance that this one is not: it tells of that alone
+_LONGER = 1.5
+
 
 class SteadyStateWarning(UserWarning):
     """A simulation ended before its steady state was reached."""
@@ -169,7 +172,7 @@ class SimulatedPropagator:
             self._report_near(places)
         self._report_enclosed(self.scene.control_points if places is None else places, result.matrix.mT)
         if with_error:
-            self._report_ringing(result.runs)
+            self._report_ringing(result.periods)
         self._report()
         return (result.matrix, result.error) if with_error else result.matrix
 
@@ -181,19 +184,20 @@ class SimulatedPropagator:
         """
         places = None if points is None else self._simulation.checked(points)
         result = self._result(places)
-        others = [other._result(places).matrix for other in self._others]
+        others = [(other._result(places), other.spacing) for other in self._others]
         free = self._free(places)
         settling: torch.Tensor = result.error * result.matrix.norm() / sizes(result.matrix, free)
-        return self._errors(result.matrix, others, free) + settling
+        return self._errors(result, others, free) + settling
 
     def _errors(
-        self, matrix: torch.Tensor, others: Sequence[torch.Tensor], free: torch.Tensor
+        self, result: TransferMatrix, others: Sequence[tuple[TransferMatrix, float]], free: torch.Tensor
     ) -> torch.Tensor:
         """Return the errors (P,) of the rows of a matrix by grid and shape.
 
-        Rows of the matrices on the other grids and in free space belong to them.
+        Rows of the matrices on `others`, grids and their spacings [m], and in free space belong to them.
         """
-        grids = [(other, one.spacing) for other, one in zip(others, self._others, strict=True)]
+        calm = [other for other in others if other[0].periods <= _LONGER * result.periods] or others[-1:]
+        matrix, grids = result.matrix, [(other.matrix, spacing) for other, spacing in calm]
         of_grids = (
             errors_by_grids if self.method == "full" else grid_errors
         )  # only boxes know the incident field
@@ -270,7 +274,8 @@ class SimulatedPropagator:
             self.runs += result.runs
             self._transducers_ran |= bool(result.runs) and not result.from_points
             if self._cache is not None and all(run.reached for run in result.runs):
-                self._cache.save(cache_key(self._plan, points), result.matrix.numpy(), result.error)
+                numbers = result.error, result.periods
+                self._cache.save(cache_key(self._plan, points), result.matrix.numpy(), *numbers)
         return self._kept.add(points, result) or result
 
     def _loaded(self, points: torch.Tensor) -> TransferMatrix | None:
@@ -278,22 +283,21 @@ class SimulatedPropagator:
         if self._cache is None:
             return None
         shape = len(points), len(self.scene.array)
-        if (found := self._cache.load(cache_key(self._plan, points), shape)) is None:
+        if (found := self._cache.load(cache_key(self._plan, points), shape, 2)) is None:
             return None
         logger.debug("transfer matrix of %s loaded from %s", self.scene.name, self._cache.folder)
-        return TransferMatrix(torch.from_numpy(found[0]), found[1], (), from_points=True)
+        matrix, (error, periods) = found
+        return TransferMatrix(torch.from_numpy(matrix), error, int(periods), (), from_points=True)
 
     @one_library_thread()
     def _with_error(self, points: torch.Tensor | None) -> TransferMatrix:
         """Return the matrix of points with its error, estimated from other grids."""
         result, others = self._result(points), [other._result(points) for other in self._others]
-        matrix, free, *rest = (
-            each.reshape(1, -1)
-            for each in (result.matrix, self._free(points), *(one.matrix for one in others))
-        )
-        whole = self._errors(matrix, rest, free)
-        runs = result.runs + tuple(run for one in others for run in one.runs)
-        return replace(result, error=result.error + float(whole), runs=runs)
+        flat, *rest = (replace(one, matrix=one.matrix.reshape(1, -1)) for one in (result, *others))
+        grids = [(one, other.spacing) for one, other in zip(rest, self._others, strict=True)]
+        whole = self._errors(flat, grids, self._free(points).reshape(1, -1))
+        periods = max(one.periods for one in (result, *others))
+        return replace(result, error=result.error + float(whole), periods=periods)
 
     @one_library_thread()
     def known_errors(self) -> tuple[float, float]:
@@ -322,9 +326,8 @@ class SimulatedPropagator:
             more = f", and of {count - 1} more," if count > 1 else ""
             logger.warning("rigid obstacles enclose the point at %s mm: its pressure%s is 0", place, more)
 
-    def _report_ringing(self, runs: Sequence[Run]) -> None:
+    def _report_ringing(self, periods: int) -> None:
         """Log once that obstacles resonate, where grids may agree and be wrong together."""
-        periods = max((run.periods for run in runs if run.reached), default=0)
         if periods > _RINGING and not self._ringing_logged:
             self._ringing_logged = True
             logger.warning(

@@ -65,12 +65,14 @@ class TransferMatrix:
     Attributes:
         matrix: complex128 (P, M) [Pa].
         error: estimated relative error; from a single grid the distance to the steady state alone.
+        periods: most periods of a run, also if it was kept or loaded.
         runs: the simulations it took; none if it was loaded.
         from_points: whether they began at the points (reciprocity), not at the transducers.
     """
 
     matrix: torch.Tensor
     error: float
+    periods: int
     runs: tuple[Run, ...]
     from_points: bool
 
@@ -169,7 +171,7 @@ class Simulation(ABC):
         heard = ~self.silent(points[:, None])
         matrix = torch.zeros((len(points), len(self.plan.scene.array)), dtype=torch.complex128, device="cpu")
         if not heard.any():
-            return TransferMatrix(matrix, 0.0, (), from_points=True)
+            return TransferMatrix(matrix, 0.0, 0, (), from_points=True)
         found = self._matrix_of(points[heard])
         matrix[heard] = found.matrix
         return replace(found, matrix=matrix)
@@ -185,8 +187,9 @@ class Simulation(ABC):
         alone = [sources.chosen(slice(own, own + 1)) for own in orbits.representatives]
         found, runs = self.run(alone, strength, receivers)
         rows, remaining = orbits.expand(found), max(run.remaining for run in runs)
+        periods = max(run.periods for run in runs)
         matrix = rows if orbits.from_points else rows.mT.contiguous()
-        return TransferMatrix(matrix, remaining, tuple(runs), orbits.from_points)
+        return TransferMatrix(matrix, remaining, periods, tuple(runs), orbits.from_points)
 
     def matrix_runs(self, points: torch.Tensor) -> int:
         """Return the number of runs that the transfer matrix of points (P, 3) takes."""
