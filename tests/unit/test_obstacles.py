@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
 from autdtorch.scene.obstacles.moving import at_rest, circumscribed, moved
+from autdtorch.scene.obstacles.voxel_surface import ThinError, VoxelSurface
 
 CENTER, TURN = (0.4, -0.2, 0.1), (0.5, -0.3, 2.0)
 BOX = Box(CENTER, (1.0, 0.6, 0.4), rotation=TURN, rigid=True)
@@ -325,9 +326,46 @@ def test_cavities_of_masks_and_meshes_are_filled():
     assert solid.filled() is solid
 
 
+@settings(max_examples=8)
+@given(
+    st.sampled_from(["ball", "sheet", "rod"]),
+    st.floats(2.0, 7.0),
+    st.sampled_from(["nothing", "hole", "tab", "specks"]),
+    st.integers(0, 2**31),
+)
+def test_a_surface_has_the_voxels_on_their_sides_or_says_so(kind, size, more, seed):
+    """Required: centres at most 0.25 voxels beyond it, but for those it calls lost, of strewn ones alone."""
+    random, count = np.random.default_rng(seed), 20
+    places = np.moveaxis(np.indices((count,) * 3), 0, -1) - (count - 1) / 2 + random.uniform(-0.5, 0.5, 3)
+    turned = np.abs(places @ rotation_matrix(random.uniform(-3, 3, 3).tolist()).numpy())
+    half = {"sheet": (size, size, 1.0), "rod": (size, 1.2, 1.2)}.get(kind)
+    mask = np.linalg.norm(places, axis=-1) < size if half is None else (turned < half).all(axis=-1)
+    place = tuple(np.argwhere(mask)[random.integers(mask.sum())])
+    if more == "hole":
+        mask[place] = False
+    elif more == "tab":
+        mask[place[0], place[1] : place[1] + 2, 2:18] = True
+    elif more == "specks":
+        mask ^= random.random(mask.shape) < 2e-3
+    try:
+        surface = VoxelSurface(mask, np.ones(3), None)
+    except ThinError:
+        assume(False)
+    inside = surface.distance(np.argwhere(np.ones_like(mask)) + 0.5)
+    assert (np.where(mask.ravel(), inside, -inside) > 0.25).sum() <= surface.lost
+    assert surface.lost == 0 or more == "specks"
+
+
+def test_a_body_at_the_end_of_grey_values_reaches_to_its_voxels_faces_in_any_unit():
+    for unit in (1e-3, 1.0, 1e3):
+        voxels = VoxelMask(unit * np.ones((6, 5, 4)), 1e-3, level=0.5 * unit, rigid=True)
+        assert (*voxels.lower, *voxels.upper) == pytest.approx((0, 0, 0, 6e-3, 5e-3, 4e-3))
+
+
 def test_voxels_that_vanish_when_smoothed_stay_cubes(caplog):
     mask = np.zeros((3, 3, 3), bool)
     mask[1, 1, 1] = True
     voxels = VoxelMask(mask, (1e-3, 2e-3, 1e-3), rigid=True)
     assert voxels.lower == pytest.approx((1e-3, 2e-3, 1e-3))
     assert "too thin to be smooth" in caplog.text
+    assert voxels.uncertainty > 0.2e-3

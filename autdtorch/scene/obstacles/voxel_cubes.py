@@ -22,12 +22,9 @@ class VoxelCubes:
     edges and corners and on the medial axis.
     """
 
-    uncertainty = 0.0
-    """Distance [m] by which the surface may be off."""
-
-    def __init__(self, mask: NDArray[np.bool_], edges: Array) -> None:
-        """Take a mask and the edges of its voxels."""
-        self._values, self._edges = mask, edges
+    def __init__(self, mask: NDArray[np.bool_], edges: Array, uncertainty: float = 0.0) -> None:
+        """Take a mask, the edges of its voxels, and the distance [m] by which their faces may be off."""
+        self._values, self._edges, self.uncertainty = mask, edges, uncertainty
 
     @property
     def bounds(self) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from autdtorch.scene.obstacles.base import Obstacle
 from autdtorch.scene.obstacles.voxel_cubes import VoxelCubes
-from autdtorch.scene.obstacles.voxel_surface import VanishedError, VoxelSurface
+from autdtorch.scene.obstacles.voxel_surface import ThinError, VoxelSurface
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.numpy_file import read_arrays
@@ -35,6 +35,9 @@ from autdtorch.utils.validation import (
 logger = logging.getLogger(__name__)
 
 _MOST_UNEQUAL = 20  # Ratio of a voxel's edges: smoothing over the longest takes so many of the shortest
+_UNCERTAIN_CUBES = (
+    0.3  # Distance by which faces of cuboids may be off that stand for something smooth [voxels]
+)
 
 
 @dataclass(frozen=True)
@@ -175,10 +178,13 @@ class VoxelMask(Obstacle):
         if not self.smooth:
             return VoxelCubes(self.mask, edges)
         try:
-            return VoxelSurface(self.mask, edges, self.level)
-        except VanishedError:
+            found = VoxelSurface(self.mask, edges, self.level)
+        except ThinError:
             logger.warning("a body of %d voxels is too thin to be smooth: taken as cuboids", self.mask.sum())
-            return VoxelCubes(self.mask, edges)
+            return VoxelCubes(self.mask, edges, _UNCERTAIN_CUBES * float(edges.max()))
+        if found.lost:
+            logger.warning("%d voxels are too small to be smooth: left out of a body, or filled", found.lost)
+        return found
 
     def _moved(self, corner: Array) -> Vector:
         x, y, z = (float(low + place) for low, place in zip(self.origin, corner, strict=True))

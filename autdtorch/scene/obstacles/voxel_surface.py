@@ -36,15 +36,16 @@ _LEVELS, _MISSED = (0.5, 0.8, 1.2, 1.8, 2.6), 0.15
 # Share of the distance between the surface and a smoother one that is the uncertainty: fitted to the fields
 # of spheres and boxes
 _UNCERTAIN = 0.5
-# Distance [voxels] from the smoother surface at which sharpening has made a cube of a body of few voxels, and
-# the uncertainty of the smoother surface, which is then taken
-_COLLAPSED, _UNCERTAIN_SMOOTH = 0.3, 0.1
-_UNCERTAIN_GREY = 0.02  # The same for grey values [voxels]
+_UNCERTAIN_SMOOTH, _UNCERTAIN_GREY = 0.1, 0.02  # Those of the smoother surface and of grey values [voxels]
+# Depth [voxels] by which a surface may have the centre of a voxel on the wrong side. Sharpened surfaces of
+# balls and boxes reach 0.2; more is a body of few voxels, a thin part or a hole that was not kept
+_WRONG_SIDE = 0.25
+_MOST_WRONG = 0.05  # Share of the voxels beside a surface from which it is not that of the mask
 _LEAST = 1e-7  # Share of a smoothed mask that is rounding
 
 
-class VanishedError(ValueError):
-    """Nothing is left of a mask once it is smoothed."""
+class ThinError(ValueError):
+    """Little is left of a mask once it is smoothed."""
 
 
 class VoxelSurface:
@@ -57,10 +58,10 @@ class VoxelSurface:
         """Take a mask, or grey values with a level.
 
         Raises:
-            VanishedError: a mask of single voxels, or one as thin.
+            ThinError: a mask of single voxels, or one as thin.
         """
         self._values, self._edges, self._level = values, edges, level
-        self._built = self._surface_and_uncertainty()
+        self._built = self._build()
 
     @property
     def bounds(self) -> tuple[Array, Array]:
@@ -77,6 +78,11 @@ class VoxelSurface:
         """Distance [m] by which the surface may be off (rms)."""
         return self._built[2]
 
+    @property
+    def lost(self) -> int:
+        """Number of voxels whose centres are on the wrong side, as they are too small to be smooth."""
+        return self._built[3]
+
     def inside(self, points: Array) -> NDArray[np.bool_]:
         """Return which points (N, 3) are in the body."""
         return np.asarray(self.distance(points) < 0)
@@ -85,21 +91,37 @@ class VoxelSurface:
         """Return the signed distances (N,) [m] of points (N, 3)."""
         return self._distance(points)
 
-    def _surface_and_uncertainty(self) -> tuple[Array, Index, float]:
+    def _build(self) -> tuple[Array, Index, float, int]:
+        """Return vertices, triangles, the uncertainty and the number of voxels lost.
+
+        Sharpening makes cubes of balls of few voxels, and a volume that is kept swells what thin parts have
+        lost: of three surfaces the first counts that has the centres of all voxels on their side.
+        """
         edge = float(np.cbrt(np.prod(self._edges)))
         if self._level is not None:
-            least = float(self._values.min())
-            grey = np.pad(self._level - self._values, 1, constant_values=self._level - least + 1)
-            return *_contour(grey, self._edges, 1), _UNCERTAIN_GREY * edge
+            return *_contour(_padded(self._level - self._values), self._edges, 1), _UNCERTAIN_GREY * edge, 0
         rough, faces = _contour(*_smoothed(self._values, self._edges, _BLUR))
-        if not len(faces):
-            raise VanishedError
-        sharp = _volume_kept(_sharpened(rough, faces, float(self._edges.max())), faces, self._volume)
         smooth = _contour(*_smoothest(self._values, self._edges))
+        if not len(faces) or not len(smooth[1]):
+            raise ThinError
+        sharp = _volume_kept(_sharpened(rough, faces, float(self._edges.max())), faces, self._volume)
         off = math.sqrt(float((MeshDistance(*sharp)(smooth[0]) ** 2).mean()))
-        if off > _COLLAPSED * edge:
-            return *_volume_kept(*smooth, self._volume), _UNCERTAIN_SMOOTH * edge
-        return *sharp, _UNCERTAIN * off
+        kept = _volume_kept(*smooth, self._volume)
+        tried = (
+            (*sharp, _UNCERTAIN * off),
+            (*kept, _UNCERTAIN_SMOOTH * edge),
+            (*smooth, _UNCERTAIN_SMOOTH * edge),
+        )
+        places, sides = _beside_surface(self._values, self._edges)
+        for vertices, faces, known in tried:
+            wrong = np.maximum(0, -sides * MeshDistance(vertices, faces)(places))
+            uncertainty = math.hypot(known, math.sqrt(float((wrong**2).mean())))
+            lost = int((wrong > _WRONG_SIDE * edge).sum())
+            if not lost:
+                break
+        if lost > _MOST_WRONG * len(places):
+            raise ThinError
+        return vertices, faces, uncertainty, lost
 
     @property
     def _volume(self) -> float:
@@ -112,6 +134,22 @@ class VoxelSurface:
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the search structures, which are built again."""
         return {name: value for name, value in vars(self).items() if name != "_distance"}
+
+
+def _padded(grey: Array) -> Array:
+    """Return a field, negative in the body, with a voxel around it; bodies at its end reach to its faces."""
+    padded = np.pad(grey, 1, mode="edge")
+    around = np.pad(np.zeros(grey.shape, bool), 1, constant_values=True)
+    return np.where(around, np.abs(padded), padded)
+
+
+def _beside_surface(mask: NDArray[np.bool_], edges: Array) -> tuple[Array, Array]:
+    """Return the centres (n, 3) [m] of voxels near those of the other kind, and -1 in the body, 1 outside."""
+    from scipy.ndimage import binary_dilation, binary_erosion
+
+    body, around = np.pad(mask, 2), np.ones((5, 5, 5), bool)
+    beside = binary_dilation(body, around) & ~binary_erosion(body, around)
+    return (np.argwhere(beside) - 1.5) * edges, np.where(body[beside], -1.0, 1.0)
 
 
 def _contour(field: Array, edges: Array, pad: int) -> tuple[Array, Index]:
