@@ -89,6 +89,11 @@ class Region:
         return [body.shape for body in self.bodies]
 
     @property
+    def walls(self) -> list[Shape]:
+        """Shapes of the sound-hard bodies."""
+        return [body.shape for body in self.bodies if body.fluid is None]
+
+    @property
     def sound_speeds(self) -> dict[str, float]:
         """Sound speeds [m/s] by where they are, for messages."""
         fluids = {f"obstacle {index}": body.fluid for index, body in enumerate(self.bodies)}

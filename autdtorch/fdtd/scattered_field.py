@@ -8,6 +8,7 @@ function: the sources of a field that is p_scat outside and zero inside (a discr
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -18,8 +19,10 @@ from torch import Tensor
 
 from autdtorch.fdtd.interpolation import Interpolation
 from autdtorch.fdtd.kernels.contract import Sources
+from autdtorch.fdtd.region import Shape
 from autdtorch.fdtd.stencil import flat_offsets
 from autdtorch.fdtd.stepping import Assembly
+from autdtorch.fdtd.turning import turned_shape
 from autdtorch.utils.apertures import Apertures, Discs
 from autdtorch.utils.array_types import Array, Index
 
@@ -102,11 +105,15 @@ class ScatteredField:
         """Return whether the interpolation kernel of any point (N, 3) in the box has heterogeneous cells."""
         return self.assembly.touches_heterogeneous(self._on_axes(points[self.inside(points)]))
 
-    def enclosed(self, points: Tensor) -> Tensor:
-        """Return which points (..., 3) [m] are in air that sound-hard bodies enclose."""
+    def enclosed(self, points: Tensor, walls: Sequence[Shape]) -> Tensor:
+        """Return which points (..., 3) [m] are in air that sound-hard bodies, the `walls`, enclose."""
         found, inside = torch.zeros(points.shape[:-1], dtype=torch.bool, device="cpu"), self.inside(points)
         if inside.any():
-            found[inside] = torch.from_numpy(self.assembly.is_enclosed(self._on_axes(points[inside])))
+            found[inside] = torch.from_numpy(
+                self.assembly.is_enclosed(
+                    self._on_axes(points[inside]), [turned_shape(wall, self.axes) for wall in walls]
+                )
+            )
         return found
 
     def positions(self, cells: Index) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -13,12 +14,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from autdtorch.fdtd.assembly.elements import elements_of
+from autdtorch.fdtd.assembly.enclosed import sees
 from autdtorch.fdtd.assembly.heterogeneous import HeterogeneousCells, heterogeneous_cells
 from autdtorch.fdtd.boundary import layer_columns, tuned_profile
 from autdtorch.fdtd.grid import Grid, make_grid
 from autdtorch.fdtd.interpolation import Interpolation, average_nodes, exclude_cells, interpolate_points
 from autdtorch.fdtd.kernels.contract import Coefficients, Receivers, Sources, State, uniform_state
-from autdtorch.fdtd.region import Region
+from autdtorch.fdtd.region import Region, Shape
 from autdtorch.fdtd.stability import fewest_steps, largest_eigenvalue, whole_steps
 from autdtorch.fdtd.stencil import Stencil, tuned_stencil
 from autdtorch.utils.validation import invalid
@@ -73,8 +75,11 @@ class Assembly:
         """Return whether the interpolation of any of the points (N, 3) [m] uses cells that are not of air."""
         return len(points) > 0 and bool(np.isin(self._in_air(points).index, self.heterogeneous.index).any())
 
-    def is_enclosed(self, points: Tensor) -> NDArray[np.bool_]:
-        """Return whether points (N, 3) [m] are nearer to enclosed cells than to others of air."""
+    def is_enclosed(self, points: Tensor, walls: Sequence[Shape]) -> NDArray[np.bool_]:
+        """Return whether points (N, 3) [m] are nearer to enclosed cells than to others of air.
+
+        Cells behind sound-hard `walls`, in the coordinates of the grid, do not count.
+        """
         if not len(self.heterogeneous.enclosed):
             return np.zeros(len(points), bool)
         cells, shape = self.grid.to_cells(points), np.array(self.grid.shape)
@@ -83,6 +88,11 @@ class Assembly:
         index = np.ravel_multi_index(tuple(np.moveaxis(corners.clip(0, shape - 1), -1, 0)), self.grid.shape)
         enclosed = np.isin(index, self.heterogeneous.enclosed)
         open_air = ~np.isin(index, self.heterogeneous.sound_hard)
+        if len(both := np.flatnonzero(enclosed.any(axis=1) & open_air.any(axis=1))):
+            places = np.array(self.grid.origin) + self.grid.spacing * corners[both]
+            seen = sees(points.numpy()[both, None], places, walls, self.grid.spacing)
+            enclosed[both] &= seen
+            open_air[both] &= seen
         nearest = [np.where(kind, far, np.inf).min(axis=1) for kind in (enclosed, open_air)]
         return np.asarray(nearest[0] < nearest[1])
 

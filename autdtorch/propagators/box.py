@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from autdtorch.fdtd.scattered_field import NearToFar, ScatteredField
-from autdtorch.fdtd.steady_state import SILENCE, Extrapolation, SteadyState, run_to_steady_state
+from autdtorch.fdtd.steady_state import Extrapolation, SteadyState, run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.fdtd.turning import is_turned
 from autdtorch.propagators.grids import MOST_PASSES, one_box
@@ -141,7 +141,8 @@ class BoxSimulation(Simulation):
         sizes = [len(transform.cells) for transform in transforms]
         silent = self.silent(receivers.positions)
         heard = (~silent[::every]).to(incident.dtype)[:, None]
-        floors = (SILENCE * incident[::every].norm(dim=0)).tolist()
+        judged = receivers.positions[::every]
+        floors = [self.silence(judged, *drive) for drive in drives]
 
         def pressure(phasors: torch.Tensor) -> torch.Tensor:
             parts = zip(readings, torch.split(phasors, sizes), strict=True)
@@ -174,7 +175,7 @@ class BoxSimulation(Simulation):
         else:
             pairs = [[box.driving(nodes, own) for nodes, own in drives] for box in boxes]
             driving = [torch.stack(fields, dim=1) for fields in pairs]
-            found = _coupled(boxes, transforms, driving, pressure, simulate, plan.tolerance)
+            found = _coupled(boxes, transforms, driving, pressure, floors, simulate, plan.tolerance)
             if not found:
                 logger.debug("the iteration between %d boxes does not converge: one box instead", len(boxes))
                 return self._in_one_box.solved(sources, strength, receivers, stepped)
@@ -186,7 +187,7 @@ class BoxSimulation(Simulation):
     def _in_enclosed_cells(self, points: torch.Tensor) -> torch.Tensor:
         found = torch.zeros(points.shape[:-1], dtype=torch.bool, device="cpu")
         for box in self.boxes:
-            found |= box.enclosed(points)
+            found |= box.enclosed(points, self.plan.region.walls)
         return found
 
 
@@ -195,14 +196,16 @@ def _coupled(
     transforms: Sequence[NearToFar],
     driving: Sequence[torch.Tensor],
     pressure: Observe,
+    floors: Sequence[float],
     simulate: Simulate,
     tolerance: float,
 ) -> list[tuple[SteadyState, float]]:
     """Iterate until the pressure (P, R) of R runs has converged; return nothing without convergence.
 
     The incident field `driving` is (n, R) on each box. Half of the relative tolerance is for the runs, half
-    for the iteration. `pressure` maps the phasors (k, R) of all boxes' cells to the receivers. The result is
-    the phasors of these cells and the seconds of each run.
+    for the iteration. `pressure` maps the phasors (k, R) of all boxes' cells to the receivers; changes are
+    relative to its norms, or to `floors` (R,) if those are more. The result is the phasors of these cells and
+    the seconds of each run.
     """
     begin = time.perf_counter()
     runs = driving[0].shape[1]
@@ -213,6 +216,7 @@ def _coupled(
     cells = sum(len(transform.cells) for transform in transforms)
     value, size = pressure(driving[0].new_zeros((cells, runs))), None
     left = torch.zeros(runs, dtype=torch.float64, device="cpu")
+    least = torch.tensor(floors, dtype=torch.float64, device="cpu").clamp(min=torch.finfo(torch.float64).tiny)
     for number in range(1, MOST_PASSES + 1):
         parts = []
         own = tolerance / 2 ** (number + 1)  # half the tolerance in all passes
@@ -235,7 +239,7 @@ def _coupled(
         amplitudes = [transform.amplitudes(part) for transform, part in zip(transforms, parts, strict=True)]
         before, value = value, pressure(phasors)
         smaller, size = size, torch.cat(amplitudes).norm(dim=0)
-        change = (value - before).norm(dim=0) / value.norm(dim=0).clamp(min=torch.finfo(torch.float64).tiny)
+        change = (value - before).norm(dim=0) / torch.maximum(value.norm(dim=0), least)
         if smaller is not None:
             remaining = _CAUTION * change * (size / smaller).clamp(max=1)
             if (remaining <= tolerance / 2).all():

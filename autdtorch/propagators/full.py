@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from autdtorch.fdtd.steady_state import SILENCE, run_to_steady_state
+from autdtorch.fdtd.steady_state import run_to_steady_state
 from autdtorch.fdtd.stepping import Assembly, assemble
 from autdtorch.propagators.plan import MOST_JUDGED
 from autdtorch.propagators.simulation import Run, Simulation, Stepped
@@ -35,7 +35,7 @@ class DomainSimulation(Simulation):
         return self.assemblies[0].touches_heterogeneous(points)
 
     def _in_enclosed_cells(self, points: torch.Tensor) -> torch.Tensor:
-        found = self.assemblies[0].is_enclosed(points.reshape(-1, 3))
+        found = self.assemblies[0].is_enclosed(points.reshape(-1, 3), self.plan.region.walls)
         return torch.from_numpy(found).reshape(points.shape[:-1])
 
     def _check(self, points: torch.Tensor) -> None:
@@ -54,19 +54,11 @@ class DomainSimulation(Simulation):
         rows, runs = [], []
         for nodes, own in zip(sources, strength, strict=True):
             begin, forces = time.perf_counter(), assembly.sources(nodes.positions, own, nodes.weights)
-            free = self._free_field(receivers.positions[::every], nodes, own)
+            floor = self.silence(receivers.positions[::every], nodes, own)
             steady = run_to_steady_state(
                 assembly, self._kernel, forces, cells, plan.tolerance, plan.max_periods,
-                lambda phasor: torch.from_numpy(some @ phasor.numpy()), stepped, SILENCE * float(free.norm()),
+                lambda phasor: torch.from_numpy(some @ phasor.numpy()), stepped, floor,
             )  # fmt: skip
             runs.append(Run.of(steady, time.perf_counter() - begin))
             rows.append(torch.from_numpy(read @ steady.pressure.numpy()))
         return torch.stack(rows).masked_fill(self.silent(receivers.positions), 0), runs
-
-    def _free_field(self, points: torch.Tensor, nodes: Apertures, strength: torch.Tensor) -> torch.Tensor:
-        """Return the pressure at the first nodes of points (P, n, 3) as if there were no obstacles."""
-        from autdtorch.fdtd.kernels.cpu_waves import superposition  # loads numba
-
-        amplitude = strength.repeat_interleave(len(nodes.weights)) * nodes.weights.repeat(len(strength))
-        settings = self.plan.scene.complex_wavenumber, self.plan.spacing / 2
-        return superposition(points[:, 0], nodes.positions.reshape(-1, 3), amplitude[:, None], *settings)

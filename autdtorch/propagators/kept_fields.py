@@ -163,6 +163,7 @@ class KeepingSimulation(BoxSimulation):
 
     def _stepped(self, sources: Sequence[Apertures], strength: torch.Tensor, receivers: Apertures) -> Solved:
         """Simulate runs, and note whether the boxes were simulated apart, not in one."""
+        self._refuse_enclosed_transducers()
         with self._progress(len(sources)) as progress:
             solved = self.solved(sources, strength, receivers, progress.advance)
         self._apart = solved.boxes is self.boxes

@@ -69,8 +69,15 @@ def refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPr
     """Return a propagator whose estimated error is within the tolerance of a plan.
 
     Where the budget does not suffice, it is the finest that fits, and where the surface of an obstacle is not
-    known well enough, it is one that does not add to that. A warning says which error it has.
+    known well enough, it is one that does not add to that. A warning says which error it has, and one that
+    obstacles resonate.
     """
+    found = _refined(pilot, budget, cache)
+    found.warn_of_ringing()
+    return found
+
+
+def _refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedPropagator:
     tolerance, region, law = pilot.tolerance, pilot.region, pilot.law
     others: list[SimulatedPropagator] = []
     spacing = coarsest_spacing(region)

@@ -123,6 +123,10 @@ class SimulatedPropagator:
         grids = zip(self._plan.grouping.groups, self._plan.grouping.axes, strict=True)
         warn_of_thin_walls(self._plan.region, self.spacing, grids)
 
+    def warn_of_ringing(self) -> None:
+        """Log if the control points' sound rings, where grids may agree and be wrong together."""
+        self._report_ringing(self._with_error(None).periods)
+
     @property
     def planned_runs(self) -> int:
         """Number of simulations of the control points' transfer matrix."""
@@ -187,7 +191,9 @@ class SimulatedPropagator:
         others = [(other._result(places), other.spacing) for other in self._others]
         free = self._free(places)
         settling: torch.Tensor = result.error * result.matrix.norm() / sizes(result.matrix, free)
-        return self._errors(result, others, free) + settling
+        self._report_ringing(max(one.periods for one in (result, *(other for other, _ in others))))
+        errors = self._errors(result, others, free) + settling
+        return torch.where(result.matrix.any(dim=1), errors, 0.0)  # where no sound is, that is exact
 
     def _errors(
         self, result: TransferMatrix, others: Sequence[tuple[TransferMatrix, float]], free: torch.Tensor
@@ -327,7 +333,7 @@ class SimulatedPropagator:
             logger.warning("rigid obstacles enclose the point at %s mm: its pressure%s is 0", place, more)
 
     def _report_ringing(self, periods: int) -> None:
-        """Log once that obstacles resonate, where grids may agree and be wrong together."""
+        """Log once that obstacles resonate; see `warn_of_ringing`."""
         if periods > _RINGING and not self._ringing_logged:
             self._ringing_logged = True
             logger.warning(

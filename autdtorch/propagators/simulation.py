@@ -13,7 +13,7 @@ from typing import cast
 
 import torch
 
-from autdtorch.fdtd.steady_state import SteadyState, fewest_periods
+from autdtorch.fdtd.steady_state import SILENCE, SteadyState, fewest_periods
 from autdtorch.fdtd.stepping import Assembly
 from autdtorch.propagators.grids import USUAL_PERIODS
 from autdtorch.propagators.plan import Plan, make_kernel
@@ -215,6 +215,14 @@ class Simulation(ABC):
         self._refuse_enclosed_transducers()
         with self._progress(len(sources)) as progress:
             return self._simulate(sources, strength, receivers, progress.advance)
+
+    def silence(self, points: torch.Tensor, sources: Apertures, strength: torch.Tensor) -> float:
+        """Return the norm of the pressure [Pa] at points (P, n, 3) below which a run may end: -80 dB.
+
+        It is relative to free space, as if the sources of strength (N,) [Pa m] did not cancel each other.
+        """
+        distance = torch.cdist(points.mean(dim=1), sources.positions.mean(dim=1))
+        return SILENCE * float((strength.abs() / distance.clamp(min=self.plan.spacing / 2)).norm())
 
     def _progress(self, runs: int) -> AbstractContextManager[Progress]:
         """Show the progress of so many runs."""

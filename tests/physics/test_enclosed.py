@@ -102,17 +102,50 @@ def test_an_open_room_is_not_silent(caplog):
     assert "enclose" not in caplog.text
 
 
-def test_a_transducer_in_a_closed_room_is_refused():
-    around = small_scene(room(1e-3))
+def test_the_side_of_a_thin_wall_decides_not_the_nearest_cell():
+    wall, half = 0.05e-3, 4e-3
+    scene = small_scene(room(wall, half))
+    propagator = make_propagator(scene, "box", SPACING, 1e-3)
+    x, y, z = CENTER
+    above = [(x, y + 0.3e-3, z + half + wall + up) for up in (0.05e-3, 0.2e-3, 0.5e-3, 0.9e-3)]
+    below = [(x, y + 0.3e-3, z + half - down) for down in (0.05e-3, 0.2e-3, 0.5e-3, 0.9e-3)]
+    matrix = propagator.transfer_matrix(torch.tensor([*above, *below], dtype=torch.float64))
+    assert (matrix[:4].norm(dim=1) > 0).all()
+    assert not matrix[4:].any()
+    assert not propagator.point_errors(torch.tensor(below, dtype=torch.float64)).any()
+
+
+@pytest.mark.parametrize("method", ["box", "full"])
+def test_a_ball_beside_a_closed_room_opens_no_wall(method):
+    """Elements beside a curved body see walls at points of a lattice, between which 0.05 mm would be lost."""
+    ball = Sphere((CENTER[0] + 6.3e-3, *CENTER[1:]), 2.2e-3, rigid=True)
+    scene = small_scene([*room(0.05e-3), ball])
+    points = with_points(scene, CENTER)
+    assert not make_propagator(scene, method, SPACING, 1e-3).transfer_matrix(points)[-1].any()
+
+
+@pytest.mark.parametrize("half", [4e-3, 20e-3])
+def test_a_transducer_in_a_closed_room_is_refused(half):
+    """Also where its distance from the walls lets its field be kept."""
+    empty, domain = small_scene(), ((-0.02,) * 3, (0.05,) * 3)
     inside = TransducerArray([CENTER], (0, 0, 1))
-    scene = Scene(inside, around.medium, 40e3, around.control_points, around.obstacles, domain=around.domain)
+    scene = Scene(inside, empty.medium, 40e3, [(0.0, 0.0, 0.045)], room(1e-3, half), domain=domain)
     with pytest.raises(ValueError, match=r"array\.positions\[0\]: .* is enclosed by rigid obstacles"):
         make_propagator(scene, "box", SPACING).transfer_matrix()
 
 
-def test_points_behind_a_ball_need_no_more_periods_than_others():
-    """All points where little arrives: a run still ends by the floor, -80 dB of free space."""
-    scene = small_scene((Sphere(CENTER, RADIUS, rigid=True),))
-    propagator = make_propagator(scene, "box", SPACING, 1e-3)
-    propagator.transfer_matrix()
+@pytest.mark.parametrize("method", ["box", "full"])
+@pytest.mark.parametrize("balls", [1, 2])
+def test_a_run_ends_where_a_drive_cancels(method, balls):
+    """In a plane of symmetry two opposite drives leave rounding alone, which never becomes steady."""
+    array = TransducerArray([(-10e-3, 0.0, -20e-3), (10e-3, 0.0, -20e-3)], (0, 0, 1))
+    obstacles = [Sphere((0.0, y, 0.0), 3e-3, rigid=True) for y in (0.0, 18e-3)[:balls]]
+    domain = ((-15e-3, -10e-3, -25e-3), (15e-3, 25e-3, 15e-3))
+    scene = Scene(array, small_scene().medium, 40e3, [(0.0, 0.0, 10e-3)], obstacles, domain=domain)
+    propagator = make_propagator(scene, method, 1.5e-3, 1e-3)
+    drive = torch.tensor([1.0, -1.0], dtype=torch.complex128)
+    cancelled, whole = (
+        propagator.field(each, scene.control_points).abs() for each in (drive, drive.abs() + 0j)
+    )
+    assert (cancelled < 1e-3 * whole).all()
     assert max(run.periods for run in propagator.runs) < 100

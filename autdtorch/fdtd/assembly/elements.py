@@ -52,6 +52,7 @@ def elements_of(region: Region, grid: Grid, stencil: Stencil) -> Elements:
     """Return the material of every element, set by the last body there, and the interface elements."""
     bodies, materials = unions_of(region, grid, stencil)
     blocks = _blocks(bodies, grid)
+    bodies = [body.measured(grid.spacing) for body in bodies]
     material, cut, beside = _located(bodies, grid)
     material = np.where(beside, material, blocks.at_centers).astype(np.int16)
     axes = sum(each[blocks.kinds].astype(np.int64) for each in blocks.varied)  # along which elements vary
@@ -79,7 +80,9 @@ def _blocks(bodies: Sequence[Union], grid: Grid) -> Blocks:
     def material(cells: Array) -> Index:
         found = np.zeros(cells.shape[:-1], np.int64)
         for body in aligned:
-            found[body.distance(cells, grid) < 0] = body.material
+            for part in body.parts():
+                near = part.near(cells, grid)
+                found[near][part.distance(cells[near], grid) < 0] = body.material
         return found
 
     places = [np.concatenate(own) for own in zip(*faces, strict=True)]
@@ -131,19 +134,21 @@ def _finite(
     """Return whether finite elements represent bodies in elements (K, n); `whole` as in `_thick`.
 
     They do where a sound-hard body is thick enough, and at edges of a fluid without a thin sound-hard body.
+    None does where a thin sound-hard body crosses the element, which sound would then pass.
     """
     near = np.asarray((np.abs(distance) < FAR).any(axis=2))
-    finite, thin = near.copy(), np.zeros(len(first), bool)
+    finite, thin, crossed = near.copy(), np.zeros(len(first), bool), np.zeros(len(first), bool)
     for body, own, level, here in zip(bodies, finite, distance, near, strict=True):
-        own &= body.finite
         if body.sound_hard:
             own[own] = _thick(body, level[own], first[own], whole, grid)
-            thin |= here & ~own
+            crossed |= (level < 0).any(axis=1) & (level > 0).any(axis=1) & ~own
+            thin |= here & ~(own & body.finite)
         else:
-            own &= near_edge
+            own &= near_edge & body.finite
             own[own] = roughness(level[own]) > _ROUGH
+        own &= body.finite
     hard = np.array([body.sound_hard for body in bodies])
-    return np.asarray(finite & (hard[:, None] | ~thin))
+    return np.asarray(finite & (hard[:, None] | ~thin) & ~crossed)
 
 
 def _thick(
@@ -165,10 +170,7 @@ def _thick(
 
 
 def _distinct(distance: Array, finite: NDArray[np.bool_], less: Array) -> tuple[Index, Index]:
-    """Return the first of the elements (n,) that are alike, and the place of each (n,) among these.
-
-    Along flat faces parallel to the grid, nearly all are alike.
-    """
+    """Return the first of the elements (n,) that are alike, and the place of each (n,) among these."""
     count = len(less)
     parts = (np.moveaxis(distance, 1, 0) / _SAME, finite.T, less / _SAME)
     keys = np.concatenate([part.reshape(count, -1).round().astype(np.int64) for part in parts], axis=1)
@@ -216,4 +218,4 @@ def _interface(
 
     with show_progress(len(index), "measuring surfaces") as progress:
         parts = [InterfaceElements(*none), *spread(chunk, range(0, len(index), _CHUNK))]
-    return InterfaceElements(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+    return InterfaceElements.joined(parts)

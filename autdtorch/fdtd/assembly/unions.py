@@ -45,6 +45,12 @@ class Union:
         beyond = np.maximum(np.array(grid.first) - cell, cell - np.array(grid.last) + 1).max(axis=-1) + 0.5
         return np.asarray(np.maximum(distance, beyond))
 
+    def measured(self, spacing: float) -> Union:
+        """Return the union as lattices of elements see it, on cells of a spacing [m]: without thin sheets."""
+        if not self.sound_hard:
+            return self
+        return replace(self, shapes=tuple(thickened(shape, spacing) for shape in self.shapes))
+
     def faces(self, grid: Grid) -> list[Array]:
         """Return the places [cells] of its faces along each axis, up to its end on a grid."""
         corners = [grid.to_cells(one.surface()[0]) for one in self.shapes]
@@ -55,6 +61,23 @@ class Union:
             inside = own[(own > first) & (own < last)]
             found.append(inside if self.continued else np.clip(own, first + 0.5, last - 0.5))
         return found
+
+    def parts(self) -> list[Union]:
+        """Return unions of one shape each."""
+        return [replace(self, shapes=(shape,)) for shape in self.shapes]
+
+    def near(self, cells: Array, grid: Grid) -> tuple[slice, slice, slice]:
+        """Return the part of positions (nx, ny, nz, 3) [cells] of a rectangular grid in the bounds of all."""
+        lower, upper = bounds(self.shapes)
+        slices = []
+        for axis, low, high in zip(range(3), lower, upper, strict=True):
+            own = np.moveaxis(cells[..., axis], axis, 0)[:, 0, 0]
+            inside = own.clip(grid.first[axis], grid.last[axis] - 1) if self.continued else own
+            places = grid.origin[axis] + grid.spacing * inside
+            first, last = np.searchsorted(places, (low - grid.spacing, high + grid.spacing))
+            slices.append(slice(int(first), int(last)))
+        x, y, z = slices
+        return x, y, z
 
     def range(self, grid: Grid) -> Index:
         """Return the first element around it along each axis, and one past the last (2, 3)."""
@@ -91,9 +114,8 @@ def unions_of(region: Region, grid: Grid, stencil: Stencil) -> tuple[list[Union]
         if body.fluid not in known:
             known.append(body.fluid)
         aligned = is_along(body.shape, np.eye(3), grid.spacing)
-        oblique = body.fluid is None and not aligned
         own = Union(
-            (thickened(body.shape, grid.spacing) if oblique else body.shape,),
+            (body.shape,),
             known.index(body.fluid),
             body.continued,
             aligned,
