@@ -132,9 +132,9 @@ class OperatorPropagator:
     ) -> torch.Tensor | tuple[torch.Tensor, float]:
         """Return the transfer matrix G; see `SimulatedPropagator.transfer_matrix`.
 
-        Differentiable by the points that are not served by the box. The error is the tolerance, and that of
-        the grid where operators are simulated, from a second grid. For rows from the box, the box estimates
-        it.
+        Differentiable by the points that are not served by the box. The error is that of the waves left out,
+        and, where operators are simulated, the tolerance and that of the grid, from a second grid. For rows
+        from the box, the box estimates it.
         """
         with_error = boolean("return_error", return_error)
         places = self._checked(points)

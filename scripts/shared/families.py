@@ -32,10 +32,14 @@ class Exact(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """The bodies of a scene, and the sphere that is the same, if any."""
+    """The bodies of a scene, the sphere that is the same, if any, and how far behind them the points are [m].
+
+    Without a distance, sources and points are all around.
+    """
 
     bodies: list[at.Obstacle]
     exact: Exact | None = None
+    behind: float | None = None
 
 
 Family = Callable[[np.random.Generator], Drawn]
@@ -167,17 +171,29 @@ def voxels(rng: np.random.Generator) -> Drawn:
     return Drawn([at.VoxelMask(mask, edge, tuple(lower.tolist()), rigid=True)], Exact(center, radius, None))
 
 
+def shadow(rng: np.random.Generator) -> Drawn:
+    """A rigid plate of 40 to 80 mm before all points."""
+    size = (*rng.uniform(40e-3, 80e-3, 2).tolist(), float(rng.uniform(3e-3, 8e-3)))
+    tilt = (*rng.uniform(0, 0.4, 2).tolist(), 0.0)
+    return Drawn([at.Box((0.0, 0.0, 0.0), size, tilt, rigid=True)], behind=50e-3)
+
+
 FAMILIES: Mapping[str, Family] = {
     each.__name__: each
-    for each in (plate, slit, corner, needle, cylinder, sphere, slow, touching, torus, shell, voxels)
+    for each in (plate, slit, corner, needle, cylinder, sphere, slow, touching, torus, shell, voxels, shadow)
 }
 
 
 def scene_of(family: str, seed: int) -> tuple[at.Scene, torch.Tensor | None]:
     """Return a scene of three sources and three points around drawn bodies, and its exact matrix if known."""
     rng = np.random.default_rng([seed, *family.encode()])
-    bodies, exact = FAMILIES[family](rng)
+    bodies, exact, behind = FAMILIES[family](rng)
     places: list[Array] = []
+    if behind is not None:
+        across = rng.uniform(-behind / 3, behind / 3, (6, 2))
+        places = [
+            np.array([x, y, side * behind]) for (x, y), side in zip(across, (-1,) * 3 + (1,) * 3, strict=True)
+        ]
     while len(places) < 6:
         direction = rng.normal(size=3)
         place = direction / np.linalg.norm(direction) * rng.uniform(18e-3, 34e-3)

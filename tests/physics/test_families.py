@@ -1,5 +1,6 @@
 """Thin plates, slits, corners, needles and voxels: right from cells of 1 mm on, and claims that hold."""
 
+import itertools
 from dataclasses import replace
 
 import pytest
@@ -9,7 +10,6 @@ from small_scenes import relative_error
 from autdtorch.propagators import make_propagator
 
 FINE, SETTLED = 0.55e-3, 1e-3
-EXACT = ["sphere", "shell", "voxels"]
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -21,14 +21,17 @@ def test_what_is_thinner_than_a_cell_is_right(family, seed):
     assert relative_error(found, fine) < 0.02
 
 
-@pytest.mark.parametrize("family", EXACT)
-def test_claims_hold_against_exact_series(family):
-    scene, exact = scene_of(family, 2)
-    propagator = make_propagator(scene, "box", None, tolerance=0.03, cache=False)
-    matrix, claimed = propagator.transfer_matrix(return_error=True)
-    true = relative_error(matrix, exact)
-    assert true < 0.03
-    assert true / 4 < claimed < 4 * true  # 93 % are within a factor of 3
+def test_claims_hold_against_exact_series():
+    """Required: no tolerance missed, 5 of 6 claims within a factor of 3; of many scenes 95 % are."""
+    near = 0
+    for family, seed in itertools.product(("sphere", "shell", "voxels"), range(2, 4)):
+        scene, exact = scene_of(family, seed)
+        propagator = make_propagator(scene, "box", None, tolerance=0.03, cache=False)
+        matrix, claimed = propagator.transfer_matrix(return_error=True)
+        true = relative_error(matrix, exact)
+        assert true < 0.03
+        near += true / 3 < claimed < 3 * true
+    assert near >= 5
 
 
 def test_smooth_voxels_are_nearer_to_a_ball_than_cubes():

@@ -15,7 +15,7 @@ from autdtorch.utils.array_types import Array, Index
 
 # Most elements along an axis of those that are fitted together; edges farther apart are fitted as if alone
 _TOGETHER = 4
-_SOUND_HARD_DENSITY = 1e12
+_CLOSED_DENSITY = 1e12
 # Stiffness that elements at corners get beyond the mean of their slices, relative to what the slices lack
 _STIFFER = 0.2
 
@@ -85,7 +85,7 @@ def _prismatic(
 
 def _densities(materials: Materials) -> Array:
     """Return the densities (m,) with sound-hard ones so large that the thinnest sheet lets nothing pass."""
-    return np.where(materials.sound_hard, _SOUND_HARD_DENSITY, materials.density)
+    return np.where(materials.sound_hard, _CLOSED_DENSITY, materials.density)
 
 
 def _numbers(materials: Materials) -> Kinds:
