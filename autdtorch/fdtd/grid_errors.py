@@ -99,6 +99,16 @@ def shape_errors(matrix: Tensor, free: Tensor, region: Region) -> Tensor:
     return errors
 
 
+def hardening_errors(matrix: Tensor, free: Tensor, region: Region) -> Tensor:
+    """Return the relative errors (P,) of the rows of a matrix (P, M) as heavy bodies are taken as sound-hard.
+
+    What passes them is known relative to the field in free space (P, M); in their shadow it is much of it.
+    """
+    passing = math.hypot(*(body.hardening for body in region.bodies))
+    errors: Tensor = passing * free.norm(dim=1) / sizes(matrix, free)
+    return errors
+
+
 def _scattered(matrix: Tensor, free: Tensor) -> Tensor:
     """Return the share (P,) of the scattered field in rows of a matrix (P, M), at most 1.
 

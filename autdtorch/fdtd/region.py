@@ -53,6 +53,8 @@ class Body:
     fluid: Fluid | None  # its material, None where it is sound-hard
     continued: bool = False  # whether it continues through the boundary layers instead of ending before them
     uncertainty: float = 0.0  # distance [m] by which its surface may be off (rms)
+    # relative difference of the field that comes from taking its material as sound-hard, in front of it
+    hardening: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from typing import Literal, overload
 import torch
 
 from autdtorch.analytic.green import free_space_matrix
-from autdtorch.fdtd.grid_errors import grid_errors, shape_errors, sizes
+from autdtorch.fdtd.grid_errors import grid_errors, hardening_errors, shape_errors, sizes
 from autdtorch.fdtd.turning import axes_along, flat_faces
 from autdtorch.propagators.bodies import ScatteringBodies, bodies_at, scattered_waves
 from autdtorch.propagators.body_matrix import Placed, Solver, placed
@@ -177,7 +177,8 @@ class OperatorPropagator:
         other = second.transfer_matrix(points)
         others = [(other, second.spacing)]
         errors = grid_errors(matrix, free, self.spacing, others, self._plan.law)
-        return self.tolerance + errors + shape_errors(matrix, free, region)
+        known = shape_errors(matrix, free, region) + hardening_errors(matrix, free, region)
+        return self.tolerance + errors + known
 
     @one_library_thread()
     def field(self, drive: torch.Tensor, points: ArrayLike) -> torch.Tensor:

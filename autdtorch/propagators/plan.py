@@ -90,6 +90,9 @@ _BESIDE, _SHARE_INSIDE = 2.0, 0.5
 an obstacle of another sound speed."""
 
 
+_HARDENED = 0.25
+"""Share of the error asked for up to which bodies are taken as rigid, where the spacing is chosen by it."""
+
 _MOST_BODIES, _MOST_WAVES = 3, 2000
 """Bodies, and waves around all, up to which "auto" takes scattering operators: more are slower than a box."""
 
@@ -132,6 +135,11 @@ class Plan:
         """Return a plan of the same method with another spacing [m], tolerance and time step [s]."""
         _, grouping = choose_grids(self.region, self.method, spacing, tolerance, self.runs)
         return replace(self, spacing=spacing, tolerance=tolerance, time_step=time_step, grouping=grouping)
+
+    @property
+    def with_materials(self) -> Self:
+        """The plan without bodies that are taken as rigid; see `hardened`."""
+        return replace(self, region=hardened(region_of(self.scene), 0.0)).at(self.spacing, self.tolerance)
 
     @property
     def second(self) -> Self:
@@ -283,11 +291,12 @@ def plan(
     """Plan a simulation, with the arguments of `make_propagator`; no spacing gives the coarsest."""
     require_kind("scene", scene, Scene)
     region, kernel, precision = region_of(scene), available_kernel(kernel, device), precision_of(dtype)
-    spacing = coarsest_spacing(region) if spacing is None else positive("spacing", spacing, "m")
     tolerance = positive("tolerance", tolerance)
     if tolerance >= 1:
         raise invalid("tolerance", tolerance, "must be in (0, 1)")
-    region = hardened(region, tolerance)
+    most = _HARDENED * tolerance if spacing is None else tolerance
+    spacing = coarsest_spacing(region) if spacing is None else positive("spacing", spacing, "m")
+    region = hardened(region, most)
     max_periods = integer_at_least("max_periods", max_periods, 1)
     time_step = None if time_step is None else positive("time_step", time_step, "s")
     require_one_of("method", method, ("auto", "free_space", "box", "full", "operator"))

@@ -36,6 +36,9 @@ _AIM = 0.5
 _SHAPE = 3.0
 """Ratio of the errors of uncertain surfaces and of the grid from which a finer grid is of no use."""
 
+_HARDENING = 0.3
+"""Error of bodies taken as rigid, relative to the tolerance, from which their materials count."""
+
 _SETTLED = 0.03
 """Distance to the steady state at which runs end, relative to the tolerance."""
 
@@ -56,10 +59,10 @@ class Budget:
     def fits(self, plan: Plan, last: Plan, taken: float) -> bool:
         """Return whether a plan is expected to fit, after the `last` one took `taken` [s].
 
-        Without limits every plan does: one that the machine cannot hold is refused.
+        Without limits every plan does that the machine can hold.
         """
         if self.is_unlimited:
-            return True
+            return plan.is_feasible()
         spent = time.perf_counter() - self.begin
         in_time = self.seconds is None or spent + taken * plan.work / last.work <= self.seconds
         return in_time and (self.memory is None or plan.memory <= self.memory) and plan.is_feasible()
@@ -88,20 +91,26 @@ def _refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedP
     while True:
         plan.require_feasible("tolerance", tolerance)
         begin, found = time.perf_counter(), SimulatedPropagator(plan, cache, others)
-        error, shape = found.known_errors()
+        error, shape, hardening = found.known_errors()
         taken = time.perf_counter() - begin
         logger.debug("spacing %.3g mm: estimated error %.2g", 1e3 * plan.spacing, error)
+        if hardening > _HARDENING * tolerance:
+            logger.debug(
+                "obstacles taken as rigid would leave an error of %.2g: their materials count", hardening
+            )
+            return _refined(pilot.with_materials, budget, cache)
         step = _LARGEST_STEP
         if others:
             accepted = tolerance * (_BY_TWO_GRIDS if len(others) == 1 else _BY_THREE_GRIDS)
-            if error - shape <= max(accepted - shape, shape / _SHAPE):
+            known = shape + hardening
+            if error - known <= max(accepted - known, shape / _SHAPE):
                 _warn_of_shape(region, shape, error, tolerance)
                 return found
             if not math.isfinite(error):
                 reason = f"too few: at a spacing of {plan.spacing:.3g} m no run came near its steady state"
                 raise invalid("max_periods", pilot.max_periods, reason)
-            aim = max(_AIM * tolerance - shape, shape / _SHAPE)
-            wanted = aim / (error - shape) * law.growth(plan.spacing)
+            aim = max(_AIM * tolerance - known, shape / _SHAPE)
+            wanted = aim / (error - known) * law.growth(plan.spacing)
             step = min(max(plan.spacing / law.spacing_of(wanted), _SMALLEST_STEP), _LARGEST_STEP)
         for ratio in (step, _SMALLEST_STEP):
             finer = plan.at(plan.spacing / ratio, plan.tolerance, pilot.time_step)
@@ -109,7 +118,7 @@ def _refined(pilot: Plan, budget: Budget, cache: DiskCache | None) -> SimulatedP
                 break
         else:
             shown = 1e3 * plan.spacing, error, tolerance
-            logger.warning("the budget ends at %.3g mm: estimated error %.2g, tolerance %g", *shown)
+            logger.warning("time or memory end at %.3g mm: estimated error %.2g, tolerance %g", *shown)
             return found
         plan, others = finer, [*others, found]
 

@@ -39,15 +39,18 @@ def region_of(scene: Scene) -> Region:
 def hardened(region: Region, tolerance: float) -> Region:
     """Return the region with its hard bodies rigid, where that changes the field by less than a tolerance.
 
-    A body that a later one may cut into keeps its material: what is left of it may be thin. No sound enters
-    the cavities of rigid bodies, so they are filled.
+    That is relative to the field in free space: errors count it (`hardening_errors`). A body that a later one
+    may cut into keeps its material: what is left of it may be thin. No sound enters the cavities of rigid
+    bodies, so they are filled.
     """
     bodies, hard = [], []
     for index, body in enumerate(region.bodies):
         whole = not any(_overlap(body.shape, later.shape) for later in region.bodies[index + 1 :])
-        if body.fluid is not None and whole and difference_from_rigid(body, region) <= tolerance:
-            hard.append(str(index))
-            body = replace(body, fluid=None)
+        if body.fluid is not None and whole:
+            difference = difference_from_rigid(body, region)
+            if difference <= tolerance:
+                hard.append(str(index))
+                body = replace(body, fluid=None, hardening=difference)
         if body.fluid is None and whole:
             body = replace(body, shape=cast(Obstacle, body.shape).filled())
         bodies.append(body)

@@ -13,7 +13,7 @@ from typing import Literal, Protocol, overload, runtime_checkable
 import torch
 
 from autdtorch.analytic.green import PAIR_BYTES, free_space_matrix
-from autdtorch.fdtd.grid_errors import errors_by_grids, grid_errors, shape_errors, sizes
+from autdtorch.fdtd.grid_errors import errors_by_grids, grid_errors, hardening_errors, shape_errors, sizes
 from autdtorch.propagators.box import BoxSimulation
 from autdtorch.propagators.cache import DiskCache, cache_key
 from autdtorch.propagators.full import DomainSimulation
@@ -34,6 +34,8 @@ logger = logging.getLogger(__name__)
 # Periods from which a run tells of a resonance. Runs of bodies without any take 15 to 60; a quality factor is
 # about half the periods, and a grid of 1.3 mm shifts frequencies by 0.2 %
 _RINGING = 100
+
+_FAINT = 1e-7  # Pressure relative to that in free space, -140 dB, which is rounding in single precision
 
 # Ratio of periods from which another grid is next to a resonance that this one is not: it tells of that alone
 _LONGER = 1.5
@@ -101,11 +103,12 @@ class SimulatedPropagator:
         self._simulation = DomainSimulation(plan) if plan.method == "full" else boxes(plan)
         self._kept = KeptMatrices(len(plan.scene.array))
         self._transducers_ran = self._near_logged = False
-        self._near_points_logged = self._enclosed_logged = self._ringing_logged = False
+        self._near_points_logged = self._enclosed_logged = False
+        self._ringing_logged = self._faint_logged = False
 
     def __repr__(self) -> str:
         """Scene, settings and number of runs."""
-        settings = f"{self.method}, spacing {1e3 * self.spacing:.4g} mm, tolerance {self.tolerance:g}"
+        settings = f"{self.method}, spacing {1e3 * self.spacing:.4g} mm, steady to {self.tolerance:g}"
         return f"SimulatedPropagator(scene {self.scene.name!r}, {settings}, {len(self.runs)} runs)"
 
     @property
@@ -175,6 +178,8 @@ class SimulatedPropagator:
         if places is not None:
             self._report_near(places)
         self._report_enclosed(self.scene.control_points if places is None else places, result.matrix.mT)
+        if places is None:
+            self._report_faint(result.matrix)
         if with_error:
             self._report_ringing(result.periods)
         self._report()
@@ -190,15 +195,15 @@ class SimulatedPropagator:
         result = self._result(places)
         others = [(other._result(places), other.spacing) for other in self._others]
         free = self._free(places)
-        settling: torch.Tensor = result.error * result.matrix.norm() / sizes(result.matrix, free)
+        settling = result.error * result.matrix.norm() / sizes(result.matrix, free)
+        settling = torch.where(result.matrix.any(dim=1), settling, 0.0)
         self._report_ringing(max(one.periods for one in (result, *(other for other, _ in others))))
-        errors = self._errors(result, others, free) + settling
-        return torch.where(result.matrix.any(dim=1), errors, 0.0)  # where no sound is, that is exact
+        return self._errors(result, others, free) + settling
 
     def _errors(
         self, result: TransferMatrix, others: Sequence[tuple[TransferMatrix, float]], free: torch.Tensor
     ) -> torch.Tensor:
-        """Return the errors (P,) of the rows of a matrix by grid and shape.
+        """Return the errors (P,) of the rows of a matrix by grid, shape and bodies taken as rigid.
 
         Rows of the matrices on `others`, grids and their spacings [m], and in free space belong to them.
         """
@@ -208,7 +213,9 @@ class SimulatedPropagator:
             errors_by_grids if self.method == "full" else grid_errors
         )  # only boxes know the incident field
         errors = of_grids(matrix, free, self.spacing, grids, self._plan.law)
-        return errors + shape_errors(matrix, free, self._plan.region)
+        errors = torch.where(matrix.any(dim=1), errors, 0.0)  # silence is exact
+        region = self._plan.region
+        return errors + shape_errors(matrix, free, region) + hardening_errors(matrix, free, region)
 
     def _free(self, points: torch.Tensor | None) -> torch.Tensor:
         """Return the matrix of points in free space, by default of the control points."""
@@ -306,17 +313,17 @@ class SimulatedPropagator:
         return replace(result, error=result.error + float(whole), periods=periods)
 
     @one_library_thread()
-    def known_errors(self) -> tuple[float, float]:
-        """Simulate the control points; return their error, and the part of it by uncertain surfaces.
+    def known_errors(self) -> tuple[float, float, float]:
+        """Simulate the control points; return their error, and its parts by uncertain surfaces and hardening.
 
-        The error is that by the grids given, infinite without any.
+        The error is that by the grids given, infinite without any. For the last part see `hardening_errors`.
         """
-        if not self._given:
-            self._result(None)
-            return math.inf, 0.0
-        result = self._with_error(None)
+        result = self._with_error(None) if self._given else self._result(None)
         matrix, free = (part.reshape(1, -1) for part in (result.matrix, self._free(None)))
-        return result.error, float(shape_errors(matrix, free, self._plan.region))
+        shape, hardening = (
+            float(of(matrix, free, self._plan.region)) for of in (shape_errors, hardening_errors)
+        )
+        return result.error if self._given else math.inf, shape, hardening
 
     def _report_near(self, points: torch.Tensor) -> None:
         """Log once, of the points of any call, which are next to a surface."""
@@ -331,6 +338,16 @@ class SimulatedPropagator:
             place = tuple(round(1e3 * entry, 3) for entry in silent[found][0].tolist())
             more = f", and of {count - 1} more," if count > 1 else ""
             logger.warning("rigid obstacles enclose the point at %s mm: its pressure%s is 0", place, more)
+
+    def _report_faint(self, matrix: torch.Tensor) -> None:
+        """Log once that what control points get is rounding: methods would make foci of it."""
+        size, free = matrix.norm(dim=1), self._free(None).norm(dim=1)
+        faint = self.scene.control_points[(size > 0) & (size < _FAINT * free)]
+        if len(faint) and not self._faint_logged:
+            self._faint_logged = True
+            place = tuple(round(1e3 * entry, 3) for entry in faint[0].tolist())
+            more = f", nor {len(faint) - 1} more" if len(faint) > 1 else ""
+            logger.warning("no sound reaches the point at %s mm%s: its pressure is rounding", place, more)
 
     def _report_ringing(self, periods: int) -> None:
         """Log once that obstacles resonate; see `warn_of_ringing`."""

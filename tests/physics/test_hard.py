@@ -12,8 +12,9 @@ from autdtorch import analytic
 from autdtorch.propagators import make_propagator
 from autdtorch.propagators.plan import plan
 from autdtorch.propagators.scene_region import difference_from_rigid, region_of
+from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Sphere
-from autdtorch.scene.scene import OverlapWarning
+from autdtorch.scene.scene import OverlapWarning, Scene
 
 CENTER = (12.2e-3, 11.9e-3, 12.1e-3)
 STEEL = {"density": 7800.0, "sound_speed": 5900.0}
@@ -60,6 +61,23 @@ def test_steel_is_rigid():
 )
 def test_others_keep_their_material(body, tolerance):
     assert plan(small_scene((body,)), "box", 0.5e-3, tolerance).region.bodies[0].fluid is not None
+
+
+@pytest.mark.parametrize(("density", "thickness"), [(60.0, 5e-3), (150.0, 3e-3)])
+def test_what_passes_a_heavy_plate_counts_in_its_shadow(density, thickness):
+    """It is below the tolerance relative to the field in free space, and far above it behind the plate."""
+    plate = Box((0.0, 0.0, 0.0), (60e-3, 60e-3, thickness), density=density, sound_speed=1200.0)
+    array = TransducerArray([(x, 2e-3, -25e-3) for x in (-8e-3, 0.0, 8e-3)], (0, 0, 1))
+    scene = Scene(array, AIR, 40e3, [(3e-3, 1e-3, 12e-3), (-5e-3, 4e-3, 14e-3)], (plate,))
+    asked = 0.1
+    matrix, claimed = make_propagator(scene, "box", None, asked).transfer_matrix(return_error=True)
+    fine = make_propagator(scene, "box", 0.9e-3, 1e-3).transfer_matrix()
+    assert relative_error(matrix, fine) < asked
+    assert claimed < asked
+    soft, rigid = (make_propagator(scene, "box", 1.3e-3, tolerance) for tolerance in (1e-3, 0.1))
+    true = relative_error(rigid.transfer_matrix(), soft.transfer_matrix())
+    assert true > 0.03
+    assert rigid.transfer_matrix(return_error=True)[1] > true / 3
 
 
 def test_a_body_that_a_later_one_cuts_keeps_its_material():
