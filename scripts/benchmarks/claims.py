@@ -1,9 +1,10 @@
 """What errors are claimed, and what they are, by family of scenes.
 
 Fills in a block of benchmarks.md, or prints the table of some families. Random scenes of `shared/families.py`
-are asked for by tolerance. The truth is an exact series, or a grid 2.5 times finer that a second one confirms;
-scenes whose truth is not known to a third of the tolerance are left out. Required: in every family at most 5 %
-of the scenes miss their tolerance without a warning, and claims are within a factor of three in 90 %.
+are asked for by tolerance. The truth is an exact series, or a grid 2.5 times finer that a second one
+confirms; scenes whose truth is not known to a third of the tolerance are left out. Required: in every family
+at most 5 % of the scenes miss their tolerance without a warning, and claims are within a factor of three in
+90 %.
 
     python scripts/benchmark.py claims              about 20 minutes on 2 idle cores, most of them for shadows
     python scripts/benchmark.py claims --families plate slit --first 100 --scenes 10
