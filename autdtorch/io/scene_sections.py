@@ -109,7 +109,7 @@ def _obstacle(obstacle: Obstacle, name: str, where: str) -> dict[str, Any]:
     known = {one.name: one.default for one in fields(obstacle) if one.init}
     given = {name: getattr(obstacle, name) for name in known}
     if isinstance(obstacle, Mesh):
-        given["path"] = f"{name}.obj"
+        given |= {"path": f"{name}.obj", "repair": False}  # its triangles are those of the body
     elif isinstance(obstacle, VoxelMask):
         section["path"] = f"{name}.npz"
         del given["mask"]

@@ -1,4 +1,4 @@
-"""OBJ and PLY files as other programs write them."""
+"""STL, OBJ and PLY files as other programs write them."""
 
 import struct
 from pathlib import Path
@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from autdtorch.scene.obstacles.mesh_file import read_obj, read_ply
+from autdtorch.scene.obstacles import Mesh
+from autdtorch.scene.obstacles.mesh_file import read_mesh
 
 CORNERS = [(0.0, 0.0, 0.0), (1.5, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -2.0)]
 FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
@@ -26,14 +27,119 @@ OBJ = {
 def test_obj(tmp_path: Path, text: str) -> None:
     path = tmp_path / "body.obj"
     path.write_bytes(text.encode())
-    vertices, faces = read_obj(str(path))
+    _, (vertices, faces) = read_mesh(path)
     assert vertices.tolist() == [list(corner) for corner in CORNERS]
     assert faces.tolist() == [list(face) for face in FACES]
 
 
-def test_a_polygon_of_an_obj_file_is_a_fan_of_triangles(tmp_path: Path) -> None:
-    (tmp_path / "body.obj").write_text(VERTICES + "f 1 2 3 4\n", encoding="utf-8")
-    assert read_obj(str(tmp_path / "body.obj"))[1].tolist() == [[0, 1, 2], [0, 2, 3]]
+OUTLINE = [(0, 0), (20, 0), (20, 10), (10, 10), (10, 20), (0, 20)]
+AREA, HEIGHT = 300.0, 5.0
+
+
+def prism(first: int) -> tuple[list[tuple[float, float, float]], list[list[int]]]:
+    """Return an L with caps of six corners, the first of them given: no fan covers it from everywhere."""
+    ring = OUTLINE[first:] + OUTLINE[:first]
+    sides = [[i, (i + 1) % 6, (i + 1) % 6 + 6, i + 6] for i in range(6)]
+    return [(x, y, z) for z in (0.0, HEIGHT) for x, y in ring], [[5, 4, 3, 2, 1, 0], [*range(6, 12)], *sides]
+
+
+def volume(mesh: Mesh) -> float:
+    vertices, faces = mesh.surface()
+    return float(vertices[faces].det().sum()) / 6
+
+
+@pytest.mark.parametrize("first", range(6))
+@pytest.mark.parametrize("kind", ["obj", "ascii", "binary_little_endian"])
+def test_polygons_need_not_be_convex(tmp_path: Path, kind: str, first: int) -> None:
+    """Files mix lengths, and faces carry texture coordinates."""
+    vertices, faces = prism(first)
+    path = tmp_path / ("body.obj" if kind == "obj" else "body.ply")
+    if kind == "obj":
+        lines = [f"v {x} {y} \\\n {z}" for x, y, z in vertices]
+        lines += ["f " + " ".join(f"{corner + 1}/1" for corner in face) for face in faces]
+        path.write_bytes(b"\xef\xbb\xbf" + "\n".join(lines).encode())
+    else:
+        head = f"ply\nformat {kind} 1.0\nelement vertex {len(vertices)}\n"
+        head += "".join(f"property float {axis}\n" for axis in "xyz") + f"element face {len(faces)}\n"
+        head += "property list uchar int vertex_indices\nproperty list uchar float texcoord\nend_header\n"
+        rows = [[*corner] for corner in vertices]
+        lists = [[len(face), *face, 2 * len(face), *[0.5] * (2 * len(face))] for face in faces]
+        if kind == "ascii":
+            body = "\n".join(" ".join(map(str, row)) for row in [*rows, *lists]).encode()
+        else:
+            body = b"".join(struct.pack("<3f", *row) for row in rows)
+            for face in faces:
+                count = len(face)
+                texture = struct.pack(f"<B{2 * count}f", 2 * count, *[0.5] * (2 * count))
+                body += struct.pack(f"<B{count}i", count, *face) + texture
+        path.write_bytes(head.encode() + body)
+    assert volume(Mesh(path, rigid=True)) == pytest.approx(AREA * HEIGHT)
+
+
+def test_a_polygon_that_crosses_itself_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "body.obj").write_text("v 0 0 0\nv 1 1 0\nv 1 0 0\nv 0 2 0\nf 1 2 3 4\n", "utf-8")
+    with pytest.raises(ValueError, match="face 0 of 4 vertices crosses itself"):
+        read_mesh(tmp_path / "body.obj")
+
+
+def stl_text(change: str = "") -> str:
+    corners = np.array(CORNERS)[np.array(FACES)]
+    lines = ["solid body"]
+    for triangle in corners:
+        lines += ["facet normal 0 0 0", " outer loop"]
+        lines += [f"  vertex {x} {y} {z}" for x, y, z in triangle] + [" endloop", "endfacet"]
+    text = "\n".join([*lines, "endsolid body", ""])
+    return text.upper() if change == "capitals" else text
+
+
+def stl_binary(name: bytes = b"body", count: int = len(FACES)) -> bytes:
+    corners = np.array(CORNERS, "<f4")[np.array(FACES)]
+    records = b"".join(struct.pack("<12fH", 0, 0, 0, *triangle.ravel(), 0) for triangle in corners)
+    return name.ljust(80) + struct.pack("<I", count) + records
+
+
+STL = {
+    "text": stl_text().encode(),
+    "capitals": stl_text("capitals").encode(),
+    "a byte order mark": b"\xef\xbb\xbf" + stl_text().encode(),
+    "blank lines first": b"\n  \n " + stl_text().encode(),
+    "line ends of Windows": stl_text().replace("\n", "\r\n").encode(),
+    "binary": stl_binary(),
+    "binary, solid": stl_binary(b"solid body"),
+    "binary, solid, a byte more": stl_binary(b"solid body") + b"\n",
+    "binary, solid, many bytes more": stl_binary(b"solid body") + b"solid facet" * 40,
+}
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("content", STL.values(), ids=STL.keys())
+def test_stl(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "body.stl").write_bytes(content)
+    assert volume(Mesh(tmp_path / "body.stl", rigid=True)) == pytest.approx(0.5)
+
+
+NO_MESH = {
+    "a.stl": (b"", "it is empty"),
+    "b.stl": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "Git LFS pointer"),
+    "c.obj": (b"\n<!DOCTYPE html><html></html>", "page of HTML"),
+    "d.ply": (ply_head := b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
+              b"property float z\nend_header\n0 0 0\n", "no faces, only points"),
+    "e.obj": (b"v 0 0 0\nv 1 0 0\n", "2 points and no faces"),
+    "f.stl": (stl_binary()[:-10], "its head tells of 4 triangles, 3 fit"),
+    "g.stl": (stl_text().replace("endfacet", "", 1).encode(), "4 facets begin and 3 end"),
+    "h.stl": (b"some other text", "neither text with facets nor a binary STL file"),
+    "i.ply": (ply_head.replace(b"float z", b"real z"), "type 'real'"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NO_MESH)
+def test_what_is_no_mesh_is_named(tmp_path: Path, name: str) -> None:
+    content, reason = NO_MESH[name]
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=r"^Mesh\.path: ") as caught:
+        Mesh(tmp_path / name, rigid=True)
+    assert reason in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 def ply(kind: str, corners: str = "vertex_indices") -> bytes:
@@ -68,7 +174,7 @@ end_header
 @pytest.mark.parametrize("corners", ["vertex_indices", "vertex_index"])
 def test_ply(tmp_path: Path, kind: str, corners: str) -> None:
     (tmp_path / "body.ply").write_bytes(ply(kind, corners))
-    vertices, faces = read_ply(str(tmp_path / "body.ply"))
+    _, (vertices, faces) = read_mesh(tmp_path / "body.ply")
     assert (vertices.dtype, faces.dtype) == (np.float64, np.int64)
     assert vertices.tolist() == [list(corner) for corner in CORNERS]
     assert faces.tolist() == [list(face) for face in FACES]
@@ -83,4 +189,4 @@ def test_a_float_index_that_is_not_a_whole_number_is_refused(tmp_path: Path, ind
         head + b"end_header\n" + body[: 4 * 21] + faces + struct.pack("<ii", 0, 1)
     )
     with pytest.raises(ValueError, match="not whole numbers"):
-        read_ply(str(tmp_path / "body.ply"))
+        read_mesh(tmp_path / "body.ply")

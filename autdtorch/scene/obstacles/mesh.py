@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Self
@@ -13,10 +14,13 @@ from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.base import Obstacle
 from autdtorch.scene.obstacles.mesh_distance import MeshDistance
 from autdtorch.scene.obstacles.mesh_file import read_mesh
+from autdtorch.scene.obstacles.mesh_repair import repaired
 from autdtorch.scene.obstacles.mesh_solid import Triangles, outer_parts, solid_of
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.digest import digest_of
-from autdtorch.utils.validation import Vector, finite_vector, invalid, positive, real_tensor, within
+from autdtorch.utils.validation import Vector, boolean, finite_vector, invalid, positive, real_tensor, within
+
+logger = logging.getLogger(__name__)
 
 _MOST = 2**53  # largest whole number that is exact in double precision
 
@@ -49,6 +53,9 @@ class Mesh(Obstacle):
         scale: metres per unit of the file, > 0; 1e-3 for a file in millimetres.
         offset: position of the file's origin (3,) [m].
         rotation: angles (3,) [rad] about the file's origin; see `autdtorch.scene.geometry.rotation_matrix`.
+        repair: whether to mend what is not watertight: join vertices up to 1e-3 of the extent apart, turn
+            triangles over, leave out doubled ones and stray pieces, close holes up to 30 % of the area, and
+            make the surface anew from winding numbers where it crosses itself. A warning says what was done.
         vertices: (V, 3) [m], float64, in the scene.
         faces: vertices of each triangle (F, 3), int64, counter-clockwise as seen from outside.
         digest: of vertices and faces. Meshes of equal digest and material are equal, whatever their files.
@@ -63,6 +70,7 @@ class Mesh(Obstacle):
     scale: float = field(default=1.0, compare=False)
     offset: Vector = field(default=(0.0, 0.0, 0.0), compare=False)
     rotation: Vector = field(default=(0.0, 0.0, 0.0), compare=False)
+    repair: bool = field(default=False, compare=False)
     vertices: torch.Tensor = field(init=False, repr=False, compare=False)
     faces: torch.Tensor = field(init=False, repr=False, compare=False)
     digest: str = field(init=False)
@@ -73,7 +81,8 @@ class Mesh(Obstacle):
         object.__setattr__(self, "scale", positive("Mesh.scale", self.scale))
         object.__setattr__(self, "offset", finite_vector("Mesh.offset", self.offset))
         object.__setattr__(self, "rotation", finite_vector("Mesh.rotation", self.rotation, "rad"))
-        path = self.path if isinstance(self.path, _Source) else _read(self.path)
+        repair = boolean("Mesh.repair", self.repair)
+        path = self.path if isinstance(self.path, _Source) else _read(self.path, repair)
         object.__setattr__(self, "path", path)
         vertices = self.scale * torch.from_numpy(path.vertices) @ rotation_matrix(self.rotation).T
         vertices = vertices + vertices.new_tensor(self.offset)
@@ -88,6 +97,7 @@ class Mesh(Obstacle):
         scale: float = 1.0,
         offset: Vector = (0.0, 0.0, 0.0),
         rotation: Vector = (0.0, 0.0, 0.0),
+        repair: bool = False,
         *,
         density: float | None = None,
         sound_speed: float | None = None,
@@ -103,8 +113,10 @@ class Mesh(Obstacle):
         """
         source = _Source("")
         with within("Mesh.surface"):
-            source.vertices, source.faces = solid_of(*_triangles(surface))
-        return cls(source, scale, offset, rotation, density=density, sound_speed=sound_speed, rigid=rigid)
+            source.vertices, source.faces = _solid(_triangles(surface), boolean("repair", repair))
+        return cls(
+            source, scale, offset, rotation, repair, density=density, sound_speed=sound_speed, rigid=rigid
+        )
 
     def filled(self) -> Self:
         """Return the mesh without its cavities and what is in them; see `Obstacle.filled`."""
@@ -148,12 +160,22 @@ class Mesh(Obstacle):
         return self.path
 
 
-def _read(given: object) -> _Source:
+def _solid(triangles: Triangles, repair: bool) -> Triangles:
+    """Return the solid of triangles, repaired if asked for."""
+    if not repair:
+        return solid_of(*triangles)
+    vertices, faces, done = repaired(*triangles)
+    if done:
+        logger.warning("the mesh is repaired, in units of the file: %s", "; ".join(done))
+    return vertices, faces
+
+
+def _read(given: object, repair: bool) -> _Source:
     """Check the path of a mesh file and read it."""
     path, triangles = read_mesh(given)
     source = _Source(path)
     try:
-        source.vertices, source.faces = solid_of(*triangles)
+        source.vertices, source.faces = _solid(triangles, repair)
     except ValueError as error:
         raise invalid("Mesh.path", path, str(error)) from error
     return source

@@ -6,6 +6,8 @@ another, is a cavity of it. A part that crosses itself has no union in manifold3
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeAlias
 
@@ -14,13 +16,13 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from autdtorch.scene.obstacles.mesh_polygons import FARTHEST
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.triangles import doubled_normals, sides_of
 
 Triangles: TypeAlias = tuple[Array, Index]
 """Vertices (V, 3) and the indices of each triangle's vertices (F, 3)."""
 
-_FARTHEST = 1e50  # largest coordinate of a vertex, in units of the file; volumes do not overflow
 _EMPTY = 1e-12  # volumes below this share of area times extent are rounding errors
 _SLIVER = 1e-9  # height, relative to the extent of the mesh, below which a triangle has no certain normal
 _EQUAL = 1e-9  # relative difference of volumes and areas that differ by rounding
@@ -30,6 +32,12 @@ _BESIDE = 1e-6  # distance from a triangle of points on both sides of it, relati
 _END = 1e-6  # share of an edge, at each end, that may touch the triangles there
 _MOST_CROSSINGS = 10**6  # of edges and triangles of all parts; a union with so many takes seconds
 _TRIED = 1000  # edges on which they are counted
+# Distances, relative to the extent, between vertices that differ by rounding: the least that is tried, in
+# steps of ten, and the most. The last is 1 um for a body of 0.1 m, as of text with six decimals in metres
+_ROUNDING, _ROUNDED = 1e-9, 1.0001e-5
+_FOLDED = 1e-10  # 1 - cosine of the angle between faces that lie on each other
+_AROUND = 1e-4  # distance from a crossing at which windings are counted, relative to the extent
+_DIRECTIONS = np.array(list(itertools.product((-1.0, 0.3, 1.1), repeat=3)))
 
 
 class _Part(NamedTuple):
@@ -54,11 +62,7 @@ def solid_of(corners: Array, triangles: Index) -> Triangles:
             The message names the place, in the coordinates of `corners`.
     """
     _require_triangles(corners, triangles)
-    used, index = np.unique(triangles, return_inverse=True)
-    # STL repeats a vertex for every triangle at it.
-    vertices, number = np.unique(corners[used] + 0.0, axis=0, return_inverse=True)
-    faces = number.reshape(-1)[index.reshape(-1, 3)].astype(np.int64)
-    faces = _without_sheets(faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)])
+    vertices, faces = joined(corners, triangles)
     if not len(faces):
         raise ValueError(f"{_box(_bounds(vertices))} has no volume; must enclose a volume")
     label = _labels(vertices, faces)
@@ -71,6 +75,7 @@ def solid_of(corners: Array, triangles: Index) -> Triangles:
     solids = [part for part in parts if abs(part.volume) > _EMPTY * part.area * _extent(part.vertices)]
     if not solids:
         raise ValueError(f"{_box(whole.bounds)} has no volume; must enclose a volume")
+    _require_unfolded(vertices, faces)
     if any(map(_touches_itself, parts)):  # manifold3d may join other sheets at an edge than the parts do
         _require_simple(whole)
         _require_air_beside(whole)
@@ -79,9 +84,57 @@ def solid_of(corners: Array, triangles: Index) -> Triangles:
     if len(parts) == 1 and not slivers:
         return whole.vertices, whole.faces
     _require_few_crossings(whole)
-    joined = _union(solids)
-    chosen = joined if slivers or not _agree(joined, parts) else whole
+    union = _union(solids)
+    chosen = union if slivers or not _agree(union, parts) else whole
     return chosen.vertices, chosen.faces
+
+
+def joined(corners: Array, triangles: Index, farthest: float = _ROUNDED) -> Triangles:
+    """Return the distinct vertices of triangles, and the faces that have an area.
+
+    STL repeats a vertex for every triangle at it, in single precision or as text, with rounding errors: at
+    edges that are open, vertices up to `farthest` apart, relative to the extent, become one if that closes
+    edges. The smallest distance that closes all counts.
+    """
+    used, index = np.unique(triangles, return_inverse=True)
+    vertices, number = np.unique(corners[used] + 0.0, axis=0, return_inverse=True)
+    whole = number.reshape(-1)[index.reshape(-1, 3)].astype(np.int64)
+    faces, open_ends = _cleaned(whole), open_edges(_cleaned(whole))
+    apart = _ROUNDING
+    while len(open_ends) and apart <= farthest:
+        nearer = _near(vertices, np.unique(open_ends), apart * _extent(vertices))[whole]
+        tried = _cleaned(nearer)
+        left = open_edges(tried)
+        if len(left) < len(open_ends):
+            whole, faces, open_ends = nearer, tried, left
+        apart *= 10
+    return vertices, faces
+
+
+def open_edges(faces: Index) -> Index:
+    """Return the edges (n, 2) at which as many triangles do not meet from either side, and not twice."""
+    ends = sides_of(faces)
+    edges, edge = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True)
+    up = np.where(ends[:, 0] < ends[:, 1], 1, -1)
+    return np.asarray(edges[np.bincount(edge.reshape(-1), weights=up, minlength=len(edges)) != 0])
+
+
+def _cleaned(faces: Index) -> Index:
+    """Leave out triangles with two equal corners, and pairs of opposite ones."""
+    return _without_sheets(faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)])
+
+
+def _near(vertices: Array, some: Index, distance: float) -> Index:
+    """Return for each vertex the one that stands for it: of `some` up to a distance apart, the first."""
+    from scipy.spatial import KDTree
+
+    pairs = KDTree(vertices[some]).query_pairs(distance, output_type="ndarray")
+    graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(some),) * 2)
+    label = connected_components(graph, directed=False)[1]
+    _, first = np.unique(label, return_index=True)
+    found = np.arange(len(vertices))
+    found[some] = some[first[label]]
+    return found
 
 
 def outer_parts(vertices: Array, faces: Index) -> NDArray[np.bool_]:
@@ -118,9 +171,9 @@ def _require_triangles(corners: Array, triangles: Index) -> None:
         raise ValueError(f"faces of shape {triangles.shape}; must be triangles (F, 3), F >= 1")
     if corners.ndim != 2 or corners.shape[1] != 3:
         raise ValueError(f"vertices of shape {corners.shape}; must be (V, 3)")
-    if len(far := np.flatnonzero(~(np.abs(corners) <= _FARTHEST).all(axis=1))):
+    if len(far := np.flatnonzero(~(np.abs(corners) <= FARTHEST).all(axis=1))):
         found = f"vertex {far[0]} at {_place(corners[far[0]])}"
-        raise ValueError(f"{found}; must be triangles with finite vertices, none beyond {_FARTHEST:g}")
+        raise ValueError(f"{found}; must be triangles with finite vertices, none beyond {FARTHEST:g}")
     if len(wrong := np.flatnonzero(((triangles < 0) | (triangles >= len(corners))).any(axis=1))):
         found = f"triangle {wrong[0]} of vertices {', '.join(map(str, triangles[wrong[0]]))}"
         raise ValueError(f"{found}; must be triangles of the {len(corners)} vertices, counted from 0")
@@ -152,7 +205,9 @@ def _labels(vertices: Array, faces: Index) -> Index:
         place = " to ".join(map(_place, vertices[list(divmod(edges[first], len(vertices)))]))
         found = f"{len(wrong)} of its {len(edges)} edges do not join two triangles of one orientation"
         where = f"the first, {place}, has {up[first]} of one and {down[first]} of the other"
-        raise ValueError(f"{found} ({where}); must be watertight")
+        turned = (up + down == 2).all()
+        why = "no hole, but triangles are turned over" if turned else "must be watertight"
+        raise ValueError(f"{found} ({where}); {why}; repair=True may mend it")
     owner = np.tile(np.arange(len(faces)), 3)
     one, other = (owner[chosen][np.lexsort((owner[chosen], edge[chosen]))] for chosen in (upwards, ~upwards))
     graph = coo_array((np.ones(len(one)), (one, other)), shape=(len(faces),) * 2)
@@ -173,12 +228,43 @@ def _part(vertices: Array, faces: Index) -> _Part:
     return _Part(own, index, float(np.linalg.det(corners).sum() / 6), float(_areas(corners).sum()))
 
 
+def _require_unfolded(vertices: Array, faces: Index) -> None:
+    """Check that no two triangles at an edge lie on each other."""
+    ends = sides_of(faces)
+    _, edge, count = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True)
+    order = np.argsort(edge.reshape(-1), kind="stable")
+    pairs = order[np.repeat(count == 2, count)].reshape(-1, 2)
+    corners = vertices[faces]
+    normal = doubled_normals(corners)
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    size = np.linalg.norm(normal, axis=1)
+    certain = size > _SLIVER * _extent(vertices) * longest
+    one, other = pairs.T % len(faces)
+    cosine = (normal[one] * normal[other]).sum(axis=1)
+    folded = (cosine < (_FOLDED - 1) * size[one] * size[other]) & certain[one] & certain[other]
+    if folded.any():
+        place = _place(vertices[ends[pairs[folded][0, 0]]].mean(axis=0))
+        raise ValueError(
+            f"the surface is folded back on itself at {place}; must be simple; repair=True may mend it"
+        )
+
+
 def _require_simple(part: _Part) -> None:
-    """Check that no edge passes through a triangle."""
+    """Check that no edge passes through a triangle; a part may touch itself.
+
+    Where two sheets cross, one of the four spaces between them is wound around twice or backwards.
+    """
     tree, first, along = _edges(part)
     hit, share, _ = tree.intersect_ray_first(part.vertices, part.faces, first, along, 1.0)
     crossed = np.flatnonzero(hit >= 0)
-    _refuse_crossing(first[crossed] + share[crossed, None] * along[crossed])
+    if not len(crossed):
+        return
+    some = crossed[np.linspace(0, len(crossed) - 1, min(len(crossed), _TRIED)).astype(np.int64)]
+    places = first[some] + share[some, None] * along[some]
+    around = places[:, None] + _AROUND * _extent(part.vertices) * _DIRECTIONS
+    turns = winding_number(part.vertices, part.faces, around.reshape(-1, 3)).reshape(len(some), -1)
+    turns = turns.round() * math.copysign(1, part.volume)
+    _refuse_crossing(places[((turns < 0) | (turns > 1)).any(axis=1)])
 
 
 def _require_few_crossings(whole: _Part) -> None:
@@ -290,12 +376,12 @@ def _manifold(part: _Part) -> Any:
     return body
 
 
-def _agree(joined: _Part, parts: Sequence[_Part]) -> bool:
+def _agree(union: _Part, parts: Sequence[_Part]) -> bool:
     """Return whether a union has the volume and the area of its parts: none overlaps another."""
     volumes, areas = np.array([(part.volume, part.area) for part in parts]).T
     return all(
         abs(total - each.sum()) <= _EQUAL * np.abs(each).sum()
-        for total, each in ((joined.volume, volumes), (joined.area, areas))
+        for total, each in ((union.volume, volumes), (union.area, areas))
     )
 
 

@@ -1,0 +1,190 @@
+"""Repair of surfaces that enclose nothing as they are: scans with holes, turned triangles, crossing parts.
+
+What is mended in its place comes first: vertices that nearly agree, doubled triangles, orientation, stray
+pieces, holes. What crosses itself after that is made anew from winding numbers (Jacobson et al. 2013,
+doi:10.1145/2461912.2461916), which tell inside from outside of any soup of triangles.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components
+
+from autdtorch.scene.obstacles.mesh_polygons import Polygons, triangulated
+from autdtorch.scene.obstacles.mesh_solid import Triangles, joined, open_edges, solid_of, winding_number
+from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.triangles import doubled_normals, sides_of
+
+_FARTHEST = 1.0001e-3  # distance between vertices that are taken as one, relative to the extent
+_STRAY = 1e-3  # share of all area below which an open piece is no part of the body
+_LARGEST_HOLE = 0.3  # area of a hole, relative to that of the surface, up to which it is closed
+_CELLS = 160  # cells along the longest side on which a surface is made anew
+
+
+class Repaired(NamedTuple):
+    """A closed surface, and what was done to it."""
+
+    vertices: Array  # (V, 3)
+    faces: Index  # (F, 3)
+    done: list[str]
+
+
+def repaired(corners: Array, triangles: Index) -> Repaired:
+    """Return the solid of triangles with faults, and what was mended, with numbers and places.
+
+    Raises:
+        ValueError: a sheet without an inside, or a hole too large to guess; the message names it.
+    """
+    try:
+        return Repaired(*solid_of(corners, triangles), [])
+    except ValueError as error:
+        reason = str(error)
+    done: list[str] = []
+    vertices, faces = joined(corners, triangles, _FARTHEST)
+    faces = _without_doubles(faces, done)
+    faces = _without_strays(vertices, faces, done)
+    faces = _oriented(vertices, faces, done)
+    vertices, faces = _closed(vertices, faces, done)
+    try:
+        return Repaired(
+            *solid_of(vertices, faces), done or [f"joined vertices up to {_FARTHEST:.0e} of its extent apart"]
+        )
+    except ValueError:
+        return Repaired(*_anew(vertices, faces, done, reason), done)
+
+
+def _without_doubles(faces: Index, done: list[str]) -> Index:
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    if len(first) < len(faces):
+        done.append(f"left out {len(faces) - len(first)} triangles that were there twice")
+    return faces[np.sort(first)]
+
+
+def _without_strays(vertices: Array, faces: Index, done: list[str]) -> Index:
+    """Leave out small pieces that are open."""
+    label = _pieces(faces)
+    area = np.bincount(label, weights=_areas(vertices, faces))
+    is_open = np.zeros(len(area), bool)
+    is_open[label[np.isin(faces, open_edges(faces)).any(axis=1)]] = True
+    stray = is_open & (area < _STRAY * area.sum())
+    if stray.any():
+        left_out = faces[stray[label]]
+        place = _place(vertices[left_out[0, 0]])
+        done.append(f"left out {stray.sum()} stray pieces of {len(left_out)} triangles, the first at {place}")
+    return np.asarray(faces[~stray[label]])
+
+
+def _oriented(vertices: Array, faces: Index, done: list[str]) -> Index:
+    """Turn triangles so that neighbours agree and most of each piece faces outwards."""
+    ends = sides_of(faces)
+    _, edge, count = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True)
+    order = np.argsort(edge.reshape(-1), kind="stable")
+    pairs = order[np.repeat(count == 2, count)].reshape(-1, 2)
+    one, other = pairs.T % len(faces)
+    opposed = (ends[pairs[:, 0]] == ends[pairs[:, 1]]).all(axis=1)  # both run along the edge the same way
+    graph = coo_array((np.ones(len(one)), (one, other)), shape=(len(faces),) * 2).tocsr()
+    against = coo_array((np.where(opposed, 2.0, 1.0), (one, other)), shape=(len(faces),) * 2).tocsr()
+    against = against.maximum(against.T)
+    number, label = connected_components(graph, directed=False)
+    turned = np.zeros(len(faces), bool)
+    for root in np.unique(label, return_index=True)[1]:
+        along, before = breadth_first_order(against, root, directed=False)
+        for face in along[1:]:
+            turned[face] = turned[before[face]] ^ (against[before[face], face] == 2)
+    faces = np.where(turned[:, None], faces[:, ::-1], faces)
+    for piece in range(number):
+        own = label == piece
+        if _signed_volume(vertices, faces[own]) < 0:
+            faces[own], turned[own] = faces[own, ::-1], ~turned[own]
+    if turned.any():
+        place = _place(vertices[faces[turned][0]].mean(axis=0))
+        done.append(f"turned {turned.sum()} triangles over, the first at {place}")
+    return faces
+
+
+def _closed(vertices: Array, faces: Index, done: list[str]) -> Triangles:
+    """Close holes by their flat outlines, or by a fan around their middle."""
+    area = _areas(vertices, faces).sum()
+    for loop in _outlines(faces):
+        rim = vertices[loop]
+        try:
+            own = loop[triangulated(Polygons(rim, np.array([len(loop)]), np.arange(len(loop))))]
+        except ValueError:  # its outline crosses itself when flat
+            vertices = np.concatenate([vertices, rim.mean(axis=0)[None]])
+            own = np.stack([loop, np.roll(loop, -1), np.full(len(loop), len(vertices) - 1)], axis=1)
+        share = _areas(vertices, own).sum() / area
+        size = f"{len(loop)} edges and {float(np.ptp(rim, axis=0).max()):.3g}"
+        found = f"a hole of {size} at {_place(rim.mean(axis=0))}"
+        if share > _LARGEST_HOLE:
+            most = f"must be at most {_LARGEST_HOLE:.0%} of that of a body"
+            raise ValueError(f"{found}, {share:.0%} of all area; {most}")
+        faces = np.concatenate([faces, own])
+        done.append(f"closed {found}")
+    return vertices, faces
+
+
+def _outlines(faces: Index) -> list[Index]:
+    """Return the holes as runs of vertices, in the direction of the faces that close them."""
+    ends = sides_of(faces)
+    here = {tuple(end) for end in ends.tolist()}
+    follow: dict[int, list[int]] = {}
+    for begin, end in sorted(here):
+        if (end, begin) not in here:
+            follow.setdefault(end, []).append(begin)
+    loops = []
+    while follow:
+        loop = [next(iter(follow))]
+        while loop[-1] in follow:
+            place = follow[loop[-1]].pop()
+            if not follow[loop[-1]]:
+                del follow[loop[-1]]
+            if place in loop:  # closed, perhaps at a vertex where two holes meet
+                begin = loop.index(place)
+                loops += [np.array(loop[begin:])] if len(loop) - begin >= 3 else []
+                loop = loop[: begin + 1]
+            else:
+                loop.append(place)
+    return loops
+
+
+def _anew(vertices: Array, faces: Index, done: list[str], reason: str) -> Triangles:
+    """Make the surface anew where a soup of triangles winds around half."""
+    import igl
+
+    lower, upper = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
+    cell = float((upper - lower).max()) / _CELLS
+    counts = np.ceil((upper - lower) / cell).astype(int) + 5
+    axes = [low + cell * (np.arange(count) - 2) for low, count in zip(lower, counts, strict=True)]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).transpose(2, 1, 0, 3).reshape(-1, 3)
+    turns = winding_number(vertices, faces, places)
+    found, triangles, _ = igl.marching_cubes(0.5 - np.abs(turns), places, *counts, 0.0)
+    if not len(triangles):
+        raise ValueError(
+            f"{reason}; it has no inside that winding numbers would tell; must be a body, not a sheet"
+        )
+    done.append(f"made the surface anew on cells of {cell:.3g}, as {reason.split(';')[0]}")
+    return solid_of(found, triangles)
+
+
+def _pieces(faces: Index) -> Index:
+    """Return the number of the piece, joined by edges, of each face (F,)."""
+    edges, edge = np.unique(np.sort(sides_of(faces), axis=1), axis=0, return_inverse=True)
+    owner = np.tile(np.arange(len(faces)), 3)
+    graph = coo_array((np.ones(len(owner)), (owner, edge.reshape(-1))), shape=(len(faces), len(edges)))
+    return np.asarray(connected_components(graph @ graph.T, directed=False)[1], np.int64)
+
+
+def _areas(vertices: Array, faces: Index) -> Array:
+    return np.asarray(np.linalg.norm(doubled_normals(vertices[faces]), axis=1) / 2)
+
+
+def _signed_volume(vertices: Array, faces: Index) -> float:
+    corners = vertices[faces] - vertices[faces].mean(axis=(0, 1))
+    return float(np.linalg.det(corners).sum() / 6)
+
+
+def _place(point: Array) -> str:
+    return f"({', '.join(f'{entry:.6g}' for entry in point)})"
