@@ -6,8 +6,9 @@ batch. With t the wanted pressures, x / |x| entry by entry, and * for a product 
 - "naive": q = sgn(G^H t), back-propagation;
 - "gs": p = t * sgn(G q), q = sgn(G^H p) in turns (Gerchberg and Saxton 1972), iterative back-propagation of
   Marzo and Drinkwater (2019), doi:10.1073/pnas.1813047115;
-- "wgs": b is multiplied by t / |G q| and divided by its largest entry, p = b * sgn(G q), q = sgn(G^H p)
-  (Di Leonardo, Ianni and Ruocco 2007), doi:10.1364/OE.15.001913;
+- "wgs": b is multiplied by (t / |G q|)^(1/2) and divided by its largest entry, p = b * sgn(G q),
+  q = sgn(G^H p) (Di Leonardo, Ianni and Ruocco 2007), doi:10.1364/OE.15.001913, whose power is 1: close foci
+  then change places for ever. The q of the highest weakest pressure over its target is kept;
 - "gs_pat": p = G G^H (t * sgn(p)) in turns, and in the end q = sgn(G^H (t^2 * p / |p|^2)) (Martinez Plasencia
   et al. 2020), doi:10.1145/3386569.3392492;
 - "diff_pat": Adam on the phases, from those of "wgs", for the least sum of (|p| - t)^2 (Fushimi, Yamamoto and
@@ -43,6 +44,9 @@ Project: TypeAlias = Callable[[torch.Tensor], torch.Tensor]
 _RATES = 0.1, 0.001  # First and last step of Adam [rad, or amplitudes]
 _MOMENTS = 0.9, 0.99  # Shares of the old means of gradients and their squares in the new ones
 TINY = 1e-30
+DAMPING = 0.5
+"""Power of wanted over present pressure in the weights of "wgs"; 1 overshoots."""
+
 UNREACHED = 1e-6  # Pressure, relative to the loudest point, below which a point gets no more weight
 
 
@@ -220,16 +224,19 @@ def _in_turns(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, proje
 
 def _weighted(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project) -> torch.Tensor:
     back, drive = matrix.mH.resolve_conj(), torch.ones_like(matrix[..., :1, :]).mT
-    weights = torch.ones_like(wanted)
+    weights, best, highest = wanted, drive, torch.zeros_like(wanted[..., :1, :])
     for _ in range(iterations):
-        pressure = matrix @ drive
-        size = pressure.abs()
+        drive = project(back @ (weights * (matrix @ drive).sgn()))
+        size = (matrix @ drive).abs()
         loudest = size.amax(dim=-2, keepdim=True).clamp_min(TINY)
         # the weight of a point that no transducer reaches would outgrow all others
-        weights = wanted * weights / torch.where(size > UNREACHED * loudest, size, loudest)
+        share = torch.where(size > UNREACHED * loudest, size, loudest) / wanted
+        level = share.amin(dim=-2, keepdim=True)
+        worse = level <= highest  # not where a matrix is not finite, which is refused later
+        best, highest = torch.where(worse, best, drive), torch.maximum(level, highest)
+        weights = torch.where(wanted > 0, weights / share.pow(DAMPING), 0.0)
         weights = weights / weights.amax(dim=-2, keepdim=True)
-        drive = project(back @ (weights * pressure.sgn()))
-    return drive
+    return best
 
 
 def _at_points(matrix: torch.Tensor, wanted: torch.Tensor, iterations: int, project: Project) -> torch.Tensor:

@@ -16,7 +16,7 @@ import torch
 from numba import njit
 
 from autdtorch.fdtd.kernels.compiled import INNER, entry
-from autdtorch.methods.holography.holography import TINY, UNREACHED
+from autdtorch.methods.holography.holography import DAMPING, TINY, UNREACHED
 from autdtorch.utils.threads import even_parts, spread, thread_count
 
 _LANES = np.uint64(16)  # Sets of a block
@@ -134,21 +134,37 @@ def _imposed(y, w, weight, count):  # type: ignore[no-untyped-def]
 
 
 @njit(**INNER)
-def _reweighted(y, w, t, weight, count):  # type: ignore[no-untyped-def]
-    """Multiply weights (P,) by wanted over present pressure, and divide them by the largest."""
+def _reweighted(y, w, t, weight, level, count):  # type: ignore[no-untyped-def]
+    """Multiply weights (P,) by a power of wanted over present pressure, and divide them by the largest.
+
+    The `level` of each set is set to its lowest present over wanted pressure.
+    """
     tiny, share = y.dtype.type(TINY), y.dtype.type(UNREACHED)
     for lane in range(_LANES):
-        loudest = tiny
+        loudest, level[lane] = tiny, np.inf
         for k in range(lane, count, _LANES):
             loudest = max(loudest, math.sqrt(y[k] * y[k] + w[k] * w[k]))
         largest = tiny
         for k in range(lane, count, _LANES):
             size = math.sqrt(y[k] * y[k] + w[k] * w[k])
-            weight[k] *= t[k] / (size if size > share * loudest else loudest)
+            size = size if size > share * loudest else loudest
+            if t[k] > 0:
+                level[lane] = min(level[lane], size / t[k])
+            weight[k] *= (t[k] / size) ** y.dtype.type(DAMPING)
         for k in range(lane, count, _LANES):
             largest = max(largest, weight[k])
         for k in range(lane, count, _LANES):
             weight[k] /= largest
+
+
+@njit(**INNER)
+def _keep(x, z, level, highest, x_best, z_best, transducers):  # type: ignore[no-untyped-def]
+    """Keep the drives of the sets whose level is their highest."""
+    for lane in range(_LANES):
+        if level[lane] > highest[lane]:
+            highest[lane] = level[lane]
+            for k in range(lane, transducers * _LANES, _LANES):
+                x_best[k], z_best[k] = x[k], z[k]
 
 
 @njit(**INNER)
@@ -189,6 +205,8 @@ def _solve(matrix, wanted, first, last, algorithm, iterations, free, drive):  # 
     x, z, size = np.empty(drives, kind), np.empty(drives, kind), np.empty(drives, kind)
     y, w, v, u = np.empty(count, kind), np.empty(count, kind), np.empty(count, kind), np.empty(count, kind)
     t, weight = np.empty(count, kind), np.empty(count, kind)
+    x_best, z_best = np.empty(drives, kind), np.empty(drives, kind)
+    level, highest = np.empty(_LANES, kind), np.empty(_LANES, kind)
     c, d = np.empty(squares, kind), np.empty(squares, kind)
     flat, targets, begin = matrix.reshape(-1), wanted.reshape(-1), np.empty(_LANES, np.uint64)
     for block in range(first, last):
@@ -209,14 +227,20 @@ def _solve(matrix, wanted, first, last, algorithm, iterations, free, drive):  # 
             _back(a, b, y, w, x, z, size, points, transducers, free)
         else:
             x[:], z[:] = 1, 0
-            for k in range(count):
-                weight[k] = t[k] if algorithm == _GS else kind.type(1)
-            for _ in range(iterations):
+            weight[:], highest[:] = t, 0
+            x_best[:], z_best[:] = np.nan, np.nan  # stays so where a matrix is not finite
+            for n in range(iterations):
                 _forward(a, b, x, z, y, w, points, transducers)
-                if algorithm == _WGS:
-                    _reweighted(y, w, t, weight, count)
+                if algorithm == _WGS and n > 0:
+                    _reweighted(y, w, t, weight, level, count)
+                    _keep(x, z, level, highest, x_best, z_best, transducers)
                 _imposed(y, w, weight, count)
                 _back(a, b, y, w, x, z, size, points, transducers, free)
+            if algorithm == _WGS:
+                _forward(a, b, x, z, y, w, points, transducers)
+                _reweighted(y, w, t, weight, level, count)
+                _keep(x, z, level, highest, x_best, z_best, transducers)
+                x[:], z[:] = x_best, z_best
         for lane in range(_LANES):
             number = np.uint64(block) * _LANES + lane
             if number < np.uint64(len(matrix)):

@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from autdtorch.methods.holography.holography import TINY, UNREACHED, checked_targets
+from autdtorch.methods.holography.holography import DAMPING, TINY, UNREACHED, checked_targets
 from autdtorch.utils.array_types import Array, ComplexArray
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import (
@@ -27,8 +27,6 @@ from autdtorch.utils.validation import (
 )
 
 _FIRST = 10  # Times as many iterations for the first frame, which has none before it
-# Power of wanted over present pressure in the weights: 1 overshoots, and loses foci in some frames
-_DAMPING = 0.5
 
 
 @one_library_thread()
@@ -140,7 +138,7 @@ def _frame(
         size = np.maximum(np.abs(pressure), TINY)
         if size.min() > highest:
             best, highest = drive, float(size.min())
-        weights = weights * (size.mean() / np.maximum(size, UNREACHED * size.max())) ** _DAMPING
+        weights = weights * (size.mean() / np.maximum(size, UNREACHED * size.max())) ** DAMPING
         weights /= weights.max()
         drive = near(back @ (weights * (pressure / size if imposed is None else imposed)))
     return best, weights
