@@ -42,6 +42,8 @@ class FileConfigSource(file_config_source.FileConfigSource):
             header = self._get_header_dict(file.read(512))
         if not self._is_trusted():
             _require_harmless(shown, header["package"], unresolved(config, shown))
+        if PurePosixPath(config_path).parts[:1] == ("scene",):
+            _begin_paths(config, os.path.dirname(path))
         return ConfigResult(self.provider, self.full_path(), config, header)
 
     def is_group(self, config_path: str) -> bool:
@@ -62,6 +64,20 @@ class FileConfigSource(file_config_source.FileConfigSource):
 def register() -> None:
     """Have Hydra read files through `FileConfigSource` in this process."""
     SourcesRegistry.instance().types["file"] = FileConfigSource
+
+
+def _begin_paths(config: Any, folder: str) -> None:
+    """Begin the paths in a scene file with its folder, as `load_scene` does; others begin where one works."""
+    from omegaconf import OmegaConf
+
+    keys = range(len(config)) if OmegaConf.is_list(config) else list(config)
+    for key in keys:
+        if OmegaConf.is_missing(config, key) or OmegaConf.is_interpolation(config, key):
+            continue
+        if key == "path" and isinstance(config[key], str):
+            config[key] = os.path.join(folder, config[key])
+        elif OmegaConf.is_config(config[key]):
+            _begin_paths(config[key], folder)
 
 
 def _require_harmless(where: str, package: str | None, content: Any) -> None:

@@ -9,7 +9,7 @@ import sys
 import traceback
 from typing import NoReturn
 
-from hydra.errors import HydraException, MissingConfigException
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf.errors import OmegaConfBaseException
 
 from autdtorch import hardware
@@ -88,5 +88,9 @@ def _of_hydra(error: BaseException, text: str) -> str:
         return f"{missing[1]}: none; must be given, as {missing[1]}=VALUE"
     if "missing EQUAL" in text and (word := re.search(r"'(.*?)'", text)):
         return f"{word[1]}: must be key=value, such as scene=three_cubes; autdtorch --help lists the settings"
+    if isinstance(error, OverrideParseException):
+        why = text.partition("\n")[0]
+        accepted = "must be KEY=VALUE, a value with signs in quotes: 'KEY=\"a=b\"'"
+        return f"argument {error.override!r}: {why}; {accepted}"
     lines = [line.strip() for line in text.splitlines()]
     return "; ".join(line for line in lines if line and not line.startswith("See https://"))

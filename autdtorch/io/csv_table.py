@@ -57,16 +57,22 @@ def write_table(path: str | os.PathLike[str], columns: Mapping[str, AnyArray]) -
 
 
 def _rows(path: str | os.PathLike[str]) -> Iterator[tuple[int, list[str]]]:
-    """Yield the number and cells of every line that is neither empty nor a comment."""
+    """Yield the number and cells of every line that is neither empty nor a comment.
+
+    Where the first one has semicolons or tabs, these separate cells; a comma then begins decimals.
+    """
     with Path(path).open(encoding="utf-8-sig", newline="") as file:
-        reader = csv.reader(file)
         try:
+            header = next((line for line in file if line.strip() and not line.lstrip().startswith("#")), "")
+            separator = max(",;\t", key=header.count)
+            file.seek(0)
+            reader = csv.reader(file, delimiter=separator)
             for cells in reader:
-                row = [cell.strip() for cell in cells]
+                row = [cell.strip() if separator == "," else cell.strip().replace(",", ".") for cell in cells]
                 if any(row) and not row[0].startswith("#"):
                     yield reader.line_num, row
         except (csv.Error, UnicodeDecodeError) as error:
-            raise ValueError(f"{path}, line {reader.line_num + 1}: {error}; must be CSV in UTF-8") from error
+            raise ValueError(f"{path}: {error}; must be CSV in UTF-8") from error
 
 
 def _column(where: str, cell: str, columns: Mapping[str, str]) -> tuple[str, float]:

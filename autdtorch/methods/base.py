@@ -40,6 +40,8 @@ Trials: TypeAlias = int | Sequence[int]
 TRIAL_BYTES = 6_000.0
 """Memory of a trial [bytes]; most of it is the state of its random generator."""
 
+_LOUDEST = 1e9  # Largest pressure [Pa] that is no error of a program; air has 1e5 Pa
+
 NEAR_TIE = 1e-5
 """Relative difference below which scores count as equal. Symmetric scenes have many equal scores, and the
 rounding of the simulation, which differs between machines, must not decide between them."""
@@ -145,6 +147,7 @@ class State:
     """The state of T trials of a method. `save_state` and `load_state` keep it in a file.
 
     Attributes:
+        method: whose state it is.
         problem: what is solved.
         seeds: of the T trials.
         trials: indices of the L trials that go on (L,), of 0 to T - 1.
@@ -153,6 +156,7 @@ class State:
         best: the best drive of each trial so far, with its history.
     """
 
+    method: Method
     problem: Problem
     seeds: tuple[int, ...]
     trials: torch.Tensor
@@ -261,12 +265,12 @@ class Method(ABC):
             torch.empty(count, 0, dtype=torch.float64, device="cpu"),
         )
         places = torch.arange(count, device="cpu")
-        return State(problem, tuple(seeds), places, step.drives, step.search, empty)
+        return State(self, problem, tuple(seeds), places, step.drives, step.search, empty)
 
     def ask(self, state: State) -> torch.Tensor:
         """Return the drives (B, M), complex128, to observe next; none when the method is done."""
-        require_kind("state", state, State)
-        return state.drives.flatten(0, 1)
+        self._require_own(state)
+        return state.drives.flatten(0, 1).clone()
 
     def tell(self, state: State, pressure: torch.Tensor) -> State:
         """Return the state after the drives of `ask` were observed.
@@ -274,10 +278,21 @@ class Method(ABC):
         Args:
             state: whose drives were observed.
             pressure: magnitudes at the control points (B, P) [Pa].
+
+        Raises:
+            ValueError: a state that is done or of another method, pressures of another shape or that cannot
+                be magnitudes, or scores that are not finite.
         """
-        require_kind("state", state, State)
+        self._require_own(state)
+        if state.done:
+            raise ValueError("state: it is done, and no drive was asked for; take best(state)")
         batch = state.drives.shape[:2]
-        pressure = _real("pressure of the objective", pressure, (batch.numel(), state.problem.foci), "Pa")
+        name = "pressure of the objective"
+        pressure = _real(name, pressure, (batch.numel(), state.problem.foci), "Pa")
+        if len(wrong := ((pressure < 0) | (pressure > _LOUDEST)).nonzero()):
+            place, value = wrong[0].tolist(), float(pressure[tuple(wrong[0])])
+            accepted = f"must be a magnitude from 0 to {_LOUDEST:g}, not a level in dB or a signed sample"
+            raise invalid(f"{name}{place}", value, accepted, "Pa")
         pressure = pressure.reshape(*batch, -1)
         score = _real("score", state.problem.goal(pressure), batch)
         state = replace(state, best=_improved(state, pressure, score))
@@ -286,12 +301,19 @@ class Method(ABC):
         return replace(state, trials=trials, drives=step.drives, search=step.search)
 
     def best(self, state: State) -> Solution:
-        """Return the best drive of each trial so far; at least one evaluation must have been made."""
-        require_kind("state", state, State)
+        """Return the best drive of each trial so far; `ValueError` before the first evaluation."""
+        self._require_own(state)
+        if not state.best.history.shape[1]:
+            raise ValueError("state: nothing was observed yet; tell what the drives of ask give first")
         history = state.best.history.cummax(dim=1).values.minimum(state.best.score[:, None])
         missing = max(0, self.most_evaluations(state.problem) - history.shape[1]) if state.done else 0
         history = torch.cat([history, history[:, -1:].expand(-1, missing)], dim=1)
         return replace(state.best, drive=state.problem.quantise(state.best.drive), history=history)
+
+    def _require_own(self, state: State) -> None:
+        require_kind("state", state, State)
+        if state.method != self:
+            raise invalid("state", f"of {state.method}", f"must be of {self}")
 
 
 def _improved(state: State, pressure: torch.Tensor, score: torch.Tensor) -> Solution:

@@ -72,7 +72,7 @@ def load_state(path: str | os.PathLike[str], method: Method, problem: Problem) -
             name.removeprefix(_SEARCH): tensor for name, tensor in tensors.items() if name.startswith(_SEARCH)
         }
         seeds = tuple(map(int, arrays["seeds"]))
-        state = State(problem, seeds, tensors["trials"], tensors["drives"], search, best)
+        state = State(method, problem, seeds, tensors["trials"], tensors["drives"], search, best)
         _require_consistent(state)
     except (KeyError, TypeError, IndexError, ValueError) as error:
         raise ValueError(f"{os.fspath(path)}: {error}; must be a file of save_state") from error

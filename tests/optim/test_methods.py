@@ -284,6 +284,55 @@ def test_bad_hyperparameters_are_named(objective, method, options, message):
     assert objective.evaluations == 0
 
 
+@pytest.mark.parametrize("transducers", [2, 5, 6])
+def test_bayes_opt_runs_with_its_defaults_on_few_transducers(make_objective, random_matrix, transducers):
+    found = at.bayes_opt(make_objective(random_matrix(2, transducers, 0)), 12, 6)
+    assert found.drive[0, -1].angle() == pytest.approx(0, abs=1e-12)
+
+
+def heard(matrix, drives):
+    return (drives @ matrix.mT).abs()
+
+
+@pytest.mark.parametrize("reading", [-0.1, 1e300, float("nan")], ids=["negative", "huge", "not a number"])
+def test_a_reading_that_cannot_be_is_refused_and_harms_nothing(random_matrix, reading):
+    matrix, method = random_matrix(3, 8, 0), at.GABS(levels=4)
+    state = method.start(at.Problem(8, 3))
+    good = heard(matrix, method.ask(state))
+    bad = good.clone()
+    bad[-1, 1] = reading
+    before = state.drives.clone()
+    with pytest.raises(ValueError, match="pressure of the objective"):
+        method.tell(state, bad)
+    assert torch.equal(state.drives, before)
+    assert method.tell(state, good).evaluations == len(good)
+
+
+def test_ask_tell_and_best_refuse_what_does_not_fit_the_state(random_matrix):
+    matrix, method = random_matrix(3, 8, 0), at.GABS(levels=2)
+    state = method.start(at.Problem(8, 3))
+    with pytest.raises(ValueError, match="nothing was observed yet"):
+        method.best(state)
+    for other in (at.LSSG(), at.GABS(levels=3)):
+        with pytest.raises(ValueError, match=r"^state: .*must be of "):
+            other.tell(state, heard(matrix, method.ask(state)))
+    while not state.done:
+        state = method.tell(state, heard(matrix, method.ask(state)))
+    with pytest.raises(ValueError, match="it is done"):
+        method.tell(state, torch.zeros(0, 3))
+
+
+def test_drives_that_a_caller_scales_in_place_leave_the_state_alone(random_matrix):
+    matrix, method, found = random_matrix(3, 8, 0), at.GABS(levels=3), []
+    for in_place in (False, True):
+        state = method.start(at.Problem(8, 3))
+        while not state.done:
+            drives = method.ask(state)
+            state = method.tell(state, heard(matrix, drives.mul_(0.5) if in_place else 0.5 * drives))
+        found.append(method.best(state).drive)
+    assert torch.equal(*found)
+
+
 def test_bayes_opt_needs_two_transducers(make_objective, random_matrix):
     with pytest.raises(ValueError, match="transducers of the objective's array: 1; must be an integer >= 2"):
         at.bayes_opt(make_objective(random_matrix(2, 1, 0)), fixed_transducer=0)

@@ -97,6 +97,15 @@ def test_csv_is_read_in_its_units_and_pointed_up_by_default(tmp_path):
     assert (array.source_strength, array.radius) == (2.0, 0)
 
 
+@pytest.mark.parametrize(
+    "text", ["x [mm];y [mm];z [mm]\n0;0;0\n10,5;0;0\n", "# mm\nx [mm]\ty [mm]\tz [mm]\n0\t0\t0\n10.5\t0\t0\n"]
+)
+def test_semicolons_and_tabs_separate_too(tmp_path, text):
+    (tmp_path / "array.csv").write_text(text, "utf-8")
+    positions = load_array(tmp_path / "array.csv").positions
+    assert positions.tolist() == [[0.0, 0.0, 0.0], [pytest.approx(10.5e-3), 0.0, 0.0]]
+
+
 def test_normals_turn_with_the_array(tmp_path):
     path = tmp_path / "array.csv"
     path.write_text("x [m],y [m],z [m],nx,ny,nz\n0.01,0,0,1,0,0\n0,0,0,0,0,2\n")

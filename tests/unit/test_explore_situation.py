@@ -156,7 +156,7 @@ def test_few_steps_are_kept_of_large_meshes(monkeypatch):
 )
 def test_methods_have_the_settings_of_their_configs(name):
     config = yaml.safe_load(Path(f"configs/method/{name}.yaml").read_text("utf-8"))
-    method = offered(16)[{"bo": "bayes_opt"}.get(name, name)]
+    method = offered()[{"bo": "bayes_opt"}.get(name, name)]
     for key, value in config.items():
         if key != "_target_" and hasattr(method, key):
             assert getattr(method, key) == (float(value) if value == "1e-4" else value)
@@ -167,6 +167,6 @@ def test_all_methods_begin_with_few_transducers(rows):
     array = at.TransducerArray.grid((2, rows), 10e-3, (0, 0, 0))
     scene = at.Scene(array, AIR, 40e3, [[0.05, 0, 0]], (), None, [[-0.05] * 3, [0.1] * 3])
     objective = at.SimulatedObjective(scene, at.make_propagator(scene))
-    for method in offered(2 * rows).values():
+    for method in offered().values():
         state = method.start(at.Problem.of(objective), 0)
         assert method.ask(state).shape[-1] == 2 * rows

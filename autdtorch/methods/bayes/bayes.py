@@ -61,6 +61,9 @@ def _defaults_of_processes() -> Iterator[None]:
         torch.set_default_dtype(before)
 
 
+_PAPERS_FIXED = 6  # Transducer whose phase is fixed in the paper, its 7th
+
+
 @dataclass(frozen=True)
 class BayesOpt(Method):
     """Maximise the score over the phases by Bayesian optimisation (Algorithm 1), all amplitudes being 1.
@@ -75,7 +78,7 @@ class BayesOpt(Method):
         initial: number of them, >= 2, that are spread over all phases before the search. With a prior, the
             search begins at the drive whose weakest focus is best in the simulation.
         fixed_transducer: index of the transducer whose phase stays 0, since a common offset of all phases
-            changes no magnitude; 6 is the paper's 7th.
+            changes no magnitude; None for 6, the paper's 7th, or the last one of fewer.
         model: "weakest": one process models the score, as in the paper. "foci": each focus has a process, and
             the improvement of the score is averaged over samples of all. The score must then be
             differentiable by PyTorch. From 3 M - 1 evaluations on, or with a prior, the processes begin at a
@@ -102,7 +105,7 @@ class BayesOpt(Method):
 
     evaluations: int = 256
     initial: int = 16
-    fixed_transducer: int = 6
+    fixed_transducer: int | None = None
     model: Literal["weakest", "foci"] = "weakest"
     kernel: Literal["phases", "circle", "phasor"] = "phases"
     acquisition: Literal["ei", "log_ei"] = "ei"
@@ -117,8 +120,9 @@ class BayesOpt(Method):
         least = self.initial + 1 if self.prior is None else 2
         evaluations = integer_at_least("evaluations", self.evaluations, least)
         object.__setattr__(self, "evaluations", evaluations)
-        fixed = integer_at_least("fixed_transducer", self.fixed_transducer, 0)
-        object.__setattr__(self, "fixed_transducer", fixed)
+        if self.fixed_transducer is not None:
+            fixed = integer_at_least("fixed_transducer", self.fixed_transducer, 0)
+            object.__setattr__(self, "fixed_transducer", fixed)
         require_one_of("model", self.model, ("weakest", "foci"))
         require_one_of("kernel", self.kernel, ("phases", "circle", "phasor"))
         if (self.kernel == "phasor") != (self.model == "foci"):
@@ -134,7 +138,7 @@ class BayesOpt(Method):
 
     def check(self, problem: Problem) -> None:
         """Check the number of transducers, and the prior."""
-        require_transducer(self.fixed_transducer, problem.transducers)
+        require_transducer(self._fixed(problem.transducers), problem.transducers)
         if self.prior is not None:
             prior_mean(self.prior, problem)
 
@@ -165,7 +169,7 @@ class BayesOpt(Method):
             "values": torch.empty(len(seeds), 0, self._outputs(problem), dtype=torch.float64, device="cpu"),
             "generators": states_of(generators),
         }
-        return Step(drives_at(points, self.fixed_transducer), search)
+        return Step(self._drives(points), search)
 
     @one_library_thread()
     @_defaults_of_processes()
@@ -181,14 +185,14 @@ class BayesOpt(Method):
         generators = restored(search["generators"])
         points = search["points"]
         if self.model == "foci":  # processes of the points that were played
-            points = self._points(state.problem.quantise(drives_at(points, self.fixed_transducer)))
+            points = self._points(state.problem.quantise(self._drives(points)))
         fit, rows = self._fitted(state.problem, search, points, generators)
         acquisition = self._acquisition(state.problem.goal, search["values"], points, fit, rows)
         if count == self.evaluations:
             return Step(state.drives[:, :0], {**search, "answer": acquisition.best})
         point = acquisition.next_points(generators, last=count == self.evaluations - 1)[:, None]
         search |= {"points": torch.cat([search["points"], point], dim=1), "generators": states_of(generators)}
-        return Step(drives_at(point, self.fixed_transducer), search)
+        return Step(self._drives(point), search)
 
     def best(self, state: State) -> Solution:
         """Return the best drive observed, or that of the highest posterior mean (model "foci")."""
@@ -196,7 +200,7 @@ class BayesOpt(Method):
         if not state.done or self.model == "weakest":
             return found
         chosen = torch.arange(len(found.score), device="cpu"), state.search["answer"]
-        drive = state.problem.quantise(drives_at(state.search["points"][chosen], self.fixed_transducer))
+        drive = state.problem.quantise(self._drives(state.search["points"][chosen]))
         pressure = state.search["values"][chosen]
         return replace(found, drive=drive, pressure=pressure, score=state.problem.goal(pressure))
 
@@ -206,13 +210,21 @@ class BayesOpt(Method):
     def _points(self, drives: torch.Tensor) -> torch.Tensor:
         """Return points (..., M - 1) in turns with the phases of drives (..., M)."""
         phases = phases_of(drives)
-        points = (phases - phases[..., [self.fixed_transducer]]) / (2 * math.pi) % 1
+        points = (phases - phases[..., [self._fixed(drives.shape[-1])]]) / (2 * math.pi) % 1
         return points[..., self._others(drives.shape[-1])[:-1]]
 
     def _others(self, transducers: int) -> list[int]:
         """Return the indices of all transducers, the fixed one at the end."""
-        others = [index for index in range(transducers) if index != self.fixed_transducer]
-        return [*others, self.fixed_transducer]
+        fixed = self._fixed(transducers)
+        return [*(index for index in range(transducers) if index != fixed), fixed]
+
+    def _fixed(self, transducers: int) -> int:
+        """Return the index of the transducer whose phase stays 0."""
+        return min(_PAPERS_FIXED, transducers - 1) if self.fixed_transducer is None else self.fixed_transducer
+
+    def _drives(self, points: torch.Tensor) -> torch.Tensor:
+        """Return the drives (..., M) of points (..., M - 1) in turns."""
+        return drives_at(points, self._fixed(points.shape[-1] + 1))
 
     def _fitted(
         self,
@@ -240,7 +252,7 @@ class BayesOpt(Method):
         from autdtorch.methods.bayes.processes import Fit, Rows, mean_intensity
 
         observed = search["values"]
-        drives = problem.quantise(drives_at(search["points"], self.fixed_transducer))
+        drives = problem.quantise(self._drives(search["points"]))
         power = mean_intensity(observed)
         variance = None if isinstance(self.noise, str) else 0.5 * self.noise / (1 + self.noise) * power
         prior = None if self.prior is None else matrix_prior(self.prior, problem)
@@ -275,7 +287,7 @@ def bayes_opt(
     initial: int = 16,
     trials: Trials = 1,
     seed: int = 0,
-    fixed_transducer: int = 6,
+    fixed_transducer: int | None = None,
     score: Score = WEAKEST_FOCUS,
     *,
     model: Literal["weakest", "foci"] = "weakest",

@@ -10,15 +10,12 @@ from autdtorch.methods.catalogue import METHODS, label_of
 from autdtorch.methods.holography.holography import Algorithm, Holography
 
 
-def offered(transducers: int) -> dict[str, Method]:
-    """Return the methods by name, for an array of so many transducers."""
-    fixed = min(BayesOpt.fixed_transducer, transducers - 1)
+def offered() -> dict[str, Method]:
+    """Return the methods by name."""
     own: dict[str, Method] = {
-        "bayes_opt": BayesOpt(fixed_transducer=fixed),
-        "bo_circle": BayesOpt(kernel="circle", fixed_transducer=fixed),
-        "bo_foci": BayesOpt(
-            evaluations=64, initial=4, model="foci", kernel="phasor", noise="inferred", fixed_transducer=fixed
-        ),
+        "bayes_opt": BayesOpt(),
+        "bo_circle": BayesOpt(kernel="circle"),
+        "bo_foci": BayesOpt(evaluations=64, initial=4, model="foci", kernel="phasor", noise="inferred"),
     }
     others = {name: kind() for name, kind in METHODS.items() if kind not in (BayesOpt, Holography)}
     return others | own | {name: Holography(algorithm=name) for name in get_args(Algorithm)}

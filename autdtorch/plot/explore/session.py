@@ -60,7 +60,7 @@ class Session:
         self._state, self._note = trame.state, note
         self._history = History(situation)
         self.display = Display(trame.state, situation)
-        self.methods = offered(len(situation.drive))
+        self.methods = offered()
         self._calculator = Calculator(spacing, lambda found: defer(self._receive, found))
         self._mouse = Mouse(self.display.picture, self)
         self._numbers, self._seeds = itertools.count(1), itertools.count()
