@@ -42,7 +42,7 @@ def test_reprs_are_short_and_hold_no_tensors(objective: SimulatedObjective, resu
     for thing in (given, results, scene, method, box, objective, noisy, *parts):
         assert len(repr(thing)) < 200  # characters, two lines of a console
         assert "tensor(" not in repr(thing)
-    assert repr(box) == "SimulatedPropagator(scene 'scene', box, spacing 2 mm, tolerance 0.002, 0 runs)"
+    assert repr(box) == "SimulatedPropagator(scene 'scene', box, spacing 2 mm, steady to 0.002, 0 runs)"
 
 
 def test_tables_tell_what_was_reached_and_escape_names(results: StudyResult) -> None:

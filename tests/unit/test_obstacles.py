@@ -334,13 +334,13 @@ def test_cavities_of_masks_and_meshes_are_filled():
     st.integers(0, 2**31),
 )
 def test_a_surface_has_the_voxels_on_their_sides_or_says_so(kind, size, more, seed):
-    """Required: centres at most 0.25 voxels beyond it, but for those it calls lost, of strewn ones alone."""
+    """Required: centres at most 0.25 voxels beyond it, but for lost ones, no more of them than were changed."""
     random, count = np.random.default_rng(seed), 20
     places = np.moveaxis(np.indices((count,) * 3), 0, -1) - (count - 1) / 2 + random.uniform(-0.5, 0.5, 3)
     turned = np.abs(places @ rotation_matrix(random.uniform(-3, 3, 3).tolist()).numpy())
     half = {"sheet": (size, size, 1.0), "rod": (size, 1.2, 1.2)}.get(kind)
     mask = np.linalg.norm(places, axis=-1) < size if half is None else (turned < half).all(axis=-1)
-    place = tuple(np.argwhere(mask)[random.integers(mask.sum())])
+    body, place = mask.copy(), tuple(np.argwhere(mask)[random.integers(mask.sum())])
     if more == "hole":
         mask[place] = False
     elif more == "tab":
@@ -353,7 +353,7 @@ def test_a_surface_has_the_voxels_on_their_sides_or_says_so(kind, size, more, se
         assume(False)
     inside = surface.distance(np.argwhere(np.ones_like(mask)) + 0.5)
     assert (np.where(mask.ravel(), inside, -inside) > 0.25).sum() <= surface.lost
-    assert surface.lost == 0 or more == "specks"
+    assert surface.lost <= (mask ^ body).sum()
 
 
 def test_a_body_at_the_end_of_grey_values_reaches_to_its_voxels_faces_in_any_unit():
