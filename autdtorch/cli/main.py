@@ -27,6 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 import autdtorch
 from autdtorch.cli.config_files import CONFIGS, register
 from autdtorch.cli.errors import AGAIN, FULL_ERROR, FailedJob, in_one_line, stop
+from autdtorch.cli.workers import end_workers_with_us, leave_workers_alone
 
 logger = logging.getLogger(__name__)
 
@@ -41,14 +42,19 @@ class SweepCallback(Callback):
     """Prepares a sweep; `configs/config.yaml` names it to Hydra."""
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Log the sweep, or on Slurm watch its jobs by `squeue`, which logs them."""
+        """Log the sweep, whose workers end with it, or on Slurm watch its jobs, which logs them."""
         launcher = config.hydra.launcher
         if launcher._target_.endswith(".SlurmLauncher"):
             from autdtorch.cli.slurm import watch_queue
 
             watch_queue(launcher.submitit_folder)
         else:
+            end_workers_with_us()
             logger.info("sweep into %s: %s", config.hydra.sweep.dir, shlex.join(config.hydra.overrides.task))
+
+    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        """Leave signals as they were."""
+        leave_workers_alone()
 
 
 def main() -> None:

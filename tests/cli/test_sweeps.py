@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import psutil
 import pytest
 import torch
 from checks.kills import Subject, of_studies, wait
@@ -218,3 +219,20 @@ def test_an_unfinished_study_is_left_out(run, tmp_path, capsys):
     assert (
         "method=lssg,plane_spacing=0.02,scene=homogeneous: not finished, left out" in capsys.readouterr().err
     )
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_workers_end_with_a_sweep_that_a_signal_ends(tmp_path, number):
+    endless = ("method=random", "method.evaluations=100000", "trials=10000", "hydra.launcher.n_jobs=2")
+    scenes = ("scene=homogeneous,two_cubes", "solver.spacing=2.4e-3", "plane_spacing=0.02")
+    command = [sys.executable, "-m", "autdtorch", "-m", "hydra/launcher=joblib", *scenes, *endless]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "stdin": subprocess.DEVNULL}
+    sweep = subprocess.Popen(command, cwd=tmp_path, **quiet)
+    own = psutil.Process(sweep.pid)
+    wait(lambda: len(own.children(recursive=True)) >= 2, sweep)
+    workers = own.children(recursive=True)
+    sweep.send_signal(number)
+    assert sweep.wait(30) == -number
+    _, alive = psutil.wait_procs(workers, timeout=10)
+    assert not alive
