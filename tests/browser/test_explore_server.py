@@ -131,6 +131,16 @@ def test_a_live_view_that_nobody_has_any_more_ends():
         socket.create_connection(("127.0.0.1", port), timeout=5)
 
 
+def test_views_may_be_opened_by_several_threads_at_once():
+    scene = at.load_scene("configs/scene/sphere.yaml")
+    with ThreadPoolExecutor(3) as threads:
+        opened = [threads.submit(at.explore, scene, spacing=2.8e-3) for _ in range(3)]
+    views = [each.result() for each in opened]
+    assert len({view.address for view in views}) == 3
+    for view in views:
+        view.close()
+
+
 def test_a_spacing_too_large_for_the_scene_is_refused():
     with pytest.raises(ValueError, match="spacing"):
         at.explore(at.load_scene("configs/scene/sphere.yaml"), spacing=6e-3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import threading
 import webbrowser
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
     from autdtorch.plot.explore.explorer import Explorer
 
 _LAST_PORT = 65535
+_OPENING = (
+    threading.Lock()
+)  # PyVista is not imported, nor a trame application made, by several threads at once
 
 
 def explore(
@@ -58,12 +62,13 @@ def explore(
         raise invalid("port", port, f"must be at most {_LAST_PORT}")
     if importlib.util.find_spec("trame_rca") is None:
         raise RuntimeError("explore: needs trame: pip install 'autdtorch[explore]'")
-    require_rendering()
-    from autdtorch.plot.explore.explorer import Explorer
-    from autdtorch.propagators.plan import plan
+    with _OPENING:
+        require_rendering()
+        from autdtorch.plot.explore.explorer import Explorer
+        from autdtorch.propagators.plan import plan
 
-    plan(scene, spacing=spacing)  # refuses a spacing too large for the scene, before there is a page
-    explorer = Explorer(scene, drive, spacing, port)
+        plan(scene, spacing=spacing)  # refuses a spacing too large for the scene, before there is a page
+        explorer = Explorer(scene, drive, spacing, port)
     if browses:
         webbrowser.open(explorer.address)
     return explorer
