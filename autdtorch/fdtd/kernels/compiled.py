@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
+import io
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from numba import njit
 from numba.core import event
+from numba.core.caching import IndexDataCacheFile
 
 logger = logging.getLogger(__name__)
 
@@ -38,6 +41,40 @@ class _CompilationLog(event.Listener):
 event.register("numba:compile", _CompilationLog())  # type: ignore[no-untyped-call]
 
 
+class _CheckedFiles(IndexDataCacheFile):
+    """Numba's files of a kernel with a checksum at their ends, which pickle ignores.
+
+    Numba would run what a crash or a full disk has left of them. Files that are not whole are compiled again.
+    """
+
+    @contextlib.contextmanager
+    def _open_for_write(self, filepath: str) -> Iterator[io.BytesIO]:
+        with super()._open_for_write(filepath) as file:
+            content = io.BytesIO()
+            yield content
+            file.write(content.getvalue() + hashlib.sha256(content.getvalue()).digest())
+
+    def _load_index(self) -> Any:
+        known = not Path(self._index_path).exists() or _is_whole(Path(self._index_path))
+        return super()._load_index() if known else {}  # type: ignore[no-untyped-call]
+
+    def _load_data(self, name: str) -> Any:
+        path = Path(self._data_path(name))  # type: ignore[no-untyped-call]
+        if not _is_whole(path):
+            raise OSError(f"{path} is not whole")  # numba compiles again
+        return super()._load_data(name)  # type: ignore[no-untyped-call]
+
+
+def _is_whole(path: Path) -> bool:
+    """Return whether a file ends with the checksum of the rest; log if it does not."""
+    content = path.read_bytes()
+    size = hashlib.sha256().digest_size
+    whole = hashlib.sha256(content[:-size]).digest() == content[-size:]
+    if not whole:
+        logger.warning("%s is not whole: compiling again", path)
+    return whole
+
+
 def entry(folder: Path = _HERE, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile a function that Python calls, and cache its machine code on disk.
 
@@ -47,11 +84,21 @@ def entry(folder: Path = _HERE, **options: Any) -> Callable[[Callable[..., Any]]
 
     def compiled(function: Callable[..., Any]) -> Any:
         function.__qualname__ += f"_{_digest(folder)}"
-        dispatcher = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
+        try:
+            dispatcher = njit(cache=True, nogil=True, error_model="numpy", **options)(function)
+            dispatcher._cache._cache_file.__class__ = _CheckedFiles
+        except RuntimeError as error:  # no folder to write to
+            _log_once(f"kernels are compiled in every process, 10 to 30 s: {error}")
+            dispatcher = njit(nogil=True, error_model="numpy", **options)(function)
         _entries.add(dispatcher)
         return dispatcher
 
     return compiled
+
+
+@functools.cache
+def _log_once(message: str) -> None:
+    logger.warning("%s", message)
 
 
 @functools.cache
