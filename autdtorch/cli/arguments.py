@@ -7,8 +7,8 @@ import re
 import sys
 
 _PATH = re.compile(r"(output|hydra\.sweep\.dir)=(?P<path>.*)", re.DOTALL)
-# What Hydra takes as it is, or as a text in quotes, an interpolation, or several values of a sweep; and what has
-# an = in it, which is rather a slip than a name
+# What Hydra takes as it is, or as a text in quotes, an interpolation, or several values of a sweep; an =
+# is rather a slip than part of a name
 _TAKEN = re.compile(r"[A-Za-z0-9_./\\:@%+ -]*|.*=.*|['\"].*|.*\$\{.*|.*,.*", re.DOTALL)
 
 
