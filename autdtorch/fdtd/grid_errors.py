@@ -25,7 +25,7 @@ _TINY = torch.finfo(torch.float64).tiny
 
 @dataclass(frozen=True)
 class Law:
-    """How errors grow with the spacing, for a shortest wavelength [m].
+    """The growth of errors with the spacing, for a shortest wavelength [m].
 
     Along faces parallel to the grid they are mostly those of the stencil, of fourth order; where cells cut
     faces, the part of second order is larger.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import os
 import re
@@ -61,18 +62,23 @@ def _rows(path: str | os.PathLike[str]) -> Iterator[tuple[int, list[str]]]:
 
     Where the first one has semicolons or tabs, these separate cells; a comma then begins decimals.
     """
-    with Path(path).open(encoding="utf-8-sig", newline="") as file:
-        try:
-            header = next((line for line in file if line.strip() and not line.lstrip().startswith("#")), "")
-            separator = max(",;\t", key=header.count)
-            file.seek(0)
-            reader = csv.reader(file, delimiter=separator)
-            for cells in reader:
-                row = [cell.strip() if separator == "," else cell.strip().replace(",", ".") for cell in cells]
-                if any(row) and not row[0].startswith("#"):
-                    yield reader.line_num, row
-        except (csv.Error, UnicodeDecodeError) as error:
-            raise ValueError(f"{path}: {error}; must be CSV in UTF-8") from error
+    content = Path(path).read_bytes()
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        raise ValueError(f"{path}, line {line}: {error}; must be CSV in UTF-8") from error
+    lines = list(io.StringIO(text, newline=""))  # as a file is read for csv
+    header = next((line for line in lines if line.strip() and not line.lstrip().startswith("#")), "")
+    separator = max(",;\t", key=header.count)
+    reader = csv.reader(lines, delimiter=separator)
+    try:
+        for cells in reader:
+            row = [cell.strip() if separator == "," else cell.strip().replace(",", ".") for cell in cells]
+            if any(row) and not row[0].startswith("#"):
+                yield reader.line_num, row
+    except csv.Error as error:
+        raise ValueError(f"{path}, line {reader.line_num + 1}: {error}; must be CSV in UTF-8") from error
 
 
 def _column(where: str, cell: str, columns: Mapping[str, str]) -> tuple[str, float]:

@@ -209,9 +209,8 @@ class SimulatedPropagator:
         """
         calm = [other for other in others if other[0].periods <= _LONGER * result.periods] or others[-1:]
         matrix, grids = result.matrix, [(other.matrix, spacing) for other, spacing in calm]
-        of_grids = (
-            errors_by_grids if self.method == "full" else grid_errors
-        )  # only boxes know the incident field
+        # only boxes know the incident field
+        of_grids = errors_by_grids if self.method == "full" else grid_errors
         errors = of_grids(matrix, free, self.spacing, grids, self._plan.law)
         errors = torch.where(matrix.any(dim=1), errors, 0.0)  # silence is exact
         region = self._plan.region

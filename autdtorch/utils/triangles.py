@@ -18,10 +18,23 @@ def sides_of(triangles: Index) -> Index:
     return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
 
 
+def areas_of(corners: Array) -> Array:
+    """Return the areas (T,) of triangles with `corners` (T, 3, 3)."""
+    return np.asarray(np.linalg.norm(doubled_normals(corners), axis=1) / 2)
+
+
+def paired_sides(triangles: Index) -> Index:
+    """Return the numbers (n, 2), in `sides_of`, of the sides that just two triangles share."""
+    sides = np.sort(sides_of(triangles), axis=1)
+    _, edge, count = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
+    order = np.argsort(edge.reshape(-1), kind="stable")
+    return np.asarray(order[np.repeat(count == 2, count)].reshape(-1, 2))
+
+
 def mean_thickness(vertices: Array, triangles: Index) -> float:
     """Return twice the volume over the area of a closed surface, vertices (V, 3), triangles (T, 3)."""
     corners = vertices[triangles] - vertices.mean(axis=0)
-    area = np.linalg.norm(doubled_normals(corners), axis=1).sum() / 2
+    area = areas_of(corners).sum()
     return float(2 * abs(np.linalg.det(corners).sum() / 6) / area)
 
 

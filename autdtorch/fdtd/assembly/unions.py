@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -68,25 +69,24 @@ class Union:
 
     def near(self, cells: Array, grid: Grid) -> tuple[slice, slice, slice]:
         """Return the part of positions (nx, ny, nz, 3) [cells] of a rectangular grid in the bounds of all."""
-        lower, upper = bounds(self.shapes)
-        slices = []
-        for axis, low, high in zip(range(3), lower, upper, strict=True):
-            own = np.moveaxis(cells[..., axis], axis, 0)[:, 0, 0]
-            inside = own.clip(grid.first[axis], grid.last[axis] - 1) if self.continued else own
-            places = grid.origin[axis] + grid.spacing * inside
-            first, last = np.searchsorted(places, (low - grid.spacing, high + grid.spacing))
-            slices.append(slice(int(first), int(last)))
-        x, y, z = slices
+        positions = [np.moveaxis(cells[..., axis], axis, 0)[:, 0, 0] for axis in range(3)]
+        if self.continued:
+            limits = zip(positions, grid.first, grid.last, strict=True)
+            positions = [along.clip(first, last - 1) for along, first, last in limits]
+        x, y, z = map(slice, *self._reach(positions, grid).tolist())
         return x, y, z
 
     def range(self, grid: Grid) -> Index:
         """Return the first element around it along each axis, and one past the last (2, 3)."""
-        middle = [np.arange(cells - 1) + 0.5 for cells in grid.shape]
-        lower, upper = bounds(self.shapes)
-        ranges = []
-        for axis, low, high in zip(range(3), lower - grid.spacing, upper + grid.spacing, strict=True):
-            inside = middle[axis].clip(grid.first[axis], grid.last[axis] - 1)
-            ranges.append(np.searchsorted(grid.origin[axis] + grid.spacing * inside, (low, high)))
+        sides = zip(grid.shape, grid.first, grid.last, strict=True)
+        middles = [(np.arange(cells - 1) + 0.5).clip(first, last - 1) for cells, first, last in sides]
+        return self._reach(middles, grid)
+
+    def _reach(self, positions: Sequence[Array], grid: Grid) -> Index:
+        """Return the first of positions [cells] in its bounds along each axis, and one past the last."""
+        ends = np.array(bounds(self.shapes)).T + grid.spacing * np.array([-1, 1])
+        axes = zip(positions, grid.origin, ends, strict=True)
+        ranges = [np.searchsorted(origin + grid.spacing * own, both) for own, origin, both in axes]
         return np.array(ranges, np.int64).T
 
 

@@ -229,17 +229,15 @@ def _solve(matrix, wanted, first, last, algorithm, iterations, free, drive):  # 
             x[:], z[:] = 1, 0
             weight[:], highest[:] = t, 0
             x_best[:], z_best[:] = np.nan, np.nan  # stays so where a matrix is not finite
-            for n in range(iterations):
-                _forward(a, b, x, z, y, w, points, transducers)
-                if algorithm == _WGS and n > 0:
-                    _reweighted(y, w, t, weight, level, count)
-                    _keep(x, z, level, highest, x_best, z_best, transducers)
+            _forward(a, b, x, z, y, w, points, transducers)
+            for _ in range(iterations):
                 _imposed(y, w, weight, count)
                 _back(a, b, y, w, x, z, size, points, transducers, free)
-            if algorithm == _WGS:
                 _forward(a, b, x, z, y, w, points, transducers)
-                _reweighted(y, w, t, weight, level, count)
-                _keep(x, z, level, highest, x_best, z_best, transducers)
+                if algorithm == _WGS:
+                    _reweighted(y, w, t, weight, level, count)
+                    _keep(x, z, level, highest, x_best, z_best, transducers)
+            if algorithm == _WGS:
                 x[:], z[:] = x_best, z_best
         for lane in range(_LANES):
             number = np.uint64(block) * _LANES + lane

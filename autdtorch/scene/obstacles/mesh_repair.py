@@ -14,9 +14,16 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from autdtorch.scene.obstacles.mesh_polygons import Polygons, triangulated
-from autdtorch.scene.obstacles.mesh_solid import Triangles, joined, open_edges, solid_of, winding_number
+from autdtorch.scene.obstacles.mesh_solid import (
+    Triangles,
+    joined,
+    open_edges,
+    place_of,
+    solid_of,
+    winding_number,
+)
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.triangles import doubled_normals, sides_of
+from autdtorch.utils.triangles import areas_of, paired_sides, sides_of
 
 _FARTHEST = 1.0001e-3  # distance between vertices that are taken as one, relative to the extent
 _STRAY = 1e-3  # share of all area below which an open piece is no part of the body
@@ -66,23 +73,20 @@ def _without_doubles(faces: Index, done: list[str]) -> Index:
 def _without_strays(vertices: Array, faces: Index, done: list[str]) -> Index:
     """Leave out small pieces that are open."""
     label = _pieces(faces)
-    area = np.bincount(label, weights=_areas(vertices, faces))
+    area = np.bincount(label, weights=areas_of(vertices[faces]))
     is_open = np.zeros(len(area), bool)
     is_open[label[np.isin(faces, open_edges(faces)).any(axis=1)]] = True
     stray = is_open & (area < _STRAY * area.sum())
     if stray.any():
         left_out = faces[stray[label]]
-        place = _place(vertices[left_out[0, 0]])
+        place = place_of(vertices[left_out[0, 0]])
         done.append(f"left out {stray.sum()} stray pieces of {len(left_out)} triangles, the first at {place}")
     return np.asarray(faces[~stray[label]])
 
 
 def _oriented(vertices: Array, faces: Index, done: list[str]) -> Index:
     """Turn triangles so that neighbours agree and most of each piece faces outwards."""
-    ends = sides_of(faces)
-    _, edge, count = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(edge.reshape(-1), kind="stable")
-    pairs = order[np.repeat(count == 2, count)].reshape(-1, 2)
+    ends, pairs = sides_of(faces), paired_sides(faces)
     one, other = pairs.T % len(faces)
     opposed = (ends[pairs[:, 0]] == ends[pairs[:, 1]]).all(axis=1)  # both run along the edge the same way
     graph = coo_array((np.ones(len(one)), (one, other)), shape=(len(faces),) * 2).tocsr()
@@ -100,14 +104,14 @@ def _oriented(vertices: Array, faces: Index, done: list[str]) -> Index:
         if _signed_volume(vertices, faces[own]) < 0:
             faces[own], turned[own] = faces[own, ::-1], ~turned[own]
     if turned.any():
-        place = _place(vertices[faces[turned][0]].mean(axis=0))
+        place = place_of(vertices[faces[turned][0]].mean(axis=0))
         done.append(f"turned {turned.sum()} triangles over, the first at {place}")
     return faces
 
 
 def _closed(vertices: Array, faces: Index, done: list[str]) -> Triangles:
     """Close holes by their flat outlines, or by a fan around their middle."""
-    area = _areas(vertices, faces).sum()
+    area = areas_of(vertices[faces]).sum()
     for loop in _outlines(faces):
         rim = vertices[loop]
         try:
@@ -115,9 +119,9 @@ def _closed(vertices: Array, faces: Index, done: list[str]) -> Triangles:
         except ValueError:  # its outline crosses itself when flat
             vertices = np.concatenate([vertices, rim.mean(axis=0)[None]])
             own = np.stack([loop, np.roll(loop, -1), np.full(len(loop), len(vertices) - 1)], axis=1)
-        share = _areas(vertices, own).sum() / area
+        share = areas_of(vertices[own]).sum() / area
         size = f"{len(loop)} edges and {float(np.ptp(rim, axis=0).max()):.3g}"
-        found = f"a hole of {size} at {_place(rim.mean(axis=0))}"
+        found = f"a hole of {size} at {place_of(rim.mean(axis=0))}"
         if share > _LARGEST_HOLE:
             most = f"must be at most {_LARGEST_HOLE:.0%} of that of a body"
             raise ValueError(f"{found}, {share:.0%} of all area; {most}")
@@ -177,14 +181,6 @@ def _pieces(faces: Index) -> Index:
     return np.asarray(connected_components(graph @ graph.T, directed=False)[1], np.int64)
 
 
-def _areas(vertices: Array, faces: Index) -> Array:
-    return np.asarray(np.linalg.norm(doubled_normals(vertices[faces]), axis=1) / 2)
-
-
 def _signed_volume(vertices: Array, faces: Index) -> float:
     corners = vertices[faces] - vertices[faces].mean(axis=(0, 1))
     return float(np.linalg.det(corners).sum() / 6)
-
-
-def _place(point: Array) -> str:
-    return f"({', '.join(f'{entry:.6g}' for entry in point)})"

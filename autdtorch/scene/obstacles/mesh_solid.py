@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from autdtorch.scene.obstacles.mesh_polygons import FARTHEST
 from autdtorch.utils.array_types import Array, Index
-from autdtorch.utils.triangles import doubled_normals, sides_of
+from autdtorch.utils.triangles import areas_of, doubled_normals, paired_sides, sides_of
 
 Triangles: TypeAlias = tuple[Array, Index]
 """Vertices (V, 3) and the indices of each triangle's vertices (F, 3)."""
@@ -172,7 +172,7 @@ def _require_triangles(corners: Array, triangles: Index) -> None:
     if corners.ndim != 2 or corners.shape[1] != 3:
         raise ValueError(f"vertices of shape {corners.shape}; must be (V, 3)")
     if len(far := np.flatnonzero(~(np.abs(corners) <= FARTHEST).all(axis=1))):
-        found = f"vertex {far[0]} at {_place(corners[far[0]])}"
+        found = f"vertex {far[0]} at {place_of(corners[far[0]])}"
         raise ValueError(f"{found}; must be triangles with finite vertices, none beyond {FARTHEST:g}")
     if len(wrong := np.flatnonzero(((triangles < 0) | (triangles >= len(corners))).any(axis=1))):
         found = f"triangle {wrong[0]} of vertices {', '.join(map(str, triangles[wrong[0]]))}"
@@ -202,7 +202,7 @@ def _labels(vertices: Array, faces: Index) -> Index:
     up, down = (np.bincount(edge[chosen], minlength=len(edges)) for chosen in (upwards, ~upwards))
     if len(wrong := np.flatnonzero(up != down)):
         first = wrong[0]
-        place = " to ".join(map(_place, vertices[list(divmod(edges[first], len(vertices)))]))
+        place = " to ".join(map(place_of, vertices[list(divmod(edges[first], len(vertices)))]))
         found = f"{len(wrong)} of its {len(edges)} edges do not join two triangles of one orientation"
         where = f"the first, {place}, has {up[first]} of one and {down[first]} of the other"
         turned = (up + down == 2).all()
@@ -225,15 +225,12 @@ def _part(vertices: Array, faces: Index) -> _Part:
     used, index = np.unique(faces, return_inverse=True)
     own, index = vertices[used], index.reshape(-1, 3)
     corners = own[index] - own.mean(axis=0)
-    return _Part(own, index, float(np.linalg.det(corners).sum() / 6), float(_areas(corners).sum()))
+    return _Part(own, index, float(np.linalg.det(corners).sum() / 6), float(areas_of(corners).sum()))
 
 
 def _require_unfolded(vertices: Array, faces: Index) -> None:
     """Check that no two triangles at an edge lie on each other."""
-    ends = sides_of(faces)
-    _, edge, count = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(edge.reshape(-1), kind="stable")
-    pairs = order[np.repeat(count == 2, count)].reshape(-1, 2)
+    ends, pairs = sides_of(faces), paired_sides(faces)
     corners = vertices[faces]
     normal = doubled_normals(corners)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
@@ -243,7 +240,7 @@ def _require_unfolded(vertices: Array, faces: Index) -> None:
     cosine = (normal[one] * normal[other]).sum(axis=1)
     folded = (cosine < (_FOLDED - 1) * size[one] * size[other]) & certain[one] & certain[other]
     if folded.any():
-        place = _place(vertices[ends[pairs[folded][0, 0]]].mean(axis=0))
+        place = place_of(vertices[ends[pairs[folded][0, 0]]].mean(axis=0))
         raise ValueError(
             f"the surface is folded back on itself at {place}; must be simple; repair=True may mend it"
         )
@@ -305,7 +302,7 @@ def _require_air_beside(whole: _Part) -> None:
 
 def _refuse_crossing(places: Array) -> None:
     if len(places):
-        found = f"the surface crosses itself at {_place(places[0])}"
+        found = f"the surface crosses itself at {place_of(places[0])}"
         raise ValueError(f"{found}; parts may overlap, but each must be simple")
 
 
@@ -320,7 +317,7 @@ def _has_sliver(part: _Part) -> bool:
     """Return whether a triangle is so flat that its normal is a rounding error."""
     corners = part.vertices[part.faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    return bool((2 * _areas(corners) < _SLIVER * _extent(part.vertices) * longest).any())
+    return bool((2 * areas_of(corners) < _SLIVER * _extent(part.vertices) * longest).any())
 
 
 def _union(parts: Sequence[_Part]) -> _Part:
@@ -385,11 +382,6 @@ def _agree(union: _Part, parts: Sequence[_Part]) -> bool:
     )
 
 
-def _areas(corners: Array) -> Array:
-    """Return the areas (F,) of triangles (F, 3, 3)."""
-    return np.asarray(np.linalg.norm(doubled_normals(corners), axis=1) / 2)
-
-
 def _bounds(vertices: Array) -> Array:
     return np.stack([vertices.min(axis=0), vertices.max(axis=0)])
 
@@ -398,9 +390,10 @@ def _extent(vertices: Array) -> float:
     return float(np.ptp(vertices, axis=0).max())
 
 
-def _place(point: Array) -> str:
+def place_of(point: Array) -> str:
+    """Return a point (3,) as messages show it."""
     return f"({', '.join(f'{entry:.6g}' for entry in point)})"
 
 
 def _box(bounds: Array) -> str:
-    return f"the space from {' to '.join(map(_place, bounds))}"
+    return f"the space from {' to '.join(map(place_of, bounds))}"

@@ -11,6 +11,7 @@ volume is kept. Grey values, as those of a scan, have their surface at a level b
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
 
@@ -100,20 +101,12 @@ class VoxelSurface:
         edge = float(np.cbrt(np.prod(self._edges)))
         if self._level is not None:
             return *_contour(_padded(self._level - self._values), self._edges, 1), _UNCERTAIN_GREY * edge, 0
-        rough, faces = _contour(*_smoothed(self._values, self._edges, _BLUR))
+        rough = _contour(*_smoothed(self._values, self._edges, _BLUR))
         smooth = _contour(*_smoothest(self._values, self._edges))
-        if not len(faces) or not len(smooth[1]):
+        if not len(rough[1]) or not len(smooth[1]):
             raise ThinError
-        sharp = _volume_kept(_sharpened(rough, faces, float(self._edges.max())), faces, self._volume)
-        off = math.sqrt(float((MeshDistance(*sharp)(smooth[0]) ** 2).mean()))
-        kept = _volume_kept(*smooth, self._volume)
-        tried = (
-            (*sharp, _UNCERTAIN * off),
-            (*kept, _UNCERTAIN_SMOOTH * edge),
-            (*smooth, _UNCERTAIN_SMOOTH * edge),
-        )
         places, sides = _beside_surface(self._values, self._edges)
-        for vertices, faces, known in tried:
+        for vertices, faces, known in self._tried(*rough, *smooth):
             wrong = np.maximum(0, -sides * MeshDistance(vertices, faces)(places))
             uncertainty = math.hypot(known, math.sqrt(float((wrong**2).mean())))
             lost = int((wrong > _WRONG_SIDE * edge).sum())
@@ -122,6 +115,18 @@ class VoxelSurface:
         if lost > _MOST_WRONG * len(places):
             raise ThinError
         return vertices, faces, uncertainty, lost
+
+    def _tried(
+        self, rough: Array, rough_faces: Index, smooth: Array, smooth_faces: Index
+    ) -> Iterator[tuple[Array, Index, float]]:
+        """Yield the surfaces that may count, each with its uncertainty [m], made when it is asked for."""
+        uncertain = _UNCERTAIN_SMOOTH * float(np.cbrt(np.prod(self._edges)))
+        sharpened = _sharpened(rough, rough_faces, float(self._edges.max()))
+        sharp = _volume_kept(sharpened, rough_faces, self._volume)
+        off = math.sqrt(float((MeshDistance(*sharp)(smooth) ** 2).mean()))
+        yield *sharp, _UNCERTAIN * off
+        yield *_volume_kept(smooth, smooth_faces, self._volume), uncertain
+        yield smooth, smooth_faces, uncertain
 
     @property
     def _volume(self) -> float:
