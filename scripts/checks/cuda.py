@@ -24,7 +24,7 @@ from triton.backends.compiler import GPUTarget
 from triton.runtime import driver
 from triton.runtime.jit import JITFunction
 
-from autdtorch.fdtd.kernels.cuda import BLOCKS, DeviceMedium, DeviceRun
+from autdtorch.fdtd.kernels.cuda import DeviceMedium, DeviceRun, blocks_of
 from autdtorch.fdtd.kernels.cuda_tables import Shape
 from autdtorch.fdtd.stepping import assemble, drive_signal
 from autdtorch.propagators.scene_region import region_of
@@ -59,7 +59,8 @@ def compiled(capability: int, dtype: torch.dtype) -> dict[str, Any]:
     )
     driver.set_active(absent_gpu)
     with patch.object(JITFunction, "run", compile_only):
-        medium = DeviceMedium(assembly.coefficients, Shape(*assembly.grid.shape), BLOCKS, torch.device("cpu"))
+        shape = Shape(*assembly.grid.shape)
+        medium = DeviceMedium(assembly.coefficients, shape, blocks_of(shape), torch.device("cpu"))
         DeviceRun(medium, assembly.silence(sources), sources, receivers, len(signal)).advance(signal)
     return found
 

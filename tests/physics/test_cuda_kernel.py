@@ -41,7 +41,7 @@ WALL = Box((4.5e-3, 4.5e-3, 7.3e-3), (30e-3, 30e-3, 1.2e-3), density=5.0, sound_
 WHOLE = Blocks(x=32, y=32, z=32, lanes=1024)
 """One program a task: interpreted, a program takes the same time however large it is."""
 
-BLOCKS = Blocks() if torch.cuda.is_available() else WHOLE
+BLOCKS = None if torch.cuda.is_available() else WHOLE
 
 Parts = tuple[tuple[int, int, int], Coefficients, Sources, Receivers]
 

@@ -19,23 +19,33 @@ from autdtorch.fdtd.kernels.contract import Coefficients, Layer, Memory, Receive
 from autdtorch.utils.validation import invalid, no_cuda
 
 _GRAPH_STEPS = 16  # Steps of a captured graph; even, so that both fields return to their places
-# Most cells of a grid whose steps are captured. Beyond, a step should take longer than its launches: 33
-# million cells at 12 bytes need 130 us at 3 TB/s, three launches from Python some 100 us. An estimate, not
-# measured.
+# Most cells of a grid whose steps are captured. Beyond, a step takes longer than its three launches from
+# Python, some 100 us: 17 million cells take 112 us on an H100.
 _MOST_CAPTURED = 2**25
+_MOST_KEPT = 2**22  # Most cells whose two fields, in single precision, stay in 50 MB of cache
+_FEWEST_PROGRAMS = 1000  # That occupy a GPU of 132 multiprocessors
 
 
 class Blocks(NamedTuple):
     """Sizes of a program's work, powers of two."""
 
     x: int = 16  # planes that a tile marches through
-    y: int = 8  # rows of a tile
+    y: int = 4  # rows of a tile
     z: int = 32  # cells of its rows, which are contiguous
     lanes: int = 16  # columns through a boundary layer
 
 
-# One thread per cell. Chosen for few registers and many programs on small grids, not by timings.
-BLOCKS = Blocks()
+def blocks_of(shape: tables.Shape) -> Blocks:
+    """Return the blocks for a grid, by timings on an H100; `docs/decisions/cuda.md` has them."""
+    nx, ny, nz = shape
+    if nx * ny * nz > _MOST_KEPT:
+        return Blocks(32, 1, 256)
+    blocks = Blocks()
+    tiles = triton.cdiv(ny, blocks.y) * triton.cdiv(nz, blocks.z)
+    # a march takes its time however few programs there are
+    while blocks.x > 1 and triton.cdiv(nx, blocks.x) * tiles < _FEWEST_PROGRAMS:
+        blocks = blocks._replace(x=blocks.x // 2)
+    return blocks
 
 
 class Ends(NamedTuple):
@@ -54,7 +64,7 @@ class DeviceMedium:
     def __init__(self, c: Coefficients, shape: tables.Shape, blocks: Blocks, device: torch.device) -> None:
         """Copy the medium `c` of a grid to a device."""
         self.coefficients, self.shape, self.blocks, self.device = c, shape, blocks, device
-        self.cells, self.depths = c.layer_cells, triton.next_power_of_2(c.layer_cells)
+        self.cells, self.depths = c.layer_cells, triton.next_power_of_2(max(1, c.layer_cells))
         self.dtype = c.layer_decay.dtype
         weights = c.center, c.face, c.edge, c.corner, c.keep
         self.weights = torch.tensor(weights, dtype=self.dtype, device=device)
@@ -154,8 +164,8 @@ class DeviceRun:
 class CudaKernel:
     """Kernel on the current CUDA device, which keeps states, the medium and the last run; see `Kernel`."""
 
-    def __init__(self, blocks: Blocks = BLOCKS) -> None:
-        """Find the device; Triton may interpret without one."""
+    def __init__(self, blocks: Blocks | None = None) -> None:
+        """Find the device; Triton may interpret without one. By default, `blocks` fit the grid."""
         interpreted = triton.knobs.runtime.interpret
         if not interpreted and not torch.cuda.is_available():
             raise invalid("kernel", "cuda", no_cuda())
@@ -177,7 +187,7 @@ class CudaKernel:
         medium, run = self._medium, self._run
         if medium is None or medium.coefficients is not c or medium.shape != shape:
             self._run = run = None
-            self._medium = medium = DeviceMedium(c, shape, self._blocks, self._device)
+            self._medium = medium = DeviceMedium(c, shape, self._blocks or blocks_of(shape), self._device)
         if (
             run is None or run.state is not state or run.sources is not sources
             or run.receivers is not receivers or len(run.signal) != len(signal)
