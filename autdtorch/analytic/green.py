@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.arrays import TransducerArray, strengths_of
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.neighbours import distances
 from autdtorch.utils.validation import (
@@ -59,7 +59,7 @@ def free_space_matrix(points: ArrayLike, array: TransducerArray, wavenumber: com
     # node by node, with memory for one matrix only
     terms = (w * green(points, at, wavenumber) for at, w in zip(positions.unbind(1), weights, strict=True))
     none = torch.zeros((), dtype=torch.complex128, device="cpu")
-    return 4 * math.pi * array.source_strength * sum(terms, start=none)
+    return 4 * math.pi * strengths_of(array).to(points.device) * sum(terms, start=none)
 
 
 def _wavenumber(value: complex) -> tuple[float, float]:

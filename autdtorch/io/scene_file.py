@@ -6,11 +6,12 @@ The keys of a section are the arguments of the function or class that builds its
 from __future__ import annotations
 
 import inspect
+import operator
 import os
 from collections.abc import Callable, Collection, Mapping
-from functools import partial
+from functools import partial, reduce
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 
@@ -59,6 +60,10 @@ _KINDS: dict[str, dict[str, Builder]] = {  # what the key `type` of a section na
         "voxel_mask": VoxelMask.load,
     },
 }
+_JOINED: dict[str, tuple[str, Builder]] = {  # an example of an entry, and how a list of entries is joined
+    "array": ("{type: autd3, center: [0, 0, 0]}", partial(reduce, operator.add)),
+    "control_points": ("{type: points, positions: [...]}", torch.cat),
+}
 _BUILDERS: dict[str, Builder] = {  # of sections without `type`
     "observation_plane": Plane,
     "domain": lambda lower, upper: (finite_vector("lower", lower), finite_vector("upper", upper)),
@@ -68,7 +73,8 @@ _BUILDERS: dict[str, Builder] = {  # of sections without `type`
 def load_scene(source: str | os.PathLike[str] | Mapping[str, Any], modules: Collection[str] = ()) -> Scene:
     """Read a scene from a YAML file, or from a mapping of the same layout such as Hydra's `cfg.scene`.
 
-    Control points are a section, or a list of sections whose points follow one another. An obstacle has a
+    Control points and array are a section each, or a list of sections, whose points or transducers follow one
+    another. An obstacle has a
     `type`, or the `_target_` of a class of the user's own, such as `mymodule.MyObstacle`. The section `pose`,
     with the keys `offset` and `rotation`, moves all obstacles as one body; see `Scene.moved`.
 
@@ -130,14 +136,14 @@ def _part(
             raise invalid(where, value, "must be a list of obstacles")
         places = [(f"{where}[{index}]", entry) for index, entry in enumerate(value)]
         return [_part(place, "obstacle", entry, air, folder, modules) for place, entry in places]
-    if key == "control_points" and isinstance(value, list):
+    if key in _JOINED and isinstance(value, list):
         if not value or not all(isinstance(entry, dict) for entry in value):
-            raise invalid(
-                where, value, "must be a mapping such as {type: points, positions: [...]}, or a list of these"
-            )
+            example, _ = _JOINED[key]
+            raise invalid(where, value, f"must be a mapping such as {example}, or a list of these")
         groups = [(f"{where}[{index}]", entry) for index, entry in enumerate(value)]
         parts = [_part(place, key, entry, air, folder, modules) for place, entry in groups]
-        return torch.cat(cast(list[torch.Tensor], parts))
+        with within(where):
+            return _JOINED[key][1](parts)
     if key not in ("medium", *_KINDS, *_BUILDERS):
         return value
     section = _mapping(where, value)

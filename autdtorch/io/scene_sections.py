@@ -12,6 +12,7 @@ import numpy as np
 import torch
 import yaml
 
+from autdtorch.scene.arrays import recipes_of
 from autdtorch.scene.drive import amplitudes_of, phases_of
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Obstacle, Sphere, VoxelMask
@@ -31,7 +32,8 @@ _KINDS = {Box: "box", Sphere: "sphere", Cylinder: "cylinder", Mesh: "mesh", Voxe
 def save_scene(path: str | os.PathLike[str], scene: Scene) -> None:
     """Write a scene to a YAML file that `load_scene` reads.
 
-    Numbers keep their full precision. A mesh becomes an .obj file in its own coordinates, a voxel mask
+    Numbers keep their full precision. An array that was made by a method such as `TransducerArray.autd3`, or
+    joined of such arrays, keeps that form. A mesh becomes an .obj file in its own coordinates, a voxel mask
     an .npz file, beside the YAML file and with its name. Files that are there are replaced.
 
     Args:
@@ -56,19 +58,13 @@ def scene_sections(scene: Scene, name: str) -> dict[str, Any]:
     Raises:
         ValueError: an obstacle of a class of the user's own.
     """
-    array, medium = scene.array, scene.medium
-    normals = array.normals.tolist()
+    medium = scene.medium
+    boards = [{"type": recipe.kind, **recipe.arguments} for recipe in recipes_of(scene.array)]
     sections: dict[str, Any] = {
         "name": scene.name,
         "frequency": scene.frequency,
         "medium": {field.name: getattr(medium, field.name) for field in fields(medium)},
-        "array": {
-            "type": "positions",
-            "positions": array.positions.tolist(),
-            "normals": normals[0] if all(normal == normals[0] for normal in normals) else normals,
-            "source_strength": array.source_strength,
-            "radius": array.radius,
-        },
+        "array": boards[0] if len(boards) == 1 else boards,
         "obstacles": [
             _obstacle(one, f"{name}_{number}", f"Scene.obstacles[{number}]")
             for number, one in enumerate(scene.obstacles)
@@ -132,10 +128,19 @@ def scene_lines(scene: Scene, drive: torch.Tensor, name: str, beside: bool = Fal
         ValueError: an obstacle of a class of the user's own.
     """
     sections = scene_sections(scene, name)
-    array = {key: value for key, value in sections["array"].items() if key != "type"}
+    boards = sections["array"] if isinstance(sections["array"], list) else [sections["array"]]
     beside = beside and any("path" in section for section in sections["obstacles"])
     lines = ["from pathlib import Path", ""] if beside else []
-    lines += ["import autdtorch as at", "", _call("array", "TransducerArray", array)]
+    lines += ["import autdtorch as at", ""]
+    names = ["array"] if len(boards) == 1 else [f"array_{number}" for number in range(len(boards))]
+    for board_name, board in zip(names, boards, strict=True):
+        kind = board["type"]
+        function = "TransducerArray" if kind == "positions" else f"TransducerArray.{kind}"
+        lines.append(
+            _call(board_name, function, {key: value for key, value in board.items() if key != "type"})
+        )
+    if len(boards) > 1:
+        lines.append(f"array = {' + '.join(names)}")
     names = []
     for number, section in enumerate(sections["obstacles"]):
         names.append(f"obstacle_{number}")

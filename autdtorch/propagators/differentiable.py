@@ -13,6 +13,7 @@ from autdtorch.fdtd.steady_state import block_of, fewest_periods
 from autdtorch.fdtd.stepping import drive_dft, drive_signal
 from autdtorch.propagators.plan import available_kernel, make_kernel, precision_of
 from autdtorch.propagators.scene_region import region_of, warn_of_ending_walls, warn_of_near_points
+from autdtorch.scene.arrays import strengths_of
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene, require_inside
 from autdtorch.utils.validation import (
@@ -100,7 +101,7 @@ def differentiable_field(
     signal = drive_signal(assembly.steps_per_period, 0, steps * math.ceil(periods / block)).to(precision)
     fields = [torch.zeros((0, len(targets)), dtype=torch.complex128, device="cpu")]
     for row in drive.reshape(-1, drive.shape[-1]):
-        strength = scene.array.source_strength * row.cpu()
+        strength = strengths_of(scene.array) * row.cpu()
         sources = cells.driven(assembly.sources(nodes.positions, strength, nodes.weights))
         record = recorded(stepper, assembly, sources, receivers, signal)
         fields.append(drive_dft(record[-steps:], block)[None])  # the last block

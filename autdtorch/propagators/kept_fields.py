@@ -21,7 +21,7 @@ from autdtorch.propagators.box import BoxSimulation, Solved
 from autdtorch.propagators.plan import Plan
 from autdtorch.propagators.simulation import Run, TransferMatrix
 from autdtorch.propagators.symmetry import Symmetry, orbits_of_array
-from autdtorch.scene.arrays import apertures_of
+from autdtorch.scene.arrays import apertures_of, strengths_of
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import Index
 
@@ -102,7 +102,7 @@ class KeepingSimulation(BoxSimulation):
         if not new:
             return field, []
         array, receivers = self.plan.scene.array, Apertures.of_points(points)
-        sources, strength = [apertures_of(array)] * len(new), array.source_strength * drive[new]
+        sources, strength = [apertures_of(array)] * len(new), strengths_of(array) * drive[new]
         solved = self._stepped(sources, strength, receivers)
         field[new] = self.total(solved)
         if self._apart:
@@ -151,13 +151,14 @@ class KeepingSimulation(BoxSimulation):
         first, place = np.unique(representative, return_inverse=True)
         array = self.plan.scene.array
         alone = [apertures_of(array).chosen(slice(own, own + 1)) for own in first]
-        strength = torch.full((len(alone), 1), array.source_strength, dtype=torch.complex128, device="cpu")
+        strength = torch.ones((len(alone), 1), dtype=torch.complex128, device="cpu")
         solved = self._stepped(alone, strength, Apertures.of_points(points))
         if self._apart:
             amplitudes = []
             for box, own in zip(solved.boxes, solved.amplitudes, strict=True):
                 images = np.stack([_images(box, each) for each in self.symmetries])
-                amplitudes.append(own[torch.from_numpy(images[symmetry].T), torch.from_numpy(place)])
+                unit = own[torch.from_numpy(images[symmetry].T), torch.from_numpy(place)]
+                amplitudes.append(strengths_of(array) * unit)
             self._transducers = KeptFields(solved.boxes, amplitudes, tuple(solved.runs))
         return solved.runs
 
@@ -177,7 +178,7 @@ class KeepingSimulation(BoxSimulation):
         Without weights, they are those that were kept.
         """
         array, receivers = self.plan.scene.array, Apertures.of_points(points)
-        sources, strength = [apertures_of(array)] * len(drive), array.source_strength * drive
+        sources, strength = [apertures_of(array)] * len(drive), strengths_of(array) * drive
         return self.incident(sources, strength, receivers).mT + kept.scattered(receivers, weights)
 
 

@@ -21,7 +21,7 @@ from autdtorch.analytic.spherical_waves import mirrored, outgoing_waves
 from autdtorch.propagators.body_matrix import Solver, placed
 from autdtorch.propagators.cache import disk_cache
 from autdtorch.propagators.plan import available_kernel
-from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.arrays import TransducerArray, strengths_of
 from autdtorch.scene.geometry import composed_rotation
 from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Obstacle
@@ -217,7 +217,7 @@ def incoming_waves(body: ScatteringOperator, array: TransducerArray) -> torch.Te
         )
         for some in parts_of(offsets, len(body.matrix))
     ]
-    return 4j * math.pi * body.wavenumber * array.source_strength * torch.cat(means)
+    return 4j * math.pi * body.wavenumber * strengths_of(array)[:, None] * torch.cat(means)
 
 
 def waves_at(body: ScatteringOperator, points: torch.Tensor) -> torch.Tensor:

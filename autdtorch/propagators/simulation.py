@@ -24,7 +24,7 @@ from autdtorch.propagators.symmetry import (
     orbits_of_transducers,
     symmetries,
 )
-from autdtorch.scene.arrays import apertures_of
+from autdtorch.scene.arrays import apertures_of, strengths_of
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.progress import Progress, show_progress
@@ -183,12 +183,12 @@ class Simulation(ABC):
         sources, receivers = (targets, transducers) if orbits.from_points else (transducers, targets)
         begins = "points" if orbits.from_points else "transducers"
         logger.debug("transfer matrix: %d runs serve %d %s", orbits.runs, len(orbits.representative), begins)
-        strength = torch.full((orbits.runs, 1), array.source_strength, dtype=torch.complex128, device="cpu")
+        strength = torch.ones((orbits.runs, 1), dtype=torch.complex128, device="cpu")
         alone = [sources.chosen(slice(own, own + 1)) for own in orbits.representatives]
         found, runs = self.run(alone, strength, receivers)
         rows, remaining = orbits.expand(found), max(run.remaining for run in runs)
         periods = max(run.periods for run in runs)
-        matrix = rows if orbits.from_points else rows.mT.contiguous()
+        matrix = strengths_of(array) * (rows if orbits.from_points else rows.mT.contiguous())
         return TransferMatrix(matrix, remaining, periods, tuple(runs), orbits.from_points)
 
     def matrix_runs(self, points: torch.Tensor) -> int:
@@ -202,7 +202,7 @@ class Simulation(ABC):
     def fields(self, drive: torch.Tensor, points: torch.Tensor) -> tuple[torch.Tensor, list[Run]]:
         """Return the pressure (R, P) [Pa] of drives (R, M), none of them silent, and the runs it took."""
         array = self.plan.scene.array
-        sources, strength = [apertures_of(array)] * len(drive), array.source_strength * drive
+        sources, strength = [apertures_of(array)] * len(drive), strengths_of(array) * drive
         return self.run(sources, strength, Apertures.of_points(points))
 
     def run(

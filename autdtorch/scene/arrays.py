@@ -4,25 +4,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
 from autdtorch.scene.geometry import Coordinates, in_plane, plane_basis
+from autdtorch.scene.transducer_values import disc_radius, for_each, unit_normals
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.memory import require_memory
-from autdtorch.utils.neighbours import closest_pair, require_distinct
+from autdtorch.utils.neighbours import require_distinct
 from autdtorch.utils.validation import (
-    LENGTH_TOLERANCE,
     ArrayLike,
-    invalid,
-    not_negative,
     points_tensor,
     positive,
     positive_integers,
     real_tensor,
-    unit_vector,
+    require_kind,
 )
 
 PAPER_SOURCE_STRENGTH = 1 / (4 * math.pi)
@@ -51,15 +49,24 @@ _RINGS, _RING_NODES = 5, 16
 
 
 class Nodes(NamedTuple):
-    """The monopoles of N sources or receivers of equal shape, n each, in float64."""
+    """The monopoles of N sources or receivers, n each, in float64."""
 
     positions: torch.Tensor  # (N, n, 3) [m]
     weights: torch.Tensor  # (n,), with the sum 1
 
 
+class Recipe(NamedTuple):
+    """The function and the arguments that make an array, as numbers and lists, for files."""
+
+    kind: str  # "positions", or the name of a method such as "autd3"
+    arguments: dict[str, Any]
+
+
 @dataclass(frozen=True, eq=False, init=False, repr=False)
 class TransducerArray:
-    """An array of M transducers of equal strength and size. Its tensors are copies on the CPU.
+    """An array of M transducers. Its tensors are copies on the CPU.
+
+    `array + other` joins two arrays: the transducers of `array`, then those of `other`.
 
     A transducer is a point or a disc of monopoles, Rayleigh's integral for a flat circular piston of uniform
     velocity. Its far field has the directivity 2 J1(k a sin t) / (k a sin t) at the angle t from the normal.
@@ -68,26 +75,27 @@ class TransducerArray:
     Attributes:
         positions: (M, 3) [m], float64, all different.
         normals: directions of emission (M, 3), float64, of length 1.
-        source_strength: on-axis pressure in the far field at full drive, times distance [Pa m], > 0.
-        radius: of the discs [m]; 0 for point sources.
+        source_strength: on-axis pressure in the far field at full drive, times distance [Pa m], > 0: a number
+            if equal for all, otherwise (M,), float64.
+        radius: of the discs [m]; 0 for point sources: a number if equal for all, otherwise (M,), float64.
     """
 
     positions: torch.Tensor
     normals: torch.Tensor
-    source_strength: float
-    radius: float
+    source_strength: float | torch.Tensor
+    radius: float | torch.Tensor
 
     def __init__(
         self,
         positions: ArrayLike,
         normals: ArrayLike,
-        source_strength: float = PAPER_SOURCE_STRENGTH,
-        radius: float | None = None,
+        source_strength: ArrayLike = PAPER_SOURCE_STRENGTH,
+        radius: ArrayLike | None = None,
     ) -> None:
         """Check and copy the input; the arguments are the attributes, see `TransducerArray`.
 
-        A single normal (3,), of any length, serves all. The radius is at most half the distance of the
-        nearest two, None or 0 for points.
+        A single normal (3,), of any length, serves all, as does a single strength or radius. The radii of two
+        transducers are together at most their distance; None or 0 for points.
 
         Raises:
             ValueError: not finite, wrong shape, zero normal, strength <= 0, two transducers at one position,
@@ -96,11 +104,11 @@ class TransducerArray:
         places = points_tensor("TransducerArray.positions", positions).cpu()
         require_distinct("TransducerArray.positions", places)
         object.__setattr__(self, "positions", places.as_subclass(Coordinates))
-        directions = _unit_normals(normals, len(places))
+        directions = unit_normals(normals, len(places))
         object.__setattr__(self, "normals", directions.as_subclass(Coordinates))
-        strength = positive("TransducerArray.source_strength", source_strength, "Pa m")
+        strength = for_each("TransducerArray.source_strength", source_strength, len(places), positive, "Pa m")
         object.__setattr__(self, "source_strength", strength)
-        object.__setattr__(self, "radius", _disc_radius(radius, places))
+        object.__setattr__(self, "radius", disc_radius(radius, places))
 
     @classmethod
     def grid(
@@ -109,18 +117,20 @@ class TransducerArray:
         pitch: float,
         center: ArrayLike,
         normal: ArrayLike = (1.0, 0.0, 0.0),
-        source_strength: float = PAPER_SOURCE_STRENGTH,
-        radius: float | None = None,
+        source_strength: ArrayLike = PAPER_SOURCE_STRENGTH,
+        radius: ArrayLike | None = None,
+        angle: float = 0.0,
     ) -> TransducerArray:
         """Return a flat rectangular array; transducer i * shape[1] + j is i pitches along u and j along v.
 
         Args:
-            shape: numbers of transducers along u and v, the axes of `plane_basis(normal)`.
+            shape: numbers of transducers along u and v, the axes of `plane_basis(normal)` turned by `angle`.
             pitch: distance between neighbours [m], > 0.
             center: centre of the array (3,) [m].
             normal: direction of emission (3,).
-            source_strength: [Pa m], > 0.
-            radius: of the discs [m], at most half the pitch; None or 0 for point sources.
+            source_strength: [Pa m], > 0, a number or (M,).
+            radius: of the discs [m], a number or (M,), at most half the pitch; None or 0 for point sources.
+            angle: by which the array is turned in its plane [rad], from u towards v.
 
         Raises:
             ValueError: an argument is not finite, has the wrong shape or is out of range.
@@ -129,7 +139,8 @@ class TransducerArray:
         require_memory("shape", shape, _TRANSDUCER_BYTES * count_u * count_v)
         pitch = positive("pitch", pitch, "m")
         places = torch.cartesian_prod(pitch * _centred(count_u), pitch * _centred(count_v)).reshape(-1, 2)
-        return cls(in_plane(places, center, normal), normal, source_strength, radius)
+        more = {"shape": [count_u, count_v], "pitch": pitch}
+        return cls._placed("grid", places, center, normal, angle, source_strength, radius, **more)
 
     @classmethod
     def autd3(
@@ -138,8 +149,8 @@ class TransducerArray:
         normal: ArrayLike = (1.0, 0.0, 0.0),
         angle: float = 0.0,
         units: tuple[int, int] = (1, 1),
-        source_strength: float = AUTD3_SOURCE_STRENGTH,
-        radius: float | None = TRANSDUCER_RADIUS,
+        source_strength: ArrayLike = AUTD3_SOURCE_STRENGTH,
+        radius: ArrayLike | None = TRANSDUCER_RADIUS,
     ) -> TransducerArray:
         """Return an array of AUTD3 units, 249 transducers each, in the order of the device, unit by unit.
 
@@ -149,16 +160,17 @@ class TransducerArray:
             angle: of the device's x from u towards v [rad], with (u, v) = `plane_basis(normal)`.
             units: numbers of units along the device's x and y; unit i * units[1] + j is the i-th along x and
                 the j-th along y.
-            source_strength: [Pa m], > 0; by default the value of the AUTD3 SDK.
-            radius: of the discs [m]; None or 0 for point sources.
+            source_strength: [Pa m], > 0, a number or (M,); by default the value of the AUTD3 SDK.
+            radius: of the discs [m], a number or (M,); None or 0 for point sources.
 
         Raises:
             ValueError: an argument is not finite, has the wrong shape or is out of range.
         """
         count_x, count_y = positive_integers("units", units, 2)
         require_memory("units", units, _TRANSDUCER_BYTES * AUTD3_TRANSDUCERS * count_x * count_y)
-        positions = in_plane(_autd3_places(count_x, count_y), center, normal, angle)
-        return cls(positions, normal, source_strength, radius)
+        places = _autd3_places(count_x, count_y)
+        units = count_x, count_y
+        return cls._placed("autd3", places, center, normal, angle, source_strength, radius, units=list(units))
 
     @classmethod
     def sonicsurface(
@@ -166,8 +178,8 @@ class TransducerArray:
         center: ArrayLike,
         normal: ArrayLike = (1.0, 0.0, 0.0),
         angle: float = 0.0,
-        source_strength: float = SONICSURFACE_SOURCE_STRENGTH,
-        radius: float | None = TRANSDUCER_RADIUS,
+        source_strength: ArrayLike = SONICSURFACE_SOURCE_STRENGTH,
+        radius: ArrayLike | None = TRANSDUCER_RADIUS,
     ) -> TransducerArray:
         """Return the array of a SonicSurface: 16 x 16 transducers row by row from the largest y, x fastest.
 
@@ -177,7 +189,7 @@ class TransducerArray:
         """
         across = _SQUARE_PITCH * _centred(_SQUARE_PLACES)
         places = torch.cartesian_prod(-across, across).flip(1)
-        return cls(in_plane(places, center, normal, angle), normal, source_strength, radius)
+        return cls._placed("sonicsurface", places, center, normal, angle, source_strength, radius)
 
     @classmethod
     def openmpd(
@@ -185,8 +197,8 @@ class TransducerArray:
         center: ArrayLike,
         normal: ArrayLike = (1.0, 0.0, 0.0),
         angle: float = 0.0,
-        source_strength: float = OPENMPD_SOURCE_STRENGTH,
-        radius: float | None = TRANSDUCER_RADIUS,
+        source_strength: ArrayLike = OPENMPD_SOURCE_STRENGTH,
+        radius: ArrayLike | None = TRANSDUCER_RADIUS,
     ) -> TransducerArray:
         """Return the array of an OpenMPD board: 16 x 16 transducers column by column from the largest y.
 
@@ -195,7 +207,41 @@ class TransducerArray:
         """
         across = _SQUARE_PITCH * _centred(_SQUARE_PLACES)
         places = torch.cartesian_prod(across, -across)
-        return cls(in_plane(places, center, normal, angle), normal, source_strength, radius)
+        return cls._placed("openmpd", places, center, normal, angle, source_strength, radius)
+
+    @classmethod
+    def _placed(
+        cls,
+        kind: str,
+        places: torch.Tensor,
+        center: ArrayLike,
+        normal: ArrayLike,
+        angle: float,
+        source_strength: ArrayLike,
+        radius: ArrayLike | None,
+        **more: Any,
+    ) -> TransducerArray:
+        """Return the array of `places` (M, 2) [m] in a plane, which remembers how it was made."""
+        array = cls(in_plane(places, center, normal, angle), normal, source_strength, radius)
+        pose = {"center": _numbers(center), "normal": _numbers(normal), "angle": float(angle)}
+        object.__setattr__(array, "_recipes", (Recipe(kind, more | pose | _sizes(array)),))
+        return array
+
+    def __add__(self, other: TransducerArray) -> TransducerArray:
+        """Return both arrays as one, the transducers of `other` after those of this one.
+
+        Raises:
+            ValueError: `other` is no array, or the arrays overlap.
+        """
+        require_kind("TransducerArray + other", other, TransducerArray)
+        joined = TransducerArray(
+            torch.cat([self.positions, other.positions]),
+            torch.cat([self.normals, other.normals]),
+            torch.cat([strengths_of(self), strengths_of(other)]),
+            torch.cat([radii_of(self), radii_of(other)]),
+        )
+        object.__setattr__(joined, "_recipes", recipes_of(self) + recipes_of(other))
+        return joined
 
     @property
     def nodes(self) -> Nodes:
@@ -210,7 +256,7 @@ class TransducerArray:
     @property
     def half_extents(self) -> torch.Tensor:
         """Half the extents of the transducers along x, y and z (M, 3) [m]."""
-        return self.radius * (1 - self.normals**2).clamp(min=0).sqrt()
+        return radii_of(self)[:, None] * (1 - self.normals**2).clamp(min=0).sqrt()
 
     def __len__(self) -> int:
         """Return the number of transducers M."""
@@ -219,21 +265,64 @@ class TransducerArray:
     def __repr__(self) -> str:
         """Return count, centre, radius and strength, with units."""
         x, y, z = (1e3 * self.positions.mean(dim=0)).tolist()
-        size = f"radius {1e3 * self.radius:.4g} mm, " if self.radius else ""
+        size = f"radius {range_text(radii_of(self), 1e3)} mm, " if radii_of(self).any() else ""
         return (
             f"TransducerArray({len(self)} transducers around ({x:.4g}, {y:.4g}, {z:.4g}) mm, "
-            f"{size}source strength {self.source_strength:.4g} Pa m)"
+            f"{size}source strength {range_text(strengths_of(self))} Pa m)"
         )
+
+
+def recipes_of(array: TransducerArray) -> tuple[Recipe, ...]:
+    """Return the recipes of the arrays that were joined to an array; of one that was not, its own."""
+    known: tuple[Recipe, ...] | None = vars(array).get("_recipes")
+    if known is not None:
+        return known
+    normals = array.normals.tolist()
+    alike = all(normal == normals[0] for normal in normals)
+    places = {"positions": array.positions.tolist(), "normals": normals[0] if alike else normals}
+    return (Recipe("positions", places | _sizes(array)),)
+
+
+def _sizes(array: TransducerArray) -> dict[str, Any]:
+    """Return strength and radius of an array as arguments."""
+    return {"source_strength": _numbers(array.source_strength), "radius": _numbers(array.radius)}
+
+
+def _numbers(values: ArrayLike) -> Any:
+    """Return values as a number or list, with full precision."""
+    return real_tensor("values", values).tolist()
+
+
+def strengths_of(array: TransducerArray) -> torch.Tensor:
+    """Return the source strength of each transducer (M,) [Pa m]."""
+    return _expanded(array.source_strength, len(array))
+
+
+def radii_of(array: TransducerArray) -> torch.Tensor:
+    """Return the radius of each transducer (M,) [m]."""
+    return _expanded(array.radius, len(array))
+
+
+def _expanded(values: float | torch.Tensor, count: int) -> torch.Tensor:
+    each = torch.as_tensor(values, dtype=torch.float64, device="cpu")
+    return each.as_subclass(torch.Tensor).expand(count)
+
+
+def range_text(values: torch.Tensor, factor: float = 1.0) -> str:
+    """Return values for messages, multiplied by `factor`: one number, or the least and the largest."""
+    least, most = (f"{factor * float(end):.4g}" for end in (values.min(), values.max()))
+    return least if least == most else f"{least} to {most}"
 
 
 def apertures_of(array: TransducerArray) -> Apertures:
     """Return the transducers as sources or receivers: their nodes, and what their far field needs."""
-    if array.radius == 0:
+    radii = radii_of(array)
+    if not radii.any():
         return Apertures.of_points(array.positions)
     disc, weights = _disc_rule()
     axes = torch.stack([torch.stack(plane_basis(normal)) for normal in array.normals])
-    positions = array.positions[:, None] + array.radius * disc @ axes
-    return Apertures(positions, weights, array.normals, array.radius)
+    positions = array.positions[:, None] + radii[:, None, None] * disc @ axes
+    return Apertures(positions, weights, array.normals, radii)
 
 
 def _autd3_places(count_x: int, count_y: int) -> torch.Tensor:
@@ -266,23 +355,3 @@ def _disc_rule() -> tuple[torch.Tensor, torch.Tensor]:
     angle = 2 * np.pi / _RING_NODES * (step + ring % 2 / 2)
     disc = np.stack((radius * np.cos(angle), radius * np.sin(angle)), axis=-1).reshape(-1, 2)
     return torch.from_numpy(disc), torch.from_numpy(np.repeat(weights / (2 * _RING_NODES), _RING_NODES))
-
-
-def _disc_radius(given: float | None, positions: torch.Tensor) -> float:
-    name = "TransducerArray.radius"
-    radius = 0.0 if given is None else not_negative(name, given, "m")
-    if radius > 0:
-        most = closest_pair(positions)[0] / 2
-        if radius > most + LENGTH_TOLERANCE:
-            raise invalid(name, radius, f"must be at most {most:.6g} m, half the distance of neighbours", "m")
-    return radius
-
-
-def _unit_normals(normals: ArrayLike, count: int) -> torch.Tensor:
-    name = "TransducerArray.normals"
-    rows = real_tensor(name, normals).detach().cpu()
-    if rows.shape == (3,):
-        return rows.new_tensor(unit_vector(name, rows)).repeat(count, 1)
-    if rows.shape != (count, 3):
-        raise ValueError(f"{name}: shape {tuple(rows.shape)}; must be (3,) or ({count}, 3) as positions")
-    return rows.new_tensor([unit_vector(f"{name}[{m}]", row) for m, row in enumerate(rows)])

@@ -11,7 +11,7 @@ from operator import attrgetter
 
 import torch
 
-from autdtorch.scene.arrays import TransducerArray
+from autdtorch.scene.arrays import TransducerArray, range_text, strengths_of
 from autdtorch.scene.geometry import Coordinates, Plane
 from autdtorch.scene.medium import Medium as Medium
 from autdtorch.scene.obstacles import Mesh, Obstacle
@@ -187,7 +187,10 @@ class Scene:
         facts = [
             ("frequency", f"{self.frequency / 1e3:.4g} kHz, wavelength {1e3 * self.wavelength:.4g} mm"),
             ("medium", f"{fluid}, {medium.absorption:.3g} dB/m"),
-            ("transducers", f"{len(self.array)}, of source strength {self.array.source_strength:.4g} Pa m"),
+            (
+                "transducers",
+                f"{len(self.array)}, of source strength {range_text(strengths_of(self.array))} Pa m",
+            ),
             ("control points", str(len(self.control_points))),
             ("obstacles", ", ".join(_kinds(self.obstacles)) or "none"),
             ("domain", f"{self._size()} mm, {self._size(self.wavelength, 3)} wavelengths"),

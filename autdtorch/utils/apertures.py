@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -20,12 +21,12 @@ _FAR_RADII, _FAR_PHASE = 10.0, 0.14
 
 
 class Apertures(NamedTuple):
-    """N sources or receivers of equal shape, with n monopoles each, in float64."""
+    """N sources or receivers with n monopoles each, in float64."""
 
     positions: torch.Tensor  # of the monopoles (N, n, 3) [m]
     weights: torch.Tensor  # (n,), with the sum 1
     normals: torch.Tensor | None = None  # of discs (N, 3)
-    radius: float = 0.0  # of discs [m]
+    radii: torch.Tensor | None = None  # of discs (N,) [m]
 
     @classmethod
     def of_points(cls, points: torch.Tensor) -> Self:
@@ -34,24 +35,24 @@ class Apertures(NamedTuple):
 
     def chosen(self, index: slice | torch.Tensor) -> Self:
         """Return some of the sources or receivers."""
-        normals = None if self.normals is None else self.normals[index]
-        return self._replace(positions=self.positions[index], normals=normals)
+        normals, radii = (None if part is None else part[index] for part in (self.normals, self.radii))
+        return self._replace(positions=self.positions[index], normals=normals, radii=radii)
 
     @property
     def discs(self) -> Discs:
         """The discs that the monopoles stand for."""
         assert self.normals is not None
-        return Discs(self.positions.mean(dim=1), self.normals, self.radius)
+        assert self.radii is not None
+        return Discs(self.positions.mean(dim=1), self.normals, self.radii)
 
     def far_from(self, points: torch.Tensor, wavenumber: complex) -> torch.Tensor:
         """Return which of them (N,) are discs far enough from all points (P, 3) for `Discs.pattern`."""
-        count = len(self.positions)
-        if self.normals is None or len(points) == 0 or abs(wavenumber) * self.radius > _LARGEST:
-            return torch.zeros(count, dtype=torch.bool, device="cpu")
-        center = self.positions.mean(dim=1)
+        if self.radii is None or len(points) == 0:
+            return torch.zeros(len(self.positions), dtype=torch.bool, device="cpu")
+        center, size = self.positions.mean(dim=1), abs(wavenumber) * self.radii
         beyond = torch.maximum(points.amin(dim=0) - center, center - points.amax(dim=0)).clamp(min=0)
-        least = self.radius * max(_FAR_RADII, abs(wavenumber) * self.radius / (2 * _FAR_PHASE))
-        return torch.gt(beyond.norm(dim=1), least)
+        least = self.radii * (size / (2 * _FAR_PHASE)).clamp(min=_FAR_RADII)
+        return torch.gt(beyond.norm(dim=1), least) & (size <= _LARGEST)
 
 
 class Discs(NamedTuple):
@@ -59,10 +60,16 @@ class Discs(NamedTuple):
 
     centers: torch.Tensor  # (N, 3) [m]
     normals: torch.Tensor  # (N, 3)
-    radius: float  # [m]
+    radii: torch.Tensor  # (N,) [m]
+
+    def of_equal_radius(self) -> Iterator[tuple[torch.Tensor, Self]]:
+        """Yield the indices (n,) of the discs of each radius, and these discs."""
+        for radius in np.unique(self.radii.numpy()):
+            index = torch.nonzero(self.radii == radius)[:, 0]
+            yield index, type(self)(*(part[index] for part in self))
 
     def pattern(self, wavenumber: complex) -> Array:
-        """Return the factor on e^{i k r} / r far from a disc, real and imaginary part (orders, 2, terms).
+        """Return the factor on e^{i k r} / r far from discs of equal radius, with parts (orders, 2, terms).
 
         It is a polynomial in 1 / r and in u, the square of the sine of the angle from the normal. The order
         zero is 2 J1(v) / v with v^2 = (k a)^2 u; order n follows from the one before by the recursion of
@@ -70,7 +77,7 @@ class Discs(NamedTuple):
         the sphere.
         """
         power = np.arange(PATTERN_TERMS, dtype=np.float64)
-        factor = -((wavenumber * self.radius) ** 2) / 4
+        factor = -((wavenumber * float(self.radii[0])) ** 2) / 4
         orders: list[AnyArray] = [
             np.cumprod(np.concatenate(([1.0 + 0j], factor / (power[1:] * (power[1:] + 1)))))
         ]

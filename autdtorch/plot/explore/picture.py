@@ -12,6 +12,7 @@ from autdtorch.plot import colours
 from autdtorch.plot.data import MM, in_decibels
 from autdtorch.plot.explore.situation import Situation
 from autdtorch.plot.view3d import meshes
+from autdtorch.scene.arrays import radii_of
 from autdtorch.scene.geometry import Plane
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import Vector
@@ -173,11 +174,17 @@ class Picture:
         scene = self._situation.scene
         ray = torch.from_numpy(near + np.linspace(0, 1, _SAMPLES)[:, None] * (far - near))
         hits: list[tuple[int, Grip]] = []
-        spots = {"focus": (scene.control_points, scene.wavelength / 4)}
-        spots["transducer"] = scene.array.positions, scene.array.radius or scene.wavelength / 3
+        spots = {
+            "focus": (
+                scene.control_points,
+                torch.tensor(scene.wavelength / 4, dtype=torch.float64, device="cpu"),
+            )
+        }
+        radii = radii_of(scene.array)
+        spots["transducer"] = scene.array.positions, torch.where(radii > 0, radii, scene.wavelength / 3)
         for kind, (places, radius) in spots.items():
-            gaps = torch.cdist(ray, places)
-            if gaps.min() < radius:
+            gaps = torch.cdist(ray, places) - radius
+            if gaps.min() < 0:
                 index = int(gaps.min(dim=0).values.argmin())
                 place = places[index].numpy()
                 hits.append((int(gaps[:, index].argmin()), Grip(kind, index, place, place)))

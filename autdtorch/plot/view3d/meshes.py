@@ -12,6 +12,7 @@ import torch
 
 from autdtorch.plot import colours
 from autdtorch.plot.data import MM, inside_any, outside_on_plane, plane_magnitude, single_drive_phases
+from autdtorch.scene.arrays import radii_of
 from autdtorch.scene.drive import amplitudes_of
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Obstacle
@@ -122,19 +123,21 @@ def add_transducers(
     import pyvista
 
     positions = scene.array.positions
+    radii = radii_of(scene.array)
     # Point sources are drawn as discs that do not touch, of at most one wavelength.
-    radius = MM * (scene.array.radius or 0.42 * min(closest_pair(positions)[0], scene.wavelength))
+    drawn = torch.where(radii > 0, radii, 0.42 * min(closest_pair(positions)[0], scene.wavelength))
     points = pyvista.PolyData(MM * positions.numpy())
+    points["radius"] = MM * drawn.numpy()
     points["normals"] = scene.array.normals.numpy()
     if phases is not None:
         points["phase"] = phases / math.pi
-    along = {"orient": "normals", "scale": False}
+    along = {"orient": "normals", "scale": "radius"}
     face, rim = (
         points.glyph(geom=pyvista.Disc(inner=inner, outer=outer, normal=(1.0, 0.0, 0.0), c_res=48), **along)
-        for inner, outer in ((0.0, radius), (radius, 1.1 * radius))
+        for inner, outer in ((0.0, 1.0), (1.0, 1.1))
     )
     shape = {"tip_length": 0.35, "tip_radius": 0.1, "shaft_radius": 0.03}
-    arrow = pyvista.Arrow(start=(0.1 * radius, 0.0, 0.0), scale=2.0 * radius, **shape)
+    arrow = pyvista.Arrow(start=(0.1, 0.0, 0.0), scale=2.0, **shape)
     look = {"scalars": "phase", "cmap": colours.PHASE_MAP, "clim": (0.0, 2.0), "nan_color": _SILENT_COLOUR}
     if phases is None:
         look = {"color": colours.TRANSDUCER_COLOUR}
