@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import io
 import math
+import os
 import textwrap
 from collections.abc import Iterable, Sequence
 from itertools import cycle
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import matplotlib as mpl
@@ -16,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from autdtorch.methods.catalogue import label_of as label_of
+from autdtorch.utils.files import in_folder
 
 
 class Look(NamedTuple):
@@ -64,6 +67,10 @@ _LETTER = 0.08  # mean width of a letter [inch]
 
 class ShownFigure(Figure):
     """A figure that Jupyter displays although it is not registered with pyplot."""
+
+    def savefig(self, fname: Any, **kwargs: Any) -> None:
+        """Save the figure as Matplotlib does, in a folder that is made if it is missing."""
+        super().savefig(in_folder(Path(fname)) if isinstance(fname, str | os.PathLike) else fname, **kwargs)
 
     def _repr_png_(self) -> tuple[bytes, dict[str, int]]:
         """Return a PNG and its width on screen [px]."""

@@ -1,4 +1,4 @@
-"""Files that are written as a whole or not at all, errors that name them, and locks."""
+"""Folders that are made, files that are written whole or not at all, errors that name them, and locks."""
 
 from __future__ import annotations
 
@@ -26,16 +26,22 @@ def naming(path: Path) -> Iterator[None]:
         raise
 
 
+def in_folder(path: Path) -> Path:
+    """Return the path of a file that is to be written, after making its folder if that is missing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Give a temporary name to write a file under, and rename it to `path` when it is complete.
 
     Readers find the old file or the new one, never a part of it, also if several processes write it at once.
-    The partial files that killed writers left in the folder are removed.
+    The folder is made if it is missing. The partial files that killed writers left in the folder are removed.
     """
     partial = path.with_name(f"{path.name}.{uuid.uuid4().hex}{PARTIAL}")
     with naming(path):
-        _remove_abandoned(path.parent)
+        _remove_abandoned(in_folder(path).parent)
         try:
             yield partial
             with partial.open("rb+") as file:

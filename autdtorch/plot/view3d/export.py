@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from PIL import Image
 
 from autdtorch.plot.data import MM
+from autdtorch.utils.files import in_folder
 from autdtorch.utils.validation import path_of
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ def export_path(name: str, value: str | Path) -> Path:
 
 def write(plotter: pyvista.Plotter, path: Path, caption: Sequence[str]) -> None:
     """Write the view in the format of the path's suffix."""
+    in_folder(path)
     if path.suffix.lower() == ".png":
         Image.fromarray(plotter.screenshot(return_img=True)).save(path)
     elif path.suffix.lower() == ".gltf":

@@ -16,6 +16,7 @@ from autdtorch.plot.view3d import meshes
 from autdtorch.plot.view3d.export import export_path, write
 from autdtorch.plot.view3d.opengl import require_rendering
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.files import in_folder
 from autdtorch.utils.validation import (
     ArrayLike,
     boolean,
@@ -145,7 +146,7 @@ def animate3d(
     palette = Image.new("P", (1, 1))
     palette.putpalette(colours.tobytes())
     first, *others = (picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures)
-    first.save(path, save_all=True, append_images=others, duration=_FRAME_TIME, loop=0)
+    first.save(in_folder(path), save_all=True, append_images=others, duration=_FRAME_TIME, loop=0)
 
 
 def _colours(plotter: pyvista.Plotter) -> NDArray[np.uint8]:
