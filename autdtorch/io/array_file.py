@@ -1,23 +1,33 @@
-"""Transducer arrays from files: CSV, .npz and the board files of OpenMPD."""
+"""Transducer arrays from files: CSV, .npz, the board files of OpenMPD and the simulations of Ultraino."""
 
 from __future__ import annotations
 
 import os
+import warnings
+from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
+import torch
 
 from autdtorch.hardware.devices.openmpd_board import OpenMPDBoard
-from autdtorch.io.csv_table import read_table
+from autdtorch.io.csv_table import read_rows, table_of
+from autdtorch.io.ultraino_file import SUFFIX, read_ultraino
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import device_axes, in_plane
+from autdtorch.scene.scene import ScaleWarning
+from autdtorch.utils.array_types import Array
+from autdtorch.utils.neighbours import closest_pair
 from autdtorch.utils.numpy_file import read_arrays
 from autdtorch.utils.validation import ArrayLike, path_of, within
 
 # Columns of a CSV file with the positions of transducers and the directions of emission, and their units.
 PLACE_COLUMNS = {"x": "m", "y": "m", "z": "m"}
 NORMAL_COLUMNS = {"nx": "", "ny": "", "nz": ""}
+SIZE_COLUMNS = {"source_strength": "Pa m", "radius": "m"}
 _IGNORED = {"frame": "", "transducer": "", "phase": "rad", "amplitude": ""}
+_PITCHES = {"m": (1e-3, 0.1), "mm": (1.0, 100.0)}  # of arrays for airborne ultrasound, in each unit
 
 
 def load_array(
@@ -25,16 +35,20 @@ def load_array(
     center: ArrayLike = (0.0, 0.0, 0.0),
     normal: ArrayLike = (0.0, 0.0, 1.0),
     angle: float = 0.0,
-    source_strength: float | None = None,
-    radius: float | None = None,
+    source_strength: ArrayLike | None = None,
+    radius: ArrayLike | None = None,
 ) -> TransducerArray:
     """Read an array from a file, and place it in the scene; by default, in the coordinates of the file.
 
-    - `.csv`: columns `x [m]`, `y [m]`, `z [m]` (or `[mm]`), and `nx`, `ny`, `nz` for the directions of
-      emission, by default +z.
-    - `.npz`: arrays `positions` (M, 3) [m] and `normals` (M, 3) or (3,), optionally the numbers
-      `source_strength` [Pa m] and `radius` [m].
+    - `.csv`: columns `x [m]`, `y [m]`, `z [m]` (or `[mm]`, `[cm]`), and `nx`, `ny`, `nz` for the directions
+      of emission, by default +z; optionally `source_strength [Pa m]` and `radius [m]`. Names and units may be
+      in a comment. Without names, the columns are x, y, z or x, y, z, nx, ny, nz. A unit that is not stated
+      is inferred from the distance of neighbours, with a `ScaleWarning`.
+    - `.npz`: arrays `positions` (M, 3) [m] and `normals` (M, 3) or (3,), optionally `source_strength` [Pa m]
+      and `radius` [m], numbers or (M,).
     - `.pat`: a board of OpenMPD, emitting along +z; `OpenMPDBoard.load` also reads its calibration.
+    - `.xml.gz` or `.xml`: a simulation of Ultraino, its transducers in the order of their numbers, with their
+      powers and half their apertures as strengths and radii. Ultraino's y axis, which points up, becomes z.
 
     Files that `save_drive` writes without a device hold the array, too.
 
@@ -43,37 +57,80 @@ def load_array(
         center: position of the file's origin (3,) [m].
         normal: direction of its z axis (3,).
         angle: of its x axis from u towards v [rad], with (u, v) = `plane_basis(normal)`.
-        source_strength: [Pa m], > 0; None for the value in the file, or else the default of its format.
-        radius: of the discs [m], 0 for points; None for the value in the file, or the default of its format.
+        source_strength: [Pa m], > 0, a number or (M,); None for that of the file, or else of its format.
+        radius: of the discs [m], 0 for points, a number or (M,); None for that of the file, or else of its
+            format.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: another suffix, bad content, or a bad argument. The message names the file, and the line
             where it has lines.
     """
-    kind = path_of("path", path, suffixes=(".csv", ".npz", ".pat")).suffix.lower()
-    if kind == ".pat":
-        file = OpenMPDBoard.load(path).array()
-    else:
-        parts = _from_csv(path) if kind == ".csv" else _from_npz(path)
-        with within(path):
-            file = TransducerArray(**parts)
-    return TransducerArray(
+    kind = path_of("path", path, suffixes=tuple(_READERS)).suffix.lower()
+    parts = _READERS[kind if kind != ".gz" else SUFFIX](path)
+    given = {"source_strength": source_strength, "radius": radius}
+    with within(path):
+        file = TransducerArray(**parts | {name: value for name, value in given.items() if value is not None})
+    positions, normals = (
         in_plane(file.positions, center, normal, angle),
         file.normals @ device_axes(normal, angle),
-        file.source_strength if source_strength is None else source_strength,
-        file.radius if radius is None else radius,
     )
+    return TransducerArray(positions, normals, file.source_strength, file.radius)
+
+
+def _from_pat(path: str | os.PathLike[str]) -> dict[str, Any]:
+    board = OpenMPDBoard.load(path).array()
+    return {name: getattr(board, name) for name in ("positions", "normals", "source_strength", "radius")}
+
+
+def _from_ultraino(path: str | os.PathLike[str]) -> dict[str, Any]:
+    return read_ultraino(path).parts
 
 
 def _from_csv(path: str | os.PathLike[str]) -> dict[str, Any]:
-    table = read_table(path, PLACE_COLUMNS | NORMAL_COLUMNS | _IGNORED)
+    known = PLACE_COLUMNS | NORMAL_COLUMNS | SIZE_COLUMNS | _IGNORED
+    table = table_of(read_rows(path), known, partial(_names, path), partial(_unit, path))
     wanted = PLACE_COLUMNS | (NORMAL_COLUMNS if NORMAL_COLUMNS.keys() & table.keys() else {})
     if missing := [name for name in wanted if name not in table]:
         raise ValueError(f"{path}: no column {', '.join(missing)}; must have {', '.join(wanted)}")
     rows = table["frame"] == 0 if "frame" in table else slice(None)  # each frame repeats the array
     values = np.stack([table[name][rows] for name in wanted], axis=1)
-    return {"positions": values[:, :3], "normals": values[:, 3:] if len(wanted) > 3 else (0.0, 0.0, 1.0)}
+    sizes = {name: table[name][rows] for name in SIZE_COLUMNS if name in table}
+    return {
+        "positions": values[:, :3],
+        "normals": values[:, 3:] if len(wanted) > 3 else (0.0, 0.0, 1.0),
+        **sizes,
+    }
+
+
+def _names(path: str | os.PathLike[str], values: Array) -> list[str]:
+    """Return the names of columns without header."""
+    names = [*PLACE_COLUMNS, *NORMAL_COLUMNS]
+    if values.shape[1] not in (3, 6):
+        accepted = (
+            f"must be 3 or 6 ({', '.join(names)}), or begin with a line of names such as x [mm],y [mm],z [mm]"
+        )
+        raise ValueError(f"{path}: {values.shape[1]} columns without names; {accepted}")
+    return names[: values.shape[1]]
+
+
+def _unit(path: str | os.PathLike[str], kind: str, table: Mapping[str, Array]) -> str:
+    """Return the unit of lengths or strengths that state none: that in which the pitch is a usual one."""
+    if kind != "m":
+        return kind
+    if table.keys() >= PLACE_COLUMNS.keys():
+        places = torch.from_numpy(np.stack([table[name] for name in PLACE_COLUMNS], axis=1))
+        pitch = closest_pair(places)[0]
+        for unit, (least, most) in _PITCHES.items():
+            if least <= pitch < most:
+                why = f"since neighbours are {pitch:.4g} {unit} apart"
+                warnings.warn(
+                    f"{path}: no unit of length; taken as {unit}, {why}", ScaleWarning, stacklevel=2
+                )
+                return unit
+    raise ValueError(
+        f"{path}: columns {', '.join(table)} have no unit; the header must be as x [m] or x [mm]"
+    )
 
 
 def _from_npz(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -83,3 +140,12 @@ def _from_npz(path: str | os.PathLike[str]) -> dict[str, Any]:
             raise ValueError(f"{path}: no array {name!r}; must have positions and normals")
     names = ("positions", "normals", "source_strength", "radius")
     return {name: arrays[name] for name in names if name in arrays}
+
+
+_READERS = {
+    ".csv": _from_csv,
+    ".npz": _from_npz,
+    ".pat": _from_pat,
+    SUFFIX: _from_ultraino,
+    ".xml": _from_ultraino,
+}

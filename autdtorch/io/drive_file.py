@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import os
+import warnings
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +14,18 @@ import numpy as np
 import torch
 
 from autdtorch.hardware.devices import DEVICES
-from autdtorch.io.array_file import NORMAL_COLUMNS, PLACE_COLUMNS
-from autdtorch.io.csv_table import read_table, write_table
-from autdtorch.scene.arrays import TransducerArray
+from autdtorch.io.array_file import NORMAL_COLUMNS, PLACE_COLUMNS, SIZE_COLUMNS
+from autdtorch.io.csv_table import Rows, read_rows, table_of, write_table
+from autdtorch.io.ultraino_file import SUFFIX, read_ultraino
+from autdtorch.scene.arrays import TransducerArray, radii_of, strengths_of
 from autdtorch.scene.drive import (
     amplitudes_of,
     drive_from_phases,
     phases_of,
     validate_drive,
 )
-from autdtorch.utils.array_types import AnyArray
+from autdtorch.scene.scene import ScaleWarning
+from autdtorch.utils.array_types import AnyArray, Array
 from autdtorch.utils.numpy_file import read_arrays, write_arrays
 from autdtorch.utils.validation import ArrayLike, path_of, real_tensor, require_kind, require_one_of, within
 
@@ -28,7 +33,8 @@ _FORMATS = (".csv", ".npz")
 _LEVEL_COLUMNS = {f"{name} {column}": "" for name, device in DEVICES.items() for column in device.columns}
 _PLAIN_COLUMNS = {"phase": "rad", "amplitude": ""}
 _NUMBERING = {"frame": "", "unit": "", "transducer": ""}
-_COLUMNS = _NUMBERING | PLACE_COLUMNS | NORMAL_COLUMNS | _PLAIN_COLUMNS | _LEVEL_COLUMNS
+_COLUMNS = _NUMBERING | PLACE_COLUMNS | NORMAL_COLUMNS | SIZE_COLUMNS | _PLAIN_COLUMNS | _LEVEL_COLUMNS
+_TURN = 2 * math.pi + 1e-6  # [rad], with room for rounding
 
 
 def save_drive(
@@ -36,9 +42,9 @@ def save_drive(
 ) -> None:
     """Write a drive, or the frames of a sequence, with full precision or as the levels of a device.
 
-    Without `device`, `.csv` has the columns transducer, x, y, z [m], nx, ny, nz, phase [rad] and amplitude.
-    `.npz` has the arrays drive (M,), positions, normals, source_strength and radius. `load_array` reads the
-    array from both; .csv has neither strength nor radius.
+    Without `device`, `.csv` has the columns transducer, x, y, z [m], nx, ny, nz, source_strength [Pa m],
+    radius [m], phase [rad] and amplitude. `.npz` has the arrays drive (M,), positions, normals,
+    source_strength and radius. `load_array` reads the array from both.
 
     With `device`, the drive is rounded to its phase levels. The array must have the order of the device, as
     `TransducerArray.autd3`, `.sonicsurface` and `.openmpd` have. `.csv` has the columns unit, transducer and,
@@ -76,7 +82,17 @@ def save_drive(
 
 
 def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
-    """Read a drive (M,) or frames (T, M), complex128, of `save_drive`, levels as the device plays them.
+    """Read a drive (M,) or frames (T, M), complex128, levels as the device plays them.
+
+    - `.csv` and `.npz` of `save_drive`.
+    - `.csv` with the columns `phase [rad]` (or `[deg]`) and `amplitude`, by default 1; phases are phi. Names
+      and units may be in a comment. Without names, one column is phases, and two are phases and amplitudes if
+      only one of them can be amplitudes. A unit that is not stated is taken as rad if the phases are within a
+      turn and not all whole numbers. What was inferred is told by a `ScaleWarning`.
+    - `.csv` of OpenMPD and AcousTools: numbers of frames and transducers, then a row of phases [rad] for each
+      frame. These are arg q, at full amplitude, in the order of the file.
+    - `.xml.gz` or `.xml`: a simulation of Ultraino, as it is shown, without its animations; its phases are
+      arg q.
 
     Args:
         path: of the file; the suffix decides the format.
@@ -86,18 +102,11 @@ def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
         ValueError: another suffix, or a file without a drive. The message names the file, and the line where
             it has lines.
     """
-    path = path_of("path", path, suffixes=_FORMATS)
+    path = path_of("path", path, suffixes=(*_FORMATS, SUFFIX, ".xml"))
     if path.suffix.lower() == ".csv":
-        table = read_table(path, _COLUMNS)
-        for name, device in DEVICES.items():
-            if any(f"{name} {column}" in table for column in device.columns):
-                return _in_frames(path, _played(path, name, table), table)
-        if missing := [column for column in _PLAIN_COLUMNS if column not in table]:
-            accepted = "must have phase and amplitude, or a device's"
-            raise ValueError(f"{path}: no column {', '.join(missing)}; {accepted}")
-        with within(path):
-            drive = drive_from_phases(table["phase"], table["amplitude"])
-        return _in_frames(path, drive, table)
+        return _from_csv(path)
+    if path.suffix.lower() in (".gz", ".xml"):
+        return _from_ultraino(path)
     arrays = read_arrays(path)
     if "device" in arrays:
         name = str(arrays["device"])
@@ -119,6 +128,77 @@ def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
         return validate_drive(stored, stored.shape[-1])
 
 
+def _from_csv(path: Path) -> torch.Tensor:
+    rows = read_rows(path)
+    if (frames := _openmpd_frames(rows)) is not None:
+        return drive_from_phases(-frames)
+    table = table_of(rows, _COLUMNS, partial(_names, path), partial(_unit, path))
+    for name, device in DEVICES.items():
+        if any(f"{name} {column}" in table for column in device.columns):
+            return _in_frames(path, _played(path, name, table), table)
+    if "phase" not in table:
+        raise ValueError(f"{path}: no column phase; must have phase, or a device's such as autd3 phase")
+    with within(path):
+        drive = drive_from_phases(table["phase"], table.get("amplitude", 1.0))
+    return _in_frames(path, drive, table)
+
+
+def _openmpd_frames(rows: Rows) -> Array | None:
+    """Return the phases (T, M) of rows after a first line with T and M; None for a table of another kind."""
+    (_, first), *others = rows.lines
+    counts = [int(cell) for cell in first if cell.isdecimal()]
+    if len(first) != 2 or len(counts) != 2 or not others or len(others[0][1]) <= 2:
+        return None
+    frames = rows.numbers(1)
+    if list(frames.shape) != counts:
+        found = f"{frames.shape[0]} rows of {frames.shape[1]} phases"
+        raise ValueError(f"{rows.path}: {found}; must be {counts[0]} of {counts[1]}, as in the first line")
+    return frames
+
+
+def _names(path: Path, values: Array) -> list[str]:
+    """Return the names of columns (R, C) without header: phase, or phase and amplitude in their order."""
+    if values.shape[1] == 1:
+        return ["phase"]
+    amplitudes = [bool(((column >= 0) & (column <= 1)).all()) for column in values.T]
+    if len(amplitudes) != 2 or sum(amplitudes) != 1:
+        accepted = (
+            "the first line must name them, as in phase [rad],amplitude; "
+            "frames of phases follow a line with their number and that of transducers"
+        )
+        raise ValueError(f"{path}: {values.shape[1]} columns without names; {accepted}")
+    names = ["amplitude", "phase"] if amplitudes[0] else ["phase", "amplitude"]
+    text = f"{path}: columns without names; taken as {' and '.join(names)}, since only one is within 0 to 1"
+    warnings.warn(text, ScaleWarning, stacklevel=2)
+    return names
+
+
+def _unit(path: Path, kind: str, table: Mapping[str, Array]) -> str:
+    """Return the unit of columns that state none: rad, if the phases can hardly be levels or degrees."""
+    if kind != "rad":
+        return kind  # of positions, which are not used
+    phases = table["phase"]
+    if (np.abs(phases) <= _TURN).all() and not (phases == phases.round()).all():
+        warnings.warn(
+            f"{path}: no unit of phases; taken as rad, since all are within a turn", ScaleWarning, 2
+        )
+        return "rad"
+    span = f"phases from {phases.min():g} to {phases.max():g} without a unit"
+    raise ValueError(f"{path}: {span}; the first line must name it, as in phase [rad] or phase [deg]")
+
+
+def _from_ultraino(path: Path) -> torch.Tensor:
+    file = read_ultraino(path)
+    amplitudes = file.amplitudes
+    if not amplitudes.any():
+        if not file.phases.any():
+            raise ValueError(f"{path}: all phases and amplitudes are 0; must be saved with a drive")
+        warnings.warn(f"{path}: all amplitudes are 0, but not the phases; taken as 1", ScaleWarning, 2)
+        amplitudes = np.ones_like(amplitudes)
+    with within(path):
+        return drive_from_phases(-file.phases, amplitudes)
+
+
 def _in_frames(path: Path, drive: torch.Tensor, table: Mapping[str, AnyArray]) -> torch.Tensor:
     """Return the drive (M,) of all rows of a table, or the frames (T, M) that the table numbers."""
     if "frame" not in table:
@@ -135,11 +215,13 @@ def _plain(drive: torch.Tensor, array: TransducerArray) -> tuple[dict[str, Any],
     columns = {"transducer": np.arange(len(array))}
     columns |= {f"{name} [m]": positions[:, axis] for axis, name in enumerate(PLACE_COLUMNS)}
     columns |= {name: normals[:, axis] for axis, name in enumerate(NORMAL_COLUMNS)}
+    columns["source_strength [Pa m]"] = strengths_of(array).numpy()
+    columns["radius [m]"] = radii_of(array).numpy()
     columns = _numbered(columns, drive)
     flat = drive.flatten()
     columns |= {"phase [rad]": phases_of(flat).numpy(), "amplitude": amplitudes_of(flat).numpy()}
     arrays = {"drive": drive.numpy(), "positions": positions, "normals": normals}
-    return columns, arrays | {"source_strength": array.source_strength, "radius": array.radius}
+    return columns, arrays | {name: np.asarray(getattr(array, name)) for name in SIZE_COLUMNS}
 
 
 def _levelled(drive: torch.Tensor, name: str) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -58,7 +58,7 @@ def path_of(name: str, value: object, what: str = "a file", suffixes: Collection
     if not isinstance(text, str) or not text or "\0" in text:
         raise invalid(name, value, f"must be the path of {what}")
     path = Path(text)
-    if suffixes and path.suffix.lower() not in suffixes:
+    if suffixes and not re.fullmatch(f".+({'|'.join(map(re.escape, suffixes))})", path.name.lower()):
         raise invalid(name, text, f"must end in one of {', '.join(suffixes)}")
     return path
 

@@ -34,17 +34,16 @@ def test_drive_and_array_come_back(tmp_path, suffix):
     torch.testing.assert_close(read, drive, rtol=0, atol=0 if suffix == ".NPZ" else 1e-14)
     torch.testing.assert_close(places.positions, array.positions, rtol=0, atol=1e-15)
     torch.testing.assert_close(places.normals, array.normals, rtol=0, atol=1e-15)
-    if suffix == ".NPZ":
-        assert (places.source_strength, places.radius) == (array.source_strength, array.radius)
+    assert (places.source_strength, places.radius) == (array.source_strength, array.radius)
 
 
 def test_csv_can_be_read_by_a_person(tmp_path):
-    array = TransducerArray([[0, 0, 0], [0, 10e-3, 0]], (1, 0, 0))
+    array = TransducerArray([[0, 0, 0], [0, 10e-3, 0]], (1, 0, 0), [2.0, 3.0], 4e-3)
     save_drive(tmp_path / "drive.csv", drive_from_phases([0.25, 1.5], [1, 0.5]), array)
     assert (tmp_path / "drive.csv").read_text().splitlines() == [
-        "transducer,x [m],y [m],z [m],nx,ny,nz,phase [rad],amplitude",
-        "0,0.0,0.0,0.0,1.0,0.0,0.0,0.25,1.0",
-        "1,0.0,0.01,0.0,1.0,0.0,0.0,1.5,0.5",
+        "transducer,x [m],y [m],z [m],nx,ny,nz,source_strength [Pa m],radius [m],phase [rad],amplitude",
+        "0,0.0,0.0,0.0,1.0,0.0,0.0,2.0,0.004,0.25,1.0",
+        "1,0.0,0.01,0.0,1.0,0.0,0.0,3.0,0.004,1.5,0.5",
     ]
 
 
@@ -95,7 +94,7 @@ def test_autd3_gets_bytes_in_the_order_of_its_units(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("transducer,phase [rad]\n0,1\n", r"d.csv: no column amplitude; must have phase and amplitude"),
+        ("transducer,amplitude\n0,1\n", r"d.csv: no column phase; must have phase"),
         ("phase [rad],amplitude\n0,2\n", r"d.csv: amplitudes: from 2 to 2"),
         ("unit,transducer,autd3 phase\n0,0,1\n", r"d.csv: no autd3 intensity; must have autd3 phase, "),
         ("frame,phase [rad],amplitude\n0,1,1\n0,1,1\n1,1,1\n", r"d.csv: column frame; must count"),

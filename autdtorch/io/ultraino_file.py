@@ -1,0 +1,237 @@
+"""Simulations that Ultraino saves (.xml.gz): transducers with their strengths, sizes, phases and amplitudes.
+
+The file is the text in which Java's XMLEncoder writes objects: a list of calls that set fields and
+properties. Only these are followed, on records of values: nothing of the file is run. Ultraino's y axis,
+along which its transducers emit, becomes z here.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.parsers import expat
+
+import numpy as np
+
+from autdtorch.utils.array_types import Array
+from autdtorch.utils.validation import within
+
+SUFFIX = ".xml.gz"
+
+_LARGEST = 2**26  # [bytes] of unpacked text; a hundred transducers take 0.3 MB, with an animation 5 MB
+_DEEPEST = 200  # levels of elements; Ultraino writes 13
+_GZIP = 16 + zlib.MAX_WBITS
+_NUMBERS = ("float", "double", "int", "long", "short", "byte")
+# Ultraino leaves out what has its default
+_TRANSDUCER = {"power": 2.53, "apperture": 9e-3, "phase": 0.0, "amplitude": 0.0, "orderNumber": 0.0}
+_ROTATION = {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
+_VECTOR = {"x": 0.0, "y": 0.0, "z": 0.0}
+
+
+class UltrainoFile(NamedTuple):
+    """The M transducers of a file, in the order of their numbers.
+
+    Attributes:
+        parts: positions (M, 3) [m], normals (M, 3), source_strength (M,) [Pa m] and radius (M,) [m].
+        amplitudes: (M,), 0 to 1.
+        phases: arg q (M,) [rad]; Ultraino corrects phases of devices elsewhere.
+    """
+
+    parts: dict[str, Array]
+    amplitudes: Array
+    phases: Array
+
+
+@dataclass(eq=False)
+class _Record:
+    """An object of the file: its class, its fields and the entries that were added to it."""
+
+    kind: str = ""
+    fields: dict[str, Any] = field(default_factory=dict)
+    entries: list[Any] = field(default_factory=list)
+
+    def get(self, name: str) -> Any:
+        return self.fields.setdefault(name, _Record())
+
+
+class _Field(NamedTuple):
+    """A field of a class, on which `set` and `get` are called."""
+
+    name: str
+
+
+def read_ultraino(path: str | os.PathLike[str]) -> UltrainoFile:
+    """Read a simulation of Ultraino; `ValueError` names the file and what is wrong."""
+    reader = _Reader()
+    try:
+        reader.feed(_unpacked(Path(path)))
+    except (expat.ExpatError, zlib.error, EOFError) as error:
+        raise ValueError(f"{path}: {error}; must be a simulation saved by Ultraino, XML in gzip") from error
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    lists = [one.fields.get("transducers") for one in reader.of_kind("Simulation")]
+    found = [one for each in lists if isinstance(each, _Record) for one in each.entries]
+    if not found:
+        raise ValueError(f"{path}: no transducers; must be a simulation saved by Ultraino with some")
+    with within(path):
+        return _transducers(found)
+
+
+def _transducers(found: list[Any]) -> UltrainoFile:
+    order = np.argsort(_values("transducer", found, _TRANSDUCER)["orderNumber"], kind="stable")
+    records = [found[index] for index in order]
+    values = _values("transducer", records, _TRANSDUCER)
+    poses = [_inner(record, "transform") for record in records]
+    places = np.stack(
+        [*_values("translation", [_inner(p, "translation") for p in poses], _VECTOR).values()], 1
+    )
+    turn = _values("rotation", [_inner(pose, "rot") for pose in poses], _ROTATION)
+    w, x, y, z = (turn[name] for name in "wxyz")
+    emitted = np.stack([2 * (x * y - w * z), w * w - x * x + y * y - z * z, 2 * (y * z + w * x)], axis=1)
+    upright = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])  # x stays, y becomes z, z becomes -y
+    parts = {
+        "positions": places @ upright,
+        "normals": emitted @ upright,
+        "source_strength": values["power"],
+        "radius": values["apperture"] / 2,
+    }
+    return UltrainoFile(parts, values["amplitude"], math.pi * values["phase"])
+
+
+def _inner(record: Any, name: str) -> Any:
+    return record.fields.get(name, _Record()) if isinstance(record, _Record) else None
+
+
+def _values(what: str, records: list[Any], defaults: Mapping[str, float]) -> dict[str, Array]:
+    """Return the numbers (M,) of the records by the names of their fields."""
+    columns = {}
+    for name, default in defaults.items():
+        column = [
+            record.fields.get(name, default) if isinstance(record, _Record) else None for record in records
+        ]
+        for number, value in enumerate(column):
+            if not isinstance(value, float) or not math.isfinite(value):
+                shown = "another object" if isinstance(value, _Record) else repr(value)
+                raise ValueError(f"{what} {number}, {name}: {shown}; must be a finite number")
+        columns[name] = np.array(column)
+    return columns
+
+
+def _unpacked(path: Path) -> bytes:
+    """Return the text of a file, packed or not, of limited size."""
+    content = path.read_bytes()
+    if content[:2] != b"\x1f\x8b":
+        text, rest = content[:_LARGEST], content[_LARGEST:]
+    else:
+        unpacker = zlib.decompressobj(_GZIP)
+        text = unpacker.decompress(content, _LARGEST)
+        rest = unpacker.unconsumed_tail
+        if not unpacker.eof and not rest:
+            raise EOFError("it breaks off")
+    if rest:
+        raise ValueError(f"more than {_LARGEST} bytes of text; Ultraino writes far less")
+    return text
+
+
+class _Call:
+    """An element that is being read: a call on a `target`, whose arguments and result are collected."""
+
+    def __init__(self, reader: _Reader, tag: str, attributes: dict[str, str], target: Any) -> None:
+        self._reader, self.tag, self.attributes, self._target = reader, tag, attributes, target
+        self.text, self.arguments = "", []  # type: str, list[Any]
+        self._result: Any = None
+        self._known = False
+        if "method" not in attributes and "property" not in attributes and tag in ("object", "void"):
+            self._keep(self._made())  # at once, as what follows in it may name it
+
+    def _made(self) -> Any:
+        if "idref" in self.attributes:
+            return self._reader.record(self.attributes["idref"])
+        return _Record(self.attributes.get("class", ""))
+
+    def _keep(self, result: Any) -> None:
+        self._result, self._known = result, True
+        if "id" in self.attributes:
+            self._reader.records[self.attributes["id"]] = result
+        if isinstance(result, _Record) and result.kind and "class" in self.attributes:
+            self._reader.made.append(result)
+
+    @property
+    def result(self) -> Any:
+        """The value of the call, made with the arguments that have been read."""
+        if not self._known:
+            self._keep(self._called())
+        return self._result
+
+    def _called(self) -> Any:
+        target, arguments = self._target, self.arguments
+        if self.tag in _NUMBERS:
+            return float(self.text)
+        if self.tag in ("string", "boolean", "char", "class"):
+            return self.text
+        method, name = self.attributes.get("method"), self.attributes.get("property")
+        if method == "getField" and arguments and isinstance(arguments[0], str):
+            return _Field(arguments[0])
+        if isinstance(target, _Field) and arguments and isinstance(arguments[0], _Record):
+            if method == "set" and len(arguments) == 2:
+                arguments[0].fields[target.name] = arguments[1]
+            return arguments[0].get(target.name)
+        if name is not None and isinstance(target, _Record):
+            if arguments:
+                target.fields[name] = arguments[-1]
+            return target.get(name)
+        if method == "add" and isinstance(target, _Record):
+            target.entries += arguments
+        return _Record()
+
+
+class _Reader:
+    """Follows the calls of a file."""
+
+    def __init__(self) -> None:
+        self.records: dict[str, Any] = {}
+        self.made: list[_Record] = []
+        self._open: list[_Call] = []
+
+    def of_kind(self, name: str) -> list[_Record]:
+        return [one for one in self.made if one.kind.rpartition(".")[2] == name]
+
+    def record(self, name: str) -> Any:
+        """Return the value of a name; that of an element that is still being read is made now."""
+        waiting = next((call for call in self._open if call.attributes.get("id") == name), None)
+        return self.records.get(name) if waiting is None else waiting.result
+
+    def feed(self, text: bytes) -> None:
+        """Read a text without a document type, which alone could define entities."""
+        parser = expat.ParserCreate()
+        parser.buffer_text = True
+        parser.StartDoctypeDeclHandler = self._refuse
+        parser.StartElementHandler = self._begin
+        parser.EndElementHandler = self._end
+        parser.CharacterDataHandler = self._add
+        parser.Parse(text, True)
+
+    def _refuse(self, *_: object) -> None:
+        raise ValueError("it has a document type; must be a simulation saved by Ultraino")
+
+    def _begin(self, tag: str, attributes: dict[str, str]) -> None:
+        if len(self._open) >= _DEEPEST:
+            raise ValueError(f"elements in more than {_DEEPEST} levels; Ultraino writes 13")
+        calls_on = self._open and tag == "void" and not attributes.keys() & {"class", "idref"}
+        target = self._open[-1].result if calls_on else None
+        self._open.append(_Call(self, tag, attributes, target))
+
+    def _end(self, tag: str) -> None:
+        call = self._open.pop()
+        result = call.result
+        if tag != "void" and self._open:
+            self._open[-1].arguments.append(result)
+
+    def _add(self, text: str) -> None:
+        if self._open:
+            self._open[-1].text += text
