@@ -22,6 +22,7 @@ _UNITS: dict[str, dict[str, float]] = {  # factors to SI of the accepted units, 
     "rad": {"rad": 1.0, "deg": math.pi / 180, "°": math.pi / 180},
     "Pa m": {"Pa m": 1.0},
 }
+_LONGEST = 1000  # characters of a name or a comment that are read; the search for units takes their square
 
 
 class Column(NamedTuple):
@@ -95,14 +96,14 @@ def read_rows(path: str | os.PathLike[str]) -> Rows:
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1
         raise ValueError(f"{path}, line {line}: {error}; must be CSV in UTF-8") from error
-    numbered = [(number, line.strip()) for number, line in enumerate(re.split("\r\n|\r|\n", text), 1)]
-    comments = [line.lstrip("# ") for _, line in numbered if line.startswith("#")]
-    lines = [(number, line) for number, line in numbered if line and not line.startswith("#")]
+    numbered = list(enumerate(re.split("\r\n|\r|\n", text), 1))
+    comments = [line.strip()[:_LONGEST].lstrip("# ") for _, line in numbered if line.lstrip().startswith("#")]
+    lines = [(number, line) for number, line in numbered if not re.fullmatch(r"[,;\s]*|\s*#.*", line)]
     if not lines:
         raise ValueError(f"{path}: empty; must begin with the names of the columns, or with numbers")
     separator = _separator(lines[0][1])
     cells = [(number, _cells(f"{path}, line {number}", line, separator)) for number, line in lines]
-    return Rows(str(path), [(number, own) for number, own in cells if any(own)], comments, separator)
+    return Rows(str(path), cells, comments, separator)
 
 
 def table_of(
@@ -161,7 +162,7 @@ def _separator(line: str) -> str:
 def _cells(where: str, line: str, separator: str) -> list[str]:
     """Return the cells of a line without blanks around them; an empty one at the end is left out."""
     if not separator:
-        return re.sub(r"\s+(?=[\[(])", "", line).split()
+        return re.sub(r"(?<!\s)\s+(?=[\[(])", "", line).split()  # a unit belongs to its name
     try:
         cells = [cell.strip() for cell in next(csv.reader([line], delimiter=separator))]
     except csv.Error as error:
@@ -203,6 +204,7 @@ def _from_comments(rows: Rows, columns: Mapping[str, str]) -> list[Column] | Non
 def _column(where: str, cell: str, columns: Mapping[str, str]) -> Column:
     """Return the column of a header such as `x [mm]`, `x (mm)`, `x_mm` or `X`."""
     by_name = {name.casefold(): name for name in columns}
+    cell = cell[:_LONGEST]
     text = cell.casefold()
     match = re.fullmatch(r"([^\[\]()]*?)\s*[\[(](.*)[\])]", text)
     if match is None and text not in by_name:

@@ -24,6 +24,7 @@ from autdtorch.utils.validation import within
 SUFFIX = ".xml.gz"
 
 _LARGEST = 2**26  # [bytes] of unpacked text; a hundred transducers take 0.3 MB, with an animation 5 MB
+_MOST = 2_000_000  # elements; an animation of 5 MB has 110,000
 _DEEPEST = 200  # levels of elements; Ultraino writes 13
 _GZIP = 16 + zlib.MAX_WBITS
 _NUMBERS = ("float", "double", "int", "long", "short", "byte")
@@ -47,7 +48,7 @@ class UltrainoFile(NamedTuple):
     phases: Array
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, slots=True)
 class _Record:
     """An object of the file: its class, its fields and the entries that were added to it."""
 
@@ -74,7 +75,7 @@ def read_ultraino(path: str | os.PathLike[str]) -> UltrainoFile:
         raise ValueError(f"{path}: {error}; must be a simulation saved by Ultraino, XML in gzip") from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    lists = [one.fields.get("transducers") for one in reader.of_kind("Simulation")]
+    lists = [one.fields.get("transducers") for one in reader.simulations]
     found = [one for each in lists if isinstance(each, _Record) for one in each.entries]
     if not found:
         raise ValueError(f"{path}: no transducers; must be a simulation saved by Ultraino with some")
@@ -158,8 +159,8 @@ class _Call:
         self._result, self._known = result, True
         if "id" in self.attributes:
             self._reader.records[self.attributes["id"]] = result
-        if isinstance(result, _Record) and result.kind and "class" in self.attributes:
-            self._reader.made.append(result)
+        if "class" in self.attributes and isinstance(result, _Record) and result.kind.endswith(".Simulation"):
+            self._reader.simulations.append(result)
 
     @property
     def result(self) -> Any:
@@ -195,11 +196,9 @@ class _Reader:
 
     def __init__(self) -> None:
         self.records: dict[str, Any] = {}
-        self.made: list[_Record] = []
+        self.simulations: list[_Record] = []
         self._open: list[_Call] = []
-
-    def of_kind(self, name: str) -> list[_Record]:
-        return [one for one in self.made if one.kind.rpartition(".")[2] == name]
+        self._count = 0
 
     def record(self, name: str) -> Any:
         """Return the value of a name; that of an element that is still being read is made now."""
@@ -222,6 +221,9 @@ class _Reader:
     def _begin(self, tag: str, attributes: dict[str, str]) -> None:
         if len(self._open) >= _DEEPEST:
             raise ValueError(f"elements in more than {_DEEPEST} levels; Ultraino writes 13")
+        self._count += 1
+        if self._count > _MOST:
+            raise ValueError(f"more than {_MOST} elements; Ultraino writes far fewer")
         calls_on = self._open and tag == "void" and not attributes.keys() & {"class", "idref"}
         target = self._open[-1].result if calls_on else None
         self._open.append(_Call(self, tag, attributes, target))

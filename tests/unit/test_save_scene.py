@@ -1,16 +1,20 @@
 """A scene that is saved is the scene that is loaded, and so are the lines of Python that make it."""
 
+import functools
 import math
+import operator
 import runpy
 
 import numpy as np
 import pytest
 import torch
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import autdtorch as at
 from autdtorch.io.scene_sections import scene_lines, write_files
+from autdtorch.scene.arrays import radii_of, recipes_of, strengths_of
 
 COORDINATE = st.floats(0.02, 0.06)
 PLACE = st.tuples(COORDINATE, COORDINATE, COORDINATE)
@@ -49,16 +53,109 @@ def scene_with(obstacle, plane):
     return at.Scene(array, at.Medium.air(31.0), 40e3, points, (obstacle,), sheet, name="a: b")
 
 
+NORMAL = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda n: math.hypot(*n) > 0.1)
+ANGLE = st.floats(-4, 4)
+STRENGTHS = st.lists(st.floats(0.1, 9), min_size=4, max_size=4)
+RADII = st.lists(st.floats(0, 4e-3), min_size=4, max_size=4)
+# Functions that make an array around (x, 0, 0), so that several can be put side by side
+BOARDS = st.one_of(
+    st.builds(
+        lambda normal, angle, strength, radius: (
+            lambda x: at.TransducerArray.grid((2, 2), 9e-3, (x, 0, 0), normal, strength, radius, angle)
+        ),
+        NORMAL, ANGLE, STRENGTHS | st.just(2.0), RADII | st.sampled_from([None, 3e-3]),
+    ),
+    st.builds(
+        lambda heights, normal, strength, radius: (
+            lambda x: at.TransducerArray(
+                [(x + 0.02 * n, 0, height) for n, height in enumerate(heights)], normal, strength, radius
+            )
+        ),
+        st.lists(COORDINATE, min_size=4, max_size=4), NORMAL, STRENGTHS, RADII,
+    ),
+    st.builds(
+        lambda kind, normal, angle: (
+            lambda x: getattr(at.TransducerArray, kind)((x, 0, 0), normal, angle, radius=None)
+        ),
+        st.sampled_from(["autd3", "sonicsurface", "openmpd"]), NORMAL, ANGLE,
+    ),
+)  # fmt: skip
+
+
+def kinds_in(path):
+    """The types of the arrays in a scene file."""
+    section = yaml.safe_load(path.read_text("utf-8"))["array"]
+    return [board["type"] for board in (section if isinstance(section, list) else [section])]
+
+
+@given(st.lists(BOARDS, min_size=1, max_size=3))
+@settings(max_examples=15, deadline=None)
+def test_arrays_keep_their_form_and_their_bits(tmp_path_factory, boards):
+    array = functools.reduce(operator.add, [board(0.5 * number) for number, board in enumerate(boards)])
+    scene = at.Scene(array, at.Medium.air(20.0), 40e3, [(0.03, 0.01, 3.0)])
+    path = tmp_path_factory.mktemp("arrays") / "scene.yaml"
+    at.save_scene(path, scene)
+    require_equal(at.load_scene(path), scene)
+    made = {}
+    exec(scene_lines(scene, torch.ones(len(array), dtype=torch.complex128), "scene"), made)
+    require_equal(made["scene"], scene)
+    assert kinds_in(path) == [recipe.kind for board in boards for recipe in recipes_of(board(0.0))]
+
+
+def test_a_scene_file_joins_boards_in_their_order(tmp_path):
+    (tmp_path / "scene.yaml").write_text("""
+frequency: 40e3
+medium: {density: 1.2, sound_speed: 343.0}
+array:
+- {type: openmpd, center: [0, 0, 0.12], normal: [0, 0, -1], angle: 3.14159}
+- {type: openmpd, center: [0, 0, -0.12], normal: [0, 0, 1]}
+- {type: grid, shape: [1, 2], pitch: 10e-3, center: [0.2, 0, 0], normal: [-1, 0, 1], angle: 0.3,
+   source_strength: [1.0, 2.0], radius: [0, 4e-3]}
+control_points: {type: points, positions: [[0, 0, 0.01]]}
+""")
+    scene = at.load_scene(tmp_path / "scene.yaml")
+    assert (scene.array.positions[:256, 2] == 0.12).all()
+    assert (scene.array.positions[256:512, 2] == -0.12).all()
+    assert strengths_of(scene.array)[-3:].tolist() == [3.4, 1.0, 2.0]
+    assert radii_of(scene.array)[-3:].tolist() == [4.5e-3, 0.0, 4e-3]
+    at.save_scene(tmp_path / "saved.yaml", scene)
+    assert kinds_in(tmp_path / "saved.yaml") == ["openmpd", "openmpd", "grid"]
+    drive = torch.ones(514, dtype=torch.complex128)
+    with pytest.raises(ValueError, match="514 transducers; must be a multiple of 256 for openmpd"):
+        at.save_drive(tmp_path / "drive.npz", drive, scene.array, "openmpd")
+    boards = at.TransducerArray.openmpd((0, 0, 0)) + at.TransducerArray.openmpd((0.1, 0, 0))
+    at.save_drive(tmp_path / "drive.npz", drive[:512] * 1j, boards, "openmpd")
+    assert at.load_drive(tmp_path / "drive.npz").shape == (512,)
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        ("[]", r"scene.yaml: array: .*; must be a mapping such as {type: autd3"),
+        ("[autd3]", r"scene.yaml: array: .*'autd3'.*; must be a mapping such as {type: autd3"),
+        ("[{type: autd3, center: [0, 0, 0]}, {type: autd, center: [0, 0, 0]}]", r"array\[1\]: type: 'autd'"),
+        ("[{type: autd3, center: [0, 0, 0]}, {type: autd3, center: [0, 0, 0]}]", r"array: .* coincide"),
+    ],
+)
+def test_what_is_wrong_with_boards_is_said(tmp_path, array, message):
+    (tmp_path / "scene.yaml").write_text(f"""
+frequency: 40e3
+medium: {{density: 1.2, sound_speed: 343.0}}
+array: {array}
+control_points: {{type: points, positions: [[0, 0, 0.1]]}}
+""")
+    with pytest.raises(ValueError, match=message):
+        at.load_scene(tmp_path / "scene.yaml")
+
+
 def require_equal(found, wanted):
     for name in ("positions", "normals"):
         assert torch.equal(getattr(found.array, name), getattr(wanted.array, name))
     assert torch.equal(found.control_points, wanted.control_points)
     for name in ("medium", "frequency", "domain", "observation_plane", "name", "obstacles"):
         assert getattr(found, name) == getattr(wanted, name)
-    assert (found.array.source_strength, found.array.radius) == (
-        wanted.array.source_strength,
-        wanted.array.radius,
-    )
+    for values in (strengths_of, radii_of):
+        assert torch.equal(values(found.array), values(wanted.array))
 
 
 @given(OBSTACLES, st.booleans())
