@@ -118,7 +118,8 @@ def _as_text(settings: Mapping[str, Any], scenes: Mapping[str, Scene]) -> str:
     sections = settings["scenes"] if "scenes" in settings else dict.fromkeys(scenes, settings["scene"])
     files = {}
     for name, section in sections.items():
-        parts = (section["array"], *(section.get("obstacles") or ()))
+        boards = [section["array"]] if isinstance(section["array"], Mapping) else section["array"]
+        parts = (*boards, *(section.get("obstacles") or ()))
         paths = [Path(part["path"]) for part in parts if part.get("path") is not None]
         if paths:
             files[name] = [hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in paths]

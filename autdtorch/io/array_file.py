@@ -70,12 +70,10 @@ def load_array(
     parts = _READERS[kind if kind != ".gz" else SUFFIX](path)
     given = {"source_strength": source_strength, "radius": radius}
     with within(path):
-        file = TransducerArray(**parts | {name: value for name, value in given.items() if value is not None})
-    positions, normals = (
-        in_plane(file.positions, center, normal, angle),
-        file.normals @ device_axes(normal, angle),
-    )
-    return TransducerArray(positions, normals, file.source_strength, file.radius)
+        file = TransducerArray(**{name: part for name, part in parts.items() if given.get(name) is None})
+    sizes = {name: getattr(file, name) if value is None else value for name, value in given.items()}
+    positions = in_plane(file.positions, center, normal, angle)
+    return TransducerArray(positions, file.normals @ device_axes(normal, angle), **sizes)
 
 
 def _from_pat(path: str | os.PathLike[str]) -> dict[str, Any]:
