@@ -57,9 +57,8 @@ def load_array(
         center: position of the file's origin (3,) [m].
         normal: direction of its z axis (3,).
         angle: of its x axis from u towards v [rad], with (u, v) = `plane_basis(normal)`.
-        source_strength: [Pa m], > 0, a number or (M,); None for that of the file, or else of its format.
-        radius: of the discs [m], 0 for points, a number or (M,); None for that of the file, or else of its
-            format.
+        source_strength: [Pa m], > 0, a number or (M,); None for the file's, or else its format's.
+        radius: of the discs [m], 0 for points, a number or (M,); None for the file's, or else its format's.
 
     Raises:
         FileNotFoundError: there is no such file.

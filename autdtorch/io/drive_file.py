@@ -88,7 +88,7 @@ def load_drive(path: str | os.PathLike[str]) -> torch.Tensor:
     - `.csv` with the columns `phase [rad]` (or `[deg]`) and `amplitude`, by default 1; phases are phi. Names
       and units may be in a comment. Without names, one column is phases, and two are phases and amplitudes if
       only one of them can be amplitudes. A unit that is not stated is taken as rad if the phases are within a
-      turn and not all whole numbers. What was inferred is told by a `ScaleWarning`.
+      turn and not all whole numbers. A `ScaleWarning` says what was inferred.
     - `.csv` of OpenMPD and AcousTools: numbers of frames and transducers, then a row of phases [rad] for each
       frame. These are arg q, at full amplitude, in the order of the file.
     - `.xml.gz` or `.xml`: a simulation of Ultraino, as it is shown, without its animations; its phases are

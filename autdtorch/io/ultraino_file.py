@@ -201,7 +201,7 @@ class _Reader:
         self._count = 0
 
     def record(self, name: str) -> Any:
-        """Return the value of a name; that of an element that is still being read is made now."""
+        """Return the value of a name, made now if its element is still being read."""
         waiting = next((call for call in self._open if call.attributes.get("id") == name), None)
         return self.records.get(name) if waiting is None else waiting.result
 

@@ -43,7 +43,7 @@ _MOST_ABSORPTION = 3.0  # [dB per wavelength]: the model assumes a small imagina
 
 
 class ScaleWarning(UserWarning):
-    """The lengths or the frequency of a scene seem to be in other units than metres and hertz."""
+    """A scene seems to be in other units than metres and hertz, or units in a file had to be inferred."""
 
 
 class OverlapWarning(UserWarning):
