@@ -6,7 +6,6 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from autdtorch.fdtd.interpolation import interpolation_width
 from autdtorch.fdtd.placement import grid_offset
 from autdtorch.fdtd.region import Region, Shape, bounds
 from autdtorch.utils.array_types import Array
+from autdtorch.utils.cached import cached_property
 from autdtorch.utils.validation import invalid, positive
 
 logger = logging.getLogger(__name__)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +17,7 @@ from torch import Tensor
 
 from autdtorch.fdtd.region import Region, Shape
 from autdtorch.utils.array_types import Array
+from autdtorch.utils.cached import cached_property
 from autdtorch.utils.triangles import doubled_normals
 from autdtorch.utils.validation import Vector
 

@@ -8,7 +8,6 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,6 +24,7 @@ from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Obstacle, Sphere
 from autdtorch.scene.obstacles.moving import at_rest, circumscribed, is_movable, shifted
 from autdtorch.scene.scene import OverlapWarning, ScaleWarning, Scene
+from autdtorch.utils.cached import cached_property
 from autdtorch.utils.digest import digest_of, package_versions, source_digest
 from autdtorch.utils.memory import require_memory
 

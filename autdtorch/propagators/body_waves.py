@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import zip_longest
 
 import numpy as np
@@ -24,6 +23,7 @@ from autdtorch.propagators.plan import MOST_JUDGED, Plan, make_kernel
 from autdtorch.propagators.symmetry import symmetries
 from autdtorch.scene.geometry import sphere_points
 from autdtorch.utils.apertures import Apertures
+from autdtorch.utils.cached import cached_property
 from autdtorch.utils.progress import show_progress
 from autdtorch.utils.threads import one_library_thread, spread
 

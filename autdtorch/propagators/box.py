@@ -13,7 +13,6 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +28,7 @@ from autdtorch.propagators.plan import MOST_JUDGED
 from autdtorch.propagators.simulation import Run, Simulation, Stepped
 from autdtorch.scene.scene import require_clear
 from autdtorch.utils.apertures import Apertures
+from autdtorch.utils.cached import cached_property
 from autdtorch.utils.threads import one_library_thread, spread
 
 logger = logging.getLogger(__name__)

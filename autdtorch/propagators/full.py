@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -16,6 +15,7 @@ from autdtorch.propagators.plan import MOST_JUDGED
 from autdtorch.propagators.simulation import Run, Simulation, Stepped
 from autdtorch.scene.scene import require_inside
 from autdtorch.utils.apertures import Apertures
+from autdtorch.utils.cached import cached_property
 from autdtorch.utils.threads import one_library_thread
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -24,6 +23,7 @@ from autdtorch.propagators.symmetry import Symmetry, orbits_of_array
 from autdtorch.scene.arrays import apertures_of, strengths_of
 from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.array_types import Index
+from autdtorch.utils.cached import cached_property
 
 _MOST_BYTES = 1e9  # of the amplitudes of all transducers
 _DRIVES = 16  # Drives whose fields are kept

@@ -6,7 +6,6 @@ import functools
 import logging
 import math
 from collections.abc import Callable, Sequence
-from functools import cached_property
 from itertools import pairwise
 from typing import Literal, overload
 
@@ -26,6 +25,7 @@ from autdtorch.propagators.simulation import Run
 from autdtorch.propagators.thin_walls import warn_of_thin_walls
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import require_clear
+from autdtorch.utils.cached import cached_property
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import ArrayLike, boolean, differentiable_points, points_grid, points_tensor
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
 from importlib.util import find_spec
 from typing import NamedTuple, Self
 
@@ -37,6 +36,7 @@ from autdtorch.propagators.scene_region import hardened, region_of
 from autdtorch.scene.arrays import apertures_of
 from autdtorch.scene.obstacles import Mesh
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.cached import cached_property
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.threads import thread_count
 from autdtorch.utils.triangles import doubled_normals

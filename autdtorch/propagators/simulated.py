@@ -7,7 +7,6 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
 from typing import Literal, Protocol, overload, runtime_checkable
 
 import torch
@@ -25,6 +24,7 @@ from autdtorch.propagators.simulation import Run, TransferMatrix
 from autdtorch.propagators.thin_walls import warn_of_thin_walls
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.cached import cached_property
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import ArrayLike, boolean, points_grid

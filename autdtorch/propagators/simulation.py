@@ -8,7 +8,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import cast
 
 import torch
@@ -27,6 +26,7 @@ from autdtorch.propagators.symmetry import (
 from autdtorch.scene.arrays import apertures_of, strengths_of
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.apertures import Apertures
+from autdtorch.utils.cached import cached_property
 from autdtorch.utils.progress import Progress, show_progress
 from autdtorch.utils.validation import ArrayLike, invalid, points_tensor
 

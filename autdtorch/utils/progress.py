@@ -13,9 +13,13 @@ from collections.abc import Iterator
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
+from autdtorch.utils.forks import in_forked
+
 logger = logging.getLogger(__name__)
 
 _PATIENCE = 3.0  # time after which the bar or the first forecast in the log appears [s]
+
+in_forked(lambda: tqdm.set_lock(threading.RLock()))  # a thread that drew a bar may have held the lock
 
 
 class Progress:

@@ -18,6 +18,8 @@ from typing import TypeVar
 import torch
 from threadpoolctl import ThreadpoolController
 
+from autdtorch.utils.forks import hold_at_fork, in_forked
+
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -28,7 +30,8 @@ class _Outside:
     """The number of threads outside `one_library_thread`, which several threads may enter at once."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()  # a fork amid `enter` would also find threadpoolctl's lock held
+        hold_at_fork(self._lock)
         self._threads = self._inside = 0
         self._blas = contextlib.ExitStack()
 
@@ -59,7 +62,7 @@ class _Outside:
     def begin_forked(self) -> None:
         """Set one thread in a forked process, also for the time after `leave`."""
         # PyTorch's threads do not survive a fork, and a forked process would wait for them forever.
-        self._lock, self._threads, self._blas = threading.Lock(), 1, contextlib.ExitStack()
+        self._threads, self._blas = 1, contextlib.ExitStack()
         torch.set_num_threads(1)
 
 
@@ -71,9 +74,7 @@ def _numpy_threads() -> ThreadpoolController:
 
 
 _outside = _Outside()
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_outside.begin_forked)
+in_forked(_outside.begin_forked)
 
 
 def thread_count() -> int:

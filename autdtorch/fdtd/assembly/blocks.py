@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.cached import cached_property
 
 _ROUNDING = 1e-6  # Distance [cells] up to which planes are one
 # Distance [cells] to which planes move from vertices: an edge then lies in an element

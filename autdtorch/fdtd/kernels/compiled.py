@@ -14,6 +14,9 @@ from typing import Any
 from numba import njit
 from numba.core import event
 from numba.core.caching import IndexDataCacheFile
+from numba.core.compiler_lock import global_compiler_lock
+
+from autdtorch.utils.forks import hold_at_fork
 
 logger = logging.getLogger(__name__)
 
@@ -39,6 +42,7 @@ class _CompilationLog(event.Listener):
 
 
 event.register("numba:compile", _CompilationLog())  # type: ignore[no-untyped-call]
+hold_at_fork(global_compiler_lock)
 
 
 class _CheckedFiles(IndexDataCacheFile):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import torch
 
@@ -12,6 +11,7 @@ from autdtorch.scene.geometry import Plane, rotation_matrix
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.obstacles.moving import is_movable, is_turnable, shifted, turned
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.cached import cached_property
 from autdtorch.utils.validation import Vector, finite_vector, require_one_of
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}

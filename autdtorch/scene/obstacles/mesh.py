@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -17,6 +16,7 @@ from autdtorch.scene.obstacles.mesh_file import read_mesh
 from autdtorch.scene.obstacles.mesh_repair import repaired
 from autdtorch.scene.obstacles.mesh_solid import Triangles, outer_parts, solid_of
 from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.cached import cached_property
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.validation import Vector, boolean, finite_vector, invalid, positive, real_tensor, within
 

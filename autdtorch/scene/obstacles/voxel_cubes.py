@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 
 from autdtorch.scene.obstacles.triangles import BOX_TRIANGLES
 from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.cached import cached_property
 
 _AIR = 2  # voxels of air around the body in the distance transform; points farther away use a search tree
 

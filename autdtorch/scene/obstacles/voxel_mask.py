@@ -6,7 +6,6 @@ import logging
 import math
 import os
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
@@ -18,6 +17,7 @@ from autdtorch.scene.obstacles.base import Obstacle
 from autdtorch.scene.obstacles.voxel_cubes import VoxelCubes
 from autdtorch.scene.obstacles.voxel_surface import ThinError, VoxelSurface
 from autdtorch.utils.array_types import Array
+from autdtorch.utils.cached import cached_property
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.numpy_file import read_arrays
 from autdtorch.utils.validation import (

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,6 +20,7 @@ from scipy.sparse import coo_array, csr_array
 
 from autdtorch.scene.obstacles.mesh_distance import MeshDistance
 from autdtorch.utils.array_types import Array, Index
+from autdtorch.utils.cached import cached_property
 from autdtorch.utils.triangles import doubled_normals
 
 _BLUR = 0.5  # Standard deviation of the first smoothing [voxels]

@@ -1,0 +1,148 @@
+"""A process forked while another thread holds a lock does not wait for that thread."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+from numba.core.compiler_lock import global_compiler_lock
+from tqdm import tqdm
+
+import autdtorch.fdtd.kernels.compiled  # what the two name to `os.register_at_fork`
+import autdtorch.utils.progress  # noqa: F401
+from autdtorch.utils import threads
+from autdtorch.utils.cached import cached_property
+
+pytestmark = [
+    pytest.mark.skipif(not hasattr(os, "fork"), reason="no forks here"),
+    pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning"),
+]
+
+PATIENCE = 5.0  # after which a child is held to hang [s]
+HELD = 0.1  # time for which a thread holds a lock during a fork [s]
+
+
+def status_of_child(work: Callable[[], object]) -> int | None:
+    """Return the status of a forked process that ends with 0 after `work`; None for one that hangs."""
+    child = os.fork()
+    if child == 0:
+        try:
+            work()
+            os._exit(0)
+        finally:
+            os._exit(1)
+    end = time.monotonic() + PATIENCE
+    while time.monotonic() < end:
+        ended, status = os.waitpid(child, os.WNOHANG)
+        if ended:
+            return os.waitstatus_to_exitcode(status)
+        time.sleep(0.01)
+    os.kill(child, 9)
+    os.waitpid(child, 0)
+    return None
+
+
+@contextmanager
+def in_thread(work: Callable[[threading.Event, threading.Event], object]) -> Iterator[None]:
+    """Run `work(begun, let_go)` in a thread, from when it is begun; the thread ends afterwards."""
+    begun, let_go = threading.Event(), threading.Event()
+    thread = threading.Thread(target=work, args=(begun, let_go))
+    thread.start()
+    assert begun.wait(PATIENCE)
+    yield
+    let_go.set()
+    thread.join()
+
+
+class Slow:
+    def __init__(self, compute: Callable[[], object]) -> None:
+        self.compute = compute
+
+    @cached_property
+    def value(self) -> Any:
+        """A docstring."""
+        return self.compute()
+
+
+def test_a_child_computes_the_property_that_another_thread_was_computing() -> None:
+    def work(begun: threading.Event, let_go: threading.Event) -> None:
+        assert Slow(lambda: (begun.set(), let_go.wait(PATIENCE))).value
+
+    with in_thread(work):
+        assert status_of_child(lambda: Slow(lambda: 1).value) == 0
+
+
+def test_a_cached_property_is_computed_once_and_can_be_forgotten() -> None:
+    calls = []
+    slow = Slow(lambda: calls.append(1) or object())
+    first = slow.value
+    assert slow.value is first
+    del slow.value
+    assert slow.value is not first
+    assert len(calls) == 2
+    assert Slow.value.__doc__ == "A docstring."
+
+
+def test_threads_that_compute_a_property_at_once_get_the_same_value() -> None:
+    barrier = threading.Barrier(2, timeout=PATIENCE)
+    slow = Slow(lambda: (barrier.wait(), object()))
+    found: list[object] = []
+    both = [threading.Thread(target=lambda: found.append(slow.value)) for _ in range(2)]
+    for thread in both:
+        thread.start()
+    for thread in both:
+        thread.join()
+    assert found[0] is found[1] is slow.value
+
+
+def one_thread() -> None:
+    with threads.one_library_thread():
+        pass
+
+
+def bar_drawn() -> None:
+    with tqdm.get_lock():
+        pass
+
+
+def kernel_compiled() -> None:
+    with global_compiler_lock:
+        pass
+
+
+LOCKS = {
+    "number of threads": (threads._outside._lock, one_thread),
+    "compiler": (global_compiler_lock, kernel_compiled),
+}
+
+
+@pytest.mark.parametrize("name", LOCKS)
+def test_a_fork_waits_for_a_lock_whose_holder_ends(name: str) -> None:
+    lock, use = LOCKS[name]
+
+    def hold(begun: threading.Event, _: threading.Event) -> None:
+        lock.acquire()
+        begun.set()
+        time.sleep(HELD)
+        lock.release()
+
+    with in_thread(hold):
+        assert status_of_child(use) == 0
+    use()  # the parent has it back
+
+
+def test_a_child_draws_while_a_bar_is_drawn_in_its_parent(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tqdm, "_lock", threading.RLock(), raising=False)
+
+    def draw(begun: threading.Event, let_go: threading.Event) -> None:
+        with tqdm.get_lock():
+            begun.set()
+            let_go.wait(PATIENCE)
+
+    with in_thread(draw):
+        assert status_of_child(bar_drawn) == 0
