@@ -1,4 +1,4 @@
-"""Arguments as users type them, for Hydra's grammar, and output as terminals take it."""
+"""Arguments as users type them, for Hydra's grammar, and standard streams that take any output."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 import re
 import sys
 
+_LAST_STANDARD = 2  # number of the last of the standard streams: input, output, errors
 _PATH = re.compile(r"(output|hydra\.sweep\.dir)=(?P<path>.*)", re.DOTALL)
 # What Hydra takes as it is, or as a text in quotes, an interpolation, or several values of a sweep; an =
 # is rather a slip than part of a name
@@ -21,8 +22,19 @@ def quoted(argument: str) -> str:
     return f"{found[1]}='{path}'"
 
 
-def tolerate_any_encoding() -> None:
-    """Have output replace the signs that its encoding lacks, such as those of units; a study must not end."""
-    for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):  # not what stands for it in a test or a notebook
+def prepare_streams() -> None:
+    """Have the standard streams take any output, as a study must not end for it.
+
+    Signs that an encoding lacks, such as those of units, are replaced. Streams that a daemon has closed, or
+    that a program without a console never had, lead nowhere; the next file that is opened must not get their
+    numbers, which libraries write errors to.
+    """
+    while (number := os.open(os.devnull, os.O_RDWR)) <= _LAST_STANDARD:
+        os.set_inheritable(number, True)
+    os.close(number)
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None or getattr(stream, "closed", False):
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - to the end
+        elif hasattr(stream, "reconfigure"):  # not what stands for it in a test or a notebook
             stream.reconfigure(errors="replace")

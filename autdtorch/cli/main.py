@@ -25,7 +25,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 import autdtorch
-from autdtorch.cli.arguments import quoted, tolerate_any_encoding
+from autdtorch.cli.arguments import prepare_streams, quoted
 from autdtorch.cli.config_files import CONFIGS, register
 from autdtorch.cli.errors import AGAIN, FULL_ERROR, FailedJob, in_one_line, stop
 from autdtorch.cli.workers import end_workers_with_us, leave_workers_alone
@@ -60,7 +60,7 @@ class SweepCallback(Callback):
 
 def main() -> None:
     """Run the command line; `errors.stop` has the statuses where it fails."""
-    tolerate_any_encoding()
+    prepare_streams()
     sys.argv[1:] = map(quoted, sys.argv[1:])
     wanted = os.environ.get(FULL_ERROR)
     os.environ[FULL_ERROR] = "1"  # makes Hydra pass exceptions on, which it would print in its own way

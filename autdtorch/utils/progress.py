@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from typing import Any
 
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
@@ -64,10 +65,21 @@ class Progress:
                 self._next = 4 * spent  # ever fewer lines
 
 
+def is_terminal(stream: Any) -> bool:
+    """Return whether a standard stream is at a terminal.
+
+    It is None in a program without a console, closed in a daemon, and any writer in a notebook or a window.
+    """
+    try:
+        return bool(stream.isatty())
+    except (AttributeError, ValueError):
+        return False
+
+
 @contextlib.contextmanager
 def show_progress(steps: int, what: str = "") -> Iterator[Progress]:
     """Show the progress of a task of `steps`, or an estimate of it; `what` names the first part."""
-    if not sys.stderr.isatty() or multiprocessing.parent_process() is not None:
+    if not is_terminal(sys.stderr) or multiprocessing.parent_process() is not None:
         yield Progress(steps, what, None)
         return
     with (

@@ -26,3 +26,36 @@ def test_output_in_any_encoding_ends_no_study(tmp_path, encoding):
     settings = os.environ | {"PYTHONIOENCODING": encoding}
     ended = subprocess.run(command, cwd=tmp_path, env=settings, capture_output=True, check=False)
     assert ended.returncode == 0, ended.stderr
+
+
+WITHOUT_STREAMS = """
+import os, sys
+from pathlib import Path
+from autdtorch.cli.arguments import prepare_streams
+prepare_streams()
+with open("data", "wb") as file:  # its number is none of those that libraries write errors to
+    print("lost")
+    print("lost", file=sys.stderr, flush=True)
+    os.write(2, b"lost")
+    Path("numbers").write_text(f"{file.fileno()} {os.path.getsize('data')}")
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="a shell that closes the streams")
+@pytest.mark.parametrize("closed", ["2>&-", "0<&- 1>&- 2>&-"])
+def test_without_standard_streams_output_leads_nowhere(tmp_path, closed):
+    command = f'exec "$0" -c "$1" {closed}'
+    subprocess.run(["sh", "-c", command, sys.executable, WITHOUT_STREAMS], cwd=tmp_path, check=True)
+    number, size = map(int, (tmp_path / "numbers").read_text().split())
+    assert number > 2
+    assert size == 0
+
+
+def test_a_program_without_a_console_runs(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "stdout", None)
+    monkeypatch.setattr(sys, "stderr", None)
+    assert run("scene=homogeneous", "plane_spacing=0.02", "method=lss", "output=made") == 0
+    assert (tmp_path / "made" / "results.h5").exists()
+    assert run("scene=none_such") == 2
+    for made in (sys.stdout, sys.stderr):
+        made.close()

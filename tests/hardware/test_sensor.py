@@ -132,3 +132,13 @@ def test_a_signal_just_before_the_wait_for_an_answer_is_not_missed(monkeypatch):
         monkeypatch.setattr(select, "select", interrupted)
         with ended_by_signals(), pytest.raises(Signalled):
             typed("how much? ")
+
+
+@pytest.mark.parametrize("stream", [None, "closed"])
+def test_without_an_input_nobody_answers(monkeypatch, tmp_path, stream):
+    if stream == "closed":
+        stream = (tmp_path / "input").open("w+")
+        stream.close()
+    monkeypatch.setattr("sys.stdin", stream)
+    with pytest.raises(SensorError, match="nobody answers"):
+        ManualSensor(POINTS).read()

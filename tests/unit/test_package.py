@@ -47,6 +47,18 @@ def test_import_is_quick_and_loads_no_heavy_package() -> None:
     assert loaded == [[], [], ["matplotlib"]]  # after the import, after all names but plots, after plots
 
 
+def test_names_of_botorch_are_imported_without_a_warning() -> None:
+    command = [
+        sys.executable,
+        "-W",
+        "error",
+        "-c",
+        "import autdtorch; autdtorch.PhasorKernel, autdtorch.FocusProblem",
+    ]
+    child = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    assert (child.returncode, child.stderr) == (0, "")
+
+
 def test_no_public_name_is_that_of_a_module() -> None:
     """Otherwise lazy_loader would replace the package's type, and pickle in joblib's workers would fail."""
     assert type(at) is types.ModuleType

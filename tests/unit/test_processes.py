@@ -14,9 +14,6 @@ KINDS = ["fork", "dataloader", "spawn", "loky"]
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks, which is safe with threads on Linux alone")
 def test_processes_of_all_kinds_find_the_same() -> None:
-    ignored = (
-        "ignore:`torch.jit.script` is deprecated:DeprecationWarning"  # of linear_operator's, at its import
-    )
-    command = [sys.executable, "-W", "error", "-W", ignored, str(PROGRAM), *KINDS]
+    command = [sys.executable, "-W", "error", str(PROGRAM), *KINDS]
     run = subprocess.run(command, capture_output=True, text=True, timeout=280)
     assert (run.returncode, run.stdout.splitlines()) == (0, [f"{kind} 0" for kind in KINDS]), run.stderr

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import re
+import sys
 
 import pytest
 from small_scenes import small_scene
@@ -60,3 +62,27 @@ def test_a_single_simulation_has_a_forecast(monkeypatch, caplog):
     monkeypatch.setattr(progress, "time", Clock(step=2.0))
     at.make_propagator(small_scene(), "full", 2e-3, cache=False).transfer_matrix()
     assert re.fullmatch("simulating scene: .* s left", told(caplog)[0])
+
+
+class Writer:
+    """What stands for a stream in a window: all that `print` needs."""
+
+    def write(self, text: str) -> int:
+        return len(text)
+
+    def flush(self) -> None:
+        pass
+
+
+def closed() -> io.StringIO:
+    stream = io.StringIO()
+    stream.close()
+    return stream
+
+
+@pytest.mark.parametrize("stream", [None, closed(), Writer()], ids=["none", "closed", "writer"])
+def test_without_a_terminal_there_is_no_bar(monkeypatch, stream):
+    monkeypatch.setattr(sys, "stderr", stream)
+    with progress.show_progress(2, "simulating") as shown:
+        shown.advance(2)
+    assert not progress.is_terminal(stream)

@@ -10,18 +10,22 @@ from collections.abc import Callable
 import torch
 
 from autdtorch.hardware.sensors.sensor import Sensor, SensorError, checked_reading
+from autdtorch.utils.progress import is_terminal
 from autdtorch.utils.validation import ArrayLike, not_negative, points_tensor, require_callable, require_kind
 
 _SIGNAL_PERIOD = 0.2  # [s] between looks for a signal
 
 
 def typed(question: str) -> str:
-    """Return the answer that is typed to a question; `EOFError` if the input has ended.
+    """Return the answer that is typed to a question; `EOFError` if the input has ended or there is none.
 
     At a terminal, `input` alone misses a signal that comes just before it begins to wait, until the answer.
     """
-    if not sys.stdin.isatty() or os.name != "posix":
-        return input(question)
+    if not is_terminal(sys.stdin) or os.name != "posix":
+        try:
+            return input(question)
+        except (RuntimeError, ValueError) as error:  # a program without a console, a closed input
+            raise EOFError(str(error)) from error
     print(question, end="", flush=True)
     while not select.select([sys.stdin], [], [], _SIGNAL_PERIOD)[0]:
         pass

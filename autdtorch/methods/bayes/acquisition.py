@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from typing import Protocol
 
 import torch
-from botorch.acquisition.analytic import _ei_helper, _log_ei_helper
-from botorch.utils.safe_math import fatmin, log_fatplus, logmeanexp
 
 from autdtorch.methods.bayes.climb import Effort, candidates, highest
+from autdtorch.methods.bayes.packages import ei_helper, fatmin, log_ei_helper, log_fatplus, logmeanexp
 from autdtorch.methods.bayes.processes import Processes
 from autdtorch.objectives.goals import WeakestFocus
 from autdtorch.objectives.objective import Score
@@ -61,8 +60,8 @@ class ScoreAcquisition:
         mean, deviation = (of[..., 0] for of in self._processes.at(points))
         scaled = (mean - self._highest) / deviation
         if self._log:
-            return _log_ei_helper(scaled) + deviation.log()
-        gain: torch.Tensor = deviation * _ei_helper(scaled)
+            return log_ei_helper(scaled) + deviation.log()
+        gain: torch.Tensor = deviation * ei_helper(scaled)
         return gain
 
 

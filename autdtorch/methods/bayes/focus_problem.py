@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import torch
-from botorch.test_functions.base import BaseTestProblem
 
 from autdtorch.methods.bayes.bayes import drives_at, require_transducer
+from autdtorch.methods.bayes.packages import BaseTestProblem
 from autdtorch.objectives.goals import WEAKEST_FOCUS
 from autdtorch.objectives.objective import (
     Objective,

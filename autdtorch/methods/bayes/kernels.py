@@ -6,8 +6,8 @@ import math
 from typing import Any
 
 import torch
-from gpytorch.kernels import Kernel
 
+from autdtorch.methods.bayes.packages import Kernel
 from autdtorch.utils.validation import complex_tensor, invalid, real_tensor, require_one_of
 
 

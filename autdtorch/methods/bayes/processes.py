@@ -6,13 +6,15 @@ import math
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import torch
-from botorch.fit import fit_gpytorch_mll
-from botorch.models import SingleTaskGP
-from gpytorch.kernels import MaternKernel
-from gpytorch.means import ZeroMean
-from gpytorch.mlls import ExactMarginalLogLikelihood
 
 from autdtorch.methods.bayes.kernels import PhasorKernel, on_circle, phasors
+from autdtorch.methods.bayes.packages import (
+    ExactMarginalLogLikelihood,
+    MaternKernel,
+    SingleTaskGP,
+    ZeroMean,
+    fit_gpytorch_mll,
+)
 
 KernelName: TypeAlias = Literal["phases", "circle", "phasor"]
 """The space in which a process measures phases: as numbers, on the circle, or by the phasors they make."""
