@@ -25,7 +25,7 @@ help:
 	@echo "PYTHON=python3.12 chooses the interpreter of .venv."
 
 $(INSTALLED): pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "autdtorch needs Python 3.11 or later")'
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "autdtorch needs Python 3.11 or later; make PYTHON=python3.12 chooses one")'
 	$(PYTHON) -m venv $(VENV)
 	$(INSTALL) .
 	@touch $@

@@ -4,7 +4,11 @@ Every public name is listed in ``__init__.pyi`` and imported when it is first us
 ``import autdtorch`` is quick and loads no simulation, plotting or optimisation package.
 """
 
+import sys
 import warnings
+
+if sys.version_info < (3, 11):  # noqa: UP036 - from a clone, or installed by force
+    raise ImportError(f"autdtorch needs Python 3.11 or later; this is {sys.version.partition(' ')[0]}")
 
 import lazy_loader
 

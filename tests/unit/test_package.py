@@ -2,13 +2,16 @@
 
 import json
 import os
+import runpy
 import subprocess
 import sys
+import tomllib
 import types
 import zipfile
 from pathlib import Path
 
 import pytest
+from build_hook import PythonCheck
 
 import autdtorch as at
 
@@ -57,6 +60,22 @@ def test_names_of_botorch_are_imported_without_a_warning() -> None:
     ]
     child = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
     assert (child.returncode, child.stderr) == (0, "")
+
+
+def test_an_older_python_is_told_the_version_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    metadata = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    hook = PythonCheck(str(ROOT), {})
+    hook.update(metadata)
+    oldest = metadata["requires-python"].removeprefix(">=")
+    major, minor = map(int, oldest.split("."))
+    older = (major, minor - 1, 99)
+    monkeypatch.setattr("platform.python_version", lambda: ".".join(map(str, older)))
+    with pytest.raises(SystemExit, match=oldest):
+        hook.update(metadata)
+    monkeypatch.setattr(sys, "version_info", older)
+    with pytest.raises(ImportError, match=oldest):  # in a clone
+        runpy.run_path(str(ROOT / "autdtorch/__init__.py"))
+    assert f"sys.version_info < ({major}, {minor})" in (ROOT / "Makefile").read_text(encoding="utf-8")
 
 
 def test_no_public_name_is_that_of_a_module() -> None:
