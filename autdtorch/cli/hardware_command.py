@@ -18,7 +18,6 @@ from hydra.core.hydra_config import HydraConfig
 from autdtorch import hardware
 from autdtorch.cli.bench_config import Bench
 from autdtorch.cli.settings import folder_of, is_given, load_method, scene_of, section_of, solver_of
-from autdtorch.hardware.sensors.sensor import checked_reading
 from autdtorch.io.drive_file import save_drive
 from autdtorch.io.goal_section import goal_section, load_goal, score_label
 from autdtorch.methods.solution import Solution
@@ -147,8 +146,7 @@ class _Trial:
             found = solve(self._method, objective, [0], self._seed, self._goal)
             progress.begin("the drive that was found, once more")
             limited.play(found.drive[0])
-            again = torch.stack([checked_reading(sensor, points) for _ in range(readings)])
-            limited.require_on()
+            again = torch.stack([limited.reading(sensor, points) for _ in range(readings)])
             limited.off()
             progress.begin("silence, outputs off, once more")
             with _silence_expected():

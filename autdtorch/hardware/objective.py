@@ -11,7 +11,7 @@ import torch
 
 from autdtorch.hardware.log import Evaluation, EvaluationLog
 from autdtorch.hardware.safety import LimitedLink, LimitError
-from autdtorch.hardware.sensors.sensor import Sensor, checked_reading
+from autdtorch.hardware.sensors.sensor import Sensor
 from autdtorch.objectives.objective import observe_drives, validate_matrix
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.digest import digest_of
@@ -140,8 +140,7 @@ class HardwareObjective:
         if self.evaluations >= most:
             raise LimitError(f"{most} evaluations are made, the limit")
         self._link.play(drive)
-        pressure = checked_reading(self._sensor, len(self.scene.control_points))
-        self._link.require_on()
+        pressure = self._link.reading(self._sensor, len(self.scene.control_points))
         evaluation = self.log.append(drive, pressure, self._link.seconds_on)
         self._watch(evaluation)
         return pressure

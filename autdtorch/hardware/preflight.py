@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 
@@ -71,15 +72,14 @@ def check_transducers(
     readings = integer_at_least("readings", readings, 1)
     background = integer_at_least("background", background, 1)
     watch("silence, outputs off")
-    silence = _power(sensor, points, background)
+    silence = _power(partial(checked_reading, sensor, points), background)
     count = len(link.link.transducers)
     powers = []
     try:
         for number, alone in enumerate(torch.eye(count, dtype=torch.complex128, device="cpu"), start=1):
             watch(f"transducer {number} of {count}")
             link.play(alone)
-            powers.append(_power(sensor, points, readings))
-            link.require_on()
+            powers.append(_power(partial(link.reading, sensor, points), readings))
     finally:
         link.off()
     pressure = torch.tensor(powers, dtype=torch.float64, device="cpu").sqrt()
@@ -95,9 +95,9 @@ def hears_silence(sensor: Sensor, check: Preflight, points: int, readings: int =
     require_kind("sensor", sensor, Sensor)
     require_kind("check", check, Preflight)
     points = integer_at_least("points", points, 1)
-    return math.sqrt(_power(sensor, points, integer_at_least("readings", readings, 1))) <= check.threshold
+    readings = integer_at_least("readings", readings, 1)
+    return math.sqrt(_power(partial(checked_reading, sensor, points), readings)) <= check.threshold
 
 
-def _power(sensor: Sensor, points: int, readings: int) -> float:
-    values = torch.stack([checked_reading(sensor, points) for _ in range(readings)])
-    return float(values.square().mean())
+def _power(read: Callable[[], torch.Tensor], readings: int) -> float:
+    return float(torch.stack([read() for _ in range(readings)]).square().mean())

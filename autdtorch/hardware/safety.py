@@ -19,6 +19,7 @@ import torch
 
 from autdtorch.hardware.link import Link
 from autdtorch.hardware.played import AmplitudeScale
+from autdtorch.hardware.sensors.sensor import Sensor, SensorError, checked_reading
 from autdtorch.utils.validation import integer_at_least, not_negative, number_between, positive, require_kind
 
 logger = logging.getLogger(__name__)
@@ -27,6 +28,8 @@ logger = logging.getLogger(__name__)
 # in the background of a shell asks for a reading.
 _ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGTTIN", "SIGBREAK")
 _SIGNALS = [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
+
+_GRACE = 0.1  # from when the timer switches off until a reading is interrupted [s]
 
 
 class LimitError(RuntimeError):
@@ -149,6 +152,7 @@ class LimitedLink:
         self._lock = threading.RLock()
         self._timer: threading.Timer | None = None
         self._on_since: float | None = None
+        self._on_until = 0.0
         self._seconds_before = 0.0
         self._rested_at = 0.0
         self._failure: Exception | None = None
@@ -173,7 +177,7 @@ class LimitedLink:
     def play(self, drive: torch.Tensor) -> None:
         """Play a drive (M,), |q| <= 1, scaled to the limit, until the next, `off`, or the end of the time.
 
-        The time may end while the sound settles: `require_on` raises then.
+        The time may end while the sound settles: `reading` and `require_on` raise then.
 
         Raises:
             LimitError: the time limit of the outputs is reached.
@@ -190,6 +194,7 @@ class LimitedLink:
             if self._on_since is None:
                 self._on_since = time.monotonic()
                 most = min(left, self.limits.seconds_in_a_row)
+                self._on_until = self._on_since + most
                 self._timer = threading.Timer(most, functools.partial(self._time_is_up, self._on_since))
                 self._timer.daemon = True
                 self._timer.start()
@@ -199,6 +204,26 @@ class LimitedLink:
     def quantised(self, drive: torch.Tensor) -> torch.Tensor:
         """Return the device's nearest drives to drives (..., M), both in the scale of `play`."""
         return self._scale.quantised(drive)
+
+    def reading(self, sensor: Sensor, points: int) -> torch.Tensor:
+        """Return the reading (P,) [Pa] of a sensor while the outputs are on.
+
+        Raises:
+            LimitError: the outputs went off meanwhile; a reading that goes on is interrupted, as
+                `checked_reading` does.
+            SensorError: the sensor gives no trustworthy reading.
+            ValueError: the reading is not P finite magnitudes.
+        """
+        self.require_on()
+        try:
+            found = checked_reading(sensor, points, self._on_until - time.monotonic() + _GRACE)
+        except SensorError:
+            if time.monotonic() >= self._on_until:
+                self.off()
+            self.require_on()
+            raise
+        self.require_on()
+        return found
 
     def require_on(self) -> None:
         """Raise `LimitError` if the outputs went off since `play`, and the readings meanwhile are void."""

@@ -1,6 +1,11 @@
 """Limits of a trial, and outputs off in every case."""
 
 import contextlib
+import functools
+import os
+import signal
+import sys
+import threading
 import time
 import weakref
 
@@ -9,6 +14,7 @@ import torch
 from faulty_bus import Disturbed
 
 from autdtorch import hardware as hw
+from autdtorch.hardware.sensors.sensor import checked_reading
 from autdtorch.methods.driver import observed
 
 FULL = torch.ones(16, dtype=torch.complex128)
@@ -67,20 +73,88 @@ def test_the_outputs_rest_as_the_duty_cycle_asks(trial):
         ({"seconds": 0.02}, r"the outputs were on for 0\.02 s, the limit"),
     ],
 )
-def test_while_a_sensor_takes_too_long_the_outputs_go_off(trial, limits, message: str):
+@pytest.mark.parametrize("in_main_thread", [True, False])
+def test_while_a_sensor_takes_too_long_the_outputs_go_off(trial, limits, message: str, in_main_thread: bool):
     def wait(_: int) -> None:
         time.sleep(0.2)
+        amplitudes.append(float(bench.drive().abs().max()))
+
+    def measure() -> None:
+        with pytest.raises(hw.LimitError, match=message):
+            objective(FULL[None])
         amplitudes.append(float(bench.drive().abs().max()))
 
     amplitudes: list[float] = []
     with limited(trial, **limits) as (bench, link):
         objective = objective_on(trial, link, Disturbed(bench, wait))
-        with pytest.raises(hw.LimitError, match=message):
-            objective(FULL[None])
-        assert amplitudes == [0.0]
+        if in_main_thread:  # the reading is interrupted
+            measure()
+            assert amplitudes == [0.0]
+        else:
+            other = threading.Thread(target=measure)
+            other.start()
+            other.join()
+            assert amplitudes == [0.0, 0.0]
         assert not objective.log.evaluations
         with pytest.raises(hw.LimitError, match=message):
             hw.check_transducers(link, Disturbed(bench, wait), points=2, readings=1, background=1)
+
+
+class Hung(hw.EmulatedSensor):
+    """A sensor that waits forever from one of its readings on: in a sleep, for a file, or for an answer."""
+
+    def __init__(self, bench, wait, at=1):
+        super().__init__(bench)
+        self._wait, self._left = wait, at
+
+    def read(self):
+        self._left -= 1
+        if not self._left:
+            self._wait()
+        return super().read()
+
+
+def wait_for_pipe(folder):
+    os.mkfifo(folder / "readings")
+    (folder / "readings").read_text()
+
+
+WAITS = {
+    "sleep": lambda _: time.sleep(60),
+    "event": lambda _: threading.Event().wait(60),
+    "pipe": wait_for_pipe,
+}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes and signals of POSIX")
+@pytest.mark.parametrize("kind", WAITS)
+def test_a_sensor_that_never_returns_ends_the_trial(trial, tmp_path, kind: str):
+    begin, before = time.monotonic(), [signal.getsignal(one) for one in signal.valid_signals()]
+    with limited(trial, seconds_in_a_row=0.1) as (bench, link):
+        objective = objective_on(trial, link, Hung(bench, functools.partial(WAITS[kind], tmp_path), at=3))
+        with pytest.raises(hw.LimitError, match="longer than the outputs may stay on"):
+            objective(FULL.expand(5, -1))
+        assert bench.drive().abs().max() == 0
+        assert objective.evaluations == 2  # and what was read is kept
+    assert time.monotonic() - begin < 5
+    assert [signal.getsignal(one) for one in signal.valid_signals()] == before
+
+
+def test_a_sensor_that_never_returns_in_silence_ends_the_check(trial, monkeypatch):
+    monkeypatch.setattr(checked_reading, "__defaults__", (0.1,))
+    with limited(trial) as (bench, link):
+        with pytest.raises(hw.SensorError, match="no reading within"):
+            hw.check_transducers(link, Hung(bench, lambda: time.sleep(60), at=2), 2)
+        assert link.seconds_on == 0
+
+
+def test_a_signal_that_comes_while_a_sensor_hangs_ends_the_trial_at_once(trial):
+    with limited(trial) as (bench, link), hw.ended_by_signals():
+        objective = objective_on(trial, link, Hung(bench, lambda: time.sleep(60)))
+        threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGTERM)).start()
+        with pytest.raises(hw.Signalled):
+            objective(FULL[None])
+        assert bench.drive().abs().max() == 0
 
 
 def test_while_the_sound_settles_the_timer_may_switch_off(trial):
@@ -122,20 +196,18 @@ def test_a_timer_that_comes_late_reaches_neither_the_next_stretch_nor_the_next_l
 @pytest.mark.parametrize("error", [hw.LinkError("stuck"), RuntimeError("stuck")])
 def test_a_timer_that_cannot_switch_off_says_so_at_once_and_ends_the_trial(trial, error, monkeypatch, caplog):
     def wait(_: int) -> None:
-        link._timer.join()
-        logged.append("the time is up, but: stuck" in caplog.text)
+        time.sleep(60)
 
     def fail() -> None:
         raise error
 
-    logged: list[bool] = []
     with limited(trial, seconds_in_a_row=0.02) as (bench, link):
         objective = objective_on(trial, link, Disturbed(bench, wait))
         monkeypatch.setattr(link.link, "off", fail)
         with pytest.raises(type(error), match="stuck"):
             objective(FULL[None])
         monkeypatch.undo()
-    assert logged == [True]
+        assert "the time is up, but: stuck" in caplog.text
     assert not objective.log.evaluations
     assert bench.firmware.drive().abs().max() == 0
 

@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
+import signal
+import threading
+from types import FrameType
 from typing import Protocol, runtime_checkable
 
 import torch
 
 from autdtorch.objectives.objective import validate_magnitudes
 
+#: Time limit of a reading while the outputs are off [s]: a person may take minutes, a hung sensor forever.
+LONGEST = 600.0
+# The signal that wakes a reading: by default ignored, so that a late one does no harm. Windows has no such.
+_WAKE: signal.Signals = getattr(signal, "SIGURG", signal.SIGINT)
+
 
 class SensorError(OSError):
     """A sensor gives no trustworthy reading."""
+
+
+class _Overdue(BaseException):
+    """A reading takes too long; not an `Exception`, which a sensor may handle and then wait on."""
 
 
 @runtime_checkable
@@ -21,6 +33,50 @@ class Sensor(Protocol):
         """Return magnitudes (P,) [Pa] at the control points, once the field is steady."""
 
 
-def checked_reading(sensor: Sensor, points: int) -> torch.Tensor:
-    """Return the reading (P,) [Pa], float64, of a sensor; `ValueError` if not P finite magnitudes."""
-    return validate_magnitudes("pressure of the sensor", sensor.read(), points)
+def checked_reading(sensor: Sensor, points: int, seconds: float = LONGEST) -> torch.Tensor:
+    """Return the reading (P,) [Pa], float64, of a sensor.
+
+    In the main thread, a reading is interrupted after a number of seconds, wherever Python can interrupt it:
+    where it sleeps, or waits for a file or a socket, but not in a driver that never returns.
+
+    Raises:
+        ValueError: the reading is not P finite magnitudes.
+        SensorError: the time is over.
+    """
+    return validate_magnitudes("pressure of the sensor", _reading(sensor, seconds), points)
+
+
+def _reading(sensor: Sensor, seconds: float) -> object:
+    if threading.current_thread() is not threading.main_thread():  # which alone receives signals
+        return sensor.read()
+    is_late = False
+
+    def wake() -> None:
+        nonlocal is_late
+        is_late = True
+        if hasattr(signal, "pthread_kill"):
+            signal.pthread_kill(threading.main_thread().ident or 0, _WAKE)
+        else:
+            signal.raise_signal(_WAKE)
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if is_late:
+            raise _Overdue
+        if callable(before):
+            before(number, frame)
+
+    before = signal.signal(_WAKE, interrupt)
+    timer = threading.Timer(seconds, wake)
+    timer.daemon = True
+    try:
+        try:
+            timer.start()
+            return sensor.read()
+        finally:
+            timer.cancel()
+            signal.signal(_WAKE, before)
+    except _Overdue:
+        signal.signal(_WAKE, before)  # it may have come amid the lines above
+        if not is_late:  # that of a reading around this one
+            raise
+        raise SensorError(f"the sensor gives no reading within {seconds:.3g} s") from None
