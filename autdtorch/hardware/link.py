@@ -17,11 +17,12 @@ from autdtorch.hardware.played import Wiring
 from autdtorch.hardware.transport.autd3_network import Autd3Port
 from autdtorch.hardware.transport.port import LinkError, Port, SerialPort, SharedPort, closed_on_error
 from autdtorch.hardware.transport.usb import find_device
-from autdtorch.utils.validation import invalid, not_negative, require_callable, require_kind
+from autdtorch.utils.validation import invalid, number_between, require_callable, require_kind
 
 #: Default settle time [s]. Sound goes 1.7 m in it; a T4010A1 rings up in some 30 periods, 0.75 ms, as the
 #: emulator of AUTD3's kit models it.
 SETTLE = 5e-3
+_LONGEST_SETTLE = 60.0  # [s]
 
 
 class OffError(LinkError):
@@ -52,12 +53,13 @@ class Link(contextlib.AbstractContextManager["Link"]):
             port: takes the bytes for the device.
             transducers: the device's transducer for each of the scene's (M,); others stay off. By default
                 the scene has all, in the order of the device.
-            settle: time that `play` waits, after the frame has gone over the wire, for steady sound [s].
+            settle: time that `play` waits, after the frame has gone over the wire, for steady sound [s]; 0
+                to 60.
             sleep: waits for a number of seconds.
 
         Raises:
             ValueError: no device, port or function; `transducers` that the device does not have, or one
-                twice; or a negative `settle`.
+                twice; or `settle` out of range.
             OffError: the device does not take the bytes.
         """
         require_kind("device", device, Device)
@@ -69,7 +71,7 @@ class Link(contextlib.AbstractContextManager["Link"]):
         self.off()
         self.wiring = Wiring(device, transducers)
         self.transducers = self.wiring.transducers
-        self.settle = not_negative("settle", settle, "s")
+        self.settle = number_between("settle", settle, 0.0, _LONGEST_SETTLE, "s")
         atexit.register(self.close)
 
     def play(self, drive: torch.Tensor) -> None:
@@ -174,7 +176,7 @@ def open_link(
 
     Raises:
         LinkError: none or several such devices, or it does not take the bytes.
-        ValueError: no `Device`; `transducers` that it does not have, or one twice; a negative `settle`; a
+        ValueError: no `Device`; `transducers` that it does not have, or one twice; `settle` out of range; a
             `serial` for a device of several boards; or a `port` for one without a serial line.
     """
     require_kind("device", device, Device)
@@ -221,8 +223,8 @@ def open_autd3(
     Raises:
         LinkError: they are not there, or do not take the commands.
         ImportError: the packages autd3 and autd3-pattern are missing.
-        ValueError: `boards` out of range; `transducers` that they do not have, or one twice; or a negative
-            `settle`.
+        ValueError: `boards` out of range; `transducers` that they do not have, or one twice; or `settle`
+            out of range.
     """
     device = AUTD3.with_boards(boards)
     port = Autd3Port(boards, network)

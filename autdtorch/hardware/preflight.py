@@ -11,10 +11,12 @@ import torch
 
 from autdtorch.hardware.safety import LimitedLink
 from autdtorch.hardware.sensors.sensor import Sensor, checked_reading
-from autdtorch.utils.validation import integer_at_least, require_callable, require_kind
+from autdtorch.utils.validation import integer_at_least, number_between, require_callable, require_kind
 
 _DEVIATIONS = 6.0  # threshold above the noise, in standard deviations of its mean power
 _WEAK = 0.1  # threshold below the median of all transducers: 20 dB, as some sensors round silence to 0
+
+_MOST_READINGS = 10_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,13 +56,13 @@ def check_transducers(
         link: plays the transducers.
         sensor: reads their pressure.
         points: number of control points P.
-        readings: number of readings of every transducer, >= 1.
-        background: number of readings of the silence, >= 1.
+        readings: number of readings of every transducer, 1 to 10,000.
+        background: number of readings of the silence, 1 to 10,000.
         watch: takes the name of each reading: "silence, outputs off", then "transducer 1 of 16" and so on.
 
     Raises:
         ValueError: the link is not limited, there is no sensor or it does not give P finite magnitudes, or
-            fewer than 1 readings.
+            another number of readings.
         LimitError: the time limit of the outputs is reached.
         LinkError: the device does not take the bytes.
     """
@@ -69,8 +71,8 @@ def check_transducers(
     watch = (lambda _: None) if watch is None else watch
     require_callable("watch", watch)
     points = integer_at_least("points", points, 1)
-    readings = integer_at_least("readings", readings, 1)
-    background = integer_at_least("background", background, 1)
+    readings = _count("readings", readings)
+    background = _count("background", background)
     watch("silence, outputs off")
     silence = _power(partial(checked_reading, sensor, points), background)
     count = len(link.link.transducers)
@@ -90,13 +92,17 @@ def check_transducers(
 def hears_silence(sensor: Sensor, check: Preflight, points: int, readings: int = 4) -> bool:
     """Return True if a sensor of P points reads no more than at the `check` before, with the outputs off.
 
-    `ValueError` if the sensor does not give P finite magnitudes, or for fewer than 1 readings.
+    `ValueError` if the sensor does not give P finite magnitudes, or for another number of readings.
     """
     require_kind("sensor", sensor, Sensor)
     require_kind("check", check, Preflight)
     points = integer_at_least("points", points, 1)
-    readings = integer_at_least("readings", readings, 1)
+    readings = _count("readings", readings)
     return math.sqrt(_power(partial(checked_reading, sensor, points), readings)) <= check.threshold
+
+
+def _count(name: str, value: object) -> int:
+    return int(number_between(name, integer_at_least(name, value, 1), 1, _MOST_READINGS))
 
 
 def _power(read: Callable[[], torch.Tensor], readings: int) -> float:

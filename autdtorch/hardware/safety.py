@@ -20,7 +20,14 @@ import torch
 from autdtorch.hardware.link import Link
 from autdtorch.hardware.played import AmplitudeScale
 from autdtorch.hardware.sensors.sensor import Sensor, SensorError, checked_reading
-from autdtorch.utils.validation import integer_at_least, not_negative, number_between, positive, require_kind
+from autdtorch.utils.validation import (
+    integer_at_least,
+    invalid,
+    not_negative,
+    number_between,
+    positive,
+    require_kind,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -29,6 +36,9 @@ logger = logging.getLogger(__name__)
 _ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGTTIN", "SIGBREAK")
 _SIGNALS = [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
 
+_LONGEST = 1e6  # time limit [s]: 12 days; timers of some systems take no more than 49
+_LONGEST_REST = 86_400.0  # [s]
+_LEAST_DUTY_CYCLE = 1e-4
 _GRACE = 0.1  # from when the timer switches off until a reading is interrupted [s]
 
 
@@ -114,8 +124,8 @@ class Limits:
         evaluations: largest number of evaluations, with those before an interruption.
         seconds: longest time that the outputs are on in all [s].
         seconds_in_a_row: longest time that they are on without a rest [s].
-        duty_cycle: share of the time that they may be on, above 0 up to 1: after a stretch of t s they rest
-            for t (1 / duty_cycle - 1) s.
+        duty_cycle: share of the time that they may be on, 1e-4 to 1: after a stretch of t s they rest for
+            t (1 / duty_cycle - 1) s, which must be at most a day.
 
     `ValueError` for an attribute out of range.
     """
@@ -129,10 +139,16 @@ class Limits:
     def __post_init__(self) -> None:
         """Check the attributes."""
         integer_at_least("evaluations", self.evaluations, 1)
-        for name in ("amplitude", "seconds", "seconds_in_a_row", "duty_cycle"):
-            positive(name, getattr(self, name))
-        for name in ("amplitude", "duty_cycle"):
-            number_between(name, getattr(self, name), 0.0, 1.0)
+        number_between("amplitude", positive("amplitude", self.amplitude), 0.0, 1.0)
+        for name in ("seconds", "seconds_in_a_row"):
+            number_between(name, positive(name, getattr(self, name), "s"), 0.0, _LONGEST, "s")
+        number_between("duty_cycle", self.duty_cycle, _LEAST_DUTY_CYCLE, 1.0)
+        longest = min(self.seconds, self.seconds_in_a_row)
+        if self.duty_cycle < (least := 1 / (1 + _LONGEST_REST / longest)):
+            accepted = (
+                f"must be >= {least:.3g}, so that they rest for at most a day after {longest:g} s in a row"
+            )
+            raise invalid("duty_cycle", self.duty_cycle, accepted)
 
 
 class LimitedLink:

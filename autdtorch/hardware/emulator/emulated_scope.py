@@ -15,12 +15,11 @@ import torch
 
 from autdtorch.hardware.emulator.bench import EmulatedBench
 from autdtorch.hardware.emulator.bus import EmulatedDevice, stall, time_out
+from autdtorch.hardware.sensors.oscilloscope import FREQUENCIES, SENSITIVITIES
 from autdtorch.utils.validation import (
-    finite_number,
     integer_at_least,
     integers,
-    not_negative,
-    positive,
+    number_between,
     require_callable,
     require_one_of,
 )
@@ -65,6 +64,10 @@ _MAKERS = {
 _INPUT_SETTINGS = frozenset({"DISP", "PROB", "COUP", "OFFS", "VERN"})
 
 
+_LARGEST_VOLTAGE = 1e3  # [V]
+_LARGEST_DRIFT = 10.0
+
+
 class EmulatedScope:
     """An oscilloscope with microphones at the control points of a bench; 8 bits, from a random moment on.
 
@@ -106,11 +109,11 @@ class EmulatedScope:
         self.unknown: list[str] = []
         self._maker = _MAKERS[maker]
         self._pressure = pressure
-        self._frequency = positive("frequency", frequency, "Hz")
-        self._sensitivity = positive("sensitivity", sensitivity, "V/Pa")
-        self._noise = not_negative("noise", noise, "V")
-        self._offset = finite_number("dc_offset", dc_offset, "V")
-        self._drift = not_negative("drift", drift)
+        self._frequency = number_between("frequency", frequency, *FREQUENCIES, "Hz")
+        self._sensitivity = number_between("sensitivity", sensitivity, *SENSITIVITIES, "V/Pa")
+        self._noise = number_between("noise", noise, 0.0, _LARGEST_VOLTAGE, "V")
+        self._offset = number_between("dc_offset", dc_offset, -_LARGEST_VOLTAGE, _LARGEST_VOLTAGE, "V")
+        self._drift = number_between("drift", drift, 0.0, _LARGEST_DRIFT)
         self._generator = np.random.default_rng(integer_at_least("seed", seed, 0))
         self._walk = 0.0
         self._time_scale, self._source = 1e-3, 0

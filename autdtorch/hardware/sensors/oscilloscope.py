@@ -22,6 +22,7 @@ from autdtorch.utils.validation import (
     integer_at_least,
     invalid,
     members,
+    number_between,
     positive,
     positive_integers,
     require_kind,
@@ -29,6 +30,11 @@ from autdtorch.utils.validation import (
 
 logger = logging.getLogger(__name__)
 
+#: Sensitivities of microphones with their amplifiers that are taken for true [V/Pa].
+SENSITIVITIES = (1e-9, 1e3)
+#: Frequencies that an oscilloscope may capture [Hz].
+FREQUENCIES = (1.0, 1e9)
+_LARGEST_VOLTAGE = 1e3  # that an input may have to take [V]
 _PERIODS_A_DIVISION = 5  # 50 or 60 on a screen, 20 samples each
 _CAPTURE_TIME = 2.0  # time limit of a capture [s]
 _QUIET = 5  # standard errors
@@ -45,8 +51,8 @@ class Microphone:
 
     Attributes:
         input: number of the oscilloscope's input, from 1.
-        sensitivity: of the microphone at the drive frequency [V/Pa].
-        loudest: largest amplitude that the input must take [Pa].
+        sensitivity: of the microphone at the drive frequency [V/Pa]; with the amplifier 1e-9 to 1e3.
+        loudest: largest amplitude that the input must take [Pa]; up to 1000 V.
         gain: of the amplifier between, as a factor.
 
     `ValueError` for an attribute out of range.
@@ -63,6 +69,15 @@ class Microphone:
         positive("sensitivity", self.sensitivity, "V/Pa")
         positive("loudest", self.loudest, "Pa")
         positive("gain", self.gain)
+        number_between("sensitivity * gain", self._volts, *SENSITIVITIES, "V/Pa")
+        if self._volts * self.loudest > _LARGEST_VOLTAGE:
+            accepted = f"must be <= {_LARGEST_VOLTAGE / self._volts:.3g}, {_LARGEST_VOLTAGE:g} V at the input"
+            raise invalid("loudest", self.loudest, accepted, "Pa")
+
+    @property
+    def _volts(self) -> float:
+        """Voltage at the input for 1 Pa [V/Pa]."""
+        return self.sensitivity * self.gain
 
 
 class Oscilloscope(contextlib.AbstractContextManager["Oscilloscope"]):
@@ -155,14 +170,13 @@ class ScopeSensor:
         """
         require_kind("scope", scope, Oscilloscope)
         self._scope = scope
-        self._frequency = positive("frequency", frequency, "Hz")
+        self._frequency = number_between("frequency", frequency, *FREQUENCIES, "Hz")
         self._microphones = members("microphones", microphones, Microphone)
         self._captures = integer_at_least("captures", captures, 1)
-        volts = [one.sensitivity * one.gain for one in self._microphones]  # at the input, for 1 Pa
-        self._volts = torch.tensor(volts, dtype=torch.float64, device="cpu")
+        volts = [one._volts for one in self._microphones]
+        self._volts_per_pascal = torch.tensor(volts, dtype=torch.float64, device="cpu")
         self._coarsest = {
-            one.input: one.loudest * factor / _DIVISIONS
-            for one, factor in zip(self._microphones, volts, strict=True)
+            one.input: max(one.loudest * one._volts / _DIVISIONS, scpi.FINEST) for one in self._microphones
         }
         self._scales = self._coarsest
         self.recaptures = 0
@@ -211,7 +225,7 @@ class ScopeSensor:
         steps = torch.tensor([one.resolution for one in waveforms], dtype=torch.float64, device="cpu")
         variance = fit.residual.square().maximum(steps.square() / 12)
         powers = torch.stack([fit.phasor.abs().square(), lock_in.noise_gain * variance], dim=1)
-        return powers / self._volts[:, None].square()
+        return powers / self._volts_per_pascal[:, None].square()
 
     def _lock_in(self, waveforms: Sequence[Waveform]) -> LockIn:
         """Return the lock-in for waveforms, which must be sampled at the same moments."""

@@ -8,8 +8,16 @@ from pathlib import Path
 import torch
 
 from autdtorch.hardware.sensors.sensor import SensorError
-from autdtorch.utils.validation import integer_at_least, invalid, not_negative, path_of, positive
+from autdtorch.utils.validation import (
+    integer_at_least,
+    invalid,
+    not_negative,
+    number_between,
+    path_of,
+    positive,
+)
 
+_LONGEST = 3600.0  # of the times of a reading [s]
 _POLL = 0.02  # [s] between looks at the file
 
 
@@ -26,15 +34,16 @@ class FileSensor:
         Args:
             path: of the file, which need not exist yet.
             points: number of control points P.
-            settle: time after a drive began in which the file may still be of the drive before [s].
-            timeout: time limit for the file to change then [s].
+            settle: time after a drive began in which the file may still be of the drive before [s], up to an
+                hour.
+            timeout: time limit for the file to change then [s], up to an hour.
 
         `ValueError` for an argument out of range.
         """
         self._path = path_of("path", path)
         self._points = integer_at_least("points", points, 1)
-        self._settle = not_negative("settle", settle, "s")
-        self._timeout = positive("timeout", timeout, "s")
+        self._settle = number_between("settle", settle, 0.0, _LONGEST, "s")
+        self._timeout = number_between("timeout", positive("timeout", timeout, "s"), 0.0, _LONGEST, "s")
 
     def read(self) -> torch.Tensor:
         """Return the magnitudes (P,) [Pa], once the file has changed.
