@@ -195,8 +195,10 @@ def test_a_damaged_file_is_computed_again(tmp_path):
 def test_a_folder_that_cannot_be_used_costs_no_result(tmp_path):
     cache = DiskCache(tmp_path / "folder")
     (tmp_path / "folder").rmdir()
+    (tmp_path / "folder").write_text("a file now")
     cache.save("one", np.ones((2, 3)), 0.0)
     assert cache.load("one", (2, 3), 1) is None
+    (tmp_path / "folder").unlink()
     (tmp_path / "folder" / f"one{SUFFIX}").mkdir(parents=True)
     assert cache.load("one", (2, 3), 1) is None
     cache.save("one", np.ones(3), 0.0)
