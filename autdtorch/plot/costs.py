@@ -13,12 +13,14 @@ from matplotlib.ticker import FixedLocator, NullLocator
 
 from autdtorch.plot import style
 from autdtorch.plot.data import ByMethod, by_scene, labelled, methods_of, require_each
-from autdtorch.plot.style import TICK_SIZE, Look, add_legend, label_of, log_axes, looks_of, styled
+from autdtorch.plot.style import TICK_SIZE, Look, add_legend, label_of, log_axes, looks_of, styled, text_width
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import boolean, invalid, members, require_kind
 
 _FRONT: dict[str, Any] = {"color": "0.8", "linewidth": 4.0, "solid_joinstyle": "miter", "zorder": 1.0}
 _PANEL = 2.6  # inch
+_INSIDE = 2.0  # inch, of a panel, without labels
+_BESIDE = 0.08  # inch, between a point and its name
 
 OVERHEAD = 2.0  # fitted costs are at least this many times the smallest: overhead is at most half of each
 FEWEST = 3  # points for a fit
@@ -61,14 +63,12 @@ def plot_pareto(
             _draw_points(ax, values, looks[method], higher_is_better)
         everything = np.concatenate(list(drawn.values()))
         best = _pareto_front(everything, higher_is_better)
-        if names is not None:
-            texts = _texts(f"names[{scene!r}]", names[scene], drawn)
-            for index in best:  # on the side of the front that has no points
-                up, side = (3, "bottom") if higher_is_better else (-3, "top")
-                where: Any = {"xytext": (-4, up), "textcoords": "offset points", "ha": "right", "va": side}
-                ax.annotate(texts[index], tuple(everything[index]), fontsize=TICK_SIZE, **where)
-        ax.margins(0.15)
+        texts = [] if names is None else _texts(f"names[{scene!r}]", names[scene], drawn)
+        shown = {index: texts[index] for index in best if texts}
+        left = max((text_width(text, TICK_SIZE) for text in shown.values()), default=0.0) + _BESIDE
+        ax.margins(max(0.15, left / (_INSIDE - 2 * left)), 0.15)
         log_axes(ax, "x" if higher_is_better else "xy")
+        _name_front(ax, everything, shown, higher_is_better)
         # The best result within each cost: steps up to the edge of the panel.
         ends = np.vstack([everything[best], (ax.get_xlim()[1], everything[best[-1], 1])])
         ax.step(*ends.T, where="post", scalex=False, scaley=False, **_FRONT)
@@ -91,6 +91,19 @@ def _pareto_front(points: Array, higher_is_better: bool) -> list[int]:
         if not kept or worse[index] < worse[kept[-1]]:
             kept.append(int(index))
     return kept
+
+
+def _name_front(ax: Axes, points: Array, names: Mapping[int, str], higher_is_better: bool) -> None:
+    """Write names on the side of the front that has no points, without those that would cover another."""
+    up, side = (3, "bottom") if higher_is_better else (-3, "top")
+    where: Any = {"xytext": (-4, up), "textcoords": "offset points", "ha": "right", "va": side}
+    place = (ax.transData + ax.transAxes.inverted()).transform(points) * _INSIDE
+    written: list[Array] = []
+    for index, name in names.items():
+        room = (text_width(name, TICK_SIZE) + _BESIDE, TICK_SIZE / 72 + _BESIDE)
+        if all((abs(place[index] - other) > room).any() for other in written):
+            ax.annotate(name, tuple(points[index]), fontsize=TICK_SIZE, **where)
+            written.append(place[index])
 
 
 def _texts(name: str, given: Mapping[str, Sequence[str]], drawn: Mapping[str, Array]) -> list[str]:

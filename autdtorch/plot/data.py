@@ -25,6 +25,8 @@ ByMethod: TypeAlias = Mapping[str, ArrayLike]
 Checked: TypeAlias = dict[str, dict[str, Array]]  # by scene and method
 
 MM = 1e3  # pictures show lengths in millimetres
+_UNITS = (("MPa", 1e6, 1e6), ("kPa", 1e3, 1e3), ("Pa", 1.0, 1e-2), ("mPa", 1e-3, 1e-5), ("µPa", 1e-6, 0.0))
+"""Units of pressure, each with its size and the least pressure that it is used for [Pa]."""
 
 
 def require_scenes(name: str, scenes: Mapping[str, ByMethod]) -> None:
@@ -114,6 +116,17 @@ def inside_any(points: torch.Tensor, obstacles: Iterable[Obstacle]) -> torch.Ten
 def largest(magnitude: Array) -> float:
     """Return the largest |p| [Pa] that is not NaN, 0 if there is none."""
     return float(np.nanmax(magnitude, initial=0.0))
+
+
+def pressure_unit(peak: float) -> tuple[str, float]:
+    """Return the unit for pressures up to a peak [Pa], and its size [Pa]: numbers stay short."""
+    return next((name, size) for name, size, least in _UNITS if (peak or 1.0) >= least)
+
+
+def pressure_text(pressure: float) -> str:
+    """Return a pressure [Pa] with three digits and its unit, such as "4.59 kPa"."""
+    name, size = pressure_unit(pressure)
+    return f"{pressure / size:.3g} {name}"
 
 
 def zero_level(reference: float | None, name: str, magnitude: Array) -> float:

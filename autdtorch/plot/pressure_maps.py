@@ -10,13 +10,14 @@ import torch
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
+from matplotlib.colorbar import Colorbar
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
 from autdtorch.plot import data
 from autdtorch.plot.colours import FLOOR, OBSTACLE_COLOUR, PRESSURE_MAP
 from autdtorch.plot.data import MM, ByMethod, outside_on_plane, plane_magnitude, require_each
-from autdtorch.plot.style import TICK_SIZE, label_of, new_figure, readable, styled, wrapped
+from autdtorch.plot.style import TICK_SIZE, label_of, new_figure, readable, set_ticks, styled, wrapped
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.array_types import Array
@@ -33,6 +34,14 @@ from autdtorch.utils.validation import (
 
 _AXIS_TOLERANCE = 1e-12  # deviation from 1 of the coordinate of a unit vector along x, y or z
 _OUTLINE_CELLS = 400  # samples along the longer side of a plane, to outline obstacles
+
+# Lengths [inch]
+_SIDE = 3.1  # of a square plane in a figure of its own
+_SMALL_SIDE = 2.0  # in a figure of several
+_WIDTH = 7.0  # of the maps in a figure of several, unless they are more than three
+_LEAST_COLUMN, _LEAST_ROW = 1.4, 0.8  # for the numbers of a colour bar, and the name of a method
+_BAR = 0.11  # thickness of a colour bar
+_LABELS = 0.62  # for tick labels and the name of an axis
 
 
 @styled
@@ -78,20 +87,26 @@ def plot_plane(
     points = None if control_points is None else points_tensor("control_points", control_points)
     if decibels:
         zero = data.zero_level(reference, "pressure", values)
-        limits, label = _limits(vmin, vmax, FLOOR, 0.0, "dB"), f"level of |p| [dB], 0 dB = {zero:.3g} Pa"
+        limits, unit = _limits(vmin, vmax, FLOOR, 0.0, "dB"), "dB"
+        label = f"level of |p| [dB]\n0 dB = {data.pressure_text(zero)}"
         values = np.maximum(data.in_decibels(values, zero), limits[0])  # no cell is -inf
     else:
         if reference is not None:
             raise invalid("reference", reference, "must be None without decibels=True", "Pa")
-        limits, label = _limits(vmin, vmax, 0.0, data.largest(values), "Pa"), "|p| [Pa]"
+        limits, unit, label = _limits(vmin, vmax, 0.0, data.largest(values), "Pa"), "Pa", "|p|"
+    size = width, height = _panel(plane, _SIDE)
+    flat = ax is None and width > 2 * height  # there is no room for numbers beside it
     if ax is None:
-        figure = new_figure(4.4, 3.6)
+        figure = new_figure(width + (1 if flat else 2.4) * _LABELS, height + (2.4 if flat else 1) * _LABELS)
         figure.set_layout_engine("compressed")  # "constrained" cuts off labels beside a square
         ax = figure.add_subplot()
     figure = cast(Figure, ax.get_figure(root=True))
-    mesh = _draw_plane(ax, values, plane, points, obstacles)
+    mesh = _draw_plane(ax, values, plane, points, obstacles, size)
     mesh.set_clim(*limits)
-    _add_colour_bar(figure, mesh, [ax], "vertical", label, _beyond([values], limits))
+    length, across = size if flat else (height, width)
+    shape: Any = {"orientation": "horizontal" if flat else "vertical", "extend": _beyond([values], limits)}
+    shape |= {"aspect": length / _BAR, "fraction": _BAR / across, "pad": 0.5 * _BAR / across}
+    _label_bar(figure.colorbar(mesh, ax=ax, **shape), limits, label, unit, length)
     return figure
 
 
@@ -134,9 +149,18 @@ def plot_planes(
     methods = data.methods_of(pressure.values())
     full = all(method in maps for method in methods for maps in pressure.values())
     alike = full and len({planes[scene] for scene in pressure}) == 1
-    figure = new_figure(2.2 * len(pressure) + 0.7, 2.2 * len(methods) + 0.8)
-    axes = figure.subplots(len(methods), len(pressure), squeeze=False)
-    for column, (scene, maps) in zip(axes.T, pressure.items(), strict=True):
+    sizes = [_panel(planes[scene], _SMALL_SIDE, _WIDTH / len(pressure)) for scene in pressure]
+    widths = [max(_LEAST_COLUMN, width) for width, _ in sizes]
+    row = max(_LEAST_ROW, *(height for _, height in sizes))
+    between = (0.25, 0.15) if alike else (_LABELS, 0.5)  # columns and rows [inch]
+    figure = new_figure(
+        1.0 + sum(widths) + between[0] * (len(widths) - 1), 1.4 + (row + between[1]) * len(methods)
+    )
+    heights = [*(row for _ in methods), _BAR]
+    axes = figure.subplots(
+        len(heights), len(widths), squeeze=False, height_ratios=heights, width_ratios=widths
+    )
+    for column, size, width, (scene, maps) in zip(axes.T, sizes, widths, pressure.items(), strict=True):
         bodies = () if obstacles is None else members(f"obstacles[{scene!r}]", obstacles[scene], Obstacle)
         magnitudes = {}
         for method, field in maps.items():
@@ -146,23 +170,43 @@ def plot_planes(
         points = None
         if control_points is not None:
             points = points_tensor(f"control_points[{scene!r}]", control_points[scene])
-        for ax, method in zip(column, methods, strict=True):
+        for ax, method in zip(column[:-1], methods, strict=True):
             if method not in magnitudes:
                 ax.set_axis_off()
                 continue
-            mesh = _draw_plane(ax, magnitudes[method], planes[scene], points, bodies)
+            mesh = _draw_plane(ax, magnitudes[method], planes[scene], points, bodies, size)
             mesh.set_clim(*limits)
-            if alike:
-                ax.label_outer()
-        column[0].set_title(wrapped(readable(scene), 2.0), weight="bold")
+            if alike and ax is not column[-2]:
+                ax.set_xlabel("")
+                ax.tick_params(labelbottom=False)
+            if alike and column[0] is not axes[0, 0]:
+                ax.set_ylabel("")
+                ax.tick_params(labelleft=False)
+        column[0].set_title(wrapped(readable(scene), width), weight="bold")
         beyond = _beyond(magnitudes.values(), limits)
-        _add_colour_bar(figure, mesh, list(column), "horizontal", "|p| [Pa]", beyond)
-    for ax, method in zip(axes[:, 0], methods, strict=True):
-        # Left of the axes, even if they are empty.
-        style: Any = {"rotation": 90, "ha": "right", "va": "center", "ma": "center", "weight": "bold"}
-        where: Any = {"xy": (0, 0.5), "xycoords": "axes fraction", "textcoords": "offset points"}
-        ax.annotate(wrapped(label_of(method), 2.0), xytext=(-40, 0), **where, **style)
+        bar = figure.colorbar(mesh, cax=column[-1], orientation="horizontal", extend=beyond)
+        _label_bar(bar, limits, "|p|", "Pa", width)
+    for ax, method in zip(axes[:-1, 0], methods, strict=True):
+        _name_row(ax, wrapped(label_of(method), row))
     return figure
+
+
+def _panel(plane: Plane, side: float, widest: float = np.inf) -> tuple[float, float]:
+    """Return the width and height [inch] of the map of a plane.
+
+    `side` is that of a square plane; longer planes have a longer side, up to one and a half times.
+    """
+    longer = max(plane.size)
+    scale = side * min(1.5, (longer / min(plane.size)) ** 0.5) / longer
+    scale = min(scale, max(widest, side) / plane.size[0])
+    return scale * plane.size[0], scale * plane.size[1]
+
+
+def _name_row(ax: Axes, name: str) -> None:
+    """Write the name of a row left of the label of its first axes, or of the axes if they are empty."""
+    style: Any = {"rotation": 90, "ha": "right", "va": "center", "ma": "center", "weight": "bold"}
+    beside: Any = (ax.yaxis.label, ax.transAxes) if ax.axison else ax.transAxes
+    ax.annotate(name, (0, 0.5), (-4, 0), xycoords=beside, textcoords="offset points", **style)
 
 
 def _limits(
@@ -177,7 +221,7 @@ def _limits(
             raise invalid("vmax", vmax, f"must be > {low:.3g}, the lower end of the colours", unit)
     elif vmin is not None and high <= low:
         raise invalid("vmin", vmin, f"must be < {high:.3g}, the upper end of the colours", unit)
-    return low, high
+    return low, high if high > low else low + 1  # of 0 Pa everywhere
 
 
 def _beyond(maps: Collection[Array], limits: tuple[float, float]) -> str:
@@ -188,8 +232,14 @@ def _beyond(maps: Collection[Array], limits: tuple[float, float]) -> str:
 
 
 def _draw_plane(
-    ax: Axes, values: Array, plane: Plane, points: torch.Tensor | None, obstacles: Iterable[Obstacle]
+    ax: Axes,
+    values: Array,
+    plane: Plane,
+    points: torch.Tensor | None,
+    obstacles: Iterable[Obstacle],
+    size: tuple[float, float],
 ) -> QuadMesh:
+    """Draw |p| or its level (Nu, Nv), points and outlines of obstacles into axes of a size [inch]."""
     axes = (_plane_axis(plane, side, cells) for side, cells in enumerate(values.shape))
     (label_u, edges_u), (label_v, edges_v) = axes
     colours = colormaps[PRESSURE_MAP].with_extremes(bad=OBSTACLE_COLOUR)  # of NaN
@@ -200,6 +250,8 @@ def _draw_plane(
         _circle_points(ax, plane, points, max(values.shape))
     ax.set(xlabel=label_u, ylabel=label_v, aspect="equal")
     ax.tick_params(labelsize=TICK_SIZE)
+    for axis, length, edges in zip((ax.xaxis, ax.yaxis), size, (edges_u, edges_v), strict=True):
+        set_ticks(axis, length, (edges[0], edges[-1]))
     return mesh
 
 
@@ -240,11 +292,9 @@ def _circle_points(ax: Axes, plane: Plane, points: torch.Tensor, cells: int) -> 
     ax.plot(*(MM * coordinates.T.cpu().numpy()), path_effects=outline, **style)
 
 
-def _add_colour_bar(
-    figure: Figure, mesh: QuadMesh, axes: list[Axes], orientation: str, label: str, extend: str
-) -> None:
-    part = min(0.15, 0.45 / len(axes))  # share of the height of all axes
-    shape: Any = {"shrink": 0.9, "aspect": 25, "fraction": part, "pad": 0.05 / len(axes)}
-    bar = figure.colorbar(mesh, ax=axes, orientation=orientation, extend=extend, **shape)
-    bar.set_label(label)
+def _label_bar(bar: Colorbar, limits: tuple[float, float], quantity: str, unit: str, length: float) -> None:
+    """Label a colour bar of a length [inch] with the quantity and its unit, and with numbers that fit."""
+    name, size = data.pressure_unit(max(map(abs, limits))) if unit == "Pa" else (unit, 1.0)
+    bar.set_label(quantity if "[" in quantity else f"{quantity} [{name}]")
     bar.ax.tick_params(labelsize=TICK_SIZE)
+    set_ticks(bar.ax.xaxis if bar.orientation == "horizontal" else bar.ax.yaxis, length, limits, size)

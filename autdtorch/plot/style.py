@@ -12,10 +12,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+from matplotlib.font_manager import FontProperties
+from matplotlib.textpath import text_to_path
+from matplotlib.ticker import FixedLocator, LogLocator, NullFormatter, StrMethodFormatter
 
 from autdtorch.methods.catalogue import label_of as label_of
 from autdtorch.utils.files import in_folder
@@ -63,6 +67,11 @@ _DPI = 150
 _SCREEN_DPI = 96  # in a notebook
 _MOST_COLUMNS = 3  # panels side by side
 _LETTER = 0.08  # mean width of a letter [inch]
+_MARGIN = 0.1  # beside a legend [inch]
+_HANDLE = 4.8  # width of a legend entry without its text, in letters: handle, space before and after the text
+_TICKS = 6  # most intervals on an axis
+_LINE = 0.18  # distance of tick labels above each other [inch]
+_GAP = 0.1  # between tick labels side by side [inch]
 
 
 class ShownFigure(Figure):
@@ -105,11 +114,61 @@ def new_panels(
 
 
 def add_legend(figure: Figure, handles: Sequence[Artist], title: str | None = None) -> None:
-    """Add a legend above all panels, in as many rows as its entries need."""
-    width = sum(0.6 + _LETTER * len(str(handle.get_label())) for handle in handles)
-    rows = math.ceil(width / figure.get_figwidth())
-    columns = math.ceil(len(handles) / rows)
+    """Add a legend above all panels, in as few rows as its width allows."""
+    size, room = _STYLE["legend.fontsize"], figure.get_figwidth() - 2 * _MARGIN
+    widths = []
+    for handle in handles:
+        handle.set_label(wrapped(str(handle.get_label()), room - _HANDLE * size / 72))
+        lines = str(handle.get_label()).splitlines()
+        widths.append(_HANDLE * size / 72 + max(text_width(line, size) for line in lines))
+    columns = len(handles)
+    while columns > 1 and sum(max(column) for column in np.array_split(widths, columns)) > room:
+        columns -= 1
     figure.legend(handles=handles, title=title, loc="outside upper center", ncols=columns)
+
+
+def text_width(text: str, size: float) -> float:
+    """Return the width [inch] of a line of text in letters of a size [points]."""
+    width, _, _ = text_to_path.get_text_width_height_descent(text, FontProperties(size=size), ismath=False)
+    return float(width) / 72
+
+
+def set_ticks(axis: Axis, length: float, limits: tuple[float, float], unit: float = 1.0) -> None:
+    """Set ticks at round numbers of a unit, whose labels do not overlap.
+
+    Args:
+        axis: a linear axis.
+        length: of the axis [inch].
+        limits: ends of the axis, in the units of its data.
+        unit: of the labels, in the units of the data.
+    """
+    low, high = sorted(limit / unit for limit in limits)
+    places, decimals = round_numbers(low, high, length, axis.axis_name == "y")
+    axis.set_major_locator(FixedLocator([unit * place for place in places]))
+    axis.set_major_formatter(lambda value, _: f"{value / unit:.{decimals}f}".replace("-", "\N{MINUS SIGN}"))
+
+
+def round_numbers(low: float, high: float, length: float, upright: bool) -> tuple[list[float], int]:
+    """Return round numbers from `low` to `high`, and their decimals, for labels that do not overlap.
+
+    Args:
+        low: lower end of the axis.
+        high: upper end of the axis.
+        length: of the axis [inch].
+        upright: True if the labels are above each other, False if they are side by side.
+    """
+    decade = 10.0 ** math.floor(math.log10((high - low) / _TICKS))
+    places, decimals = np.zeros(0), 0
+    for step in (decade * digit for digit in (1, 2, 5, 10, 20, 50, 100)):
+        wider = step * np.arange(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
+        if len(wider) == 0:
+            break
+        places, decimals = wider, max(0, -math.floor(math.log10(step) + 1e-9))
+        room = length * step / (high - low)
+        widest = max(text_width(f"{place:.{decimals}f}", TICK_SIZE) for place in places)
+        if high - low <= _TICKS * step and room >= (_LINE if upright else widest + _GAP):
+            return places.tolist(), decimals
+    return places[len(places) // 2 :][:1].tolist(), decimals
 
 
 def log_axes(ax: Axes, which: str = "xy") -> None:

@@ -35,6 +35,7 @@ _ROW = 2.1  # height of a panel of boxes [inch]
 _LOW_ROW = 1.4  # without boxes
 _FEWEST = 6  # trials for a box; of fewer, each is a dot
 _PANEL = (2.7, 2.6)  # convergence of a scene [inch]
+_POSES = (4.6, 3.2)  # a figure of scores along a path [inch]
 
 
 @styled
@@ -119,7 +120,8 @@ def plot_poses(
         raise ValueError(f"places: shape {along.shape}; must be (poses,)")
     require_kind("xlabel", xlabel, str)
     require_kind("ylabel", ylabel, str)
-    figure, looks = style.new_figure(4.6, 3.0), looks_of(data)
+    (width, height), looks = _POSES, looks_of(data)
+    figure = style.new_figure(width, height)
     ax = figure.subplots()
     for method, values in data.items():
         if len(values) != len(along):
@@ -136,7 +138,7 @@ def plot_poses(
             raise ValueError("bounds: nan; must be numbers, or infinite where none is known")
         if np.isfinite(limits).any():
             ax.plot(along, limits, "k:", label="bound")
-    ax.set(xlabel=xlabel, ylabel=ylabel)
+    ax.set(xlabel=style.wrapped(xlabel, width - 1.0), ylabel=style.wrapped(ylabel, height - 1.0))
     ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]))
     ax.tick_params(labelsize=TICK_SIZE)
     add_legend(figure, ax.get_legend_handles_labels()[0])

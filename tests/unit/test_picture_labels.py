@@ -1,0 +1,110 @@
+"""No label of a figure covers another or leaves the figure, and every colour bar has a unit."""
+
+import itertools
+import re
+
+import numpy as np
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox
+
+import autdtorch as at
+
+METHODS = ("lssg", "bayes_opt", "bo_foci", "gabs,levels=8,passes=3", "identify", "gradient_ascent")
+SCENES = ("lab", "two_cubes", "two_cubes,array.pitch=0.0105,medium.temperature=25", "hand_with_many_fingers")
+UNIT = re.compile(r"\[(Pa|kPa|MPa|mPa|µPa|dB|rad|%|s|mm|mm²)\]")
+
+# Shrinking would draw hundreds of figures.
+few = settings(max_examples=6, deadline=None, derandomize=True, phases=[Phase.generate])
+
+
+def labels(figure: Figure) -> dict[str, Bbox]:
+    """The boxes of all texts that are drawn [pixels], by text and place."""
+    figure.draw_without_rendering()
+    shown = [ax for ax in figure.findobj(lambda artist: isinstance(artist, Text)) if ax.get_visible()]
+    hidden = [text for ax in figure.axes if not ax.axison for axis in (ax.xaxis, ax.yaxis)
+              for text in axis.findobj(Text)]  # fmt: skip
+    boxes = {}
+    for text in shown:
+        if text.get_text() and text not in hidden:
+            box = text.get_window_extent()
+            boxes[f"{text.get_text()!r} at {np.round(box.p0)}"] = box
+    return boxes
+
+
+def require_clear(figure: Figure) -> None:
+    """Check that no label covers another by over a pixel of 150 in an inch, or leaves the figure."""
+    boxes = labels(figure)
+    assert boxes
+    frame = figure.bbox
+    for name, box in boxes.items():
+        inside = (box.x0 > frame.x0 - 2, box.y0 > frame.y0 - 2, box.x1 < frame.x1 + 2, box.y1 < frame.y1 + 2)
+        assert all(inside), f"{name} leaves the figure: {box}"
+    for (name, box), (other, covered) in itertools.combinations(boxes.items(), 2):
+        width = min(box.x1, covered.x1) - max(box.x0, covered.x0)
+        height = min(box.y1, covered.y1) - max(box.y0, covered.y0)
+        assert min(width, height) <= 1, f"{name} and {other} overlap"
+
+
+@st.composite
+def planes(draw: st.DrawFn) -> at.Plane:
+    sides = draw(
+        st.sampled_from([(0.1, 0.1), (0.012, 0.2), (0.2, 0.012), (0.16, 0.1), (1e-3, 2e-3), (3.0, 2.0)])
+    )
+    normal = draw(st.sampled_from([(1, 0, 0), (0, 0, -1), (1, 1, 1)]))
+    place = draw(st.sampled_from([0.0, 0.05, -1.234]))
+    return at.Plane((place, 0.05, -place), normal, sides)
+
+
+def field(draw: st.DrawFn) -> np.ndarray:
+    peak = draw(st.sampled_from([0.0, 3e-7, 2.7e-3, 0.9, 8.56, 999.0, 4590.0, 3.3e6]))
+    return peak * np.random.default_rng(0).random((6, 5))
+
+
+@few
+@given(data=st.data())
+def test_labels_of_a_map_are_clear(data: st.DataObject) -> None:
+    values, plane = field(data.draw), data.draw(planes())
+    decibels = bool(values.any()) and data.draw(st.booleans())
+    figure = at.plot_plane(values, plane, decibels=decibels)
+    require_clear(figure)
+    assert UNIT.search(figure.axes[1].get_ylabel() + figure.axes[1].get_xlabel())
+
+
+@few
+@given(data=st.data())
+def test_labels_of_maps_are_clear(data: st.DataObject) -> None:
+    scenes = data.draw(st.lists(st.sampled_from(SCENES), min_size=1, max_size=3, unique=True))
+    some = st.lists(st.sampled_from(METHODS), min_size=1, max_size=4, unique=True)
+    maps = {scene: {method: field(data.draw) for method in data.draw(some)} for scene in scenes}
+    plane = data.draw(planes())
+    figure = at.plot_planes(maps, {scene: data.draw(st.just(plane) | planes()) for scene in scenes})
+    require_clear(figure)
+    assert all(UNIT.search(ax.get_xlabel()) for ax in figure.axes[-len(scenes) :])
+
+
+@few
+@given(data=st.data())
+def test_labels_over_trials_are_clear(data: st.DataObject) -> None:
+    scenes = data.draw(st.lists(st.sampled_from(SCENES), min_size=1, max_size=4, unique=True))
+    methods = data.draw(st.lists(st.sampled_from(METHODS), min_size=1, max_size=6, unique=True))
+    random = np.random.default_rng(data.draw(st.integers(0, 9)))
+    scale = data.draw(st.sampled_from([1e-3, 1.0, 5e3]))
+    values = {scene: {method: scale * random.random(7) for method in methods} for scene in scenes}
+    require_clear(at.plot_trials({"mean pressure of the foci [Pa]": values, "area per focus [mm²]": values}))
+    history = {
+        scene: {name: np.sort(own)[None] for name, own in mine.items()} for scene, mine in values.items()
+    }
+    levels = {scene: {"bound": 1.1 * scale, "90 % of the bound": scale} for scene in scenes}
+    require_clear(at.plot_convergence(history, levels))
+    points = {
+        scene: {name: random.lognormal(0, 3, (3, 2)) for name in mine} for scene, mine in values.items()
+    }
+    names = {scene: {name: ["0.5 mm", "1 mm", "2 mm"] for name in mine} for scene, mine in values.items()}
+    require_clear(at.plot_pareto(points, "time of the search [s per trial]", "error [%]", names=names))
+    path = {name: random.random((7, 2)) for name in methods}
+    require_clear(
+        at.plot_poses(path, np.arange(7.0), "shift along the path [mm]", "weakest of eight foci [Pa]")
+    )
