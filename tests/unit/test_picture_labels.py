@@ -17,21 +17,21 @@ SCENES = ("lab", "two_cubes", "two_cubes,array.pitch=0.0105,medium.temperature=2
 UNIT = re.compile(r"\[(Pa|kPa|MPa|mPa|µPa|dB|rad|%|s|mm|mm²)\]")
 
 # Shrinking would draw hundreds of figures.
-few = settings(max_examples=6, deadline=None, derandomize=True, phases=[Phase.generate])
+few = settings(max_examples=4, deadline=None, derandomize=True, phases=[Phase.generate])
 
 
 def labels(figure: Figure) -> dict[str, Bbox]:
     """The boxes of all texts that are drawn [pixels], by text and place."""
     figure.draw_without_rendering()
-    shown = [ax for ax in figure.findobj(lambda artist: isinstance(artist, Text)) if ax.get_visible()]
-    hidden = [text for ax in figure.axes if not ax.axison for axis in (ax.xaxis, ax.yaxis)
-              for text in axis.findobj(Text)]  # fmt: skip
-    boxes = {}
-    for text in shown:
-        if text.get_text() and text not in hidden:
-            box = text.get_window_extent()
-            boxes[f"{text.get_text()!r} at {np.round(box.p0)}"] = box
-    return boxes
+    hidden = set()
+    for axis in (axis for ax in figure.axes for axis in (ax.xaxis, ax.yaxis)):
+        low, high = sorted(axis.get_view_interval())
+        beyond = [tick for tick in axis.get_major_ticks() if not low <= tick.get_loc() <= high]
+        for artist in beyond if axis.axes.axison else [axis]:  # Matplotlib keeps texts that it does not draw
+            hidden.update(artist.findobj(Text))
+    drawn = [text for text in figure.findobj(Text) if text.get_visible() and text not in hidden]
+    boxes = [(text.get_text(), text.get_window_extent()) for text in drawn if text.get_text()]
+    return {f"{text!r} at {np.round(box.p0)}": box for text, box in boxes}
 
 
 def require_clear(figure: Figure) -> None:
