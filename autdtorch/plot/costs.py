@@ -18,7 +18,7 @@ from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import boolean, invalid, members, require_kind
 
 _FRONT: dict[str, Any] = {"color": "0.8", "linewidth": 4.0, "solid_joinstyle": "miter", "zorder": 1.0}
-_PANEL = 2.6  # inch
+_PANEL, _HEIGHT = 2.6, 2.4  # inch
 _INSIDE = 2.0  # inch, of a panel, without labels
 _BESIDE = 0.08  # inch, between a point and its name
 
@@ -57,7 +57,7 @@ def plot_pareto(
     if names is not None:
         require_each("names", names, data)
     looks = looks_of(methods_of(data.values()))
-    figure, panels = style.new_panels(data, _PANEL, _PANEL, xlabel, ylabel, sharey=higher_is_better)
+    figure, panels = style.new_panels(data, _PANEL, _HEIGHT, xlabel, ylabel, sharey=higher_is_better)
     for ax, (scene, drawn) in zip(panels, data.items(), strict=True):
         for method, values in drawn.items():
             _draw_points(ax, values, looks[method], higher_is_better)

@@ -37,7 +37,7 @@ _OUTLINE_CELLS = 400  # samples along the longer side of a plane, to outline obs
 
 # Lengths [inch]
 _SIDE = 3.1  # of a square plane in a figure of its own
-_SMALL_SIDE = 2.0  # in a figure of several
+_SMALL_SIDE = 1.85  # in a figure of several
 _WIDTH = 7.0  # of the maps in a figure of several, unless they are more than three
 _LEAST_COLUMN, _LEAST_ROW = 1.4, 0.8  # for the numbers of a colour bar, and the name of a method
 _BAR = 0.11  # thickness of a colour bar

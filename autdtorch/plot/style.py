@@ -124,6 +124,7 @@ def add_legend(figure: Figure, handles: Sequence[Artist], title: str | None = No
     columns = len(handles)
     while columns > 1 and sum(max(column) for column in np.array_split(widths, columns)) > room:
         columns -= 1
+    columns = math.ceil(len(handles) / math.ceil(len(handles) / columns))  # rows of equal length
     figure.legend(handles=handles, title=title, loc="outside upper center", ncols=columns)
 
 

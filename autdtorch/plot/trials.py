@@ -31,10 +31,10 @@ _FEW: dict[str, Any] = {"marker": "o", "markersize": 4}  # of each of a few tria
 
 _WIDTH = 7.2  # of a figure of boxes [inch]
 _BOX = 0.22  # least width of a box with its margin [inch]
-_ROW = 2.1  # height of a panel of boxes [inch]
-_LOW_ROW = 1.4  # without boxes
+_ROW = 1.75  # height of a panel of boxes [inch]
+_LOW_ROW = 1.3  # without boxes
 _FEWEST = 6  # trials for a box; of fewer, each is a dot
-_PANEL = (2.7, 2.6)  # convergence of a scene [inch]
+_PANEL = (2.7, 2.3)  # convergence of a scene [inch]
 _POSES = (4.6, 3.2)  # a figure of scores along a path [inch]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,6 +18,7 @@ from autdtorch.objectives.metrics import FocusMetrics
 from autdtorch.objectives.objective import validate_drives
 from autdtorch.propagators import Run
 from autdtorch.study.provenance import Provenance
+from autdtorch.utils.digits import decimals_of
 from autdtorch.utils.html import html_table
 from autdtorch.utils.validation import invalid, real_tensor
 
@@ -186,23 +187,41 @@ def median_trial(score: torch.Tensor) -> int:
 def summary_rows(results: StudyResult) -> list[list[str]]:
     """Return a table of the metrics, header first: mean over the trials ± standard deviation.
 
-    The score has a column where it is not the pressure of the weakest focus, as in the paper.
+    The score has a column where it is not the pressure of the weakest focus, as in the paper. The numbers of
+    a column have equal decimals.
     """
     scored = any(scene.goal != PAPERS_GOAL for scene in results.scenes.values())
     head = ["scene", "method", "trials", *(["score"] if scored else [])]
     rows = [[*head, "mean [Pa]", "weakest [Pa]", "std [Pa]", "area [mm²]", "evaluations"]]
+    scores = column_decimals(results, lambda method: method.solution.score)
+    pressures = column_decimals(results, lambda method: method.metrics.mean)
+    areas = column_decimals(results, lambda method: _square_mm(method.metrics.area))
     for scene_name, scene in results.scenes.items():
         for name, method in scene.methods.items():
-            metrics = method.metrics
-            area = "none" if metrics.area is None else _over_trials(1e6 * metrics.area, ".0f")
-            pressures = (metrics.mean, metrics.min, metrics.std)
-            score = [scene.in_unit(_over_trials(method.solution.score, ".3g"))] if scored else []
-            numbers = [*score, *(_over_trials(values, ".2f") for values in pressures), area]
+            metrics, area = method.metrics, _square_mm(method.metrics.area)
+            score = [scene.in_unit(_over_trials(method.solution.score, scores))] if scored else []
+            numbers = [_over_trials(values, pressures) for values in (metrics.mean, metrics.min, metrics.std)]
+            numbers.append("none" if area is None else _over_trials(area, areas))
             evaluations = f"{method.solution.evaluations.double().mean():.0f}"
-            rows.append([scene_name, label_of(name), str(method.trials), *numbers, evaluations])
+            rows.append([scene_name, label_of(name), str(method.trials), *score, *numbers, evaluations])
     return rows
 
 
-def _over_trials(values: torch.Tensor, form: str) -> str:
-    mean = f"{values.mean():{form}}"
-    return mean if len(values) == 1 else f"{mean} ± {values.std():{form}}"
+def column_decimals(
+    results: StudyResult, quantity: Callable[[MethodResult], torch.Tensor | None], digits: int = 3
+) -> int:
+    """Return decimals for a column of a table: the largest value of each scene has some digits or more."""
+    found = [0]
+    for scene in results.scenes.values():
+        values = [value for method in scene.methods.values() if (value := quantity(method)) is not None]
+        found.append(decimals_of((float(value.abs().max()) for value in values), digits))
+    return max(found)
+
+
+def _square_mm(area: torch.Tensor | None) -> torch.Tensor | None:
+    return None if area is None else 1e6 * area
+
+
+def _over_trials(values: torch.Tensor, decimals: int) -> str:
+    mean = f"{values.mean():.{decimals}f}"
+    return mean if len(values) == 1 else f"{mean} ± {values.std():.{decimals}f}"

@@ -29,18 +29,8 @@ class Interval:
     low: float = -math.inf
     high: float = math.inf
 
-    def __str__(self) -> str:
-        """Return "1.23 [1.10, 1.35]", or the number alone if it is exact or its interval unknown."""
-        if self.low == self.high and self.value.is_integer():
-            return f"{self:.0f}"
-        largest = max(abs(number) for number in (self.value, self.low, self.high) if math.isfinite(number))
-        digits = max(0, 2 - math.floor(math.log10(largest))) if largest else 0
-        return f"{self:.{digits}f}"
-
     def __format__(self, form: str) -> str:
-        """Return the text of `str`, with each number in the given form."""
-        if not form:
-            return str(self)
+        """Return "1.23 [1.10, 1.35]" in a form of numbers, or the number alone without an interval."""
         value, low, high = (format(number, form) for number in (self.value, self.low, self.high))
         return f"{value} [{low}, {high}]" if self.low < self.high < math.inf else value
 

@@ -12,6 +12,8 @@ from urllib.parse import unquote
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from small_scenes import AIR, CUBE, small_scene
 
 import autdtorch.study.report.study_report
@@ -22,7 +24,7 @@ from autdtorch.objectives.goals import TargetPressures
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.scene import Scene
 from autdtorch.study.report.claims import judge_claims
-from autdtorch.study.report.document import code
+from autdtorch.study.report.document import as_page, code
 from autdtorch.study.report.findings import findings
 from autdtorch.study.report.study_report import HTML_FILE, write_report
 from autdtorch.study.report.tables import gap_rows, simulation_rows
@@ -71,6 +73,11 @@ def tables(report):
     return [[line[2:-2].split(" | ") for line in block.strip().splitlines()] for block in blocks]
 
 
+@functools.cache
+def of_seven_trials():
+    return studied({"a": scene()}, trials=7)
+
+
 BOTH = {"homogeneous": scene(), "three_cubes": scene(obstacles=(CUBE,))}
 
 
@@ -87,10 +94,11 @@ def test_all_figures_and_tables_are_there_and_no_number_is_missing(tmp_path):
     assert not re.search(r"\bnan\b|\binf\b|None|[{}]", report)
     for table in tables(report):
         assert len({len(row) for row in table}) == 1
-    summary, _, verdicts, beyond, simulation = tables(report)
+    summary, _, points, verdicts, evidence, beyond, simulation = tables(report)
     assert len(summary) == 2 + 2 * 3
     assert len(beyond) == 2 + 2 * (3 + 1)  # and the bound
-    assert len(verdicts) == 2 + 11
+    assert len(verdicts) == len(evidence) == 2 + 11
+    assert len(points[0]) == 2 + 3
     assert all(row[-1].startswith(("**reproduced**", "**not reproduced**")) for row in verdicts[2:])
     assert [row[0] for row in simulation[2:]] == ["homogeneous", "three_cubes"]
     provenance = results.provenance
@@ -112,10 +120,41 @@ def test_the_table_gives_the_mean_over_the_trials():
     metrics = results.scenes["a"].methods["gabs"].metrics
     assert head[2:5] == ["trials", "mean [Pa]", "weakest [Pa]"]
     assert gabs_row[:3] == ["a", "GABS", "3"]
-    assert gabs_row[3] == f"{metrics.mean.mean():.2f} ± {metrics.mean.std():.2f}"
-    assert gabs_row[6] == f"{1e6 * metrics.area.mean():.0f} ± {1e6 * metrics.area.std():.0f}"
+    for cell, values in ((gabs_row[3], metrics.mean), (gabs_row[6], 1e6 * metrics.area)):
+        shown = [float(number) for number in cell.split(" ± ")]
+        half = 0.5 * 10.0 ** -decimals(cell)[0] + 1e-9  # of the last digit
+        assert shown == pytest.approx([float(values.mean()), float(values.std())], abs=half)
     assert gabs_row[7] == str(1 + 3 * 4)
-    assert lssg_row[3] == f"{results.scenes['a'].methods['lssg'].metrics.mean[0]:.2f}"
+    mean = float(results.scenes["a"].methods["lssg"].metrics.mean)
+    assert float(lssg_row[3]) == pytest.approx(mean, rel=5e-3)  # three digits
+
+
+def decimals(cell):
+    """The decimals of each number in a cell."""
+    return [len(digits) for digits in re.findall(r"\d+\.?(\d*)", cell)]
+
+
+@settings(deadline=None, max_examples=16)
+@given(factors=st.lists(st.sampled_from([1e-4, 0.02, 1.0, 700.0]), min_size=2, max_size=2))
+def test_numbers_of_a_column_have_equal_decimals_and_three_digits_in_every_scene(factors):
+    original, scenes = of_seven_trials(), {}
+    for number, factor in enumerate(factors):
+        result = original.scenes["a"]
+        methods = {}
+        for name, method in result.methods.items():
+            solution, metrics = method.solution, method.metrics
+            history = factor * solution.history
+            solution = replace(solution, score=factor * solution.score, history=history)
+            metrics = replace(metrics, mean=factor * metrics.mean, area=factor * metrics.area)
+            methods[name] = replace(method, solution=solution, metrics=metrics)
+        scenes[f"scene_{number}"] = replace(result, methods=methods, bound=factor * result.bound)
+    results = replace(original, scenes=scenes)
+    for rows, columns in ((summary_rows(results), (3, 4, 5, 6)), (gap_rows(results), (2, 3))):
+        for column in columns:
+            assert len({count for row in rows[1:] for count in decimals(row[column])}) == 1
+    for row, factor in zip(summary_rows(results)[1::3], factors, strict=True):
+        mean = float(original.scenes["a"].methods["lssg"].metrics.mean)
+        assert float(row[3]) == pytest.approx(factor * mean, rel=5e-2)  # two digits of the lowest
 
 
 def with_bound(results, bound):
@@ -126,10 +165,12 @@ def with_bound(results, bound):
 def test_every_method_has_a_gap_to_the_bound():
     results = studied({"a": scene()}, trials=7)
     bound = focus_bound(results.scenes["a"].transfer_matrix)
-    assert gap_rows(results)[1][:3] == ["a", "*bound*", f"{bound:.3g} Pa"]
+    head = gap_rows(results)[1]
+    assert head[:2] == ["a", "*bound*"]
+    assert float(head[2].removesuffix(" Pa")) == pytest.approx(bound, rel=5e-3)
     median = float(results.scenes["a"].methods["gabs"].solution.score.median())  # of seven, one of them
     _, bound_row, lssg_row, _, gabs_row = gap_rows(with_bound(results, 2 * median))
-    assert bound_row[:4] == ["a", "*bound*", f"{2 * median:.3g} Pa", "0"]
+    assert float(bound_row[2].removesuffix(" Pa")) == pytest.approx(2 * median, rel=5e-3)
     assert gabs_row[3].startswith("50.0")
     assert gabs_row[4:6] == [str(1 + 3 * 4), "- (0 of 7)"]
     assert lssg_row[5] == "-"
@@ -230,7 +271,7 @@ def test_methods_may_differ_between_scenes_and_claims_without_data_are_no_table(
     assert "claims 2, 3, 4, 7 of 11" in text  # those of obstacles
     del results.scenes["third"]
     report = write_report(results, scenes, tmp_path, "autdtorch collect it").read_text("utf-8")
-    assert "The paper's claims</h2>\n<p>No data" in report
+    assert "paper" not in report.replace("experiment=paper", "").lower()
     assert not re.search(r"\bnan\b|\binf\b|None", report)
 
 
@@ -336,3 +377,30 @@ def test_a_single_trial_has_no_figures_of_one_point(tmp_path, monkeypatch):
         monkeypatch.delitem(METHODS, name)
     _, report = reported({"plain": scene()}, tmp_path)
     assert figures(report) == ["fig1_plain.png", "fig2.png", "fig3d.png"]
+
+
+def test_of_many_methods_one_of_equal_scores_is_shown(tmp_path):
+    results = studied({"a": scene()}, trials=2)
+    methods = results.scenes["a"].methods
+    for name, twin in (("bo_foci", "bayes_opt"), ("identify", "bayes_opt"), ("random_search", "gabs")):
+        methods[name] = methods[twin]
+    drawn = Mock(wraps=autdtorch.study.report.study_report.plot_planes)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(autdtorch.study.report.study_report, "plot_planes", drawn)
+        write_report(results, {"a": scene()}, tmp_path, "autdtorch")
+    scores = {name: float(method.solution.score.median()) for name, method in methods.items()}
+    shown, folded = (list(call.args[0]["a"]) for call in drawn.call_args_list)
+    assert [*shown, *folded] != list(methods)
+    assert sorted([*shown, *folded]) == sorted(methods)
+    for name in folded:  # a method of its score is shown
+        assert any(scores[name] == pytest.approx(scores[other], rel=0.01) for other in shown)
+    for name in shown:  # and no other one
+        assert sum(scores[name] == pytest.approx(scores[other], rel=0.009) for other in shown) == 1
+    page = (tmp_path / HTML_FILE).read_text(encoding="utf-8")
+    assert page.index("fold") < page.index("maps of the other methods</summary>")
+
+
+def test_a_fold_of_a_name_is_text(tmp_path):
+    fold = "<details><summary>mine</summary>"
+    page = as_page(f"# Title\n\n{fold}\n\ntext\n", tmp_path)
+    assert "<details" not in page

@@ -19,6 +19,7 @@ from autdtorch.methods.catalogue import label_of
 from autdtorch.methods.solution import Solution
 from autdtorch.study.results import SceneResult, StudyResult
 from autdtorch.study.statistics import Interval, bootstrap, share_interval
+from autdtorch.utils.digits import decimals_of
 
 Comparison: TypeAlias = tuple[str, list[Interval]]
 """Our numbers in one scene as text, and margins that are all positive if the claim holds there."""
@@ -34,6 +35,7 @@ LAST_PART = 0.1  # last share of the evaluations
 CONVERGED = 0.01  # a trial has converged if its last part raises the score by at most this share
 FORMED = 0.5  # foci have formed if the weakest has at least this share of their mean pressure
 
+_SHARE = ".2f"  # form of shares and ratios
 _UNITS = {"mean": ("Pa", 1.0), "std": ("Pa", 1.0), "area": ("mm²", 1e6), "evaluations": ("", 1.0)}
 
 
@@ -102,13 +104,15 @@ def _values(scene: SceneResult, method: str, quantity: str) -> torch.Tensor | fl
     return float(values.mean()) if exact else values
 
 
-def _means(scene: SceneResult, methods: Iterable[str], quantity: str) -> str:
-    parts = []
+def _means(scene: SceneResult, methods: Iterable[str], quantity: str) -> tuple[str, str]:
+    """Return the means of methods as text, and the form of their numbers."""
+    means = {}
     for method in methods:
         own = _values(scene, method, quantity)
-        mean = Interval(own, own, own) if isinstance(own, float) else Interval(float(own.mean()))
-        parts.append(f"{label_of(method)} {mean}")
-    return f"{', '.join(parts)} {_UNITS[quantity][0]}".rstrip()
+        means[label_of(method)] = own if isinstance(own, float) else float(own.mean())
+    form = ".0f" if quantity == "evaluations" else f".{decimals_of(means.values())}f"
+    texts = ", ".join(f"{label} {mean:{form}}" for label, mean in means.items())
+    return f"{texts} {_UNITS[quantity][0]}".rstrip(), form
 
 
 def _above(number: Interval, threshold: float) -> Interval:
@@ -123,24 +127,26 @@ def _ordered(smaller: str, larger: tuple[str, ...], quantity: str) -> Compare:
     """Compare a quantity, which must be smaller for one method than for each of the others."""
 
     def compare(scene: SceneResult, _: SceneResult) -> Comparison:
-        parts, margins = [_means(scene, (smaller, *larger), quantity)], []
+        means, form = _means(scene, (smaller, *larger), quantity)
+        parts, margins = [means], []
         for name in larger:
             both = (_values(scene, method, quantity) for method in (name, smaller))
             margins.append(bootstrap(*both, combine=operator.sub))
-            parts.append(f"{label_of(name)} minus {label_of(smaller)}: {margins[-1]}")
+            parts.append(f"{label_of(name)} minus {label_of(smaller)}: {margins[-1]:{form}}")
         return "; ".join(parts), margins
 
     return compare
 
 
 def _listed(numbers: dict[str, Interval]) -> str:
-    return ", ".join(f"{label} {number}" for label, number in numbers.items())
+    """Return shares and ratios by label."""
+    return ", ".join(f"{label} {number:{_SHARE}}" for label, number in numbers.items())
 
 
 def _same_area(scene: SceneResult, _: SceneResult) -> Comparison:
     both = (_values(scene, method, "area") for method in (GABS, BO))
     ratio = bootstrap(*both, combine=operator.truediv)
-    text = f"{_means(scene, (GABS, BO), 'area')}; GABS / BO {ratio}"
+    text = f"{_means(scene, (GABS, BO), 'area')[0]}; GABS / BO {ratio:{_SHARE}}"
     return text, [_above(ratio, 1 - SAME_LEVEL), _below(ratio, 1 / (1 - SAME_LEVEL))]
 
 
@@ -213,7 +219,7 @@ CLAIMS = (
     ),
     Claim(
         "Without obstacles, the foci of GABS and BO have areas at the same level.",
-        f"same level: less than {SAME_LEVEL:.0%} apart",
+        f"same level: less than {100 * SAME_LEVEL:.0f} % apart",
         _same_area,
         obstacles=False,
         area=True,
@@ -232,7 +238,8 @@ CLAIMS = (
     ),
     Claim(
         "BO may converge within the evaluations it is given, GABS needs all of its own.",
-        f"converged: the last {LAST_PART:.0%} of the evaluations raise the score by at most {CONVERGED:.0%}; "
+        f"converged: the last {100 * LAST_PART:.0f} % of the evaluations raise the score by at most "
+        f"{100 * CONVERGED:.0f} %; "
         "more than half of the trials of BO, less than half of those of GABS, in every scene",
         _convergence,
         heading="share of the trials that converged",
@@ -245,7 +252,8 @@ CLAIMS = (
     ),
     Claim(
         "With BO and GABS the foci form, without and with obstacles.",
-        f"formed: the weakest focus has over {FORMED:.0%} of the mean pressure of the foci, in every scene",
+        f"formed: the weakest focus has over {100 * FORMED:.0f} % of the mean pressure of the foci, "
+        "in every scene",
         _foci_form,
         heading="weakest focus over mean",
     ),

@@ -15,9 +15,19 @@ from markdown_it import MarkdownIt
 from markdown_it.renderer import RendererHTML
 from markdown_it.token import Token
 from markdown_it.utils import EnvType, OptionsDict
+from PIL import Image
 
-_TAGS = ("<br>", "<details><summary>all settings</summary>", "</details>")
+_FOLDED = ("all settings", "maps of the other methods", "pressure at each control point")
+_FOLDED += (
+    "our readings and numbers",
+    "definitions",
+    "definitions, and how the paper was read",
+    "simulation",
+)
+_TAGS = ("<br>", "</details>", *(f"<details><summary>{text}</summary>" for text in _FOLDED))
 """HTML that a report itself contains; names and settings may come from others and are shown as text."""
+
+_SCREEN_DPI = 96  # of a browser, in which letters of figures have the size of those of the text
 
 _SHORT = 30  # characters; a table of no longer cells keeps each value in one line
 _ROUND = str.maketrans("[]", "()")
@@ -100,6 +110,9 @@ def _embed_images(tokens: Sequence[Token], folder: Path) -> None:
                     raise ValueError(f"image: {name!r}; must be a file in the folder of the report")
                 image = base64.b64encode((folder / name).read_bytes()).decode("ascii")
                 part.attrSet("src", f"data:image/png;base64,{image}")
+                with Image.open(folder / name) as opened:
+                    if "dpi" in opened.info:
+                        part.attrSet("width", round(opened.width * _SCREEN_DPI / opened.info["dpi"][0]))
 
 
 def _mark_sections(tokens: Sequence[Token]) -> list[tuple[str, str]]:

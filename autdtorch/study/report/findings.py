@@ -14,7 +14,7 @@ from autdtorch.study.statistics import has_shares
 
 MOST_NAMED = 4  # scenes, groups or gaps that a sentence names; more are counted
 
-_LEVEL = 0.01  # methods are level with the best if their score is lower by less than this share of it
+LEVEL = 0.01  # methods are level with the best if their score is lower by less than this share of it
 _EQUAL = 0.005  # smaller changes by obstacles would be shown as 0 %
 
 
@@ -59,7 +59,7 @@ def _best(scene: SceneResult) -> _Best:
     scores = {label_of(name): median_score(method) for name, method in competitors(scene).items()}
     ranked = sorted(scores, key=lambda label: -scores[label])
     top = scores[ranked[0]]
-    return _Best(top, tuple(label for label in ranked if top - scores[label] <= _LEVEL * abs(top)))
+    return _Best(top, tuple(label for label in ranked if top - scores[label] <= LEVEL * abs(top)))
 
 
 def _winners(results: StudyResult, best: Mapping[str, _Best]) -> str:
@@ -84,7 +84,7 @@ def _winners(results: StudyResult, best: Mapping[str, _Best]) -> str:
 
 
 def _level(labels: Sequence[str]) -> str:
-    return f" (less than {100 * _LEVEL:.0f} % apart)" if len(labels) > 1 else ""
+    return f" (less than {100 * LEVEL:.0f} % apart)" if len(labels) > 1 else ""
 
 
 def _scores(names: Sequence[str], scenes: Mapping[str, SceneResult], best: Mapping[str, _Best]) -> str:

@@ -21,6 +21,7 @@ from autdtorch.objectives.objective import Objective
 from autdtorch.plot.trials import plot_convergence
 from autdtorch.study.report import alt_texts
 from autdtorch.study.report.document import code, picture, rendered
+from autdtorch.utils.digits import in_digits
 from autdtorch.utils.files import naming, replace_file
 
 REPORT_FILE = "report.md"
@@ -104,7 +105,7 @@ def write_hardware_report(
 
 
 def _percent(share: float) -> str:
-    return f"{round(100 * share, 6):.2g}"  # smaller digits are rounding
+    return in_digits(round(100 * share, 6), 2)  # smaller digits are rounding
 
 
 def _value(own: Any) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -22,7 +22,7 @@ from autdtorch.scene.scene import Scene
 from autdtorch.study.report import alt_texts, tables
 from autdtorch.study.report.claims import BO, GABS, judge_claims
 from autdtorch.study.report.document import as_page, picture, rendered
-from autdtorch.study.report.findings import findings, gaps
+from autdtorch.study.report.findings import LEVEL, findings, gaps
 from autdtorch.study.results import MethodResult, SceneResult, StudyResult, summary_rows
 from autdtorch.study.results_file import RESULTS_FILE
 from autdtorch.study.statistics import FEWEST_TRIALS, NEAR_BOUND, has_shares
@@ -35,6 +35,7 @@ _Key = TypeVar("_Key")
 
 _FEW_TRIALS = 20  # with fewer, the spread of a method is not well known
 _PLANES_A_FIGURE = 4
+_MOST_MAPS = 4  # methods; of more, some with equal scores are folded away
 
 
 def write_report(
@@ -77,6 +78,7 @@ def _markdown(
         for name, method in scene.methods.items():
             counts.setdefault(name, []).append(method.trials)
     judged = judge_claims(results)
+    shown = _without_alike(results, counts)
     trials_picture, quantities = _draw_trials(results, folder)
     tolerances = {scene.simulation.tolerance for scene in results.scenes.values()}
     return rendered(
@@ -96,7 +98,12 @@ def _markdown(
             (name, picture(f"fig1_{name}.png", alt_texts.of_scene(name, results.scenes[name])))
             for name in scenes
         ],
-        planes=_draw_planes(results, scenes, folder),
+        planes=_draw_planes(results, scenes, folder, "fig2", shown),
+        alike=[label_of(name) for name in counts if name not in shown],
+        alike_planes=_draw_planes(
+            results, scenes, folder, "fig2_alike", [name for name in counts if name not in shown]
+        ),
+        points=tables.focus_rows(results),
         goals=list(dict.fromkeys(scene.score_label for scene in results.scenes.values())),
         differences=not all(has_shares(scene.bound) for scene in results.scenes.values()),
         convergence=_draw_convergence(results, folder),
@@ -105,12 +112,15 @@ def _markdown(
         quantities=quantities,
         summary=summary_rows(results),
         claims=tables.claim_rows(judged),
+        evidence=tables.evidence_rows(judged),
+        paper=any(verdict for _, verdict in judged),
         claims_in_all=len(judged),
         claims_without_data=[n for n, (_, verdict) in enumerate(judged, start=1) if verdict is None],
         gaps=tables.gap_rows(results),
         near=tables.NEAR,
         baseline=label_of(tables.BASELINE) if any(map(tables.is_baseline, counts)) else "",
         simulations=tables.simulation_rows(results),
+        missed=sum(not run.reached for scene in results.scenes.values() for run in scene.simulation.runs),
         tolerances=[f"{one:g}" for one in sorted(one for one in tolerances if one is not None)],
         results_file=RESULTS_FILE,
         trials_file=TRIALS_FILE,
@@ -137,17 +147,42 @@ def _trim(file: Path) -> None:
         picture.crop(kept).save(file)
 
 
-def _draw_planes(results: StudyResult, scenes: Mapping[str, Scene], folder: Path) -> list[str]:
-    """Return the pictures."""
-    pressure = _by_method(results, lambda result: result.plane_pressure)
-    planes = {name: plane for name in pressure if (plane := scenes[name].observation_plane) is not None}
+def _without_alike(results: StudyResult, methods: Iterable[str]) -> list[str]:
+    """Return the methods whose maps are shown: of many, one of those that are level in every scene."""
+    every, shown = list(methods), list[str]()
+    for name in every:
+        if len(every) <= _MOST_MAPS or not any(_always_level(results, name, other) for other in shown):
+            shown.append(name)
+    return shown
+
+
+def _always_level(results: StudyResult, name: str, other: str) -> bool:
+    """Return whether two methods have the same scenes, with median scores that are level."""
+    for scene in results.scenes.values():
+        if (name in scene.methods) != (other in scene.methods):
+            return False
+        if name in scene.methods:
+            scores = [tables.median_score(scene.methods[one]) for one in (name, other)]
+            if max(scores) - min(scores) > LEVEL * max(map(abs, scores)):
+                return False
+    return True
+
+
+def _draw_planes(
+    results: StudyResult, scenes: Mapping[str, Scene], folder: Path, name: str, methods: Collection[str]
+) -> list[str]:
+    """Return the pictures of some methods, in files of a name."""
+    every = _by_method(results, lambda result: result.plane_pressure)
+    chosen = {scene: {one: maps[one] for one in maps if one in methods} for scene, maps in every.items()}
+    pressure = {scene: maps for scene, maps in chosen.items() if maps}
+    planes = {one: plane for one in pressure if (plane := scenes[one].observation_plane) is not None}
     names = list(planes)
     pictures: list[str] = []
     for start in range(0, len(names), _PLANES_A_FIGURE):
-        part = {name: pressure[name] for name in names[start : start + _PLANES_A_FIGURE]}
-        points = {name: scenes[name].control_points for name in part}
-        obstacles = {name: scenes[name].obstacles for name in part}
-        file = _numbered("fig2", pictures)
+        part = {one: pressure[one] for one in names[start : start + _PLANES_A_FIGURE]}
+        points = {one: scenes[one].control_points for one in part}
+        obstacles = {one: scenes[one].obstacles for one in part}
+        file = _numbered(name, pictures)
         plot_planes(part, planes, points, obstacles).savefig(folder / file)
         pictures.append(picture(file, alt_texts.of_planes(part)))
     return pictures

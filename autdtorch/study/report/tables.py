@@ -13,14 +13,16 @@ import torch
 from autdtorch.methods.catalogue import label_of
 from autdtorch.propagators import Run
 from autdtorch.study.report.claims import Claim, Verdict
-from autdtorch.study.results import MethodResult, SceneResult, StudyResult
+from autdtorch.study.results import MethodResult, SceneResult, StudyResult, column_decimals
 from autdtorch.study.statistics import NEAR_BOUND, Interval, bound_gap, has_shares
 from autdtorch.study.sweeps import Sweep
+from autdtorch.utils.digits import in_digits
 from autdtorch.utils.files import replacing
 
 SUMMARY_FILE = "summary.csv"
 BASELINE = "gradient_ascent"  # not a competitor: it knows the transfer matrix
 NEAR = f"{100 * NEAR_BOUND:.0f} %"
+_MOST_POINTS = 8  # control points, whose pressures have a column each
 
 
 def is_baseline(method: str) -> bool:
@@ -40,13 +42,37 @@ def median_score(method: MethodResult) -> float:
 
 
 def claim_rows(judged: Iterable[tuple[Claim, Verdict | None]]) -> list[list[str]]:
-    """Return the claims that have a verdict, with our numbers."""
-    rows = [["no.", "the paper's claim", "our reading", "our numbers", "verdict"]]
+    """Return the claims that have a verdict."""
+    rows = [["no.", "the paper's claim", "verdict"]]
     for number, (claim, verdict) in enumerate(judged, start=1):
         if verdict is not None:
             outcome = "**reproduced**" if verdict.holds else "**not reproduced**"
-            outcome += "" if verdict.clear else ", but not clearly"
-            rows.append([str(number), claim.text, claim.reading, "<br>".join(verdict.evidence), outcome])
+            rows.append([str(number), claim.text, outcome + ("" if verdict.clear else ", but not clearly")])
+    return rows
+
+
+def evidence_rows(judged: Iterable[tuple[Claim, Verdict | None]]) -> list[list[str]]:
+    """Return the reading of each claim that has a verdict, with our numbers."""
+    rows = [["no.", "our reading", "our numbers"]]
+    for number, (claim, verdict) in enumerate(judged, start=1):
+        if verdict is not None:
+            rows.append([str(number), claim.reading, "<br>".join(verdict.evidence)])
+    return rows
+
+
+def focus_rows(results: StudyResult) -> list[list[str]]:
+    """Return the pressure at each control point in the trials that are shown; nothing of many points."""
+    scenes = results.scenes.values()
+    most = max(len(scene.transfer_matrix) for scene in scenes)
+    if most > _MOST_POINTS:
+        return []
+    rows = [["scene", "method", *(f"point {number} [Pa]" for number in range(1, most + 1))]]
+    decimals = column_decimals(results, lambda method: method.solution.pressure)
+    for name, scene in results.scenes.items():
+        for method, found in scene.methods.items():
+            pressures = found.solution.pressure[found.shown_trial].tolist()
+            cells = [f"{pressure:.{decimals}f}" for pressure in pressures]
+            rows.append([name, label_of(method), *cells, *["-"] * (most - len(cells))])
     return rows
 
 
@@ -54,31 +80,32 @@ def gap_rows(results: StudyResult) -> list[list[str]]:
     """Return score, gap to the bound and cost of every method."""
     head = ["scene", "method", "score", "gap to the bound", "evaluations"]
     rows = [[*head, f"to {NEAR} of the bound", "s per trial"]]
+    form = f".{column_decimals(results, lambda method: method.solution.score)}f"
     for scene_name, scene in results.scenes.items():
-        bounded = math.isfinite(scene.bound)
-        cells = [scene.in_unit(f"{scene.bound:.3g}"), "0"] if bounded else ["no bound", "-"]
-        rows.append([scene_name, "*bound*", *cells, "-", "-", "-"])
+        bound = scene.in_unit(f"{scene.bound:{form}}") if math.isfinite(scene.bound) else "no bound"
+        rows.append([scene_name, "*bound*", bound, "-", "-", "-", "-"])
         for name, method in scene.methods.items():
             found = bound_gap(method, scene.bound)
-            scores = [scene.in_unit(found.score), _gap(found.gap, scene)]
+            scores = [scene.in_unit(f"{found.score:{form}}"), _gap(found.gap, scene, form)]
             evaluations = f"{method.solution.evaluations.double().mean():.0f}"
             near = _median_of_reached(found.evaluations) if has_shares(scene.bound) else "-"
             counts = ["-", "-"] if is_baseline(name) else [evaluations, near]
-            rows.append([scene_name, label_of(name), *scores, *counts, f"{method.seconds.median():.2g}"])
+            seconds = in_digits(float(method.seconds.median()), 2)
+            rows.append([scene_name, label_of(name), *scores, *counts, seconds])
     return rows
 
 
-def _gap(gap: Interval, scene: SceneResult) -> str:
+def _gap(gap: Interval, scene: SceneResult, form: str) -> str:
     """Return the gap to the bound in percent, or as a difference where scores are no shares of the bound."""
     if has_shares(scene.bound):
         return f"{gap.mapped(lambda share: 100 * share):.1f} %"
-    return scene.in_unit(gap) if math.isfinite(scene.bound) else "-"
+    return scene.in_unit(f"{gap:{form}}") if math.isfinite(scene.bound) else "-"
 
 
 def _median_of_reached(evaluations: torch.Tensor) -> str:
     """Return the median, and the number of trials that got there if not all did (inf otherwise)."""
     median, reached = float(np.median(evaluations.numpy())), int(evaluations.isfinite().sum())
-    shown = f"{median:g}" if math.isfinite(median) else "-"
+    shown = f"{median:.0f}" if math.isfinite(median) else "-"
     return shown if len(evaluations) in (1, reached) else f"{shown} ({reached} of {len(evaluations)})"
 
 
@@ -86,22 +113,25 @@ def simulation_rows(results: StudyResult) -> list[list[str]]:
     """Return the simulation of every scene."""
     head = ["scene", "method", "spacing [mm]", "cells per wavelength", "runs", "periods", "to steady state"]
     rows = [[*head, "reached", "matrix [s]", "plane [s]"]]
+    spacings = [scene.simulation.spacing for scene in results.scenes.values()]
+    # As many decimals as the spacing with most of them has.
+    decimals = max(len(f"{1e3 * (one or 0):g}".partition(".")[2]) for one in spacings)
     for name, scene in results.scenes.items():
         simulation, runs = scene.simulation, scene.simulation.runs
         if simulation.spacing is None:
             cells = [f"{simulation.method} (exact)", *["-"] * 6]
         else:
             a_wavelength = simulation.wavelength / simulation.spacing
-            cells = [simulation.method, f"{1e3 * simulation.spacing:g}", f"{a_wavelength:.1f}"]
+            cells = [simulation.method, f"{1e3 * simulation.spacing:.{decimals}f}", f"{a_wavelength:.1f}"]
             cells += _run_cells(runs) if runs else ["0, kept on disk", "-", "-", "-"]
         seconds = (simulation.matrix_seconds, simulation.plane_seconds)
-        rows.append([name, *cells, *(f"{one:.1f}" for one in seconds)])
+        rows.append([name, *cells, *(f"{one:.2f}" for one in seconds)])
     return rows
 
 
 def _run_cells(runs: Sequence[Run]) -> list[str]:
     missed = sum(not run.reached for run in runs)
-    reached = f"not in {missed} runs" if missed else "yes"
+    reached = f"not in {missed} run{'' if missed == 1 else 's'}" if missed else "yes"
     remaining = f"{max(run.remaining for run in runs):.1e}"
     return [str(len(runs)), extent([run.periods for run in runs]), remaining, reached]
 
