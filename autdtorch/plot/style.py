@@ -15,7 +15,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
+from matplotlib.axis import Axis, YAxis
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import text_to_path
@@ -144,7 +144,7 @@ def set_ticks(axis: Axis, length: float, limits: tuple[float, float], unit: floa
         unit: of the labels, in the units of the data.
     """
     low, high = sorted(limit / unit for limit in limits)
-    places, decimals = round_numbers(low, high, length, axis.axis_name == "y")
+    places, decimals = round_numbers(low, high, length, isinstance(axis, YAxis))
     axis.set_major_locator(FixedLocator([unit * place for place in places]))
     axis.set_major_formatter(lambda value, _: f"{value / unit:.{decimals}f}".replace("-", "\N{MINUS SIGN}"))
 
@@ -159,17 +159,17 @@ def round_numbers(low: float, high: float, length: float, upright: bool) -> tupl
         upright: True if the labels are above each other, False if they are side by side.
     """
     decade = 10.0 ** math.floor(math.log10((high - low) / _TICKS))
-    places, decimals = np.zeros(0), 0
+    places, decimals = list[float](), 0
     for step in (decade * digit for digit in (1, 2, 5, 10, 20, 50, 100)):
-        wider = step * np.arange(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
-        if len(wider) == 0:
+        counts = range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
+        if not counts:
             break
-        places, decimals = wider, max(0, -math.floor(math.log10(step) + 1e-9))
+        places, decimals = [step * count for count in counts], max(0, -math.floor(math.log10(step) + 1e-9))
         room = length * step / (high - low)
         widest = max(text_width(f"{place:.{decimals}f}", TICK_SIZE) for place in places)
         if high - low <= _TICKS * step and room >= (_LINE if upright else widest + _GAP):
-            return places.tolist(), decimals
-    return places[len(places) // 2 :][:1].tolist(), decimals
+            return places, decimals
+    return places[len(places) // 2 :][:1], decimals
 
 
 def log_axes(ax: Axes, which: str = "xy") -> None:

@@ -17,12 +17,14 @@ from markdown_it.token import Token
 from markdown_it.utils import EnvType, OptionsDict
 from PIL import Image
 
-_FOLDED = ("all settings", "maps of the other methods", "pressure at each control point")
-_FOLDED += (
+_FOLDED = (
+    "maps of the other methods",
+    "pressure at each control point",
     "our readings and numbers",
     "definitions",
     "definitions, and how the paper was read",
     "simulation",
+    "all settings",
 )
 _TAGS = ("<br>", "</details>", *(f"<details><summary>{text}</summary>" for text in _FOLDED))
 """HTML that a report itself contains; names and settings may come from others and are shown as text."""
