@@ -8,21 +8,27 @@ from typing import Any, cast
 import numpy as np
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from mpl_toolkits.mplot3d.proj3d import proj_transform
 from numpy.typing import NDArray
 
 from autdtorch.plot import colours
+from autdtorch.plot.axes3d import axes_of, grid_lines, view_from
 from autdtorch.plot.data import MM, single_drive_phases
-from autdtorch.plot.style import TICK_SIZE, new_figure, styled
+from autdtorch.plot.style import TICK_SIZE, new_figure, styled, text_width
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.triangles import doubled_normals, sides_of
 from autdtorch.utils.validation import ArrayLike, Vector, require_kind
 
-_TICKS = 5  # along the longest side; on a short side as many would overlap
+# Lengths [inch]
+_SIZE = (5.2, 4.2)  # of the figure
+_MARGIN = 0.08  # at its edges
+_LEGEND_ROOM = 0.35  # above the axes
+_BAR_ROOM = 0.9  # beside them
+_BAR = (1 - 0.8 / _SIZE[0], 0.2, 0.12 / _SIZE[0], 0.55)  # place of the colour bar, as shares of the figure
 _ELEVATION, _AZIMUTH = 22.0, -118.0  # of the viewer [degrees]
 
 
@@ -51,8 +57,9 @@ def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
     """
     require_kind("scene", scene, Scene)
     phases = None if drive is None else single_drive_phases(drive, len(scene.array))
-    figure = new_figure(5.2, 4.2)
-    ax = cast(Axes3D, figure.add_subplot(projection="3d", computed_zorder=False))
+    figure = new_figure(*_SIZE)
+    figure.set_layout_engine("none")  # the places of all parts are given
+    ax = _new_axes(figure, scene.domain, 0.0 if phases is None else _BAR_ROOM)
     if scene.observation_plane is not None:
         corners = MM * scene.observation_plane.corners[[0, 1, 3, 2]].numpy()
         ax.add_collection3d(Poly3DCollection([corners], facecolor=colours.PLANE_COLOUR, alpha=0.3, zorder=1))
@@ -62,18 +69,53 @@ def plot_scene(scene: Scene, drive: ArrayLike | None = None) -> Figure:
     foci = MM * scene.control_points.numpy()
     ax.scatter(*foci.T, color=colours.FOCUS_COLOUR, s=22, depthshade=False, label="control points", zorder=3)
     _scatter_transducers(ax, scene, phases)
-    lower, upper = (MM * np.array(corner) for corner in scene.domain)
-    ax.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), zlim=(lower[2], upper[2]))
-    ax.set(xlabel="x [mm]", ylabel="y [mm]")
-    ax.zaxis.set_rotate_label(False)  # it would be upside down
-    ax.set_zlabel("z [mm]", rotation=90)
-    ax.set_box_aspect(upper - lower, zoom=0.85)
-    for axis, length in zip((ax.xaxis, ax.yaxis, ax.zaxis), upper - lower, strict=True):
-        axis.set_major_locator(MaxNLocator(max(2, round(_TICKS * length / max(upper - lower)))))
-    ax.view_init(elev=_ELEVATION, azim=_AZIMUTH)
-    ax.tick_params(labelsize=TICK_SIZE)
-    ax.legend(loc="upper left")
+    figure.legend(handles=ax.get_legend_handles_labels()[0], loc="upper center", ncols=2)
     return figure
+
+
+def _new_axes(figure: Figure, domain: tuple[Vector, Vector], right: float) -> Axes3D:
+    """Return axes that show a domain [m] below the legend and left of a margin [inch], with their labels.
+
+    Matplotlib's own ticks and labels overlap if the sides of the domain differ much.
+    """
+    lower, upper = (MM * np.array(corner) for corner in domain)
+    view, (width, height) = view_from(_TO_VIEWER), _SIZE
+    room = width - right - 2 * _MARGIN, height - _LEGEND_ROOM - 2 * _MARGIN
+    titles = [f"{name} [mm]" for name in "xyz"]
+    axes = axes_of(lower, upper, view, room, _text_size, titles)
+    middle = np.array([(width - right) / 2, (height - _LEGEND_ROOM) / 2]) - (axes.low + axes.high) / 2
+
+    ax = cast(Axes3D, figure.add_axes((0.0, 0.0, 1.0, 1.0), projection="3d", computed_zorder=False))
+    ax.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), zlim=(lower[2], upper[2]))
+    ax.set_axis_off()
+    ax.set_proj_type("ortho")
+    ax.view_init(elev=_ELEVATION, azim=_AZIMUTH)
+    ax.set_box_aspect(upper - lower)
+    centre, length = (lower + upper) / 2, max(upper - lower)
+    drawn, above = (_place(ax, centre + step * view[1]) for step in (0.0, length))
+    ax.set_box_aspect(upper - lower, zoom=axes.scale * length / (above - drawn)[1])
+    ax.set_position((*(middle - drawn) / _SIZE, 1.0, 1.0))
+    lines = grid_lines(lower, upper, axes.ticks)
+    broken = np.concatenate([lines, np.full_like(lines[:, :1], np.nan)], axis=1).reshape(-1, 3)
+    ax.plot(*broken.T, color="0.75", linewidth=0.6, zorder=0)
+    for label in axes.labels:
+        corner = middle + axes.scale * view @ (label.point - centre) + label.corner
+        figure.text(
+            corner[0] / width, corner[1] / height, label.text, fontsize=TICK_SIZE, va="baseline", ha="left"
+        )
+    return ax
+
+
+def _place(ax: Axes3D, point: Array) -> Array:
+    """Return the place (2,) [inch] in the figure of a point (3,) in the axes."""
+    ax.apply_aspect()
+    projected = proj_transform(*point, ax.get_proj())[:2]
+    place: Array = ax.transData.transform(projected) / ax.get_figure().dpi
+    return place
+
+
+def _text_size(text: str) -> tuple[float, float]:
+    return text_width(text, TICK_SIZE), 0.75 * TICK_SIZE / 72  # of digits, which have no descenders
 
 
 def _add_obstacle(ax: Axes3D, obstacle: Obstacle, domain: tuple[Vector, Vector]) -> None:
@@ -131,7 +173,8 @@ def _scatter_transducers(ax: Axes3D, scene: Scene, phases: Array | None) -> None
         ax.scatter(*positions.T, color=colours.TRANSDUCER_COLOUR, **style)
         return
     dots = ax.scatter(*positions.T, c=phases, cmap=colours.PHASE_MAP, vmin=0, vmax=2 * np.pi, **style)
-    bar = ax.get_figure().colorbar(dots, ax=ax, shrink=0.6, pad=0.12)
+    figure = ax.get_figure()
+    bar = figure.colorbar(dots, cax=figure.add_axes(_BAR))
     bar.set_ticks([0, np.pi, 2 * np.pi], labels=["0", "π", "2π"])
     bar.set_label("phase [rad]")
 

@@ -6,7 +6,7 @@ import io
 import math
 import os
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -144,19 +144,23 @@ def set_ticks(axis: Axis, length: float, limits: tuple[float, float], unit: floa
         unit: of the labels, in the units of the data.
     """
     low, high = sorted(limit / unit for limit in limits)
-    places, decimals = round_numbers(low, high, length, isinstance(axis, YAxis))
+
+    def fits(text: str, intervals: float) -> bool:
+        needed = _LINE if isinstance(axis, YAxis) else text_width(text, TICK_SIZE) + _GAP
+        return length / intervals >= needed
+
+    places, decimals = round_numbers(low, high, fits)
     axis.set_major_locator(FixedLocator([unit * place for place in places]))
     axis.set_major_formatter(lambda value, _: f"{value / unit:.{decimals}f}".replace("-", "\N{MINUS SIGN}"))
 
 
-def round_numbers(low: float, high: float, length: float, upright: bool) -> tuple[list[float], int]:
+def round_numbers(low: float, high: float, fits: Callable[[str, float], bool]) -> tuple[list[float], int]:
     """Return round numbers from `low` to `high`, and their decimals, for labels that do not overlap.
 
     Args:
         low: lower end of the axis.
         high: upper end of the axis.
-        length: of the axis [inch].
-        upright: True if the labels are above each other, False if they are side by side.
+        fits: whether a label has room if the axis is divided into a number of intervals.
     """
     decade = 10.0 ** math.floor(math.log10((high - low) / _TICKS))
     places, decimals = list[float](), 0
@@ -165,9 +169,9 @@ def round_numbers(low: float, high: float, length: float, upright: bool) -> tupl
         if not counts:
             break
         places, decimals = [step * count for count in counts], max(0, -math.floor(math.log10(step) + 1e-9))
-        room = length * step / (high - low)
-        widest = max(text_width(f"{place:.{decimals}f}", TICK_SIZE) for place in places)
-        if high - low <= _TICKS * step and room >= (_LINE if upright else widest + _GAP):
+        longest = max((f"{place:.{decimals}f}" for place in places), key=len)
+        intervals = (high - low) / step
+        if intervals <= _TICKS and fits(longest, intervals):
             return places, decimals
     return places[len(places) // 2 :][:1], decimals
 

@@ -11,6 +11,7 @@ from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
 import autdtorch as at
+from autdtorch.plot.axes3d import axes_of, view_from
 
 METHODS = ("lssg", "bayes_opt", "bo_foci", "gabs,levels=8,passes=3", "identify", "gradient_ascent")
 SCENES = ("lab", "two_cubes", "two_cubes,array.pitch=0.0105,medium.temperature=25", "hand_with_many_fingers")
@@ -108,3 +109,54 @@ def test_labels_over_trials_are_clear(data: st.DataObject) -> None:
     require_clear(
         at.plot_poses(path, np.arange(7.0), "shift along the path [mm]", "weakest of eight foci [Pa]")
     )
+
+
+SIDE = st.floats(1.0, 3e3)  # mm
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    sides=st.tuples(SIDE, SIDE, SIDE),
+    start=st.floats(-2e3, 2e3),
+    towards=st.tuples(st.floats(-1.0, -0.3), st.floats(-1.0, -0.3), st.floats(0.2, 1.0)),
+)
+def test_labels_of_a_box_are_clear_and_at_their_ticks(
+    sides: tuple[float, ...], start: float, towards: tuple[float, ...]
+) -> None:
+    lower, room = np.full(3, start), np.array([800.0, 600.0])
+    upper = lower + sides
+    view = view_from(np.array(towards))
+    np.testing.assert_allclose(view @ view.T, np.eye(2), atol=1e-12)
+    np.testing.assert_allclose(view @ towards, 0, atol=1e-12)
+
+    def size(text: str) -> tuple[float, float]:
+        return 12.0 * len(text), 18.0
+
+    axes = axes_of(lower, upper, view, (800.0, 600.0), size, ("x [mm]", "y [mm]", "z [mm]"))
+    assert (axes.high - axes.low <= room).all()
+    boxes = []
+    for text, point, corner in axes.labels:
+        place = axes.scale * view @ (point - (lower + upper) / 2) + corner
+        boxes.append((place, place + size(text)))
+        assert (boxes[-1][0] >= axes.low - 1e-9).all()
+        assert (boxes[-1][1] <= axes.high + 1e-9).all()
+        if "mm" not in text:  # a number, of one of the coordinates
+            assert np.isclose(point, float(text.replace("\N{MINUS SIGN}", "-")), rtol=0, atol=1e-6).any()
+    for (low, high), (other, end) in itertools.combinations(boxes, 2):
+        assert not ((low < end) & (high > other)).all()
+    assert {"x [mm]", "y [mm]", "z [mm]"} <= {label.text for label in axes.labels}
+    for axis, ticks in enumerate(axes.ticks):
+        assert all(lower[axis] - 1e-6 <= tick <= upper[axis] + 1e-6 for tick in ticks)
+
+
+@few
+@given(data=st.data())
+def test_labels_of_a_scene_are_clear(data: st.DataObject) -> None:
+    counts = data.draw(st.sampled_from([(1, 1), (4, 3), (16, 16), (24, 2)]))
+    array = at.TransducerArray.grid(counts, pitch=10e-3, center=(0.0, 0.0, 0.0), normal=(0, 0, 1))
+    height = data.draw(st.sampled_from([0.02, 0.15, 0.9]))
+    scene = at.Scene(array, at.Medium.air(), 40e3, [[0.0, 0.0, height]])
+    drive = data.draw(st.sampled_from([None, at.drive_from_phases(np.zeros(len(array)))]))
+    figure = at.plot_scene(scene, drive)
+    require_clear(figure)
+    assert {"x [mm]", "y [mm]", "z [mm]"} <= {text.get_text() for text in figure.texts}

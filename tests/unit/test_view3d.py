@@ -15,6 +15,7 @@ from small_scenes import scene_of_all_kinds, small_scene
 
 import autdtorch as at
 from autdtorch.plot.view3d import animate3d, rendering_problem, view3d
+from autdtorch.plot.view3d.still_axes import STILL_AXES
 
 SPACING = 5e-3  # m, cells of the plane in the pictures
 
@@ -115,6 +116,33 @@ def test_a_picture_is_written_and_not_blank(scene: at.Scene, tmp_path: Path) -> 
 
 
 @pytest.mark.usefixtures("renderer")
+def test_labels_of_the_axes_are_in_the_window_and_clear_of_the_colour_bars() -> None:
+    array = at.TransducerArray.autd3((0.0, 0.0, 0.0), normal=(0, 0, 1))
+    plane = at.Plane((0.0, 0.0, 150e-3), (0, 0, 1), (150e-3, 150e-3))
+    scene = at.Scene(array, at.Medium.air(), 40e3, [[0.0, 0.0, 150e-3]], (), plane)
+    plotter = view3d(scene, at.drive_from_phases(np.zeros(len(array))), np.ones((3, 3)))
+    plotter.render()
+    boxes = {}
+    for name, actor in plotter.actors.items():
+        if name.startswith(STILL_AXES) and hasattr(actor, "GetDisplayOffset"):
+            plotter.renderer.SetWorldPoint(*actor.GetPosition(), 1.0)
+            plotter.renderer.WorldToDisplay()
+            low = np.array(plotter.renderer.GetDisplayPoint()[:2]) + actor.GetDisplayOffset()
+            letters = actor.GetTextProperty().GetFontSize()
+            extent = np.array([0.65 * len(actor.GetInput()), 1.0])  # letters of the font are narrower
+            boxes[actor.GetInput()] = low, low + letters * extent
+    width, height = plotter.window_size
+    bars = [bar.GetPosition()[0] * width for bar in plotter.scalar_bars.values()]
+    plotter.close()
+    assert {"x [mm]", "y [mm]", "z [mm]", "0", "50"} <= boxes.keys()
+    for low, high in boxes.values():
+        assert low[0] > min(bars) + 0.05 * width
+        assert high[0] < max(bars)
+        assert low[1] > 0
+        assert high[1] < height
+
+
+@pytest.mark.usefixtures("renderer")
 def test_obstacles_are_drawn_where_they_are_in_millimetres_as_far_as_the_domain(tmp_path: Path) -> None:
     def bounds(scene: at.Scene) -> list[tuple[float, ...]]:
         plotter = view3d(scene)
@@ -157,7 +185,7 @@ def test_meshes_hold_the_phases_and_levels_given_in_millimetres(scene: at.Scene)
     wanted = np.delete(at.phases_of(drive).numpy(), 3) / math.pi
     assert set(np.round(discs["phase"][~np.isnan(discs["phase"])], 6)) == set(np.round(wanted, 6))
     assert np.isnan(discs["phase"]).mean() == pytest.approx(1 / len(drive))  # the silent one
-    assert limits["phase / π\n"] == pytest.approx((0, 2))
+    assert limits["phase [π rad]\n"] == pytest.approx((0, 2))
     assert limits["pressure [dB]\n"] == pytest.approx((-30, 0))
 
 

@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING
 from PIL import Image
 
 from autdtorch.plot.data import MM
+from autdtorch.plot.view3d.meshes import add_axes
+from autdtorch.plot.view3d.still_axes import STILL_AXES
+from autdtorch.scene.scene import Scene
 from autdtorch.utils.files import in_folder
 from autdtorch.utils.validation import path_of
 
@@ -37,15 +40,23 @@ def export_path(name: str, value: str | Path) -> Path:
     return path
 
 
-def write(plotter: pyvista.Plotter, path: Path, caption: Sequence[str]) -> None:
+def write(plotter: pyvista.Plotter, path: Path, scene: Scene, caption: Sequence[str]) -> None:
     """Write the view in the format of the path's suffix."""
     in_folder(path)
     if path.suffix.lower() == ".png":
         Image.fromarray(plotter.screenshot(return_img=True)).save(path)
-    elif path.suffix.lower() == ".gltf":
+        return
+    still = [actor for name, actor in plotter.actors.items() if name.startswith(STILL_AXES)]
+    for actor in still:  # axes of a picture, in which the view does not turn
+        actor.SetVisibility(False)
+    if path.suffix.lower() == ".gltf":
         _write_gltf(plotter, path)
     else:
+        add_axes(plotter, scene.domain)
         _write_html(plotter, path, caption)
+        plotter.remove_bounds_axes()
+    for actor in still:
+        actor.SetVisibility(True)
 
 
 def _write_gltf(plotter: pyvista.Plotter, path: Path) -> None:

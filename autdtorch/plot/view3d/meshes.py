@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +11,8 @@ import torch
 
 from autdtorch.plot import colours
 from autdtorch.plot.data import MM, inside_any, outside_on_plane, plane_magnitude, single_drive_phases
+from autdtorch.plot.view3d.font import use_font
+from autdtorch.plot.view3d.still_axes import add_still_axes
 from autdtorch.scene.arrays import radii_of
 from autdtorch.scene.drive import amplitudes_of
 from autdtorch.scene.geometry import Plane
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _WINDOW = (1200, 860)  # pixels
+_MARGINS = (180, 215)  # pixels, for colour bars on the left and on the right
 
 # Size of tick labels and axis titles: VTK's default, and one for a picture at half size
 _LETTERS = 10.0, 16.0
@@ -35,7 +37,7 @@ _TITLES = 30.0  # distance of the axis titles from the tick labels, VTK's 20 by 
 
 POINT_COLOUR = "#00C8A0"  # green: not in the colour map of the pressure
 _SILENT_COLOUR = "#C8C8C8"
-_PHASE_BAR = 0.03  # left edge of a colour bar, as a share of the window
+_PHASE_BAR = 0.045  # left edge of a colour bar, as a share of the window
 FIELD_BAR = 0.9
 _CAPTION = (0.85, 0.15)  # lower left corner, as shares of the window
 _CAMERA = (-0.75, -1.0, 0.5)  # from the centre towards the camera
@@ -46,11 +48,18 @@ _BAR = {"vertical": True, "position_y": 0.25, "width": 0.05, "height": 0.5, "col
 _BAR |= {"title_font_size": 20, "label_font_size": 18, "unconstrained_font_size": True}
 
 
-def new_plotter(scene: Scene, off_screen: bool) -> pyvista.Plotter:
-    """Return a plotter with obstacles, control points, axes and camera."""
+def new_plotter(scene: Scene, off_screen: bool, bars: tuple[bool, bool]) -> pyvista.Plotter:
+    """Return a plotter with obstacles, control points, axes and camera.
+
+    `bars` says whether there is a colour bar on the left, and on the right.
+    """
     import pyvista
 
     plotter = empty_plotter(scene.domain, off_screen)
+    if off_screen:
+        plotter.remove_bounds_axes()
+        left, right = (margin * bar for margin, bar in zip(_MARGINS, bars, strict=True))
+        add_still_axes(plotter, scene.domain, _CAMERA, (left, right))
     for obstacle in scene.obstacles:
         add_obstacle(plotter, obstacle, scene.domain)
     points = pyvista.PolyData(MM * scene.control_points.numpy())
@@ -88,6 +97,7 @@ def add_axes(
     axes = plotter.show_bounds(bounds=_bounds(domain), **titles, **style)
     for axis in range(3):
         axes.SetAxisLabels(axis, None)  # PyVista's are not round numbers, VTK's are
+    axes.GetLabelTextProperty(2).SetOrientation(90.0)  # upright
     lower, upper = domain
     sides = np.subtract(upper, lower)
     axes.SetScreenSize(letters or _LETTERS[int(min(sides) >= _SHORT * max(sides))])
@@ -143,7 +153,7 @@ def add_transducers(
         look = {"color": colours.TRANSDUCER_COLOUR}
     actor = plotter.add_mesh(face, lighting=False, show_scalar_bar=False, **look)
     if phases is not None and bar:
-        add_bar(plotter, actor, "phase / π", position=_PHASE_BAR, labels=5, fmt="%.1f")
+        add_bar(plotter, actor, "phase [π rad]", position=_PHASE_BAR, labels=5, fmt="%.1f")
     plotter.add_mesh(rim, color=colours.EDGE_COLOUR, lighting=False)
     plotter.add_mesh(points.glyph(geom=arrow, **along), color="#555555")
     return face
@@ -164,22 +174,13 @@ def add_bar(
     bar = plotter.add_scalar_bar(
         title, mapper=mesh.mapper, n_labels=labels, fmt=fmt, position_x=position, **_BAR
     )
-    _use_font(bar.GetTitleTextProperty(), bar.GetLabelTextProperty())
+    use_font(bar.GetTitleTextProperty(), bar.GetLabelTextProperty())
 
 
 def add_caption(plotter: pyvista.Plotter, *lines: str) -> None:
     """Write lines below the colour bar of the field."""
     text = plotter.add_text("\n".join(lines), position=_CAPTION, viewport=True, font_size=10, color="black")
-    _use_font(text.prop)
-
-
-def _use_font(*properties: pyvista.TextProperty) -> None:
-    """Use the font of Matplotlib's figures; VTK's fonts have no π."""
-    from matplotlib import get_data_path
-
-    for text in properties:
-        text.SetFontFamily(4)  # VTK_FONT_FILE
-        text.SetFontFile(str(Path(get_data_path()) / "fonts/ttf/DejaVuSans.ttf"))
+    use_font(text.prop)
 
 
 def add_obstacle(

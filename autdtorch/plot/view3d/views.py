@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageColor
 
 from autdtorch.plot.colours import FLOOR, WAVE_MAP
-from autdtorch.plot.data import in_decibels, largest, zero_level
+from autdtorch.plot.data import in_decibels, largest, pressure_text, zero_level
 from autdtorch.plot.view3d import meshes
 from autdtorch.plot.view3d.export import export_path, write
 from autdtorch.plot.view3d.opengl import require_rendering
@@ -82,18 +82,18 @@ def view3d(
     zero = zero_level(reference, name, np.ones(1) if shown is None else shown)
     path = None if save is None else export_path("save", save)
     require_rendering()
-    plotter = meshes.new_plotter(scene, off_screen)
+    plotter = meshes.new_plotter(scene, off_screen, (drive is not None, shown is not None))
     meshes.add_transducers(plotter, scene, phases)
     if scene.observation_plane is not None:
         level = None if on_plane is None else in_decibels(on_plane, zero)
         meshes.add_plane(plotter, scene.observation_plane, level)
-    caption = [] if on_plane is None and in_domain is None else [f"0 dB = {zero:.3g} Pa"]
+    caption = [] if on_plane is None and in_domain is None else [f"0 dB = {pressure_text(zero)}"]
     if in_domain is not None:
         meshes.add_isosurface(plotter, scene, in_decibels(in_domain, zero), height)
         caption.append(f"surface: {height:g} dB")
     meshes.add_caption(plotter, *caption)
     if path is not None:
-        write(plotter, path, caption)
+        write(plotter, path, scene, caption)
     return plotter
 
 
@@ -125,7 +125,7 @@ def animate3d(
     frames = integer_at_least("frames", frames, 2)
     path = path_of("path", path, suffixes=(".gif",))
     require_rendering()
-    plotter = meshes.new_plotter(scene, off_screen=True)
+    plotter = meshes.new_plotter(scene, off_screen=True, bars=(True, True))
     discs = meshes.add_transducers(plotter, scene, phases)
     sheet = meshes.plane_mesh(plane, pressure.real)
     peak = largest(magnitude)

@@ -1,0 +1,67 @@
+"""Axes of a picture: their labels are upright, and do not turn with the view as VTK's do."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from PIL import ImageFont
+
+from autdtorch.plot.axes3d import axes_of, grid_lines, view_from
+from autdtorch.plot.data import MM
+from autdtorch.plot.view3d.font import FONT_FILE, use_font
+from autdtorch.utils.validation import Vector
+
+if TYPE_CHECKING:
+    import pyvista
+
+STILL_AXES = "still axes"  # begins the names of the actors
+_LETTERS = 26  # pixels; pictures are shown at half their size
+_MARGIN = 12  # pixels
+_GREY = "#909090"
+
+
+def add_still_axes(
+    plotter: pyvista.Plotter,
+    domain: tuple[Vector, Vector],
+    towards_camera: Vector,
+    margins: tuple[float, float],
+) -> None:
+    """Draw axes around a domain [m], and set the camera so that they fill the window but for its margins.
+
+    `margins` are those on the left and on the right [pixels].
+    """
+    import pyvista
+    from vtkmodules.vtkRenderingCore import vtkBillboardTextActor3D
+
+    font = ImageFont.truetype(FONT_FILE, _LETTERS)
+    lower, upper = (MM * np.array(corner) for corner in domain)
+    towards = np.array(towards_camera) / np.linalg.norm(towards_camera)
+    view = view_from(towards)
+    width, height = plotter.window_size
+    room = width - sum(margins) - 2 * _MARGIN, height - 2 * _MARGIN
+    titles = [f"{name} [mm]" for name in "xyz"]
+    axes = axes_of(lower, upper, view, room, lambda text: (font.getlength(text), 0.8 * _LETTERS), titles)
+
+    # The middle of box and labels is in the middle of the room.
+    off = np.array([(margins[0] - margins[1]) / 2, 0.0]) - (axes.low + axes.high) / 2
+    focal = (lower + upper) / 2 - off @ view / axes.scale
+    plotter.camera.focal_point = focal
+    plotter.camera.position = focal + 2 * np.linalg.norm(upper - lower) * towards
+    plotter.camera.up = view[1]
+    plotter.camera.parallel_scale = height / 2 / axes.scale
+    plotter.camera.is_set = True
+
+    lines = pyvista.line_segments_from_points(grid_lines(lower, upper, axes.ticks).reshape(-1, 3))
+    look = {"color": _GREY, "line_width": 1, "lighting": False, "reset_camera": False}
+    plotter.add_mesh(lines, name=f"{STILL_AXES}: grid", **look)
+    for number, label in enumerate(axes.labels):
+        text = vtkBillboardTextActor3D()
+        text.SetInput(label.text)
+        text.SetPosition(*label.point)
+        text.SetDisplayOffset(*np.round(label.corner).astype(int).tolist())
+        letters = text.GetTextProperty()
+        letters.SetFontSize(_LETTERS)
+        letters.SetColor(0.0, 0.0, 0.0)
+        use_font(letters)
+        plotter.add_actor(text, name=f"{STILL_AXES}: {number}", reset_camera=False)
