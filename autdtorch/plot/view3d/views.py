@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageColor
 
 from autdtorch.plot.colours import FLOOR, WAVE_MAP
-from autdtorch.plot.data import in_decibels, largest, pressure_text, zero_level
+from autdtorch.plot.data import in_decibels, largest, pressure_text, pressure_unit, zero_level
 from autdtorch.plot.view3d import meshes
 from autdtorch.plot.view3d.export import export_path, write
 from autdtorch.plot.view3d.opengl import require_rendering
@@ -121,18 +121,20 @@ def animate3d(
     phases = meshes.emitted_phases(drive, len(scene.array))
     plane, magnitude = meshes.plane_pressure(scene, field)
     pressure = complex_tensor("field", field).detach().cpu().numpy()
+    unit, size = pressure_unit(largest(magnitude))
     pressure[np.isnan(magnitude)] = math.nan
+    pressure /= size
     frames = integer_at_least("frames", frames, 2)
     path = path_of("path", path, suffixes=(".gif",))
     require_rendering()
     plotter = meshes.new_plotter(scene, off_screen=True, bars=(True, True))
     discs = meshes.add_transducers(plotter, scene, phases)
     sheet = meshes.plane_mesh(plane, pressure.real)
-    peak = largest(magnitude)
+    peak = largest(magnitude) / size
     digit = 10.0 ** math.floor(math.log10(peak)) if peak else 1.0
     limit = digit * max(1, math.ceil(peak / digit))  # of one digit, for round numbers on the colour bar
     actor = meshes.add_sheet(plotter, sheet, WAVE_MAP, (-limit, limit))
-    meshes.add_bar(plotter, actor, "p(t) [Pa]", position=meshes.FIELD_BAR, labels=5, fmt="%.3g")
+    meshes.add_bar(plotter, actor, f"p(t) [{unit}]", position=meshes.FIELD_BAR, labels=5, fmt="%.3g")
     meshes.add_caption(plotter, f"one period: {1e6 / scene.frequency:.3g} µs")
     emitted = discs["phase"].copy()
     pictures = []
