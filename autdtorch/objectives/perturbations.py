@@ -26,6 +26,7 @@ from autdtorch.utils.validation import (
     number_between,
     positive,
 )
+from autdtorch.utils.wording import counted
 
 SNRS = (-1000.0, 1000.0)
 """Range of signal-to-noise ratios [dB]; far beyond it their powers overflow."""
@@ -51,7 +52,7 @@ class Perturbation:
 
     def __repr__(self) -> str:
         """Return the nested objectives, from the outside inwards."""
-        return f"{type(self).__name__}({self.inner!r}, {self.evaluations} evaluations)"
+        return f"{type(self).__name__}({self.inner!r}, {counted(self.evaluations, 'evaluation')})"
 
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:
         """Observe drives (..., M), perturbed: pressure magnitudes (..., P) [Pa]."""

@@ -11,6 +11,7 @@ from autdtorch.propagators import Propagator
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import invalid, require_kind, require_one_of
+from autdtorch.utils.wording import counted
 
 _PRODUCTS = 2**16  # of transfer matrix and drives, that are computed at once
 
@@ -56,7 +57,8 @@ class SimulatedObjective:
     def __repr__(self) -> str:
         """Return scene, mode and number of evaluations."""
         mode = "replay" if self.transfer_matrix is None else "transfer"
-        return f"SimulatedObjective(scene {self.scene.name!r}, mode {mode!r}, {self.evaluations} evaluations)"
+        evaluations = counted(self.evaluations, "evaluation")
+        return f"SimulatedObjective(scene {self.scene.name!r}, mode {mode!r}, {evaluations})"
 
     @one_library_thread()
     def __call__(self, drive: torch.Tensor) -> torch.Tensor:

@@ -18,7 +18,7 @@ from autdtorch.utils.array_types import Array
 from autdtorch.utils.validation import boolean, invalid, members, require_kind
 
 _FRONT: dict[str, Any] = {"color": "0.8", "linewidth": 4.0, "solid_joinstyle": "miter", "zorder": 1.0}
-_PANEL, _HEIGHT = 2.6, 2.4  # inch
+_PANEL, _HEIGHT = 2.6, 2.5  # inch
 _INSIDE = 2.0  # inch, of a panel, without labels
 _BESIDE = 0.08  # inch, between a point and its name
 

@@ -19,6 +19,7 @@ from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.memory import available_memory
 from autdtorch.utils.validation import positive
+from autdtorch.utils.wording import counted
 
 _MEASURED_STEPS, _MEASURED_CELLS = 80, (300_000, 1_000_000)
 _AIR_SPACING, _AIR_RIM = 1e-3, 28
@@ -54,7 +55,7 @@ class Estimate:
     def __repr__(self) -> str:
         """Return all values with units."""
         grid = "" if self.spacing is None else f" at {1e3 * self.spacing:.4g} mm, {self.cells:,} cells"
-        cost = f"{self.runs} runs, {self.memory / 1e6:,.0f} MB, {self.seconds:.2g} s"
+        cost = f"{counted(self.runs, 'run')}, {self.memory / 1e6:,.0f} MB, {self.seconds:.2g} s"
         return f"Estimate({self.method}{grid}, {cost})"
 
 

@@ -12,6 +12,7 @@ from autdtorch.analytic.green import free_space_matrix
 from autdtorch.scene.drive import validate_drive
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import ArrayLike, boolean, points_grid, require_kind
+from autdtorch.utils.wording import counted
 
 logger = logging.getLogger(__name__)
 
@@ -29,7 +30,7 @@ class FreeSpacePropagator:
         self.scene = scene
         if scene.obstacles:
             count = len(scene.obstacles)
-            logger.warning("free_space ignores the %d obstacles of scene %r", count, scene.name)
+            logger.warning("free_space ignores %s of scene %r", counted(count, "obstacle"), scene.name)
 
     def __repr__(self) -> str:
         """Name of the scene."""

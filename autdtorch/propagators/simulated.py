@@ -28,6 +28,7 @@ from autdtorch.utils.cached import cached_property
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import ArrayLike, boolean, points_grid
+from autdtorch.utils.wording import counted
 
 logger = logging.getLogger(__name__)
 
@@ -109,7 +110,7 @@ class SimulatedPropagator:
     def __repr__(self) -> str:
         """Scene, settings and number of runs."""
         settings = f"{self.method}, spacing {1e3 * self.spacing:.4g} mm, steady to {self.tolerance:g}"
-        return f"SimulatedPropagator(scene {self.scene.name!r}, {settings}, {len(self.runs)} runs)"
+        return f"SimulatedPropagator(scene {self.scene.name!r}, {settings}, {counted(len(self.runs), 'run')})"
 
     @property
     def time_step(self) -> float:

@@ -29,6 +29,7 @@ from autdtorch.utils.apertures import Apertures
 from autdtorch.utils.cached import cached_property
 from autdtorch.utils.progress import Progress, show_progress
 from autdtorch.utils.validation import ArrayLike, invalid, points_tensor
+from autdtorch.utils.wording import counted
 
 logger = logging.getLogger(__name__)
 
@@ -228,7 +229,7 @@ class Simulation(ABC):
         """Show the progress of so many runs."""
         plan, grids = self.plan, [assembly.grid for assembly in self.assemblies]
         what = f"simulating {plan.scene.name}"
-        count = "1 run" if runs == 1 else f"{runs} runs"
+        count = counted(runs, "run")
         logger.debug("%s: %s, cells of %.3g mm, %s", what, plan.method, 1e3 * plan.spacing, count)
         arrival = max(grid.arrival for grid in grids)
         return show_progress(math.ceil(runs * USUAL_PERIODS * fewest_periods(arrival)), what)

@@ -22,6 +22,7 @@ from autdtorch.utils.validation import (
     real_tensor,
     require_kind,
 )
+from autdtorch.utils.wording import counted
 
 PAPER_SOURCE_STRENGTH = 1 / (4 * math.pi)
 """Source strength in the paper's Eq. 2: on-axis pressure at full drive times distance [Pa m]."""
@@ -267,7 +268,7 @@ class TransducerArray:
         x, y, z = (1e3 * self.positions.mean(dim=0)).tolist()
         size = f"radius {range_text(radii_of(self), 1e3)} mm, " if radii_of(self).any() else ""
         return (
-            f"TransducerArray({len(self)} transducers around ({x:.4g}, {y:.4g}, {z:.4g}) mm, "
+            f"TransducerArray({counted(len(self), 'transducer')} around ({x:.4g}, {y:.4g}, {z:.4g}) mm, "
             f"{size}source strength {range_text(strengths_of(self))} Pa m)"
         )
 

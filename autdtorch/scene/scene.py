@@ -31,6 +31,7 @@ from autdtorch.utils.validation import (
     real_tensor,
     require_kind,
 )
+from autdtorch.utils.wording import counted
 
 _OVERLAP_SAMPLES = 16  # along each axis of the intersection of two bounding boxes
 _DEFAULT_MARGIN = 2.0  # [wavelengths] of air on each side, where no domain is given
@@ -176,8 +177,9 @@ class Scene:
     def __repr__(self) -> str:
         """Return name, frequency, counts and extent, with units."""
         wave = f"{self.frequency / 1e3:.4g} kHz, wavelength {1e3 * self.wavelength:.4g} mm"
-        counts = f"{len(self.array)} transducers, {len(self.control_points)} control points"
-        space = f"{len(self.obstacles)} obstacles, domain {self._size()} mm"
+        points = counted(len(self.control_points), "control point")
+        counts = f"{counted(len(self.array), 'transducer')}, {points}"
+        space = f"{counted(len(self.obstacles), 'obstacle')}, domain {self._size()} mm"
         return f"Scene({self.name!r}, {wave}, {counts}, {space})"
 
     def _repr_html_(self) -> str:

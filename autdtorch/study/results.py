@@ -18,9 +18,9 @@ from autdtorch.objectives.metrics import FocusMetrics
 from autdtorch.objectives.objective import validate_drives
 from autdtorch.propagators import Run
 from autdtorch.study.provenance import Provenance
-from autdtorch.utils.digits import decimals_of
 from autdtorch.utils.html import html_table
 from autdtorch.utils.validation import invalid, real_tensor
+from autdtorch.utils.wording import counted, decimals_of
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,11 @@ class Simulation:
 
     def __repr__(self) -> str:
         """Return method, settings and times, with units."""
-        grid = "" if self.spacing is None else f"spacing {1e3 * self.spacing:.4g} mm, {len(self.runs)} runs, "
+        grid = (
+            ""
+            if self.spacing is None
+            else f"spacing {1e3 * self.spacing:.4g} mm, {counted(len(self.runs), 'run')}, "
+        )
         times = f"matrix {self.matrix_seconds:.2g} s, plane {self.plane_seconds:.2g} s"
         return f"Simulation({self.method}, {grid}{times})"
 
@@ -116,7 +120,8 @@ class SceneResult:
         """Return counts, bound and methods, with units."""
         points, transducers = self.transfer_matrix.shape
         return (
-            f"SceneResult({self.obstacles} obstacles, {transducers} transducers, {points} control points, "
+            f"SceneResult({counted(self.obstacles, 'obstacle')}, {counted(transducers, 'transducer')}, "
+            f"{counted(points, 'control point')}, "
             f"goal {self.goal['name']}, bound {self.in_unit(f'{self.bound:.4g}')}, "
             f"methods {', '.join(self.methods)})"
         )

@@ -45,6 +45,7 @@ from autdtorch.utils.validation import (
     require_name,
     within,
 )
+from autdtorch.utils.wording import counted
 
 logger = logging.getLogger(__name__)
 
@@ -342,7 +343,7 @@ def _in_short(propagator: Propagator, result: SceneResult) -> str:
             work += f", {propagator.cells:,} cells of {1e3 * propagator.spacing:.3g} mm"
     parts = [f"{work}, {simulation.matrix_seconds + simulation.plane_seconds:.1f} s"]
     for name, method in result.methods.items():
-        trials = "1 trial" if method.trials == 1 else f"{method.trials} trials"
+        trials = counted(method.trials, "trial")
         parts.append(f"{name}, {trials}, {float(method.seconds.sum()):.1f} s")
     return "; ".join(parts)
 

@@ -58,7 +58,7 @@ def test_a_coarse_spacing_is_logged_once_where_the_medium_is_differentiated(capl
 
 def test_free_space_warns_of_ignored_obstacles(caplog):
     make_propagator(small_scene((CUBE,)), "free_space")
-    assert "1 obstacles" in caplog.text
+    assert "1 obstacle of" in caplog.text
 
 
 def test_pilot_grids_are_not_logged(caplog):

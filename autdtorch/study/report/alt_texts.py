@@ -14,6 +14,7 @@ from autdtorch.methods.solution import Solution
 from autdtorch.study.report.findings import MOST_NAMED
 from autdtorch.study.report.tables import competitors, median_score
 from autdtorch.study.results import SceneResult
+from autdtorch.utils.wording import counted
 
 Spread = Mapping[str, Mapping[str, torch.Tensor]]
 """Values by scene and method."""
@@ -25,8 +26,9 @@ def of_scene(name: str, scene: SceneResult) -> str:
     """Return the text of the drawing of a scene."""
     points, transducers = scene.transfer_matrix.shape
     count = scene.obstacles
-    obstacles = "no obstacles" if count == 0 else "1 obstacle" if count == 1 else f"{count} obstacles"
-    return f"Scene {name} in 3D: {transducers} transducers, {obstacles}, {points} control points"
+    obstacles = counted(count, "obstacle") if count else "no obstacles"
+    shown = f"{counted(transducers, 'transducer')}, {obstacles}, {counted(points, 'control point')}"
+    return f"Scene {name} in 3D: {shown}"
 
 
 def of_planes(pressure: Spread) -> str:

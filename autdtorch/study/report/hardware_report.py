@@ -21,8 +21,8 @@ from autdtorch.objectives.objective import Objective
 from autdtorch.plot.trials import plot_convergence
 from autdtorch.study.report import alt_texts
 from autdtorch.study.report.document import code, picture, rendered
-from autdtorch.utils.digits import in_digits
 from autdtorch.utils.files import naming, replace_file
+from autdtorch.utils.wording import in_digits
 
 REPORT_FILE = "report.md"
 _FIGURE = "convergence.png"

@@ -16,8 +16,8 @@ from autdtorch.study.report.claims import Claim, Verdict
 from autdtorch.study.results import MethodResult, SceneResult, StudyResult, column_decimals
 from autdtorch.study.statistics import NEAR_BOUND, Interval, bound_gap, has_shares
 from autdtorch.study.sweeps import Sweep
-from autdtorch.utils.digits import in_digits
 from autdtorch.utils.files import replacing
+from autdtorch.utils.wording import counted, in_digits
 
 SUMMARY_FILE = "summary.csv"
 BASELINE = "gradient_ascent"  # not a competitor: it knows the transfer matrix
@@ -131,7 +131,7 @@ def simulation_rows(results: StudyResult) -> list[list[str]]:
 
 def _run_cells(runs: Sequence[Run]) -> list[str]:
     missed = sum(not run.reached for run in runs)
-    reached = f"not in {missed} run{'' if missed == 1 else 's'}" if missed else "yes"
+    reached = f"not in {counted(missed, 'run')}" if missed else "yes"
     remaining = f"{max(run.remaining for run in runs):.1e}"
     return [str(len(runs)), extent([run.periods for run in runs]), remaining, reached]
 

@@ -1,4 +1,4 @@
-"""Digits of the numbers in tables."""
+"""Numbers in texts and tables: their digits, and counts with their noun."""
 
 from __future__ import annotations
 
@@ -15,3 +15,8 @@ def decimals_of(numbers: Iterable[float], digits: int = 3) -> int:
 def in_digits(number: float, digits: int) -> str:
     """Return a finite number with some digits, without an exponent."""
     return f"{number:.{decimals_of([number], digits)}f}"
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a count with its noun, such as "1 run" or "3 runs"."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
