@@ -13,6 +13,7 @@ from autdtorch.methods.lssg import lssg
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.scene import Scene
 from autdtorch.study.report.study_report import write_report
+from autdtorch.study.results import StudyResult
 from autdtorch.study.run import run_study
 
 METHODS = {
@@ -66,7 +67,20 @@ def reports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
             command = "autdtorch collect multirun/" + "method=gabs,scene=two_cubes," * 6
             unfinished = ["multirun/method=gabs,scene=" + "two_cubes" * 12]
             pages[name] = write_report(results, scenes, folder, command, (), unfinished)
+            if name == "many":
+                pages["paper"] = write_report(as_large_as_the_papers(results), scenes, folder / "paper", "")
     return pages
+
+
+def as_large_as_the_papers(results: StudyResult) -> StudyResult:
+    """Results of six methods in each scene."""
+    found = {}
+    for name, scene in results.scenes.items():
+        methods = dict(scene.methods)
+        for other in ("lssg", "bo_foci", "identify", "gradient_ascent"):
+            methods.setdefault(other, methods["gabs"])
+        found[name] = replace(scene, methods=methods)
+    return replace(results, scenes=found)
 
 
 @pytest.fixture(params=["many", "single"])
@@ -118,6 +132,15 @@ def test_figures_have_texts_with_numbers_and_tables_have_headers(page):
     assert all(re.search(r"\d", text) and len(text) > 40 for text in texts)
     assert page.eval_on_selector_all("th:not([scope])", "all => all.length") == 0
     assert page.eval_on_selector_all("table:not(:has(th[scope=row]))", "all => all.length") == 0
+
+
+def test_a_report_of_the_papers_size_is_not_long(browser, reports):
+    page = browser.new_page(viewport={"width": 1200, "height": 900})
+    page.goto(reports["paper"].as_uri())
+    assert page.evaluate("document.documentElement.scrollHeight") < 6000  # px
+    page.eval_on_selector_all("details", "all => all.forEach(one => { one.open = true; })")
+    assert page.evaluate("document.documentElement.scrollHeight") > 7000  # what is folded is there
+    page.close()
 
 
 def test_links_lead_to_the_sections(page):
