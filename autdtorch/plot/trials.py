@@ -35,6 +35,7 @@ _ROW = 1.75  # height of a panel of boxes [inch]
 _LOW_ROW = 1.3  # without boxes
 _FEWEST = 6  # trials for a box; of fewer, each is a dot
 _PANEL = (2.7, 2.3)  # convergence of a scene [inch]
+_ALIKE = 5.0  # scenes share the axis of the score if the highest of one is at most this times that of another
 _POSES = (4.6, 3.2)  # a figure of scores along a path [inch]
 
 
@@ -172,21 +173,30 @@ def plot_convergence(
         require_kind(f"levels[{scene!r}]", by_label, Mapping)
     if unknown := levels.keys() - history.keys():
         raise ValueError(f"levels: of scenes {list(unknown)}; must be of scenes in history: {list(history)}")
+    heights = {
+        scene: {name: finite_number(f"levels[{scene!r}][{name!r}]", own) for name, own in by_label.items()}
+        for scene, by_label in levels.items()
+    }
     level_labels = list(dict.fromkeys(name for by_label in levels.values() for name in by_label))
     styles = {name: _LEVELS[index % len(_LEVELS)] for index, name in enumerate(level_labels)}
     looks = looks_of(methods_of(histories.values()))
-    figure, panels = style.new_panels(history, *_PANEL, "evaluations", label, sharey=True)
+    peaks = [
+        max(*(values.max() for values in by_method.values()), 0.0, *heights.get(scene, {}).values())
+        for scene, by_method in histories.items()
+    ]
+    alike = max(peaks) <= _ALIKE * min(peaks)  # otherwise the lower curves would be flat
+    figure, panels = style.new_panels(history, *_PANEL, "evaluations", label, sharey=alike)
     title = None
     for ax, (scene, by_method) in zip(panels, histories.items(), strict=True):
         for method, values in by_method.items():
             title = "median of the trials, band: quartiles" if len(values) > 1 else title
             _draw_history(ax, values, looks[method])
-        for name, level in levels.get(scene, {}).items():
-            height = finite_number(f"levels[{scene!r}][{name!r}]", level)
+        for name, height in heights.get(scene, {}).items():
             ax.axhline(height, zorder=1, **styles[name])
         ax.set_xlim(left=0.0)
     # After all panels are drawn: they share the axis, and a limit set earlier would keep it from growing.
-    panels[0].set_ylim(bottom=min(0.0, panels[0].get_ylim()[0]))
+    for ax in panels:
+        ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]))
     handles = [
         Line2D([], [], color=look.colour, linestyle=look.dashes, label=label_of(method))
         for method, look in looks.items()

@@ -250,6 +250,14 @@ def test_convergence_draws_median_and_quartile_band() -> None:
     assert first.get_ylabel().endswith("[Pa]")
 
 
+@pytest.mark.parametrize(("factor", "shared"), [(2.0, True), (500.0, False)])
+def test_scenes_of_other_scales_have_their_own_axis(factor: float, shared: bool) -> None:
+    first, second = plot_convergence({"a": {"gabs": [[1.0, 2.0]]}, "b": {"gabs": [[factor, factor]]}}).axes
+    assert (first.get_ylim() == second.get_ylim()) == shared
+    assert first.get_ylim()[0] == second.get_ylim()[0] == 0
+    assert first.get_ylim()[1] >= 2.0
+
+
 def test_poses_draw_the_median_and_the_bound_along_the_path() -> None:
     scores = {"gabs": 1 + RANDOM.random((7, 5)), "lssg": 1 + RANDOM.random((7, 1))}
     figure = plot_poses(scores, np.arange(7.0), "path [mm]", "weakest focus [Pa]", np.full(7, 2.0))

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import pyvista
 
 STILL_AXES = "still axes"  # begins the names of the actors
-_LETTERS = 26  # pixels; pictures are shown at half their size
+_LETTERS = 30  # pixels; pictures are shown at half their size
 _MARGIN = 12  # pixels
 _GREY = "#909090"
 

@@ -91,8 +91,12 @@ class Claim:
 
 
 def judge_claims(results: StudyResult) -> list[tuple[Claim, Verdict | None]]:
-    """Return every claim with its verdict, None if the results have no data on it."""
-    return [(claim, claim.judge(results)) for claim in CLAIMS]
+    """Return every claim with its verdict, None if the results have no data on it.
+
+    Studies that do not compare the paper's three methods are about something else, and get no verdict.
+    """
+    compared = any(scene.methods.keys() >= {LSSG, BO, GABS} for scene in results.scenes.values())
+    return [(claim, claim.judge(results) if compared else None) for claim in CLAIMS]
 
 
 def _values(scene: SceneResult, method: str, quantity: str) -> torch.Tensor | float:

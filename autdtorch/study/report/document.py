@@ -147,6 +147,7 @@ def _mark_tables(tokens: Sequence[Token]) -> list[Token]:
             if max(len(cell.content) for cell in own if cell.type == "inline") <= _SHORT:
                 own[0].attrSet("class", "short")
             _mark_headers(own)
+            _mark_numbers(own)
     return marked
 
 
@@ -158,6 +159,13 @@ def _mark_headers(table: Sequence[Token]) -> None:
         elif token.type == "td_open" and before.type == "tr_open":
             token.tag = close.tag = "th"
             token.attrSet("scope", "row")
+
+
+def _mark_numbers(table: Sequence[Token]) -> None:
+    """Keep the numbers of a short cell in one line."""
+    for token, content in itertools.pairwise(table):
+        if token.type == "td_open" and re.match(r"[-\d]", content.content) and len(content.content) <= _SHORT:
+            token.attrSet("class", "number")
 
 
 def _pictures(table: Sequence[Token]) -> list[tuple[Token, Token]]:

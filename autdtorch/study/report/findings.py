@@ -139,11 +139,15 @@ def _cost_of_obstacles(results: StudyResult, best: Mapping[str, _Best]) -> str:
     if not with_obstacles:
         return "No scene has obstacles."
     for empty_name, empty in results.scenes.items():
-        same = {name: one for name, one in with_obstacles.items() if _comparable(one, empty)}
+        same = {
+            name: one
+            for name, one in with_obstacles.items()
+            if _comparable(one, empty) and one.transfer_matrix.shape == empty.transfer_matrix.shape
+        }
         if empty.obstacles == 0 and best[empty_name].score > 0 and same:
             break
     else:
-        return "What the obstacles cost is not known: no scene of the same goal is without obstacles."
+        return "What the obstacles cost is not known: no scene of equal goal, array and foci is without them."
     changes = {name: best[name].score / best[empty_name].score - 1 for name in same}
     if len(changes) <= MOST_NAMED:
         shown = _in_scenes({name: _change(change) for name, change in changes.items()})
