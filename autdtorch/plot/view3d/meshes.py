@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _WINDOW = (1200, 860)  # pixels
-_MARGINS = (180, 215)  # pixels, for colour bars on the left and on the right
+_MARGINS = (160, 185)  # pixels, for colour bars on the left and on the right
 
 # Size of tick labels and axis titles: VTK's default, and one for a picture at half size
 _LETTERS = 10.0, 16.0

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import pyvista
 
 STILL_AXES = "still axes"  # begins the names of the actors
-_LETTERS = 30  # pixels; pictures are shown at half their size
+_LETTERS, _BESIDE_BARS = 30, 23  # pixels; pictures without colour bars are shown smaller, as in reports
 _MARGIN = 12  # pixels
 _GREY = "#909090"
 
@@ -34,14 +34,15 @@ def add_still_axes(
     import pyvista
     from vtkmodules.vtkRenderingCore import vtkBillboardTextActor3D
 
-    font = ImageFont.truetype(FONT_FILE, _LETTERS)
+    letters = _BESIDE_BARS if any(margins) else _LETTERS
+    font = ImageFont.truetype(FONT_FILE, letters)
     lower, upper = (MM * np.array(corner) for corner in domain)
     towards = np.array(towards_camera) / np.linalg.norm(towards_camera)
     view = view_from(towards)
     width, height = plotter.window_size
     room = width - sum(margins) - 2 * _MARGIN, height - 2 * _MARGIN
     titles = [f"{name} [mm]" for name in "xyz"]
-    axes = axes_of(lower, upper, view, room, lambda text: (font.getlength(text), 0.8 * _LETTERS), titles)
+    axes = axes_of(lower, upper, view, room, lambda text: (font.getlength(text), 0.8 * letters), titles)
 
     # The middle of box and labels is in the middle of the room.
     off = np.array([(margins[0] - margins[1]) / 2, 0.0]) - (axes.low + axes.high) / 2
@@ -60,8 +61,8 @@ def add_still_axes(
         text.SetInput(label.text)
         text.SetPosition(*label.point)
         text.SetDisplayOffset(*np.round(label.corner).astype(int).tolist())
-        letters = text.GetTextProperty()
-        letters.SetFontSize(_LETTERS)
-        letters.SetColor(0.0, 0.0, 0.0)
-        use_font(letters)
+        style = text.GetTextProperty()
+        style.SetFontSize(letters)
+        style.SetColor(0.0, 0.0, 0.0)
+        use_font(style)
         plotter.add_actor(text, name=f"{STILL_AXES}: {number}", reset_camera=False)
