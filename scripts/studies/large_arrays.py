@@ -17,6 +17,7 @@ from shared.document import fill_in, measured, table
 from shared.scenes import MIDDLE, autd3_array, paper_scene, with_array
 
 import autdtorch as at
+from autdtorch.utils.wording import in_digits
 
 DOCUMENT = "methods.md"
 
@@ -64,7 +65,7 @@ def measure(objectives: Mapping[str, at.SimulatedObjective], trials: int) -> lis
             seconds.append(duration)
             print(where, name, shares[-1], f"{duration:.2g} s a trial", flush=True)
         mean = torch.stack(evaluations).mean()
-        rows.append([name, f"{mean:.0f}", *shares, f"{sum(seconds) / len(seconds):.2g}"])
+        rows.append([name, f"{mean:.0f}", *shares, in_digits(sum(seconds) / len(seconds), 2)])
     return rows
 
 
