@@ -106,7 +106,7 @@ class _Texts:
     """Texts of a picture at a scale, placed one after the other."""
 
     def __init__(self, centre: Array, view: Array, size: TextSize) -> None:
-        """Begin with no text; `view` is that of `axes_of` times the scale."""
+        """Begin with no text; `view` includes the scale."""
         self.labels: list[Label] = []
         self.boxes: list[tuple[Array, Array]] = []  # lower and upper corners, from the projected centre
         self._centre, self._view, self._size = centre, view, size

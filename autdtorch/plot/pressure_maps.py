@@ -194,7 +194,7 @@ def plot_planes(
 def _panel(plane: Plane, side: float, widest: float = np.inf) -> tuple[float, float]:
     """Return the width and height [inch] of the map of a plane.
 
-    `side` is that of a square plane; longer planes have a longer side, up to one and a half times.
+    A square plane has the given `side`. The longer side of others is up to one and a half times as long.
     """
     longer = max(plane.size)
     scale = side * min(1.5, (longer / min(plane.size)) ** 0.5) / longer

@@ -35,7 +35,7 @@ _ROW = 1.75  # height of a panel of boxes [inch]
 _LOW_ROW = 1.3  # without boxes
 _FEWEST = 6  # trials for a box; of fewer, each is a dot
 _PANEL = (2.7, 2.3)  # convergence of a scene [inch]
-_ALIKE = 5.0  # scenes share the axis of the score if the highest of one is at most this times that of another
+_ALIKE = 5.0  # largest ratio of the highest scores of scenes that share an axis
 _POSES = (4.6, 3.2)  # a figure of scores along a path [inch]
 
 

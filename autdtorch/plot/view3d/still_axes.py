@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import ImageFont
 
-from autdtorch.plot.axes3d import axes_of, grid_lines, view_from
 from autdtorch.plot.data import MM
-from autdtorch.plot.view3d.font import FONT_FILE, use_font
+from autdtorch.plot.view3d.font import font_file, use_font
 from autdtorch.utils.validation import Vector
 
 if TYPE_CHECKING:
@@ -27,15 +26,17 @@ def add_still_axes(
     towards_camera: Vector,
     margins: tuple[float, float],
 ) -> None:
-    """Draw axes around a domain [m], and set the camera so that they fill the window but for its margins.
+    """Draw axes around a domain [m], and fit the camera to them, between the margins of the window.
 
     `margins` are those on the left and on the right [pixels].
     """
     import pyvista
     from vtkmodules.vtkRenderingCore import vtkBillboardTextActor3D
 
+    from autdtorch.plot.axes3d import axes_of, grid_lines, view_from  # with Matplotlib
+
     letters = _BESIDE_BARS if any(margins) else _LETTERS
-    font = ImageFont.truetype(FONT_FILE, letters)
+    font = ImageFont.truetype(font_file(), letters)
     lower, upper = (MM * np.array(corner) for corner in domain)
     towards = np.array(towards_camera) / np.linalg.norm(towards_camera)
     view = view_from(towards)
