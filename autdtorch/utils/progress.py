@@ -1,4 +1,7 @@
-"""Progress of long work with a forecast: a bar on a terminal, log lines elsewhere and in workers."""
+"""Progress of long work with a forecast: a bar on a terminal, log lines elsewhere and in workers.
+
+Work that shows its progress can be stopped, by `stopping_when`.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,8 @@ import multiprocessing
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from typing import Any
 
 from tqdm import tqdm
@@ -19,8 +23,23 @@ from autdtorch.utils.forks import in_forked
 logger = logging.getLogger(__name__)
 
 _PATIENCE = 3.0  # time after which the bar or the first forecast in the log appears [s]
+_asked: ContextVar[Callable[[], bool]] = ContextVar("asked to stop", default=lambda: False)
 
 in_forked(lambda: tqdm.set_lock(threading.RLock()))  # a thread that drew a bar may have held the lock
+
+
+class Stopped(Exception):
+    """Work that was asked to stop has done so, without a result."""
+
+
+@contextlib.contextmanager
+def stopping_when(asked: Callable[[], bool]) -> Iterator[None]:
+    """Let work within raise `Stopped` at its next step, if `asked` returns True there."""
+    token = _asked.set(asked)
+    try:
+        yield
+    finally:
+        _asked.reset(token)
 
 
 class Progress:
@@ -33,6 +52,7 @@ class Progress:
         self._first: tuple[float, int] | None = None  # time and number of the first steps
         self._next = _PATIENCE
         self._lock = threading.Lock()  # several threads run simulations
+        self._asked = _asked.get()  # those threads have another context
 
     def begin(self, what: str) -> None:
         """Name the current task."""
@@ -47,7 +67,13 @@ class Progress:
             self._bar.set_description(what)
 
     def advance(self, steps: int) -> None:
-        """Count finished steps; any thread may call it."""
+        """Count finished steps; any thread may call it.
+
+        Raises:
+            Stopped: the work was asked to stop.
+        """
+        if self._asked():
+            raise Stopped
         with self._lock:
             self._done += steps
             if self._bar is not None:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import io
+import itertools
 import logging
 import re
 import sys
 
 import pytest
-from small_scenes import small_scene
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from small_scenes import CUBE, small_scene
 
 import autdtorch as at
 from autdtorch.utils import progress
@@ -86,3 +91,30 @@ def test_without_a_terminal_there_is_no_bar(monkeypatch, stream):
     with progress.show_progress(2, "simulating") as shown:
         shown.advance(2)
     assert not progress.is_terminal(stream)
+
+
+@functools.cache
+def propagator_and_matrix(method):
+    make = functools.partial(at.make_propagator, small_scene((CUBE,)), method, 2.5e-3, cache=False)
+    return make, make().transfer_matrix()
+
+
+@settings(max_examples=15)
+@given(st.integers(0, 30), st.sampled_from(["full", "box", "operator"]))
+def test_work_that_was_stopped_at_any_step_begins_again_as_if_it_had_not(step, method):
+    make, expected = propagator_and_matrix(method)
+    propagator, steps = make(), itertools.count()
+    try:
+        with progress.stopping_when(lambda: next(steps) == step):
+            propagator.transfer_matrix()
+    except progress.Stopped:
+        assert next(steps) >= step + 1
+    else:
+        assert next(steps) <= step
+    assert torch.equal(propagator.transfer_matrix(), expected)
+
+
+def test_work_beside_is_not_stopped():
+    with progress.stopping_when(lambda: True), pytest.raises(progress.Stopped):
+        at.make_propagator(small_scene((CUBE,)), "box", 2.5e-3, cache=False).transfer_matrix()
+    assert at.make_propagator(small_scene((CUBE,)), "box", 2.5e-3, cache=False).transfer_matrix().any()

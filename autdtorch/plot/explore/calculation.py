@@ -32,6 +32,7 @@ from autdtorch.propagators import (
 from autdtorch.propagators.volume import are_shown
 from autdtorch.scene.geometry import Plane
 from autdtorch.utils.array_types import Array
+from autdtorch.utils.progress import Stopped, stopping_when
 
 Propagator: TypeAlias = FreeSpacePropagator | OperatorPropagator | SimulatedPropagator
 
@@ -134,19 +135,25 @@ class Calculator:
             self._changed.notify()
 
     def close(self) -> None:
-        """End the thread at its next step."""
+        """End the thread at its next step; keep no propagator, as trame has a global with its last server."""
         with self._changed:
             self._closed = True
             self._changed.notify()
         self._thread.join()
+        self._propagators.clear()
 
     def _work(self) -> None:
         while (request := self._next()) is not None:
+            # while something is dragged, each field is shown, so that the picture follows
+            asked = self._is_old if request.fine else self._is_closed
             try:
-                for result in self._results(request):
-                    self._report(result)
-                    if self._is_old():
-                        break
+                with stopping_when(asked):
+                    for result in self._results(request):
+                        self._report(result)
+                        if self._is_old():
+                            break
+            except Stopped:
+                continue
             except Exception as error:  # the page shows it; the next request may well succeed
                 logger.debug("request %d", request.number, exc_info=True)
                 self._report(Failure(request, error))
@@ -159,6 +166,9 @@ class Calculator:
 
     def _is_old(self) -> bool:
         return self._wanted is not None or self._closed
+
+    def _is_closed(self) -> bool:
+        return self._closed
 
     def _rests(self) -> bool:
         """Return whether nothing is asked for within a while."""

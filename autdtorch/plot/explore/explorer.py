@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import weakref
-from collections.abc import Callable
 from html import escape
 from typing import Any
 
@@ -14,7 +13,7 @@ from trame.widgets import rca
 
 from autdtorch.plot.explore.controls import Controls
 from autdtorch.plot.explore.page import page
-from autdtorch.plot.explore.server import Defer, Server
+from autdtorch.plot.explore.server import Defer, End, Server
 from autdtorch.plot.explore.session import Session
 from autdtorch.plot.explore.situation import Situation
 from autdtorch.scene.scene import Scene
@@ -83,7 +82,7 @@ class _Shown:
         self.situation = situation
 
 
-def _build(shown: _Shown, method: str | None, spacing: float, trame: Any, defer: Defer) -> Callable[[], None]:
+def _build(shown: _Shown, method: str | None, spacing: float, trame: Any, defer: Defer) -> End:
     """Make the application on a trame server; return what ends it."""
     session = Session(trame, shown.situation, spacing, defer, shown.note)
     Controls(trame, session)
@@ -94,7 +93,14 @@ def _build(shown: _Shown, method: str | None, spacing: float, trame: Any, defer:
         **_QUALITY,
     )  # fmt: skip
     session.display.update = handler.update
-    with DivLayout(trame) as layout:
-        layout.root.classes = "explore"
-        layout.root.add_child(page(view.html))
-    return session.close
+    layout = DivLayout(trame)  # without `with`, which would keep the server until another is made
+    layout.root.classes = "explore"
+    layout.root.add_child(page(view.html))
+    layout.flush_content()
+
+    async def end() -> None:
+        session.close()
+        await handler.close()  # before its window, which a frame would open again for ever
+        session.display.picture.close()
+
+    return end

@@ -7,6 +7,7 @@ import contextlib
 import functools
 import secrets
 import threading
+import weakref
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from trame.app import get_server
 from trame.app.core import AVAILABLE_SERVERS
 from trame_client.module.vue3 import www
 
+from autdtorch.plot.explore.outbox import Outboxes
+
 HOST = "127.0.0.1"
 
 _NAMES = HOST, "localhost"  # by which a browser may call this machine; others are those of an attack
@@ -23,6 +26,7 @@ _ASSETS = Path(__file__).with_name("assets")
 _PATIENCE = 60.0  # s until the server must have started
 
 Defer = Callable[..., None]
+End = Callable[[], Awaitable[None]]
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
@@ -34,7 +38,7 @@ class Server:
         token: the first part of the path of all addresses.
     """
 
-    def __init__(self, build: Callable[[Any, Defer], Callable[[], None]], port: int = 0) -> None:
+    def __init__(self, build: Callable[[Any, Defer], End], port: int = 0) -> None:
         """Start the server; `build` makes the application, in the thread, and returns what ends it.
 
         It is given a trame server, and a function that calls others in the thread, soon.
@@ -46,6 +50,7 @@ class Server:
         self.port = port
         self._build = build
         self._failure: BaseException | None = None
+        self._connections: weakref.WeakSet[asyncio.BaseTransport] = weakref.WeakSet()
         self._started = threading.Event()
         self._thread = threading.Thread(target=self._run, name="autdtorch explore page", daemon=True)
         self._thread.start()
@@ -72,8 +77,14 @@ class Server:
     def close(self) -> None:
         """Stop the server and end the thread."""
         if self.running:
-            asyncio.run_coroutine_threadsafe(self._trame.stop(), self._loop)
+            asyncio.run_coroutine_threadsafe(self._stop(), self._loop)
             self._thread.join(_PATIENCE)
+
+    async def _stop(self) -> None:
+        for connection in self._connections:
+            if isinstance(connection, asyncio.WriteTransport):
+                connection.abort()  # a page that does not read would never take the rest
+        await self._trame.stop()
 
     def _run(self) -> None:
         self._loop = asyncio.new_event_loop()
@@ -98,14 +109,14 @@ class Server:
                              "scripts": ["__explore/explore.js"]})  # fmt: skip
         trame.controller.on_server_bind.add(self._guard)
         trame.controller.on_server_ready.add(self._note)
-        close = self._build(trame, self._call)
+        end = self._build(trame, self._call)
         try:
             await trame.start(
                 port=self.port, host=HOST, exec_mode="coroutine", backend="aiohttp", timeout=0, thread=True,
                 open_browser=False, show_connection_info=False, disable_logging=True, follow_symlinks=False,
             )  # fmt: skip
         finally:
-            close()
+            await end()
 
     def _call(self, function: Callable[..., object], *arguments: object) -> None:
         with contextlib.suppress(RuntimeError):  # the loop is closed: nobody looks any more
@@ -118,6 +129,8 @@ class Server:
     def _guard(self, server: Any) -> None:
         """Serve the pages below the token alone, and refuse what does not come from them."""
         app: web.Application = server.app
+        for handler in server._ws_handlers:
+            handler.connections = Outboxes()
         app.middlewares.append(self._refuse_others)
         folders = {"": www} | dict(self._trame.serve)
         for name, path in sorted(folders.items(), reverse=True):
@@ -134,6 +147,8 @@ class Server:
             raise web.HTTPForbidden(text="explore: open the address that was printed, with its token")
         if origin is not None and origin != f"http://{request.host}":
             raise web.HTTPForbidden(text="explore: the page of another origin")
+        if request.transport is not None:
+            self._connections.add(request.transport)
         response = await handler(request)
         if not response.prepared:
             response.headers["Referrer-Policy"] = "no-referrer"  # the address has the token

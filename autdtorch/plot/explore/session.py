@@ -71,6 +71,7 @@ class Session:
         self._waits = False  # a change of the view, for the end of the method
         self._ended = ""  # a text about a method that did not end
         self._saved: set[str] = set()
+        self._closed = False
         self._waiting = asyncio.get_running_loop().call_later(_PATIENCE, self.display.update)
 
     @property
@@ -90,10 +91,10 @@ class Session:
         self._note(self.now)
 
     def close(self) -> None:
-        """End calculations and rendering."""
+        """End calculations; what comes of them later is not shown."""
+        self._closed = True
         self._waiting.cancel()
         self._calculator.close()
-        self.display.picture.close()
 
     # Changes of the situation
 
@@ -273,6 +274,8 @@ class Session:
 
     def _receive(self, found: Result | Progress | Failure) -> None:
         """Show what was calculated."""
+        if self._closed:
+            return
         is_newest = found.request.number == self._request.number
         with self._state:
             if isinstance(found, Result):
