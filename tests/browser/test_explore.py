@@ -111,8 +111,7 @@ def test_an_obstacle_is_dragged_and_turned_in_the_picture(live):
     assert moved.center[2] - before.center[2] > 5e-3
     assert moved.rotation == before.rotation
     drag(page, (start[0], start[1] - 60), (40, 0), shift=True)
-    wait_for(lambda: explorer.scene.obstacles[0].rotation != before.rotation)
-    np.testing.assert_allclose(explorer.scene.obstacles[0].rotation, (0, 0, np.radians(20)), atol=1e-6)
+    wait_for(lambda: np.allclose(explorer.scene.obstacles[0].rotation, (0, 0, np.radians(20)), atol=1e-6))
     assert explorer.scene.obstacles[0].center == moved.center
 
 
@@ -204,7 +203,8 @@ def test_phases_follow_an_obstacle_and_undo_brings_them_back(live):
 def test_the_drive_is_edited(live):
     explorer, page = live
     before = explorer.drive
-    page.select_option("#transducer", "5")
+    page.fill("#transducer", "5")
+    page.press("#transducer", "Enter")
     chosen = float(torch.rad2deg(at.phases_of(before)[5]))
     wait_for(lambda: abs(float(page.input_value("#phase_number")) - chosen) < 0.01)
     with settled(page):
@@ -221,6 +221,22 @@ def test_the_drive_is_edited(live):
     others = [index for index in range(16) if index != 5]
     assert torch.equal(explorer.drive[others], before[others])
     np.testing.assert_allclose(pressures(page), simulated(explorer), rtol=1e-2)
+
+
+def test_undo_brings_back_the_colours_of_the_field(live):
+    _, page = live
+    first = page.input_value("#reference")
+    page.fill("#reference", "123")
+    page.press("#reference", "Enter")
+    wait_for(lambda: "123 Pa" in page.inner_text(".legend span:nth-child(3)"))
+    page.select_option("#method", "gs")
+    with settled(page):
+        page.click("#find")  # new colours for a new drive
+    assert page.input_value("#reference") != "123"
+    for expected in ("123", first):
+        with settled(page):
+            page.click("#undo")
+        assert page.input_value("#reference") == expected
 
 
 def test_plane_unit_and_volume_change_the_picture(live):

@@ -7,10 +7,8 @@ import threading
 import webbrowser
 from typing import TYPE_CHECKING
 
-import torch
-
+from autdtorch.plot.explore.situation import checked_drive
 from autdtorch.plot.view3d.opengl import require_rendering
-from autdtorch.scene.drive import validate_single_drive
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.validation import ArrayLike, boolean, integer_at_least, invalid, positive, require_kind
 
@@ -46,7 +44,8 @@ def explore(
         open_browser: True to open the page in this machine's browser.
 
     Returns:
-        The live view. Its `scene` and `drive` are those that it shows; `close` ends it.
+        The live view. Its `scene` and `drive` are those that it shows, and can be set; `ready` waits for the
+        calculation, and `close` ends the view.
 
     Raises:
         ValueError: an argument out of range, or not a drive of the scene.
@@ -56,7 +55,7 @@ def explore(
     """
     require_kind("scene", scene, Scene)
     if drive is not None:
-        drive = validate_single_drive(drive, len(scene.array)).detach().to("cpu", torch.complex128)
+        drive = checked_drive(drive, scene)
     spacing, browses = positive("spacing", spacing, "m"), boolean("open_browser", open_browser)
     if not 0 <= (port := integer_at_least("port", port, 0)) <= _LAST_PORT:
         raise invalid("port", port, f"must be at most {_LAST_PORT}")

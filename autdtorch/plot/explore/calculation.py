@@ -115,10 +115,20 @@ class Failure:
     error: Exception
 
 
+@dataclass(frozen=True)
+class Finished:
+    """The end of a request: no result of it follows."""
+
+    request: Request
+
+
+Report = Result | Progress | Failure | Finished
+
+
 class Calculator:
     """A thread that answers the newest request."""
 
-    def __init__(self, spacing: float, report: Callable[[Result | Progress | Failure], None]) -> None:
+    def __init__(self, spacing: float, report: Callable[[Report], None]) -> None:
         """Calculate with cells of `spacing` [m] when fine; `report` is called in the thread."""
         self._spacing, self._report = spacing, report
         self._wanted: Request | None = None
@@ -157,6 +167,7 @@ class Calculator:
             except Exception as error:  # the page shows it; the next request may well succeed
                 logger.debug("request %d", request.number, exc_info=True)
                 self._report(Failure(request, error))
+            self._report(Finished(request))
 
     def _next(self) -> Request | None:
         with self._changed:

@@ -32,7 +32,7 @@ class Controls:
             (("phase", "amplitude"), self._edit_drive),
             (("plane",), self._choose_plane),
             (("height",), self._move_plane),
-            (("unit",), self._display.redraw),
+            (("unit",), session.redraw),
             (("reference", "surface"), self._choose_scale),
             (("volume",), session.look),
             (("dark",), self._choose_dark),
@@ -50,8 +50,7 @@ class Controls:
 
     def rescale(self) -> None:
         """Fit the colours to the field."""
-        self._display.reference = None
-        self._display.redraw()
+        self._session.rescale()
 
     def _look(self, name: str) -> None:
         self._display.picture.move_camera(*CAMERA[name].move)
@@ -99,17 +98,17 @@ class Controls:
             self._attempt(lambda: now.with_plane(now.plane, MM * entered[0]))
 
     def _choose_scale(self) -> None:
-        display = self._display
-        shown = 1.0 if display.reference is None else four_digits(display.reference)
+        display, now = self._display, self._session.now
+        shown = 1.0 if now.reference is None else four_digits(now.reference)
         reference = self._entered(("reference",), (shown,))
         surface = self._entered(("surface",), (display.surface,))
-        if reference and reference[0] > 0:
-            display.reference = reference[0]
         if surface and _LOWEST <= surface[0] < 0:
             display.surface = surface[0]
             self._state.message = ""
-        if reference or surface:
-            display.redraw()  # sets back what is out of range
+        if reference and reference[0] > 0:
+            self._session.rescale(reference[0])
+        elif reference or surface:
+            self._session.redraw()  # sets back what is out of range
 
     def _choose_dark(self) -> None:
         self._display.picture.set_dark(bool(self._state.dark))

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from autdtorch.plot.data import largest
 from autdtorch.plot.explore.calculation import Result
 from autdtorch.plot.explore.history import History
-from autdtorch.plot.explore.page import FIRST_SURFACE
+from autdtorch.plot.explore.page import FIRST_SURFACE, scene_state
 from autdtorch.plot.explore.picture import Picture, Scale
 from autdtorch.plot.explore.readings import four_digits, in_degrees, in_mm, rows, summary
 from autdtorch.plot.explore.situation import Situation
@@ -29,7 +28,7 @@ class Display:
     Attributes:
         picture: the picture.
         update: sends the picture, once there is a page.
-        reference: pressure of the brightest colour [Pa]; None to fit it to the next field.
+        result: the newest; None until there is one.
         surface: level of the surface in the volume [dB].
         silent: phases [degrees] of transducers with amplitude 0, by index; their drives have none.
     """
@@ -39,10 +38,9 @@ class Display:
         self._state = state
         self.picture = Picture(situation)
         self.update: Callable[[], None] = lambda: None
-        self.reference: float | None = None
         self.surface = FIRST_SURFACE
         self.silent: dict[int, float] = {}
-        self._result: Result | None = None
+        self.result: Result | None = None
 
     def chosen(self, name: str, count: int) -> int:
         """Return the index that a list of the page has chosen."""
@@ -68,6 +66,11 @@ class Display:
     def place(self, history: History) -> None:
         """Set the numbers of the page to the situation now, and move what is in the picture."""
         state, now = self._state, history.now
+        if not self.picture.shows(now):
+            self.picture.draw(now)
+            self.silent.clear()
+            with state:
+                state.update(scene_state(now))
         points = now.scene.control_points
         focus = self.chosen("focus", len(points))
         with state:
@@ -82,6 +85,7 @@ class Display:
             low, high = now.heights
             state.update(
                 {
+                    "transducer": transducer,
                     "foci": [(index, str(index)) for index in range(len(points))], "focus": focus,
                     "plane": now.plane, "height": in_mm(now.height),
                     "range_height": [in_mm(low), in_mm(high)],
@@ -90,19 +94,9 @@ class Display:
             )  # fmt: skip
         self.picture.place(now, focus, transducer)
 
-    def show(self, result: Result, keeps: bool) -> None:
-        """Show a result; its colour scale stays for the next ones if it `keeps`."""
-        self._result = result
-        self.redraw(keeps)
-
-    def redraw(self, keeps: bool = True) -> None:
-        """Colour the plane, draw the surface, and set the readings."""
-        if (result := self._result) is None:
-            return
+    def redraw(self, result: Result, reference: float) -> None:
+        """Colour the plane, draw the surface, and set the readings; `reference` [Pa] is the brightest."""
         magnitude = np.abs(result.field)
-        reference = self.reference or largest(magnitude) or 1.0
-        if keeps:
-            self.reference = reference
         scale = Scale(reference, self._state.unit != "Pa")
         self.picture.show_field(result.request.situation.sheet, magnitude, scale)
         low, high = scale.limits

@@ -43,6 +43,16 @@ class History:
             self._before = self.now
         self.now = situation
 
+    def amend(self, situation: Situation) -> None:
+        """Show a situation that is now in place of that of the last step."""
+        self.now = situation
+
+    def step(self, situation: Situation) -> None:
+        """Show another situation, as a step of its own."""
+        self.settle()
+        self.change(situation)
+        self.settle()
+
     def settle(self) -> bool:
         """End a step; return False if none has begun."""
         if self._before is None:

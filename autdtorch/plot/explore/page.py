@@ -164,7 +164,9 @@ def page(view: str) -> str:
         {_button("cancel", "Cancel", "!busy")}</div>
       <progress max="100" :value="progress" aria-label="progress of the method" v-show="busy"></progress>
       {_box("follow", "find them again after every move, by gradient ascent")}
-      {_choice("transducer", "transducer", "transducers")}
+      <label>transducer, or click one
+        <input type="number" id="transducer" v-model.lazy.number="transducer" min="0" :max="transducers - 1">
+      </label>
       {_slider("phase", "phase [°]", "0", "360", 1)} {_slider("amplitude", "amplitude", "0", "1", 0.01)}
       <div class="row">{_button("in_phase", "All in phase")}</div>
     </fieldset>
@@ -187,6 +189,19 @@ def page(view: str) -> str:
 
 def first_state(situation: Situation, methods: dict[str, Method]) -> dict[str, Any]:
     """Return the state of the page at first, without what `Display.place` sets."""
+    return scene_state(situation) | {
+        "message": "", "status": "", "summary": "", "saved": "", "python": "", "rows": [], "columns": COLUMNS,
+        "methods": choices(methods), "method": "gradient_ascent", "follow": False, "busy": False,
+        "progress": 0,
+        "units": [("dB", "dB"), ("Pa", "Pa")], "unit": "dB", "reference": 1.0,
+        "volume": False, "surface": FIRST_SURFACE, "dark": False, "scale_low": "", "scale_high": "",
+        "scale_style": gradient(colours.PRESSURE_MAP), "phase_style": gradient(colours.PHASE_MAP),
+        "folder": saving.free_folder(), "shown": -1, "wanted": 0, "settled": 0,
+    }  # fmt: skip
+
+
+def scene_state(situation: Situation) -> dict[str, Any]:
+    """Return the part of the state that stays while obstacles and foci move."""
     scene = situation.scene
     lower, upper = scene.domain
     obstacles = [
@@ -196,17 +211,9 @@ def first_state(situation: Situation, methods: dict[str, Method]) -> dict[str, A
     planes = [(name, "as in the scene" if name == OWN_PLANE else name) for name in situation.planes]
     return {
         "trame__title": f"autdtorch explore: {scene.name}", "name": scene.name,
-        "message": "", "status": "", "summary": "", "saved": "", "python": "", "rows": [], "columns": COLUMNS,
         "bodies": list(enumerate(obstacles)), "body": 0, "body_moves": False, "body_turns": False,
-        "focus": 0, "transducers": [(index, str(index)) for index in range(len(scene.array))],
-        "transducer": 0,
-        "methods": choices(methods), "method": "gradient_ascent", "follow": False, "busy": False,
-        "progress": 0,
-        "planes": planes, "units": [("dB", "dB"), ("Pa", "Pa")], "unit": "dB", "reference": 1.0,
-        "volume": False, "surface": FIRST_SURFACE, "dark": False, "scale_low": "", "scale_high": "",
-        "scale_style": gradient(colours.PRESSURE_MAP), "phase_style": gradient(colours.PHASE_MAP),
-        "devices": devices, "device": "", "folder": saving.free_folder(),
-        "shown": -1, "wanted": 0, "settled": 0,
+        "focus": 0, "transducers": len(scene.array), "transducer": 0,
+        "planes": planes, "devices": devices, "device": "",
     } | {
         f"range_{axis}": [in_mm(low), in_mm(high)]
         for axis, low, high in zip("xyz", lower, upper, strict=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -68,8 +69,23 @@ class Picture:
 
     def __init__(self, situation: Situation) -> None:
         """Draw a situation, as yet without a field."""
+        self.plotter = meshes.empty_plotter(situation.scene.domain, off_screen=True)
+        self._dark = False
+        self.draw(situation)
+        self.plotter.render_window.AddObserver("WindowResizeEvent", lambda *_: self._fit())
+
+    def shows(self, situation: Situation) -> bool:
+        """Return whether bodies, array and domain of a situation are those of the picture."""
+        one, other = situation, self._situation
+        firsts = [[body.first for body in each.bodies] for each in (one, other)]
+        same_bodies = len(firsts[0]) == len(firsts[1]) and all(map(operator.is_, *firsts))
+        return same_bodies and one.scene.array is other.scene.array and one.scene.domain == other.scene.domain
+
+    def draw(self, situation: Situation) -> None:
+        """Draw a situation in place of another, as yet without a field."""
         scene, self._situation = situation.scene, situation
-        self.plotter = meshes.empty_plotter(scene.domain, off_screen=True)
+        self.plotter.clear_actors()
+        meshes.look_at(self.plotter, scene.domain)
         self._bodies = [meshes.add_obstacle(self.plotter, body.first) for body in situation.bodies]
         self._foci: list[Any] = []
         self._faces = meshes.add_transducers(
@@ -79,11 +95,11 @@ class Picture:
         self.plotter.add_mesh(self._ring, color=meshes.POINT_COLOUR, lighting=False, reset_camera=False)
         self._sheet = meshes.plane_mesh(situation.sheet, np.full((1, 1), math.nan))
         self._actor = meshes.add_sheet(self.plotter, self._sheet, colours.PRESSURE_MAP, (0.0, 1.0))
-        self.set_dark(False)
+        self.set_dark(self._dark)
         self.place(situation, 0, 0)
         self._fitted = self.plotter.camera.parallel_scale
         self._first = self.plotter.camera_position
-        self.plotter.render_window.AddObserver("WindowResizeEvent", lambda *_: self._fit())
+        self._fit()
 
     def _fit(self) -> None:
         """Show the whole domain in a window of another size, unless the user has zoomed."""
@@ -109,6 +125,7 @@ class Picture:
 
     def set_dark(self, dark: bool) -> None:
         """Take light lines on a dark background, or dark on light."""
+        self._dark = dark
         ink, paper = _INK[dark]
         self.plotter.set_background(paper)
         meshes.add_axes(self.plotter, self._situation.scene.domain, ink, _LETTERS)

@@ -69,10 +69,28 @@ class Server:
         """True until it is closed."""
         return self._thread.is_alive()
 
+    def require_running(self) -> None:
+        """Raise a `RuntimeError` if it is closed."""
+        if not self.running:
+            raise RuntimeError("explore: the live view is closed")
+
     def wait(self) -> None:
         """Wait until it is closed, in steps that let Ctrl+C through."""
         while self.running:
             self._thread.join(0.5)
+
+    def call(self, function: Callable[[], object]) -> None:
+        """Call a function in the thread, and wait for its end.
+
+        Raises:
+            RuntimeError: it is closed.
+        """
+
+        async def called() -> None:
+            function()
+
+        self.require_running()
+        asyncio.run_coroutine_threadsafe(called(), self._loop).result(_PATIENCE)
 
     def close(self) -> None:
         """Stop the server and end the thread."""
@@ -104,7 +122,7 @@ class Server:
         del AVAILABLE_SERVERS[f"explore-{self.token}"]  # which would keep it, and all that it shows, for ever
         # trame would read the arguments of the user's own program, among them the host
         trame.cli.parse_known_args = functools.partial(trame.cli.parse_known_args, [])
-        trame.cli.set_defaults(ws=f"{self.token}/ws", host=HOST)
+        trame.cli.set_defaults(ws=f"{self.token}/ws", host=HOST, nowscompress=True)
         trame.enable_module({"serve": {"__explore": str(_ASSETS)}, "styles": ["__explore/explore.css"],
                              "scripts": ["__explore/explore.js"]})  # fmt: skip
         trame.controller.on_server_bind.add(self._guard)

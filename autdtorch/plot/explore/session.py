@@ -7,23 +7,33 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import threading
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
 
+from autdtorch.plot.data import largest
 from autdtorch.plot.explore import saving
-from autdtorch.plot.explore.calculation import Calculator, Failure, Progress, Request, Result
+from autdtorch.plot.explore.calculation import (
+    Calculator,
+    Failure,
+    Finished,
+    Report,
+    Request,
+    Result,
+)
 from autdtorch.plot.explore.catalogue import offered
 from autdtorch.plot.explore.display import Display
 from autdtorch.plot.explore.history import History
 from autdtorch.plot.explore.mouse import Mouse
 from autdtorch.plot.explore.picture import Grip
 from autdtorch.plot.explore.readings import MM, refusal
-from autdtorch.plot.explore.situation import Situation
+from autdtorch.plot.explore.situation import Situation, in_phase, same_array
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.moving import angles_of
+from autdtorch.scene.scene import Scene
 from autdtorch.utils.array_types import Array
 
 DIGITS = 7
@@ -32,6 +42,8 @@ DIGITS = 7
 _PATIENCE = 0.25  # s; a picture before the field would slow its calculation down
 _NEW_FOCUS = 1.5  # wavelengths beside the last focus
 _FOLLOWING = "follow"
+FIRST_METHOD = "gradient_ascent"
+"""The method that finds the first drive."""
 
 
 class Session:
@@ -43,6 +55,8 @@ class Session:
     Attributes:
         display: page and picture.
         methods: the methods that the page offers, by name.
+        ready: set while nothing is calculated; threads may wait for it.
+        failure: what ended the last calculation.
     """
 
     def __init__(
@@ -72,6 +86,8 @@ class Session:
         self._ended = ""  # a text about a method that did not end
         self._saved: set[str] = set()
         self._closed = False
+        self.ready = threading.Event()
+        self.failure: Exception | None = None
         self._waiting = asyncio.get_running_loop().call_later(_PATIENCE, self.display.update)
 
     @property
@@ -113,8 +129,7 @@ class Session:
     def settle(self) -> None:
         """Calculate finely what was changed, if anything was: the mouse or a slider was let go."""
         if self._history.settle():
-            self.place()
-            self._ask()
+            self._show()
 
     def refuse(self, error: Exception) -> None:
         """Say why something cannot be, and set the page back."""
@@ -146,21 +161,38 @@ class Session:
         with self._state:
             self._state[grip.kind] = grip.number
 
+    # Changes by the program
+
+    def show(self, scene: Scene) -> None:
+        """Show another scene, as a step; a search that runs goes on there, and another array begins one."""
+        before = self.now
+        self._history.step(before.with_scene(scene))
+        if not same_array(scene.array, before.scene.array):
+            self._end_search()
+            self._search = FIRST_METHOD
+        elif self._state.follow:
+            self._search = self._search or _FOLLOWING
+        self._show()
+
+    def play(self, drive: torch.Tensor) -> None:
+        """Show the field of a drive (M,), as a step."""
+        self._end_search()
+        self._history.step(self.now.with_drive(drive))
+        self._show()
+
     # Actions of the page
 
     def undo(self) -> None:
         """Go a step back."""
         self._end_search()
         self._history.undo()
-        self.place()
-        self._ask()
+        self._show()
 
     def redo(self) -> None:
         """Take a step again."""
         self._end_search()
         self._history.redo()
-        self.place()
-        self._ask()
+        self._show()
 
     def add_focus(self) -> None:
         """Add a focus beside the chosen one."""
@@ -190,7 +222,7 @@ class Session:
 
     def in_phase(self) -> None:
         """Give all transducers phase 0 and amplitude 1."""
-        self._change(self.now.with_drive(torch.ones_like(self.now.drive)))
+        self._change(self.now.with_drive(in_phase(self.now.scene)))
         self.settle()
 
     def find(self) -> None:
@@ -209,6 +241,12 @@ class Session:
     def look(self) -> None:
         """Calculate the field again, since the page wants more of it."""
         self._ask()
+
+    def rescale(self, reference: float | None = None) -> None:
+        """Take a pressure [Pa] as the brightest colour, by default the largest, as a step."""
+        self._history.step(self.now.with_reference(reference))
+        self.place()
+        self.redraw()
 
     def write_python(self) -> None:
         """Write scene and drive as Python."""
@@ -244,9 +282,21 @@ class Session:
             self._ended = f"{self.methods[str(self._search)].label} cancelled, "
         self._search, self._running, self._waits = None, False, False
 
+    def _show(self) -> None:
+        self.place()
+        self._ask()
+
+    def redraw(self) -> None:
+        """Draw the field; the first one decides the colours."""
+        if (result := self.display.result) is not None:
+            reference = self.now.reference or largest(np.abs(result.field)) or 1.0
+            self._history.amend(self.now.with_reference(reference))  # first, as the page tells it back
+            self.display.redraw(result, reference)
+
     def _ask(self, fine: bool = True) -> None:
         """Ask for the field of the situation, and show the picture with it, or without if that takes long."""
         self.display.picture.smooth(fine)
+        self.ready.clear()
         self._waiting.cancel()
         self._waiting = asyncio.get_running_loop().call_later(_PATIENCE, self._show_wait, fine)
         if self._running and self.now.scene is self._request.situation.scene:
@@ -254,6 +304,7 @@ class Session:
             return
         method = self.methods.get(self._search or "") if fine else None
         self._running = method is not None
+        self.failure = None
         self._request = Request(
             next(self._numbers), self.now, fine,
             follow=self._search == _FOLLOWING,
@@ -272,7 +323,7 @@ class Session:
                 self._state.status = f"{self._ended}calculating ..."
         self.display.update()
 
-    def _receive(self, found: Result | Progress | Failure) -> None:
+    def _receive(self, found: Report) -> None:
         """Show what was calculated."""
         if self._closed:
             return
@@ -282,8 +333,10 @@ class Session:
                 self._take(found, is_newest)
             elif not is_newest:
                 return
+            elif isinstance(found, Finished):
+                self.ready.set()
             elif isinstance(found, Failure):
-                self._search, self._running = None, False
+                self._search, self._running, self.failure = None, False, found.error
                 self._state.update(
                     {
                         "message": refusal(found.error),
@@ -299,6 +352,8 @@ class Session:
 
     def _take(self, result: Result, is_newest: bool) -> None:
         request = result.request
+        if not is_newest and not self.display.picture.shows(request.situation):
+            return
         if is_newest:
             if not torch.equal(result.drive, self.now.drive):
                 self._take_drive(result)
@@ -306,7 +361,8 @@ class Session:
                 self._search = None
             self._running = self._state.busy = False
         self._waiting.cancel()
-        self.display.show(result, keeps=is_newest)
+        self.display.result = result
+        self.redraw()
         what = "calculated" if request.fine else "coarse, calculated"
         self._state.status = f"{self._ended}{what} in {result.seconds:.2g} s"
         self._ended = "" if request.fine else self._ended
@@ -317,11 +373,10 @@ class Session:
     def _take_drive(self, result: Result) -> None:
         """Take the drive of a search: a step of its own, or a part of the move that it follows."""
         situation, is_first = self.now.with_drive(result.drive), result.request.number == 1
-        if result.request.method is not None and not is_first:
-            self._history.change(situation)
-            self._history.settle()
-        else:
-            self._history.now = situation
         if result.request.method is not None:
-            self.display.reference = None
+            situation = situation.with_reference(None)
+        if result.request.method is not None and not is_first:
+            self._history.step(situation)
+        else:
+            self._history.amend(situation)
         self.place()

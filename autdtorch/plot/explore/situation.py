@@ -6,13 +6,14 @@ from dataclasses import dataclass, field, replace
 
 import torch
 
+from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.drive import drive_from_phases, validate_single_drive
 from autdtorch.scene.geometry import Plane, rotation_matrix
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.obstacles.moving import is_movable, is_turnable, shifted, turned
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.cached import cached_property
-from autdtorch.utils.validation import Vector, finite_vector, require_one_of
+from autdtorch.utils.validation import ArrayLike, Vector, finite_vector, require_one_of
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 OWN_PLANE = "scene"
@@ -76,6 +77,7 @@ class Situation:
         plane: name of the plane of the field: "x", "y" or "z" for a section of the domain across this axis,
             "scene" for the scene's own.
         height: of the plane along its normal [m]; for the scene's own from where it was.
+        reference: pressure of the brightest colour [Pa]; None to fit it to the next field.
     """
 
     bodies: tuple[Body, ...]
@@ -84,6 +86,7 @@ class Situation:
     plane: str
     height: float
     _own: Plane | None = field(repr=False)
+    reference: float | None = None
 
     @classmethod
     def of(cls, scene: Scene, drive: torch.Tensor) -> Situation:
@@ -154,6 +157,13 @@ class Situation:
         obstacles = tuple(one.obstacle for one in bodies)
         return replace(self, bodies=bodies, scene=replace(self.scene, obstacles=obstacles))
 
+    def with_scene(self, scene: Scene) -> Situation:
+        """Return the situation of another scene: with the drive where its array stays, else all in phase."""
+        stays = same_array(scene.array, self.scene.array)
+        drive = self.drive if stays else in_phase(scene)
+        changed = replace(Situation.of(scene, drive), reference=self.reference if stays else None)
+        return changed.with_plane(self.plane, self.height) if self.plane in _AXES else changed
+
     def with_points(self, points: torch.Tensor) -> Situation:
         """Return the situation with other control points (P, 3) [m].
 
@@ -180,6 +190,10 @@ class Situation:
         drive[index] = drive_from_phases([phase], [amplitude])[0]
         return self.with_drive(drive)
 
+    def with_reference(self, reference: float | None) -> Situation:
+        """Return the situation with another pressure of the brightest colour [Pa]; None to fit it."""
+        return self if reference == self.reference else replace(self, reference=reference)
+
     def with_plane(self, plane: str, height: float | None = None) -> Situation:
         """Return the situation with another plane; without a height it passes through the foci."""
         require_one_of("plane", plane, self.planes)
@@ -189,6 +203,21 @@ class Situation:
         low, high = changed.heights
         height = min(max(height or 0.0, low), high)
         return self if (plane, height) == (self.plane, self.height) else replace(changed, height=height)
+
+
+def in_phase(scene: Scene) -> torch.Tensor:
+    """Return the drive (M,) with phase 0 and amplitude 1."""
+    return torch.ones(len(scene.array), dtype=torch.complex128, device="cpu")
+
+
+def checked_drive(drive: ArrayLike, scene: Scene) -> torch.Tensor:
+    """Return a drive (M,) of a scene, complex128 on the CPU, after checking it."""
+    return validate_single_drive(drive, len(scene.array)).detach().to("cpu", torch.complex128)
+
+
+def same_array(one: TransducerArray, other: TransducerArray) -> bool:
+    """Return whether two arrays have their transducers at the same places."""
+    return torch.equal(one.positions, other.positions) and torch.equal(one.normals, other.normals)
 
 
 def _middle(obstacle: Obstacle) -> Vector:

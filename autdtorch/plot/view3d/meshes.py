@@ -77,11 +77,16 @@ def empty_plotter(domain: tuple[Vector, Vector], off_screen: bool) -> pyvista.Pl
         plotter = pyvista.Plotter(off_screen=off_screen, window_size=list(_WINDOW))
     plotter.set_background("white")
     add_axes(plotter, domain)
+    look_at(plotter, domain)
+    return plotter
+
+
+def look_at(plotter: pyvista.Plotter, domain: tuple[Vector, Vector]) -> None:
+    """Set the camera, so that it shows a whole domain [m]."""
     plotter.view_vector(_CAMERA, viewup=(0.0, 0.0, 1.0))
     plotter.enable_parallel_projection()
     plotter.reset_camera(bounds=_bounds(domain))
     plotter.camera.zoom(1.05)
-    return plotter
 
 
 def add_axes(
