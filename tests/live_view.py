@@ -99,18 +99,18 @@ def center_of_box(page):
     return box["x"] + float(5 * column + 12), box["y"] + float(5 * row + 12)
 
 
-def drag(page, start, offset, shift=False):
-    """Drag by some pixels, in steps."""
+def drag(page, start, offset, key=None):
+    """Drag by some pixels, in steps, with a key held."""
     page.mouse.move(*start)
-    if shift:
-        page.keyboard.down("Shift")
+    if key:
+        page.keyboard.down(key)
     page.mouse.down()
     for share in (0.2, 0.4, 0.6, 0.8, 1.0):
         page.mouse.move(start[0] + share * offset[0], start[1] + share * offset[1])
         page.wait_for_timeout(60)  # the page sends at most one event in 30 ms
     page.mouse.up()
-    if shift:
-        page.keyboard.up("Shift")
+    if key:
+        page.keyboard.up(key)
 
 
 def share_of_bound(explorer):

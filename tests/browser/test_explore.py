@@ -105,12 +105,17 @@ def test_an_obstacle_is_dragged_and_turned_in_the_picture(live):
     start = center_of_box(page)
     before = explorer.scene.obstacles[0]
     with settled(page):
-        drag(page, start, (0, -60))
+        drag(page, start, (40, 0))
+    aside = explorer.scene.obstacles[0]
+    assert np.linalg.norm(np.subtract(aside.center, before.center)) > 4e-3
+    assert aside.center[2] == before.center[2]  # as on a table
+    assert aside.rotation == before.rotation
+    with settled(page):
+        drag(page, (start[0] + 40, start[1]), (0, -60), key="Control")
     moved = explorer.scene.obstacles[0]
-    # The camera looks down a little, so that up on the screen is mostly up in space
-    assert moved.center[2] - before.center[2] > 5e-3
-    assert moved.rotation == before.rotation
-    drag(page, (start[0], start[1] - 60), (40, 0), shift=True)
+    assert moved.center[2] - aside.center[2] > 5e-3
+    assert moved.center[:2] == aside.center[:2]
+    drag(page, (start[0] + 40, start[1] - 60), (40, 0), key="Shift")
     wait_for(lambda: np.allclose(explorer.scene.obstacles[0].rotation, (0, 0, np.radians(20)), atol=1e-6))
     assert explorer.scene.obstacles[0].center == moved.center
 

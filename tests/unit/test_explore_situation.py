@@ -3,6 +3,7 @@
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -14,6 +15,7 @@ import autdtorch as at
 from autdtorch.plot.explore import history as history_module
 from autdtorch.plot.explore.catalogue import offered
 from autdtorch.plot.explore.history import History
+from autdtorch.plot.explore.picture import followed
 from autdtorch.plot.explore.situation import OWN_PLANE, Body, Situation
 
 PLACE = st.tuples(*[st.floats(-0.1, 0.1)] * 3)
@@ -170,3 +172,25 @@ def test_all_methods_begin_with_few_transducers(rows):
     for method in offered().values():
         state = method.start(at.Problem.of(objective), 0)
         assert method.ask(state).shape[-1] == 2 * rows
+
+
+@given(
+    st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda sight: math.hypot(*sight) > 0.1),
+    st.tuples(*[st.floats(-0.1, 0.1)] * 3),
+    st.tuples(*[st.floats(-0.05, 0.05)] * 3),
+    st.booleans(),
+)
+def test_what_is_dragged_stays_at_its_height_or_on_its_vertical(sight, place, offset, upright):
+    sight, place, near = np.array(sight), np.array(place), np.add(place, offset)
+    found = followed(place, near, sight, upright)
+    moved = np.abs(found - place)
+    assert (moved[:2] == 0).all() if upright else moved[2] == 0
+    assert moved.max() <= 6 * math.hypot(*offset) + 1e-12  # also where one looks along the table
+    slope = abs(sight[2]) / np.linalg.norm(sight)
+    away = np.linalg.norm(np.cross(found - near, sight)) / np.linalg.norm(sight)
+    if not upright and slope > 0.25:
+        assert away < 1e-9  # it is below the mouse
+    if upright and slope < 0.9:
+        beside = place + np.array([[0, 0, 1e-4], [0, 0, -1e-4]]) + found - place
+        others = np.linalg.norm(np.cross(beside - near, sight), axis=1) / np.linalg.norm(sight)
+        assert away <= others.min() + 1e-9  # no other height is nearer to it

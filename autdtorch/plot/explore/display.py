@@ -99,8 +99,8 @@ class Display:
         magnitude = np.abs(result.field)
         scale = Scale(reference, self._state.unit != "Pa")
         self.picture.show_field(result.request.situation.sheet, magnitude, scale)
-        low, high = scale.limits
-        zero = f"0 dB = {reference:.3g} Pa"
+        low, _ = scale.limits
+        brightest = f"{float(f'{reference:.3g}'):g} Pa"  # 1180, not 1.18e+03
         with self._state:
             if not self.picture.show_volume(result.volume, scale, self.surface):
                 self._state.message = f"No surface: around the foci all is below {self.surface:g} dB."
@@ -110,7 +110,7 @@ class Display:
                     "reference": four_digits(reference), "surface": self.surface,
                     "shown": result.request.number,
                     "scale_low": f"{low:.3g} {'dB' if scale.decibels else 'Pa'}",
-                    "scale_high": zero if scale.decibels else f"{high:.3g} Pa",
+                    "scale_high": f"0 dB = {brightest}" if scale.decibels else brightest,
                 }
             )  # fmt: skip
         self.update()

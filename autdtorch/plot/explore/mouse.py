@@ -6,6 +6,8 @@ import functools
 import math
 from typing import Any, Protocol
 
+import numpy as np
+
 from autdtorch.plot.explore.picture import Grip, Picture
 from autdtorch.utils.array_types import Array
 
@@ -37,7 +39,8 @@ class Mouse:
         """Listen to the picture's window."""
         self._picture, self._owner = picture, owner
         self._grip: Grip | None = None
-        self._from = 0.0
+        self._place = np.zeros(3)
+        self._from, self._upright = 0.0, False
         self._interactor: Any = picture.plotter.iren.interactor
         for event, listener in (
             *((event, functools.partial(self._stop, event)) for event in _KEYS),
@@ -55,7 +58,7 @@ class Mouse:
             return
         self._owner.choose(found)
         if found.kind != "transducer":
-            self._grip, self._from = found, x
+            self._grip, self._from, self._upright, self._place = found, x, False, found.place
             self._stop("LeftButtonPressEvent")
 
     def _move(self, *_: object) -> None:
@@ -65,7 +68,12 @@ class Mouse:
         if self._interactor.GetShiftKey():
             self._owner.turn(self._grip, _ANGLE * (x - self._from))
         else:
-            self._owner.drag(self._grip, self._picture.moved(self._grip, x, y))
+            upright = bool(self._interactor.GetControlKey() or self._interactor.GetAltKey())
+            if upright != self._upright:  # go on from where it is
+                middle = self._grip.origin + self._place - self._grip.place
+                self._grip, self._upright = self._grip._replace(place=self._place, origin=middle), upright
+            self._place = self._picture.moved(self._grip, x, y, upright)
+            self._owner.drag(self._grip, self._place)
         self._stop("MouseMoveEvent")
 
     def _release(self, *_: object) -> None:

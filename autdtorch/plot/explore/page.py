@@ -110,26 +110,32 @@ def page(view: str) -> str:
     return f"""
 <header>
   <h1>autdtorch explore: {{{{ name }}}}</h1>
+</header>
+<section class="tools" aria-label="search and history">
+  {_choice("method", "method", "methods")}
+  {_button("find", "Find the phases", "busy")} {_button("cancel", "Cancel", "!busy")}
   {_button("undo", "Undo", "!can_undo")} {_button("redo", "Redo", "!can_redo")}
   <span id="status" role="status">{{{{ status }}}}</span>
-</header>
-<p id="message" role="alert">{{{{ message }}}}</p>
+  <progress max="100" :value="progress" aria-label="progress of the method" v-show="busy"></progress>
+</section>
 <main>
   <section class="picture" aria-label="picture and readings" :aria-busy="shown != wanted" :data-shown="shown">
+    <p id="message" role="alert">{{{{ message }}}}</p>
     <div class="view" role="img" :aria-label="summary">{view}</div>
-    <div class="legend">
-      <span>{{{{ scale_low }}}}</span><span class="bar" :style="scale_style"></span>
-      <span>{{{{ scale_high }}}}</span>
-      <span class="hint">grey: in obstacles and next to transducers</span>
+    <div class="legends">
+      <div class="legend" title="grey: in obstacles and next to transducers">
+        <span>{{{{ scale_low }}}}</span><span class="bar" :style="scale_style"></span>
+        <span>{{{{ scale_high }}}}</span>
+      </div>
+      <div class="legend" title="of the transducers; light grey: silent">
+        <span>phase 0°</span><span class="bar" :style="phase_style"></span><span>360°</span>
+      </div>
+      <div class="row" role="group" aria-label="camera">{looks}</div>
     </div>
-    <div class="legend">
-      <span>phase 0°</span><span class="bar" :style="phase_style"></span><span>360°</span>
-      <span class="hint">of the transducers; light grey: silent</span>
-    </div>
-    <div class="row" role="group" aria-label="camera">{looks}</div>
-    <p class="hint">Drag an obstacle or a focus to move it, an obstacle with Shift to turn it. Click a
-      transducer to choose it. Drag elsewhere to look around, scroll to zoom.</p>
     <p id="summary" aria-live="polite">{{{{ summary }}}}</p>
+    <p class="hint">Drag an obstacle or a focus to move it at its height, with Ctrl or Alt to lift it, an
+      obstacle with Shift to turn it. Click a transducer to choose it. Drag elsewhere to look around, scroll
+      to zoom. Grey is in obstacles and next to transducers; light grey transducers are silent.</p>
     <div class="scroll" tabindex="0" role="region" aria-label="pressures">
       <table>
         <caption>Pressure at the foci</caption>
@@ -159,11 +165,7 @@ def page(view: str) -> str:
         {_button("remove_focus", "Remove it", "foci.length < 2")}</div>
     </fieldset>
     <fieldset><legend>Drive</legend>
-      {_choice("method", "method", "methods")}
-      <div class="row">{_button("find", "Find the phases", "busy")}
-        {_button("cancel", "Cancel", "!busy")}</div>
-      <progress max="100" :value="progress" aria-label="progress of the method" v-show="busy"></progress>
-      {_box("follow", "find them again after every move, by gradient ascent")}
+      {_box("follow", "find the phases again after every move, by gradient ascent")}
       <label>transducer, or click one
         <input type="number" id="transducer" v-model.lazy.number="transducer" min="0" :max="transducers - 1">
       </label>

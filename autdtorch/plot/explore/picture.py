@@ -23,7 +23,12 @@ _SAMPLES = 600  # along a ray through the scene, to find the body under the mous
 _AROUND = 1.05  # height of the window, relative to the domain's sphere; leaves room for letters
 _LETTERS = 9.0  # size of tick labels and titles
 _SAMPLES_A_PIXEL = 4
-_CHOSEN = 1.7  # size of the chosen focus
+_MARK, _WIRE = (
+    0.33,
+    0.04,
+)  # wavelengths: radii of the ring around a focus, so that it is seen, and of its wire
+_CHOSEN = 1.6  # size of the ring around the chosen focus
+_SLANTING = 0.2  # sine of the least angle of a line of sight to a plane in which something is dragged
 _RING = 1.1, 1.4  # radii of the ring around the chosen transducer, relative to its disc
 _SURFACE_NAME = "isosurface"
 
@@ -129,6 +134,7 @@ class Picture:
         ink, paper = _INK[dark]
         self.plotter.set_background(paper)
         meshes.add_axes(self.plotter, self._situation.scene.domain, ink, _LETTERS)
+        self.plotter.actors[meshes.ARROWS].prop.color = ink
 
     def place(self, situation: Situation, focus: int, transducer: int) -> None:
         """Move bodies and foci; mark the chosen focus and transducer by their indices."""
@@ -137,15 +143,19 @@ class Picture:
             for actor in actors:
                 actor.user_matrix = _matrix(*body.pose)
         points = MM * situation.scene.control_points.numpy()
-        look = {"color": meshes.POINT_COLOUR, "ambient": 0.3, "reset_camera": False}
         while len(self._foci) > len(points):
             self.plotter.remove_actor(self._foci.pop(), reset_camera=False, render=False)
-        for index, point in enumerate(points):
-            if index == len(self._foci):
-                sphere = meshes.point_mesh(situation.scene)
-                self._foci.append(self.plotter.add_mesh(sphere, **look))
-            self._foci[index].position = point
-            self._foci[index].scale = _CHOSEN if index == focus else 1.0
+        while len(self._foci) < len(points):
+            radius, wire = (MM * share * situation.scene.wavelength for share in (_MARK, _WIRE))
+            look = {"color": meshes.POINT_COLOUR, "ambient": 0.5, "reset_camera": False}
+            self._foci.append(self.plotter.add_mesh(meshes.torus_mesh(radius, wire), **look))
+        across = np.stack([axis.numpy() for axis in situation.sheet.basis])
+        axes = np.vstack([across, np.cross(*across)]).T  # rings lie in the plane of the field
+        for index, (point, ring) in enumerate(zip(points, self._foci, strict=True)):
+            matrix = np.eye(4)
+            matrix[:3, :3] = (_CHOSEN if index == focus else 1.0) * axes
+            matrix[:3, 3] = point
+            ring.user_matrix = matrix
         if transducer != self._ringed:
             self._ringed = transducer
             self._ring.copy_from(self._around(transducer))
@@ -222,17 +232,41 @@ class Picture:
         found: Array = np.array(place) / weight / MM
         return found
 
-    def moved(self, grip: Grip, x: float, y: float) -> Array:
-        """Return the place (3,) [m] of a grip that follows the mouse, at its distance from the camera."""
+    def moved(self, grip: Grip, x: float, y: float, upright: bool) -> Array:
+        """Return the place (3,) [m] of a grip that follows the mouse: at its height, or `upright` over it."""
         near, far = (self.at(x, y, depth) for depth in (0.0, 1.0))
-        along = far - near
-        share = ((grip.place - near) @ along) / (along @ along)
-        place: Array = near + share * along
-        return place
+        return followed(grip.place, near, far - near, upright)
 
     def close(self) -> None:
         """Free the window."""
         self.plotter.close()
+
+
+def followed(place: Array, near: Array, sight: Array, upright: bool) -> Array:
+    """Return the place (3,) [m] below the mouse to which something is dragged from a place (3,) [m].
+
+    It stays in the horizontal plane or, `upright`, on the vertical through the place. Where one looks along
+    that plane or that vertical, it follows the mouse as far as it can be seen to.
+
+    Args:
+        place: where it was.
+        near: a point on the line of sight.
+        sight: the direction of this line.
+        upright: whether the height changes.
+    """
+    sight = sight / np.linalg.norm(sight)
+    offset = near - place
+    offset = offset - (offset @ sight) * sight  # to the point of the line of sight that is nearest
+    vertical = np.array([0.0, 0.0, 1.0])
+    if upright:
+        seen = vertical - sight[2] * sight
+        step = (offset @ seen) / max(seen @ seen, _SLANTING**2) * vertical
+    else:
+        slope = math.copysign(max(abs(sight[2]), _SLANTING), sight[2])
+        step = offset - offset[2] / slope * sight
+        step[2] = 0.0
+    found: Array = place + step
+    return found
 
 
 def gradient(name: str, count: int = 9) -> str:

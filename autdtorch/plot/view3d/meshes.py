@@ -36,6 +36,9 @@ _SHORT = 0.5  # of the longest side of the domain; on a shorter one, large label
 _TITLES = 30.0  # distance of the axis titles from the tick labels, VTK's 20 by default
 
 POINT_COLOUR = "#00C8A0"  # green: not in the colour map of the pressure
+ARROWS = "arrows"
+"""Name of the actor of the arrows that show where transducers emit."""
+_ARROW_COLOUR = "#555555"
 _SILENT_COLOUR = "#C8C8C8"
 _PHASE_BAR = 0.045  # left edge of a colour bar, as a share of the window
 FIELD_BAR = 0.9
@@ -160,8 +163,16 @@ def add_transducers(
     if phases is not None and bar:
         add_bar(plotter, actor, "phase [π rad]", position=_PHASE_BAR, labels=5, fmt="%.1f")
     plotter.add_mesh(rim, color=colours.EDGE_COLOUR, lighting=False)
-    plotter.add_mesh(points.glyph(geom=arrow, **along), color="#555555")
+    plotter.add_mesh(points.glyph(geom=arrow, **along), color=_ARROW_COLOUR, name=ARROWS)
     return face
+
+
+def torus_mesh(radius: float, thickness: float) -> pyvista.PolyData:
+    """Return a torus about z; radii of the ring and of its section in mm."""
+    import pyvista
+
+    shape = {"u_res": 48, "v_res": 12, "w_res": 12}
+    return pyvista.ParametricTorus(ringradius=radius, crosssectionradius=thickness, **shape)
 
 
 def ring_mesh(center: Array, normal: list[float], inner: float, outer: float) -> pyvista.PolyData:
