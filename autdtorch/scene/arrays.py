@@ -321,7 +321,8 @@ def apertures_of(array: TransducerArray) -> Apertures:
     if not radii.any():
         return Apertures.of_points(array.positions)
     disc, weights = _disc_rule()
-    axes = torch.stack([torch.stack(plane_basis(normal)) for normal in array.normals])
+    normals, facing = torch.unique(array.normals, dim=0, return_inverse=True)  # most arrays have one
+    axes = torch.stack([torch.stack(plane_basis(normal)) for normal in normals])[facing]
     positions = array.positions[:, None] + radii[:, None, None] * disc @ axes
     return Apertures(positions, weights, array.normals, radii)
 
