@@ -10,11 +10,11 @@ import warnings
 if sys.version_info < (3, 11):  # noqa: UP036 - from a clone, or installed by force
     raise ImportError(f"autdtorch needs Python 3.11 or later; this is {sys.version.partition(' ')[0]}")
 
-import lazy_loader
+from autdtorch.utils.hints import lazy_names
 
 __version__ = "0.1.0"
 
-_load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_load, __dir__, __all__ = lazy_names(__name__, __file__)
 
 #: Names of version 0.1 that were renamed since, and their names now.
 _RENAMED = {"Dead": "FailedTransducers", "reference": "analytic"}

@@ -279,6 +279,7 @@ OTHERS: dict[str, Any] = {
     "Problem.transducers": 4,
     "Oscilloscope.port": Made(lambda _: scope()._port),
     "Plane.size": (0.1, 0.1),
+    "Scene.equals.other": AIR_ALONE,
     "SimulatedObjective.scene": AIR_ALONE,
     "VoxelMask.from_image.image": Made(lambda _: image()),
     "VoxelMask.from_image.name": None,

@@ -13,6 +13,7 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.special import hankel1, jv
 
 from autdtorch.utils.array_types import Array, ComplexArray
+from autdtorch.utils.units import real_wavenumber
 from autdtorch.utils.validation import ArrayLike, invalid, positive, real_tensor
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
@@ -45,7 +46,7 @@ class Layering:
 
     def __post_init__(self) -> None:
         """Check the attributes and make them floats."""
-        object.__setattr__(self, "wavenumber", positive("wavenumber", self.wavenumber, "rad/m"))
+        object.__setattr__(self, "wavenumber", real_wavenumber(self.wavenumber))
         object.__setattr__(self, "density_ratio", positive("density_ratio", self.density_ratio))
         object.__setattr__(self, "speed_ratio", positive("speed_ratio", self.speed_ratio))
 

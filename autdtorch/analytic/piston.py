@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from scipy.special import j1
 
+from autdtorch.utils.units import real_wavenumber
 from autdtorch.utils.validation import ArrayLike, Vector, points_tensor, positive, real_tensor, unit_vector
 
 _HALVINGS = 30  # halvings of the angle along the rim towards the point nearest to the receiver
@@ -32,7 +33,7 @@ def piston_directivity(angle: ArrayLike, wavenumber: float, radius: float) -> to
     Source: Morse & Ingard, Theoretical Acoustics (1968), section 7.4; Pierce, Acoustics, chapter 5.
     """
     angles = real_tensor("angle", angle, "rad").detach()
-    reach = positive("wavenumber", wavenumber, "rad/m") * positive("radius", radius, "m")
+    reach = real_wavenumber(wavenumber) * positive("radius", radius, "m")
     argument = reach * np.sin(angles.cpu().numpy())
     safe = np.where(argument == 0, 1, argument)
     ratio = np.where(argument == 0, 1, 2 * j1(safe) / safe)
@@ -50,7 +51,7 @@ def piston_on_axis(distance: ArrayLike, wavenumber: float, radius: float) -> tor
     z = real_tensor("distance", distance, "m").detach()
     if (z < 0).any():
         raise ValueError(f"distance: {float(z.min()):g} m; every entry must be >= 0")
-    wavenumber, radius = positive("wavenumber", wavenumber, "rad/m"), positive("radius", radius, "m")
+    wavenumber, radius = real_wavenumber(wavenumber), positive("radius", radius, "m")
     rim = torch.hypot(z, torch.full_like(z, radius))
     # Written as a product, the difference of the two waves does not cancel far away.
     half_path = radius**2 / (rim + z) / 2
@@ -83,7 +84,7 @@ def piston_field(
     """
     targets = points_tensor("points", points)
     centers = points_tensor("sources", sources).to(targets.device)
-    wavenumber, radius = positive("wavenumber", wavenumber, "rad/m"), positive("radius", radius, "m")
+    wavenumber, radius = real_wavenumber(wavenumber), positive("radius", radius, "m")
     axis = targets.new_tensor(unit_vector("normal", normal))
     between = targets[:, None] - centers
     along = between @ axis

@@ -19,6 +19,7 @@ from typing import TypeAlias
 import torch
 
 from autdtorch.analytic.green import green
+from autdtorch.utils.units import real_wavenumber
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
@@ -151,7 +152,7 @@ class _Setup:
 def _setup(points: ArrayLike, sources: ArrayLike, wavenumber: float, center: Vector, radius: float) -> _Setup:
     targets = points_tensor("points", points)
     origins = points_tensor("sources", sources).to(targets.device)
-    wavenumber, radius = positive("wavenumber", wavenumber, "rad/m"), positive("radius", radius, "m")
+    wavenumber, radius = real_wavenumber(wavenumber), positive("radius", radius, "m")
     middle = targets.new_tensor(finite_vector("center", center))
     from_center = targets - middle
     sources_from_center = origins - middle

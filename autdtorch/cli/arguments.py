@@ -5,6 +5,25 @@ from __future__ import annotations
 import os
 import re
 import sys
+from collections.abc import Sequence
+from importlib.util import find_spec
+from typing import NoReturn
+
+from hydra._internal.utils import get_args_parser
+
+from autdtorch.utils.hints import did_you_mean, with_extra
+
+COMMANDS = ("explore", "collect")
+"""Words that stand for another command than a study, anywhere among the arguments."""
+
+MULTIRUN = {"-m", "--multirun"}
+
+_LAUNCHER = re.compile(r"\+*hydra/launcher=(slurm|submitit_\w+|joblib)")
+_OPTIONS = {
+    option: action.nargs is None  # whether a word follows
+    for action in get_args_parser()._actions
+    for option in action.option_strings
+}
 
 _LAST_STANDARD = 2  # number of the last of the standard streams: input, output, errors
 _PATH = re.compile(r"(output|hydra\.sweep\.dir)=(?P<path>.*)", re.DOTALL)
@@ -20,6 +39,48 @@ def quoted(argument: str) -> str:
         return argument
     path = re.sub(r"(\\*)'", r"\1\1\\'", os.path.expanduser(found["path"]))
     return f"{found[1]}='{path}'"
+
+
+def command_of(arguments: list[str]) -> str | None:
+    """Take the word of a command out of the arguments, wherever it stands, and return it."""
+    for place, word in enumerate(arguments):
+        if word in COMMANDS and not (place and _OPTIONS.get(arguments[place - 1])):
+            return arguments.pop(place)
+    return None
+
+
+def require_options(arguments: Sequence[str]) -> None:
+    """Refuse, in one line, options that Hydra does not have and settings that a sweep does not take."""
+    parser = get_args_parser()
+
+    def refuse(message: str) -> NoReturn:
+        dashed = [word for word in arguments if word.startswith("-")]
+        wrong = next((word for word in dashed if word.partition("=")[0] not in _OPTIONS), message)
+        name, _, value = wrong.lstrip("-").partition("=")
+        alike = [option for option in _OPTIONS if option.startswith("--") or not wrong.startswith("--")]
+        hint = did_you_mean(wrong.partition("=")[0], alike)
+        accepted = f"settings have no dashes, as in {name}={value or 'VALUE'}; autdtorch --help lists them"
+        raise ValueError(f"{wrong}: unknown option{hint}; {accepted}")
+
+    parser.error = refuse  # type: ignore[method-assign]
+    if "--version" not in arguments:  # which prints and ends
+        parser.parse_args(arguments)
+    for word in arguments:
+        if found := _LAUNCHER.fullmatch(word):
+            plugin = "joblib" if found[1] == "joblib" else "submitit"
+            if not _has_plugin(f"hydra_{plugin}_launcher"):
+                needs = f"needs the extra cluster: {with_extra('cluster')}"
+                raise ValueError(f"hydra/launcher: {found[1]!r}; {needs}")
+        if re.match(r"\+*output=", word) and MULTIRUN & set(arguments):
+            accepted = "a sweep has a folder for each job in hydra.sweep.dir"
+            raise ValueError(f"{word}: {accepted}, as hydra.sweep.dir={word.partition('=')[2]}")
+
+
+def _has_plugin(name: str) -> bool:
+    try:
+        return find_spec(f"hydra_plugins.{name}") is not None
+    except ModuleNotFoundError:  # no plugin at all
+        return False
 
 
 def prepare_streams() -> None:

@@ -7,12 +7,17 @@ import re
 import signal
 import sys
 import traceback
+from collections.abc import Sequence
+from pathlib import Path
 from typing import NoReturn
 
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from autdtorch import hardware
+from autdtorch.cli.arguments import COMMANDS
+from autdtorch.utils.hints import did_you_mean, with_extra
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 """Environment variable that asks for tracebacks."""
@@ -71,23 +76,49 @@ def _message(error: BaseException) -> str:
     return _of_hydra(error, text)
 
 
+def _of_missing(file: str, options: Sequence[str]) -> str:
+    """Return the message of a config that is not there, such as "scene/two_cube"."""
+    groups = ("hydra/launcher", "hardware/sensor", file.partition("/")[0])
+    group = next(group for group in groups if file.startswith(f"{group}/"))
+    name = file.removeprefix(f"{group}/")
+    path = Path(name)
+    if path.suffix in (".yaml", ".yml") or len(path.parts) > 1:
+        stem, folder = path.stem, path.parent.parent if path.parent.name == group else Path("FOLDER")
+        ours = f"{group}={stem}"
+        mine = f"a file of your own is FOLDER/{group}/NAME.yaml, given as --config-dir FOLDER {group}=NAME"
+        if stem not in options:
+            ours = f"--config-dir {folder} {group}={stem}"
+        return f"{group}: {name!r}; must be a name, not a path: {ours}; {mine}"
+    more = f"; the extra cluster brings more ({with_extra('cluster')}), hydra.searchpath=[FOLDER] your own"
+    more = more if group == "hydra/launcher" else ""
+    return f"{group}: {name!r}; must be one of {', '.join(options)}{did_you_mean(name, options)}{more}"
+
+
+def _siblings(error: BaseException | None) -> list[str]:
+    """Return the keys that are there, where an error of OmegaConf is about one that is not."""
+    parent = getattr(error, "parent_node", None)
+    return [str(key) for key in parent] if isinstance(parent, DictConfig) else []
+
+
 def _of_hydra(error: BaseException, text: str) -> str:
     """Return a message of Hydra in our words; others as they are, in one line."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
-        group, _, name = error.missing_cfg_file.rpartition("/")
-        more = "; pip install 'autdtorch[cluster]' brings more, hydra.searchpath=[FOLDER] your own"
-        more = more if group == "hydra/launcher" else ""
-        return f"{group}: {name!r}; must be one of {', '.join(error.options)}{more}"
+        return _of_missing(error.missing_cfg_file, error.options)
     # Hydra would advise to add the key, which we would then refuse.
     if unknown := re.match(r"Could not override '(.+)'", text):
-        key = getattr(error.__cause__, "full_key", None) or unknown[1]
-        return f"{key}: unknown key; autdtorch --cfg job lists the settings"
+        key = str(getattr(error.__cause__, "full_key", None) or unknown[1])
+        keys = _siblings(error.__cause__)
+        hint = did_you_mean(key.rpartition(".")[2], keys)
+        listed = f"; allowed keys: {', '.join(keys)}" if keys and "." in key else ""
+        return f"{key}: unknown key{hint}{listed}; autdtorch --cfg job lists the settings"
     if found := re.match(r"(Error merging override [^,\n]+)", text):
         text = f"{found[1]}: {error.__cause__}"
     if missing := re.match(r"Missing mandatory value: (\S+)", text):
         return f"{missing[1]}: none; must be given, as {missing[1]}=VALUE"
     if "missing EQUAL" in text and (word := re.search(r"'(.*?)'", text)):
-        return f"{word[1]}: must be key=value, such as scene=three_cubes; autdtorch --help lists the settings"
+        accepted = "must be key=value, such as scene=three_cubes"
+        hint = did_you_mean(word[1], COMMANDS)
+        return f"{word[1]}: {accepted}{hint}; autdtorch --help lists the settings"
     if isinstance(error, OverrideParseException):
         why = text.partition("\n")[0]
         accepted = "must be KEY=VALUE, a value with signs in quotes: 'KEY=\"a=b\"'"

@@ -25,7 +25,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 import autdtorch
-from autdtorch.cli.arguments import prepare_streams, quoted
+from autdtorch.cli.arguments import MULTIRUN, command_of, prepare_streams, quoted, require_options
 from autdtorch.cli.config_files import CONFIGS, register
 from autdtorch.cli.errors import AGAIN, FULL_ERROR, FailedJob, in_one_line, stop
 from autdtorch.cli.workers import end_workers_with_us, leave_workers_alone
@@ -66,20 +66,19 @@ def main() -> None:
     os.environ[FULL_ERROR] = "1"  # makes Hydra pass exceptions on, which it would print in its own way
     error: BaseException
     try:
-        if sys.argv[1:2] == ["collect"]:
+        arguments = sys.argv[1:]
+        if (command := command_of(arguments)) == "collect":
             from autdtorch.cli.study_command import collect
 
-            collect(sys.argv[2:])
-        elif sys.argv[1:2] == ["explore"]:
-            del sys.argv[1]
-            register()
-            _explore()
-        elif sys.argv[1:] == ["--version"]:
+            collect(arguments)
+        elif arguments == ["--version"]:
             print(f"autdtorch {autdtorch.__version__}")
         else:
+            require_options(arguments)
+            sys.argv[1:] = arguments
             register()
-            _run()
-            if {"-m", "--multirun"} & set(sys.argv[1:]):
+            _explore() if command == "explore" else _run()
+            if MULTIRUN & set(arguments):
                 print("autdtorch collect merges the results of a sweep into one table and one report")
     except _Carrier as carrier:
         error = carrier.__cause__ or carrier

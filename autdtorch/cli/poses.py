@@ -12,9 +12,10 @@ from autdtorch.cli.settings import section_of
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.moving import angles_of
 from autdtorch.utils.array_types import Array
+from autdtorch.utils.units import angles
 from autdtorch.utils.validation import finite_vector, integer_at_least, invalid, require_known, within
 
-_KEYS = ("offset", "rotation", "count")
+_KEYS = ("offset", "rotation", "rotation_degrees", "count")
 _MOST = 10_000
 
 
@@ -40,7 +41,7 @@ def along_path(settings: dict[str, Any]) -> Poses:
         raise invalid("poses", poses, "must not be given beside an experiment")
     with within("poses"):
         offset = np.array(finite_vector("offset", poses.get("offset", (0, 0, 0))))
-        rotation = np.array(finite_vector("rotation", poses.get("rotation", (0, 0, 0)), "rad"))
+        rotation = _turn("", poses)
         count = integer_at_least("count", poses.get("count"), 2)
         if count > _MOST:
             raise invalid("count", count, f"must be at most {_MOST}")
@@ -50,8 +51,9 @@ def along_path(settings: dict[str, Any]) -> Poses:
             )
     scene, chosen = section_of(settings, "scene"), HydraConfig.get().runtime.choices
     first = section_of(scene, "pose") if scene.get("pose") else {}
-    require_known("scene.pose", first, _KEYS[:2])
-    start = [np.array(finite_vector(f"scene.pose.{key}", first.get(key, (0, 0, 0)))) for key in _KEYS[:2]]
+    require_known("scene.pose", first, _KEYS[:3])
+    start = [np.array(finite_vector("scene.pose.offset", first.get("offset", (0, 0, 0))))]
+    start.append(_turn("scene.pose.", first))
     shares, digits = np.linspace(0, 1, count), len(str(count - 1))
     turns = [rotation_matrix(tuple((share * rotation).tolist())) for share in shares]
     settings["scenes"] = {
@@ -70,3 +72,9 @@ def along_path(settings: dict[str, Any]) -> Poses:
         return Poses(1e3 * float(np.linalg.norm(offset)) * shares, "path of the obstacles [mm]")
     cosines = [(float(torch.trace(turn)) - 1) / 2 for turn in turns]
     return Poses(np.degrees(np.arccos(np.clip(cosines, -1, 1))), "turn of the obstacles [degrees]")
+
+
+def _turn(where: str, section: dict[str, Any]) -> Array:
+    """Return the angles (3,) [rad] of a section, which may give them in degrees."""
+    turn = angles(f"{where}rotation", section.get("rotation", (0, 0, 0)), section.get("rotation_degrees"))
+    return np.array(turn)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import re
 import shlex
 import sys
 from collections.abc import Mapping
@@ -16,7 +17,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from autdtorch.cli.poses import Poses, along_path
-from autdtorch.cli.settings import folder_of, is_given, load_method, scene_of, section_of, solver_of
+from autdtorch.cli.settings import folder_of, load_method, scene_of, section_of, solver_of
 from autdtorch.io.goal_section import load_goal
 from autdtorch.propagators import CACHE_VARIABLE
 from autdtorch.scene.scene import Scene
@@ -33,12 +34,7 @@ of one's own, which the module NAME defines."""
 def study(settings: dict[str, Any], modules: list[Any], output: Any, sweep: Path | None) -> None:
     """Run a study; `sweep` is the folder of the sweep that the job belongs to, if any."""
     solver = solver_of(settings)
-    if sweep is None:
-        folder = folder_of("output", output)
-    else:
-        folder = Path(HydraConfig.get().runtime.output_dir)
-        if is_given("output"):
-            raise ValueError(f"output: {output}; a sweep has a folder for each job in hydra.sweep.dir")
+    folder = folder_of("output", output) if sweep is None else Path(HydraConfig.get().runtime.output_dir)
     if solver.get("cache") is None and CACHE_VARIABLE not in os.environ:
         # A study that goes on needs them again, and jobs in one scene share them.
         solver["cache"] = (sweep or folder) / "matrices"
@@ -81,7 +77,8 @@ def collect(arguments: list[str]) -> None:
         return
     modules = [word.removeprefix("modules=") for word in arguments if word.startswith("modules=")]
     folders = [word for word in arguments if not word.startswith("modules=")]
-    if len(folders) != 1 or folders[0].startswith("-"):
+    wrong = [word for word in folders if re.match(r"-|.*=", word) and not Path(word).exists()]
+    if len(folders) != 1 or wrong:
         raise ValueError(f"collect: {shlex.join(arguments)!r}; must be one folder, such as multirun")
     logging.basicConfig(format="%(message)s")
     folder = Path(folders[0])

@@ -4,6 +4,6 @@ Every public name is listed in ``__init__.pyi`` and imported when it is first us
 open link import pyusb.
 """
 
-import lazy_loader
+from autdtorch.utils.hints import lazy_names
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_names(__name__, __file__)

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from autdtorch.hardware.devices import require_device
 from autdtorch.hardware.devices.autd3 import AUTD3
 from autdtorch.hardware.devices.device import Device
 from autdtorch.hardware.played import Wiring
@@ -62,7 +63,7 @@ class Link(contextlib.AbstractContextManager["Link"]):
                 twice; or `settle` out of range.
             OffError: the device does not take the bytes.
         """
-        require_kind("device", device, Device)
+        require_device(device)
         require_kind("port", port, Port)
         require_callable("sleep", sleep)
         self.device, self._port, self._sleep = device, port, sleep
@@ -179,7 +180,7 @@ def open_link(
         ValueError: no `Device`; `transducers` that it does not have, or one twice; `settle` out of range; a
             `serial` for a device of several boards; or a `port` for one without a serial line.
     """
-    require_kind("device", device, Device)
+    require_device(device)
     if port is None:
         opened = _usb_port(device, serial, backend)
     elif device.baud is None:

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 import torch
 
+from autdtorch.hardware.devices import require_device
 from autdtorch.hardware.devices.device import Device
 from autdtorch.objectives.objective import Objective
 from autdtorch.objectives.perturbations import Perturbation
 from autdtorch.scene.drive import AMPLITUDE_TOLERANCE, validate_drive, validate_single_drive
-from autdtorch.utils.validation import indices, invalid, number_between, positive, require_kind
+from autdtorch.utils.validation import indices, invalid, number_between, positive
 
 _FINEST = 2.0**-14  # resolution of the search; two levels of a device here are further apart
 
@@ -20,7 +21,7 @@ class Wiring:
 
     def __init__(self, device: Device, transducers: Sequence[int] | torch.Tensor | None = None) -> None:
         """Wire a device; by default all its transducers in order."""
-        require_kind("device", device, Device)
+        require_device(device)
         self.device = device
         chosen = range(device.transducers) if transducers is None else transducers
         places = indices("transducers", chosen, device.transducers)

@@ -18,6 +18,7 @@ from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import device_axes, in_plane
 from autdtorch.scene.scene import ScaleWarning
 from autdtorch.utils.array_types import Array
+from autdtorch.utils.hints import suggesting
 from autdtorch.utils.neighbours import closest_pair
 from autdtorch.utils.numpy_file import read_arrays
 from autdtorch.utils.validation import ArrayLike, path_of, within
@@ -30,6 +31,7 @@ _IGNORED = {"frame": "", "transducer": "", "phase": "rad", "amplitude": ""}
 _PITCHES = {"m": (1e-3, 0.1), "mm": (1.0, 100.0)}  # of arrays for airborne ultrasound, in each unit
 
 
+@suggesting
 def load_array(
     path: str | os.PathLike[str],
     center: ArrayLike = (0.0, 0.0, 0.0),

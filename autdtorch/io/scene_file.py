@@ -21,7 +21,9 @@ from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.geometry import Plane, circle_points, sphere_points
 from autdtorch.scene.obstacles import Box, Cylinder, Mesh, Sphere, VoxelMask
 from autdtorch.scene.scene import Medium, Scene
+from autdtorch.utils.hints import suggesting
 from autdtorch.utils.trusted import TARGET, load_trusted
+from autdtorch.utils.units import warned_within
 from autdtorch.utils.validation import (
     finite_vector,
     invalid,
@@ -70,13 +72,15 @@ _BUILDERS: dict[str, Builder] = {  # of sections without `type`
 }
 
 
+@suggesting
 def load_scene(source: str | os.PathLike[str] | Mapping[str, Any], modules: Collection[str] = ()) -> Scene:
     """Read a scene from a YAML file, or from a mapping of the same layout such as Hydra's `cfg.scene`.
 
     Control points and array are a section each, or a list of sections, whose points or transducers follow one
     another. An obstacle has a
     `type`, or the `_target_` of a class of the user's own, such as `mymodule.MyObstacle`. The section `pose`,
-    with the keys `offset` and `rotation`, moves all obstacles as one body; see `Scene.moved`.
+    with the keys `offset` and `rotation`, or `rotation_degrees`, moves all obstacles as one body; see
+    `Scene.moved`.
 
     Args:
         source: path of the file, or the mapping. A value may be an interpolation of another key, `${key}`;
@@ -164,7 +168,7 @@ def _part(
 
 def _build(where: str, section: dict[str, Any], builder: Builder) -> Any:
     _check_keys(where, section, builder)
-    with within(where):
+    with within(where), warned_within(where):
         return builder(**section)
 
 

@@ -13,8 +13,9 @@ from autdtorch.methods.solution import Solution
 from autdtorch.methods.state_file import load_state, save_state
 from autdtorch.objectives.goals import WEAKEST_FOCUS
 from autdtorch.objectives.objective import Objective, Score, require_objective
+from autdtorch.utils.hints import did_you_mean, suggesting
 from autdtorch.utils.progress import show_progress
-from autdtorch.utils.validation import invalid, path_of, require_callable, require_kind, within
+from autdtorch.utils.validation import invalid, path_of, require_callable, within
 
 
 @overload
@@ -40,6 +41,7 @@ def run(
     stop: Callable[[State], bool] | None = None,
     start: torch.Tensor | None = None,
 ) -> list[Solution]: ...
+@suggesting
 def run(
     method: Method,
     objective: Objective | Sequence[Objective],
@@ -77,7 +79,7 @@ def run(
             another method, problem, seed or other trials.
         OSError: the state file cannot be read or written.
     """
-    require_kind("method", method, Method)
+    _require_method(method)
     require_callable("score", score)
     if stop is not None:
         require_callable("stop", stop)
@@ -96,6 +98,19 @@ def run(
         start = found[-1].drive if found else start
         found.append(_run(method, pose, trials, seed, score, stop, None, start))
     return found
+
+
+def _require_method(method: object) -> None:
+    """Refuse what is no method: a name, a class that is not called, or a function that runs one."""
+    if isinstance(method, Method):
+        return
+    from autdtorch.methods.catalogue import METHODS  # which imports this module
+
+    classes = {name: kind.__name__ for name, kind in METHODS.items()}
+    given = method if isinstance(method, str) else getattr(method, "__name__", "")
+    name = given if given in classes else next((own for own in classes if classes[own] == given), "")
+    hint = f"such as {classes[name or 'gabs']}()" + ("" if name else did_you_mean(given, classes))
+    raise invalid("method", method, f"must be a Method, {hint}")
 
 
 def _run(

@@ -14,9 +14,11 @@ from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS
 from autdtorch.objectives.objective import Objective, Score
+from autdtorch.utils.hints import suggesting
 from autdtorch.utils.validation import integer_at_least, invalid
 
 
+@suggesting
 @dataclass(frozen=True)
 class GABS(Method):
     """Switch on one transducer after the other, each with the best of several phases (Algorithm 2).
@@ -120,6 +122,7 @@ class GABS(Method):
         return coordinates.begin_ascent(alone[orders[:, 0]], orders)
 
 
+@suggesting
 def gabs(
     objective: Objective,
     levels: int = 16,

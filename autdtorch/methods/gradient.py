@@ -8,17 +8,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, cast
 
+import numpy as np
 import torch
 
 from autdtorch.methods.base import Method, Problem, Step, Trials, generators_of, known_matrix, starts_of
 from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
+from autdtorch.objectives.bound import checked_matrix
 from autdtorch.objectives.goals import WEAKEST_FOCUS, slope_of
 from autdtorch.objectives.objective import Objective, Score
+from autdtorch.utils.hints import suggesting
 from autdtorch.utils.threads import one_library_thread
-from autdtorch.utils.validation import integer_at_least
+from autdtorch.utils.validation import ArrayLike, integer_at_least
 
 # First and last value, in equal ratios between: smoothing of `Goal.slope`, and step in amplitudes
 _SMOOTHING = (0.3, 1e-4)
@@ -27,6 +30,7 @@ _MOMENTUM = 0.9
 _TINY = 1e-300
 
 
+@suggesting
 @dataclass(frozen=True)
 class GradientAscent(Method):
     """Climb the goal over all drives of amplitudes <= 1, by the transfer matrix of the problem.
@@ -68,16 +72,36 @@ class GradientAscent(Method):
         return Step(torch.stack(highest)[:, None], {})
 
 
+@suggesting
 def gradient_ascent(
-    objective: Objective,
+    objective: Objective | ArrayLike,
     starts: int = 32,
     steps: int = 300,
     trials: Trials = 1,
     seed: int = 0,
     score: Score = WEAKEST_FOCUS,
 ) -> Solution:
-    """Run `GradientAscent` with these settings on an objective with a transfer matrix; see `run`."""
-    return run(GradientAscent(starts, steps), objective, trials, seed, score=score)
+    """Run `GradientAscent` with these settings on an objective, or on a transfer matrix; see `run`.
+
+    Args:
+        objective: one with a transfer matrix, or the transfer matrix G (P, M) [Pa] alone.
+        starts: see `GradientAscent`.
+        steps: see `GradientAscent`.
+        trials: number of trials T, >= 1, or their numbers.
+        seed: of the random choices, >= 0.
+        score: function of pressures (..., P) [Pa] that is maximised.
+
+    Returns:
+        The drive that each trial chose.
+    """
+    method = GradientAscent(starts, steps)
+    if not isinstance(objective, torch.Tensor | np.ndarray | list | tuple):
+        return run(method, cast(Objective, objective), trials, seed, score=score)
+    matrix = torch.from_numpy(checked_matrix(objective, "objective"))
+    points, transducers = matrix.shape
+    state = method.start(Problem(transducers, points, score, transfer_matrix=matrix), seed, trials)
+    pressure = (method.ask(state) @ matrix.mT).abs()
+    return method.best(method.tell(state, pressure))
 
 
 def random_drives(count: int, transducers: int, generator: torch.Generator) -> torch.Tensor:

@@ -20,6 +20,7 @@ from autdtorch.methods.prior import Prior, best_simulated_drives, matrix_prior, 
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS
 from autdtorch.objectives.objective import Objective, Score
+from autdtorch.utils.hints import suggesting
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import integer_at_least, invalid
 
@@ -31,6 +32,7 @@ _SAMPLE_STEPS = 60  # of the climb on a sample of the matrix, from the best driv
 _GROWTH = 24  # a round observes one drive for so many that were observed
 
 
+@suggesting
 @dataclass(frozen=True)
 class Identify(Method):
     """Fit the transfer matrix to observed magnitudes, and maximise the goal on the matrix.
@@ -127,6 +129,7 @@ class Identify(Method):
         return replace(found, drive=last, pressure=state.search["pressure"], score=state.search["score"])
 
 
+@suggesting
 def identify(
     objective: Objective,
     evaluations: int | None = None,

@@ -15,6 +15,7 @@ from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS
 from autdtorch.objectives.objective import Objective, Score
 from autdtorch.scene.drive import drive_from_phases, focus_phases, normalise
+from autdtorch.utils.hints import suggesting
 from autdtorch.utils.validation import integer_at_least, invalid
 
 
@@ -34,6 +35,7 @@ class LSS(Method):
         return Step(normalise(_focus_drives(problem).sum(dim=0))[None, None], {})
 
 
+@suggesting
 @dataclass(frozen=True)
 class LSSG(Method):
     """Superpose the free-space drives of the single foci, with the best offset for each (Eq. 4, 5 and 6).
@@ -94,11 +96,13 @@ class LSSG(Method):
         return Step(normalise(weights @ search["foci"]), search, goes_on)
 
 
+@suggesting
 def lss(objective: Objective, score: Score = WEAKEST_FOCUS) -> Solution:
     """Run `LSS` on an objective, with a `score` to report; see `run`."""
     return run(LSS(), objective, score=score)
 
 
+@suggesting
 def lssg(
     objective: Objective,
     levels: int = 16,

@@ -14,11 +14,13 @@ from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.goals import WEAKEST_FOCUS
 from autdtorch.objectives.objective import Objective, Score
+from autdtorch.utils.hints import suggesting
 from autdtorch.utils.validation import integer_at_least
 
 _AT_ONCE = 64  # evaluations of a trial in one step, which bounds the memory of a step
 
 
+@suggesting
 @dataclass(frozen=True)
 class RandomSearch(Method):
     """Try random phases at full amplitude, and keep the best.
@@ -65,6 +67,7 @@ class RandomSearch(Method):
         return Step(drives, {"generators": states_of(generators)})
 
 
+@suggesting
 def random_search(
     objective: Objective,
     evaluations: int = 256,

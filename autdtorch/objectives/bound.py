@@ -69,11 +69,11 @@ def least_bound(foci: ComplexArray, wanted: Array) -> float:
     return phase_bound(foci, wanted, level_bound(foci, wanted)[0])
 
 
-def checked_matrix(G: ArrayLike) -> ComplexArray:
-    """Return a transfer matrix (P, M) after checking it."""
-    matrix = complex_tensor("G", G).detach().cpu().numpy().astype(np.complex128)
+def checked_matrix(G: ArrayLike, name: str = "G") -> ComplexArray:
+    """Return a transfer matrix (P, M), called `name` in messages, after checking it."""
+    matrix = complex_tensor(name, G).detach().cpu().numpy().astype(np.complex128)
     if matrix.ndim != 2 or matrix.size == 0:
-        raise ValueError(f"G: shape {matrix.shape}; must be (P, M) with P, M >= 1")
+        raise ValueError(f"{name}: shape {matrix.shape}; must be (P, M) with P, M >= 1")
     return matrix
 
 

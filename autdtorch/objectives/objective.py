@@ -53,7 +53,9 @@ class Objective(Protocol):
 
 def require_objective(objective: Objective) -> None:
     """Check that `objective` is an objective of a scene."""
-    require_kind("objective", objective, Objective)
+    if not isinstance(objective, Objective):
+        accepted = "must be an Objective, such as SimulatedObjective(scene, make_propagator(scene))"
+        raise invalid("objective", objective, accepted)
     require_kind("objective.scene", objective.scene, Scene)
 
 

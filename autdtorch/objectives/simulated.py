@@ -9,6 +9,7 @@ import torch
 from autdtorch.objectives.objective import observe_drives
 from autdtorch.propagators import Propagator
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.hints import suggesting
 from autdtorch.utils.threads import one_library_thread
 from autdtorch.utils.validation import invalid, require_kind, require_one_of
 from autdtorch.utils.wording import counted
@@ -16,6 +17,7 @@ from autdtorch.utils.wording import counted
 _PRODUCTS = 2**16  # of transfer matrix and drives, that are computed at once
 
 
+@suggesting
 class SimulatedObjective:
     """An objective whose observations are simulated.
 
@@ -36,7 +38,7 @@ class SimulatedObjective:
         """Prepare the observations.
 
         Args:
-            scene: of the propagator.
+            scene: of the propagator, or an equal one.
             propagator: simulates the scene.
             mode: "transfer" simulates the transfer matrix G once, here, and observes |G q|, since the field
                 is linear in the drive. "replay" asks the propagator for the field of every drive: a
@@ -45,9 +47,9 @@ class SimulatedObjective:
         require_kind("scene", scene, Scene)
         require_kind("propagator", propagator, Propagator)
         require_one_of("mode", mode, ("transfer", "replay"))
-        if propagator.scene is not scene:
+        if not scene.equals(propagator.scene):
             raise invalid("scene", scene, f"must be the propagator's scene, {propagator.scene!r}")
-        self.scene = scene
+        self.scene = propagator.scene
         self.evaluations = 0
         self._propagator = propagator
         self.transfer_matrix: torch.Tensor | None = None

@@ -21,6 +21,7 @@ from autdtorch.plot.style import TICK_SIZE, label_of, new_figure, readable, set_
 from autdtorch.scene.geometry import Plane
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.array_types import Array
+from autdtorch.utils.hints import suggesting
 from autdtorch.utils.validation import (
     ArrayLike,
     boolean,
@@ -45,6 +46,7 @@ _LABELS = 0.62  # for tick labels and the name of an axis
 
 
 @styled
+@suggesting
 def plot_plane(
     pressure: ArrayLike,
     plane: Plane,
@@ -111,16 +113,19 @@ def plot_plane(
 
 
 @styled
+@suggesting
 def plot_planes(
-    pressure: Mapping[str, ByMethod],
-    planes: Mapping[str, Plane],
-    control_points: Mapping[str, ArrayLike] | None = None,
-    obstacles: Mapping[str, Iterable[Obstacle]] | None = None,
+    pressure: Mapping[str, ByMethod] | ByMethod,
+    planes: Mapping[str, Plane] | Plane,
+    control_points: Mapping[str, ArrayLike] | ArrayLike | None = None,
+    obstacles: Mapping[str, Iterable[Obstacle]] | Iterable[Obstacle] | None = None,
     *,
     vmin: float | None = None,
     vmax: float | None = None,
 ) -> Figure:
     """Plot pressure maps, one row per method and one column per scene (the paper's Fig. 2).
+
+    Of a single scene, all arguments may leave out its name: ``plot_planes({"a": p, "b": q}, plane)``.
 
     All maps of a scene share one colour scale, of the pressures outside the `obstacles`; cells inside these
     are grey. Without `obstacles` nothing is masked.
@@ -138,6 +143,21 @@ def plot_planes(
         ValueError: no scene, a scene without plane, an argument of another shape, or ends of the colours that
             are out of range.
     """
+    given: tuple[Any, ...] = pressure, planes, control_points, obstacles
+    by_scene = _as_one_scene(*given) if isinstance(planes, Plane) else given
+    return _rows_of_maps(*by_scene, vmin=vmin, vmax=vmax)
+
+
+def _rows_of_maps(
+    pressure: Mapping[str, ByMethod],
+    planes: Mapping[str, Plane],
+    control_points: Mapping[str, ArrayLike] | None,
+    obstacles: Mapping[str, Iterable[Obstacle]] | None,
+    *,
+    vmin: float | None,
+    vmax: float | None,
+) -> Figure:
+    """Plot as `plot_planes` does, the arguments by name of the scene."""
     data.require_scenes("pressure", pressure)
     require_each("planes", planes, pressure)
     for scene in pressure:
@@ -207,6 +227,16 @@ def _name_row(ax: Axes, name: str) -> None:
     style: Any = {"rotation": 90, "ha": "right", "va": "center", "ma": "center", "weight": "bold"}
     beside: Any = (ax.yaxis.label, ax.transAxes) if ax.axison else ax.transAxes
     ax.annotate(name, (0, 0.5), (-4, 0), xycoords=beside, textcoords="offset points", **style)
+
+
+def _as_one_scene(pressure: Any, *others: Any) -> tuple[Any, ...]:
+    """Return arguments of one scene under a name, the empty one."""
+    nested = isinstance(pressure, Mapping) and any(isinstance(one, Mapping) for one in pressure.values())
+    if nested or not isinstance(pressure, Mapping):
+        accepted = "must be maps by name, as {'gabs': p}, for one plane; plot_plane plots a single map"
+        raise invalid("pressure", pressure, accepted)
+    given = [None if one is None or isinstance(one, Mapping) else {"": one} for one in others]
+    return {"": pressure}, *given
 
 
 def _limits(

@@ -17,6 +17,7 @@ from autdtorch.propagators.operator_propagator import OperatorPropagator
 from autdtorch.propagators.plan import make_kernel, plan
 from autdtorch.propagators.simulated import SimulatedPropagator
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.hints import suggesting
 from autdtorch.utils.memory import available_memory
 from autdtorch.utils.validation import positive
 from autdtorch.utils.wording import counted
@@ -59,6 +60,7 @@ class Estimate:
         return f"Estimate({self.method}{grid}, {cost})"
 
 
+@suggesting
 def estimate(
     scene: Scene,
     spacing: float = 1e-3,

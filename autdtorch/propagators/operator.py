@@ -27,6 +27,7 @@ from autdtorch.scene.medium import Medium
 from autdtorch.scene.obstacles import Obstacle
 from autdtorch.utils.numpy_file import read_arrays, write_arrays
 from autdtorch.utils.threads import one_library_thread
+from autdtorch.utils.units import turn_tensor
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
@@ -128,20 +129,24 @@ class ScatteringOperator:
         return float(left.norm() / math.sqrt(len(left)))
 
     def moved(
-        self, offset: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike = (0.0, 0.0, 0.0)
+        self,
+        offset: ArrayLike = (0.0, 0.0, 0.0),
+        rotation: ArrayLike = (0.0, 0.0, 0.0),
+        *,
+        rotation_degrees: ArrayLike | None = None,
     ) -> ScatteringOperator:
         """Return the body after a shift, and a rotation about its centre.
 
         Args:
             offset: (3,) [m].
             rotation: angles (3,) [rad] about the fixed axes x, y, z, in this order.
+            rotation_degrees: these angles (3,) in degrees, in place of `rotation`.
 
-        Gradients of both pass.
+        Gradients of all pass.
         """
-        shift, angles = real_tensor("offset", offset, "m"), real_tensor("rotation", rotation, "rad")
-        for name, value in (("offset", shift), ("rotation", angles)):
-            if value.shape != (3,):
-                raise ValueError(f"{name}: shape {tuple(value.shape)}; must be (3,)")
+        shift, angles = real_tensor("offset", offset, "m"), turn_tensor(rotation, rotation_degrees)
+        if shift.shape != (3,):
+            raise ValueError(f"offset: shape {tuple(shift.shape)}; must be (3,)")
         return replace(
             self, center=self.center + shift, axes=composed_rotation(angles.cos(), angles.sin()) @ self.axes
         )

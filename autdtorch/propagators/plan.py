@@ -37,6 +37,7 @@ from autdtorch.scene.arrays import apertures_of
 from autdtorch.scene.obstacles import Mesh
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.cached import cached_property
+from autdtorch.utils.hints import with_extra
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.threads import thread_count
 from autdtorch.utils.triangles import doubled_normals
@@ -349,7 +350,7 @@ def available_kernel(name: str, device: torch.device | str | None = None) -> str
         name = str(kind)
     if name == "cuda" and not has_triton:
         field, value = ("kernel", name) if device is None else ("device", str(device))
-        raise invalid(field, value, f"needs Triton: pip install 'autdtorch[cuda]'; {ON_CPU}")
+        raise invalid(field, value, f"needs Triton: {with_extra('cuda')}; {ON_CPU}")
     return name
 
 

@@ -381,7 +381,8 @@ class SimulatedPropagator:
         if unsettled := [run for run in runs if not run.reached]:
             periods, error = max(run.periods for run in unsettled), max(run.remaining for run in unsettled)
             warnings.warn(
-                f"no steady state after {periods} periods in {len(unsettled)} of {len(runs)} runs: estimated "
-                f"relative error up to {error:.1e}, tolerance {self.tolerance:g}; raise max_periods or "
-                "tolerance", SteadyStateWarning, stacklevel=4,  # the caller of the public, decorated method
+                f"no steady state after {periods} periods in {len(unsettled)} of {counted(len(runs), 'run')}"
+                f": estimated relative error up to {error:.1e}, tolerance {self.tolerance:g}; raise "
+                "max_periods or tolerance", SteadyStateWarning,
+                stacklevel=4,  # the caller of the public, decorated method
             )  # fmt: skip

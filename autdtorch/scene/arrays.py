@@ -12,6 +12,7 @@ import torch
 from autdtorch.scene.geometry import Coordinates, in_plane, plane_basis
 from autdtorch.scene.transducer_values import disc_radius, for_each, unit_normals
 from autdtorch.utils.apertures import Apertures
+from autdtorch.utils.hints import suggesting
 from autdtorch.utils.memory import require_memory
 from autdtorch.utils.neighbours import require_distinct
 from autdtorch.utils.validation import (
@@ -63,6 +64,7 @@ class Recipe(NamedTuple):
     arguments: dict[str, Any]
 
 
+@suggesting
 @dataclass(frozen=True, eq=False, init=False, repr=False)
 class TransducerArray:
     """An array of M transducers. Its tensors are copies on the CPU.
@@ -112,6 +114,7 @@ class TransducerArray:
         object.__setattr__(self, "radius", disc_radius(radius, places))
 
     @classmethod
+    @suggesting
     def grid(
         cls,
         shape: tuple[int, int],
@@ -144,6 +147,7 @@ class TransducerArray:
         return cls._placed("grid", places, center, normal, angle, source_strength, radius, **more)
 
     @classmethod
+    @suggesting
     def autd3(
         cls,
         center: ArrayLike,
@@ -174,6 +178,7 @@ class TransducerArray:
         return cls._placed("autd3", places, center, normal, angle, source_strength, radius, units=list(units))
 
     @classmethod
+    @suggesting
     def sonicsurface(
         cls,
         center: ArrayLike,
@@ -193,6 +198,7 @@ class TransducerArray:
         return cls._placed("sonicsurface", places, center, normal, angle, source_strength, radius)
 
     @classmethod
+    @suggesting
     def openmpd(
         cls,
         center: ArrayLike,

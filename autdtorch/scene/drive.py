@@ -7,13 +7,14 @@ import math
 import numpy as np
 import torch
 
+from autdtorch.utils.hints import suggesting
 from autdtorch.utils.neighbours import distances
+from autdtorch.utils.units import real_wavenumber, warn_user
 from autdtorch.utils.validation import (
     ArrayLike,
     complex_tensor,
     finite_vector,
     points_tensor,
-    positive,
     real_tensor,
 )
 
@@ -21,6 +22,7 @@ AMPLITUDE_TOLERANCE = 1e-6
 """Excess of |q| over 1 that is accepted: the rounding error of a drive computed in float32."""
 
 
+@suggesting
 def drive_from_phases(phases: ArrayLike, amplitudes: ArrayLike | None = None) -> torch.Tensor:
     """Return the drive q = a e^{-i phi} (Eq. 1); differentiable in both arguments.
 
@@ -33,8 +35,12 @@ def drive_from_phases(phases: ArrayLike, amplitudes: ArrayLike | None = None) ->
 
     Raises:
         ValueError: not finite real numbers, an amplitude outside [0, 1], or shapes that do not broadcast.
+
+    Warns:
+        ScaleWarning: the phases seem to be in degrees.
     """
     phi = real_tensor("phases", phases, "rad")
+    _warn_of_degrees(phi.detach())
     if phi.ndim == 0:
         raise ValueError("phases: shape (); must be (..., M)")
     if amplitudes is None:
@@ -50,13 +56,20 @@ def drive_from_phases(phases: ArrayLike, amplitudes: ArrayLike | None = None) ->
     return torch.polar(a.expand(shape), -phi.expand(shape))
 
 
+def _warn_of_degrees(phases: torch.Tensor) -> None:
+    """Warn of whole numbers up to 90 or more; phases that are not wrapped are seldom whole."""
+    if phases.numel() > 1 and phases.abs().max() >= 90 and torch.equal(phases, phases.round()):
+        shown = f"phases: whole numbers from {phases.min():g} to {phases.max():g} rad"
+        warn_user(f"{shown}; are these degrees? Then take numpy.radians(phases)")
+
+
 def phases_of(drive: ArrayLike) -> torch.Tensor:
     """Return the phases of a `drive` (..., M) in [0, 2 pi) [rad]; 0 where the drive is 0.
 
     Raises:
         ValueError: not finite complex numbers.
     """
-    drive = complex_tensor("drive", drive)
+    drive = drive_tensor(drive)
     phases = torch.remainder(-torch.angle(drive), 2 * math.pi)
     # remainder rounds a phase just below 0 to 2 pi and keeps -0, and the angle of -0 is pi.
     return torch.where((phases >= 2 * math.pi) | (phases == 0) | (drive == 0), 0.0, phases)
@@ -64,9 +77,10 @@ def phases_of(drive: ArrayLike) -> torch.Tensor:
 
 def amplitudes_of(drive: ArrayLike) -> torch.Tensor:
     """Return the amplitudes |q| of a `drive` (..., M); errors as for `phases_of`."""
-    return complex_tensor("drive", drive).abs()
+    return drive_tensor(drive).abs()
 
 
+@suggesting
 def focus_phases(positions: ArrayLike, focus: ArrayLike, wavenumber: float) -> torch.Tensor:
     """Return phases that focus on a point in free space: phi_i = k |r_f - r_i| (Eq. 3), not wrapped.
 
@@ -82,7 +96,7 @@ def focus_phases(positions: ArrayLike, focus: ArrayLike, wavenumber: float) -> t
         ValueError: not finite, wrong shape, or a wavenumber <= 0.
     """
     sources = points_tensor("positions", positions)
-    wavenumber = positive("wavenumber", wavenumber, "rad/m")
+    wavenumber = real_wavenumber(wavenumber)
     foci = real_tensor("focus", focus, "m")
     if foci.ndim == 1:
         single = torch.tensor([finite_vector("focus", focus)], dtype=torch.float64, device=sources.device)
@@ -98,9 +112,15 @@ def normalise(drive: torch.Tensor) -> torch.Tensor:
     return drive / largest
 
 
+def drive_tensor(drive: ArrayLike) -> torch.Tensor:
+    """Return `drive` as a finite complex128 tensor of any shape; phases alone are refused."""
+    accepted = "must be complex, q = a e^(-i phi), as drive_from_phases(phases) makes it"
+    return complex_tensor("drive", drive, accepted)
+
+
 def validate_drive(drive: ArrayLike, transducers: int) -> torch.Tensor:
     """Return `drive` as complex128 after checking that it is complex (..., transducers) with |q| <= 1."""
-    drive = complex_tensor("drive", drive)
+    drive = drive_tensor(drive)
     if drive.ndim == 0 or drive.shape[-1] != transducers:
         raise ValueError(f"drive: shape {tuple(drive.shape)}; must be (..., {transducers})")
     if drive.numel():

@@ -12,11 +12,12 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from autdtorch.utils.hints import suggesting
 from autdtorch.utils.memory import require_memory
+from autdtorch.utils.units import angle as checked_angle
 from autdtorch.utils.validation import (
     ArrayLike,
     Vector,
-    finite_number,
     finite_vector,
     integer_at_least,
     positive,
@@ -83,7 +84,7 @@ def device_axes(normal: ArrayLike, angle: float = 0.0) -> torch.Tensor:
 
     z is along `normal`; x is turned by `angle` [rad] from u towards v, with (u, v) = `plane_basis(normal)`.
     """
-    turn = finite_number("angle", angle, "rad")
+    turn = checked_angle("angle", angle)
     u, v = plane_basis(normal)
     x = math.cos(turn) * u + math.sin(turn) * v
     y = math.cos(turn) * v - math.sin(turn) * u
@@ -118,6 +119,7 @@ def composed_rotation(
     return matrix
 
 
+@suggesting
 def circle_points(
     center: ArrayLike, radius: float, count: int, normal: ArrayLike, angle: float = 0.0
 ) -> torch.Tensor:
@@ -138,11 +140,12 @@ def circle_points(
     """
     origin, radius, count = _round(center, radius, count)
     u, v = plane_basis(normal)
-    start = finite_number("angle", angle, "rad")
+    start = checked_angle("angle", angle)
     angles = start + 2 * math.pi * torch.arange(count, dtype=torch.float64, device="cpu") / count
     return origin + radius * (angles.cos()[:, None] * u + angles.sin()[:, None] * v)
 
 
+@suggesting
 def sphere_points(center: ArrayLike, radius: float, count: int) -> torch.Tensor:
     """Return evenly spread points on a sphere: a Fibonacci lattice.
 
@@ -175,6 +178,7 @@ def _round(center: ArrayLike, radius: float, count: int) -> tuple[torch.Tensor, 
     return origin, radius, count
 
 
+@suggesting
 @dataclass(frozen=True)
 class Plane:
     """A rectangle on which a field is sampled.

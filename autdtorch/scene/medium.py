@@ -8,12 +8,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
+from autdtorch.utils.hints import suggesting
+from autdtorch.utils.units import warn_user
 from autdtorch.utils.validation import fluid, not_negative, number_between
 
 _TEMPERATURES = -20.0, 50.0  # deg C; range of ISO 9613-1
 _PRESSURES = 50e3, 200e3  # Pa; from half an atmosphere to the limit of ISO 9613-1
 _FREQUENCIES_BY_PRESSURE = 4e-4, 10.0  # Hz/Pa; range of ISO 9613-1
+
+_USUAL_SPEEDS = 20.0, 15e3  # m/s; bubbly water is slowest, and diamond faster than any fluid
 
 _ZERO_CELSIUS = 273.15  # K
 _REFERENCE_TEMPERATURE = 293.15  # K
@@ -23,6 +28,7 @@ _GAS_CONSTANT = 8.314462618  # J/(mol K)
 _DRY_AIR, _WATER = 28.9647e-3, 18.01528e-3  # kg/mol
 
 
+@suggesting
 @dataclass(frozen=True)
 class Medium:
     """A uniform fluid.
@@ -34,11 +40,17 @@ class Medium:
 
     Raises:
         ValueError: an attribute is not finite or out of range.
+
+    Warns:
+        ScaleWarning: a sound speed that no fluid has.
     """
 
     density: float
     sound_speed: float
     absorption: float = 0.0
+
+    #: Frequency [Hz] for which `air` computed the absorption; None where it was given.
+    absorption_frequency: ClassVar[float | None] = None
 
     def __post_init__(self) -> None:
         """Check the attributes."""
@@ -46,8 +58,12 @@ class Medium:
         object.__setattr__(self, "density", density)
         object.__setattr__(self, "sound_speed", sound_speed)
         object.__setattr__(self, "absorption", not_negative("Medium.absorption", self.absorption, "dB/m"))
+        if not _USUAL_SPEEDS[0] <= sound_speed <= _USUAL_SPEEDS[1]:
+            odd = f"Medium.sound_speed: {sound_speed:g} m/s, as of no fluid; it comes after the density"
+            warn_user(f"{odd}, which is {density:g} kg/m^3: are they swapped, or in other units?")
 
     @classmethod
+    @suggesting
     def air(
         cls,
         temperature: float = 20.0,
@@ -59,16 +75,27 @@ class Medium:
 
         Args:
             temperature: [deg C], -20 to 50.
-            relative_humidity: [%], 0 to 100.
+            relative_humidity: [%], 0 to 100; 50, not 0.5, is half of saturation.
             pressure: ambient [Pa], 50e3 to 200e3.
             frequency: drive frequency, for the absorption [Hz]; 4e-4 to 10 times the pressure in Pa.
 
         Raises:
             ValueError: an argument is not a number in its range.
+
+        Warns:
+            ScaleWarning: the humidity seems to be a share of 1.
         """
         density, sound_speed = _density_and_sound_speed(temperature, relative_humidity, pressure)
         absorption = _absorption_of_air(temperature, relative_humidity, pressure, frequency)
-        return cls(density, sound_speed, absorption)
+        if 0 < relative_humidity <= 1:
+            dry = f"relative_humidity: {relative_humidity:g} %, drier than any room"
+            warn_user(
+                f"{dry}; a share of {relative_humidity:g} is relative_humidity={100 * relative_humidity:g}"
+            )
+        medium = cls(density, sound_speed, absorption)
+        # No field: an absorption that is given, or replaced, is of no known frequency.
+        object.__setattr__(medium, "absorption_frequency", float(frequency))
+        return medium
 
 
 def vapour_fraction(temperature: float, relative_humidity: float, pressure: float) -> float:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -14,10 +13,14 @@ import torch
 from autdtorch.scene.arrays import TransducerArray, range_text, strengths_of
 from autdtorch.scene.geometry import Coordinates, Plane
 from autdtorch.scene.medium import Medium as Medium
-from autdtorch.scene.obstacles import Mesh, Obstacle
+from autdtorch.scene.obstacles import Obstacle
 from autdtorch.scene.obstacles.moving import moved
+from autdtorch.scene.plausibility import extent_of, unit_hint, warn_of_implausible
+from autdtorch.utils.hints import suggesting
 from autdtorch.utils.html import html_facts
 from autdtorch.utils.neighbours import nearest, require_distinct
+from autdtorch.utils.units import ScaleWarning as ScaleWarning
+from autdtorch.utils.units import angles, warn_user
 from autdtorch.utils.validation import (
     LENGTH_TOLERANCE,
     ArrayLike,
@@ -38,13 +41,7 @@ _DEFAULT_MARGIN = 2.0  # [wavelengths] of air on each side, where no domain is g
 _FARTHEST = 1e6  # [m] along an axis; far beyond any simulation, and volumes do not overflow
 _FREQUENCIES = 1e-3, 1e12  # [Hz]
 _DECIBELS = 20 / math.log(10)  # in a neper
-_USUAL_EXTENT = 0.1, 2000.0  # [wavelengths] across array and control points
-_USUAL_MESH = 20.0  # [extents of array and control points] across a mesh whose file is in metres
 _MOST_ABSORPTION = 3.0  # [dB per wavelength]: the model assumes a small imaginary part of the wavenumber
-
-
-class ScaleWarning(UserWarning):
-    """A scene seems to be in other units than metres and hertz, or units in a file had to be inferred."""
 
 
 class OverlapWarning(UserWarning):
@@ -77,6 +74,7 @@ class Scene:
     domain: tuple[Vector, Vector]
     name: str
 
+    @suggesting
     def __init__(
         self,
         array: TransducerArray,
@@ -102,7 +100,8 @@ class Scene:
 
         Warns:
             OverlapWarning: two obstacles of different materials overlap.
-            ScaleWarning: lengths, or the file of a mesh, seem to be in mm, or the frequency in kHz.
+            ScaleWarning: lengths, or the file of a mesh, seem to be in mm, or the frequency in kHz; all
+                control points lie behind the array; or `Medium.air` was made for another frequency.
         """
         require_kind("Scene.array", array, TransducerArray)
         require_kind("Scene.medium", medium, Medium)
@@ -130,9 +129,16 @@ class Scene:
         _require_separate_points(self)
         _require_in_domain(self)
         _warn_of_overlaps(self.obstacles)
-        _warn_of_units(self)
+        warn_of_implausible(self, domain is not None)
 
-    def moved(self, offset: ArrayLike = (0.0, 0.0, 0.0), rotation: ArrayLike = (0.0, 0.0, 0.0)) -> Scene:
+    @suggesting
+    def moved(
+        self,
+        offset: ArrayLike = (0.0, 0.0, 0.0),
+        rotation: ArrayLike = (0.0, 0.0, 0.0),
+        *,
+        rotation_degrees: ArrayLike | None = None,
+    ) -> Scene:
         """Return the scene with all obstacles shifted, and turned as one body.
 
         They turn about the centre of the sphere around them, as those of a `ScatteringOperator`.
@@ -140,14 +146,30 @@ class Scene:
         Args:
             offset: (3,) [m].
             rotation: angles (3,) [rad] about the fixed axes x, y, z, in this order.
+            rotation_degrees: these angles (3,) in degrees, in place of `rotation`.
 
         Raises:
             ValueError: an obstacle then holds a transducer or control point, or is of a kind that cannot be
                 moved; a `VoxelMask` cannot be turned.
         """
         shift = torch.tensor(finite_vector("offset", offset), dtype=torch.float64, device="cpu")
-        angles = finite_vector("rotation", rotation, "rad")
-        return replace(self, obstacles=moved(self.obstacles, shift, angles))
+        turn = angles("rotation", rotation, rotation_degrees)
+        return replace(self, obstacles=moved(self.obstacles, shift, turn))
+
+    def equals(self, other: Scene) -> bool:
+        """Return whether another scene describes the same field at the same points, whatever its name."""
+        require_kind("other", other, Scene)
+        if self is other:
+            return True
+        alike = ("medium", "frequency", "obstacles", "observation_plane", "domain")
+        array, theirs = self.array, other.array
+        return (
+            all(getattr(self, name) == getattr(other, name) for name in alike)
+            and torch.equal(self.control_points, other.control_points)
+            and torch.equal(array.positions, theirs.positions)
+            and torch.equal(array.normals, theirs.normals)
+            and (array.source_strength, array.radius) == (theirs.source_strength, theirs.radius)
+        )
 
     @property
     def angular_frequency(self) -> float:
@@ -269,38 +291,30 @@ def _require_separate_points(scene: Scene) -> None:
     groups = {"array.positions": array.positions, "control_points": points, "array.nodes": array.nodes[0]}
     for name, group in groups.items():
         for index, obstacle in enumerate(scene.obstacles):
+            if _is_of_medium(scene, obstacle):
+                continue
             inside = obstacle.contains(group, margin=LENGTH_TOLERANCE)
             if inside.any():
+                inside &= ~_in_later_medium(scene, index, group)
+            if inside.any():
                 first = tuple(inside.nonzero()[0].tolist())
-                accepted = f"lies in or on obstacle {index}, {_extent(obstacle)}, must be outside it"
-                accepted += _unit_hint(scene, obstacle)
+                accepted = f"lies in or on obstacle {index}, {extent_of(obstacle)}, must be outside it"
+                accepted += unit_hint(scene, obstacle)
                 raise invalid(f"Scene.{name}{list(first)}", group[first], accepted, "m")
 
 
-def _warn_of_units(scene: Scene) -> None:
-    extent = _observed_extent(scene)
-    least, most = (bound * scene.wavelength for bound in _USUAL_EXTENT)
-    if not least <= extent <= most:
-        found = f"{extent:.4g} m from end to end of array and control points, but a wavelength of"
-        text = f"Scene: {found} {scene.wavelength:.4g} m; are lengths in m and the frequency in Hz?"
-        warnings.warn(text, ScaleWarning, stacklevel=3)
-    for index, obstacle in enumerate(scene.obstacles):
-        if hint := _unit_hint(scene, obstacle):
-            text = f"Scene.obstacles[{index}]: a mesh of {_extent(obstacle)}{hint}"
-            warnings.warn(text, ScaleWarning, stacklevel=3)
+def _is_of_medium(scene: Scene, obstacle: Obstacle) -> bool:
+    """Return whether an obstacle is of the medium's material: it cuts earlier ones, and hides no point."""
+    return (obstacle.density, obstacle.sound_speed) == (scene.medium.density, scene.medium.sound_speed)
 
 
-def _unit_hint(scene: Scene, obstacle: Obstacle) -> str:
-    """Return what to do about a mesh far larger than the array and the control points; else nothing."""
-    size = math.dist(obstacle.lower, obstacle.upper)
-    too_large = isinstance(obstacle, Mesh) and size > _USUAL_MESH * _observed_extent(scene)
-    return "; take scale=1e-3 for a file in millimetres" if too_large else ""
-
-
-def _observed_extent(scene: Scene) -> float:
-    """Return the diagonal [m] of the bounding box of array and control points."""
-    points = torch.cat([scene.array.positions, scene.control_points])
-    return float((points.amax(dim=0) - points.amin(dim=0)).norm())
+def _in_later_medium(scene: Scene, index: int, points: torch.Tensor) -> torch.Tensor:
+    """Return whether points (..., 3) are within an obstacle of the medium's material that follows `index`."""
+    cleared = torch.zeros(points.shape[:-1], dtype=torch.bool, device="cpu")
+    for later in scene.obstacles[index + 1 :]:
+        if _is_of_medium(scene, later):
+            cleared |= later.signed_distance(points) < -LENGTH_TOLERANCE
+    return cleared
 
 
 def _warn_of_overlaps(obstacles: tuple[Obstacle, ...]) -> None:
@@ -317,7 +331,7 @@ def _warn_of_overlaps(obstacles: tuple[Obstacle, ...]) -> None:
     ]
     if pairs:
         text = f"{', '.join(pairs)}, of another material; where both are, the later counts"
-        warnings.warn(f"Scene.obstacles: {text}", OverlapWarning, stacklevel=3)
+        warn_user(f"Scene.obstacles: {text}", OverlapWarning)
 
 
 def _overlap(obstacle: Obstacle, other: Obstacle) -> bool:
@@ -337,13 +351,6 @@ def _shared(
     corners = torch.tensor([box, other], dtype=torch.float64, device="cpu")
     lower, upper = corners[:, 0].amax(dim=0), corners[:, 1].amin(dim=0)
     return (lower, upper) if (upper - lower).min() > LENGTH_TOLERANCE else None
-
-
-def _extent(obstacle: Obstacle) -> str:
-    """Return the corners of the bounding box as text, without rounding errors."""
-    bounds = obstacle.lower, obstacle.upper
-    low, high = (tuple(float(f"{entry:.9g}") for entry in corner) for corner in bounds)
-    return f"{low} to {high} m"
 
 
 def require_clear(array: TransducerArray, name: str, points: torch.Tensor) -> None:
@@ -373,5 +380,5 @@ def _require_in_domain(scene: Scene) -> None:
     for index, obstacle in enumerate(scene.obstacles):
         if _shared((obstacle.lower, obstacle.upper), scene.domain) is None:
             accepted = f"must be at least partly inside the domain, {scene.domain[0]} to {scene.domain[1]} m"
-            accepted += _unit_hint(scene, obstacle)
-            raise ValueError(f"Scene.obstacles[{index}]: {_extent(obstacle)}; {accepted}")
+            accepted += unit_hint(scene, obstacle)
+            raise ValueError(f"Scene.obstacles[{index}]: {extent_of(obstacle)}; {accepted}")

@@ -16,6 +16,7 @@ from autdtorch.study.results import SceneResult, StudyResult
 from autdtorch.study.results_file import RESULTS_FILE, load_results, save_results
 from autdtorch.study.trial_file import TRIALS_FILE, TrialFile
 from autdtorch.utils.files import held
+from autdtorch.utils.wording import counted
 
 logger = logging.getLogger(__name__)
 
@@ -68,7 +69,7 @@ class StudyFolder:
             self.trials = self._trial_file()
         self.trials.mend()
         if len(self.trials) and len(self.scenes) < len(self._shapes):
-            logger.info("re-using %d trials from %s", len(self.trials), self.path)
+            logger.info("re-using %s from %s", counted(len(self.trials), "trial"), self.path)
 
     def _take_up(self) -> None:
         """Use the files of this study; note why others are not used."""

@@ -141,7 +141,7 @@ def run_study(
                 level = logging.DEBUG if poses else logging.INFO
                 logger.log(level, "%s: %s", name, _in_short(propagator, finished))
         if poses and missing:
-            logger.info("%d poses, the last: %s", len(missing), _in_short(propagator, finished))
+            logger.info("%s, the last: %s", counted(len(missing), "pose"), _in_short(propagator, finished))
         return StudyResult(kept.provenance, {name: kept.scenes[name] for name in scenes})
 
 
@@ -354,7 +354,7 @@ def _accuracy(propagator: SimulatedPropagator | OperatorPropagator, simulation: 
         waves = f"{propagator.planned_runs} waves" if propagator.cells else "exact waves"
         return f"{waves}, error {propagator.tolerance:g}"
     count, error = len(simulation.runs), propagator.known_errors()[0]
-    runs = "1 run" if count == 1 else f"{count} runs"
+    runs = counted(count, "run")
     if math.isfinite(error):
         return f"{runs}, estimated error {error:.1g}"
     return f"{runs}, within {max((run.remaining for run in simulation.runs), default=0.0):.1g} of steady"

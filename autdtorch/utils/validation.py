@@ -7,7 +7,6 @@ value raises a `ValueError` of one line, ``field: value unit; accepted range``.
 from __future__ import annotations
 
 import contextlib
-import difflib
 import math
 import numbers
 import os
@@ -21,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from autdtorch.utils.hints import did_you_mean
 from autdtorch.utils.values import DEEPEST, SHOWN_ENTRIES, is_plain
 from autdtorch.utils.values import invalid as invalid
 from autdtorch.utils.values import is_dense as is_dense
@@ -66,28 +66,23 @@ def path_of(name: str, value: object, what: str = "a file", suffixes: Collection
 def require_one_of(name: str, value: object, accepted: Collection[str]) -> None:
     """Check that `value` is one of the accepted texts."""
     if not isinstance(value, str) or value not in accepted:
-        raise invalid(name, value, f"must be one of {', '.join(accepted)}{_hint(value, accepted)}")
+        raise invalid(name, value, f"must be one of {', '.join(accepted)}{did_you_mean(value, accepted)}")
 
 
 def require_known(where: str, given: Iterable[Any], allowed: Collection[str], what: str = "key") -> None:
     """Refuse keys that are not allowed."""
     for key in given:
         if key not in allowed:
-            found = f"unknown {what} {key!r}{_hint(key, allowed)}"
+            found = f"unknown {what} {key!r}{did_you_mean(key, allowed)}"
             raise ValueError(f"{where}: {found}; allowed {what}s: {', '.join(allowed)}")
-
-
-def _hint(given: object, allowed: Collection[str]) -> str:
-    """Return a question for messages with the allowed text most like `given`; empty if none is alike."""
-    nearest = difflib.get_close_matches(given, allowed, n=1) if isinstance(given, str) else []
-    return f" (did you mean {nearest[0]!r}?)" if nearest else ""
 
 
 def require_kind(name: str, value: object, kind: type) -> None:
     """Check that `value` is an instance of a class or protocol."""
     if not isinstance(value, kind):
         article = "an" if kind.__name__[0] in "AEIOU" else "a"
-        raise invalid(name, value, f"must be {article} {kind.__name__}")
+        hint = ", which load_scene(path) makes" if kind.__name__ == "Scene" and isinstance(value, str) else ""
+        raise invalid(name, value, f"must be {article} {kind.__name__}{hint}")
 
 
 def members(name: str, value: object, kind: type) -> tuple[Any, ...]:
@@ -266,21 +261,16 @@ def unit_vector(name: str, value: object) -> Vector:
 
 def real_tensor(name: str, value: object, unit: str = "") -> torch.Tensor:
     """Return `value` as a finite float64 tensor of any shape; a tensor keeps its device and its gradient."""
-    accepted = f"must be an array of real numbers{_in_unit(unit)}"
-    tensor = _tensor(name, value, accepted)
-    if tensor.is_complex():
-        raise invalid(name, value, accepted)
-    tensor = tensor.to(torch.float64)
-    _require_finite(name, tensor, unit)
-    return tensor
+    return _real(name, value, f"must be an array of real numbers{_in_unit(unit)}", unit)
 
 
-def complex_tensor(name: str, value: object) -> torch.Tensor:
+def complex_tensor(
+    name: str, value: object, accepted: str = "must be an array of complex numbers"
+) -> torch.Tensor:
     """Return `value` as a finite complex128 tensor of any shape; a tensor keeps its device and its gradient.
 
     A lazy conjugate is resolved, because not every PyTorch function takes one.
     """
-    accepted = "must be an array of complex numbers"
     tensor = _tensor(name, value, accepted)
     if not tensor.is_complex():
         raise invalid(name, value, accepted)
@@ -322,10 +312,20 @@ def _in_unit(unit: str) -> str:
 
 
 def _entries(name: str, value: object, count: int, unit: str) -> tuple[float, ...]:
-    tensor = real_tensor(name, value, unit)
+    accepted = f"must be {count} real numbers{_in_unit(unit)}"
+    tensor = _real(name, value, accepted, unit)
     if tensor.shape != (count,):
-        raise invalid(name, value, f"must be {count} real numbers{_in_unit(unit)}")
+        raise invalid(name, value, accepted)
     return tuple(float(entry) for entry in tensor.detach())
+
+
+def _real(name: str, value: object, accepted: str, unit: str) -> torch.Tensor:
+    tensor = _tensor(name, value, accepted)
+    if tensor.is_complex():
+        raise invalid(name, value, accepted)
+    tensor = tensor.to(torch.float64)
+    _require_finite(name, tensor, unit)
+    return tensor
 
 
 def _tensor(name: str, value: object, accepted: str) -> torch.Tensor:

@@ -14,6 +14,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+import autdtorch.cli.arguments
 import autdtorch.study.run
 from autdtorch.cli.config_files import CONFIGS
 from autdtorch.cli.settings import load_method
@@ -175,10 +176,25 @@ WRONG = [
     (["experiment=paper", "methods.gabs.levels=0"], r"methods\.gabs: levels: 0"),
     (["experiment=paper", "trials.gabs=0"], r"trials\.gabs: 0; must be an integer >= 1"),
     (["three_cubes"], "three_cubes: must be key=value"),
-    (["hydra/launcher=nope"], r"hydra/launcher: 'nope'; must be one of basic, joblib.*autdtorch\[cluster\]"),
+    (["hydra/launcher=nope"], r"hydra/launcher: 'nope'; must be one of basic, joblib.*extra cluster"),
     (["collect"], "collect: ''; must be one folder"),
     (["collect", "."], r"\.: no finished study \(results\.h5\) there or below"),
     (["experiment=paper", "scenes=3"], "scenes: 3; must be a mapping"),
+    (["method.level=8"], r"method\.level: unknown key \(did you mean 'levels'\?\); allowed keys: .*order"),
+    (["trails=3"], r"trails: unknown key \(did you mean 'trials'\?\)"),
+    (["scene.freqency=4"], r"scene\.freqency: unknown key \(did you mean 'frequency'\?\)"),
+    (["method=GABS"], r"method: 'GABS'; must be one of .* \(did you mean 'gabs'\?\)"),
+    (["scene=two_cube"], r"scene: 'two_cube'; .* \(did you mean 'two_cubes'\?\)"),
+    (["scene=configs/scene/two_cubes.yaml"], "scene: .* a name, not a path: scene=two_cubes; .*--config-dir"),
+    (["scene=lab/scene/duct.yaml"], "scene: .* a name, not a path: --config-dir lab scene=duct"),
+    (["hardware=emulated", "hardware/sensor=scpe"], r"hardware/sensor: 'scpe'; .*did you mean 'scope'"),
+    (["explor"], "explor: must be key=value, .*did you mean 'explore'"),
+    (["scene=homogeneous", "explore", "explore.port=-1"], "port: -1; must be an integer >= 0"),
+    (["scene=homogeneous", "collect"], "collect: 'scene=homogeneous'; must be one folder"),
+    (["--scene", "two_cubes"], "--scene: unknown option; settings have no dashes, as in scene=VALUE"),
+    (["--multrun", "seed=1,2"], "--multrun: unknown option .*did you mean '--multirun'"),
+    (["-m", "output=x"], r"output=x: a sweep has a folder .* hydra\.sweep\.dir=x"),
+    (["poses={rotaton: [0, 0, 1], count: 3}"], "poses: unknown key 'rotaton' .*'rotation'"),
 ]
 
 
@@ -188,6 +204,20 @@ def test_a_wrong_command_gets_one_line(arguments, message, refused, write, monke
     write("file", "")
     line = refused(*arguments)
     assert re.match(rf"autdtorch: {message}", line), line
+
+
+@pytest.mark.parametrize("launcher", ["slurm", "joblib", "submitit_local"])
+def test_a_launcher_that_is_not_installed_names_its_extra(launcher, refused, monkeypatch):
+    monkeypatch.setattr(autdtorch.cli.arguments, "find_spec", lambda _: None)
+    line = refused("-m", "scene=homogeneous", f"hydra/launcher={launcher}")
+    assert re.match(rf"autdtorch: hydra/launcher: '{launcher}'; needs the extra cluster: pip install", line)
+
+
+@pytest.mark.filterwarnings("always")
+def test_degrees_on_the_command_line_are_told(run, capsys):
+    words = ("scene=three_cubes", "solver.spacing=2e-3", "method=lss", "plane_spacing=0.02")
+    assert run(*words, "+scene.obstacles.0.rotation=[0,0,45]") == 0
+    assert "obstacles[0]: Box.rotation: (0.0, 0.0, 45.0) rad is more than a turn" in capsys.readouterr().err
 
 
 def test_the_traceback_comes_back_where_it_is_asked_for(run, refused, monkeypatch):

@@ -1,6 +1,7 @@
 """Cavities and rooms of rigid walls: no sound reaches them, and they change nothing outside."""
 
 import itertools
+import warnings
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from small_scenes import relative_error, small_scene
 from autdtorch.propagators import make_propagator
 from autdtorch.scene.arrays import TransducerArray
 from autdtorch.scene.obstacles import Box, Mesh, Sphere, VoxelMask
-from autdtorch.scene.scene import Scene
+from autdtorch.scene.scene import OverlapWarning, Scene
 
 CENTER = (12.2e-3, 11.9e-3, 12.1e-3)
 RADIUS, SPACING, SETTLED = 4.2e-3, 1e-3, 1e-4
@@ -149,3 +150,22 @@ def test_a_run_ends_where_a_drive_cancels(method, balls):
     )
     assert (cancelled < 1e-3 * whole).all()
     assert max(run.periods for run in propagator.runs) < 100
+
+
+def test_air_cut_from_a_rigid_cube_is_a_notch_between_plates():
+    """A point in the notch hears what it does between plates that leave the notch free."""
+    x, y, z = CENTER
+    cube = Box(CENTER, (10e-3,) * 3, rigid=True)
+    air = Box((x + 2e-3, y, z), (10e-3, 4e-3, 4e-3), density=1.293, sound_speed=340.0)
+    plates = [Box((x - 4e-3, y, z), (2e-3, 10e-3, 10e-3), rigid=True)]
+    for side in (-3.5e-3, 3.5e-3):
+        plates.append(Box((x + 1e-3, y + side, z), (8e-3, 3e-3, 10e-3), rigid=True))
+        plates.append(Box((x + 1e-3, y, z + side), (8e-3, 4e-3, 3e-3), rigid=True))
+    scene, matrices = small_scene(), []
+    points = [(x + 3.1e-3, y + 0.4e-3, z), (x + 8.3e-3, y, z)]
+    for obstacles in ([cube, air], plates):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", OverlapWarning)
+            built = Scene(scene.array, scene.medium, 40e3, points, obstacles, domain=scene.domain)
+        matrices.append(make_propagator(built, "full", SPACING, SETTLED).transfer_matrix())
+    assert relative_error(*matrices) < 1e-3  # one body in two descriptions; measured 0

@@ -328,6 +328,8 @@ def test_a_list_of_any_class_is_a_list(kind: Callable[[list[float]], Any]) -> No
 def test_the_largest_scene_is_refused_for_its_memory(method: Any) -> None:
     far = 1e6
     wall = box(center=(0, 0, far / 2), size=(far, far, far - 2))
-    wide = scene(domain=((-far,) * 3, (far,) * 3), obstacles=[wall])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", at.ScaleWarning)
+        wide = scene(domain=((-far,) * 3, (far,) * 3), obstacles=[wall])
     with pytest.raises(ValueError, match=r"^spacing: 0\.001 m; (needs about|gives) "):
         at.make_propagator(wide, method)

@@ -55,7 +55,7 @@ def test_basis_is_orthonormal_and_right_handed(normal):
     radius=st.floats(1e-3, 1),
     count=st.integers(1, 12),
     normal=normals(),
-    angle=st.floats(-10, 10),
+    angle=st.floats(-6, 6),
 )
 def test_circle_points_are_even_on_the_circle_and_in_its_plane(center, radius, count, normal, angle):
     offsets = circle_points(center, radius, count, normal, angle) - torch.from_numpy(center)

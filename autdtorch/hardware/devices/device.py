@@ -9,9 +9,9 @@ from typing import ClassVar, Protocol, Self
 import torch
 
 from autdtorch.hardware.transport.serial_chips import Adapter
-from autdtorch.scene.drive import validate_drive
+from autdtorch.scene.drive import drive_tensor, validate_drive
 from autdtorch.scene.phase_levels import PhaseLevels
-from autdtorch.utils.validation import ArrayLike, complex_tensor, integer_at_least, invalid
+from autdtorch.utils.validation import ArrayLike, integer_at_least, invalid
 
 _BITS = 10  # of a byte on a serial line: start, 8, stop
 
@@ -81,7 +81,7 @@ class Device(ABC):
 
         `ValueError` for not finite complex numbers, no axis, or an amplitude above 1.
         """
-        tensor = drive if isinstance(drive, torch.Tensor) else complex_tensor("drive", drive)
+        tensor = drive if isinstance(drive, torch.Tensor) else drive_tensor(drive)
         checked = validate_drive(tensor, tensor.shape[-1] if tensor.ndim else 0)
         return self.phase_levels.nearest(checked.detach())
 

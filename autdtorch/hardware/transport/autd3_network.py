@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from autdtorch.hardware.transport.port import LinkError, Port, closed_on_error
+from autdtorch.utils.hints import with_extra
 
 _ANSWER_MS = 100  # wait of the kit for an answer; its own 10 ms run out on a busy computer
 _TIMEOUT = 5.0  # of a command [s]; the kit asks boards that do not answer 8 times more before it gives up
@@ -27,7 +28,7 @@ def autd3_kit() -> Any:
         import autd3_core  # noqa: F401
         import autd3_pattern  # noqa: F401
     except ImportError as error:
-        raise ImportError(f"{error}; pip install 'autdtorch[autd3]' brings what is needed") from error
+        raise ImportError(f"{error}; {with_extra('autd3')} brings it") from error
     return autd3
 
 

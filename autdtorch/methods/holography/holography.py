@@ -26,7 +26,8 @@ import torch
 
 from autdtorch.methods.base import Method, Problem, Step, known_matrix
 from autdtorch.objectives.goals import Goal
-from autdtorch.objectives.objective import Score
+from autdtorch.objectives.objective import Objective, Score
+from autdtorch.utils.hints import suggesting
 from autdtorch.utils.validation import (
     ArrayLike,
     boolean,
@@ -50,6 +51,7 @@ DAMPING = 0.5
 UNREACHED = 1e-6  # Pressure, relative to the loudest point, below which a point gets no more weight
 
 
+@suggesting
 @dataclass(frozen=True)
 class Holography(Method):
     """Compute one drive from the transfer matrix of the problem, by an algorithm of holography.
@@ -95,8 +97,9 @@ class Holography(Method):
         return Step(drive[None, None], {})
 
 
+@suggesting
 def holography(
-    G: ArrayLike,
+    G: ArrayLike | Objective,
     targets: ArrayLike | None = None,
     algorithm: Algorithm = "wgs",
     iterations: int = 200,
@@ -106,7 +109,7 @@ def holography(
     """Return drives for wanted pressures, for one transfer matrix or a batch of them.
 
     Args:
-        G: transfer matrices (..., P, M), complex [Pa], on the CPU or a GPU.
+        G: transfer matrices (..., P, M), complex [Pa], on the CPU or a GPU; or an objective that has one.
         targets: wanted pressures (..., P) or (P,), >= 0 and not all 0: relative to each other, and [Pa] for
             "diff_pat" and where amplitudes are free. None for 1 everywhere.
         algorithm: "naive", "gs" (iterative back-propagation), "wgs" (weighted), "gs_pat" or "diff_pat".
@@ -126,6 +129,8 @@ def holography(
     require_one_of("algorithm", algorithm, get_args(Algorithm))
     iterations = integer_at_least("iterations", iterations, 1)
     free = boolean("free_amplitudes", free_amplitudes)
+    if isinstance(G, Objective):
+        G = known_matrix(Problem.of(G))
     matrix = _checked_matrix(G)
     wanted = checked_targets(targets, matrix)
     solver = "wgs" if algorithm == "diff_pat" else algorithm

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from autdtorch.plot.explore.situation import checked_drive
 from autdtorch.plot.view3d.opengl import require_rendering
 from autdtorch.scene.scene import Scene
+from autdtorch.utils.hints import suggesting, with_extra
 from autdtorch.utils.validation import ArrayLike, boolean, integer_at_least, invalid, positive, require_kind
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ _OPENING = (
 )  # PyVista is not imported, nor a trame application made, by several threads at once
 
 
+@suggesting
 def explore(
     scene: Scene,
     drive: ArrayLike | None = None,
@@ -60,7 +62,7 @@ def explore(
     if not 0 <= (port := integer_at_least("port", port, 0)) <= _LAST_PORT:
         raise invalid("port", port, f"must be at most {_LAST_PORT}")
     if importlib.util.find_spec("trame_rca") is None:
-        raise RuntimeError("explore: needs trame: pip install 'autdtorch[explore]'")
+        raise RuntimeError(f"explore: needs trame: {with_extra('explore')}")
     with _OPENING:
         require_rendering()
         from autdtorch.plot.explore.explorer import Explorer

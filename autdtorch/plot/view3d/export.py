@@ -15,6 +15,7 @@ from autdtorch.plot.view3d.meshes import add_axes
 from autdtorch.plot.view3d.still_axes import STILL_AXES
 from autdtorch.scene.scene import Scene
 from autdtorch.utils.files import in_folder
+from autdtorch.utils.hints import with_extra
 from autdtorch.utils.validation import path_of
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ def export_path(name: str, value: str | Path) -> Path:
     """Return the path of a file that can be written."""
     path = path_of(name, value, suffixes=(".png", ".html", ".gltf"))
     if path.suffix.lower() == ".html" and importlib.util.find_spec("trame_pyvista") is None:
-        raise RuntimeError(f"{name}: {str(path)!r} needs trame-pyvista: pip install 'autdtorch[notebook]'")
+        raise RuntimeError(f"{name}: {str(path)!r} needs trame-pyvista: {with_extra('notebook')}")
     return path
 
 

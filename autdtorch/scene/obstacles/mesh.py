@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field, replace
+from dataclasses import InitVar, dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -18,6 +18,8 @@ from autdtorch.scene.obstacles.mesh_solid import Triangles, outer_parts, solid_o
 from autdtorch.utils.array_types import Array, Index
 from autdtorch.utils.cached import cached_property
 from autdtorch.utils.digest import digest_of
+from autdtorch.utils.hints import suggesting
+from autdtorch.utils.units import angles
 from autdtorch.utils.validation import Vector, boolean, finite_vector, invalid, positive, real_tensor, within
 
 logger = logging.getLogger(__name__)
@@ -41,6 +43,7 @@ class _Source(str):
         return {name: value for name, value in vars(self).items() if name != "distance"}
 
 
+@suggesting
 @dataclass(frozen=True)
 class Mesh(Obstacle):
     """The inside of a watertight triangle mesh, from an STL, OBJ or PLY file or by `from_surface`.
@@ -53,6 +56,7 @@ class Mesh(Obstacle):
         scale: metres per unit of the file, > 0; 1e-3 for a file in millimetres.
         offset: position of the file's origin (3,) [m].
         rotation: angles (3,) [rad] about the file's origin; see `autdtorch.scene.geometry.rotation_matrix`.
+        rotation_degrees: these angles (3,) in degrees, in place of `rotation`; it is no attribute afterwards.
         repair: whether to mend what is not watertight: join vertices up to 1e-3 of the extent apart, turn
             triangles over, leave out doubled ones and stray pieces, close holes up to 30 % of the area, and
             make the surface anew from winding numbers where it crosses itself. A warning says what was done.
@@ -71,16 +75,17 @@ class Mesh(Obstacle):
     offset: Vector = field(default=(0.0, 0.0, 0.0), compare=False)
     rotation: Vector = field(default=(0.0, 0.0, 0.0), compare=False)
     repair: bool = field(default=False, compare=False)
+    rotation_degrees: InitVar[Vector | None] = field(default=None, kw_only=True)
     vertices: torch.Tensor = field(init=False, repr=False, compare=False)
     faces: torch.Tensor = field(init=False, repr=False, compare=False)
     digest: str = field(init=False)
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, rotation_degrees: Vector | None) -> None:
         """Check the attributes and read the file."""
         super().__post_init__()
         object.__setattr__(self, "scale", positive("Mesh.scale", self.scale))
         object.__setattr__(self, "offset", finite_vector("Mesh.offset", self.offset))
-        object.__setattr__(self, "rotation", finite_vector("Mesh.rotation", self.rotation, "rad"))
+        object.__setattr__(self, "rotation", angles("Mesh.rotation", self.rotation, rotation_degrees))
         repair = boolean("Mesh.repair", self.repair)
         path = self.path if isinstance(self.path, _Source) else _read(self.path, repair)
         object.__setattr__(self, "path", path)
@@ -91,6 +96,7 @@ class Mesh(Obstacle):
         object.__setattr__(self, "digest", digest_of(vertices, self.faces)[:16])
 
     @classmethod
+    @suggesting
     def from_surface(
         cls,
         surface: Any,
@@ -99,6 +105,7 @@ class Mesh(Obstacle):
         rotation: Vector = (0.0, 0.0, 0.0),
         repair: bool = False,
         *,
+        rotation_degrees: Vector | None = None,
         density: float | None = None,
         sound_speed: float | None = None,
         rigid: bool = False,
@@ -114,9 +121,8 @@ class Mesh(Obstacle):
         source = _Source("")
         with within("Mesh.surface"):
             source.vertices, source.faces = _solid(_triangles(surface), boolean("repair", repair))
-        return cls(
-            source, scale, offset, rotation, repair, density=density, sound_speed=sound_speed, rigid=rigid
-        )
+        material: dict[str, Any] = {"density": density, "sound_speed": sound_speed, "rigid": rigid}
+        return cls(source, scale, offset, rotation, repair, rotation_degrees=rotation_degrees, **material)
 
     def filled(self) -> Self:
         """Return the mesh without its cavities and what is in them; see `Obstacle.filled`."""

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass, field
 
 import torch
 
 from autdtorch.scene.geometry import rotation_matrix
 from autdtorch.scene.obstacles.base import Obstacle
 from autdtorch.scene.obstacles.triangles import BOX_TRIANGLES, SEGMENTS, revolved
+from autdtorch.utils.hints import suggesting
+from autdtorch.utils.units import angles
 from autdtorch.utils.validation import Vector, finite_vector, positive, positive_entries, unit_vector
 
 
@@ -47,6 +49,7 @@ class _Centred(Obstacle):
         return points - points.new_tensor(self.center)
 
 
+@suggesting
 @dataclass(frozen=True)
 class Box(_Centred):
     """A cuboid.
@@ -55,6 +58,7 @@ class Box(_Centred):
         center: centre (3,) [m].
         size: edge lengths (3,) [m], > 0, before rotation.
         rotation: angles (3,) [rad] about the centre; see `autdtorch.scene.geometry.rotation_matrix`.
+        rotation_degrees: these angles (3,) in degrees, in place of `rotation`; it is no attribute afterwards.
 
     Raises:
         ValueError: an attribute is not finite, has the wrong shape or is out of range; see also `Obstacle`.
@@ -62,12 +66,13 @@ class Box(_Centred):
 
     size: Vector
     rotation: Vector = (0.0, 0.0, 0.0)
+    rotation_degrees: InitVar[Vector | None] = field(default=None, kw_only=True)
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, rotation_degrees: Vector | None) -> None:
         """Check the attributes and bring them into canonical form."""
         super().__post_init__()
         object.__setattr__(self, "size", positive_entries("Box.size", self.size, 3))
-        object.__setattr__(self, "rotation", finite_vector("Box.rotation", self.rotation, "rad"))
+        object.__setattr__(self, "rotation", angles("Box.rotation", self.rotation, rotation_degrees))
 
     def surface(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return two triangles for each face; see `Obstacle.surface`."""
@@ -95,6 +100,7 @@ class Box(_Centred):
         return self._from_center(points) @ rotation_matrix(self.rotation).to(points)
 
 
+@suggesting
 @dataclass(frozen=True)
 class Sphere(_Centred):
     """A sphere.
@@ -129,6 +135,7 @@ class Sphere(_Centred):
         return from_center - self.radius
 
 
+@suggesting
 @dataclass(frozen=True)
 class Cylinder(_Centred):
     """A circular cylinder with flat ends.

@@ -19,6 +19,7 @@ from autdtorch.scene.obstacles.voxel_surface import ThinError, VoxelSurface
 from autdtorch.utils.array_types import Array
 from autdtorch.utils.cached import cached_property
 from autdtorch.utils.digest import digest_of
+from autdtorch.utils.hints import suggesting
 from autdtorch.utils.numpy_file import read_arrays
 from autdtorch.utils.validation import (
     Vector,
@@ -40,6 +41,7 @@ _UNCERTAIN_CUBES = (
 )
 
 
+@suggesting
 @dataclass(frozen=True)
 class VoxelMask(Obstacle):
     """A body of voxels, such as a segmented scan.
@@ -86,6 +88,7 @@ class VoxelMask(Obstacle):
         object.__setattr__(self, "digest", digest_of(self.mask)[:16])
 
     @classmethod
+    @suggesting
     def load(
         cls,
         path: str | os.PathLike[str],
@@ -110,6 +113,7 @@ class VoxelMask(Obstacle):
         return cls(values, spacing, origin, level, smooth, **material)
 
     @classmethod
+    @suggesting
     def from_image(
         cls,
         image: Any,

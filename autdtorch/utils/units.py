@@ -1,0 +1,92 @@
+"""Quantities that are given in another unit than the one that is meant: angles in degrees."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+
+import torch
+
+from autdtorch.utils.validation import (
+    ArrayLike,
+    Vector,
+    finite_number,
+    finite_vector,
+    invalid,
+    positive,
+    real_tensor,
+)
+
+_TURN = 2 * math.pi * (1 + 1e-9)  # [rad], with room for rounding
+
+
+class ScaleWarning(UserWarning):
+    """A quantity seems to be in another unit, or of another frequency, than the scene's: mm, kHz, degrees."""
+
+
+def warn_user(text: str, category: type[Warning] = ScaleWarning) -> None:
+    """Warn at the line outside this package that called it, however deep the call is."""
+    depth, frame = 2, sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "autdtorch":
+        depth, frame = depth + 1, frame.f_back
+    warnings.warn(text, category, stacklevel=depth)
+
+
+def angle(name: str, value: object) -> float:
+    """Return `value` as an angle [rad]; warn of more than a turn, which is rather in degrees."""
+    number = finite_number(name, value, "rad")
+    _warn_of_degrees(name, (number,), f"math.radians({number:g})")
+    return number
+
+
+def angles(name: str, value: object, degrees: object = None) -> Vector:
+    """Return `value`, three angles [rad], or `degrees`, the three in degrees, as radians.
+
+    More than a turn in `value` brings a warning; both at once are refused.
+    """
+    turn = finite_vector(name, value, "rad")
+    if degrees is None:
+        shown = ", ".join(f"{one:g}" for one in turn)
+        _warn_of_degrees(name, turn, f"{name.rpartition('.')[2]}_degrees=({shown})")
+        return turn
+    if any(turn):
+        raise invalid(f"{name}_degrees", degrees, f"must not be given beside {name}, {turn} rad", "degrees")
+    x, y, z = map(math.radians, finite_vector(f"{name}_degrees", degrees, "degrees"))
+    return x, y, z
+
+
+def turn_tensor(value: ArrayLike, degrees: ArrayLike | None) -> torch.Tensor:
+    """Return the angles `rotation` (3,) [rad], as of `angles`, as a tensor with its gradient."""
+    angles("rotation", value, degrees)
+    if degrees is None:
+        return real_tensor("rotation", value, "rad")
+    return torch.deg2rad(real_tensor("rotation_degrees", degrees, "degrees"))
+
+
+def real_wavenumber(value: object) -> float:
+    """Return a wavenumber [rad/m] > 0; one with an attenuation is refused, which few solutions have."""
+    if isinstance(value, complex) and value.imag == 0:  # of a scene without absorption
+        value = value.real
+    if isinstance(value, complex):
+        accepted = "must be real, such as scene.wavenumber: of exact solutions, green alone has attenuation"
+        raise invalid("wavenumber", value, accepted, "rad/m")
+    return positive("wavenumber", value, "rad/m")
+
+
+@contextlib.contextmanager
+def warned_within(place: str) -> Iterator[None]:
+    """Put the name of a place, such as a file, in front of warnings."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield
+    for one in caught:
+        warn_user(f"{place}: {one.message}", one.category)
+
+
+def _warn_of_degrees(name: str, turn: Sequence[float], fix: str) -> None:
+    if max(map(abs, turn)) > _TURN:
+        shown = turn[0] if len(turn) == 1 else turn
+        warn_user(f"{name}: {shown} rad is more than a turn; are these degrees? Then take {fix}")

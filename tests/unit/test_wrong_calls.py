@@ -1,0 +1,231 @@
+"""Calls that newcomers get wrong: each is told in one line with the field and the fix, or is right."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+import autdtorch as at
+from autdtorch import hardware
+from autdtorch.utils.hints import did_you_mean, suggesting
+
+FOCI = at.circle_points((80e-3, 50e-3, 50e-3), 30e-3, 4, (1, 0, 0))
+ARRAY = at.TransducerArray.grid((4, 4), 10e-3, (1e-3, 50e-3, 50e-3))
+AIR = at.Medium(1.293, 340.0)
+PLANE = at.Plane((80e-3, 50e-3, 50e-3), (1, 0, 0), (0.1, 0.1))
+MAP = np.ones((4, 4))
+PHASES = np.linspace(0, 3, 16)
+MIDDLE = (41e-3, 50e-3, 50e-3)
+
+
+def box(**changes):
+    return at.Box(**{"center": MIDDLE, "size": (16e-3,) * 3, "rigid": True} | changes)
+
+
+def scene(*obstacles, **changes):
+    parts = {"array": ARRAY, "medium": AIR, "frequency": 40e3, "control_points": FOCI, "obstacles": obstacles}
+    return at.Scene(**parts | changes)
+
+
+def facing(x, normal, **other):
+    return scene(array=at.TransducerArray.grid((4, 4), 10e-3, (x, 50e-3, 50e-3), normal), **other)
+
+
+@pytest.fixture(scope="module")
+def objective():
+    free = scene()
+    return at.SimulatedObjective(free, at.make_propagator(free))
+
+
+WARNED = {
+    "rotation=45": (lambda: box(rotation=(0, 0, 45)), r"Box\.rotation.*degrees.*rotation_degrees=\(0, 0, 45"),
+    "rotation=-180": (lambda: box(rotation=(-180, 0, 0)), r"Box\.rotation.*degrees"),
+    "moved": (lambda: scene(box()).moved(rotation=(0, 0, 20)), r"rotation.*rotation_degrees"),
+    "angle=90": (lambda: at.TransducerArray.autd3((0, 0, 0), angle=90), r"angle.*math\.radians\(90\)"),
+    "circle": (lambda: at.circle_points(MIDDLE, 0.03, 4, (1, 0, 0), 45), "angle.*degrees"),
+    "phases": (lambda: at.drive_from_phases([0, 90, 180, 270]), "phases.*degrees"),
+    "mm of size": (lambda: scene(box(size=(0.01, 20, 0.01), center=(0.04, 20, 0.05))), "obstacles.*in m"),
+    "mm of both": (lambda: scene(box(center=(41, 50, 50), size=(16,) * 3)), r"obstacles\[0\].*in m"),
+    "mm of center": (lambda: scene(at.Sphere((41, 50, 50), 8e-3, rigid=True)), r"obstacles\[0\].*in m"),
+    "mm of domain": (lambda: scene(domain=((0, 0, 0), (100, 100, 100))), r"Scene\.domain.*in m"),
+    "mm of plane": (lambda: scene(observation_plane=replace(PLANE, size=(9, 9))), "observation_plane.*in m"),
+    "kHz": (lambda: scene(frequency=40.0), "frequency in Hz, 40 kHz as 40e3"),
+    "humidity": (lambda: at.Medium.air(20, 0.5), "relative_humidity.*50"),
+    "other air": (lambda: scene(medium=at.Medium.air(frequency=25e3)), "Scene.medium.*frequency=40000"),
+    "swapped": (lambda: at.Medium(340.0, 1.2), "sound_speed.*swapped"),
+    "behind": (lambda: facing(0.2, (1, 0, 0)), "control_points.*behind.*normal"),
+    "turned away": (lambda: facing(1e-3, (-1, 0, 0)), "control_points.*behind.*normal"),
+}
+
+
+@pytest.mark.parametrize("name", WARNED)
+def test_what_is_possible_but_seldom_meant_is_told_at_the_line_of_the_caller(name):
+    call, message = WARNED[name]
+    with pytest.warns(at.ScaleWarning, match=message) as caught:
+        call()
+    assert {one.filename for one in caught} == {__file__}
+
+
+def test_what_is_meant_is_not_told():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene(box(rotation=(math.pi, -math.pi, 2 * math.pi)))
+        wall = box(center=(0.6, 0.05, 0.05), size=(1.0, 1.0, 1.0))
+        scene(wall, medium=at.Medium.air(), control_points=[(0.05, 0.05, 0.05)])
+        around = at.sphere_points((1e-3, 50e-3, 50e-3), 0.1, 9)  # some behind
+        scene(control_points=around, medium=at.Medium.air(20, 50, frequency=40.1e3))
+        scene(frequency=25e3, medium=replace(at.Medium.air(), absorption=0.5))
+        at.drive_from_phases(at.focus_phases(ARRAY.positions, FOCI[0], 739.2))
+        at.drive_from_phases(torch.arange(16))
+
+
+@given(degrees=st.tuples(*[st.floats(-360, 360)] * 3))
+def test_degrees_are_radians_in_the_end(degrees):
+    turned = box(rotation_degrees=degrees)
+    assert turned.rotation == tuple(map(math.radians, degrees))
+    assert replace(turned, center=(0, 0, 0)).rotation == turned.rotation
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a turn of 360 degrees may round to more
+        assert (
+            scene(box()).moved(rotation_degrees=degrees).obstacles
+            == scene(box()).moved(rotation=turned.rotation).obstacles
+        )
+
+
+REFUSED = {
+    "both": (lambda _: box(rotation=(0, 0, 1), rotation_degrees=(0, 0, 45)), "rotation_degrees.*rotation,"),
+    "size in it": (lambda _: scene(box(size=(20, 20, 20))), "obstacle 0.*in m, 16 mm as 16e-3"),
+    "text": (lambda _: box(rotation="45"), r"Box\.rotation.*3 real numbers"),
+    "path": (lambda _: at.make_propagator("two_cubes.yaml"), r"scene.*load_scene\(path\)"),
+    "phases": (lambda seen: seen(PHASES), r"drive.*complex.*drive_from_phases\(phases\)"),
+    "amplitudes_of": (lambda _: at.amplitudes_of(PHASES), "drive.*drive_from_phases"),
+    "name": (lambda seen: at.run("gabs", seen), r"method.*GABS\(\)"),
+    "wrong name": (lambda seen: at.run("lsg", seen), "method.*did you mean 'lssg'"),
+    "function": (lambda seen: at.run(at.identify, seen), r"method.*Identify\(\)"),
+    "class": (lambda seen: at.run(at.BayesOpt, seen), r"method.*BayesOpt\(\)"),
+    "scene": (lambda seen: at.run(at.GABS(), seen.scene), r"objective.*SimulatedObjective\(scene"),
+    "device": (lambda _: hardware.open_link("autd3"), r"device.*hardware\.AUTD3.*open_autd3\(\)"),
+    "near device": (lambda _: hardware.open_link("ultrano"), "device.*did you mean 'ultraino'"),
+    "capitals": (lambda _: at.Holography("GS"), "algorithm.*did you mean 'gs'"),
+    "sphere": (
+        lambda _: at.analytic.rigid_sphere(FOCI, ARRAY.positions, 739 + 1j, MIDDLE, 0.01),
+        r"wavenumber.*real.*scene\.wavenumber",
+    ),
+    "maps": (lambda _: at.plot_planes({"a": {"b": MAP}}, PLANE), "pressure.*by name"),
+    "map": (lambda _: at.plot_planes(MAP, PLANE), "pressure.*plot_plane"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_refusal_names_field_and_fix_in_a_line(name, objective):
+    call, message = REFUSED[name]
+    with pytest.raises(ValueError, match=message) as caught:
+        call(objective)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_equal_scene_serves_and_another_does_not(objective):
+    assert at.SimulatedObjective(scene(name="again"), at.make_propagator(scene())).scene.equals(scene())
+    for other in (
+        scene(box()),
+        scene(frequency=41e3),
+        scene(control_points=FOCI[:3]),
+        facing(2e-3, (1, 0, 0)),
+    ):
+        assert not scene().equals(other)
+        with pytest.raises(ValueError, match="must be the propagator's scene"):
+            at.SimulatedObjective(other, at.make_propagator(scene()))
+
+
+def test_matrix_and_objective_serve_alike(objective):
+    G = objective.transfer_matrix
+    torch.testing.assert_close(at.holography(objective), at.holography(G), rtol=0, atol=0)
+    ours, theirs = (at.gradient_ascent(given, starts=2, steps=20) for given in (G, objective))
+    torch.testing.assert_close(ours.drive, theirs.drive, rtol=0, atol=0)
+    torch.testing.assert_close(ours.pressure, theirs.pressure)  # one sum is of complex, one of real numbers
+
+
+def test_maps_of_one_plane_are_those_of_one_scene():
+    one = at.plot_planes({"a": MAP, "b": 2 * MAP}, PLANE, FOCI, [box()])
+    named = at.plot_planes({"s": {"a": MAP, "b": 2 * MAP}}, {"s": PLANE}, {"s": FOCI}, {"s": [box()]})
+    values = [
+        [mesh.get_array() for ax in figure.axes for mesh in ax.collections if mesh.get_array() is not None]
+        for figure in (one, named)
+    ]
+    assert len(values[0]) > 1
+    for ours, theirs in zip(*values, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_air_cut_from_a_body_later_is_air():
+    hollow = box(size=(30e-3,) * 3), box(size=(10e-3,) * 3, rigid=False, density=1.293, sound_speed=340.0)
+    with pytest.warns(at.OverlapWarning):
+        scene(*hollow, control_points=[MIDDLE])
+    for obstacles in (hollow[::-1], (*hollow, box(size=(5e-3,) * 3))):
+        with pytest.raises(ValueError, match="lies in or on obstacle"):
+            scene(*obstacles, control_points=[MIDDLE])
+    wall = (MIDDLE[0] + 5e-3, *MIDDLE[1:])
+    with pytest.raises(ValueError, match="lies in or on obstacle 0"):
+        scene(*hollow, control_points=[wall])
+
+
+KEYWORDS = {
+    "metod": (lambda seen: at.make_propagator(seen.scene, metod="box"), "method"),
+    "spcing": (lambda seen: at.make_propagator(seen.scene, spcing=1e-3), "spacing"),
+    "centre": (lambda _: box(centre=MIDDLE), "center"),
+    "rotation_deg": (lambda _: box(rotation_deg=(0, 0, 45)), "rotation_degrees"),
+    "diameter": (lambda _: at.Sphere(MIDDLE, diameter=1.0, rigid=True), "radius"),
+    "control_point": (lambda _: at.Scene(ARRAY, AIR, 40e3, control_point=FOCI), "control_points"),
+    "level": (lambda seen: at.gabs(seen, level=8), "levels"),
+    "trails": (lambda seen: at.run(at.LSS(), seen, trails=3), "trials"),
+    "decibel": (lambda _: at.plot_plane(MAP, PLANE, decibel=True), "decibels"),
+    "humidity": (lambda _: at.Medium.air(20, humidity=50), "relative_humidity"),
+    "units": (lambda _: at.TransducerArray.autd3((0, 0, 0), unit=(2, 1)), "units"),
+}
+
+
+@pytest.mark.parametrize("name", KEYWORDS)
+def test_a_wrong_keyword_brings_the_right_one(name, objective):
+    call, right = KEYWORDS[name]
+    with pytest.raises(TypeError, match=rf"'{name}|\b{right}\b") as caught:
+        call(objective)
+    assert right in str(caught.value).partition("keyword argument")[2]
+
+
+def test_errors_within_a_function_stay_what_they_are():
+    @suggesting
+    def outer(alpha=1):
+        return inner(beta=alpha)
+
+    def inner(gamma=1): ...
+
+    with pytest.raises(TypeError, match=r"inner\(\) got an unexpected keyword argument 'beta'$"):
+        outer(2)
+
+
+@pytest.mark.parametrize(
+    ("package", "name", "right"), [(at, "makepropagator", "make_propagator"), (hardware, "AUDT3", "AUTD3")]
+)
+def test_a_wrong_name_brings_the_right_one(package, name, right):
+    with pytest.raises(AttributeError, match=f"{name}.*did you mean '{right}'"):
+        getattr(package, name)
+
+
+@given(name=st.sampled_from(at.__all__), place=st.integers(0, 30), letter=st.sampled_from("xyz_"))
+def test_one_wrong_letter_finds_the_name(name, place, letter):
+    wrong = f"{name[: place % len(name)]}{letter}{name[place % len(name) :]}"
+    if len(name) > 4 and wrong not in at.__all__:
+        assert did_you_mean(wrong, at.__all__)
+
+
+def test_one_is_singular():
+    single = at.Scene(at.TransducerArray([(0, 0, 0)], (1, 0, 0)), AIR, 40e3, [(0.05, 0, 0)], [box()])
+    assert "1 transducer, 1 control point, 1 obstacle," in repr(single)
+    assert "16 transducers, 4 control points, 0 obstacles" in repr(scene())
