@@ -151,14 +151,17 @@ def _job(config: DictConfig, sweep: Path | None) -> None:
 
     settings, modules, output = settings_of(config)
     settings.pop("explore", None)
+    drive = settings.pop("drive", None)
     if settings.get("hardware") is None:
         from autdtorch.cli.study_command import study
 
         settings.pop("hardware", None)
-        study(settings, modules, output, sweep)
+        study(settings, modules, output, sweep, drive)
         return
     from autdtorch.cli.hardware_command import hardware_trial
 
+    if drive is not None:
+        raise ValueError(f"drive: {drive!r}; must be null: a hardware trial writes its drive as drive.npz")
     if sweep is not None:
         raise ValueError("hardware: a sweep; must be one trial at a time")
     hardware_trial(settings, modules, output)

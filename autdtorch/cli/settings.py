@@ -34,6 +34,7 @@ _SETTINGS = (
     "seed",
     "plane_spacing",
     "poses",
+    "drive",
     "explore",
 )
 _PLACES = ("modules", "output")  # settings that change no result

@@ -17,12 +17,15 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from autdtorch.cli.poses import Poses, along_path
-from autdtorch.cli.settings import folder_of, load_method, scene_of, section_of, solver_of
+from autdtorch.cli.settings import folder_of, is_given, load_method, scene_of, section_of, solver_of
+from autdtorch.hardware import DEVICES
+from autdtorch.io.drive_file import save_drive
 from autdtorch.io.goal_section import load_goal
 from autdtorch.propagators import CACHE_VARIABLE
 from autdtorch.scene.scene import Scene
 from autdtorch.study.results import StudyResult, summary_rows
 from autdtorch.study.run import StudyMethod, name_of, run_study
+from autdtorch.utils.validation import require_one_of
 
 _HELP = """autdtorch collect FOLDER [modules=NAME]
 
@@ -31,17 +34,29 @@ Merges the finished studies in a folder and below it, such as those of a sweep i
 of one's own, which the module NAME defines."""
 
 
-def study(settings: dict[str, Any], modules: list[Any], output: Any, sweep: Path | None) -> None:
-    """Run a study; `sweep` is the folder of the sweep that the job belongs to, if any."""
+def study(
+    settings: dict[str, Any], modules: list[Any], output: Any, sweep: Path | None, drive: Any = None
+) -> None:
+    """Run a study.
+
+    Args:
+        settings: of the study.
+        modules: that the user trusts.
+        output: folder of the results, outside a sweep.
+        sweep: the folder of the sweep that the job belongs to, if any.
+        drive: "full" or the name of a device, to write the best drives to files; None for no files.
+    """
     solver = solver_of(settings)
     folder = folder_of("output", output) if sweep is None else Path(HydraConfig.get().runtime.output_dir)
     if solver.get("cache") is None and CACHE_VARIABLE not in os.environ:
-        # A study that goes on needs them again, and jobs in one scene share them.
-        solver["cache"] = (sweep or folder) / "matrices"
+        # A study that goes on needs them again, and jobs or runs of several methods in one scene share them.
+        usual = folder if is_given("output") or len(folder.parts) == 1 else folder.parent
+        solver["cache"] = (sweep or usual) / "matrices"
     settings["solver"] = {key: value for key, value in solver.items() if key != "cache"}  # changes no result
     poses = None if settings.get("poses") is None else along_path(settings)
     scenes, methods = _parts(settings, modules)
     goal = load_goal("goal", settings.get("goal"))
+    device = _device_of(drive, scenes)
     results = run_study(
         scenes,
         methods,
@@ -52,6 +67,8 @@ def study(settings: dict[str, Any], modules: list[Any], output: Any, sweep: Path
         config=_as_text(settings, scenes),
         poses=poses is not None,
     )
+    if drive is not None:
+        _save_drives(results, scenes, folder, device)
     shown = Path(os.path.relpath(folder))  # shorter, and equal on every machine
     if poses is not None:
         _draw_poses(results, poses, folder)
@@ -121,6 +138,28 @@ def _as_text(settings: Mapping[str, Any], scenes: Mapping[str, Scene]) -> str:
         if paths:
             files[name] = [hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in paths]
     return OmegaConf.to_yaml(OmegaConf.create({**settings, **({"files": files} if files else {})}))
+
+
+def _device_of(drive: Any, scenes: Mapping[str, Scene]) -> str | None:
+    """Return the device whose levels the files of drives have; None for full precision."""
+    if drive is None or drive == "full":
+        return None
+    require_one_of("drive", drive, ("full", *DEVICES))
+    for name, scene in scenes.items():
+        if len(scene.array) % (board := DEVICES[drive].board):
+            count = f"{len(scene.array)} transducers of the scene {name}"
+            raise ValueError(f"drive: {drive!r}, {count}; must be a multiple of {board}, or drive=full")
+    return str(drive)
+
+
+def _save_drives(results: StudyResult, scenes: Mapping[str, Scene], folder: Path, device: str | None) -> None:
+    """Write the drive of the best trial of each method in each scene."""
+    single = len(scenes) == 1 and all(len(scene.methods) == 1 for scene in results.scenes.values())
+    for name, result in results.scenes.items():
+        for method, own in result.methods.items():
+            best = own.solution.drive[int(own.solution.score.argmax())]
+            path = folder / ("drive.csv" if single else f"drive_{name}_{method}.csv")
+            save_drive(path, best, scenes[name].array, device)
 
 
 def _draw_plane(results: StudyResult, scenes: Mapping[str, Scene], folder: Path) -> None:

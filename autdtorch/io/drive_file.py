@@ -221,7 +221,8 @@ def _plain(drive: torch.Tensor, array: TransducerArray) -> tuple[dict[str, Any],
     columns["radius [m]"] = radii_of(array).numpy()
     columns = _numbered(columns, drive)
     flat = drive.flatten()
-    columns |= {"phase [rad]": phases_of(flat).numpy(), "amplitude": amplitudes_of(flat).numpy()}
+    amplitudes = amplitudes_of(flat).clamp(max=1.0)  # rounding may exceed 1, which is refused when read
+    columns |= {"phase [rad]": phases_of(flat).numpy(), "amplitude": amplitudes.numpy()}
     arrays = {"drive": drive.numpy(), "positions": positions, "normals": normals}
     return columns, arrays | {name: np.asarray(getattr(array, name)) for name in SIZE_COLUMNS}
 

@@ -192,12 +192,12 @@ def median_trial(score: torch.Tensor) -> int:
 def summary_rows(results: StudyResult) -> list[list[str]]:
     """Return a table of the metrics, header first: mean over the trials ± standard deviation.
 
-    The score has a column where it is not the pressure of the weakest focus, as in the paper. The numbers of
-    a column have equal decimals.
+    The score has a column where it is not the pressure of the weakest focus, as in the paper. The last column
+    has the mean score over the bound of the scene. The numbers of a column have equal decimals.
     """
     scored = any(scene.goal != PAPERS_GOAL for scene in results.scenes.values())
     head = ["scene", "method", "trials", *(["score"] if scored else [])]
-    rows = [[*head, "mean [Pa]", "weakest [Pa]", "std [Pa]", "area [mm²]", "evaluations"]]
+    rows = [[*head, "mean [Pa]", "weakest [Pa]", "std [Pa]", "area [mm²]", "evaluations", "of the bound"]]
     scores = column_decimals(results, lambda method: method.solution.score)
     pressures = column_decimals(results, lambda method: method.metrics.mean)
     areas = column_decimals(results, lambda method: _square_mm(method.metrics.area))
@@ -208,7 +208,10 @@ def summary_rows(results: StudyResult) -> list[list[str]]:
             numbers = [_over_trials(values, pressures) for values in (metrics.mean, metrics.min, metrics.std)]
             numbers.append("none" if area is None else _over_trials(area, areas))
             evaluations = f"{method.solution.evaluations.double().mean():.0f}"
-            rows.append([scene_name, label_of(name), str(method.trials), *score, *numbers, evaluations])
+            share = _share_of_bound(scene, float(method.solution.score.mean()))
+            rows.append(
+                [scene_name, label_of(name), str(method.trials), *score, *numbers, evaluations, share]
+            )
     return rows
 
 
@@ -221,6 +224,13 @@ def column_decimals(
         values = [value for method in scene.methods.values() if (value := quantity(method)) is not None]
         found.append(decimals_of((float(value.abs().max()) for value in values), digits))
     return max(found)
+
+
+def _share_of_bound(scene: SceneResult, score: float) -> str:
+    """Return the share of a score in the bound of its scene, and the bound; "none" where it has no such."""
+    if not (math.isfinite(scene.bound) and scene.bound > 0 and score >= 0):
+        return "none"
+    return f"{100 * score / scene.bound:.1f} % of {scene.in_unit(f'{scene.bound:.4g}')}"
 
 
 def _square_mm(area: torch.Tensor | None) -> torch.Tensor | None:

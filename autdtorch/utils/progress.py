@@ -23,6 +23,11 @@ from autdtorch.utils.forks import in_forked
 logger = logging.getLogger(__name__)
 
 _PATIENCE = 3.0  # time after which the bar or the first forecast in the log appears [s]
+_MOST_POINTS = 1000  # times that are kept
+_BAR = (
+    "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"  # tqdm's forecast: of means
+)
+_UNSURE = 1.5  # ratio of two forecasts, from which both are told
 _asked: ContextVar[Callable[[], bool]] = ContextVar("asked to stop", default=lambda: False)
 
 in_forked(lambda: tqdm.set_lock(threading.RLock()))  # a thread that drew a bar may have held the lock
@@ -49,7 +54,7 @@ class Progress:
         """Show the progress on `bar`, or in the log if it is None; `steps` may be an estimate."""
         self._bar, self._steps, self._what, self._done = bar, steps, what, 0
         self._begun = time.monotonic()
-        self._first: tuple[float, int] | None = None  # time and number of the first steps
+        self._points: list[tuple[float, int]] = []  # times after advances, with the number of steps
         self._next = _PATIENCE
         self._lock = threading.Lock()  # several threads run simulations
         self._asked = _asked.get()  # those threads have another context
@@ -76,19 +81,42 @@ class Progress:
             raise Stopped
         with self._lock:
             self._done += steps
+            now = time.monotonic()
+            self._points.append((now, self._done))
+            if len(self._points) > _MOST_POINTS:
+                self._points = [*self._points[:-1:2], self._points[-1]]
             if self._bar is not None:
                 self._bar.total = max(self._bar.total, self._done)
+                self._bar.set_postfix_str(self._forecast(), refresh=False)
                 self._bar.update(steps)
                 return
-            now = time.monotonic()
-            if self._first is None:  # the time before may include compiling kernels
-                self._first = now, self._done
-            begun, done = self._first
             spent = now - self._begun
-            if spent >= self._next and done < self._done < self._steps:
-                left = (now - begun) * (self._steps - self._done) / (self._done - done)
-                logger.info("%s: %.0f s so far, about %.0f s left", self._what, spent, left)
+            if spent >= self._next and self._done < self._steps and (left := self._forecast()):
+                logger.info("%s: %.0f s so far, %s", self._what, spent, left)
                 self._next = 4 * spent  # ever fewer lines
+
+    def _forecast(self) -> str:
+        """Return the time left as text; nothing before it is known.
+
+        The remaining steps take as long as those of the later half so far, or become slower along the line
+        through both halves; where these differ much, both are told.
+        """
+        left = self._steps - self._done
+        if left < 0:
+            return "longer than expected"
+        (begun, first), (now, done) = self._points[0], self._points[-1]
+        if done == first:  # the time before the first may include compiling kernels
+            return ""
+        middle, half = min(self._points, key=lambda point: abs(point[1] - (first + done) / 2))
+        if not first < half < done:
+            return f"about {left * (now - begun) / (done - first):.0f} s left"
+        early, late = (middle - begun) / (half - first), (now - middle) / (done - half)
+        growth = max(0.0, late - early) / ((done - first) / 2)  # of the time of a step, by each step
+        least = left * late
+        most = least + left * growth * (done - half + left) / 2
+        if most < _UNSURE * least:
+            return f"about {(least + most) / 2:.0f} s left"
+        return f"about {least:.0f} to {most:.0f} s left"
 
 
 def is_terminal(stream: Any) -> bool:
@@ -113,6 +141,7 @@ def show_progress(steps: int, what: str = "") -> Iterator[Progress]:
         tqdm(
             desc=what, total=steps, file=sys.stderr, dynamic_ncols=True, delay=_PATIENCE,
             leave=None,  # the outermost bar stays
+            bar_format=_BAR,
         ) as bar,
     ):  # fmt: skip
         yield Progress(steps, what, bar)

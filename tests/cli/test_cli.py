@@ -19,7 +19,7 @@ import autdtorch.study.run
 from autdtorch.cli.config_files import CONFIGS
 from autdtorch.cli.settings import load_method
 from autdtorch.hardware import DEVICES, Limits
-from autdtorch.io.drive_file import save_drive
+from autdtorch.io.drive_file import load_drive, save_drive
 from autdtorch.io.goal_section import GOALS, load_goal
 from autdtorch.io.scene_file import load_scene
 from autdtorch.methods.base import Method
@@ -211,6 +211,37 @@ def test_a_launcher_that_is_not_installed_names_its_extra(launcher, refused, mon
     monkeypatch.setattr(autdtorch.cli.arguments, "find_spec", lambda _: None)
     line = refused("-m", "scene=homogeneous", f"hydra/launcher={launcher}")
     assert re.match(rf"autdtorch: hydra/launcher: '{launcher}'; needs the extra cluster: pip install", line)
+
+
+def test_runs_of_other_methods_in_a_scene_simulate_its_matrix_once(run, tmp_path, capsys):
+    words = ("scene=two_cubes", "solver.spacing=2e-3", "plane_spacing=0.05")
+    shares = []
+    for method, runs in (("lss", 2), ("gradient", 1)):  # the observation plane is simulated each time
+        assert run(*words, f"method={method}", "drive=full") == 0
+        captured = capsys.readouterr()
+        assert f"box, {runs} run" in captured.err
+        shares.append(float(re.search(r"([\d.]+) % of [\d.]+ Pa", captured.out)[1]))
+        folder = tmp_path / "outputs" / f"two_cubes_{method}"
+        found = load_results(folder).scenes["two_cubes"]
+        (solution,) = (own.solution for own in found.methods.values())
+        assert shares[-1] == pytest.approx(100 * float(solution.score) / found.bound, abs=0.051)
+        np.testing.assert_allclose(load_drive(folder / "drive.csv"), solution.drive[0], atol=1e-12)
+    assert shares[0] < shares[1] <= 100
+    assert len(list((tmp_path / "outputs" / "matrices").iterdir())) == 1
+
+
+def test_the_best_drive_is_written_as_the_levels_of_a_device(run, refused, tmp_path):
+    array = "scene.array={type: sonicsurface, center: [1e-3, 50e-3, 50e-3]}"
+    words = ("scene=homogeneous", "method=random", "method.evaluations=2", "trials=3", "plane_spacing=0.05")
+    wide = ("~scene.array", f"+{array}", "~scene.domain", *words)
+    assert run(*wide, "drive=sonicsurface", "output=out") == 0
+    (own,) = load_results(tmp_path / "out").scenes["homogeneous"].methods.values()
+    best = own.solution.drive[int(own.solution.score.argmax())]
+    np.testing.assert_array_equal(
+        load_drive(tmp_path / "out" / "drive.csv"), DEVICES["sonicsurface"].quantised(best)
+    )
+    assert "drive: 'autd3'" in refused(*words, "drive=autd3")
+    assert "did you mean 'autd3'" in refused(*words, "drive=audt3")
 
 
 @pytest.mark.filterwarnings("always")

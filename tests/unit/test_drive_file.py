@@ -158,3 +158,10 @@ def test_a_drive_that_is_not_the_devices_is_refused(tmp_path, changes, message):
     given = {"path": "d.csv", "drive": torch.ones(16) + 0j, "array": array} | changes
     with pytest.raises(ValueError, match=message):
         save_drive(**given | {"path": tmp_path / given["path"]})
+
+
+def test_an_amplitude_beyond_1_by_rounding_is_read_again(tmp_path):
+    array = TransducerArray.grid((2, 2), 10e-3, (0, 0, 0))
+    drive = torch.polar(torch.full((4,), 1 + 1e-9, dtype=torch.float64), torch.arange(4, dtype=torch.float64))
+    save_drive(tmp_path / "drive.csv", drive, array)
+    torch.testing.assert_close(load_drive(tmp_path / "drive.csv"), drive, rtol=0, atol=1e-8)

@@ -118,3 +118,42 @@ def test_work_beside_is_not_stopped():
     with progress.stopping_when(lambda: True), pytest.raises(progress.Stopped):
         at.make_propagator(small_scene((CUBE,)), "box", 2.5e-3, cache=False).transfer_matrix()
     assert at.make_propagator(small_scene((CUBE,)), "box", 2.5e-3, cache=False).transfer_matrix().any()
+
+
+def forecasts_of(clock, caplog, cost, count):
+    """Return least and most of each forecast, and the truth [s], for steps that take `cost(step)` seconds."""
+    times = [cost(step) for step in range(count)]
+    found = []
+    caplog.set_level(logging.INFO)
+    with progress.show_progress(count, "work") as shown:
+        for step, seconds in enumerate(times):
+            clock.now += seconds
+            before = len(told(caplog))
+            shown.advance(1)
+            for line in told(caplog)[before:]:
+                ends = re.search(r"about (\d+)(?: to (\d+))? s left", line)
+                found.append((float(ends[1]), float(ends[2] or ends[1]), sum(times[step + 1 :])))
+    return found
+
+
+@pytest.mark.parametrize(
+    "cost",
+    [
+        lambda step: 1.0,
+        lambda step: 0.01 + 0.02 * step,  # a process of ever more evaluations
+        lambda step: 0.1 if step < 16 else 1.0,  # the first evaluations need no process
+        lambda step: 1.5 if step % 2 else 0.5,
+    ],
+    ids=["even", "growing", "later slow", "in turns"],
+)
+def test_a_forecast_holds_the_truth(clock, caplog, cost):
+    found = forecasts_of(clock, caplog, cost, 200)
+    assert len(found) >= 3
+    for least, most, truth in found:
+        assert 0.65 * least <= truth <= 1.6 * most
+
+
+def test_work_beyond_its_estimate_has_no_forecast(clock, caplog):
+    lines = lines_of(clock, caplog, 10, [(1, 1)] * 60)
+    assert lines
+    assert not any("about 0 s" in line for line in lines)
