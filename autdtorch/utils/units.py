@@ -24,7 +24,7 @@ _TURN = 2 * math.pi * (1 + 1e-9)  # [rad], with room for rounding
 
 
 class ScaleWarning(UserWarning):
-    """A quantity seems to be in another unit, or of another frequency, than the scene's: mm, kHz, degrees."""
+    """A quantity seems to be in another unit or of another frequency than the scene's, or a unit was guessed."""
 
 
 def warn_user(text: str, category: type[Warning] = ScaleWarning) -> None:
