@@ -34,7 +34,6 @@ logger = logging.getLogger(__name__)
 SENSITIVITIES = (1e-9, 1e3)
 #: Frequencies that an oscilloscope may capture [Hz].
 FREQUENCIES = (1.0, 1e9)
-_LARGEST_VOLTAGE = 1e3  # that an input may have to take [V]
 _PERIODS_A_DIVISION = 5  # 50 or 60 on a screen, 20 samples each
 _CAPTURE_TIME = 2.0  # time limit of a capture [s]
 _QUIET = 5  # standard errors
@@ -52,7 +51,7 @@ class Microphone:
     Attributes:
         input: number of the oscilloscope's input, from 1.
         sensitivity: of the microphone at the drive frequency [V/Pa]; with the amplifier 1e-9 to 1e3.
-        loudest: largest amplitude that the input must take [Pa]; up to 1000 V.
+        loudest: largest amplitude that the input must take [Pa]; up to 17.5 V.
         gain: of the amplifier between, as a factor.
 
     `ValueError` for an attribute out of range.
@@ -70,8 +69,11 @@ class Microphone:
         positive("loudest", self.loudest, "Pa")
         positive("gain", self.gain)
         number_between("sensitivity * gain", self._volts, *SENSITIVITIES, "V/Pa")
-        if self._volts * self.loudest > _LARGEST_VOLTAGE:
-            accepted = f"must be <= {_LARGEST_VOLTAGE / self._volts:.3g}, {_LARGEST_VOLTAGE:g} V at the input"
+        most = _DIVISIONS * scpi.COARSEST
+        if self._volts * self.loudest > most:
+            accepted = (
+                f"must be <= {most / self._volts:.3g}, which gives {most:g} V at the input; lower the gain"
+            )
             raise invalid("loudest", self.loudest, accepted, "Pa")
 
     @property

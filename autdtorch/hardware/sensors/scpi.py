@@ -13,6 +13,8 @@ from autdtorch.hardware.transport.port import LinkError
 
 #: Finest vertical scale of both makers [V/division].
 FINEST = 1e-3
+#: Coarsest vertical scale that both makers have [V/division].
+COARSEST = 5.0
 #: Commands of both makers: of an input, with its vertical scale, and for its waveform.
 SET_UP_INPUT = (
     ":CHANnel{input}:DISPlay ON",
