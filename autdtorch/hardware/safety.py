@@ -228,8 +228,10 @@ class LimitedLink:
             LimitError: the outputs went off meanwhile; a reading that goes on is interrupted, as
                 `checked_reading` does.
             SensorError: the sensor gives no trustworthy reading.
-            ValueError: the reading is not P finite magnitudes.
+            ValueError: no sensor, `points` below 1, or a reading that is not P finite magnitudes.
         """
+        require_kind("sensor", sensor, Sensor)
+        points = integer_at_least("points", points, 1)
         self.require_on()
         try:
             found = checked_reading(sensor, points, self._on_until - time.monotonic() + _GRACE)
