@@ -1,4 +1,8 @@
-"""The state of a method in a file: plain NumPy arrays and a line of JSON, so that reading it runs no code."""
+"""The state of a method in a file: plain NumPy arrays and a line of JSON, so that reading it runs no code.
+
+The line holds a version of the format, what the state is of, and a digest of every array, so that nothing but
+what `save_state` has written goes on.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,7 @@ import dataclasses
 import io
 import json
 import os
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,13 +18,15 @@ import torch
 
 from autdtorch.methods.base import Method, Problem, State
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal
+from autdtorch.objectives.goals import Goal
+from autdtorch.utils.array_types import AnyArray
 from autdtorch.utils.digest import digest_of
 from autdtorch.utils.files import replace_file
 from autdtorch.utils.numpy_file import read_arrays
-from autdtorch.utils.validation import path_of, require_kind
+from autdtorch.utils.validation import invalid, path_of, require_kind, within
 
-_BEST, _SEARCH, _ORIGIN = "best.", "search.", "origin"
+_BEST, _SEARCH, _HEADER = "best.", "search.", "header"
+_VERSION = 2  # of the format; a new one where `State`, or what a method keeps in `search`, changes
 _COLUMNS = tuple(field.name for field in dataclasses.fields(Solution))
 
 
@@ -41,7 +48,9 @@ def save_state(path: str | os.PathLike[str], method: Method, state: State) -> No
     tensors |= {f"{_BEST}{name}": getattr(state.best, name) for name in _COLUMNS}
     tensors |= {f"{_SEARCH}{name}": tensor for name, tensor in state.search.items()}
     arrays: dict[str, Any] = {name: tensor.numpy() for name, tensor in tensors.items()}
-    arrays[_ORIGIN] = np.array(_origin(method, state.problem))
+    digests = {name: digest_of(array.shape, array) for name, array in arrays.items()}
+    header = [_VERSION, _origin(method, state.problem), digests]
+    arrays[_HEADER] = np.array(json.dumps([*header, digest_of(*header)]))
     content = io.BytesIO()
     np.savez(content, **arrays)
     replace_file(path_of("path", path), content.getvalue())
@@ -57,59 +66,52 @@ def load_state(path: str | os.PathLike[str], method: Method, problem: Problem) -
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: a damaged file, or the state of another method or problem. The message names the file.
+        ValueError: the state of another method or problem, a file of another version of the format, or one
+            that is not as `save_state` wrote it. The message names the file and the field.
     """
     require_kind("method", method, Method)
     require_kind("problem", problem, Problem)
     arrays = read_arrays(path_of("path", path))
-    origin = _origin(method, problem)
-    if (found := str(arrays.pop(_ORIGIN, ""))) != origin:
-        raise ValueError(f"{os.fspath(path)}: state of {found or 'nothing'}; must be of {origin}")
+    with within(os.fspath(path)):
+        _require_as_saved(arrays, arrays.pop(_HEADER, None), _origin(method, problem))
+    tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    best = Solution(**{name: tensors[f"{_BEST}{name}"] for name in _COLUMNS})
+    search = {
+        name.removeprefix(_SEARCH): tensor for name, tensor in tensors.items() if name.startswith(_SEARCH)
+    }
+    seeds = tuple(map(int, arrays["seeds"]))
+    return State(method, problem, seeds, tensors["trials"], tensors["drives"], search, best)
+
+
+def _require_as_saved(arrays: Mapping[str, AnyArray], header: AnyArray | None, origin: str) -> None:
+    """Check the header of a file: its version, what it is the state of, and the digest of each array."""
+    if header is None:
+        raise ValueError("header: missing; must be a file of save_state, of this version of autdtorch")
     try:
-        tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
-        best = Solution(**{name: tensors[f"{_BEST}{name}"] for name in _COLUMNS})
-        search = {
-            name.removeprefix(_SEARCH): tensor for name, tensor in tensors.items() if name.startswith(_SEARCH)
-        }
-        seeds = tuple(map(int, arrays["seeds"]))
-        state = State(method, problem, seeds, tensors["trials"], tensors["drives"], search, best)
-        _require_consistent(state)
-    except (KeyError, TypeError, IndexError, ValueError) as error:
-        raise ValueError(f"{os.fspath(path)}: {error}; must be a file of save_state") from error
-    return state
+        version, written, digests, digest = json.loads(str(header))
+        whole = digest == digest_of(version, written, digests)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise invalid("header", str(header), "must be as save_state wrote it") from error
+    if version != _VERSION:
+        raise invalid("header: version", version, f"must be {_VERSION}, the one that this autdtorch writes")
+    if not whole:
+        raise ValueError("header: changed; must be as save_state wrote it")
+    if written != origin:
+        raise ValueError(f"state of {written}; must be of {origin}")
+    missing = [f"{name}: missing" for name in digests if name not in arrays]
+    found = {name: digest_of(array.shape, array) for name, array in arrays.items()}
+    changed = [f"{name}: changed" for name, digest in found.items() if digest != digests.get(name)]
+    if missing or changed:
+        raise ValueError(f"{', '.join(missing + changed)}; must be as save_state wrote it")
 
 
 def _origin(method: Method, problem: Problem) -> str:
-    """Return method, settings, size, goal and start of a problem as JSON; of a tensor, its digest.
-
-    The paper's goal, and no start, are left out: older files do not name them.
-    """
+    """Return method, settings, size, goal and start of a problem as JSON; of a tensor, its digest."""
     settings = dataclasses.asdict(method)
     prior = settings.get("prior")
     if prior is not None and prior["transfer_matrix"] is None:  # then it is that of the problem
         prior["transfer_matrix"] = problem.transfer_matrix
     goal = problem.goal
     named = repr(goal) if isinstance(goal, Goal) else getattr(goal, "__qualname__", type(goal).__name__)
-    goals = [] if goal == WEAKEST_FOCUS else [named]
-    starts = [] if problem.start is None else [problem.start]
-    parts = [method.name, settings, problem.transducers, problem.foci, *goals, *starts]
+    parts = [method.name, settings, problem.transducers, problem.foci, named, problem.start]
     return json.dumps(parts, default=digest_of)
-
-
-def _require_consistent(state: State) -> None:
-    """Check the shapes and types of what all methods share."""
-    count, transducers, foci = len(state.seeds), state.problem.transducers, state.problem.foci
-    evaluations = state.best.history.shape[-1]
-    wanted = {
-        "trials": (state.trials, (len(state.trials),), torch.int64),
-        "drives": (state.drives, (len(state.trials), state.drives.shape[1], transducers), torch.complex128),
-        "drive": (state.best.drive, (count, transducers), torch.complex128),
-        "pressure": (state.best.pressure, (count, foci), torch.float64),
-        "score": (state.best.score, (count,), torch.float64),
-        "evaluations": (state.best.evaluations, (count,), torch.int64),
-        "history": (state.best.history, (count, evaluations), torch.float64),
-    }
-    for name, (tensor, shape, dtype) in wanted.items():
-        if tensor.shape != shape or tensor.dtype != dtype:
-            found = f"{tensor.dtype} of shape {tuple(tensor.shape)}"
-            raise ValueError(f"{name}: {found}; must be {dtype} of shape {shape}")

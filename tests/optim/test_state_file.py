@@ -1,0 +1,121 @@
+"""Files of states: what was changed in them is refused, and named."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import autdtorch as at
+from autdtorch.methods.catalogue import METHODS
+
+GUESS = torch.randn(2, 4, dtype=torch.complex128, generator=torch.Generator().manual_seed(1))
+FOCI = {"model": "foci", "kernel": "phasor", "noise": "inferred"}
+SMALL = [
+    at.GABS(levels=3),
+    at.LSSG(levels=3),
+    at.LSS(),
+    at.RandomSearch(evaluations=70),
+    at.Identify(evaluations=13),
+    at.Identify(evaluations=4, prior=at.Prior(GUESS)),
+    at.BayesOpt(evaluations=7, initial=4),
+    at.BayesOpt(evaluations=3, prior=at.Prior(GUESS), **FOCI),
+    at.GradientAscent(starts=2, steps=5),
+    at.Holography("gs"),
+]
+
+
+@pytest.fixture(scope="module")
+def states(make_objective, random_matrix, tmp_path_factory):
+    """Every method, its problem, and the arrays of its state before and after the first evaluations."""
+    objective, folder = make_objective(random_matrix(2, 4, 0)), tmp_path_factory.mktemp("states")
+    found, problem = [], at.Problem.of(objective)
+    for method in SMALL:
+        state = method.start(problem, seed=0)
+        for _ in range(2):
+            if not state.done:
+                at.save_state(folder / "state.npz", method, state)
+                with np.load(folder / "state.npz") as file:
+                    found.append((method, problem, dict(file)))
+                state = method.tell(state, objective(method.ask(state)))
+    return found
+
+
+def test_every_method_is_here(states):
+    assert {method.name for method, _, _ in states} == set(METHODS)
+    assert len(states) > len(SMALL)
+
+
+def removed(array, draw):
+    return None
+
+
+def of_another_type(array, draw):
+    other = {"f": "f4", "c": "c8", "i": "i4", "u": "i8", "b": "i8"}.get(array.dtype.kind, "S9000")
+    return array.astype(draw(st.sampled_from([other, "U40"])))
+
+
+def of_another_shape(array, draw):
+    return draw(st.sampled_from([array[None], np.repeat(array[None], 2, axis=0), array.reshape(-1)[:0]]))
+
+
+def of_another_value(array, draw):
+    changed = array.reshape(-1).copy()
+    at_index = draw(st.integers(0, changed.size - 1))
+    kind = changed.dtype.kind
+    other = {"f": [np.nan, np.inf, -1e300], "c": [np.nan, 1e300, 5j]}.get(kind, [0, 1, -1, 127])
+    value = np.array(draw(st.sampled_from(other))).astype(changed.dtype)
+    if kind == "U" or np.array_equal(value, changed[at_index], equal_nan=kind in "fc"):
+        return None
+    changed[at_index] = value
+    return changed.reshape(array.shape)
+
+
+DAMAGES = [removed, of_another_type, of_another_shape, of_another_value]
+
+
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_a_field_that_was_changed_is_refused_by_its_name(states, tmp_path, data):
+    method, problem, arrays = data.draw(st.sampled_from(states))
+    name = data.draw(st.sampled_from(sorted(arrays)))
+    damage = data.draw(st.sampled_from(DAMAGES))
+    damaged = dict(arrays)
+    if (array := damage(arrays[name], data.draw) if arrays[name].size else None) is None:
+        del damaged[name]
+    else:
+        damaged[name] = array
+    np.savez(tmp_path / "state.npz", **damaged)
+    with pytest.raises(ValueError, match=rf"state\.npz: .*{name}") as refused:
+        at.load_state(tmp_path / "state.npz", method, problem)
+    assert "\n" not in str(refused.value)
+
+
+@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_a_header_that_was_changed_is_refused(states, tmp_path, data):
+    method, problem, arrays = data.draw(st.sampled_from(states))
+    header = json.loads(str(arrays["header"]))
+    place = data.draw(st.integers(0, len(header) - 1))
+    header[place] = data.draw(st.sampled_from([None, 1, "", [], {}, {"drives": "0"}, [[header[0]]]]))
+    damaged = {**arrays, "header": np.array(json.dumps(header))}
+    np.savez(tmp_path / "state.npz", **damaged)
+    with pytest.raises(ValueError, match=r"state\.npz: (header|state of)"):
+        at.load_state(tmp_path / "state.npz", method, problem)
+
+
+def test_a_file_of_an_older_version_is_refused(states, tmp_path):
+    method, problem, arrays = states[0]
+    older = {name: array for name, array in arrays.items() if name != "header"}
+    np.savez(tmp_path / "state.npz", origin=np.array("[]"), **older)
+    with pytest.raises(ValueError, match="header: missing; must be .* of this version"):
+        at.load_state(tmp_path / "state.npz", method, problem)
+
+
+def test_fields_that_nobody_saved_are_refused(states, tmp_path):
+    method, problem, arrays = states[0]
+    np.savez(tmp_path / "state.npz", **{**arrays, "search.more": np.zeros(2)})
+    with pytest.raises(ValueError, match=r"search\.more: changed"):
+        at.load_state(tmp_path / "state.npz", method, problem)
