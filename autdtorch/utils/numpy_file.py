@@ -16,6 +16,7 @@ from numpy.lib import format as npy
 
 from autdtorch.utils.array_types import AnyArray
 from autdtorch.utils.files import replacing
+from autdtorch.utils.values import within
 
 _LARGEST = 2**30  # [bytes] of unpacked arrays; a small file can hold many zeros
 _LONGEST_HEADER = 1000  # [bytes]; NumPy writes 128 for plain arrays
@@ -48,8 +49,9 @@ def read_arrays(path: str | os.PathLike[str]) -> dict[str, AnyArray]:
                 raise ValueError(f"{size} bytes, more than {_LARGEST}")
             arrays = {}
             for member in members:
-                with archive.open(member) as file:
-                    arrays[member.filename.removesuffix(".npy")] = _read(file, member.file_size)
+                name = member.filename.removesuffix(".npy")
+                with archive.open(member) as file, within(name):
+                    arrays[name] = _read(file, member.file_size)
             return arrays
     except (*_DAMAGE, *_ARCHIVE_DAMAGE) as error:
         raise ValueError(f"{os.fspath(path)}: {error}; must hold plain NumPy arrays") from error
