@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import numbers
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, NamedTuple, TypeAlias
 
@@ -12,7 +13,7 @@ import numpy as np
 import torch
 
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal, goal_of
+from autdtorch.objectives.goals import WEAKEST_FOCUS, Goal, goal_of, scores_of
 from autdtorch.objectives.objective import (
     Objective,
     Score,
@@ -34,6 +35,8 @@ from autdtorch.utils.validation import (
     within,
 )
 
+logger = logging.getLogger(__name__)
+
 Trials: TypeAlias = int | Sequence[int]
 """A number of trials T, or the numbers of the T trials to run, so that a study can run them in blocks."""
 
@@ -41,6 +44,9 @@ TRIAL_BYTES = 6_000.0
 """Memory of a trial [bytes]; most of it is the state of its random generator."""
 
 _LOUDEST = 1e9  # Largest pressure [Pa] that is no error of a program; air has 1e5 Pa
+
+_LONE = 3.0  # ratio of the highest score to the next one above which it may be an outlier
+_COMPARED = 8  # scores from which on this is looked at
 
 NEAR_TIE = 1e-5
 """Relative difference below which scores count as equal. Symmetric scenes have many equal scores, and the
@@ -294,11 +300,13 @@ class Method(ABC):
             accepted = f"must be a magnitude from 0 to {_LOUDEST:g}, not a level in dB or a signed sample"
             raise invalid(f"{name}{place}", value, accepted, "Pa")
         pressure = pressure.reshape(*batch, -1)
-        score = _real("score", state.problem.goal(pressure), batch)
+        score = scores_of(state.problem.goal, pressure).detach().cpu()
         state = replace(state, best=_improved(state, pressure, score))
         step = self.advance(state, pressure, score)
         trials = state.trials if step.goes_on is None else state.trials[step.goes_on]
-        return replace(state, trials=trials, drives=step.drives, search=step.search)
+        state = replace(state, trials=trials, drives=step.drives, search=step.search)
+        self._log_doubts(state)
+        return state
 
     def best(self, state: State) -> Solution:
         """Return the best drive of each trial so far; `ValueError` before the first evaluation."""
@@ -309,6 +317,25 @@ class Method(ABC):
         missing = max(0, self.most_evaluations(state.problem) - history.shape[1]) if state.done else 0
         history = torch.cat([history, history[:, -1:].expand(-1, missing)], dim=1)
         return replace(state.best, drive=state.problem.quantise(state.best.drive), history=history)
+
+    def _doubts(self, state: State, trial: int) -> Iterator[str]:
+        """Describe what is doubtful about the readings of a trial after `tell`: a lone highest score."""
+        score = state.best.history[trial]
+        score = score[score.isfinite()]
+        if state.done and len(score) >= _COMPARED:
+            second, first = score.topk(2).values.flip(0).tolist()
+            if 0 < _LONE * second < first:
+                which = f"the score {first:.3g} of evaluation {int(score.argmax())}, counted from 0,"
+                yield f"{which} is {first / second:.3g} times the next highest: observe its drive again"
+
+    def _log_doubts(self, state: State) -> None:
+        """Log in one line what is doubtful about the first of the trials that have doubtful readings."""
+        doubts = [(trial, "; ".join(self._doubts(state, trial))) for trial in range(len(state.seeds))]
+        doubtful = [(trial, doubt) for trial, doubt in doubts if doubt]
+        if doubtful:
+            trial, doubt = doubtful[0]
+            more = f" ({len(doubtful) - 1} more trials have doubtful readings)" if len(doubtful) > 1 else ""
+            logger.warning("%s, trial %d: %s%s", self.label, trial, doubt, more)
 
     def _require_own(self, state: State) -> None:
         require_kind("state", state, State)

@@ -17,7 +17,7 @@ from autdtorch.methods.base import Method, Problem, Step, Trials, generators_of,
 from autdtorch.methods.driver import run
 from autdtorch.methods.solution import Solution
 from autdtorch.objectives.bound import checked_matrix
-from autdtorch.objectives.goals import WEAKEST_FOCUS, slope_of
+from autdtorch.objectives.goals import WEAKEST_FOCUS, scores_of, slope_of
 from autdtorch.objectives.objective import Objective, Score
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.threads import one_library_thread
@@ -114,7 +114,7 @@ def random_drives(count: int, transducers: int, generator: torch.Generator) -> t
 def climb(goal: Score, matrix: torch.Tensor, drive: torch.Tensor, steps: int) -> torch.Tensor:
     """Return the highest drive (M,) of the climbs of a goal from drives (S, M), on one matrix (P, M)."""
     drive = climbed(goal, matrix, drive, steps)
-    return drive[goal(_pressure(matrix, drive).abs()).argmax()]
+    return drive[scores_of(goal, _pressure(matrix, drive).abs()).argmax()]
 
 
 @one_library_thread()

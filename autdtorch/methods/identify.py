@@ -6,19 +6,21 @@ Enough magnitudes determine each row of the matrix up to a phase (docs/decisions
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
 
 from autdtorch.methods.base import Method, Problem, State, Step, Trials, generators_of, restored, states_of
+from autdtorch.methods.doubts import reading_doubts, sensor_doubts
 from autdtorch.methods.driver import run
 from autdtorch.methods.gradient import climb, climbed, random_drives
-from autdtorch.methods.matrix_posterior import MatrixPosterior, kept, posteriors
+from autdtorch.methods.magnitudes import Magnitudes, range_ends
+from autdtorch.methods.matrix_fits import Fit, kept, posteriors
 from autdtorch.methods.prior import Prior, best_simulated_drives, matrix_prior, prior_mean, prior_of
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.goals import WEAKEST_FOCUS
+from autdtorch.objectives.goals import WEAKEST_FOCUS, scores_of
 from autdtorch.objectives.objective import Objective, Score
 from autdtorch.utils.hints import suggesting
 from autdtorch.utils.threads import one_library_thread
@@ -30,6 +32,8 @@ _STARTS = 16  # drives from which the fitted matrix is climbed
 _CLIMB_STEPS = 300
 _SAMPLE_STEPS = 60  # of the climb on a sample of the matrix, from the best drive
 _GROWTH = 24  # a round observes one drive for so many that were observed
+_WORSE = 9.0  # median deviations of scores from the fit, 6 standard deviations, and
+_LEAST_WORSE = 0.05  # of the score, by which the last drive must be below another one not to be the solution
 
 
 @suggesting
@@ -40,7 +44,11 @@ class Identify(Method):
     Without a prior, the first max(3 M - 2, evaluations / 2) drives, or all but the last, have random phases.
     With one, the first is the best drive of the simulation. Each of the others is the best drive of a sample
     of the matrix, from its posterior (Thompson 1933). The last one is the best drive of the likeliest matrix.
-    It is the solution, since the highest of many noisy readings is a lucky one.
+    It is the solution, since the highest of many noisy readings is a lucky one; unless it reads far worse
+    than another drive whose readings the matrix explains.
+
+    Readings far from the fit of the others are left out, and readings at the end of a sensor's range are
+    taken as lower limits. Both are logged, like a sensor that does not respond to the drives.
 
     Attributes:
         evaluations: number of evaluations of a trial, > 2.3 M, or >= 2 with a prior. With fewer than 3 M - 1
@@ -88,8 +96,7 @@ class Identify(Method):
         """Observe random phases, or the best drive of the prior."""
         generators = generators_of(seeds)
         if self.prior is None:
-            most = self.most_evaluations(problem)
-            count = min(max(3 * problem.transducers - 2, most // 2), most - 1)
+            count = self._random_drives(problem)
             drives = torch.stack([random_drives(count, problem.transducers, own) for own in generators])
         else:
             drives = best_simulated_drives(self.prior, problem, generators)[:, None]
@@ -98,35 +105,64 @@ class Identify(Method):
     @one_library_thread()
     def advance(self, state: State, pressure: torch.Tensor, score: torch.Tensor) -> Step:
         """Fit the matrix, and observe the best drives of samples of it; that of the fit at the end."""
-        search = dict(state.search)
-        if "last" in search:
-            return Step(state.drives[:, :0], {**search, "pressure": pressure[:, 0], "score": score[:, 0]})
+        search, problem = dict(state.search), state.problem
         drives, observed = state.drives, pressure
         if "drives" in search:
             drives = torch.cat([search["drives"], drives], dim=1)
             observed = torch.cat([search["observed"], observed], dim=1)
+        left = self.most_evaluations(problem) - drives.shape[1] - 1
+        if left < 0:
+            search |= {"drives": drives, "observed": observed}
+            return Step(state.drives[:, :0], {**search, "answer": _answer(problem.goal, search)})
         generators = restored(search["generators"])
-        prior = None if self.prior is None else matrix_prior(self.prior, state.problem)
+        prior = None if self.prior is None else matrix_prior(self.prior, problem)
         fits = posteriors(prior, search, drives, observed, generators)
         apart = [own.clone() for own in drives]  # their products must not round by the place in memory
-        goal = state.problem.goal
-        best = torch.stack([_highest(goal, *of) for of in zip(fits, apart, generators, strict=True)])
+        best = torch.stack([_highest(problem.goal, *of) for of in zip(fits, apart, generators, strict=True)])
         search |= {"drives": drives, "observed": observed, **kept(fits)}
-        left = self.most_evaluations(state.problem) - drives.shape[1] - 1
         if left == 0:
-            return Step(best[:, None], {**search, "last": best})
+            last = problem.quantise(best)[:, None]
+            played = torch.cat([drives, last], dim=1)
+            return Step(last, {**search, "fitted": _magnitudes(fits, played)})
         count = min(left, max(1, drives.shape[1] // _GROWTH))
         each = zip(fits, apart, best, generators, strict=True)
-        chosen = torch.stack([_sampled(goal, *of, count) for of in each])
-        return Step(state.problem.quantise(chosen), {**search, "generators": states_of(generators)})
+        chosen = torch.stack([_sampled(problem.goal, *of, count) for of in each])
+        search |= {"fitted": _magnitudes(fits, drives), "generators": states_of(generators)}
+        return Step(problem.quantise(chosen), search)
 
     def best(self, state: State) -> Solution:
-        """Return the last drive of each trial once it was observed, and the best one before."""
-        found = super().best(state)
-        if not state.done:
+        """Return the solution of each trial; before the last evaluation, the best one that is no outlier."""
+        found, search = super().best(state), state.search
+        if "outliers" not in search:
             return found
-        last = state.problem.quantise(state.search["last"])
-        return replace(found, drive=last, pressure=state.search["pressure"], score=state.search["score"])
+        answer = (
+            search["answer"] if state.done else _best_believed(_believed_scores(state.problem.goal, search))
+        )
+        chosen = torch.arange(len(answer), device="cpu"), answer
+        pressure = search["observed"][chosen]
+        score = scores_of(state.problem.goal, pressure)
+        return replace(found, drive=search["drives"][chosen], pressure=pressure, score=score)
+
+    def _doubts(self, state: State, trial: int) -> Iterator[str]:
+        """Describe doubtful sensors after the random drives, in time to mend them, and all at the end."""
+        random = self.prior is None and state.best.history.shape[1] == self._random_drives(state.problem)
+        if not (random or state.done):
+            return
+        search = {name: tensor[trial] for name, tensor in state.search.items()}
+        drives, observed, fitted = search["drives"], search["observed"], search["fitted"]
+        count = len(search["outliers"])  # of readings that were fitted
+        outliers = torch.nn.functional.pad(search["outliers"], (0, 0, 0, len(drives) - count))
+        read = Magnitudes.of(observed, outliers, range_ends(drives, observed))
+        yield from sensor_doubts(drives[:count], read.first(count), fitted[:count])
+        if state.done:
+            yield from reading_doubts(observed, read, fitted, search["variance"].sqrt())
+            if int(search["answer"]) < count:
+                yield f"the last drive is far worse than the solution, evaluation {int(search['answer'])}"
+
+    def _random_drives(self, problem: Problem) -> int:
+        """Return the number of random drives of a trial without a prior."""
+        most = self.most_evaluations(problem)
+        return min(max(3 * problem.transducers - 2, most // 2), most - 1)
 
 
 @suggesting
@@ -143,23 +179,52 @@ def identify(
     return run(Identify(evaluations, prior), objective, trials, seed, score=score)
 
 
-def _highest(
-    goal: Score, fit: MatrixPosterior, drives: torch.Tensor, generator: torch.Generator
-) -> torch.Tensor:
+def _highest(goal: Score, fit: Fit, drives: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
     """Return the best drive (M,) of a fitted matrix, which was fitted to drives (N, M)."""
-    seen = drives[goal((drives @ fit.matrix.T).abs()).argmax()]
+    seen = drives[scores_of(goal, (drives @ fit.posterior.matrix.T).abs()).argmax()]
     starts = random_drives(_STARTS, len(seen), generator)
-    return climb(goal, fit.matrix, torch.cat([seen[None], starts]), _CLIMB_STEPS)
+    return climb(goal, fit.posterior.matrix, torch.cat([seen[None], starts]), _CLIMB_STEPS)
 
 
 def _sampled(
     goal: Score,
-    fit: MatrixPosterior,
+    fit: Fit,
     drives: torch.Tensor,
     best: torch.Tensor,
     generator: torch.Generator,
     count: int,
 ) -> torch.Tensor:
     """Return the best drives (count, M) of samples of the matrix, near the best of the fitted one."""
-    samples = torch.stack([fit.sample(drives, generator) for _ in range(count)])
+    samples = torch.stack([fit.posterior.sample(drives, fit.read, generator) for _ in range(count)])
     return climbed(goal, samples, best.expand(count, -1), _SAMPLE_STEPS)
+
+
+def _magnitudes(fits: Sequence[Fit], drives: torch.Tensor) -> torch.Tensor:
+    """Return the magnitudes (T, N, P) [Pa] that fitted matrices give for drives (T, N, M)."""
+    return torch.stack([(own @ fit.posterior.matrix.T).abs() for fit, own in zip(fits, drives, strict=True)])
+
+
+def _believed_scores(goal: Score, search: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    """Return the scores (T, N) of the evaluations that were fitted, NaN where a reading is an outlier."""
+    outliers = search["outliers"]
+    score = scores_of(goal, search["observed"][:, : outliers.shape[1]])
+    return score.masked_fill(outliers.any(dim=-1), torch.nan)
+
+
+def _best_believed(score: torch.Tensor) -> torch.Tensor:
+    """Return the index (T,) of the highest of scores (T, N) that are not NaN."""
+    return score.nan_to_num(-torch.inf).argmax(dim=1)
+
+
+def _answer(goal: Score, search: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    """Return the index (T,) of the solution: the last evaluation, or the best before where it is far worse.
+
+    How far scores are from those of the fitted matrix says what is far.
+    """
+    score = _believed_scores(goal, search)
+    last = scores_of(goal, search["observed"][:, -1])
+    off = (score - scores_of(goal, search["fitted"][:, :-1])).abs().nanmedian(dim=1).values
+    index = _best_believed(score)
+    highest = score.gather(1, index[:, None])[:, 0]
+    worse = last < highest - torch.maximum(_WORSE * off, _LEAST_WORSE * highest.abs())
+    return torch.where(worse, index, score.shape[1])

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 
-from autdtorch.methods.phase_retrieval import retrieve
+from autdtorch.methods.magnitudes import Magnitudes
 from autdtorch.utils.threads import one_library_thread
 
-_KEPT = ("factors", "entries", "variance")
 _STEPS = 10  # of Gauss and Newton
 _HALVINGS = 6  # of a step that misfits more
 _ENOUGH = 1e-3  # relative gain of a step below which the fit ends
@@ -20,6 +18,11 @@ _DARK = 1e-6  # smallest entries that a row is expected to have, in those of the
 _TINY = 1e-150  # in pascals: their squares must not be 0
 _USUAL_NOISE = 0.03  # in rms pressures at random phases, assumed before readings
 _WEIGHT = 4.0  # of this assumption beside readings: so many of them
+_FAR = 5.0  # ratio of a first reading's units to those of the others above which it is an outlier
+_OUTLIER = 6.0  # standard deviations, as the median of all shows them, beyond which a reading is an outlier
+_HARMLESS = 0.1  # in rms pressures at random phases: smaller deviations harm no more than usual noise
+_LEAST_SHARE = 0.02  # of a reading's variance that the fit leaves; less is rounding
+_MEDIAN = 0.6745  # of the magnitude of a normal deviate
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,21 +50,30 @@ class MatrixPrior:
         power = (self.rows.abs().square() + self.spread[:, None].square()).sum(dim=1).mean()
         return 0.5 * _USUAL_NOISE**2 * power
 
-    def in_units_of(self, drive: torch.Tensor, observed: torch.Tensor) -> MatrixPrior:
-        """Return the prior in the units of a first reading: magnitudes (P,) that a drive (M,) made."""
-        expected = (self.rows @ drive).abs().norm()
-        factor = observed.norm() / expected if observed.any() and expected > 0 else 1.0
+    def in_units_of(self, drives: torch.Tensor, observed: torch.Tensor) -> MatrixPrior:
+        """Return the prior in the units of the first of magnitudes (N, P) that drives (N, M) made.
+
+        Where it is far from the median of all, an outlier, the median decides.
+        """
+        expected = (drives @ self.rows.T).abs()
+        ratio = (observed / expected)[(observed > 0) & (expected > 0)]
+        if not len(ratio):
+            return self
+        usual = ratio.median()
+        factor = observed[0].norm() / expected[0].norm()
+        if not usual / _FAR < factor < usual * _FAR:
+            factor = usual
         parts = {name: factor * getattr(self, name) for name in ("rows", "spread", "changes")}
         return replace(self, **parts)
 
     @classmethod
-    def unknown(cls, observed: torch.Tensor, transducers: int) -> MatrixPrior:
+    def unknown(cls, read: Magnitudes, transducers: int) -> MatrixPrior:
         """Return the prior of a matrix of which only magnitudes (N, P) of full drives are known."""
-        rows = torch.zeros(observed.shape[1], transducers, dtype=torch.complex128, device="cpu")
-        spread = observed.square().mean(dim=0).div(transducers).sqrt()
+        rows = torch.zeros(read.value.shape[1], transducers, dtype=torch.complex128, device="cpu")
+        spread = read.power.div(transducers).sqrt()
         # A focus that nothing reaches has an unknown row, too.
         spread = spread.clamp_min(_DARK * float(spread.max())).clamp_min(_TINY)
-        return cls(rows, spread, observed.new_empty(0), rows.new_empty(0, *rows.shape))
+        return cls(rows, spread, spread.new_empty(0), rows.new_empty(0, *rows.shape))
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,32 +104,30 @@ class MatrixPosterior:
         return self._scaled()[0] + self.prior.spread[:, None] * self.entries
 
     @one_library_thread()
-    def fitted(
-        self, drives: torch.Tensor, observed: torch.Tensor, infer_noise: bool = True
-    ) -> MatrixPosterior:
+    def fitted(self, drives: torch.Tensor, read: Magnitudes, infer_noise: bool = True) -> MatrixPosterior:
         """Return the posterior given magnitudes (N, P) that drives (N, M) made.
 
         The maximum is sought from this one. The noise follows by MacKay's rule (1992): the misfit over the
         number of readings that no unknown explains, beside a few readings of the usual noise.
         """
-        now, line = self._maximum(_Linearised.at(self, drives), drives, observed)
+        now, line = self._maximum(_Linearised.at(self, drives, read), drives, read)
         for _ in range(_NOISE_ROUNDS if infer_noise else 0):
-            before, now = now.variance[0], now._with_noise(line, observed)
+            before, now = now.variance[0], now._with_noise(line)
             if not 1 / _NOISE_FACTOR < now.variance[0] / before < _NOISE_FACTOR:
-                now, line = now._maximum(line, drives, observed)
+                now, line = now._maximum(line, drives, read)
         return now
 
     def _maximum(
-        self, line: _Linearised, drives: torch.Tensor, observed: torch.Tensor
+        self, line: _Linearised, drives: torch.Tensor, read: Magnitudes
     ) -> tuple[MatrixPosterior, _Linearised]:
         """Return the maximum that damped steps of Gauss and Newton find, linearised."""
         now = self
         for _ in range(_STEPS):
-            target, misfit = now._solved(line, observed), now._misfit(line, observed)
+            target, misfit = now._solved(line), now._misfit(line)
             for halving in range(_HALVINGS):
                 there = now._towards(target, 0.5**halving)
-                new_line = _Linearised.at(there, drives)
-                better = there._misfit(new_line, observed)
+                new_line = _Linearised.at(there, drives, read)
+                better = there._misfit(new_line)
                 if better < misfit:
                     break
             else:
@@ -127,18 +137,18 @@ class MatrixPosterior:
                 break
         return now, line
 
-    def _with_noise(self, line: _Linearised, observed: torch.Tensor) -> MatrixPosterior:
-        left = (observed - line.magnitudes).square().sum() + _WEIGHT * self.prior.usual_variance
+    def _with_noise(self, line: _Linearised) -> MatrixPosterior:
+        left = line.left.square().sum() + _WEIGHT * self.prior.usual_variance
         variance = left / (line.unexplained(self) + _WEIGHT)
         return replace(self, variance=variance.expand_as(self.variance))
 
     @one_library_thread()
-    def sample(self, drives: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-        """Return a sample (P, M) [Pa] of the matrix, given readings of drives (N, M) that were fitted.
+    def sample(self, drives: torch.Tensor, read: Magnitudes, generator: torch.Generator) -> torch.Tensor:
+        """Return a sample (P, M) [Pa] of the matrix, given readings (N, P) of drives (N, M) that were fitted.
 
         A sample of the prior is corrected by the readings that it would give (Matheron's rule).
         """
-        line = _Linearised.at(self, drives)
+        line = _Linearised.at(self, drives, read)
         factors = self.prior.widths * _normal(generator, *self.factors.shape)
         entries = _circular(generator, *self.entries.shape)
         noise = self.variance.sqrt() * _normal(generator, *line.magnitudes.shape)
@@ -155,6 +165,20 @@ class MatrixPosterior:
         turn = (drawn.matrix * self.matrix.conj()).sum(dim=1).imag / self.matrix.abs().square().sum(dim=1)
         return drawn.matrix - 1j * turn.nan_to_num()[:, None] * self.matrix
 
+    def outliers(self, drives: torch.Tensor, read: Magnitudes, observed: torch.Tensor) -> torch.Tensor:
+        """Return which of all readings (N, P) of drives (N, M) are far from this fit to those in `read`."""
+        line = _Linearised.at(self, drives, read)
+        left = torch.where(read.outliers, observed - line.magnitudes, line.left).abs()
+        doubtful: torch.Tensor = left > _HARMLESS * self.matrix.norm(dim=1)
+        if not doubtful.any():
+            return doubtful
+        share = line.unexplained_shares(self).masked_fill(~line.decided, 1)
+        ratio = left / share.clamp_min(_LEAST_SHARE).sqrt()
+        usual = ratio.masked_fill(~line.decided, torch.nan)
+        # Of all readings, or of the control point's: a row that was not found explains none of its readings.
+        deviation = torch.maximum(usual.nanmedian(), usual.nanmedian(dim=0).values.nan_to_num()) / _MEDIAN
+        return doubtful.logical_and(ratio > _OUTLIER * deviation)
+
     def _scaled(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return rows (P, M) and changes (K, P, M) of the prior, by the factors."""
         rows, changes = self.prior.rows, self.prior.changes
@@ -165,8 +189,8 @@ class MatrixPosterior:
         factor = torch.polar((gain + scale).exp(), phase)
         return factor * (rows + (amounts[:, None, None] * changes).sum(dim=0)), factor * changes
 
-    def _solved(self, line: _Linearised, observed: torch.Tensor) -> MatrixPosterior:
-        left = observed - line.magnitudes + line.change(self.factors, self.entries)
+    def _solved(self, line: _Linearised) -> MatrixPosterior:
+        left = line.left + line.change(self.factors, self.entries)
         factors, entries = line.explained(self, left)
         return replace(self, factors=factors, entries=entries)
 
@@ -177,71 +201,34 @@ class MatrixPosterior:
             entries=self.entries + share * (other.entries - self.entries),
         )
 
-    def _misfit(self, line: _Linearised, observed: torch.Tensor) -> torch.Tensor:
+    def _misfit(self, line: _Linearised) -> torch.Tensor:
         """Return twice the negative logarithm of the posterior, but for a constant."""
-        readings = ((observed - line.magnitudes).square() / self.variance).sum()
+        readings = (line.left.square() / self.variance).sum()
         factors = (self.factors / self.prior.widths).square().sum()
         return readings + factors + 2 * self.entries.abs().square().sum()
 
 
-def posteriors(
-    prior: MatrixPrior | None,
-    search: Mapping[str, torch.Tensor],
-    drives: torch.Tensor,
-    observed: torch.Tensor,
-    generators: Sequence[torch.Generator],
-    variance: torch.Tensor | None = None,
-) -> list[MatrixPosterior]:
-    """Return the posteriors of T trials, given all their readings.
-
-    Args:
-        prior: of the matrix; None if nothing is known, for at least 3 M - 2 readings.
-        search: what `kept` returned after fewer readings, if there were any.
-        drives: (T, N, M).
-        observed: magnitudes (T, N, P).
-        generators: of the trials, for the first search without a prior.
-        variance: of the magnitudes' noise (T, P) [Pa^2]; None to infer it.
-    """
-    found = []
-    for trial, generator in enumerate(generators):
-        # Copies: products of a part of a tensor may round by its place in memory.
-        own, seen = drives[trial].clone(), observed[trial].clone()
-        if prior is None:
-            given = MatrixPrior.unknown(seen, own.shape[1])
-        else:
-            given = prior.in_units_of(own[0], seen[0])
-        if "entries" in search:
-            given = replace(given, spread=search["spread"][trial].clone())
-            start = MatrixPosterior(given, *(search[name][trial].clone() for name in _KEPT))
-        else:
-            start = MatrixPosterior.start(given)
-            if prior is None:
-                rows = retrieve(own, seen, generator).T
-                start = replace(start, entries=rows / given.spread[:, None])
-        if variance is not None:
-            start = replace(start, variance=variance[trial])
-        found.append(start.fitted(own, seen, infer_noise=variance is None))
-    return found
-
-
-def kept(found: Sequence[MatrixPosterior]) -> dict[str, torch.Tensor]:
-    """Return tensors from which `posteriors` goes on."""
-    tensors = {name: torch.stack([getattr(one, name) for one in found]) for name in _KEPT}
-    return {**tensors, "spread": torch.stack([one.prior.spread for one in found])}
-
-
 @dataclass(frozen=True, eq=False)
 class _Linearised:
-    """Magnitudes (N, P), and their derivatives by factors (N, P, K) and entries (N, P, M)."""
+    """Magnitudes (N, P), and their derivatives by factors (N, P, K) and entries (N, P, M).
+
+    Attributes:
+        left: differences (N, P) of readings to the magnitudes.
+        decided: which readings say something here (N, P); of the others, differences and derivatives are 0.
+    """
 
     magnitudes: torch.Tensor
+    left: torch.Tensor
+    decided: torch.Tensor
     by_factors: torch.Tensor
     by_entries: torch.Tensor
 
     @classmethod
-    def at(cls, posterior: MatrixPosterior, drives: torch.Tensor) -> _Linearised:
+    def at(cls, posterior: MatrixPosterior, drives: torch.Tensor, read: Magnitudes) -> _Linearised:
         pressure = drives @ posterior.matrix.T
-        turned = pressure.sgn().conj()[..., None] * drives[:, None]
+        magnitudes = pressure.abs()
+        decided = read.decided(magnitudes)
+        turned = (pressure.sgn().conj() * decided)[..., None] * drives[:, None]
         by_factors = pressure.real.new_empty(*pressure.shape, 0)
         if len(posterior.factors):
             rows, changes = posterior._scaled()
@@ -249,7 +236,8 @@ class _Linearised:
             by_amounts = torch.einsum("npm,kpm->npk", turned, changes).real
             by_scale = parts.real.sum(dim=-1, keepdim=True)
             by_factors = torch.cat([parts.real, -parts.imag, by_scale, by_amounts], dim=-1)
-        return cls(pressure.abs(), by_factors, turned * posterior.prior.spread[:, None])
+        left = read.nearest(magnitudes) - magnitudes
+        return cls(magnitudes, left, decided, by_factors, turned * posterior.prior.spread[:, None])
 
     def change(self, factors: torch.Tensor, entries: torch.Tensor) -> torch.Tensor:
         """Return the change of the magnitudes (N, P) with factors and entries."""
@@ -273,9 +261,18 @@ class _Linearised:
         if not len(posterior.factors):
             slope, factor = self._of_rows(posterior)
             unknown = 2 * torch.cholesky_inverse(factor).diagonal(dim1=1, dim2=2).sum()
-            return self.magnitudes.numel() - slope.shape[0] * slope.shape[2] + unknown
+            return self.decided.sum() - slope.shape[0] * slope.shape[2] + unknown
+        return (self.unexplained_shares(posterior) * self.decided).sum()
+
+    def unexplained_shares(self, posterior: MatrixPosterior) -> torch.Tensor:
+        """Return the share of each reading's variance (N, P) that no unknown explains."""
+        if not len(posterior.factors):
+            slope, factor = self._of_rows(posterior)
+            whitened = torch.linalg.solve_triangular(factor, slope.mT, upper=False)
+            shares: torch.Tensor = 1 - whitened.square().sum(dim=1).T / posterior.variance
+            return shares
         inverse = torch.cholesky_inverse(self._of_readings(posterior))
-        return (inverse.diagonal().reshape(self.magnitudes.T.shape).T * posterior.variance).sum()
+        return inverse.diagonal().reshape(self.magnitudes.T.shape).T * posterior.variance
 
     def _of_rows(self, posterior: MatrixPosterior) -> tuple[torch.Tensor, torch.Tensor]:
         """Return derivatives (P, N, 2 M), and the Cholesky factor of the inverse covariance of the entries.

@@ -204,6 +204,30 @@ def goal_of(score: Score) -> Score:
     return WEAKEST_FOCUS if score is weakest_focus else score
 
 
+def scores_of(goal: Score, pressure: torch.Tensor) -> torch.Tensor:
+    """Return the scores (...) that a goal or any function gives for magnitudes (..., P), after checking them.
+
+    The function gets a copy, which it may change.
+    """
+    found = real_tensor("score", goal(pressure.clone()))
+    if found.shape != pressure.shape[:-1]:
+        accepted = f"must be {tuple(pressure.shape[:-1])}, one number for each drive"
+        raise ValueError(f"score: shape {tuple(found.shape)}; {accepted}")
+    return found
+
+
+def differentiable_scores(goal: Score, pressure: torch.Tensor) -> torch.Tensor:
+    """Return `scores_of` magnitudes that require a gradient; `ValueError` for scores that have none."""
+    accepted = "must be differentiable by PyTorch, for a method that climbs it"
+    try:
+        score = scores_of(goal, pressure)
+    except RuntimeError as error:  # of PyTorch, such as for a conversion to NumPy
+        raise invalid("score", goal, f"{accepted} ({error})") from error
+    if pressure.requires_grad and not score.requires_grad:
+        raise invalid("score", goal, accepted)
+    return score
+
+
 def slope_of(goal: Score, pressure: torch.Tensor, smoothing: float) -> torch.Tensor:
     """Return the derivatives (..., P) of a goal or of any function of magnitudes; see `Goal.slope`."""
     return goal.slope(pressure, smoothing) if isinstance(goal, Goal) else derivative(goal, pressure)
@@ -213,7 +237,8 @@ def derivative(goal: Score, pressure: torch.Tensor) -> torch.Tensor:
     """Return the derivatives (..., P) of scores by magnitudes (..., P), by automatic differentiation."""
     with torch.enable_grad():
         magnitude = pressure.detach().requires_grad_()
-        found = torch.autograd.grad(goal(magnitude).sum(), magnitude, allow_unused=True)[0]
+        score = differentiable_scores(goal, magnitude)
+        found = torch.autograd.grad(score.sum(), magnitude, allow_unused=True)[0]
     return torch.zeros_like(pressure) if found is None else found
 
 

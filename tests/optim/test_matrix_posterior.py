@@ -6,7 +6,9 @@ import torch
 
 import autdtorch as at
 from autdtorch.methods.gradient import random_drives
-from autdtorch.methods.matrix_posterior import MatrixPosterior, MatrixPrior, _Linearised, posteriors
+from autdtorch.methods.magnitudes import Magnitudes
+from autdtorch.methods.matrix_fits import posteriors
+from autdtorch.methods.matrix_posterior import MatrixPosterior, MatrixPrior, _Linearised
 from autdtorch.objectives.perturbations import Noise
 
 FOCI = {"model": "foci", "kernel": "phasor", "noise": "inferred"}
@@ -20,6 +22,11 @@ def deviating(matrix, seed, gain=0.1, phase=0.5):
     """The matrix (P, M) of transducers whose gains and phases deviate."""
     draws = torch.randn(2, matrix.shape[1], dtype=torch.float64, generator=generator(seed))
     return matrix * torch.polar((gain * draws[0]).exp(), phase * draws[1])
+
+
+def exact(magnitudes):
+    """Readings (N, P) none of which is a lower limit."""
+    return Magnitudes(magnitudes, torch.zeros_like(magnitudes, dtype=torch.bool))
 
 
 @pytest.fixture
@@ -46,7 +53,7 @@ def test_derivatives_are_those_of_the_magnitudes(prior, with_factors):
     entries = here.entries.clone().requires_grad_(True)
     there = MatrixPosterior(prior, factors, entries, here.variance)
     magnitudes = (drives @ there.matrix.T).abs()
-    line = _Linearised.at(here, drives)
+    line = _Linearised.at(here, drives, exact(magnitudes.detach()))
     for index in range(magnitudes.numel()):
         by = torch.autograd.grad(
             magnitudes.flatten()[index], (factors, entries), retain_graph=True, allow_unused=True
@@ -60,7 +67,7 @@ def test_derivatives_are_those_of_the_magnitudes(prior, with_factors):
 
 def slopes(posterior, drives):
     """Derivatives (N P, K) of magnitudes by factors, and by real and imaginary parts of all entries."""
-    line = _Linearised.at(posterior, drives)
+    line = _Linearised.at(posterior, drives, exact((drives @ posterior.matrix.T).abs()))
     by_parts = torch.zeros(*line.magnitudes.shape, *posterior.entries.shape, 2, dtype=torch.float64)
     for focus in range(len(posterior.entries)):
         entry = line.by_entries[:, focus]
@@ -81,7 +88,8 @@ def test_samples_have_the_covariance_that_readings_leave(prior):
     of_readings = known * variance @ known.T + 1e-6 * torch.eye(6, dtype=torch.float64)
     expected = wanted * variance @ wanted.T - explained @ torch.linalg.solve(of_readings, explained.T)
     draws = generator(5)
-    samples = torch.stack([here.sample(read, draws) for _ in range(3000)])
+    given = exact((read @ here.matrix.T).abs())
+    samples = torch.stack([here.sample(read, given, draws) for _ in range(3000)])
     found = (others @ samples.mT).abs().flatten(1).T.cov()
     # Of 3000 samples, the standard error of an entry is at most 0.03 of the largest variance.
     assert (found - expected).abs().max() < 0.13 * expected.diagonal().max()
@@ -94,7 +102,7 @@ def test_samples_have_the_magnitudes_of_readings_that_determine_a_row(random_mat
     matrix, drives = random_matrix(2, 5, 0), random_drives(60, 5, generator(1))
     observed = (drives @ matrix.T).abs()
     (fit,) = posteriors(None, {}, drives[None], observed[None], [generator(2)])
-    sample = fit.sample(drives, generator(3))
+    sample = fit.posterior.sample(drives, fit.read, generator(3))
     # The noise, assumed from few readings, is half a per cent.
     torch.testing.assert_close((drives @ sample.T).abs(), observed, rtol=0.02, atol=0.03)
 

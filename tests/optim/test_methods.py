@@ -134,6 +134,46 @@ def test_pressures_and_scores_of_another_kind_are_refused(objective, pressure, s
         at.run(at.RandomSearch(evaluations=2), Broken(objective, pressure), score=score)
 
 
+WRONG_SCORES = {
+    "each focus": lambda pressure: pressure,
+    "one for all": lambda pressure: pressure.min(),
+    "nothing": lambda pressure: None,
+    "text": lambda pressure: "loud",
+    "complex": lambda pressure: pressure.amin(dim=-1) * 1j,
+    "boolean": lambda pressure: pressure.amin(dim=-1) > 1,
+    "not a number": lambda pressure: pressure.amin(dim=-1) * math.nan,
+    "infinite": lambda pressure: pressure.amin(dim=-1) / 0,
+    "two things": lambda pressure: (pressure.amin(dim=-1), 1),
+}
+
+
+@pytest.mark.parametrize("score", WRONG_SCORES.values(), ids=WRONG_SCORES)
+@each([*METHODS[1:3], METHODS[6], METHODS[7], *METHODS[8:]])
+def test_a_goal_that_gives_no_scores_is_refused_by_every_method(objective, method, score):
+    problem = at.Problem.of(objective, score)
+    with pytest.raises(ValueError, match=r"^score") as refused:
+        method.tell(state := method.start(problem), objective(method.ask(state)))
+    assert "\n" not in str(refused.value)
+
+
+@each([at.Identify(evaluations=20), at.GradientAscent(steps=5)])
+def test_a_method_that_climbs_refuses_goals_without_a_gradient(objective, method):
+    for score in (
+        lambda pressure: pressure.detach().amin(dim=-1),
+        lambda pressure: pressure.amin(-1).numpy(),
+    ):
+        with pytest.raises(ValueError, match=r"score: .*must be differentiable"):
+            at.run(method, objective, score=score)
+
+
+def test_a_goal_that_changes_its_argument_harms_nothing(objective):
+    def score(pressure):
+        return pressure.mul_(-1).amax(dim=-1).neg()
+
+    found, expected = (at.run(at.GABS(levels=4), objective, score=goal) for goal in (score, at.weakest_focus))
+    assert torch.equal(found.pressure, expected.pressure)
+
+
 def test_a_problem_without_geometry_or_matrix_is_refused_where_they_are_needed():
     problem = at.Problem(transducers=4, foci=2)
     assert at.GABS().start(problem).drives.shape == (1, 1, 4)

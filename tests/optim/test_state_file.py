@@ -110,7 +110,7 @@ def test_a_file_of_an_older_version_is_refused(states, tmp_path):
     method, problem, arrays = states[0]
     older = {name: array for name, array in arrays.items() if name != "header"}
     np.savez(tmp_path / "state.npz", origin=np.array("[]"), **older)
-    with pytest.raises(ValueError, match="header: missing; must be .* of this version"):
+    with pytest.raises(ValueError, match=r"header: missing; must be .* of this version"):
         at.load_state(tmp_path / "state.npz", method, problem)
 
 

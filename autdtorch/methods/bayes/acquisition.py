@@ -10,9 +10,8 @@ import torch
 from autdtorch.methods.bayes.climb import Effort, candidates, highest
 from autdtorch.methods.bayes.packages import ei_helper, fatmin, log_ei_helper, log_fatplus, logmeanexp
 from autdtorch.methods.bayes.processes import Processes
-from autdtorch.objectives.goals import WeakestFocus
+from autdtorch.objectives.goals import WeakestFocus, differentiable_scores
 from autdtorch.objectives.objective import Score
-from autdtorch.utils.validation import invalid
 
 _SCORE_EFFORT = Effort(candidates=128, starts=2, steps=20)
 _FOCUS_EFFORT = Effort(candidates=256, starts=8, steps=60)
@@ -113,10 +112,10 @@ class FocusAcquisition:
         if isinstance(self._goal, WeakestFocus):
             minimum: torch.Tensor = fatmin(self._goal.levels(pressure), dim=-1, tau=_SMOOTH_MINIMUM)
             return minimum
-        score = self._goal(unit * pressure) / unit[..., 0]
-        if intensity.requires_grad and not score.requires_grad:
-            raise invalid("score", self._goal, 'must be differentiable by PyTorch, for the model "foci"')
-        return score
+        pressure = unit * pressure
+        lost = ~pressure.isfinite()  # where a search left what the process can calculate
+        score = differentiable_scores(self._goal, pressure.masked_fill(lost, 0)) / unit[..., 0]
+        return score.masked_fill(lost.any(dim=-1), torch.nan)
 
 
 def _chosen(points: torch.Tensor, index: torch.Tensor) -> torch.Tensor:

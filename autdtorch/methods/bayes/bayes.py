@@ -23,10 +23,10 @@ from autdtorch.methods.base import (
 )
 from autdtorch.methods.driver import run
 from autdtorch.methods.gradient import climbed
-from autdtorch.methods.matrix_posterior import kept, posteriors
+from autdtorch.methods.matrix_fits import kept, posteriors
 from autdtorch.methods.prior import Prior, best_simulated_drives, matrix_prior, prior_mean, prior_of
 from autdtorch.methods.solution import Solution
-from autdtorch.objectives.goals import WEAKEST_FOCUS
+from autdtorch.objectives.goals import WEAKEST_FOCUS, scores_of
 from autdtorch.objectives.objective import Objective, Score
 from autdtorch.scene.drive import drive_from_phases, phases_of
 from autdtorch.utils.hints import suggesting
@@ -204,7 +204,7 @@ class BayesOpt(Method):
         chosen = torch.arange(len(found.score), device="cpu"), state.search["answer"]
         drive = state.problem.quantise(self._drives(state.search["points"][chosen]))
         pressure = state.search["values"][chosen]
-        return replace(found, drive=drive, pressure=pressure, score=state.problem.goal(pressure))
+        return replace(found, drive=drive, pressure=pressure, score=scores_of(state.problem.goal, pressure))
 
     def _outputs(self, problem: Problem) -> int:
         return 1 if self.model == "weakest" else problem.foci
@@ -260,14 +260,15 @@ class BayesOpt(Method):
         prior = None if self.prior is None else matrix_prior(self.prior, problem)
         fits = posteriors(prior, search, drives, observed, generators, variance)
         search |= kept(fits)
-        mean = torch.stack([fit.matrix for fit in fits])
-        sampled = torch.stack([fit.sample(*of) for fit, *of in zip(fits, drives, generators, strict=True)])
+        mean = torch.stack([fit.posterior.matrix for fit in fits])
+        each = zip(fits, drives, generators, strict=True)
+        sampled = torch.stack([fit.posterior.sample(drives, fit.read, draws) for fit, drives, draws in each])
         spread = (sampled - mean).abs().square().mean(dim=-1)
         # The search explores what a sample makes likely; the answer, and the last drive, follow the mean.
         rows = mean if observed.shape[1] >= self.evaluations - 1 else sampled
         share = (2 * search["variance"] / power).clamp_max(0.5)
         fit = Fit(torch.ones_like(share), share / (1 - share))
-        seen = problem.goal((drives @ rows.mT).abs()).argmax(dim=1)
+        seen = scores_of(problem.goal, (drives @ rows.mT).abs()).argmax(dim=1)
         best = climbed(problem.goal, rows, drives[torch.arange(len(seen), device="cpu"), seen], _SAMPLE_STEPS)
         return fit, Rows(rows[..., self._others(problem.transducers)], spread, self._points(best))
 
