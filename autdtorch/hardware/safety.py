@@ -143,12 +143,15 @@ class Limits:
         for name in ("seconds", "seconds_in_a_row"):
             number_between(name, positive(name, getattr(self, name), "s"), 0.0, _LONGEST, "s")
         number_between("duty_cycle", self.duty_cycle, _LEAST_DUTY_CYCLE, 1.0)
-        longest = min(self.seconds, self.seconds_in_a_row)
-        if self.duty_cycle < (least := 1 / (1 + _LONGEST_REST / longest)):
-            accepted = (
-                f"must be >= {least:.3g}, so that they rest for at most a day after {longest:g} s in a row"
-            )
+        if self.duty_cycle < (least := 1 / (1 + _LONGEST_REST / self.longest_stretch)):
+            after = f"after {self.longest_stretch:g} s in a row"
+            accepted = f"must be >= {least:.3g}, so that they rest for at most a day {after}"
             raise invalid("duty_cycle", self.duty_cycle, accepted)
+
+    @property
+    def longest_stretch(self) -> float:
+        """Longest time without a rest that the outputs can be on [s]."""
+        return min(self.seconds, self.seconds_in_a_row)
 
 
 class LimitedLink:
@@ -185,7 +188,7 @@ class LimitedLink:
         The length of its last stretch is unknown: the outputs rest as after the longest.
         """
         self._seconds_before += not_negative("seconds", seconds, "s")
-        rest = self._rest(self.limits.seconds_in_a_row)
+        rest = self._rest(self.limits.longest_stretch)
         self._rested_at = time.monotonic() + rest
         if rest > 0:
             logger.info("resting for %.3g s first, for the duty cycle", rest)

@@ -10,7 +10,7 @@ from operator import attrgetter
 
 import torch
 
-from autdtorch.scene.arrays import TransducerArray, range_text, strengths_of
+from autdtorch.scene.arrays import TransducerArray, radii_of, range_text, strengths_of
 from autdtorch.scene.geometry import Coordinates, Plane
 from autdtorch.scene.medium import Medium as Medium
 from autdtorch.scene.obstacles import Obstacle
@@ -168,7 +168,8 @@ class Scene:
             and torch.equal(self.control_points, other.control_points)
             and torch.equal(array.positions, theirs.positions)
             and torch.equal(array.normals, theirs.normals)
-            and (array.source_strength, array.radius) == (theirs.source_strength, theirs.radius)
+            and torch.equal(strengths_of(array), strengths_of(theirs))
+            and torch.equal(radii_of(array), radii_of(theirs))
         )
 
     @property

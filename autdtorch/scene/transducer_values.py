@@ -31,7 +31,7 @@ def for_each(
     if each.shape != (count,):
         raise ValueError(f"{name}: shape {tuple(each.shape)}; must be a number or ({count},) as positions")
     numbers = [check(f"{name}[{index}]", value, unit) for index, value in enumerate(each.tolist())]
-    return numbers[0] if len(set(numbers)) == 1 else each.as_subclass(Coordinates)
+    return numbers[0] if len(set(numbers)) == 1 else each.clone().as_subclass(Coordinates)
 
 
 def disc_radius(given: ArrayLike | None, positions: torch.Tensor) -> float | torch.Tensor:

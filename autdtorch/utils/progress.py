@@ -17,6 +17,7 @@ from typing import Any
 
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
+from tqdm.std import TqdmDefaultWriteLock
 
 from autdtorch.utils.forks import in_forked
 
@@ -24,13 +25,19 @@ logger = logging.getLogger(__name__)
 
 _PATIENCE = 3.0  # time after which the bar or the first forecast in the log appears [s]
 _MOST_POINTS = 1000  # times that are kept
-_BAR = (
-    "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"  # tqdm's forecast: of means
-)
+# without tqdm's own forecast, which is of means
+_BAR = "{desc}: {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
 _UNSURE = 1.5  # ratio of two forecasts, from which both are told
 _asked: ContextVar[Callable[[], bool]] = ContextVar("asked to stop", default=lambda: False)
 
-in_forked(lambda: tqdm.set_lock(threading.RLock()))  # a thread that drew a bar may have held the lock
+
+def _renew_lock() -> None:
+    """Replace tqdm's own lock, which a thread that drew a bar may have held, but not one that a user set."""
+    if isinstance(tqdm.get_lock(), TqdmDefaultWriteLock):
+        tqdm.set_lock(threading.RLock())  # all of the default ones share theirs
+
+
+in_forked(_renew_lock)
 
 
 class Stopped(Exception):
@@ -91,7 +98,7 @@ class Progress:
                 self._bar.update(steps)
                 return
             spent = now - self._begun
-            if spent >= self._next and self._done < self._steps and (left := self._forecast()):
+            if spent >= self._next and self._done != self._steps and (left := self._forecast()):
                 logger.info("%s: %.0f s so far, %s", self._what, spent, left)
                 self._next = 4 * spent  # ever fewer lines
 

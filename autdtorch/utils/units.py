@@ -7,6 +7,7 @@ import math
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
+from contextvars import ContextVar
 
 import torch
 
@@ -20,11 +21,12 @@ from autdtorch.utils.validation import (
     real_tensor,
 )
 
+_place: ContextVar[str] = ContextVar("place of what is warned of", default="")
 _TURN = 2 * math.pi * (1 + 1e-9)  # [rad], with room for rounding
 
 
 class ScaleWarning(UserWarning):
-    """A quantity seems to be in another unit or of another frequency than the scene's, or a unit was guessed."""
+    """A quantity seems to be in another unit or of another frequency than the scene, or one was guessed."""
 
 
 def warn_user(text: str, category: type[Warning] = ScaleWarning) -> None:
@@ -32,7 +34,7 @@ def warn_user(text: str, category: type[Warning] = ScaleWarning) -> None:
     depth, frame = 2, sys._getframe(1)
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "autdtorch":
         depth, frame = depth + 1, frame.f_back
-    warnings.warn(text, category, stacklevel=depth)
+    warnings.warn(_place.get() + text, category, stacklevel=depth)
 
 
 def angle(name: str, value: object) -> float:
@@ -78,12 +80,12 @@ def real_wavenumber(value: object) -> float:
 
 @contextlib.contextmanager
 def warned_within(place: str) -> Iterator[None]:
-    """Put the name of a place, such as a file, in front of warnings."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    """Put the name of a place, such as a file, in front of the warnings of `warn_user`."""
+    token = _place.set(f"{_place.get()}{place}: ")
+    try:
         yield
-    for one in caught:
-        warn_user(f"{place}: {one.message}", one.category)
+    finally:
+        _place.reset(token)
 
 
 def _warn_of_degrees(name: str, turn: Sequence[float], fix: str) -> None:

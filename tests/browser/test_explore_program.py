@@ -69,7 +69,7 @@ def test_what_cannot_be_set_changes_nothing(view, scene):
     with pytest.raises(ValueError, match="scene"):
         view.scene = "two_cubes"
     with pytest.raises(ValueError, match="spacing"):
-        view.scene = replace(scene, frequency=90e3)  # too coarse cells
+        view.scene = replace(scene, frequency=90e3, medium=at.Medium(1.2, 343.0))  # too coarse cells
     for wrong in (drive[:3], 2 * drive, float("nan") * drive):
         with pytest.raises(ValueError, match="drive"):
             view.drive = wrong

@@ -41,9 +41,9 @@ def trial(run, write, tmp_path, capsys):
     """Runs a trial in the scene above; returns its status, and what it printed on stdout and stderr."""
     write("ours/scene/two.yaml", SCENE)
 
-    def command(*words):
+    def command(*words, folder="output=out"):
         capsys.readouterr()
-        status = run("--config-dir", str(tmp_path / "ours"), "scene=two", "output=out", *words)
+        status = run("--config-dir", str(tmp_path / "ours"), "scene=two", folder, *words)
         return status, *capsys.readouterr()
 
     return command
@@ -154,12 +154,16 @@ OPENMPD = ("hardware=openmpd", "hardware.limits.amplitude=1", "hardware.transduc
             "goal: targets: (1.0, 2.0, 3.0); must be 2",
         ),
         ((*GABS, "hardware=nowhere"), "hardware: 'nowhere'; must be one of autd3, base, emulated"),
-        ((*GABS, "-m"), "hardware: a sweep; must be one trial at a time"),
     ],
 )
 def test_a_trial_that_may_not_be_made_ends_with_one_line(trial, words, message):
     status, _, log = trial(*words)
     assert (status, message in log) == (2, True)
+
+
+def test_a_sweep_of_trials_is_refused(trial):
+    status, _, log = trial(*GABS, "-m", folder="hydra.sweep.dir=out")
+    assert (status, "hardware: a sweep; must be one trial at a time" in log) == (2, True)
 
 
 @pytest.mark.parametrize(

@@ -262,6 +262,14 @@ def test_the_time_on_goes_on_with_the_trial(trial):
         assert link.seconds_on == 60.0
 
 
+def test_a_trial_that_goes_on_rests_no_longer_than_its_limits_promise(trial):
+    with limited(trial, seconds=0.1, seconds_in_a_row=1e6, duty_cycle=0.5) as (_, link):
+        link.go_on(0.0)
+        begin = time.monotonic()
+        link.play(FULL)
+        assert time.monotonic() - begin < 5  # 0.1 s, and the link's own times; 12 days by the other limit
+
+
 def test_the_time_of_an_earlier_check_counts_and_is_rested_from(trial):
     with limited(trial) as (bench, link):
         sensor = hw.EmulatedSensor(bench)
@@ -323,3 +331,40 @@ def test_a_transducer_20_db_below_the_others_has_failed_where_silence_is_read_as
             sensor.leak = share * typical
             check = hw.check_transducers(link, sensor, points=2)
             assert (check.silence, check.dead) == (0, failed)
+
+
+class Slow:
+    """Something whose removal takes long: what a signal raises there is dropped."""
+
+    def __del__(self):
+        time.sleep(0.4)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("kept", ["in a __del__", "by a handler"])
+def test_a_late_reading_ends_although_the_first_signal_is_lost(kept):
+    class Sensor:
+        def read(self):
+            if kept == "by a handler":
+                with contextlib.suppress(BaseException):
+                    time.sleep(1)
+            else:
+                one = Slow()
+                del one
+            time.sleep(60)
+
+    begin = time.monotonic()
+    with pytest.raises(hw.SensorError, match=r"no reading within 0\.2 s"):
+        checked_reading(Sensor(), 1, 0.2)
+    assert time.monotonic() - begin < 20
+
+
+def test_a_reading_that_ends_late_is_none():
+    class Sensor:
+        def read(self):
+            with contextlib.suppress(BaseException):
+                time.sleep(1)
+            return torch.ones(1)
+
+    with pytest.raises(hw.SensorError, match=r"no reading within 0\.1 s"):
+        checked_reading(Sensor(), 1, 0.1)

@@ -156,3 +156,18 @@ def test_discs_of_unequal_radii_may_touch_but_not_overlap():
         TransducerArray(places, (1, 0, 0), radius=[7e-3, 3.1e-3, 0.0])
     with pytest.raises(ValueError, match=r"radius\[0\].*transducer 1, 0 m"):
         TransducerArray(places, (1, 0, 0), radius=[11e-3, 0.0, 1e-3])
+
+
+def test_equal_arrays_of_unequal_transducers_make_equal_scenes():
+    assert with_array(UNEQUAL, RADII).equals(with_array(UNEQUAL.clone(), RADII.clone()))
+    assert not with_array(UNEQUAL, RADII).equals(with_array(UNEQUAL, RADII.flip(0)))
+    assert not with_array(UNEQUAL, RADII).equals(with_array(UNEQUAL.flip(0), RADII))
+    assert not with_array(UNEQUAL).equals(with_array(1.0))
+
+
+def test_what_is_given_may_change_afterwards():
+    strength, radius = UNEQUAL.clone(), RADII.clone()
+    array = with_array(strength, radius).array
+    strength[0], radius[0] = -1.0, 1.0
+    assert torch.equal(strengths_of(array), UNEQUAL)
+    assert torch.equal(radii_of(array), RADII)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -12,6 +13,7 @@ from typing import Any
 import pytest
 from numba.core.compiler_lock import global_compiler_lock
 from tqdm import tqdm
+from tqdm.std import TqdmDefaultWriteLock
 
 import autdtorch.fdtd.kernels.compiled  # what the two name to `os.register_at_fork`
 import autdtorch.utils.progress  # noqa: F401
@@ -137,7 +139,7 @@ def test_a_fork_waits_for_a_lock_whose_holder_ends(name: str) -> None:
 
 
 def test_a_child_draws_while_a_bar_is_drawn_in_its_parent(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tqdm, "_lock", threading.RLock(), raising=False)
+    monkeypatch.setattr(tqdm, "_lock", TqdmDefaultWriteLock(), raising=False)
 
     def draw(begun: threading.Event, let_go: threading.Event) -> None:
         with tqdm.get_lock():
@@ -146,3 +148,33 @@ def test_a_child_draws_while_a_bar_is_drawn_in_its_parent(monkeypatch: pytest.Mo
 
     with in_thread(draw):
         assert status_of_child(bar_drawn) == 0
+
+
+def test_a_signal_that_comes_while_a_fork_waits_is_raised_after_it() -> None:
+    def hold(begun: threading.Event, _: threading.Event) -> None:
+        with global_compiler_lock:
+            begun.set()
+            time.sleep(HELD)
+            signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+            time.sleep(HELD)
+
+    def fork() -> None:
+        if os.fork() == 0:
+            os._exit(0)
+        time.sleep(PATIENCE)
+
+    with in_thread(hold), pytest.raises(KeyboardInterrupt):
+        fork()
+    assert status_of_child(kernel_compiled) == 0
+    os.waitpid(-1, 0)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_lock_that_a_user_gave_tqdm_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    lock = threading.RLock()
+    monkeypatch.setattr(tqdm, "_lock", lock, raising=False)
+
+    def same() -> None:
+        assert tqdm.get_lock() is lock
+
+    assert status_of_child(same) == 0

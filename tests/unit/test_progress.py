@@ -155,5 +155,5 @@ def test_a_forecast_holds_the_truth(clock, caplog, cost):
 
 def test_work_beyond_its_estimate_has_no_forecast(clock, caplog):
     lines = lines_of(clock, caplog, 10, [(1, 1)] * 60)
-    assert lines
+    assert "longer than expected" in lines[-1]
     assert not any("about 0 s" in line for line in lines)

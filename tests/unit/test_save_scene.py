@@ -88,6 +88,7 @@ def kinds_in(path):
     return [board["type"] for board in (section if isinstance(section, list) else [section])]
 
 
+@pytest.mark.filterwarnings("ignore::autdtorch.utils.units.ScaleWarning")  # boards face all ways
 @given(st.lists(BOARDS, min_size=1, max_size=3))
 @settings(max_examples=15, deadline=None)
 def test_arrays_keep_their_form_and_their_bits(tmp_path_factory, boards):

@@ -1,3 +1,5 @@
+import warnings
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -190,3 +192,23 @@ def test_control_points_of_several_groups_follow_one_another(tmp_path):
     assert points[0].tolist() == [80e-3, 0, 0]
     assert torch.equal(points[1:6], sphere_points((60e-3, 0, 0), 3e-3, 5))
     assert points[6:, 0].tolist() == pytest.approx([90e-3] * 6)
+
+
+def test_scenes_read_in_threads_leave_warnings_as_they_were():
+    """Each section has its place in front of its warnings, which threads must not mix up."""
+    box = {"type": "box", "center": [0.05, 0, 0], "size": [0.01] * 3, "rigid": True}
+    section = {
+        "array": {"type": "grid", "shape": [2, 2], "pitch": 10e-3, "center": [0, 0, 0], "normal": [1, 0, 0]},
+        "medium": {"density": 1.2, "sound_speed": 343.0}, "frequency": 40e3,
+        "control_points": {"type": "points", "positions": [[0.1, 0, 0]]},
+        "obstacles": [box | {"rotation": [0, 0, 45.0]}],
+    }  # fmt: skip
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        with ThreadPoolExecutor(8) as pool:
+            list(pool.map(load_scene, [section] * 40))
+        warnings.warn("still told", UserWarning, stacklevel=1)
+    told = [str(one.message) for one in caught]
+    assert told.pop() == "still told"
+    assert len(told) == 40
+    assert all("obstacles[0]" in one for one in told)

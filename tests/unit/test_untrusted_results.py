@@ -158,7 +158,7 @@ OURS |= {
     "summary",
 }
 ATTRIBUTES = {"lang", "charset", "name", "content", "class", "src", "alt", "href", "id", "scope", "role"}
-ATTRIBUTES |= {"aria-label", "tabindex"}
+ATTRIBUTES |= {"aria-label", "tabindex", "width"}
 
 
 def test_a_report_shows_hostile_texts_as_texts(tmp_path):

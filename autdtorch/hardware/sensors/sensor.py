@@ -15,6 +15,7 @@ from autdtorch.objectives.objective import validate_magnitudes
 LONGEST = 600.0
 # The signal that wakes a reading: by default ignored, so that a late one does no harm. Windows has no such.
 _WAKE: signal.Signals = getattr(signal, "SIGURG", signal.SIGINT)
+_AGAIN = 0.5  # [s] between two signals
 
 
 class SensorError(OSError):
@@ -49,34 +50,40 @@ def checked_reading(sensor: Sensor, points: int, seconds: float = LONGEST) -> to
 def _reading(sensor: Sensor, seconds: float) -> object:
     if threading.current_thread() is not threading.main_thread():  # which alone receives signals
         return sensor.read()
-    is_late = False
-
-    def wake() -> None:
-        nonlocal is_late
-        is_late = True
-        if hasattr(signal, "pthread_kill"):
-            signal.pthread_kill(threading.main_thread().ident or 0, _WAKE)
-        else:
-            signal.raise_signal(_WAKE)
+    done, is_late = threading.Event(), threading.Event()
+    before = signal.getsignal(_WAKE) or signal.SIG_DFL  # None where a library has set it
 
     def interrupt(number: int, frame: FrameType | None) -> None:
-        if is_late:
+        if is_late.is_set():
             raise _Overdue
         if callable(before):
             before(number, frame)
 
-    before = signal.signal(_WAKE, interrupt)
-    timer = threading.Timer(seconds, wake)
-    timer.daemon = True
     try:
         try:
-            timer.start()
-            return sensor.read()
+            signal.signal(_WAKE, interrupt)
+            threading.Thread(target=_wake, args=(seconds, done, is_late), daemon=True).start()
+            found = sensor.read()
         finally:
-            timer.cancel()
+            done.set()
             signal.signal(_WAKE, before)
     except _Overdue:
         signal.signal(_WAKE, before)  # it may have come amid the lines above
-        if not is_late:  # that of a reading around this one
+        if not is_late.is_set():  # that of a reading around this one
             raise
-        raise SensorError(f"the sensor gives no reading within {seconds:.3g} s") from None
+    if is_late.is_set():
+        raise SensorError(f"the sensor gives no reading within {seconds:.3g} s")
+    return found
+
+
+def _wake(seconds: float, done: threading.Event, is_late: threading.Event) -> None:
+    """Interrupt the main thread after some time, again and again: what a `__del__` raises is dropped."""
+    if done.wait(seconds):
+        return
+    is_late.set()
+    while not done.is_set():
+        if hasattr(signal, "pthread_kill"):
+            signal.pthread_kill(threading.main_thread().ident or 0, _WAKE)
+        else:
+            signal.raise_signal(_WAKE)
+        done.wait(_AGAIN)
