@@ -6,7 +6,9 @@ import difflib
 import functools
 import inspect
 import re
+import sys
 from collections.abc import Callable, Collection
+from functools import partial
 from typing import Any, TypeVar
 
 import lazy_loader
@@ -14,13 +16,22 @@ import lazy_loader
 Named = TypeVar("Named", bound=Callable[..., Any])
 
 _UNEXPECTED = re.compile(r"got an unexpected keyword argument '(\w+)'")
+_SUGGESTS = "_suggests"  # attribute of functions that are decorated by `suggesting`
 
 
 def did_you_mean(given: object, accepted: Collection[str]) -> str:
     """Return a question for messages with the accepted name most like `given`; empty if none is alike."""
-    names = {name.casefold(): name for name in accepted}
-    nearest = difflib.get_close_matches(given.casefold(), names, n=1) if isinstance(given, str) else []
-    return f" (did you mean {names[nearest[0]]!r}?)" if nearest else ""
+    if not isinstance(given, str):
+        return ""
+    nearest = difflib.get_close_matches(given.casefold(), {name.casefold() for name in accepted})
+    alike = [name for name in accepted if name.casefold() in nearest]  # some differ in capitals alone
+    return f" (did you mean {max(alike, key=partial(_likeness, given))!r}?)" if alike else ""
+
+
+def _likeness(given: str, name: str) -> float:
+    """Return how alike two names are, first without and then with regard to capitals, 0 to 2."""
+    pairs = (given.casefold(), name.casefold()), (given, name)
+    return sum(difflib.SequenceMatcher(None, *pair).ratio() for pair in pairs)
 
 
 def with_extra(extra: str) -> str:
@@ -44,31 +55,37 @@ def suggesting(function: Named) -> Named:
             return function(*arguments, **keywords)
         except TypeError as error:
             unexpected = _UNEXPECTED.search(str(error))
-            within = error.__traceback__ is not None and error.__traceback__.tb_next is not None
-            if within or unexpected is None:  # not of this call
-                raise
             names = [name for name in inspect.signature(function).parameters if name not in ("self", "cls")]
+            # A wrong keyword of a call further in is not one of this call.
+            if unexpected is None or unexpected[1] in names or unexpected[1] not in keywords:
+                raise
             message = str(error).partition(". Did you mean")[0]
             hint = did_you_mean(unexpected[1], names) or f"; keywords: {', '.join(names)}"
             raise TypeError(message + hint) from None
 
+    setattr(call, _SUGGESTS, True)
     return call  # type: ignore[return-value]
 
 
 def lazy_names(package: str, file: str) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
     """Return `__getattr__`, `__dir__` and `__all__` of a package whose stub beside `file` lists its names.
 
-    A name is imported when it is first used.
+    A name is imported when it is first used. Every public function is `suggesting`.
     """
     load, names, public = lazy_loader.attach_stub(package, file)
 
     def attribute(name: str) -> object:
         try:
-            return load(name)
+            value = load(name)
         except AttributeError as error:
             if name in public:
                 raise
             missing = f"module {package!r} has no attribute {name!r}"
             raise AttributeError(missing + did_you_mean(name, public)) from error
+        if inspect.isfunction(value) and not hasattr(value, _SUGGESTS):
+            home, value = sys.modules[value.__module__], suggesting(value)
+            setattr(home, value.__name__, value)  # where pickle looks for it
+            setattr(sys.modules[package], name, value)
+        return value
 
     return attribute, names, public
